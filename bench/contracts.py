@@ -252,6 +252,21 @@ class Metric(Protocol):
         """Compare two (H, W, 3) 8-bit images. Raises `UnavailableError` where it cannot be had."""
 
 
+class Measurement(NamedTuple):
+    """One number for an avatar as a whole, and what else was learnt in measuring it."""
+
+    value: float
+    details: Mapping[str, float]
+
+
+@runtime_checkable
+class AvatarMetric(Protocol):
+    """One number per avatar (storage, speed), not per frame."""
+
+    def __call__(self, avatar: Avatar, workload: Sequence[tuple[Camera, HeadPose]]) -> Measurement:
+        """Measure an avatar; ``workload`` is a walk over cameras and poses, neighbours always different."""
+
+
 # ------------------------------------------------------------------ specs: light to import, heavy to create
 
 
@@ -286,7 +301,11 @@ class MethodSpec:
 
 @dataclass(frozen=True)
 class MetricSpec:
-    """What a table needs to know of a metric. ``implementation`` is "package.module:function_or_class"."""
+    """What a table needs to know of a metric.
+
+    ``implementation`` is "package.module:function" of a `Metric`, or of an `AvatarMetric` where ``per_frame``
+    is False; a class there is made without arguments.
+    """
 
     name: str
     label: str
@@ -300,11 +319,15 @@ class MetricSpec:
 
 @dataclass(frozen=True)
 class DatasetSpec:
-    """A reader: ``implementation`` names a function ``(path, **settings) -> Clip``."""
+    """A reader: ``implementation`` names a function ``(path, **settings) -> Clip``.
+
+    ``find`` names a function ``(root) -> list of paths`` that lists the captures under a folder.
+    """
 
     name: str
     summary: str
     implementation: str
+    find: str = ""
 
 
 @dataclass(frozen=True)

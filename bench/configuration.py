@@ -1,0 +1,169 @@
+"""Settings: YAML and ``--set a.b=c`` into frozen dataclasses. Unknown keys and wrong types are refused."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import types
+import typing
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import yaml
+
+from .errors import InputError
+from .registry import unknown
+
+T = TypeVar("T")
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Read a YAML mapping (safe loader: data, never code)."""
+    try:
+        value = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(path, "", "a readable YAML file", error.strerror or str(error)) from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        reason = " ".join(str(error).split())
+        raise InputError(path, "", "valid YAML", reason) from error
+    if value is None:
+        return {}
+    if not isinstance(value, dict):
+        raise InputError(path, "", "a mapping of settings", type(value).__name__)
+    return value
+
+
+def parse_assignments(assignments: Iterable[str]) -> dict[str, Any]:
+    """Turn ``["a.b=1", "c=x"]`` into ``{"a": {"b": 1}, "c": "x"}``; values are YAML scalars or lists."""
+    nested: dict[str, Any] = {}
+    for assignment in assignments:
+        path, equals, text = assignment.partition("=")
+        keys = path.strip().split(".")
+        if not equals or not all(keys):
+            raise InputError("--set", assignment, "KEY=VALUE with dots in KEY for nesting", "no such form")
+        try:
+            value = _scalar(yaml.safe_load(text))
+        except yaml.YAMLError as error:
+            raise InputError("--set", path, "a YAML value", " ".join(str(error).split())) from error
+        level = nested
+        for key in keys[:-1]:
+            level = level.setdefault(key, {})
+            if not isinstance(level, dict):
+                raise InputError("--set", path, f"{key} to be a group of settings", "a value set before")
+        level[keys[-1]] = value
+    return nested
+
+
+def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """Merge nested mappings; ``over`` wins."""
+    result = dict(base)
+    for key, value in over.items():
+        if isinstance(value, Mapping) and isinstance(result.get(key), Mapping):
+            result[key] = merge(result[key], value)
+        else:
+            result[key] = value
+    return result
+
+
+def build(cls: type[T], values: Mapping[str, Any], source: str, prefix: str = "") -> T:
+    """Build dataclass ``cls`` from a mapping.
+
+    Parameters
+    ----------
+    source : file or option the values came from, for the error.
+    prefix : dotted path of ``values`` inside it.
+
+    Raises
+    ------
+    InputError : an unknown key (with the nearest known one), a missing one, or a value of the wrong type.
+    """
+    hints = get_type_hints(cls)
+    fields = {f.name: f for f in dataclasses.fields(cls) if f.init}  # type: ignore[arg-type]
+    arguments: dict[str, Any] = {}
+    for key, value in values.items():
+        if key not in fields:
+            raise unknown(source, f"{prefix}{key}", str(key), fields)
+        arguments[key] = _convert(hints[key], value, source, f"{prefix}{key}")
+    for name, field in fields.items():
+        required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+        if required and name not in arguments:
+            raise InputError(source, f"{prefix}{name}", "a value", "nothing")
+    try:
+        return cls(**arguments)
+    except ValueError as error:
+        raise InputError(source, prefix.rstrip(".") or cls.__name__, "valid settings", str(error)) from error
+
+
+def _scalar(value: Any) -> Any:
+    """Read 1e-3 as a number: YAML 1.1 takes it for text because it has no dot."""
+    if isinstance(value, str):
+        try:
+            number = float(value)
+        except ValueError:
+            return value
+        return number if math.isfinite(number) else value
+    return value
+
+
+def _convert(hint: Any, value: Any, source: str, key: str) -> Any:
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin is typing.Literal:
+        if value not in arguments:
+            raise unknown(source, key, str(value), [str(a) for a in arguments])
+        return value
+    if origin in (Union, types.UnionType):
+        if value is None and type(None) in arguments:
+            return None
+        inner = [a for a in arguments if a is not type(None)]
+        for candidate in inner[:-1]:
+            try:
+                return _convert(candidate, value, source, key)
+            except InputError:
+                continue
+        return _convert(inner[-1], value, source, key)
+    if origin is tuple:
+        if isinstance(value, str):
+            value = [part.strip() for part in value.split(",") if part.strip()]
+        if not isinstance(value, (list, tuple)):
+            raise InputError(source, key, "a list", _shown(value))
+        repeated = len(arguments) == 2 and arguments[1] is Ellipsis
+        if not repeated and len(arguments) != len(value):
+            raise InputError(source, key, f"{len(arguments)} values", f"{len(value)}")
+        kinds = [arguments[0]] * len(value) if repeated else arguments
+        return tuple(_convert(k, v, source, f"{key}[{i}]") for i, (k, v) in enumerate(zip(kinds, value)))
+    if origin in (dict, Mapping) or hint is dict:
+        if not isinstance(value, Mapping):
+            raise InputError(source, key, "a group of settings", _shown(value))
+        return dict(value)
+    if dataclasses.is_dataclass(hint) and isinstance(hint, type):
+        if not isinstance(value, Mapping):
+            raise InputError(source, key, "a group of settings", _shown(value))
+        return build(hint, value, source, f"{key}.")
+    return _convert_scalar(hint, value, source, key)
+
+
+def _convert_scalar(hint: Any, value: Any, source: str, key: str) -> Any:
+    if hint is Any:
+        return value
+    if hint is bool and isinstance(value, bool):
+        return value
+    if hint is int and not isinstance(value, bool):
+        if isinstance(value, int):
+            return value
+        if isinstance(value, float) and value.is_integer():
+            return int(value)
+    if hint is float and not isinstance(value, bool) and isinstance(value, (int, float)):
+        if math.isfinite(value):
+            return float(value)
+        raise InputError(source, key, "a finite number", str(value))
+    if hint in (str, Path) and isinstance(value, (str, Path)):
+        return hint(value)
+    if hint is str and isinstance(value, (int, float)) and not isinstance(value, bool):
+        return str(value)
+    names = {int: "a whole number", float: "a number", bool: "true or false", str: "text", Path: "a path"}
+    raise InputError(source, key, names.get(hint, getattr(hint, "__name__", str(hint))), _shown(value))
+
+
+def _shown(value: Any) -> str:
+    return f"{value!r} ({type(value).__name__})"

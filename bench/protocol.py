@@ -1,0 +1,103 @@
+"""The protocol of a comparison: which frames are shown and scored, and how. An object with an id and a hash.
+
+The task picks the protocol, never the method. Its hash stands in every row; rows of different hashes are
+never compared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+
+from .contracts import Clip, FrameKey, TaskName
+from .errors import InputError
+from .files import digest
+
+TASK_TITLES: Mapping[str, str] = {
+    "novel_view": "Novel view",
+    "self_reenactment": "Self-reenactment",
+}
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """What is measured. Everything that changes a number is a field, and so changes the hash.
+
+    Attributes
+    ----------
+    task : names the split whose frames are scored.
+    keys : the frames, sorted; every method renders exactly these.
+    excluded : frames left out, with the reason.
+    clips : fingerprint of each subject's clip (images, cameras and driving signal).
+    resolution : at which size metrics are taken.
+    background : colour that renders and truth are composited on.
+    quantisation : how float renders become 8-bit frames.
+    metric_profile : the named set of metric definitions.
+    """
+
+    task: TaskName
+    keys: tuple[FrameKey, ...]
+    excluded: tuple[tuple[FrameKey, str], ...]
+    clips: tuple[tuple[str, str], ...]
+    resolution: str = "native"
+    background: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    quantisation: str = "round-to-8-bit"
+    metric_profile: str = "canonical"
+
+    @property
+    def id(self) -> str:
+        """Readable name."""
+        return f"{self.task}/{self.metric_profile}/1"
+
+    @property
+    def hash(self) -> str:
+        """First 12 hex digits of the digest of all fields."""
+        return digest(self.id, asdict(self))[:12]
+
+
+def make_protocol(task: TaskName, clips: Sequence[Clip], max_frames: int | None = None) -> Protocol:
+    """Make the protocol of ``task`` over some clips.
+
+    Parameters
+    ----------
+    max_frames : score at most so many frames of each clip, evenly spaced over the sorted keys; None: all.
+
+    Raises
+    ------
+    InputError : a clip without frames for the task, or one whose task frames are also training frames.
+    """
+    keys: list[FrameKey] = []
+    excluded: list[tuple[FrameKey, str]] = []
+    for clip in clips:
+        frames = sorted(clip.splits.get(task, ()))
+        if not frames:
+            raise InputError(f"clip {clip.subject}", f"splits.{task}", "at least one frame", "none")
+        leaked = set(frames) & set(clip.splits["train"])
+        if leaked:
+            raise InputError(
+                f"clip {clip.subject}",
+                f"splits.{task}",
+                "no frame of the training split",
+                f"{len(leaked)} shared, the first {min(leaked)}",
+            )
+        keys += _evenly(frames, max_frames)
+        excluded += sorted(clip.excluded.items())
+    backgrounds = {tuple(float(v) for v in clip.background) for clip in clips}
+    if len(backgrounds) != 1:
+        raise InputError("clips", "background", "one colour for all clips", f"{sorted(backgrounds)}")
+    red, green, blue = backgrounds.pop()
+    return Protocol(
+        task=task,
+        keys=tuple(keys),
+        excluded=tuple(excluded),
+        clips=tuple(sorted((clip.subject, clip.fingerprint) for clip in clips)),
+        background=(red, green, blue),
+    )
+
+
+def _evenly(frames: list[FrameKey], count: int | None) -> list[FrameKey]:
+    if count is None or count >= len(frames):
+        return frames
+    if count < 1:
+        raise InputError("protocol", "max_frames", "at least 1", str(count))
+    return [frames[(2 * i + 1) * len(frames) // (2 * count)] for i in range(count)]

@@ -1,0 +1,119 @@
+"""Finds methods, readers, metrics and reports by entry points; imports an implementation when it is used.
+
+This is how the command line reaches rooms it may not import: an entry point names a light spec, the spec
+names its implementation as ``"package.module:attribute"``.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import logging
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, Literal
+
+from .contracts import DatasetSpec, MethodSpec, MetricSpec, ReportSpec
+from .errors import HeadbenchError, InputError
+
+Group = Literal["methods", "datasets", "metrics", "reports"]
+SPEC_TYPES: dict[str, type] = {
+    "methods": MethodSpec,
+    "datasets": DatasetSpec,
+    "metrics": MetricSpec,
+    "reports": ReportSpec,
+}
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Plugin:
+    """One entry point: its spec, or why it could not be loaded."""
+
+    name: str
+    origin: str  # distribution and version that brought it
+    spec: Any | None
+    error: str = ""
+
+
+def discover(group: Group) -> dict[str, Plugin]:
+    """All plug-ins of a group by name. A broken one is listed with its error, never fatal.
+
+    Where two distributions claim a name, headbench's own wins and the clash is logged.
+    """
+    found: dict[str, Plugin] = {}
+    entries = sorted(entry_points(group=f"headbench.{group}"), key=lambda e: _origin(e) != _OWN)
+    for entry in entries:
+        plugin = _load(entry, group)
+        if entry.name in found:
+            if found[entry.name].origin != plugin.origin:
+                log.warning(
+                    "%s %r of %s is hidden by that of %s",
+                    group,
+                    entry.name,
+                    plugin.origin,
+                    found[entry.name].origin,
+                )
+            continue
+        found[entry.name] = plugin
+    return found
+
+
+def get(group: Group, name: str) -> Any:
+    """Return the spec called ``name``, or named by ``"package.module:ATTRIBUTE"`` (a plug-in not yet packaged).
+
+    Raises `InputError` for an unknown name (with the nearest one), `HeadbenchError` for a broken plug-in.
+    """
+    if ":" in name:
+        return _checked(resolve(name), group, name)
+    plugins = discover(group)
+    if name not in plugins:
+        raise unknown(f"registry of {group}", "name", name, plugins)
+    plugin = plugins[name]
+    if plugin.spec is None:
+        raise HeadbenchError(f"{group[:-1]} {name!r} of {plugin.origin} is broken: {plugin.error}")
+    return plugin.spec
+
+
+def resolve(reference: str) -> Any:
+    """Import ``"package.module:attribute"``."""
+    module_name, _, attribute = reference.partition(":")
+    try:
+        value: Any = importlib.import_module(module_name)
+        for part in attribute.split("."):
+            value = getattr(value, part)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise HeadbenchError(f"{reference}: cannot be imported: {error}") from error
+    return value
+
+
+def unknown(file: str, key: str, name: str, known: Any) -> InputError:
+    """Build the error for a name that is not among ``known``, with the nearest one as a hint."""
+    names = sorted(known)
+    near = difflib.get_close_matches(name, names, n=1, cutoff=0.4)
+    hint = f"Did you mean {near[0]!r}?" if near else ""
+    return InputError(file, key, f"one of {', '.join(names)}", repr(name), hint)
+
+
+_OWN = "headbench"
+
+
+def _origin(entry: EntryPoint) -> str:
+    return entry.dist.name if entry.dist is not None else "unknown"
+
+
+def _load(entry: EntryPoint, group: str) -> Plugin:
+    version = f" {entry.dist.version}" if entry.dist is not None else ""
+    origin = f"{_origin(entry)}{version}"
+    try:
+        return Plugin(entry.name, origin, _checked(entry.load(), group, entry.name))
+    except Exception as error:  # noqa: BLE001 - a plug-in may fail in any way; the others must still load
+        return Plugin(entry.name, origin, None, f"{type(error).__name__}: {error}")
+
+
+def _checked(spec: Any, group: str, name: str) -> Any:
+    if not isinstance(spec, SPEC_TYPES[group]):
+        raise InputError(
+            f"registry of {group}", name, f"a {SPEC_TYPES[group].__name__}", f"a {type(spec).__name__}"
+        )
+    return spec

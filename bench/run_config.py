@@ -1,0 +1,112 @@
+"""What a comparison is asked to do, resolved and checked whole before any work."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from .configuration import build, merge
+from .contracts import Budget, MethodSpec, MetricSpec, TaskName
+from .errors import InputError
+from .registry import get, resolve, unknown
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Settings of ``headbench run``, as in its YAML file.
+
+    Attributes
+    ----------
+    data : capture folder, or a folder with several.
+    out : folder for everything the run makes.
+    methods : names of registered methods, or "package.module:SPEC".
+    preset : settings by name: smoke, demo, fast, paper.
+    seeds : one avatar is trained for each.
+    tasks, metrics : what is measured.
+    reader : which dataset reader opens the captures.
+    reader_settings : passed to it (for example ``head``: path of the head model).
+    frames_per_task : score at most so many frames per subject and task, evenly spaced; None: all.
+    device : "cpu", "cuda", ...
+    settings : per method, over the preset; the key ``budget`` holds iterations and seconds.
+    """
+
+    data: str
+    out: str
+    methods: tuple[str, ...] = ("mean-image", "nearest-camera", "ga", "ours")
+    preset: str = "fast"
+    seeds: tuple[int, ...] = (0,)
+    tasks: tuple[TaskName, ...] = ("novel_view", "self_reenactment")
+    metrics: tuple[str, ...] = ("psnr", "ssim", "lpips", "storage", "fps")
+    reader: str = "ga"
+    reader_settings: dict[str, Any] = field(default_factory=dict)
+    frames_per_task: int | None = None
+    device: str = "cpu"
+    settings: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Refuse what could only fail later."""
+        for name in ("methods", "seeds", "tasks", "metrics"):
+            values = getattr(self, name)
+            if not values:
+                raise ValueError(f"{name} is empty")
+            if len(set(values)) != len(values):
+                raise ValueError(f"{name} names something twice: {', '.join(map(str, values))}")
+        if self.frames_per_task is not None and self.frames_per_task < 1:
+            raise ValueError(f"frames_per_task is {self.frames_per_task}; at least 1, or none for all")
+
+
+@dataclass(frozen=True)
+class ResolvedMethod:
+    """A method with its settings: spec, configuration and budget."""
+
+    spec: MethodSpec
+    config: Any
+    budget: Budget
+
+    def create(self) -> Any:
+        """Import the implementation and make the `Method`."""
+        implementation = resolve(self.spec.implementation)
+        return implementation() if self.config is None else implementation(self.config)
+
+    def record(self) -> dict[str, Any]:
+        """Everything that decides what this method does, for fingerprint and manifest."""
+        return {
+            "name": self.spec.name,
+            "version": self.spec.version,
+            "implementation": self.spec.implementation,
+            "config": None if self.config is None else asdict(self.config),
+            "budget": asdict(self.budget),
+        }
+
+
+def resolve_methods(config: RunConfig) -> list[ResolvedMethod]:
+    """Resolve every method of a run. Raises `InputError` for unknown methods, presets and settings."""
+    specs: list[MethodSpec] = [get("methods", name) for name in config.methods]
+    stray = set(config.settings) - {spec.name for spec in specs}
+    if stray:
+        raise unknown("settings", "method", min(stray), [spec.name for spec in specs])
+    return [resolve_method(spec, config.preset, config.settings.get(spec.name, {})) for spec in specs]
+
+
+def resolve_method(spec: MethodSpec, preset: str, settings: Mapping[str, Any]) -> ResolvedMethod:
+    """Lay ``settings`` over a preset. A method without presets takes any preset name."""
+    if spec.presets and preset not in spec.presets:
+        raise unknown(f"method {spec.name}", "preset", preset, spec.presets)
+    source = f"settings of {spec.name}"
+    values = merge(spec.presets.get(preset, {}), settings)
+    budget = build(Budget, values.pop("budget", {}), source, "budget.")
+    if (budget.iterations is not None and budget.iterations < 1) or (
+        budget.seconds is not None and budget.seconds <= 0
+    ):
+        raise InputError(source, "budget", "a positive number of iterations or seconds", str(asdict(budget)))
+    if not spec.config:
+        if values:
+            raise InputError(source, next(iter(values)), "no settings: this method has none", "a setting")
+        return ResolvedMethod(spec, None, budget)
+    return ResolvedMethod(spec, build(resolve(spec.config), values, source), budget)
+
+
+def resolve_metrics(config: RunConfig) -> list[MetricSpec]:
+    """Resolve the metrics of a run by name."""
+    return [get("metrics", name) for name in config.metrics]

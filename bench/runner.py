@@ -1,0 +1,170 @@
+"""Runs a comparison: checks everything, then fits, renders and measures cell by cell, then reports."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from .contracts import Clip, MetricSpec
+from .errors import HeadbenchError, InputError, UnavailableError
+from .machine import machine_record, peak_memory_bytes
+from .progress import duration
+from .protocol import Protocol, make_protocol
+from .registry import get, resolve
+from .run_config import ResolvedMethod, RunConfig, resolve_methods, resolve_metrics
+from .stages import Job, failed_rows, fit, measure, render
+from .store import RunFolder, write_rows
+
+log = logging.getLogger(__name__)
+
+
+def run(config: RunConfig) -> pd.DataFrame:
+    """Run a comparison into ``config.out`` and return its rows.
+
+    Everything that can be checked is checked before the first long step: settings, methods, captures, the
+    output folder. A method that fails is recorded as failed and the others go on. Started again with the same
+    configuration after a kill, it keeps what is done and continues what is not.
+    """
+    start = time.perf_counter()
+    methods, metrics = resolve_methods(config), resolve_metrics(config)
+    clips = open_clips(config)
+    protocols: dict[str, Protocol] = {
+        task: make_protocol(task, clips, config.frames_per_task) for task in config.tasks
+    }
+    folder = RunFolder(Path(config.out))
+    folder.prepare()
+    jobs = _jobs(config, methods, clips, protocols, folder)
+    for job in jobs:
+        job.check()
+    _warn_of_missing_metrics(metrics, clips[0])
+
+    manifest = _manifest(config, methods, metrics, clips, protocols)
+    folder.write_manifest({**manifest, "status": "started"})
+    for protocol in protocols.values():
+        log.info("%s, protocol %s: %d frames", protocol.task, protocol.hash, len(protocol.keys))
+    frames = [_run_cell(job, metrics) for job in jobs]
+    rows = pd.concat(frames, ignore_index=True)
+    write_rows(folder.rows, rows)
+    folder.write_manifest(
+        {
+            **manifest,
+            "status": "done",
+            "seconds": round(time.perf_counter() - start, 3),
+            "peak_memory_bytes": peak_memory_bytes(),
+        }
+    )
+    write_reports(folder.root)
+    log.info("finished in %s: %s", duration(time.perf_counter() - start), folder.root)
+    return rows
+
+
+def open_clips(config: RunConfig) -> list[Clip]:
+    """Open every capture under ``config.data`` and validate it whole."""
+    spec = get("datasets", config.reader)
+    root = Path(config.data)
+    if not root.exists():
+        raise InputError(root, "--data", "a capture folder", "no such folder")
+    paths: Sequence[Path] = resolve(spec.find)(root) if spec.find else [root]
+    if not paths:
+        raise InputError(root, "--data", f"captures that reader {spec.name!r} knows", "none")
+    read = resolve(spec.implementation)
+    try:
+        clips: list[Clip] = [read(path, **config.reader_settings) for path in paths]
+    except TypeError as error:
+        raise InputError(
+            f"reader {spec.name}", "reader_settings", "settings the reader knows", str(error)
+        ) from error
+    subjects = [clip.subject for clip in clips]
+    if len(set(subjects)) != len(subjects):
+        raise InputError(root, "subject", "a different subject in each capture", ", ".join(subjects))
+    return clips
+
+
+def write_reports(run_folder: Path) -> list[Path]:
+    """Write every registered report of a finished run."""
+    written: list[Path] = []
+    for name in ("table", "contact-sheet"):
+        written += resolve(get("reports", name).implementation)(run_folder)
+    return written
+
+
+def _jobs(
+    config: RunConfig,
+    methods: Sequence[ResolvedMethod],
+    clips: Sequence[Clip],
+    protocols: Mapping[str, Protocol],
+    folder: RunFolder,
+) -> list[Job]:
+    return [
+        Job(clip, method, seed, config.device, folder.cell(clip.subject, method.spec.name, seed), protocols)
+        for clip in clips
+        for method in methods
+        for seed in config.seeds
+    ]
+
+
+def _run_cell(job: Job, metrics: Sequence[MetricSpec]) -> pd.DataFrame:
+    log.info("%s", job.name)
+    try:
+        avatar = fit(job)
+        render(job, avatar)
+        return measure(job, avatar, metrics)
+    except InputError as error:
+        log.error("%s failed: %s", job.name, error)
+        return failed_rows(job, metrics, error)
+    except Exception as error:
+        log.exception("%s failed", job.name)
+        return failed_rows(job, metrics, error)
+
+
+def _warn_of_missing_metrics(metrics: Sequence[MetricSpec], clip: Clip) -> None:
+    """Say before the training, not after it, which metric cannot be had."""
+    image = clip.image(clip.splits["train"][0])
+    for spec in metrics:
+        implementation = resolve(spec.implementation)
+        if not spec.per_frame:
+            continue
+        metric = implementation() if isinstance(implementation, type) else implementation
+        try:
+            value = metric(image, image)
+        except UnavailableError as error:
+            log.warning("%s will be missing: %s", spec.label, error)
+        else:
+            if not np.isfinite(value):
+                raise HeadbenchError(f"metric {spec.name} gives {value} for identical images")
+
+
+def _manifest(
+    config: RunConfig,
+    methods: Sequence[ResolvedMethod],
+    metrics: Sequence[MetricSpec],
+    clips: Sequence[Clip],
+    protocols: Mapping[str, Protocol],
+) -> dict[str, Any]:
+    return {
+        "configuration": asdict(config),
+        "methods": [method.record() for method in methods],
+        "metrics": [asdict(metric) for metric in metrics],
+        "clips": [
+            {
+                "subject": clip.subject,
+                "fingerprint": clip.fingerprint,
+                "steps": [asdict(step) for step in clip.steps],
+                "splits": {name: len(keys) for name, keys in clip.splits.items()},
+                "excluded": {str(key): reason for key, reason in sorted(clip.excluded.items())},
+            }
+            for clip in clips
+        ],
+        "protocols": {
+            task: {"id": protocol.id, "hash": protocol.hash, **asdict(protocol)}
+            for task, protocol in protocols.items()
+        },
+        "machine": machine_record(),
+    }

@@ -1,0 +1,232 @@
+"""The stages of one cell (a subject, a method, a seed): fit, render, measure. Each picks up where it was."""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import time
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import pandas as pd
+
+from .contracts import Avatar, Camera, Clip, FrameKey, HeadPose, Metric, MetricSpec
+from .errors import HeadbenchError, InputError, UnavailableError
+from .files import digest
+from .frames import quantise, read_png, write_png
+from .machine import peak_memory_bytes
+from .progress import duration, progress
+from .protocol import Protocol
+from .registry import resolve
+from .run_config import ResolvedMethod
+from .store import Cell, Row, read_rows, to_frame, write_rows
+
+log = logging.getLogger(__name__)
+RESULT_FORMAT = 1  # raise when a stage changes what it leaves behind
+
+
+@dataclass(frozen=True)
+class Job:
+    """One cell with all it needs."""
+
+    clip: Clip
+    method: ResolvedMethod
+    seed: int
+    device: str
+    cell: Cell
+    protocols: Mapping[str, Protocol]
+
+    @property
+    def name(self) -> str:
+        return f"{self.clip.subject} {self.method.spec.name} seed {self.seed}"
+
+    @property
+    def fit_fingerprint(self) -> str:
+        """Digest of everything the trained avatar depends on."""
+        return digest(RESULT_FORMAT, self.method.record(), self.seed, self.device, self.clip.fingerprint)
+
+    def check(self) -> None:
+        """Refuse a folder that holds an avatar made of something else."""
+        state = self.cell.stage("fit")
+        if state is not None and state.get("fingerprint") != self.fit_fingerprint:
+            raise InputError(
+                self.cell.folder / "fit.json",
+                "fingerprint",
+                f"{self.fit_fingerprint[:12]}, that of this run's settings and data",
+                f"{str(state.get('fingerprint'))[:12]}, an avatar of other settings or data",
+                "Choose another --out, or delete that folder.",
+            )
+
+
+def fit(job: Job) -> Avatar:
+    """Train, or continue, or read what was trained; return the avatar as read back from disk."""
+    method = job.method.create()
+    if not job.cell.is_done("fit", job.fit_fingerprint):
+        earlier = job.cell.stage("fit") or {}
+        spent = float(earlier.get("seconds", 0.0))
+        job.cell.begin("fit", job.fit_fingerprint)
+        start = time.perf_counter()
+        with progress(f"{job.name}: training") as report:
+            method.fit(
+                job.clip,
+                job.cell.avatar,
+                job.method.budget,
+                device=job.device,
+                seed=job.seed,
+                progress=report,
+            )
+        seconds = spent + time.perf_counter() - start
+        job.cell.finish(
+            "fit",
+            job.fit_fingerprint,
+            seconds=round(seconds, 3),
+            peak_memory_bytes=peak_memory_bytes(),
+            method=job.method.record(),
+        )
+        log.info("%s: trained in %s", job.name, duration(seconds))
+    avatar: Avatar = method.load(job.cell.avatar, device=job.device)
+    return avatar
+
+
+def render(job: Job, avatar: Avatar) -> None:
+    """Render every frame of every protocol to 8-bit PNG; frames already there are kept."""
+    wanted = [
+        (protocol, key)
+        for protocol in job.protocols.values()
+        for key in protocol.keys
+        if key.subject == job.clip.subject
+    ]
+    with progress(f"{job.name}: rendering") as report:
+        for index, (protocol, key) in enumerate(wanted):
+            path = job.cell.render(protocol.task, key)
+            if not path.exists():
+                camera, pose = job.clip.cameras[key.camera], job.clip.poses[key.timestep]
+                frame = avatar.render(camera, pose, protocol.background)
+                if frame.rgb.shape != (camera.height, camera.width, 3):
+                    raise InputError(
+                        job.name, str(key), f"shape {(camera.height, camera.width, 3)}", f"{frame.rgb.shape}"
+                    )
+                write_png(path, quantise(frame.rgb))
+            report(index + 1, len(wanted), protocol.task)
+
+
+def measure(job: Job, avatar: Avatar, metrics: Sequence[MetricSpec]) -> pd.DataFrame:
+    """Score the stored frames and the avatar as a whole; rows already measured are read back."""
+    fingerprint = digest(
+        RESULT_FORMAT,
+        job.fit_fingerprint,
+        sorted(p.hash for p in job.protocols.values()),
+        [(m.name, m.implementation) for m in metrics],
+    )
+    if job.cell.is_done("measure", fingerprint) and job.cell.rows.exists():
+        rows = read_rows(job.cell.rows)
+        if (rows["status"] == "ok").all():
+            return rows
+    values: list[Row] = []
+    details: dict[str, Any] = {}
+    for spec in metrics:
+        metric = _instance(spec)
+        if spec.per_frame:
+            for protocol in job.protocols.values():
+                values += _score(job, spec, metric, protocol)
+        else:
+            row, extra = _measure_avatar(job, spec, metric, avatar)
+            values.append(row)
+            details[spec.name] = extra
+    rows = to_frame(values)
+    write_rows(job.cell.rows, rows)
+    job.cell.finish("measure", fingerprint, details=details)
+    return rows
+
+
+def failed_rows(job: Job, metrics: Sequence[MetricSpec], error: Exception) -> pd.DataFrame:
+    """Rows that show a failed cell as failed, with its error."""
+    reason = f"{type(error).__name__}: {error}"
+    rows = [
+        _row(job, spec, protocol, None, math.nan, "failed", reason)
+        for spec in metrics
+        for protocol in (job.protocols.values() if spec.per_frame else [None])
+    ]
+    return to_frame(rows)
+
+
+def workload(clip: Clip, protocols: Mapping[str, Protocol]) -> list[tuple[Camera, HeadPose]]:
+    """Return a walk over the cameras and poses of the scored frames, a new camera and pose at every step."""
+    keys = [k for p in protocols.values() for k in p.keys if k.subject == clip.subject]
+    timesteps = sorted({k.timestep for k in keys})
+    cameras = sorted(clip.cameras)
+    steps = max(len(timesteps), len(cameras), 2)
+    walk = [
+        (clip.cameras[cameras[i % len(cameras)]], clip.poses[timesteps[i % len(timesteps)]])
+        for i in range(steps)
+    ]
+    first, last = walk[0], walk[-1]
+    return walk[:-1] if len(walk) > 2 and first[0] is last[0] and first[1] is last[1] else walk
+
+
+def _instance(spec: MetricSpec) -> Any:
+    implementation = resolve(spec.implementation)
+    return implementation() if isinstance(implementation, type) else implementation
+
+
+def _score(job: Job, spec: MetricSpec, metric: Metric, protocol: Protocol) -> list[Row]:
+    keys = [key for key in protocol.keys if key.subject == job.clip.subject]
+
+    def score(key: FrameKey) -> float:
+        return metric(read_png(job.cell.render(protocol.task, key)), job.clip.image(key))
+
+    try:
+        first = score(keys[0])
+    except UnavailableError as error:
+        return [_row(job, spec, protocol, key, math.nan, "missing", str(error)) for key in keys]
+    values = [first]
+    with (
+        progress(f"{job.name}: {spec.label} of {protocol.task}") as report,
+        ThreadPoolExecutor(os.cpu_count()) as pool,
+    ):
+        for value in pool.map(score, keys[1:]):
+            values.append(value)
+            report(len(values), len(keys))
+    return [_row(job, spec, protocol, key, value, "ok", "") for key, value in zip(keys, values)]
+
+
+def _measure_avatar(
+    job: Job, spec: MetricSpec, metric: Any, avatar: Avatar
+) -> tuple[Row, Mapping[str, float]]:
+    try:
+        measured = metric(avatar, workload(job.clip, job.protocols))
+    except UnavailableError as error:
+        return _row(job, spec, None, None, math.nan, "missing", str(error)), {}
+    return _row(job, spec, None, None, measured.value, "ok", ""), measured.details
+
+
+def _row(
+    job: Job,
+    spec: MetricSpec,
+    protocol: Protocol | None,
+    key: FrameKey | None,
+    value: float,
+    status: str,
+    reason: str,
+) -> Row:
+    if status == "ok" and not math.isfinite(value):
+        raise HeadbenchError(f"{job.name}: {spec.name} of {key} is {value}; a metric must be finite")
+    return Row(
+        method=job.method.spec.name,
+        version=job.method.spec.version,
+        seed=job.seed,
+        task=protocol.task if protocol else "",
+        subject=job.clip.subject,
+        sequence=key.sequence if key else "",
+        timestep=key.timestep if key else -1,
+        camera=key.camera if key else "",
+        region="full",
+        metric=spec.name,
+        value=value,
+        protocol=protocol.hash if protocol else "",
+        status=status,
+        reason=reason,
+    )
