@@ -1,0 +1,283 @@
+"""The differentiable head: linear blendshapes, pose correctives and skinning over any head in FLAME's layout.
+
+Li et al., "Learning a model of facial shape and expression from 4D scans", SIGGRAPH Asia 2017, section 4;
+the formulation of the skinning is that of SMPL (Loper et al., SIGGRAPH Asia 2015, section 3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...bench.contracts import HeadAsset, HeadPose
+from ...bench.errors import InputError
+from .rotations import axis_angle_to_matrix, rodrigues
+
+__all__ = ["HeadModel", "rodrigues"]
+
+
+class HeadModel(torch.nn.Module):
+    """Vertices of a head from identity, expression and pose. Batched and differentiable in every input.
+
+    Every argument is ``(B, n)`` or ``(n,)``, and arguments of batch size 1 are broadcast. Lengths are metres,
+    rotations axis-angle in radians.
+
+    Parameters
+    ----------
+    asset : a head in FLAME's layout, e.g. `HeadArrays`.
+    dtype, device : of the buffers; inputs have to match.
+    """
+
+    template: Tensor
+    faces: Tensor
+    shape_matrix: Tensor
+    expression_matrix: Tensor
+    pose_matrix: Tensor
+    joint_regressor: Tensor
+    skinning_weights: Tensor
+    eyelid_matrix: Tensor | None
+
+    def __init__(
+        self, asset: HeadAsset, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
+    ) -> None:
+        super().__init__()
+        self.version = asset.version
+        self.parents = tuple(int(parent) for parent in asset.parents)
+
+        def buffer(name: str, values: Any) -> None:
+            array = np.ascontiguousarray(values, dtype=np.float64)
+            self.register_buffer(
+                name, torch.from_numpy(array).to(device=device, dtype=dtype), persistent=False
+            )
+
+        def basis(name: str, values: Any) -> None:
+            # (V, 3, K) to (K, 3V): the product with coefficients is then one matrix multiplication.
+            buffer(name, np.asarray(values).reshape(-1, np.shape(values)[2]).T)
+
+        buffer("template", asset.template)
+        basis("shape_matrix", asset.shape_basis)
+        basis("expression_matrix", asset.expression_basis)
+        basis("pose_matrix", asset.pose_basis)
+        buffer("joint_regressor", asset.joint_regressor)
+        buffer("skinning_weights", asset.skinning_weights)
+        if asset.eyelid_basis is None:
+            self.eyelid_matrix = None
+        else:
+            basis("eyelid_matrix", asset.eyelid_basis)
+        faces = torch.from_numpy(np.asarray(asset.faces, dtype=np.int64)).to(device)
+        self.register_buffer("faces", faces, persistent=False)
+
+    @property
+    def vertex_count(self) -> int:
+        """V."""
+        return self.template.shape[0]
+
+    @property
+    def shape_size(self) -> int:
+        """S, the number of identity coefficients."""
+        return self.shape_matrix.shape[0]
+
+    @property
+    def expression_size(self) -> int:
+        """E, the number of expression coefficients."""
+        return self.expression_matrix.shape[0]
+
+    def forward(
+        self,
+        *,
+        shape: Tensor | None = None,
+        expression: Tensor,
+        rotation: Tensor,
+        neck: Tensor,
+        jaw: Tensor,
+        eyes: Tensor,
+        translation: Tensor,
+        static_offset: Tensor | None = None,
+        eyelids: Tensor | None = None,
+        canonical: Tensor | None = None,
+    ) -> Tensor:
+        """Vertices (B, V, 3), metres.
+
+        Shaped mesh, joints regressed from it, pose correctives, linear blend skinning, translation, eyelids.
+
+        Parameters
+        ----------
+        shape : (B, S) identity coefficients.
+        expression : (B, E).
+        rotation, neck, jaw : (B, 3); ``rotation`` turns about joint 0, not about the origin.
+        eyes : (B, 6) left, then right.
+        translation : (B, 3).
+        static_offset : (B, V, 3) or (V, 3), added to the shaped template.
+        eyelids : (B, 2) left, right; only for models with eyelid bases.
+        canonical : (B, V, 3), what `canonical` gave for this identity; replaces ``shape`` and
+            ``static_offset``. Worth it where the identity is fixed: the identity basis is the largest array.
+
+        Raises
+        ------
+        ValueError
+            Where sizes do not fit the model, or identity is given both ways or not at all.
+        """
+        shaped = self._shaped(shape, expression, static_offset, canonical)
+        rotations = self._rotations(rotation, neck, jaw, eyes)
+        joints = self.joint_regressor @ shaped
+
+        identity = torch.eye(3, dtype=rotations.dtype, device=rotations.device)
+        feature = (rotations[:, 1:] - identity).flatten(1)
+        posed = shaped + (feature @ self.pose_matrix).unflatten(1, (-1, 3))
+
+        world = chain_transforms(rotations, joints, self.parents)
+        # What joint j adds at vertex x is R_j x + o_j; the offset takes x from the joint and back.
+        offsets = world[..., 3] - (world[..., :3] @ joints[..., None])[..., 0]
+        relative = torch.cat([world[..., :3], offsets[..., None]], dim=-1)
+        blended = (self.skinning_weights @ relative.flatten(2)).unflatten(2, (3, 4))
+        vertices = (blended[..., :3] @ posed[..., None])[..., 0] + blended[..., 3]
+        vertices = vertices + _rows(translation, 3, "translation")[:, None]
+        if eyelids is not None:
+            if self.eyelid_matrix is None:
+                raise ValueError(f"head model {self.version!r} has no eyelid basis, but eyelids were given")
+            vertices = vertices + (_rows(eyelids, 2, "eyelids") @ self.eyelid_matrix).unflatten(1, (-1, 3))
+        return vertices
+
+    def canonical(self, shape: Tensor, static_offset: Tensor | None = None) -> Tensor:
+        """Neutral, unposed head of an identity: (B, V, 3), metres."""
+        blend = _rows(shape, self.shape_size, "shape") @ self.shape_matrix
+        vertices = self.template + blend.unflatten(1, (-1, 3))
+        return vertices if static_offset is None else vertices + self._offset(static_offset)
+
+    def joints(self, shape: Tensor, expression: Tensor, static_offset: Tensor | None = None) -> Tensor:
+        """Joint positions of the shaped, unposed head: (B, J, 3), metres."""
+        return self.joint_regressor @ self._shaped(shape, expression, static_offset, None)
+
+    def head_transform(
+        self,
+        *,
+        shape: Tensor,
+        expression: Tensor,
+        rotation: Tensor,
+        neck: Tensor,
+        translation: Tensor,
+        static_offset: Tensor | None = None,
+    ) -> Tensor:
+        """Rigid motion of the head, (B, 4, 4): translation after the root's and the neck's rotation.
+
+        What trackers call the head pose: vertices that hang on the neck joint alone move by it, apart from
+        the pose correctives of the neck.
+        """
+        joints = self.joints(shape, expression, static_offset)
+        still = torch.zeros_like(_rows(rotation, 3, "rotation"))
+        rotations = self._rotations(rotation, neck, still, torch.cat([still, still], dim=-1))
+        world = chain_transforms(rotations, joints, self.parents)[:, 1]
+        turn = world[..., :3]
+        shift = world[..., 3] - (turn @ joints[:, 1, :, None])[..., 0] + _rows(translation, 3, "translation")
+        batch = shift.shape[0]
+        last = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=turn.dtype, device=turn.device).expand(batch, 1, 4)
+        return torch.cat([torch.cat([turn.expand(batch, 3, 3), shift[..., None]], dim=-1), last], dim=-2)
+
+    def pose_arguments(self, poses: Sequence[HeadPose]) -> dict[str, Tensor]:
+        """Stack poses into arguments of `forward`, in this model's dtype and on its device.
+
+        ``eyelids`` is among them only where the model has eyelid bases (zeros for poses that lack them).
+
+        Raises
+        ------
+        InputError
+            Where there is no pose, one belongs to another head model, or its sizes do not fit.
+        """
+        if not poses:
+            raise InputError("poses", "", "at least one pose", "none")
+        sizes = {"expression": self.expression_size, "rotation": 3, "neck": 3, "jaw": 3, "eyes": 6}
+        sizes["translation"] = 3
+        for pose in poses:
+            self._check_pose(pose, sizes)
+        columns = {name: np.stack([getattr(pose, name) for pose in poses]) for name in sizes}
+        if self.eyelid_matrix is not None:
+            columns["eyelids"] = np.stack(
+                [np.zeros(2) if pose.eyelids is None else pose.eyelids for pose in poses]
+            )
+        like = self.template
+        return {
+            name: torch.from_numpy(np.asarray(values, dtype=np.float64)).to(like)
+            for name, values in columns.items()
+        }
+
+    def _check_pose(self, pose: HeadPose, sizes: dict[str, int]) -> None:
+        where = f"pose of {pose.subject or 'unnamed subject'}"
+        if pose.timestep is not None:
+            where += f", timestep {pose.timestep}"
+        if pose.head_model != self.version:
+            raise InputError(
+                where,
+                "head_model",
+                repr(self.version),
+                repr(pose.head_model),
+                "Coefficients of one head model mean nothing to another; refit the tracking first.",
+            )
+        for name, size in sizes.items():
+            found = np.shape(getattr(pose, name))
+            if found != (size,):
+                raise InputError(where, name, f"shape ({size},)", f"shape {found}")
+
+    def _shaped(
+        self, shape: Tensor | None, expression: Tensor, static_offset: Tensor | None, canonical: Tensor | None
+    ) -> Tensor:
+        if (shape is None) == (canonical is None):
+            raise ValueError("give the identity once: either shape or canonical")
+        if canonical is None:
+            assert shape is not None
+            canonical = self.canonical(shape, static_offset)
+        elif static_offset is not None:
+            raise ValueError("canonical already holds the static offset")
+        blend = _rows(expression, self.expression_size, "expression") @ self.expression_matrix
+        return canonical + blend.unflatten(1, (-1, 3))
+
+    def _rotations(self, rotation: Tensor, neck: Tensor, jaw: Tensor, eyes: Tensor) -> Tensor:
+        """Local rotation matrices in joint order, (B, J, 3, 3)."""
+        parts = [_rows(rotation, 3, "rotation"), _rows(neck, 3, "neck"), _rows(jaw, 3, "jaw")]
+        parts.append(_rows(eyes, 6, "eyes"))
+        batch = max(part.shape[0] for part in parts)
+        full = torch.cat([part.expand(batch, -1) for part in parts], dim=1)
+        return axis_angle_to_matrix(full.unflatten(1, (-1, 3)))
+
+    def _offset(self, static_offset: Tensor) -> Tensor:
+        if static_offset.shape[-2:] != self.template.shape:
+            expected, found = tuple(self.template.shape), tuple(static_offset.shape)
+            raise ValueError(f"static_offset: expected (..., {expected[0]}, 3), found {found}")
+        return static_offset
+
+
+def chain_transforms(rotations: Tensor, joints: Tensor, parents: Sequence[int]) -> Tensor:
+    """Rigid world transforms of the joints along the joint tree.
+
+    Parameters
+    ----------
+    rotations : (B, J, 3, 3) local rotation of each joint relative to its parent.
+    joints : (B, J, 3) rest positions; the root stays where it is.
+    parents : parent of each joint, -1 for the root; parents come first.
+
+    Returns
+    -------
+    (B, J, 3, 4): world rotation and world position of each joint.
+    """
+    world_rotations, positions = [rotations[:, 0]], [joints[:, 0]]
+    for joint, parent in enumerate(parents[1:], start=1):
+        bone = (joints[:, joint] - joints[:, parent])[..., None]
+        positions.append((world_rotations[parent] @ bone)[..., 0] + positions[parent])
+        world_rotations.append(world_rotations[parent] @ rotations[:, joint])
+    batch = max(rotations.shape[0], joints.shape[0])
+    columns = [
+        torch.cat([turn.expand(batch, 3, 3), place.expand(batch, 3)[..., None]], dim=-1)
+        for turn, place in zip(world_rotations, positions)
+    ]
+    return torch.stack(columns, dim=1)
+
+
+def _rows(values: Tensor, size: int, name: str) -> Tensor:
+    """(B, size), with a batch axis added to a vector."""
+    rows = values if values.ndim > 1 else values[None]
+    if rows.ndim != 2 or rows.shape[1] != size:
+        raise ValueError(f"{name}: expected (B, {size}) or ({size},), found {tuple(values.shape)}")
+    return rows
