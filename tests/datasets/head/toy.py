@@ -42,10 +42,12 @@ def toy_head(
     upper, middle, lower = (1 + (_MOUTH_ROW + k) * n + mouth for k in range(3))
 
     skin = skin * np.array([0.075, 0.11, 0.09])
+    between = 0.5 * (skin[upper, 1] + skin[lower, 1])
+    skin[upper, 1], skin[lower, 1] = between + 0.003, between - 0.003
+    skin[middle, 1] = between
     skin[middle, 2] -= 0.03  # the pocket behind the lips
-    skin[middle, 1] = 0.5 * (skin[upper, 1] + skin[lower, 1])
     ball, ball_faces = _sphere(2, n)
-    centers = np.array([[0.03, 0.025, 0.066], [-0.03, 0.025, 0.066]])
+    centers = np.array([[0.03, 0.025, 0.076], [-0.03, 0.025, 0.076]])
     count, ball_count = len(skin), len(ball)
     template = np.concatenate([skin, *(center + 0.012 * ball for center in centers)])
     faces = np.concatenate([skin_faces, ball_faces + count, ball_faces + count + ball_count])
