@@ -1,0 +1,42 @@
+# The commands of this project. `make demo` and `make test` do all the set-up they need.
+PYTHON ?= python3
+VENV   := .venv
+BIN    := $(VENV)/bin
+OUT    ?= demo-output
+
+.PHONY: help setup demo test check bench clean
+
+help:
+	@echo "make setup   make $(VENV) with headbench in it"
+	@echo "make demo    compare avatar methods on a capture made on the spot (OUT=$(OUT))"
+	@echo "make test    run the tests"
+	@echo "make check   style, types, architecture"
+	@echo "make bench   measure the speed of the splat renderer"
+
+setup: $(VENV)/.installed
+
+# Reinstalled when packaging or the kernel changes; Python sources are used in place.
+KERNEL := CMakeLists.txt $(wildcard methods/splats/CMakeLists.txt methods/splats/csrc/*)
+$(VENV)/.installed: pyproject.toml constraints.txt __init__.py $(KERNEL)
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "headbench needs Python 3.11 or newer; set PYTHON=")'
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	@touch $@
+
+demo: setup
+	$(BIN)/headbench demo --out $(OUT)
+
+test: setup
+	$(BIN)/python -m pytest
+
+check: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy bench datasets methods metrics reports
+	$(BIN)/python -m pytest -q tests/test_architecture.py
+
+bench: setup
+	$(BIN)/headbench bench splats
+
+clean:
+	rm -rf build $(VENV)

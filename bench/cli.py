@@ -1,0 +1,269 @@
+"""The command line. It composes the rooms through the registry; commands themselves hold no logic of a room."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from .configuration import build, merge, parse_assignments, read_yaml
+from .demo import DemoConfig, demo_run_config, parse_size
+from .errors import HeadbenchError, InputError
+from .files import plain
+from .progress import log_to, progress
+from .registry import Group, discover, get, resolve
+from .run_config import RunConfig
+from .runner import run as run_comparison
+
+EXIT_FAILED_CELL = 1
+EXIT_BAD_INPUT = 2
+
+Preset = Literal["smoke", "demo", "fast", "paper"]
+Text = Annotated[str | None, tyro.conf.arg(metavar="TEXT")]
+PathText = Annotated[str | None, tyro.conf.arg(metavar="PATH")]
+Assignments = Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="KEY=VALUE")]
+
+
+def demo(
+    out: str = "demo-output",
+    preset: Preset = "demo",
+    seed: int = 0,
+    set: Assignments = (),
+    json: bool = False,
+) -> int:
+    """Compare methods from nothing: make a capture, train, render, measure, print the table.
+
+    Needs no data, no accelerator and no network. Everything lands in OUT: the capture, the avatars, the renders,
+    tables (Markdown, CSV, LaTeX) and contact_sheet.png. Started again after a kill it continues.
+
+    Args:
+        out: Folder for everything the demo makes.
+        preset: How much effort: smoke takes seconds and proves nothing about quality; demo takes minutes.
+        seed: Seeds the capture and the training.
+        set: Change a setting of the run, as for `headbench run`; repeatable. `capture.size=96x136` and the like
+            change the capture.
+        json: Print the result as JSON.
+    """
+    values = parse_assignments(set)
+    config = build(
+        DemoConfig, {"preset": preset, "seed": seed, "out": out, **values.pop("capture", {})}, "--set"
+    )
+    with log_to(_log_file(Path(out))):
+        _synthesise(config.capture_arguments())
+        return _run(build(RunConfig, merge(demo_run_config(config), values), "--set"), json)
+
+
+def synth(
+    out: str,
+    subjects: int = 1,
+    cameras: int = 16,
+    timesteps: int = 60,
+    size: str = "275x401",
+    head: str = "procedural",
+    seed: int = 0,
+    tracking_noise: float = 0.0,
+) -> int:
+    """Render a synthetic multi-view capture in the GaussianAvatars/VHAP layout.
+
+    Path-traced heads with expression-dependent wrinkles and blush, on NeRSemble's camera rig, with sequences
+    named as there. Frames already rendered with the same settings are kept.
+
+    Args:
+        out: Folder to write.
+        subjects: How many heads; each differs in shape, skin, hair.
+        cameras: 2 to 16 views; the frontal one is always there and is held out as the novel view.
+        timesteps: Frames per camera, shared out over the sequences; FREE is held out for self-reenactment.
+        size: Width x height of the images in pixels, for example 550x802 (NeRSemble at a quarter).
+        head: `procedural`, or the path of a head model (ICT-FaceKit npz).
+        seed: Decides subjects and performances.
+        tracking_noise: Noise on the tracked parameters, as a fraction of their standard deviation.
+    """
+    with log_to(None):
+        _synthesise(
+            {
+                "out": Path(out),
+                "subjects": subjects,
+                "cameras": cameras,
+                "timesteps": timesteps,
+                "size": parse_size(size),
+                "head": head,
+                "seed": seed,
+                "tracking_noise": tracking_noise,
+            }
+        )
+    print(out)
+    return 0
+
+
+def run(
+    data: PathText = None,
+    out: PathText = None,
+    methods: Text = None,
+    preset: Preset | None = None,
+    config: PathText = None,
+    head: PathText = None,
+    set: Assignments = (),
+    json: bool = False,
+) -> int:
+    """Train methods on a capture, render, measure, and write tables and pictures.
+
+    Settings come from --config, then from the options here, then from --set. A run that was killed continues
+    when started again. Exit code 0: all done; 1: some method failed (the table shows which and why); 2: bad input,
+    found before any training.
+
+    Args:
+        data: Capture in the GaussianAvatars/VHAP layout: a UNION folder, a sequence folder, or a folder of them.
+        out: Folder for everything the run makes.
+        methods: Names, separated by commas; see `headbench list methods`. Default: all that compare fairly here:
+            mean-image,nearest-camera,ga,ours.
+        preset: How much training: smoke (seconds), demo (minutes), fast, paper (the published schedule).
+        config: YAML file with any settings of a run.
+        head: Head model for captures that bring none: FLAME pickle or npz.
+        set: Any setting, for example `seeds=0,1,2`, `frames_per_task=50`, `settings.ga.budget.iterations=5000`;
+            repeatable.
+        json: Print the result as JSON.
+    """
+    values: dict[str, Any] = read_yaml(Path(config)) if config else {}
+    given = {"data": data, "out": out, "methods": methods, "preset": preset}
+    values = merge(values, {key: value for key, value in given.items() if value is not None})
+    if head is not None:
+        values = merge(values, {"reader_settings": {"head": head}})
+    source = config or "command line"
+    for key in ("data", "out"):
+        if key not in values:
+            raise InputError(source, key, f"--{key} or the key {key} in --config", "neither")
+    settings = build(RunConfig, merge(values, parse_assignments(set)), source)
+    with log_to(_log_file(Path(settings.out))):
+        return _run(settings, json)
+
+
+def table(run: Annotated[str, tyro.conf.Positional], format: Literal["md", "csv", "latex"] = "md") -> int:
+    """Print the comparison table of a finished run.
+
+    Args:
+        run: Folder of the run.
+        format: Markdown, CSV, or LaTeX (booktabs).
+    """
+    render: Callable[[Path, str], str] = resolve(get("reports", "table-text").implementation)
+    print(render(Path(run), format))
+    return 0
+
+
+def list_(
+    what: Annotated[Literal["methods", "presets", "metrics", "datasets", "reports"], tyro.conf.Positional],
+    json: bool = False,
+) -> int:
+    """List what is installed: methods, presets, metrics, dataset readers, reports.
+
+    Args:
+        what: What to list.
+        json: Print JSON with everything known of each.
+    """
+    group: Group = "methods" if what == "presets" else what
+    entries = []
+    for name, plugin in discover(group).items():
+        entry: dict[str, Any] = {"name": name, "origin": plugin.origin, "error": plugin.error}
+        if plugin.spec is not None:
+            entry = {**entry, **asdict(plugin.spec), "name": name}
+        entries.append(entry)
+    if what == "presets":
+        entries = [
+            {
+                "name": f"{entry['name']} {preset}",
+                "summary": _settings_line(values),
+                "settings": values,
+                "error": "",
+            }
+            for entry in entries
+            for preset, values in entry.get("presets", {}).items()
+        ]
+    if json:
+        _print_json(entries)
+        return 0
+    width = max((len(entry["name"]) for entry in entries), default=0)
+    for entry in entries:
+        text = f"broken: {entry['error']}" if entry["error"] else entry["summary"]
+        print(f"{entry['name']:<{width}}  {text}")
+    return 0
+
+
+COMMANDS: dict[str, Callable[..., int]] = {
+    "demo": demo,
+    "synth": synth,
+    "run": run,
+    "table": table,
+    "list": list_,
+}
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Entry point of the console script; returns the exit code."""
+    try:
+        return tyro.extras.subcommand_cli_from_dict(
+            COMMANDS,
+            prog="headbench",
+            description="Benchmark of animatable 3D head avatars. Start with `headbench demo`.",
+            args=arguments,
+            config=(tyro.conf.FlagCreatePairsOff,),
+        )
+    except HeadbenchError as error:
+        print(f"headbench: {error}", file=sys.stderr)
+        return EXIT_BAD_INPUT
+    except KeyboardInterrupt:
+        print("headbench: interrupted; start it again to continue", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        # The reader of our output has gone (`headbench list methods | head`): not an error of ours.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+def _synthesise(arguments: dict[str, Any]) -> None:
+    make = resolve(get("datasets", "synthetic").implementation)
+    with progress("capture") as report:
+        make(**arguments, progress=report)
+
+
+def _run(config: RunConfig, as_json: bool) -> int:
+    rows = run_comparison(config)
+    failed = rows[rows["status"] == "failed"]
+    if as_json:
+        means = rows.groupby(["task", "method", "metric"], sort=False)["value"].mean().reset_index()
+        _print_json(
+            {
+                "out": config.out,
+                "failed": sorted(set(failed["method"])),
+                "means": means.astype(object).where(means.notna(), None).to_dict("records"),
+            }
+        )
+    else:
+        table(config.out)
+        print(f"\nPictures, tables and everything else: {config.out}")
+    return EXIT_FAILED_CELL if len(failed) else 0
+
+
+def _log_file(out: Path) -> Path | None:
+    """Where to log; None where the folder cannot be made, which the run then reports properly."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return None
+    return out / "run.log" if os.access(out, os.W_OK) else None
+
+
+def _settings_line(values: dict[str, Any]) -> str:
+    return ", ".join(f"{key}={value}" for key, value in values.items())
+
+
+def _print_json(value: Any) -> None:
+    print(json.dumps(value, indent=1, default=plain))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,143 @@
+"""The walls of the house: which room may import which, and what no code may contain."""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+ROOMS = ("bench", "datasets", "methods", "metrics", "reports")
+MAY_IMPORT = {
+    "bench": set(),
+    "datasets": {"bench"},
+    "methods": {"bench", "datasets"},
+    "metrics": {"bench"},
+    "reports": {"bench"},
+}
+FORBIDDEN_PACKAGES = {"reports": {"torch"}, "bench": {"torch"}}
+NOWHERE = {"torchvision", "pickle5", "chumpy"}
+SOURCES = [path for room in ROOMS for path in sorted((ROOT / room).rglob("*.py"))]
+
+
+def imports(path: Path, tree: ast.AST) -> list[str]:
+    """Absolute dotted names of everything a source imports, ``headbench.`` in front for our own."""
+    package = ["headbench", *path.relative_to(ROOT).parent.parts]
+    names: list[str] = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else []
+            stem = ".".join([*base, *([node.module] if node.module else [])])
+            names += [stem] if node.module else [f"{stem}.{alias.name}" for alias in node.names]
+    return names
+
+
+def violations(path: Path, source: str) -> list[str]:
+    """What a source of a room imports against the rules."""
+    room = path.relative_to(ROOT).parts[0]
+    found = []
+    for name in imports(path, ast.parse(source)):
+        parts = name.split(".")
+        if parts[0] == "headbench":
+            other = parts[1] if len(parts) > 1 else ""
+            if other != room and other not in MAY_IMPORT[room]:
+                found.append(f"{room} imports {name}")
+        elif parts[0] in FORBIDDEN_PACKAGES.get(room, set()) | NOWHERE | set(ROOMS):
+            found.append(f"{room} imports {name}")
+    return found
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_rooms_import_only_what_stands_below_them(path):
+    assert violations(path, path.read_text()) == []
+
+
+@pytest.mark.parametrize(
+    ("path", "source"),
+    [
+        ("bench/x.py", "from ..methods import ga"),
+        ("bench/x.py", "def f():\n    import torch"),
+        ("metrics/x.py", "from ..datasets.clip import CaptureClip"),
+        ("datasets/head/x.py", "from ...methods.ga import GA"),
+        ("datasets/head/x.py", "from headbench.metrics import psnr"),
+        ("reports/x.py", "import torch.nn"),
+        ("methods/x.py", "import torchvision"),
+        ("methods/x.py", "from datasets import clip"),
+    ],
+)
+def test_a_forbidden_import_is_found(path, source):
+    assert violations(ROOT / path, source)
+
+
+@pytest.mark.parametrize(
+    ("path", "source"),
+    [
+        ("methods/splats/x.py", "from ...datasets.head.model import HeadModel\nfrom .. import configs"),
+        ("datasets/head/x.py", "from ...bench.contracts import Clip\nfrom . import arrays"),
+        ("bench/x.py", "from .contracts import Clip"),
+    ],
+)
+def test_a_lawful_import_passes(path, source):
+    assert violations(ROOT / path, source) == []
+
+
+def test_contracts_need_numpy_and_the_standard_library_only():
+    import sys
+
+    path = ROOT / "bench" / "contracts.py"
+    roots = {name.split(".")[0] for name in imports(path, ast.parse(path.read_text()))}
+    assert roots <= {"numpy"} | set(sys.stdlib_module_names)
+
+
+def test_rooms_are_namespace_packages():
+    # A top-level datasets/__init__.py would shadow the well-known package of that name.
+    assert [room for room in (*ROOMS, "tests") if (ROOT / room / "__init__.py").exists()] == []
+
+
+BANNED = {
+    "a vertex or triangle count of FLAME": r"\b(5023|5143|9976|10144)\b",
+    "a welded device": r"\.cuda\(\)",
+    "eval or exec": r"(?<![\w.])(eval|exec)\(",
+    "bare pickle": r"\bpickle\.loads?\(|allow_pickle\s*=\s*True|weights_only\s*=\s*False",
+    "unsafe YAML": r"yaml\.(load|unsafe_load|full_load)\(",
+    "a debugger": r"\bbreakpoint\(\)|set_trace\(",
+    "a machine's path": r"[\"'](/home|/root|/data|/tmp|/mnt)/",
+}
+
+
+@pytest.mark.parametrize("what", BANNED)
+def test_no_code_contains(what):
+    pattern = re.compile(BANNED[what])
+    hits = [
+        f"{path.relative_to(ROOT)}:{number}: {line.strip()}"
+        for path in SOURCES
+        for number, line in enumerate(path.read_text().splitlines(), 1)
+        if pattern.search(line)
+    ]
+    assert hits == []
+
+
+def test_torch_load_is_always_restricted():
+    for path in SOURCES:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call) and ast.unparse(node.func) == "torch.load":
+                keywords = {k.arg: ast.unparse(k.value) for k in node.keywords}
+                assert keywords.get("weights_only") == "True", f"{path}:{node.lineno}"
+
+
+def test_importing_specs_imports_neither_torch_nor_mitsuba():
+    import subprocess
+    import sys
+
+    code = (
+        "import sys\n"
+        "from headbench.bench.registry import discover\n"
+        "for group in ('methods', 'datasets', 'metrics', 'reports'):\n"
+        "    broken = {n: p.error for n, p in discover(group).items() if p.error}\n"
+        "    assert not broken, broken\n"
+        "heavy = {'torch', 'mitsuba', 'pymeshlab', 'sklearn'} & set(sys.modules)\n"
+        "assert not heavy, heavy\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
