@@ -1,0 +1,6 @@
+"""Differentiable Gaussian splat renderer: one function, `rasterize`, with interchangeable backends."""
+
+from .rasterize import available_backends, rasterize
+from .request import Rendering
+
+__all__ = ["Rendering", "available_backends", "rasterize"]

@@ -1,0 +1,84 @@
+"""The renderer's one public function and the choice of its backend."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from . import cpu
+from .reference import rasterize_reference
+from .request import ArrayLike, Rendering, make_request
+
+
+def rasterize(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmat: ArrayLike,
+    K: ArrayLike,
+    width: int,
+    height: int,
+    *,
+    background: ArrayLike | None = None,
+    near: float = 0.01,
+    far: float = 1e10,
+    eps2d: float = 0.3,
+    means2d_offset: Tensor | None = None,
+    backend: str = "auto",
+    threads: int | None = None,
+    check_finite: bool = True,
+) -> Rendering:
+    """Render 3D Gaussians into one camera; differentiable in every tensor but ``K``.
+
+    Names, meanings and constants are gsplat's. To render depth or features, pass them as colours.
+
+    Parameters
+    ----------
+    means : (N, 3) metres, float32 or float64; everything that comes out has its dtype.
+    quats : (N, 4) rotations, wxyz, of any length; zero means no rotation.
+    scales : (N, 3) standard deviations along the splat's axes, metres, > 0 (not their logarithms).
+    opacities : (N,) in [0, 1]. A splat below 1/255 is culled, so its gradient is zero.
+    colors : (N, C), any range, 1 <= C <= 32.
+    viewmat : (4, 4) world to camera, OpenCV axes, metres.
+    K : (3, 3) pixels; focal lengths and principal point count, skew does not. The centre of the top left
+        pixel is at (0.5, 0.5).
+    width, height : image size, pixels.
+    background : (C,), black if None.
+    near, far : splats with camera z outside this range (metres) are culled.
+    eps2d : low-pass filter: variance added to both image axes, square pixels.
+    means2d_offset : (N, 2) pixels, added to the projected means. Zeros that require a gradient collect the
+        gradient by the 2D means, in pixel units as gsplat's; culled splats get zero.
+    backend : one of `available_backends`, or "auto": the kernel for float32 on the CPU, else the reference.
+    threads : of the kernel; None takes ``torch.get_num_threads()``. Results are equal bit for bit for any number.
+    check_finite : refuse NaN and infinity in any tensor. Without the check a non-finite geometry is culled
+        and a non-finite colour spreads to the pixels it touches.
+
+    Returns
+    -------
+    `Rendering`: image (H, W, C), alpha (H, W), radii (N,).
+
+    Raises
+    ------
+    ValueError : an argument has a wrong type, shape, dtype, device or value; the message names it.
+    UnavailableError : the backend asked for cannot be had here.
+    """
+    request = make_request(
+        *(means, quats, scales, opacities, colors, viewmat, K, width, height),
+        background=background,
+        near=near,
+        far=far,
+        eps2d=eps2d,
+        means2d_offset=means2d_offset,
+        check_finite=check_finite,
+    )
+    if backend == "auto":
+        backend = "cpu" if cpu.supports(request) and cpu.usable_or_warn() else "reference"
+    if backend == "reference":
+        return rasterize_reference(request)
+    return cpu.rasterize_cpu(request, backend, threads)
+
+
+def available_backends() -> tuple[str, ...]:
+    """Names `rasterize` accepts as ``backend`` on this machine, besides "auto"; the preferred one first."""
+    return (*cpu.names(), "reference")

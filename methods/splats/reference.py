@@ -1,0 +1,215 @@
+"""The renderer in plain torch: the readable twin every faster backend is tested against.
+
+Elliptical weighted average splatting (Zwicker et al., "EWA Splatting", TVCG 2002) of 3D Gaussians (Kerbl
+et al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering", SIGGRAPH 2023), with gsplat's
+conventions (Ye et al., "gsplat: An Open-Source Library for Gaussian Splatting", arXiv 2409.06765).
+Works in float32 and float64; all gradients come from autograd. Pixels are composited tile by tile and
+recomputed in the backward pass, so memory grows with the image and the splats, not with their product.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from .constants import (
+    ALPHA_MAX,
+    ALPHA_MIN,
+    FRUSTUM_MARGIN,
+    QUATERNION_MIN,
+    RADIUS_MAX,
+    TILE,
+    TRANSMITTANCE_MIN,
+)
+from .request import Rendering, Request
+
+CHUNK = 1024
+"""Splats composited at once within a tile."""
+
+
+class Footprints(NamedTuple):
+    """M splats on the image plane. Pixels, with pixel centres at half-integers."""
+
+    means: Tensor  # (M, 2)
+    covariances: Tensor  # (M, 3): xx, xy, yy, low-pass filter included
+    determinants: Tensor  # (M,) of the covariances
+    depths: Tensor  # (M,) camera z, metres
+
+
+def rasterize_reference(request: Request) -> Rendering:
+    """Render ``request``; see `rasterize` for the meaning of every field."""
+    with torch.no_grad():
+        visible, radii, extents = _find_visible(request)
+    footprints = project(request, visible)
+    order = torch.argsort(footprints.depths.detach(), stable=True)
+    visible, extents = visible[order], extents[order]
+    footprints = Footprints(*(value[order] for value in footprints))
+    opacities, colors = request.opacities[visible], request.colors[visible]
+
+    rows = []
+    for top in range(0, request.height, TILE):
+        bottom = min(top + TILE, request.height)
+        row = []
+        for left in range(0, request.width, TILE):
+            right = min(left + TILE, request.width)
+            touching = _touching(footprints.means.detach(), extents, left, top, right, bottom)
+            pixels = _pixel_centers(left, top, right, bottom).to(request.means)
+            tile = _composite_tile(
+                Footprints(*(value[touching] for value in footprints)),
+                opacities[touching],
+                colors[touching],
+                request.background,
+                pixels,
+            )
+            row.append(tile.reshape(bottom - top, right - left, -1))
+        rows.append(torch.cat(row, dim=1))
+    image_and_alpha = torch.cat(rows, dim=0)
+    return Rendering(image_and_alpha[..., :-1], image_and_alpha[..., -1], radii)
+
+
+def rotation_matrices(quats: Tensor) -> Tensor:
+    """Turn quaternions (N, 4), wxyz of any length, into rotation matrices (N, 3, 3); zero gives the identity.
+
+    The largest component is divided out first, so that no square overflows or underflows.
+    """
+    largest = quats.detach().abs().amax(dim=-1, keepdim=True).clamp(min=QUATERNION_MIN)
+    scaled = quats / largest
+    norm = torch.linalg.vector_norm(scaled, dim=-1, keepdim=True).clamp(min=1.0)
+    w, x, y, z = (scaled / norm).unbind(-1)
+    entries = [
+        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    ]
+    return torch.stack(entries, dim=-1).reshape(-1, 3, 3)
+
+
+def project(request: Request, subset: Tensor) -> Footprints:
+    """Project the splats ``subset`` (indices) of ``request`` onto the image plane.
+
+    The covariance is factored as ``Q Qᵀ + eps2d I`` with ``Q = J W R S`` (EWA Splatting, eq. 24-31: J the
+    Jacobian of the perspective division, W the camera's rotation, R S the splat's axes). By the
+    Cauchy-Binet formula its determinant is a sum of squares, which needles do not cancel away:
+    ``|q0 x q1|² + eps2d (|q0|² + |q1|²) + eps2d²``.
+    """
+    rotation, translation = request.viewmat[:3, :3], request.viewmat[:3, 3]
+    fx, fy, cx, cy = request.K[0, 0], request.K[1, 1], request.K[0, 2], request.K[1, 2]
+
+    x, y, z = (request.means[subset] @ rotation.T + translation).unbind(-1)
+    means = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=-1)
+    if request.means2d_offset is not None:
+        means = means + request.means2d_offset[subset]
+
+    # Far outside the image the linearisation degenerates; gsplat clamps the slopes it is taken at.
+    margin_x = FRUSTUM_MARGIN * 0.5 * request.width / fx
+    margin_y = FRUSTUM_MARGIN * 0.5 * request.height / fy
+    slope_x = torch.clamp(x / z, min=-cx / fx - margin_x, max=(request.width - cx) / fx + margin_x)
+    slope_y = torch.clamp(y / z, min=-cy / fy - margin_y, max=(request.height - cy) / fy + margin_y)
+    zero = torch.zeros_like(z)
+    jacobian = torch.stack(
+        [
+            torch.stack([fx / z, zero, -fx * slope_x / z], -1),
+            torch.stack([zero, fy / z, -fy * slope_y / z], -1),
+        ],
+        dim=-2,
+    )
+
+    axes = rotation_matrices(request.quats[subset]) * request.scales[subset][:, None, :]
+    q0, q1 = (jacobian @ rotation @ axes).unbind(-2)
+    xx, xy, yy = (q0 * q0).sum(-1), (q0 * q1).sum(-1), (q1 * q1).sum(-1)
+    area = torch.linalg.cross(q0, q1).square().sum(-1)
+    eps = request.eps2d
+    determinants = area + eps * (xx + yy) + eps * eps
+    return Footprints(means, torch.stack([xx + eps, xy, yy + eps], dim=-1), determinants, z)
+
+
+def _find_visible(request: Request) -> tuple[Tensor, Tensor, Tensor]:
+    """Indices (M,) of the splats to draw, radii (N,) of all, and half sizes (M, 2) of the bounding boxes.
+
+    Conditions are stated positively, so that a NaN anywhere culls.
+    """
+    radii = torch.zeros(len(request.means), dtype=torch.int32, device=request.means.device)
+    depths = request.means @ request.viewmat[2, :3] + request.viewmat[2, 3]
+    candidate = (depths > request.near) & (depths < request.far) & (request.opacities >= ALPHA_MIN)
+    subset = candidate.nonzero().squeeze(-1)
+    footprints = project(request, subset)
+
+    # alpha falls to ALPHA_MIN on the ellipse at Mahalanobis distance sqrt(2 ln(opacity / ALPHA_MIN)).
+    level = 2 * torch.log(request.opacities[subset] / ALPHA_MIN)
+    extents = torch.sqrt(level[:, None].clamp(min=0) * footprints.covariances[:, [0, 2]])
+    reach = torch.ceil(extents)
+    size = torch.tensor([request.width, request.height], device=reach.device)
+    inside = (footprints.means + reach > 0).all(-1) & (footprints.means - reach < size).all(-1)
+    drawable = (footprints.determinants > 0) & torch.isfinite(footprints.determinants)
+    keep = inside & drawable & (reach.amax(-1) < RADIUS_MAX)
+    visible = subset[keep]
+    radii[visible] = reach[keep].amax(-1).to(torch.int32)
+    return visible, radii, extents[keep]
+
+
+def _touching(means: Tensor, extents: Tensor, left: int, top: int, right: int, bottom: int) -> Tensor:
+    """Indices of the splats whose bounding box, grown by a pixel against rounding, meets the tile."""
+    low, high = means - extents - 1, means + extents + 1
+    meets_x = (high[:, 0] > left) & (low[:, 0] < right)
+    meets_y = (high[:, 1] > top) & (low[:, 1] < bottom)
+    return (meets_x & meets_y).nonzero().squeeze(-1)
+
+
+def _pixel_centers(left: int, top: int, right: int, bottom: int) -> Tensor:
+    """Centres (P, 2) of a tile's pixels, row by row."""
+    y, x = torch.meshgrid(torch.arange(top, bottom) + 0.5, torch.arange(left, right) + 0.5, indexing="ij")
+    return torch.stack([x.reshape(-1), y.reshape(-1)], dim=-1)
+
+
+def _composite_tile(
+    splats: Footprints, opacities: Tensor, colors: Tensor, background: Tensor, pixels: Tensor
+) -> Tensor:
+    """Composite depth-sorted splats front to back onto ``pixels`` (P, 2); gives (P, C + 1), alpha last."""
+    image = pixels.new_zeros(len(pixels), colors.shape[1])
+    transmittance = pixels.new_ones(len(pixels))
+    running = torch.ones_like(transmittance, dtype=torch.bool)
+    for start in range(0, len(opacities), CHUNK):
+        part = slice(start, start + CHUNK)
+        image, transmittance, running = checkpoint(
+            _composite_chunk,
+            *(image, transmittance, running, pixels),
+            *(splats.means[part], splats.covariances[part], splats.determinants[part]),
+            *(opacities[part], colors[part]),
+            use_reentrant=False,
+            preserve_rng_state=False,
+        )
+    image = image + transmittance[:, None] * background
+    return torch.cat([image, 1 - transmittance[:, None]], dim=1)
+
+
+def _composite_chunk(
+    image: Tensor,
+    transmittance: Tensor,
+    running: Tensor,
+    pixels: Tensor,
+    means: Tensor,
+    covariances: Tensor,
+    determinants: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Blend one chunk over what is there (3D Gaussian Splatting, eq. 3).
+
+    The exponent ``dᵀ Σ⁻¹ d`` is written as the sum of squares ``Σ_yy/det (dx - Σ_xy/Σ_yy dy)² + dy²/Σ_yy``,
+    which rounding cannot make negative.
+    """
+    dx, dy = (pixels[:, None, :] - means).unbind(-1)
+    xy, yy = covariances[:, 1], covariances[:, 2]
+    distance = yy / determinants * (dx - xy / yy * dy) ** 2 + dy * dy / yy
+    alpha = (opacities * torch.exp(-0.5 * distance)).clamp(max=ALPHA_MAX)
+    alpha = torch.where(alpha >= ALPHA_MIN, alpha, 0)
+
+    after = transmittance.detach()[:, None] * torch.cumprod(1 - alpha.detach(), dim=1)
+    drawn = running[:, None] & (after > TRANSMITTANCE_MIN)
+    alpha = torch.where(drawn, alpha, 0)
+    passed = transmittance[:, None] * torch.cumprod(1 - alpha, dim=1)
+    before = torch.cat([transmittance[:, None], passed[:, :-1]], dim=1)
+    return image + (alpha * before) @ colors, passed[:, -1], drawn[:, -1]
