@@ -96,12 +96,14 @@ def build(cls: type[T], values: Mapping[str, Any], source: str, prefix: str = ""
 
 
 def _scalar(value: Any) -> Any:
-    """Read 1e-3 as a number: YAML 1.1 takes it for text because it has no dot."""
-    if isinstance(value, str):
+    """Read text that is a number as one: YAML 1.1 takes 1e-3 for text because it has no dot."""
+    if not isinstance(value, str):
+        return value
+    for kind in (int, float):
         try:
-            number = float(value)
+            number = kind(value)
         except ValueError:
-            return value
+            continue
         return number if math.isfinite(number) else value
     return value
 
@@ -124,7 +126,7 @@ def _convert(hint: Any, value: Any, source: str, key: str) -> Any:
         return _convert(inner[-1], value, source, key)
     if origin is tuple:
         if isinstance(value, str):
-            value = [part.strip() for part in value.split(",") if part.strip()]
+            value = [_scalar(part.strip()) for part in value.split(",") if part.strip()]
         if not isinstance(value, (list, tuple)):
             raise InputError(source, key, "a list", _shown(value))
         repeated = len(arguments) == 2 and arguments[1] is Ellipsis

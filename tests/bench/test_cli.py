@@ -1,0 +1,71 @@
+import json
+
+import pytest
+
+from headbench.bench import cli
+from headbench.bench.demo import DemoConfig, parse_size
+from headbench.bench.errors import InputError
+
+
+@pytest.mark.parametrize("command", ["demo", "synth", "run", "table", "list"])
+def test_help_teaches_every_option(command, capsys):
+    with pytest.raises(SystemExit) as caught:
+        cli.main([command, "--help"])
+    assert caught.value.code == 0
+    assert "usage: headbench" in capsys.readouterr().out
+
+
+def test_bad_input_is_one_paragraph_and_exit_code_2(capsys, tmp_path):
+    code = cli.main(["run", "--data", str(tmp_path / "none"), "--out", str(tmp_path / "out")])
+    error = capsys.readouterr().err
+    assert code == 2
+    assert "no such folder" in error
+    assert "Traceback" not in error
+
+
+def test_an_unknown_method_names_the_nearest(capsys, tmp_path):
+    code = cli.main(["run", "--data", str(tmp_path), "--out", str(tmp_path / "out"), "--methods", "our,ga"])
+    assert code == 2
+    assert "Did you mean 'ours'" in capsys.readouterr().err
+
+
+def test_an_unknown_key_in_the_configuration_file_is_refused(capsys, tmp_path):
+    (tmp_path / "run.yaml").write_text("data: a\nout: b\nmetods: [ga]\n")
+    assert cli.main(["run", "--config", str(tmp_path / "run.yaml")]) == 2
+    error = capsys.readouterr().err
+    assert "run.yaml, metods" in error
+    assert "Did you mean 'methods'" in error
+
+
+def test_missing_data_is_asked_for(capsys):
+    assert cli.main(["run", "--out", "x"]) == 2
+    assert "--data" in capsys.readouterr().err
+
+
+def test_lists_are_machine_readable(capsys):
+    assert cli.main(["list", "methods", "--json"]) == 0
+    names = [entry["name"] for entry in json.loads(capsys.readouterr().out)]
+    assert {"ours", "ga", "mean-image", "nearest-camera"} <= set(names)
+    assert cli.main(["list", "presets"]) == 0
+    assert "ours paper" in capsys.readouterr().out
+
+
+def test_a_table_of_nothing_is_refused(capsys, tmp_path):
+    assert cli.main(["table", str(tmp_path)]) == 2
+    assert "run.json" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("text", ["550", "550x", "axb", "0x10", "-5x20", "5x5", "1e3x20"])
+def test_a_malformed_size_is_refused(text):
+    with pytest.raises(InputError):
+        parse_size(text)
+
+
+def test_sizes_are_width_first():
+    assert parse_size("550x802") == (550, 802)
+
+
+def test_smoke_shrinks_the_capture():
+    small, full = DemoConfig(preset="smoke").capture_arguments(), DemoConfig().capture_arguments()
+    assert small["cameras"] < full["cameras"]
+    assert small["timesteps"] < full["timesteps"]

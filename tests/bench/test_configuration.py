@@ -1,0 +1,104 @@
+from dataclasses import dataclass, field
+from typing import Literal
+
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from headbench.bench.configuration import build, merge, parse_assignments, read_yaml
+from headbench.bench.errors import InputError
+
+
+@dataclass(frozen=True)
+class Inner:
+    rate: float = 0.1
+    steps: int = 3
+
+
+@dataclass(frozen=True)
+class Outer:
+    name: str
+    inner: Inner = field(default_factory=Inner)
+    sizes: tuple[int, ...] = (1,)
+    limit: int | None = None
+    kind: Literal["a", "b"] = "a"
+    on: bool = False
+
+
+def test_nested_values_are_built_with_their_types():
+    built = build(Outer, {"name": "x", "inner": {"rate": 1}, "sizes": [4, 5], "limit": 7}, "file")
+    assert built == Outer("x", Inner(1.0), (4, 5), 7)
+    assert isinstance(built.inner.rate, float)
+
+
+@pytest.mark.parametrize(
+    ("values", "key", "hint"),
+    [
+        ({"name": "x", "inner": {"rte": 1}}, "inner.rte", "Did you mean 'rate'"),
+        ({"name": "x", "sizes": "1,b"}, "sizes[1]", "whole number"),
+        ({"name": "x", "inner": {"steps": 2.5}}, "inner.steps", "whole number"),
+        ({"name": "x", "on": 1}, "on", "true or false"),
+        ({"name": "x", "kind": "c"}, "kind", "one of a, b"),
+        ({"name": "x", "inner": 3}, "inner", "group"),
+        ({"name": "x", "inner": {"rate": float("nan")}}, "inner.rate", "finite"),
+        ({}, "name", "nothing"),
+    ],
+)
+def test_a_wrong_value_names_file_key_expected_and_found(values, key, hint):
+    with pytest.raises(InputError) as caught:
+        build(Outer, values, "run.yaml")
+    assert caught.value.file == "run.yaml"
+    assert caught.value.key == key
+    assert hint in str(caught.value)
+
+
+def test_assignments_nest_and_know_numbers():
+    assert parse_assignments(["a.b=1", "a.c=1e-3", "d=x", "e=[1, 2]", "f=null", "g=true"]) == {
+        "a": {"b": 1, "c": 0.001},
+        "d": "x",
+        "e": [1, 2],
+        "f": None,
+        "g": True,
+    }
+
+
+@pytest.mark.parametrize("text", ["nothing", "=3", "a..b=1", "a=["])
+def test_a_malformed_assignment_is_refused(text):
+    with pytest.raises(InputError):
+        parse_assignments([text])
+
+
+def test_an_assignment_cannot_turn_a_value_into_a_group():
+    with pytest.raises(InputError, match="group of settings"):
+        parse_assignments(["a=1", "a.b=2"])
+
+
+def test_merge_lays_one_over_the_other_without_changing_either():
+    base = {"a": {"x": 1, "y": 2}, "b": 3}
+    over = {"a": {"y": 5}, "c": 6}
+    assert merge(base, over) == {"a": {"x": 1, "y": 5}, "b": 3, "c": 6}
+    assert base == {"a": {"x": 1, "y": 2}, "b": 3}
+
+
+@given(
+    st.dictionaries(
+        st.sampled_from("abc"), st.integers() | st.dictionaries(st.sampled_from("xy"), st.integers())
+    )
+)
+def test_merging_with_itself_or_nothing_changes_nothing(values):
+    assert merge(values, values) == merge(values, {}) == merge({}, values) == values
+
+
+def test_yaml_is_data_never_code(tmp_path):
+    path = tmp_path / "evil.yaml"
+    path.write_text("a: !!python/object/apply:os.system ['true']")
+    with pytest.raises(InputError, match="valid YAML"):
+        read_yaml(path)
+    path.write_text(yaml.safe_dump({"a": {"b": 1}}))
+    assert read_yaml(path) == {"a": {"b": 1}}
+    path.write_text("- 1")
+    with pytest.raises(InputError, match="mapping"):
+        read_yaml(path)
+    with pytest.raises(InputError, match="readable"):
+        read_yaml(tmp_path / "none.yaml")

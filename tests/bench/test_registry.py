@@ -1,0 +1,57 @@
+from importlib.metadata import EntryPoint
+
+import pytest
+
+from headbench.bench import registry
+from headbench.bench.contracts import MetricSpec
+from headbench.bench.errors import HeadbenchError, InputError
+
+
+def with_entries(monkeypatch, *entries):
+    monkeypatch.setattr(registry, "entry_points", lambda group: list(entries))
+
+
+def entry(name, value):
+    return EntryPoint(name, value, "headbench.metrics")
+
+
+def test_an_unknown_name_is_refused_with_the_nearest():
+    with pytest.raises(InputError, match="Did you mean 'psnr'"):
+        registry.get("metrics", "pnsr")
+
+
+def test_a_broken_plugin_is_listed_and_raises_when_asked_for(monkeypatch, toy):
+    with_entries(monkeypatch, entry("gone", "no_such_module:SPEC"), entry("good", "toy_plugin:ERROR"))
+    plugins = registry.discover("metrics")
+    assert plugins["good"].spec is toy.ERROR
+    assert "no_such_module" in plugins["gone"].error
+    with pytest.raises(HeadbenchError, match="broken"):
+        registry.get("metrics", "gone")
+
+
+def test_an_entry_of_the_wrong_kind_is_broken(monkeypatch, toy):
+    with_entries(monkeypatch, entry("method", "toy_plugin:METHOD"))
+    assert "MetricSpec" in registry.discover("metrics")["method"].error
+
+
+def test_a_plugin_that_raises_on_import_does_not_take_others_along(monkeypatch, toy, tmp_path):
+    (tmp_path / "explodes.py").write_text("raise SystemError('boom')")
+    monkeypatch.syspath_prepend(tmp_path)
+    with_entries(monkeypatch, entry("explodes", "explodes:SPEC"), entry("good", "toy_plugin:ERROR"))
+    plugins = registry.discover("metrics")
+    assert plugins["explodes"].spec is None
+    assert isinstance(plugins["good"].spec, MetricSpec)
+
+
+def test_the_first_party_wins_a_clash_of_names(monkeypatch, toy, caplog):
+    other, own = entry("psnr", "toy_plugin:NOT_HERE"), entry("psnr", "toy_plugin:ERROR")
+    monkeypatch.setattr(registry, "_origin", lambda e: "headbench" if e is own else "other")
+    with_entries(monkeypatch, other, own)
+    assert registry.discover("metrics")["psnr"].spec is toy.ERROR
+    assert "hidden" in caplog.text
+
+
+def test_a_spec_not_yet_packaged_is_reached_by_module(toy):
+    assert registry.get("methods", "toy_plugin:METHOD") is toy.METHOD
+    with pytest.raises(HeadbenchError, match="cannot be imported"):
+        registry.get("methods", "toy_plugin:NOTHING")

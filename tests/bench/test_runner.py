@@ -1,0 +1,172 @@
+"""The harness on toy plug-ins: what a run leaves, resumes, refuses and records."""
+
+import json
+import math
+
+import pytest
+
+from headbench.bench import runner
+from headbench.bench.errors import InputError
+from headbench.bench.run_config import RunConfig
+from headbench.bench.store import RunFolder, read_rows
+
+
+@pytest.fixture
+def capture(tmp_path):
+    for name in ("subject1", "subject2"):
+        (tmp_path / "data" / name).mkdir(parents=True)
+    return tmp_path / "data"
+
+
+@pytest.fixture
+def config(toy, capture, tmp_path, monkeypatch):
+    monkeypatch.setattr(runner, "write_reports", lambda folder: [])
+    return RunConfig(
+        data=str(capture),
+        out=str(tmp_path / "out"),
+        methods=("toy_plugin:METHOD",),
+        preset="smoke",
+        metrics=("toy_plugin:ERROR", "toy_plugin:FILES"),
+        reader="toy_plugin:READER",
+    )
+
+
+def changed(config, **changes):
+    from dataclasses import replace
+
+    return replace(config, **changes)
+
+
+def test_rows_hold_every_frame_of_every_task_keyed(config):
+    rows = runner.run(config)
+    errors = rows[rows["metric"] == "error"]
+    assert len(errors) == 2 * (3 + 2)  # subjects x (novel-view + self-reenactment frames)
+    row = errors[
+        (errors["subject"] == "subject2") & (errors["task"] == "novel_view") & (errors["timestep"] == 2)
+    ]
+    # rendered level round(0.5 * 255) = 128 against 40 + 20 + 1
+    assert row["value"].tolist() == [128 - 61]
+    assert row["protocol"].nunique() == 1
+    per_avatar = rows[rows["metric"] == "files"]
+    assert per_avatar["value"].tolist() == [1.0, 1.0]
+    assert (per_avatar["timestep"] == -1).all()
+    assert read_rows(RunFolder(runner.Path(config.out)).rows).equals(rows)
+
+
+def test_the_manifest_names_everything_that_made_the_numbers(config):
+    runner.run(config)
+    record = RunFolder(runner.Path(config.out)).read_manifest()
+    assert record["status"] == "done"
+    assert record["methods"][0]["config"] == {"level": 0.5, "fail": False}
+    assert record["methods"][0]["budget"] == {"iterations": 2, "seconds": None}
+    assert [clip["fingerprint"] for clip in record["clips"]] == ["toy-subject1", "toy-subject2"]
+    assert record["clips"][0]["excluded"] == {"subject1/FREE/00004/a": "tongue out"}
+    assert set(record["protocols"]) == {"novel_view", "self_reenactment"}
+    assert record["machine"]["packages"]["numpy"]
+
+
+def test_a_second_run_trains_nothing_again_and_gives_the_same_rows(config, toy):
+    first = runner.run(config)
+    toy.FITS.clear()
+    assert runner.run(config).equals(first)
+    assert toy.FITS == []
+
+
+def test_a_run_killed_in_training_continues(config, toy, monkeypatch):
+    whole = runner.run(changed(config, out=config.out + "-whole"))
+
+    def killed(self, *args, **kwargs):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(toy.ToyAvatar, "render", killed)
+        with pytest.raises(KeyboardInterrupt):
+            runner.run(config)
+    toy.FITS.clear()
+    assert runner.run(config).equals(whole)
+    assert toy.FITS == ["subject2"]  # the first had been trained
+
+
+def test_another_setting_in_the_same_folder_is_refused_before_work(config, toy):
+    runner.run(config)
+    toy.FITS.clear()
+    with pytest.raises(InputError, match="Choose another --out"):
+        runner.run(changed(config, settings={"toy": {"level": 0.75}}))
+    assert toy.FITS == []
+
+
+def test_measuring_something_else_trains_nothing_again(config, toy):
+    runner.run(config)
+    toy.FITS.clear()
+    rows = runner.run(changed(config, metrics=("toy_plugin:ERROR",), tasks=("novel_view",)))
+    assert set(rows["task"]) == {"novel_view"}
+    assert toy.FITS == []
+
+
+def test_a_failing_method_is_recorded_and_the_others_go_on(config):
+    rows = runner.run(changed(config, methods=("toy_plugin:FAILING", "toy_plugin:METHOD")))
+    failed = rows[rows["method"] == "failing"]
+    assert set(failed["status"]) == {"failed"}
+    assert failed["reason"].str.contains("the training diverged").all()
+    assert failed["value"].isna().all()
+    assert (rows[rows["method"] == "toy"]["status"] == "ok").all()
+
+
+def test_a_metric_that_cannot_be_had_is_missing_with_reason_and_said_before_training(config, toy, caplog):
+    import logging
+
+    logging.getLogger("headbench").propagate = True
+    rows = runner.run(changed(config, metrics=("toy_plugin:NOT_HERE", "toy_plugin:ERROR")))
+    missing = rows[rows["metric"] == "not_here"]
+    assert set(missing["status"]) == {"missing"}
+    assert missing["reason"].str.contains("Put them there").all()
+    assert all(math.isnan(v) for v in missing["value"])
+    assert "Absent will be missing" in caplog.records[0].getMessage()
+
+
+def test_a_preset_and_settings_reach_the_method(config):
+    runner.run(changed(config, preset="fast", settings={"toy": {"budget": {"iterations": 3}}}))
+    record = RunFolder(runner.Path(config.out)).read_manifest()
+    assert record["methods"][0]["config"]["level"] == 0.25
+    assert record["methods"][0]["budget"]["iterations"] == 3
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"preset": "smok"}, "Did you mean 'smoke'"),
+        ({"settings": {"toi": {}}}, "Did you mean 'toy'"),
+        ({"settings": {"toy": {"levl": 1}}}, "Did you mean 'level'"),
+        ({"settings": {"toy": {"budget": {"iterations": 0}}}}, "positive"),
+        ({"data": "nowhere"}, "no such folder"),
+        ({"reader_settings": {"shfit": 1}}, "shfit"),
+        ({"methods": ("ors",)}, "Did you mean 'ours'"),
+    ],
+)
+def test_bad_settings_are_refused_before_training(config, toy, changes, match):
+    with pytest.raises(InputError, match=match):
+        runner.run(changed(config, **changes))
+    assert toy.FITS == []
+
+
+def test_an_unwritable_output_is_refused_before_training(config, toy, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="can be written"):
+        runner.run(changed(config, out=str(tmp_path / "file" / "out")))
+    assert toy.FITS == []
+
+
+def test_settings_that_contradict_themselves_are_refused():
+    with pytest.raises(ValueError, match="twice"):
+        RunConfig("a", "b", methods=("ga", "ga"))
+    with pytest.raises(ValueError, match="empty"):
+        RunConfig("a", "b", tasks=())
+
+
+def test_a_damaged_manifest_is_refused(tmp_path):
+    folder = RunFolder(tmp_path)
+    with pytest.raises(InputError, match=r"no run\.json"):
+        folder.read_manifest()
+    folder.manifest.write_text(json.dumps({"format": 99}))
+    with pytest.raises(InputError, match="format"):
+        folder.read_manifest()

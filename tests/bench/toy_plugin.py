@@ -1,0 +1,136 @@
+"""A reader, three methods and three metrics small enough to see through, for the harness's own tests."""
+
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from headbench.bench.contracts import (
+    Camera,
+    DatasetSpec,
+    Frame,
+    FrameKey,
+    HeadPose,
+    Measurement,
+    MethodSpec,
+    MetricSpec,
+)
+from headbench.bench.errors import UnavailableError
+
+SIZE = (8, 6)  # width, height
+
+
+class ToyClip:
+    """Two cameras, four timesteps; image brightness tells camera and timestep apart."""
+
+    head = None
+    shape = np.zeros(1)
+    static_offset = np.zeros((1, 3))
+    background = np.ones(3)
+    steps = ()
+
+    def __init__(self, path):
+        self.subject = Path(path).name
+        self.fingerprint = f"toy-{self.subject}"
+        self.cameras = {
+            name: Camera(name, *SIZE, np.eye(3), np.diag([1.0, 1, 1, 1 + i])) for i, name in enumerate("ab")
+        }
+        zero = np.zeros(3)
+        self.poses = {
+            t: HeadPose("toy", np.array([t / 10]), zero, zero, zero, np.zeros(6), zero, None, self.subject, t)
+            for t in range(4)
+        }
+        sequence = {0: "EMO", 1: "EMO", 2: "EMO", 3: "FREE"}
+
+        def key(t, c):
+            return FrameKey(self.subject, sequence[t], t, c)
+
+        self.splits = {
+            "train": tuple(key(t, "a") for t in range(3)),
+            "novel_view": tuple(key(t, "b") for t in range(3)),
+            "self_reenactment": tuple(key(3, c) for c in "ab"),
+        }
+        self.excluded = {FrameKey(self.subject, "FREE", 4, "a"): "tongue out"}
+
+    def image(self, key):
+        return np.full((SIZE[1], SIZE[0], 3), 40 + 10 * key.timestep + (key.camera == "b"), np.uint8)
+
+    def mask(self, key):
+        return None
+
+
+def read(path, shift=0):
+    return ToyClip(path)
+
+
+def find(root):
+    return sorted(p for p in Path(root).iterdir() if p.is_dir() and p.name.startswith("subject"))
+
+
+READER = DatasetSpec("toy", "toy captures", "toy_plugin:read", find="toy_plugin:find")
+
+
+@dataclass(frozen=True)
+class ToyConfig:
+    level: float = 0.5
+    fail: bool = False
+
+
+class ToyAvatar:
+    def __init__(self, path):
+        self.path = path
+        self.level = float((path / "level.txt").read_text())
+
+    def render(self, camera, pose, background=(1.0, 1.0, 1.0)):
+        rgb = np.full((camera.height, camera.width, 3), self.level, np.float32)
+        return Frame(rgb, np.ones(rgb.shape[:2], np.float32))
+
+    def files(self):
+        return [self.path / "level.txt"]
+
+
+FITS: list[str] = []
+
+
+class ToyMethod:
+    def __init__(self, config):
+        self.config = config
+
+    def fit(self, clip, out, budget, *, device, seed, progress):
+        FITS.append(clip.subject)
+        if self.config.fail:
+            raise RuntimeError("the training diverged")
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "level.txt").write_text(str(self.config.level))
+        for i in range(budget.iterations or 1):
+            progress(i + 1, budget.iterations or 1)
+        return self.load(out, device=device)
+
+    def load(self, path, *, device):
+        return ToyAvatar(path)
+
+
+PRESETS = {"smoke": {"budget": {"iterations": 2}}, "fast": {"budget": {"iterations": 9}, "level": 0.25}}
+METHOD = MethodSpec("toy", "one grey level", "toy_plugin:ToyMethod", "toy_plugin:ToyConfig", PRESETS)
+FAILING = MethodSpec(
+    "failing", "always fails", "toy_plugin:ToyMethod", "toy_plugin:ToyConfig", {"smoke": {"fail": True}}
+)
+
+
+def mean_error(image, truth):
+    return float(np.abs(image.astype(float) - truth).mean())
+
+
+def not_here(image, truth):
+    raise UnavailableError("The toy weights are not here.", "Put them there.")
+
+
+def files_in_avatar(avatar, workload):
+    assert all(a is not b for a, b in pairwise(workload))
+    return Measurement(float(len(avatar.files())), {"frames": len(workload)})
+
+
+ERROR = MetricSpec("error", "Error", "levels", False, 2, "toy_plugin:mean_error")
+NOT_HERE = MetricSpec("not_here", "Absent", "", True, 2, "toy_plugin:not_here")
+FILES = MetricSpec("files", "Files", "", False, 0, "toy_plugin:files_in_avatar", per_frame=False)
