@@ -1,0 +1,127 @@
+"""Teeth as GaussianAvatars and VHAP add them: two bent double plates hung from the rings of the lips.
+
+Qian et al., "GaussianAvatars", CVPR 2024, supplement; the construction is the one their code follows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ...bench.contracts import FloatArray, IntArray
+from ...bench.errors import InputError
+from .arrays import JOINT_NAMES, HeadArrays
+from .lips import lip_rings
+
+ROWS = (
+    *("upper_root", "lower_root", "upper_edge", "lower_edge"),
+    *("upper_root_back", "upper_edge_back", "lower_root_back", "lower_edge_back"),
+)
+"""Blocks of n vertices, in the order in which they are appended."""
+
+# Lengths in units of d, the mean distance between the lips' rings.
+SET_BACK = 1.5
+GAP = 0.1
+OVERBITE = 0.4
+HEIGHT = 2.0
+THICKNESS = 1.0
+
+
+def with_teeth(arrays: HeadArrays) -> HeadArrays:
+    """Append 8 n teeth vertices and 12 (n - 1) triangles, n being the length of the lip rings.
+
+    Upper teeth hang on the neck joint, lower ones on the jaw. They follow the identity as the lips in front
+    of them do (mean of the matching upper and lower lip vertex), and neither expression, pose correctives
+    nor the joint regressor know them. Adds the regions ``teeth``, ``teeth_upper`` and ``teeth_lower``.
+
+    Raises
+    ------
+    InputError
+        Where the head has teeth already, or no lip rings and none can be found.
+    """
+    if "teeth" in arrays.regions:
+        found = f"{len(arrays.regions['teeth'])} vertices"
+        raise InputError(f"head model {arrays.version!r}", "regions[teeth]", "a head without teeth", found)
+    upper, lower = lip_rings(arrays)
+    vertices, columns = arrays.template.shape[0], len(upper)
+    positions = _positions(arrays.template[upper], arrays.template[lower])
+    follow = 0.5 * (arrays.shape_basis[upper] + arrays.shape_basis[lower])
+    joints = ["jaw" if row.startswith("lower") else "neck" for row in ROWS]
+    weights = np.zeros((len(ROWS) * columns, len(JOINT_NAMES)))
+    weights[np.arange(len(weights)), np.repeat([JOINT_NAMES.index(name) for name in joints], columns)] = 1
+    towards_left = float(arrays.template[upper[-1], 0] - arrays.template[upper[0], 0]) > 0
+    triangles = vertices + _triangles(columns, towards_left)
+    on_jaw = np.repeat([name == "jaw" for name in joints], columns)
+    teeth = vertices + np.arange(len(weights))
+    return replace(
+        arrays,
+        template=_append(arrays.template, positions),
+        faces=np.concatenate([arrays.faces, triangles.astype(arrays.faces.dtype)]),
+        shape_basis=_append(arrays.shape_basis, np.tile(follow, (len(ROWS), 1, 1))),
+        expression_basis=_append_zeros(arrays.expression_basis, len(weights)),
+        pose_basis=_append_zeros(arrays.pose_basis, len(weights)),
+        joint_regressor=_append_zeros(arrays.joint_regressor.T, len(weights)).T.copy(),
+        skinning_weights=_append(arrays.skinning_weights, weights),
+        eyelid_basis=None
+        if arrays.eyelid_basis is None
+        else _append_zeros(arrays.eyelid_basis, len(weights)),
+        regions={
+            **arrays.regions,
+            "teeth": teeth,
+            "teeth_upper": teeth[~on_jaw],
+            "teeth_lower": teeth[on_jaw],
+        },
+    )
+
+
+def _positions(upper: FloatArray, lower: FloatArray) -> FloatArray:
+    """(8 n, 3) vertices, block by block as in `ROWS`, from the (n, 3) rings."""
+    distance = np.linalg.norm(upper - lower, axis=1).mean()
+
+    def along(y: float = 0.0, z: float = 0.0) -> FloatArray:
+        return distance * np.array([0.0, y, z])
+
+    middle = 0.5 * (upper + lower)
+    middle[:, 1] = middle[:, 1].mean()
+    middle = middle + along(z=-SET_BACK)
+    rows = {"upper_edge": middle + along(y=GAP), "lower_edge": middle + along(y=-GAP, z=-OVERBITE)}
+    rows["upper_root"] = rows["upper_edge"] + along(y=HEIGHT)
+    rows["lower_root"] = rows["lower_edge"] + along(y=-HEIGHT)
+    rows |= {f"{name}_back": row + along(z=-THICKNESS) for name, row in rows.items()}
+    return np.concatenate([rows[name] for name in ROWS])
+
+
+def _triangles(columns: int, towards_left: bool) -> IntArray:
+    """Triangles of the six strips, seen from outside counter-clockwise, as indices into the new vertices."""
+    block = {name: index * columns + np.arange(columns) for index, name in enumerate(ROWS)}
+    strips = [
+        _strip(block["upper_edge"], block["upper_root"]),
+        _strip(block["upper_root_back"], block["upper_edge_back"]),
+        _strip(block["upper_edge_back"], block["upper_edge"]),
+        _strip(block["lower_root"], block["lower_edge"]),
+        _strip(block["lower_edge_back"], block["lower_root_back"]),
+        _strip(block["lower_edge"], block["lower_edge_back"]),
+    ]
+    triangles = np.concatenate(strips)
+    return triangles if towards_left else triangles[:, ::-1]
+
+
+def _strip(low: IntArray, high: IntArray) -> IntArray:
+    """Quads between two rows in two triangles each; the diagonal flips at the middle for symmetry.
+
+    The triangles face the viewer for whom the rows run to the right and ``high`` is above ``low``.
+    """
+    a, b, c, d = low[:-1], low[1:], high[1:], high[:-1]
+    rising = np.stack([a, b, c, a, c, d], axis=1).reshape(-1, 2, 3)
+    falling = np.stack([a, b, d, b, c, d], axis=1).reshape(-1, 2, 3)
+    first_half = np.arange(len(a)) < len(a) / 2
+    return np.where(first_half[:, None, None], rising, falling).reshape(-1, 3)
+
+
+def _append(array: FloatArray, rows: FloatArray) -> FloatArray:
+    return np.concatenate([array, rows.astype(array.dtype)])
+
+
+def _append_zeros(array: FloatArray, count: int) -> FloatArray:
+    return _append(array, np.zeros((count, *array.shape[1:])))
