@@ -1,0 +1,236 @@
+"""Read a GaussianAvatars/VHAP capture, a union or a single sequence, into a `CaptureClip`.
+
+Everything is checked before anything long happens: JSON keys, images, parameters, timesteps, cameras, leaks
+between splits. What the layout leaves open (where ``cy`` counts from, teeth, shifted worlds) is settled as
+documented at the arguments, and the decisions stand in the clip's first step record.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from ..bench.contracts import FrameKey, HeadPose, Progress, StepRecord, no_progress
+from ..bench.errors import InputError
+from ..bench.files import digest
+from . import ga_layout as layout
+from .capture_cameras import CaptureCameras, collect_cameras
+from .clip import CaptureClip, FrameFiles
+from .content_digests import content_digests
+from .flame_parameters import TeethPolicy, Tracking, read_tracking
+from .head.arrays import HeadArrays, read_head
+from .images import ImageStore
+from .principal_point import settle_cy
+from .splits import check_disjoint, sequence_names, split_by_holding_out
+from .steps.exclude import exclude_timesteps
+from .transforms import FrameEntry, read_transforms
+from .validate import LeakPolicy, check_images, check_leaks, check_timesteps, find_leaks
+
+WHITE = (1.0, 1.0, 1.0)
+
+
+def read_capture(
+    path: str | Path,
+    *,
+    head: HeadArrays | str | Path | None = None,
+    subject: str = "",
+    cy: layout.CyConvention | Literal["auto"] = "auto",
+    teeth: TeethPolicy = "auto",
+    background: Sequence[float] | None = None,
+    held_out_sequences: Sequence[str] = (),
+    held_out_cameras: Sequence[str] = (),
+    excluded: Mapping[int, str] | None = None,
+    leaks: LeakPolicy = "error",
+    decode: bool = False,
+    cache_mb: float = 512.0,
+    progress: Progress = no_progress,
+) -> CaptureClip:
+    """Read a capture folder (or the folder that holds its one union).
+
+    Parameters
+    ----------
+    head : head model, or its file; None takes the one that ``headbench.json`` names or ``head_model.npz``.
+    subject : subject id; "" takes it from ``headbench.json`` or the folder's name.
+    cy : convention of the principal point. "auto" takes what ``headbench.json`` declares, else compares the
+        tracked mesh with the masks; where the images do not decide and it matters, that is an `InputError`.
+        "centre" puts the principal point at the image centre, as GaussianAvatars does.
+    teeth : see `read_tracking`.
+    background : (r, g, b) in [0, 1] for RGBA images; None takes the declared one, else white. Images without
+        alpha cannot change theirs.
+    held_out_sequences, held_out_cameras : make the splits anew instead of taking the JSONs': all frames of
+        these sequences (full names or unique prefixes) are self-reenactment, these cameras' other frames
+        novel view, the rest training.
+    excluded : reason by timestep, in addition to what ``headbench.json`` declares.
+    leaks : "error" refuses splits that share data; "record" notes it in the step record.
+    decode : decode every image when checking; finds damage in the middle of files.
+    cache_mb : bound of the decoded images held in memory, in 10^6 bytes.
+
+    Raises
+    ------
+    InputError
+        For the first fault found.
+    """
+    folder = find_capture(Path(path))
+    declaration = layout.Declaration.read(folder)
+    entries = _read_splits(folder, bool(held_out_sequences or held_out_cameras))
+    everything = [entry for part in entries.values() for entry in part]
+    check_timesteps(folder, everything)
+    infos = check_images(everything, decode=decode, progress=progress)
+    rig = collect_cameras(everything, infos)
+    ground = _background(folder, declaration, background, all(i.channels in (2, 4) for i in infos.values()))
+    asset = _find_head(folder, declaration, head)
+    subject = subject or _subject(folder, declaration, everything)
+    files = {entry.timestep: entry.parameters for entry in everything}
+    tracking = read_tracking(files, asset, subject, teeth=teeth)
+    poses = _shift_poses(tracking, rig, everything)
+    declared = declaration.cy if declaration else None
+    convention, basis = settle_cy(folder, cy, declared, rig, tracking, poses, everything, ground)
+
+    names = sequence_names(everything, declaration.sequences if declaration else {})
+    keyed = {part: [(_key(subject, names, e), e) for e in group] for part, group in entries.items()}
+    splits = {part: tuple(key for key, _ in pairs) for part, pairs in keyed.items()}
+    check_disjoint(folder, splits)
+    frames = {key: FrameFiles(e.image, e.mask) for pairs in keyed.values() for key, e in pairs}
+    if held_out_sequences or held_out_cameras:
+        splits = split_by_holding_out(folder, frames, held_out_sequences, held_out_cameras)
+    digests = content_digests(folder, _used_files(folder, everything), progress=progress)
+    found = find_leaks(splits, {key: frame.image for key, frame in frames.items()}, digests)
+    record = {
+        "cy": convention,
+        "cy_from": basis,
+        "sequence_shifts_m": {names[name]: shift for name, shift in rig.shifts.items() if shift.any()},
+        "held_out_sequences": list(held_out_sequences),
+        "held_out_cameras": list(held_out_cameras),
+        "leaks": check_leaks(folder, found, leaks),
+        "synthetic": dict(declaration.synthetic) if declaration else {},
+        **tracking.notes,
+    }
+    contents = {Path(os.path.relpath(file, folder)).as_posix(): value for file, value in digests.items()}
+    source = digest(tracking.head.fingerprint(), contents, subject)
+    clip = CaptureClip(
+        subject=subject,
+        head=tracking.head,
+        shape=tracking.shape,
+        static_offset=tracking.static_offset,
+        cameras=rig.resolve(convention),
+        poses=poses,
+        splits=splits,
+        excluded={},
+        background=np.array(ground),
+        steps=(StepRecord("read_capture", record, source),),
+        files=frames,
+        source_fingerprint=source,
+        store=ImageStore(cache_mb),
+    )
+    reasons = {**(declaration.excluded if declaration else {}), **(excluded or {})}
+    return exclude_timesteps(clip, reasons) if reasons else clip
+
+
+def find_capture(path: Path) -> Path:
+    """The folder with the transforms JSONs: ``path`` itself, or the one union folder in it."""
+    if not path.is_dir():
+        raise InputError(path, "", "a capture folder", "a file" if path.exists() else "nothing")
+    if any((path / file).exists() for file in (*layout.SPLIT_FILES.values(), layout.ALL_FRAMES_FILE)):
+        return path
+    unions = sorted(p for p in path.glob("UNION*") if (p / layout.SPLIT_FILES["train"]).exists())
+    if len(unions) == 1:
+        return unions[0]
+    found = f"{len(unions)} union folders: {', '.join(p.name for p in unions)}" if unions else "neither"
+    raise InputError(
+        path, "", "transforms_train.json, or one UNION folder that has it", found, "Name one capture."
+    )
+
+
+def _read_splits(folder: Path, resplit: bool) -> dict[str, list[FrameEntry]]:
+    """Entries by split name; with ``resplit``, ``transforms.json`` will do in place of the three."""
+    paths = {name: folder / file for name, file in layout.SPLIT_FILES.items()}
+    if resplit and not any(path.exists() for path in paths.values()):
+        return {"train": read_transforms(folder / layout.ALL_FRAMES_FILE)}
+    return {name: read_transforms(path) for name, path in paths.items()}
+
+
+def _find_head(
+    folder: Path, declaration: layout.Declaration | None, head: HeadArrays | str | Path | None
+) -> HeadArrays:
+    if isinstance(head, HeadArrays):
+        asset = head
+    else:
+        path = Path(head) if head else folder / (declaration.head_file if declaration else layout.HEAD_FILE)
+        if not path.exists():
+            raise InputError(
+                path,
+                "",
+                "the head model the capture was tracked with",
+                "no such file",
+                "Captures of NeRSemble subjects need flame2023.pkl (FLAME 2023, versions with jaw rotation) "
+                "from https://flame.is.tue.mpg.de; give its path as head=. Synthetic captures hold theirs.",
+            )
+        if path.suffix == ".npz":
+            asset = read_head(path)
+        else:
+            from .head.loaders import load_head
+
+            asset = load_head(path)
+    if declaration and asset.version != declaration.head_model:
+        raise InputError(
+            folder / layout.DECLARATION_FILE,
+            "head_model",
+            f"{asset.version}, the version of the head model given",
+            declaration.head_model,
+            "Coefficients of one head model mean nothing to another.",
+        )
+    return asset
+
+
+def _subject(folder: Path, declaration: layout.Declaration | None, entries: Sequence[FrameEntry]) -> str:
+    if declaration:
+        return declaration.subject
+    named = (
+        layout.parse_union_folder(folder.name) or layout.parse_sequence_folder(entries[0].sequence_folder)[0]
+    )
+    return named or folder.name
+
+
+def _background(
+    folder: Path, declaration: layout.Declaration | None, wanted: Sequence[float] | None, alpha: bool
+) -> tuple[float, ...]:
+    declared = declaration.background if declaration else WHITE
+    if wanted is None:
+        return declared
+    colour = tuple(float(c) for c in wanted)
+    if len(colour) != 3 or not all(0 <= c <= 1 for c in colour):
+        raise InputError("read_capture", "background", "three numbers in [0, 1]", f"{colour}")
+    if colour != declared and not alpha:
+        raise InputError(
+            folder, "background", f"{declared}, as images without alpha are composited already", f"{colour}"
+        )
+    return colour
+
+
+def _shift_poses(
+    tracking: Tracking, rig: CaptureCameras, entries: Iterable[FrameEntry]
+) -> dict[int, HeadPose]:
+    """Poses moved into the first sequence's world."""
+    folders = {entry.timestep: entry.sequence_folder for entry in entries}
+    poses = {}
+    for timestep, pose in tracking.poses.items():
+        shift = rig.shifts[folders[timestep]].astype(pose.translation.dtype)
+        poses[timestep] = replace(pose, translation=pose.translation + shift)
+    return poses
+
+
+def _key(subject: str, names: Mapping[str, str], entry: FrameEntry) -> FrameKey:
+    return FrameKey(subject, names[entry.sequence_folder], entry.timestep, entry.camera_id)
+
+
+def _used_files(folder: Path, entries: Iterable[FrameEntry]) -> set[Path]:
+    """Every file the clip depends on, but the head model, which may lie elsewhere and has its own digest."""
+    files = {folder / layout.DECLARATION_FILE} if (folder / layout.DECLARATION_FILE).exists() else set()
+    for entry in entries:
+        files |= {entry.file, entry.image, entry.parameters} | ({entry.mask} if entry.mask else set())
+    return files

@@ -1,0 +1,96 @@
+"""Decoded images under a memory bound: least recently used goes first."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Iterable
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from ..bench.contracts import ByteArray
+from ..bench.errors import InputError
+
+
+class ImageStore:
+    """Reads images and masks, keeping at most ``limit_mb`` (10^6 bytes) of decoded pixels.
+
+    Safe to share between threads: the lock covers the bookkeeping, never the decoding. Two threads that ask
+    for one image at one time may both decode it. Arrays are shared, hence read-only.
+    """
+
+    def __init__(self, limit_mb: float = 512.0):
+        if limit_mb < 0:
+            raise InputError("image store", "limit_mb", "a number from 0", f"{limit_mb}")
+        self._limit = int(limit_mb * 1e6)
+        self._held = 0
+        self._arrays: OrderedDict[tuple[Path, tuple[float, ...] | None], ByteArray] = OrderedDict()
+        self._lock = threading.Lock()
+
+    @property
+    def held_bytes(self) -> int:
+        """Decoded bytes held now; never above the limit."""
+        return self._held
+
+    def image(self, path: Path, background: Iterable[float]) -> ByteArray:
+        """(H, W, 3) 8-bit RGB; straight alpha is composited on ``background`` (three numbers in [0, 1])."""
+        return self._get(path, tuple(float(c) for c in background))
+
+    def mask(self, path: Path) -> ByteArray:
+        """(H, W) 8-bit coverage: the alpha channel where the file has one, else its first channel."""
+        return self._get(path, None)
+
+    def _get(self, path: Path, background: tuple[float, ...] | None) -> ByteArray:
+        key = (path, background)
+        with self._lock:
+            if key in self._arrays:
+                self._arrays.move_to_end(key)
+                return self._arrays[key]
+        array = read_mask(path) if background is None else read_image(path, background)
+        array.flags.writeable = False
+        with self._lock:
+            if key not in self._arrays and array.nbytes <= self._limit:
+                self._arrays[key] = array
+                self._held += array.nbytes
+                while self._held > self._limit:
+                    _, oldest = self._arrays.popitem(last=False)
+                    self._held -= oldest.nbytes
+        return array
+
+
+def read_image(path: Path, background: Iterable[float]) -> ByteArray:
+    """Decode a PNG or JPEG to (H, W, 3) RGB, straight alpha composited on ``background`` and rounded.
+
+    Raises `InputError` where the file does not decode or has more than 8 bits per channel.
+    """
+    pixels = _decode(path)
+    if pixels.ndim == 2:
+        return cv2.cvtColor(pixels, cv2.COLOR_GRAY2RGB).astype(np.uint8, copy=False)
+    if pixels.shape[2] == 3:
+        return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
+    rgba = cv2.cvtColor(pixels, cv2.COLOR_BGRA2RGBA)
+    alpha = rgba[..., 3:].astype(np.float32) / 255
+    ground = np.array([*background], dtype=np.float32) * 255
+    blended = rgba[..., :3] * alpha + ground * (1 - alpha)
+    return np.round(blended).astype(np.uint8)
+
+
+def read_mask(path: Path) -> ByteArray:
+    """Decode a mask to (H, W): the alpha channel where there is one, else the first channel."""
+    pixels = _decode(path)
+    if pixels.ndim == 2:
+        return pixels
+    channel = 3 if pixels.shape[2] == 4 else 0
+    return np.ascontiguousarray(pixels[..., channel])
+
+
+def _decode(path: Path) -> ByteArray:
+    pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if pixels is None:
+        found = "damaged data" if path.exists() else "no such file"
+        raise InputError(path, "", "an image that decodes", found)
+    if pixels.dtype != np.uint8:
+        raise InputError(path, "", "8 bits per channel", f"{pixels.dtype}")
+    return pixels.astype(np.uint8, copy=False)

@@ -1,0 +1,15 @@
+"""Captures that headbench reads or makes. Light to import: implementations are named, not loaded."""
+
+from ..bench.contracts import DatasetSpec
+
+GA_LAYOUT = DatasetSpec(
+    name="ga",
+    summary="A capture in the GaussianAvatars/VHAP layout: a UNION folder or a single sequence.",
+    implementation="headbench.datasets.ga_reader:read_capture",
+)
+
+SYNTHETIC = DatasetSpec(
+    name="synthetic",
+    summary="A path-traced procedural head with exact tracking, written in the same layout.",
+    implementation="headbench.datasets.synthetic.capture:synthesize",
+)

@@ -1,0 +1,51 @@
+"""Leave labelled frames out of every split: FLAME has no tongue, so frames that show one are not compared."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from pathlib import Path
+
+from ...bench.contracts import FrameKey
+from ...bench.errors import InputError
+from ..clip import CaptureClip
+from ..transforms import read_json_object
+
+
+def exclude_timesteps(
+    clip: CaptureClip, reasons: Mapping[int, str], *, only: Collection[str] = ()
+) -> CaptureClip:
+    """Move the labelled timesteps of a clip from its splits to `excluded`, with their reasons.
+
+    Parameters
+    ----------
+    reasons : label by timestep, such as {57: "tongue out"}.
+    only : labels to act on; empty means all.
+
+    Raises
+    ------
+    InputError
+        Where a timestep is not in the clip, or no training frame would be left.
+    """
+    unknown = sorted(set(reasons) - set(clip.poses))
+    if unknown:
+        expected = f"timesteps of the clip, 0 to {max(clip.poses)}"
+        raise InputError("excluded frames", "timestep", expected, ", ".join(map(str, unknown)))
+    chosen = {t: reason for t, reason in reasons.items() if not only or reason in only}
+    gone = {key: chosen[key.timestep] for key in clip.files if key.timestep in chosen}
+    splits = {name: tuple(key for key in keys if key not in gone) for name, keys in clip.splits.items()}
+    if not splits["train"]:
+        raise InputError("excluded frames", "timestep", "training frames left", "none left")
+    parameters = {"reasons": {str(t): reason for t, reason in sorted(chosen.items())}}
+    excluded: dict[FrameKey, str] = {**clip.excluded, **gone}
+    return clip.derive("exclude_timesteps", parameters, splits=splits, excluded=excluded)
+
+
+def read_labels(path: Path) -> dict[int, str]:
+    """Read frame labels: a JSON object {"<timestep>": "<reason>"}; `InputError` where it is none."""
+    labels = {}
+    for key, reason in read_json_object(path).items():
+        if not (key.isascii() and key.isdigit() and isinstance(reason, str)):
+            expected = "entries that map a timestep to a reason"
+            raise InputError(path, key, expected, f"{key!r}: {reason!r}"[:80])
+        labels[int(key)] = reason
+    return labels

@@ -1,0 +1,133 @@
+"""A tiny capture on disk for tests: a toy head, flat-shaded by its silhouette, written by our writer."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from headbench.bench.contracts import Camera, HeadPose
+from headbench.datasets.ga_writer import CapturePlan, CaptureWriter, SequencePlan
+from headbench.datasets.head.arrays import HeadArrays
+from headbench.datasets.head.model import HeadModel
+
+from .head.toy import toy_head
+
+SERIALS = ("222200042", "222200037", "222200038")
+FRONTAL = "222200037"
+
+
+def look_at(name: str, position: np.ndarray, width: int, height: int, cx: float, cy: float) -> Camera:
+    """Camera at ``position`` looking at the origin, +y up."""
+    forward = -position / np.linalg.norm(position)
+    right = np.cross(forward, [0.0, 1.0, 0.0])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation, -rotation @ position
+    focal = 3.2 * width
+    return Camera(name, width, height, np.array([[focal, 0, cx], [0, focal, cy], [0, 0, 1.0]]), matrix)
+
+
+def rig(width: int = 48, height: int = 64, cx: float = 24.7, cy: float = 29.3) -> list[Camera]:
+    """Three cameras on an arc in front of the head."""
+    angles = np.radians([-40.0, 0.0, 40.0])
+    return [
+        look_at(name, np.array([np.sin(a), 0.1, np.cos(a)]), width, height, cx, cy)
+        for name, a in zip(SERIALS, angles)
+    ]
+
+
+def random_pose(head: HeadArrays, rng: np.random.Generator) -> HeadPose:
+    """A pose whose numbers float32 holds exactly."""
+
+    def draw(size: int, scale: float) -> np.ndarray:
+        return (scale * rng.normal(size=size)).astype(np.float32)
+
+    return HeadPose(
+        head_model=head.version,
+        expression=draw(head.expression_basis.shape[2], 1.0),
+        rotation=draw(3, 0.05),
+        neck=draw(3, 0.05),
+        jaw=np.abs(draw(3, 0.2)) * np.array([1, 0, 0], np.float32),
+        eyes=draw(6, 0.1),
+        translation=draw(3, 0.003),
+        eyelids=None if head.eyelid_basis is None else draw(2, 0.3),
+    )
+
+
+def make_plan(
+    *, lengths: dict[str, int] | None = None, cameras: list[Camera] | None = None, seed: int = 0, **changes
+) -> CapturePlan:
+    """Plan of two training sequences and FREE, whose last frame shows the tongue."""
+    head = changes.pop("head", None) or toy_head(16)
+    rng = np.random.default_rng(seed)
+    lengths = lengths or {"FREE": 3, "EMO-1-shout+laugh": 2, "SEN-01-cramp_small_danger": 2}
+    vertices, _, identities = head.shape_basis.shape
+    sequences = [
+        SequencePlan(
+            name,
+            [random_pose(head, rng) for _ in range(count)],
+            {count - 1: "tongue out"} if name == "FREE" else {},
+        )
+        for name, count in lengths.items()
+    ]
+    settings = {
+        "subject": "901",
+        "head": head,
+        "shape": rng.normal(size=identities).astype(np.float32),
+        "static_offset": (0.001 * rng.normal(size=(vertices, 3))).astype(np.float32),
+        "cameras": cameras or rig(),
+        "sequences": sequences,
+        "test_sequences": ("FREE",),
+        "novel_view_cameras": (FRONTAL,),
+    }
+    return CapturePlan(**(settings | changes))
+
+
+def posed_vertices(plan: CapturePlan, pose: HeadPose) -> np.ndarray:
+    """(V, 3) mesh of a pose, metres."""
+    model = HeadModel(plan.head, dtype=torch.float64)
+    canonical = model.canonical(torch.tensor(plan.shape.astype(float)), torch.tensor(plan.static_offset.astype(float)))
+    return model(canonical=canonical, **model.pose_arguments([pose]))[0].numpy()
+
+
+def silhouette(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> np.ndarray:
+    """(H, W) bool: pixels whose centre is covered, tested triangle by triangle with barycentric signs."""
+    points = vertices @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    pixels = (points @ camera.K.T)[:, :2] / points[:, 2:]
+    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
+    covered = np.zeros((camera.height, camera.width), dtype=bool)
+    for a, b, c in pixels[faces]:
+        sides = [(q[0] - p[0]) * (y - p[1]) - (q[1] - p[1]) * (x - p[0]) for p, q in ((a, b), (b, c), (c, a))]
+        covered |= np.all([side >= 0 for side in sides], axis=0) | np.all([side <= 0 for side in sides], axis=0)
+    return covered
+
+
+def paint(plan: CapturePlan, pose: HeadPose, camera: Camera, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Image (noise inside the silhouette, white outside) and mask of a frame."""
+    covered = silhouette(posed_vertices(plan, pose), plan.head.faces, camera)
+    noise = np.random.default_rng(seed).integers(20, 200, size=(camera.height, camera.width, 3))
+    image = np.where(covered[..., None], noise, 255).astype(np.uint8)
+    return image, (covered * 255).astype(np.uint8)
+
+
+def write_tiny_capture(root: Path, plan: CapturePlan | None = None) -> tuple[CaptureWriter, dict]:
+    """Write a whole capture; returns the writer and (image, mask) by (sequence, timestep, camera)."""
+    plan = plan or make_plan()
+    writer = CaptureWriter(root, plan)
+    frames = {}
+    for sequence in plan.sequences:
+        for timestep, pose in enumerate(sequence.poses):
+            for camera in plan.cameras:
+                key = (sequence.name, timestep, camera.id)
+                frames[key] = paint(plan, pose, camera, len(frames))
+                writer.write_frame(*key, *frames[key])
+    writer.write_metadata()
+    return writer, frames
+
+
+def decode_png(path: Path) -> np.ndarray:
+    """(H, W, 3) RGB."""
+    return cv2.imread(str(path), cv2.IMREAD_COLOR)[..., ::-1]
