@@ -12,6 +12,7 @@ import numpy as np
 from ..bench.contracts import FloatArray, HeadPose
 from ..bench.errors import InputError
 from .head.arrays import HeadArrays, read_npz
+from .head.teeth import with_teeth
 
 TeethPolicy = Literal["auto", "add", "keep"]
 
@@ -93,8 +94,6 @@ def resolve_teeth(
         teeth == "auto" and (head.version.startswith("flame") or (rows or 0) > vertices)
     )
     if wanted and not has_teeth:
-        from .head.teeth import with_teeth
-
         head = with_teeth(head)
         has_teeth = True
     total = len(head.template)

@@ -20,14 +20,15 @@ from ..bench.errors import InputError
 from ..bench.files import digest
 from . import ga_layout as layout
 from .capture_cameras import CaptureCameras, collect_cameras
+from .capture_head import find_head
 from .clip import CaptureClip, FrameFiles
 from .content_digests import content_digests
 from .flame_parameters import TeethPolicy, Tracking, read_tracking
-from .head.arrays import HeadArrays, read_head
+from .head.arrays import HeadArrays
 from .images import ImageStore
 from .principal_point import settle_cy
 from .splits import check_disjoint, sequence_names, split_by_holding_out
-from .steps.exclude import exclude_timesteps
+from .steps.exclude import exclude_timesteps, read_labels
 from .transforms import FrameEntry, read_transforms
 from .validate import LeakPolicy, check_images, check_leaks, check_timesteps, find_leaks
 
@@ -38,13 +39,15 @@ def read_capture(
     path: str | Path,
     *,
     head: HeadArrays | str | Path | None = None,
+    masks: str | Path | None = None,
+    regions: str | Path | None = None,
     subject: str = "",
     cy: layout.CyConvention | Literal["auto"] = "auto",
     teeth: TeethPolicy = "auto",
     background: Sequence[float] | None = None,
     held_out_sequences: Sequence[str] = (),
     held_out_cameras: Sequence[str] = (),
-    excluded: Mapping[int, str] | None = None,
+    excluded: Mapping[int, str] | str | Path | None = None,
     leaks: LeakPolicy = "error",
     decode: bool = False,
     cache_mb: float = 512.0,
@@ -54,7 +57,7 @@ def read_capture(
 
     Parameters
     ----------
-    head : head model, or its file; None takes the one that ``headbench.json`` names or ``head_model.npz``.
+    head, masks, regions : head model or its file, and files with regions; see `find_head`.
     subject : subject id; "" takes it from ``headbench.json`` or the folder's name.
     cy : convention of the principal point. "auto" takes what ``headbench.json`` declares, else compares the
         tracked mesh with the masks; where the images do not decide and it matters, that is an `InputError`.
@@ -65,7 +68,7 @@ def read_capture(
     held_out_sequences, held_out_cameras : make the splits anew instead of taking the JSONs': all frames of
         these sequences (full names or unique prefixes) are self-reenactment, these cameras' other frames
         novel view, the rest training.
-    excluded : reason by timestep, in addition to what ``headbench.json`` declares.
+    excluded : reason by timestep, or a file for `read_labels`; added to what ``headbench.json`` declares.
     leaks : "error" refuses splits that share data; "record" notes it in the step record.
     decode : decode every image when checking; finds damage in the middle of files.
     cache_mb : bound of the decoded images held in memory, in 10^6 bytes.
@@ -75,7 +78,7 @@ def read_capture(
     InputError
         For the first fault found.
     """
-    folder = find_capture(Path(path))
+    folder = _one_capture(Path(path))
     declaration = layout.Declaration.read(folder)
     entries = _read_splits(folder, bool(held_out_sequences or held_out_cameras))
     everything = [entry for part in entries.values() for entry in part]
@@ -83,7 +86,7 @@ def read_capture(
     infos = check_images(everything, decode=decode, progress=progress)
     rig = collect_cameras(everything, infos)
     ground = _background(folder, declaration, background, all(i.channels in (2, 4) for i in infos.values()))
-    asset = _find_head(folder, declaration, head)
+    asset = find_head(folder, declaration, head, masks=masks, regions=regions)
     subject = subject or _subject(folder, declaration, everything)
     files = {entry.timestep: entry.parameters for entry in everything}
     tracking = read_tracking(files, asset, subject, teeth=teeth)
@@ -127,23 +130,27 @@ def read_capture(
         source_fingerprint=source,
         store=ImageStore(cache_mb),
     )
-    reasons = {**(declaration.excluded if declaration else {}), **(excluded or {})}
+    labels = read_labels(Path(excluded)) if isinstance(excluded, (str, Path)) else excluded
+    reasons = {**(declaration.excluded if declaration else {}), **(labels or {})}
     return exclude_timesteps(clip, reasons) if reasons else clip
 
 
-def find_capture(path: Path) -> Path:
-    """The folder with the transforms JSONs: ``path`` itself, or the one union folder in it."""
+def find_captures(root: Path) -> list[Path]:
+    """Captures under ``root``: the folder itself if it holds transforms JSONs, else its union folders."""
+    if any((root / file).exists() for file in (*layout.SPLIT_FILES.values(), layout.ALL_FRAMES_FILE)):
+        return [root]
+    return sorted(path.parent for path in root.glob(f"UNION*/{layout.SPLIT_FILES['train']}"))
+
+
+def _one_capture(path: Path) -> Path:
     if not path.is_dir():
         raise InputError(path, "", "a capture folder", "a file" if path.exists() else "nothing")
-    if any((path / file).exists() for file in (*layout.SPLIT_FILES.values(), layout.ALL_FRAMES_FILE)):
-        return path
-    unions = sorted(p for p in path.glob("UNION*") if (p / layout.SPLIT_FILES["train"]).exists())
-    if len(unions) == 1:
-        return unions[0]
-    found = f"{len(unions)} union folders: {', '.join(p.name for p in unions)}" if unions else "neither"
-    raise InputError(
-        path, "", "transforms_train.json, or one UNION folder that has it", found, "Name one capture."
-    )
+    captures = find_captures(path)
+    if len(captures) != 1:
+        found = ", ".join(capture.name for capture in captures) or "neither"
+        expected = f"{layout.SPLIT_FILES['train']}, or one UNION folder that has it"
+        raise InputError(path, "", expected, found, "Name one capture.")
+    return captures[0]
 
 
 def _read_splits(folder: Path, resplit: bool) -> dict[str, list[FrameEntry]]:
@@ -152,39 +159,6 @@ def _read_splits(folder: Path, resplit: bool) -> dict[str, list[FrameEntry]]:
     if resplit and not any(path.exists() for path in paths.values()):
         return {"train": read_transforms(folder / layout.ALL_FRAMES_FILE)}
     return {name: read_transforms(path) for name, path in paths.items()}
-
-
-def _find_head(
-    folder: Path, declaration: layout.Declaration | None, head: HeadArrays | str | Path | None
-) -> HeadArrays:
-    if isinstance(head, HeadArrays):
-        asset = head
-    else:
-        path = Path(head) if head else folder / (declaration.head_file if declaration else layout.HEAD_FILE)
-        if not path.exists():
-            raise InputError(
-                path,
-                "",
-                "the head model the capture was tracked with",
-                "no such file",
-                "Captures of NeRSemble subjects need flame2023.pkl (FLAME 2023, versions with jaw rotation) "
-                "from https://flame.is.tue.mpg.de; give its path as head=. Synthetic captures hold theirs.",
-            )
-        if path.suffix == ".npz":
-            asset = read_head(path)
-        else:
-            from .head.loaders import load_head
-
-            asset = load_head(path)
-    if declaration and asset.version != declaration.head_model:
-        raise InputError(
-            folder / layout.DECLARATION_FILE,
-            "head_model",
-            f"{asset.version}, the version of the head model given",
-            declaration.head_model,
-            "Coefficients of one head model mean nothing to another.",
-        )
-    return asset
 
 
 def _subject(folder: Path, declaration: layout.Declaration | None, entries: Sequence[FrameEntry]) -> str:

@@ -6,6 +6,7 @@ GA_LAYOUT = DatasetSpec(
     name="ga",
     summary="A capture in the GaussianAvatars/VHAP layout: a UNION folder or a single sequence.",
     implementation="headbench.datasets.ga_reader:read_capture",
+    find="headbench.datasets.ga_reader:find_captures",
 )
 
 SYNTHETIC = DatasetSpec(

@@ -1,0 +1,99 @@
+"""Jaw bases: a few jaw rotations that span those of a performance, and the weights of a pose on them.
+
+"3D Gaussian Head Avatars with Expressive Dynamic Appearances by Compact Tensorial Representations"
+(CVPR 2025, arXiv 2504.14967), section on feature lines. The paper's code draws the bases from validation and
+test poses and seeds them with a half turn; here they come from training poses alone and are seeded with the
+identity. The published behaviour is ``compatibility="tga"``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ...bench.contracts import Clip, FloatArray, HeadPose
+
+IDENTITY = (1.0, 0.0, 0.0, 0.0)
+HALF_TURN = (0.0, 0.0, 0.0, 1.0)
+"""Real part first: half a turn about z. The published code meant the identity, real part last."""
+
+DEFAULT_COUNT = 16
+DISTINCT_ANGLE = np.radians(0.25)
+"""Rotations nearer than this, in radians, count as one: a tenth of the jaw's smallest visible motion."""
+
+TGA_TEST_STRIDE = 16
+"""The published code takes every 16th test frame: with 16 cameras, each timestep once."""
+
+
+def jaw_quaternions(poses: Sequence[HeadPose]) -> FloatArray:
+    """(N, 4) unit quaternions, real part first, of the poses' jaw rotations."""
+    rotations = Rotation.from_rotvec(np.array([pose.jaw for pose in poses], dtype=np.float64).reshape(-1, 3))
+    return rotations.as_quat()[:, [3, 0, 1, 2]]
+
+
+def quaternion_distances(one: FloatArray, other: FloatArray) -> FloatArray:
+    """(N, M) distances 1 - |<p, q>| of (N, 4) and (M, 4) unit quaternions; in [0, 1], blind to sign."""
+    return 1 - np.abs(one @ other.T)
+
+
+def farthest_quaternions(
+    candidates: FloatArray, seed: Sequence[float], count: int, *, tolerance: float = 0.0
+) -> FloatArray:
+    """Greedy farthest-point sampling: ``seed``, then each time the candidate farthest from those chosen.
+
+    Parameters
+    ----------
+    candidates : (N, 4) unit quaternions, real part first.
+    seed : (4,) the first choice; counts among the ``count``.
+    tolerance : stop where no candidate is farther than this from those chosen.
+
+    Returns
+    -------
+    (n, 4), n at most ``count``: fewer where the candidates are not that many distinct ones.
+    """
+    chosen = [np.asarray(seed, dtype=np.float64)]
+    nearest = quaternion_distances(candidates, chosen[0][None])[:, 0]
+    while len(chosen) < count and nearest.size and nearest.max() > tolerance:
+        chosen.append(candidates[nearest.argmax()])
+        nearest = np.minimum(nearest, quaternion_distances(candidates, chosen[-1][None])[:, 0])
+    return np.array(chosen)
+
+
+def jaw_bases(
+    clip: Clip, count: int = DEFAULT_COUNT, *, compatibility: Literal["", "tga"] = ""
+) -> FloatArray:
+    """Jaw bases of a clip, (n, 4) unit quaternions with the real part first, n <= ``count``.
+
+    Fewer than ``count`` where the performance has fewer jaw rotations that differ by more than
+    `DISTINCT_ANGLE`.
+
+    Parameters
+    ----------
+    compatibility : "tga" reproduces the published code: candidates are the poses of all novel-view frames
+        and of every 16th self-reenactment frame (**a leak of the test signal**), seeded with `HALF_TURN`.
+    """
+    if compatibility == "tga":
+        test = sorted(clip.splits["self_reenactment"], key=lambda key: (key.timestep, key.camera))
+        keys = [*sorted(clip.splits["novel_view"]), *test[::TGA_TEST_STRIDE]]
+        candidates = jaw_quaternions([clip.poses[key.timestep] for key in keys])
+        return farthest_quaternions(candidates, HALF_TURN, count)
+    timesteps = sorted({key.timestep for key in clip.splits["train"]})
+    candidates = jaw_quaternions([clip.poses[timestep] for timestep in timesteps])
+    # |<p, q>| is the cosine of half the angle between two rotations.
+    tolerance = 1 - np.cos(DISTINCT_ANGLE / 2)
+    return farthest_quaternions(candidates, IDENTITY, count, tolerance=tolerance)
+
+
+def jaw_weights(quaternions: FloatArray, bases: FloatArray) -> FloatArray:
+    """(N, n) weights of jaw rotations on the bases: |<q, q_i>| / sum_j |<q, q_j>|; rows sum to 1.
+
+    Parameters
+    ----------
+    quaternions : (N, 4) unit quaternions, real part first.
+    bases : (n, 4), from `jaw_bases`.
+    """
+    likeness = np.abs(quaternions @ bases.T)
+    return likeness / likeness.sum(axis=1, keepdims=True)
