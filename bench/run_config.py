@@ -75,6 +75,7 @@ class ResolvedMethod:
             "name": self.spec.name,
             "version": self.spec.version,
             "implementation": self.spec.implementation,
+            "trivial": self.spec.trivial,
             "config": None if self.config is None else asdict(self.config),
             "budget": asdict(self.budget),
         }

@@ -1,0 +1,134 @@
+"""The conformance kit: does a plug-in keep the contract? For authors of methods and for our own tests."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from .contracts import Avatar, Clip, Frame, HeadPose, no_progress
+from .errors import HeadbenchError, InputError
+from .files import digest_file
+from .run_config import ResolvedMethod
+
+
+class _TrainingOnly:
+    """A clip that raises when anything but the training split is looked at."""
+
+    def __init__(self, clip: Clip):
+        self._clip = clip
+        self._allowed = frozenset(clip.splits["train"])
+
+    def __getattr__(self, name: str):
+        return getattr(self._clip, name)
+
+    def image(self, key):
+        return self._clip.image(self._checked(key))
+
+    def mask(self, key):
+        return self._clip.mask(self._checked(key))
+
+    def _checked(self, key):
+        if key not in self._allowed:
+            raise HeadbenchError(f"the method read {key}, which is not a training frame")
+        return key
+
+
+def check_method(method: ResolvedMethod, clip: Clip, out: Path, *, device: str = "cpu") -> list[str]:
+    """Train a method briefly on ``clip`` and return every breach of the contract found; empty means it conforms.
+
+    Checked: `fit` reads training images alone, reports progress, can be repeated without training again into
+    something else; `load` gives back the same avatar to the bit; frames have the camera's size, finite float32
+    colours in [0, 1] and coverage in [0, 1]; the background shows where nothing covers it; rendering does not
+    depend on what was rendered before; files exist; a pose of another head model is refused.
+
+    Parameters
+    ----------
+    method : with a small budget; the kit fits it once and continues it once.
+    clip : a capture with all three splits.
+    out : empty folder to train into.
+    """
+    calls: list[tuple[int, int]] = []
+
+    def record(done: int, total: int, note: str = "") -> None:
+        calls.append((done, total))
+
+    instance = method.create()
+    avatar: Avatar = instance.fit(
+        _TrainingOnly(clip), out, method.budget, device=device, seed=0, progress=record
+    )
+    breaches: list[str] = []
+    if method.spec.presets and not calls:
+        breaches.append("fit never reported progress")
+    if any(done > total for done, total in calls) or sorted(calls) != calls:
+        breaches.append("progress ran backwards or past its total")
+    loaded = instance.load(out, device=device)
+    breaches += _file_breaches(avatar, out)
+    breaches += _render_breaches(avatar, loaded, clip)
+    before = {path: digest_file(path) for path in avatar.files()}
+    again = method.create().fit(
+        _TrainingOnly(clip), out, method.budget, device=device, seed=0, progress=no_progress
+    )
+    if {path: digest_file(path) for path in again.files()} != before:
+        breaches.append("fitting a finished avatar again changed its files")
+    return breaches
+
+
+def _file_breaches(avatar: Avatar, out: Path) -> Iterator[str]:
+    files = list(avatar.files())
+    if not files:
+        yield "files() names no file"
+    for path in files:
+        if not path.is_file():
+            yield f"files() names {path}, which is not there"
+        elif out.resolve() not in path.resolve().parents:
+            yield f"files() names {path}, which lies outside the avatar's folder"
+
+
+def _render_breaches(avatar: Avatar, loaded: Avatar, clip: Clip) -> Iterator[str]:
+    keys = [*clip.splits["train"][:1], *clip.splits["novel_view"][:1], *clip.splits["self_reenactment"][:1]]
+    views = [(clip.cameras[key.camera], clip.poses[key.timestep]) for key in keys]
+    first = [avatar.render(camera, pose) for camera, pose in views]
+    for (camera, _), frame in zip(views, first):
+        yield from _frame_breaches(frame, camera.height, camera.width)
+    for (camera, pose), frame in zip(reversed(views), reversed(first)):
+        if not _same(loaded.render(camera, pose), frame):
+            yield "a loaded avatar, asked in another order, renders something else"
+            break
+    camera, pose = views[0]
+    black = avatar.render(camera, pose, (0.0, 0.0, 0.0))
+    uncovered = black.alpha < 1e-3
+    if uncovered.any() and np.abs(black.rgb[uncovered]).max() > 0.01:
+        yield "where alpha is 0 the background asked for does not show"
+    if not _refuses(lambda: avatar.render(camera, replace(pose, head_model="some other model")), avatar):
+        yield "a pose of another head model was rendered instead of refused"
+    unseen: HeadPose = replace(pose, subject="", timestep=None)
+    yield from _frame_breaches(avatar.render(camera, unseen), camera.height, camera.width)
+
+
+def _frame_breaches(frame: Frame, height: int, width: int) -> Iterator[str]:
+    for name, array, shape in (
+        ("rgb", frame.rgb, (height, width, 3)),
+        ("alpha", frame.alpha, (height, width)),
+    ):
+        if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype != np.float32:
+            yield f"{name} is not a float32 numpy array of shape {shape}"
+        elif not np.isfinite(array).all():
+            yield f"{name} is not finite"
+        elif array.min() < 0 or array.max() > 1:
+            yield f"{name} leaves [0, 1]: {array.min():.4g} to {array.max():.4g}"
+
+
+def _same(a: Frame, b: Frame) -> bool:
+    return np.array_equal(a.rgb, b.rgb) and np.array_equal(a.alpha, b.alpha)
+
+
+def _refuses(render: Callable[[], Frame], avatar: Avatar) -> bool:
+    try:
+        render()
+    except InputError:
+        return True
+    # An avatar that knows no head model (an image, a folder of frames) has nothing to refuse.
+    return not hasattr(avatar, "splats")
