@@ -1,0 +1,168 @@
+"""Load a head model from what it comes as: a FLAME pickle, our npz, or ICT-FaceKit's."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...bench.contracts import IntArray
+from ...bench.errors import InputError
+from .arrays import RING_REGIONS, HeadArrays, read_head, read_npz
+from .ict import ict_head, is_ict
+from .regions import with_derived_regions
+from .unpickle import read_pickle
+
+FLAME_IDENTITY_SIZE = 300
+"""Columns of FLAME's ``shapedirs`` that span identity; those after them span expression."""
+
+_ZIP = b"PK\x03\x04"
+
+
+def load_head(
+    path: str | PathLike[str],
+    *,
+    masks: str | PathLike[str] | None = None,
+    regions: str | PathLike[str] | None = None,
+    version: str | None = None,
+) -> HeadArrays:
+    """Load a head model; what the file is follows from its content.
+
+    Parameters
+    ----------
+    path : FLAME pickle (2020: ``generic_model.pkl``, 2023: ``flame2023.pkl``), npz written by `save_head`,
+        or ICT-FaceKit npz.
+    masks : ``FLAME_masks.pkl``, for a FLAME pickle; the derived regions are added.
+    regions : JSON file ``{name: [vertex, ...]}`` with further regions, such as the lip rings.
+    version : names the expression basis. Needed where the file name of a FLAME pickle does not tell
+        ("flame2020", "flame2023"); must agree with what a npz of ours says.
+
+    Raises
+    ------
+    InputError
+        Where a file is missing, damaged or of no known kind, or holds arrays that make no head.
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as stream:
+            start = stream.read(len(_ZIP))
+    except OSError as error:
+        raise InputError(path, "", "a head model file", error.strerror or "nothing readable") from error
+    if start != _ZIP:
+        head = _flame(path, version or flame_version(path))
+    else:
+        content = read_npz(path)
+        head = ict_head(path, content) if is_ict(content) else read_head(path)
+        if version is not None and version != head.version:
+            raise InputError(path, "version", repr(version), repr(head.version))
+    if masks is not None:
+        head = replace(head, regions={**head.regions, **read_masks(masks)})
+    if regions is not None:
+        head = replace(head, regions={**head.regions, **read_regions(regions)})
+    if masks is not None or regions is not None:
+        head.validate(regions or masks or path)
+    return with_derived_regions(head)
+
+
+def flame_version(path: Path) -> str:
+    """Version of a FLAME pickle by its usual file name.
+
+    Raises
+    ------
+    InputError
+        Where the name does not tell: the two files have the same layout, and confusing them goes unnoticed.
+    """
+    name = path.stem.lower().replace("-", "_")
+    if "2023" in name:
+        return "flame2023_no_jaw" if "no_jaw" in name else "flame2023"
+    if "2020" in name or name == "generic_model":
+        return "flame2020"
+    raise InputError(
+        path,
+        "version",
+        "a file name that tells FLAME's version (generic_model.pkl, flame2020.pkl, flame2023.pkl)",
+        repr(path.name),
+        "Say which it is: version='flame2020' or 'flame2023'. Their coefficients are not interchangeable.",
+    )
+
+
+def read_masks(path: str | PathLike[str]) -> dict[str, IntArray]:
+    """Regions of a ``FLAME_masks.pkl``: sorted, unique vertex indices by name."""
+    return {name: _members(path, name, members) for name, members in read_pickle(path).items()}
+
+
+def read_regions(path: str | PathLike[str]) -> dict[str, IntArray]:
+    """Regions of a JSON file ``{name: [vertex, ...]}``. Lip rings keep their order, others are sorted."""
+    try:
+        content = json.loads(Path(path).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(path, "", "a JSON file of vertex indices by region", str(error)) from error
+    if not isinstance(content, dict):
+        raise InputError(path, "", "a JSON object of regions", f"a {type(content).__name__}")
+    result = {}
+    for name, members in content.items():
+        is_list = isinstance(members, list) and all(type(member) is int for member in members)
+        if not is_list:
+            raise InputError(path, name, "a list of vertex indices", f"{str(members)[:40]}")
+        result[name] = _members(path, name, np.array(members, dtype=np.int64))
+    return result
+
+
+def with_eyelids(head: HeadArrays, left: str | PathLike[str], right: str | PathLike[str]) -> HeadArrays:
+    """Add the eyelid bases of the metrical tracker: ``l_eyelid.npy`` and ``r_eyelid.npy``, (V, 3) metres."""
+    columns = []
+    for path in (left, right):
+        try:
+            column = np.load(path, allow_pickle=False)
+        except (OSError, ValueError, EOFError) as error:
+            raise InputError(path, "", "a numpy array file", str(error)) from error
+        if not isinstance(column, np.ndarray) or column.shape != head.template.shape:
+            found = getattr(column, "shape", "an archive")
+            raise InputError(path, "", f"an array of shape {head.template.shape}", f"{found}")
+        columns.append(column)
+    return replace(head, eyelid_basis=np.stack(columns, axis=-1)).validate(left)
+
+
+def _members(path: str | PathLike[str], name: str, members: Any) -> IntArray:
+    if not isinstance(members, np.ndarray) or members.ndim != 1 or members.dtype.kind not in "iu":
+        raise InputError(path, name, "an array of vertex indices", f"{type(members).__name__}")
+    members = members.astype(np.int64)
+    return members if name in RING_REGIONS else np.unique(members)
+
+
+def _flame(path: Path, version: str) -> HeadArrays:
+    content = read_pickle(path)
+
+    def array(name: str, kinds: str, ndim: int) -> np.ndarray:
+        values = content.get(name)
+        if not isinstance(values, np.ndarray):
+            raise InputError(
+                path, name, "an array of that name", f"only {', '.join(sorted(content)) or 'nothing'}"
+            )
+        if values.dtype.kind not in kinds or values.ndim != ndim:
+            expected = f"{ndim} dimensions of {'integers' if 'i' in kinds else 'floats'}"
+            raise InputError(path, name, expected, f"{values.ndim} of {values.dtype}")
+        return values
+
+    directions = array("shapedirs", "f", 3)
+    if directions.shape[2] <= FLAME_IDENTITY_SIZE:
+        expected = f"{FLAME_IDENTITY_SIZE} identity directions and then those of expression"
+        raise InputError(path, "shapedirs", expected, f"{directions.shape[2]} directions in all")
+    tree = array("kintree_table", "iu", 2)
+    parents = tree[0].astype(np.int64)
+    parents[:1] = -1  # the file has an unsigned -1 there
+    return HeadArrays(
+        version=version,
+        template=array("v_template", "f", 2),
+        faces=array("f", "iu", 2).astype(np.int64),
+        shape_basis=directions[:, :, :FLAME_IDENTITY_SIZE],
+        expression_basis=directions[:, :, FLAME_IDENTITY_SIZE:],
+        pose_basis=array("posedirs", "f", 3),
+        joint_regressor=array("J_regressor", "f", 2),
+        skinning_weights=array("weights", "f", 2),
+        parents=parents,
+    ).validate(path)
