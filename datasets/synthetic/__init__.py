@@ -1,0 +1,1 @@
+"""Synthetic captures: a procedural person, performed, photographed by a path tracer, written as a capture."""

@@ -1,0 +1,248 @@
+"""Where things are on a head: the points and curves that painting, hair and wrinkles hang on.
+
+Everything is measured on the subject's own neutral shape, so that any head with the named landmarks (or the
+68 of iBUG's scheme) can be dressed. Left is the subject's left, +x; +y is up and +z is front; metres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from skimage.measure import find_contours
+
+from ...bench.contracts import FloatArray, HeadAsset, IntArray
+from ...bench.errors import InputError
+
+SIDES = ("left", "right")
+_IBUG = {
+    "chin": 8,
+    "nose_bridge": 27,
+    "nose_tip": 30,
+    "upper_lip_mid": 51,
+    "lower_lip_mid": 57,
+    "right_mouth_corner": 48,
+    "left_mouth_corner": 54,
+    "right_eye_outer": 36,
+    "right_eye_inner": 39,
+    "left_eye_inner": 42,
+    "left_eye_outer": 45,
+    "right_brow_outer": 17,
+    "right_brow_mid": 19,
+    "right_brow_inner": 21,
+    "left_brow_inner": 22,
+    "left_brow_mid": 24,
+    "left_brow_outer": 26,
+}
+_IBUG_LIPS = tuple(range(48, 60))  # outer contour, starting at the subject's right corner, upper lip first
+_REFERENCE_EYE_DISTANCE = 0.063  # adult interpupillary distance, metres
+
+
+@dataclass(frozen=True, eq=False)
+class Eye:
+    """One eye: its ball and the outline of its opening as seen from the front.
+
+    ``upper`` and ``lower`` are (n, 2) curves in x and y from the inner to the outer corner, at rest.
+    """
+
+    center: FloatArray
+    radius: float
+    upper: FloatArray
+    lower: FloatArray
+
+    @property
+    def outline(self) -> FloatArray:
+        """(2n, 2) closed outline."""
+        return np.concatenate([self.upper, self.lower[::-1]])
+
+
+@dataclass(frozen=True, eq=False)
+class Anatomy:
+    """Named points (3,), eyes, and the lip outline of one subject at rest.
+
+    ``scale`` is 1 for an adult head of average size; lengths in painting are multiples of it.
+    ``skin_faces`` are the tracked triangles that are skin: no eyeballs, no teeth.
+    ``lip_outline`` (n, 3) runs once around the red of the lips.
+    """
+
+    points: Mapping[str, FloatArray]
+    eyes: Mapping[str, Eye]
+    lip_outline: FloatArray
+    skin_faces: IntArray
+    scale: float
+
+    def __getitem__(self, name: str) -> FloatArray:
+        return self.points[name]
+
+
+def measure(head: HeadAsset, vertices: FloatArray) -> Anatomy:
+    """Find the anatomy of ``head`` in the neutral shape ``vertices`` (V, 3).
+
+    Raises
+    ------
+    InputError
+        Where the head names neither its own landmarks nor iBUG's, or lacks eyeball regions.
+    """
+    landmarks: Mapping[str, int] = getattr(head, "landmarks", {})
+    points = {name: vertices[landmark_index(landmarks, name)] for name in _IBUG}
+    for region in ("left_eyeball", "right_eyeball"):
+        if region not in head.regions:
+            raise InputError(head.version, f"regions[{region!r}]", "the eyeball's vertices", "no such region")
+    balls = {side: _fit_sphere(vertices[head.regions[f"{side}_eyeball"]]) for side in SIDES}
+    scale = float(np.linalg.norm(balls["left"][0] - balls["right"][0])) / _REFERENCE_EYE_DISTANCE
+    skin = skin_triangles(head)
+    eyes = {}
+    for side in SIDES:
+        center, radius = balls[side]
+        corners = points[f"{side}_eye_inner"], points[f"{side}_eye_outer"]
+        faces = head.faces[np.isin(head.faces[:, 0], head.regions[f"{side}_eyeball"])]
+        upper, lower = _opening(vertices, skin, faces, corners, scale)
+        eyes[side] = Eye(center, radius, upper, lower)
+    points.update(_derived(points, vertices, skin, scale))
+    return Anatomy(points, eyes, _lip_outline(head, landmarks, vertices), skin, scale)
+
+
+def landmark_index(landmarks: Mapping[str, int], name: str) -> int:
+    """Vertex of a landmark by our name, or by its number in iBUG's scheme ("ibug_36")."""
+    for key in (name, f"ibug_{_IBUG[name]}", f"ibug{_IBUG[name]}"):
+        if key in landmarks:
+            return landmarks[key]
+    raise InputError(
+        "head model",
+        f"landmarks[{name!r}]",
+        f"the vertex, under this name or as ibug_{_IBUG[name]}",
+        f"{len(landmarks)} other landmarks",
+        "Use the procedural head or an ICT-FaceKit file, or add landmarks to the head model.",
+    )
+
+
+def skin_triangles(head: HeadAsset) -> IntArray:
+    """Triangles of ``head`` that are skin: not eyeballs, teeth, gums or tongue."""
+    inside = [
+        indices
+        for name, indices in head.regions.items()
+        if name in ("left_eyeball", "right_eyeball", "gums", "tongue", "gums_tongue") or "teeth" in name
+    ]
+    other = np.zeros(len(head.template), bool)
+    for indices in inside:
+        other[indices] = True
+    return head.faces[~other[head.faces].any(axis=1)]
+
+
+def _fit_sphere(points: FloatArray) -> tuple[FloatArray, float]:
+    """Algebraic least-squares sphere (centre, radius) through (n, 3) points."""
+    middle = points.mean(axis=0)
+    local = points - middle
+    design = np.concatenate([2.0 * local, np.ones((len(local), 1))], axis=1)
+    solution = np.linalg.lstsq(design, (local**2).sum(axis=1), rcond=None)[0]
+    return middle + solution[:3], float(np.sqrt(solution[3] + solution[:3] @ solution[:3]))
+
+
+def _opening(
+    vertices: FloatArray,
+    skin: IntArray,
+    ball: IntArray,
+    corners: tuple[FloatArray, FloatArray],
+    scale: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Upper and lower lid line: the outline of the visible eyeball in an orthographic front view."""
+    step = 0.0003 * scale
+    inner, outer = corners
+    low = np.minimum(inner, outer)[:2] - np.array([0.006, 0.016]) * scale
+    size = np.ceil((np.maximum(inner, outer)[:2] + np.array([0.006, 0.016]) * scale - low) / step).astype(int)
+    seen = front_depth(vertices, ball, low, step, size) > front_depth(vertices, skin, low, step, size)
+    contours = find_contours(np.pad(seen.astype(float), 1), 0.5)
+    if not contours:
+        raise InputError("head model", "eyes", "eyeballs visible between the lids", "closed or hidden eyes")
+    outline = (max(contours, key=len)[:, ::-1] - 1.0) * step + low
+    along = np.linspace(0.0, 1.0, 33)
+    inward = np.sign(outer[0] - inner[0])
+    span = np.sort(inward * outline[[outline[:, 0].argmin(), outline[:, 0].argmax()], 0])
+    x = inward * (span[0] + (span[1] - span[0]) * along)
+    curves = []
+    for pick in (np.max, np.min):
+        y = np.array([pick(outline[np.abs(outline[:, 0] - value) < 3.0 * step, 1]) for value in x])
+        curves.append(np.stack([x, np.convolve(np.pad(y, 2, mode="edge"), np.full(5, 0.2), "valid")], axis=1))
+    # Both lids share their corners.
+    ends = 0.5 * (curves[0][[0, -1]] + curves[1][[0, -1]])
+    for curve in curves:
+        curve[[0, -1]] = ends
+    return curves[0], curves[1]
+
+
+def front_depth(vertices: FloatArray, faces: IntArray, low: FloatArray, step: float, size: IntArray) -> FloatArray:
+    """Largest z of ``faces`` over a grid of x and y, (rows along y, columns along x); -inf where there is none.
+
+    Grid point (row, column) is at ``low + step * (column, row)``.
+    """
+    depth = np.full((size[1], size[0]), -np.inf)
+    corner = vertices[faces]
+    grid = (corner[..., :2] - low) / step
+    first = np.clip(np.ceil(grid.min(axis=1)), 0, size).astype(int)
+    last = np.clip(np.floor(grid.max(axis=1)) + 1, 0, size).astype(int)
+    for index in np.flatnonzero((first < last).all(axis=1)):
+        (x0, y0), (x1, y1) = first[index], last[index]
+        a, b, c = grid[index]
+        area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+        if abs(area) < 1e-12:
+            continue
+        y, x = np.mgrid[y0:y1, x0:x1]
+        v = ((x - a[0]) * (c[1] - a[1]) - (y - a[1]) * (c[0] - a[0])) / area
+        w = ((b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0])) / area
+        inside = (v >= -1e-9) & (w >= -1e-9) & (v + w <= 1.0 + 1e-9)
+        z = corner[index, :, 2] @ np.stack([(1.0 - v - w).ravel(), v.ravel(), w.ravel()])
+        patch = depth[y0:y1, x0:x1]
+        np.maximum(patch, np.where(inside, z.reshape(v.shape), -np.inf), out=patch)
+    return depth
+
+
+def _derived(
+    points: Mapping[str, FloatArray], vertices: FloatArray, skin: IntArray, scale: float
+) -> dict[str, FloatArray]:
+    """Points that follow from the named ones."""
+    surface = vertices[np.unique(skin)]
+    tip, bridge = points["nose_tip"], points["nose_bridge"]
+    brows = 0.5 * (points["left_brow_inner"] + points["right_brow_inner"])
+    derived = {
+        "vertex_top": surface[surface[:, 1].argmax()],
+        "glabella": brows,
+        "mouth": 0.5 * (points["upper_lip_mid"] + points["lower_lip_mid"]),
+        "nose_base": tip + np.array([0.0, -0.013, -0.010]) * scale,
+    }
+    top = derived["vertex_top"][1]
+    face_height = top - points["chin"][1]
+    forehead = np.array([0.0, brows[1] + 0.14 * face_height, 0.0])
+    derived["forehead"] = _front_point(surface, forehead)
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        corner, eye = points[f"{side}_mouth_corner"], points[f"{side}_eye_outer"]
+        derived[f"{side}_ala"] = tip + np.array([sign * 0.017, -0.006, -0.018]) * scale
+        cheek = np.array([0.5 * (corner[0] + eye[0]) + sign * 0.012 * scale, 0.5 * (bridge[1] + tip[1]), 0.0])
+        cheek[1] = 0.45 * eye[1] + 0.55 * corner[1] + 0.004 * scale
+        derived[f"{side}_cheek"] = _front_point(surface, cheek)
+        side_points = surface[(surface[:, 0] * sign > 0) & (surface[:, 1] > corner[1]) & (surface[:, 1] < brows[1])]
+        derived[f"{side}_ear"] = side_points[(side_points[:, 0] * sign).argmax()]
+    return derived
+
+
+def _front_point(surface: FloatArray, at: FloatArray) -> FloatArray:
+    """The frontmost surface vertex near the x and y of ``at``."""
+    distance = np.linalg.norm(surface[:, :2] - at[:2], axis=1)
+    near = surface[distance <= max(0.006, float(distance.min()))]
+    return near[near[:, 2].argmax()]
+
+
+def _lip_outline(head: HeadAsset, landmarks: Mapping[str, int], vertices: FloatArray) -> FloatArray:
+    """Closed outline of the lips' red, (n, 3)."""
+    rings = [head.regions.get(f"lip_outside_ring_{part}") for part in ("upper", "lower")]
+    if rings[0] is not None and rings[1] is not None:
+        ring = vertices[np.unique(np.concatenate([rings[0], rings[1]]))]
+        middle, extent = 0.5 * (ring.max(axis=0) + ring.min(axis=0)), np.ptp(ring, axis=0)
+        # The outline is star-shaped once its height is stretched to its width: sort it by angle.
+        return ring[np.argsort(np.arctan2(*((ring - middle) / extent)[:, 1::-1].T))]
+    keys = [next((k for k in (f"ibug_{i}", f"ibug{i}") if k in landmarks), None) for i in _IBUG_LIPS]
+    if None in keys:
+        raise InputError(
+            head.version, "regions", "lip_outside_ring_upper and _lower, or iBUG's lip landmarks", "neither"
+        )
+    return vertices[[landmarks[key] for key in keys if key is not None]]

@@ -1,0 +1,167 @@
+"""The photograph: meshes, lights and a camera handed to Mitsuba 3, an image and a matte taken back.
+
+Mitsuba's own kernel (Embree rays, direct illumination) has nothing in common with the splat renderer, so an
+error of projection or blending in one cannot hide in the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import drjit
+import mitsuba
+import numpy as np
+
+from ...bench.contracts import ByteArray, Camera, FloatArray, IntArray
+from ...bench.errors import InputError
+from .rig import Light
+
+SAMPLE_COUNTS = (9, 25, 49, 121, 169, 289)
+"""Squares of primes: what the orthogonal-array sampler takes. 25 divides evenly among five lights."""
+
+_VARIANT = "scalar_rgb"
+
+
+@dataclass(frozen=True)
+class Material:
+    """Surface of a mesh; its colour comes with the vertices. ``two_sided`` for strips and sheets."""
+
+    roughness: float
+    specular: float
+    two_sided: bool = False
+
+
+MATERIALS: Mapping[str, Material] = {
+    "skin": Material(0.50, 0.40),
+    "lips": Material(0.35, 0.45),
+    "eye": Material(0.14, 0.6),
+    "hair": Material(0.38, 0.35, two_sided=True),
+    "lash": Material(0.6, 0.1, two_sided=True),
+    "teeth": Material(0.22, 0.5, two_sided=True),
+    "gums": Material(0.28, 0.5, two_sided=True),
+    "tongue": Material(0.35, 0.45, two_sided=True),
+    "mouth": Material(0.6, 0.2, two_sided=True),
+    "cloth": Material(0.9, 0.05, two_sided=True),
+}
+
+
+def sample_count(wanted: int) -> int:
+    """The smallest count the sampler takes that is at least ``wanted``."""
+    for count in SAMPLE_COUNTS:
+        if count >= wanted:
+            return count
+    raise InputError("--samples", "", f"at most {SAMPLE_COUNTS[-1]} samples per pixel", str(wanted))
+
+
+class Studio:
+    """A lit scene whose meshes keep their triangles and colours may move from frame to frame.
+
+    Not thread-safe; one per process. ``threads`` bounds Mitsuba's own pool.
+    """
+
+    def __init__(self, lights: Sequence[Light], samples: int, threads: int = 1):
+        if mitsuba.variant() != _VARIANT:
+            mitsuba.set_variant(_VARIANT)
+        drjit.set_thread_count(threads)
+        self._lights = lights
+        self._samples = sample_count(samples)
+        self._meshes: dict[str, Any] = {}
+        self._scene: Any = None
+        self._parameters: Any = None
+
+    def add(self, name: str, vertices: FloatArray, faces: IntArray, albedo: FloatArray, material: str) -> None:
+        """Add a mesh: (n, 3) world positions, (m, 3) triangles, (n, 3) linear reflectance."""
+        properties = mitsuba.Properties()
+        properties["mesh_bsdf"] = mitsuba.load_dict(_bsdf(MATERIALS[material]))
+        mesh = mitsuba.Mesh(name, len(vertices), len(faces), has_vertex_normals=True, props=properties)
+        mesh.add_attribute("vertex_color", 3, _flat(albedo))
+        parameters = mitsuba.traverse(mesh)
+        parameters["vertex_positions"] = _flat(vertices)
+        parameters["faces"] = np.ascontiguousarray(faces, np.uint32).ravel()
+        parameters.update()
+        self._meshes[name] = mesh
+        self._scene = None
+
+    def move(self, name: str, vertices: FloatArray, albedo: FloatArray | None = None) -> None:
+        """Give a mesh new positions, and colours if they changed. Takes effect with the next image."""
+        parameters = self._traverse()
+        parameters[f"{name}.vertex_positions"] = _flat(vertices)
+        if albedo is not None:
+            parameters[f"{name}.vertex_color"] = _flat(albedo)
+
+    def image(self, camera: Camera, seed: int) -> tuple[FloatArray, FloatArray]:
+        """Render linear light, straight (not premultiplied) rgb (H, W, 3), and coverage (H, W) in [0, 1]."""
+        self._traverse().update()
+        pixels = np.array(
+            mitsuba.render(self._scene, sensor=self._sensor(camera), spp=self._samples, seed=seed), np.float64
+        )
+        alpha = np.clip(pixels[..., 3], 0.0, 1.0)
+        return pixels[..., :3] / np.maximum(pixels[..., 3:], 1e-6) * (alpha[..., None] > 0), alpha
+
+    def _traverse(self) -> Any:
+        if self._scene is None:
+            content: dict[str, Any] = {"type": "scene", "integrator": {"type": "direct", "hide_emitters": True}}
+            content |= self._meshes
+            for index, light in enumerate(self._lights):
+                content[f"light_{index}"] = {
+                    "type": "directional",
+                    "direction": [float(-value) for value in light.direction],
+                    "irradiance": {"type": "rgb", "value": [float(value) for value in light.irradiance]},
+                }
+            self._scene = mitsuba.load_dict(content)
+            self._parameters = mitsuba.traverse(self._scene)
+        return self._parameters
+
+    def _sensor(self, camera: Camera) -> Any:
+        K = camera.K
+        to_world = np.linalg.inv(camera.world_to_camera) @ np.diag([-1.0, -1.0, 1.0, 1.0])
+        return mitsuba.load_dict(
+            {
+                "type": "perspective",
+                "fov": float(np.degrees(2.0 * np.arctan(0.5 * camera.width / K[0, 0]))),
+                "fov_axis": "x",
+                "near_clip": 0.01,
+                "far_clip": 100.0,
+                "principal_point_offset_x": float(K[0, 2] / camera.width - 0.5),
+                "principal_point_offset_y": float(K[1, 2] / camera.height - 0.5),
+                "to_world": mitsuba.ScalarTransform4f(to_world.tolist()),
+                "film": {
+                    "type": "hdrfilm",
+                    "width": camera.width,
+                    "height": camera.height,
+                    "pixel_format": "rgba",
+                    "component_format": "float32",
+                    "rfilter": {"type": "gaussian", "stddev": 0.45},
+                },
+                "sampler": {"type": "orthogonal", "sample_count": self._samples},
+            }
+        )
+
+
+def develop(rgb: FloatArray, alpha: FloatArray, background: FloatArray) -> tuple[ByteArray, ByteArray]:
+    """Turn linear straight colour into an 8-bit sRGB picture on ``background`` and an 8-bit matte.
+
+    Highlights above ``knee`` roll off towards 1 instead of clipping; below it the tone is untouched.
+    """
+    knee = 0.65
+    over = np.maximum(rgb - knee, 0.0)
+    tone = np.minimum(rgb, knee) + (1.0 - knee) * (1.0 - np.exp(-over / (1.0 - knee)))
+    display = np.where(tone <= 0.0031308, 12.92 * tone, 1.055 * np.maximum(tone, 1e-8) ** (1 / 2.4) - 0.055)
+    picture = display * alpha[..., None] + background * (1.0 - alpha[..., None])
+    return np.round(255.0 * picture).astype(np.uint8), np.round(255.0 * alpha).astype(np.uint8)
+
+
+def _bsdf(material: Material) -> dict[str, Any]:
+    surface: dict[str, Any] = {
+        "type": "principled",
+        "base_color": {"type": "mesh_attribute", "name": "vertex_color"},
+        "roughness": material.roughness,
+        "specular": material.specular,
+    }
+    return {"type": "twosided", "surface": surface} if material.two_sided else surface
+
+
+def _flat(values: FloatArray) -> FloatArray:
+    return np.ascontiguousarray(values, np.float32).ravel()
