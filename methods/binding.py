@@ -1,0 +1,92 @@
+"""Splats bound to the triangles of a posed mesh: local frames and the way to the world.
+
+Qian et al., "GaussianAvatars: Rigged 3D Gaussian Splatting", CVPR 2024, section 3.2, with the frame of its code.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..datasets.head.rotations import matrix_to_quaternion, quaternion_multiply
+
+NORM_FLOOR = 1e-10
+
+
+class Frames(NamedTuple):
+    """Frame of each triangle.
+
+    Attributes
+    ----------
+    rotation : (F, 3, 3); columns are an edge, the normal, and an in-plane axis away from the third vertex.
+    center : (F, 3) centroid, metres.
+    size : (F,) mean of base and height, metres.
+    quaternion : (F, 4) of ``rotation``, real part first.
+    """
+
+    rotation: Tensor
+    center: Tensor
+    size: Tensor
+    quaternion: Tensor
+
+
+class WorldSplats(NamedTuple):
+    """Splats in the world: (N, 3) means, (N, 4) unit quaternions wxyz, (N, 3) scales; metres."""
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+
+
+def triangle_frames(vertices: Tensor, faces: Tensor) -> Frames:
+    """Frames of the triangles (v0, v1, v2) of a mesh.
+
+    a0 = unit(v1 - v0), a1 = unit(a0 x (v2 - v0)), a2 = -unit(a1 x a0), R = [a0 a1 a2];
+    size = (|v1 - v0| + |a2 . (v2 - v0)|) / 2. A rotation of the mesh rotates R, and nothing else changes.
+
+    Parameters
+    ----------
+    vertices : (V, 3).
+    faces : (F, 3) int64.
+    """
+    corners = vertices.index_select(0, faces.reshape(-1)).view(-1, 3, 3)
+    origin = corners[:, 0]
+    base = corners[:, 1] - origin
+    side = corners[:, 2] - origin
+    base_length = torch.linalg.vector_norm(base, dim=1, keepdim=True)
+    along = base / base_length.clamp_min(NORM_FLOOR)
+    normal = _unit(torch.linalg.cross(along, side))
+    across = -_unit(torch.linalg.cross(normal, along))
+    height = (across * side).sum(1).abs()
+    rotation = torch.stack([along, normal, across], dim=2)
+    size = 0.5 * (base_length[:, 0] + height)
+    return Frames(rotation, corners.mean(1), size, matrix_to_quaternion(rotation))
+
+
+def to_world(
+    frames: Frames, binding: Tensor, means: Tensor, log_scales: Tensor, quats: Tensor
+) -> WorldSplats:
+    """Carry local splats to the world: mean' = k R mean + T, scale' = k exp(s), q' = q(R) q/|q|.
+
+    Parameters
+    ----------
+    binding : (N,) int64, the triangle of each splat.
+    means : (N, 3) in units of the triangle's size.
+    log_scales : (N, 3) logarithms in the same unit.
+    quats : (N, 4), real part first, of any length.
+    """
+    count = len(frames.size)
+    linear = (frames.size[:, None, None] * frames.rotation).view(count, 9)
+    # One gather instead of four, and one scatter for its gradient.
+    packed = torch.cat([linear, frames.center, frames.size[:, None], frames.quaternion], dim=1)
+    rows = packed.index_select(0, binding)
+    linear, center, size, quaternion = rows.split([9, 3, 1, 4], dim=1)
+    world_means = (linear.view(-1, 3, 3) * means[:, None, :]).sum(2) + center
+    local = quats / torch.linalg.vector_norm(quats, dim=1, keepdim=True).clamp_min(1e-12)
+    return WorldSplats(world_means, quaternion_multiply(quaternion, local), size * log_scales.exp())
+
+
+def _unit(vectors: Tensor) -> Tensor:
+    return vectors / torch.linalg.vector_norm(vectors, dim=1, keepdim=True).clamp_min(NORM_FLOOR)

@@ -1,0 +1,61 @@
+"""Rendering of splats bound to a mesh, shared by the avatars that differ in colour and opacity."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..bench.contracts import FloatArray, Frame
+from .binding import WorldSplats
+from .bound_training import View
+from .splats import rasterize
+
+
+@dataclass(frozen=True, eq=False)
+class PosedSplats:
+    """Splats of one pose in the world, as numpy float32.
+
+    Attributes
+    ----------
+    means, quats, scales : (N, 3) metres, (N, 4) unit quaternions wxyz, (N, 3) metres.
+    opacities : (N,).
+    colors : (N, 3) as the camera asked for sees them; None where no camera was given.
+    """
+
+    means: FloatArray
+    quats: FloatArray
+    scales: FloatArray
+    opacities: FloatArray
+    colors: FloatArray | None
+
+
+def render_splats(
+    world: WorldSplats, opacities: Tensor, colors: Tensor, view: View, background: Sequence[float]
+) -> Frame:
+    """Rasterise to a numpy frame, clipped to [0, 1]."""
+    rendering = rasterize(
+        *(world.means, world.quats, world.scales, opacities, colors),
+        *(view.world_to_camera, view.K, view.camera.width, view.camera.height),
+        background=world.means.new_tensor([float(channel) for channel in background]),
+        check_finite=False,
+    )
+    return Frame(_numpy(rendering.image.clamp(0, 1)), _numpy(rendering.alpha.clamp(0, 1)))
+
+
+def posed_splats(world: WorldSplats, opacities: Tensor, colors: Tensor | None) -> PosedSplats:
+    """Copy to numpy."""
+    return PosedSplats(
+        _numpy(world.means),
+        _numpy(world.quats),
+        _numpy(world.scales),
+        _numpy(opacities),
+        None if colors is None else _numpy(colors),
+    )
+
+
+def _numpy(values: Tensor) -> np.ndarray:
+    return values.detach().to("cpu", torch.float32).numpy()

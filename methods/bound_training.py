@@ -1,0 +1,245 @@
+"""Training of splats bound to a mesh, shared by the methods that differ in colour, opacity and tracking."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ..bench.contracts import Camera, Clip, FrameKey
+from ..bench.errors import InputError
+from .binding import Frames, WorldSplats, to_world
+from .configs import SplatTraining
+from .splats import rasterize
+from .training.densify import Densifier, logit
+from .training.images import TrainingImages
+from .training.losses import photometric_loss, position_penalty, scale_penalty
+from .training.optimiser import Optimiser
+from .training.sampling import Sampler
+from .training.schedule import DensifySchedule, Timeline, log_linear
+
+GEOMETRY = ("means", "log_scales", "quats", "opacities")
+
+
+class Shading(NamedTuple):
+    """What a method adds to placed splats."""
+
+    colors: Tensor  # (N, 3) >= 0
+    opacities: Tensor  # (N,) in (0, 1)
+    penalty: Tensor | None  # scalar added to the loss
+
+
+@dataclass(frozen=True)
+class View:
+    """A camera as tensors."""
+
+    camera: Camera
+    world_to_camera: Tensor
+    K: Tensor
+    center: Tensor
+
+
+class Appearance(Protocol):
+    """The part of a mesh-bound method that is its own: tracking, colour and opacity.
+
+    Per-splat tensors live in the optimiser (`splat_parameters`), everything else too (`parameters`).
+    """
+
+    def splat_parameters(self, count: int) -> dict[str, tuple[Tensor, float]]:
+        """Initial per-splat tensors besides the geometry, with learning rates; name -> ((N, ...), rate)."""
+
+    def parameters(self) -> dict[str, tuple[Tensor, float]]:
+        """Initial tensors that all splats share, with learning rates."""
+
+    def begin(self, timeline: Timeline) -> None:
+        """Fit schedules to the length of the run."""
+
+    def frames(self, timestep: int, optimiser: Optimiser) -> Frames:
+        """Triangle frames of a training timestep."""
+
+    def shade(
+        self,
+        world: WorldSplats,
+        frames: Frames,
+        binding: Tensor,
+        view: View,
+        timestep: int,
+        optimiser: Optimiser,
+        iteration: int,
+    ) -> Shading:
+        """Colours and opacities of the splats as this camera sees them."""
+
+
+class BoundTraining:
+    """A `Trainable`: splats on the triangles of a mesh, seen in the training images of a clip.
+
+    One splat per triangle at the start, of the triangle's size, at its centroid.
+    """
+
+    def __init__(
+        self,
+        clip: Clip,
+        settings: SplatTraining,
+        appearance: Appearance,
+        sampler: Sampler,
+        face_count: int,
+        device: str,
+        seed: int,
+    ):
+        self._settings, self._appearance, self._seed = settings, appearance, seed
+        self.keys: Sequence[FrameKey] = clip.splits["train"]
+        self._images = TrainingImages(clip, self.keys, sampler, device)
+        cameras = {key.camera: clip.cameras[key.camera] for key in self.keys}
+        self._views = {name: view_of(camera, device) for name, camera in cameras.items()}
+        self._background = torch.as_tensor(np.asarray(clip.background), dtype=torch.float32, device=device)
+        self.extent = scene_extent(cameras)
+
+        geometry = _initial_geometry(face_count, settings, self.extent, device)
+        own = appearance.splat_parameters(face_count)
+        shared = appearance.parameters()
+        self.splat_names = (*geometry, *own)
+        initial = {**geometry, **own, **shared}
+        self._optimiser = Optimiser(
+            {name: nn.Parameter(value) for name, (value, _) in initial.items()},
+            {name: rate for name, (_, rate) in initial.items()},
+        )
+        binding = torch.arange(face_count, device=device)
+        self._densifier = Densifier(
+            settings, self._optimiser, self.splat_names, binding, face_count, self.extent, seed
+        )
+
+    @property
+    def optimiser(self) -> Optimiser:
+        """Adam over everything trained."""
+        return self._optimiser
+
+    @property
+    def binding(self) -> Tensor:
+        """(N,) int64, triangle of each splat."""
+        return self._densifier.binding
+
+    def begin(self, timeline: Timeline) -> None:
+        """Fit schedules to the length of the run."""
+        self._timeline = timeline
+        self._schedule = DensifySchedule.of(self._settings, timeline)
+        self._appearance.begin(timeline)
+
+    def loss(self, iteration: int, index: int) -> Tensor:
+        """Photometric loss of one image and the regularisers of section 3.4 of GaussianAvatars."""
+        key, settings, optimiser = self.keys[index], self._settings, self._optimiser
+        view = self._views[key.camera]
+        truth = self._images.get(iteration, index)
+        frames = self._appearance.frames(key.timestep, optimiser)
+        means, log_scales = optimiser["means"], optimiser["log_scales"]
+        world = to_world(frames, self.binding, means, log_scales, optimiser["quats"])
+        shading = self._appearance.shade(
+            world, frames, self.binding, view, key.timestep, optimiser, iteration
+        )
+        offset = means.new_zeros(len(means), 2).requires_grad_()
+        rendering = rasterize(
+            *(world.means, world.quats, world.scales, shading.opacities, shading.colors),
+            *(view.world_to_camera, view.K, view.camera.width, view.camera.height),
+            background=self._background,
+            means2d_offset=offset,
+            check_finite=False,
+        )
+        visible = rendering.radii > 0
+        loss = photometric_loss(rendering.image, truth, settings.ssim_weight)
+        loss = loss + settings.position_weight * position_penalty(means, visible, settings.position_threshold)
+        loss = loss + settings.scale_weight * scale_penalty(log_scales, visible, settings.scale_threshold)
+        if shading.penalty is not None:
+            loss = loss + shading.penalty
+        self._seen = (offset, visible, view.camera, frames.size.detach())
+        return loss
+
+    def after_backward(self, iteration: int) -> None:
+        """Densification and resets of this iteration, and the position learning rate."""
+        settings, schedule = self._settings, self._schedule
+        offset, visible, camera, face_sizes = self._seen
+        if schedule.gathers(iteration) and offset.grad is not None:
+            self._densifier.observe(offset.grad, visible, camera.width, camera.height)
+            if schedule.is_round(iteration):
+                self._densifier.run(iteration, schedule, face_sizes)
+        if schedule.is_reset(iteration):
+            self._densifier.reset_opacity()
+        rate = log_linear(
+            settings.position_lr, settings.position_lr_final, self._timeline.fraction(iteration)
+        )
+        self._optimiser.set_learning_rate("means", rate * self.extent)
+
+    def state(self) -> dict[str, Any]:
+        """Parameters, moments, binding and densification statistics."""
+        return {"optimiser": self._optimiser.state(), "densifier": self._densifier.state()}
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Take over what `state` gave."""
+        self._optimiser.load_state(state["optimiser"])
+        self._densifier.load_state(state["densifier"])
+
+    def note(self) -> str:
+        """Number of splats."""
+        return f"{len(self.binding)} splats"
+
+    def close(self) -> None:
+        """Stop background work."""
+        self._images.close()
+
+
+def scene_extent(cameras: Mapping[str, Camera]) -> float:
+    """1.1 times the largest distance of a training camera from their mean centre, metres.
+
+    A single camera has no such radius; half its distance to the origin stands in, so that learning rates and
+    size thresholds keep their scale.
+    """
+    centers = np.stack([camera.center for camera in cameras.values()])
+    radius = float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
+    if radius < 1e-6:
+        radius = 0.5 * float(np.linalg.norm(centers[0]))
+    return 1.1 * max(radius, 1e-3)
+
+
+def check_training_split(clip: Clip) -> None:
+    """Raise `InputError` unless the clip has training frames, all with a pose of its head model and a camera."""
+    keys = clip.splits.get("train", ())
+    if not keys:
+        raise InputError(f"clip of {clip.subject}", "splits[train]", "at least one frame", "none")
+    for key in keys:
+        if key.camera not in clip.cameras:
+            raise InputError(f"clip of {clip.subject}", str(key), "a known camera", repr(key.camera))
+        pose = clip.poses.get(key.timestep)
+        if pose is None:
+            raise InputError(f"clip of {clip.subject}", str(key), "a tracked pose", "none")
+        if pose.head_model != clip.head.version:
+            raise InputError(
+                f"clip of {clip.subject}",
+                f"poses[{key.timestep}].head_model",
+                repr(clip.head.version),
+                repr(pose.head_model),
+            )
+
+
+def view_of(camera: Camera, device: str) -> View:
+    """Put a camera on a device."""
+
+    def tensor(values: Any) -> Tensor:
+        return torch.as_tensor(np.asarray(values), dtype=torch.float32, device=device)
+
+    return View(camera, tensor(camera.world_to_camera), tensor(camera.K), tensor(camera.center))
+
+
+def _initial_geometry(
+    count: int, settings: SplatTraining, extent: float, device: str
+) -> dict[str, tuple[Tensor, float]]:
+    quats = torch.zeros(count, 4, device=device)
+    quats[:, 0] = 1
+    opacities = torch.full((count,), logit(settings.initial_opacity), device=device)
+    return {
+        "means": (torch.zeros(count, 3, device=device), settings.position_lr * extent),
+        "log_scales": (torch.zeros(count, 3, device=device), settings.scale_lr),
+        "quats": (quats, settings.rotation_lr),
+        "opacities": (opacities, settings.opacity_lr),
+    }

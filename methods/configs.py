@@ -1,0 +1,177 @@
+"""Settings of the methods, as frozen dataclasses. Light: neither torch nor numpy is imported here.
+
+The defaults are the published values (600,000 iterations). Moments in training are written on the published
+scale and mapped to the budget at hand as fractions (`training.schedule`); the ``min_...`` fields say how many
+iterations a thing needs in any run to do more good than harm, and rule only in runs much shorter than published.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class SplatTraining:
+    """How splats bound to a mesh are trained: GaussianAvatars (CVPR 2024), section 3 and its code.
+
+    Attributes
+    ----------
+    schedule_length : iterations of the published run; every ``..._from``, ``..._every`` below is on its scale.
+    position_lr, position_lr_final : log-linear from one to the other over the run, times the scene extent.
+    ssim_weight : the loss is ``(1 - w) L1 + w (1 - SSIM)``.
+    position_weight, position_threshold : penalty on local positions longer than the threshold (triangle sizes).
+    scale_weight, scale_threshold : penalty on local scales above the threshold (triangle sizes).
+    densify_from, densify_every, densify_until : rounds of cloning, splitting and pruning.
+    densify_gradient : mean gradient of the projected mean, in normalised device units, that asks for a round.
+    densify_extent : splats larger than this part of the scene extent are split, smaller ones cloned.
+    split_offsets : "local" scatters the two children of a split over the parent. "world" is the compatibility
+        option for the published code, which uses world-space scales in local coordinates and so puts both
+        children almost onto the parent.
+    prune_opacity : splats below it are removed.
+    prune_extent, prune_extent_from : so are splats larger than this part of the extent, from then on.
+    reset_every, reset_at_start, reset_opacity : opacities are cut to ``reset_opacity`` regularly, and once when
+        densification starts (published for white backgrounds).
+    max_splats : densification stops adding above this number; None for no bound.
+    min_densify_every, min_reset_every : in iterations of the actual run. A gradient mean needs some views, and
+        opacities some steps to recover.
+    min_settle : no densification and no reset in the last so many iterations of the actual run.
+    mesh_cache_mb : memory for the posed meshes of known timesteps.
+    checkpoint_every_s : seconds between checkpoints.
+    """
+
+    schedule_length: int = 600_000
+    position_lr: float = 5e-3
+    position_lr_final: float = 5e-5
+    opacity_lr: float = 0.05
+    scale_lr: float = 0.017
+    rotation_lr: float = 1e-3
+    ssim_weight: float = 0.2
+    position_weight: float = 0.01
+    position_threshold: float = 1.0
+    scale_weight: float = 1.0
+    scale_threshold: float = 0.6
+    initial_opacity: float = 0.1
+    densify_from: int = 10_000
+    densify_every: int = 2_000
+    densify_until: int = 600_000
+    densify_gradient: float = 2e-4
+    densify_extent: float = 0.01
+    split_offsets: Literal["local", "world"] = "local"
+    prune_opacity: float = 0.005
+    prune_extent: float = 0.1
+    prune_extent_from: int = 60_000
+    reset_every: int = 60_000
+    reset_at_start: bool = True
+    reset_opacity: float = 0.01
+    max_splats: int | None = None
+    min_densify_every: int = 100
+    min_reset_every: int = 3_000
+    min_settle: int = 300
+    mesh_cache_mb: int = 512
+    checkpoint_every_s: float = 120.0
+
+    def __post_init__(self) -> None:
+        for name in (
+            "schedule_length",
+            "densify_every",
+            "reset_every",
+            "min_densify_every",
+            "min_reset_every",
+        ):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, found {getattr(self, name)}")
+        if not 0 < self.initial_opacity < 1 or not 0 < self.reset_opacity < 1:
+            raise ValueError("initial_opacity and reset_opacity must lie between 0 and 1")
+        if not 0 <= self.ssim_weight <= 1:
+            raise ValueError(f"ssim_weight must lie in [0, 1], found {self.ssim_weight}")
+        if self.max_splats is not None and self.max_splats < 1:
+            raise ValueError(f"max_splats must be at least 1 or null, found {self.max_splats}")
+
+
+@dataclass(frozen=True)
+class GAConfig:
+    """GaussianAvatars: spherical harmonics per splat, and tracking refined with the avatar.
+
+    Attributes
+    ----------
+    sh_degree, sh_every, min_sh_every : degree of the spherical harmonics at the end; one degree more each
+        ``sh_every`` iterations (published scale), but at least ``min_sh_every`` of the actual run.
+    refine_tracking : optimise expression, poses and translation of the training timesteps.
+    """
+
+    splats: SplatTraining = field(default_factory=SplatTraining)
+    sh_degree: int = 3
+    sh_every: int = 1_000
+    min_sh_every: int = 100
+    sh_dc_lr: float = 0.0025
+    sh_rest_lr: float = 0.000125
+    refine_tracking: bool = True
+    expression_lr: float = 1e-3
+    pose_lr: float = 1e-5
+    translation_lr: float = 1e-6
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.sh_degree <= 3:
+            raise ValueError(f"sh_degree must be 0 to 3, found {self.sh_degree}")
+
+
+@dataclass(frozen=True)
+class OursConfig:
+    """Compact tensorial Gaussian avatars (CVPR 2025): tri-plane colour, feature lines for opacity.
+
+    Attributes
+    ----------
+    plane_resolution, plane_channels : samples per side, and channels of the (x,y), (x,z) and (y,z) planes.
+    plane_bounds : "mesh" fits the planes to the canonical mesh; "published" sets x to +-0.25 m as the paper.
+    lines : dynamic opacity on or off.
+    line_resolution, line_channels, expressions, jaw_bases : samples and channels per line; how many leading
+        expression coefficients (as many as there are, if fewer) and jaw bases have lines.
+    line_bounds : box in which splats have dynamic opacity: the "head" (whole mesh) or the "face" region.
+    lines_from : iteration (published scale) at which lines and penalty start.
+    jaw_compatibility : "train" takes jaw bases from training poses, seeded with the identity. "published" seeds
+        with the half turn of the published code; its use of held-out poses is never reproduced.
+    penalty : weight of the adaptive truncated opacity penalty; 0 turns it off.
+    penalty_face_mm, penalty_other_mm, penalty_other_weight : surface displacement under which opacity may not
+        change, in the face region and elsewhere, and the weight elsewhere.
+    balanced_sampling, expression_classes : draw images so that each class of expressions has an equal share.
+    """
+
+    splats: SplatTraining = field(default_factory=SplatTraining)
+    plane_resolution: int = 128
+    plane_channels: tuple[int, int, int] = (32, 16, 16)
+    plane_bounds: Literal["mesh", "published"] = "mesh"
+    plane_lr: float = 2e-3
+    color_mlp_lr: float = 1e-4
+    hidden: int = 128
+    lines: bool = True
+    line_resolution: int = 64
+    line_channels: int = 32
+    expressions: int = 80
+    jaw_bases: int = 16
+    jaw_compatibility: Literal["train", "published"] = "train"
+    line_bounds: Literal["head", "face"] = "head"
+    lines_from: int = 60_000
+    line_lr: float = 2e-3
+    line_mlp_lr: float = 1e-4
+    penalty: float = 1.0
+    penalty_face_mm: float = 1.0
+    penalty_other_mm: float = 2.0
+    penalty_other_weight: float = 10.0
+    balanced_sampling: bool = True
+    expression_classes: int = 16
+
+    def __post_init__(self) -> None:
+        if self.plane_resolution < 2 or self.line_resolution < 2:
+            raise ValueError("plane_resolution and line_resolution must be at least 2")
+        if min(self.plane_channels) < 1 or self.line_channels < 1 or self.hidden < 1:
+            raise ValueError("channel counts must be at least 1")
+        if self.expressions < 0 or self.jaw_bases < 0:
+            raise ValueError("expressions and jaw_bases must not be negative")
+
+
+@dataclass(frozen=True)
+class NearestCameraConfig:
+    """Nearest training image. ``max_timesteps`` keeps that many, evenly spaced, and bounds the storage."""
+
+    max_timesteps: int | None = None

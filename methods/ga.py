@@ -1,0 +1,238 @@
+"""GaussianAvatars: Gaussians rigged to a tracked mesh.
+
+Qian et al., "GaussianAvatars: Photorealistic Head Avatars with Rigged 3D Gaussians", CVPR 2024.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..bench.contracts import Budget, Camera, Clip, Frame, HeadPose, Progress
+from .avatar_files import (
+    TRACKED,
+    RefinedTracking,
+    Subject,
+    is_finished,
+    read_shared_head,
+    run_digest,
+    save_shared_head,
+    write_record,
+)
+from .binding import Frames, WorldSplats, to_world
+from .bound_avatar import PosedSplats, posed_splats, render_splats
+from .bound_training import BoundTraining, Shading, View, check_training_split, view_of
+from .configs import GAConfig
+from .ga_files import (
+    PLY_FILE,
+    SUBJECT_FILE,
+    read_ga_splats,
+    read_subject,
+    write_ga_splats,
+    write_subject,
+)
+from .seeds import torch_generator
+from .sh import coefficient_count, sh_to_rgb
+from .subject_mesh import BoundedCache, SubjectMesh
+from .training.loop import CHECKPOINT, check_budget, train
+from .training.optimiser import Optimiser
+from .training.sampling import ShuffledEpochs
+from .training.schedule import Timeline
+
+DRIVING_FILE = "driving.npz"
+STORED_DEGREE = 3  # the PLY layout has room for degree 3, whatever degree was trained
+POSES = ("rotation", "neck", "jaw", "eyes")
+
+
+class GAAppearance:
+    """Spherical harmonics in world directions, and tracking that is refined along with the splats."""
+
+    def __init__(self, mesh: SubjectMesh, clip: Clip, config: GAConfig, device: str, seed: int):
+        self._mesh, self._config, self._device, self._seed = mesh, config, device, seed
+        self.timesteps = sorted({key.timestep for key in clip.splits["train"]})
+        self._row = {timestep: row for row, timestep in enumerate(self.timesteps)}
+        self.tracked = mesh.arguments([clip.poses[timestep] for timestep in self.timesteps])
+        # A frame is 9 + 3 + 1 + 4 floats per triangle.
+        entries = config.splats.mesh_cache_mb * 2**20 // (4 * 17 * len(mesh.faces))
+        self._cached = BoundedCache(self._tracked_frames, entries)
+        self._degree_every = 1
+
+    def splat_parameters(self, count: int) -> dict[str, tuple[Tensor, float]]:
+        """Spherical harmonics: nearly zero at degree 0, zero above."""
+        generator = torch_generator(self._seed, "sh")
+        dc = torch.rand(count, 1, 3, generator=generator).to(self._device) / 255
+        rest = torch.zeros(count, coefficient_count(STORED_DEGREE) - 1, 3, device=self._device)
+        return {"sh_dc": (dc, self._config.sh_dc_lr), "sh_rest": (rest, self._config.sh_rest_lr)}
+
+    def parameters(self) -> dict[str, tuple[Tensor, float]]:
+        """The tracked values of the training timesteps, (T, n) each, where they are refined."""
+        if not self._config.refine_tracking:
+            return {}
+        config = self._config
+        rates = {"expression": config.expression_lr, "translation": config.translation_lr}
+        rates |= dict.fromkeys(POSES, config.pose_lr)
+        return {name: (self.tracked[name].clone(), rates[name]) for name in TRACKED}
+
+    def begin(self, timeline: Timeline) -> None:
+        """Fit the steps of the harmonics' degree to the run."""
+        self._degree_every = timeline.every(self._config.sh_every, self._config.min_sh_every)
+
+    def frames(self, timestep: int, optimiser: Optimiser) -> Frames:
+        """Triangle frames; differentiable in the refined tracking."""
+        row = self._row[timestep]
+        if not self._config.refine_tracking:
+            return self._cached(row)
+        arguments = {name: values[row : row + 1] for name, values in self.tracked.items()}
+        arguments |= {name: optimiser[name][row : row + 1] for name in TRACKED}
+        return self._mesh.frames(self._mesh.posed(arguments))
+
+    def shade(
+        self,
+        world: WorldSplats,
+        frames: Frames,
+        binding: Tensor,
+        view: View,
+        timestep: int,
+        optimiser: Optimiser,
+        iteration: int,
+    ) -> Shading:
+        """Colour by direction from the camera; opacity as it is."""
+        degree = min(self._config.sh_degree, iteration // self._degree_every)
+        directions = torch.nn.functional.normalize(world.means - view.center, dim=1)
+        colors = sh_to_rgb(optimiser["sh_dc"], optimiser["sh_rest"], directions, degree)
+        return Shading(colors, torch.sigmoid(optimiser["opacities"]), None)
+
+    def refined(self, subject: str, optimiser: Optimiser) -> RefinedTracking | None:
+        """Tracking before and after, or None where it was left alone."""
+        if not self._config.refine_tracking:
+            return None
+        before = {name: self.tracked[name].cpu().numpy() for name in TRACKED}
+        after = {name: optimiser[name].detach().cpu().numpy() for name in TRACKED}
+        return RefinedTracking(subject, np.array(self.timesteps), before, after)
+
+    def _tracked_frames(self, row: int) -> Frames:
+        with torch.no_grad():
+            return self._mesh.frames(
+                self._mesh.posed({name: values[row : row + 1] for name, values in self.tracked.items()})
+            )
+
+
+class GAAvatar:
+    """A trained GaussianAvatars head.
+
+    Files: ``point_cloud.ply`` in GaussianAvatars' layout and ``subject.npz`` count as storage; beside them lie
+    the shared head model, and the refined tracking of the training timesteps, which is driving signal.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        mesh: SubjectMesh,
+        splats: dict[str, Tensor],
+        binding: Tensor,
+        refined: RefinedTracking | None,
+        device: str,
+    ):
+        self._folder, self._mesh, self._splats, self._binding = folder, mesh, splats, binding
+        self._refined, self._device = refined, device
+
+    @classmethod
+    def read(cls, folder: Path, device: str) -> GAAvatar:
+        """Read an avatar from its folder. Raises `InputError` for damaged or foreign files."""
+        subject = read_subject(folder / SUBJECT_FILE)
+        mesh = SubjectMesh(read_shared_head(folder), subject.shape, subject.static_offset, device)
+        splats, binding = read_ga_splats(folder / PLY_FILE, len(mesh.faces), device)
+        driving = folder / DRIVING_FILE
+        refined = RefinedTracking.read(driving) if driving.exists() else None
+        return cls(folder, mesh, splats, binding, refined, device)
+
+    @torch.no_grad()
+    def render(self, camera: Camera, pose: HeadPose, background: Sequence[float] = (1.0, 1.0, 1.0)) -> Frame:
+        """Render one frame. Raises `InputError` where the pose is of another head model."""
+        world = self._world(pose)
+        view = view_of(camera, self._device)
+        return render_splats(world, self._opacities(), self._colors(world, view), view, background)
+
+    @torch.no_grad()
+    def splats(self, pose: HeadPose, camera: Camera | None = None) -> PosedSplats:
+        """Splats of a pose in the world; with colours where a camera says from where they are seen."""
+        world = self._world(pose)
+        colors = None if camera is None else self._colors(world, view_of(camera, self._device))
+        return posed_splats(world, self._opacities(), colors)
+
+    def files(self) -> Sequence[Path]:
+        """The PLY and the subject."""
+        return [self._folder / PLY_FILE, self._folder / SUBJECT_FILE]
+
+    def _world(self, pose: HeadPose) -> WorldSplats:
+        if self._refined is not None:
+            pose = self._refined(pose)
+        frames = self._mesh.frames(self._mesh.posed(self._mesh.arguments([pose])))
+        s = self._splats
+        return to_world(frames, self._binding, s["means"], s["log_scales"], s["quats"])
+
+    def _opacities(self) -> Tensor:
+        return torch.sigmoid(self._splats["opacities"])
+
+    def _colors(self, world: WorldSplats, view: View) -> Tensor:
+        directions = torch.nn.functional.normalize(world.means - view.center, dim=1)
+        return sh_to_rgb(self._splats["sh_dc"], self._splats["sh_rest"], directions, STORED_DEGREE)
+
+
+class GA:
+    """The method: see the module."""
+
+    name, version = "ga", "1"
+
+    def __init__(self, config: GAConfig | None = None):
+        self.config = config or GAConfig()
+
+    def fit(
+        self, clip: Clip, out: Path, budget: Budget, *, device: str, seed: int, progress: Progress
+    ) -> GAAvatar:
+        """Train on the training split and write the avatar under ``out``; continues a killed run."""
+        check_budget(budget)
+        check_training_split(clip)
+        run = run_digest(self.name, self.version, self.config, clip, budget, seed)
+        if is_finished(out, run):
+            return self.load(out, device=device)
+        settings = self.config.splats
+        subject = Subject.of(clip)
+        mesh = SubjectMesh(clip.head, subject.shape, subject.static_offset, device)
+        appearance = GAAppearance(mesh, clip, self.config, device, seed)
+        sampler = ShuffledEpochs(len(clip.splits["train"]), seed)
+        training = BoundTraining(clip, settings, appearance, sampler, len(mesh.faces), device, seed)
+        try:
+            outcome = train(
+                training,
+                sampler,
+                published_length=settings.schedule_length,
+                budget=budget,
+                folder=out,
+                run=run,
+                device=device,
+                progress=progress,
+                checkpoint_every_s=settings.checkpoint_every_s,
+            )
+        finally:
+            training.close()
+        optimiser = training.optimiser
+        write_ga_splats(
+            out / PLY_FILE, {name: optimiser[name] for name in training.splat_names}, training.binding
+        )
+        write_subject(out / SUBJECT_FILE, subject)
+        refined = appearance.refined(clip.subject, optimiser)
+        if refined is not None:
+            refined.save(out / DRIVING_FILE)
+        save_shared_head(out, clip.head)
+        write_record(out, run, outcome, splats=len(training.binding))
+        (out / CHECKPOINT).unlink(missing_ok=True)
+        return self.load(out, device=device)
+
+    def load(self, path: Path, *, device: str) -> GAAvatar:
+        """Read an avatar that `fit` wrote."""
+        return GAAvatar.read(path, device)

@@ -1,0 +1,87 @@
+"""GaussianAvatars' files: the PLY its viewers open, and the subject it needs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..bench.errors import InputError
+from .avatar_files import Subject, read_arrays, write_arrays
+from .ply import read_ply, write_ply
+
+PLY_FILE = "point_cloud.ply"
+SUBJECT_FILE = "subject.npz"
+
+REST = 15  # coefficients of degrees 1 to 3
+COLUMNS = (
+    *("x", "y", "z", "nx", "ny", "nz"),
+    *(f"f_dc_{i}" for i in range(3)),
+    *(f"f_rest_{i}" for i in range(3 * REST)),
+    "opacity",
+    *(f"scale_{i}" for i in range(3)),
+    *(f"rot_{i}" for i in range(4)),
+    "binding_0",
+)
+"""63 float32 = 252 bytes per splat: local position, zero normals, spherical harmonics (the rest channel by
+channel), logit of opacity, log-scales, quaternion wxyz, triangle."""
+
+
+def write_ga_splats(path: Path, splats: dict[str, Tensor], binding: Tensor) -> None:
+    """Write splats in GaussianAvatars' layout. Triangle indices are exact in float32 up to 2^24."""
+    count = len(binding)
+    columns = [
+        splats["means"],
+        torch.zeros(count, 3),
+        splats["sh_dc"][:, 0],
+        splats["sh_rest"].transpose(1, 2).reshape(count, 3 * REST),
+        splats["opacities"][:, None],
+        splats["log_scales"],
+        splats["quats"],
+        binding[:, None].to(torch.float32),
+    ]
+    table = torch.cat([column.detach().to("cpu", torch.float32) for column in columns], dim=1)
+    write_ply(path, COLUMNS, table.numpy())
+
+
+def read_ga_splats(path: Path, face_count: int, device: str) -> tuple[dict[str, Tensor], Tensor]:
+    """Read what GaussianAvatars or `write_ga_splats` wrote: per-splat tensors by name, and the binding.
+
+    Raises `InputError` for another layout or a triangle the mesh does not have.
+    """
+    table = torch.from_numpy(read_ply(path, COLUMNS))
+    binding = table[:, -1].to(torch.int64)
+    if len(binding) and not (0 <= int(binding.min()) and int(binding.max()) < face_count):
+        found = f"{int(binding.min())} to {int(binding.max())}"
+        raise InputError(path, "binding_0", f"triangles 0 to {face_count - 1}", found)
+    widths = [3, 3, 3, 3 * REST, 1, 3, 4, 1]
+    means, _, dc, rest, opacity, log_scales, quats, _ = table.to(device).split(widths, dim=1)
+    splats = {
+        "means": means,
+        "log_scales": log_scales,
+        "quats": quats,
+        "opacities": opacity[:, 0],
+        "sh_dc": dc[:, None],
+        "sh_rest": rest.reshape(-1, 3, REST).transpose(1, 2),
+    }
+    return {name: value.contiguous() for name, value in splats.items()}, binding.to(device)
+
+
+def write_subject(path: Path, subject: Subject) -> None:
+    """Write identity coefficients and static offset as float32 npz."""
+    arrays: dict[str, Any] = {
+        "name": np.array(subject.name),
+        "head_model": np.array(subject.head_model),
+        "shape": subject.shape.astype(np.float32),
+        "static_offset": subject.static_offset.astype(np.float32),
+    }
+    write_arrays(path, arrays)
+
+
+def read_subject(path: Path) -> Subject:
+    """Read what `write_subject` wrote."""
+    arrays = read_arrays(path, ("name", "head_model", "shape", "static_offset"))
+    return Subject(str(arrays["name"]), str(arrays["head_model"]), arrays["shape"], arrays["static_offset"])

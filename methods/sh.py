@@ -1,0 +1,52 @@
+"""Real spherical harmonics up to degree 3, as 3DGS stores colour with them."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+C0 = 0.28209479177387814
+C1 = 0.4886025119029199
+C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
+C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
+
+
+def coefficient_count(degree: int) -> int:
+    """Number of coefficients up to a degree."""
+    return (degree + 1) ** 2
+
+
+def sh_basis(directions: Tensor, degree: int) -> Tensor:
+    """Real spherical harmonics of unit directions, (N, (degree+1)^2).
+
+    Order and signs are those of 3DGS: degree by degree, m from -l to l, with the Condon-Shortley phase kept
+    (so the m = +-1 terms of degree 1 are -y and -x). Degrees above 3 are not stored by any tool of the field.
+    """
+    x, y, z = directions.unbind(1)
+    terms = [torch.full_like(x, C0)]
+    if degree >= 1:
+        terms += [-C1 * y, C1 * z, -C1 * x]
+    if degree >= 2:
+        xx, yy, zz = x * x, y * y, z * z
+        terms += [C2[0] * x * y, -C2[0] * y * z, C2[1] * (2 * zz - xx - yy), -C2[0] * x * z]
+        terms += [C2[2] * (xx - yy)]
+    if degree >= 3:
+        terms += [-C3[0] * y * (3 * xx - yy), C3[1] * x * y * z, -C3[2] * y * (4 * zz - xx - yy)]
+        terms += [C3[3] * z * (2 * zz - 3 * xx - 3 * yy), -C3[2] * x * (4 * zz - xx - yy)]
+        terms += [C3[4] * z * (xx - yy), -C3[0] * x * (xx - 3 * yy)]
+    return torch.stack(terms, dim=1)
+
+
+def sh_to_rgb(dc: Tensor, rest: Tensor, directions: Tensor, degree: int) -> Tensor:
+    """Colours (N, 3) >= 0 seen along unit directions (from the camera to the splat): relu(0.5 + SH).
+
+    Parameters
+    ----------
+    dc : (N, 1, 3) coefficient of degree 0.
+    rest : (N, 15, 3) coefficients of degrees 1 to 3; those above ``degree`` are not used.
+    """
+    if degree == 0:
+        return torch.relu(0.5 + C0 * dc[:, 0])
+    basis = sh_basis(directions, degree)[:, 1:]
+    view = (basis[:, :, None] * rest[:, : basis.shape[1]]).sum(1)
+    return torch.relu(0.5 + C0 * dc[:, 0] + view)

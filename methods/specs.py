@@ -1,0 +1,58 @@
+"""What there is to know of the methods before any of them is imported."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from ..bench.contracts import MethodSpec
+
+PAPER_ITERATIONS = 600_000
+
+# Short runs. The published rates assume hundreds of visits to every image; with a few thousand iterations in all,
+# colours and planes must move faster to arrive, and the number of splats is kept to what so few steps can train.
+_SHORT_SPLATS: dict[str, Any] = {"min_densify_every": 100, "min_settle": 300}
+
+
+def _presets(fast: Mapping[str, Any], smoke: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    return {
+        "smoke": {"budget": {"iterations": 60}, **smoke},
+        "demo": {"budget": {"iterations": 2_000}, **fast, "splats": {**_SHORT_SPLATS, "max_splats": 20_000}},
+        "fast": {"budget": {"iterations": 10_000}, **fast, "splats": {**_SHORT_SPLATS, "max_splats": 60_000}},
+        "paper": {"budget": {"iterations": PAPER_ITERATIONS}},
+    }
+
+
+OURS = MethodSpec(
+    name="ours",
+    summary="Mesh-bound splats with tri-plane colour and expression-driven opacity along feature lines.",
+    implementation="headbench.methods.ours:Ours",
+    config="headbench.methods.configs:OursConfig",
+    presets=_presets({}, {}),
+    source="3D Gaussian Head Avatars with Expressive Dynamic Appearances by Compact Tensorial Representations, "
+    "CVPR 2025, arXiv 2504.14967",
+)
+
+GA = MethodSpec(
+    name="ga",
+    summary="GaussianAvatars: splats with spherical harmonics rigged to the triangles of the tracked mesh.",
+    implementation="headbench.methods.ga:GA",
+    config="headbench.methods.configs:GAConfig",
+    presets=_presets({}, {}),
+    source="GaussianAvatars: Photorealistic Head Avatars with Rigged 3D Gaussians, CVPR 2024, arXiv 2312.02069",
+)
+
+MEAN_IMAGE = MethodSpec(
+    name="mean-image",
+    summary="The mean of all training images, whatever is asked for: the floor of every table.",
+    implementation="headbench.methods.trivial:MeanImage",
+    presets={name: {"budget": {"iterations": 1}} for name in ("smoke", "demo", "fast", "paper")},
+)
+
+NEAREST_CAMERA = MethodSpec(
+    name="nearest-camera",
+    summary="The training image of the nearest pose and camera, as it is: what memorising alone achieves.",
+    implementation="headbench.methods.trivial:NearestCamera",
+    config="headbench.methods.configs:NearestCameraConfig",
+    presets={name: {"budget": {"iterations": 1}} for name in ("smoke", "demo", "fast", "paper")},
+)

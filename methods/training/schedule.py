@@ -1,0 +1,92 @@
+"""When things happen in a run: moments of the published run as fractions of the budget at hand."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from ..configs import SplatTraining
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """Maps iterations of the published run onto a run of ``total`` iterations, numbered from 1.
+
+    Parameters
+    ----------
+    total : iterations of the actual run.
+    published : iterations of the run the settings were written for.
+    """
+
+    total: int
+    published: int
+
+    def at(self, moment: int) -> int:
+        """Iteration of the actual run that corresponds to a published one."""
+        return round(moment * self.total / self.published)
+
+    def every(self, interval: int, minimum: int = 1) -> int:
+        """Interval of the actual run that corresponds to a published one, at least ``minimum``."""
+        return max(minimum, self.at(interval), 1)
+
+    def fraction(self, iteration: int) -> float:
+        """How far into the run an iteration is, in (0, 1]."""
+        return iteration / self.total
+
+
+def log_linear(start: float, end: float, fraction: float) -> float:
+    """Interpolate the logarithm; the position learning rate of 3DGS. ``fraction`` is clipped to [0, 1]."""
+    fraction = min(max(fraction, 0.0), 1.0)
+    return math.exp((1 - fraction) * math.log(start) + fraction * math.log(end))
+
+
+@dataclass(frozen=True)
+class DensifySchedule:
+    """Rounds of densification and opacity reset in one run.
+
+    With the published 600,000 iterations: rounds at 12,000, 14,000, ... 598,000; resets at 10,000, 60,000,
+    120,000, ... 540,000. A shorter run keeps the fractions until an interval would fall below its minimum; a run
+    shorter than the minimum reset interval has no reset at all.
+    """
+
+    start: int
+    every: int
+    stop: int  # first iteration without rounds or resets
+    reset_every: int
+    first_reset: int | None
+    prune_extent_from: int
+
+    @classmethod
+    def of(cls, settings: SplatTraining, timeline: Timeline) -> DensifySchedule:
+        """Fit the published schedule to a run."""
+        long_enough = timeline.total > settings.min_reset_every
+        full = timeline.total >= settings.schedule_length
+        settle = 1 if full else settings.min_settle
+        return cls(
+            start=timeline.at(settings.densify_from),
+            every=timeline.every(settings.densify_every, settings.min_densify_every),
+            stop=min(timeline.at(settings.densify_until), timeline.total - settle + 1),
+            reset_every=timeline.every(settings.reset_every, settings.min_reset_every),
+            first_reset=timeline.at(settings.densify_from)
+            if settings.reset_at_start and long_enough
+            else None,
+            prune_extent_from=timeline.at(settings.prune_extent_from),
+        )
+
+    def gathers(self, iteration: int) -> bool:
+        """Whether gradients of this iteration still serve a later round."""
+        return iteration < self.stop
+
+    def is_round(self, iteration: int) -> bool:
+        """Whether this iteration clones, splits and prunes."""
+        return self.start < iteration < self.stop and iteration % self.every == 0
+
+    def is_reset(self, iteration: int) -> bool:
+        """Whether this iteration cuts the opacities."""
+        if iteration >= self.stop:
+            return False
+        return iteration % self.reset_every == 0 or iteration == self.first_reset
+
+    def prunes_large(self, iteration: int) -> bool:
+        """Whether a round at this iteration also removes splats that are large in the world."""
+        return iteration > self.prune_extent_from

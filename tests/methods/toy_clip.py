@@ -1,0 +1,146 @@
+"""A clip in memory whose images come from known splats on the toy head, so that training has a true answer."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from headbench.bench.contracts import Camera, FrameKey, HeadPose, StepRecord
+from headbench.bench.files import digest
+from headbench.datasets.head.arrays import HeadArrays
+from headbench.methods.binding import to_world
+from headbench.methods.splats import rasterize
+from headbench.methods.subject_mesh import SubjectMesh
+
+
+@dataclass(frozen=True, eq=False)
+class ToyClip:
+    """A `Clip` of arrays."""
+
+    head: HeadArrays
+    shape: np.ndarray
+    static_offset: np.ndarray
+    cameras: Mapping[str, Camera]
+    poses: Mapping[int, HeadPose]
+    splits: Mapping[str, tuple[FrameKey, ...]]
+    images: Mapping[FrameKey, np.ndarray]
+    masks: Mapping[FrameKey, np.ndarray]
+    background: np.ndarray
+    subject: str = "toy"
+    excluded: Mapping[FrameKey, str] = field(default_factory=dict)
+    steps: Sequence[StepRecord] = ()
+
+    @property
+    def fingerprint(self) -> str:
+        keys = sorted(self.images)
+        return digest([str(key) for key in keys], *(self.images[key] for key in keys))
+
+    def image(self, key: FrameKey) -> np.ndarray:
+        return self.images[key]
+
+    def mask(self, key: FrameKey) -> np.ndarray:
+        return self.masks[key]
+
+
+def look_at(position: np.ndarray, target: np.ndarray, name: str, width: int, height: int) -> Camera:
+    """Camera at a position looking at a target, y up in the world, with a 40 degree field of view."""
+    forward = (target - position) / np.linalg.norm(target - position)
+    right = np.cross(forward, [0.0, 1.0, 0.0])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    world_to_camera = np.eye(4)
+    world_to_camera[:3, :3], world_to_camera[:3, 3] = rotation, -rotation @ position
+    focal = 0.5 * height / np.tan(np.radians(20))
+    K = np.array([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1.0]])
+    return Camera(name, width, height, K, world_to_camera)
+
+
+def toy_cameras(count: int, width: int, height: int) -> dict[str, Camera]:
+    """Cameras on an arc in front of the head, 0.5 m away."""
+    cameras = {}
+    for index, angle in enumerate(np.linspace(-0.9, 0.9, count)):
+        position = 0.5 * np.array([np.sin(angle), 0.1 * np.cos(3 * angle), np.cos(angle)])
+        cameras[f"{index:02d}"] = look_at(position, np.zeros(3), f"{index:02d}", width, height)
+    return cameras
+
+
+def toy_pose(head: HeadArrays, rng: np.random.Generator, timestep: int | None, subject: str) -> HeadPose:
+    """A random pose of moderate size."""
+
+    def small(size: int, scale: float) -> np.ndarray:
+        return (scale * rng.standard_normal(size)).astype(np.float32)
+
+    return HeadPose(
+        head.version,
+        expression=small(head.expression_basis.shape[2], 1.0),
+        rotation=small(3, 0.05),
+        neck=small(3, 0.05),
+        jaw=np.array([abs(rng.standard_normal()) * 0.1, 0, 0], np.float32),
+        eyes=small(6, 0.05),
+        translation=small(3, 0.003),
+        subject=subject,
+        timestep=timestep,
+    )
+
+
+def toy_clip(
+    head: HeadArrays,
+    *,
+    timesteps: int = 3,
+    cameras: int = 4,
+    width: int = 40,
+    height: int = 48,
+    seed: int = 0,
+    held_out: int = 1,
+) -> ToyClip:
+    """Render a clip: one opaque coloured splat per triangle. The last camera and ``held_out`` timesteps are held out."""
+    rng = np.random.default_rng(seed)
+    shape = rng.standard_normal(head.shape_basis.shape[2]) * 0.5
+    offset = np.zeros_like(head.template)
+    mesh = SubjectMesh(head, shape, offset, "cpu")
+    faces = len(head.faces)
+    center = mesh.canonical[mesh.faces].mean(1).numpy()
+    colors = torch.from_numpy(0.5 + 0.5 * np.sin(60 * center + np.array([0.0, 2.0, 4.0]))).float()
+    rig = toy_cameras(cameras, width, height)
+    names = list(rig)
+    count = timesteps + held_out
+    poses = {t: toy_pose(head, rng, t, "toy") for t in range(count)}
+    background = np.ones(3)
+    log_scales = torch.log(torch.tensor([0.4, 0.05, 0.4])).expand(faces, 3)
+    images, masks = {}, {}
+    splits: dict[str, list[FrameKey]] = {"train": [], "novel_view": [], "self_reenactment": []}
+    for t, pose in poses.items():
+        frames = mesh.frames(mesh.posed(mesh.arguments([pose])))
+        quats = torch.tensor([1.0, 0, 0, 0]).expand(faces, 4)
+        world = to_world(frames, torch.arange(faces), torch.zeros(faces, 3), log_scales, quats)
+        for name, camera in rig.items():
+            sequence = "TRAIN" if t < timesteps else "FREE"
+            key = FrameKey("toy", sequence, t, name)
+            rendering = rasterize(
+                *world,
+                torch.full((faces,), 0.95),
+                colors,
+                camera.world_to_camera,
+                camera.K,
+                width,
+                height,
+                background=background,
+            )
+            images[key] = np.round(rendering.image.clamp(0, 1).numpy() * 255).astype(np.uint8)
+            masks[key] = np.round(rendering.alpha.clamp(0, 1).numpy() * 255).astype(np.uint8)
+            split = "self_reenactment" if t >= timesteps else "novel_view" if name == names[-1] else "train"
+            splits[split].append(key)
+    return ToyClip(
+        head,
+        shape,
+        offset,
+        rig,
+        poses,
+        {name: tuple(keys) for name, keys in splits.items()},
+        images,
+        masks,
+        background,
+    )
