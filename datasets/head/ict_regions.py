@@ -139,14 +139,17 @@ def regions_of(
     skin[parts.face_material] = True
     x, y, z = template.T
 
-    # From the side the contour runs from the ear down to the chin; the face lies in front of it. Towards the
-    # ears it is held at the first landmark, above them it goes straight up.
+    # From the side the contour runs from the ear down to the chin; the face lies in front of it. The
+    # landmarks sit before the ear, so the line is moved back to it, less and less towards the chin; above
+    # the ear the face reaches as far back as its material.
+    ear_line, ear_top = points[0, 1], points[0, 1] + 0.05 * length
     contour = points[list(_CONTOUR)[: _CHIN + 1]]
     order = np.argsort(contour[:, 1])
-    behind = np.interp(y, contour[order, 1], contour[order, 2])
-    face = skin & (z > behind - 0.01 * length) & (y > contour[:, 1].min() - 0.02 * length)
-    ear_top, ear_front = points[0, 1] + 0.25 * length, points[0, 2] - 0.04 * length
-    ear = skin & ~face & (y < ear_top) & (y > points[0, 1] - 0.55 * length) & (z < ear_front)
+    along = np.interp(y, contour[order, 1], contour[order, 2])
+    rise = np.clip((y - points[_CHIN, 1]) / (ear_line - points[_CHIN, 1]), 0, 1)
+    in_front = (z > along - (0.01 + 0.17 * rise) * length) | (y > ear_top)
+    face = skin & in_front & (y > contour[:, 1].min() - 0.02 * length)
+    ear = skin & ~face & (y <= ear_top) & (y > ear_line - 0.58 * length)
     ear &= np.abs(x) > 0.93 * np.abs(points[0, 0])
     height = profile.height(template)
     outer = np.zeros_like(skin)
@@ -158,7 +161,7 @@ def regions_of(
     masks = {
         "face": face,
         "forehead": face & (y > brow),
-        "nose": face & _near(template, nose, 0.09 * length),
+        "nose": face & _near(template, nose, 0.12 * length) & (y > nose[:, 1].min() - 0.02 * length),
         "lips": skin
         & _inside(template[:, :2], points[list(_OUTER_LIPS), :2], 0.02 * length)
         & (z > points[list(_OUTER_LIPS), 2].min() - 0.06 * length),
