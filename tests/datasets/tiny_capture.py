@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -113,8 +115,31 @@ def paint(plan: CapturePlan, pose: HeadPose, camera: Camera, seed: int) -> tuple
     return image, (covered * 255).astype(np.uint8)
 
 
-def write_tiny_capture(root: Path, plan: CapturePlan | None = None) -> tuple[CaptureWriter, dict]:
-    """Write a whole capture; returns the writer and (image, mask) by (sequence, timestep, camera)."""
+class TinyCapture(NamedTuple):
+    """A written capture: its writer, and (image, mask) by (sequence, timestep in it, camera)."""
+
+    writer: CaptureWriter
+    frames: dict[tuple[str, int, str], tuple[np.ndarray, np.ndarray]]
+
+    @property
+    def union(self) -> Path:
+        return self.writer.union
+
+    def moved(self, root: Path) -> TinyCapture:
+        """The same capture in another place."""
+        return TinyCapture(CaptureWriter(root, self.writer.plan), self.frames)
+
+    def edit(self, file: str, change) -> Path:
+        """Apply ``change`` to a JSON of the union folder."""
+        path = self.union / file
+        value = json.loads(path.read_text())
+        change(value)
+        path.write_text(json.dumps(value))
+        return path
+
+
+def write_tiny_capture(root: Path, plan: CapturePlan | None = None) -> TinyCapture:
+    """Write a whole capture."""
     plan = plan or make_plan()
     writer = CaptureWriter(root, plan)
     frames = {}
@@ -125,7 +150,7 @@ def write_tiny_capture(root: Path, plan: CapturePlan | None = None) -> tuple[Cap
                 frames[key] = paint(plan, pose, camera, len(frames))
                 writer.write_frame(*key, *frames[key])
     writer.write_metadata()
-    return writer, frames
+    return TinyCapture(writer, frames)
 
 
 def decode_png(path: Path) -> np.ndarray:

@@ -1,0 +1,107 @@
+"""The image store: its memory bound, its order of eviction, threads."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import cv2
+import numpy as np
+import pytest
+from headbench.bench.errors import InputError
+from headbench.datasets import images
+from headbench.datasets.ga_writer import write_png
+from headbench.datasets.images import ImageStore, read_image
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+WHITE = (1.0, 1.0, 1.0)
+BYTES = 10 * 10 * 3
+
+
+@pytest.fixture(scope="module")
+def paths(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("images")
+    result = [folder / f"{i}.png" for i in range(6)]
+    for i, path in enumerate(result):
+        write_png(path, np.full((10, 10, 3), i, np.uint8))
+    return result
+
+
+@pytest.fixture
+def reads(monkeypatch):
+    """Paths decoded, in order."""
+    decoded = []
+    original = images._decode
+    monkeypatch.setattr(images, "_decode", lambda path: decoded.append(path) or original(path))
+    return decoded
+
+
+def test_least_recently_used_goes_first(paths, reads):
+    store = ImageStore(3 * BYTES / 1e6)
+    for i in (0, 1, 2, 0, 3):  # 1 is the least recently used when 3 comes
+        store.image(paths[i], WHITE)
+    reads.clear()
+    for i in (0, 2, 3):
+        store.image(paths[i], WHITE)
+    assert reads == []
+    store.image(paths[1], WHITE)
+    assert reads == [paths[1]]
+
+
+@settings(max_examples=30, deadline=None)
+@given(order=st.lists(st.integers(0, 5), max_size=30), capacity=st.integers(0, 4))
+def test_bound_holds_after_every_read_and_pixels_are_right(paths, order, capacity):
+    store = ImageStore(capacity * BYTES / 1e6)
+    for i in order:
+        assert (store.image(paths[i], WHITE) == i).all()
+        assert store.held_bytes <= capacity * BYTES
+    assert store.held_bytes == min(capacity, len(set(order))) * BYTES
+
+
+def test_image_larger_than_the_bound_is_read_and_not_kept(paths, reads):
+    store = ImageStore(0)
+    for _ in range(2):
+        assert (store.image(paths[5], WHITE) == 5).all()
+    assert store.held_bytes == 0
+    assert len(reads) == 2
+
+
+def test_shared_pixels_cannot_be_written(paths):
+    with pytest.raises(ValueError, match="read-only"):
+        ImageStore().image(paths[0], WHITE)[0, 0] = 1
+
+
+def test_many_threads_read_right_pixels_within_the_bound(paths):
+    store = ImageStore(2 * BYTES / 1e6)
+    order = np.random.default_rng(0).integers(0, len(paths), size=400).tolist()
+
+    def read(i):
+        return i, int(store.image(paths[i], WHITE).max()), store.held_bytes
+
+    with ThreadPoolExecutor(8) as pool:
+        results = list(pool.map(read, order))
+    assert all(i == value for i, value, _ in results)
+    assert store.held_bytes == 2 * BYTES == sum(array.nbytes for array in store._arrays.values())
+
+
+def test_grey_and_palette_files_become_rgb(tmp_path):
+    grey = np.arange(100, dtype=np.uint8).reshape(10, 10)
+    write_png(tmp_path / "grey.png", grey)
+    np.testing.assert_array_equal(read_image(tmp_path / "grey.png", WHITE), np.repeat(grey[..., None], 3, axis=2))
+
+
+def test_jpeg_channels_are_in_order(tmp_path):
+    cv2.imwrite(str(tmp_path / "red.jpg"), np.full((16, 16, 3), (0, 0, 200), np.uint8))  # BGR
+    pixel = read_image(tmp_path / "red.jpg", WHITE)[8, 8].astype(int)
+    assert np.abs(pixel - [200, 0, 0]).max() <= 3
+
+
+def test_file_that_does_not_decode_is_named(tmp_path):
+    path = tmp_path / "bad.png"
+    path.write_bytes(b"\x89PNG\r\n\x1a\nrubbish")
+    with pytest.raises(InputError, match="bad.png: expected an image that decodes, found damaged data"):
+        ImageStore().image(path, WHITE)
+    with pytest.raises(InputError, match="found no such file"):
+        ImageStore().mask(tmp_path / "none.png")
+    with pytest.raises(InputError, match="limit_mb"):
+        ImageStore(-1)
