@@ -81,4 +81,4 @@ def rasterize(
 
 def available_backends() -> tuple[str, ...]:
     """Names `rasterize` accepts as ``backend`` on this machine, besides "auto"; the preferred one first."""
-    return (*cpu.names(), "reference")
+    return (*cpu.instruction_sets(), "reference")

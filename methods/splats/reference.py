@@ -171,7 +171,8 @@ def _composite_tile(
     image = pixels.new_zeros(len(pixels), colors.shape[1])
     transmittance = pixels.new_ones(len(pixels))
     running = torch.ones_like(transmittance, dtype=torch.bool)
-    for start in range(0, len(opacities), CHUNK):
+    # Once even without splats: what is drawn depends on the inputs all the same, with zero gradient.
+    for start in range(0, max(len(opacities), 1), CHUNK):
         part = slice(start, start + CHUNK)
         image, transmittance, running = checkpoint(
             _composite_chunk,
@@ -210,6 +211,6 @@ def _composite_chunk(
     after = transmittance.detach()[:, None] * torch.cumprod(1 - alpha.detach(), dim=1)
     drawn = running[:, None] & (after > TRANSMITTANCE_MIN)
     alpha = torch.where(drawn, alpha, 0)
-    passed = transmittance[:, None] * torch.cumprod(1 - alpha, dim=1)
-    before = torch.cat([transmittance[:, None], passed[:, :-1]], dim=1)
-    return image + (alpha * before) @ colors, passed[:, -1], drawn[:, -1]
+    light = torch.cumprod(torch.cat([transmittance[:, None], 1 - alpha], dim=1), dim=1)
+    running = torch.cat([running[:, None], drawn], dim=1)[:, -1]
+    return image + (alpha * light[:, :-1]) @ colors, light[:, -1], running

@@ -1,3 +1,162 @@
+// The kernel as a Python module. Arrays are typed and contiguous; outputs are allocated by the caller.
 #include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/unique_ptr.h>
+#include <nanobind/stl/vector.h>
 
-NB_MODULE(_kernel, m) { m.doc() = "Gaussian splat rasteriser"; }
+#include <memory>
+#include <optional>
+#include <stdexcept>
+#include <string>
+#include <vector>
+
+#include "frame.h"
+#include "instruction_sets.h"
+
+namespace nb = nanobind;
+using namespace nb::literals;
+
+namespace headbench {
+namespace {
+
+template <class T, nb::ssize_t... Shape>
+using Array = nb::ndarray<T, nb::shape<Shape...>, nb::c_contig, nb::device::cpu>;
+
+// The inputs in the order of `rasterize`; `offset` is empty (0, 2) where there is none.
+struct Inputs {
+  Array<const float, -1, 3> means;
+  Array<const float, -1, 4> quats;
+  Array<const float, -1, 3> scales;
+  Array<const float, -1> opacities;
+  Array<const float, -1, -1> colors;
+  Array<const float, -1, 2> offset;
+  Array<const float, -1> background;
+
+  // Shapes were checked in Python with clear messages; this only keeps memory safe.
+  Splats splats() const {
+    const std::size_t count = means.shape(0);
+    const bool fit = quats.shape(0) == count && scales.shape(0) == count && opacities.shape(0) == count &&
+                     colors.shape(0) == count && (offset.shape(0) == count || offset.shape(0) == 0) &&
+                     background.shape(0) == colors.shape(1) && colors.shape(1) >= 1 &&
+                     colors.shape(1) <= static_cast<std::size_t>(kChannelsMax) && count < (std::size_t{1} << 32);
+    if (!fit) throw std::invalid_argument("arrays do not fit together");
+    return {static_cast<std::int64_t>(count), static_cast<int>(colors.shape(1)), means.data(), quats.data(),
+            scales.data(), opacities.data(), colors.data(), offset.shape(0) ? offset.data() : nullptr,
+            background.data()};
+  }
+};
+
+const Stages& stages_by_name(const std::string& name) {
+  for (const Stages* stages : runnable_stages())
+    if (name == stages->name) return *stages;
+  throw std::invalid_argument("instruction set " + name + " is not available here");
+}
+
+View make_view(const Array<const float, 4, 4>& viewmat, const Array<const float, 3, 3>& K, float near, float far,
+               float eps2d, std::size_t width, std::size_t height) {
+  View view{};
+  for (int i = 0; i < 3; ++i) {
+    for (int j = 0; j < 3; ++j) view.rotation[3 * i + j] = viewmat(i, j);
+    view.translation[i] = viewmat(i, 3);
+  }
+  view.fx = K(0, 0);
+  view.fy = K(1, 1);
+  view.cx = K(0, 2);
+  view.cy = K(1, 2);
+  view.near = near;
+  view.far = far;
+  view.eps2d = eps2d;
+  constexpr std::size_t kSizeMax = std::size_t{1} << 19;  // tile indices have 16 bits
+  if (width < 1 || height < 1 || width > kSizeMax || height > kSizeMax)
+    throw std::invalid_argument("image sides must be from 1 to 2^19 pixels");
+  view.width = static_cast<int>(width);
+  view.height = static_cast<int>(height);
+  view.tiles_x = (view.width + kTile - 1) / kTile;
+  view.tiles_y = (view.height + kTile - 1) / kTile;
+  return view;
+}
+
+std::unique_ptr<Frame> forward(const Array<const float, -1, 3>& means, const Array<const float, -1, 4>& quats,
+                               const Array<const float, -1, 3>& scales, const Array<const float, -1>& opacities,
+                               const Array<const float, -1, -1>& colors, const Array<const float, -1, 2>& offset,
+                               const Array<const float, -1>& background, const Array<const float, 4, 4>& viewmat,
+                               const Array<const float, 3, 3>& K, float near, float far, float eps2d,
+                               const Array<float, -1, -1, -1>& image, const Array<float, -1, -1>& alpha,
+                               const Array<std::int32_t, -1>& radii, const std::string& instruction_set,
+                               int threads) {
+  const Splats splats = Inputs{means, quats, scales, opacities, colors, offset, background}.splats();
+  const View view = make_view(viewmat, K, near, far, eps2d, image.shape(1), image.shape(0));
+  if (image.shape(2) != colors.shape(1) || alpha.shape(0) != image.shape(0) || alpha.shape(1) != image.shape(1) ||
+      radii.shape(0) != means.shape(0) || threads < 1)
+    throw std::invalid_argument("outputs do not fit the inputs");
+  const Stages& stages = stages_by_name(instruction_set);
+  nb::gil_scoped_release unlocked;
+  return std::make_unique<Frame>(view, splats, ImageOut{image.data(), alpha.data()}, radii.data(), stages, threads);
+}
+
+void backward(Frame& frame, const Array<const float, -1, 3>& means, const Array<const float, -1, 4>& quats,
+              const Array<const float, -1, 3>& scales, const Array<const float, -1>& opacities,
+              const Array<const float, -1, -1>& colors, const Array<const float, -1, 2>& offset,
+              const Array<const float, -1>& background, const Array<const float, -1, -1, -1>& grad_image,
+              const Array<const float, -1, -1>& grad_alpha, const Array<float, -1, 3>& grad_means,
+              const Array<float, -1, 4>& grad_quats, const Array<float, -1, 3>& grad_scales,
+              const Array<float, -1>& grad_opacities, const Array<float, -1, -1>& grad_colors,
+              const Array<float, -1, 2>& grad_offset, const Array<float, -1>& grad_background,
+              const Array<float, 4, 4>& grad_viewmat, int threads) {
+  const Splats splats = Inputs{means, quats, scales, opacities, colors, offset, background}.splats();
+  const auto same = [](const auto& a, const auto& b) {
+    for (std::size_t i = 0; i < a.ndim(); ++i)
+      if (a.shape(i) != b.shape(i)) return false;
+    return true;
+  };
+  if (!frame.fits(splats, grad_image.shape(1), grad_image.shape(0)) || !same(grad_means, means) ||
+      !same(grad_quats, quats) || !same(grad_scales, scales) || !same(grad_opacities, opacities) ||
+      !same(grad_colors, colors) || !same(grad_offset, offset) || !same(grad_background, background) ||
+      grad_image.shape(2) != colors.shape(1) || grad_alpha.shape(0) != grad_image.shape(0) ||
+      grad_alpha.shape(1) != grad_image.shape(1) || threads < 1)
+    throw std::invalid_argument("gradients do not fit the inputs");
+  Gradients grads{};
+  grads.image = grad_image.data();
+  grads.alpha = grad_alpha.data();
+  grads.means = grad_means.data();
+  grads.quats = grad_quats.data();
+  grads.scales = grad_scales.data();
+  grads.opacities = grad_opacities.data();
+  grads.colors = grad_colors.data();
+  grads.means2d = grad_offset.shape(0) ? grad_offset.data() : nullptr;
+  float view_gradient[kViewGradient];
+  {
+    nb::gil_scoped_release unlocked;
+    frame.backward(splats, grads, grad_background.data(), view_gradient, threads);
+  }
+  for (int i = 0; i < 3; ++i) {
+    for (int j = 0; j < 3; ++j) grad_viewmat(i, j) = view_gradient[3 * i + j];
+    grad_viewmat(i, 3) = view_gradient[9 + i];
+  }
+}
+
+std::vector<std::string> instruction_sets() {
+  std::vector<std::string> names;
+  for (const Stages* stages : runnable_stages()) names.emplace_back(stages->name);
+  return names;
+}
+
+}  // namespace
+}  // namespace headbench
+
+NB_MODULE(_kernel, m) {
+  using namespace headbench;
+  // A tensor that is alive when the interpreter ends keeps its frame; that is no leak.
+  nb::set_leak_warnings(false);
+  m.doc() = "Gaussian splat rasteriser";
+  nb::class_<Frame>(m, "Frame", "A drawn frame: what its backward pass needs.");
+  m.def("forward", &forward, "means"_a, "quats"_a, "scales"_a, "opacities"_a, "colors"_a, "offset"_a, "background"_a,
+        "viewmat"_a, "K"_a, "near"_a, "far"_a, "eps2d"_a, "image"_a, "alpha"_a, "radii"_a, "instruction_set"_a,
+        "threads"_a, "Draw into image, alpha and radii.");
+  m.def("backward", &backward, "frame"_a, "means"_a, "quats"_a, "scales"_a, "opacities"_a, "colors"_a, "offset"_a,
+        "background"_a, "grad_image"_a, "grad_alpha"_a, "grad_means"_a, "grad_quats"_a, "grad_scales"_a,
+        "grad_opacities"_a, "grad_colors"_a, "grad_offset"_a, "grad_background"_a, "grad_viewmat"_a, "threads"_a,
+        "Write the gradients of visible splats, background and camera.");
+  m.def("instruction_sets", &instruction_sets, "Variants this machine can run, the fastest first.");
+}

@@ -1,0 +1,195 @@
+#include "frame.h"
+
+#include <algorithm>
+#include <cstring>
+#include <limits>
+#include <stdexcept>
+#include <utility>
+#include <vector>
+
+#include "thread_pool.h"
+
+namespace headbench {
+
+namespace {
+
+constexpr std::int64_t kSplatsPerTask = 1024;
+
+std::int64_t task_count(std::int64_t splats) { return (splats + kSplatsPerTask - 1) / kSplatsPerTask; }
+
+std::size_t round_up(std::size_t value, std::size_t step) { return (value + step - 1) / step * step; }
+
+}  // namespace
+
+Frame::Frame(const View& view, const Splats& splats, const ImageOut& out, std::int32_t* radii,
+             const Stages& stages, int threads)
+    : view_(view),
+      stages_(stages),
+      count_(splats.count),
+      channels_(splats.channels),
+      has_offset_(splats.offset != nullptr) {
+  const std::size_t count = static_cast<std::size_t>(splats.count);
+  const std::size_t tiles = static_cast<std::size_t>(view.tiles_x) * view.tiles_y;
+  // Records start on cache lines: drawing reads them at random.
+  data_.record_stride = static_cast<int>(round_up(kGeometry + splats.channels, 16));
+  data_.records = records_.resize(count * data_.record_stride);
+  data_.depths = depths_.resize(count);
+  data_.radii = radii;
+  data_.rects = rects_.resize(count);
+  data_.entry_begin = entry_begin_.resize(count);
+  data_.entry_count = entry_count_.resize(count);
+  data_.transmittances = transmittances_.resize(tiles * kTilePixels);
+  data_.last = last_.resize(tiles * kTilePixels);
+
+  ThreadPool& pool = ThreadPool::instance();
+  pool.run(task_count(splats.count), threads, [&](std::int64_t task, int) {
+    const std::int64_t begin = task * kSplatsPerTask;
+    stages.project(view_, splats, data_, begin, std::min(begin + kSplatsPerTask, splats.count));
+  });
+  list_visible(splats.count);
+  sort_by_depth();
+  reserve_entries();
+  fill_tiles(threads);
+
+  const std::size_t scratch_stride = round_up(stages.scratch_floats(splats.channels), 16);
+  Buffer<float> scratch;
+  scratch.resize(scratch_stride * threads);
+  pool.run(static_cast<std::int64_t>(tiles), threads, [&](std::int64_t tile, int worker) {
+    stages.draw_tile(view_, splats, data_, out, static_cast<int>(tile), scratch.data() + worker * scratch_stride);
+  });
+  // Of these the backward pass needs nothing.
+  depths_.release();
+  rects_.release();
+  order_.release();
+  entry_tiles_.release();
+  entry_blocks_.release();
+  data_.radii = nullptr;
+}
+
+void Frame::list_visible(std::int64_t count) {
+  std::uint32_t* visible = visible_.resize(static_cast<std::size_t>(count));
+  for (std::int64_t splat = 0; splat < count; ++splat) {
+    visible[visible_count_] = static_cast<std::uint32_t>(splat);
+    visible_count_ += data_.depths[splat] > 0.0f;
+  }
+  data_.visible = visible;
+}
+
+// Radix sort, stable: splats at one depth keep the order of their indices. Depths are positive, so that their bits
+// sort as whole numbers do.
+void Frame::sort_by_depth() {
+  constexpr int kBits = 11, kPasses = 3, kBins = 1 << kBits;
+  const std::size_t count = static_cast<std::size_t>(visible_count_);
+  Buffer<std::uint32_t> key_buffers[2], other;
+  std::uint32_t *keys = key_buffers[0].resize(count), *next_keys = key_buffers[1].resize(count);
+  std::uint32_t *values = order_.resize(count), *next_values = other.resize(count);
+  std::vector<std::uint32_t> bins(kPasses * kBins, 0);
+  for (std::size_t i = 0; i < count; ++i) {
+    values[i] = data_.visible[i];
+    std::memcpy(&keys[i], &data_.depths[values[i]], sizeof(float));
+    for (int pass = 0; pass < kPasses; ++pass) ++bins[pass * kBins + (keys[i] >> (kBits * pass) & (kBins - 1))];
+  }
+  for (int pass = 0; pass < kPasses; ++pass) {
+    std::uint32_t* starts = bins.data() + pass * kBins;
+    std::uint32_t total = 0;
+    for (int bin = 0; bin < kBins; ++bin) total += std::exchange(starts[bin], total);
+    for (std::size_t i = 0; i < count; ++i) {
+      const std::uint32_t place = starts[keys[i] >> (kBits * pass) & (kBins - 1)]++;
+      next_keys[place] = keys[i];
+      next_values[place] = values[i];
+    }
+    std::swap(keys, next_keys);
+    std::swap(values, next_values);
+  }
+  // An odd number of passes ends in the other buffer.
+  static_assert(kPasses % 2 == 1);
+  std::copy(values, values + count, next_values);
+  data_.order = order_.data();
+}
+
+// Give every splat as many entries as its rectangle has tiles; what it does not use is never touched.
+void Frame::reserve_entries() {
+  for (std::int64_t i = 0; i < visible_count_; ++i) {
+    const std::uint32_t splat = data_.visible[i];
+    const Rect& rect = data_.rects[splat];
+    data_.entry_begin[splat] = static_cast<std::uint32_t>(entries_);
+    entries_ += std::size_t{1} * (rect.x1 - rect.x0 + 1) * (rect.y1 - rect.y0 + 1);
+    if (entries_ > std::numeric_limits<std::uint32_t>::max())
+      throw std::length_error("the splats touch more tiles than 32 bits can count");
+  }
+  data_.entry_tiles = entry_tiles_.resize(entries_);
+  data_.entry_blocks = entry_blocks_.resize(entries_);
+}
+
+// Counting sort of the entries into tiles. Splats are dealt with in depth order, cut into as many pieces as there
+// are threads; a piece's pairs go behind those of the pieces before it, so the lists do not depend on the cut.
+void Frame::fill_tiles(int threads) {
+  const std::size_t tiles = static_cast<std::size_t>(view_.tiles_x) * view_.tiles_y;
+  const std::int64_t pieces = std::max<std::int64_t>(1, std::min<std::int64_t>(threads, task_count(visible_count_)));
+  const auto piece_begin = [&](std::int64_t piece) { return visible_count_ * piece / pieces; };
+  std::vector<std::uint32_t> places(static_cast<std::size_t>(pieces) * tiles, 0);
+  ThreadPool& pool = ThreadPool::instance();
+  pool.run(pieces, threads, [&](std::int64_t piece, int) {
+    stages_.find_pairs(view_, data_, piece_begin(piece), piece_begin(piece + 1), &places[piece * tiles]);
+  });
+
+  data_.tile_begin = tile_begin_.resize(tiles + 1);
+  std::uint32_t total = 0;
+  for (std::size_t tile = 0; tile < tiles; ++tile) {
+    data_.tile_begin[tile] = total;
+    for (std::int64_t piece = 0; piece < pieces; ++piece) total += std::exchange(places[piece * tiles + tile], total);
+    // Indices within a tile are kept as floats.
+    if (total - data_.tile_begin[tile] > 1u << std::numeric_limits<float>::digits)
+      throw std::length_error("more than 2^24 splats touch one tile");
+  }
+  data_.tile_begin[tiles] = total;
+
+  data_.pairs = pairs_.resize(total);
+  pool.run(pieces, threads, [&](std::int64_t piece, int) {
+    std::uint32_t* place = &places[piece * tiles];
+    for (std::int64_t i = piece_begin(piece); i < piece_begin(piece + 1); ++i) {
+      const std::uint32_t splat = data_.order[i];
+      const std::uint32_t begin = data_.entry_begin[splat], end = begin + data_.entry_count[splat];
+      for (std::uint32_t entry = begin; entry < end; ++entry)
+        data_.pairs[place[data_.entry_tiles[entry]]++] = {data_.entry_blocks[entry], splat, entry};
+    }
+  });
+}
+
+void Frame::backward(const Splats& splats, Gradients grads, float* background, float* view_gradient, int threads) {
+  const std::int64_t tiles = static_cast<std::int64_t>(view_.tiles_x) * view_.tiles_y;
+  const int channels = splats.channels;
+  const std::size_t scratch_stride = round_up(stages_.scratch_floats(channels), 16);
+  Buffer<float> scratch, entries;
+  scratch.resize(scratch_stride * threads);
+  grads.entry_stride = static_cast<int>(round_up(kMoments + channels, stages_.lanes));
+  grads.entries = entries.resize(entries_ * grads.entry_stride);
+  std::vector<double> tile_background(static_cast<std::size_t>(tiles) * channels);
+  grads.background = tile_background.data();
+  ThreadPool& pool = ThreadPool::instance();
+  pool.run(tiles, threads, [&](std::int64_t tile, int worker) {
+    stages_.draw_tile_backward(view_, splats, data_, grads, static_cast<int>(tile),
+                               scratch.data() + worker * scratch_stride);
+  });
+
+  // Tasks of a fixed size, added in order: sums do not depend on the number of threads.
+  const std::int64_t tasks = task_count(visible_count_);
+  std::vector<double> task_view(static_cast<std::size_t>(tasks) * kViewGradient, 0.0);
+  pool.run(tasks, threads, [&](std::int64_t task, int) {
+    const std::int64_t begin = task * kSplatsPerTask;
+    stages_.project_backward(view_, splats, data_, grads, begin, std::min(begin + kSplatsPerTask, visible_count_),
+                             &task_view[task * kViewGradient]);
+  });
+  for (int c = 0; c < channels; ++c) {
+    double sum = 0.0;
+    for (std::int64_t tile = 0; tile < tiles; ++tile) sum += tile_background[tile * channels + c];
+    background[c] = static_cast<float>(sum);
+  }
+  for (int k = 0; k < kViewGradient; ++k) {
+    double sum = 0.0;
+    for (std::int64_t task = 0; task < tasks; ++task) sum += task_view[task * kViewGradient + k];
+    view_gradient[k] = static_cast<float>(sum);
+  }
+}
+
+}  // namespace headbench

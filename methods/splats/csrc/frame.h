@@ -1,0 +1,72 @@
+// One rendered frame: drives the stages, and keeps what the backward pass needs.
+#pragma once
+
+#include <cstddef>
+#include <new>
+
+#include "scene.h"
+
+namespace headbench {
+
+// Uninitialised memory on cache-line boundaries.
+template <class T>
+class Buffer {
+ public:
+  Buffer() = default;
+  Buffer(const Buffer&) = delete;
+  Buffer& operator=(const Buffer&) = delete;
+  ~Buffer() { release(); }
+
+  T* resize(std::size_t count) {
+    release();
+    data_ = static_cast<T*>(::operator new(count ? count * sizeof(T) : 1, std::align_val_t{64}));
+    return data_;
+  }
+  void release() {
+    ::operator delete(data_, std::align_val_t{64});
+    data_ = nullptr;
+  }
+  T* data() const { return data_; }
+
+ private:
+  T* data_ = nullptr;
+};
+
+class Frame {
+ public:
+  // Draws at once. Throws std::length_error where splats touch more tiles than 32 bits can count.
+  Frame(const View& view, const Splats& splats, const ImageOut& out, std::int32_t* radii, const Stages& stages,
+        int threads);
+
+  // `splats` must hold the same values as when drawn. Entries of culled splats are left as they are; the rest of
+  // `grads`, `background` (C,) and `view_gradient` (kViewGradient,) are overwritten.
+  void backward(const Splats& splats, Gradients grads, float* background, float* view_gradient, int threads);
+
+  // Whether these inputs and this image size can be the ones drawn: arrays of the same sizes.
+  bool fits(const Splats& splats, std::size_t width, std::size_t height) const {
+    return splats.count == count_ && splats.channels == channels_ && (splats.offset != nullptr) == has_offset_ &&
+           width == static_cast<std::size_t>(view_.width) && height == static_cast<std::size_t>(view_.height);
+  }
+
+ private:
+  void list_visible(std::int64_t count);
+  void sort_by_depth();
+  void reserve_entries();
+  void fill_tiles(int threads);
+
+  const View view_;
+  const Stages& stages_;
+  const std::int64_t count_;
+  const int channels_;
+  const bool has_offset_;
+  FrameData data_{};
+  std::int64_t visible_count_ = 0;
+  Buffer<float> records_, depths_, transmittances_, last_;
+  Buffer<Rect> rects_;
+  Buffer<std::uint32_t> entry_begin_, entry_count_, visible_, order_, tile_begin_, entry_tiles_;
+  Buffer<std::uint64_t> entry_blocks_;
+  Buffer<Pair> pairs_;
+  std::size_t entries_ = 0;
+};
+
+}  // namespace headbench

@@ -1,0 +1,190 @@
+// Projection of splats onto the image plane and its derivative, one splat per lane.
+//
+// The formulas are those of reference.py, `project`. The covariance is kept in factored form Q Qᵀ + eps I, its
+// inverse as a triangular L with  log2 alpha = log2 opacity - u² - v²,  u = l11 dx + l21 dy,  v = l22 dy.
+#pragma once
+
+#include <math.h>
+
+#include "scene.h"
+
+namespace headbench::HEADBENCH_ISA {
+
+constexpr int W = Real::lanes;
+constexpr float kLog2e = 1.4426950408889634f;
+constexpr float kLn2 = 0.6931471805599453f;
+constexpr float kSqrtHalfLog2e = 0.8493218002880191f;
+
+// W splats, component by component. Lanes without a splat hold a copy of the first.
+struct SplatLanes {
+  alignas(64) float mean[3][W], quat[4][W], scale[3][W], opacity[W], offset[2][W];
+};
+
+inline void load_lane(const Splats& splats, std::int64_t splat, int lane, SplatLanes& out) {
+  for (int k = 0; k < 3; ++k) out.mean[k][lane] = splats.means[3 * splat + k];
+  for (int k = 0; k < 4; ++k) out.quat[k][lane] = splats.quats[4 * splat + k];
+  for (int k = 0; k < 3; ++k) out.scale[k][lane] = splats.scales[3 * splat + k];
+  out.opacity[lane] = splats.opacities[splat];
+  for (int k = 0; k < 2; ++k) out.offset[k][lane] = splats.offset ? splats.offset[2 * splat + k] : 0.0f;
+}
+
+// Every intermediate value the derivative needs.
+struct Projection {
+  Real mean[3], scale[3];
+  Real x, y, z, inv_z;
+  Real mean_x, mean_y;
+  Real slope_x, slope_y;
+  Mask free_x, free_y;  // slope not clamped
+  Real quat[4], inv_norm;
+  Mask normalised;  // quaternion long enough to be divided by its own norm
+  Real rotation[9];
+  Real axes[9];         // rotation times scales
+  Real camera_axes[9];  // the same seen by the camera
+  Real q0[3], q1[3];
+  Real xx, xy, yy, det;
+  Real l11, l21, l22;
+};
+
+inline void rotation_matrix(const Real* q, Real* r) {
+  const Real w = q[0], x = q[1], y = q[2], z = q[3], two = 2.0f, one = 1.0f;
+  r[0] = fnma(two, fma(y, y, z * z), one);
+  r[1] = two * fnma(w, z, x * y);
+  r[2] = two * fma(w, y, x * z);
+  r[3] = two * fma(w, z, x * y);
+  r[4] = fnma(two, fma(x, x, z * z), one);
+  r[5] = two * fnma(w, x, y * z);
+  r[6] = two * fnma(w, y, x * z);
+  r[7] = two * fma(w, x, y * z);
+  r[8] = fnma(two, fma(x, x, y * y), one);
+}
+
+inline Real dot3(const Real* a, const Real* b) { return fma(a[0], b[0], fma(a[1], b[1], a[2] * b[2])); }
+
+inline Real absolute(Real a) { return max(a, Real(0.0f) - a); }
+
+inline void project_lanes(const View& view, const SplatLanes& in, Projection& p) {
+  for (int k = 0; k < 3; ++k) p.mean[k] = load(in.mean[k]);
+  for (int k = 0; k < 3; ++k) p.scale[k] = load(in.scale[k]);
+  Real camera[3];
+  for (int k = 0; k < 3; ++k) {
+    const float* r = view.rotation + 3 * k;
+    camera[k] = fma(r[0], p.mean[0], fma(r[1], p.mean[1], fma(r[2], p.mean[2], view.translation[k])));
+  }
+  p.x = camera[0];
+  p.y = camera[1];
+  p.z = camera[2];
+  p.inv_z = Real(1.0f) / p.z;
+  const Real ratio_x = p.x * p.inv_z, ratio_y = p.y * p.inv_z;
+  p.mean_x = fma(view.fx, ratio_x, view.cx) + load(in.offset[0]);
+  p.mean_y = fma(view.fy, ratio_y, view.cy) + load(in.offset[1]);
+
+  const float margin_x = kFrustumMargin * 0.5f * view.width / view.fx;
+  const float margin_y = kFrustumMargin * 0.5f * view.height / view.fy;
+  const Real low_x = -view.cx / view.fx - margin_x, high_x = (view.width - view.cx) / view.fx + margin_x;
+  const Real low_y = -view.cy / view.fy - margin_y, high_y = (view.height - view.cy) / view.fy + margin_y;
+  p.free_x = (ratio_x >= low_x) & (high_x >= ratio_x);
+  p.free_y = (ratio_y >= low_y) & (high_y >= ratio_y);
+  p.slope_x = min(max(ratio_x, low_x), high_x);
+  p.slope_y = min(max(ratio_y, low_y), high_y);
+
+  // Dividing by the largest component first keeps every square in range; true divisions, because the largest
+  // must become exactly 1 for the test below.
+  Real quat[4];
+  for (int k = 0; k < 4; ++k) quat[k] = load(in.quat[k]);
+  const Real largest = max(max(max(absolute(quat[0]), absolute(quat[1])), max(absolute(quat[2]), absolute(quat[3]))),
+                           Real(kQuaternionMin));
+  for (int k = 0; k < 4; ++k) quat[k] = quat[k] / largest;
+  const Real norm2 = fma(quat[0], quat[0], fma(quat[1], quat[1], fma(quat[2], quat[2], quat[3] * quat[3])));
+  p.normalised = norm2 >= Real(1.0f);
+  const Real inv = Real(1.0f) / sqrt(max(norm2, Real(1.0f)));
+  p.inv_norm = inv / largest;
+  for (int k = 0; k < 4; ++k) p.quat[k] = quat[k] * inv;
+
+  rotation_matrix(p.quat, p.rotation);
+  for (int i = 0; i < 9; ++i) p.axes[i] = p.rotation[i] * p.scale[i % 3];
+  for (int i = 0; i < 3; ++i) {
+    const float* r = view.rotation + 3 * i;
+    for (int j = 0; j < 3; ++j)
+      p.camera_axes[3 * i + j] = fma(r[0], p.axes[j], fma(r[1], p.axes[3 + j], Real(r[2]) * p.axes[6 + j]));
+  }
+  const Real fx_z = Real(view.fx) * p.inv_z, fy_z = Real(view.fy) * p.inv_z;
+  for (int j = 0; j < 3; ++j) {
+    p.q0[j] = fx_z * fnma(p.slope_x, p.camera_axes[6 + j], p.camera_axes[j]);
+    p.q1[j] = fy_z * fnma(p.slope_y, p.camera_axes[6 + j], p.camera_axes[3 + j]);
+  }
+  const Real cross[3] = {fnma(p.q0[2], p.q1[1], p.q0[1] * p.q1[2]), fnma(p.q0[0], p.q1[2], p.q0[2] * p.q1[0]),
+                         fnma(p.q0[1], p.q1[0], p.q0[0] * p.q1[1])};
+  const Real xx = dot3(p.q0, p.q0), yy = dot3(p.q1, p.q1), eps = view.eps2d;
+  p.xy = dot3(p.q0, p.q1);
+  p.det = fma(eps, xx + yy, fma(eps, eps, dot3(cross, cross)));
+  p.xx = xx + eps;
+  p.yy = yy + eps;
+  const Real root = sqrt(p.yy);
+  p.l11 = Real(kSqrtHalfLog2e) * root / sqrt(p.det);
+  p.l21 = Real(0.0f) - p.l11 * p.xy / p.yy;
+  p.l22 = Real(kSqrtHalfLog2e) / root;
+}
+
+// Tile index of a pixel coordinate, clamped to the image while still a float: huge values are safe.
+inline std::uint16_t tile_of(float pixel, int tiles) {
+  const float tile = floorf(pixel / kTile);
+  return static_cast<std::uint16_t>(tile > 0.0f ? (tile < tiles - 1 ? tile : tiles - 1) : 0.0f);
+}
+
+inline void project(const View& view, const Splats& splats, const FrameData& frame, std::int64_t begin,
+                    std::int64_t end) {
+  for (std::int64_t first = begin; first < end; first += W) {
+    const int used = static_cast<int>(end - first < W ? end - first : W);
+    SplatLanes in;
+    for (int lane = 0; lane < W; ++lane) load_lane(splats, first + (lane < used ? lane : 0), lane, in);
+    Projection p;
+    project_lanes(view, in, p);
+
+    alignas(64) float level_log2[W];
+    for (int lane = 0; lane < W; ++lane) level_log2[lane] = log2f(in.opacity[lane]);
+    const Real log2_opacity = load(level_log2);
+    const Real level = Real(2.0f * kLn2) * max(log2_opacity - Real(kLog2AlphaMin), 0.0f);
+    const Real extent_x = sqrt(level * p.xx), extent_y = sqrt(level * p.yy);
+    const Real reach_x = ceil(extent_x), reach_y = ceil(extent_y), radius = max(reach_x, reach_y);
+    // All conditions positive: a NaN anywhere culls.
+    const Mask in_depth = (p.z > Real(view.near)) & (Real(view.far) > p.z);
+    const Mask in_image = (p.mean_x + reach_x > Real(0.0f)) & (p.mean_y + reach_y > Real(0.0f)) &
+                          (Real(static_cast<float>(view.width)) > p.mean_x - reach_x) &
+                          (Real(static_cast<float>(view.height)) > p.mean_y - reach_y);
+    const Real largest = 3e38f;
+    const Mask drawable = (p.det > Real(0.0f)) & (largest > p.det) & (largest > p.l11) &
+                          (Real(kRadiusMax) > radius) & (load(in.opacity) >= Real(kAlphaMin));
+
+    alignas(64) float visible[W], field[kGeometry][W], depth[W], reach[W], half_x[W], half_y[W];
+    store(visible, zero_unless(in_depth & in_image & drawable, 1.0f));
+    store(field[kMeanX], p.mean_x);
+    store(field[kMeanY], p.mean_y);
+    store(field[kL11], p.l11);
+    store(field[kL21], p.l21);
+    store(field[kL22], p.l22);
+    store(field[kLog2Opacity], log2_opacity);
+    store(depth, p.z);
+    store(reach, radius);
+    store(half_x, extent_x);
+    store(half_y, extent_y);
+    for (int lane = 0; lane < used; ++lane) {
+      const std::int64_t splat = first + lane;
+      if (visible[lane] == 0.0f) {
+        frame.depths[splat] = 0.0f;
+        frame.radii[splat] = 0;
+        continue;
+      }
+      frame.depths[splat] = depth[lane];
+      frame.radii[splat] = static_cast<std::int32_t>(reach[lane]);
+      const float x = field[kMeanX][lane], y = field[kMeanY][lane];
+      // A tenth of a pixel covers rounding; tiles that turn out untouched are dropped when pairs are found.
+      frame.rects[splat] = {tile_of(x - half_x[lane] - 0.1f, view.tiles_x), tile_of(y - half_y[lane] - 0.1f, view.tiles_y),
+                            tile_of(x + half_x[lane] + 0.1f, view.tiles_x), tile_of(y + half_y[lane] + 0.1f, view.tiles_y)};
+      float* record = frame.records + splat * frame.record_stride;
+      for (int k = 0; k < kGeometry; ++k) record[k] = field[k][lane];
+      for (int c = 0; c < splats.channels; ++c) record[kGeometry + c] = splats.colors[splat * splats.channels + c];
+    }
+  }
+}
+
+}  // namespace headbench::HEADBENCH_ISA

@@ -1,0 +1,123 @@
+// What a rendering call works on: plain data, shared by all instruction sets.
+//
+// N splats, C channels, P pairs of a tile and a splat that touches it. Everything here is pointers and
+// numbers: inline code in this header could otherwise be compiled for one instruction set and, the linker
+// keeping only one copy, be run on a processor that lacks it.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+
+namespace headbench {
+
+// The constants of methods/splats/constants.py.
+constexpr int kTile = 16;
+constexpr int kTilePixels = kTile * kTile;
+constexpr float kAlphaMin = 1.0f / 255.0f;
+constexpr float kLog2AlphaMin = -7.994353436858858f;
+constexpr float kAlphaMax = 0.99f;
+constexpr float kTransmittanceMin = 1e-4f;
+constexpr float kFrustumMargin = 0.3f;
+constexpr float kQuaternionMin = 1e-12f;
+constexpr float kRadiusMax = 16777216.0f;
+constexpr int kChannelsMax = 32;
+
+// A record holds what drawing needs of a splat: kGeometry numbers, then the colour.
+enum RecordField { kMeanX, kMeanY, kL11, kL21, kL22, kLog2Opacity, kGeometry };
+
+// A gradient record holds moments of the alpha gradient over pixels, then the gradient of the colour.
+enum GradientField { kSum, kSumX, kSumY, kSumXX, kSumXY, kSumYY, kMoments };
+
+constexpr int kViewGradient = 12;  // rows of the rotation, then the translation
+
+struct View {
+  float rotation[9], translation[3];
+  float fx, fy, cx, cy;
+  float near, far, eps2d;
+  int width, height;
+  int tiles_x, tiles_y;
+};
+
+// Inputs, as the caller's arrays.
+struct Splats {
+  std::int64_t count;
+  int channels;
+  const float* means;       // (N, 3)
+  const float* quats;       // (N, 4)
+  const float* scales;      // (N, 3)
+  const float* opacities;   // (N,)
+  const float* colors;      // (N, C)
+  const float* offset;      // (N, 2) or null
+  const float* background;  // (C,)
+};
+
+// Tiles a splat may touch, last ones included.
+struct Rect {
+  std::uint16_t x0, y0, x1, y1;
+};
+
+// A splat in a tile's list. Bit `4 band + column` of `blocks` tells whether the splat reaches that block of
+// the tile; `entry` is where the pair's gradient goes, the pairs of one splat being neighbours.
+struct Pair {
+  std::uint64_t blocks;
+  std::uint32_t splat, entry;
+};
+
+// What the stages hand on to each other.
+struct FrameData {
+  int record_stride;             // floats per record
+  float* records;                // (N, record_stride), set for visible splats
+  float* depths;                 // (N,) camera z, 0 where culled
+  std::int32_t* radii;           // (N,)
+  Rect* rects;                   // (N,)
+  std::uint32_t* entry_begin;    // (N,)
+  std::uint32_t* entry_count;    // (N,)
+  std::uint32_t* entry_tiles;    // tile and blocks of each entry, before they are sorted into pairs
+  std::uint64_t* entry_blocks;
+  const std::uint32_t* visible;  // (M,) ascending
+  const std::uint32_t* order;    // (M,) by depth
+  Pair* pairs;                   // (P,) tile by tile, each by depth
+  std::uint32_t* tile_begin;     // (tiles + 1,)
+  float* transmittances;         // (tiles, 256) in block order
+  float* last;                   // (tiles, 256) index in the tile's list of the pixel's last splat, or -1
+};
+
+struct ImageOut {
+  float* image;  // (H, W, C)
+  float* alpha;  // (H, W)
+};
+
+struct Gradients {
+  const float* image;      // (H, W, C)
+  const float* alpha;      // (H, W)
+  int entry_stride;        // floats per gradient record
+  float* entries;          // gradient records, by Pair::entry
+  double* background;      // (tiles, C)
+  float* means;            // (N, 3)
+  float* quats;            // (N, 4)
+  float* scales;           // (N, 3)
+  float* opacities;        // (N,)
+  float* colors;           // (N, C)
+  float* means2d;          // (N, 2) or null
+};
+
+// The stages compiled for one instruction set.
+struct Stages {
+  const char* name;
+  int lanes;
+  // Project splats [begin, end): records, depths, radii, rects.
+  void (*project)(const View&, const Splats&, const FrameData&, std::int64_t begin, std::int64_t end);
+  // Find the tiles and blocks that splats order[begin .. end) reach; count them by tile.
+  void (*find_pairs)(const View&, const FrameData&, std::int64_t begin, std::int64_t end,
+                     std::uint32_t* tile_counts);
+  std::size_t (*scratch_floats)(int channels);
+  void (*draw_tile)(const View&, const Splats&, const FrameData&, const ImageOut&, int tile, float* scratch);
+  void (*draw_tile_backward)(const View&, const Splats&, const FrameData&, const Gradients&, int tile,
+                             float* scratch);
+  // Gather the gradient records of splats visible[begin .. end) and take them back to the inputs; adds to
+  // view_gradient (kViewGradient numbers).
+  void (*project_backward)(const View&, const Splats&, const FrameData&, const Gradients&,
+                           std::int64_t begin, std::int64_t end, double* view_gradient);
+};
+
+}  // namespace headbench

@@ -1,0 +1,76 @@
+// Sixteen floats: AVX-512 (F, DQ, BW, VL).
+#pragma once
+
+#include <immintrin.h>
+
+namespace headbench::HEADBENCH_ISA {
+
+struct Real {
+  static constexpr int lanes = 16;
+  __m512 v;
+  Real() = default;
+  Real(__m512 x) : v(x) {}
+  Real(float x) : v(_mm512_set1_ps(x)) {}
+};
+
+struct Mask {
+  __mmask16 v;
+};
+
+inline Real load(const float* p) { return _mm512_loadu_ps(p); }
+inline void store(float* p, Real a) { _mm512_storeu_ps(p, a.v); }
+inline Real operator+(Real a, Real b) { return _mm512_add_ps(a.v, b.v); }
+inline Real operator-(Real a, Real b) { return _mm512_sub_ps(a.v, b.v); }
+inline Real operator*(Real a, Real b) { return _mm512_mul_ps(a.v, b.v); }
+inline Real operator/(Real a, Real b) { return _mm512_div_ps(a.v, b.v); }
+inline Real fma(Real a, Real b, Real c) { return _mm512_fmadd_ps(a.v, b.v, c.v); }
+inline Real fnma(Real a, Real b, Real c) { return _mm512_fnmadd_ps(a.v, b.v, c.v); }
+inline Real min(Real a, Real b) { return _mm512_min_ps(a.v, b.v); }
+inline Real max(Real a, Real b) { return _mm512_max_ps(a.v, b.v); }
+inline Real sqrt(Real a) { return _mm512_sqrt_ps(a.v); }
+inline Real ceil(Real a) { return _mm512_roundscale_ps(a.v, _MM_FROUND_TO_POS_INF | _MM_FROUND_NO_EXC); }
+inline Mask operator>(Real a, Real b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_GT_OQ)}; }
+inline Mask operator>=(Real a, Real b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_GE_OQ)}; }
+inline Mask operator&(Mask a, Mask b) { return {static_cast<__mmask16>(a.v & b.v)}; }
+inline Real select(Mask m, Real a, Real b) { return _mm512_mask_mov_ps(b.v, m.v, a.v); }
+inline Real zero_unless(Mask m, Real a) { return _mm512_maskz_mov_ps(m.v, a.v); }
+inline bool any(Mask m) { return m.v != 0; }
+
+// One Newton step on the 14-bit estimate: 1 to 2 units in the last place.
+inline Real reciprocal(Real a) {
+  const Real r = _mm512_rcp14_ps(a.v);
+  return fma(r, fnma(a, r, 1.0f), r);
+}
+
+// Split x into the nearest whole number and the rest in [-1/2, 1/2].
+inline Real round(Real a, Real& rest) {
+  const Real whole = _mm512_roundscale_ps(a.v, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
+  rest = a - whole;
+  return whole;
+}
+
+// a 2^n for whole n.
+inline Real scale_by_power(Real a, Real n) { return _mm512_scalef_ps(a.v, n.v); }
+
+// The matrix whose rows lie at p, p + lanes, ...: its columns. Quarters of rows i, i + 4, i + 8 and i + 12
+// share a register from the start, so that what is left are four 4 x 4 transposes side by side.
+inline void load_transposed(const float* p, Real* columns) {
+  for (int quarter = 0; quarter < 4; ++quarter) {
+    __m512 r[4];
+    for (int i = 0; i < 4; ++i) {
+      const float* row = p + 16 * i + 4 * quarter;
+      __m512 x = _mm512_castps128_ps512(_mm_loadu_ps(row));
+      x = _mm512_mask_broadcast_f32x4(x, 0x00f0, _mm_loadu_ps(row + 64));
+      x = _mm512_mask_broadcast_f32x4(x, 0x0f00, _mm_loadu_ps(row + 128));
+      r[i] = _mm512_mask_broadcast_f32x4(x, 0xf000, _mm_loadu_ps(row + 192));
+    }
+    const __m512 a = _mm512_unpacklo_ps(r[0], r[1]), b = _mm512_unpackhi_ps(r[0], r[1]);
+    const __m512 c = _mm512_unpacklo_ps(r[2], r[3]), d = _mm512_unpackhi_ps(r[2], r[3]);
+    columns[4 * quarter + 0].v = _mm512_shuffle_ps(a, c, 0x44);
+    columns[4 * quarter + 1].v = _mm512_shuffle_ps(a, c, 0xee);
+    columns[4 * quarter + 2].v = _mm512_shuffle_ps(b, d, 0x44);
+    columns[4 * quarter + 3].v = _mm512_shuffle_ps(b, d, 0xee);
+  }
+}
+
+}  // namespace headbench::HEADBENCH_ISA

@@ -1,0 +1,20 @@
+// The stages of this instruction set as a table. Included once per instruction set, after its simd header.
+#pragma once
+
+#include "backward.h"
+#include "binning.h"
+#include "forward.h"
+#include "projection_backward.h"
+
+namespace headbench::HEADBENCH_ISA {
+
+inline std::size_t scratch_floats(int channels) {
+  const std::size_t forward = forward_scratch(channels), backward = backward_scratch(channels);
+  return forward > backward ? forward : backward;
+}
+
+extern const Stages stages;
+const Stages stages = {HEADBENCH_ISA_NAME, W,         project,            find_pairs,
+                       scratch_floats,     draw_tile, draw_tile_backward, project_backward};
+
+}  // namespace headbench::HEADBENCH_ISA
