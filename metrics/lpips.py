@@ -1,0 +1,117 @@
+"""Learned perceptual image patch similarity of one frame.
+
+Zhang, Isola, Efros, Shechtman, Wang, "The unreasonable effectiveness of deep features as a perceptual metric",
+CVPR 2018, equation 1, version 0.1 (with the scaling layer). Inputs are brought to [-1, 1], as the scaling
+layer's constants expect. Feeding [0, 1] instead, as some published avatar code does, gives lower numbers; the
+two do not compare.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterable, Iterator
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..bench.contracts import ByteArray, FloatArray
+from ..bench.errors import InputError, UnavailableError
+from ..bench.files import digest
+from .pairs import check_pair
+from .weights import find_backbone, load_backbone, load_linear, network_spec
+
+SHIFT = (-0.030, -0.088, -0.188)
+SCALE = (0.458, 0.448, 0.450)
+EPSILON = 1e-10
+
+
+class Lpips:
+    """LPIPS with its weights loaded, ready to compare frames.
+
+    Parameters
+    ----------
+    net : "alex" (customary for reporting), "squeeze" or "vgg".
+    weights : file with the backbone, or folder to look in; see `headbench.metrics.weights` for the default.
+    device : where the network runs; always in float32.
+
+    Attributes
+    ----------
+    fingerprint : hex digest of all weights in use, the same for a full file and one of features alone.
+
+    Raises
+    ------
+    UnavailableError : no weights; says how to get them.
+    InputError : weights that are not those of the network.
+    """
+
+    def __init__(self, net: str = "alex", *, weights: Path | None = None, device: str = "cpu") -> None:
+        self.spec = network_spec(net)
+        backbone = load_backbone(self.spec, find_backbone(self.spec, weights))
+        linear = load_linear(self.spec)
+        self.fingerprint = digest(*(value.numpy() for value in (*backbone.values(), *linear)))
+        self.device = torch.device(device)
+        self._network = self.spec.build()
+        self._network.load_state_dict(backbone)
+        self._network.requires_grad_(False).to(self.device)
+        self._linear = [value.to(self.device) for value in linear]
+        self._shift = torch.tensor(SHIFT, device=self.device).view(1, 3, 1, 1)
+        self._scale = torch.tensor(SCALE, device=self.device).view(1, 3, 1, 1)
+
+    def __call__(self, image: ByteArray, truth: ByteArray) -> float:
+        """Distance of two (H, W, 3) 8-bit images, 0 for identical ones."""
+        check_pair(image, truth, self.spec.smallest)
+        return float(self.distances(image[None], truth[None])[0])
+
+    def distances(self, images: ByteArray, truths: ByteArray) -> FloatArray:
+        """(N,) float64 distances of two stacks (N, H, W, 3) of 8-bit images, in one pass."""
+        if images.ndim != 4 or images.shape != truths.shape:
+            found = f"{images.shape} and {truths.shape}"
+            raise InputError("LPIPS", "images", "two stacks of one shape (N, H, W, 3)", found)
+        if not len(images):
+            return np.empty(0)
+        check_pair(images[0], truths[0], self.spec.smallest)
+        # Both stacks go through the network separately: half the peak memory, the same numbers.
+        with torch.inference_mode():
+            total = torch.zeros(len(images), dtype=torch.float64, device=self.device)
+            layers = zip(self._features(images), self._features(truths), self._linear)
+            for features, true_features, weight in layers:
+                difference = (features - true_features).square_()
+                total += (difference * weight).sum(dim=1).mean(dim=(1, 2), dtype=torch.float64)
+        return np.asarray(total.cpu().numpy())
+
+    def batched(self, pairs: Iterable[tuple[ByteArray, ByteArray]], size: int = 8) -> Iterator[float]:
+        """Distances of many pairs of one size, in order, ``size`` at a time; ``pairs`` is read lazily."""
+        stream = iter(pairs)
+        while batch := list(islice(stream, size)):
+            images, truths = zip(*batch)
+            yield from map(float, self.distances(np.stack(images), np.stack(truths)))
+
+    def _features(self, images: ByteArray) -> list[Tensor]:
+        """Unit-length features of each tapped layer, (N, C, h, w)."""
+        x = torch.from_numpy(np.ascontiguousarray(images)).to(self.device)
+        x = x.permute(0, 3, 1, 2).to(torch.float32) / 127.5 - 1.0
+        outputs = self._network((x - self._shift) / self._scale)
+        return [out / (out.square().sum(dim=1, keepdim=True).sqrt() + EPSILON) for out in outputs]
+
+
+def lpips(image: ByteArray, truth: ByteArray) -> float:
+    """LPIPS (AlexNet, on the CPU) of two (H, W, 3) 8-bit images; the weights are loaded once.
+
+    Raises `UnavailableError`, at every call, where the weights cannot be had.
+    """
+    loaded = _default()
+    if isinstance(loaded, UnavailableError):
+        raise UnavailableError(loaded.what, loaded.remedy)
+    return loaded(image, truth)
+
+
+@functools.cache
+def _default() -> Lpips | UnavailableError:
+    """The network of `lpips`, or why there is none: remembered either way."""
+    try:
+        return Lpips()
+    except UnavailableError as error:
+        return error

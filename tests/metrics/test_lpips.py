@@ -1,0 +1,125 @@
+import cv2
+import numpy as np
+import pytest
+import torch
+from torch.nn import functional
+
+from headbench.bench.errors import InputError, UnavailableError
+from headbench.metrics.lpips import Lpips, lpips
+from headbench.metrics.networks import NETWORKS
+from headbench.metrics.weights import VARIABLE
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture
+def random_weights(tmp_path):
+    """A folder with random weights for every network: enough for whatever does not depend on their values."""
+    torch.manual_seed(3)
+    for spec in NETWORKS.values():
+        torch.save(spec.build().state_dict(), tmp_path / spec.features_file)
+    return tmp_path
+
+
+def frames(count, size=(40, 48), seed=0):
+    return np.random.default_rng(seed).integers(0, 256, (count, *size, 3), dtype=np.uint8)
+
+
+@pytest.mark.parametrize(("net", "first", "second"), [("alex", 0.7219, 0.1376), ("squeeze", 0.7110, 0.1479)])
+def test_published_check_images_have_their_reference_scores(reference_folder, net, first, second):
+    reference, p0, p1 = (
+        cv2.cvtColor(cv2.imread(str(reference_folder / "check_images" / f"ex_{n}.png")), cv2.COLOR_BGR2RGB)
+        for n in ("ref", "p0", "p1")
+    )
+    metric = Lpips(net, weights=reference_folder)
+    assert round(metric(p0, reference), 4) == first
+    assert round(metric(p1, reference), 4) == second
+    assert metric(reference, reference) == 0.0
+
+
+def test_the_metric_of_the_registry_is_alexnet(reference_folder, bare_machine, monkeypatch):
+    monkeypatch.setenv(VARIABLE, str(reference_folder))
+    a, b = frames(2)
+    assert lpips(a, b) == Lpips("alex", weights=reference_folder)(a, b)
+    assert lpips(a, b) != Lpips("squeeze", weights=reference_folder)(a, b)
+
+
+@pytest.mark.parametrize("net", NETWORKS)
+def test_equals_the_definition_in_float64(random_weights, net):
+    """Equation 1 written out with plain functional calls for the layers' outputs."""
+    metric = Lpips(net, weights=random_weights)
+    a, b = frames(2)
+    network = NETWORKS[net].build().double()
+    network.load_state_dict(torch.load(random_weights / NETWORKS[net].features_file, weights_only=True))
+
+    def features(image):
+        x = torch.tensor(image, dtype=torch.float64).permute(2, 0, 1)[None] / 255 * 2 - 1
+        shift, scale = torch.tensor([-0.030, -0.088, -0.188]), torch.tensor([0.458, 0.448, 0.450])
+        x = (x - shift[:, None, None]) / scale[:, None, None]
+        with torch.no_grad():
+            return [functional.normalize(f, dim=1)[0].numpy() for f in network(x)]
+
+    expected = 0.0
+    for fa, fb, weight in zip(features(a), features(b), metric._linear, strict=True):
+        expected += np.einsum("chw,c->hw", (fa - fb) ** 2, weight.double().numpy().ravel()).mean()
+    assert metric(a, b) == pytest.approx(expected, rel=1e-4)
+
+
+def test_symmetry_identity_and_batches(random_weights):
+    metric = Lpips("squeeze", weights=random_weights)
+    images, truths = frames(5), frames(5, seed=1)
+    one_by_one = [metric(a, b) for a, b in zip(images, truths)]
+    assert metric(truths[0], images[0]) == pytest.approx(one_by_one[0], rel=1e-6)
+    assert metric(images[0], images[0]) == 0.0
+    np.testing.assert_allclose(metric.distances(images, truths), one_by_one, rtol=1e-5)
+    np.testing.assert_allclose(list(metric.batched(zip(images, truths), size=2)), one_by_one, rtol=1e-5)
+    assert metric.distances(images[:0], truths[:0]).shape == (0,)
+
+
+def test_batches_are_read_lazily(random_weights):
+    metric = Lpips("squeeze", weights=random_weights)
+    drawn = []
+
+    def pairs():
+        for i in range(6):
+            drawn.append(i)
+            yield frames(1, seed=i)[0], frames(1, seed=i + 9)[0]
+
+    next(metric.batched(pairs(), size=2))
+    assert drawn == [0, 1]
+
+
+def test_frames_a_network_cannot_see_are_refused(random_weights):
+    metric = Lpips("alex", weights=random_weights)
+    small = frames(1, (30, 64))[0]
+    with pytest.raises(InputError, match="at least 31"):
+        metric(small, small)
+    with pytest.raises(InputError, match="two stacks"):
+        metric.distances(frames(2), frames(3))
+
+
+def test_the_fingerprint_tells_weights_apart_and_not_files(random_weights, tmp_path):
+    state = torch.load(random_weights / "alexnet_features.pth", weights_only=True)
+    full = {**state, "classifier.1.bias": torch.zeros(3)}
+    torch.save(full, tmp_path / "full.pth")
+    other = {**state, "features.0.bias": state["features.0.bias"] + 1e-3}
+    torch.save(other, tmp_path / "other.pth")
+    first, second, third = (
+        Lpips(weights=path).fingerprint
+        for path in (random_weights / "alexnet_features.pth", tmp_path / "full.pth", tmp_path / "other.pth")
+    )
+    assert first == second != third
+
+
+def test_without_weights_it_is_unavailable_at_every_call_and_asks_once(bare_machine):
+    a, b = frames(2)
+    for _ in range(3):
+        with pytest.raises(UnavailableError, match=VARIABLE):
+            lpips(a, b)
+    assert len(bare_machine) == 1

@@ -1,0 +1,130 @@
+import hashlib
+import io
+from dataclasses import replace
+
+import pytest
+import torch
+
+from headbench.bench.errors import InputError, UnavailableError
+from headbench.metrics import weights
+from headbench.metrics.networks import SQUEEZE
+
+
+@pytest.fixture
+def state():
+    torch.manual_seed(0)
+    return SQUEEZE.build().state_dict()
+
+
+def test_places_are_searched_in_order(bare_machine, tmp_path, monkeypatch):
+    hub = tmp_path / "hub" / "checkpoints" / SQUEEZE.file
+    own = weights.cache_folder() / SQUEEZE.features_file
+    variable = tmp_path / "variable.pth"
+    explicit = tmp_path / "folder" / SQUEEZE.features_file
+    for path in (hub, own, variable, explicit):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    hub.touch()
+    assert weights.find_backbone(SQUEEZE) == hub
+    own.touch()
+    assert weights.find_backbone(SQUEEZE) == own
+    variable.touch()
+    monkeypatch.setenv(weights.VARIABLE, str(variable))
+    assert weights.find_backbone(SQUEEZE) == variable
+    explicit.touch()
+    assert weights.find_backbone(SQUEEZE, explicit.parent) == explicit
+    assert bare_machine == []
+
+
+def test_a_named_place_without_weights_is_bad_input_not_a_reason_to_look_on(
+    bare_machine, tmp_path, monkeypatch
+):
+    with pytest.raises(InputError, match="not there"):
+        weights.find_backbone(SQUEEZE, tmp_path / "nowhere")
+    monkeypatch.setenv(weights.VARIABLE, str(tmp_path))
+    with pytest.raises(InputError, match=f"{weights.VARIABLE}.*without either"):
+        weights.find_backbone(SQUEEZE)
+    assert bare_machine == []
+
+
+def test_without_weights_or_network_it_says_how_to_mend_it_and_asks_once(bare_machine):
+    for _ in range(2):
+        with pytest.raises(UnavailableError) as caught:
+            weights.find_backbone(SQUEEZE)
+        for part in ("the network is down", SQUEEZE.url, str(weights.cache_folder()), weights.VARIABLE):
+            assert part in str(caught.value)
+    assert bare_machine == [(SQUEEZE.url, weights.TIMEOUT_S)]
+
+
+def test_what_is_fetched_is_kept_if_its_hash_is_right_and_not_otherwise(bare_machine, monkeypatch, state):
+    buffer = io.BytesIO()
+    torch.save(state, buffer)
+    prefix = hashlib.sha256(buffer.getvalue()).hexdigest()[:8]
+    monkeypatch.setattr("urllib.request.urlopen", lambda url, timeout: io.BytesIO(buffer.getvalue()))
+    good, bad = (replace(SQUEEZE, file=f"net-{p}.pth", features_file="none") for p in (prefix, "00000000"))
+    path = weights.find_backbone(good)
+    assert path == weights.cache_folder() / good.file
+    assert weights.load_backbone(SQUEEZE, path).keys() == state.keys()
+    with pytest.raises(UnavailableError, match=f"SHA-256 is {prefix}"):
+        weights.find_backbone(bad)
+    assert [p.name for p in weights.cache_folder().iterdir()] == [good.file]
+
+
+def test_a_full_file_gives_the_same_as_one_of_features_alone(tmp_path, state):
+    torch.save(state, tmp_path / "features.pth")
+    torch.save({**state, "classifier.1.weight": torch.zeros(4, 4)}, tmp_path / "full.pth")
+    loaded = [weights.load_backbone(SQUEEZE, tmp_path / name) for name in ("features.pth", "full.pth")]
+    for values in loaded:
+        assert values.keys() == state.keys()
+        assert all(torch.equal(values[key], state[key]) for key in state)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda s: s.pop("features.3.squeeze.bias"), r"features\.3\.squeeze\.bias.*no such entry"),
+        (lambda s: s.update({"features.0.bias": torch.zeros(63)}), r"features\.0\.bias.*shape \(63,\)"),
+        (lambda s: s.update({"features.0.bias": torch.full((64,), torch.nan)}), "finite"),
+        (lambda s: s.update({"features.0.bias": torch.zeros(64, dtype=torch.int32)}), "int32"),
+        (lambda s: s.update({"features.0.bias": "text"}), "found str"),
+    ],
+)
+def test_a_faulty_entry_is_named(tmp_path, state, spoil, message):
+    spoil(state)
+    torch.save(state, tmp_path / "w.pth")
+    with pytest.raises(InputError, match=message):
+        weights.load_backbone(SQUEEZE, tmp_path / "w.pth")
+
+
+class Payload:
+    def __reduce__(self):
+        return print, ("code from a weights file ran",)
+
+
+@pytest.mark.parametrize("content", [b"", b"<html>404</html>", b"PK\x03\x04 not really a zip"])
+def test_a_file_that_is_no_weights_file_is_bad_input(tmp_path, content):
+    (tmp_path / "w.pth").write_bytes(content)
+    with pytest.raises(InputError, match="cannot be read"):
+        weights.load_backbone(SQUEEZE, tmp_path / "w.pth")
+
+
+def test_code_in_a_weights_file_is_not_run(tmp_path, capsys):
+    torch.save({"features.0.weight": Payload()}, tmp_path / "w.pth")
+    with pytest.raises(InputError, match="cannot be read"):
+        weights.load_backbone(SQUEEZE, tmp_path / "w.pth")
+    assert "ran" not in capsys.readouterr().out
+
+
+def test_linear_layers_come_from_torchmetrics_and_equal_the_reference(reference_folder):
+    for net in ("alex", "squeeze", "vgg"):
+        spec = weights.network_spec(net)
+        ours = weights.load_linear(spec)
+        theirs = weights.load_linear(spec, reference_folder / "lin_v0.1" / f"{net}.pth")
+        assert [w.shape[1] for w in ours] == list(spec.channels)
+        for a, b in zip(ours, theirs, strict=True):
+            torch.testing.assert_close(a, b, rtol=0, atol=0)
+            assert (a >= 0).all()
+
+
+def test_an_unknown_network_is_named():
+    with pytest.raises(InputError, match="alex, squeeze, vgg"):
+        weights.network_spec("resnet")
