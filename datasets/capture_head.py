@@ -6,7 +6,8 @@ from pathlib import Path
 
 from ..bench.errors import InputError
 from .ga_layout import DECLARATION_FILE, HEAD_FILE, Declaration
-from .head.arrays import HeadArrays, read_head
+from .head.arrays import HeadArrays
+from .head.loaders import load_head
 
 FLAME_MASKS_FILE = "FLAME_masks.pkl"
 
@@ -62,8 +63,4 @@ def _load(path: Path, masks: str | Path | None, regions: str | Path | None) -> H
     beside = path.with_name(FLAME_MASKS_FILE)
     if masks is None and path.suffix != ".npz" and beside.exists():
         masks = beside
-    if path.suffix == ".npz":
-        return read_head(path)
-    from .head.loaders import load_head
-
     return load_head(path, masks=masks, regions=regions)

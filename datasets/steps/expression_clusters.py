@@ -24,6 +24,8 @@ DEFAULT_CLASSES = 16
 EXACT_LIMIT = 2000
 """Timesteps up to which all pairs are compared; beyond, as many landmarks stand for the rest."""
 
+SIMILARITY_FLOOR = 1e-6
+
 _MESH_BATCH = 64
 _PAIR_BLOCK = 128
 
@@ -131,7 +133,8 @@ def cluster_by_distance(distances: FloatArray, classes: int, *, seed: int = 0) -
     if classes <= 1:
         return np.zeros(len(distances), dtype=np.int64)
     similarity = 1 - distances.astype(np.float64) / largest
-    similarity = np.maximum(0.5 * (similarity + similarity.T), 0.0)
+    # The farthest pair has similarity 0; the floor keeps a graph of few distinct faces connected.
+    similarity = np.maximum(0.5 * (similarity + similarity.T), SIMILARITY_FLOOR)
     if classes >= len(distances):
         return np.arange(len(distances))
     spectral = SpectralClustering(classes, affinity="precomputed", random_state=seed)

@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+
 from headbench.bench.errors import InputError
 from headbench.datasets.ga_writer import CaptureWriter
 
@@ -13,7 +14,14 @@ from .tiny_capture import FRONTAL, decode_png, make_plan, paint
 
 UNION_FRAME_KEYS = [
     *("timestep_index", "camera_index", "camera_id", "cx", "cy", "fl_x", "fl_y", "h", "w"),
-    *("camera_angle_x", "camera_angle_y", "transform_matrix", "file_path", "fg_mask_path", "flame_param_path"),
+    *(
+        "camera_angle_x",
+        "camera_angle_y",
+        "transform_matrix",
+        "file_path",
+        "fg_mask_path",
+        "flame_param_path",
+    ),
 ]
 TOP_LEVEL_KEYS = {
     *("frames", "cx", "cy", "fl_x", "fl_y", "h", "w", "camera_angle_x", "camera_angle_y"),

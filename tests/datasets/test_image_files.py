@@ -6,11 +6,12 @@ import io
 
 import numpy as np
 import pytest
-from headbench.bench.errors import InputError
-from headbench.datasets.image_files import ImageInfo, probe_image
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
+
+from headbench.bench.errors import InputError
+from headbench.datasets.image_files import ImageInfo, probe_image
 
 MODES = {"L": 1, "RGB": 3, "RGBA": 4, "LA": 2, "P": 3}
 

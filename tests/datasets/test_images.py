@@ -7,12 +7,13 @@ from concurrent.futures import ThreadPoolExecutor
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
 from headbench.bench.errors import InputError
 from headbench.datasets import images
 from headbench.datasets.ga_writer import write_png
 from headbench.datasets.images import ImageStore, read_image
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 WHITE = (1.0, 1.0, 1.0)
 BYTES = 10 * 10 * 3
@@ -87,7 +88,9 @@ def test_many_threads_read_right_pixels_within_the_bound(paths):
 def test_grey_and_palette_files_become_rgb(tmp_path):
     grey = np.arange(100, dtype=np.uint8).reshape(10, 10)
     write_png(tmp_path / "grey.png", grey)
-    np.testing.assert_array_equal(read_image(tmp_path / "grey.png", WHITE), np.repeat(grey[..., None], 3, axis=2))
+    np.testing.assert_array_equal(
+        read_image(tmp_path / "grey.png", WHITE), np.repeat(grey[..., None], 3, axis=2)
+    )
 
 
 def test_jpeg_channels_are_in_order(tmp_path):

@@ -8,6 +8,7 @@ import shutil
 import cv2
 import numpy as np
 import pytest
+
 from headbench.bench.contracts import FrameKey
 from headbench.bench.errors import InputError
 from headbench.datasets.ga_reader import read_capture
@@ -261,9 +262,11 @@ def test_bad_parameter_array(capture, key, value):
 def test_parameter_file_that_is_missing_or_damaged(capture):
     path = capture.writer.sequence_folder("FREE") / "flame_param" / "00001.npz"
     path.write_bytes(path.read_bytes()[:200])
-    assert fault(capture).file == str(capture.union / "../901_FREE_v3_whiteBg_staticOffset/flame_param/00001.npz")
+    assert fault(capture).file == str(
+        capture.union / "../901_FREE_v3_whiteBg_staticOffset/flame_param/00001.npz"
+    )
     path.unlink()
-    assert fault(capture).key == "" and "00001.npz" in str(fault(capture))
+    assert fault(capture).file.endswith("00001.npz")
 
 
 def test_parameter_file_with_a_pickle_is_not_unpickled(capture, tmp_path):

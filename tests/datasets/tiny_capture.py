@@ -9,6 +9,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
+
 from headbench.bench.contracts import Camera, HeadPose
 from headbench.datasets.ga_writer import CapturePlan, CaptureWriter, SequencePlan
 from headbench.datasets.head.arrays import HeadArrays
@@ -91,7 +92,9 @@ def make_plan(
 def posed_vertices(plan: CapturePlan, pose: HeadPose) -> np.ndarray:
     """(V, 3) mesh of a pose, metres."""
     model = HeadModel(plan.head, dtype=torch.float64)
-    canonical = model.canonical(torch.tensor(plan.shape.astype(float)), torch.tensor(plan.static_offset.astype(float)))
+    canonical = model.canonical(
+        torch.tensor(plan.shape.astype(float)), torch.tensor(plan.static_offset.astype(float))
+    )
     return model(canonical=canonical, **model.pose_arguments([pose]))[0].numpy()
 
 
@@ -103,7 +106,9 @@ def silhouette(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> np.nd
     covered = np.zeros((camera.height, camera.width), dtype=bool)
     for a, b, c in pixels[faces]:
         sides = [(q[0] - p[0]) * (y - p[1]) - (q[1] - p[1]) * (x - p[0]) for p, q in ((a, b), (b, c), (c, a))]
-        covered |= np.all([side >= 0 for side in sides], axis=0) | np.all([side <= 0 for side in sides], axis=0)
+        covered |= np.all([side >= 0 for side in sides], axis=0) | np.all(
+            [side <= 0 for side in sides], axis=0
+        )
     return covered
 
 

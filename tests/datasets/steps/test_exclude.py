@@ -1,0 +1,61 @@
+"""Leaving frames out by label."""
+
+from __future__ import annotations
+
+import pytest
+
+from headbench.bench.contracts import FrameKey
+from headbench.bench.errors import InputError
+from headbench.datasets.steps.exclude import exclude_timesteps, read_labels
+
+from .clips import make_clip
+
+
+def test_labelled_frames_leave_every_split_and_are_listed_with_their_reasons():
+    clip = make_clip(4, test=2)
+    out = exclude_timesteps(clip, {1: "tongue out", 5: "blur"})
+    assert {key.timestep for keys in out.splits.values() for key in keys} == {0, 2, 3, 4}
+    assert {(key.timestep, reason) for key, reason in out.excluded.items()} == {
+        (1, "tongue out"),
+        (5, "blur"),
+    }
+    assert FrameKey("s", "q", 1, "b") in out.excluded
+    assert len(out.excluded) + sum(map(len, out.splits.values())) == len(clip.files)
+    assert clip.excluded == {}
+    assert len(clip.splits["train"]) == 4
+
+
+def test_step_is_on_record_and_in_the_fingerprint():
+    clip = make_clip(4)
+    out = exclude_timesteps(clip, {1: "tongue out"})
+    assert out.steps[-1].name == "exclude_timesteps"
+    assert out.steps[-1].input_fingerprint == clip.fingerprint
+    assert (
+        len({clip.fingerprint, out.fingerprint, exclude_timesteps(clip, {2: "tongue out"}).fingerprint}) == 3
+    )
+
+
+def test_only_chosen_labels_are_acted_on_and_steps_add_up():
+    clip = make_clip(4)
+    tongue = exclude_timesteps(clip, {1: "tongue out", 2: "blur"}, only=["tongue out"])
+    assert tongue.timesteps("train") == [0, 2, 3]
+    both = exclude_timesteps(tongue, {2: "blur"})
+    assert both.timesteps("train") == [0, 3]
+    assert set(both.excluded.values()) == {"tongue out", "blur"}
+
+
+def test_unknown_timestep_and_empty_training_are_refused():
+    with pytest.raises(InputError, match="found 8, 9"):
+        exclude_timesteps(make_clip(4), {9: "blur", 8: "blur"})
+    with pytest.raises(InputError, match="training frames left"):
+        exclude_timesteps(make_clip(2), {0: "blur", 1: "blur"})
+
+
+def test_labels_are_read_from_json(tmp_path):
+    path = tmp_path / "labels.json"
+    path.write_text('{"57": "tongue out", "3": "blur"}')
+    assert read_labels(path) == {57: "tongue out", 3: "blur"}
+    for text in ('{"-1": "blur"}', '{"a": "blur"}', '{"1": 2}', '{"1.5": "blur"}', "[]", ""):
+        path.write_text(text)
+        with pytest.raises(InputError):
+            read_labels(path)
