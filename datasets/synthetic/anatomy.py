@@ -36,6 +36,10 @@ _IBUG = {
     "left_brow_outer": 26,
 }
 _IBUG_LIPS = tuple(range(48, 60))  # outer contour, starting at the subject's right corner, upper lip first
+_NOT_SKIN = {
+    *("left_eyeball", "right_eyeball", "teeth", "teeth_upper", "teeth_lower", "gums_and_tongue"),
+    *("eyelashes", "lacrimal_fluid", "eye_occlusion", "eye_blend"),
+}
 _REFERENCE_EYE_DISTANCE = 0.063  # adult interpupillary distance, metres
 
 
@@ -104,29 +108,24 @@ def measure(head: HeadAsset, vertices: FloatArray) -> Anatomy:
 
 
 def landmark_index(landmarks: Mapping[str, int], name: str) -> int:
-    """Vertex of a landmark by our name, or by its number in iBUG's scheme ("ibug_36")."""
-    for key in (name, f"ibug_{_IBUG[name]}", f"ibug{_IBUG[name]}"):
+    """Vertex of a landmark by our name, or by its number in iBUG's scheme ("ibug_08")."""
+    for key in (name, f"ibug_{_IBUG[name]:02d}"):
         if key in landmarks:
             return landmarks[key]
     raise InputError(
         "head model",
         f"landmarks[{name!r}]",
-        f"the vertex, under this name or as ibug_{_IBUG[name]}",
+        f"the vertex, under this name or as ibug_{_IBUG[name]:02d}",
         f"{len(landmarks)} other landmarks",
         "Use the procedural head or an ICT-FaceKit file, or add landmarks to the head model.",
     )
 
 
 def skin_triangles(head: HeadAsset) -> IntArray:
-    """Triangles of ``head`` that are skin: not eyeballs, teeth, gums or tongue."""
-    inside = [
-        indices
-        for name, indices in head.regions.items()
-        if name in ("left_eyeball", "right_eyeball", "gums", "tongue", "gums_tongue") or "teeth" in name
-    ]
+    """Triangles of ``head`` that are skin: not eyeballs, teeth, gums, tongue, lashes or tear films."""
     other = np.zeros(len(head.template), bool)
-    for indices in inside:
-        other[indices] = True
+    for name in _NOT_SKIN & head.regions.keys():
+        other[head.regions[name]] = True
     return head.faces[~other[head.faces].any(axis=1)]
 
 
@@ -240,9 +239,9 @@ def _lip_outline(head: HeadAsset, landmarks: Mapping[str, int], vertices: FloatA
         middle, extent = 0.5 * (ring.max(axis=0) + ring.min(axis=0)), np.ptp(ring, axis=0)
         # The outline is star-shaped once its height is stretched to its width: sort it by angle.
         return ring[np.argsort(np.arctan2(*((ring - middle) / extent)[:, 1::-1].T))]
-    keys = [next((k for k in (f"ibug_{i}", f"ibug{i}") if k in landmarks), None) for i in _IBUG_LIPS]
-    if None in keys:
+    keys = [f"ibug_{index:02d}" for index in _IBUG_LIPS]
+    if not set(keys) <= landmarks.keys():
         raise InputError(
             head.version, "regions", "lip_outside_ring_upper and _lower, or iBUG's lip landmarks", "neither"
         )
-    return vertices[[landmarks[key] for key in keys if key is not None]]
+    return vertices[[landmarks[key] for key in keys]]

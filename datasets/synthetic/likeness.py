@@ -15,8 +15,9 @@ from . import brows, skin
 from .anatomy import SIDES, Anatomy, measure
 from .controls import Activations
 from .eyes import eye_mesh
+from .geometry import Geometry
 from .hair import ear_share, make_hair
-from .mouth import MouthPart
+from .mouth import tracked_parts
 from .people import Person
 from .refine import FineMesh, refine, vertex_normals
 from .wrinkles import make_folds
@@ -45,18 +46,11 @@ class Fixture:
 
 
 class Likeness:
-    """A subject's visible body over a head model.
+    """A subject's visible body over a head model; ``shape`` (S,) are the subject's identity coefficients."""
 
-    Parameters
-    ----------
-    head : head model; ``shape`` (S,) the subject's identity coefficients.
-    mouth : parts inside the mouth in the subject's neutral shape.
-    """
-
-    def __init__(
-        self, person: Person, head: HeadAsset, shape: FloatArray, mouth: Sequence[MouthPart] = ()
-    ) -> None:
-        self.head, self.shape = head, np.asarray(shape, np.float64)
+    def __init__(self, person: Person, geometry: Geometry, shape: FloatArray) -> None:
+        head = geometry.head
+        self.shape = np.asarray(shape, np.float64)
         self._model = HeadModel(head, dtype=torch.float64)
         self.neutral = self._model.canonical(torch.from_numpy(self.shape))[0].numpy()
         self.anatomy = measure(head, self.neutral)
@@ -73,7 +67,8 @@ class Likeness:
         self._rooted = brows.make_brows_and_lashes(person, self.anatomy, points, normals)
         self._rest_points = points
         self._eyes = {side: eye_mesh(person, self.anatomy.eyes[side]) for side in SIDES}
-        self._mouth = tuple(mouth)
+        self._mouth = tuple(geometry.mouth(person, self.anatomy, self.shape))
+        self._tracked_parts = tracked_parts(head)
         self._frames = self._fine.frames(self.neutral, self._rooted.root)
 
     def fixtures(self) -> dict[str, Fixture]:
@@ -84,7 +79,8 @@ class Likeness:
             "brows": Fixture(self._rooted.strands.faces, self._rooted.strands.albedo, "lash"),
         }
         fixed |= {f"eye_{side}": Fixture(e.faces, e.albedo, "eye") for side, e in self._eyes.items()}
-        return fixed | {part.name: Fixture(part.faces, part.albedo, part.material) for part in self._mouth}
+        parts = (*self._mouth, *self._tracked_parts)
+        return fixed | {part.name: Fixture(part.faces, part.albedo, part.material) for part in parts}
 
     def tracked(self, pose: HeadPose) -> FloatArray:
         """(V, 3) vertices of the head model in a pose: the mesh that a tracker would report."""
@@ -106,6 +102,8 @@ class Likeness:
         }
         for side, joint in zip(SIDES, EYE_JOINTS):
             made[f"eye_{side}"] = Surface(_moved(joints[joint], self._eyes[side].vertices), None)
+        for inner in self._tracked_parts:
+            made[inner.name] = Surface(tracked[inner.vertices], None)
         for part in self._mouth:
             rest = part.at(activations["tongue_out"])
             blended = np.einsum("nj,jab->nab", part.weights, joints)
@@ -154,8 +152,3 @@ def _fine_region(fine: FineMesh, head: HeadAsset, names: Sequence[str]) -> IntAr
     for name in names:
         inside[head.regions[name]] = 1.0
     return np.flatnonzero(fine.interpolate(inside) > 0.5)
-
-
-def neutral_activations(names: Sequence[str]) -> Mapping[str, float]:
-    """All controls at rest."""
-    return dict.fromkeys(names, 0.0)

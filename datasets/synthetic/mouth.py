@@ -1,23 +1,31 @@
-"""Teeth, gums and tongue: modelled around the landmarks of any head, outside the tracked mesh."""
+"""Teeth, gums and tongue: what shows when the mouth opens."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from ...bench.contracts import FloatArray, IntArray
+from ...bench.contracts import FloatArray, HeadAsset, IntArray
 from .anatomy import Anatomy
 from .curves import ramp
 from .noise import value_noise
+from .people import Person
+
+_TEETH = np.array([0.62, 0.56, 0.46])
+_GUMS = np.array([0.42, 0.13, 0.12])
+_TONGUE = np.array([0.45, 0.15, 0.14])
+_NECK_JOINT, _JAW_JOINT = 1, 2
+_TRACKED: Mapping[str, tuple[FloatArray, str]] = {"teeth": (_TEETH, "teeth"), "gums_and_tongue": (_GUMS, "gums")}
 
 
 @dataclass(frozen=True, eq=False)
 class MouthPart:
-    """A mesh in the mouth at rest.
+    """A mesh in the mouth that the tracked mesh lacks.
 
-    ``vertices`` (n, 3) and ``out`` (n, 3), the same with the tongue put out; ``weights`` (n, J) bind it to the
-    joints.
+    ``vertices`` (n, 3) at rest and ``out`` (n, 3), the same with the tongue put out; ``weights`` (n, J) bind
+    it to the joints; ``albedo`` (n, 3) is linear.
     """
 
     name: str
@@ -31,3 +39,56 @@ class MouthPart:
     def at(self, tongue_out: float) -> FloatArray:
         """Rest vertices for a tongue that is out by a share in [0, 1]."""
         return self.vertices + tongue_out * (self.out - self.vertices)
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedPart:
+    """Triangles of the tracked mesh that are no skin: ``vertices`` (n,) numbers them, ``faces`` (m, 3) are local."""
+
+    name: str
+    vertices: IntArray
+    faces: IntArray
+    albedo: FloatArray
+    material: str
+
+
+def tracked_parts(head: HeadAsset) -> tuple[TrackedPart, ...]:
+    """Teeth and gums that belong to the tracked mesh."""
+    made = []
+    for region, (color, material) in _TRACKED.items():
+        if region not in head.regions:
+            continue
+        faces = head.faces[np.isin(head.faces, head.regions[region]).all(axis=1)]
+        used, local = np.unique(faces, return_inverse=True)
+        made.append(
+            TrackedPart(region, used, local.reshape(-1, 3), np.tile(color, (len(used), 1)), material)
+        )
+    return tuple(made)
+
+
+def tongue(person: Person, anatomy: Anatomy, joints: int) -> MouthPart:
+    """A tongue that lies behind the lower teeth and can be put out over the lower lip; it follows the jaw."""
+    s, mouth = anatomy.scale, anatomy["mouth"]
+    along, around = 26, 20
+    u = np.linspace(0.0, 1.0, along)
+    phi = np.linspace(0.0, 2.0 * np.pi, around, endpoint=False)
+    uu, pp = (grid.ravel() for grid in np.meshgrid(u, phi, indexing="ij"))
+    section = np.sqrt(np.clip(1.0 - np.clip((uu - 0.72) / 0.28, 0.0, 1.0) ** 2.4, 0.0, 1.0))
+    groove = 0.0016 * np.exp(-0.5 * (np.cos(pp) / 0.22) ** 2) * (np.sin(pp) > 0) * ramp(uu, 0.1, 0.4)
+
+    def body(back: FloatArray, length: float, droop: float, half_width: float, half_height: float) -> FloatArray:
+        x = half_width * section * np.cos(pp)
+        y = half_height * section * np.sin(pp) - groove - droop * uu**2.2
+        return back + s * np.stack([x, y, length * uu], axis=1)
+
+    inside = body(mouth + np.array([0.0, -0.014, -0.062]) * s, 0.043, -0.002, 0.019, 0.007)
+    out = body(mouth + np.array([0.0, -0.008, -0.052]) * s, 0.082, 0.030, 0.0185, 0.0055)
+    index = np.arange(along * around).reshape(along, around)
+    a, b = index[:-1], index[1:]
+    a1, b1 = np.roll(a, -1, axis=1), np.roll(b, -1, axis=1)
+    faces = np.concatenate([np.stack([a, a1, b1], -1).reshape(-1, 3), np.stack([a, b1, b], -1).reshape(-1, 3)])
+    buds = 1.0 + 0.14 * value_noise(inside / (0.0014 * s), person.seed + 95)
+    weights = np.zeros((len(inside), joints))
+    weights[:, _JAW_JOINT] = ramp(uu, -0.3, 0.35)
+    weights[:, _NECK_JOINT] = 1.0 - weights[:, _JAW_JOINT]
+    return MouthPart("tongue", inside, out, faces, _TONGUE * buds[:, None], weights, "tongue")

@@ -1,0 +1,202 @@
+"""What a subject performs: NeRSemble's sequences as smooth curves of the semantic controls.
+
+A sequence is a list of phrases, each a target set of controls held around its peak; curves between them are
+monotone cubics, so nothing overshoots and a held face stays held. Blinks, gaze and head motion run on top.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+
+from ...bench.contracts import FloatArray
+from ...bench.errors import InputError
+from .controls import CONTROLS
+
+Face = Mapping[str, float]
+
+HELD_OUT = "FREE"
+"""The sequence kept for self-reenactment."""
+
+TONGUE = "tongue out"
+"""Why a frame is left out of a comparison: no head model of FLAME's layout has a tongue."""
+
+_TONGUE_SEEN = 0.08
+_FPS = 25.0
+_PHRASE_SECONDS = 0.9
+
+
+def _both(name: str, value: float) -> dict[str, float]:
+    return {f"{name}_left": value, f"{name}_right": value}
+
+
+_REST: Face = {}
+_SHOUT: Face = {"jaw_open": 0.95, **_both("upper_lip_up", 0.5), **_both("lower_lip_down", 0.5), **_both("brow_down", 0.5)}
+_LAUGH: Face = {**_both("smile", 1.0), **_both("cheek_raise", 0.8), "jaw_open": 0.45, **_both("squint", 0.5)}
+_SURPRISE: Face = {"brow_inner_up": 1.0, **_both("brow_outer_up", 1.0), **_both("eye_wide", 0.8), "jaw_open": 0.55}
+_FEAR: Face = {"brow_inner_up": 0.9, **_both("brow_down", 0.3), **_both("eye_wide", 0.9), **_both("mouth_stretch", 0.8)}
+_ANGRY: Face = {**_both("brow_down", 1.0), **_both("squint", 0.4), "lip_press": 0.9, **_both("nose_sneer", 0.25)}
+_SAD: Face = {"brow_inner_up": 0.85, "mouth_frown": 0.9, "chin_raise": 0.5, "gaze_up": -0.4}
+_DISGUST: Face = {**_both("nose_sneer", 1.0), **_both("upper_lip_up", 0.6), **_both("brow_down", 0.5), **_both("squint", 0.4)}
+_HAPPY: Face = {**_both("smile", 1.0), **_both("cheek_raise", 0.5)}
+_TONGUE: Face = {"jaw_open": 0.55, "tongue_out": 1.0, **_both("lower_lip_down", 0.2)}
+
+SEQUENCES: Mapping[str, tuple[Face, ...]] = {
+    "EMO-1-shout+laugh": (_REST, _SHOUT, _SHOUT, _REST, _LAUGH, {**_LAUGH, "jaw_open": 0.2}, _LAUGH, _REST),
+    "EMO-2-surprise+fear": (_REST, _SURPRISE, {**_SURPRISE, "jaw_open": 0.2}, _REST, _FEAR, {**_FEAR, "jaw_open": 0.3}, _REST),
+    "EMO-3-angry+sad": (_REST, _ANGRY, {**_ANGRY, "lip_press": 0.0, "jaw_open": 0.3}, _REST, _SAD, {**_SAD, "gaze_left": 0.5}, _REST),
+    "EMO-4-disgust+happy": (_REST, _DISGUST, {**_DISGUST, "jaw_open": 0.2}, _REST, _HAPPY, {**_HAPPY, "jaw_open": 0.2}, _REST),
+    "EXP-2-eyes": (
+        {"gaze_left": 0.9},
+        {"gaze_left": -0.9},
+        {"gaze_up": 0.9, "brow_inner_up": 0.4, **_both("brow_outer_up", 0.4)},
+        {"gaze_up": -0.9, **_both("blink", 0.3)},
+        {**_both("squint", 1.0), **_both("blink", 0.5), **_both("cheek_raise", 0.6)},
+        _both("blink", 1.0),
+        {"blink_left": 1.0, "squint_left": 0.6},
+        {"blink_right": 1.0, "squint_right": 0.6},
+        _both("eye_wide", 1.0),
+    ),
+    "EXP-3-cheeks+nose": (
+        {"cheek_puff": 1.0},
+        _REST,
+        _both("nose_sneer", 1.0),
+        {"nose_sneer_left": 1.0, "smile_left": 0.4},
+        {"nose_sneer_right": 1.0, "smile_right": 0.4},
+        {"cheek_puff": 0.8, "lip_press": 0.6},
+        _both("cheek_raise", 1.0),
+    ),
+    "EXP-4-lips": (
+        {"pucker": 1.0},
+        {"funnel": 1.0, "jaw_open": 0.15},
+        {"lip_press": 1.0},
+        {"lip_roll": 1.0},
+        _both("mouth_stretch", 1.0),
+        {"mouth_left": 1.0},
+        {"mouth_right": 1.0},
+        _both("smile", 0.8),
+    ),
+    "EXP-5-mouth": (
+        {**_both("upper_lip_up", 1.0), **_both("smile", 0.3)},
+        {**_both("lower_lip_down", 1.0)},
+        {**_both("smile", 1.0), **_both("upper_lip_up", 0.5), **_both("lower_lip_down", 0.4)},
+        {"mouth_frown": 1.0, "chin_raise": 0.6},
+        {"chin_raise": 1.0},
+        {"smile_left": 1.0},
+        {"smile_right": 1.0},
+        {"jaw_open": 0.4, "funnel": 0.7},
+    ),
+    "EXP-8-jaw-1": ({"jaw_open": 0.5}, {"jaw_open": 1.0}, {"jaw_open": 0.3}, {"jaw_open": 0.9, "funnel": 0.4}, _REST),
+    "EXP-9-jaw-2": ({"jaw_side": 0.9}, {"jaw_side": -0.9}, {"jaw_side": 0.7, "jaw_open": 0.4}, {"jaw_side": -0.7, "jaw_open": 0.4}),
+    # Nothing here is new on its own; the combinations are.
+    "FREE": (
+        {**_both("smile", 0.6), "gaze_left": 0.4},
+        {"brow_inner_up": 0.7, "brow_outer_up_left": 1.0, "smile_right": 0.7},
+        {**_both("brow_down", 0.6), "pucker": 0.7},
+        {"jaw_open": 0.6, **_both("smile", 0.7), **_both("brow_outer_up", 0.7), "brow_inner_up": 0.7},
+        _TONGUE,
+        {**_both("nose_sneer", 0.6), "mouth_left": 0.5, "blink_left": 0.9},
+        {"jaw_open": 0.3, "jaw_side": 0.5, **_both("brow_down", 0.5)},
+        {"mouth_frown": 0.7, "brow_inner_up": 0.6, "gaze_left": -0.7},
+        {"jaw_open": 0.75, **_both("eye_wide", 0.6), **_both("lower_lip_down", 0.5)},
+        {**_both("cheek_raise", 0.8), "lip_press": 0.5},
+    ),
+}
+"""Phrases by sequence, in NeRSemble's order."""
+
+# The order in which sequences join as timesteps allow: first those that differ most.
+_PRIORITY = (
+    *("FREE", "EMO-1-shout+laugh", "EXP-4-lips", "EMO-2-surprise+fear", "EXP-2-eyes", "EMO-4-disgust+happy"),
+    *("EMO-3-angry+sad", "EXP-8-jaw-1", "EXP-5-mouth", "EXP-3-cheeks+nose", "EXP-9-jaw-2"),
+)
+_MINIMUM = 8  # timesteps below which another sequence is not worth opening
+
+
+@dataclass(frozen=True, eq=False)
+class Performed:
+    """A performed sequence: one dictionary of controls per timestep, and the timesteps to label."""
+
+    name: str
+    activations: Sequence[Mapping[str, float]]
+    excluded: Mapping[int, str]
+
+
+def share_out(timesteps: int) -> dict[str, int]:
+    """Timesteps of each sequence, in NeRSemble's order; they sum to ``timesteps``.
+
+    FREE gets a double share. Few timesteps make few sequences, two at least.
+    """
+    if timesteps < 4:
+        raise InputError("--timesteps", "", "at least 4 (two sequences)", str(timesteps))
+    count = int(np.clip(timesteps // _MINIMUM, 2, len(_PRIORITY)))
+    chosen = [name for name in SEQUENCES if name in _PRIORITY[:count]]
+    weight = np.array([2.0 if name == HELD_OUT and count > 2 else 1.0 for name in chosen])
+    ends = np.round(np.cumsum(weight) / weight.sum() * timesteps).astype(int)
+    return {name: int(n) for name, n in zip(chosen, np.diff(ends, prepend=0))}
+
+
+def perform(name: str, timesteps: int, seed: int) -> Performed:
+    """Play a sequence, sampled evenly at ``timesteps`` moments. The same seed gives the same take."""
+    number = list(SEQUENCES).index(name)
+    rng = np.random.default_rng([seed, number])
+    phrases = SEQUENCES[name]
+    seconds = _PHRASE_SECONDS * (len(phrases) + 1)
+    time = (np.arange(timesteps) + 0.5) / timesteps * seconds
+    curves = _phrase_curves(phrases, seconds, rng)
+    values = {control: curve(time) for control, curve in curves.items()}
+    values |= {control: np.zeros(timesteps) for control in CONTROLS if control not in values}
+    for side, curve in (("left", _blinks(time, seconds, rng)),):
+        values[f"blink_{side}"] = np.maximum(values[f"blink_{side}"], curve)
+        values["blink_right"] = np.maximum(values["blink_right"], curve)
+    for control, amplitude, period in _IDLE:
+        values[control] = values[control] + amplitude * _drift(time, period, rng)
+    # Lids follow the eyes down.
+    for side in ("left", "right"):
+        values[f"blink_{side}"] = np.clip(values[f"blink_{side}"] + 0.35 * np.maximum(-values["gaze_up"], 0), 0, 1)
+    activations = [{control: float(values[control][t]) for control in CONTROLS} for t in range(timesteps)]
+    excluded = {t: TONGUE for t, a in enumerate(activations) if a["tongue_out"] > _TONGUE_SEEN}
+    return Performed(name, activations, excluded)
+
+
+_IDLE = (
+    *(("head_turn", 0.10, 3.1), ("head_nod", 0.05, 2.7), ("head_tilt", 0.035, 3.7)),
+    *(("neck_turn", 0.05, 2.9), ("neck_nod", 0.03, 3.3)),
+    *(("sway_x", 0.004, 4.1), ("sway_y", 0.003, 3.9), ("sway_z", 0.004, 4.7)),
+    *(("gaze_left", 0.10, 1.3), ("gaze_up", 0.06, 1.7)),
+)
+"""(control, amplitude, seconds per swing) of what never stands still."""
+
+
+def _phrase_curves(
+    phrases: Sequence[Face], seconds: float, rng: np.random.Generator
+) -> dict[str, PchipInterpolator]:
+    """Monotone cubics through rest, each phrase (held for a moment, at its own strength), and rest."""
+    knots, faces = [0.0], [_REST]
+    for index, phrase in enumerate(phrases):
+        middle = _PHRASE_SECONDS * (index + 1) + rng.uniform(-0.08, 0.08)
+        strength = rng.uniform(0.85, 1.0)
+        face = {control: strength * value for control, value in phrase.items()}
+        knots += [middle - 0.14, middle + 0.14]
+        faces += [face, face]
+    knots.append(seconds)
+    faces.append(_REST)
+    used = sorted({control for face in faces for control in face})
+    return {c: PchipInterpolator(knots, [face.get(c, 0.0) for face in faces]) for c in used}
+
+
+def _blinks(time: FloatArray, seconds: float, rng: np.random.Generator) -> FloatArray:
+    """Spontaneous blinks, every two to four seconds, of a quarter of a second."""
+    closed, moment = np.zeros(len(time)), rng.uniform(0.5, 2.0)
+    while moment < seconds:
+        closed = np.maximum(closed, np.exp(-0.5 * ((time - moment) / 0.055) ** 2))
+        moment += rng.uniform(2.0, 4.0)
+    return closed
+
+
+def _drift(time: FloatArray, period: float, rng: np.random.Generator) -> FloatArray:
+    """Slow irregular motion in about [-1, 1]: two sines of unrelated periods."""
+    a, b = rng.uniform(0.0, 2.0 * np.pi, 2)
+    return 0.65 * np.sin(2.0 * np.pi * time / period + a) + 0.35 * np.sin(2.0 * np.pi * time / (0.381 * period) + b)

@@ -1,0 +1,179 @@
+"""Make a synthetic capture: plan every subject, photograph what is missing, write the layout.
+
+A folder belongs to one set of settings. Each image is written whole or not at all and depends on nothing but
+those settings, so a killed run continues where it stopped and ends with the same capture.
+"""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from ...bench.contracts import Progress, no_progress
+from ...bench.errors import InputError
+from ...bench.files import write_json, write_text
+from ..image_files import probe_image
+from .geometry import load_geometry
+from .photographer import Photographer
+from .rig import SERIALS
+from .scene import sample_count
+from .take import Settings, Take, plan_take
+
+MANIFEST = "synthesis.json"
+_VERSION = 1
+_README = """This folder holds synthetic recordings made by `headbench synth`.
+
+No person was recorded. Heads, skin, hair and performances are computed; subject numbers from 900 up, camera
+serials and sequence names only follow the conventions of real recordings so that the same tools read both.
+Settings: synthesis.json.
+"""
+
+
+def synthesize(
+    out: str | Path,
+    *,
+    subjects: int = 1,
+    cameras: int = 16,
+    timesteps: int = 60,
+    size: tuple[int, int] = (275, 401),
+    head: str = "procedural",
+    seed: int = 0,
+    tracking_noise: float = 0.0,
+    samples_per_pixel: int = 25,
+    workers: int | None = None,
+    progress: Progress = no_progress,
+) -> list[Path]:
+    """Photograph ``subjects`` performing heads and write them as captures; return their union folders.
+
+    Parameters
+    ----------
+    cameras : 2 to 16; the frontal one is always there and held out as the novel view.
+    timesteps : per subject, shared out over the sequences; FREE is held out for self-reenactment, and its
+        frames with the tongue out are labelled as excluded.
+    size : (width, height) of the images, pixels.
+    head : see `geometry.load_geometry`.
+    tracking_noise : standard deviation of the error of each stored parameter, as a fraction of that
+        parameter's own standard deviation over the subject's timesteps. Images show the exact poses.
+    samples_per_pixel : rounded up to a count that the sampler takes.
+    workers : processes that render; by default as many as there are cores.
+
+    Raises
+    ------
+    InputError
+        Before rendering, for settings out of range or a folder that holds a capture of other settings.
+    """
+    settings = Settings(
+        subjects, cameras, timesteps, size, head, seed, tracking_noise, sample_count(samples_per_pixel)
+    )
+    _check(settings)
+    geometry = load_geometry(head)
+    out = Path(out)
+    _claim(out, settings, geometry.head.fingerprint())
+    takes = [plan_take(out, index, geometry, settings) for index in range(subjects)]
+    total = subjects * timesteps * cameras
+    done = 0
+    progress(done, total, "planned")
+    for take in takes:
+        missing = [(s, t, _missing(take, s, t)) for s, t in take.moments()]
+        done += timesteps * cameras - sum(len(names) for _, _, names in missing)
+        work = [entry for entry in missing if entry[2]]
+        for sequence, count in _photograph(out, take, work, workers):
+            done += count
+            progress(done, total, f"{take.person.name} {sequence}")
+    return [take.writer.write_metadata() for take in takes]
+
+
+Job = tuple[str, int, tuple[str, ...]]
+"""A sequence, a timestep in it, and the cameras whose image is missing."""
+
+
+def _photograph(out: Path, take: Take, work: list[Job], workers: int | None) -> Iterator[tuple[str, int]]:
+    """Render the jobs; give (sequence, number of images) as each is written."""
+    count = min(workers or len(os.sched_getaffinity(0)), len(work))
+    if count <= 1:
+        photographer = Photographer(take) if work else None
+        for job in work:
+            assert photographer is not None
+            photographer.shoot(*job)
+            yield job[0], len(job[2])
+        return
+    # Spawned, since neither torch nor the renderer's thread pool survives a fork.
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(count, context, _begin, (out, take.index, take.settings)) as pool:
+        futures = {pool.submit(_shoot, job): job for job in work}
+        for future in as_completed(futures):
+            future.result()
+            yield futures[future][0], len(futures[future][2])
+
+
+_photographer: list[Photographer] = []
+"""This process's own, in a worker: spawned processes cannot be handed one."""
+
+
+def _begin(out: Path, index: int, settings: Settings) -> None:
+    _photographer.append(Photographer(plan_take(out, index, load_geometry(settings.head), settings)))
+
+
+def _shoot(job: Job) -> None:
+    _photographer[0].shoot(*job)
+
+
+def _missing(take: Take, sequence: str, timestep: int) -> tuple[str, ...]:
+    """Cameras whose image or matte is not there, or not whole."""
+    return tuple(camera for camera in take.cameras if not _is_whole(take, sequence, timestep, camera))
+
+
+def _is_whole(take: Take, sequence: str, timestep: int, camera: str) -> bool:
+    writer = take.writer
+    for path in (writer.image_path(sequence, timestep, camera), writer.mask_path(sequence, timestep, camera)):
+        try:
+            info = probe_image(path)
+        except InputError:
+            return False
+        if (info.width, info.height) != take.settings.size:
+            return False
+    return True
+
+
+def _check(settings: Settings) -> None:
+    if settings.subjects < 1:
+        raise InputError("--subjects", "", "at least 1", str(settings.subjects))
+    if not 2 <= settings.cameras <= len(SERIALS):
+        raise InputError(
+            "--cameras", "", f"2 to {len(SERIALS)}, as the frontal one is held out", str(settings.cameras)
+        )
+    if min(settings.size) < 16:
+        raise InputError("--size", "", "at least 16 pixels each way", "x".join(map(str, settings.size)))
+    if not (np.isfinite(settings.tracking_noise) and settings.tracking_noise >= 0.0):
+        raise InputError("--tracking-noise", "", "a number from 0 up", str(settings.tracking_noise))
+
+
+def _claim(out: Path, settings: Settings, head: str) -> None:
+    """Mark the folder as this capture's, or refuse one that is another's."""
+    wanted = {"version": _VERSION, **asdict(settings), "size": list(settings.size), "head_fingerprint": head}
+    # The same file may lie elsewhere: its content counts, not its path.
+    wanted["head"] = Path(settings.head).name
+    manifest = out / MANIFEST
+    if not manifest.exists():
+        if out.exists() and any(out.iterdir()):
+            raise InputError(out, "", "an empty folder or an earlier synthetic capture", "other files")
+        write_text(out / "README.txt", _README)
+        write_json(manifest, wanted)
+        return
+    try:
+        found = json.loads(manifest.read_text(encoding="utf-8"))
+    except json.JSONDecodeError as error:
+        raise InputError(manifest, "", "JSON", str(error), "Delete the folder and start anew.") from error
+    for key, value in wanted.items():
+        if not isinstance(found, dict) or found.get(key) != value:
+            had = found.get(key) if isinstance(found, dict) else found
+            raise InputError(
+                manifest, key, f"{value!r}, as asked for", f"{had!r}", "Take another folder, or the same settings."
+            )

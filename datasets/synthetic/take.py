@@ -1,0 +1,110 @@
+"""One subject's recording before it is photographed: who, which poses, which cameras, where it is written."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ...bench.contracts import Camera, FloatArray, HeadPose
+from ...bench.files import digest
+from ..ga_writer import CapturePlan, CaptureWriter, SequencePlan
+from ..head.model import HeadModel
+from . import rig
+from .anatomy import measure
+from .geometry import Geometry
+from .performance import HELD_OUT, Performed, perform, share_out
+from .people import Person, person
+from .tracking import with_tracking_noise
+
+FIRST_SUBJECT = 900
+"""Synthetic subjects count from here: no participant of NeRSemble has such a number."""
+
+_IDENTITY_SPREAD = 0.65  # standard deviations of the identity basis; 1 would draw rare faces too often
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What decides a synthetic capture's content. ``size`` is (width, height)."""
+
+    subjects: int
+    cameras: int
+    timesteps: int
+    size: tuple[int, int]
+    head: str
+    seed: int
+    tracking_noise: float
+    samples_per_pixel: int
+
+
+@dataclass(frozen=True, eq=False)
+class Take:
+    """One subject's plan. ``poses`` are exact, by sequence; what is stored may carry tracking noise."""
+
+    index: int
+    person: Person
+    geometry: Geometry
+    shape: FloatArray
+    cameras: Mapping[str, Camera]
+    performed: Mapping[str, Performed]
+    poses: Mapping[str, tuple[HeadPose, ...]]
+    writer: CaptureWriter
+    settings: Settings
+
+    def moments(self) -> Iterator[tuple[str, int]]:
+        """(sequence, timestep) of everything to photograph."""
+        for name, poses in self.poses.items():
+            for timestep in range(len(poses)):
+                yield name, timestep
+
+    def render_seed(self, sequence: str, timestep: int, camera: str) -> int:
+        """Seed of one image's sampling, the same however the work is divided."""
+        return int(digest(self.settings.seed, self.person.name, sequence, timestep, camera)[:7], 16)
+
+
+def plan_take(out: Path, index: int, geometry: Geometry, settings: Settings) -> Take:
+    """Plan subject number ``index``: nothing is rendered or written."""
+    name = f"{FIRST_SUBJECT + index}"
+    who = person(name, index, settings.seed)
+    rng = np.random.default_rng([settings.seed, index, 3])
+    head = geometry.head
+    shape = rng.standard_normal(head.shape_basis.shape[2]) * _IDENTITY_SPREAD
+    shape = np.clip(shape, -1.6, 1.6).astype(np.float32).astype(np.float64)
+    width, height = settings.size
+    target = _middle(geometry, shape)
+    views = rig.cameras(settings.cameras, width, height, target, seed=settings.seed + 101 * index)
+    performed, poses = {}, {}
+    for sequence, count in share_out(settings.timesteps).items():
+        performed[sequence] = perform(sequence, count, seed=settings.seed + 101 * index)
+        poses[sequence] = tuple(
+            geometry.translation.pose(activations, name, timestep)
+            for timestep, activations in enumerate(performed[sequence].activations)
+        )
+    every = [pose for sequence in poses.values() for pose in sequence]
+    tracked = iter(with_tracking_noise(every, settings.tracking_noise, settings.seed + 101 * index))
+    plan = CapturePlan(
+        subject=name,
+        head=head,
+        shape=shape,
+        static_offset=np.zeros(head.template.shape),
+        cameras=list(views.values()),
+        sequences=[
+            SequencePlan(sequence, [next(tracked) for _ in exact], performed[sequence].excluded)
+            for sequence, exact in poses.items()
+        ],
+        test_sequences=[HELD_OUT],
+        novel_view_cameras=[rig.FRONTAL],
+        synthetic={**asdict(settings), "head": geometry.source, "style": who.style},
+    )
+    return Take(index, who, geometry, shape, views, performed, poses, CaptureWriter(out, plan), settings)
+
+
+def _middle(geometry: Geometry, shape: FloatArray) -> FloatArray:
+    """Where the cameras look: the middle of the head at rest, a little low so that hair has room."""
+    model = HeadModel(geometry.head, dtype=torch.float64)
+    anatomy = measure(geometry.head, model.canonical(torch.from_numpy(shape))[0].numpy())
+    height = 0.5 * (anatomy["vertex_top"][1] + anatomy["chin"][1])
+    return np.array([0.0, height - 0.024 * anatomy.scale, 0.5 * (anatomy["left_ear"][2] + anatomy["nose_tip"][2])])
