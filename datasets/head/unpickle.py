@@ -239,6 +239,11 @@ def _encode(text: Any, encoding: Any = "latin1") -> bytes:
     return text.encode("latin1")
 
 
+def _no_bytes() -> bytes:
+    """``bytes()``: how Python 3 writes the content of an empty array in old protocols."""
+    return b""
+
+
 def _set(items: Any = ()) -> list[Any]:
     """``set`` in chumpy's bookkeeping; nothing reads it."""
     if not isinstance(items, list):
@@ -269,6 +274,7 @@ def _table() -> dict[tuple[str, str], Any]:
         table[f"{core}.numeric", "_frombuffer"] = _Function(_from_buffer)
     for builtins in ("__builtin__", "builtins"):
         table[builtins, "set"] = _Function(_set)
+        table[builtins, "bytes"] = _Function(_no_bytes)
         table[builtins, "object"] = _Function(_not_to_be_called)
     for registry in ("copy_reg", "copyreg"):
         table[registry, "_reconstructor"] = _Function(_object_of)
@@ -284,11 +290,16 @@ def _not_to_be_called(*arguments: Any) -> None:
     raise _Malformed("a bare object")
 
 
-class _RestrictedUnpickler(pickle.Unpickler):
+# The unpickler written in Python: the one in C allocates whatever memo size the stream names, so that nine
+# bytes can ask for gigabytes. Arrays are single opcodes, hence nothing is lost in speed.
+_PythonUnpickler: Any = vars(pickle)["_Unpickler"]
+
+
+class _RestrictedUnpickler(_PythonUnpickler):
     """Resolves names in the closed table and nowhere else."""
 
-    def __init__(self, stream: io.BufferedIOBase) -> None:
-        super().__init__(stream, encoding="latin1")
+    def __init__(self, content: bytes) -> None:
+        super().__init__(io.BytesIO(content), encoding="latin1")
         self._table = _table()
 
     def find_class(self, module: str, name: str) -> Any:
@@ -331,8 +342,7 @@ def read_pickle(path: str | PathLike[str]) -> dict[str, Any]:
     path = Path(path)
     expected = "a pickled dictionary of numpy, scipy.sparse and chumpy arrays"
     try:
-        with path.open("rb") as stream:
-            content = _RestrictedUnpickler(stream).load()
+        content = _RestrictedUnpickler(path.read_bytes()).load()
         if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
             raise _Malformed(f"a {type(content).__name__.lstrip('_').lower()}, not a dictionary with names")
         return {key: _plain(value) for key, value in content.items()}

@@ -1,0 +1,158 @@
+"""Head arrays: what validation refuses, and the npz round trip."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from headbench.bench.contracts import HeadAsset
+from headbench.bench.errors import InputError
+from headbench.datasets.head.arrays import read_head, save_head
+
+from .toy import toy_head
+
+HEAD = toy_head(16, eyelids=True)
+
+
+def spoiled(array, index, value):
+    copy = array.copy()
+    copy[index] = value
+    return copy
+
+
+BAD = {
+    "NaN in template": ("template", {"template": spoiled(HEAD.template, (3, 1), np.nan)}),
+    "infinite basis": ("shape_basis", {"shape_basis": spoiled(HEAD.shape_basis, (0, 0, 0), np.inf)}),
+    "integer template": ("template", {"template": np.zeros(HEAD.template.shape, int)}),
+    "flat template": ("template", {"template": HEAD.template[:, :2]}),
+    "short basis": ("expression_basis", {"expression_basis": HEAD.expression_basis[:-1]}),
+    "root in pose basis": ("pose_basis", {"pose_basis": np.zeros((len(HEAD.template), 3, 45))}),
+    "sideways regressor": ("joint_regressor", {"joint_regressor": HEAD.joint_regressor.T}),
+    "face beyond vertices": ("faces", {"faces": spoiled(HEAD.faces, (0, 0), len(HEAD.template))}),
+    "negative face": ("faces", {"faces": spoiled(HEAD.faces, (0, 0), -1)}),
+    "quads": ("faces", {"faces": np.zeros((4, 4), int)}),
+    "real faces": ("faces", {"faces": HEAD.faces.astype(float)}),
+    "no faces": ("template", {"faces": HEAD.faces[:0]}),
+    "loop in the tree": ("parents", {"parents": np.array([-1, 2, 1, 1, 1])}),
+    "two roots": ("parents", {"parents": np.array([-1, 0, -1, 1, 1])}),
+    "own parent": ("parents", {"parents": np.array([-1, 1, 1, 1, 1])}),
+    "no root": ("parents", {"parents": np.array([0, 0, 1, 1, 1])}),
+    "weights": ("skinning_weights", {"skinning_weights": spoiled(HEAD.skinning_weights, (7, 0), 0.99)}),
+    "eyelids": ("eyelid_basis", {"eyelid_basis": HEAD.eyelid_basis[:, :, :1]}),
+    "region beyond vertices": ("regions[x]", {"regions": {"x": np.array([0, 10**6])}}),
+    "negative region": ("regions[x]", {"regions": {"x": np.array([-1, 0])}}),
+    "unsorted region": ("regions[x]", {"regions": {"x": np.array([2, 1])}}),
+    "repeated region": ("regions[x]", {"regions": {"x": np.array([1, 1])}}),
+    "mask as region": ("regions[x]", {"regions": {"x": np.zeros(5, bool)}}),
+    "landmark": ("landmarks[x]", {"landmarks": {"x": len(HEAD.template)}}),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_validate_refuses(name):
+    key, change = BAD[name]
+    with pytest.raises(InputError) as caught:
+        replace(HEAD, **change).validate("some file")
+    assert caught.value.file == "some file"
+    assert caught.value.key == key
+
+
+def test_valid_heads_pass_and_fit_the_contract():
+    assert HEAD.validate("toy") is HEAD
+    assert isinstance(HEAD, HeadAsset)
+    ring = {"lip_outside_ring_upper": np.array([5, 3, 9])}
+    assert replace(HEAD, regions=ring).validate("toy").regions == ring
+
+
+@pytest.mark.parametrize("eyelids", [False, True])
+def test_round_trip(tmp_path, eyelids):
+    head = toy_head(16, seed=3, eyelids=eyelids, version="flame2020", dtype=np.float32)
+    save_head(tmp_path / "head.npz", head)
+    again = read_head(tmp_path / "head.npz")
+    for field in fields(head):
+        before, after = getattr(head, field.name), getattr(again, field.name)
+        if field.name == "regions":
+            assert set(before) == set(after)
+            for name in before:
+                np.testing.assert_array_equal(before[name], after[name])
+        else:
+            np.testing.assert_equal(after, before)
+    assert again.template.dtype == np.float32
+    assert again.fingerprint() == head.fingerprint()
+    assert [path.name for path in tmp_path.iterdir()] == ["head.npz"]
+
+
+def test_fingerprint_sees_every_part():
+    changes = [
+        {"version": "other"},
+        {"template": spoiled(HEAD.template, (0, 0), 0.5)},
+        {"eyelid_basis": None},
+        {"regions": {}},
+        {"landmarks": {"nose_tip": 0}},
+    ]
+    prints = {replace(HEAD, **change).fingerprint() for change in changes} | {HEAD.fingerprint()}
+    assert len(prints) == len(changes) + 1
+
+
+def test_a_killed_write_leaves_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "head.npz"
+    save_head(path, HEAD)
+    before = path.read_bytes()
+
+    def fail(stream, **content):
+        stream.write(b"half")
+        raise OSError("disk full")
+
+    monkeypatch.setattr(np, "savez_compressed", fail)
+    with pytest.raises(OSError, match="disk full"):
+        save_head(path, HEAD)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("missing", ["template", "version", "landmark_names"])
+def test_read_names_what_is_missing(tmp_path, missing):
+    save_head(tmp_path / "head.npz", HEAD)
+    with np.load(tmp_path / "head.npz") as archive:
+        content = {name: archive[name] for name in archive.files if name != missing}
+    np.savez(tmp_path / "less.npz", **content)
+    with pytest.raises(InputError) as caught:
+        read_head(tmp_path / "less.npz")
+    assert caught.value.key == missing
+
+
+def test_read_refuses_other_files(tmp_path):
+    save_head(tmp_path / "head.npz", HEAD)
+    whole = (tmp_path / "head.npz").read_bytes()
+    bad = {
+        "cut.npz": whole[: len(whole) // 2],
+        "text.npz": b"not an archive",
+        "empty.npz": b"",
+    }
+    for name, content in bad.items():
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(InputError):
+            read_head(tmp_path / name)
+    np.savez(tmp_path / "objects.npz", format=np.array([{}], dtype=object))
+    with pytest.raises(InputError):
+        read_head(tmp_path / "objects.npz")
+    np.savez(tmp_path / "other.npz", x=np.zeros(3))
+    with pytest.raises(InputError, match="format"):
+        read_head(tmp_path / "other.npz")
+    with pytest.raises(InputError):
+        read_head(tmp_path / "none.npz")
+
+
+def test_flipped_bytes_are_refused_or_harmless(tmp_path):
+    save_head(tmp_path / "head.npz", HEAD)
+    whole = bytearray((tmp_path / "head.npz").read_bytes())
+    refused = 0
+    for position in range(50, len(whole), len(whole) // 40):
+        broken = whole.copy()
+        broken[position] ^= 0xFF
+        (tmp_path / "broken.npz").write_bytes(broken)
+        try:  # some bytes, such as dates, mean nothing
+            assert read_head(tmp_path / "broken.npz").fingerprint() == HEAD.fingerprint()
+        except InputError:
+            refused += 1
+    assert refused > 30

@@ -1,0 +1,241 @@
+"""The head model against smplx, against a float64 loop in numpy, and against what rigid motion must do."""
+
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from headbench.bench.contracts import HeadPose
+from headbench.bench.errors import InputError
+from headbench.datasets.head.model import HeadModel
+
+from .flame_files import flame_content
+from .toy import toy_head
+
+HEAD = toy_head(16, eyelids=True)
+MODEL = HeadModel(HEAD, dtype=torch.float64)
+SIZES = {"shape": 6, "expression": 8, "rotation": 3, "neck": 3, "jaw": 3, "eyes": 6, "translation": 3}
+vectors = st.lists(st.floats(-1.5, 1.5), min_size=3, max_size=3)
+
+
+def zeros(**given_values):
+    values = {name: torch.zeros(size, dtype=torch.float64) for name, size in SIZES.items()}
+    return values | {
+        name: torch.as_tensor(value, dtype=torch.float64) for name, value in given_values.items()
+    }
+
+
+def random_arguments(batch=3, seed=0, sizes=SIZES, dtype=torch.float64):
+    generator = torch.Generator().manual_seed(seed)
+    return {name: torch.randn(batch, size, generator=generator, dtype=dtype) for name, size in sizes.items()}
+
+
+def loop_reference(head, one, offset=None, eyelids=None):
+    """Vertices of one pose, vertex by vertex, with 4x4 matrices (float64)."""
+    one = {name: value.double().numpy() for name, value in one.items()}
+    shaped = head.template + head.shape_basis @ one["shape"] + head.expression_basis @ one["expression"]
+    shaped = shaped + (0 if offset is None else offset)
+    joints = head.joint_regressor @ shaped
+    pose = [one["rotation"], one["neck"], one["jaw"], one["eyes"][:3], one["eyes"][3:]]
+    turns = [Rotation.from_rotvec(vector).as_matrix() for vector in pose]
+    world: list[np.ndarray] = []
+    for joint, parent in enumerate(head.parents):
+        about = np.eye(4)
+        about[:3, :3] = turns[joint]
+        about[:3, 3] = joints[joint] - turns[joint] @ joints[joint]
+        world.append(about if parent < 0 else world[parent] @ about)
+    result = np.empty_like(shaped)
+    for vertex in range(len(shaped)):
+        place = shaped[vertex].copy()
+        for joint in range(1, 5):
+            for row in range(3):
+                for column in range(3):
+                    amount = turns[joint][row, column] - (row == column)
+                    place += amount * head.pose_basis[vertex, :, 9 * (joint - 1) + 3 * row + column]
+        blended = sum(head.skinning_weights[vertex, joint] * world[joint] for joint in range(5))
+        result[vertex] = (blended @ np.append(place, 1))[:3] + one["translation"]
+    return result if eyelids is None else result + head.eyelid_basis @ eyelids
+
+
+def test_agrees_with_smplx(tmp_path):
+    smplx = pytest.importorskip("smplx")
+    head = toy_head(16, shape_size=300, expression_size=100)
+    (tmp_path / "FLAME_NEUTRAL.pkl").write_bytes(pickle.dumps(flame_content(head)))
+    landmarks = {"lmk_face_idx": np.zeros(51, int), "lmk_b_coords": np.full((51, 3), 1 / 3)}
+    (tmp_path / "flame_static_embedding.pkl").write_bytes(pickle.dumps(landmarks))
+    theirs = smplx.FLAME(str(tmp_path), num_betas=300, num_expression_coeffs=100, dtype=torch.float64)
+    a = random_arguments(4, sizes=SIZES | {"shape": 300, "expression": 100})
+    expected = theirs(
+        betas=a["shape"],
+        expression=a["expression"],
+        global_orient=a["rotation"],
+        neck_pose=a["neck"],
+        jaw_pose=a["jaw"],
+        leye_pose=a["eyes"][:, :3],
+        reye_pose=a["eyes"][:, 3:],
+        transl=a["translation"],
+    ).vertices.detach()
+    assert (HeadModel(head, dtype=torch.float64)(**a) - expected).abs().max() < 1e-6
+    single = HeadModel(head)(**{name: value.float() for name, value in a.items()})
+    assert (single - expected).abs().max() < 5e-6  # coefficients of unit variance stretch the toy to metres
+
+
+def test_agrees_with_a_loop():
+    a = random_arguments(3)
+    offset = torch.randn(*MODEL.template.shape, dtype=torch.float64) * 0.01
+    eyelids = torch.randn(3, 2, dtype=torch.float64)
+    ours = MODEL(**a, static_offset=offset, eyelids=eyelids)
+    for index in range(3):
+        one = {name: value[index] for name, value in a.items()}
+        expected = loop_reference(HEAD, one, offset.numpy(), eyelids[index].numpy())
+        np.testing.assert_allclose(ours[index], expected, atol=1e-13)
+
+
+def test_canonical_stands_for_shape_and_offset():
+    a = random_arguments(3)
+    offset = torch.randn(3, *MODEL.template.shape, dtype=torch.float64) * 0.01
+    canonical = MODEL.canonical(a["shape"], offset)
+    expected = MODEL(**a, static_offset=offset)
+    without = {name: value for name, value in a.items() if name != "shape"}
+    np.testing.assert_array_equal(MODEL(**without, canonical=canonical), expected)
+    with pytest.raises(ValueError, match="identity once"):
+        MODEL(**a, canonical=canonical)
+    with pytest.raises(ValueError, match="identity once"):
+        MODEL(**without)
+    with pytest.raises(ValueError, match="static offset"):
+        MODEL(**without, canonical=canonical, static_offset=offset)
+
+
+def test_zero_pose_is_the_shaped_template():
+    shape, expression = torch.randn(6, dtype=torch.float64), torch.randn(8, dtype=torch.float64)
+    expected = HEAD.template + HEAD.shape_basis @ shape.numpy() + HEAD.expression_basis @ expression.numpy()
+    np.testing.assert_allclose(MODEL(**zeros(shape=shape, expression=expression))[0], expected, atol=1e-15)
+    neutral = HEAD.template + HEAD.shape_basis @ shape.numpy()
+    np.testing.assert_allclose(MODEL.canonical(shape)[0], neutral, atol=1e-15)
+
+
+def test_one_row_stands_for_all():
+    a = random_arguments(4)
+    for name in a:
+        mixed = a | {name: a[name][:1]}
+        full = a | {name: a[name][:1].expand(4, -1)}
+        np.testing.assert_allclose(MODEL(**mixed), MODEL(**full), atol=1e-14, err_msg=name)
+    assert MODEL(**{name: value[0] for name, value in a.items()}).shape == (1, *HEAD.template.shape)
+
+
+@settings(max_examples=25, deadline=None)
+@given(vectors, vectors, st.integers(0, 5))
+def test_root_turns_about_its_joint(rotation, translation, seed):
+    a = {name: value[0] for name, value in random_arguments(1, seed).items()}
+    still = MODEL(**a | {"rotation": torch.zeros(3), "translation": torch.zeros(3)} | zeros_of_root())[0]
+    moved = MODEL(**a | zeros_of_root(rotation, translation))[0]
+    joint = MODEL.joints(a["shape"], a["expression"])[0, 0].numpy()
+    expected = Rotation.from_rotvec(rotation).apply(still.numpy() - joint) + joint + translation
+    np.testing.assert_allclose(moved, expected, atol=1e-12)
+
+
+def zeros_of_root(rotation=(0, 0, 0), translation=(0, 0, 0)):
+    parts = {"rotation": rotation, "translation": translation}
+    return {name: torch.tensor(value, dtype=torch.float64) for name, value in parts.items()}
+
+
+RIGID = HeadModel(replace(HEAD, pose_basis=np.zeros_like(HEAD.pose_basis)), dtype=torch.float64)
+
+
+@settings(max_examples=25, deadline=None)
+@given(vectors, vectors, vectors)
+def test_eyes_turn_alone(left, right, jaw):
+    turned = RIGID(**zeros(eyes=[*left, *right], jaw=jaw))[0].numpy()
+    still = RIGID(**zeros(jaw=jaw))[0].numpy()
+    joints = RIGID.joints(torch.zeros(6).double(), torch.zeros(8).double())[0].numpy()
+    for side, joint, vector in (("left", 3, left), ("right", 4, right)):
+        ball = HEAD.regions[f"{side}_eyeball"]
+        expected = Rotation.from_rotvec(vector).apply(still[ball] - joints[joint]) + joints[joint]
+        np.testing.assert_allclose(turned[ball], expected, atol=1e-12)
+    rest = np.setdiff1d(
+        np.arange(len(still)), [*HEAD.regions["left_eyeball"], *HEAD.regions["right_eyeball"]]
+    )
+    np.testing.assert_array_equal(turned[rest], still[rest])
+
+
+@settings(max_examples=25, deadline=None)
+@given(vectors, vectors, vectors)
+def test_head_transform_moves_what_hangs_on_the_neck(rotation, neck, translation):
+    a = {"shape": torch.full((6,), 0.7).double(), "expression": torch.full((8,), -0.4).double()}
+    motion = {"rotation": rotation, "neck": neck, "translation": translation}
+    motion = {name: torch.tensor(value, dtype=torch.float64) for name, value in motion.items()}
+    matrix = RIGID.head_transform(**a, **motion)[0].numpy()
+    on_neck = HEAD.skinning_weights[:, 1] == 1
+    assert on_neck.sum() > 20
+    local = RIGID(**zeros(**a))[0].numpy()[on_neck]
+    moved = RIGID(**zeros(**a, **motion))[0].numpy()[on_neck]
+    np.testing.assert_allclose(local @ matrix[:3, :3].T + matrix[:3, 3], moved, atol=1e-12)
+    np.testing.assert_array_equal(matrix[3], [0, 0, 0, 1])
+
+
+@pytest.mark.parametrize("scale", [0.0, 1.0])
+def test_gradients_of_every_input(scale):
+    a = {name: (scale * value).requires_grad_() for name, value in random_arguments(2).items()}
+    offset = torch.zeros(*MODEL.template.shape, dtype=torch.float64, requires_grad=True)
+    eyelids = torch.zeros(1, 2, dtype=torch.float64, requires_grad=True)
+    direction = torch.randn(2, *MODEL.template.shape, dtype=torch.float64)
+
+    def probe(*values):
+        vertices = MODEL(**dict(zip(a, values)), static_offset=values[-2], eyelids=values[-1])
+        return (vertices * direction).sum(-1)
+
+    assert torch.autograd.gradcheck(probe, (*a.values(), offset, eyelids), fast_mode=True)
+
+
+def test_sizes_are_checked():
+    for name, size in SIZES.items():
+        with pytest.raises(ValueError, match=name):
+            MODEL(**zeros(**{name: [0.0] * (size + 1)}))
+    with pytest.raises(ValueError, match="static_offset"):
+        MODEL(**zeros(), static_offset=torch.zeros(5, 3, dtype=torch.float64))
+    with pytest.raises(ValueError, match="no eyelid basis"):
+        HeadModel(toy_head(16), dtype=torch.float64)(**zeros(), eyelids=torch.zeros(2))
+
+
+def test_module_moves_between_precisions():
+    model = HeadModel(HEAD)
+    assert model.faces.dtype == torch.int64
+    a = random_arguments(2)
+    single = model(**{name: value.float() for name, value in a.items()})
+    assert single.dtype == torch.float32
+    double = model.double()(**a)
+    assert double.dtype == torch.float64
+    np.testing.assert_allclose(single, double, atol=2e-6)
+    assert not list(model.parameters())
+    assert not model.state_dict()  # the head model is an asset, not part of a checkpoint
+
+
+def pose(**changes):
+    values = {name: np.full(size, 0.1) for name, size in SIZES.items() if name != "shape"}
+    return HeadPose(**{"head_model": "toy", **values, **changes})
+
+
+def test_pose_arguments_stack():
+    model = HeadModel(HEAD)
+    poses = [pose(), pose(jaw=np.array([0.3, 0, 0]), eyelids=np.array([1.0, 0.5]))]
+    arguments = model.pose_arguments(poses)
+    np.testing.assert_allclose(arguments["jaw"], [[0.1, 0.1, 0.1], [0.3, 0, 0]])
+    np.testing.assert_allclose(arguments["eyelids"], np.array([[0, 0], [1, 0.5]]))
+    assert all(value.dtype == torch.float32 for value in arguments.values())
+    assert model(shape=torch.zeros(6), **arguments).shape == (2, *HEAD.template.shape)
+    assert "eyelids" not in HeadModel(toy_head(16)).pose_arguments(poses)
+
+
+def test_pose_arguments_refuse():
+    with pytest.raises(InputError, match="head_model"):
+        MODEL.pose_arguments([pose(), pose(head_model="flame2023")])
+    with pytest.raises(InputError, match="subject 7, timestep 12") as caught:
+        MODEL.pose_arguments([pose(expression=np.zeros(3), subject="subject 7", timestep=12)])
+    assert caught.value.key == "expression"
+    with pytest.raises(InputError, match="at least one"):
+        MODEL.pose_arguments([])

@@ -1,0 +1,126 @@
+"""Rotations against scipy, and gradients where textbook formulae have none."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from headbench.datasets.head import rotations
+
+AXES = np.concatenate([np.eye(3), -np.eye(3), Rotation.random(20, random_state=0).apply([0.0, 0.0, 1.0])])
+ANGLES = (0.0, 1e-12, 1e-7, 1e-4, 0.03, 0.19, 0.21, 1.0, 2.5, np.pi - 1e-3, np.pi - 1e-7, np.pi - 1e-12)
+VECTORS = np.concatenate([AXES * angle for angle in ANGLES])
+
+
+def quaternions_wxyz(rotation: Rotation) -> np.ndarray:
+    quaternion = rotation.as_quat()[:, [3, 0, 1, 2]]
+    return np.where(quaternion[:, :1] < 0, -quaternion, quaternion)
+
+
+def test_axis_angle_to_matrix_agrees_with_scipy():
+    ours = rotations.axis_angle_to_matrix(torch.from_numpy(VECTORS))
+    np.testing.assert_allclose(ours, Rotation.from_rotvec(VECTORS).as_matrix(), atol=1e-14)
+
+
+def test_axis_angle_beyond_a_turn():
+    vectors = AXES * 9.7
+    ours = rotations.rodrigues(torch.from_numpy(vectors))
+    np.testing.assert_allclose(ours, Rotation.from_rotvec(vectors).as_matrix(), atol=1e-13)
+
+
+def test_small_rotations_keep_relative_precision_in_float32():
+    vectors = torch.tensor([[1e-6, -2e-6, 5e-7]])
+    matrix = rotations.axis_angle_to_matrix(vectors)[0]
+    np.testing.assert_allclose(matrix[2, 1].item(), 1e-6, rtol=1e-6)
+    back = rotations.quaternion_to_axis_angle(rotations.axis_angle_to_quaternion(vectors))
+    np.testing.assert_allclose(back, vectors, rtol=1e-6)
+
+
+def test_axis_angle_to_quaternion_agrees_with_scipy():
+    ours = rotations.axis_angle_to_quaternion(torch.from_numpy(VECTORS))
+    np.testing.assert_allclose(ours, quaternions_wxyz(Rotation.from_rotvec(VECTORS)), atol=1e-14)
+
+
+def test_quaternion_to_axis_angle_agrees_with_scipy():
+    vectors = VECTORS[np.linalg.norm(VECTORS, axis=1) < np.pi - 1e-9]  # at pi the sign of the axis is free
+    quaternion = torch.from_numpy(quaternions_wxyz(Rotation.from_rotvec(vectors)))
+    np.testing.assert_allclose(rotations.quaternion_to_axis_angle(3.7 * quaternion), vectors, atol=1e-13)
+    np.testing.assert_allclose(rotations.quaternion_to_axis_angle(-quaternion), vectors, atol=1e-13)
+
+
+def test_matrix_conversions_agree_with_scipy():
+    rotation = Rotation.concatenate([Rotation.from_rotvec(VECTORS), Rotation.random(200, random_state=1)])
+    matrix = torch.from_numpy(rotation.as_matrix())
+    ours = rotations.matrix_to_quaternion(matrix)
+    dots = np.abs((ours.numpy() * quaternions_wxyz(rotation)).sum(1))  # equal up to sign
+    np.testing.assert_allclose(dots, 1, atol=1e-14)
+    np.testing.assert_allclose(rotations.quaternion_to_matrix(ours), matrix, atol=1e-14)
+    again = rotations.axis_angle_to_matrix(rotations.matrix_to_axis_angle(matrix))
+    np.testing.assert_allclose(again, matrix, atol=2e-8)  # acos-like near pi: square root of the precision
+    assert np.linalg.norm(rotations.matrix_to_axis_angle(matrix), axis=1).max() <= np.pi + 1e-12
+
+
+def test_quaternion_multiply_composes():
+    a, b = Rotation.random(30, random_state=2), Rotation.random(30, random_state=3)
+    product = rotations.quaternion_multiply(*(torch.from_numpy(quaternions_wxyz(r)) for r in (a, b)))
+    np.testing.assert_allclose(rotations.quaternion_to_matrix(product), (a * b).as_matrix(), atol=1e-14)
+
+
+def test_rotation_6d_is_the_first_two_rows():
+    matrix = torch.from_numpy(Rotation.random(10, random_state=4).as_matrix())
+    six = rotations.matrix_to_rotation_6d(matrix)
+    np.testing.assert_array_equal(six[:, 3:], matrix[:, 1])
+    stretched = torch.cat([2 * six[:, :3], 0.5 * six[:, 3:] + 0.3 * six[:, :3]], dim=1)
+    np.testing.assert_allclose(rotations.rotation_6d_to_matrix(stretched), matrix, atol=1e-14)
+    identity = torch.tensor([1.0, 0, 0, 0, 1, 0], dtype=torch.float64)
+    np.testing.assert_array_equal(rotations.rotation_6d_to_matrix(identity), np.eye(3))
+
+
+def test_any_batch_shape():
+    vectors = torch.from_numpy(VECTORS[:24]).reshape(2, 3, 4, 3)
+    matrix = rotations.axis_angle_to_matrix(vectors)
+    assert matrix.shape == (2, 3, 4, 3, 3)
+    assert rotations.matrix_to_quaternion(matrix).shape == (2, 3, 4, 4)
+    assert rotations.matrix_to_axis_angle(matrix[0, 0, 0]).shape == (3,)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 0.19, 0.21, 2.0, 3.1])
+def test_gradients_are_right(angle):
+    vectors = torch.from_numpy(AXES[:9] * angle).requires_grad_()
+    assert torch.autograd.gradcheck(rotations.axis_angle_to_matrix, vectors, atol=1e-7)
+    assert torch.autograd.gradcheck(rotations.axis_angle_to_quaternion, vectors, atol=1e-7)
+    quaternion = rotations.axis_angle_to_quaternion(vectors).detach().requires_grad_()
+    assert torch.autograd.gradcheck(rotations.quaternion_to_axis_angle, quaternion, atol=1e-6)
+    assert torch.autograd.gradcheck(rotations.quaternion_to_matrix, quaternion, atol=1e-7)
+
+
+def test_second_derivatives_at_zero():
+    zero = torch.zeros(2, 3, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradgradcheck(rotations.axis_angle_to_matrix, zero, atol=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_gradients_are_finite_everywhere(dtype):
+    def gradient_is_finite(output, source):
+        return bool(torch.isfinite(torch.autograd.grad(output.sum(), source)[0]).all())
+
+    vectors = torch.from_numpy(VECTORS).to(dtype).requires_grad_()
+    matrix = rotations.axis_angle_to_matrix(vectors)
+    assert gradient_is_finite(matrix, vectors)
+    assert gradient_is_finite(rotations.matrix_to_axis_angle(rotations.rodrigues(vectors)), vectors)
+    half_turns = torch.diag_embed(2 * torch.eye(3, dtype=dtype) - 1).requires_grad_()
+    assert gradient_is_finite(rotations.matrix_to_axis_angle(half_turns), half_turns)
+    zero = torch.zeros(4, dtype=dtype, requires_grad=True)
+    assert gradient_is_finite(rotations.quaternion_to_matrix(zero), zero)
+    assert gradient_is_finite(rotations.quaternion_to_axis_angle(zero), zero)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.floats(-4, 4), min_size=3, max_size=3))
+def test_matrices_are_rotations(vector):
+    matrix = rotations.axis_angle_to_matrix(torch.tensor(vector, dtype=torch.float64))
+    np.testing.assert_allclose(matrix @ matrix.T, np.eye(3), atol=1e-13)
+    np.testing.assert_allclose(torch.linalg.det(matrix), 1, atol=1e-13)
+    np.testing.assert_allclose(matrix @ torch.tensor(vector, dtype=torch.float64), vector, atol=1e-13)

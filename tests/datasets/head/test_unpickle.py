@@ -1,0 +1,282 @@
+"""The restricted unpickler: reads what FLAME's files hold, and refuses whatever could run code."""
+
+import builtins
+import copyreg
+import io
+import os
+import pickle
+import tracemalloc
+
+import numpy as np
+import pytest
+import scipy.sparse
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from headbench.bench.errors import InputError
+from headbench.datasets.head.unpickle import read_pickle
+
+from .flame_files import chumpy_stand_in, flame_content, legacy_pickle
+from .toy import toy_head
+
+RNG = np.random.default_rng(0)
+ARRAYS = {
+    "double": RNG.normal(size=(4, 3, 2)),
+    "single": RNG.normal(size=5).astype(np.float32),
+    "unsigned": np.arange(6, dtype=np.uint32).reshape(2, 3),
+    "big endian": RNG.normal(size=(3, 2)).astype(">f8"),
+    "fortran": np.asfortranarray(RNG.normal(size=(4, 5))),
+    "boolean": np.array([True, False]),
+    "empty": np.zeros((0, 3)),
+    "scalar": np.float64(2.5),
+}
+MATRICES = {
+    layout: scipy.sparse.random(5, 40, density=0.2, random_state=1).asformat(layout)
+    for layout in ("csc", "csr", "coo")
+}
+
+
+def refusal(path, content):
+    path.write_bytes(content)
+    with pytest.raises(InputError) as caught:
+        read_pickle(path)
+    assert caught.value.file == str(path)
+    return caught.value
+
+
+@pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
+def test_reads_arrays_of_every_protocol(tmp_path, protocol):
+    (tmp_path / "x.pkl").write_bytes(pickle.dumps(ARRAYS | MATRICES | {"text": "lbs"}, protocol=protocol))
+    content = read_pickle(tmp_path / "x.pkl")
+    for name, expected in ARRAYS.items():
+        np.testing.assert_array_equal(content[name], expected)
+        assert content[name].dtype == np.asarray(expected).dtype.newbyteorder("=")
+    for name, matrix in MATRICES.items():
+        np.testing.assert_array_equal(content[name], matrix.toarray())
+    assert content["text"] == "lbs"
+
+
+def test_reads_what_python_2_wrote(tmp_path):
+    head = toy_head(16)
+    source = flame_content(head) | MATRICES
+    with chumpy_stand_in() as ch:
+        stream = legacy_pickle(source | {"v_template": ch(head.template), "shapedirs": ch(head.shape_basis)})
+    for name in (b"chumpy.ch\nCh", b"numpy.core.multiarray\n_reconstruct", b"scipy.sparse.csc\ncsc_matrix"):
+        assert name in stream
+    assert b"numpy._core" not in stream
+    (tmp_path / "x.pkl").write_bytes(stream)
+    content = read_pickle(tmp_path / "x.pkl")
+    np.testing.assert_array_equal(content["v_template"], head.template)
+    np.testing.assert_array_equal(content["shapedirs"], head.shape_basis)
+    np.testing.assert_array_equal(content["J_regressor"], head.joint_regressor)
+    np.testing.assert_array_equal(content["f"], head.faces)
+    np.testing.assert_array_equal(content["coo"], MATRICES["coo"].toarray())
+
+
+@pytest.mark.parametrize("protocol", [0, 1, 2, 4])
+def test_reads_chumpy_of_every_protocol(tmp_path, protocol):
+    with chumpy_stand_in() as ch:
+        (tmp_path / "x.pkl").write_bytes(pickle.dumps({"x": ch(np.arange(6.0))}, protocol=protocol))
+    np.testing.assert_array_equal(read_pickle(tmp_path / "x.pkl")["x"], np.arange(6.0))
+
+
+def test_sums_repeated_entries_as_scipy_does(tmp_path):
+    matrix = scipy.sparse.coo_matrix(([1.0, 2.0, 4.0], ([0, 0, 1], [1, 1, 0])), shape=(2, 2))
+    (tmp_path / "x.pkl").write_bytes(pickle.dumps({"x": matrix}))
+    np.testing.assert_array_equal(read_pickle(tmp_path / "x.pkl")["x"], [[0, 3], [4, 0]])
+
+
+class Call:
+    """Pickles as a call."""
+
+    def __init__(self, function, *arguments, state=None):
+        self.parts = (function, arguments) if state is None else (function, arguments, state)
+
+    def __reduce__(self):
+        return self.parts
+
+
+def test_an_attack_that_works_elsewhere_does_nothing_here(tmp_path):
+    target = tmp_path / "created"
+    stream = pickle.dumps({"x": np.zeros(3), "y": Call(os.mkdir, str(target))})
+    error = refusal(tmp_path / "attack.pkl", stream)
+    assert not target.exists()
+    assert f"{os.mkdir.__module__}.mkdir" in error.key
+    pickle.loads(stream)
+    assert target.exists()  # the stream is live
+
+
+ATTACKS = {
+    "os.system": Call(os.system, "true"),
+    "eval": Call(eval, "1"),
+    "exec": Call(exec, ""),
+    "getattr": Call(getattr, np.zeros(1), "tofile"),
+    "import": Call(builtins.__import__, "os"),
+    "open": Call(open, os.devnull),
+    "numpy.load": Call(np.load, "x.npy"),
+    "numpy.fromfile": Call(np.fromfile, "x"),
+    "numpy.memmap": Call(np.memmap, "x"),
+    "numpy.frombuffer": Call(np.frombuffer, b"1234"),
+    "numpy.frompyfunc": Call(np.frompyfunc, len, 1, 1),
+    "scipy function": Call(scipy.sparse.load_npz, "x"),
+    "other sparse": scipy.sparse.eye(3, format="dok"),
+    "object array": np.array([{}], dtype=object),
+    "text array": np.array(["abc"]),
+    "record array": np.zeros(2, dtype=[("a", "f8")]),
+    "date array": np.zeros(2, dtype="M8[s]"),
+    "class": dict,
+    "nested call": Call(np.dtype, Call(os.getcwd)),
+    "call in a state": Call(np.dtype, "f8", state=(3, Call(os.getcwd), None, None, None, -1, -1, 0)),
+    "call in a list": [1, [2, (3, Call(os.getcwd))]],
+    "call in chumpy": None,  # made in the test
+}
+
+
+@pytest.mark.parametrize("protocol", [0, 2, 4, 5])
+@pytest.mark.parametrize("name", ATTACKS)
+def test_refuses(tmp_path, name, protocol):
+    if name == "call in chumpy":
+        with chumpy_stand_in() as ch:
+            stream = pickle.dumps({"x": ch(Call(os.getcwd))}, protocol=protocol)
+    else:
+        stream = pickle.dumps({"x": ATTACKS[name]}, protocol=protocol)
+    refusal(tmp_path / "attack.pkl", stream)
+
+
+def test_names_the_global(tmp_path):
+    error = refusal(tmp_path / "attack.pkl", b"cposix\nsystem\n(S'true'\ntR.")
+    assert error.key == "global posix.system"
+    assert "could run code" in str(error)
+
+
+ARRAY = b"cnumpy.core.multiarray\n_reconstruct\n"
+STREAMS = {
+    "altered function": ARRAY + b"(dS'_call'\nS'x'\nsb.",
+    "function with slots": ARRAY + b"(N(dS'_call'\nS'x'\nstb.",
+    "altered class": b"cchumpy.ch\nCh\n(dS'array'\nS'x'\nsb.",
+    "altered array class": b"cnumpy\nndarray\n(dS'x'\nS'x'\nsb.",
+    "reconstruction of a class": ARRAY + b"(cchumpy.ch\nCh\n(I0\ntS'b'\ntR.",
+    "array without a state": b"(dS'x'\n" + ARRAY + b"(cnumpy\nndarray\n(I0\ntS'b'\ntRs.",
+    "chumpy without a state": b"(dS'x'\n(ichumpy.ch\nCh\ns.",
+    "bare object": b"c__builtin__\nobject\n)R.",
+    "reconstructor of a function": b"ccopy_reg\n_reconstructor\n(" + ARRAY + b"c__builtin__\nobject\nNtR.",
+    "dotted name": b"\x80\x04\x8c\x05numpy\x8c\x0endarray.tofile\x93.",
+    "dunder": b"\x80\x04\x8c\x05numpy\x8c\x11ndarray.__class__\x93.",
+    "persistent object": b"Pname\n.",
+    "out-of-band buffer": b"\x80\x05\x97.",
+    "huge memo": b"\x80\x02N\x72\xff\xff\xff\xff.",
+    "huge bytes": b"\x80\x04\x8e\xff\xff\xff\xff\xff\xff\xff\x7fabc.",
+    "pop from nothing": b"0.",
+    "no pickle": b"solid mesh",
+    "empty": b"",
+    "list": b"(lp0\n.",
+    "array at the top": pickle.dumps(np.zeros(3)),
+    "numbers as names": b"(dI1\nI2\ns.",
+}
+
+
+@pytest.mark.parametrize("name", STREAMS)
+def test_refuses_crafted_streams(tmp_path, name):
+    refusal(tmp_path / "crafted.pkl", STREAMS[name])
+    (tmp_path / "good.pkl").write_bytes(pickle.dumps(ARRAYS))
+    np.testing.assert_array_equal(read_pickle(tmp_path / "good.pkl")["double"], ARRAYS["double"])  # unharmed
+
+
+@pytest.mark.parametrize(
+    "bomb", [b"\x80\x02Nr\xff\xff\xff\x0f.", b"\x80\x04\x8e\x00\x00\x00\x00\x04\0\0\0abc."]
+)
+def test_a_few_bytes_cannot_ask_for_gigabytes(tmp_path, bomb):
+    tracemalloc.start()
+    try:
+        refusal(tmp_path / "bomb.pkl", bomb)
+        assert tracemalloc.get_traced_memory()[1] < 10_000_000
+    finally:
+        tracemalloc.stop()
+
+
+def test_refuses_registered_extensions(tmp_path):
+    copyreg.add_extension("os", "getcwd", 0x7FFF0001)
+    try:
+        stream = pickle.dumps({"x": Call(os.getcwd)}, protocol=2)
+        refusal(tmp_path / "x.pkl", b"\x80\x02}U\x01x\x84\x01\x00\xff\x7f)Rs.")
+        refusal(tmp_path / "y.pkl", stream)
+    finally:
+        copyreg.remove_extension("os", "getcwd", 0x7FFF0001)
+
+
+def sparse_with(**changes):
+    matrix = MATRICES["csc"].copy()
+    state = dict(vars(matrix)) | changes
+    stream = io.BytesIO()
+
+    class Pickler(pickle._Pickler):  # type: ignore[name-defined, misc]
+        def reducer_override(self, obj):
+            if obj is matrix:
+                return copyreg.__newobj__, (type(matrix),), state  # type: ignore[attr-defined]
+            return NotImplemented
+
+    Pickler(stream, protocol=2).dump({"x": matrix})
+    return stream.getvalue()
+
+
+def test_sparse_matrices_are_checked(tmp_path):
+    (tmp_path / "x.pkl").write_bytes(sparse_with())
+    np.testing.assert_array_equal(read_pickle(tmp_path / "x.pkl")["x"], MATRICES["csc"].toarray())
+    matrix = MATRICES["csc"]
+    bad: dict[str, dict[str, object]] = {
+        "huge": {"_shape": (10**9, 40)},
+        "negative": {"_shape": (-5, 40)},
+        "rows": {"_shape": (2, 40)},
+        "columns": {"_shape": (5, 39)},
+        "cube": {"_shape": (5, 8, 5)},
+        "values": {"data": matrix.data[:-1]},
+        "indices": {"indices": matrix.indices + 5},
+        "pointers": {"indptr": matrix.indptr[::-1].copy()},
+        "text": {"data": "abc"},
+        "none": {"indices": None},
+    }
+    for name, change in bad.items():
+        error = refusal(tmp_path / f"{name}.pkl", sparse_with(**change))
+        assert "shape" in error.found if name == "negative" else "a sparse matrix" in error.found
+
+
+def test_arrays_have_the_bytes_they_declare(tmp_path):
+    good = pickle.dumps({"x": np.arange(3.0)}, protocol=2)
+    shape = b"K\x03\x85"
+    assert good.count(shape) == 1
+    refusal(tmp_path / "more.pkl", good.replace(shape, b"K\x04\x85"))
+    refusal(tmp_path / "negative.pkl", good.replace(shape, b"J\xff\xff\xff\xff\x85"))
+    refusal(tmp_path / "huge.pkl", good.replace(shape, b"J\xff\xff\xff\x7f\x85"))
+
+
+def test_refuses_truncated_files(tmp_path):
+    with chumpy_stand_in() as ch:
+        stream = legacy_pickle({"x": ch(np.arange(4.0)), "y": MATRICES["csc"], "z": "text"})
+    for length in range(0, len(stream), 7):
+        refusal(tmp_path / "cut.pkl", stream[:length])
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(InputError, match=r"none\.pkl"):
+        read_pickle(tmp_path / "none.pkl")
+
+
+FUZZ = legacy_pickle({"a": np.arange(4.0), "b": MATRICES["csc"], "c": np.arange(3, dtype=np.int32)})
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.lists(st.tuples(st.integers(0, len(FUZZ) - 1), st.integers(0, 255)), min_size=1, max_size=4))
+def test_damage_is_refused_or_harmless(tmp_path_factory, changes):
+    damaged = bytearray(FUZZ)
+    for position, value in changes:
+        damaged[position] = value
+    path = tmp_path_factory.getbasetemp() / "damaged.pkl"
+    path.write_bytes(damaged)
+    try:
+        content = read_pickle(path)
+    except InputError:
+        return
+    assert all(
+        isinstance(value, (np.ndarray, str, bytes, int, float, list, tuple, dict))
+        for value in content.values()
+    )
