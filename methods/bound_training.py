@@ -4,19 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..bench.contracts import Camera, Clip, FrameKey
+from ..bench.contracts import Budget, Camera, Clip, FrameKey, Progress
 from ..bench.errors import InputError
 from .binding import Frames, WorldSplats, to_world
 from .configs import SplatTraining
 from .splats import rasterize
 from .training.densify import Densifier, logit
 from .training.images import TrainingImages
+from .training.loop import Outcome, train
 from .training.losses import photometric_loss, position_penalty, scale_penalty
 from .training.optimiser import Optimiser
 from .training.sampling import Sampler
@@ -187,6 +189,39 @@ class BoundTraining:
     def close(self) -> None:
         """Stop background work."""
         self._images.close()
+
+
+def run_bound_training(
+    clip: Clip,
+    settings: SplatTraining,
+    appearance: Appearance,
+    sampler: Sampler,
+    face_count: int,
+    *,
+    budget: Budget,
+    folder: Path,
+    run: str,
+    device: str,
+    seed: int,
+    progress: Progress,
+) -> tuple[BoundTraining, Outcome]:
+    """Train splats bound to a mesh of ``face_count`` triangles; arguments as those of `training.loop.train`."""
+    training = BoundTraining(clip, settings, appearance, sampler, face_count, device, seed)
+    try:
+        outcome = train(
+            training,
+            sampler,
+            published_length=settings.schedule_length,
+            budget=budget,
+            folder=folder,
+            run=run,
+            device=device,
+            progress=progress,
+            checkpoint_every_s=settings.checkpoint_every_s,
+        )
+    finally:
+        training.close()
+    return training, outcome
 
 
 def scene_extent(cameras: Mapping[str, Camera]) -> float:

@@ -123,14 +123,15 @@ class OursConfig:
     Attributes
     ----------
     plane_resolution, plane_channels : samples per side, and channels of the (x,y), (x,z) and (y,z) planes.
-    plane_bounds : "mesh" fits the planes to the canonical mesh; "published" sets x to +-0.25 m as the paper.
+    plane_bounds : "mesh" fits the planes to the canonical mesh in all directions; "published" sets x to +-0.25 m
+        as the paper does, which leaves half the samples in x unused on a head without long hair.
     lines : dynamic opacity on or off.
     line_resolution, line_channels, expressions, jaw_bases : samples and channels per line; how many leading
         expression coefficients (as many as there are, if fewer) and jaw bases have lines.
     line_bounds : box in which splats have dynamic opacity: the "head" (whole mesh) or the "face" region.
     lines_from : iteration (published scale) at which lines and penalty start.
-    jaw_compatibility : "train" takes jaw bases from training poses, seeded with the identity. "published" seeds
-        with the half turn of the published code; its use of held-out poses is never reproduced.
+    jaw_compatibility : "" takes jaw bases from training poses, seeded with the identity. "tga" reproduces the
+        published code, which draws them from held-out poses: a leak, for comparison with it only.
     penalty : weight of the adaptive truncated opacity penalty; 0 turns it off.
     penalty_face_mm, penalty_other_mm, penalty_other_weight : surface displacement under which opacity may not
         change, in the face region and elsewhere, and the weight elsewhere.
@@ -149,7 +150,7 @@ class OursConfig:
     line_channels: int = 32
     expressions: int = 80
     jaw_bases: int = 16
-    jaw_compatibility: Literal["train", "published"] = "train"
+    jaw_compatibility: Literal["", "tga"] = ""
     line_bounds: Literal["head", "face"] = "head"
     lines_from: int = 60_000
     line_lr: float = 2e-3

@@ -25,7 +25,7 @@ from .avatar_files import (
 )
 from .binding import Frames, WorldSplats, to_world
 from .bound_avatar import PosedSplats, posed_splats, render_splats
-from .bound_training import BoundTraining, Shading, View, check_training_split, view_of
+from .bound_training import Shading, View, check_training_split, run_bound_training, view_of
 from .configs import GAConfig
 from .ga_files import (
     PLY_FILE,
@@ -38,7 +38,7 @@ from .ga_files import (
 from .seeds import torch_generator
 from .sh import coefficient_count, sh_to_rgb
 from .subject_mesh import BoundedCache, SubjectMesh
-from .training.loop import CHECKPOINT, check_budget, train
+from .training.loop import CHECKPOINT, check_budget
 from .training.optimiser import Optimiser
 from .training.sampling import ShuffledEpochs
 from .training.schedule import Timeline
@@ -200,26 +200,23 @@ class GA:
         run = run_digest(self.name, self.version, self.config, clip, budget, seed)
         if is_finished(out, run):
             return self.load(out, device=device)
-        settings = self.config.splats
         subject = Subject.of(clip)
         mesh = SubjectMesh(clip.head, subject.shape, subject.static_offset, device)
         appearance = GAAppearance(mesh, clip, self.config, device, seed)
         sampler = ShuffledEpochs(len(clip.splits["train"]), seed)
-        training = BoundTraining(clip, settings, appearance, sampler, len(mesh.faces), device, seed)
-        try:
-            outcome = train(
-                training,
-                sampler,
-                published_length=settings.schedule_length,
-                budget=budget,
-                folder=out,
-                run=run,
-                device=device,
-                progress=progress,
-                checkpoint_every_s=settings.checkpoint_every_s,
-            )
-        finally:
-            training.close()
+        training, outcome = run_bound_training(
+            clip,
+            self.config.splats,
+            appearance,
+            sampler,
+            len(mesh.faces),
+            budget=budget,
+            folder=out,
+            run=run,
+            device=device,
+            seed=seed,
+            progress=progress,
+        )
         optimiser = training.optimiser
         write_ga_splats(
             out / PLY_FILE, {name: optimiser[name] for name in training.splat_names}, training.binding

@@ -1,0 +1,94 @@
+"""Compact tensorial Gaussian avatars: static colour from planes, dynamic opacity from feature lines.
+
+"3D Gaussian Head Avatars with Expressive Dynamic Appearances by Compact Tensorial Representations", CVPR 2025,
+arXiv 2504.14967. What the paper does not change is as in GaussianAvatars (`bound_training`).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ..bench.contracts import Budget, Clip, Progress
+from ..datasets.head.regions import faces_in_region
+from ..datasets.steps.expression_clusters import cluster_expressions
+from .avatar_files import Subject, is_finished, run_digest, save_shared_head, write_record
+from .bound_training import BoundTraining, check_training_split, run_bound_training
+from .configs import OursConfig
+from .ga_files import SUBJECT_FILE, write_subject
+from .ours_appearance import OursAppearance
+from .ours_avatar import FIELD_FILE, OursAvatar, write_field
+from .subject_mesh import SubjectMesh
+from .training.loop import CHECKPOINT, check_budget
+from .training.sampling import Sampler, ShuffledEpochs, Weighted, balanced_weights
+
+
+class Ours:
+    """The method: see the module."""
+
+    name, version = "ours", "1"
+
+    def __init__(self, config: OursConfig | None = None):
+        self.config = config or OursConfig()
+
+    def fit(
+        self, clip: Clip, out: Path, budget: Budget, *, device: str, seed: int, progress: Progress
+    ) -> OursAvatar:
+        """Train on the training split and write the avatar under ``out``; continues a killed run."""
+        check_budget(budget)
+        check_training_split(clip)
+        config = self.config
+        if config.balanced_sampling or (config.lines and (config.penalty or config.line_bounds == "face")):
+            faces_in_region(
+                clip.head, "face"
+            )  # raises before the long work where the head has no face region
+        run = run_digest(self.name, self.version, config, clip, budget, seed)
+        if is_finished(out, run):
+            return self.load(out, device=device)
+        subject = Subject.of(clip)
+        mesh = SubjectMesh(clip.head, subject.shape, subject.static_offset, device)
+        appearance = OursAppearance(mesh, clip, config, device, seed)
+        training, outcome = run_bound_training(
+            clip,
+            config.splats,
+            appearance,
+            self._sampler(clip, seed),
+            len(mesh.faces),
+            budget=budget,
+            folder=out,
+            run=run,
+            device=device,
+            seed=seed,
+            progress=progress,
+        )
+        self._write(out, training, appearance)
+        write_subject(out / SUBJECT_FILE, subject)
+        save_shared_head(out, clip.head)
+        write_record(out, run, outcome, splats=len(training.binding), jaw_bases=len(appearance.jaw_bases))
+        (out / CHECKPOINT).unlink(missing_ok=True)
+        return self.load(out, device=device)
+
+    def load(self, path: Path, *, device: str) -> OursAvatar:
+        """Read an avatar that `fit` wrote."""
+        return OursAvatar.read(path, device)
+
+    def _sampler(self, clip: Clip, seed: int) -> Sampler:
+        keys = clip.splits["train"]
+        if not self.config.balanced_sampling:
+            return ShuffledEpochs(len(keys), seed)
+        clusters = cluster_expressions(clip, self.config.expression_classes, seed=seed)
+        timesteps = np.array([key.timestep for key in keys])
+        return Weighted(balanced_weights(timesteps, clusters.by_timestep), seed)
+
+    def _write(self, out: Path, training: BoundTraining, appearance: OursAppearance) -> None:
+        optimiser = training.optimiser
+        write_field(
+            out / FIELD_FILE,
+            {name: optimiser[name] for name in training.splat_names},
+            training.binding,
+            {name: optimiser[name] for name in appearance.parameters()},
+            appearance.plane_box,
+            appearance.line_box,
+            appearance.jaw_bases,
+        )

@@ -1,0 +1,172 @@
+"""Training side of "ours": known timesteps prepared once, colour from planes, opacity from lines, the penalty."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..bench.contracts import Clip, FloatArray, HeadPose
+from ..datasets.head.regions import faces_in_region
+from ..datasets.steps.jaw_bases import jaw_bases, jaw_quaternions, jaw_weights
+from .binding import Frames, WorldSplats
+from .bound_training import Shading, View
+from .configs import OursConfig
+from .feature_lines import blend_lines, line_position, opacity_offsets
+from .ours_field import (
+    Box,
+    CanonicalFrames,
+    canonical_directions,
+    initial_parameters,
+    line_box,
+    plane_box,
+    plane_features,
+    position_part,
+    shade_directions,
+)
+from .seeds import torch_generator
+from .subject_mesh import BoundedCache, SubjectMesh
+from .training.optimiser import Optimiser
+from .training.schedule import Timeline
+
+FLOATS_PER_FACE = 17 + 9 + 1  # triangle frame, turn to canonical, penalty weight
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedTimestep:
+    """What does not change while training: frames, directions, driving coefficients, penalty weights."""
+
+    frames: Frames
+    turns: Tensor  # (F, 3, 3) world directions to canonical ones
+    expression: Tensor  # (E,)
+    jaw: Tensor  # (J,)
+    penalty: Tensor  # (F,)
+
+
+class OursAppearance:
+    """Tri-plane colour and feature-line opacity; tracking is left as it is."""
+
+    def __init__(self, mesh: SubjectMesh, clip: Clip, config: OursConfig, device: str, seed: int):
+        self._mesh, self._clip, self._config, self._device, self._seed = mesh, clip, config, device, seed
+        self.canonical = CanonicalFrames.of(mesh.frames(mesh.canonical))
+        self.plane_box = plane_box(mesh.canonical, config.plane_bounds)
+        self.line_box = _line_box(mesh, clip, config)
+        self.expressions = min(config.expressions, clip.head.expression_basis.shape[2])
+        self.jaw_bases: FloatArray = np.zeros((0, 4))
+        if config.lines and config.jaw_bases:
+            self.jaw_bases = jaw_bases(clip, config.jaw_bases, compatibility=config.jaw_compatibility)
+        self._is_face = torch.zeros(len(mesh.faces), dtype=torch.bool, device=device)
+        if config.lines and config.penalty:
+            self._is_face[torch.from_numpy(faces_in_region(clip.head, "face")).to(device)] = True
+        entries = config.splats.mesh_cache_mb * 2**20 // (4 * FLOATS_PER_FACE * len(mesh.faces))
+        self._prepared = BoundedCache(self._prepare, entries)
+        self._lines_from = 0
+
+    def splat_parameters(self, count: int) -> dict[str, tuple[Tensor, float]]:
+        """None: a splat has geometry and opacity only."""
+        return {}
+
+    def parameters(self) -> dict[str, tuple[Tensor, float]]:
+        """Planes, lines and networks."""
+        generator = torch_generator(self._seed, "field")
+        initial = initial_parameters(self._config, self.expressions, len(self.jaw_bases), generator)
+        return {name: (value.to(self._device), rate) for name, (value, rate) in initial.items()}
+
+    def begin(self, timeline: Timeline) -> None:
+        """Fit the start of the lines to the run."""
+        self._lines_from = timeline.at(self._config.lines_from)
+
+    def frames(self, timestep: int, optimiser: Optimiser) -> Frames:
+        """Triangle frames, without gradient."""
+        return self._prepared(timestep).frames
+
+    def shade(
+        self,
+        world: WorldSplats,
+        frames: Frames,
+        binding: Tensor,
+        view: View,
+        timestep: int,
+        optimiser: Optimiser,
+        iteration: int,
+    ) -> Shading:
+        """Colour by canonical position and direction; opacity with its offset once the lines are on."""
+        prepared = self._prepared(timestep)
+        positions = self.canonical.positions(binding, optimiser["means"])
+        features = plane_features(optimiser, self.plane_box, positions)
+        directions = canonical_directions(prepared.turns, binding, world.means, view.center)
+        colors = shade_directions(optimiser, position_part(optimiser, features), directions)
+        logits = optimiser["opacities"]
+        if not self._config.lines or iteration <= self._lines_from:
+            return Shading(colors, torch.sigmoid(logits), None)
+        offsets = self.opacity_offsets(optimiser, positions.detach(), prepared.expression, prepared.jaw)
+        penalty = None
+        if self._config.penalty:
+            weights = prepared.penalty.index_select(0, binding)
+            penalty = self._config.penalty * (offsets.abs() * weights).mean()
+        return Shading(colors, torch.sigmoid(logits + offsets), penalty)
+
+    def opacity_offsets(
+        self, optimiser: Optimiser, positions: Tensor, expression: Tensor, jaw: Tensor
+    ) -> Tensor:
+        """(N,) offsets; zero, and not computed, outside the lines' box."""
+        inside = self.line_box.contains(positions).nonzero().squeeze(1)
+        unit = self.line_box.unit(positions.index_select(0, inside))
+        blended = blend_lines(optimiser["lines"], expression, jaw)
+        position = line_position(unit, self._config.line_resolution)
+        offsets = opacity_offsets(optimiser, blended, position)
+        return positions.new_zeros(len(positions)).index_copy(0, inside, offsets)
+
+    @torch.no_grad()
+    def _prepare(self, timestep: int) -> PreparedTimestep:
+        pose = self._clip.poses[timestep]
+        arguments = self._mesh.arguments([pose])
+        frames = self._mesh.frames(self._mesh.posed(arguments))
+        expression, jaw = driving_coefficients(pose, self.expressions, self.jaw_bases, self._device)
+        weights = frames.size.new_zeros(len(frames.size))
+        if self._config.lines and self._config.penalty:
+            unposed = self._mesh.unposed(arguments)
+            weights = penalty_weights(
+                unposed, self._mesh.canonical, self._mesh.faces, self._is_face, self._config
+            )
+        return PreparedTimestep(frames, self.canonical.turns(frames), expression, jaw, weights)
+
+
+def driving_coefficients(
+    pose: HeadPose, expressions: int, bases: FloatArray, device: str
+) -> tuple[Tensor, Tensor]:
+    """Blend coefficients of the lines: the first expression coefficients, and the jaw's weights on its bases."""
+    expression = torch.as_tensor(np.asarray(pose.expression)[:expressions], dtype=torch.float32)
+    jaw = np.zeros(0)
+    if len(bases):
+        jaw = jaw_weights(jaw_quaternions([pose]), bases)[0]
+    return expression.to(device), torch.as_tensor(jaw, dtype=torch.float32).to(device)
+
+
+def penalty_weights(
+    unposed: Tensor, canonical: Tensor, faces: Tensor, is_face: Tensor, config: OursConfig
+) -> Tensor:
+    """(F,) weights of the adaptive truncated opacity penalty.
+
+    Where the expression moves a triangle's centroid by less than a threshold, its splats may not change their
+    opacity; where it moves it more, they may. The face region and the rest differ in threshold and weight.
+
+    Parameters
+    ----------
+    unposed, canonical : (V, 3) metres, with and without expression, jaw and eyes.
+    is_face : (F,) triangles of the face region.
+    """
+    moved = (unposed - canonical).index_select(0, faces.reshape(-1)).view(-1, 3, 3).mean(1)
+    millimetres = 1000 * torch.linalg.vector_norm(moved, dim=1)
+    still_face = (millimetres < config.penalty_face_mm).to(moved.dtype)
+    still_other = config.penalty_other_weight * (millimetres < config.penalty_other_mm).to(moved.dtype)
+    return torch.where(is_face, still_face, still_other)
+
+
+def _line_box(mesh: SubjectMesh, clip: Clip, config: OursConfig) -> Box:
+    if config.line_bounds == "head":
+        return line_box(mesh.canonical)
+    triangles = torch.from_numpy(faces_in_region(clip.head, "face")).to(mesh.faces.device)
+    return line_box(mesh.canonical[mesh.faces[triangles].reshape(-1)])

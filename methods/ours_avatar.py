@@ -1,0 +1,189 @@
+"""The trained avatar of "ours": its files and its rendering."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from ..bench.contracts import Camera, Frame, HeadPose
+from ..bench.errors import InputError
+from ..bench.files import atomic_path
+from .avatar_files import read_shared_head
+from .binding import WorldSplats, to_world
+from .bound_avatar import PosedSplats, posed_splats, render_splats
+from .bound_training import view_of
+from .feature_lines import blend_lines, line_position, opacity_offsets
+from .ga_files import SUBJECT_FILE, read_subject
+from .ours_appearance import driving_coefficients
+from .ours_field import (
+    Box,
+    CanonicalFrames,
+    canonical_directions,
+    plane_features,
+    position_part,
+    shade_directions,
+)
+from .subject_mesh import SubjectMesh
+from .triplane import ENCODING_SIZE, PAIRS
+
+FIELD_FILE = "avatar.safetensors"
+SPLAT_WIDTHS = {"means": 3, "opacities": 1, "log_scales": 3, "quats": 4, "binding": 1}
+"""Columns of the (N, 12) float32 splat table, 48 bytes each; the triangle is exact up to 2^24."""
+
+
+def write_field(
+    path: Path,
+    splats: Mapping[str, Tensor],
+    binding: Tensor,
+    shared: Mapping[str, Tensor],
+    plane_box: Box,
+    line_box: Box,
+    jaw_bases: np.ndarray,
+) -> None:
+    """Write splats, planes, lines, networks, boxes and jaw bases as float32 safetensors."""
+    columns = {**splats, "opacities": splats["opacities"][:, None], "binding": binding[:, None]}
+    table = torch.cat([columns[name].detach().to("cpu", torch.float32) for name in SPLAT_WIDTHS], dim=1)
+    tensors = {name: value.detach().cpu().contiguous() for name, value in shared.items()}
+    tensors |= {
+        "splats": table,
+        "plane_box": torch.stack(list(plane_box)).cpu(),
+        "line_box": torch.stack(list(line_box)).cpu(),
+        "jaw_bases": torch.from_numpy(np.asarray(jaw_bases, dtype=np.float32)),
+    }
+    with atomic_path(path) as temporary:
+        save_file(tensors, temporary)
+
+
+def read_field(path: Path, face_count: int, expression_size: int, device: str) -> dict[str, Tensor]:
+    """Read and check what `write_field` wrote. Raises `InputError` where a tensor is missing or does not fit."""
+    try:
+        tensors = load_file(path, device=device)
+    except (SafetensorError, OSError) as error:
+        raise InputError(path, "", "a safetensors file", str(error)) from error
+    needed = ["splats", "plane_box", "line_box", "jaw_bases", "color_weight_0", "color_weight_1"]
+    needed += [f"plane_{name}" for name, _, _ in PAIRS]
+    if "lines" in tensors:
+        needed += [f"line_{part}_{layer}" for layer in range(3) for part in ("direction", "gain", "bias")]
+    for name in needed:
+        if name not in tensors:
+            raise InputError(path, name, "a tensor of that name", "none")
+    for name, value in tensors.items():
+        if value.dtype != torch.float32 or not torch.isfinite(value).all():
+            raise InputError(path, name, "finite float32 numbers", f"{value.dtype} or non-finite numbers")
+    _check_shapes(path, tensors, face_count, expression_size)
+    return tensors
+
+
+def _check_shapes(path: Path, tensors: Mapping[str, Tensor], face_count: int, expression_size: int) -> None:
+    def require(name: str, fits: bool, expected: str) -> None:
+        if not fits:
+            raise InputError(path, name, expected, f"shape {tuple(tensors[name].shape)}")
+
+    splats = tensors["splats"]
+    width = sum(SPLAT_WIDTHS.values())
+    require("splats", splats.ndim == 2 and splats.shape[1] == width, f"(N, {width})")
+    binding = splats[:, -1]
+    if len(binding) and not (0 <= float(binding.min()) and float(binding.max()) < face_count):
+        found = f"{float(binding.min()):g} to {float(binding.max()):g}"
+        raise InputError(path, "splats, triangle", f"0 to {face_count - 1}", found)
+    channels = 0
+    for name in (f"plane_{pair}" for pair, _, _ in PAIRS):
+        plane = tensors[name]
+        square = plane.ndim == 2 and round(len(plane) ** 0.5) ** 2 == len(plane) >= 4
+        require(name, square, "(R * R, C)")
+        channels += plane.shape[1]
+    for name in ("plane_box", "line_box"):
+        require(name, tensors[name].shape == (2, 3), "(2, 3)")
+    first, last = tensors["color_weight_0"], tensors["color_weight_1"]
+    require("color_weight_0", first.ndim == 2 and first.shape[1] == channels + ENCODING_SIZE, "(H, C + 27)")
+    require("color_weight_1", last.shape == (3, len(first)), f"(3, {len(first)})")
+    require("jaw_bases", tensors["jaw_bases"].ndim == 2 and tensors["jaw_bases"].shape[1] == 4, "(J, 4)")
+    if "lines" in tensors:
+        lines, jaws = tensors["lines"], len(tensors["jaw_bases"])
+        fits = lines.ndim == 4 and lines.shape[1] == 3 and jaws <= len(lines) <= jaws + expression_size
+        require("lines", fits, f"(E + {jaws}, 3, L, C), E at most {expression_size}")
+        inputs = 6 * lines.shape[3]
+        direction = tensors["line_direction_0"]
+        require("line_direction_0", direction.ndim == 2 and direction.shape[1] == inputs, f"(H, {inputs})")
+
+
+class OursAvatar:
+    """A trained head: splats without colour, planes, lines and two small networks.
+
+    What depends on canonical position alone (plane features, places on the lines) is computed once when loaded.
+    """
+
+    def __init__(self, folder: Path, mesh: SubjectMesh, tensors: Mapping[str, Tensor], device: str):
+        self._folder, self._mesh, self._tensors, self._device = folder, mesh, tensors, device
+        table = tensors["splats"].split(list(SPLAT_WIDTHS.values()), dim=1)
+        columns = {name: column.contiguous() for name, column in zip(SPLAT_WIDTHS, table)}
+        self._means, self._log_scales, self._quats = (columns[k] for k in ("means", "log_scales", "quats"))
+        self._logits = columns["opacities"][:, 0]
+        self._binding = columns["binding"][:, 0].to(torch.int64)
+        self._canonical = CanonicalFrames.of(mesh.frames(mesh.canonical))
+        positions = self._canonical.positions(self._binding, self._means)
+        self._from_position = position_part(
+            tensors, plane_features(tensors, Box(*tensors["plane_box"]), positions)
+        )
+        self._jaw_bases = tensors["jaw_bases"].cpu().numpy().astype(np.float64)
+        if "lines" in tensors:
+            box = Box(*tensors["line_box"])
+            self._inside = box.contains(positions).nonzero().squeeze(1)
+            unit = box.unit(positions.index_select(0, self._inside))
+            self._line_position = line_position(unit, tensors["lines"].shape[2])
+
+    @classmethod
+    def read(cls, folder: Path, device: str) -> OursAvatar:
+        """Read an avatar from its folder. Raises `InputError` for damaged or foreign files."""
+        subject = read_subject(folder / SUBJECT_FILE)
+        mesh = SubjectMesh(read_shared_head(folder), subject.shape, subject.static_offset, device)
+        tensors = read_field(folder / FIELD_FILE, len(mesh.faces), mesh.model.expression_size, device)
+        return cls(folder, mesh, tensors, device)
+
+    @torch.no_grad()
+    def render(self, camera: Camera, pose: HeadPose, background: Sequence[float] = (1.0, 1.0, 1.0)) -> Frame:
+        """Render one frame. Raises `InputError` where the pose is of another head model."""
+        world, turns = self._world(pose)
+        view = view_of(camera, self._device)
+        colors = self._colors(world, turns, view.center)
+        return render_splats(world, self._opacities(pose), colors, view, background)
+
+    @torch.no_grad()
+    def splats(self, pose: HeadPose, camera: Camera | None = None) -> PosedSplats:
+        """Splats of a pose in the world; with colours where a camera says from where they are seen."""
+        world, turns = self._world(pose)
+        colors = None
+        if camera is not None:
+            colors = self._colors(world, turns, view_of(camera, self._device).center)
+        return posed_splats(world, self._opacities(pose), colors)
+
+    def files(self) -> Sequence[Path]:
+        """The field with its splats, and the subject."""
+        return [self._folder / FIELD_FILE, self._folder / SUBJECT_FILE]
+
+    def _world(self, pose: HeadPose) -> tuple[WorldSplats, Tensor]:
+        frames = self._mesh.frames(self._mesh.posed(self._mesh.arguments([pose])))
+        world = to_world(frames, self._binding, self._means, self._log_scales, self._quats)
+        return world, self._canonical.turns(frames)
+
+    def _colors(self, world: WorldSplats, turns: Tensor, center: Tensor) -> Tensor:
+        directions = canonical_directions(turns, self._binding, world.means, center)
+        return shade_directions(self._tensors, self._from_position, directions)
+
+    def _opacities(self, pose: HeadPose) -> Tensor:
+        logits = self._logits
+        if "lines" in self._tensors:
+            lines = self._tensors["lines"]
+            expressions = len(lines) - len(self._jaw_bases)
+            blended = blend_lines(
+                lines, *driving_coefficients(pose, expressions, self._jaw_bases, self._device)
+            )
+            offsets = opacity_offsets(self._tensors, blended, self._line_position)
+            logits = logits.index_add(0, self._inside, offsets)
+        return torch.sigmoid(logits)
