@@ -1,0 +1,49 @@
+"""The table as Markdown, aligned so that it also reads well unrendered."""
+
+from __future__ import annotations
+
+import re
+
+from .tables import Table, TableCell
+
+
+def to_markdown(table: Table) -> str:
+    """Write a pipe table. Header: tasks, first body row: metrics; best bold, second underlined (``<ins>``)."""
+    tasks, names = [""], ["**Method**"]
+    for index, column in enumerate(table.columns):
+        follows = index > 0 and table.columns[index - 1].title == column.title
+        tasks.append("" if follows else escape(column.title))
+        unit = f" [{column.unit}]" if column.unit else ""
+        names.append(f"**{escape(column.label)}**{escape(unit)} {column.arrow}")
+    lines = [tasks, names]
+    for title, rows in table.groups:
+        if len(table.groups) > 1:
+            lines.append([f"*{escape(title)}*", *[""] * len(table.columns)])
+        lines += [[escape(row.method), *map(_cell, row.cells)] for row in rows]
+    widths = [max(3, *(len(line[i]) for line in lines)) for i in range(len(names))]
+    body = [
+        _line([c.ljust(w) if i == 0 else c.rjust(w) for i, (c, w) in enumerate(zip(x, widths))])
+        for x in lines
+    ]
+    rule = _line([":" + "-" * (widths[0] - 1), *("-" * (w - 1) + ":" for w in widths[1:])])
+    notes = [f"<sup>{i + 1}</sup> {escape(note)}  " for i, note in enumerate(table.notes)]
+    parts = ["\n".join([body[0], rule, *body[1:]]), escape(table.caption)]
+    return "\n\n".join([*parts, *(["\n".join(notes)] if notes else [])]) + "\n"
+
+
+def escape(text: str) -> str:
+    """Make text stand for itself in Markdown, on one line."""
+    return re.sub(r"([\\`*_{}\[\]<>|#~&])", r"\\\1", " ".join(text.split()))
+
+
+def _cell(cell: TableCell) -> str:
+    text = escape(cell.text)
+    if cell.rank == 1:
+        text = f"**{text}**"
+    elif cell.rank == 2:
+        text = f"<ins>{text}</ins>"
+    return text if cell.note is None else f"{text}<sup>{cell.note + 1}</sup>"
+
+
+def _line(cells: list[str]) -> str:
+    return f"| {' | '.join(cells)} |"

@@ -1,0 +1,23 @@
+"""The reports offered; light to import."""
+
+from __future__ import annotations
+
+from ..bench.contracts import ReportSpec
+
+TABLE = ReportSpec(
+    name="table",
+    summary="Comparison of all methods over all metrics, as Markdown, CSV and LaTeX files.",
+    implementation="headbench.reports.table_report:write_tables",
+)
+
+TABLE_TEXT = ReportSpec(
+    name="table-text",
+    summary="The same comparison as text: Markdown, CSV or LaTeX.",
+    implementation="headbench.reports.table_report:table_text",
+)
+
+CONTACT_SHEET = ReportSpec(
+    name="contact-sheet",
+    summary="Some frames of each task side by side: truth, renders and error maps of all methods, as PNG.",
+    implementation="headbench.reports.sheet_report:write_contact_sheet",
+)
