@@ -1,0 +1,67 @@
+"""Rendering a scene with gradients, and comparing two outcomes."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from headbench.methods.splats import Rendering, rasterize
+
+from .scenes import Scene
+
+DIFFERENTIABLE = (
+    "means",
+    "quats",
+    "scales",
+    "opacities",
+    "colors",
+    "viewmat",
+    "background",
+    "means2d_offset",
+)
+
+
+class Outcome(NamedTuple):
+    """A rendering and the gradients of all inputs, by name."""
+
+    rendering: Rendering
+    gradients: dict[str, Tensor]
+
+
+def render_with_gradients(
+    scene: Scene, dtype: torch.dtype, *, weights: Tensor | None = None, seed: int = 0, **options
+) -> Outcome:
+    """Render in ``dtype`` and differentiate a random linear function of image and alpha.
+
+    ``weights`` (H, W) scale it per pixel.
+    """
+    leaves = {
+        name: value.detach().to(dtype).clone().requires_grad_()
+        for name, value in {**scene._asdict(), "means2d_offset": torch.zeros(len(scene.means), 2)}.items()
+        if name in DIFFERENTIABLE
+    }
+    result = rasterize(
+        *(leaves[name] for name in ("means", "quats", "scales", "opacities", "colors", "viewmat")),
+        scene.K,
+        scene.width,
+        scene.height,
+        background=leaves["background"],
+        means2d_offset=leaves["means2d_offset"],
+        **options,
+    )
+    rng = torch.Generator().manual_seed(seed)
+    on_image = torch.randn(result.image.shape, generator=rng).to(dtype)
+    on_alpha = torch.randn(result.alpha.shape, generator=rng).to(dtype)
+    if weights is not None:
+        on_image, on_alpha = on_image * weights[..., None], on_alpha * weights
+    gradients = torch.autograd.grad((result.image, result.alpha), list(leaves.values()), (on_image, on_alpha))
+    detached = Rendering(result.image.detach(), result.alpha.detach(), result.radii)
+    return Outcome(detached, dict(zip(leaves, gradients, strict=True)))
+
+
+def relative_error(value: Tensor, truth: Tensor) -> float:
+    """Norm of the difference over the norm of the truth; the difference alone where the truth is zero."""
+    difference, norm = float((value.double() - truth.double()).norm()), float(truth.double().norm())
+    return difference / norm if norm else difference

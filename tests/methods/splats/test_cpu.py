@@ -1,0 +1,280 @@
+"""The kernel, in every instruction set this machine runs, against the float64 reference."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from headbench.methods.splats import available_backends, rasterize
+
+from .compare import relative_error, render_with_gradients
+from .dense import render_dense
+from .scenes import Scene, cloud, head_shell
+
+KERNELS = [name for name in available_backends() if name.startswith("cpu-")]
+pytestmark = pytest.mark.skipif(
+    not KERNELS, reason="the splat kernel is not installed: no C++ compiler was found"
+)
+kernels = pytest.mark.parametrize("kernel", KERNELS)
+
+
+def replaced(scene: Scene, **parts) -> Scene:
+    """A scene whose first splats take other values: ``parts`` are rows by field name."""
+    fields = {}
+    for name, rows in parts.items():
+        value = getattr(scene, name).clone()
+        value[: len(rows)] = torch.tensor(rows)
+        fields[name] = value
+    return scene._replace(**fields)
+
+
+SCENES = {
+    "odd size": lambda: cloud(150, 61, 45, seed=1),
+    "one channel": lambda: cloud(120, 33, 17, seed=2, channels=1),
+    "four channels": lambda: cloud(120, 20, 31, seed=3, channels=4),
+    "five channels": lambda: cloud(100, 16, 16, seed=4, channels=5),
+    "32 channels": lambda: cloud(100, 40, 24, seed=5, channels=32),
+    "one pixel": lambda: cloud(200, 1, 1, seed=6, size=0.2),
+    "one row": lambda: cloud(150, 50, 1, seed=7, size=0.1),
+    "many faint in a tile": lambda: cloud(1500, 18, 19, seed=8, size=0.2, opacity=-4.5),
+    "many opaque in a tile": lambda: cloud(1500, 18, 19, seed=9, size=0.1, opacity=4.0),
+    "smaller than pixels": lambda: cloud(400, 48, 40, seed=10, size=1e-4, opacity=2.0),
+    "larger than the image": lambda: cloud(60, 30, 30, seed=11, size=1.5, opacity=-2.0),
+    "quaternions of any length": lambda: replaced(
+        cloud(80, 32, 32, seed=12),
+        quats=[
+            [0.0, 0, 0, 0],
+            [1e-25, 0, 0, 0],
+            [1e20, 2e20, -1e20, 0],
+            [0, 3, 0, 0],
+            [1e-11, 2e-11, 0, 1e-11],
+        ],
+    ),
+    "opacities at their ends": lambda: replaced(
+        cloud(80, 32, 32, seed=13, size=0.1), opacities=[0.0, 1.0, 1.0, 1 / 256, 1 / 250, 0.99, 1.0, 0.0]
+    ),
+    "zero scales": lambda: replaced(
+        cloud(80, 32, 32, seed=14), scales=[[0.0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0]]
+    ),
+}
+
+
+@kernels
+@pytest.mark.parametrize("name", SCENES)
+def test_image_and_gradients_agree_with_the_reference(kernel, name):
+    scene = SCENES[name]()
+    # Where an alpha lies on a threshold, float32 may take the other side: such pixels are compared loosely, and kept
+    # out of the gradients.
+    safe = render_dense(scene).safe
+    assert safe.float().mean() > 0.5
+    truth = render_with_gradients(scene, torch.float64, weights=safe.double(), backend="reference")
+    result = render_with_gradients(scene, torch.float32, weights=safe.float(), backend=kernel)
+
+    assert truth.rendering.alpha.max() > 0.1, "an empty image would prove nothing"
+    for field in ("image", "alpha"):
+        error = (getattr(result.rendering, field) - getattr(truth.rendering, field)).abs()
+        assert error[safe].max() < 2e-5, field
+        assert error.max() < 0.05, field
+    assert result.rendering.radii.dtype == torch.int32
+    wrong = result.rendering.radii - truth.rendering.radii
+    assert wrong.abs().max() <= 1, "radii may differ where rounding up falls on the other side, by one"
+    assert (wrong != 0).float().mean() < 0.02
+    for field, gradient in truth.gradients.items():
+        assert result.gradients[field].dtype == torch.float32
+        assert relative_error(result.gradients[field], gradient) < 1e-4, field
+
+
+@kernels
+def test_empty_scenes_show_the_background(kernel):
+    nothing = cloud(0, 21, 18)
+    behind = cloud(30, 21, 18)
+    behind = behind._replace(means=behind.means - torch.tensor([0.0, 0.0, 20.0]))
+    for scene in (nothing, behind):
+        result = render_with_gradients(scene, torch.float32, backend=kernel)
+        assert torch.equal(result.rendering.image, scene.background.expand(18, 21, 3))
+        assert not result.rendering.alpha.any()
+        assert not result.rendering.radii.any()
+        for name, gradient in result.gradients.items():
+            assert bool(gradient.any()) == (name == "background"), name
+        truth = render_with_gradients(scene, torch.float64, backend="reference")
+        assert relative_error(result.gradients["background"], truth.gradients["background"]) < 1e-6
+
+
+@kernels
+def test_extreme_splats_stay_finite_and_near_the_reference(kernel):
+    """Needles, giants and splats just beyond the near plane: float32 loses digits, but never its head."""
+    scene = replaced(
+        cloud(60, 40, 30, seed=20),
+        scales=[
+            [5.0, 1e-6, 1e-6],
+            [1e4, 1e-3, 1e-3],
+            [1e4, 1e4, 1e4],
+            [50.0, 1e-5, 10.0],
+            [1e12] * 3,
+            [1e-30] * 3,
+        ],
+        means=[
+            [0.1, 0, 2],
+            [0, 0, 2],
+            [0, 0, 3],
+            [0, 0.2, 2],
+            [0, 0, 2],
+            [0, 0, 2],
+            [0, 0, 0.0101],
+            [1e6, 0, 2],
+            [1e10, 1e10, 0.02],
+        ],
+        viewmat=torch.eye(4).tolist(),
+    )
+    scene.opacities[:10] = 0.3
+    truth = render_with_gradients(scene, torch.float64, backend="reference")
+    result = render_with_gradients(scene, torch.float32, backend=kernel)
+    assert result.rendering.radii[4] == 0, "beyond float32: culled"
+    assert result.rendering.radii[2] > 10_000
+    error = (result.rendering.image - truth.rendering.image).abs()
+    assert error.mean() < 1e-4
+    for name, gradient in result.gradients.items():
+        assert torch.isfinite(gradient).all(), name
+    assert relative_error(result.gradients["colors"], truth.gradients["colors"]) < 1e-3
+    assert relative_error(result.gradients["opacities"], truth.gradients["opacities"]) < 1e-3
+
+
+@kernels
+def test_needles_keep_their_determinant(kernel):
+    """A needle 2000 px long and 0.55 px thin: with ac - b² in float32 its width would be lost."""
+    count = 40
+    scene = cloud(count, 64, 48, seed=21)
+    scene = scene._replace(
+        means=torch.tensor([0.1, 0.05, 2.0])
+        + 0.1 * torch.randn(count, 3, generator=torch.Generator().manual_seed(0)),
+        scales=torch.tensor([60.0, 1e-4, 1e-4]).repeat(count, 1),
+        opacities=torch.full((count,), 0.5),
+        viewmat=torch.eye(4),
+    )
+    truth = render_with_gradients(scene, torch.float64, backend="reference")
+    result = render_with_gradients(scene, torch.float32, backend=kernel)
+    assert truth.rendering.radii.max() > 1000
+    assert (result.rendering.image - truth.rendering.image).abs().mean() < 1e-3
+    assert relative_error(result.gradients["colors"], truth.gradients["colors"]) < 1e-2
+
+
+@kernels
+def test_any_number_of_threads_gives_the_same_bits(kernel):
+    scene = head_shell(4000, 90, 70)
+    outcomes = [render_with_gradients(scene, torch.float32, backend=kernel, threads=n) for n in (1, 2, 3, 4)]
+    first = outcomes[0]
+    for other in outcomes[1:]:
+        for a, b in zip(first.rendering, other.rendering, strict=True):
+            assert torch.equal(a, b)
+        for name, gradient in first.gradients.items():
+            assert torch.equal(gradient, other.gradients[name]), name
+
+
+def test_arrays_need_not_be_contiguous():
+    scene = cloud(90, 30, 26, seed=30)
+    plain = render_with_gradients(scene, torch.float32, backend="cpu")
+    strided = [
+        value.t().contiguous().t() if value.ndim == 2 else value.repeat_interleave(2)[::2]
+        for value in scene[:5]
+    ]
+    assert not any(value.is_contiguous() for value in strided)
+    leaves = [value.requires_grad_() for value in strided]
+    view = scene.viewmat.t().contiguous().t()
+    result = rasterize(
+        *leaves, view, scene.K.t().contiguous().t(), 30, 26, background=scene.background, backend="cpu"
+    )
+    assert torch.equal(result.image, plain.rendering.image)
+    upstream = torch.randn(26, 30, 3)
+    transposed = upstream.permute(1, 0, 2).contiguous().permute(1, 0, 2)
+    wanted = torch.autograd.grad(result.image, leaves, upstream, retain_graph=True)
+    for a, b in zip(wanted, torch.autograd.grad(result.image, leaves, transposed), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_loss_of_alpha_alone_has_gradients():
+    scene = cloud(50, 20, 20, seed=31)
+
+    def gradient(dtype: torch.dtype, backend: str) -> torch.Tensor:
+        inputs = [value.to(dtype) for value in scene[:6]]
+        inputs[3] = scene.opacities.to(dtype, copy=True).requires_grad_()
+        alpha = rasterize(*inputs, scene.K, 20, 20, backend=backend).alpha
+        return torch.autograd.grad(alpha.sum(), inputs[3])[0]
+
+    assert relative_error(gradient(torch.float32, "cpu"), gradient(torch.float64, "reference")) < 1e-3
+
+
+def test_renders_in_a_forked_child():
+    scene = head_shell(2000, 64, 64)
+    before = rasterize(*scene[:9], backend="cpu", threads=3).image
+    child = os.fork()
+    if child == 0:  # only the outcome may leave the child: no exception, no pytest
+        same = False
+        try:
+            same = torch.equal(rasterize(*scene[:9], backend="cpu", threads=3).image, before)
+        finally:
+            os._exit(0 if same else 1)
+    deadline = time.monotonic() + 20
+    while (status := os.waitpid(child, os.WNOHANG)) == (0, 0):
+        if time.monotonic() > deadline:
+            os.kill(child, signal.SIGKILL)
+            os.waitpid(child, 0)
+            pytest.fail("the forked child hangs: its thread pool is the parent's")
+        time.sleep(0.01)
+    assert os.waitstatus_to_exitcode(status[1]) == 0
+    assert torch.equal(rasterize(*scene[:9], backend="cpu", threads=3).image, before)
+
+
+def test_threads_of_one_process_may_render_at_once():
+    scenes = [head_shell(1500, 60, 50, seed=seed) for seed in range(4)]
+    alone = [rasterize(*scene[:9], backend="cpu", threads=2).image for scene in scenes]
+    together: dict[int, list[torch.Tensor]] = {}
+
+    def render(index: int) -> None:
+        together[index] = [rasterize(*scenes[index][:9], backend="cpu", threads=2).image for _ in range(10)]
+
+    workers = [threading.Thread(target=render, args=(index,)) for index in range(4)]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join()
+    for index, image in enumerate(alone):
+        assert len(together[index]) == 10
+        assert all(torch.equal(other, image) for other in together[index])
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    seed=st.integers(0, 10_000),
+    width=st.integers(1, 40),
+    height=st.integers(1, 40),
+    channels=st.integers(1, 6),
+)
+def test_order_of_splats_never_matters(seed, width, height, channels):
+    scene = cloud(60, width, height, seed=seed, channels=channels)
+    order = torch.randperm(60, generator=torch.Generator().manual_seed(seed))
+    shuffled = [value[order] for value in scene[:5]]
+    one = rasterize(*scene[:9], backend="cpu")
+    two = rasterize(*shuffled, *scene[5:9], backend="cpu")
+    assert torch.equal(one.image, two.image)
+    assert torch.equal(one.radii[order], two.radii)
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10_000), size=st.floats(1e-3, 1.0), opacity=st.floats(-4, 4))
+def test_image_is_affine_in_colours_and_background(seed, size, opacity):
+    scene = cloud(40, 25, 22, seed=seed, size=size, opacity=opacity)
+    result = rasterize(*scene[:9], background=scene.background, backend="cpu")
+    assert result.alpha.min() >= 0
+    assert result.alpha.max() <= 1
+    doubled = scene._replace(colors=2 * scene.colors)
+    twice = rasterize(*doubled[:9], background=2 * scene.background, backend="cpu")
+    assert torch.equal(twice.image, 2 * result.image)
+    white = rasterize(*scene._replace(colors=torch.ones_like(scene.colors))[:9], backend="cpu")
+    torch.testing.assert_close(white.image[..., 0], result.alpha, rtol=0, atol=2e-6)

@@ -1,0 +1,153 @@
+"""What the public function refuses, and how it chooses its backend."""
+
+from __future__ import annotations
+
+import logging
+
+import pytest
+import torch
+
+from headbench.bench.errors import UnavailableError
+from headbench.methods.splats import available_backends, cpu, rasterize
+
+from .scenes import cloud
+
+BAD = {
+    "means": [
+        (torch.zeros(5, 2), r"means: expected shape \(5, 3\)"),
+        (torch.zeros(5, 3, dtype=torch.int64), "means: .*int64"),
+    ],
+    "quats": [(torch.zeros(4, 4), r"quats: expected shape \(5, 4\).*found shape \(4, 4\)")],
+    "scales": [(torch.zeros(5, 3, dtype=torch.float64), "scales: expected dtype torch.float32.*float64")],
+    "opacities": [
+        (torch.zeros(5, 1), r"opacities: expected shape \(5,\)"),
+        ([0.0] * 5, "opacities: .*torch tensor.*list"),
+    ],
+    "colors": [
+        (torch.zeros(5), "colors"),
+        (torch.zeros(5, 33), "colors: .*1 to 32"),
+        (torch.zeros(5, 0), "colors"),
+    ],
+    "viewmat": [(torch.eye(3), r"viewmat: expected shape \(4, 4\)")],
+    "K": [(torch.eye(4), r"K: expected shape \(3, 3\)")],
+    "width": [(0, "width: expected a positive integer"), (10.0, "width: expected a positive integer")],
+    "height": [(-3, "height: expected a positive integer")],
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"), [(k, v, m) for k, cases in BAD.items() for v, m in cases]
+)
+def test_wrong_arguments_are_named(name, value, message):
+    scene = cloud(5, 8, 8)._replace(**{name: value})
+    with pytest.raises(ValueError, match=message):
+        rasterize(*scene[:9])
+
+
+@pytest.mark.parametrize("backend", available_backends())
+@pytest.mark.parametrize(
+    "name", ["means", "quats", "scales", "opacities", "colors", "viewmat", "K", "background"]
+)
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_values_that_are_not_finite_are_refused(backend, name, value):
+    scene = cloud(5, 8, 8)
+    bad = getattr(scene, name).clone()
+    bad.view(-1)[-1] = value
+    scene = scene._replace(**{name: bad})
+    with pytest.raises(ValueError, match=rf"{name}: expected finite values, found 1 that are not"):
+        rasterize(*scene[:9], background=scene.background, backend=backend)
+
+
+def test_large_finite_values_are_not_mistaken_for_infinite():
+    scene = cloud(5, 8, 8)
+    scene.means[:] = 3e38  # their sum overflows
+    assert not rasterize(*scene[:9]).alpha.any()
+
+
+@pytest.mark.parametrize("backend", available_backends())
+def test_unchecked_geometry_that_is_not_finite_is_culled(backend):
+    scene = cloud(40, 20, 20, seed=1, size=0.1)
+    for index, field in enumerate(("means", "quats", "scales", "opacities")):
+        getattr(scene, field)[index] = float("nan")
+    result = rasterize(*scene[:9], backend=backend, check_finite=False)
+    assert result.radii[:4].tolist() == [0] * 4
+    without = rasterize(*[value[4:] for value in scene[:5]], *scene[5:9], backend=backend)
+    assert torch.equal(result.image, without.image)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"near": 0.0}, "near, far"),
+        ({"near": 2.0, "far": 1.0}, "near, far"),
+        ({"eps2d": -0.1}, "eps2d"),
+        ({"background": torch.zeros(4)}, r"background: expected shape \(3,\)"),
+        ({"means2d_offset": torch.zeros(5, 3)}, r"means2d_offset: expected shape \(5, 2\)"),
+        ({"backend": "gpu"}, "backend: expected one of 'auto'"),
+        ({"backend": "cpu", "threads": 0}, "threads: expected a positive integer"),
+    ],
+)
+def test_wrong_options_are_named(options, message):
+    if options.get("threads") == 0 and "cpu" not in available_backends():
+        pytest.skip("the splat kernel is not installed: no C++ compiler was found")
+    with pytest.raises(ValueError, match=message):
+        rasterize(*cloud(5, 8, 8)[:9], **options)
+
+
+@pytest.mark.parametrize("backend", available_backends())
+def test_near_far_and_low_pass_are_parameters(backend):
+    scene = cloud(1, 15, 15)._replace(
+        means=torch.tensor([[0.0, 0.0, 1.0]]), viewmat=torch.eye(4), opacities=torch.tensor([0.9])
+    )
+    assert rasterize(*scene[:9], backend=backend).alpha.any()
+    assert not rasterize(*scene[:9], near=1.1, backend=backend).alpha.any()
+    assert not rasterize(*scene[:9], far=0.9, backend=backend).alpha.any()
+    sharp, soft = (rasterize(*scene[:9], eps2d=eps, backend=backend) for eps in (0.01, 30.0))
+    assert (sharp.alpha > 0).sum() < (soft.alpha > 0).sum()
+
+
+def test_cameras_may_be_numpy_and_of_another_precision():
+    scene = cloud(30, 12, 12)
+    one = rasterize(*scene[:9])
+    two = rasterize(*scene[:5], scene.viewmat.double().numpy(), scene.K.double().numpy(), 12, 12)
+    assert torch.equal(one.image, two.image)
+
+
+def test_double_precision_goes_to_the_reference():
+    scene = cloud(10, 9, 9)
+    inputs = [value.double() for value in scene[:7]]
+    auto, reference = (rasterize(*inputs, 9, 9, backend=backend) for backend in ("auto", "reference"))
+    assert auto.image.dtype == torch.float64
+    assert torch.equal(auto.image, reference.image)
+    if "cpu" in available_backends():
+        with pytest.raises(ValueError, match="float32 on the CPU.*float64"):
+            rasterize(*inputs, 9, 9, backend="cpu")
+
+
+@pytest.fixture
+def without_kernel(monkeypatch):
+    """Make the kernel's import fail, as on a machine without a compiler."""
+
+    def fail(*_):
+        raise ImportError("no kernel here")
+
+    for cached in (cpu.load, cpu.instruction_sets, cpu.usable_or_warn):
+        cached.cache_clear()
+    monkeypatch.setattr(cpu.importlib, "import_module", fail)
+    yield
+    for cached in (cpu.load, cpu.instruction_sets, cpu.usable_or_warn):
+        cached.cache_clear()
+
+
+@pytest.mark.usefixtures("without_kernel")
+def test_without_the_kernel_the_reference_draws_and_says_so_once(caplog):
+    scene = cloud(10, 9, 9)
+    assert available_backends() == ("reference",)
+    with caplog.at_level(logging.WARNING):
+        images = [rasterize(*scene[:9]).image for _ in range(2)]
+    assert torch.equal(images[0], rasterize(*scene[:9], backend="reference").image)
+    assert [record.message for record in caplog.records] == [
+        f"The splat kernel cannot be used (no kernel here). {cpu.REMEDY}"
+    ]
+    with pytest.raises(UnavailableError, match="no kernel here.*compiler"):
+        rasterize(*scene[:9], backend="cpu")

@@ -1,0 +1,188 @@
+"""The reference renderer against closed forms, finite differences and a brute-force renderer."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from headbench.methods.splats import rasterize
+from headbench.methods.splats.reference import rotation_matrices
+
+from .compare import DIFFERENTIABLE, relative_error, render_with_gradients
+from .dense import render_dense
+from .scenes import Scene, cloud
+
+F64 = torch.float64
+FOCAL, DEPTH, SIZE = 40.0, 2.0, 21
+K = torch.tensor([[FOCAL, 0, 10.5], [0, FOCAL, 10.5], [0, 0, 1]], dtype=F64)
+
+
+def on_axis(depths, scales, opacities, colors):
+    """Isotropic splats on the optical axis, one per entry."""
+    count = len(depths)
+    means = torch.zeros(count, 3, dtype=F64)
+    means[:, 2] = torch.tensor(depths, dtype=F64)
+    quats = torch.tensor([[1.0, 0, 0, 0]], dtype=F64).repeat(count, 1)
+    return (
+        means,
+        quats,
+        torch.tensor(scales, dtype=F64)[:, None].repeat(1, 3),
+        torch.tensor(opacities, dtype=F64),
+        torch.tensor(colors, dtype=F64),
+        torch.eye(4, dtype=F64),
+        K,
+        SIZE,
+        SIZE,
+    )
+
+
+def test_one_isotropic_splat_has_the_closed_form():
+    scale, opacity = 0.1, 0.7
+    result = rasterize(*on_axis([DEPTH], [scale], [opacity], [[2.0]]), background=[0.5], backend="reference")
+    # On the axis the projection of an isotropic Gaussian is isotropic, of variance (f s / z)² + 0.3.
+    variance = (FOCAL * scale / DEPTH) ** 2 + 0.3
+    for row in range(SIZE):
+        for column in range(SIZE):
+            distance2 = (row + 0.5 - 10.5) ** 2 + (column + 0.5 - 10.5) ** 2
+            alpha = opacity * math.exp(-distance2 / (2 * variance))
+            alpha = alpha if alpha >= 1 / 255 else 0.0
+            assert float(result.alpha[row, column]) == pytest.approx(alpha, abs=1e-14)
+            assert float(result.image[row, column, 0]) == pytest.approx(
+                2 * alpha + 0.5 * (1 - alpha), abs=1e-14
+            )
+    reach = math.sqrt(2 * math.log(255 * opacity) * variance)
+    assert result.radii.tolist() == [math.ceil(reach)]
+
+
+def test_nearer_splat_covers_the_farther_whatever_their_order():
+    near_first = on_axis([2.0, 3.0], [0.1, 0.1], [0.6, 0.5], [[1.0, 0.0], [0.0, 1.0]])
+    far_first = on_axis([3.0, 2.0], [0.1, 0.1], [0.5, 0.6], [[0.0, 1.0], [1.0, 0.0]])
+    one, two = (rasterize(*s, backend="reference") for s in (near_first, far_first))
+    torch.testing.assert_close(one.image[10, 10], torch.tensor([0.6, 0.4 * 0.5], dtype=F64))
+    assert torch.equal(one.image, two.image)
+
+
+def test_alpha_is_clamped_and_the_clamp_stops_the_gradient():
+    inputs = list(on_axis([DEPTH], [0.1], [1.0], [[1.0]]))
+    inputs[3].requires_grad_()
+    result = rasterize(*inputs, backend="reference")
+    assert result.alpha[10, 10].item() == pytest.approx(0.99)
+    (gradient,) = torch.autograd.grad(result.image[10, 10, 0], inputs[3], retain_graph=True)
+    assert gradient.item() == 0
+    (gradient,) = torch.autograd.grad(result.image[10, 12, 0], inputs[3])
+    assert gradient.item() > 0
+
+
+def test_pixel_stops_before_the_splat_that_would_make_it_opaque():
+    # Transmittance 1, 0.01, 2e-4, and then 2e-5 would pass the limit of 1e-4: that splat is left out with all behind
+    # it, even the last, which by itself would not pass it.
+    inputs = on_axis([1.0, 2.0, 3.0, 4.0], [0.2] * 4, [0.99, 0.98, 0.9, 0.3], [[1.0], [10.0], [1e3], [1e4]])
+    result = rasterize(*inputs, backend="reference")
+    assert float(result.alpha[10, 10]) == pytest.approx(1 - 0.01 * 0.02)
+    assert float(result.image[10, 10, 0]) == pytest.approx(0.99 + 10 * 0.01 * 0.98)
+
+
+def test_equal_depths_keep_the_order_of_indices():
+    result = rasterize(
+        *on_axis([2.0, 2.0], [0.1, 0.1], [0.5, 0.5], [[1.0, 0.0], [0.0, 1.0]]), backend="reference"
+    )
+    torch.testing.assert_close(result.image[10, 10], torch.tensor([0.5, 0.25], dtype=F64))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_agrees_with_brute_force(seed):
+    scene = cloud(80, 37, 26, seed=seed)
+    truth = render_dense(scene)
+    result = rasterize(
+        *(v.double() if torch.is_tensor(v) else v for v in scene[:9]), background=scene.background
+    )
+    assert truth.safe.float().mean() > 0.8
+    torch.testing.assert_close(result.image[truth.safe], truth.image[truth.safe], rtol=0, atol=1e-9)
+    torch.testing.assert_close(result.alpha[truth.safe], truth.alpha[truth.safe], rtol=0, atol=1e-9)
+
+
+def test_gradients_agree_with_finite_differences():
+    # Faint wide splats: every one reaches every pixel, so no threshold makes the image jump.
+    scene = cloud(6, 5, 4, seed=3, size=0.4, opacity=-1.0)
+    scene = scene._replace(
+        means=scene.means * torch.tensor([0.2, 0.2, 0.1]) + torch.tensor([0.0, 0.0, 1.5]),
+        opacities=scene.opacities.clamp(0.2, 0.5),
+    )
+    leaves = [
+        value.double().requires_grad_()
+        for value in (*scene[:6], scene.background, torch.zeros(len(scene.means), 2))
+    ]
+
+    def render(*tensors):
+        *geometry, background, offset = tensors
+        result = rasterize(
+            *geometry, scene.K, scene.width, scene.height, background=background, means2d_offset=offset
+        )
+        return result.image, result.alpha
+
+    assert len(leaves) == len(DIFFERENTIABLE)
+    assert torch.autograd.gradcheck(render, leaves, eps=1e-6, atol=1e-6)
+
+
+def test_gradients_where_slopes_are_clamped():
+    # A wide splat beyond the widened frustum that still reaches into the image.
+    scene = cloud(1, 6, 5, seed=1)._replace(
+        means=torch.tensor([[2.2, 0.1, 1.0]]),
+        scales=torch.tensor([[0.9, 0.8, 0.7]]),
+        opacities=torch.tensor([0.8]),
+        viewmat=torch.eye(4),
+    )
+    leaves = [scene.means.double().requires_grad_(), scene.viewmat.double().requires_grad_()]
+
+    def render(means, viewmat):
+        rest = (v.double() for v in scene[1:5])
+        return rasterize(means, *rest, viewmat, scene.K, scene.width, scene.height).image
+
+    assert render(*leaves).abs().max() > 0.01
+    assert torch.autograd.gradcheck(render, leaves, eps=1e-6, atol=1e-6)
+
+
+def test_tiles_and_chunks_do_not_show(monkeypatch):
+    from headbench.methods.splats import reference
+
+    scene = cloud(60, 40, 35, seed=5)
+    whole = render_with_gradients(scene, F64, backend="reference")
+    monkeypatch.setattr(reference, "TILE", 7)
+    monkeypatch.setattr(reference, "CHUNK", 5)
+    cut = render_with_gradients(scene, F64, backend="reference")
+    torch.testing.assert_close(cut.rendering.image, whole.rendering.image, rtol=0, atol=1e-12)
+    for name, gradient in whole.gradients.items():
+        assert relative_error(cut.gradients[name], gradient) < 1e-10, name
+
+
+def test_rotation_matrices_agree_with_scipy_at_any_length():
+    quats = torch.randn(50, 4, dtype=F64, generator=torch.Generator().manual_seed(0))
+    truth = torch.from_numpy(Rotation.from_quat(quats[:, [1, 2, 3, 0]].numpy()).as_matrix())
+    for length in (1.0, 1e-9, 1e150):
+        torch.testing.assert_close(rotation_matrices(length * quats), truth, rtol=0, atol=1e-12)
+    assert torch.equal(rotation_matrices(torch.zeros(1, 4))[0], torch.eye(3))
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 10_000), angle=st.floats(-3, 3), shift=st.floats(-5, 5))
+def test_moving_splats_and_camera_together_changes_nothing(seed, angle, shift):
+    scene = Scene(*(v.double() if torch.is_tensor(v) else v for v in cloud(12, 18, 17, seed=seed)))
+    turn = Rotation.from_rotvec([0.3 * angle, angle, -0.7 * angle])
+    motion = torch.eye(4, dtype=F64)
+    motion[:3, :3] = torch.from_numpy(turn.as_matrix())
+    motion[:3, 3] = torch.tensor([shift, -2 * shift, 0.5])
+    turned = (turn * Rotation.from_quat(scene.quats[:, [1, 2, 3, 0]].numpy())).as_quat()
+    moved = scene._replace(
+        means=scene.means @ motion[:3, :3].T + motion[:3, 3],
+        quats=torch.from_numpy(turned[:, [3, 0, 1, 2]]),
+        viewmat=scene.viewmat @ torch.linalg.inv(motion),
+    )
+    # Pixels at a threshold may jump with the last bit of the motion.
+    safe = render_dense(scene).safe
+    one, two = (rasterize(*s[:9], background=s.background) for s in (scene, moved))
+    torch.testing.assert_close(one.image[safe], two.image[safe], rtol=0, atol=1e-9)
