@@ -171,7 +171,7 @@ def _weights(
     inside = np.concatenate([parts.teeth, parts.gums_and_tongue, parts.mouth_socket])
     on_neck[inside] = 1  # what is in the mouth hangs on the head, however low it reaches
     still = np.zeros_like(jaw)
-    weights = np.stack([(1 - jaw) * (1 - on_neck), (1 - jaw) * on_neck, jaw, still, still], axis=1)
+    weights = np.stack([1 - on_neck, on_neck * (1 - jaw), on_neck * jaw, still, still], axis=1)
     weights[parts.left_eyeball] = [0, 0, 0, 1, 0]
     weights[parts.right_eyeball] = [0, 0, 0, 0, 1]
     return weights

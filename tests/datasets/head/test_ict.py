@@ -1,0 +1,188 @@
+"""ICT-FaceKit: the fitted rig against the kit's own blendshapes."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from headbench.bench.errors import InputError
+from headbench.datasets.head.ict import (
+    DROPPED_SHAPES,
+    VERSION,
+    expression_names,
+    fitted_jaw,
+    ict_head,
+    is_ict,
+)
+from headbench.datasets.head.loaders import load_head
+from headbench.datasets.head.model import HeadModel
+from headbench.datasets.head.teeth import with_teeth
+
+FILE = Path(__file__).parents[4] / "shared" / "data" / "ict_facekit" / "ict_facekit_f16.npz"
+
+
+@pytest.fixture(scope="module")
+def content():
+    if not FILE.exists():
+        pytest.skip("ICT-FaceKit is not beside the repository (shared/data/ict_facekit)")
+    with np.load(FILE, allow_pickle=False) as archive:
+        return {name: archive[name] for name in archive.files}
+
+
+@pytest.fixture(scope="module")
+def head(content):
+    return load_head(FILE)
+
+
+@pytest.fixture(scope="module")
+def model(head):
+    return HeadModel(head, dtype=torch.float64)
+
+
+def displacement(content, name):
+    index = [str(shape) for shape in content["expr_names"]].index(name)
+    return content["expr_deltas"][index].astype(np.float64) * 0.01
+
+
+def vertices(model, **given_values):
+    sizes = {"shape": model.shape_size, "expression": model.expression_size}
+    sizes |= {"rotation": 3, "neck": 3, "jaw": 3, "eyes": 6, "translation": 3}
+    values = {name: torch.zeros(size, dtype=torch.float64) for name, size in sizes.items()}
+    return model(**values | {k: torch.tensor(v, dtype=torch.float64) for k, v in given_values.items()})[
+        0
+    ].numpy()
+
+
+def test_layout(head, content):
+    assert head.version == VERSION
+    assert head.shape_basis.shape[2] == len(content["id_deltas"])
+    assert head.expression_basis.shape[2] == len(content["expr_names"]) - 2
+    assert len(expression_names(content)) == head.expression_basis.shape[2]
+    assert not set(DROPPED_SHAPES) & set(expression_names(content))
+    assert len([name for name in head.landmarks if name.startswith("ibug_")]) == 68
+
+
+def test_placement_is_metric_and_central(head):
+    nose, chin = (head.template[head.landmarks[name]] for name in ("ibug_30", "ibug_08"))
+    assert nose[2] > 0.08
+    assert chin[1] < -0.08
+    assert head.template[head.landmarks["ibug_45"], 0] > 0.03  # subject's left is +x
+    above_chin = head.template[head.template[:, 1] > chin[1]]
+    np.testing.assert_allclose(above_chin.min(0) + above_chin.max(0), 0, atol=1e-9)
+    assert 0.055 < np.ptp(HeadModel(head).joints(*zeros(head))[0, 3:, 0].numpy()) < 0.07  # between the pupils
+
+
+def zeros(head):
+    return torch.zeros(head.shape_basis.shape[2]), torch.zeros(head.expression_basis.shape[2])
+
+
+def test_expressions_and_identities_are_the_kits(head, model, content):
+    names = expression_names(content)
+    for name in (names[0], "eyeBlink_L", names[-1]):
+        moved = vertices(model, expression=np.eye(len(names))[names.index(name)]) - head.template
+        np.testing.assert_allclose(moved, displacement(content, name), atol=1e-8)
+    moved = model.canonical(torch.eye(100, dtype=torch.float64)[7])[0].numpy() - head.template
+    np.testing.assert_allclose(moved, content["id_deltas"][7].astype(np.float64) * 0.01, atol=1e-8)
+
+
+def test_the_jaw_reproduces_jaw_open(head, model, content):
+    wanted = displacement(content, "jawOpen")
+    jaw = fitted_jaw(head, wanted)
+    assert 15 < np.degrees(jaw.angle) < 35
+    np.testing.assert_allclose(model.joints(*(z.double() for z in zeros(head)))[0, 2], jaw.center, atol=1e-9)
+    full = vertices(model, jaw=[jaw.angle, 0, 0]) - head.template
+    assert np.linalg.norm(full - wanted, axis=1).max() < 1e-6
+    # Half-way the teeth follow the arc, the linear blendshape the chord: 2.4 mm apart at most.
+    half = vertices(model, jaw=[jaw.angle / 2, 0, 0]) - head.template
+    assert np.linalg.norm(half - wanted / 2, axis=1).max() < 2.5e-3
+
+
+def test_skinning_alone_explains_the_jaw(head, content):
+    wanted = displacement(content, "jawOpen")
+    jaw = fitted_jaw(head, wanted)
+    rigid = head.skinning_weights[:, 2:3] * jaw.displacement(head.template)
+    moving = np.linalg.norm(wanted, axis=1) > 1e-4
+    error = np.linalg.norm(rigid - wanted, axis=1)
+    assert np.sqrt(np.mean(error[moving] ** 2)) < 3e-3
+    assert np.percentile(error[moving], 95) < 6e-3
+    assert error[head.regions["teeth_lower"]].max() < 3e-4
+
+
+def test_eyes_turn_about_their_centres(head, model):
+    turned = vertices(model, eyes=[0, 0.3, 0, 0, 0.3, 0])
+    joints = model.joints(*(z.double() for z in zeros(head)))[0].numpy()
+    for side, joint in (("left", 3), ("right", 4)):
+        ball = head.regions[f"{side}_sclera"]
+        distance = np.linalg.norm(head.template[ball] - joints[joint], axis=1)
+        back = head.template[ball, 2] < joints[joint, 2]
+        assert np.ptp(distance[back]) < 0.1 * distance[back].mean()
+        np.testing.assert_allclose(np.linalg.norm(turned[ball] - joints[joint], axis=1), distance, atol=1e-12)
+        front = ball[np.argmax(head.template[ball, 2])]
+        assert turned[front, 0] - head.template[front, 0] > 0.003  # to the subject's left
+
+
+def test_the_neck_carries_the_head_and_leaves_the_shoulders(head, model):
+    turned = vertices(model, neck=[0, 0.4, 0])
+    moved = np.linalg.norm(turned - head.template, axis=1)
+    assert moved[head.regions["shoulders"]].max() < 1e-6
+    face = head.regions["face"]
+    joint = model.joints(*(z.double() for z in zeros(head)))[0, 1].numpy()
+    before, after = (np.linalg.norm(place[face] - joint, axis=1) for place in (head.template, turned))
+    np.testing.assert_allclose(before, after, atol=1e-6)
+
+
+def test_regions(head):
+    regions = {name: set(members.tolist()) for name, members in head.regions.items()}
+    needed = (
+        "face",
+        "eye_region",
+        "lips",
+        "scalp",
+        "neck",
+        "left_ear",
+        "teeth_upper",
+        "hair",
+        "skin",
+        "nose",
+    )
+    for name in needed:
+        assert regions[name], name
+    assert not regions["face"] & (regions["neck"] | regions["left_ear"] | regions["right_ear"])
+    assert regions["eye_region"] | regions["forehead"] <= regions["face"]
+    assert regions["teeth_upper"] | regions["teeth_lower"] == regions["teeth"]
+    assert not regions["teeth_upper"] & regions["teeth_lower"]
+    assert {head.landmarks[f"ibug_{index:02d}"] for index in range(48, 60)} <= regions["lips"]
+    assert {head.landmarks[f"ibug_{index:02d}"] for index in range(17, 68)} <= regions["face"]
+    left = head.template[head.regions["left_ear"], 0]
+    assert left.min() > 0.05
+    assert abs(len(regions["left_ear"]) - len(regions["right_ear"])) < 5  # the kit is symmetric
+    with pytest.raises(InputError, match="without teeth"):
+        with_teeth(head)
+
+
+BAD = {
+    "v_neutral": lambda c: c["v_neutral"][:-1],
+    "id_deltas": lambda c: None,
+    "tri_v": lambda c: c["tri_v"].astype(float),
+    "tri_material": lambda c: c["tri_material"] + 12,
+    "expr_names": lambda c: np.array([str(name).upper() for name in c["expr_names"]]),
+    "material_names": lambda c: np.array([str(name).upper() for name in c["material_names"]]),
+    "idx_to_landmark_verts": lambda c: c["idx_to_landmark_verts"][:51],
+}
+
+
+@pytest.mark.parametrize("key", BAD)
+def test_refuses_other_content(content, key):
+    changed = content | {key: BAD[key](content)}
+    changed = {name: value for name, value in changed.items() if value is not None}
+    with pytest.raises(InputError) as caught:
+        ict_head("kit.npz", changed)
+    assert caught.value.file == "kit.npz"
+    if key != "v_neutral":  # there it is the first array that disagrees
+        assert caught.value.key == key
+
+
+def test_recognises_the_kit(content):
+    assert is_ict(content)
+    assert not is_ict({"template": np.zeros(3)})

@@ -1,0 +1,149 @@
+"""Loading by content: FLAME pickles of both kinds, our npz, masks and further files."""
+
+import json
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from headbench.bench.errors import InputError
+from headbench.datasets.head.arrays import RING_REGIONS, save_head
+from headbench.datasets.head.loaders import flame_version, load_head, read_masks, with_eyelids
+
+from .flame_files import flame_content, legacy_pickle, write_flame
+from .toy import toy_head
+
+FLAME = toy_head(16, shape_size=300, expression_size=100)
+RINGS = {name: FLAME.regions[name] for name in RING_REGIONS}
+MASKS = {name: members for name, members in FLAME.regions.items() if name not in RINGS}
+
+
+@pytest.mark.parametrize("legacy", [True, False])
+def test_flame_pickle(tmp_path, legacy):
+    head = load_head(write_flame(tmp_path / "generic_model.pkl", FLAME, legacy=legacy))
+    assert head.version == "flame2020"
+    for name in ("template", "faces", "shape_basis", "expression_basis", "pose_basis", "joint_regressor"):
+        np.testing.assert_array_equal(getattr(head, name), getattr(FLAME, name))
+    np.testing.assert_array_equal(head.skinning_weights, FLAME.skinning_weights)
+    np.testing.assert_array_equal(head.parents, [-1, 0, 1, 1, 1])
+    assert head.regions == {}
+
+
+@pytest.mark.parametrize(
+    ("name", "version"),
+    [
+        ("generic_model.pkl", "flame2020"),
+        ("FLAME2020.pkl", "flame2020"),
+        ("flame2023.pkl", "flame2023"),
+        ("FLAME-2023.pkl", "flame2023"),
+        ("flame2023_no_jaw.pkl", "flame2023_no_jaw"),
+    ],
+)
+def test_version_by_name(name, version):
+    assert flame_version(Path("some/where") / name) == version
+
+
+def test_version_is_asked_for_where_the_name_is_silent(tmp_path):
+    path = write_flame(tmp_path / "model.pkl", FLAME)
+    with pytest.raises(InputError, match="not interchangeable") as caught:
+        load_head(path)
+    assert caught.value.key == "version"
+    assert load_head(path, version="flame2023").version == "flame2023"
+
+
+def test_masks_and_regions(tmp_path):
+    path = write_flame(tmp_path / "flame2023.pkl", FLAME)
+    shuffled = {name: np.random.default_rng(0).permutation(members) for name, members in MASKS.items()}
+    (tmp_path / "FLAME_masks.pkl").write_bytes(legacy_pickle(shuffled))
+    rings = {name: members[::-1].tolist() for name, members in RINGS.items()}
+    (tmp_path / "rings.json").write_text(json.dumps(rings))
+    head = load_head(path, masks=tmp_path / "FLAME_masks.pkl", regions=tmp_path / "rings.json")
+    for name, members in MASKS.items():
+        np.testing.assert_array_equal(head.regions[name], members)
+    for name in RING_REGIONS:
+        np.testing.assert_array_equal(head.regions[name], rings[name])  # order kept
+    assert {"hair", "ears", "eyeballs", "skin"} <= set(head.regions)
+
+
+def test_our_npz_round_trip(tmp_path):
+    head = load_head(write_flame(tmp_path / "flame2020.pkl", FLAME))
+    save_head(tmp_path / "head.npz", head)
+    again = load_head(tmp_path / "head.npz")
+    assert again.fingerprint() == head.fingerprint()
+    assert load_head(tmp_path / "head.npz", version="flame2020").version == "flame2020"
+    with pytest.raises(InputError, match="flame2023"):
+        load_head(tmp_path / "head.npz", version="flame2023")
+
+
+def flame_without(**changes):
+    content = flame_content(FLAME) | changes
+    return {name: value for name, value in content.items() if value is not None}
+
+
+BAD = {
+    "v_template": {"v_template": None},
+    "shapedirs": {"shapedirs": FLAME.shape_basis},
+    "f": {"f": FLAME.faces.astype(float)},
+    "kintree_table": {"kintree_table": np.arange(5)},
+    "parents": {"kintree_table": np.array([[0, 0, 9, 1, 1], [0, 1, 2, 3, 4]])},
+    "pose_basis": {"posedirs": FLAME.pose_basis[:, :, :9]},
+    "J_regressor": {"J_regressor": "text"},
+    "skinning_weights": {"weights": 2 * FLAME.skinning_weights},
+    "template": {"v_template": np.full_like(FLAME.template, np.nan)},
+}
+
+
+@pytest.mark.parametrize("key", BAD)
+def test_refuses_what_makes_no_head(tmp_path, key):
+    path = tmp_path / "flame2020.pkl"
+    path.write_bytes(pickle.dumps(flame_without(**BAD[key])))
+    with pytest.raises(InputError) as caught:
+        load_head(path)
+    assert caught.value.file == str(path)
+    assert caught.value.key == key
+
+
+def test_refuses_other_files(tmp_path):
+    (tmp_path / "flame2020.pkl").write_text("solid head")
+    np.savez(tmp_path / "other.npz", x=np.zeros(3))
+    for name in ("flame2020.pkl", "other.npz", "none.npz"):
+        with pytest.raises(InputError, match=name):
+            load_head(tmp_path / name)
+    with pytest.raises(InputError):
+        load_head(tmp_path)
+
+
+def test_masks_are_checked(tmp_path):
+    path = write_flame(tmp_path / "flame2020.pkl", FLAME)
+    bad = {"real.pkl": np.array([0.5]), "table.pkl": np.zeros((2, 2), int), "far.pkl": np.array([10**6])}
+    for name, members in bad.items():
+        (tmp_path / name).write_bytes(pickle.dumps({"face": members}))
+        with pytest.raises(InputError, match="face"):
+            load_head(path, masks=tmp_path / name)
+    with pytest.raises(InputError):
+        read_masks(tmp_path / "none.pkl")
+
+
+@pytest.mark.parametrize(
+    "text", ["[1, 2]", '{"x": "abc"}', '{"x": [1.5]}', '{"x": [true]}', '{"x": [[1]]}', "{"]
+)
+def test_region_files_are_checked(tmp_path, text):
+    path = write_flame(tmp_path / "flame2020.pkl", FLAME)
+    (tmp_path / "regions.json").write_text(text)
+    with pytest.raises(InputError, match=r"regions\.json"):
+        load_head(path, regions=tmp_path / "regions.json")
+
+
+def test_eyelid_files(tmp_path):
+    bases = np.random.default_rng(0).normal(size=(2, *FLAME.template.shape))
+    np.save(tmp_path / "l.npy", bases[0])
+    np.save(tmp_path / "r.npy", bases[1])
+    head = with_eyelids(FLAME, tmp_path / "l.npy", tmp_path / "r.npy")
+    np.testing.assert_array_equal(head.eyelid_basis[:, :, 1], bases[1])
+    np.save(tmp_path / "short.npy", bases[0, :-1])
+    np.save(tmp_path / "object.npy", np.array([{}], dtype=object), allow_pickle=True)
+    (tmp_path / "cut.npy").write_bytes((tmp_path / "l.npy").read_bytes()[:200])
+    for name in ("short.npy", "object.npy", "cut.npy", "none.npy"):
+        with pytest.raises(InputError, match=name):
+            with_eyelids(FLAME, tmp_path / "l.npy", tmp_path / name)

@@ -1,0 +1,181 @@
+"""Teeth: GaussianAvatars' counts, block order and geometry on any topology; lip rings found in the mesh."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from headbench.bench.errors import InputError
+from headbench.datasets.head.arrays import RING_REGIONS
+from headbench.datasets.head.lips import lip_rings
+from headbench.datasets.head.model import HeadModel
+from headbench.datasets.head.teeth import with_teeth
+
+from .toy import toy_head
+
+HEAD = toy_head(80, eyelids=True)
+
+
+def ringed(columns, reverse=False):
+    """The toy with rings of a given length."""
+    upper, lower = (HEAD.regions[name] for name in RING_REGIONS)
+    step = -1 if reverse else 1
+    rings = dict(zip(RING_REGIONS, (upper[:columns][::step], lower[:columns][::step])))
+    return replace(HEAD, regions=HEAD.regions | rings)
+
+
+def rows_of(head, columns):
+    return head.template[len(HEAD.template) :].reshape(8, columns, 3)
+
+
+def test_counts_of_the_flame_layout():
+    head, toothed = ringed(13), with_teeth(ringed(13))
+    toothed.validate("toothed")
+    assert len(head.regions["lip_outside_ring_upper"]) == 13
+    assert len(toothed.template) - len(head.template) == 8 * 13
+    assert len(toothed.faces) - len(head.faces) == 12 * 12
+    big = toy_head(96)
+    assert len(big.regions["lip_outside_ring_upper"]) == 17
+    rings = {name: big.regions[name][1:-1] for name in RING_REGIONS}
+    toothed = with_teeth(replace(big, regions=big.regions | rings))
+    assert len(toothed.template) - len(big.template) == 120
+    assert len(toothed.faces) - len(big.faces) == 168
+    new = toothed.faces[len(big.faces) :] - len(big.template)
+    assert new.min() == 0
+    assert new.max() == 119
+    # Blocks of 15: upper root, lower root, upper edge, lower edge, upper root back, upper edge back, lower
+    # root back, lower edge back; strips of 28: upper front, back, edge, then lower front, back, edge.
+    blocks = [set(np.unique(strip // 15)) for strip in new.reshape(6, 28, 3)]
+    assert blocks == [{0, 2}, {4, 5}, {2, 5}, {1, 3}, {6, 7}, {3, 7}]
+    upper = {*range(15), *range(30, 45), *range(60, 90)}
+    assert set(toothed.regions["teeth_upper"] - len(big.template)) == upper
+    assert set(toothed.regions["teeth_lower"] - len(big.template)) == set(range(120)) - upper
+
+
+def test_positions_follow_the_recipe():
+    columns = 11
+    head = ringed(columns)
+    upper, lower = (head.template[head.regions[name]] for name in RING_REGIONS)
+    distance = np.mean([np.linalg.norm(a - b) for a, b in zip(upper, lower)])
+    rows = rows_of(with_teeth(head), columns)
+    level = np.mean([(a[1] + b[1]) / 2 for a, b in zip(upper, lower)])
+    for column in range(columns):
+        x = (upper[column, 0] + lower[column, 0]) / 2
+        z = (upper[column, 2] + lower[column, 2]) / 2 - 1.5 * distance
+        expected = [
+            (level + 2.1 * distance, z),
+            (level - 2.1 * distance, z - 0.4 * distance),
+            (level + 0.1 * distance, z),
+            (level - 0.1 * distance, z - 0.4 * distance),
+            (level + 2.1 * distance, z - distance),
+            (level + 0.1 * distance, z - distance),
+            (level - 2.1 * distance, z - 1.4 * distance),
+            (level - 0.1 * distance, z - 1.4 * distance),
+        ]
+        np.testing.assert_allclose(rows[:, column, 0], x, atol=1e-15)
+        np.testing.assert_allclose(rows[:, column, 1:], expected, atol=1e-15)
+
+
+@pytest.mark.parametrize("reverse", [False, True])
+def test_teeth_face_outwards(reverse):
+    columns = 13
+    toothed = with_teeth(ringed(columns, reverse))
+    triangles = toothed.template[toothed.faces[len(HEAD.faces) :]].reshape(6, 2 * (columns - 1), 3, 3)
+    normals = np.cross(triangles[:, :, 1] - triangles[:, :, 0], triangles[:, :, 2] - triangles[:, :, 0])
+    outward = [(2, 1), (2, -1), (1, -1), (2, 1), (2, -1), (1, 1)]  # front +z, back -z, edges towards the gap
+    for strip, (axis, sign) in zip(normals, outward):
+        assert (sign * strip[:, axis] > 0).all()
+
+
+def test_diagonals_mirror_at_the_middle():
+    columns = 13
+    new = with_teeth(ringed(columns)).faces[len(HEAD.faces) :] - len(HEAD.template)
+    front = {frozenset((int(v) // columns, int(v) % columns) for v in triangle) for triangle in new[:24]}
+    mirrored = {frozenset((block, columns - 1 - column) for block, column in triangle) for triangle in front}
+    assert front == mirrored
+
+
+def test_teeth_move_with_the_jaw_and_the_identity_alone():
+    columns = 13
+    head = with_teeth(ringed(columns))
+    model = HeadModel(head, dtype=torch.float64)
+    zero = {"rotation": 3, "neck": 3, "jaw": 3, "eyes": 6, "translation": 3, "expression": 8, "shape": 6}
+    still = {name: torch.zeros(size, dtype=torch.float64) for name, size in zero.items()}
+    upper, lower = head.regions["teeth_upper"], head.regions["teeth_lower"]
+    rest = model(**still)[0].numpy()
+
+    jaw = torch.tensor([0.3, 0.0, 0.0], dtype=torch.float64)
+    opened = model(**still | {"jaw": jaw})[0].numpy()
+    np.testing.assert_allclose(opened[upper], rest[upper], atol=1e-15)
+    joint = model.joints(still["shape"], still["expression"])[0, 2].numpy()
+    c, s = np.cos(0.3), np.sin(0.3)
+    turn = np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
+    np.testing.assert_allclose(opened[lower], (rest[lower] - joint) @ turn.T + joint, atol=1e-14)
+
+    smiling = model(**still | {"expression": torch.ones(8, dtype=torch.float64)})[0].numpy()
+    np.testing.assert_array_equal(smiling[upper], rest[upper])
+
+    shape = torch.linspace(-1, 1, 6, dtype=torch.float64)
+    moved = model.canonical(shape)[0].numpy() - rest
+    rings = [head.regions[name] for name in RING_REGIONS]
+    expected = 0.5 * (moved[rings[0]] + moved[rings[1]])
+    for block in moved[len(HEAD.template) :].reshape(8, columns, 3):
+        np.testing.assert_allclose(block, expected, atol=1e-15)
+
+    plain = HeadModel(ringed(columns), dtype=torch.float64)
+    a = still | {"jaw": jaw, "neck": 2 * jaw, "shape": shape}
+    np.testing.assert_allclose(model(**a)[0, : len(HEAD.template)], plain(**a)[0], atol=1e-14)
+
+
+def test_refuses_a_second_set_and_unequal_rings():
+    with pytest.raises(InputError, match="without teeth"):
+        with_teeth(with_teeth(HEAD))
+    uneven = {"lip_outside_ring_upper": HEAD.regions["lip_outside_ring_upper"][1:]}
+    with pytest.raises(InputError, match="one length"):
+        with_teeth(replace(HEAD, regions=HEAD.regions | uneven))
+
+
+def without_rings():
+    """The toy as FLAME_masks.pkl would describe it: lips that reach into the mouth, face that does not."""
+    regions = {name: members for name, members in HEAD.regions.items() if name not in RING_REGIONS}
+    upper, lower = (HEAD.regions[name] for name in RING_REGIONS)
+    inside = np.setdiff1d(HEAD.regions["lips"], [*upper, *lower])
+    regions["face"] = np.setdiff1d(np.union1d(regions["face"], [*upper, *lower]), inside)
+    return replace(HEAD, regions=regions)
+
+
+@pytest.mark.parametrize("length", [5, 9, 13])
+def test_rings_are_found_where_the_lips_turn_inwards(length):
+    head = without_rings()
+    true_upper, true_lower = (HEAD.regions[name] for name in RING_REGIONS)
+    upper, lower = lip_rings(head, length)
+    assert len(upper) == len(lower) == length
+    assert set(upper) <= set(true_upper)
+    assert set(lower) <= set(true_lower)
+    for ring in (upper, lower):
+        x = head.template[ring, 0]
+        assert (np.diff(x) > 0).all()
+        spacing = np.ptp(x) / (length - 1)
+        assert np.abs(x - np.linspace(x[0], x[-1], length)).max() < spacing
+    with_teeth(head).validate("toothed")
+
+
+def test_all_of_a_short_rim_is_taken():
+    upper, lower = lip_rings(without_rings(), 99)
+    np.testing.assert_array_equal(upper, HEAD.regions["lip_outside_ring_upper"])
+    np.testing.assert_array_equal(lower, HEAD.regions["lip_outside_ring_lower"])
+
+
+def test_says_what_rings_need():
+    head = without_rings()
+    for name in ("lips", "face"):
+        rest = {key: members for key, members in head.regions.items() if key != name}
+        with pytest.raises(InputError, match=name):
+            lip_rings(replace(head, regions=rest))
+    outside = replace(head, regions=head.regions | {"face": np.arange(len(head.template))})
+    with pytest.raises(InputError, match="into the mouth"):
+        lip_rings(outside)
+    stiff = np.tile([0.0, 1, 0, 0, 0], (len(head.template), 1))
+    with pytest.raises(InputError, match="jaw"):
+        lip_rings(replace(head, skinning_weights=stiff))
