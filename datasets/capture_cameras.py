@@ -8,6 +8,7 @@ the shifted sequences are to be moved along.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -111,7 +112,7 @@ def _check_ids(entries: Sequence[FrameEntry]) -> None:
 def _check_same_optics(first: FrameEntry, entry: FrameEntry, infos: Mapping[Path, ImageInfo]) -> None:
     same_keys = first.intrinsics.keys() == entry.intrinsics.keys()
     if not same_keys or not all(
-        np.isclose(entry.intrinsics[key], value, rtol=1e-6, atol=1e-9)
+        math.isclose(entry.intrinsics[key], value, rel_tol=1e-6, abs_tol=1e-9)
         for key, value in first.intrinsics.items()
     ):
         raise InputError(

@@ -15,6 +15,7 @@ from ..bench.errors import InputError
 
 INTRINSIC_KEYS = ("cx", "cy", "fl_x", "fl_y", "camera_angle_x")
 RIGID_TOLERANCE = 1e-4
+_IDENTITY, _LAST_ROW = np.eye(3), np.array([0.0, 0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,8 +162,9 @@ class _Reader:
         if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
             raise self._fail(key, "a 4x4 matrix of finite numbers")
         rotation = matrix[:3, :3]
-        orthonormal = np.allclose(rotation @ rotation.T, np.eye(3), atol=RIGID_TOLERANCE)
-        if not orthonormal or np.linalg.det(rotation) < 0 or not np.allclose(matrix[3], [0, 0, 0, 1]):
+        skew = np.abs(rotation @ rotation.T - _IDENTITY).max()
+        projective = np.abs(matrix[3] - _LAST_ROW).max()
+        if max(skew, projective) > RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
             raise self._fail(key, "a rigid motion (orthonormal, right-handed, last row 0 0 0 1)")
         return matrix
 

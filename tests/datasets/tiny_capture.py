@@ -102,13 +102,18 @@ def silhouette(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> np.nd
     """(H, W) bool: pixels whose centre is covered, tested triangle by triangle with barycentric signs."""
     points = vertices @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
     pixels = (points @ camera.K.T)[:, :2] / points[:, 2:]
-    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
     covered = np.zeros((camera.height, camera.width), dtype=bool)
-    for a, b, c in pixels[faces]:
-        sides = [(q[0] - p[0]) * (y - p[1]) - (q[1] - p[1]) * (x - p[0]) for p, q in ((a, b), (b, c), (c, a))]
-        covered |= np.all([side >= 0 for side in sides], axis=0) | np.all(
-            [side <= 0 for side in sides], axis=0
-        )
+    size = [camera.width, camera.height]
+    for corners in pixels[faces]:
+        left, top = np.clip(np.floor(corners.min(axis=0)).astype(int), 0, size)
+        right, bottom = np.clip(np.ceil(corners.max(axis=0)).astype(int), 0, size)
+        y, x = np.mgrid[top:bottom, left:right] + 0.5
+        sides = [
+            (q[0] - p[0]) * (y - p[1]) - (q[1] - p[1]) * (x - p[0])
+            for p, q in zip(corners, np.roll(corners, -1, axis=0))
+        ]
+        inside = np.all([s >= 0 for s in sides], axis=0) | np.all([s <= 0 for s in sides], axis=0)
+        covered[top:bottom, left:right] |= inside
     return covered
 
 
