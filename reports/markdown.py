@@ -13,8 +13,8 @@ def to_markdown(table: Table) -> str:
     for index, column in enumerate(table.columns):
         follows = index > 0 and table.columns[index - 1].title == column.title
         tasks.append("" if follows else escape(column.title))
-        unit = f" [{column.unit}]" if column.unit else ""
-        names.append(f"**{escape(column.label)}**{escape(unit)} {column.arrow}")
+        unit = f" {escape(f'[{column.unit}]')}" if column.unit else ""
+        names.append(f"**{escape(column.label)}**{unit} {column.arrow}")
     lines = [tasks, names]
     for title, rows in table.groups:
         if len(table.groups) > 1:

@@ -79,13 +79,15 @@ class RunData:
         """Frames of a task, sorted."""
         return sorted(keys_of(self.manifest, task))
 
+    @property
+    def seed(self) -> int:
+        """The seed whose images are shown: the first configured."""
+        return int(self.manifest["configuration"]["seeds"][0])
+
     def render_path(self, method: str, task: str, key: FrameKey) -> Path | None:
-        """Render of a frame by the first seed that has it."""
-        for seed in self.manifest["configuration"]["seeds"]:
-            path = self.folder.cell(key.subject, method, int(seed)).render(task, key)
-            if path.is_file():
-                return path
-        return None
+        """Where that seed's render of a frame lies, or None where there is none."""
+        path = self.folder.cell(key.subject, method, self.seed).render(task, key)
+        return path if path.is_file() else None
 
     def render(self, method: str, task: str, key: FrameKey) -> ByteArray | None:
         """Read that render, (H, W, 3) 8-bit, or return None where there is none."""
@@ -103,10 +105,8 @@ class RunData:
         return "not rendered" if failed.empty else str(failed.iloc[0]["reason"])
 
     def value(self, metric: str, method: str, task: str, key: FrameKey) -> float | None:
-        """One frame's value of a metric, by the first seed; None where it was not measured."""
-        rows = self._by_frame
-        index = (metric, method, task, *key)
-        return float(rows.loc[index].iloc[0]) if index in rows.index else None
+        """Return a metric of the image shown, or None where it was not measured."""
+        return self._by_frame.get((metric, method, task, *key))
 
     @property
     def image_size(self) -> str:
@@ -126,10 +126,11 @@ class RunData:
         return " to ".join(dict.fromkeys(f"{w} x {h}" for w, h in (min(sizes), max(sizes)))) if sizes else ""
 
     @cached_property
-    def _by_frame(self) -> pd.Series:
-        measured = self.rows[(self.rows["status"] == "ok") & (self.rows["timestep"] >= 0)]
-        index = ["metric", "method", "task", *FrameKey._fields]
-        return measured.sort_values("seed").set_index(index)["value"].sort_index(kind="stable")
+    def _by_frame(self) -> dict[tuple[Any, ...], float]:
+        rows = self.rows
+        shown = rows[(rows["status"] == "ok") & (rows["timestep"] >= 0) & (rows["seed"] == self.seed)]
+        places = shown[["metric", "method", "task", *FrameKey._fields]].itertuples(index=False, name=None)
+        return dict(zip(places, shown["value"].astype(float)))
 
     @cached_property
     def _clips(self) -> dict[str, Clip]:

@@ -36,7 +36,7 @@ def write_contact_sheet(run_folder: Path, frames_per_task: int = FRAMES_PER_TASK
         data.methods,
         path,
         title=f"headbench: {', '.join(dict.fromkeys(key.subject for t in data.tasks for key in data.keys(t)))}",
-        subtitle=f"Frames evenly spaced over each task. Protocol {protocols}. First seed.",
+        subtitle=f"Frames evenly spaced over each task. Protocol {protocols}. Seed {data.seed}.",
         scaled_by=ranked or None,
     )
     return [path]

@@ -1,0 +1,78 @@
+import numpy as np
+import pytest
+
+from headbench.bench.errors import InputError
+from headbench.reports.aggregate import check_rows, macro_mean, summarise, task_frames
+
+
+def test_each_level_weighs_its_members_equally(make_rows):
+    values = {"EMO": (1.0, 2.0, 6.0), "EXP": 11.0, "s2": 100.0}
+
+    def value(metric, seed, subject, sequence, timestep, camera):
+        one = values["s2"] if subject == "s2" else values[sequence]
+        return (one[timestep] if isinstance(one, tuple) else one) + 10 * seed
+
+    rows = make_rows({"a": value}, seeds=(0, 2))
+    own = rows[(rows["task"] == "novel_view") & (rows["metric"] == "psnr")]
+    subject_1 = ((1 + 2 + 6) / 3 + 11) / 2
+    assert macro_mean(own) == pytest.approx((subject_1 + 100) / 2 + (0 + 20) / 2)
+    assert macro_mean(own) != pytest.approx(own["value"].mean())
+    assert macro_mean(own.sample(frac=1, random_state=1)) == pytest.approx(macro_mean(own))
+
+
+def test_a_method_that_lacks_a_frame_has_no_mean(make_rows):
+    rows = make_rows({"a": 1.0, "b": 2.0})
+    last = rows[(rows["method"] == "a") & (rows["task"] == "novel_view") & (rows["metric"] == "psnr")].index[
+        -1
+    ]
+    rows = rows.drop(last)
+    own = rows[rows["method"] == "a"]
+    assert len(task_frames(rows, "novel_view")) == 5
+    aggregate = summarise(rows, own, "novel_view", "psnr")
+    assert aggregate.value is None
+    assert aggregate.status == "missing"
+    assert "1 of 5 frames" in aggregate.reason
+    assert summarise(rows, own, "self_reenactment", "psnr").value == 1.0
+
+
+def test_a_seed_that_lacks_a_frame_leaves_no_mean_either(make_rows):
+    rows = make_rows({"a": 1.0}, seeds=(0, 1))
+    gone = (rows["seed"] == 1) & (rows["task"] == "novel_view") & (rows["sequence"] == "EXP")
+    assert "2 of 10" not in summarise(rows, rows, "novel_view", "psnr").reason
+    rows = rows[~gone]
+    assert "1 of 10 frames" in summarise(rows, rows, "novel_view", "psnr").reason
+
+
+@pytest.mark.parametrize("status", ["missing", "failed"])
+def test_one_value_without_a_number_names_the_reason(make_rows, status):
+    rows = make_rows({"a": 1.0})
+    where = (rows["task"] == "novel_view") & (rows["metric"] == "lpips") & (rows["timestep"] == 1)
+    rows.loc[where, ["status", "value", "reason"]] = [status, np.nan, "no weights\n here"]
+    aggregate = summarise(rows, rows, "novel_view", "lpips")
+    assert (aggregate.status, aggregate.value) == (status, None)
+    assert aggregate.reason == f"1 of 5 values {status}: no weights here"
+
+
+def test_metrics_of_the_avatar_need_every_subject(make_rows):
+    rows = make_rows({"a": 1.0, "b": 1.0})
+    gone = rows[(rows["method"] == "a") & (rows["metric"] == "size") & (rows["subject"] == "s2")].index
+    rows = rows.drop(gone)
+    assert "1 of 2 avatars" in summarise(rows, rows[rows["method"] == "a"], "", "size").reason
+    assert summarise(rows, rows[rows["method"] == "b"], "", "size").value == 1.0
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda r: r.drop(columns="protocol"), "no protocol"),
+        (lambda r: r.assign(status="good"), "'good'"),
+        (lambda r: r.assign(value=np.inf), "finite value"),
+        (lambda r: r.iloc[[0, 0]], "repeats"),
+        (lambda r: r.assign(version=[str(i) for i in range(len(r))]), "one version"),
+    ],
+)
+def test_faulty_rows_are_refused(make_rows, change, message):
+    rows = make_rows({"a": 1.0})
+    check_rows(rows)
+    with pytest.raises(InputError, match=message):
+        check_rows(change(rows))

@@ -1,0 +1,109 @@
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from headbench.bench.contracts import ReportSpec
+from headbench.bench.errors import InputError
+from headbench.bench.registry import resolve
+from headbench.bench.store import RunFolder, read_rows
+from headbench.reports import specs
+from headbench.reports.run_data import RunData
+from headbench.reports.sheet_report import evenly_spaced, write_contact_sheet
+from headbench.reports.table_report import table_of, table_text, write_tables
+
+
+def change_manifest(folder, change):
+    path = RunFolder(folder).manifest
+    manifest = json.loads(path.read_text())
+    change(manifest)
+    path.write_text(json.dumps(manifest))
+
+
+def test_tables_of_a_run(toy_run):
+    files = write_tables(toy_run)
+    assert [f.name for f in files] == ["comparison.md", "comparison.csv", "comparison.tex"]
+    data = RunData.read(toy_run)
+    table = table_of(data)
+    good, failing = table.rows
+    rows = read_rows(toy_run / "rows.parquet")
+    error = rows[(rows["metric"] == "error") & (rows["task"] == "novel_view") & (rows["method"] == "toy")]
+    assert good.cells[0].value == pytest.approx(error.groupby("subject")["value"].mean().mean())
+    assert good.cells[1].status == "missing"
+    assert "Put them there." in table.notes[good.cells[1].note]
+    assert good.cells[-1].value == 1.0
+    assert {cell.status for cell in failing.cells} == {"failed"}
+    assert "RuntimeError: the training diverged" in table.notes
+    assert "Images of 8 x 6 pixels" in table.caption
+    for task in ("novel_view", "self_reenactment"):
+        assert data.manifest["protocols"][task]["hash"] in table.caption
+    for file, name in zip(files, ("md", "csv", "latex")):
+        assert file.read_text() == table_text(toy_run, name)
+
+
+def test_an_unknown_format_is_refused(toy_run):
+    with pytest.raises(InputError, match="md, csv, latex"):
+        table_text(toy_run, "html")
+
+
+def test_contact_sheet_of_a_run(toy_run):
+    (path,) = write_contact_sheet(toy_run, frames_per_task=2)
+    assert path == toy_run / "contact_sheet.png"
+    assert Image.open(path).size[0] >= 700
+    sheet = np.asarray(Image.open(path).convert("RGB"))
+    data = RunData.read(toy_run)
+    key = evenly_spaced(data.keys("novel_view"), 2)[0]
+    level = data.truth(key)[0, 0, 0]
+    assert (sheet == (level, level, level)).all(axis=2).sum() >= 8 * 6  # the truth of that frame is on it
+
+
+def test_a_capture_that_changed_since_is_not_shown(toy_run):
+    change_manifest(toy_run, lambda m: m["clips"][0].update(fingerprint="0" * 64))
+    with pytest.raises(InputError, match="as when the run was made"):
+        write_contact_sheet(toy_run)
+
+
+@pytest.mark.parametrize("key", ["metrics", "methods", "protocols"])
+def test_a_manifest_without_its_records_is_refused(toy_run, key):
+    change_manifest(toy_run, lambda m: m.pop(key))
+    with pytest.raises(InputError, match=key):
+        RunData.read(toy_run)
+
+
+def test_a_damaged_render_is_named(toy_run):
+    path = next((toy_run / "subject1" / "toy").rglob("*.png"))
+    path.write_bytes(b"no image")
+    with pytest.raises(InputError, match=path.name):
+        table_text(toy_run)
+
+
+def test_frames_are_spread_evenly():
+    assert evenly_spaced(range(10), 2) == [2, 7]
+    assert evenly_spaced(range(9), 3) == [1, 4, 7]
+    assert evenly_spaced("ab", 5) == ["a", "b"]
+    assert evenly_spaced([], 3) == []
+
+
+@pytest.mark.parametrize(
+    "spec", [v for v in vars(specs).values() if isinstance(v, ReportSpec)], ids=lambda s: s.name
+)
+def test_every_report_is_there(spec):
+    assert callable(resolve(spec.implementation))
+
+
+def test_reports_need_no_torch():
+    code = "import sys, headbench.reports.sheet_report, headbench.reports.table_report; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_the_number_under_an_image_is_that_of_the_image(toy_run):
+    data = RunData.read(toy_run)
+    for key in data.keys("novel_view"):
+        error = np.abs(data.render("toy", "novel_view", key).astype(float) - data.truth(key)).mean()
+        assert data.value("error", "toy", "novel_view", key) == pytest.approx(error)
+        assert data.value("error", "failing", "novel_view", key) is None
+        assert data.render("failing", "novel_view", key) is None
+        assert "the training diverged" in data.reason("failing", "novel_view", key)

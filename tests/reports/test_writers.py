@@ -1,0 +1,110 @@
+import csv
+import io
+import re
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from headbench.reports import latex, markdown
+from headbench.reports.csv_table import to_csv
+from headbench.reports.latex import to_latex
+from headbench.reports.markdown import to_markdown
+from headbench.reports.tables import build_table
+
+NASTY = "a_b%&{x}$#^~\\|*<i>`é"
+
+
+@pytest.fixture
+def table(make_rows, metrics):
+    rows = make_rows({"good": 30.126, NASTY: 25.5, "floor": 10.0}, size={"good": 2.25, NASTY: 1.75})
+    lpips = (rows["metric"] == "lpips") & (rows["method"] == NASTY)
+    rows.loc[lpips, ["status", "value", "reason"]] = ["missing", np.nan, "No 100% weights_file."]
+    return build_table(rows, metrics, ["good", NASTY, "floor"], trivial=["floor"])
+
+
+def cells_of(line):
+    return [c.strip() for c in re.split(r"(?<!\\)\|", line)[1:-1]]
+
+
+def test_markdown_is_a_table_of_equal_lines(table):
+    text = to_markdown(table)
+    lines = [line for line in text.splitlines() if line.startswith("|")]
+    assert {len(cells_of(line)) for line in lines} == {6}
+    assert cells_of(lines[0]) == ["", "Novel view", "", "Self-reenactment", "", "Avatar"]
+    assert cells_of(lines[2])[:3] == ["**Method**", r"**PSNR** \[dB\] ↑", "**LPIPS** ↓"]
+    good = next(cells_of(line) for line in lines if "good" in line)
+    assert good[1:] == ["**30.13**", "30.126", "**30.13**", "30.126", "<ins>2.2</ins>"]
+    nasty = next(cells_of(line) for line in lines if "25.50" in line)
+    assert nasty[1:3] == ["<ins>25.50</ins>", "–<sup>1</sup>"]
+    assert "<i>" not in text
+    assert r"<sup>1</sup> 2 of 5" not in text
+    assert r"<sup>1</sup> No 100% weights\_file." in text
+    assert "hash-novel" in text
+
+
+@given(st.text(max_size=40))
+def test_markdown_text_stays_in_its_cell(text):
+    escaped = markdown.escape(text)
+    assert "\n" not in escaped
+    assert len(cells_of(f"| {escaped} | x |")) == 2
+    assert re.sub(r"\\(.)", r"\1", escaped) == " ".join(text.split())
+
+
+def test_csv_reads_back_with_full_precision(table):
+    rows = list(csv.DictReader(io.StringIO(to_csv(table))))
+    assert [row["method"] for row in rows] == ["good", NASTY, "floor"]
+    first, second, floor = rows
+    assert float(first["novel_view/psnr"]) == pytest.approx(30.126, abs=1e-12)
+    assert (first["novel_view/psnr/rank"], second["novel_view/psnr/rank"]) == ("1", "2")
+    assert (second["novel_view/lpips"], second["novel_view/lpips/status"]) == ("", "missing")
+    assert second["notes"] == "No 100% weights_file."
+    assert (floor["group"], floor["novel_view/psnr/rank"]) == ("Floor (not ranked)", "")
+    assert first["protocol"] == "novel_view=hash-novel_view self_reenactment=hash-self_reenactment"
+
+
+def balance(text):
+    """Depth of unescaped braces at the end; -1 as soon as one closes that was not opened."""
+    depth = 0
+    for brace in re.sub(r"\\.", "", text):
+        depth += {"{": 1, "}": -1}.get(brace, 0)
+        if depth < 0:
+            return -1
+    return depth
+
+
+def test_latex_is_a_balanced_booktabs_table(table):
+    text = to_latex(table)
+    code = [line for line in text.splitlines() if not line.startswith("%")]
+    assert balance("\n".join(code)) == 0
+    opened = re.findall(r"\\begin\{(\S+?)\}", text)
+    assert opened == ["table*", "tabular", "minipage"]
+    assert re.findall(r"\\end\{(\S+?)\}", text) == ["tabular", "minipage", "table*"]
+    body = [line for line in code if line.endswith(r"\\")]
+    for line in body:
+        spanned = sum(int(n) - 1 for n in re.findall(r"\\multicolumn\{(\d+)\}", line))
+        assert len(re.findall(r"(?<!\\)&", line)) + spanned == 5, line
+    assert text.startswith("% Novel view: protocol  hash-novel_view".replace("  ", " "))
+    for rule in (r"\toprule", r"\midrule", r"\bottomrule", r"\cmidrule(lr){2-3} \cmidrule(lr){4-5}"):
+        assert rule in text
+    assert r"PSNR\,{[}dB{]} $\uparrow$ & LPIPS $\downarrow$" in text
+    assert r"\best{30.13}" in text
+    assert r"\second{25.50}" in text
+    assert r"--\textsuperscript{1}" in text
+    assert r"\providecommand{\best}" in text
+    assert r"No 100\% weights\_file." in text
+
+
+def test_latex_of_a_nasty_name():
+    expected = r"a\_b\%\&\{x\}\$\#\textasciicircum{}\textasciitilde{}\textbackslash{}\textbar{}*\textless{}i\textgreater{}`é"
+    assert latex.escape(NASTY) == expected
+
+
+@given(st.text(max_size=40))
+def test_latex_text_has_no_live_character(text):
+    escaped = latex.escape(text)
+    assert balance(escaped) == 0
+    bare = re.sub(r"\$\\[a-z]+\$|\\[a-zA-Z]+|\\[{}$&#%_]", "", escaped)
+    assert not set(bare) & set("\\$&#%_^~\n")
+    assert all(ord(c) < 256 for c in escaped)
