@@ -83,9 +83,14 @@ def to_world(
     packed = torch.cat([linear, frames.center, frames.size[:, None], frames.quaternion], dim=1)
     rows = packed.index_select(0, binding)
     linear, center, size, quaternion = rows.split([9, 3, 1, 4], dim=1)
-    world_means = (linear.view(-1, 3, 3) * means[:, None, :]).sum(2) + center
+    world_means = apply_matrices(linear, means) + center
     local = quats / torch.linalg.vector_norm(quats, dim=1, keepdim=True).clamp_min(1e-12)
     return WorldSplats(world_means, quaternion_multiply(quaternion, local), size * log_scales.exp())
+
+
+def apply_matrices(rows: Tensor, vectors: Tensor) -> Tensor:
+    """Product of each (3, 3) matrix, given as a row of (N, 9), with its vector of (N, 3)."""
+    return torch.bmm(rows.view(-1, 3, 3), vectors[:, :, None])[:, :, 0]
 
 
 def _unit(vectors: Tensor) -> Tensor:

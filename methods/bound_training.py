@@ -12,7 +12,6 @@ import torch
 from torch import Tensor, nn
 
 from ..bench.contracts import Budget, Camera, Clip, FrameKey, Progress
-from ..bench.errors import InputError
 from .binding import Frames, WorldSplats, to_world
 from .configs import SplatTraining
 from .splats import rasterize
@@ -235,26 +234,6 @@ def scene_extent(cameras: Mapping[str, Camera]) -> float:
     if radius < 1e-6:
         radius = 0.5 * float(np.linalg.norm(centers[0]))
     return 1.1 * max(radius, 1e-3)
-
-
-def check_training_split(clip: Clip) -> None:
-    """Raise `InputError` unless the clip has training frames, all with a pose of its head model and a camera."""
-    keys = clip.splits.get("train", ())
-    if not keys:
-        raise InputError(f"clip of {clip.subject}", "splits[train]", "at least one frame", "none")
-    for key in keys:
-        if key.camera not in clip.cameras:
-            raise InputError(f"clip of {clip.subject}", str(key), "a known camera", repr(key.camera))
-        pose = clip.poses.get(key.timestep)
-        if pose is None:
-            raise InputError(f"clip of {clip.subject}", str(key), "a tracked pose", "none")
-        if pose.head_model != clip.head.version:
-            raise InputError(
-                f"clip of {clip.subject}",
-                f"poses[{key.timestep}].head_model",
-                repr(clip.head.version),
-                repr(pose.head_model),
-            )
 
 
 def view_of(camera: Camera, device: str) -> View:

@@ -80,8 +80,9 @@ def opacity_offsets(parameters: Parameters, blended: Tensor, position: LinePosit
     kinds, axes, resolution, channels = blended.shape
     first = normalised_weight(parameters, 0).view(-1, kinds, axes, channels)
     table = torch.einsum("kalc,hkac->alh", blended, first).reshape(axes * resolution, -1)
-    hidden = torch.relu(_SumRows.apply(table, *position) + parameters["line_bias_0"])  # type: ignore[no-untyped-call]
-    hidden = torch.relu(torch.addmm(parameters["line_bias_1"], hidden, normalised_weight(parameters, 1).t()))
+    summed = _SumRows.apply(table, *position)  # type: ignore[no-untyped-call]
+    hidden = (summed + parameters["line_bias_0"]).relu_()
+    hidden = torch.addmm(parameters["line_bias_1"], hidden, normalised_weight(parameters, 1).t()).relu_()
     return torch.addmm(parameters["line_bias_2"], hidden, normalised_weight(parameters, 2).t())[:, 0]
 
 

@@ -25,7 +25,8 @@ from .avatar_files import (
 )
 from .binding import Frames, WorldSplats, to_world
 from .bound_avatar import PosedSplats, posed_splats, render_splats
-from .bound_training import Shading, View, check_training_split, run_bound_training, view_of
+from .bound_training import Shading, View, run_bound_training, view_of
+from .clip_checks import check_training_split
 from .configs import GAConfig
 from .ga_files import (
     PLY_FILE,
@@ -64,8 +65,8 @@ class GAAppearance:
     def splat_parameters(self, count: int) -> dict[str, tuple[Tensor, float]]:
         """Spherical harmonics: nearly zero at degree 0, zero above."""
         generator = torch_generator(self._seed, "sh")
-        dc = torch.rand(count, 1, 3, generator=generator).to(self._device) / 255
-        rest = torch.zeros(count, coefficient_count(STORED_DEGREE) - 1, 3, device=self._device)
+        dc = torch.rand(count, 3, generator=generator).to(self._device) / 255
+        rest = torch.zeros(count, 3, coefficient_count(STORED_DEGREE) - 1, device=self._device)
         return {"sh_dc": (dc, self._config.sh_dc_lr), "sh_rest": (rest, self._config.sh_rest_lr)}
 
     def parameters(self) -> dict[str, tuple[Tensor, float]]:

@@ -36,8 +36,8 @@ def write_ga_splats(path: Path, splats: dict[str, Tensor], binding: Tensor) -> N
     columns = [
         splats["means"],
         torch.zeros(count, 3),
-        splats["sh_dc"][:, 0],
-        splats["sh_rest"].transpose(1, 2).reshape(count, 3 * REST),
+        splats["sh_dc"],
+        splats["sh_rest"].reshape(count, 3 * REST),
         splats["opacities"][:, None],
         splats["log_scales"],
         splats["quats"],
@@ -64,8 +64,8 @@ def read_ga_splats(path: Path, face_count: int, device: str) -> tuple[dict[str, 
         "log_scales": log_scales,
         "quats": quats,
         "opacities": opacity[:, 0],
-        "sh_dc": dc[:, None],
-        "sh_rest": rest.reshape(-1, 3, REST).transpose(1, 2),
+        "sh_dc": dc,
+        "sh_rest": rest.reshape(-1, 3, REST),
     }
     return {name: value.contiguous() for name, value in splats.items()}, binding.to(device)
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .binding import Frames
+from .binding import Frames, apply_matrices
 from .configs import OursConfig
 from .feature_lines import Parameters, initial_line_network, uniform
 from .sh import C0
@@ -76,8 +76,8 @@ class CanonicalFrames:
 
     def positions(self, binding: Tensor, means: Tensor) -> Tensor:
         """Canonical positions (N, 3) of local means: k_c R_c mean + T_c."""
-        linear = self.linear.index_select(0, binding).view(-1, 3, 3)
-        return (linear * means[:, None, :]).sum(2) + self.center.index_select(0, binding)
+        linear = self.linear.index_select(0, binding)
+        return apply_matrices(linear, means) + self.center.index_select(0, binding)
 
     def turns(self, frames: Frames) -> Tensor:
         """(F, 3, 3) rotations that take world directions of a posed mesh to canonical ones: R_c R_t^T."""
@@ -87,8 +87,8 @@ class CanonicalFrames:
 def canonical_directions(turns: Tensor, binding: Tensor, means: Tensor, center: Tensor) -> Tensor:
     """Unit vectors (N, 3) from world means to the camera, turned to canonical space by each splat's triangle."""
     directions = torch.nn.functional.normalize(center - means, dim=1)
-    rows = turns.view(-1, 9).index_select(0, binding).view(-1, 3, 3)
-    return torch.nn.functional.normalize((rows * directions[:, None, :]).sum(2), dim=1)
+    rows = turns.reshape(-1, 9).index_select(0, binding)
+    return torch.nn.functional.normalize(apply_matrices(rows, directions), dim=1)
 
 
 def plane_features(parameters: Parameters, box: Box, positions: Tensor) -> Tensor:
@@ -107,7 +107,7 @@ def shade_directions(parameters: Parameters, from_position: Tensor, directions: 
     """Colours (N, 3) >= 0: hidden layer of position and encoded direction, ReLU, relu(0.5 + C0 * out)."""
     first, last = parameters["color_weight_0"], parameters["color_weight_1"]
     of_direction = first[:, first.shape[1] - ENCODING_SIZE :]
-    hidden = torch.relu(torch.addmm(from_position, encode_directions(directions), of_direction.t()))
+    hidden = torch.addmm(from_position, encode_directions(directions), of_direction.t()).relu_()
     return torch.relu(0.5 + C0 * (hidden @ last.t()))
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -37,16 +39,31 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
     return torch.stack(terms, dim=1)
 
 
+class _Weigh(torch.autograd.Function):
+    """(N, 3, K) coefficients times (N, K) basis values; spares autograd's two passes over the coefficients."""
+
+    @staticmethod
+    def forward(ctx: Any, coefficients: Tensor, basis: Tensor) -> Tensor:
+        ctx.save_for_backward(coefficients, basis)
+        return torch.bmm(coefficients, basis[:, :, None])[:, :, 0]
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor]:
+        coefficients, basis = ctx.saved_tensors
+        gradient = grads[0]
+        return gradient[:, :, None] * basis[:, None, :], torch.bmm(gradient[:, None, :], coefficients)[:, 0]
+
+
 def sh_to_rgb(dc: Tensor, rest: Tensor, directions: Tensor, degree: int) -> Tensor:
     """Colours (N, 3) >= 0 seen along unit directions (from the camera to the splat): relu(0.5 + SH).
 
     Parameters
     ----------
-    dc : (N, 1, 3) coefficient of degree 0.
-    rest : (N, 15, 3) coefficients of degrees 1 to 3; those above ``degree`` are not used.
+    dc : (N, 3) coefficient of degree 0.
+    rest : (N, 3, 15) coefficients of degrees 1 to 3 by channel; those above ``degree`` are not used.
     """
     if degree == 0:
-        return torch.relu(0.5 + C0 * dc[:, 0])
-    basis = sh_basis(directions, degree)[:, 1:]
-    view = (basis[:, :, None] * rest[:, : basis.shape[1]]).sum(1)
-    return torch.relu(0.5 + C0 * dc[:, 0] + view)
+        return torch.relu(0.5 + C0 * dc)
+    basis = sh_basis(directions, degree)[:, 1:].contiguous()
+    view = _Weigh.apply(rest[:, :, : basis.shape[1]].contiguous(), basis)  # type: ignore[no-untyped-call]
+    return torch.relu(0.5 + C0 * dc + view)

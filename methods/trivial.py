@@ -16,7 +16,7 @@ from ..bench.contracts import Budget, Camera, Clip, FloatArray, Frame, HeadPose,
 from ..bench.errors import InputError
 from ..bench.files import atomic_path
 from .avatar_files import is_finished, read_arrays, run_digest, write_arrays, write_record
-from .bound_training import check_training_split
+from .clip_checks import check_training_split
 from .configs import NearestCameraConfig
 from .training.loop import Outcome
 
@@ -137,7 +137,10 @@ class NearestCameraAvatar:
         signal = driving_signal(pose)
         if signal.shape != scales.shape:
             raise InputError("pose", "expression", f"{len(scales)} driving values", f"{len(signal)}")
-        row = int(np.argmin((((signals - signal) / scales) ** 2).sum(1)))
+        distances = (((signals - signal) / scales) ** 2).sum(1)
+        # Among equally near timesteps the pose's own wins: a face may rest with its tracking unchanged.
+        own = self._index["timesteps"] == (-1 if pose.timestep is None else pose.timestep)
+        row = int(np.lexsort((~own, distances))[0])
         available = np.flatnonzero(self._index["images"][row] >= 0)
         origin = np.asarray(pose.translation, np.float64)
         towards = _unit(self._index["centers"][available] - origin)
