@@ -15,9 +15,7 @@ from torch import Tensor
 
 from ...bench.contracts import HeadAsset, HeadPose
 from ...bench.errors import InputError
-from .rotations import axis_angle_to_matrix, rodrigues
-
-__all__ = ["HeadModel", "rodrigues"]
+from .rotations import axis_angle_to_matrix
 
 
 class HeadModel(torch.nn.Module):

@@ -25,6 +25,7 @@ MAX_DENSE_ELEMENTS = 50_000_000
 """Sparse matrices above this many elements are refused: a few bytes can declare any shape."""
 
 _KINDS = {"f", "i", "u", "b"}
+_DATA = (np.ndarray, str, bytes, int, float, complex, type(None), list, tuple, dict)
 _ByteOrder = Literal["<", ">", "|", "="]
 
 
@@ -331,7 +332,7 @@ def read_pickle(path: str | PathLike[str]) -> dict[str, Any]:
 
     Returns
     -------
-    The dictionary: arrays (also 0-d, for numpy scalars), strings, numbers.
+    The dictionary: arrays (also 0-d, for numpy scalars), strings, numbers, plain containers.
 
     Raises
     ------
@@ -345,7 +346,11 @@ def read_pickle(path: str | PathLike[str]) -> dict[str, Any]:
         content = _RestrictedUnpickler(path.read_bytes()).load()
         if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
             raise _Malformed(f"a {type(content).__name__.lstrip('_').lower()}, not a dictionary with names")
-        return {key: _plain(value) for key, value in content.items()}
+        arrays = {key: _plain(value) for key, value in content.items()}
+        for key, value in arrays.items():
+            if not isinstance(value, _DATA):
+                raise _Malformed(f"no data under {key!r}")
+        return arrays
     except FileNotFoundError as error:
         raise InputError(path, "", "a file", "none") from error
     except _Refused as error:

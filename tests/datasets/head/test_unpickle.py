@@ -158,6 +158,9 @@ STREAMS = {
     "reconstruction of a class": ARRAY + b"(cchumpy.ch\nCh\n(I0\ntS'b'\ntR.",
     "array without a state": b"(dS'x'\n" + ARRAY + b"(cnumpy\nndarray\n(I0\ntS'b'\ntRs.",
     "chumpy without a state": b"(dS'x'\n(ichumpy.ch\nCh\ns.",
+    "class as data": b"(dS'x'\ncnumpy\nndarray\ns.",
+    "function as data": b"(dS'x'\n" + ARRAY + b"s.",
+    "dtype as data": b"(dS'x'\ncnumpy\ndtype\n(S'f8'\ntRs.",
     "bare object": b"c__builtin__\nobject\n)R.",
     "reconstructor of a function": b"ccopy_reg\n_reconstructor\n(" + ARRAY + b"c__builtin__\nobject\nNtR.",
     "dotted name": b"\x80\x04\x8c\x05numpy\x8c\x0endarray.tofile\x93.",
@@ -232,6 +235,7 @@ def test_sparse_matrices_are_checked(tmp_path):
         "values": {"data": matrix.data[:-1]},
         "indices": {"indices": matrix.indices + 5},
         "pointers": {"indptr": matrix.indptr[::-1].copy()},
+        "unordered": {"indptr": matrix.indptr[[0, *range(39, 0, -1), 40]]},
         "text": {"data": "abc"},
         "none": {"indices": None},
     }
