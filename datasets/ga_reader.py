@@ -95,10 +95,7 @@ def read_capture(
     convention, basis = settle_cy(folder, cy, declared, rig, tracking, poses, everything, ground)
 
     names = sequence_names(everything, declaration.sequences if declaration else {})
-    keyed = {part: [(_key(subject, names, e), e) for e in group] for part, group in entries.items()}
-    splits = {part: tuple(key for key, _ in pairs) for part, pairs in keyed.items()}
-    check_disjoint(folder, splits)
-    frames = {key: FrameFiles(e.image, e.mask) for pairs in keyed.values() for key, e in pairs}
+    splits, frames = _index_frames(folder, subject, names, entries)
     if held_out_sequences or held_out_cameras:
         splits = split_by_holding_out(folder, frames, held_out_sequences, held_out_cameras)
     digests = content_digests(folder, _used_files(folder, everything), progress=progress)
@@ -106,7 +103,7 @@ def read_capture(
     record = {
         "cy": convention,
         "cy_from": basis,
-        "sequence_shifts_m": {names[name]: shift for name, shift in rig.shifts.items() if shift.any()},
+        "sequence_shifts_m": {names[k]: v.tolist() for k, v in rig.shifts.items() if v.any()},
         "held_out_sequences": list(held_out_sequences),
         "held_out_cameras": list(held_out_cameras),
         "leaks": check_leaks(folder, found, leaks),
@@ -198,8 +195,18 @@ def _shift_poses(
     return poses
 
 
-def _key(subject: str, names: Mapping[str, str], entry: FrameEntry) -> FrameKey:
-    return FrameKey(subject, names[entry.sequence_folder], entry.timestep, entry.camera_id)
+def _index_frames(
+    folder: Path, subject: str, names: Mapping[str, str], entries: Mapping[str, Sequence[FrameEntry]]
+) -> tuple[dict[str, tuple[FrameKey, ...]], dict[FrameKey, FrameFiles]]:
+    """Keys by split as the JSONs have them, and files by key."""
+    splits: dict[str, tuple[FrameKey, ...]] = {}
+    frames: dict[FrameKey, FrameFiles] = {}
+    for part, group in entries.items():
+        keys = [FrameKey(subject, names[e.sequence_folder], e.timestep, e.camera_id) for e in group]
+        splits[part] = tuple(keys)
+        frames |= {key: FrameFiles(e.image, e.mask) for key, e in zip(keys, group)}
+    check_disjoint(folder, splits)
+    return splits, frames
 
 
 def _used_files(folder: Path, entries: Iterable[FrameEntry]) -> set[Path]:

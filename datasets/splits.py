@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
@@ -27,8 +28,8 @@ def check_disjoint(file: Path, splits: Mapping[str, Sequence[FrameKey]]) -> None
     """Raise `InputError` where a key stands twice, in one split or in two."""
     for name, keys in splits.items():
         if len(set(keys)) != len(keys):
-            twice = next(key for i, key in enumerate(keys) if key in keys[:i])
-            raise InputError(file, name, "every frame once", f"{twice} more than once")
+            twice, count = Counter(keys).most_common(1)[0]
+            raise InputError(file, name, "every frame once", f"{twice} {count} times")
     for one, other in combinations(splits, 2):
         shared = sorted(set(splits[one]) & set(splits[other]))
         if shared:

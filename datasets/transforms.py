@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -150,14 +152,18 @@ class _Reader:
 
     def number(self, key: str) -> float:
         value = self._get(key)
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
+        number = math.nan
+        if isinstance(value, (int, float)) and not isinstance(value, bool):
+            with suppress(OverflowError):  # JSON integers have no bound
+                number = float(value)
+        if not math.isfinite(number):
             raise self._fail(key, "a finite number")
-        return float(value)
+        return number
 
     def rigid(self, key: str) -> FloatArray:
         try:
             matrix = np.array(self._frame.get(key), dtype=np.float64)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise self._fail(key, "a 4x4 matrix of numbers") from None
         if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
             raise self._fail(key, "a 4x4 matrix of finite numbers")

@@ -5,6 +5,7 @@ Each fault is one `InputError` that names the file, the entry, what was expected
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
@@ -46,7 +47,7 @@ def check_images(
 
 
 def _probe_referenced(entry: FrameEntry, path: Path, key: str, decode: bool) -> ImageInfo:
-    if not path.exists():
+    if not os.path.exists(path):  # unlike Path.exists, False for names no file can have
         raise InputError(entry.file, f"{entry.where}.{key}", "an existing file", f"no {path}")
     return probe_image(path, decode=decode)
 

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -16,6 +16,7 @@ from headbench.datasets import ga_layout as layout
 finite = st.floats(-3, 3)
 
 
+@settings(deadline=None)
 @given(
     axis=st.tuples(finite, finite, finite),
     place=st.tuples(finite, finite, finite),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from types import SimpleNamespace
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from headbench.bench.contracts import FrameKey
@@ -29,6 +29,7 @@ def test_names_are_declared_or_parsed_and_never_shared():
     }
 
 
+@settings(deadline=None)
 @given(
     cameras=st.sets(st.sampled_from("abc")), sequences=st.sets(st.sampled_from(["EMO-1", "EMO-2", "FREE"]))
 )

@@ -183,7 +183,7 @@ def test_timestep_with_two_parameter_files(capture):
 
 def test_frame_listed_twice(capture):
     capture.edit(TRAIN, lambda document: document["frames"].append(document["frames"][0]))
-    assert "more than once" in fault(capture).found
+    assert "2 times" in fault(capture).found
 
 
 # ------------------------------------------------------------------ cameras

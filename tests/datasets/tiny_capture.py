@@ -131,6 +131,9 @@ class TinyCapture(NamedTuple):
     writer: CaptureWriter
     frames: dict[tuple[str, int, str], tuple[np.ndarray, np.ndarray]]
 
+    def __repr__(self) -> str:  # hypothesis prints its arguments
+        return f"TinyCapture({self.union})"
+
     @property
     def union(self) -> Path:
         return self.writer.union

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.metrics import adjusted_rand_score
 
@@ -168,6 +168,7 @@ def test_spectral_clustering_tells_rings_apart_where_nearest_means_cannot():
     assert labels[0] != labels[10]
 
 
+@settings(deadline=None)
 @given(labels=st.lists(st.integers(0, 5), min_size=1, max_size=40))
 def test_balanced_probabilities_give_every_class_the_same_share(labels):
     probabilities = balanced_probabilities(labels)
