@@ -39,7 +39,8 @@ def make_brows_and_lashes(
             _, root = tree.query(paths[:, 0])
             shades = color[None] * np.exp(0.2 * rng.standard_normal((len(paths), 1)))
             facing = normals[root][:, None] + rng.normal(0.0, 0.3, (len(paths), 1, 3))
-            strands = ribbons(paths, facing, np.full(len(paths), width * anatomy.scale), shades, 0.9)
+            widths = np.full(len(paths), width * anatomy.scale)
+            strands = ribbons(paths, facing, widths, np.repeat(shades[:, None], 2, axis=1))
             made = strands if made is None else made.joined(strands)
             roots.append(root)
     assert made is not None

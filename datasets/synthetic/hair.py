@@ -1,11 +1,12 @@
-"""Hair on the head: a hairline, a thick cap under it, and combed ribbons over the cap.
+"""Hair on the head: a hairline, a thick cap under it, and combed locks over the cap.
 
-The cap is the scalp itself pushed outwards, so that no skin shows between the ribbons and the matte stays
-whole; the ribbons give strands, shine and a soft outline. Both move with the head.
+The cap is the scalp itself pushed outwards, so that no skin shows between the locks and the matte stays
+whole; the locks give strands, shine and a soft outline. Both move with the head.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,14 +24,16 @@ from .strands import Strands, grow, ribbons
 class Style:
     """A way to wear hair; lengths in metres.
 
-    ``fall`` is the pull downwards (0 keeps hair on the skull), ``sweep`` the pull to the side of the parting,
-    ``back`` the pull backwards, ``curl`` the amplitude of waves relative to the growth direction.
+    ``locks`` ribbons of ``width``, standing out by ``rise`` at the tip; ``cap`` is the thickness under them.
+    ``fall`` pulls down, ``sweep`` away from the parting (at x = ``parting``), ``back`` backwards; ``curl`` is
+    the amplitude of waves relative to the growth direction.
     """
 
     length: float
     cap: float
-    strands: int
+    locks: int
     width: float
+    rise: float
     fall: float
     sweep: float
     back: float
@@ -39,10 +42,10 @@ class Style:
 
 
 STYLES = {
-    "crop": Style(0.012, 0.0035, 6500, 0.0010, 0.05, 0.10, -0.30, 0.35, 0.0),
-    "short": Style(0.045, 0.0100, 6000, 0.0013, 0.25, 0.80, 0.35, 0.30, 0.025),
-    "bob": Style(0.170, 0.0110, 4200, 0.0017, 1.10, 0.55, 0.45, 0.22, -0.018),
-    "long": Style(0.270, 0.0110, 4500, 0.0018, 1.20, 0.50, 0.55, 0.40, 0.012),
+    "crop": Style(0.011, 0.0040, 3600, 0.0030, 0.0008, 0.05, 0.10, -0.30, 0.25, 0.0),
+    "short": Style(0.042, 0.0100, 1500, 0.0085, 0.0030, 0.30, 0.80, 0.55, 0.20, 0.028),
+    "bob": Style(0.150, 0.0120, 900, 0.0130, 0.0060, 0.85, 0.90, 0.70, 0.12, -0.020),
+    "swept": Style(0.075, 0.0100, 1300, 0.0100, 0.0035, 0.20, 0.15, 1.30, 0.16, 0.0),
 }
 
 # Hairline: height above the brows (m) by azimuth from the front (degrees), for a head of average size.
@@ -52,7 +55,7 @@ _HEIGHT = np.array([0.060, 0.058, 0.050, 0.024, -0.008, -0.036, -0.026, -0.052, 
 
 @dataclass(frozen=True, eq=False)
 class Hair:
-    """``cap`` (N,) thickness over the fine skin points in metres, ``share`` (N,) coverage, and ribbons."""
+    """``cap`` (N,) thickness over the fine skin points in metres, ``share`` (N,) coverage, and locks."""
 
     cap: FloatArray
     share: FloatArray
@@ -83,7 +86,7 @@ def make_hair(
     uneven = 1.0 + 0.35 * fractal_noise(points, 0.03 * s, person.seed + 81, 2)
     cap = style.cap * s * share * uneven
     rng = np.random.default_rng(person.seed + 82)
-    chosen = _sample(points, faces, share, style.strands, rng)
+    chosen = _sample(points, faces, share, style.locks, rng)
     weights = rng.dirichlet(np.ones(3), len(chosen))
     surface = points + cap[:, None] * normals
     roots = np.einsum("nk,nki->ni", weights, surface[faces[chosen]])
@@ -91,47 +94,66 @@ def make_hair(
     # Hair close to the hairline is shorter on short heads; long hair keeps its length.
     edge = np.einsum("nk,nk->n", weights, share[faces[chosen]])
     lengths *= 0.45 + 0.55 * edge if style.length < 0.1 else 1.0
-    tree, surface_normals = cKDTree(surface), normals
+    tree = cKDTree(surface)
+    layer = rng.uniform(0.3, 1.0, len(roots))
+
+    limit = _face_limit(anatomy)
 
     def keep_out(place: FloatArray, along: float) -> FloatArray:
         _, nearest = tree.query(place, k=4)
-        normal = surface_normals[nearest].mean(axis=1)
+        normal = normals[nearest].mean(axis=1)
         height = np.einsum("ni,ni->n", place - surface[nearest].mean(axis=1), normal)
-        wanted = (0.0006 + 0.0024 * along) * s
-        return place + np.maximum(wanted - height, 0.0)[:, None] * normal
+        wanted = (0.0005 * s + style.rise * along) * layer
+        place = place + np.maximum(wanted - height, 0.0)[:, None] * normal
+        place[:, 2] = np.minimum(place[:, 2], limit(place))
+        return place
 
-    parting = style.parting * s + anatomy["vertex_top"][0]
-    phase = rng.integers(0, 3, len(roots)) * 31.7
+    parting = style.parting * s
+    phase = rng.integers(0, 3, (len(roots), 1)) * 31.7
 
     def field(place: FloatArray, along: float) -> FloatArray:
         _, nearest = tree.query(place)
-        normal = surface_normals[nearest]
-        side = np.tanh((place[:, 0] - parting) / (0.02 * s))
-        top = ramp(normal[:, 1], 0.2, 0.8)
-        front = ramp(place[:, 2], anatomy["vertex_top"][2], anatomy["glabella"][2])
+        normal = normals[nearest]
+        side = np.tanh((place[:, 0] - parting) / (0.015 * s))
+        top = ramp(normal[:, 1], 0.1, 0.8)
+        front = ramp(place[:, 2], anatomy["vertex_top"][2] - 0.02 * s, anatomy["glabella"][2])
         wish = np.stack(
-            [style.sweep * side * (0.4 + 0.6 * top), np.full(len(place), -style.fall), -style.back * (0.3 + 0.7 * front)],
+            [style.sweep * side * (0.3 + 0.7 * top), np.full(len(place), -style.fall), -style.back * (0.25 + 0.75 * front)],
             axis=1,
         )
-        # Away from the crown, down the skull.
-        crown = anatomy["vertex_top"] + np.array([0.0, 0.0, -0.03]) * s
-        away = place - crown
-        wish += 0.45 * away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
-        tangent = wish - np.einsum("ni,ni->n", wish, normal)[:, None] * normal
-        wave = [value_noise(place / (0.02 * s) + phase[:, None] + 7.0 * axis, person.seed + 83) for axis in range(3)]
-        lift = 0.25 * (1.0 - along) * normal
-        free = ramp(place[:, 1], anatomy["mouth"][1] + 0.02 * s, anatomy["mouth"][1] - 0.02 * s)[:, None]
-        hang = np.array([0.0, -style.fall, -0.12])
-        return tangent * (1.0 - 0.6 * free) + free * hang + lift + style.curl * np.stack(wave, axis=1)
+        away = place - (anatomy["vertex_top"] + np.array([0.0, 0.0, -0.03]) * s)
+        wish += 0.35 * away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
+        # Off the skull, hair hangs.
+        free = ramp(place[:, 1], anatomy["nose_tip"][1] + 0.02 * s, anatomy["mouth"][1])[:, None]
+        wish = (1.0 - free) * wish + free * np.array([0.0, -1.0, -0.10])
+        wish -= (1.0 - free) * np.einsum("ni,ni->n", wish, normal)[:, None] * normal
+        wish /= np.maximum(np.linalg.norm(wish, axis=1, keepdims=True), 1e-9)
+        wave = [value_noise(place / (0.03 * s) + phase + 7.0 * axis, person.seed + 83) for axis in range(3)]
+        return wish + 0.10 * (1.0 - along) * normal + style.curl * np.stack(wave, axis=1)
 
-    segments = int(np.clip(round(style.length / 0.014), 4, 14))
+    segments = int(np.clip(round(style.length / 0.010), 4, 15))
     paths = grow(roots, lengths, field, keep_out, segments)
-    _, nearest = tree.query(paths[:, segments // 2])
-    roll = rng.normal(0.0, 0.35, (len(roots), 1, 3))
-    clump = 0.5 * fractal_noise(roots, 0.016 * s, person.seed + 84, 2) + 0.22 * rng.standard_normal(len(roots))
-    color = person.hair[None] * np.exp(0.75 * clump)[:, None]
+    _, nearest = tree.query(paths)
+    facing = normals[nearest] + rng.normal(0.0, 0.10, (len(roots), 1, 3))
+    columns = 5
+    tone = 0.55 * fractal_noise(roots, 0.02 * s, person.seed + 84, 2)[:, None] + 0.20 * rng.standard_normal(
+        (len(roots), columns)
+    )
+    color = person.hair * np.exp(0.6 * tone)[:, :, None]
     width = style.width * s * rng.uniform(0.7, 1.3, len(roots))
-    return Hair(cap, share, ribbons(paths, normals[nearest][:, None] + roll, width, color, 1.35))
+    locks = ribbons(paths, facing, width, color, tip_shade=1.3, tip_width=0.3, arch=0.16)
+    return Hair(cap, share, locks)
+
+
+def _face_limit(anatomy: Anatomy) -> Callable[[FloatArray], FloatArray]:
+    """Largest z that hair may have at points (n, 3), so that none hangs into the face."""
+    s, brow = anatomy.scale, anatomy["glabella"][1]
+    high, low = anatomy["forehead"][2] + 0.03 * s, anatomy["left_ear"][2] + 0.042 * s
+
+    def limit(points: FloatArray) -> FloatArray:
+        return low + (high - low) * ramp(points[:, 1], brow + 0.018 * s, brow + 0.062 * s)
+
+    return limit
 
 
 def ear_share(anatomy: Anatomy, points: FloatArray, labelled: IntArray | None) -> FloatArray:

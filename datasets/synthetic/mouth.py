@@ -76,13 +76,18 @@ def tongue(person: Person, anatomy: Anatomy, joints: int) -> MouthPart:
     section = np.sqrt(np.clip(1.0 - np.clip((uu - 0.72) / 0.28, 0.0, 1.0) ** 2.4, 0.0, 1.0))
     groove = 0.0016 * np.exp(-0.5 * (np.cos(pp) / 0.22) ** 2) * (np.sin(pp) > 0) * ramp(uu, 0.1, 0.4)
 
-    def body(back: FloatArray, length: float, droop: float, half_width: float, half_height: float) -> FloatArray:
+    def body(back: FloatArray, length: float, bend: float, half_width: float, half_height: float) -> FloatArray:
+        # The middle line runs straight over the lower teeth and lip, then turns down by ``bend`` radians.
+        turn = bend * ramp(u, 0.62, 1.0)
+        z = np.concatenate([[0.0], np.cumsum(np.cos(turn[1:]))]) * length / (along - 1)
+        y = -np.concatenate([[0.0], np.cumsum(np.sin(turn[1:]))]) * length / (along - 1)
+        turn, z, y = (np.repeat(line, around) for line in (turn, z, y))
+        thick = half_height * section * np.sin(pp) - groove
         x = half_width * section * np.cos(pp)
-        y = half_height * section * np.sin(pp) - groove - droop * uu**2.2
-        return back + s * np.stack([x, y, length * uu], axis=1)
+        return back + s * np.stack([x, y + thick * np.cos(turn), z + thick * np.sin(turn)], axis=1)
 
-    inside = body(mouth + np.array([0.0, -0.014, -0.062]) * s, 0.043, -0.002, 0.019, 0.007)
-    out = body(mouth + np.array([0.0, -0.008, -0.052]) * s, 0.082, 0.030, 0.0185, 0.0055)
+    inside = body(mouth + np.array([0.0, -0.014, -0.062]) * s, 0.043, 0.0, 0.019, 0.007)
+    out = body(mouth + np.array([0.0, -0.0045, -0.050]) * s, 0.084, 1.15, 0.0180, 0.0050)
     index = np.arange(along * around).reshape(along, around)
     a, b = index[:-1], index[1:]
     a1, b1 = np.roll(a, -1, axis=1), np.roll(b, -1, axis=1)

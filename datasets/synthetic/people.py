@@ -12,7 +12,7 @@ from ...bench.contracts import FloatArray
 _SKIN = ("#eac6b2", "#e2b49a", "#d3a083", "#b98363", "#8f5f43", "#6a4430")
 _HAIR = ("#2a1d16", "#14100e", "#4a3020", "#7b5836", "#b08a56", "#8c4322", "#8f8a86")
 _IRIS = ("#5b3a1e", "#3f6f8f", "#6d7f45", "#7d7468", "#3a2414")
-STYLES = ("short", "bob", "crop", "long")
+STYLES = ("short", "bob", "crop", "swept")
 
 
 def linear(color: str | FloatArray) -> FloatArray:

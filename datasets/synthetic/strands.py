@@ -54,28 +54,39 @@ def grow(
 
 
 def ribbons(
-    paths: FloatArray, outward: FloatArray, width: FloatArray, color: FloatArray, tip_shade: float
+    paths: FloatArray,
+    outward: FloatArray,
+    width: FloatArray,
+    color: FloatArray,
+    *,
+    tip_shade: float = 1.0,
+    tip_width: float = 0.25,
+    arch: float = 0.0,
 ) -> Strands:
-    """Flat tapered ribbons around paths (n, k, 3).
+    """Tapered ribbons around paths (n, k, 3).
 
     Parameters
     ----------
     outward : (n, k, 3) or (n, 1, 3) direction that a ribbon's flat side faces.
-    width : (n,) at the root; a quarter of it at the tip.
-    color : (n, 3) linear reflectance of each strand.
+    width : (n,) metres, at the root.
+    color : (n, c, 3) linear reflectance across each ribbon, c >= 2 columns.
     tip_shade : factor on the colour at the tip (above 1 for sun-bleached tips).
+    tip_width : width at the tip as a share of the width at the root.
+    arch : how far the middle stands out from the edges, as a share of the width.
     """
     count, points = paths.shape[:2]
-    along = np.gradient(paths, axis=1)
-    across = np.cross(along, np.broadcast_to(outward, paths.shape))
+    columns = color.shape[1]
+    outward = np.broadcast_to(outward, paths.shape)
+    across = np.cross(np.gradient(paths, axis=1), outward)
     across /= np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-12)
-    taper = np.interp(np.linspace(0.0, 1.0, points), [0.0, 0.6, 1.0], [1.0, 0.85, 0.25])
-    half = 0.5 * width[:, None, None] * taper[None, :, None] * across
-    vertices = np.stack([paths - half, paths + half], axis=2)  # (n, k, 2, 3)
-    index = np.arange(count * points * 2).reshape(count, points, 2)
-    a, b, c, d = (index[:, :-1, 0], index[:, :-1, 1], index[:, 1:, 0], index[:, 1:, 1])
+    taper = np.interp(np.linspace(0.0, 1.0, points), [0.0, 0.6, 1.0], [1.0, 0.9, tip_width])
+    wide = (width[:, None] * taper)[:, :, None, None]
+    u = np.linspace(-1.0, 1.0, columns)[None, None, :, None]
+    vertices = paths[:, :, None] + wide * (0.5 * u * across[:, :, None] + arch * (1.0 - u * u) * outward[:, :, None])
+    index = np.arange(count * points * columns).reshape(count, points, columns)
+    a, b, c, d = (index[:, :-1, :-1], index[:, :-1, 1:], index[:, 1:, :-1], index[:, 1:, 1:])
     faces = np.concatenate([np.stack([a, b, d], -1).reshape(-1, 3), np.stack([a, d, c], -1).reshape(-1, 3)])
-    shade = np.linspace(1.0, tip_shade, points)[None, :, None, None] * np.ones((1, 1, 2, 1))
-    albedo = np.clip(color[:, None, None, :] * shade, 0.003, 0.9)
-    strand = np.repeat(np.arange(count), points * 2)
+    shade = np.linspace(1.0, tip_shade, points)[None, :, None, None]
+    albedo = np.clip(color[:, None] * shade, 0.003, 0.9)
+    strand = np.repeat(np.arange(count), points * columns)
     return Strands(vertices.reshape(-1, 3), faces, albedo.reshape(-1, 3), strand)
