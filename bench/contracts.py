@@ -284,7 +284,6 @@ class MethodSpec:
     head_models : versions the method accepts; empty means any.
     monocular : needs the views as one video.
     native : runs on our own implementation; False for an adapter to an official repository.
-    floor : a trivial avatar that every real method must beat; shown, never ranked.
     source : the paper.
     trivial : a floor that every real method should beat; shown in tables, never ranked.
     """
@@ -297,7 +296,6 @@ class MethodSpec:
     head_models: tuple[str, ...] = ()
     monocular: bool = False
     native: bool = True
-    floor: bool = False
     version: str = "1"
     source: str = ""
     trivial: bool = False
