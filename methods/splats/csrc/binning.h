@@ -6,46 +6,74 @@
 
 namespace headbench::HEADBENCH_ISA {
 
-// First and last block column, over the whole image, that one band of pixel rows touches.
-struct Span {
-  int first, last;
+// A vector has a band of pixel rows per lane. It holds several tile rows, or a tile row takes several vectors.
+constexpr int kSpans = W > kBands ? W : kBands;
+constexpr int kTileRows = kSpans / kBands;
+
+// First and last block column, over the whole image, that the bands of kTileRows tile rows touch; first > last where
+// one touches none.
+struct Spans {
+  alignas(64) float first[kSpans], last[kSpans];
 };
 
-// Spans of a tile row's bands. `radius2` is the level of the ellipse in the units of u² + v².
-inline void find_spans(const View& view, const float* record, float radius2, int tile_y, Span* spans) {
-  alignas(64) float low[kTile], high[kTile];
-  const Real x = record[kMeanX], y = record[kMeanY], inv_l11 = 1.0f / record[kL11];
-  const Real slope = record[kL21] / record[kL11], l22 = record[kL22];
-  for (int row = 0; row < kTile; row += W) {
-    alignas(64) float centers[W];
-    for (int lane = 0; lane < W; ++lane) centers[lane] = static_cast<float>(tile_y * kTile + row + lane) + 0.5f;
-    const Real dy = load(centers) - y, v = l22 * dy;
-    const Real left = fnma(v, v, radius2);
-    const Mask crossed = left >= Real(0.0f);
-    const Real half = sqrt(max(left, 0.0f)) * inv_l11, middle = fnma(slope, dy, x);
-    store(low + row, select(crossed, middle - half, 3e38f));
-    store(high + row, select(crossed, middle + half, -3e38f));
+// `radius2` is the level of the ellipse in the units of u² + v².
+HEADBENCH_INLINE void find_spans(const View& view, const float* record, float radius2, int tile_y, Spans& spans) {
+  const Real x = record[kMeanX], inv_l11 = 1.0f / record[kL11], slope = record[kL21] / record[kL11];
+  const Real l22 = record[kL22], nowhere = 3e38f;
+  const Real width = static_cast<float>(view.width), per_block = 1.0f / kBlockWidth;
+  for (int band = 0; band < kSpans; band += W) {
+    alignas(64) float tops[W];
+    for (int lane = 0; lane < W; ++lane) tops[lane] = static_cast<float>((band + lane) * kBlockHeight);
+    const Real above = load(tops) + Real(static_cast<float>(tile_y * kTile) + 0.5f - record[kMeanY]);
+    Real low = nowhere, high = Real(0.0f) - nowhere;
+    for (int row = 0; row < kBlockHeight; ++row) {
+      const Real dy = above + Real(static_cast<float>(row)), v = l22 * dy, rest = fnma(v, v, radius2);
+      const Mask crossed = rest >= Real(0.0f);
+      const Real half = sqrt(max(rest, 0.0f)) * inv_l11, middle = fnma(slope, dy, x);
+      low = select(crossed, min(low, middle - half), low);
+      high = select(crossed, max(high, middle + half), high);
+    }
+    // From the ends of the span to the pixel centres inside. A hundredth of a pixel of slack covers rounding; it
+    // costs at most a block tested in vain. Clamped to just outside the image, where the numbers are small again.
+    const Real first = max(min(ceil(low - Real(0.51f)), width), 0.0f);
+    const Real last = min(max(floor(high - Real(0.49f)), -1.0f), width - Real(1.0f));
+    const Mask touched = last >= first;
+    store(spans.first + band, select(touched, floor(first * per_block), width));
+    store(spans.last + band, select(touched, floor(last * per_block), -1.0f));
   }
-  const float width = static_cast<float>(view.width);
+}
+
+// Enter the tiles of one tile row, whose bands' spans are given; gives the next free entry.
+HEADBENCH_INLINE std::uint32_t enter_tile_row(const View& view, const FrameData& frame, const Rect& rect, int tile_y,
+                                              const float* first, const float* last, std::uint32_t entry,
+                                              std::uint32_t* tile_counts) {
+  int firsts[kBands], lasts[kBands];
+  int leftmost = view.tiles_x * kColumns, rightmost = -1;
   for (int band = 0; band < kBands; ++band) {
-    float lo = low[band * kBlockHeight], hi = high[band * kBlockHeight];
-    for (int row = 1; row < kBlockHeight; ++row) {
-      const float a = low[band * kBlockHeight + row], b = high[band * kBlockHeight + row];
-      lo = a < lo ? a : lo;
-      hi = b > hi ? b : hi;
-    }
-    // A hundredth of a pixel of slack covers rounding; it costs at most a block tested in vain. Clamped while
-    // still floats, since huge splats exceed the integers.
-    lo = lo - 0.51f;
-    hi = hi - 0.49f;
-    if (!(hi >= 0.0f && lo <= width - 1.0f && lo <= hi)) {
-      spans[band] = {1, 0};
-      continue;
-    }
-    const int first = lo > 0.0f ? static_cast<int>(ceilf(lo)) : 0;
-    const int last = hi < width - 1.0f ? static_cast<int>(hi) : view.width - 1;
-    spans[band] = first <= last ? Span{first / kBlockWidth, last / kBlockWidth} : Span{1, 0};
+    firsts[band] = static_cast<int>(first[band]);
+    lasts[band] = static_cast<int>(last[band]);
+    leftmost = firsts[band] < leftmost ? firsts[band] : leftmost;
+    rightmost = lasts[band] > rightmost ? lasts[band] : rightmost;
   }
+  if (rightmost < 0) return entry;
+  // Rounding must not carry an entry past the places reserved for the rectangle.
+  const int begin = leftmost / kColumns > rect.x0 ? leftmost / kColumns : rect.x0;
+  const int end = rightmost / kColumns < rect.x1 ? rightmost / kColumns : rect.x1;
+  for (int tile_x = begin; tile_x <= end; ++tile_x) {
+    std::uint64_t blocks = 0;
+    for (int band = 0; band < kBands; ++band) {
+      const int a = firsts[band] - tile_x * kColumns, b = lasts[band] - tile_x * kColumns;
+      const int lo = a > 0 ? a : 0, hi = b < kColumns - 1 ? b : kColumns - 1;
+      if (lo <= hi) blocks |= static_cast<std::uint64_t>((2u << hi) - (1u << lo)) << (kColumns * band);
+    }
+    if (!blocks) continue;
+    const std::uint32_t tile = static_cast<std::uint32_t>(tile_y * view.tiles_x + tile_x);
+    frame.entry_tiles[entry] = tile;
+    frame.entry_blocks[entry] = blocks;
+    ++entry;
+    ++tile_counts[tile];
+  }
+  return entry;
 }
 
 inline void find_pairs(const View& view, const FrameData& frame, std::int64_t begin, std::int64_t end,
@@ -63,33 +91,12 @@ inline void find_pairs(const View& view, const FrameData& frame, std::int64_t be
     // The slack keeps pixels that pass the drawing's own test by a rounding.
     const float radius2 = record[kLog2Opacity] - kLog2AlphaMin + 1e-5f;
     std::uint32_t entry = frame.entry_begin[splat];
-    for (int tile_y = rect.y0; tile_y <= rect.y1; ++tile_y) {
-      Span spans[kBands];
+    for (int tile_y = rect.y0; tile_y <= rect.y1; tile_y += kTileRows) {
+      Spans spans;
       find_spans(view, record, radius2, tile_y, spans);
-      int first = view.tiles_x, last = -1;
-      for (int band = 0; band < kBands; ++band) {
-        if (spans[band].first > spans[band].last) continue;
-        const int a = spans[band].first / kColumns, b = spans[band].last / kColumns;
-        first = a < first ? a : first;
-        last = b > last ? b : last;
-      }
-      // Rounding must not carry an entry past the places reserved for the rectangle.
-      first = first > rect.x0 ? first : rect.x0;
-      last = last < rect.x1 ? last : rect.x1;
-      for (int tile_x = first; tile_x <= last; ++tile_x) {
-        std::uint64_t blocks = 0;
-        for (int band = 0; band < kBands; ++band) {
-          const int a = spans[band].first - tile_x * kColumns, b = spans[band].last - tile_x * kColumns;
-          const int lo = a > 0 ? a : 0, hi = b < kColumns - 1 ? b : kColumns - 1;
-          if (lo <= hi) blocks |= static_cast<std::uint64_t>((2u << hi) - (1u << lo)) << (kColumns * band);
-        }
-        if (!blocks) continue;
-        const std::uint32_t tile = static_cast<std::uint32_t>(tile_y * view.tiles_x + tile_x);
-        frame.entry_tiles[entry] = tile;
-        frame.entry_blocks[entry] = blocks;
-        ++entry;
-        ++tile_counts[tile];
-      }
+      for (int row = 0; row < kTileRows && tile_y + row <= rect.y1; ++row)
+        entry = enter_tile_row(view, frame, rect, tile_y + row, spans.first + row * kBands, spans.last + row * kBands,
+                               entry, tile_counts);
     }
     frame.entry_count[splat] = entry - frame.entry_begin[splat];
   }

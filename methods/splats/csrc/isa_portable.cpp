@@ -1,5 +1,9 @@
 #define HEADBENCH_ISA portable
 #define HEADBENCH_ISA_NAME "portable"
-#include "simd_portable.h"
-// The instruction set comes first: the stages are written in its vectors.
+#if defined(__GNUC__) && !defined(HEADBENCH_PLAIN)
+#include "simd_vector4.h"
+#else
+#include "simd_plain.h"
+#endif
+// The vectors come first: the stages are written in them.
 #include "stages.h"

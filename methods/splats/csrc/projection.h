@@ -20,7 +20,7 @@ struct SplatLanes {
   alignas(64) float mean[3][W], quat[4][W], scale[3][W], opacity[W], offset[2][W];
 };
 
-inline void load_lane(const Splats& splats, std::int64_t splat, int lane, SplatLanes& out) {
+HEADBENCH_INLINE void load_lane(const Splats& splats, std::int64_t splat, int lane, SplatLanes& out) {
   for (int k = 0; k < 3; ++k) out.mean[k][lane] = splats.means[3 * splat + k];
   for (int k = 0; k < 4; ++k) out.quat[k][lane] = splats.quats[4 * splat + k];
   for (int k = 0; k < 3; ++k) out.scale[k][lane] = splats.scales[3 * splat + k];
@@ -45,7 +45,7 @@ struct Projection {
   Real l11, l21, l22;
 };
 
-inline void rotation_matrix(const Real* q, Real* r) {
+HEADBENCH_INLINE void rotation_matrix(const Real* q, Real* r) {
   const Real w = q[0], x = q[1], y = q[2], z = q[3], two = 2.0f, one = 1.0f;
   r[0] = fnma(two, fma(y, y, z * z), one);
   r[1] = two * fnma(w, z, x * y);
@@ -58,9 +58,9 @@ inline void rotation_matrix(const Real* q, Real* r) {
   r[8] = fnma(two, fma(x, x, y * y), one);
 }
 
-inline Real dot3(const Real* a, const Real* b) { return fma(a[0], b[0], fma(a[1], b[1], a[2] * b[2])); }
+HEADBENCH_INLINE Real dot3(const Real* a, const Real* b) { return fma(a[0], b[0], fma(a[1], b[1], a[2] * b[2])); }
 
-inline Real absolute(Real a) { return max(a, Real(0.0f) - a); }
+HEADBENCH_INLINE Real absolute(Real a) { return max(a, Real(0.0f) - a); }
 
 inline void project_lanes(const View& view, const SplatLanes& in, Projection& p) {
   for (int k = 0; k < 3; ++k) p.mean[k] = load(in.mean[k]);

@@ -6,7 +6,7 @@
 namespace headbench::HEADBENCH_ISA {
 
 // Derivative of `rotation_matrix` followed by the normalisation; d is the gradient of the matrix.
-inline void rotation_backward(const Projection& p, const Real* d, Real* out) {
+HEADBENCH_INLINE void rotation_backward(const Projection& p, const Real* d, Real* out) {
   const Real w = p.quat[0], x = p.quat[1], y = p.quat[2], z = p.quat[3], two = 2.0f;
   const Real a = d[7] - d[5], b = d[2] - d[6], c = d[3] - d[1];
   const Real e = d[1] + d[3], f = d[2] + d[6], g = d[5] + d[7];

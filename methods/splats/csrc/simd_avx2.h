@@ -1,6 +1,8 @@
 // Eight floats: AVX2 with fused multiply-add.
 #pragma once
 
+#include "inlining.h"
+
 #include <immintrin.h>
 
 namespace headbench::HEADBENCH_ISA {
@@ -17,47 +19,48 @@ struct Mask {
   __m256 v;
 };
 
-inline Real load(const float* p) { return _mm256_loadu_ps(p); }
-inline void store(float* p, Real a) { _mm256_storeu_ps(p, a.v); }
-inline Real operator+(Real a, Real b) { return _mm256_add_ps(a.v, b.v); }
-inline Real operator-(Real a, Real b) { return _mm256_sub_ps(a.v, b.v); }
-inline Real operator*(Real a, Real b) { return _mm256_mul_ps(a.v, b.v); }
-inline Real operator/(Real a, Real b) { return _mm256_div_ps(a.v, b.v); }
-inline Real fma(Real a, Real b, Real c) { return _mm256_fmadd_ps(a.v, b.v, c.v); }
-inline Real fnma(Real a, Real b, Real c) { return _mm256_fnmadd_ps(a.v, b.v, c.v); }
-inline Real min(Real a, Real b) { return _mm256_min_ps(a.v, b.v); }
-inline Real max(Real a, Real b) { return _mm256_max_ps(a.v, b.v); }
-inline Real sqrt(Real a) { return _mm256_sqrt_ps(a.v); }
-inline Real ceil(Real a) { return _mm256_ceil_ps(a.v); }
-inline Mask operator>(Real a, Real b) { return {_mm256_cmp_ps(a.v, b.v, _CMP_GT_OQ)}; }
-inline Mask operator>=(Real a, Real b) { return {_mm256_cmp_ps(a.v, b.v, _CMP_GE_OQ)}; }
-inline Mask operator&(Mask a, Mask b) { return {_mm256_and_ps(a.v, b.v)}; }
-inline Real select(Mask m, Real a, Real b) { return _mm256_blendv_ps(b.v, a.v, m.v); }
-inline Real zero_unless(Mask m, Real a) { return _mm256_and_ps(m.v, a.v); }
-inline bool any(Mask m) { return _mm256_movemask_ps(m.v) != 0; }
+HEADBENCH_INLINE Real load(const float* p) { return _mm256_loadu_ps(p); }
+HEADBENCH_INLINE void store(float* p, Real a) { _mm256_storeu_ps(p, a.v); }
+HEADBENCH_INLINE Real operator+(Real a, Real b) { return _mm256_add_ps(a.v, b.v); }
+HEADBENCH_INLINE Real operator-(Real a, Real b) { return _mm256_sub_ps(a.v, b.v); }
+HEADBENCH_INLINE Real operator*(Real a, Real b) { return _mm256_mul_ps(a.v, b.v); }
+HEADBENCH_INLINE Real operator/(Real a, Real b) { return _mm256_div_ps(a.v, b.v); }
+HEADBENCH_INLINE Real fma(Real a, Real b, Real c) { return _mm256_fmadd_ps(a.v, b.v, c.v); }
+HEADBENCH_INLINE Real fnma(Real a, Real b, Real c) { return _mm256_fnmadd_ps(a.v, b.v, c.v); }
+HEADBENCH_INLINE Real min(Real a, Real b) { return _mm256_min_ps(a.v, b.v); }
+HEADBENCH_INLINE Real max(Real a, Real b) { return _mm256_max_ps(a.v, b.v); }
+HEADBENCH_INLINE Real sqrt(Real a) { return _mm256_sqrt_ps(a.v); }
+HEADBENCH_INLINE Real ceil(Real a) { return _mm256_ceil_ps(a.v); }
+HEADBENCH_INLINE Real floor(Real a) { return _mm256_floor_ps(a.v); }
+HEADBENCH_INLINE Mask operator>(Real a, Real b) { return {_mm256_cmp_ps(a.v, b.v, _CMP_GT_OQ)}; }
+HEADBENCH_INLINE Mask operator>=(Real a, Real b) { return {_mm256_cmp_ps(a.v, b.v, _CMP_GE_OQ)}; }
+HEADBENCH_INLINE Mask operator&(Mask a, Mask b) { return {_mm256_and_ps(a.v, b.v)}; }
+HEADBENCH_INLINE Real select(Mask m, Real a, Real b) { return _mm256_blendv_ps(b.v, a.v, m.v); }
+HEADBENCH_INLINE Real zero_unless(Mask m, Real a) { return _mm256_and_ps(m.v, a.v); }
+HEADBENCH_INLINE bool any(Mask m) { return _mm256_movemask_ps(m.v) != 0; }
 
 // One Newton step on the 12-bit estimate: 1 to 2 units in the last place.
-inline Real reciprocal(Real a) {
+HEADBENCH_INLINE Real reciprocal(Real a) {
   const Real r = _mm256_rcp_ps(a.v);
   return fma(r, fnma(a, r, 1.0f), r);
 }
 
 // Split x into the nearest whole number and the rest in [-1/2, 1/2].
-inline Real round(Real a, Real& rest) {
+HEADBENCH_INLINE Real round(Real a, Real& rest) {
   const Real whole = _mm256_round_ps(a.v, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
   rest = a - whole;
   return whole;
 }
 
 // a 2^n for whole n from -126 to 127.
-inline Real scale_by_power(Real a, Real n) {
+HEADBENCH_INLINE Real scale_by_power(Real a, Real n) {
   const __m256i exponent = _mm256_add_epi32(_mm256_cvtps_epi32(n.v), _mm256_set1_epi32(127));
   return a * Real(_mm256_castsi256_ps(_mm256_slli_epi32(exponent, 23)));
 }
 
 // The matrix whose rows lie at p, p + lanes, ...: its columns. Rows i and i + 4 share a register from the
 // start, so that what is left are two 4 x 4 transposes side by side.
-inline void load_transposed(const float* p, Real* columns) {
+HEADBENCH_INLINE void load_transposed(const float* p, Real* columns) {
   for (int half = 0; half < 2; ++half) {
     __m256 r[4];
     for (int i = 0; i < 4; ++i) {

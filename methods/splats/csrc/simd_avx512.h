@@ -1,6 +1,8 @@
 // Sixteen floats: AVX-512 (F, DQ, BW, VL).
 #pragma once
 
+#include "inlining.h"
+
 #include <immintrin.h>
 
 namespace headbench::HEADBENCH_ISA {
@@ -17,44 +19,45 @@ struct Mask {
   __mmask16 v;
 };
 
-inline Real load(const float* p) { return _mm512_loadu_ps(p); }
-inline void store(float* p, Real a) { _mm512_storeu_ps(p, a.v); }
-inline Real operator+(Real a, Real b) { return _mm512_add_ps(a.v, b.v); }
-inline Real operator-(Real a, Real b) { return _mm512_sub_ps(a.v, b.v); }
-inline Real operator*(Real a, Real b) { return _mm512_mul_ps(a.v, b.v); }
-inline Real operator/(Real a, Real b) { return _mm512_div_ps(a.v, b.v); }
-inline Real fma(Real a, Real b, Real c) { return _mm512_fmadd_ps(a.v, b.v, c.v); }
-inline Real fnma(Real a, Real b, Real c) { return _mm512_fnmadd_ps(a.v, b.v, c.v); }
-inline Real min(Real a, Real b) { return _mm512_min_ps(a.v, b.v); }
-inline Real max(Real a, Real b) { return _mm512_max_ps(a.v, b.v); }
-inline Real sqrt(Real a) { return _mm512_sqrt_ps(a.v); }
-inline Real ceil(Real a) { return _mm512_roundscale_ps(a.v, _MM_FROUND_TO_POS_INF | _MM_FROUND_NO_EXC); }
-inline Mask operator>(Real a, Real b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_GT_OQ)}; }
-inline Mask operator>=(Real a, Real b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_GE_OQ)}; }
-inline Mask operator&(Mask a, Mask b) { return {static_cast<__mmask16>(a.v & b.v)}; }
-inline Real select(Mask m, Real a, Real b) { return _mm512_mask_mov_ps(b.v, m.v, a.v); }
-inline Real zero_unless(Mask m, Real a) { return _mm512_maskz_mov_ps(m.v, a.v); }
-inline bool any(Mask m) { return m.v != 0; }
+HEADBENCH_INLINE Real load(const float* p) { return _mm512_loadu_ps(p); }
+HEADBENCH_INLINE void store(float* p, Real a) { _mm512_storeu_ps(p, a.v); }
+HEADBENCH_INLINE Real operator+(Real a, Real b) { return _mm512_add_ps(a.v, b.v); }
+HEADBENCH_INLINE Real operator-(Real a, Real b) { return _mm512_sub_ps(a.v, b.v); }
+HEADBENCH_INLINE Real operator*(Real a, Real b) { return _mm512_mul_ps(a.v, b.v); }
+HEADBENCH_INLINE Real operator/(Real a, Real b) { return _mm512_div_ps(a.v, b.v); }
+HEADBENCH_INLINE Real fma(Real a, Real b, Real c) { return _mm512_fmadd_ps(a.v, b.v, c.v); }
+HEADBENCH_INLINE Real fnma(Real a, Real b, Real c) { return _mm512_fnmadd_ps(a.v, b.v, c.v); }
+HEADBENCH_INLINE Real min(Real a, Real b) { return _mm512_min_ps(a.v, b.v); }
+HEADBENCH_INLINE Real max(Real a, Real b) { return _mm512_max_ps(a.v, b.v); }
+HEADBENCH_INLINE Real sqrt(Real a) { return _mm512_sqrt_ps(a.v); }
+HEADBENCH_INLINE Real ceil(Real a) { return _mm512_roundscale_ps(a.v, _MM_FROUND_TO_POS_INF | _MM_FROUND_NO_EXC); }
+HEADBENCH_INLINE Real floor(Real a) { return _mm512_roundscale_ps(a.v, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC); }
+HEADBENCH_INLINE Mask operator>(Real a, Real b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_GT_OQ)}; }
+HEADBENCH_INLINE Mask operator>=(Real a, Real b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_GE_OQ)}; }
+HEADBENCH_INLINE Mask operator&(Mask a, Mask b) { return {static_cast<__mmask16>(a.v & b.v)}; }
+HEADBENCH_INLINE Real select(Mask m, Real a, Real b) { return _mm512_mask_mov_ps(b.v, m.v, a.v); }
+HEADBENCH_INLINE Real zero_unless(Mask m, Real a) { return _mm512_maskz_mov_ps(m.v, a.v); }
+HEADBENCH_INLINE bool any(Mask m) { return m.v != 0; }
 
 // One Newton step on the 14-bit estimate: 1 to 2 units in the last place.
-inline Real reciprocal(Real a) {
+HEADBENCH_INLINE Real reciprocal(Real a) {
   const Real r = _mm512_rcp14_ps(a.v);
   return fma(r, fnma(a, r, 1.0f), r);
 }
 
 // Split x into the nearest whole number and the rest in [-1/2, 1/2].
-inline Real round(Real a, Real& rest) {
+HEADBENCH_INLINE Real round(Real a, Real& rest) {
   const Real whole = _mm512_roundscale_ps(a.v, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
   rest = a - whole;
   return whole;
 }
 
 // a 2^n for whole n.
-inline Real scale_by_power(Real a, Real n) { return _mm512_scalef_ps(a.v, n.v); }
+HEADBENCH_INLINE Real scale_by_power(Real a, Real n) { return _mm512_scalef_ps(a.v, n.v); }
 
 // The matrix whose rows lie at p, p + lanes, ...: its columns. Quarters of rows i, i + 4, i + 8 and i + 12
 // share a register from the start, so that what is left are four 4 x 4 transposes side by side.
-inline void load_transposed(const float* p, Real* columns) {
+HEADBENCH_INLINE void load_transposed(const float* p, Real* columns) {
   for (int quarter = 0; quarter < 4; ++quarter) {
     __m512 r[4];
     for (int i = 0; i < 4; ++i) {

@@ -22,7 +22,7 @@ struct Block {
   Mask inside;            // lanes inside the image
 };
 
-inline Block block_of(const View& view, int tile, int index) {
+HEADBENCH_INLINE Block block_of(const View& view, int tile, int index) {
   Block b;
   b.left = tile % view.tiles_x * kTile + index % kColumns * kBlockWidth;
   b.top = tile / view.tiles_x * kTile + index / kColumns * kBlockHeight;
@@ -38,7 +38,7 @@ inline Block block_of(const View& view, int tile, int index) {
 }
 
 // Lowest bit of a non-zero word, as an index.
-inline int lowest_bit(std::uint64_t bits) {
+HEADBENCH_INLINE int lowest_bit(std::uint64_t bits) {
 #if defined(__GNUC__) || defined(__clang__)
   return __builtin_ctzll(bits);
 #else
@@ -48,7 +48,7 @@ inline int lowest_bit(std::uint64_t bits) {
 #endif
 }
 
-inline void prefetch(const void* address) {
+HEADBENCH_INLINE void prefetch(const void* address) {
 #if defined(__GNUC__) || defined(__clang__)
   __builtin_prefetch(address);
 #else
@@ -97,7 +97,7 @@ inline void fill_chunk(const Splats& splats, const FrameData& frame, const Pair*
 }
 
 // 2^x for x from -126 to 127; relative error below 2e-7.
-inline Real exp2(Real x) {
+HEADBENCH_INLINE Real exp2(Real x) {
   Real f;
   const Real n = round(max(x, -126.0f), f);
   // Minimax in relative error on [-1/2, 1/2] with the constant held at 1, so that whole powers are exact.
@@ -117,7 +117,7 @@ struct Alpha {
 
 // Alpha of the splat in `row` at a block's pixels. Forward and backward both come here: were the two to differ
 // by a rounding, pixels at a threshold would get gradients of another image.
-inline Alpha alpha_of(const float* row, const Block& block) {
+HEADBENCH_INLINE Alpha alpha_of(const float* row, const Block& block) {
   const Real dx = block.pixel_x - Real(row[kMeanX]), dy = block.pixel_y - Real(row[kMeanY]);
   const Real u = fma(row[kL11], dx, Real(row[kL21]) * dy), v = Real(row[kL22]) * dy;
   const Real exponent = fnma(v, v, fnma(u, u, row[kLog2Opacity]));

@@ -1,0 +1,73 @@
+// Four floats in the vector extension of GCC and Clang: SSE2, NEON or whatever the platform's baseline has.
+#pragma once
+
+#include <math.h>
+
+#include <cstdint>
+
+#include "inlining.h"
+
+namespace headbench::HEADBENCH_ISA {
+
+typedef float Float4 __attribute__((vector_size(16)));
+typedef std::int32_t Int4 __attribute__((vector_size(16)));
+
+struct Real {
+  static constexpr int lanes = 4;
+  Float4 v;
+  Real() = default;
+  Real(Float4 x) : v(x) {}
+  Real(float x) : v(Float4{x, x, x, x}) {}
+};
+
+struct Mask {
+  Int4 v;  // 0 or -1
+};
+
+HEADBENCH_INLINE Real load(const float* p) {
+  Real a;
+  __builtin_memcpy(&a.v, p, sizeof a.v);
+  return a;
+}
+HEADBENCH_INLINE void store(float* p, Real a) { __builtin_memcpy(p, &a.v, sizeof a.v); }
+HEADBENCH_INLINE Real operator+(Real a, Real b) { return a.v + b.v; }
+HEADBENCH_INLINE Real operator-(Real a, Real b) { return a.v - b.v; }
+HEADBENCH_INLINE Real operator*(Real a, Real b) { return a.v * b.v; }
+HEADBENCH_INLINE Real operator/(Real a, Real b) { return a.v / b.v; }
+HEADBENCH_INLINE Real fma(Real a, Real b, Real c) { return a.v * b.v + c.v; }
+HEADBENCH_INLINE Real fnma(Real a, Real b, Real c) { return c.v - a.v * b.v; }
+HEADBENCH_INLINE Mask operator>(Real a, Real b) { return {a.v > b.v}; }
+HEADBENCH_INLINE Mask operator>=(Real a, Real b) { return {a.v >= b.v}; }
+HEADBENCH_INLINE Mask operator&(Mask a, Mask b) { return {a.v & b.v}; }
+HEADBENCH_INLINE Real select(Mask m, Real a, Real b) { return (Float4)(((Int4)a.v & m.v) | ((Int4)b.v & ~m.v)); }
+HEADBENCH_INLINE Real zero_unless(Mask m, Real a) { return (Float4)((Int4)a.v & m.v); }
+HEADBENCH_INLINE Real min(Real a, Real b) { return select({a.v < b.v}, a, b); }
+HEADBENCH_INLINE Real max(Real a, Real b) { return select({a.v > b.v}, a, b); }
+HEADBENCH_INLINE bool any(Mask m) { return (m.v[0] | m.v[1] | m.v[2] | m.v[3]) != 0; }
+HEADBENCH_INLINE Real reciprocal(Real a) { return Real(1.0f) / a; }
+
+HEADBENCH_INLINE Real sqrt(Real a) { return Float4{sqrtf(a.v[0]), sqrtf(a.v[1]), sqrtf(a.v[2]), sqrtf(a.v[3])}; }
+HEADBENCH_INLINE Real ceil(Real a) { return Float4{ceilf(a.v[0]), ceilf(a.v[1]), ceilf(a.v[2]), ceilf(a.v[3])}; }
+HEADBENCH_INLINE Real floor(Real a) {
+  return Float4{floorf(a.v[0]), floorf(a.v[1]), floorf(a.v[2]), floorf(a.v[3])};
+}
+
+// Split x into the nearest whole number and the rest in [-1/2, 1/2].
+HEADBENCH_INLINE Real round(Real a, Real& rest) {
+  constexpr float magic = 12582912.0f;  // 1.5 2^23: adding it drops the fraction
+  const Real whole = (a + Real(magic)) - Real(magic);
+  rest = a - whole;
+  return whole;
+}
+
+// a 2^n for whole n from -126 to 127.
+HEADBENCH_INLINE Real scale_by_power(Real a, Real n) {
+  return a.v * (Float4)((__builtin_convertvector(n.v, Int4) + 127) << 23);
+}
+
+// The matrix whose rows lie at p, p + lanes, ...: its columns.
+HEADBENCH_INLINE void load_transposed(const float* p, Real* columns) {
+  for (int j = 0; j < 4; ++j) columns[j] = Float4{p[j], p[4 + j], p[8 + j], p[12 + j]};
+}
+
+}  // namespace headbench::HEADBENCH_ISA
