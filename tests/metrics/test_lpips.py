@@ -43,6 +43,15 @@ def test_published_check_images_have_their_reference_scores(reference_folder, ne
     assert metric(reference, reference) == 0.0
 
 
+def test_an_odd_size_has_the_score_that_torchmetrics_documents(reference_folder):
+    """Its documentation's pair, here rounded to 8 bits; 100 pixels do not divide evenly in the pooling."""
+    torch.manual_seed(42)
+    images, truths = (torch.rand(2, 3, 100, 100).permute(0, 2, 3, 1) for _ in range(2))
+    stacks = ((x * 255).round().to(torch.uint8).numpy() for x in (images, truths))
+    scores = Lpips("squeeze", weights=reference_folder).distances(*stacks)
+    np.testing.assert_allclose(scores, [0.1024, 0.0938], atol=1.5e-4)
+
+
 def test_the_metric_of_the_registry_is_alexnet(reference_folder, bare_machine, monkeypatch):
     monkeypatch.setenv(VARIABLE, str(reference_folder))
     a, b = frames(2)

@@ -62,7 +62,7 @@ def test_a_floor_can_be_kept_from_setting_the_scale(tmp_path):
 
 def test_errors_of_opposite_sign_do_not_cancel_in_a_reduced_map(tmp_path):
     truth = np.full((80, 60, 3), 100, np.uint8)
-    signs = np.indices((80, 60)).sum(axis=0)[..., None] % 2
+    signs = np.indices((80, 60, 3)).sum(axis=0) % 2
     render = np.where(signs, truth + 20, truth - 20).astype(np.uint8)
     sheet, places = draw(tmp_path, [SheetRow("N", [], truth, {"a": render})], ["a"], panel_width=30)
     place = places[0, "error a"]
