@@ -25,6 +25,7 @@ from .clip import CaptureClip, FrameFiles
 from .content_digests import content_digests
 from .flame_parameters import TeethPolicy, Tracking, read_tracking
 from .head.arrays import HeadArrays
+from .image_files import ImageInfo
 from .images import ImageStore
 from .principal_point import settle_cy
 from .splits import check_disjoint, sequence_names, split_by_holding_out
@@ -54,6 +55,9 @@ def read_capture(
     progress: Progress = no_progress,
 ) -> CaptureClip:
     """Read a capture folder (or the folder that holds its one union).
+
+    The first call reads every file once for the fingerprint and keeps the digests in the capture's folder,
+    see `content_digests`.
 
     Parameters
     ----------
@@ -85,7 +89,7 @@ def read_capture(
     check_timesteps(folder, everything)
     infos = check_images(everything, decode=decode, progress=progress)
     rig = collect_cameras(everything, infos)
-    ground = _background(folder, declaration, background, all(i.channels in (2, 4) for i in infos.values()))
+    ground = _background(folder, declaration, background, all(info.has_alpha for info in infos.values()))
     asset = find_head(folder, declaration, head, masks=masks, regions=regions)
     subject = subject or _subject(folder, declaration, everything)
     files = {entry.timestep: entry.parameters for entry in everything}
@@ -95,7 +99,7 @@ def read_capture(
     convention, basis = settle_cy(folder, cy, declared, rig, tracking, poses, everything, ground)
 
     names = sequence_names(everything, declaration.sequences if declaration else {})
-    splits, frames = _index_frames(folder, subject, names, entries)
+    splits, frames = _index_frames(folder, subject, names, entries, infos)
     if held_out_sequences or held_out_cameras:
         splits = split_by_holding_out(folder, frames, held_out_sequences, held_out_cameras)
     digests = content_digests(folder, _used_files(folder, everything), progress=progress)
@@ -196,15 +200,21 @@ def _shift_poses(
 
 
 def _index_frames(
-    folder: Path, subject: str, names: Mapping[str, str], entries: Mapping[str, Sequence[FrameEntry]]
+    folder: Path,
+    subject: str,
+    names: Mapping[str, str],
+    entries: Mapping[str, Sequence[FrameEntry]],
+    infos: Mapping[Path, ImageInfo],
 ) -> tuple[dict[str, tuple[FrameKey, ...]], dict[FrameKey, FrameFiles]]:
-    """Keys by split as the JSONs have them, and files by key."""
+    """Keys by split as the JSONs have them, and files by key. Without a mask, an alpha channel is the mask."""
     splits: dict[str, tuple[FrameKey, ...]] = {}
     frames: dict[FrameKey, FrameFiles] = {}
     for part, group in entries.items():
         keys = [FrameKey(subject, names[e.sequence_folder], e.timestep, e.camera_id) for e in group]
         splits[part] = tuple(keys)
-        frames |= {key: FrameFiles(e.image, e.mask) for key, e in zip(keys, group)}
+        for key, entry in zip(keys, group):
+            own_alpha = entry.image if infos[entry.image].has_alpha else None
+            frames[key] = FrameFiles(entry.image, entry.mask or own_alpha)
     check_disjoint(folder, splits)
     return splits, frames
 

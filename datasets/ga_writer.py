@@ -212,7 +212,8 @@ class CaptureWriter:
         self._write_canonical(self.union)
         save_head(self.union / layout.HEAD_FILE, self.plan.head)
         self._declaration([*train, *test], layout.HEAD_FILE).write(self.union)
-        for name, file in layout.SPLIT_FILES.items():
+        # Training last: it is the file that readers recognise a capture by.
+        for name, file in reversed(layout.SPLIT_FILES.items()):
             self._write_transforms(self.union / file, parts[name])
 
     def _frames(self, sequence: SequencePlan, start: int, prefix: str) -> Iterable[dict[str, Any]]:

@@ -28,6 +28,11 @@ class ImageInfo:
     height: int
     channels: int
 
+    @property
+    def has_alpha(self) -> bool:
+        """Whether the file has an alpha channel, beside grey or RGB."""
+        return self.channels in (2, 4)
+
 
 def probe_image(path: Path, *, decode: bool = False) -> ImageInfo:
     """Read the size of a PNG or JPEG and make sure that the file is whole.

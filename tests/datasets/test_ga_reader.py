@@ -94,6 +94,16 @@ def test_single_sequence_is_read_with_the_head_its_declaration_names(pristine_ca
     assert {key.timestep for key in tongue.excluded} == {2}
 
 
+def test_one_camera_has_no_novel_view(tmp_path):
+    plan = make_plan(cameras=rig()[:1], novel_view_cameras=())
+    clip = read_capture(write_tiny_capture(tmp_path, plan).union)
+    assert {name: len(keys) for name, keys in clip.splits.items()} == {
+        "train": 4,
+        "novel_view": 0,
+        "self_reenactment": 2,
+    }
+
+
 def test_captures_are_found_from_the_folder_above(pristine_capture, tmp_path):
     root = pristine_capture.writer.root
     assert find_captures(root) == [pristine_capture.union]
@@ -310,6 +320,7 @@ def test_rgba_is_composited_on_the_background_asked_for(tmp_path):
         alpha = rgba[..., 3:] / 255
         expected = rgba[..., :3] * alpha + np.array([0, 127.5, 255]) * (1 - alpha)
         assert np.abs(clip.image(key) - expected).max() <= 0.5 + 1e-4
+        np.testing.assert_array_equal(clip.mask(key), rgba[..., 3])
 
 
 def test_rgb_images_keep_their_background(capture):
