@@ -148,7 +148,7 @@ def test_flipped_bytes_are_refused_or_harmless(tmp_path):
     whole = bytearray((tmp_path / "head.npz").read_bytes())
     refused = 0
     in_data = range(50, len(whole), len(whole) // 40)
-    in_directory = range(len(whole) - 400, len(whole))  # names, methods, versions, flags
+    in_directory = range(len(whole) - 400, len(whole), 5)  # names, methods, versions, flags
     for position in (*in_data, *in_directory):
         broken = whole.copy()
         broken[position] ^= 0xFF
@@ -157,4 +157,4 @@ def test_flipped_bytes_are_refused_or_harmless(tmp_path):
             assert read_head(tmp_path / "broken.npz").fingerprint() == HEAD.fingerprint()
         except InputError:
             refused += 1
-    assert refused > 200
+    assert refused > 60

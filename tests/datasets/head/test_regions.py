@@ -24,6 +24,11 @@ def test_derived_regions_are_the_sets_they_name():
     with_derived_regions(HEAD).validate("toy")
 
 
+def test_hair_is_scalp_without_face_and_neck():
+    parts = {"scalp": np.array([1, 2, 3, 4]), "face": np.array([2, 9]), "neck": np.array([3, 8])}
+    np.testing.assert_array_equal(derived_regions(parts, 10)["hair"], [1, 4])
+
+
 def test_only_what_follows_is_derived():
     assert derived_regions({}, 10) == {}
     some = {"left_ear": np.array([1]), "scalp": np.array([2]), "face": np.array([3])}
