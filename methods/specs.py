@@ -46,6 +46,7 @@ MEAN_IMAGE = MethodSpec(
     name="mean-image",
     summary="The mean of all training images, whatever is asked for: the floor of every table.",
     implementation="headbench.methods.trivial:MeanImage",
+    trivial=True,
     presets={name: {"budget": {"iterations": 1}} for name in ("smoke", "demo", "fast", "paper")},
 )
 
@@ -53,6 +54,7 @@ NEAREST_CAMERA = MethodSpec(
     name="nearest-camera",
     summary="The training image of the nearest pose and camera, as it is: what memorising alone achieves.",
     implementation="headbench.methods.trivial:NearestCamera",
+    trivial=True,
     config="headbench.methods.configs:NearestCameraConfig",
     presets={name: {"budget": {"iterations": 1}} for name in ("smoke", "demo", "fast", "paper")},
 )

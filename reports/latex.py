@@ -53,7 +53,7 @@ def to_latex(table: Table, label: str = "tab:headbench") -> str:
         start += count
     names = ["Method"]
     for column in columns:
-        unit = rf"\,{escape(f'[{column.unit}]')}" if column.unit else ""
+        unit = rf"\,({escape(column.unit)})" if column.unit else ""
         names.append(f"{escape(column.label)}{unit} {escape(column.arrow)}")
     body: list[str] = []
     for index, (title, rows) in enumerate(table.groups):

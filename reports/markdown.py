@@ -13,7 +13,7 @@ def to_markdown(table: Table) -> str:
     for index, column in enumerate(table.columns):
         follows = index > 0 and table.columns[index - 1].title == column.title
         tasks.append("" if follows else escape(column.title))
-        unit = f" {escape(f'[{column.unit}]')}" if column.unit else ""
+        unit = f" ({escape(column.unit)})" if column.unit else ""
         names.append(f"**{escape(column.label)}**{unit} {column.arrow}")
     lines = [tasks, names]
     for title, rows in table.groups:
@@ -32,8 +32,8 @@ def to_markdown(table: Table) -> str:
 
 
 def escape(text: str) -> str:
-    """Make text stand for itself in Markdown, on one line."""
-    return re.sub(r"([\\`*_{}\[\]<>|#~&])", r"\\\1", " ".join(text.split()))
+    """Make text stand for itself in Markdown, on one line; an underscore within a word already does."""
+    return re.sub(r"([\\`*{}\[\]<>|#~&]|(?<!\w)_|_(?!\w))", r"\\\1", " ".join(text.split()))
 
 
 def _cell(cell: TableCell) -> str:

@@ -107,7 +107,7 @@ class Table:
             frames = "1 frame" if task.frames == 1 else f"{task.frames} frames"
             subjects = "1 subject" if task.subjects == 1 else f"{task.subjects} subjects"
             name = f"{task.protocol_id} " if task.protocol_id else ""
-            parts.append(f"{task.title}: {frames}, {subjects}, protocol {name}[{task.protocol_hash}].")
+            parts.append(f"{task.title}: {frames}, {subjects}, protocol {name}({task.protocol_hash}).")
         if self.image_size:
             parts.append(f"Images of {self.image_size} pixels.")
         seeds = "one seed" if self.seeds == 1 else f"{self.seeds} seeds"

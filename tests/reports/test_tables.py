@@ -121,8 +121,8 @@ def test_the_caption_tells_protocol_frames_and_size(make_rows, metrics):
         image_size="550 x 802",
     )
     for part in (
-        "Novel view: 5 frames, 2 subjects, protocol novel_view/canonical/1 [hash-novel_view].",
-        "Self-reenactment: 5 frames, 2 subjects, protocol [hash-self_reenactment].",
+        "Novel view: 5 frames, 2 subjects, protocol novel_view/canonical/1 (hash-novel_view).",
+        "Self-reenactment: 5 frames, 2 subjects, protocol (hash-self_reenactment).",
         "550 x 802",
         "2 seeds",
         "Mean over frames, then sequences, then subjects",
