@@ -122,11 +122,15 @@ def landmark_index(landmarks: Mapping[str, int], name: str) -> int:
 
 
 def skin_triangles(head: HeadAsset) -> IntArray:
-    """Triangles of ``head`` that are skin: not eyeballs, teeth, gums, tongue, lashes or tear films."""
+    """Triangles of ``head`` that are skin, turned outwards: no eyeballs, teeth, gums, tongue, lashes or tears."""
     other = np.zeros(len(head.template), bool)
     for name in _NOT_SKIN & head.regions.keys():
         other[head.regions[name]] = True
-    return head.faces[~other[head.faces].any(axis=1)]
+    skin = head.faces[~other[head.faces].any(axis=1)]
+    # Light falls on fronts only, so a model whose triangles turn the other way round is turned over: the sign
+    # of the volume they enclose tells (divergence theorem).
+    a, b, c = head.template[skin].astype(np.float64).transpose(1, 0, 2)
+    return skin if np.einsum("ni,ni->", np.cross(a, b), c) > 0 else skin[:, ::-1]
 
 
 def _fit_sphere(points: FloatArray) -> tuple[FloatArray, float]:
@@ -233,15 +237,15 @@ def _front_point(surface: FloatArray, at: FloatArray) -> FloatArray:
 
 def _lip_outline(head: HeadAsset, landmarks: Mapping[str, int], vertices: FloatArray) -> FloatArray:
     """Closed outline of the lips' red, (n, 3)."""
-    rings = [head.regions.get(f"lip_outside_ring_{part}") for part in ("upper", "lower")]
-    if rings[0] is not None and rings[1] is not None:
-        ring = vertices[np.unique(np.concatenate([rings[0], rings[1]]))]
-        middle, extent = 0.5 * (ring.max(axis=0) + ring.min(axis=0)), np.ptp(ring, axis=0)
-        # The outline is star-shaped once its height is stretched to its width: sort it by angle.
-        return ring[np.argsort(np.arctan2(*((ring - middle) / extent)[:, 1::-1].T))]
     keys = [f"ibug_{index:02d}" for index in _IBUG_LIPS]
-    if not set(keys) <= landmarks.keys():
+    if set(keys) <= landmarks.keys():
+        return vertices[[landmarks[key] for key in keys]]
+    rings = [head.regions.get(f"lip_outside_ring_{part}") for part in ("upper", "lower")]
+    if rings[0] is None or rings[1] is None:
         raise InputError(
             head.version, "regions", "lip_outside_ring_upper and _lower, or iBUG's lip landmarks", "neither"
         )
-    return vertices[[landmarks[key] for key in keys]]
+    ring = vertices[np.unique(np.concatenate([rings[0], rings[1]]))]
+    middle, extent = 0.5 * (ring.max(axis=0) + ring.min(axis=0)), np.ptp(ring, axis=0)
+    # The outline is star-shaped once its height is stretched to its width: sort it by angle.
+    return ring[np.argsort(np.arctan2(*((ring - middle) / extent)[:, 1::-1].T))]

@@ -6,17 +6,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 
 from ...bench.contracts import FloatArray
 from ...bench.errors import InputError
 from ..head.arrays import HeadArrays, read_npz
 from ..head.ict import expression_names, ict_head, is_ict
+from ..procedural.model import procedural_head
 from .anatomy import Anatomy
 from .controls import EXPRESSION_CONTROLS, Translation
-from .mouth import MouthPart, tongue
+from .mouth import MouthPart, teeth, tongue
 from .people import Person
-from .translations import ict_targets, named_translation
+from .translations import ict_targets, named_translation, procedural_translation
 
 PROCEDURAL = ("procedural", "procedural2020", "procedural2023")
 
@@ -42,6 +42,8 @@ def load_geometry(name: str) -> Geometry:
     InputError
         Where the file is no ICT-FaceKit npz: other models' coefficients have no semantic translation here.
     """
+    if name in PROCEDURAL:
+        return _procedural(name.removeprefix("procedural") or "2023")
     path = Path(name)
     if not path.is_file():
         raise InputError("--head", "", f"{', '.join(PROCEDURAL)} or an existing file", name)
@@ -58,3 +60,13 @@ def load_geometry(name: str) -> Geometry:
         return (tongue(person, anatomy, len(head.parents)),)
 
     return Geometry(head, translation, mouth, "ict-facekit")
+
+
+def _procedural(version: str) -> Geometry:
+    head = procedural_head(version)
+
+    def mouth(person: Person, anatomy: Anatomy, shape: FloatArray) -> Sequence[MouthPart]:
+        joints = len(head.parents)
+        return (*teeth(anatomy, joints), tongue(person, anatomy, joints))
+
+    return Geometry(head, procedural_translation(head), mouth, head.version)

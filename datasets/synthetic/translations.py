@@ -8,6 +8,8 @@ import numpy as np
 
 from ...bench.contracts import HeadAsset
 from ...bench.errors import InputError
+from ..procedural.expressions import SEMANTIC_NAMES
+from ..procedural.model import semantic_to_coefficients
 from .controls import EXPRESSION_CONTROLS, Translation
 
 # ICT-FaceKit's shapes carry ARKit's names with _L and _R.
@@ -60,3 +62,10 @@ def named_translation(
                 raise InputError(head.version, "expression names", name, f"{len(names)} others")
             matrix[row, list(names).index(name)] = weight
     return Translation(head.version, matrix, None)
+
+
+def procedural_translation(head: HeadAsset) -> Translation:
+    """The procedural head speaks these controls itself; its coefficients are combinations of them."""
+    expression, eyelids = semantic_to_coefficients(head.version)
+    rows = [SEMANTIC_NAMES.index(control) for control in EXPRESSION_CONTROLS]
+    return Translation(head.version, expression[rows], None if eyelids is None else eyelids[rows])
