@@ -91,7 +91,8 @@ class Lpips:
 
     def _features(self, images: ByteArray) -> list[Tensor]:
         """Unit-length features of each tapped layer, (N, C, h, w)."""
-        x = torch.from_numpy(np.ascontiguousarray(images)).to(self.device)
+        # A copy: images of a clip may be read-only, or views of negative stride; tensors can be neither.
+        x = torch.from_numpy(images.copy()).to(self.device)
         x = x.permute(0, 3, 1, 2).to(torch.float32) / 127.5 - 1.0
         outputs = self._network((x - self._shift) / self._scale)
         return [out / (out.square().sum(dim=1, keepdim=True).sqrt() + EPSILON) for out in outputs]

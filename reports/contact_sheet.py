@@ -82,7 +82,8 @@ def contact_sheet(
     methods : columns, in order.
     out : the PNG.
     title, subtitle : above everything.
-    panel_width : pixels; wider images are reduced to it (by area), narrower ones are shown as they are.
+    panel_width : pixels; wider images are reduced to it (by area), narrower ones enlarged by a whole factor, each
+        pixel a square, as far as they fit.
     scaled_by : methods whose errors set the scale (default: all), so that a floor does not darken the rest.
 
     Returns
@@ -134,7 +135,8 @@ class _Strip:
     @classmethod
     def make(cls, row: SheetRow, methods: Sequence[str], panel_width: int) -> _Strip:
         truth = _read(row.truth)
-        factor = min(1.0, panel_width / truth.shape[1])
+        enlarged = panel_width // truth.shape[1]
+        factor = enlarged if enlarged else panel_width / truth.shape[1]
         size = (max(1, round(truth.shape[1] * factor)), max(1, round(truth.shape[0] * factor)))
         renders: dict[str, ByteArray | Missing] = {}
         errors: dict[str, FloatArray] = {}
@@ -148,21 +150,22 @@ class _Strip:
                 raise InputError(
                     "contact sheet", f"render of {method}", f"shape {truth.shape}", str(render.shape)
                 )
-            renders[method] = _reduce(render, size)
+            renders[method] = _resize(render, size)
             # Reduced after the difference: reducing before it would average errors of opposite sign away.
             error = np.abs(render.astype(np.float32) - truth).mean(axis=2)
-            errors[method] = _reduce(error, size)
-        return cls(_reduce(truth, size), renders, errors)
+            errors[method] = _resize(error, size)
+        return cls(_resize(truth, size), renders, errors)
 
 
 def _read(picture: Picture) -> ByteArray:
     return picture() if callable(picture) else picture
 
 
-def _reduce(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+def _resize(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     if size == (image.shape[1], image.shape[0]):
         return image
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+    larger = size[0] > image.shape[1]
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_NEAREST if larger else cv2.INTER_AREA))
 
 
 def _nice_scale(errors: Sequence[FloatArray]) -> int:

@@ -132,3 +132,12 @@ def test_without_weights_it_is_unavailable_at_every_call_and_asks_once(bare_mach
         with pytest.raises(UnavailableError, match=VARIABLE):
             lpips(a, b)
     assert len(bare_machine) == 1
+
+
+@pytest.mark.filterwarnings("error")
+def test_read_only_and_mirrored_frames_are_fine(random_weights):
+    metric = Lpips("squeeze", weights=random_weights)
+    a, b = frames(2)
+    expected = metric(a[:, ::-1].copy(), b)
+    a.flags.writeable = b.flags.writeable = False
+    assert metric(a[:, ::-1], b) == expected

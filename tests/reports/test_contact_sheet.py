@@ -18,7 +18,7 @@ def crop(sheet, place):
 
 
 def draw(tmp_path, rows, methods, **options):
-    places = contact_sheet(rows, methods, tmp_path / "sheet.png", **options)
+    places = contact_sheet(rows, methods, tmp_path / "sheet.png", **{"panel_width": 30, **options})
     sheet = np.asarray(Image.open(tmp_path / "sheet.png").convert("RGB"))
     return sheet, {(place.row, place.column): place for place in places}
 
@@ -31,7 +31,7 @@ def test_images_are_shown_pixel_for_pixel_where_they_fit(tmp_path):
         )
         for i, section in enumerate(["Novel view", "Novel view", "Self-reenactment"])
     ]
-    sheet, places = draw(tmp_path, rows, ["a"], title="Title")
+    sheet, places = draw(tmp_path, rows, ["a"], title="Title", panel_width=100)
     for i in range(3):
         np.testing.assert_array_equal(crop(sheet, places[i, "truth"]), truths[i])
         np.testing.assert_array_equal(crop(sheet, places[i, "render a"]), renders[i])
@@ -39,6 +39,20 @@ def test_images_are_shown_pixel_for_pixel_where_they_fit(tmp_path):
     assert tops == sorted(tops)
     assert tops[1] - tops[0] < tops[2] - tops[1]  # a heading between the sections
     assert len({places[i, "truth"].left for i in range(3)}) == 1
+
+
+def test_small_images_are_enlarged_by_whole_pixels(tmp_path):
+    truth, render = picture(0), picture(1)
+    sheet, places = draw(tmp_path, [SheetRow("N", [], truth, {"a": render})], ["a"], panel_width=199)
+    for name, image in (("truth", truth), ("render a", render)):
+        np.testing.assert_array_equal(crop(sheet, places[0, name]), image.repeat(3, axis=0).repeat(3, axis=1))
+
+
+def test_large_images_are_reduced_by_area(tmp_path):
+    truth = picture(0)
+    sheet, places = draw(tmp_path, [SheetRow("N", [], truth, {})], [], panel_width=30)
+    expected = truth.reshape(45, 2, 30, 2, 3).mean(axis=(1, 3))
+    assert np.abs(crop(sheet, places[0, "truth"]) - expected).max() <= 0.5
 
 
 def test_error_maps_share_one_scale_in_levels(tmp_path):
@@ -73,7 +87,7 @@ def test_errors_of_opposite_sign_do_not_cancel_in_a_reduced_map(tmp_path):
 def test_a_missing_render_is_a_labelled_grey_box(tmp_path):
     truth = picture(0, 120, 100)
     row = SheetRow("N", [], truth, {"a": truth, "b": Missing("RuntimeError: diverged " * 40)})
-    sheet, places = draw(tmp_path, [row], ["a", "b"])
+    sheet, places = draw(tmp_path, [row], ["a", "b"], panel_width=100)
     assert (0, "render b") not in places
     pitch = places[0, "error a"].left - places[0, "truth"].left
     group = places[0, "error a"].left - places[0, "render a"].left
