@@ -14,12 +14,16 @@ PAPER_ITERATIONS = 600_000
 _SHORT_SPLATS: dict[str, Any] = {"min_densify_every": 100, "min_settle": 300}
 
 
-def _presets(fast: Mapping[str, Any], smoke: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+def _presets(short: Mapping[str, Any], paper: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     return {
-        "smoke": {"budget": {"iterations": 60}, **smoke},
-        "demo": {"budget": {"iterations": 2_000}, **fast, "splats": {**_SHORT_SPLATS, "max_splats": 20_000}},
-        "fast": {"budget": {"iterations": 10_000}, **fast, "splats": {**_SHORT_SPLATS, "max_splats": 60_000}},
-        "paper": {"budget": {"iterations": PAPER_ITERATIONS}},
+        "smoke": {"budget": {"iterations": 60}, **short},
+        "demo": {"budget": {"iterations": 2_000}, **short, "splats": {**_SHORT_SPLATS, "max_splats": 20_000}},
+        "fast": {
+            "budget": {"iterations": 10_000},
+            **short,
+            "splats": {**_SHORT_SPLATS, "max_splats": 60_000},
+        },
+        "paper": {"budget": {"iterations": PAPER_ITERATIONS}, **paper},
     }
 
 
@@ -28,7 +32,7 @@ OURS = MethodSpec(
     summary="Mesh-bound splats with tri-plane colour and expression-driven opacity along feature lines.",
     implementation="headbench.methods.ours:Ours",
     config="headbench.methods.configs:OursConfig",
-    presets=_presets({}, {}),
+    presets=_presets({}, {"plane_bounds": "published"}),
     source="3D Gaussian Head Avatars with Expressive Dynamic Appearances by Compact Tensorial Representations, "
     "CVPR 2025, arXiv 2504.14967",
 )

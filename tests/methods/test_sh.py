@@ -16,9 +16,7 @@ def real_harmonics(directions, degree):
     for order in range(degree + 1):
         for m in range(-order, order + 1):
             value = sph_harm_y(order, abs(m), theta, phi)
-            columns.append(
-                value.real if m == 0 else np.sqrt(2) * (value.imag if m < 0 else value.real)
-            )
+            columns.append(value.real if m == 0 else np.sqrt(2) * (value.imag if m < 0 else value.real))
     return np.stack(columns, axis=1)
 
 

@@ -17,9 +17,10 @@ from headbench.methods.training.schedule import DensifySchedule
 NAMES = ("means", "log_scales", "quats", "opacities", "extra")
 ALWAYS = DensifySchedule(0, 1, 10**9, 10**9, None, prune_extent_from=100)
 EXTENT = 1.0
+PUBLISHED = SplatTraining()
 
 
-def make(binding, scales, opacities, face_count, config=SplatTraining(), seed=0):
+def make(binding, scales, opacities, face_count, config=PUBLISHED, seed=0):
     """Splats of the given scales; faces have size 1, so that local and world scale agree."""
     rng = np.random.default_rng(seed)
     count = len(binding)

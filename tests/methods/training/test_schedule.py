@@ -1,5 +1,7 @@
 """Schedules against the published moments and what short runs need."""
 
+from itertools import pairwise
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -38,7 +40,7 @@ def test_a_shorter_run_follows_the_same_course(total):
 def test_short_runs_keep_the_minimum_intervals(total):
     short = schedule(total)
     rounds = [i for i in range(1, total + 1) if short.is_round(i)]
-    assert all(b - a >= PUBLISHED.min_densify_every for a, b in zip(rounds, rounds[1:]))
+    assert all(b - a >= PUBLISHED.min_densify_every for a, b in pairwise(rounds))
     assert all(total - i >= PUBLISHED.min_settle for i in rounds)
     resets = [i for i in range(1, total + 1) if short.is_reset(i)]
     if total <= PUBLISHED.min_reset_every:

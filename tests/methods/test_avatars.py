@@ -1,0 +1,204 @@
+"""Both splat avatars: what is on disk, what comes back, what is refused; and that they learn."""
+
+import struct
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from headbench.bench.contracts import Avatar, Budget, Method, no_progress
+from headbench.bench.errors import InputError
+from headbench.methods.configs import GAConfig, OursConfig, SplatTraining
+from headbench.methods.ga import GA
+from headbench.methods.ga_files import COLUMNS
+from headbench.methods.ours import Ours
+
+FAST = SplatTraining(max_splats=1200, min_densify_every=40, min_settle=20)
+CONFIGS = {
+    "ga": lambda: GA(GAConfig(splats=FAST)),
+    "ours": lambda: Ours(
+        OursConfig(splats=FAST, plane_resolution=16, line_resolution=8, line_channels=4, hidden=16)
+    ),
+}
+STORED = {"ga": "point_cloud.ply", "ours": "avatar.safetensors"}
+
+
+@pytest.fixture(scope="module", params=["ga", "ours"])
+def fitted(request, clip, tmp_path_factory):
+    """Method name, folder and avatar after a few iterations with a densification."""
+    folder = tmp_path_factory.mktemp(request.param)
+    method = CONFIGS[request.param]()
+    avatar = method.fit(clip, folder, Budget(iterations=90), device="cpu", seed=0, progress=no_progress)
+    return request.param, method, folder, avatar
+
+
+def first(clip, split="train"):
+    key = clip.splits[split][0]
+    return clip.cameras[key.camera], clip.poses[key.timestep]
+
+
+def test_contracts_are_met(fitted, clip):
+    _, method, _, avatar = fitted
+    assert isinstance(method, Method)
+    assert isinstance(avatar, Avatar)
+    camera, pose = first(clip)
+    rgb, alpha = avatar.render(camera, pose)
+    assert rgb.shape == (camera.height, camera.width, 3)
+    assert alpha.shape == (camera.height, camera.width)
+    assert rgb.dtype == alpha.dtype == np.float32
+    assert 0 <= rgb.min()
+    assert rgb.max() <= 1
+
+
+def test_an_avatar_lives_in_its_folder_alone(fitted, clip, tmp_path):
+    name, method, folder, avatar = fitted
+    for path in folder.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    moved = method.load(tmp_path, device="cpu")
+    for split in clip.splits:
+        camera, pose = first(clip, split)
+        one, other = avatar.render(camera, pose), moved.render(camera, pose)
+        np.testing.assert_array_equal(one.rgb, other.rgb)
+        np.testing.assert_array_equal(one.alpha, other.alpha)
+    assert [path.parent for path in moved.files()] == [tmp_path] * 2
+    assert STORED[name] in {path.name for path in moved.files()}
+    assert not {"head_model.npz", "driving.npz"} & {path.name for path in moved.files()}
+
+
+def test_background_shows_where_the_avatar_does_not(fitted, clip):
+    _, _, _, avatar = fitted
+    camera, pose = first(clip)
+    white, alpha = avatar.render(camera, pose)
+    black, _ = avatar.render(camera, pose, background=(0.0, 0.0, 0.0))
+    np.testing.assert_allclose(white - black, np.repeat(1 - alpha[..., None], 3, axis=2), atol=1e-4)
+
+
+def test_another_head_models_pose_is_refused(fitted, clip):
+    _, _, _, avatar = fitted
+    camera, pose = first(clip)
+    with pytest.raises(InputError, match="head_model"):
+        avatar.render(camera, replace(pose, head_model="another"))
+
+
+def test_splats_of_a_pose(fitted, clip):
+    _, _, _, avatar = fitted
+    camera, pose = first(clip)
+    splats = avatar.splats(pose)
+    assert splats.colors is None
+    count = len(splats.means)
+    assert splats.quats.shape == (count, 4)
+    assert splats.scales.min() > 0
+    np.testing.assert_allclose(np.linalg.norm(splats.quats, axis=1), 1, atol=1e-5)
+    assert avatar.splats(pose, camera).colors.shape == (count, 3)
+
+
+def test_a_second_fit_of_the_same_run_loads_and_of_another_is_refused(fitted, clip):
+    _, method, folder, avatar = fitted
+
+    def fail(*_):
+        raise AssertionError("trained again")
+
+    again = method.fit(clip, folder, Budget(iterations=90), device="cpu", seed=0, progress=fail)
+    camera, pose = first(clip)
+    np.testing.assert_array_equal(again.render(camera, pose).rgb, avatar.render(camera, pose).rgb)
+    with pytest.raises(InputError, match="another run"):
+        method.fit(clip, folder, Budget(iterations=90), device="cpu", seed=1, progress=no_progress)
+
+
+def test_damaged_files_are_input_errors(fitted, tmp_path):
+    name, method, folder, _ = fitted
+    for path in folder.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    stored = tmp_path / STORED[name]
+    whole = stored.read_bytes()
+    stored.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match=STORED[name]):
+        method.load(tmp_path, device="cpu")
+    stored.unlink()
+    with pytest.raises(InputError, match=STORED[name]):
+        method.load(tmp_path, device="cpu")
+
+
+@pytest.mark.parametrize("name", ["ga", "ours"])
+def test_a_clip_without_training_frames_is_refused_before_work(name, clip, tmp_path):
+    empty = replace(clip, splits={**clip.splits, "train": ()})
+    with pytest.raises(InputError, match="at least one frame"):
+        CONFIGS[name]().fit(empty, tmp_path, Budget(iterations=1), device="cpu", seed=0, progress=no_progress)
+
+
+def test_ga_ply_has_the_published_layout_byte_for_byte(clip, tmp_path):
+    method = CONFIGS["ga"]()
+    avatar = method.fit(clip, tmp_path, Budget(iterations=2), device="cpu", seed=0, progress=no_progress)
+    content = (tmp_path / "point_cloud.ply").read_bytes()
+    header, body = content.split(b"end_header\n", 1)
+    names = [line.split()[2].decode() for line in header.splitlines() if line.startswith(b"property float")]
+    assert names == list(COLUMNS)
+    assert names[:9] == ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    assert names[54:] == [
+        "opacity",
+        *(f"scale_{i}" for i in range(3)),
+        *(f"rot_{i}" for i in range(4)),
+        "binding_0",
+    ]
+    faces = len(clip.head.faces)
+    assert len(body) == 252 * faces
+    # One splat per triangle at the start, in order; normals zero; quaternions real part first.
+    rows = [struct.unpack("<63f", body[252 * i : 252 * (i + 1)]) for i in range(faces)]
+    assert [row[62] for row in rows] == list(range(faces))
+    assert all(row[3:6] == (0, 0, 0) for row in rows)
+    assert all(abs(row[58] - 1) < 0.01 for row in rows)
+    assert len(avatar.splats(clip.poses[0]).means) == faces
+
+
+def test_ga_harmonics_are_stored_channel_by_channel(clip, tmp_path):
+    from headbench.methods.ga_files import read_ga_splats, write_ga_splats
+
+    count = 4
+    generator = torch.Generator().manual_seed(0)
+    widths = {
+        "means": (3,),
+        "log_scales": (3,),
+        "quats": (4,),
+        "opacities": (),
+        "sh_dc": (3,),
+        "sh_rest": (3, 15),
+    }
+    splats = {name: torch.randn(count, *shape, generator=generator) for name, shape in widths.items()}
+    path, binding = tmp_path / "x.ply", torch.tensor([3, 1, 0, 2])
+    write_ga_splats(path, splats, binding)
+    body = path.read_bytes().split(b"end_header\n", 1)[1]
+    table = np.frombuffer(body, "<f4").reshape(count, 63)
+    # 15 red, then 15 green, then 15 blue.
+    np.testing.assert_array_equal(table[:, 9:24], splats["sh_rest"][:, 0])
+    np.testing.assert_array_equal(table[:, 39:54], splats["sh_rest"][:, 2])
+    found, faces = read_ga_splats(path, 4, "cpu")
+    assert torch.equal(faces, binding)
+    assert all(torch.equal(found[name], splats[name]) for name in splats)
+    with pytest.raises(InputError, match="binding_0"):
+        read_ga_splats(path, 3, "cpu")
+
+
+def test_ours_costs_48_bytes_per_splat_beside_what_is_fixed(clip, tmp_path):
+    sizes = {}
+    for iterations in (2, 90):
+        folder = tmp_path / str(iterations)
+        avatar = CONFIGS["ours"]().fit(
+            clip, folder, Budget(iterations=iterations), device="cpu", seed=0, progress=no_progress
+        )
+        sizes[len(avatar.splats(clip.poses[0]).means)] = (folder / "avatar.safetensors").stat().st_size
+    (few, small), (many, large) = sorted(sizes.items())
+    assert many > few
+    # The header pads to 8 bytes and spells the number of splats out.
+    assert abs((large - small) - 48 * (many - few)) <= 32
+
+
+@pytest.mark.parametrize("name", ["ga", "ours"])
+def test_a_single_frame_is_overfitted(name, clip, tmp_path):
+    key = clip.splits["train"][1]
+    single = replace(clip, splits={**clip.splits, "train": (key,)})
+    method = Ours(OursConfig(splats=FAST, plane_resolution=64)) if name == "ours" else CONFIGS[name]()
+    avatar = method.fit(single, tmp_path, Budget(iterations=250), device="cpu", seed=0, progress=no_progress)
+    rgb = avatar.render(clip.cameras[key.camera], clip.poses[key.timestep]).rgb
+    error = float(np.mean((rgb - clip.image(key) / 255.0) ** 2))
+    assert -10 * np.log10(error) > 27

@@ -1,0 +1,54 @@
+"""PLY reading and writing."""
+
+import numpy as np
+import pytest
+
+from headbench.bench.errors import InputError
+from headbench.methods.ply import read_ply, write_ply
+
+TABLE = np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32)
+
+
+def test_columns_come_back_by_name_in_any_order(tmp_path):
+    path = tmp_path / "a.ply"
+    write_ply(path, ("x", "y", "z"), TABLE)
+    np.testing.assert_array_equal(read_ply(path, ("z", "x")), TABLE[:, [2, 0]])
+
+
+def test_another_program_reads_the_positions(tmp_path):
+    pymeshlab = pytest.importorskip("pymeshlab")
+    path = tmp_path / "a.ply"
+    write_ply(path, ("x", "y", "z"), TABLE)
+    meshes = pymeshlab.MeshSet()
+    meshes.load_new_mesh(str(path))
+    np.testing.assert_allclose(meshes.current_mesh().vertex_matrix(), TABLE, rtol=1e-6)
+
+
+HEADER = "ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nend_header\n"
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (b"", "PLY header"),
+        (b"ply\nnothing", "PLY header"),
+        (HEADER.replace("binary_little_endian", "ascii").encode() + b"1.0\n", "binary_little_endian"),
+        (HEADER.encode() + b"\0" * 3, "4 bytes"),
+        (HEADER.encode() + b"\0" * 8, "4 bytes"),
+        (HEADER.replace("float x", "list uchar int x").encode() + b"\0" * 4, "float property"),
+        (HEADER.replace("float x", "double x").encode() + b"\0" * 8, "float property"),
+        (HEADER.replace("float x", "float y").encode() + b"\0" * 4, "property of that name"),
+        (HEADER.replace("vertex 1", "vertex 99999999999").encode() + b"\0" * 4, "bytes"),
+        (HEADER.encode() + np.float32(np.nan).tobytes(), "finite"),
+    ],
+)
+def test_other_files_are_refused(tmp_path, content, says):
+    path = tmp_path / "bad.ply"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=says):
+        read_ply(path, ("x",))
+
+
+def test_a_missing_file_is_an_input_error(tmp_path):
+    with pytest.raises(InputError, match="none.ply"):
+        read_ply(tmp_path / "none.ply", ("x",))

@@ -1,0 +1,139 @@
+"""A run killed anywhere and continued ends with the same avatar, bit for bit."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from headbench.bench.contracts import Budget, no_progress
+from headbench.methods.configs import GAConfig, OursConfig, SplatTraining
+from headbench.methods.ga import GA
+from headbench.methods.ours import Ours
+from headbench.methods.training.loop import CHECKPOINT
+
+from ..datasets.head.toy import toy_head
+from .toy_clip import toy_clip
+
+# Rounds at 8, 16, ..., 32, resets at 10, 30; lines from iteration 4 on.
+SPLATS = SplatTraining(
+    min_densify_every=8,
+    min_reset_every=10,
+    min_settle=4,
+    densify_gradient=1e-5,
+    max_splats=900,
+    checkpoint_every_s=0.0,
+)
+METHODS = {
+    "ga": lambda: GA(GAConfig(splats=SPLATS, min_sh_every=5)),
+    "ours": lambda: Ours(
+        OursConfig(splats=SPLATS, plane_resolution=16, line_resolution=8, line_channels=4, hidden=16)
+    ),
+}
+BUDGET = Budget(iterations=40)
+
+
+class Killed(Exception):
+    pass
+
+
+def fit(name, clip, folder, progress=no_progress):
+    return METHODS[name]().fit(clip, folder, BUDGET, device="cpu", seed=7, progress=progress)
+
+
+def content(avatar):
+    return {path.name: path.read_bytes() for path in avatar.files()}
+
+
+@pytest.fixture(scope="module", params=["ga", "ours"])
+def unbroken(request, clip, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("unbroken")
+    return request.param, content(fit(request.param, clip, folder))
+
+
+def test_another_seed_gives_another_avatar(unbroken, clip, tmp_path):
+    name, expected = unbroken
+    avatar = METHODS[name]().fit(clip, tmp_path, BUDGET, device="cpu", seed=8, progress=no_progress)
+    assert content(avatar) != expected
+
+
+def test_an_unbroken_run_repeats_itself(unbroken, clip, tmp_path):
+    name, expected = unbroken
+    assert content(fit(name, clip, tmp_path)) == expected
+
+
+# Right after a densification, right before one, after a reset, and several kills in one run.
+@pytest.mark.parametrize("kills", [(8,), (15,), (10, 16, 33)])
+def test_interrupted_and_continued_is_the_same_bit_for_bit(unbroken, clip, tmp_path, kills):
+    name, expected = unbroken
+    for kill in kills:
+
+        def killer(done, total, note="", kill=kill):
+            if done == kill:
+                raise Killed
+
+        with pytest.raises(Killed):
+            fit(name, clip, tmp_path, killer)
+        assert (tmp_path / CHECKPOINT).exists()
+    first_seen = []
+    avatar = fit(name, clip, tmp_path, lambda done, total, note="": first_seen.append(done))
+    assert first_seen[0] == kills[-1] + 1
+    assert content(avatar) == expected
+    assert not (tmp_path / CHECKPOINT).exists()
+
+
+def test_the_comparison_would_notice_a_lost_moment(unbroken, clip, tmp_path, monkeypatch):
+    from headbench.methods.training.optimiser import Optimiser
+
+    name, expected = unbroken
+    whole = Optimiser.state
+
+    def without_moments(self):
+        return {key: {**entry, "moments": {}} for key, entry in whole(self).items()}
+
+    def killer(done, total, note=""):
+        if done == 20:
+            raise Killed
+
+    monkeypatch.setattr(Optimiser, "state", without_moments)
+    with pytest.raises(Killed):
+        fit(name, clip, tmp_path, killer)
+    assert content(fit(name, clip, tmp_path)) != expected
+
+
+def _child(name, folder):
+    """Train as a process of its own; `test_a_process_killed_outright` kills it."""
+    clip = toy_clip(toy_head(16), timesteps=3, cameras=3, width=28, height=36)
+    fit(name, clip, Path(folder), lambda done, total, note="": time.sleep(0.05))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("after_s", [0.0, 0.4, 1.1])
+def test_a_process_killed_outright(unbroken, clip, tmp_path, after_s):
+    name, expected = unbroken
+    root = Path(__file__).parents[2]
+    code = (
+        "import importlib, sys; sys.path.insert(0, sys.argv[1])\n"
+        "importlib.import_module('tests.methods.test_resume')._child(sys.argv[2], sys.argv[3])"
+    )
+    child = subprocess.Popen([sys.executable, "-c", code, str(root), name, str(tmp_path)])
+    deadline = time.monotonic() + 120
+    while not (tmp_path / CHECKPOINT).exists():
+        assert child.poll() is None, "the child ended before its first checkpoint"
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    time.sleep(after_s)
+    os.kill(child.pid, signal.SIGKILL)
+    assert child.wait() == -signal.SIGKILL
+    assert content(fit(name, clip, tmp_path)) == expected
+
+
+def test_seconds_bound_a_run_and_the_avatar_is_whole(clip, tmp_path):
+    method = GA(replace(METHODS["ga"]().config))
+    avatar = method.fit(clip, tmp_path, Budget(seconds=1.0), device="cpu", seed=0, progress=no_progress)
+    key = clip.splits["train"][0]
+    assert avatar.render(clip.cameras[key.camera], clip.poses[key.timestep]).rgb.shape[2] == 3

@@ -1,0 +1,69 @@
+"""Specs: every preset resolves, and the paper presets are the published values."""
+
+import pytest
+
+from headbench.bench.configuration import build
+from headbench.bench.contracts import Budget
+from headbench.bench.registry import resolve
+from headbench.methods.configs import GAConfig, OursConfig, SplatTraining
+from headbench.methods.specs import GA, MEAN_IMAGE, NEAREST_CAMERA, OURS
+
+SPECS = {spec.name: spec for spec in (OURS, GA, MEAN_IMAGE, NEAREST_CAMERA)}
+PRESETS = ("smoke", "demo", "fast", "paper")
+
+
+@pytest.mark.parametrize("name", SPECS)
+@pytest.mark.parametrize("preset", PRESETS)
+def test_presets_resolve(name, preset):
+    spec = SPECS[name]
+    settings = dict(spec.presets[preset])
+    budget = build(Budget, settings.pop("budget"), "preset")
+    assert budget.iterations
+    implementation = resolve(spec.implementation)
+    if spec.config:
+        config = build(resolve(spec.config), settings, "preset")
+        assert implementation(config).config == config
+    else:
+        assert settings == {}
+        implementation()
+
+
+def test_paper_presets_are_the_published_values():
+    for spec in (OURS, GA):
+        settings = dict(spec.presets["paper"])
+        assert settings.pop("budget") == {"iterations": 600_000}
+    splats = SplatTraining()
+    rates = (
+        splats.position_lr,
+        splats.position_lr_final,
+        splats.opacity_lr,
+        splats.scale_lr,
+        splats.rotation_lr,
+    )
+    assert rates == (5e-3, 5e-5, 0.05, 0.017, 1e-3)
+    assert (splats.densify_gradient, splats.densify_extent, splats.prune_opacity) == (2e-4, 0.01, 0.005)
+    ga = GAConfig()
+    rates = (ga.sh_dc_lr, ga.sh_rest_lr, ga.expression_lr, ga.pose_lr, ga.translation_lr)
+    assert rates == (0.0025, 0.000125, 1e-3, 1e-5, 1e-6)
+    published = build(OursConfig, {k: v for k, v in OURS.presets["paper"].items() if k != "budget"}, "preset")
+    assert published.plane_bounds == "published"
+    rates = (published.plane_lr, published.color_mlp_lr, published.line_lr, published.line_mlp_lr)
+    assert rates == (2e-3, 1e-4, 2e-3, 1e-4)
+    assert published.lines_from == 60_000
+
+
+@pytest.mark.parametrize(
+    ("config", "wrong"),
+    [
+        (SplatTraining, {"densify_every": 0}),
+        (SplatTraining, {"initial_opacity": 1.0}),
+        (SplatTraining, {"ssim_weight": 1.5}),
+        (SplatTraining, {"max_splats": 0}),
+        (GAConfig, {"sh_degree": 4}),
+        (OursConfig, {"plane_resolution": 1}),
+        (OursConfig, {"expressions": -1}),
+    ],
+)
+def test_settings_out_of_range_are_refused(config, wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong)).split("_")[0]):
+        config(**wrong)
