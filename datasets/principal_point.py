@@ -145,8 +145,8 @@ def weigh_cy(views: Sequence[View], faces: IntArray) -> CyEvidence:
     """Compare both readings of ``cy`` over some frames.
 
     For each frame: the mesh is projected and filled; agreement is the mean over its outline's pixels of
-    exp(-(d / sigma)^2) with d the distance to the foreground's outline. Pixels at the image border are left
-    out, as the border cuts both.
+    exp(-(d / sigma)^2) with d the distance to the foreground's outline. The image border is no outline, as it
+    cuts both.
     """
     top, bottom = [], []
     for view in views:
@@ -184,12 +184,9 @@ def _agreement(pixels: FloatArray, faces: IntArray, distance: FloatArray) -> flo
 
 
 def _outline(filled: ByteArray) -> np.ndarray:
-    """Boundary pixels of a filled shape, without those at the image border."""
-    eroded = cv2.erode(filled, np.ones((3, 3), np.uint8), borderValue=1)
-    outline = (filled > 0) & (eroded == 0)
-    outline[[0, -1]] = False
-    outline[:, [0, -1]] = False
-    return outline
+    """Pixels of a filled shape next to unfilled ones; where the image border cuts the shape there are none."""
+    eroded = cv2.erode(filled, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
+    return (filled > 0) & (eroded == 0)
 
 
 def _distance_to_outline(foreground: ByteArray) -> FloatArray:

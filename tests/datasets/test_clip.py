@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -52,3 +53,18 @@ def test_derived_clip_shares_pixels_and_differs_in_fingerprint(pristine_capture)
     assert derived.store is clip.store
     assert derived.fingerprint == clip.derive("halve", {"factor": 2}, splits=derived.splits).fingerprint
     assert derived.fingerprint != clip.derive("halve", {"factor": 3}, splits=derived.splits).fingerprint
+
+
+def test_fingerprint_covers_what_a_method_sees(pristine_capture):
+    clip = read_capture(pristine_capture.union)
+    changes = {
+        "source_fingerprint": "other",
+        "splits": {**clip.splits, "train": clip.splits["train"][1:]},
+        "excluded": {},
+        "background": np.zeros(3),
+        "steps": clip.steps[:1],
+    }
+    found = {clip.fingerprint} | {
+        replace(clip, **{name: value}).fingerprint for name, value in changes.items()
+    }
+    assert len(found) == len(changes) + 1

@@ -88,6 +88,18 @@ def test_empty_and_full_masks_do_not_decide():
         assert weigh_cy(blind, HEAD.faces).decision is None
 
 
+def test_image_border_is_no_outline():
+    """A mesh that fills the lower half of the image, cut by three borders, agrees along one line only."""
+    camera = Camera("c", 40, 40, np.array([[40.0, 0, 20], [0, 40, 20], [0, 0, 1]]), np.eye(4))
+    corners = np.array([[-9, 0.0125, 1], [9, 0.0125, 1], [9, 9, 1], [-9, 9, 1]])  # top edge at y = 20.5
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    mask = np.zeros((40, 40), np.uint8)
+    mask[20:] = 255
+    assert weigh_cy([View(corners, camera, lambda: mask)], faces).top == 1
+    mask_without_edge = np.full((40, 40), 255, np.uint8)
+    assert weigh_cy([View(corners, camera, lambda: mask_without_edge)], faces).top == 0
+
+
 @pytest.mark.parametrize(
     ("evidence", "decision"),
     [

@@ -74,13 +74,13 @@ def test_no_more_bases_than_distinct_rotations():
 
 def test_published_behaviour_draws_on_held_out_poses_and_a_half_turn():
     clip = make_clip(10, test=0)
-    cameras = [f"{i:02d}" for i in range(16)]
+    cameras = [f"{i:02d}" for i in range(8)]  # every 16th frame is then every second timestep
     test = tuple(FrameKey("s", "q", t, c) for t in range(10, 14) for c in cameras)
     poses = make_clip(10, test=4).poses
     clip = clip.derive("test", {}, splits={**clip.splits, "self_reenactment": test}, poses=poses)
-    bases = jaw_bases(clip, 14, compatibility="tga")
-    candidates = jaw_quaternions([poses[t] for t in range(14)])
-    np.testing.assert_array_equal(bases, brute_force_farthest(candidates, HALF_TURN, 14))
+    bases = jaw_bases(clip, 13, compatibility="tga")
+    candidates = jaw_quaternions([poses[t] for t in [*range(10), 10, 12]])
+    np.testing.assert_array_equal(bases, brute_force_farthest(candidates, HALF_TURN, 13))
 
 
 @settings(deadline=None)
