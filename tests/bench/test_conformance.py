@@ -1,0 +1,84 @@
+"""The kit finds what breaks the contract."""
+
+import numpy as np
+import pytest
+
+from headbench.bench.conformance import check_method
+from headbench.bench.contracts import Frame
+from headbench.bench.errors import HeadbenchError
+from headbench.bench.run_config import resolve_method
+
+
+@pytest.fixture
+def check(toy, tmp_path):
+    def run():
+        return check_method(
+            resolve_method(toy.METHOD, "smoke", {}), toy.ToyClip(tmp_path / "s"), tmp_path / "out"
+        )
+
+    return run
+
+
+def test_a_method_that_keeps_the_contract_passes(check):
+    assert check() == []
+
+
+def altered(toy, monkeypatch, change):
+    original = toy.ToyAvatar.render
+
+    def render(self, camera, pose, background=(1.0, 1.0, 1.0)):
+        return change(original(self, camera, pose, background), pose, background)
+
+    monkeypatch.setattr(toy.ToyAvatar, "render", render)
+
+
+@pytest.mark.parametrize(
+    ("change", "breach"),
+    [
+        (lambda f, p, b: Frame(f.rgb.astype(np.float64), f.alpha), "float32"),
+        (lambda f, p, b: Frame(f.rgb[1:], f.alpha), "shape"),
+        (lambda f, p, b: Frame(f.rgb * np.float32(np.nan), f.alpha), "not finite"),
+        (lambda f, p, b: Frame(f.rgb * 3, f.alpha), "leaves [0, 1]"),
+        (lambda f, p, b: Frame(f.rgb, f.alpha * 0), "background"),
+    ],
+)
+def test_a_bad_frame_is_found(toy, monkeypatch, check, change, breach):
+    altered(toy, monkeypatch, change)
+    assert any(breach in found for found in check())
+
+
+def test_a_render_that_depends_on_the_last_one_is_found(toy, monkeypatch, check):
+    counter = iter(range(100))
+    altered(toy, monkeypatch, lambda f, p, b: replace_level(f, next(counter)))
+    assert any("another order" in found for found in check())
+
+
+def replace_level(frame, index):
+    return Frame(np.full_like(frame.rgb, index / 100), frame.alpha)
+
+
+def test_looking_at_held_out_frames_raises(toy, monkeypatch, check):
+    def fit(self, clip, out, budget, **_):
+        clip.image(clip.splits["novel_view"][0])
+
+    monkeypatch.setattr(toy.ToyMethod, "fit", fit)
+    with pytest.raises(HeadbenchError, match="not a training frame"):
+        check()
+
+
+def test_a_file_outside_the_folder_is_found(toy, monkeypatch, check, tmp_path):
+    (tmp_path / "elsewhere").write_text("")
+    monkeypatch.setattr(toy.ToyAvatar, "files", lambda self: [tmp_path / "elsewhere"])
+    assert any("outside" in found for found in check())
+
+
+def test_progress_that_runs_backwards_is_found(toy, monkeypatch, check):
+    original = toy.ToyMethod.fit
+
+    def fit(self, clip, out, budget, *, progress, **rest):
+        progress(2, 2)
+        progress(1, 2)
+        return original(self, clip, out, budget, progress=progress, **rest)
+
+    monkeypatch.setattr(toy.ToyMethod, "fit", fit)
+    assert any("backwards" in found for found in check())
