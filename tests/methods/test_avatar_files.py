@@ -76,9 +76,10 @@ def test_refining_moves_wrong_tracking_towards_the_truth(clip, tmp_path):
         seed=0,
         progress=no_progress,
     )
-    refined = RefinedTracking.read(tmp_path / "driving.npz")(wrong[1])
-    left = np.linalg.norm(refined.translation[:2] - clip.poses[1].translation[:2])
-    assert left < 0.004
+    refine = RefinedTracking.read(tmp_path / "driving.npz")
+    off = {t: refine(wrong[t]).translation - clip.poses[t].translation for t in (0, 1, 2)}
+    # Splats may shift against the mesh as a whole, so only the difference between timesteps means something.
+    assert np.linalg.norm(off[1] - 0.5 * (off[0] + off[2])) < 0.2 * np.linalg.norm(shift)
     key = clip.splits["train"][0]
     assert avatar.render(clip.cameras[key.camera], wrong[key.timestep]).rgb.shape[2] == 3
 
