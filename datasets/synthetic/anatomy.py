@@ -174,7 +174,9 @@ def _opening(
     return curves[0], curves[1]
 
 
-def front_depth(vertices: FloatArray, faces: IntArray, low: FloatArray, step: float, size: IntArray) -> FloatArray:
+def front_depth(
+    vertices: FloatArray, faces: IntArray, low: FloatArray, step: float, size: IntArray
+) -> FloatArray:
     """Largest z of ``faces`` over a grid of x and y, (rows along y, columns along x); -inf where there is none.
 
     Grid point (row, column) is at ``low + step * (column, row)``.
@@ -223,7 +225,9 @@ def _derived(
         cheek = np.array([0.5 * (corner[0] + eye[0]) + sign * 0.012 * scale, 0.5 * (bridge[1] + tip[1]), 0.0])
         cheek[1] = 0.45 * eye[1] + 0.55 * corner[1] + 0.004 * scale
         derived[f"{side}_cheek"] = _front_point(surface, cheek)
-        side_points = surface[(surface[:, 0] * sign > 0) & (surface[:, 1] > corner[1]) & (surface[:, 1] < brows[1])]
+        side_points = surface[
+            (surface[:, 0] * sign > 0) & (surface[:, 1] > corner[1]) & (surface[:, 1] < brows[1])
+        ]
         derived[f"{side}_ear"] = side_points[(side_points[:, 0] * sign).argmax()]
     return derived
 

@@ -94,7 +94,9 @@ def _lashes(
         (eye.lower, -1.0, _LOWER_LASHES, 0.0038),
     ):
         place = np.sort(rng.uniform(0.12, 0.98, count))
-        flat = np.stack([np.interp(place, np.linspace(0, 1, len(curve)), curve[:, axis]) for axis in (0, 1)], 1)
+        flat = np.stack(
+            [np.interp(place, np.linspace(0, 1, len(curve)), curve[:, axis]) for axis in (0, 1)], 1
+        )
         depth = eye.radius**2 - ((flat - eye.center[:2]) ** 2).sum(axis=1)
         z = eye.center[2] + np.sqrt(np.maximum(depth, 0.0)) + 0.0006 * s
         _, root = tree.query(np.concatenate([flat, z[:, None]], axis=1))

@@ -28,6 +28,7 @@ from .take import Settings, Take, plan_take
 
 MANIFEST = "synthesis.json"
 _VERSION = 1
+_SMALL = 400_000  # pixels in all that are rendered sooner than another process starts
 _README = """This folder holds synthetic recordings made by `headbench synth`.
 
 No person was recorded. Heads, skin, hair and performances are computed; subject numbers from 900 up, camera
@@ -62,7 +63,7 @@ def synthesize(
     tracking_noise : standard deviation of the error of each stored parameter, as a fraction of that
         parameter's own standard deviation over the subject's timesteps. Images show the exact poses.
     samples_per_pixel : rounded up to a count that the sampler takes.
-    workers : processes that render; by default as many as there are cores.
+    workers : processes that render; by default as many as there are cores, or one where there is little to do.
 
     Raises
     ------
@@ -96,7 +97,9 @@ Job = tuple[str, int, tuple[str, ...]]
 
 def _photograph(out: Path, take: Take, work: list[Job], workers: int | None) -> Iterator[tuple[str, int]]:
     """Render the jobs; give (sequence, number of images) as each is written."""
-    count = min(workers or len(os.sched_getaffinity(0)), len(work))
+    images = sum(len(cameras) for _, _, cameras in work)
+    small = images * take.settings.size[0] * take.settings.size[1] < _SMALL
+    count = min(workers or (1 if small else len(os.sched_getaffinity(0))), len(work))
     if count <= 1:
         photographer = Photographer(take) if work else None
         for job in work:
@@ -175,5 +178,9 @@ def _claim(out: Path, settings: Settings, head: str) -> None:
         if not isinstance(found, dict) or found.get(key) != value:
             had = found.get(key) if isinstance(found, dict) else found
             raise InputError(
-                manifest, key, f"{value!r}, as asked for", f"{had!r}", "Take another folder, or the same settings."
+                manifest,
+                key,
+                f"{value!r}, as asked for",
+                f"{had!r}",
+                "Take another folder, or the same settings.",
             )

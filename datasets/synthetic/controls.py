@@ -11,8 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...bench.contracts import FloatArray, HeadAsset, HeadPose
-from ...bench.errors import InputError
+from ...bench.contracts import FloatArray, HeadPose
 
 Activations = Mapping[str, float]
 
@@ -63,5 +62,7 @@ class Translation:
             "translation": np.array([a["sway_x"], a["sway_y"], a["sway_z"]]),
         }
         stored = {name: value.astype(np.float32).astype(np.float64) for name, value in fields.items()}
-        eyelids = None if self.eyelids is None else (values @ self.eyelids).astype(np.float32).astype(np.float64)
+        eyelids = (
+            None if self.eyelids is None else (values @ self.eyelids).astype(np.float32).astype(np.float64)
+        )
         return HeadPose(self.head_model, **stored, eyelids=eyelids, subject=subject, timestep=timestep)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from scipy.interpolate import CubicSpline
 from skimage.measure import points_in_poly
@@ -11,7 +9,7 @@ from skimage.measure import points_in_poly
 from ...bench.contracts import FloatArray
 
 
-def blob(points: FloatArray, center: FloatArray, radius: float | Sequence[float]) -> FloatArray:
+def blob(points: FloatArray, center: FloatArray, radius: float | FloatArray) -> FloatArray:
     """Gaussian of standard deviation ``radius`` (a number or one per axis) about ``center``; 1 in the middle."""
     return np.exp(-0.5 * (((points - center) / np.asarray(radius)) ** 2).sum(axis=-1))
 

@@ -63,11 +63,17 @@ def _paint(person: Person, eye: Eye, theta: FloatArray, phi: FloatArray, unit: F
     # Veins and warmth grow towards the corners.
     side = ramp(np.abs(unit[:, 0]), 0.35, 0.8)
     veins = ramp(np.abs(value_noise(unit * np.array([4.0, 14.0, 4.0]), person.seed + 71)), 0.08, 0.0)
-    white *= 1.0 - side[:, None] * np.array([0.10, 0.26, 0.28]) - (side * veins * 0.5)[:, None] * np.array([0.2, 0.7, 0.7])
+    white *= (
+        1.0
+        - side[:, None] * np.array([0.10, 0.26, 0.28])
+        - (side * veins * 0.5)[:, None] * np.array([0.2, 0.7, 0.7])
+    )
     ring = np.stack([np.cos(phi), np.sin(phi), np.zeros_like(phi)], axis=1)
     fibres = value_noise(np.concatenate([ring[:, :2] * 9.0, radius[:, None] * 1.5], axis=1), person.seed + 72)
     glow = 0.8 + 0.55 * ramp(radius, 0.9, 0.45) + 0.35 * fibres
     iris = person.iris[None] * np.clip(glow, 0.3, 2.0)[:, None]
     iris *= (1.0 - 0.75 * ramp(radius, 0.80, 1.0))[:, None]  # limbal ring
     color = white + ramp(radius, 1.06, 0.96)[:, None] * (iris - white)
-    return np.clip(color * (1.0 - 0.985 * ramp(radius, _PUPIL_SHARE + 0.05, _PUPIL_SHARE - 0.05))[:, None], 0.002, 0.9)
+    return np.clip(
+        color * (1.0 - 0.985 * ramp(radius, _PUPIL_SHARE + 0.05, _PUPIL_SHARE - 0.05))[:, None], 0.002, 0.9
+    )

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-
 from ...bench.contracts import FloatArray
 from ...bench.errors import InputError
 from ..head.arrays import HeadArrays, read_npz

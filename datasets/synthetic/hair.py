@@ -118,7 +118,11 @@ def make_hair(
         top = ramp(normal[:, 1], 0.1, 0.8)
         front = ramp(place[:, 2], anatomy["vertex_top"][2] - 0.02 * s, anatomy["glabella"][2])
         wish = np.stack(
-            [style.sweep * side * (0.3 + 0.7 * top), np.full(len(place), -style.fall), -style.back * (0.25 + 0.75 * front)],
+            [
+                style.sweep * side * (0.3 + 0.7 * top),
+                np.full(len(place), -style.fall),
+                -style.back * (0.25 + 0.75 * front),
+            ],
             axis=1,
         )
         away = place - (anatomy["vertex_top"] + np.array([0.0, 0.0, -0.03]) * s)
@@ -156,12 +160,10 @@ def _face_limit(anatomy: Anatomy) -> Callable[[FloatArray], FloatArray]:
     return limit
 
 
-def ear_share(anatomy: Anatomy, points: FloatArray, labelled: IntArray | None) -> FloatArray:
-    """1 on the ears, 0 elsewhere, (N,): from labelled fine points where the head names its ears."""
-    if labelled is not None:
-        share = np.zeros(len(points))
-        share[labelled] = 1.0
-        return share
+def ear_share(anatomy: Anatomy, points: FloatArray, labelled: FloatArray) -> FloatArray:
+    """1 on the ears, 0 elsewhere, (N,): ``labelled`` (N,) where the head names its ears, else by their place."""
+    if labelled.any():
+        return (labelled > 0.5).astype(float)
     s, total = anatomy.scale, np.zeros(len(points))
     for side in SIDES:
         middle = anatomy[f"{side}_ear"] * np.array([0.93, 1.0, 1.0]) + np.array([0.0, -0.008, 0.008]) * s

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -57,8 +57,9 @@ class Likeness:
         self._fine = _fine_mesh(self.anatomy, self.neutral)
         points = self._fine.positions(self.neutral)
         normals = vertex_normals(points, self._fine.faces)
-        paint = skin.paint_skin(person, self.anatomy, points, normals)
-        ears = ear_share(self.anatomy, points, _fine_region(self._fine, head, ("left_ear", "right_ear")))
+        cavity = _region_share(self._fine, head, ("mouth_socket",))
+        paint = skin.paint_skin(person, self.anatomy, points, normals, cavity)
+        ears = ear_share(self.anatomy, points, _region_share(self._fine, head, ("left_ear", "right_ear")))
         hair = make_hair(person, self.anatomy, points, normals, self._fine.faces, ears)
         under = paint.albedo + hair.share[:, None] * (0.55 * person.hair - paint.albedo)
         self._folds = make_folds(person, self.anatomy, points, paint.lips)
@@ -79,8 +80,8 @@ class Likeness:
             "brows": Fixture(self._rooted.strands.faces, self._rooted.strands.albedo, "lash"),
         }
         fixed |= {f"eye_{side}": Fixture(e.faces, e.albedo, "eye") for side, e in self._eyes.items()}
-        parts = (*self._mouth, *self._tracked_parts)
-        return fixed | {part.name: Fixture(part.faces, part.albedo, part.material) for part in parts}
+        fixed |= {p.name: Fixture(p.faces, p.albedo, p.material) for p in self._mouth}
+        return fixed | {p.name: Fixture(p.faces, p.albedo, p.material) for p in self._tracked_parts}
 
     def tracked(self, pose: HeadPose) -> FloatArray:
         """(V, 3) vertices of the head model in a pose: the mesh that a tracker would report."""
@@ -107,9 +108,7 @@ class Likeness:
         for part in self._mouth:
             rest = part.at(activations["tongue_out"])
             blended = np.einsum("nj,jab->nab", part.weights, joints)
-            made[part.name] = Surface(
-                np.einsum("nab,nb->na", blended[..., :3], rest) + blended[..., 3], None
-            )
+            made[part.name] = Surface(np.einsum("nab,nb->na", blended[..., :3], rest) + blended[..., 3], None)
         return made
 
     def _rooted_vertices(self, tracked: FloatArray, points: FloatArray) -> FloatArray:
@@ -144,11 +143,9 @@ def _fine_mesh(anatomy: Anatomy, neutral: FloatArray) -> FineMesh:
     return refine(neutral, anatomy.skin_faces, target * anatomy.scale)
 
 
-def _fine_region(fine: FineMesh, head: HeadAsset, names: Sequence[str]) -> IntArray | None:
-    """Fine points on tracked regions, or None where the head does not name them all."""
-    if any(name not in head.regions for name in names):
-        return None
+def _region_share(fine: FineMesh, head: HeadAsset, names: Sequence[str]) -> FloatArray:
+    """(N,) share of fine points in tracked regions; regions the head does not name are empty."""
     inside = np.zeros(len(head.template))
     for name in names:
-        inside[head.regions[name]] = 1.0
-    return np.flatnonzero(fine.interpolate(inside) > 0.5)
+        inside[head.regions.get(name, [])] = 1.0
+    return fine.interpolate(inside)

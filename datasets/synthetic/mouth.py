@@ -13,11 +13,14 @@ from .curves import ramp
 from .noise import value_noise
 from .people import Person
 
-_TEETH = np.array([0.62, 0.56, 0.46])
+_TEETH = np.array([0.80, 0.74, 0.63])
 _GUMS = np.array([0.42, 0.13, 0.12])
 _TONGUE = np.array([0.45, 0.15, 0.14])
 _NECK_JOINT, _JAW_JOINT = 1, 2
-_TRACKED: Mapping[str, tuple[FloatArray, str]] = {"teeth": (_TEETH, "teeth"), "gums_and_tongue": (_GUMS, "gums")}
+_TRACKED: Mapping[str, tuple[FloatArray, str]] = {
+    "teeth": (_TEETH, "teeth"),
+    "gums_and_tongue": (_GUMS, "gums"),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,9 +63,7 @@ def tracked_parts(head: HeadAsset) -> tuple[TrackedPart, ...]:
             continue
         faces = head.faces[np.isin(head.faces, head.regions[region]).all(axis=1)]
         used, local = np.unique(faces, return_inverse=True)
-        made.append(
-            TrackedPart(region, used, local.reshape(-1, 3), np.tile(color, (len(used), 1)), material)
-        )
+        made.append(TrackedPart(region, used, local.reshape(-1, 3), np.tile(color, (len(used), 1)), material))
     return tuple(made)
 
 
@@ -76,7 +77,9 @@ def tongue(person: Person, anatomy: Anatomy, joints: int) -> MouthPart:
     section = np.sqrt(np.clip(1.0 - np.clip((uu - 0.72) / 0.28, 0.0, 1.0) ** 2.4, 0.0, 1.0))
     groove = 0.0016 * np.exp(-0.5 * (np.cos(pp) / 0.22) ** 2) * (np.sin(pp) > 0) * ramp(uu, 0.1, 0.4)
 
-    def body(back: FloatArray, length: float, bend: float, half_width: float, half_height: float) -> FloatArray:
+    def body(
+        back: FloatArray, length: float, bend: float, half_width: float, half_height: float
+    ) -> FloatArray:
         # The middle line runs straight over the lower teeth and lip, then turns down by ``bend`` radians.
         turn = bend * ramp(u, 0.62, 1.0)
         z = np.concatenate([[0.0], np.cumsum(np.cos(turn[1:]))]) * length / (along - 1)
@@ -91,7 +94,9 @@ def tongue(person: Person, anatomy: Anatomy, joints: int) -> MouthPart:
     index = np.arange(along * around).reshape(along, around)
     a, b = index[:-1], index[1:]
     a1, b1 = np.roll(a, -1, axis=1), np.roll(b, -1, axis=1)
-    faces = np.concatenate([np.stack([a, a1, b1], -1).reshape(-1, 3), np.stack([a, b1, b], -1).reshape(-1, 3)])
+    faces = np.concatenate(
+        [np.stack([a, a1, b1], -1).reshape(-1, 3), np.stack([a, b1, b], -1).reshape(-1, 3)]
+    )
     buds = 1.0 + 0.14 * value_noise(inside / (0.0014 * s), person.seed + 95)
     weights = np.zeros((len(inside), joints))
     weights[:, _JAW_JOINT] = ramp(uu, -0.3, 0.35)
@@ -102,12 +107,17 @@ def tongue(person: Person, anatomy: Anatomy, joints: int) -> MouthPart:
 def teeth(anatomy: Anatomy, joints: int) -> tuple[MouthPart, MouthPart]:
     """Upper and lower teeth in their gums, on arches fitted behind the lips; upper ones hang on the head."""
     s, outline = anatomy.scale, anatomy.lip_outline
-    wide = min(0.5 * np.ptp(outline[:, 0]), 0.028 * s) - 0.002 * s
+    wide = min(0.5 * float(np.ptp(outline[:, 0])), 0.028 * s) - 0.002 * s
     contact = anatomy["left_mouth_corner"][1] * 0.5 + anatomy["right_mouth_corner"][1] * 0.5
     front = outline[:, 2].max() - 0.0115 * s
     made = []
-    for name, sign, joint, back in (("teeth_upper", 1.0, _NECK_JOINT, 0.0), ("teeth_lower", -1.0, _JAW_JOINT, 0.0024)):
-        made.append(_arch(name, sign, joint, wide - back * s, contact - 0.0004 * s, front - back * s, s, joints))
+    for name, sign, joint, back in (
+        ("teeth_upper", 1.0, _NECK_JOINT, 0.0),
+        ("teeth_lower", -1.0, _JAW_JOINT, 0.0024),
+    ):
+        made.append(
+            _arch(name, sign, joint, wide - back * s, contact - 0.0004 * s, front - back * s, s, joints)
+        )
     return made[0], made[1]
 
 
@@ -126,7 +136,9 @@ def _arch(
     gum_line = crown * (0.86 + 0.14 * (1.0 - tooth**2))
     height = 0.0175 * vv
     on_gum = ramp(height - gum_line, -0.0002, 0.0004)
-    bulge = (1.0 - on_gum) * (0.0011 * (1.0 - tooth**4) - 0.0009 * ramp(height, 0.0018, 0.0)) + on_gum * 0.0009
+    bulge = (1.0 - on_gum) * (
+        0.0011 * (1.0 - tooth**4) - 0.0009 * ramp(height, 0.0018, 0.0)
+    ) + on_gum * 0.0009
     ragged = (1.0 - on_gum) * 0.0007 * tooth**3
     x = (wide + bulge * s) * np.sin(angle)
     z = front - 0.046 * s * (1.0 - np.cos(angle)) + bulge * s * np.cos(angle)

@@ -14,7 +14,7 @@ _SEED_MIX = np.uint64(0xD6E8FEB86659FD93)
 def lattice_value(cells: IntArray, seed: int) -> FloatArray:
     """Hash integer points (..., 3) to floats in [0, 1) (a splitmix-like finaliser)."""
     with np.errstate(over="ignore"):
-        state = np.uint64(seed) * _SEED_MIX
+        state = np.full(cells.shape[:-1], seed, np.uint64) * _SEED_MIX
         for axis, factor in enumerate(_MIX):
             state = state ^ (cells[..., axis].astype(np.int64).view(np.uint64) * factor)
             state = (state ^ (state >> np.uint64(29))) * np.uint64(0xBF58476D1CE4E5B9)

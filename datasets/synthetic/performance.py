@@ -34,21 +34,70 @@ def _both(name: str, value: float) -> dict[str, float]:
 
 
 _REST: Face = {}
-_SHOUT: Face = {"jaw_open": 0.95, **_both("upper_lip_up", 0.5), **_both("lower_lip_down", 0.5), **_both("brow_down", 0.5)}
+_SHOUT: Face = {
+    "jaw_open": 0.95,
+    **_both("upper_lip_up", 0.5),
+    **_both("lower_lip_down", 0.5),
+    **_both("brow_down", 0.5),
+}
 _LAUGH: Face = {**_both("smile", 1.0), **_both("cheek_raise", 0.8), "jaw_open": 0.45, **_both("squint", 0.5)}
-_SURPRISE: Face = {"brow_inner_up": 1.0, **_both("brow_outer_up", 1.0), **_both("eye_wide", 0.8), "jaw_open": 0.55}
-_FEAR: Face = {"brow_inner_up": 0.9, **_both("brow_down", 0.3), **_both("eye_wide", 0.9), **_both("mouth_stretch", 0.8)}
-_ANGRY: Face = {**_both("brow_down", 1.0), **_both("squint", 0.4), "lip_press": 0.9, **_both("nose_sneer", 0.25)}
+_SURPRISE: Face = {
+    "brow_inner_up": 1.0,
+    **_both("brow_outer_up", 1.0),
+    **_both("eye_wide", 0.8),
+    "jaw_open": 0.55,
+}
+_FEAR: Face = {
+    "brow_inner_up": 0.9,
+    **_both("brow_down", 0.3),
+    **_both("eye_wide", 0.9),
+    **_both("mouth_stretch", 0.8),
+}
+_ANGRY: Face = {
+    **_both("brow_down", 1.0),
+    **_both("squint", 0.4),
+    "lip_press": 0.9,
+    **_both("nose_sneer", 0.25),
+}
 _SAD: Face = {"brow_inner_up": 0.85, "mouth_frown": 0.9, "chin_raise": 0.5, "gaze_up": -0.4}
-_DISGUST: Face = {**_both("nose_sneer", 1.0), **_both("upper_lip_up", 0.6), **_both("brow_down", 0.5), **_both("squint", 0.4)}
+_DISGUST: Face = {
+    **_both("nose_sneer", 1.0),
+    **_both("upper_lip_up", 0.6),
+    **_both("brow_down", 0.5),
+    **_both("squint", 0.4),
+}
 _HAPPY: Face = {**_both("smile", 1.0), **_both("cheek_raise", 0.5)}
 _TONGUE: Face = {"jaw_open": 0.55, "tongue_out": 1.0, **_both("lower_lip_down", 0.2)}
 
 SEQUENCES: Mapping[str, tuple[Face, ...]] = {
     "EMO-1-shout+laugh": (_REST, _SHOUT, _SHOUT, _REST, _LAUGH, {**_LAUGH, "jaw_open": 0.2}, _LAUGH, _REST),
-    "EMO-2-surprise+fear": (_REST, _SURPRISE, {**_SURPRISE, "jaw_open": 0.2}, _REST, _FEAR, {**_FEAR, "jaw_open": 0.3}, _REST),
-    "EMO-3-angry+sad": (_REST, _ANGRY, {**_ANGRY, "lip_press": 0.0, "jaw_open": 0.3}, _REST, _SAD, {**_SAD, "gaze_left": 0.5}, _REST),
-    "EMO-4-disgust+happy": (_REST, _DISGUST, {**_DISGUST, "jaw_open": 0.2}, _REST, _HAPPY, {**_HAPPY, "jaw_open": 0.2}, _REST),
+    "EMO-2-surprise+fear": (
+        _REST,
+        _SURPRISE,
+        {**_SURPRISE, "jaw_open": 0.2},
+        _REST,
+        _FEAR,
+        {**_FEAR, "jaw_open": 0.3},
+        _REST,
+    ),
+    "EMO-3-angry+sad": (
+        _REST,
+        _ANGRY,
+        {**_ANGRY, "lip_press": 0.0, "jaw_open": 0.3},
+        _REST,
+        _SAD,
+        {**_SAD, "gaze_left": 0.5},
+        _REST,
+    ),
+    "EMO-4-disgust+happy": (
+        _REST,
+        _DISGUST,
+        {**_DISGUST, "jaw_open": 0.2},
+        _REST,
+        _HAPPY,
+        {**_HAPPY, "jaw_open": 0.2},
+        _REST,
+    ),
     "EXP-2-eyes": (
         {"gaze_left": 0.9},
         {"gaze_left": -0.9},
@@ -89,8 +138,19 @@ SEQUENCES: Mapping[str, tuple[Face, ...]] = {
         {"smile_right": 1.0},
         {"jaw_open": 0.4, "funnel": 0.7},
     ),
-    "EXP-8-jaw-1": ({"jaw_open": 0.5}, {"jaw_open": 1.0}, {"jaw_open": 0.3}, {"jaw_open": 0.9, "funnel": 0.4}, _REST),
-    "EXP-9-jaw-2": ({"jaw_side": 0.9}, {"jaw_side": -0.9}, {"jaw_side": 0.7, "jaw_open": 0.4}, {"jaw_side": -0.7, "jaw_open": 0.4}),
+    "EXP-8-jaw-1": (
+        {"jaw_open": 0.5},
+        {"jaw_open": 1.0},
+        {"jaw_open": 0.3},
+        {"jaw_open": 0.9, "funnel": 0.4},
+        _REST,
+    ),
+    "EXP-9-jaw-2": (
+        {"jaw_side": 0.9},
+        {"jaw_side": -0.9},
+        {"jaw_side": 0.7, "jaw_open": 0.4},
+        {"jaw_side": -0.7, "jaw_open": 0.4},
+    ),
     # Nothing here is new on its own; the combinations are.
     "FREE": (
         {**_both("smile", 0.6), "gaze_left": 0.4},
@@ -155,7 +215,9 @@ def perform(name: str, timesteps: int, seed: int) -> Performed:
         values[control] = values[control] + amplitude * _drift(time, period, rng)
     # Lids follow the eyes down.
     for side in ("left", "right"):
-        values[f"blink_{side}"] = np.clip(values[f"blink_{side}"] + 0.35 * np.maximum(-values["gaze_up"], 0), 0, 1)
+        values[f"blink_{side}"] = np.clip(
+            values[f"blink_{side}"] + 0.35 * np.maximum(-values["gaze_up"], 0), 0, 1
+        )
     activations = [{control: float(values[control][t]) for control in CONTROLS} for t in range(timesteps)]
     excluded = {t: TONGUE for t, a in enumerate(activations) if a["tongue_out"] > _TONGUE_SEEN}
     return Performed(name, activations, excluded)
@@ -199,4 +261,6 @@ def _blinks(time: FloatArray, seconds: float, rng: np.random.Generator) -> Float
 def _drift(time: FloatArray, period: float, rng: np.random.Generator) -> FloatArray:
     """Slow irregular motion in about [-1, 1]: two sines of unrelated periods."""
     a, b = rng.uniform(0.0, 2.0 * np.pi, 2)
-    return 0.65 * np.sin(2.0 * np.pi * time / period + a) + 0.35 * np.sin(2.0 * np.pi * time / (0.381 * period) + b)
+    return 0.65 * np.sin(2.0 * np.pi * time / period + a) + 0.35 * np.sin(
+        2.0 * np.pi * time / (0.381 * period) + b
+    )

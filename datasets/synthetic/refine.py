@@ -81,8 +81,8 @@ def refine(vertices: FloatArray, faces: IntArray, target: FloatArray, rounds: in
     target : (V,) longest edge wanted around each vertex, metres.
     """
     used, local = np.unique(faces, return_inverse=True)
-    triangles = local.reshape(faces.shape).astype(np.int64)
-    owner = np.arange(len(faces))
+    triangles: IntArray = local.reshape(faces.shape).astype(np.int64)
+    owner: IntArray = np.arange(len(faces))
     # Barycentric coordinates are with respect to the three corners of ``owner``; a point on an edge may be
     # written by either neighbour, so points carry global parents and weights instead.
     parents = np.repeat(used[:, None], 3, axis=1)

@@ -19,7 +19,16 @@ SERIALS = (
     *("222200042", "222200044", "222200046", "222200040", "222200036", "222200048", "220700191", "222200041"),
     *(FRONTAL, "222200038", "222200047", "222200043", "222200049", "222200039", "222200045", "221501007"),
 )
-_LOWER = {"222200044", "222200040", "222200048", "222200041", "222200038", "222200043", "222200039", "222200045"}
+_LOWER = {
+    "222200044",
+    "222200040",
+    "222200048",
+    "222200041",
+    "222200038",
+    "222200043",
+    "222200039",
+    "222200045",
+}
 _ARC = np.radians(93.0)
 _RISE = np.radians(32.0)
 _DISTANCE = 1.0  # metres from the head's middle
@@ -48,7 +57,9 @@ def cameras(count: int, width: int, height: int, target: FloatArray, seed: int =
         raise InputError("--cameras", "", f"1 to {len(SERIALS)} cameras", str(count))
     focal = _DISTANCE * min(width / _FRAME_WIDTH, height / _FRAME_HEIGHT)
     shift = np.random.default_rng([seed, 11]).uniform(-0.008, 0.008, 2) * width
-    K = np.array([[focal, 0.0, 0.5 * width + shift[0]], [0.0, focal, 0.5 * height + shift[1]], [0.0, 0.0, 1.0]])
+    K = np.array(
+        [[focal, 0.0, 0.5 * width + shift[0]], [0.0, focal, 0.5 * height + shift[1]], [0.0, 0.0, 1.0]]
+    )
     chosen = sorted(_SPREAD[:count])
     return {SERIALS[i]: Camera(SERIALS[i], width, height, K, _look_at(*_place(i), target)) for i in chosen}
 

@@ -71,7 +71,9 @@ class Studio:
         self._scene: Any = None
         self._parameters: Any = None
 
-    def add(self, name: str, vertices: FloatArray, faces: IntArray, albedo: FloatArray, material: str) -> None:
+    def add(
+        self, name: str, vertices: FloatArray, faces: IntArray, albedo: FloatArray, material: str
+    ) -> None:
         """Add a mesh: (n, 3) world positions, (m, 3) triangles, (n, 3) linear reflectance."""
         properties = mitsuba.Properties()
         properties["mesh_bsdf"] = mitsuba.load_dict(_bsdf(MATERIALS[material]))
@@ -94,15 +96,20 @@ class Studio:
     def image(self, camera: Camera, seed: int) -> tuple[FloatArray, FloatArray]:
         """Render linear light, straight (not premultiplied) rgb (H, W, 3), and coverage (H, W) in [0, 1]."""
         self._traverse().update()
-        pixels = np.array(
-            mitsuba.render(self._scene, sensor=self._sensor(camera), spp=self._samples, seed=seed), np.float64
-        )
+        sensor = self._sensor(camera)
+        rendered = mitsuba.render(self._scene, sensor=sensor, spp=self._samples, seed=mitsuba.UInt32(seed))
+        pixels = np.array(rendered, np.float64)
         alpha = np.clip(pixels[..., 3], 0.0, 1.0)
         return pixels[..., :3] / np.maximum(pixels[..., 3:], 1e-6) * (alpha[..., None] > 0), alpha
 
     def _traverse(self) -> Any:
         if self._scene is None:
-            content: dict[str, Any] = {"type": "scene", "integrator": {"type": "direct", "hide_emitters": True}}
+            # The lamps are points of the sky: rays sampled from surfaces would never meet one.
+            sampling = {"emitter_samples": 1, "bsdf_samples": 0}
+            content: dict[str, Any] = {
+                "type": "scene",
+                "integrator": {"type": "direct", "hide_emitters": True, **sampling},
+            }
             content |= self._meshes
             for index, light in enumerate(self._lights):
                 content[f"light_{index}"] = {
@@ -163,5 +170,5 @@ def _bsdf(material: Material) -> dict[str, Any]:
     return {"type": "twosided", "surface": surface} if material.two_sided else surface
 
 
-def _flat(values: FloatArray) -> FloatArray:
+def _flat(values: FloatArray) -> Any:
     return np.ascontiguousarray(values, np.float32).ravel()

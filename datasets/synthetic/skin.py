@@ -21,16 +21,19 @@ _FRONT = 0.35  # z component of the normal from which on a point counts as facin
 
 @dataclass(frozen=True, eq=False)
 class SkinPaint:
-    """(N, 3) reflectance, and (N,) shares that later steps need: lips, mouth cavity, brows."""
+    """(N, 3) reflectance, and the (N,) share of the lips' red, which folds and flushes need."""
 
     albedo: FloatArray
     lips: FloatArray
-    cavity: FloatArray
-    brows: FloatArray
 
 
-def paint_skin(person: Person, anatomy: Anatomy, points: FloatArray, normals: FloatArray) -> SkinPaint:
-    """Paint the fine skin points (N, 3), given their outward normals (N, 3), of a neutral subject."""
+def paint_skin(
+    person: Person, anatomy: Anatomy, points: FloatArray, normals: FloatArray, cavity: FloatArray
+) -> SkinPaint:
+    """Paint the fine skin points (N, 3) of a neutral subject.
+
+    ``normals`` (N, 3) point outwards; ``cavity`` (N,) is the share of each point in the mouth's wall.
+    """
     s, seed = anatomy.scale, person.seed
     color = np.tile(person.skin, (len(points), 1))
     red = person.skin * np.array([1.02, 0.66, 0.62])
@@ -41,7 +44,9 @@ def paint_skin(person: Person, anatomy: Anatomy, points: FloatArray, normals: Fl
     color[:, 1:] *= (1.0 - 0.06 * fractal_noise(points, 0.012 * s, seed + 7, 3))[:, None]
     color *= (1.0 + 0.05 * value_noise(points / (0.0014 * s), seed + 8))[:, None]
     facing = ramp(normals[:, 2], 0.0, _FRONT)
-    color = _mix(color, person.skin * np.array([0.62, 0.44, 0.34]), person.freckles * _freckles(anatomy, points, seed))
+    color = _mix(
+        color, person.skin * np.array([0.62, 0.44, 0.34]), person.freckles * _freckles(anatomy, points, seed)
+    )
     moles = spots(points, 0.045 * s, 0.0016 * s, 0.25, seed + 31)
     color = _mix(color, person.skin * np.array([0.22, 0.14, 0.12]), moles)
     beard = person.hair * 0.6 + person.skin * np.array([0.10, 0.12, 0.13])
@@ -49,14 +54,13 @@ def paint_skin(person: Person, anatomy: Anatomy, points: FloatArray, normals: Fl
     lips = lip_share(anatomy, points) * facing
     stripes = 1.0 + 0.10 * value_noise(points / (np.array([0.0012, 0.02, 0.02]) * s), seed + 40)
     color = _mix(color, person.lips[None] * stripes[:, None], 0.92 * lips)
-    cavity = mouth_cavity(anatomy, points)
     color = _mix(color, np.array([0.055, 0.012, 0.012]), cavity)
     color = _mix(color, person.skin * np.array([0.10, 0.05, 0.05]), 0.9 * _nostrils(anatomy, points, normals))
     lid = _lid_lines(anatomy, points)
     color = _mix(color, np.minimum(person.hair, 0.02) + np.array([0.012, 0.006, 0.005]), lid)
     brows = brow_share(person, anatomy, points) * facing
     color = _mix(color, brow_color(person), 0.85 * brows)
-    return SkinPaint(np.clip(color, 0.004, 0.95), lips, cavity, brows)
+    return SkinPaint(np.clip(color, 0.004, 0.95), lips)
 
 
 def brow_color(person: Person) -> FloatArray:
@@ -92,17 +96,6 @@ def lip_share(anatomy: Anatomy, points: FloatArray) -> FloatArray:
     return share * (points[:, 2] > outline[:, 2].min() - 0.008 * s)
 
 
-def mouth_cavity(anatomy: Anatomy, points: FloatArray) -> FloatArray:
-    """Share of points inside the mouth, behind the lips."""
-    s, outline = anatomy.scale, anatomy.lip_outline
-    offset = (points - anatomy["mouth"]) / s
-    # The lips' front runs back towards the corners, roughly as a parabola through the outline.
-    wide = 0.5 * np.ptp(outline[:, 0])
-    front = outline[:, 2].max() - (outline[:, 2].max() - outline[:, 2].min()) * ((points[:, 0]) / wide) ** 2
-    behind = ramp(points[:, 2] - front, -0.007 * s, -0.014 * s)
-    return behind * (np.abs(offset[:, 0]) < 0.034) * (np.abs(offset[:, 1]) < 0.05) * (points[:, 2] > 0.0)
-
-
 def _mix(color: FloatArray, other: FloatArray, share: FloatArray) -> FloatArray:
     return color + share[:, None] * (other - color)
 
@@ -114,7 +107,9 @@ def _near(points: FloatArray, center: FloatArray, radius: float) -> FloatArray:
 def _flush(anatomy: Anatomy, points: FloatArray) -> FloatArray:
     """Where blood shows: cheeks, nose, ears, chin."""
     s = anatomy.scale
-    total = 0.9 * blob(points, anatomy["nose_tip"], 0.011 * s) + 0.35 * blob(points, anatomy["chin"], 0.014 * s)
+    total = 0.9 * blob(points, anatomy["nose_tip"], 0.011 * s) + 0.35 * blob(
+        points, anatomy["chin"], 0.014 * s
+    )
     for side in SIDES:
         total += 0.75 * blob(points, anatomy[f"{side}_cheek"], 0.019 * s)
         total += 0.55 * blob(points, anatomy[f"{side}_ala"], 0.007 * s)
@@ -131,7 +126,9 @@ def _around_eyes(anatomy: Anatomy, points: FloatArray) -> FloatArray:
         flat = points[near, :2]
         crease, _ = polyline_distance(flat, eye.upper + np.array([0.0, 0.0055 * s]))
         bag, _ = polyline_distance(flat, eye.lower - np.array([0.0, 0.0060 * s]))
-        share = 0.75 * np.exp(-0.5 * (crease / (0.0032 * s)) ** 2) + 0.38 * np.exp(-0.5 * (bag / (0.004 * s)) ** 2)
+        share = 0.75 * np.exp(-0.5 * (crease / (0.0032 * s)) ** 2) + 0.38 * np.exp(
+            -0.5 * (bag / (0.004 * s)) ** 2
+        )
         inner = np.linalg.norm(flat - eye.upper[0], axis=1)
         total[near] = np.maximum(total[near], share + 0.5 * np.exp(-0.5 * (inner / (0.006 * s)) ** 2))
     return np.minimum(total, 1.0)
@@ -145,7 +142,11 @@ def _lid_lines(anatomy: Anatomy, points: FloatArray) -> FloatArray:
         near = _near(points, np.append(eye.outline.mean(axis=0), eye.center[2] + eye.radius), 0.03 * s)
         for curve, width, strength in ((eye.upper, 0.0011, 0.95), (eye.lower, 0.0007, 0.55)):
             distance, place = polyline_distance(points[near, :2], curve)
-            share = strength * np.exp(-0.5 * (distance / (width * s)) ** 2) * (0.45 + 0.55 * ramp(place, 0.05, 0.5))
+            share = (
+                strength
+                * np.exp(-0.5 * (distance / (width * s)) ** 2)
+                * (0.45 + 0.55 * ramp(place, 0.05, 0.5))
+            )
             total[near] = np.maximum(total[near], share)
     return total
 
@@ -153,7 +154,7 @@ def _lid_lines(anatomy: Anatomy, points: FloatArray) -> FloatArray:
 def _nostrils(anatomy: Anatomy, points: FloatArray, normals: FloatArray) -> FloatArray:
     """The two dark openings under the nose's tip."""
     s, total = anatomy.scale, np.zeros(len(points))
-    for side, sign in zip(SIDES, (1.0, -1.0)):
+    for sign in (1.0, -1.0):
         middle = anatomy["nose_base"] + np.array([sign * 0.0068, 0.0025, 0.0]) * s
         total += blob(points, middle, np.array([0.0034, 0.0030, 0.0055]) * s)
     return np.minimum(1.6 * total, 1.0) * ramp(-normals[:, 1], 0.1, 0.55)
@@ -170,7 +171,9 @@ def _beard(anatomy: Anatomy, points: FloatArray, seed: int) -> FloatArray:
     """Where a beard would grow, grained as stubble."""
     s = anatomy.scale
     mouth, chin = anatomy["mouth"], anatomy["chin"]
-    low = ramp(points[:, 1], mouth[1] + 0.018 * s, mouth[1] - 0.006 * s) * ramp(points[:, 1], chin[1] - 0.03 * s, chin[1])
+    low = ramp(points[:, 1], mouth[1] + 0.018 * s, mouth[1] - 0.006 * s) * ramp(
+        points[:, 1], chin[1] - 0.03 * s, chin[1]
+    )
     front = ramp(points[:, 2], anatomy["left_ear"][2] + 0.012 * s, anatomy["left_ear"][2] + 0.035 * s)
     cheeks = sum(blob(points, anatomy[f"{side}_cheek"], np.array([0.02, 0.026, 0.03]) * s) for side in SIDES)
     grain = 0.75 + 0.35 * value_noise(points / (0.0016 * s), seed + 60)

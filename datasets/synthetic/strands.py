@@ -82,7 +82,9 @@ def ribbons(
     taper = np.interp(np.linspace(0.0, 1.0, points), [0.0, 0.6, 1.0], [1.0, 0.9, tip_width])
     wide = (width[:, None] * taper)[:, :, None, None]
     u = np.linspace(-1.0, 1.0, columns)[None, None, :, None]
-    vertices = paths[:, :, None] + wide * (0.5 * u * across[:, :, None] + arch * (1.0 - u * u) * outward[:, :, None])
+    vertices = paths[:, :, None] + wide * (
+        0.5 * u * across[:, :, None] + arch * (1.0 - u * u) * outward[:, :, None]
+    )
     index = np.arange(count * points * columns).reshape(count, points, columns)
     a, b, c, d = (index[:, :-1, :-1], index[:, :-1, 1:], index[:, 1:, :-1], index[:, 1:, 1:])
     faces = np.concatenate([np.stack([a, b, d], -1).reshape(-1, 3), np.stack([a, d, c], -1).reshape(-1, 3)])

@@ -16,8 +16,8 @@ from ..head.model import HeadModel
 from . import rig
 from .anatomy import measure
 from .geometry import Geometry
-from .performance import HELD_OUT, Performed, perform, share_out
 from .people import Person, person
+from .performance import HELD_OUT, Performed, perform, share_out
 from .tracking import with_tracking_noise
 
 FIRST_SUBJECT = 900
@@ -107,4 +107,6 @@ def _middle(geometry: Geometry, shape: FloatArray) -> FloatArray:
     model = HeadModel(geometry.head, dtype=torch.float64)
     anatomy = measure(geometry.head, model.canonical(torch.from_numpy(shape))[0].numpy())
     height = 0.5 * (anatomy["vertex_top"][1] + anatomy["chin"][1])
-    return np.array([0.0, height - 0.024 * anatomy.scale, 0.5 * (anatomy["left_ear"][2] + anatomy["nose_tip"][2])])
+    return np.array(
+        [0.0, height - 0.024 * anatomy.scale, 0.5 * (anatomy["left_ear"][2] + anatomy["nose_tip"][2])]
+    )

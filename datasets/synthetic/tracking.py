@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +22,7 @@ def with_tracking_noise(poses: Sequence[HeadPose], amount: float, seed: int) -> 
     if amount == 0.0:
         return list(poses)
     rng = np.random.default_rng([seed, 5])
-    changed: list[dict[str, np.ndarray]] = [{} for _ in poses]
+    changed: list[dict[str, Any]] = [{} for _ in poses]
     for name in _FIELDS:
         if getattr(poses[0], name) is None:
             continue

@@ -50,12 +50,12 @@ _FOLDS = (
     *("chin", "dimple_left", "dimple_right", "lip_lines", "neck"),
 )
 _FLUSHES = {
-    "cheeks": (1.06, 0.70, 0.70),
+    "cheeks": (1.04, 0.83, 0.84),
     "forehead_pale": (1.10, 1.17, 1.18),
     "lips_pale": (1.05, 1.55, 1.5),
     "lips_full": (0.92, 0.62, 0.66),
-    "anger": (1.05, 0.80, 0.80),
-    "nose": (1.05, 0.70, 0.72),
+    "anger": (1.04, 0.84, 0.85),
+    "nose": (1.04, 0.80, 0.82),
 }
 
 
@@ -72,7 +72,9 @@ def fold_strengths(a: Activations) -> FloatArray:
         "glabella": 0.5 * (a["brow_down_left"] + a["brow_down_right"]) + 0.35 * sneer,
         **{f"crow_{side}": squint[side] for side in SIDES},
         **{
-            f"nasolabial_{side}": smile[side] + 0.7 * a[f"nose_sneer_{side}"] + 0.35 * a[f"mouth_stretch_{side}"]
+            f"nasolabial_{side}": smile[side]
+            + 0.7 * a[f"nose_sneer_{side}"]
+            + 0.35 * a[f"mouth_stretch_{side}"]
             for side in SIDES
         },
         "bunny": sneer,
@@ -168,7 +170,9 @@ class _Sketch:
     def _wobble(self, number: int, count: int) -> FloatArray:
         """Smooth irregularity in [-1, 1] along a line."""
         t = np.linspace(0.0, 3.0, count)
-        return value_noise(np.stack([t, np.full(count, 3.1 * number), np.zeros(count)], 1), self.person.seed + 90)
+        return value_noise(
+            np.stack([t, np.full(count, 3.1 * number), np.zeros(count)], 1), self.person.seed + 90
+        )
 
     def _forehead(self) -> dict[str, tuple[FloatArray, FloatArray]]:
         a, s = self.anatomy, self.s
@@ -197,7 +201,9 @@ class _Sketch:
             x = sign * (0.0062 * s + tilt * y * 0.4)
             lines.append(np.stack([x, a["glabella"][1] + y, np.full(15, a["glabella"][2])], axis=1))
         x = np.linspace(-0.010, 0.010, 11) * s
-        lines.append(np.stack([x, np.full(11, a["nose_bridge"][1] + 0.004 * s), np.full(11, a["nose_bridge"][2])], 1))
+        lines.append(
+            np.stack([x, np.full(11, a["nose_bridge"][1] + 0.004 * s), np.full(11, a["nose_bridge"][2])], 1)
+        )
         return self._lines(lines, 0.0014, 0.0014)
 
     def _crow(self, side: str, sign: float) -> tuple[FloatArray, FloatArray]:
@@ -206,7 +212,9 @@ class _Sketch:
         for number, angle in enumerate(np.radians([34.0, 12.0, -10.0, -32.0])):
             reach = np.linspace(0.006, 0.026 - 0.002 * abs(number - 1.5), 13) * self.s
             bend = 0.0010 * self.s * self._wobble(10 + number, 13)
-            line = corner + np.stack([sign * reach * np.cos(angle), reach * np.sin(angle) + bend, -0.75 * reach], 1)
+            line = corner + np.stack(
+                [sign * reach * np.cos(angle), reach * np.sin(angle) + bend, -0.75 * reach], 1
+            )
             lines.append(line)
         return self._lines(lines, 0.0009, 0.0011)
 
@@ -249,7 +257,9 @@ class _Sketch:
 
     def _chin(self) -> tuple[FloatArray, FloatArray]:
         a, s = self.anatomy, self.s
-        where = blob(self.points, a["chin"] + np.array([0.0, 0.012, 0.002]) * s, np.array([0.014, 0.010, 0.015]) * s)
+        where = blob(
+            self.points, a["chin"] + np.array([0.0, 0.012, 0.002]) * s, np.array([0.014, 0.010, 0.015]) * s
+        )
         pits = ramp(value_noise(self.points / (0.0042 * s), self.person.seed + 91), 0.05, 0.6)
         return -0.0011 * s * where * pits, 0.45 * where * pits
 
@@ -263,11 +273,19 @@ class _Sketch:
         a, s = self.anatomy, self.s
         around = blob(self.points, a["mouth"], np.array([0.020, 0.013, 0.02]) * s)
         angle = np.arctan2(self.points[:, 1] - a["mouth"][1], self.points[:, 0] - a["mouth"][0])
-        ray = ramp(np.cos(26.0 * angle + 1.5 * value_noise(self.points / (0.006 * s), self.person.seed + 92)), 0.1, 1.0)
+        ray = ramp(
+            np.cos(26.0 * angle + 1.5 * value_noise(self.points / (0.006 * s), self.person.seed + 92)),
+            0.1,
+            1.0,
+        )
         return -0.0006 * s * around * ray, 0.40 * around * ray
 
     def _neck(self) -> tuple[FloatArray, FloatArray]:
         a, s = self.anatomy, self.s
-        where = blob(self.points, a["chin"] + np.array([0.0, -0.055, -0.03]) * s, np.array([0.045, 0.028, 0.045]) * s)
-        bands = np.cos(self.points[:, 0] / (0.0085 * s)) * ramp(a["chin"][1] - self.points[:, 1], 0.0, 0.02 * s)
+        where = blob(
+            self.points, a["chin"] + np.array([0.0, -0.055, -0.03]) * s, np.array([0.045, 0.028, 0.045]) * s
+        )
+        bands = np.cos(self.points[:, 0] / (0.0085 * s)) * ramp(
+            a["chin"][1] - self.points[:, 1], 0.0, 0.02 * s
+        )
         return 0.0014 * s * where * bands, 0.18 * where * ramp(-bands, 0.0, 1.0)

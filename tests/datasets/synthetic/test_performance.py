@@ -1,0 +1,46 @@
+import numpy as np
+import pytest
+from headbench.bench.errors import InputError
+from headbench.datasets.synthetic.controls import CONTROLS
+from headbench.datasets.synthetic.performance import HELD_OUT, SEQUENCES, perform, share_out
+
+
+@pytest.mark.parametrize("timesteps", [4, 8, 15, 16, 40, 60, 88, 300])
+def test_timesteps_are_shared_out_exactly(timesteps):
+    shares = share_out(timesteps)
+    assert sum(shares.values()) == timesteps
+    assert HELD_OUT in shares
+    assert len(shares) >= 2
+    assert min(shares.values()) >= 2
+
+
+def test_many_timesteps_make_all_sequences():
+    assert list(share_out(300)) == list(SEQUENCES)
+
+
+def test_too_few_are_refused():
+    with pytest.raises(InputError, match="timesteps"):
+        share_out(3)
+
+
+@pytest.mark.parametrize("name", SEQUENCES)
+def test_curves_are_bounded_smooth_and_repeatable(name):
+    played = perform(name, 400, seed=1)
+    values = np.array([[a[control] for control in CONTROLS] for a in played.activations])
+    assert np.isfinite(values).all()
+    assert np.abs(values).max() <= 1.3
+    # No jumps: about 40 moments a second, and a blink closes in about 80 ms.
+    assert np.abs(np.diff(values, axis=0)).max() < 0.5
+    again = perform(name, 400, seed=1).activations
+    assert again == played.activations
+    assert perform(name, 400, seed=2).activations != played.activations
+
+
+def test_tongue_is_out_in_free_alone_and_labelled_exactly_there():
+    for name in SEQUENCES:
+        played = perform(name, 120, seed=0)
+        out = {t for t, a in enumerate(played.activations) if a["tongue_out"] > 0.08}
+        assert set(played.excluded) == out
+        assert all("tongue" in reason for reason in played.excluded.values())
+        assert bool(out) == (name == HELD_OUT)
+        assert len(out) < 60

@@ -1,0 +1,44 @@
+import numpy as np
+import pytest
+from headbench.bench.errors import InputError
+from headbench.datasets.synthetic.rig import FRONTAL, SERIALS, cameras
+
+TARGET = np.array([0.01, 0.02, 0.03])
+
+
+@pytest.mark.parametrize("count", range(1, 17))
+def test_every_set_has_the_frontal_camera_in_canonical_order(count):
+    made = list(cameras(count, 100, 146, TARGET))
+    assert len(made) == count
+    assert FRONTAL in made
+    assert made == [serial for serial in SERIALS if serial in made]
+
+
+def test_arc_spans_93_by_32_degrees_and_all_look_at_the_head():
+    azimuth, elevation = [], []
+    for camera in cameras(16, 550, 802, TARGET).values():
+        x, y, z = camera.center - TARGET
+        azimuth.append(np.degrees(np.arctan2(x, z)))
+        elevation.append(np.degrees(np.arctan2(y, np.hypot(x, z))))
+        rotation = camera.world_to_camera[:3, :3]
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(rotation) == pytest.approx(1.0)
+        seen = camera.K @ (rotation @ TARGET + camera.world_to_camera[:3, 3])
+        np.testing.assert_allclose(seen[:2] / seen[2], camera.K[:2, 2], atol=1e-9)
+        assert (rotation @ [0.0, 1.0, 0.0])[1] < 0  # up in the world is up in the image
+    assert np.ptp(azimuth) == pytest.approx(93.0, abs=4)
+    assert np.ptp(elevation) == pytest.approx(32.0, abs=1)
+    assert len(np.unique(np.round(azimuth, 3))) >= 15
+
+
+def test_principal_point_is_off_centre_but_near():
+    K = cameras(2, 550, 802, TARGET, seed=3)[FRONTAL].K
+    offset = K[:2, 2] - [275, 401]
+    assert 0 < np.abs(offset).min()
+    assert np.abs(offset).max() < 0.01 * 550
+
+
+def test_impossible_counts_are_refused():
+    for count in (0, 17):
+        with pytest.raises(InputError, match="cameras"):
+            cameras(count, 100, 146, TARGET)
