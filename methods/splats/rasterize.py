@@ -52,7 +52,7 @@ def rasterize(
     backend : one of `available_backends`, or "auto": the kernel for float32 on the CPU, else the reference.
     threads : of the kernel; None takes ``torch.get_num_threads()``. Results are equal bit for bit for any number.
     check_finite : refuse NaN and infinity in any tensor. Without the check a non-finite geometry is culled
-        and a non-finite colour spreads to the pixels it touches.
+        and a non-finite colour spreads to the pixels about it.
 
     Returns
     -------

@@ -59,19 +59,30 @@ HEADBENCH_INLINE std::uint32_t enter_tile_row(const View& view, const FrameData&
   // Rounding must not carry an entry past the places reserved for the rectangle.
   const int begin = leftmost / kColumns > rect.x0 ? leftmost / kColumns : rect.x0;
   const int end = rightmost / kColumns < rect.x1 ? rightmost / kColumns : rect.x1;
-  for (int tile_x = begin; tile_x <= end; ++tile_x) {
-    std::uint64_t blocks = 0;
+  // As many tiles at a time as a word has bits for: the columns a band touches are a run of them.
+  constexpr int kGroup = 64 / kColumns;
+  constexpr std::uint64_t kAll = ~std::uint64_t{0};
+  for (int group = begin; group <= end; group += kGroup) {
+    std::uint64_t columns[kBands];
     for (int band = 0; band < kBands; ++band) {
-      const int a = firsts[band] - tile_x * kColumns, b = lasts[band] - tile_x * kColumns;
-      const int lo = a > 0 ? a : 0, hi = b < kColumns - 1 ? b : kColumns - 1;
-      if (lo <= hi) blocks |= static_cast<std::uint64_t>((2u << hi) - (1u << lo)) << (kColumns * band);
+      const int a = firsts[band] - group * kColumns, b = lasts[band] - group * kColumns;
+      const int lo = a > 0 ? a : 0, hi = b < 63 ? b : 63;
+      columns[band] = lo <= hi ? kAll >> (63 - hi) & kAll << lo : 0;
     }
-    if (!blocks) continue;
-    const std::uint32_t tile = static_cast<std::uint32_t>(tile_y * view.tiles_x + tile_x);
-    frame.entry_tiles[entry] = tile;
-    frame.entry_blocks[entry] = blocks;
-    ++entry;
-    ++tile_counts[tile];
+    const int group_end = group + kGroup - 1 < end ? group + kGroup - 1 : end;
+    for (int tile_x = group; tile_x <= group_end; ++tile_x) {
+      std::uint64_t blocks = 0;
+      for (int band = 0; band < kBands; ++band) {
+        blocks |= (columns[band] & ((1 << kColumns) - 1)) << (kColumns * band);
+        columns[band] >>= kColumns;
+      }
+      if (!blocks) continue;
+      const std::uint32_t tile = static_cast<std::uint32_t>(tile_y * view.tiles_x + tile_x);
+      frame.entry_tiles[entry] = tile;
+      frame.entry_blocks[entry] = blocks;
+      ++entry;
+      ++tile_counts[tile];
+    }
   }
   return entry;
 }
