@@ -12,11 +12,11 @@ from ...bench.contracts import FloatArray
 
 FLOOR = -0.19  # height of the flat cut at the base of the neck
 
-EYE_CENTER = np.array([0.0315, 0.0200, 0.0500])
+EYE_CENTER = np.array([0.0315, 0.0200, 0.0510])
 EYE_RADIUS = 0.0120
 LID_CLEARANCE = 0.0004  # between the eyeball and the inner side of the lids
-MEDIAL_CANTHUS = -0.0145  # along x from the centre of the eye
-LATERAL_CANTHUS = 0.0140
+MEDIAL_CANTHUS = -0.0138  # along x from the centre of the eye
+LATERAL_CANTHUS = 0.0132
 UPPER_LID_HEIGHT = 0.0062  # above the line through the canthi
 LOWER_LID_DEPTH = 0.0046
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.sparse import coo_matrix, diags
+from scipy.sparse.linalg import splu
 
 from ...bench.contracts import FloatArray
 from .anatomy import EYE_CENTER, EYE_RADIUS, eye_front, lid_curves
@@ -25,6 +27,9 @@ def margin_angles(x: FloatArray) -> tuple[FloatArray, FloatArray]:
 def lid_turn(surface: Surface, upper: FloatArray | float, lower: FloatArray | float) -> FloatArray:
     """(V, 3) displacement that turns the margins of the left eye's lids.
 
+    The margins, and the lids' inner sides, turn rigidly about the eyeball; the skin around follows by the
+    harmonic field between the margins and what stays at rest.
+
     Parameters
     ----------
     surface : the surface at rest.
@@ -33,20 +38,34 @@ def lid_turn(surface: Surface, upper: FloatArray | float, lower: FloatArray | fl
     relative = surface.vertices - EYE_CENTER
     x, y, z = relative.T
     top, bottom = margin_angles(x)
-    middle = (top + bottom) / 2
     angle = np.arctan2(y, z)
-    on_upper = angle > middle
+    on_upper = angle > (top + bottom) / 2
     beyond = np.where(on_upper, angle - top, bottom - angle)
+    distance = np.linalg.norm(relative, axis=1)
+    margin = (surface.skin > 0) & (beyond < 0.16) & (distance < EYE_RADIUS + 0.0030) & (np.abs(x) < 0.0165)
+    inner = surface.in_socket & (surface.vertices[:, 0] > 0)
+    fade = np.where(inner, 1 - smoothstep(beyond, 0.2, 1.2), 1) * (1 - smoothstep(np.abs(x), 0.0145, 0.0165))
+    turn = np.where(on_upper, upper, lower) * fade
     radius = np.hypot(y, z)
-    over = np.linalg.norm(relative, axis=1) - EYE_RADIUS
-    skin = surface.skin * (surface.vertices[:, 0] > 0)
-    # A lid moves as one along its margin; its skin is drawn from the fold below the brow, or from the cheek.
-    along = 1 - smoothstep(beyond, 0.12, np.where(on_upper, 0.85, 0.70))
-    across = 1 - smoothstep(over, 0.0040, 0.0110)
-    sideways = 1 - smoothstep(np.abs(x), 0.0150, 0.0220)
-    turn = np.where(on_upper, upper, lower) * along * across * sideways * skin
-    moved = np.column_stack([x, radius * np.sin(angle + turn), radius * np.cos(angle + turn)])
-    return keep_off_eyes(surface, np.where(skin[:, None] > 0, moved - relative, 0))
+    turned = np.column_stack([x, radius * np.sin(angle + turn), radius * np.cos(angle + turn)]) - relative
+    held = margin | inner
+    turned[~held] = 0
+    free = (surface.skin > 0) & ~held & (np.linalg.norm(relative * [0.85, 1, 1], axis=1) < 0.021)
+    return keep_off_eyes(surface, harmonic(surface, turned, free))
+
+
+def harmonic(surface: Surface, field: FloatArray, free: FloatArray) -> FloatArray:
+    """The field with its values at ``free`` vertices made the mean of their neighbours' (uniform weights)."""
+    count = len(surface.vertices)
+    edges = np.concatenate([surface.faces[:, [0, 1]], surface.faces[:, [1, 2]], surface.faces[:, [2, 0]]])
+    pairs = np.unique(np.concatenate([edges, edges[:, ::-1]]), axis=0)
+    adjacency = coo_matrix((np.ones(len(pairs)), pairs.T), (count, count)).tocsr()
+    inside, known = np.flatnonzero(free), np.flatnonzero(~free)
+    laplacian = diags(np.asarray(adjacency.sum(axis=1)).ravel()) - adjacency
+    system = laplacian[inside][:, inside].tocsc()
+    filled = field.copy()
+    filled[inside] = splu(system).solve(-(laplacian[inside][:, known] @ field[known]))
+    return filled
 
 
 def blink(surface: Surface) -> FloatArray:

@@ -33,11 +33,12 @@ from .fields import (
 # Clay strokes on the left half: height (metres, positive adds), centre, deviations, turn in degrees.
 PLANES: tuple[tuple[float, tuple[float, ...], tuple[float, ...], tuple[float, ...] | None], ...] = (
     (0.0020, (0.000, 0.042, 0.077), (0.012, 0.009, 0.020), None),  # glabella
-    (0.0030, (0.024, 0.038, 0.072), (0.013, 0.0065, 0.020), (0, 0, 6)),  # brow ridge
+    (0.0022, (0.024, 0.039, 0.070), (0.013, 0.0060, 0.020), (0, 0, 6)),  # brow ridge
     (0.0022, (0.044, 0.036, 0.056), (0.009, 0.008, 0.014), (0, 0, -25)),  # outer brow
     (-0.0030, (0.066, 0.040, 0.030), (0.020, 0.018, 0.016), None),  # temple
-    (-0.0085, (0.030, 0.0225, 0.060), (0.0150, 0.0100, 0.016), None),  # orbit
-    (-0.0045, (0.0140, 0.0220, 0.066), (0.0055, 0.0100, 0.012), None),  # inner corner of the orbit
+    (-0.0040, (0.032, 0.0300, 0.062), (0.0130, 0.0050, 0.014), None),  # under the brow
+    (-0.0050, (0.031, 0.0235, 0.060), (0.0150, 0.0085, 0.016), None),  # orbit
+    (-0.0120, (0.0180, 0.0210, 0.063), (0.0058, 0.0085, 0.014), None),  # inner corner of the orbit
     (0.0030, (0.052, -0.004, 0.046), (0.014, 0.011, 0.020), (0, 0, 20)),  # cheekbone
     (0.0022, (0.034, -0.016, 0.064), (0.013, 0.013, 0.015), None),  # front of the cheek
     (-0.0030, (0.054, -0.043, 0.032), (0.014, 0.018, 0.018), None),  # hollow of the cheek
@@ -67,29 +68,30 @@ def add_eyes(head: FloatArray, points: FloatArray) -> FloatArray:
     """Lids over the eyeball, crease, aperture and the cavity the eyeball sits in."""
     radius = EYE_RADIUS + LID_CLEARANCE
     lid = ellipsoid(points, EYE_CENTER, (radius + 0.0022, radius + 0.0016, radius + 0.0016))
-    head = union(head, lid, 0.0060)
+    head = union(head, lid, 0.0050)
     x, y, z = (points - EYE_CENTER.astype(points.dtype)).T
-    # supratarsal crease and the groove under the lower lid
-    span = np.linspace(MEDIAL_CANTHUS - 0.001, LATERAL_CANTHUS + 0.002, 7)
+    span = np.linspace(MEDIAL_CANTHUS + 0.001, LATERAL_CANTHUS + 0.003, 7)
     upper, lower = lid_curves(span)
-    crease = _on_lid(span, upper * 0.75 + 0.0062, 0.0148)
-    head = head + 0.0011 * ridge(points, crease, 0.0011)
-    fold = _on_lid(span, upper * 0.6 + 0.0098, 0.0152)
-    head = head - 0.0016 * ridge(points, fold, 0.0020)
-    bag = _on_lid(span, lower * 0.8 - 0.0062, 0.0142)
-    head = head + 0.0006 * ridge(points, bag, 0.0014)
-    head = np.maximum(head, radius - np.linalg.norm(np.stack([x, y, z], 1), axis=1))
+    head = head + 0.0015 * _crease(points, span, 0.80 * upper + 0.0036, 0.0009)
+    head = head - 0.0014 * _crease(points, span, 0.70 * upper + 0.0066, 0.0018)
+    head = head - 0.0004 * _crease(points, span, upper + 0.0008, 0.0009)
+    head = head - 0.0005 * _crease(points, span, lower - 0.0010, 0.0010)
+    head = head + 0.0007 * _crease(points, span[:5], 0.8 * lower[:5] - 0.0062, 0.0016)
     top, bottom = lid_curves(x)
     lens = intersection(y - top, bottom - y, 0.0016)
-    outside = radius - 0.0010 - np.linalg.norm(np.stack([x * 0.80, y, z], 1), axis=1)
-    opening = np.maximum(np.maximum(lens, outside), -0.002 - z)
-    return subtraction(head, opening, 0.0012)
+    # Beyond the ball, at the corners, the opening has a floor; the ball's cavity melts into it without a sliver.
+    floor = radius - 0.0006 - np.linalg.norm(np.stack([x * 0.80, y, z], 1), axis=1)
+    opening = intersection(np.maximum(lens, -0.001 - z), floor, 0.001)
+    cavity = np.linalg.norm(np.stack([x, y, z], 1), axis=1) - radius
+    return subtraction(head, union(cavity, opening, 0.0020), 0.0010)
 
 
-def _on_lid(x: FloatArray, y: FloatArray, radius: float) -> list[tuple[float, float, float]]:
-    """Points of the head at (x, y) from the centre of the eye, in front, at ``radius`` from it."""
-    depth = np.sqrt(np.maximum(radius**2 - x**2 - y**2, 1e-6))
-    return [tuple(row) for row in np.column_stack([x, y, depth]) + EYE_CENTER]
+def _crease(points: FloatArray, x: FloatArray, y: FloatArray, width: float) -> FloatArray:
+    """Weight of a stroke seen from the front, along (x, y) from the centre of the eye, whatever the depth."""
+    center = EYE_CENTER.astype(points.dtype)
+    flat = (points - center) * np.array([1, 1, 0], points.dtype)
+    weight = ridge(flat, [(a, b, 0.0) for a, b in zip(x, y, strict=True)], width)
+    return weight * np.clip((points[:, 2] - center[2]) / 0.004, 0, 1)
 
 
 @within((-0.01, -0.05, 0.04), (0.04, 0.045, 0.13))
@@ -103,8 +105,8 @@ def add_nose(head: FloatArray, points: FloatArray) -> FloatArray:
     )
     wall = tube(
         points,
-        [(0.0070, 0.014, 0.0600), (0.0095, -0.004, 0.0660), (0.0110, -0.018, 0.0720)],
-        [0.0050, 0.0060, 0.0065],
+        [(0.0050, 0.012, 0.0620), (0.0090, -0.004, 0.0660), (0.0110, -0.018, 0.0720)],
+        [0.0040, 0.0060, 0.0065],
         samples=5,
     )
     nose = union(bridge, wall, 0.010)
@@ -171,7 +173,7 @@ def add_ears(head: FloatArray, points: FloatArray) -> FloatArray:
         offset = np.array([out, up, -back]) * 1e-3
         return tuple(np.asarray(EAR_ORIGIN) + rotation_xyz(turn) @ offset)
 
-    plate = ellipsoid(points, at(12, 6, 1.0), (0.0030, 0.0270, 0.0150), turn)
+    plate = ellipsoid(points, at(12, 6, 0.5), (0.0038, 0.0295, 0.0165), turn)
     lobe = ellipsoid(points, at(6, -19, 1.5), (0.0032, 0.0085, 0.0070), turn)
     ear = union(plate, lobe, 0.006)
     helix = tube(
@@ -181,10 +183,10 @@ def add_ears(head: FloatArray, points: FloatArray) -> FloatArray:
             at(0, 11, 2.5),
             at(2, 23, 3),
             at(10, 31, 3),
-            at(20, 30, 4),
-            at(26, 20, 5),
-            at(26, 6, 5),
-            at(20, -8, 4),
+            at(20, 29, 3),
+            at(25.5, 20, 3.6),
+            at(26, 6, 3.6),
+            at(20.5, -8, 3),
             at(12, -19, 3),
         ],
         [0.0016, 0.0022, 0.0025, 0.0026, 0.0027, 0.0027, 0.0026, 0.0022, 0.0018],
@@ -192,7 +194,7 @@ def add_ears(head: FloatArray, points: FloatArray) -> FloatArray:
     )
     ear = union(ear, helix, 0.0022)
     fossa = tube(
-        points, [at(9, 25, 4.5), at(17, 23, 5), at(21.5, 14, 6), at(21.5, 4, 6)], [0.0022] * 4, samples=8
+        points, [at(9, 25, 5.2), at(16, 23, 5.2), at(21, 14, 5.6), at(21, 4, 5.6)], [0.0022] * 4, samples=8
     )
     ear = subtraction(ear, fossa, 0.0025)
     antihelix = tube(
@@ -204,7 +206,9 @@ def add_ears(head: FloatArray, points: FloatArray) -> FloatArray:
     ear = union(ear, antihelix, 0.002)
     ear = union(ear, ellipsoid(points, at(-2, 0, 2.5), (0.0026, 0.0050, 0.0032), turn), 0.003)
     head = union(head, ear, 0.004)
-    concha = ellipsoid(points, at(8, 0.5, 5.0), (0.0062, 0.0100, 0.0068), turn)
+    shell = ellipsoid(points, at(8, 2, -2.0), (0.0060, 0.0130, 0.0100), turn)
+    head = union(head, shell, 0.003)
+    concha = ellipsoid(points, at(8, 0.5, 5.0), (0.0058, 0.0095, 0.0066), turn)
     cymba = ellipsoid(points, at(9, 10, 5.0), (0.0045, 0.0050, 0.0060), turn)
     return subtraction(head, union(concha, cymba, 0.002), 0.0022)
 

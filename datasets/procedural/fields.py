@@ -6,6 +6,7 @@ inside. The bounds are those of I. Quilez, "Distance functions" and "Smooth mini
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from functools import wraps
 
@@ -53,10 +54,7 @@ def capsule(points: FloatArray, a: Point, b: Point, radius_a: float, radius_b: f
 def tube(points: FloatArray, knots: Sequence[Point], radii: Point, samples: int = 12) -> FloatArray:
     """Tube of varying radius along the cubic spline through ``knots``."""
     path = resample(np.column_stack([np.asarray(knots, float), np.asarray(radii, float)]), samples)
-    pieces = [
-        capsule(points, a[:3], b[:3], float(a[3]), float(b[3]))
-        for a, b in zip(path[:-1], path[1:], strict=True)
-    ]
+    pieces = [capsule(points, a[:3], b[:3], float(a[3]), float(b[3])) for a, b in itertools.pairwise(path)]
     return np.minimum.reduce(pieces)
 
 

@@ -32,5 +32,5 @@ def polygonise(
         index = (chunk[:, None, None, None] + offsets).reshape(-1, 3)
         values = field((low + index * step).astype(np.float32))
         grid[tuple(index.T)] = values
-    vertices, faces, _, _ = marching_cubes(grid, 0.0, spacing=(step,) * 3, gradient_direction="ascent")
+    vertices, faces, _, _ = marching_cubes(grid, 0.0, spacing=(step,) * 3, gradient_direction="descent")
     return vertices.astype(np.float64) + low, faces.astype(np.int64)

@@ -125,7 +125,7 @@ def _centers(
         / np.maximum(total, 1e-30)[:, None]
     )
     distance = np.linalg.norm(vertices - centroid[label], axis=1)
-    lines = np.array([bin(int(b)).count("1") for b in range(int(border.max()) + 1)])[border]
+    lines = np.array([int(b).bit_count() for b in range(int(border.max()) + 1)])[border]
     order = np.lexsort((distance, -lines, label))
     first = np.searchsorted(label[order], np.arange(len(seeds)))
     moved = order[first]

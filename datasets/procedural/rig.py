@@ -29,7 +29,7 @@ def jaw_weight(surface: Surface) -> FloatArray:
     rise = 0.022 * smoothstep(around, 0.36, 1.4)
     below = rise - surface.above_slit
     # The lips part like a cut in the middle; towards the corners and the cheek the change is gradual.
-    width = 0.0002 + 0.0100 * smoothstep(u, 0.50, 1.05) + 0.020 * smoothstep(around, 0.34, 0.75)
+    width = 0.0002 + 0.0075 * smoothstep(u, 0.74, 1.05) + 0.022 * smoothstep(around, 0.36, 0.80)
     depth = 0.0002 + 0.0095 * smoothstep(lip_arc(x) - z, 0.012, 0.050)
     width = np.where(surface.in_mouth & (u < 0.97), np.maximum(depth, width), width)
     weight = smoothstep(below, -width, width)
@@ -60,7 +60,7 @@ def joint_regressor(surface: Surface) -> FloatArray:
     joint is the mean of its ball.
     """
     vertices = surface.vertices
-    x, y, z = vertices.T
+    _x, y, z = vertices.T
     supports = {
         ROOT: np.flatnonzero(surface.outside & (np.abs(y - JOINTS[ROOT, 1]) < 0.012)),
         NECK: np.flatnonzero(surface.outside & (np.abs(y - JOINTS[NECK, 1]) < 0.014) & (z < 0.02)),

@@ -32,6 +32,7 @@ from .features import EAR_ORIGIN, sculpture
 from .polygonise import polygonise
 from .remesh import border_edges, coarsen
 
+SHORTEST_EDGE = 0.00035  # metres; the sheets of lids and lips are sculpted several times further apart
 LOW, HIGH = (0.0, FLOOR, -0.13), (0.115, 0.15, 0.11)
 
 
@@ -47,7 +48,7 @@ class Settings:
     """
 
     out: Path
-    step: float = 0.0008
+    step: float = 0.0007
     detail: float = 1.13
 
 
@@ -67,13 +68,13 @@ def edge_length(points: FloatArray) -> FloatArray:
         axis=1,
     )
     face = np.linalg.norm(np.maximum(np.abs(points - (0, -0.02, 0.07)) - (0.055, 0.075, 0.035), 0), axis=1)
-    wanted = np.full(len(points), 0.0100)
+    wanted = np.full(len(points), 0.0115)
     for distance, size, growth in (
-        (margin, 0.0014, 0.20),
+        (margin, 0.0010, 0.17),
         (lips, 0.0021, 0.22),
         (nose, 0.0024, 0.22),
         (ear, 0.0028, 0.30),
-        (face, 0.0050, 0.20),
+        (face, 0.0055, 0.20),
     ):
         wanted = np.minimum(wanted, size + growth * np.maximum(distance, 0))
     return wanted
@@ -81,8 +82,7 @@ def edge_length(points: FloatArray) -> FloatArray:
 
 def feature_points() -> FloatArray:
     """(P, 3) points of the left half that become vertices: lid margins and the contour of the lips."""
-    across = np.linspace(0, np.pi, 21)
-    x = (MEDIAL_CANTHUS + LATERAL_CANTHUS) / 2 + (LATERAL_CANTHUS - MEDIAL_CANTHUS) / 2 * np.cos(across)
+    x = np.linspace(0.97 * MEDIAL_CANTHUS, 0.97 * LATERAL_CANTHUS, 24)
     upper, lower = lid_curves(x)
     rims = [eye_front(x, y, 0.0010) for y in (upper + 0.0006, lower - 0.0006)]
     lip = np.linspace(0, LIP_RING_REACH * MOUTH_HALF_WIDTH, 15)  # every other one is of the lips' rings
@@ -92,16 +92,18 @@ def feature_points() -> FloatArray:
     return np.concatenate(rims)
 
 
-def clean(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray]:
-    """Largest piece of the mesh without duplicate or degenerate elements."""
+def clean(vertices: FloatArray, faces: IntArray, *, merge: float, flip: bool) -> tuple[FloatArray, IntArray]:
+    """Largest piece of the mesh, vertices nearer than ``merge`` metres made one, slivers flipped away if asked."""
     meshes = pymeshlab.MeshSet()
     meshes.add_mesh(pymeshlab.Mesh(vertices, faces))
-    meshes.meshing_merge_close_vertices(threshold=pymeshlab.PureValue(1e-6))
+    meshes.meshing_merge_close_vertices(threshold=pymeshlab.PureValue(merge))
     meshes.meshing_remove_duplicate_faces()
     meshes.meshing_remove_null_faces()
     meshes.meshing_repair_non_manifold_edges()
     meshes.meshing_remove_connected_component_by_face_number(mincomponentsize=len(faces) // 2)
     meshes.meshing_remove_unreferenced_vertices()
+    if flip:
+        meshes.meshing_edge_flip_by_planar_optimization(pthreshold=25, iterations=0)
     mesh = meshes.current_mesh()
     return mesh.vertex_matrix(), mesh.face_matrix().astype(np.int64)
 
@@ -120,20 +122,30 @@ def mirrored(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArra
 
 def sculpt(step: float, detail: float) -> tuple[FloatArray, IntArray, IntArray]:
     """Vertices (V, 3), triangles (F, 3) and mirror images (V,) of the skin, metres."""
-    vertices, faces = clean(*polygonise(sculpture, np.array(LOW), np.array(HIGH), step))
+    vertices, faces = clean(
+        *polygonise(sculpture, np.array(LOW), np.array(HIGH), step), merge=1e-6, flip=False
+    )
     on_border = np.zeros(len(vertices), int)
     edge_vertices = np.unique(border_edges(faces))
     on_border[edge_vertices] += np.abs(vertices[edge_vertices, 0] - LOW[0]) < step / 10
     on_border[edge_vertices] += 2 * (np.abs(vertices[edge_vertices, 1] - LOW[1]) < step / 10)
-    fixed = np.unique(cKDTree(vertices).query(feature_points())[1])
+    size = detail * edge_length(vertices)
+    fixed = _spaced(vertices, cKDTree(vertices).query(feature_points())[1], 0.75 * size)
     corners = np.flatnonzero(on_border == 3)
-    coarse, triangles = coarsen(
-        vertices, faces, detail * edge_length(vertices), fixed=np.union1d(fixed, corners), border=on_border
-    )
+    coarse, triangles = coarsen(vertices, faces, size, fixed=np.union1d(fixed, corners), border=on_border)
     coarse[np.abs(coarse[:, 0]) < step / 10, 0] = 0
-    coarse, triangles = clean(coarse, triangles)
+    coarse, triangles = clean(coarse, triangles, merge=SHORTEST_EDGE, flip=True)
     whole, triangles, mirror = mirrored(coarse, triangles)
     return close_mouth(whole), triangles, mirror
+
+
+def _spaced(vertices: FloatArray, candidates: IntArray, spacing: FloatArray) -> IntArray:
+    """Those of the candidates, taken in order, that keep their ``spacing`` (V,) from all taken before."""
+    taken: list[int] = []
+    for vertex in candidates:
+        if not taken or np.linalg.norm(vertices[taken] - vertices[vertex], axis=1).min() > spacing[vertex]:
+            taken.append(int(vertex))
+    return np.array(taken)
 
 
 def main(settings: Settings) -> None:
