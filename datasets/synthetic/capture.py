@@ -21,9 +21,10 @@ from ...bench.errors import InputError
 from ...bench.files import write_json, write_text
 from ..image_files import probe_image
 from .geometry import load_geometry
+from .performance import share_out
 from .photographer import Photographer
 from .rig import SERIALS
-from .scene import sample_count
+from .scene import default_samples, sample_count
 from .take import Settings, Take, plan_take
 
 MANIFEST = "synthesis.json"
@@ -47,7 +48,7 @@ def synthesize(
     head: str = "procedural",
     seed: int = 0,
     tracking_noise: float = 0.0,
-    samples_per_pixel: int = 25,
+    samples_per_pixel: int | None = None,
     workers: int | None = None,
     progress: Progress = no_progress,
 ) -> list[Path]:
@@ -62,7 +63,8 @@ def synthesize(
     head : see `geometry.load_geometry`.
     tracking_noise : standard deviation of the error of each stored parameter, as a fraction of that
         parameter's own standard deviation over the subject's timesteps. Images show the exact poses.
-    samples_per_pixel : rounded up to a count that the sampler takes.
+    samples_per_pixel : rounded up to a count that the sampler takes; by default enough for 40 dB between two
+        renders of a frame.
     workers : processes that render; by default as many as there are cores, or one where there is little to do.
 
     Raises
@@ -70,9 +72,8 @@ def synthesize(
     InputError
         Before rendering, for settings out of range or a folder that holds a capture of other settings.
     """
-    settings = Settings(
-        subjects, cameras, timesteps, size, head, seed, tracking_noise, sample_count(samples_per_pixel)
-    )
+    samples = default_samples(*size) if samples_per_pixel is None else sample_count(samples_per_pixel)
+    settings = Settings(subjects, cameras, timesteps, tuple(size), head, seed, tracking_noise, samples)
     _check(settings)
     geometry = load_geometry(head)
     out = Path(out)
@@ -152,6 +153,7 @@ def _check(settings: Settings) -> None:
         raise InputError(
             "--cameras", "", f"2 to {len(SERIALS)}, as the frontal one is held out", str(settings.cameras)
         )
+    share_out(settings.timesteps)
     if min(settings.size) < 16:
         raise InputError("--size", "", "at least 16 pixels each way", "x".join(map(str, settings.size)))
     if not (np.isfinite(settings.tracking_noise) and settings.tracking_noise >= 0.0):

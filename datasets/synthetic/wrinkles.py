@@ -102,15 +102,20 @@ def flush_strengths(a: Activations) -> FloatArray:
     return np.clip([strengths[name] for name in _FLUSHES], 0.0, 1.2)
 
 
-def make_folds(person: Person, anatomy: Anatomy, points: FloatArray, lips: FloatArray) -> Folds:
-    """Lay the folds out on the neutral fine skin, (N, 3) points with (N,) lip shares."""
+def make_folds(
+    person: Person, anatomy: Anatomy, points: FloatArray, lips: FloatArray, bare: FloatArray
+) -> Folds:
+    """Lay the folds out on the neutral fine skin, (N, 3) points.
+
+    ``lips`` (N,) is the share of the lips' red; ``bare`` (N,) is 0 where hair hides the skin.
+    """
     sketch = _Sketch(person, anatomy, points)
     groups = sketch.groups()
     height = np.stack([groups[name][0] for name in _FOLDS]) * person.lines
     shade = np.stack([groups[name][1] for name in _FOLDS]) * np.minimum(person.lines, 1.15)
-    keep = 1.0 - 0.9 * lips
+    keep = (1.0 - 0.9 * lips) * bare
     keep_lip_lines = np.where(np.array([name == "lip_lines" for name in _FOLDS])[:, None], 1.0, keep)
-    flush = np.stack([sketch.flush(name, lips) for name in _FLUSHES])
+    flush = np.stack([sketch.flush(name, lips) for name in _FLUSHES]) * bare
     tint = np.array(list(_FLUSHES.values()))
     return Folds(height * keep_lip_lines, shade * keep_lip_lines, flush, tint)
 

@@ -7,6 +7,7 @@ import pytest
 from headbench.datasets.synthetic.controls import CONTROLS
 from headbench.datasets.synthetic.geometry import load_geometry
 from headbench.datasets.synthetic.likeness import Likeness
+from headbench.datasets.synthetic.scene import default_samples
 from headbench.datasets.synthetic.take import Settings, plan_take
 
 
@@ -17,7 +18,7 @@ def geometry():
 
 @pytest.fixture(scope="session")
 def take(geometry, tmp_path_factory):
-    settings = Settings(1, 3, 8, (48, 70), "procedural", 0, 0.0, 25)
+    settings = Settings(1, 3, 8, (48, 70), "procedural", 0, 0.0, default_samples(48, 70))
     return plan_take(Path(tmp_path_factory.mktemp("take")), 0, geometry, settings)
 
 

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+
 from headbench.bench.errors import InputError
 from headbench.datasets.synthetic.controls import CONTROLS
 from headbench.datasets.synthetic.performance import HELD_OUT, SEQUENCES, perform, share_out

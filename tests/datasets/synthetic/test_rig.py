@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+
 from headbench.bench.errors import InputError
 from headbench.datasets.synthetic.rig import FRONTAL, SERIALS, cameras
 

@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+from scipy.spatial import ConvexHull
+from skimage.draw import polygon2mask
+
 from headbench.bench.contracts import Camera
 from headbench.bench.errors import InputError
 from headbench.datasets.synthetic.rig import lights
 from headbench.datasets.synthetic.scene import Studio, develop, sample_count
-from scipy.spatial import ConvexHull
-from skimage.draw import polygon2mask
 
 
 def ball(center, radius, steps=24):
@@ -15,10 +16,17 @@ def ball(center, radius, steps=24):
     theta, phi = np.meshgrid(
         np.linspace(0.1, np.pi - 0.1, steps), np.linspace(0, 2 * np.pi, steps, endpoint=False), indexing="ij"
     )
-    unit = np.stack([np.sin(theta) * np.cos(phi), np.cos(theta), np.sin(theta) * np.sin(phi)], -1).reshape(-1, 3)
+    unit = np.stack([np.sin(theta) * np.cos(phi), np.cos(theta), np.sin(theta) * np.sin(phi)], -1).reshape(
+        -1, 3
+    )
     hull = ConvexHull(unit)
     faces = hull.simplices.copy()
-    inward = np.einsum("ni,ni->n", np.cross(*(unit[faces[:, k]] - unit[faces[:, 0]] for k in (1, 2))), unit[faces[:, 0]]) < 0
+    inward = (
+        np.einsum(
+            "ni,ni->n", np.cross(*(unit[faces[:, k]] - unit[faces[:, 0]] for k in (1, 2))), unit[faces[:, 0]]
+        )
+        < 0
+    )
     faces[inward] = faces[inward][:, ::-1]
     return center + radius * unit, faces
 
@@ -26,9 +34,9 @@ def ball(center, radius, steps=24):
 @pytest.mark.parametrize("principal", [(40.0, 30.0), (47.5, 22.0), (33.0, 37.5)])
 def test_silhouette_lies_where_the_pinhole_camera_puts_it(principal):
     angle = 0.4
-    rotation = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]) @ np.diag(
-        [1.0, -1.0, -1.0]
-    )
+    rotation = np.array(
+        [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+    ) @ np.diag([1.0, -1.0, -1.0])
     world_to_camera = np.eye(4)
     world_to_camera[:3, :3], world_to_camera[:3, 3] = rotation, [0.02, -0.01, 1.1]
     K = np.array([[200.0, 0, principal[0]], [0, 200.0, principal[1]], [0, 0, 1]])
@@ -49,7 +57,9 @@ def test_silhouette_lies_where_the_pinhole_camera_puts_it(principal):
     assert overlap > 0.97
     rows, columns = np.mgrid[:60, :80] + 0.5
     for axis in (rows, columns):
-        assert (alpha * axis).sum() / alpha.sum() == pytest.approx((expected * axis).sum() / expected.sum(), abs=0.1)
+        assert (alpha * axis).sum() / alpha.sum() == pytest.approx(
+            (expected * axis).sum() / expected.sum(), abs=0.1
+        )
 
 
 def test_moved_mesh_is_rendered_where_it_went():

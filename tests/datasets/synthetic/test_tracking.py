@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+
 from headbench.bench.contracts import HeadPose
 from headbench.datasets.synthetic.tracking import with_tracking_noise
 
@@ -8,7 +9,13 @@ from headbench.datasets.synthetic.tracking import with_tracking_noise
 def poses():
     rng = np.random.default_rng(0)
     return [
-        HeadPose("m", rng.normal(0, [1.0, 4.0, 0.0], 3), *rng.normal(0, 0.1, (3, 3)), rng.normal(0, 1, 6), np.zeros(3))
+        HeadPose(
+            "m",
+            rng.normal(0, [1.0, 4.0, 0.0], 3),
+            *rng.normal(0, 0.1, (3, 3)),
+            rng.normal(0, 1, 6),
+            np.zeros(3),
+        )
         for _ in range(4000)
     ]
 

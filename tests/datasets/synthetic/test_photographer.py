@@ -1,0 +1,107 @@
+"""Pictures: noise, mattes, and a face that a detector finds."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from skimage.data import lbp_frontal_face_cascade_filename
+from skimage.draw import polygon2mask
+from skimage.feature import Cascade
+
+from headbench.datasets.synthetic.photographer import Photographer
+from headbench.datasets.synthetic.rig import FRONTAL
+from headbench.datasets.synthetic.take import Settings, plan_take
+
+
+@pytest.fixture(scope="module")
+def photographer(take):
+    return Photographer(take)
+
+
+def psnr(a, b):
+    return -10 * np.log10(np.mean((a / 255.0 - b / 255.0) ** 2))
+
+
+def test_two_seeds_agree_to_40_db_and_one_seed_exactly(photographer):
+    photographer.pose("FREE", 1)
+    first, matte = photographer.picture(FRONTAL, 1)
+    again, _ = photographer.picture(FRONTAL, 1)
+    other, other_matte = photographer.picture(FRONTAL, 2)
+    np.testing.assert_array_equal(first, again)
+    assert 40 < psnr(first, other) < 70
+    assert psnr(matte, other_matte) > 38
+
+
+def test_matte_is_clean(photographer):
+    photographer.pose("FREE", 0)
+    picture, matte = photographer.picture(FRONTAL, 3)
+    assert (picture[matte == 0] == 255).all()
+    assert matte[:2].max() == 0  # room above the hair
+    assert (matte == 255).mean() > 0.25
+    assert ((matte > 0) & (matte < 255)).mean() < 0.15
+    assert picture[matte == 255].max(1).mean() < 235
+
+
+def test_tracked_skin_projects_into_the_matte(take, likeness, photographer):
+    """The face's tracked triangles, projected here by hand, are covered; below the hair they fill the matte."""
+    photographer.pose("FREE", 1)
+    camera = take.cameras[FRONTAL]
+    _, matte = photographer.picture(FRONTAL, 1)
+    tracked = likeness.tracked(take.poses["FREE"][1])
+    seen = tracked @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    pixels = seen @ camera.K.T
+    pixels = pixels[:, :2] / pixels[:, 2:]
+    scale = 4
+    covered = np.zeros((camera.height * scale, camera.width * scale), bool)
+    for triangle in pixels[likeness.anatomy.skin_faces]:
+        low = np.floor(triangle.min(0) * scale).astype(int).clip(0)
+        high = np.ceil(triangle.max(0) * scale).astype(int) + 1
+        if (low >= [camera.width * scale, camera.height * scale]).any():
+            continue
+        local = triangle[:, ::-1] * scale - low[::-1] - 0.5
+        patch = covered[low[1] : high[1], low[0] : high[0]]
+        patch |= polygon2mask((high - low)[::-1], local)[: patch.shape[0], : patch.shape[1]]
+    expected = covered.reshape(camera.height, scale, camera.width, scale).mean((1, 3))
+    chin = int(pixels[take.geometry.head.landmarks["chin"], 1])
+    alpha = matte[: chin + 4] / 255.0
+    assert np.maximum(expected[: chin + 4] - alpha, 0).sum() < 0.02 * expected[: chin + 4].sum()
+    below = slice(chin + 1, chin + 4)
+    overlap = (
+        np.minimum(expected[below], matte[below] / 255).sum()
+        / np.maximum(expected[below], matte[below] / 255).sum()
+    )
+    assert overlap > 0.9 if take.person.style != "bob" else overlap > 0.5
+
+
+def test_expression_is_seen_in_the_picture(photographer, take):
+    likeness = photographer._likeness
+    rest = dict.fromkeys(take.performed["FREE"].activations[0], 0.0)
+    pose = take.geometry.translation.pose(rest, "900", 0)
+    raised = {**rest, "brow_inner_up": 1.0, "brow_outer_up_left": 1.0, "brow_outer_up_right": 1.0}
+    pictures = []
+    for activations in (rest, raised):
+        for name, surface in likeness.surfaces(pose, activations).items():
+            photographer._studio.move(name, surface.vertices, surface.albedo)
+        pictures.append(photographer.picture(FRONTAL, 1)[0].astype(int))
+    assert (np.abs(pictures[0] - pictures[1]).max(2) >= 6).sum() >= 10
+
+
+@pytest.mark.slow
+def test_a_detector_finds_the_face(geometry):
+    """scikit-image's LBP cascade, trained on photographs, finds the one face in at least 95 % of frames."""
+    detector = Cascade(lbp_frontal_face_cascade_filename())
+    found, total = 0, 0
+    for index in range(2):
+        settings = Settings(2, 2, 8, (275, 401), "procedural", 0, 0.0, 25)
+        take = plan_take(Path("unused"), index, geometry, settings)
+        photographer = Photographer(take)
+        for sequence, timestep in take.moments():
+            photographer.pose(sequence, timestep)
+            picture, _ = photographer.picture(FRONTAL, 1)
+            boxes = detector.detect_multi_scale(
+                img=picture, scale_factor=1.2, step_ratio=1, min_size=(90, 90), max_size=(260, 260)
+            )
+            middles = [(box["c"] + box["width"] / 2, box["r"] + box["height"] / 2) for box in boxes]
+            found += bool(middles) and all(abs(x - 137) < 40 and 110 < y < 270 for x, y in middles)
+            total += 1
+    assert found >= 0.95 * total
