@@ -166,6 +166,39 @@ def test_needles_keep_their_determinant(kernel):
 
 
 @kernels
+def test_quaternion_gradients_at_any_length(kernel):
+    # Splat by splat: the shorter a quaternion the larger its gradient, and one norm over all would see only those. The
+    # lengths below 1e-12 are the ones that are not divided by themselves.
+    lengths = [1.0, 1e20, 1e-6, 1e-11, 3e-13, 1e-14, 0.0]
+    quats = torch.tensor([0.5, -0.3, 0.7, 0.4]) * torch.tensor(lengths)[:, None]
+    count = len(lengths)
+    scene = cloud(count, 30, 30, seed=22)._replace(
+        means=torch.tensor([0.0, 0.0, 2.0])
+        + 0.2 * torch.randn(count, 3, generator=torch.Generator().manual_seed(0)),
+        scales=torch.tensor([0.2, 0.05, 0.1]).repeat(count, 1),
+        quats=quats,
+        opacities=torch.full((count,), 0.4),
+        viewmat=torch.eye(4),
+    )
+    truth = render_with_gradients(scene, torch.float64, backend="reference").gradients["quats"]
+    result = render_with_gradients(scene, torch.float32, backend=kernel).gradients["quats"]
+    assert (truth[:-1].norm(dim=1) > 0).all(), "only at zero itself the gradient vanishes"
+    for length, row, true_row in zip(lengths, result, truth, strict=True):
+        assert relative_error(row, true_row) < 2e-3, length
+
+
+@kernels
+def test_equal_depths_keep_the_order_of_indices(kernel):
+    scene = cloud(100, 24, 24, seed=23, size=0.3, opacity=-1.0)
+    means = scene.means.clone()
+    means[:, 2] = 2.0
+    scene = scene._replace(means=means, viewmat=torch.eye(4))
+    truth = render_dense(scene)
+    result = rasterize(*scene[:9], background=scene.background, backend=kernel)
+    assert (result.image - truth.image).abs()[truth.safe].max() < 2e-5
+
+
+@kernels
 def test_any_number_of_threads_gives_the_same_bits(kernel):
     scene = head_shell(4000, 90, 70)
     outcomes = [render_with_gradients(scene, torch.float32, backend=kernel, threads=n) for n in (1, 2, 3, 4)]
