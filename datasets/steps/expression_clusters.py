@@ -27,7 +27,8 @@ EXACT_LIMIT = 2000
 SIMILARITY_FLOOR = 1e-6
 
 _MESH_BATCH = 64
-_PAIR_BLOCK = 128
+_COLUMN_BLOCK = 16
+_ITEM_BLOCK = 128
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,22 +98,23 @@ def expression_displacements(clip: Clip, timesteps: Sequence[int]) -> FloatArray
 def mean_vertex_distances(one: FloatArray, other: FloatArray | None = None) -> FloatArray:
     """(N, M) mean over vertices of the Euclidean distance between (N, F, 3) and (M, F, 3) meshes, metres.
 
-    Without ``other``: among ``one``, each pair once. Works in blocks: besides the result and the inputs it
-    holds `_PAIR_BLOCK` squared distances per vertex.
+    Without ``other``: among ``one``, each pair once. Besides the result and the inputs it holds the squared
+    distances of `_COLUMN_BLOCK` meshes to one, few enough to stay in the processor's cache.
     """
-    # cdist compares point sets, so the vertex is the batch axis.
-    rows = _tensor(one).transpose(0, 1).contiguous()
-    columns = rows if other is None else _tensor(other).transpose(0, 1).contiguous()
+    rows = _components(one)
+    columns = rows if other is None else _components(other)
     result = np.zeros((rows.shape[1], columns.shape[1]), dtype=np.float32)
-    for i in range(0, rows.shape[1], _PAIR_BLOCK):
-        for j in range(i if other is None else 0, columns.shape[1], _PAIR_BLOCK):
-            block = torch.cdist(
-                rows[:, i : i + _PAIR_BLOCK],
-                columns[:, j : j + _PAIR_BLOCK],
-                # The product form loses the small distances between neighbouring frames to cancellation.
-                compute_mode="donot_use_mm_for_euclid_dist",
-            )
-            result[i : i + _PAIR_BLOCK, j : j + _PAIR_BLOCK] = block.mean(dim=0).numpy()
+    for start in range(0, columns.shape[1], _COLUMN_BLOCK):
+        block = columns[:, start : start + _COLUMN_BLOCK]
+        squared, part = np.empty_like(block[0]), np.empty_like(block[0])
+        last = rows.shape[1] if other is not None else min(start + _COLUMN_BLOCK, rows.shape[1])
+        for row in range(last):
+            # Differences first: the product form |a|^2 - 2ab + |b|^2 loses what sets neighbouring frames apart.
+            np.square(np.subtract(block[0], rows[0, row], out=squared), out=squared)
+            for axis in (1, 2):
+                np.square(np.subtract(block[axis], rows[axis, row], out=part), out=part)
+                squared += part
+            result[row, start : start + _COLUMN_BLOCK] = np.sqrt(squared, out=squared).mean(axis=1)
     if other is None:
         upper = np.triu(result, 1)
         result = upper + upper.T
@@ -172,10 +174,15 @@ def _face_vertices(head: HeadAsset) -> tuple[IntArray, torch.Tensor]:
 def _nearest(items: FloatArray, landmarks: FloatArray) -> IntArray:
     """(N,) index of the landmark nearest to each item, a block of items at a time."""
     parts = [
-        mean_vertex_distances(items[start : start + _PAIR_BLOCK], landmarks).argmin(axis=1)
-        for start in range(0, len(items), _PAIR_BLOCK)
+        mean_vertex_distances(items[start : start + _ITEM_BLOCK], landmarks).argmin(axis=1)
+        for start in range(0, len(items), _ITEM_BLOCK)
     ]
     return np.concatenate(parts)
+
+
+def _components(meshes: FloatArray) -> FloatArray:
+    """(3, N, F) contiguous float32 of (N, F, 3)."""
+    return np.ascontiguousarray(np.moveaxis(meshes, 2, 0), dtype=np.float32)
 
 
 def _tensor(array: FloatArray) -> torch.Tensor:

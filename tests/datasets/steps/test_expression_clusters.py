@@ -118,7 +118,7 @@ def test_landmarks_give_the_same_classes_without_all_pairs(monkeypatch):
     assert (
         adjusted_rand_score(exact.labels, approximate.labels) == 1 == adjusted_rand_score(truth, exact.labels)
     )
-    assert max(sizes) <= max(40 * 40, module._PAIR_BLOCK * 40) < 150 * 150
+    assert max(sizes) <= max(40 * 40, module._ITEM_BLOCK * 40) < 150 * 150
 
 
 def test_held_out_poses_do_not_matter():
