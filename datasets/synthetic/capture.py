@@ -73,7 +73,7 @@ def synthesize(
         Before rendering, for settings out of range or a folder that holds a capture of other settings.
     """
     samples = default_samples(*size) if samples_per_pixel is None else sample_count(samples_per_pixel)
-    settings = Settings(subjects, cameras, timesteps, tuple(size), head, seed, tracking_noise, samples)
+    settings = Settings(subjects, cameras, timesteps, (size[0], size[1]), head, seed, tracking_noise, samples)
     _check(settings)
     geometry = load_geometry(head)
     out = Path(out)

@@ -14,6 +14,7 @@ from scipy.interpolate import PchipInterpolator
 
 from ...bench.contracts import FloatArray
 from ...bench.errors import InputError
+from .anatomy import SIDES
 from .controls import CONTROLS
 
 Face = Mapping[str, float]
@@ -25,7 +26,6 @@ TONGUE = "tongue out"
 """Why a frame is left out of a comparison: no head model of FLAME's layout has a tongue."""
 
 _TONGUE_SEEN = 0.08
-_FPS = 25.0
 _PHRASE_SECONDS = 0.9
 
 
@@ -205,16 +205,21 @@ def perform(name: str, timesteps: int, seed: int) -> Performed:
     phrases = SEQUENCES[name]
     seconds = _PHRASE_SECONDS * (len(phrases) + 1)
     time = (np.arange(timesteps) + 0.5) / timesteps * seconds
-    curves = _phrase_curves(phrases, seconds, rng)
+    middles = _PHRASE_SECONDS * np.arange(1, len(phrases) + 1) + rng.uniform(-0.08, 0.08, len(phrases))
+    for middle, phrase in zip(middles, phrases):
+        if "tongue_out" in phrase:
+            # However few the timesteps, one shows the tongue: a capture without it would test no exclusion.
+            time[np.abs(time - middle).argmin()] = middle
+    curves = _phrase_curves(phrases, middles, seconds, rng)
     values = {control: curve(time) for control, curve in curves.items()}
     values |= {control: np.zeros(timesteps) for control in CONTROLS if control not in values}
-    for side, curve in (("left", _blinks(time, seconds, rng)),):
-        values[f"blink_{side}"] = np.maximum(values[f"blink_{side}"], curve)
-        values["blink_right"] = np.maximum(values["blink_right"], curve)
+    blinks = _blinks(time, seconds, rng)
+    for side in SIDES:
+        values[f"blink_{side}"] = np.maximum(values[f"blink_{side}"], blinks)
     for control, amplitude, period in _IDLE:
         values[control] = values[control] + amplitude * _drift(time, period, rng)
     # Lids follow the eyes down.
-    for side in ("left", "right"):
+    for side in SIDES:
         values[f"blink_{side}"] = np.clip(
             values[f"blink_{side}"] + 0.35 * np.maximum(-values["gaze_up"], 0), 0, 1
         )
@@ -233,12 +238,11 @@ _IDLE = (
 
 
 def _phrase_curves(
-    phrases: Sequence[Face], seconds: float, rng: np.random.Generator
+    phrases: Sequence[Face], middles: FloatArray, seconds: float, rng: np.random.Generator
 ) -> dict[str, PchipInterpolator]:
     """Monotone cubics through rest, each phrase (held for a moment, at its own strength), and rest."""
     knots, faces = [0.0], [_REST]
-    for index, phrase in enumerate(phrases):
-        middle = _PHRASE_SECONDS * (index + 1) + rng.uniform(-0.08, 0.08)
+    for middle, phrase in zip(middles, phrases):
         strength = rng.uniform(0.85, 1.0)
         face = {control: strength * value for control, value in phrase.items()}
         knots += [middle - 0.14, middle + 0.14]
