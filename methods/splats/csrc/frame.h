@@ -1,4 +1,10 @@
 // One rendered frame: drives the stages, and keeps what the backward pass needs.
+//
+//   forward   project (splats) -> sort by depth -> find pairs (splats) -> fill tiles -> draw (tiles)
+//   backward  draw backward (tiles), a record for every pair -> gather and project backward (splats)
+//
+// What stands in parentheses is dealt out to threads. No two threads write to one place, and every sum has a fixed
+// order, so that results are equal bit for bit for any number of threads.
 #pragma once
 
 #include <cstddef>

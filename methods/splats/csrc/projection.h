@@ -178,8 +178,9 @@ inline void project(const View& view, const Splats& splats, const FrameData& fra
       frame.radii[splat] = static_cast<std::int32_t>(reach[lane]);
       const float x = field[kMeanX][lane], y = field[kMeanY][lane];
       // A tenth of a pixel covers rounding; tiles that turn out untouched are dropped when pairs are found.
-      frame.rects[splat] = {tile_of(x - half_x[lane] - 0.1f, view.tiles_x), tile_of(y - half_y[lane] - 0.1f, view.tiles_y),
-                            tile_of(x + half_x[lane] + 0.1f, view.tiles_x), tile_of(y + half_y[lane] + 0.1f, view.tiles_y)};
+      const float w = half_x[lane] + 0.1f, h = half_y[lane] + 0.1f;
+      frame.rects[splat] = {tile_of(x - w, view.tiles_x), tile_of(y - h, view.tiles_y), tile_of(x + w, view.tiles_x),
+                            tile_of(y + h, view.tiles_y)};
       float* record = frame.records + splat * frame.record_stride;
       for (int k = 0; k < kGeometry; ++k) record[k] = field[k][lane];
       for (int c = 0; c < splats.channels; ++c) record[kGeometry + c] = splats.colors[splat * splats.channels + c];
