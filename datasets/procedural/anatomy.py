@@ -12,7 +12,7 @@ from ...bench.contracts import FloatArray
 
 FLOOR = -0.19  # height of the flat cut at the base of the neck
 
-EYE_CENTER = np.array([0.0315, 0.0200, 0.0510])
+EYE_CENTER = np.array([0.0315, 0.0200, 0.0535])
 EYE_RADIUS = 0.0120
 LID_CLEARANCE = 0.0004  # between the eyeball and the inner side of the lids
 MEDIAL_CANTHUS = -0.0138  # along x from the centre of the eye
@@ -28,7 +28,7 @@ LIP_RING_HEIGHT = 0.0025  # of the rings of the lips over and under the closed s
 LIP_RING_REACH = 0.93  # where the rings end, in half widths of the mouth
 
 
-def canthal_height(x: FloatArray) -> FloatArray:
+def canthal_height(x: FloatArray | float) -> FloatArray | float:
     """Height over the centre of the eye of the line through the canthi, ``x`` from the centre of the eye."""
     return -0.0004 + 0.055 * x
 

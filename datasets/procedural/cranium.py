@@ -13,10 +13,10 @@ from .fields import capsule, ellipsoid, intersection, stroke, tube, union
 FACE_SECTIONS = np.array(
     [
         # y, front, half width, widest at, exponent
-        [0.080, 0.0690, 0.0600, 0.000, 2.10],
-        [0.060, 0.0745, 0.0625, 0.002, 2.05],
-        [0.042, 0.0755, 0.0640, 0.004, 2.00],
-        [0.020, 0.0680, 0.0655, 0.006, 2.05],
+        [0.080, 0.0650, 0.0600, 0.000, 2.10],
+        [0.060, 0.0690, 0.0625, 0.002, 2.05],
+        [0.042, 0.0705, 0.0640, 0.004, 2.00],
+        [0.020, 0.0660, 0.0655, 0.006, 2.05],
         [0.000, 0.0690, 0.0665, 0.008, 2.10],
         [-0.020, 0.0730, 0.0640, 0.006, 2.10],
         [-0.035, 0.0765, 0.0610, 0.004, 2.05],
@@ -75,7 +75,7 @@ def head_mass(points: FloatArray) -> FloatArray:
     skull = ellipsoid(points, (0, 0.052, -0.019), (0.0765, 0.083, 0.0950))
     occiput = ellipsoid(points, (0, 0.030, -0.055), (0.062, 0.062, 0.056))
     skull = union(skull, occiput, 0.03)
-    forehead = ellipsoid(points, (0, 0.062, 0.010), (0.060, 0.056, 0.0640))
+    forehead = ellipsoid(points, (0, 0.062, 0.006), (0.060, 0.056, 0.0640))
     skull = union(skull, forehead, 0.03)
     head = union(skull, face_mass(points), 0.022)
     return union(head, neck_mass(points), 0.022)

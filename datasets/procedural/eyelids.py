@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import splu
 
@@ -54,7 +55,7 @@ def lid_turn(surface: Surface, upper: FloatArray | float, lower: FloatArray | fl
     return keep_off_eyes(surface, harmonic(surface, turned, free))
 
 
-def harmonic(surface: Surface, field: FloatArray, free: FloatArray) -> FloatArray:
+def harmonic(surface: Surface, field: FloatArray, free: NDArray[np.bool_]) -> FloatArray:
     """The field with its values at ``free`` vertices made the mean of their neighbours' (uniform weights)."""
     count = len(surface.vertices)
     edges = np.concatenate([surface.faces[:, [0, 1]], surface.faces[:, [1, 2]], surface.faces[:, [2, 0]]])

@@ -32,7 +32,7 @@ from .fields import (
 
 # Clay strokes on the left half: height (metres, positive adds), centre, deviations, turn in degrees.
 PLANES: tuple[tuple[float, tuple[float, ...], tuple[float, ...], tuple[float, ...] | None], ...] = (
-    (0.0020, (0.000, 0.042, 0.077), (0.012, 0.009, 0.020), None),  # glabella
+    (0.0010, (0.000, 0.042, 0.077), (0.012, 0.009, 0.020), None),  # glabella
     (0.0022, (0.024, 0.039, 0.070), (0.013, 0.0060, 0.020), (0, 0, 6)),  # brow ridge
     (0.0022, (0.044, 0.036, 0.056), (0.009, 0.008, 0.014), (0, 0, -25)),  # outer brow
     (-0.0030, (0.066, 0.040, 0.030), (0.020, 0.018, 0.016), None),  # temple
@@ -67,7 +67,7 @@ def planes(points: FloatArray) -> FloatArray:
 def add_eyes(head: FloatArray, points: FloatArray) -> FloatArray:
     """Lids over the eyeball, crease, aperture and the cavity the eyeball sits in."""
     radius = EYE_RADIUS + LID_CLEARANCE
-    lid = ellipsoid(points, EYE_CENTER, (radius + 0.0022, radius + 0.0016, radius + 0.0016))
+    lid = ellipsoid(points, EYE_CENTER.tolist(), (radius + 0.0022, radius + 0.0016, radius + 0.0016))
     head = union(head, lid, 0.0050)
     x, y, z = (points - EYE_CENTER.astype(points.dtype)).T
     span = np.linspace(MEDIAL_CANTHUS + 0.001, LATERAL_CANTHUS + 0.003, 7)
@@ -167,7 +167,7 @@ EAR_TURN = (-14.0, -24.0, -3.0)  # leaning back, flaring out
 @within((0.045, -0.045, -0.075), (0.13, 0.065, 0.02))
 def add_ears(head: FloatArray, points: FloatArray) -> FloatArray:
     """Auricle in its own frame: x out, y up, z front (so the rim is at negative z)."""
-    turn = np.asarray(EAR_TURN)
+    turn = EAR_TURN
 
     def at(back: float, up: float, out: float) -> tuple[float, float, float]:
         offset = np.array([out, up, -back]) * 1e-3
@@ -175,7 +175,7 @@ def add_ears(head: FloatArray, points: FloatArray) -> FloatArray:
 
     plate = ellipsoid(points, at(12, 6, 0.5), (0.0038, 0.0295, 0.0165), turn)
     lobe = ellipsoid(points, at(6, -19, 1.5), (0.0032, 0.0085, 0.0070), turn)
-    ear = union(plate, lobe, 0.006)
+    ear: FloatArray = union(plate, lobe, 0.006)
     helix = tube(
         points,
         [
@@ -215,7 +215,7 @@ def add_ears(head: FloatArray, points: FloatArray) -> FloatArray:
 
 def sculpture(points: FloatArray) -> FloatArray:
     """Signed distance, about, of the whole head to ``points`` (N, 3) with x >= 0; mirror for the other half."""
-    head = head_mass(points) - planes(points)
+    head: FloatArray = head_mass(points) - planes(points)
     head = add_eyes(head, points)
     head = add_nose(head, points)
     head = add_mouth(head, points)

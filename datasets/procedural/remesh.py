@@ -19,7 +19,7 @@ def vertex_areas(vertices: FloatArray, faces: IntArray) -> FloatArray:
     """(V,) a third of the area of the triangles around each vertex, square metres."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
-    return np.bincount(faces.ravel(), np.repeat(area, 3), len(vertices))
+    return np.bincount(faces.ravel(), np.repeat(area, 3), len(vertices)).astype(float)
 
 
 def border_edges(faces: IntArray) -> IntArray:
@@ -66,7 +66,7 @@ def coarsen(
     size: FloatArray,
     *,
     fixed: IntArray,
-    border: FloatArray,
+    border: IntArray,
     iterations: int = 40,
 ) -> tuple[FloatArray, IntArray]:
     """Coarse mesh of a fine one.

@@ -74,7 +74,7 @@ def edge_length(points: FloatArray) -> FloatArray:
         (lips, 0.0021, 0.22),
         (nose, 0.0024, 0.22),
         (ear, 0.0028, 0.30),
-        (face, 0.0055, 0.20),
+        (face, 0.0056, 0.11),
     ):
         wanted = np.minimum(wanted, size + growth * np.maximum(distance, 0))
     return wanted

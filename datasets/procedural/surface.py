@@ -8,6 +8,7 @@ from importlib.resources import as_file, files
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...bench.contracts import FloatArray, IntArray
 from ...bench.errors import InputError
@@ -46,14 +47,14 @@ class Surface:
         return (np.arange(len(self.vertices)) < self.skin_count).astype(float)
 
     @cached_property
-    def in_mouth(self) -> FloatArray:
+    def in_mouth(self) -> NDArray[np.bool_]:
         """(V,) bool: on the wall of the mouth's cavity."""
         center, radii = (np.asarray(part) for part in MOUTH_CAVITY)
         inside = np.linalg.norm((self.vertices - center) / (radii + 0.0012), axis=1) < 1
         return inside & (self.skin > 0)
 
     @cached_property
-    def in_socket(self) -> FloatArray:
+    def in_socket(self) -> NDArray[np.bool_]:
         """(V,) bool: on the wall of the cavity behind a lid."""
         from_eye = np.linalg.norm(
             np.abs(self.vertices) * [1, 0, 0] + self.vertices * [0, 1, 1] - EYE_CENTER, axis=1
@@ -61,7 +62,7 @@ class Surface:
         return (from_eye < EYE_RADIUS + LID_CLEARANCE + 0.0004) & (self.skin > 0)
 
     @cached_property
-    def outside(self) -> FloatArray:
+    def outside(self) -> NDArray[np.bool_]:
         """(V,) bool: skin that is seen from outside."""
         return (self.skin > 0) & ~self.in_mouth & ~self.in_socket
 
