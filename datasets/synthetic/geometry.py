@@ -13,7 +13,7 @@ from ..head.ict import expression_names, ict_head, is_ict
 from ..procedural.model import procedural_head
 from .anatomy import Anatomy
 from .controls import EXPRESSION_CONTROLS, Translation
-from .mouth import MouthPart, teeth, tongue
+from .mouth import MouthPart, procedural_parts, tongue
 from .people import Person
 from .translations import ict_targets, named_translation, procedural_translation
 
@@ -65,7 +65,6 @@ def _procedural(version: str) -> Geometry:
     head = procedural_head(version)
 
     def mouth(person: Person, anatomy: Anatomy, shape: FloatArray) -> Sequence[MouthPart]:
-        joints = len(head.parents)
-        return (*teeth(anatomy, joints), tongue(person, anatomy, joints))
+        return procedural_parts(person, head, shape)
 
     return Geometry(head, procedural_translation(head), mouth, head.version)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...bench.contracts import FloatArray, HeadAsset, IntArray
+from ..procedural.parts import render_parts
 from .anatomy import Anatomy
 from .curves import ramp
 from .noise import value_noise
@@ -104,52 +105,22 @@ def tongue(person: Person, anatomy: Anatomy, joints: int) -> MouthPart:
     return MouthPart("tongue", inside, out, faces, _TONGUE * buds[:, None], weights, "tongue")
 
 
-def teeth(anatomy: Anatomy, joints: int) -> tuple[MouthPart, MouthPart]:
-    """Upper and lower teeth in their gums, on arches fitted behind the lips; upper ones hang on the head."""
-    s, outline = anatomy.scale, anatomy.lip_outline
-    wide = min(0.5 * float(np.ptp(outline[:, 0])), 0.028 * s) - 0.002 * s
-    contact = anatomy["left_mouth_corner"][1] * 0.5 + anatomy["right_mouth_corner"][1] * 0.5
-    front = outline[:, 2].max() - 0.0115 * s
+def procedural_parts(person: Person, head: HeadAsset, shape: FloatArray) -> tuple[MouthPart, ...]:
+    """Teeth, gums and tongue that come with the procedural head, for a subject's identity (S,)."""
+    colors = {"teeth": _TEETH, "gums": _GUMS, "tongue": _TONGUE}
     made = []
-    for name, sign, joint, back in (
-        ("teeth_upper", 1.0, _NECK_JOINT, 0.0),
-        ("teeth_lower", -1.0, _JAW_JOINT, 0.0024),
-    ):
+    for part, out in zip(render_parts(head, shape), render_parts(head, shape, tongue_out=1.0)):
+        mottled = 1.0 + 0.08 * value_noise(part.vertices / 0.0014, person.seed + 95)
+        albedo = colors[part.material] * mottled[:, None]
         made.append(
-            _arch(name, sign, joint, wide - back * s, contact - 0.0004 * s, front - back * s, s, joints)
+            MouthPart(
+                part.name,
+                part.vertices,
+                out.vertices,
+                part.faces,
+                albedo,
+                part.skinning_weights,
+                part.material,
+            )
         )
-    return made[0], made[1]
-
-
-def _arch(
-    name: str, sign: float, joint: int, wide: float, edge: float, front: float, s: float, joints: int
-) -> MouthPart:
-    """A sheet bent along a dental arch: crowns from the biting edge, gums above them (``sign`` +1 is up)."""
-    count, columns, rows = 14, 12, 22
-    u = np.linspace(-1.0, 1.0, count * columns + 1)
-    v = np.linspace(0.0, 1.0, rows)
-    vv, uu = (grid.ravel() for grid in np.meshgrid(v, u, indexing="ij"))
-    # Front teeth are wider on screen than molars: equal steps of angle on an ellipse of arch 52 by 46 mm.
-    angle = 0.5 * np.pi * uu * 0.96
-    tooth = np.abs(np.mod((uu + 1.0) * 0.5 * count, 1.0) * 2.0 - 1.0)  # 0 amid a tooth, 1 between two
-    crown = 0.0088 * (1.0 - 0.22 * np.abs(uu))  # height of the crown, metres
-    gum_line = crown * (0.86 + 0.14 * (1.0 - tooth**2))
-    height = 0.0175 * vv
-    on_gum = ramp(height - gum_line, -0.0002, 0.0004)
-    bulge = (1.0 - on_gum) * (
-        0.0011 * (1.0 - tooth**4) - 0.0009 * ramp(height, 0.0018, 0.0)
-    ) + on_gum * 0.0009
-    ragged = (1.0 - on_gum) * 0.0007 * tooth**3
-    x = (wide + bulge * s) * np.sin(angle)
-    z = front - 0.046 * s * (1.0 - np.cos(angle)) + bulge * s * np.cos(angle)
-    y = edge + sign * s * (np.maximum(height, ragged) - (0.0016 if sign > 0 else 0.0002))
-    vertices = np.stack([x, y, z], axis=1)
-    index = np.arange(len(vertices)).reshape(rows, len(u))
-    a, b, c, d = (index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:])
-    faces = np.concatenate([np.stack([a, b, d], -1).reshape(-1, 3), np.stack([a, d, c], -1).reshape(-1, 3)])
-    gap = 1.0 - 0.75 * ramp(tooth, 0.86, 1.0)
-    color = _TEETH * (gap * (0.85 + 0.15 * ramp(height, 0.008, 0.002)))[:, None]
-    color = color + on_gum[:, None] * (_GUMS - color)
-    weights = np.zeros((len(vertices), joints))
-    weights[:, joint] = 1.0
-    return MouthPart(name, vertices, vertices, faces if sign > 0 else faces[:, ::-1], color, weights, "teeth")
+    return tuple(made)

@@ -34,7 +34,7 @@ class Material:
 
 
 MATERIALS: Mapping[str, Material] = {
-    "skin": Material(0.50, 0.40),
+    "skin": Material(0.50, 0.40, two_sided=True),  # lids and lips show their inner side too
     "lips": Material(0.35, 0.45),
     "eye": Material(0.14, 0.6),
     "hair": Material(0.38, 0.35, two_sided=True),

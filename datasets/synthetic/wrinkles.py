@@ -239,7 +239,7 @@ class _Sketch:
         )
         height, shade = self._lines([line], 0.0020, 0.0021, bulge=0.5)
         cheek = blob(self.points, a[f"{side}_cheek"], 0.014 * s)
-        return height + 0.0012 * s * cheek, shade
+        return height + 0.0012 * s * cheek, 0.7 * shade
 
     def _bunny(self) -> tuple[FloatArray, FloatArray]:
         a, s = self.anatomy, self.s
@@ -272,7 +272,7 @@ class _Sketch:
         a, s = self.anatomy, self.s
         corner = a[f"{side}_mouth_corner"]
         line = corner + np.linspace(-1.0, 1.0, 9)[:, None] * np.array([0.0, 0.007, 0.0]) * s
-        return self._lines([line + np.array([sign * 0.0045, 0.001, 0.0]) * s], 0.0013, 0.0016)
+        return self._lines([line + np.array([sign * 0.0045, 0.001, 0.0]) * s], 0.0010, 0.0016)
 
     def _lip_lines(self) -> tuple[FloatArray, FloatArray]:
         a, s = self.anatomy, self.s

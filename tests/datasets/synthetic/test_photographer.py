@@ -103,7 +103,7 @@ def test_a_detector_finds_the_face(geometry):
             photographer.pose(sequence, timestep)
             picture, _ = photographer.picture(FRONTAL, 1)
             boxes = detector.detect_multi_scale(
-                img=picture, scale_factor=1.2, step_ratio=1, min_size=(90, 90), max_size=(260, 260)
+                img=picture, scale_factor=1.2, step_ratio=1, min_size=(120, 120), max_size=(260, 260)
             )
             middles = [(box["c"] + box["width"] / 2, box["r"] + box["height"] / 2) for box in boxes]
             found += bool(middles) and all(abs(x - 137) < 40 and 110 < y < 270 for x, y in middles)
