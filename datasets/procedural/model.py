@@ -103,5 +103,5 @@ def version_shapes(surface: Surface, version: str) -> dict[str, FloatArray]:
 
 def _expression_basis(shapes: dict[str, FloatArray], version: str) -> ExpressionBasis:
     kept = {name: field for name, field in shapes.items() if version != "procedural2020" or name not in LIDS}
-    deviation = np.array([0.45 if name in LIDS else 0.35 for name in kept])
+    deviation = np.array([0.30 if name in LIDS else 0.35 for name in kept])
     return principal_basis(kept, deviation, _SEEDS[version])
