@@ -52,6 +52,10 @@ class _SamplePlane(torch.autograd.Function):
         return by_plane, by_coordinates, None
 
 
+FREQUENCIES = (1.0, 2.0, 4.0, 8.0)
+ENCODING_SIZE = 3 + 2 * 3 * len(FREQUENCIES)
+
+
 def sample_plane(plane: Tensor, coordinates: Tensor, resolution: int) -> Tensor:
     """Features (N, C) of a (R * R, C) plane at (N, 2) coordinates in [-1, 1], width first; clamped outside."""
     return _SamplePlane.apply(plane, coordinates, resolution)  # type: ignore[no-untyped-call]
@@ -67,8 +71,7 @@ def sample_triplane(planes: dict[str, Tensor], points: Tensor, resolution: int) 
 
 def encode_directions(directions: Tensor) -> Tensor:
     """(N, 27) positional encoding of (N, 3) unit vectors: identity, then sin and cos at 1, 2, 4, 8 (no pi)."""
-    scaled = [directions * frequency for frequency in (1, 2, 4, 8)]
-    return torch.cat([directions, *(f(angle) for angle in scaled for f in (torch.sin, torch.cos))], dim=1)
-
-
-ENCODING_SIZE = 27
+    frequencies = directions.new_tensor(FREQUENCIES)
+    angles = frequencies[:, None] * directions[:, None, :]
+    waves = torch.stack([torch.sin(angles), torch.cos(angles)], dim=2)
+    return torch.cat([directions, waves.flatten(1)], dim=1)

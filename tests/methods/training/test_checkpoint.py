@@ -41,7 +41,7 @@ class Touches:
 
 def test_code_in_a_checkpoint_is_not_run(tmp_path):
     path, witness = tmp_path / "checkpoint.pt", tmp_path / "witness"
-    path.write_bytes(pickle.dumps(Touches(witness)))
+    path.write_bytes(pickle.dumps(Touches(witness), protocol=2))
     with pytest.raises(InputError):
         load_checkpoint(path, "run", "cpu")
     torch.save({"layout": 1, "run": "run", "state": Touches(witness)}, path)
