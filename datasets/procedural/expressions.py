@@ -51,7 +51,7 @@ class Clay:
         return weight[:, None] * np.array(millimetres) * 1e-3
 
     def compress(self, share: float, back: float) -> FloatArray:
-        """Press the lips: heights over the slit shrink by ``share``, and the red moves ``back`` millimetres."""
+        """Press the lips: heights over the slit shrink by ``share``, the red moves ``back`` millimetres."""
         x, _, z = self.surface.vertices.T
         above = self.surface.above_slit
         near = np.exp(-((above / 0.0085) ** 2)) * (1 - smoothstep(np.abs(x) / MOUTH_HALF_WIDTH, 0.7, 1.15))
@@ -235,8 +235,9 @@ def principal_basis(shapes: dict[str, FloatArray], deviation: FloatArray, seed: 
 
     Notes
     -----
-    With activations a ~ N(0, L L'), displacements are a'D. The SVD L'D = U S W' gives orthogonal directions S W',
-    in order of variance, whose coefficients are N(0, 1); activations a have the coefficients a inv(L') U.
+    With activations a ~ N(0, L L'), displacements are a'D. The SVD L'D = U S W' gives directions S W',
+    orthogonal and in order of variance, whose coefficients are N(0, 1); activations a have the coefficients
+    a inv(L') U.
     """
     stack = np.stack([field.ravel() for field in shapes.values()])
     random = np.random.default_rng(seed)

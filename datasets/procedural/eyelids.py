@@ -17,7 +17,7 @@ LID_DEPTH = 0.0009  # height over the eyeball of the middle of a lid's margin
 
 
 def margin_angles(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Angles about the x axis of the eye, from straight ahead and up, of the upper and lower margin at ``x``."""
+    """Angles about the eye's x axis, from straight ahead and up, of the upper and lower margin at ``x``."""
     angles = []
     for height in lid_curves(x):
         point = eye_front(x, height, LID_DEPTH) - EYE_CENTER

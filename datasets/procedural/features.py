@@ -1,4 +1,4 @@
-"""The features of the face: eyes, nose, lips, ears, and the clay strokes that model the planes between them."""
+"""The features of the face: eyes, nose, lips, ears, and the clay strokes that model the planes between."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def add_eyes(head: FloatArray, points: FloatArray) -> FloatArray:
     head = head + 0.0007 * _crease(points, span[:5], 0.8 * lower[:5] - 0.0062, 0.0016)
     top, bottom = lid_curves(x)
     lens = intersection(y - top, bottom - y, 0.0016)
-    # Beyond the ball, at the corners, the opening has a floor; the ball's cavity melts into it without a sliver.
+    # Beyond the ball, at the corners, the opening has a floor; the cavity melts into it without a sliver.
     floor = radius - 0.0006 - np.linalg.norm(np.stack([x * 0.80, y, z], 1), axis=1)
     opening = intersection(np.maximum(lens, -0.001 - z), floor, 0.001)
     cavity = np.linalg.norm(np.stack([x, y, z], 1), axis=1) - radius
@@ -214,7 +214,7 @@ def add_ears(head: FloatArray, points: FloatArray) -> FloatArray:
 
 
 def sculpture(points: FloatArray) -> FloatArray:
-    """Signed distance, about, of the whole head to ``points`` (N, 3) with x >= 0; mirror for the other half."""
+    """Signed distance, about, of the head to ``points`` (N, 3) with x >= 0; mirror for the other half."""
     head: FloatArray = head_mass(points) - planes(points)
     head = add_eyes(head, points)
     head = add_nose(head, points)

@@ -1,7 +1,7 @@
 """Implicit-surface vocabulary of the sculpture: primitives, smooth booleans and clay strokes.
 
-Every function works on points ``(N, 3)`` in metres and returns ``(N,)`` approximate signed distances, negative
-inside. The bounds are those of I. Quilez, "Distance functions" and "Smooth minimum".
+Every function works on points ``(N, 3)`` in metres and returns ``(N,)`` approximate signed distances,
+negative inside. The bounds are those of I. Quilez, "Distance functions" and "Smooth minimum".
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def stroke(points: FloatArray, center: Point, sigma: Point, degrees: Point | Non
 
 
 def ridge(points: FloatArray, knots: Sequence[Point], width: float, samples: int = 10) -> FloatArray:
-    """Weight in [0, 1] of a stroke along a spline: Gaussian of the distance to it, ``width`` its deviation."""
+    """Weight in [0, 1] of a stroke along a spline: Gaussian of its distance, of deviation ``width``."""
     distance = tube(points, knots, [0.0] * len(knots), samples)
     return np.exp(-0.5 * (distance / width) ** 2)
 
@@ -97,7 +97,7 @@ Feature = Callable[[FloatArray, FloatArray], FloatArray]
 
 
 def within(low: Point, high: Point) -> Callable[[Feature], Feature]:
-    """Decorate ``feature(head, points) -> head`` to touch only points in a box, which must hold all it changes."""
+    """Decorate ``feature(head, points) -> head`` to touch only a box, which must hold all it changes."""
 
     def decorate(feature: Feature) -> Feature:
         @wraps(feature)

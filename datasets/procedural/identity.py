@@ -1,4 +1,4 @@
-"""Identity directions: how people differ, as smooth fields over space, made orthogonal and ordered by variance."""
+"""Identity directions: how people differ, as smooth fields over space, orthogonal and ordered by variance."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def _lip_fullness(points: FloatArray) -> FloatArray:
 
 
 def trait_field(name: str, points: FloatArray) -> FloatArray:
-    """(N, 3) displacement, metres, by one standard deviation of a trait; each eye and its lids move as one."""
+    """(N, 3) displacement, metres, by one deviation of a trait; each eye and its lids move as one."""
     field = TRAITS[name](points)
     for ball in (EYE_CENTER, EYE_CENTER * MIRROR):
         rigid = TRAITS[name](ball[None])[0]

@@ -58,8 +58,8 @@ def semantic_to_coefficients(version: str = "2023") -> tuple[FloatArray, FloatAr
 
     Returns
     -------
-    (K, E) expression coefficients of each shape in `SEMANTIC_NAMES` at activation 1, and (K, 2) coefficients of
-    the eyelid bases, or None where the version has none. Coefficients of combinations add up.
+    (K, E) expression coefficients of each shape in `SEMANTIC_NAMES` at activation 1, and (K, 2) coefficients
+    of the eyelid bases, or None where the version has none. Coefficients of combinations add up.
     """
     name = full_version(version)
     shapes = version_shapes(load_surface(), name)

@@ -1,8 +1,8 @@
 """Coarse mesh with a prescribed local edge length: dual of a centroidal geodesic Voronoi diagram.
 
 After S. Valette and J.-M. Chassery, "Approximated centroidal Voronoi diagrams for uniform polygonal mesh
-coarsening" (2004): vertices of a fine mesh are clustered, and each triangle of the fine mesh whose corners lie
-in three clusters gives a triangle of the coarse one. Clusters grow along the surface, so the two sheets of
+coarsening" (2004): vertices of a fine mesh are clustered, and each of its triangles whose corners lie in
+three clusters gives a triangle of the coarse one. Clusters grow along the surface, so the two sheets of
 the lips or lids never merge, however close they are.
 """
 

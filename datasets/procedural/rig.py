@@ -22,7 +22,7 @@ def smoothstep(value: FloatArray, low: float | FloatArray, high: float | FloatAr
 
 
 def jaw_weight(surface: Surface) -> FloatArray:
-    """(V,) share of the jaw: the lower lip and chin wholly, fading over cheek, throat and the mouth's walls."""
+    """(V,) share of the jaw: the lower lip and chin wholly, fading over cheek, throat and mouth."""
     x, y, z = surface.vertices.T
     u = np.abs(x) / MOUTH_HALF_WIDTH
     around = np.arctan2(np.abs(x), z + 0.002)  # 0.36 at the corner of the mouth, about 1.4 at the jaw's angle

@@ -1,4 +1,4 @@
-"""Sculpt the default head anew and store it: ``python -m headbench.datasets.procedural.sculpt --out FILE``."""
+"""Sculpt the default head anew: ``python -m headbench.datasets.procedural.sculpt --out FILE``."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Settings:
 
 
 def edge_length(points: FloatArray) -> FloatArray:
-    """(N,) wanted length of the edges at each point, metres: fine where features are, smoothly coarser away."""
+    """(N,) wanted length of the edges at each point, metres: fine at features, smoothly coarser away."""
     x, y, z = points.T
     eye = points - EYE_CENTER
     top, bottom = lid_curves(eye[:, 0])
@@ -93,7 +93,7 @@ def feature_points() -> FloatArray:
 
 
 def clean(vertices: FloatArray, faces: IntArray, *, merge: float, flip: bool) -> tuple[FloatArray, IntArray]:
-    """Largest piece of the mesh, vertices nearer than ``merge`` metres made one, slivers flipped away if asked."""
+    """Largest piece of the mesh; vertices nearer than ``merge`` metres made one, slivers flipped if asked."""
     meshes = pymeshlab.MeshSet()
     meshes.add_mesh(pymeshlab.Mesh(vertices, faces))
     meshes.meshing_merge_close_vertices(threshold=pymeshlab.PureValue(merge))

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ...bench.contracts import FloatArray, IntArray
 from ...bench.errors import InputError
+from ..head.arrays import read_npz
 from .anatomy import EYE_CENTER, EYE_RADIUS, LID_CLEARANCE, MOUTH_CAVITY, slit_height
 
 MIRROR = np.array([-1.0, 1.0, 1.0])
@@ -141,11 +142,11 @@ def load_surface(path: Path | None = None) -> Surface:
     if path is None:
         with as_file(files(__package__) / "head.npz") as packaged:
             return load_surface(packaged)
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            vertices, faces, mirror = (stored[name] for name in ("vertices", "faces", "mirror"))
-    except (OSError, ValueError, KeyError) as error:
-        raise InputError(path, "", "an npz with vertices, faces and mirror", str(error)) from error
+    stored = read_npz(path)
+    missing = [name for name in ("vertices", "faces", "mirror") if name not in stored]
+    if missing:
+        raise InputError(path, missing[0], "an array of that name", f"only {', '.join(sorted(stored))}")
+    vertices, faces, mirror = (stored[name] for name in ("vertices", "faces", "mirror"))
     if vertices.ndim != 2 or vertices.shape[1] != 3 or mirror.shape != vertices.shape[:1]:
         raise InputError(path, "vertices", "(V, 3), and (V,) of mirror", f"{vertices.shape}, {mirror.shape}")
     return assemble(vertices.astype(np.float64), faces.astype(np.int64), mirror.astype(np.int64))
