@@ -95,8 +95,8 @@ def test_a_detector_finds_the_face(geometry):
     """scikit-image's LBP cascade, trained on photographs, finds the one face in at least 95 % of frames."""
     detector = Cascade(lbp_frontal_face_cascade_filename())
     found, total = 0, 0
-    for index in range(2):
-        settings = Settings(2, 2, 8, (275, 401), "procedural", 0, 0.0, 25)
+    for index in range(4):
+        settings = Settings(4, 2, 8, (275, 401), "procedural", 0, 0.0, 25)
         take = plan_take(Path("unused"), index, geometry, settings)
         photographer = Photographer(take)
         for sequence, timestep in take.moments():
