@@ -114,32 +114,34 @@ def render(job: Job, avatar: Avatar) -> None:
 
 
 def measure(job: Job, avatar: Avatar, metrics: Sequence[MetricSpec]) -> pd.DataFrame:
-    """Score the stored frames and the avatar as a whole; rows already measured are read back."""
-    fingerprint = digest(
-        RESULT_FORMAT,
-        job.fit_fingerprint,
-        sorted(p.hash for p in job.protocols.values()),
-        [(m.name, m.implementation) for m in metrics],
-    )
-    if job.cell.is_done("measure", fingerprint) and job.cell.rows.exists():
-        rows = read_rows(job.cell.rows)
-        if (rows["status"] == "ok").all():
-            return rows
-    values: list[Row] = []
-    details: dict[str, Any] = {}
+    """Score the stored frames and the avatar as a whole; what was measured already is read back."""
+    stage = job.cell.stage("measure") or {}
+    known, details = stage.get("fingerprints", {}), dict(stage.get("details", {}))
+    old = read_rows(job.cell.rows) if job.cell.rows.exists() else to_frame([])
+    fingerprints = {spec.name: _measure_fingerprint(job, spec) for spec in metrics}
+    parts: list[pd.DataFrame] = []
     for spec in metrics:
+        kept = old[old["metric"] == spec.name]
+        if known.get(spec.name) == fingerprints[spec.name] and len(kept) and (kept["status"] == "ok").all():
+            parts.append(kept)
+            continue
         metric = _instance(spec)
         if spec.per_frame:
-            for protocol in job.protocols.values():
-                values += _score(job, spec, metric, protocol)
+            rows = [row for protocol in job.protocols.values() for row in _score(job, spec, metric, protocol)]
         else:
-            row, extra = _measure_avatar(job, spec, metric, avatar)
-            values.append(row)
-            details[spec.name] = extra
-    rows = to_frame(values)
-    write_rows(job.cell.rows, rows)
-    job.cell.finish("measure", fingerprint, details=details)
-    return rows
+            row, details[spec.name] = _measure_avatar(job, spec, metric, avatar)
+            rows = [row]
+        parts.append(to_frame(rows))
+    result = pd.concat(parts, ignore_index=True)
+    write_rows(job.cell.rows, result)
+    job.cell.finish("measure", job.fit_fingerprint, fingerprints=fingerprints, details=details)
+    return result
+
+
+def _measure_fingerprint(job: Job, spec: MetricSpec) -> str:
+    """Digest of everything a metric's values depend on."""
+    protocols = sorted(protocol.hash for protocol in job.protocols.values())
+    return digest(RESULT_FORMAT, job.fit_fingerprint, protocols, spec.name, spec.implementation)
 
 
 def failed_rows(job: Job, metrics: Sequence[MetricSpec], error: Exception) -> pd.DataFrame:

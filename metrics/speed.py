@@ -80,10 +80,10 @@ def measure_speed(
 
 
 def fps(avatar: Avatar, workload: Sequence[tuple[Camera, HeadPose]]) -> Measurement:
-    """Frames per second of `Avatar.render` over ``workload``: up to 300 frames, or those of 20 s if fewer.
+    """Frames per second of `Avatar.render` over ``workload``: up to 300 frames, or those of 10 s if fewer.
 
     What counts is all that animation takes: driving signal to mesh, mesh to primitives, rasterisation, and the
     image in host memory. Details: the fields of `Speed`. Numbers of different machines do not compare.
     """
-    speed = measure_speed(avatar.render, workload, warm_up=3, limit_s=20.0)
+    speed = measure_speed(avatar.render, workload, warm_up=3, limit_s=10.0)
     return Measurement(speed.fps, asdict(speed))

@@ -124,6 +124,19 @@ def test_a_metric_that_cannot_be_had_is_missing_with_reason_and_said_before_trai
     assert "Absent will be missing" in caplog.records[0].getMessage()
 
 
+def test_what_was_missing_is_measured_once_it_is_there_and_nothing_else_again(config, toy, monkeypatch):
+    counted = []
+    original = toy.mean_error
+    monkeypatch.setattr(toy, "mean_error", lambda *pair: counted.append(1) or original(*pair))
+    both = changed(config, metrics=("toy_plugin:NOT_HERE", "toy_plugin:ERROR"))
+    runner.run(both)
+    counted.clear()
+    monkeypatch.setattr(toy, "not_here", lambda image, truth: 1.0)
+    rows = runner.run(both)
+    assert (rows["status"] == "ok").all()
+    assert len(counted) == 1  # the check before training, nothing else
+
+
 def test_a_preset_and_settings_reach_the_method(config):
     runner.run(changed(config, preset="fast", settings={"toy": {"budget": {"iterations": 3}}}))
     record = RunFolder(runner.Path(config.out)).read_manifest()
