@@ -45,9 +45,9 @@ def demo(
     Args:
         out: Folder for everything the demo makes.
         preset: How much effort: smoke takes seconds and proves nothing about quality; demo takes minutes.
-        seed: Seeds the capture and the training.
-        set: Change a setting of the run, as for `headbench run`; repeatable. `capture.size=96x136` and the like
-            change the capture.
+        seed: Seeds the training.
+        set: Change a setting of the run, as for `headbench run`; repeatable. `capture.size=96x136`,
+            `capture.subject_seed=3` and the like change the capture.
         json: Print the result as JSON.
     """
     values = parse_assignments(set)

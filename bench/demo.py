@@ -20,9 +20,10 @@ class DemoConfig:
 
     out: str = "demo-output"
     preset: str = "demo"
-    seed: int = 0
-    cameras: int = 8
-    timesteps: int = 40
+    seed: int = 0  # of the training
+    subject_seed: int = 14  # of the capture: who is recorded and what they do
+    cameras: int = 12
+    timesteps: int = 28
     size: str = "144x208"
     head: str = "procedural"
     tracking_noise: float = 0.0
@@ -37,7 +38,7 @@ class DemoConfig:
             "timesteps": min(self.timesteps, 8) if smoke else self.timesteps,
             "size": (48, 64) if smoke else parse_size(self.size),
             "head": self.head,
-            "seed": self.seed,
+            "seed": self.subject_seed,
             "tracking_noise": self.tracking_noise,
         }
 
