@@ -1,0 +1,73 @@
+"""Every method of ours that is registered keeps the contract, and none learns from what is held out."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from headbench.bench.conformance import check_method
+from headbench.bench.contracts import MethodSpec, no_progress
+from headbench.bench.files import digest_file
+from headbench.bench.registry import discover
+from headbench.bench.run_config import resolve_method
+
+from .toy_clip import toy_pose
+
+TRAINED = {
+    "budget": {"iterations": 24},
+    # Rounds at 8 and 16, resets at 10 and 20.
+    "splats": {"min_densify_every": 8, "min_reset_every": 10, "min_settle": 2, "checkpoint_every_s": 0.0},
+}
+SMALL = {"ours": {"plane_resolution": 16, "line_resolution": 8, "line_channels": 4, "hidden": 16}}
+SPECS = {
+    name: plugin.spec
+    for name, plugin in discover("methods").items()
+    if isinstance(plugin.spec, MethodSpec) and plugin.spec.native and plugin.origin.startswith("headbench ")
+}
+
+
+def resolved(name, **more):
+    """The method at its smoke preset, shorter and smaller where it trains."""
+    settings = {} if SPECS[name].trivial else TRAINED
+    return resolve_method(SPECS[name], "smoke", {**settings, **SMALL.get(name, {}), **more})
+
+
+def stored(method, clip, folder):
+    """Digests of the files of a freshly fitted avatar."""
+    avatar = method.create().fit(clip, folder, method.budget, device="cpu", seed=0, progress=no_progress)
+    return {path.name: digest_file(path) for path in avatar.files()}
+
+
+@pytest.fixture
+def altered(clip, head):
+    """The clip with other images, masks and driving signals wherever training has no business to look."""
+    rng = np.random.default_rng(1)
+    kept = set(clip.splits["train"])
+    seen = {key.timestep for key in kept}
+    return replace(
+        clip,
+        images={key: image if key in kept else 255 - image for key, image in clip.images.items()},
+        masks={key: mask if key in kept else 255 - mask for key, mask in clip.masks.items()},
+        poses={t: pose if t in seen else toy_pose(head, rng, t, "toy") for t, pose in clip.poses.items()},
+    )
+
+
+def test_our_methods_are_registered():
+    assert {"ours", "ga", "mean-image", "nearest-camera"} <= set(SPECS)
+
+
+@pytest.mark.parametrize("name", SPECS)
+def test_keeps_the_contract(name, clip, tmp_path):
+    assert check_method(resolved(name), clip, tmp_path) == []
+
+
+@pytest.mark.parametrize("name", SPECS)
+def test_nothing_held_out_reaches_the_avatar(name, clip, altered, tmp_path):
+    assert altered.fingerprint != clip.fingerprint
+    expected = stored(resolved(name), clip, tmp_path / "one")
+    assert stored(resolved(name), altered, tmp_path / "other") == expected
+
+
+def test_the_published_leak_would_be_noticed(clip, altered, tmp_path):
+    leaky = resolved("ours", jaw_compatibility="tga")
+    assert stored(leaky, clip, tmp_path / "one") != stored(leaky, altered, tmp_path / "other")
