@@ -4,7 +4,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 OUT    ?= demo-output
 
-.PHONY: help setup demo test check bench clean
+.PHONY: help setup demo test check bench readme clean
 
 help:
 	@echo "make setup   make $(VENV) with headbench in it"
@@ -37,6 +37,10 @@ check: setup
 
 bench: setup
 	$(BIN)/headbench bench splats
+
+# The README's table and picture are those of the last demo.
+readme: demo
+	$(BIN)/python -m headbench.reports.readme $(OUT) README.md
 
 clean:
 	rm -rf build $(VENV)

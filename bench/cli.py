@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -55,8 +56,12 @@ def demo(
         DemoConfig, {"preset": preset, "seed": seed, "out": out, **values.pop("capture", {})}, "--set"
     )
     with log_to(_log_file(Path(out))):
+        start = time.perf_counter()
         _synthesise(config.capture_arguments())
-        return _run(build(RunConfig, merge(demo_run_config(config), values), "--set"), json)
+        seconds = round(time.perf_counter() - start, 3)
+        return _run(
+            build(RunConfig, merge(demo_run_config(config), values), "--set"), json, capture_seconds=seconds
+        )
 
 
 def synth(
@@ -230,8 +235,8 @@ def _synthesise(arguments: dict[str, Any]) -> None:
         make(**arguments, progress=report)
 
 
-def _run(config: RunConfig, as_json: bool) -> int:
-    rows = run_comparison(config)
+def _run(config: RunConfig, as_json: bool, **record: Any) -> int:
+    rows = run_comparison(config, **record)
     failed = rows[rows["status"] == "failed"]
     if as_json:
         means = rows.groupby(["task", "method", "metric"], sort=False)["value"].mean().reset_index()

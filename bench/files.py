@@ -1,4 +1,4 @@
-"""Files written whole or not at all, and fingerprints of content."""
+"""Files written whole or not at all, JSON read with care, names fit for files, fingerprints of content."""
 
 from __future__ import annotations
 
@@ -13,6 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from .errors import InputError
+
+MAX_NAME_BYTES = 120
+"""Longest name of a subject, a sequence or a camera; a file name made of several has to fit into 255 bytes."""
 
 
 @contextmanager
@@ -45,6 +50,39 @@ def write_text(path: Path, text: str) -> None:
 def write_json(path: Path, value: Any) -> None:
     """Write a JSON file atomically, keys in the order given, numpy scalars and arrays as numbers and lists."""
     write_text(path, json.dumps(value, indent=1, default=plain) + "\n")
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON file whose top level is an object.
+
+    Raises `InputError` for a file that is missing, cannot be read, does not parse (nesting without end
+    included) or holds something else.
+    """
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise InputError(path, "", "a JSON file", "no such file") from error
+    except OSError as error:
+        raise InputError(path, "", "a readable JSON file", error.strerror or str(error)) from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(path, "", "valid JSON", f"content that does not parse ({error})") from error
+    if not isinstance(value, dict):
+        raise InputError(path, "", "a JSON object", f"a {type(value).__name__}")
+    return value
+
+
+def check_name(name: str, file: str | os.PathLike[str], key: str) -> str:
+    """Return a name if it can be one part of a path; it came from outside, and folders are named after it.
+
+    Raises `InputError` for an empty name, one that starts with a dot, one longer than `MAX_NAME_BYTES`, and one
+    with a slash, a backslash, a colon or a control character: such a name could lead out of the folder that it
+    is put in.
+    """
+    unfit = any(character in "/\\:" or not character.isprintable() for character in name)
+    if not name or name.startswith(".") or unfit or len(name.encode(errors="replace")) > MAX_NAME_BYTES:
+        expected = f"a name without slashes, colons and leading dots, of 1 to {MAX_NAME_BYTES} bytes"
+        raise InputError(file, key, expected, repr(name[:60]))
+    return name
 
 
 def plain(value: Any) -> Any:

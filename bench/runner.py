@@ -25,8 +25,8 @@ from .store import RunFolder, write_rows
 log = logging.getLogger(__name__)
 
 
-def run(config: RunConfig) -> pd.DataFrame:
-    """Run a comparison into ``config.out`` and return its rows.
+def run(config: RunConfig, **record: Any) -> pd.DataFrame:
+    """Run a comparison into ``config.out`` and return its rows; ``record`` is added to the manifest.
 
     Everything that can be checked is checked before the first long step: settings, methods, captures, the
     output folder. A method that fails is recorded as failed and the others go on. Started again with the same
@@ -45,7 +45,7 @@ def run(config: RunConfig) -> pd.DataFrame:
         job.check()
     _warn_of_missing_metrics(metrics, clips[0])
 
-    manifest = _manifest(config, methods, metrics, clips, protocols)
+    manifest = {**_manifest(config, methods, metrics, clips, protocols), **record}
     folder.write_manifest({**manifest, "status": "started"})
     for protocol in protocols.values():
         log.info("%s, protocol %s: %d frames", protocol.task, protocol.hash, len(protocol.keys))

@@ -15,7 +15,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -25,7 +24,7 @@ import pandas as pd
 
 from .contracts import FrameKey
 from .errors import InputError
-from .files import atomic_path, write_json
+from .files import atomic_path, read_json, write_json
 
 FORMAT = 1
 
@@ -79,19 +78,6 @@ def read_rows(path: Path) -> pd.DataFrame:
     if missing:
         raise InputError(path, "columns", ", ".join(COLUMNS), f"no {', '.join(missing)}")
     return frame
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object. Raises `InputError` where it is not one."""
-    try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(path, "", "a readable JSON file", error.strerror or str(error)) from error
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(path, "", "valid JSON", str(error)) from error
-    if not isinstance(value, dict):
-        raise InputError(path, "", "a JSON object", type(value).__name__)
-    return value
 
 
 @dataclass(frozen=True)

@@ -46,3 +46,10 @@ def test_make_targets_exist():
 def test_ci_runs_the_test_command_of_the_readme():
     assert "make test" in README
     assert "make test" in (ROOT / ".ci" / "run").read_text(encoding="utf-8")
+
+
+def test_the_table_is_generated_from_the_stored_rows_never_typed():
+    from headbench.reports.readme import BEGIN, END, GALLERY, block
+
+    shown = README.split(BEGIN)[1].split(END)[0].strip()
+    assert shown == block(ROOT / GALLERY).strip()

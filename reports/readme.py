@@ -1,0 +1,58 @@
+"""Puts the result of a run into the README: the table, the picture, and the rows they are views of.
+
+python -m headbench.reports.readme demo-output README.md
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from pathlib import Path
+
+import cv2
+
+from ..bench.errors import InputError
+from ..bench.files import atomic_path, write_text
+from ..bench.frames import read_png
+from ..bench.progress import duration
+from ..bench.store import RunFolder
+from .table_report import table_text
+
+BEGIN, END = "<!-- demo:begin -->", "<!-- demo:end -->"
+GALLERY = "reports/gallery"
+PICTURE = "contact_sheet.jpg"
+
+
+def publish(run_folder: Path, readme: Path) -> None:
+    """Copy manifest, rows and contact sheet of a run beside the README, and write the block made of them."""
+    source, target = RunFolder(run_folder), RunFolder(readme.parent / GALLERY)
+    for name in ("manifest", "rows"):
+        with atomic_path(getattr(target, name)) as temporary:
+            shutil.copyfile(getattr(source, name), temporary)
+    # A page's picture, not a measurement: a lossy copy a third the size.
+    sheet = cv2.cvtColor(read_png(source.contact_sheet), cv2.COLOR_RGB2BGR)
+    with atomic_path(target.root / PICTURE) as temporary:
+        cv2.imwrite(str(temporary), sheet, [cv2.IMWRITE_JPEG_QUALITY, 90])
+    text = readme.read_text(encoding="utf-8")
+    if text.count(BEGIN) != 1 or text.count(END) != 1:
+        raise InputError(readme, "", f"the marks {BEGIN} and {END} once each", "something else")
+    before, rest = text.split(BEGIN)
+    _, after = rest.split(END)
+    write_text(readme, f"{before}{BEGIN}\n{block(target.root)}\n{END}{after}")
+
+
+def block(gallery: Path) -> str:
+    """Return the README's block for the stored result in ``gallery``: Markdown."""
+    record = RunFolder(gallery).read_manifest()
+    machine, capture_s = record["machine"], record["capture_seconds"]
+    cost = (
+        f"`make demo` took {duration(capture_s + record['seconds'])}, {duration(capture_s)} of them for the capture, on "
+        f"{machine['cores']} cores ({machine['processor']}); the largest process took "
+        f"{record['peak_memory_bytes'] / 1e9:.1f} GB."
+    )
+    picture = f"![Ground truth, renders and error maps of every method]({GALLERY}/{PICTURE})"
+    return f"{picture}\n\n{table_text(gallery, 'md').strip()}\n\n{cost}"
+
+
+if __name__ == "__main__":
+    publish(Path(sys.argv[1]), Path(sys.argv[2]))
