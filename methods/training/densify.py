@@ -146,14 +146,14 @@ class Densifier:
         self._append(children, binding)
 
     def _prune(self, parents: Tensor, face_sizes: Tensor, large_too: bool) -> None:
-        faint = torch.sigmoid(self._optimiser["opacities"].detach()) < self._settings.prune_opacity
-        remove = faint
-        remove[: len(parents)] |= parents
+        replaced = torch.zeros_like(self.binding, dtype=torch.bool)
+        replaced[: len(parents)] = parents
+        unfit = torch.sigmoid(self._optimiser["opacities"].detach()) < self._settings.prune_opacity
         if large_too:
-            remove |= self._world_scale(face_sizes) > self._settings.prune_extent * self._extent
-        kept = torch.bincount(self.binding[~remove], minlength=self._face_count)
-        remove &= kept.index_select(0, self.binding) > 0
-        keep = ~remove
+            unfit |= self._world_scale(face_sizes) > self._settings.prune_extent * self._extent
+        # A parent goes in any case: its children hold the face, fit or not.
+        kept = torch.bincount(self.binding[~(replaced | unfit)], minlength=self._face_count)
+        keep = ~(replaced | unfit & (kept.index_select(0, self.binding) > 0))
         self._optimiser.select(self._names, keep)
         self.binding = self.binding[keep]
 

@@ -109,6 +109,15 @@ def test_faint_splats_go_but_never_the_last_of_a_face():
     assert densifier.binding.tolist() == [0, 1, 2, 2]
 
 
+def test_a_split_parent_goes_even_where_its_children_are_faint():
+    # Face 0 has nothing but a faint splat, which is split: the children stay in its place, not beside it.
+    densifier, optimiser, _ = make([0, 1], [0.05, 0.005], [0.001, 0.5], 2)
+    ask(densifier, [0], 2)
+    densifier.run(1, ALWAYS, torch.ones(2, dtype=torch.float64))
+    assert densifier.binding.tolist() == [1, 0, 0]
+    np.testing.assert_allclose(optimiser["log_scales"][1:].detach().exp(), 0.05 / SHRINK)
+
+
 @pytest.mark.parametrize(("iteration", "left"), [(100, 2), (101, 1)])
 def test_splats_large_in_the_world_go_once_that_is_on(iteration, left):
     densifier, _, _ = make([0, 0], [0.05, 0.02], [0.5] * 2, 1)
