@@ -15,9 +15,11 @@ from ...bench.errors import InputError
 from .fields import resample
 from .rig import JAW, NECK, PARENTS
 
-# Mesiodistal widths from the midline, millimetres (Wheeler's Dental Anatomy), incisors to first molar.
-UPPER_WIDTHS = (8.5, 6.5, 7.5, 7.0, 7.0, 10.0)
-LOWER_WIDTHS = (5.2, 5.7, 7.0, 7.0, 7.2, 11.0)
+# Mesiodistal widths from the midline, millimetres (Wheeler's Dental Anatomy), incisors to second premolar:
+# molars would stand in the wall of the mouth.
+UPPER_WIDTHS = (8.5, 6.5, 7.5, 7.0, 7.0)
+LOWER_WIDTHS = (5.2, 5.7, 7.0, 7.0, 7.2)
+ARCH_REACH = 0.029  # half width of the dental arch, metres
 COLUMNS = 7  # of vertices across a tooth
 TONGUE_SECTIONS, TONGUE_SECTORS = 18, 16
 
@@ -78,15 +80,26 @@ def render_parts(head: HeadAsset, shape: FloatArray | None = None, tongue_out: f
 
 
 def dental_arch(length: FloatArray, front: float) -> tuple[FloatArray, FloatArray]:
-    """Points (n, 3) at arc ``length`` from the midline along the arch, y = 0, and outward normals (n, 3)."""
-    x = np.linspace(-0.028, 0.028, 401)
-    z = front - 26.0 * x**2
-    along = np.concatenate([[0], np.cumsum(np.hypot(np.diff(x), np.diff(z)))])
-    along -= along[len(x) // 2]
-    px = np.interp(length, along, x)
+    """Points (n, 3) at arc ``length`` from the midline along the arch, y = 0, and outward normals (n, 3).
+
+    ``length`` is in metres and ends at ``arch_length()`` on either side.
+    """
+    x = np.linspace(-ARCH_REACH, ARCH_REACH, 401)
+    px = np.interp(length, _parabola_length(x), x)
     points = np.column_stack([px, 0 * px, front - 26.0 * px**2])
     normals = np.column_stack([52.0 * px, 0 * px, np.ones_like(px)])
     return points, normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+
+def arch_length() -> float:
+    """Length of one half of the dental arch, metres."""
+    return float(_parabola_length(np.array([ARCH_REACH]))[0])
+
+
+def _parabola_length(x: FloatArray) -> FloatArray:
+    """Signed length of z = -26 x^2 from the vertex to ``x``, in closed form."""
+    slope = 52.0 * x
+    return (slope * np.sqrt(1.0 + slope**2) + np.arcsinh(slope)) / 104.0
 
 
 def _teeth(
@@ -118,7 +131,8 @@ def _teeth(
 
 def _gums(front: float, *, near: float, far: float) -> tuple[FloatArray, IntArray]:
     """Gum from just over the necks of the teeth (``near``) to the vault or floor of the mouth (``far``)."""
-    place, normal = dental_arch(np.linspace(-0.040, 0.040, 81), front)
+    end = arch_length()
+    place, normal = dental_arch(np.linspace(-end, end, 81), front)
     rows = []
     for height, out in (
         (1.0, -0.0010),

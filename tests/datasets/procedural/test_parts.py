@@ -7,7 +7,15 @@ import pytest
 
 from headbench.bench.errors import InputError
 from headbench.datasets.procedural.anatomy import lip_arc
-from headbench.datasets.procedural.parts import dental_arch, render_parts, tongue
+from headbench.datasets.procedural.parts import (
+    ARCH_REACH,
+    LOWER_WIDTHS,
+    UPPER_WIDTHS,
+    arch_length,
+    dental_arch,
+    render_parts,
+    tongue,
+)
 
 
 @pytest.fixture(scope="module")
@@ -22,6 +30,23 @@ def test_parts_hang_rigidly_on_one_joint(parts):
         assert part.skinning_weights.sum() == len(part.vertices)
         assert part.faces.min() == 0
         assert part.faces.max() == len(part.vertices) - 1
+
+
+def test_no_vertex_is_without_a_normal(parts):
+    """Each vertex is used by triangles with an area; a renderer cannot shade it otherwise."""
+    for part in parts.values():
+        a, b, c = (part.vertices[part.faces[:, k]] for k in range(3))
+        area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+        assert area.min() > 1e-10  # square metres
+        assert set(part.faces.ravel()) == set(range(len(part.vertices)))
+
+
+@pytest.mark.parametrize("widths", [UPPER_WIDTHS, LOWER_WIDTHS])
+def test_the_row_of_teeth_fits_on_the_arch(widths):
+    x = np.linspace(0.0, ARCH_REACH, 20001)
+    measured = np.hypot(np.diff(x), np.diff(26.0 * x**2)).sum()
+    assert arch_length() == pytest.approx(measured, rel=1e-6)
+    assert sum(widths) * 1e-3 < measured
 
 
 def test_teeth_lie_behind_the_lips_at_rest(parts):
