@@ -69,6 +69,7 @@ class Studio:
     def __init__(self, lights: Sequence[Light], samples: int, threads: int = 1):
         if mitsuba.variant() != _VARIANT:
             mitsuba.set_variant(_VARIANT)
+        mitsuba.set_log_level(mitsuba.LogLevel.Error)  # it writes to the terminal, past Python's logging
         drjit.set_thread_count(threads)
         self._lights = lights
         self._samples = sample_count(samples)
