@@ -129,13 +129,21 @@ class RefinedTracking:
             *(f"{kind}_{name}" for kind in ("tracked", "refined") for name in TRACKED),
         )
         arrays = read_arrays(path, names)
-        count = len(arrays["timesteps"])
-        for name in names[2:]:
-            if arrays[name].ndim != 2 or len(arrays[name]) != count:
-                raise InputError(path, name, f"{count} rows", f"shape {arrays[name].shape}")
+        timesteps = arrays["timesteps"]
+        if timesteps.ndim != 1 or not np.issubdtype(timesteps.dtype, np.integer):
+            raise InputError(
+                path, "timesteps", "(T,) integers", f"{timesteps.dtype} of shape {timesteps.shape}"
+            )
+        for name in TRACKED:
+            shape = (len(timesteps), arrays[f"tracked_{name}"].size // max(len(timesteps), 1))
+            for key in (f"tracked_{name}", f"refined_{name}"):
+                values = arrays[key]
+                if values.shape != shape or values.dtype != np.float32 or not np.isfinite(values).all():
+                    found = f"{values.dtype} of shape {values.shape}, or non-finite numbers"
+                    raise InputError(path, key, f"finite float32 of shape {shape}", found)
         tracked = {name: arrays[f"tracked_{name}"] for name in TRACKED}
         refined = {name: arrays[f"refined_{name}"] for name in TRACKED}
-        return cls(str(arrays["subject"]), arrays["timesteps"], tracked, refined)
+        return cls(str(arrays["subject"]), timesteps, tracked, refined)
 
 
 def run_digest(method: str, version: str, config: Any, clip: Clip, budget: Budget, seed: int) -> str:

@@ -144,8 +144,9 @@ class GAAvatar:
     @classmethod
     def read(cls, folder: Path, device: str) -> GAAvatar:
         """Read an avatar from its folder. Raises `InputError` for damaged or foreign files."""
-        subject = read_subject(folder / SUBJECT_FILE)
-        mesh = SubjectMesh(read_shared_head(folder), subject.shape, subject.static_offset, device)
+        head = read_shared_head(folder)
+        subject = read_subject(folder / SUBJECT_FILE, head)
+        mesh = SubjectMesh(head, subject.shape, subject.static_offset, device)
         splats, binding = read_ga_splats(folder / PLY_FILE, len(mesh.faces), device)
         driving = folder / DRIVING_FILE
         refined = RefinedTracking.read(driving) if driving.exists() else None

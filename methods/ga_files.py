@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..bench.contracts import HeadAsset
 from ..bench.errors import InputError
 from .avatar_files import Subject, read_arrays, write_arrays
 from .ply import read_ply, write_ply
@@ -81,7 +82,18 @@ def write_subject(path: Path, subject: Subject) -> None:
     write_arrays(path, arrays)
 
 
-def read_subject(path: Path) -> Subject:
-    """Read what `write_subject` wrote."""
+def read_subject(path: Path, head: HeadAsset) -> Subject:
+    """Read what `write_subject` wrote. Raises `InputError` where it does not fit the head model."""
     arrays = read_arrays(path, ("name", "head_model", "shape", "static_offset"))
-    return Subject(str(arrays["name"]), str(arrays["head_model"]), arrays["shape"], arrays["static_offset"])
+    subject = Subject(
+        str(arrays["name"]), str(arrays["head_model"]), arrays["shape"], arrays["static_offset"]
+    )
+    if subject.head_model != head.version:
+        raise InputError(path, "head_model", repr(head.version), repr(subject.head_model))
+    expected = {"shape": head.shape_basis.shape[2:], "static_offset": head.template.shape}
+    for name, shape in expected.items():
+        values = arrays[name]
+        if values.shape != shape or values.dtype != np.float32 or not np.isfinite(values).all():
+            found = f"{values.dtype} of shape {values.shape}, or non-finite numbers"
+            raise InputError(path, name, f"finite float32 of shape {shape}", found)
+    return subject

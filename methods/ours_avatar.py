@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -81,9 +82,14 @@ def read_field(path: Path, face_count: int, expression_size: int, device: str) -
 
 
 def _check_shapes(path: Path, tensors: Mapping[str, Tensor], face_count: int, expression_size: int) -> None:
+    """Raise `InputError` at the first tensor that does not fit the others, so that no rendering can."""
+
     def require(name: str, fits: bool, expected: str) -> None:
         if not fits:
             raise InputError(path, name, expected, f"shape {tuple(tensors[name].shape)}")
+
+    def exactly(name: str, *shape: int) -> None:
+        require(name, tensors[name].shape == shape, f"shape {shape}")
 
     splats = tensors["splats"]
     width = sum(SPLAT_WIDTHS.values())
@@ -92,25 +98,35 @@ def _check_shapes(path: Path, tensors: Mapping[str, Tensor], face_count: int, ex
     if len(binding) and not (0 <= float(binding.min()) and float(binding.max()) < face_count):
         found = f"{float(binding.min()):g} to {float(binding.max()):g}"
         raise InputError(path, "splats, triangle", f"0 to {face_count - 1}", found)
-    channels = 0
-    for name in (f"plane_{pair}" for pair, _, _ in PAIRS):
+    for name in ("plane_box", "line_box"):
+        exactly(name, 2, 3)
+        if not (tensors[name][0] < tensors[name][1]).all():
+            raise InputError(path, name, "a low corner below the high one", str(tensors[name].tolist()))
+
+    planes = [f"plane_{pair}" for pair, _, _ in PAIRS]
+    for name in planes:
         plane = tensors[name]
         square = plane.ndim == 2 and round(len(plane) ** 0.5) ** 2 == len(plane) >= 4
-        require(name, square, "(R * R, C)")
-        channels += plane.shape[1]
-    for name in ("plane_box", "line_box"):
-        require(name, tensors[name].shape == (2, 3), "(2, 3)")
-    first, last = tensors["color_weight_0"], tensors["color_weight_1"]
-    require("color_weight_0", first.ndim == 2 and first.shape[1] == channels + ENCODING_SIZE, "(H, C + 27)")
-    require("color_weight_1", last.shape == (3, len(first)), f"(3, {len(first)})")
-    require("jaw_bases", tensors["jaw_bases"].ndim == 2 and tensors["jaw_bases"].shape[1] == 4, "(J, 4)")
-    if "lines" in tensors:
-        lines, jaws = tensors["lines"], len(tensors["jaw_bases"])
-        fits = lines.ndim == 4 and lines.shape[1] == 3 and jaws <= len(lines) <= jaws + expression_size
-        require("lines", fits, f"(E + {jaws}, 3, L, C), E at most {expression_size}")
-        inputs = 6 * lines.shape[3]
-        direction = tensors["line_direction_0"]
-        require("line_direction_0", direction.ndim == 2 and direction.shape[1] == inputs, f"(H, {inputs})")
+        require(name, square and len(plane) == len(tensors[planes[0]]), "(R * R, C), R of all planes equal")
+    inputs = sum(tensors[name].shape[1] for name in planes) + ENCODING_SIZE
+    first = tensors["color_weight_0"]
+    require("color_weight_0", first.ndim == 2 and first.shape[1] == inputs, f"(H, {inputs})")
+    exactly("color_weight_1", 3, len(first))
+
+    bases = tensors["jaw_bases"]
+    require("jaw_bases", bases.ndim == 2 and bases.shape[1] == 4, "(J, 4)")
+    if "lines" not in tensors:
+        return
+    lines, jaws = tensors["lines"], len(bases)
+    fits = lines.ndim == 4 and lines.shape[1] == 3 and jaws <= len(lines) <= jaws + expression_size
+    require(
+        "lines", fits and lines.shape[2] >= 2, f"(E + {jaws}, 3, L, C), E at most {expression_size}, L > 1"
+    )
+    sizes = [6 * lines.shape[3], *(len(tensors[f"line_bias_{layer}"]) for layer in (0, 1)), 1]
+    for layer, (fan_in, fan_out) in enumerate(pairwise(sizes)):
+        exactly(f"line_direction_{layer}", fan_out, fan_in)
+        exactly(f"line_gain_{layer}", fan_out, 1)
+        exactly(f"line_bias_{layer}", fan_out)
 
 
 class OursAvatar:
@@ -128,9 +144,8 @@ class OursAvatar:
         self._binding = columns["binding"][:, 0].to(torch.int64)
         self._canonical = CanonicalFrames.of(mesh.frames(mesh.canonical))
         positions = self._canonical.positions(self._binding, self._means)
-        self._from_position = position_part(
-            tensors, plane_features(tensors, Box(*tensors["plane_box"]), positions)
-        )
+        features = plane_features(tensors, Box(*tensors["plane_box"]), positions)
+        self._from_position = position_part(tensors, torch.cat(features, dim=1))
         self._jaw_bases = tensors["jaw_bases"].cpu().numpy().astype(np.float64)
         if "lines" in tensors:
             box = Box(*tensors["line_box"])
@@ -141,8 +156,9 @@ class OursAvatar:
     @classmethod
     def read(cls, folder: Path, device: str) -> OursAvatar:
         """Read an avatar from its folder. Raises `InputError` for damaged or foreign files."""
-        subject = read_subject(folder / SUBJECT_FILE)
-        mesh = SubjectMesh(read_shared_head(folder), subject.shape, subject.static_offset, device)
+        head = read_shared_head(folder)
+        subject = read_subject(folder / SUBJECT_FILE, head)
+        mesh = SubjectMesh(head, subject.shape, subject.static_offset, device)
         tensors = read_field(folder / FIELD_FILE, len(mesh.faces), mesh.model.expression_size, device)
         return cls(folder, mesh, tensors, device)
 

@@ -49,6 +49,25 @@ def test_it_survives_the_disk(clip, tmp_path):
         RefinedTracking.read(tmp_path / "short.npz")
 
 
+@pytest.mark.parametrize(
+    ("key", "change"),
+    [
+        ("timesteps", lambda values: values.astype(float)),
+        ("tracked_neck", lambda values: values[:, 0]),
+        ("refined_expression", lambda values: values[:, :-1]),
+        ("refined_translation", lambda values: values * np.float32(np.nan)),
+        ("refined_jaw", lambda values: values.astype(np.float64)),
+    ],
+)
+def test_tracking_that_does_not_fit_is_refused(clip, tmp_path, key, change):
+    path = tmp_path / "driving.npz"
+    tracking(clip).save(path)
+    arrays = dict(np.load(path))
+    np.savez(path, **{**arrays, key: change(arrays[key])})
+    with pytest.raises(InputError, match=key):
+        RefinedTracking.read(path)
+
+
 def test_the_head_model_beside_an_avatar_is_the_clips(head, tmp_path):
     save_shared_head(tmp_path, head)
     found = read_shared_head(tmp_path)

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
 
 from headbench.bench.contracts import Avatar, Budget, Method, no_progress
 from headbench.bench.errors import InputError
@@ -117,6 +118,50 @@ def test_damaged_files_are_input_errors(fitted, tmp_path):
         method.load(tmp_path, device="cpu")
     stored.unlink()
     with pytest.raises(InputError, match=STORED[name]):
+        method.load(tmp_path, device="cpu")
+
+
+def shortened(tensors, name):
+    """The tensors with one row less of one of them."""
+    return {**tensors, name: tensors[name][:-1].contiguous()}
+
+
+@pytest.mark.parametrize("fitted", ["ours"], indirect=True)
+def test_no_tensor_of_ours_can_be_of_another_size(fitted, tmp_path):
+    _, method, folder, _ = fitted
+    for path in folder.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    whole = load_file(folder / "avatar.safetensors")
+    # Fewer splats, or lines of fewer expressions, make another sound avatar.
+    for key in sorted(set(whole) - {"splats", "lines"}):
+        save_file(shortened(whole, key), tmp_path / "avatar.safetensors")
+        with pytest.raises(InputError, match="avatar.safetensors"):
+            method.load(tmp_path, device="cpu")
+    coarse = {**whole, "plane_yz": whole["plane_yz"][:64].contiguous()}
+    flat = {**whole, "plane_box": torch.zeros(2, 3)}
+    for tensors, says in ((coarse, "plane_yz"), (flat, "plane_box")):
+        save_file(tensors, tmp_path / "avatar.safetensors")
+        with pytest.raises(InputError, match=says):
+            method.load(tmp_path, device="cpu")
+
+
+@pytest.mark.parametrize(
+    ("key", "change"),
+    [
+        ("head_model", lambda value: np.array("another")),
+        ("shape", lambda value: value[:-1]),
+        ("shape", lambda value: value * np.float32(np.nan)),
+        ("static_offset", lambda value: value[:, :2]),
+        ("static_offset", lambda value: value.astype(np.int64)),
+    ],
+)
+def test_a_subject_that_does_not_fit_the_head_is_refused(fitted, tmp_path, key, change):
+    _, method, folder, _ = fitted
+    for path in folder.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    subject = dict(np.load(folder / "subject.npz"))
+    np.savez(tmp_path / "subject.npz", **{**subject, key: change(subject[key])})
+    with pytest.raises(InputError, match=key):
         method.load(tmp_path, device="cpu")
 
 
