@@ -78,6 +78,8 @@ def build(cls: type[T], values: Mapping[str, Any], source: str, prefix: str = ""
     ------
     InputError : an unknown key (with the nearest known one), a missing one, or a value of the wrong type.
     """
+    if not isinstance(values, Mapping):
+        raise InputError(source, prefix.rstrip("."), "a group of settings", _shown(values))
     hints = get_type_hints(cls)
     fields = {f.name: f for f in dataclasses.fields(cls) if f.init}  # type: ignore[arg-type]
     arguments: dict[str, Any] = {}
@@ -139,8 +141,6 @@ def _convert(hint: Any, value: Any, source: str, key: str) -> Any:
             raise InputError(source, key, "a group of settings", _shown(value))
         return dict(value)
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
-        if not isinstance(value, Mapping):
-            raise InputError(source, key, "a group of settings", _shown(value))
         return build(hint, value, source, f"{key}.")
     return _convert_scalar(hint, value, source, key)
 

@@ -82,7 +82,7 @@ def resolve(reference: str) -> Any:
         value: Any = importlib.import_module(module_name)
         for part in attribute.split("."):
             value = getattr(value, part)
-    except (ImportError, AttributeError, ValueError) as error:
+    except (ImportError, AttributeError, ValueError, TypeError) as error:
         raise HeadbenchError(f"{reference}: cannot be imported: {error}") from error
     return value
 

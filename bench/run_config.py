@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 from .configuration import build, merge
 from .contracts import Budget, MethodSpec, MetricSpec, TaskName
 from .errors import InputError
+from .files import check_name
 from .registry import get, resolve, unknown
 
 
@@ -84,6 +86,10 @@ class ResolvedMethod:
 def resolve_methods(config: RunConfig) -> list[ResolvedMethod]:
     """Resolve every method of a run. Raises `InputError` for unknown methods, presets and settings."""
     specs: list[MethodSpec] = [get("methods", name) for name in config.methods]
+    for name, count in Counter(spec.name for spec in specs).items():
+        check_name(name, "registry of methods", "name")
+        if count > 1:
+            raise InputError("methods", name, "each method once", f"{count} of that name")
     stray = set(config.settings) - {spec.name for spec in specs}
     if stray:
         raise unknown("settings", "method", min(stray), [spec.name for spec in specs])
@@ -95,6 +101,8 @@ def resolve_method(spec: MethodSpec, preset: str, settings: Mapping[str, Any]) -
     if spec.presets and preset not in spec.presets:
         raise unknown(f"method {spec.name}", "preset", preset, spec.presets)
     source = f"settings of {spec.name}"
+    if not isinstance(settings, Mapping):
+        raise InputError(source, "", "a group of settings", repr(settings))
     values = merge(spec.presets.get(preset, {}), settings)
     budget = build(Budget, values.pop("budget", {}), source, "budget.")
     if (budget.iterations is not None and budget.iterations < 1) or (

@@ -55,3 +55,11 @@ def test_a_spec_not_yet_packaged_is_reached_by_module(toy):
     assert registry.get("methods", "toy_plugin:METHOD") is toy.METHOD
     with pytest.raises(HeadbenchError, match="cannot be imported"):
         registry.get("methods", "toy_plugin:NOTHING")
+
+
+@pytest.mark.parametrize(
+    "name", [":", "toy_plugin:", "toy_plugin:NOTHING", ".toy_plugin:METHOD", "no.such:METHOD"]
+)
+def test_a_reference_that_leads_nowhere_is_refused(toy, name):
+    with pytest.raises(HeadbenchError, match="cannot be imported"):
+        registry.get("methods", name)

@@ -113,6 +113,7 @@ class ToyMethod:
 
 PRESETS = {"smoke": {"budget": {"iterations": 2}}, "fast": {"budget": {"iterations": 9}, "level": 0.25}}
 METHOD = MethodSpec("toy", "one grey level", "toy_plugin:ToyMethod", "toy_plugin:ToyConfig", PRESETS)
+SAME_NAME = MethodSpec("toy", "another of that name", "toy_plugin:ToyMethod", "toy_plugin:ToyConfig", PRESETS)
 FAILING = MethodSpec(
     "failing", "always fails", "toy_plugin:ToyMethod", "toy_plugin:ToyConfig", {"smoke": {"fail": True}}
 )
