@@ -18,7 +18,6 @@ VHAP measures ``cy`` from the bottom edge since its commit 34afb35 (November 202
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Mapping
@@ -30,7 +29,7 @@ import numpy as np
 
 from ..bench.contracts import Camera, FloatArray
 from ..bench.errors import InputError
-from ..bench.files import write_json
+from ..bench.files import check_name, read_json, write_json
 
 CyConvention = Literal["top", "bottom", "centre"]
 """Where the principal point stands: ``cy`` from the top edge, from the bottom edge, or (as GaussianAvatars
@@ -170,11 +169,8 @@ class Declaration:
         path = folder / DECLARATION_FILE
         if not path.exists():
             return None
-        try:
-            value = json.loads(path.read_text(encoding="utf-8"))
-        except ValueError as error:
-            raise InputError(path, "", "a JSON document", f"text that does not parse ({error})") from error
-        found = value.get("format_version") if isinstance(value, dict) else value
+        value = read_json(path)
+        found = value.get("format_version")
         if found != FORMAT_VERSION:
             raise InputError(
                 path,
@@ -227,3 +223,6 @@ def _check_declaration(path: Path, value: Mapping[str, Any]) -> None:
             raise InputError(path, key, expected, "no such entry")
         if not holds(value[key]):
             raise InputError(path, key, expected, repr(value[key])[:80])
+    check_name(value["subject"], path, "subject")
+    for folder, name in value["sequences"].items():
+        check_name(name, path, f"sequences.{folder[:60]}")

@@ -17,7 +17,7 @@ import numpy as np
 
 from ..bench.contracts import FrameKey, HeadPose, Progress, StepRecord, no_progress
 from ..bench.errors import InputError
-from ..bench.files import digest
+from ..bench.files import check_name, digest
 from . import ga_layout as layout
 from .capture_cameras import CaptureCameras, collect_cameras
 from .capture_head import find_head
@@ -82,7 +82,7 @@ def read_capture(
     InputError
         For the first fault found.
     """
-    folder = _one_capture(Path(path))
+    folder = _one_capture(Path(os.path.abspath(path)))  # "." has no name to take a subject from
     declaration = layout.Declaration.read(folder)
     entries = _read_splits(folder, bool(held_out_sequences or held_out_cameras))
     everything = [entry for part in entries.values() for entry in part]
@@ -91,7 +91,7 @@ def read_capture(
     rig = collect_cameras(everything, infos)
     ground = _background(folder, declaration, background, all(info.has_alpha for info in infos.values()))
     asset = find_head(folder, declaration, head, masks=masks, regions=regions)
-    subject = subject or _subject(folder, declaration, everything)
+    subject = check_name(subject or _subject(folder, declaration, everything), folder, "subject")
     files = {entry.timestep: entry.parameters for entry in everything}
     tracking = read_tracking(files, asset, subject, teeth=teeth)
     poses = _shift_poses(tracking, rig, everything)
@@ -131,9 +131,11 @@ def read_capture(
         source_fingerprint=source,
         store=ImageStore(cache_mb),
     )
-    labels = read_labels(Path(excluded)) if isinstance(excluded, (str, Path)) else excluded
-    reasons = {**(declaration.excluded if declaration else {}), **(labels or {})}
-    return exclude_timesteps(clip, reasons) if reasons else clip
+    if declaration and declaration.excluded:
+        clip = exclude_timesteps(clip, declaration.excluded, source=folder / layout.DECLARATION_FILE)
+    if isinstance(excluded, (str, Path)):
+        return exclude_timesteps(clip, read_labels(Path(excluded)), source=excluded)
+    return exclude_timesteps(clip, excluded) if excluded else clip
 
 
 def find_captures(root: Path) -> list[Path]:
@@ -159,7 +161,10 @@ def _read_splits(folder: Path, resplit: bool) -> dict[str, list[FrameEntry]]:
     paths = {name: folder / file for name, file in layout.SPLIT_FILES.items()}
     if resplit and not any(path.exists() for path in paths.values()):
         return {"train": read_transforms(folder / layout.ALL_FRAMES_FILE)}
-    return {name: read_transforms(path) for name, path in paths.items()}
+    entries = {name: read_transforms(path) for name, path in paths.items()}
+    if not entries["train"]:
+        raise InputError(paths["train"], "frames", "at least one training frame", "an empty list")
+    return entries
 
 
 def _subject(folder: Path, declaration: layout.Declaration | None, entries: Sequence[FrameEntry]) -> str:

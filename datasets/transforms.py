@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -14,6 +13,7 @@ import numpy as np
 
 from ..bench.contracts import FloatArray
 from ..bench.errors import InputError
+from ..bench.files import check_name, read_json
 
 INTRINSIC_KEYS = ("cx", "cy", "fl_x", "fl_y", "camera_angle_x")
 RIGID_TOLERANCE = 1e-4
@@ -50,24 +50,11 @@ def read_transforms(path: Path) -> list[FrameEntry]:
     Raises `InputError` for text that is no JSON, missing keys, values of the wrong type or range, and
     matrices that are no rigid motion.
     """
-    document = read_json_object(path)
+    document = read_json(path)
     frames = document.get("frames")
     if not isinstance(frames, list):
         raise InputError(path, "frames", "a list of frames", _kind(document, "frames"))
     return [_parse_frame(path, f"frames[{i}]", frame, document) for i, frame in enumerate(frames)]
-
-
-def read_json_object(path: Path) -> dict[str, Any]:
-    """Read a JSON file whose top level is an object; `InputError` where it is not."""
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise InputError(path, "", "a JSON file", "no such file") from error
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(path, "", "a JSON document", f"content that does not parse ({error})") from error
-    if not isinstance(document, dict):
-        raise InputError(path, "", "a JSON object", type(document).__name__)
-    return document
 
 
 def _parse_frame(path: Path, where: str, frame: Any, document: Mapping[str, Any]) -> FrameEntry:
@@ -86,8 +73,8 @@ def _parse_frame(path: Path, where: str, frame: Any, document: Mapping[str, Any]
         where=where,
         timestep=reader.integer("timestep_index"),
         camera_index=camera_index,
-        camera_id=reader.text("camera_id") if "camera_id" in frame else f"{camera_index:02d}",
-        sequence_folder=_sequence_folder(path.parent, image),
+        camera_id=reader.name("camera_id") if "camera_id" in frame else f"{camera_index:02d}",
+        sequence_folder=check_name(_sequence_folder(path.parent, image), path, f"{where}.file_path"),
         image=path.parent / image,
         mask=path.parent / mask if mask else None,
         parameters=path.parent / reader.text("flame_param_path"),
@@ -142,6 +129,9 @@ class _Reader:
         if not isinstance(value, str) or not value:
             raise self._fail(key, "text")
         return value
+
+    def name(self, key: str) -> str:
+        return check_name(self.text(key), self._path, f"{self._where}.{key}")
 
     def integer(self, key: str) -> int:
         value = self._get(key)

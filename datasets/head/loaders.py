@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 
 from ...bench.contracts import IntArray
 from ...bench.errors import InputError
+from ...bench.files import read_json
 from .arrays import RING_REGIONS, HeadArrays, read_head, read_npz
 from .ict import ict_head, is_ict
 from .regions import with_derived_regions
@@ -97,14 +97,8 @@ def read_masks(path: str | PathLike[str]) -> dict[str, IntArray]:
 
 def read_regions(path: str | PathLike[str]) -> dict[str, IntArray]:
     """Regions of a JSON file ``{name: [vertex, ...]}``. Lip rings keep their order, others are sorted."""
-    try:
-        content = json.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(path, "", "a JSON file of vertex indices by region", str(error)) from error
-    if not isinstance(content, dict):
-        raise InputError(path, "", "a JSON object of regions", f"a {type(content).__name__}")
     result = {}
-    for name, members in content.items():
+    for name, members in read_json(Path(path)).items():
         is_list = isinstance(members, list) and all(type(member) is int for member in members)
         if not is_list:
             raise InputError(path, name, "a list of vertex indices", f"{str(members)[:40]}")

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from os import PathLike
 from pathlib import Path
 
 from ...bench.contracts import FrameKey
 from ...bench.errors import InputError
+from ...bench.files import read_json
 from ..clip import CaptureClip
-from ..transforms import read_json_object
 
 
 def exclude_timesteps(
-    clip: CaptureClip, reasons: Mapping[int, str], *, only: Collection[str] = ()
+    clip: CaptureClip,
+    reasons: Mapping[int, str],
+    *,
+    only: Collection[str] = (),
+    source: str | PathLike[str] = "excluded frames",
 ) -> CaptureClip:
     """Move the labelled timesteps of a clip from its splits to `excluded`, with their reasons.
 
@@ -20,6 +25,7 @@ def exclude_timesteps(
     ----------
     reasons : label by timestep, such as {57: "tongue out"}.
     only : labels to act on; empty means all.
+    source : where the reasons come from; named in the error.
 
     Raises
     ------
@@ -29,12 +35,12 @@ def exclude_timesteps(
     unknown = sorted(set(reasons) - set(clip.poses))
     if unknown:
         expected = f"timesteps of the clip, 0 to {max(clip.poses)}"
-        raise InputError("excluded frames", "timestep", expected, ", ".join(map(str, unknown)))
+        raise InputError(source, "timestep", expected, ", ".join(map(str, unknown)))
     chosen = {t: reason for t, reason in reasons.items() if not only or reason in only}
     gone = {key: chosen[key.timestep] for key in clip.files if key.timestep in chosen}
     splits = {name: tuple(key for key in keys if key not in gone) for name, keys in clip.splits.items()}
     if not splits["train"]:
-        raise InputError("excluded frames", "timestep", "training frames left", "none left")
+        raise InputError(source, "timestep", "training frames left", "none left")
     parameters = {"reasons": {str(t): reason for t, reason in sorted(chosen.items())}}
     excluded: dict[FrameKey, str] = {**clip.excluded, **gone}
     return clip.derive("exclude_timesteps", parameters, splits=splits, excluded=excluded)
@@ -43,7 +49,7 @@ def exclude_timesteps(
 def read_labels(path: Path) -> dict[int, str]:
     """Read frame labels: a JSON object {"<timestep>": "<reason>"}; `InputError` where it is none."""
     labels = {}
-    for key, reason in read_json_object(path).items():
+    for key, reason in read_json(path).items():
         if not (key.isascii() and key.isdigit() and isinstance(reason, str)):
             expected = "entries that map a timestep to a reason"
             raise InputError(path, key, expected, f"{key!r}: {reason!r}"[:80])

@@ -1,7 +1,20 @@
+import os
+
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from headbench.bench.files import atomic_path, digest, digest_file, write_json
+from headbench.bench.errors import InputError
+from headbench.bench.files import (
+    MAX_NAME_BYTES,
+    atomic_path,
+    check_name,
+    digest,
+    digest_file,
+    read_json,
+    write_json,
+)
 
 
 def test_a_failed_write_leaves_the_old_file_and_no_rubbish(tmp_path):
@@ -48,3 +61,61 @@ def test_file_digest_is_sha256(tmp_path):
 def test_json_takes_numpy(tmp_path):
     write_json(tmp_path / "a.json", {"x": np.float32(0.5), "y": np.arange(2), "p": tmp_path, "s": {"b", "a"}})
     assert '"x": 0.5' in (tmp_path / "a.json").read_text()
+
+
+@pytest.mark.parametrize("text", ["", "{", "[" * 200_000, "[1]", "3", '"text"', "\ufeff{}"])
+def test_json_that_is_no_object_is_refused_in_one_paragraph(tmp_path, text):
+    path = tmp_path / "a.json"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(InputError) as caught:
+        read_json(path)
+    assert caught.value.file == str(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_json_that_cannot_be_read_is_refused(tmp_path):
+    with pytest.raises(InputError, match="no such file"):
+        read_json(tmp_path / "none.json")
+    with pytest.raises(InputError, match="readable"):
+        read_json(tmp_path)
+    (tmp_path / "bytes.json").write_bytes(b"\xff\xfe\x81")
+    with pytest.raises(InputError, match="does not parse"):
+        read_json(tmp_path / "bytes.json")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "",
+        ".",
+        "..",
+        ".hidden",
+        "../up",
+        "/root",
+        "a/b",
+        "a\\b",
+        "C:",
+        "a\0",
+        "a\n",
+        "x" * (MAX_NAME_BYTES + 1),
+    ],
+)
+def test_a_name_that_could_leave_its_folder_is_refused(name):
+    with pytest.raises(InputError) as caught:
+        check_name(name, "capture.json", "subject")
+    assert (caught.value.file, caught.value.key) == ("capture.json", "subject")
+
+
+@given(st.text(min_size=1, max_size=200))
+def test_an_accepted_name_stays_directly_in_its_folder(tmp_path_factory, name):
+    try:
+        check_name(name, "capture.json", "subject")
+    except InputError:
+        return
+    folder = tmp_path_factory.getbasetemp()
+    assert os.path.dirname(os.path.normpath(folder / name)) == str(folder)
+
+
+@pytest.mark.parametrize("name", ["074", "EMO-1-shout+laugh", "222200037", "Kopf 3 (neu)", "面", "a..b"])
+def test_names_of_the_field_are_accepted(name):
+    assert check_name(name, "", "") == name

@@ -310,8 +310,56 @@ def test_declaration_without_an_entry(capture):
     assert fault(capture).found == "no such entry"
 
 
+def test_declaration_that_is_no_object(capture):
+    path = capture.union / "headbench.json"
+    for text in ("[" * 200_000, "3", "{"):
+        path.write_text(text)
+        assert fault(capture).file == str(path)
+    path.unlink()
+    path.mkdir()
+    assert fault(capture).file == str(path)
+
+
 def test_excluded_timestep_that_does_not_exist(capture):
     assert "99" in fault(capture, excluded={99: "blur"}).found
+    capture.edit(
+        "headbench.json", lambda document: document["excluded"].append({"timestep": 99, "reason": ""})
+    )
+    error = fault(capture)
+    assert (error.file, error.key) == (str(capture.union / "headbench.json"), "timestep")
+
+
+def test_no_training_frame(capture):
+    capture.edit(TRAIN, lambda document: document.update(frames=[]))
+    error = fault(capture)
+    assert error.file.endswith(TRAIN)
+    assert error.key == "frames"
+
+
+# ------------------------------------------------------------------ names that folders are made of
+
+OUTSIDE = "../../outside"
+
+
+def test_subject_that_leads_out_of_the_output_folder(capture):
+    assert fault(capture, subject=OUTSIDE).key == "subject"
+    for subject in (OUTSIDE, "/outside", ""):
+        capture.edit("headbench.json", lambda document, name=subject: document.update(subject=name))
+        error = fault(capture)
+        assert (error.file, error.key) == (str(capture.union / "headbench.json"), "subject")
+
+
+def test_sequence_that_leads_out_of_the_output_folder(capture):
+    def change(document):
+        document["sequences"] = dict.fromkeys(document["sequences"], OUTSIDE)
+
+    capture.edit("headbench.json", change)
+    assert fault(capture).key.startswith("sequences.")
+
+
+def test_camera_that_leads_out_of_the_output_folder(capture):
+    capture.edit(TRAIN, lambda document: document["frames"][1].update(camera_id=OUTSIDE))
+    assert fault(capture).key == "frames[1].camera_id"
 
 
 # ------------------------------------------------------------------ leaks
