@@ -138,9 +138,10 @@ def _array(path: Path, arrays: Mapping[str, np.ndarray], key: str) -> FloatArray
     array = arrays[key]
     if array.dtype.kind not in "fiu":
         raise InputError(path, key, "numbers", f"dtype {array.dtype}")
-    broken = int(array.size - np.count_nonzero(np.isfinite(array)))
+    with np.errstate(over="ignore"):  # what overflows becomes infinite and is counted
+        broken = int(array.size - np.count_nonzero(np.isfinite(array.astype(np.float32))))
     if broken:
-        raise InputError(path, key, "finite numbers", f"{broken} that are NaN or infinite")
+        raise InputError(path, key, "finite float32 numbers", f"{broken} that are NaN or infinite")
     return array
 
 

@@ -85,7 +85,10 @@ def _probe_jpeg(path: Path, stream: BinaryIO) -> ImageInfo:
         if segment[0] != 0xFF:
             break
         if marker in _JPEG_FRAME_MARKERS:
-            depth, height, width, channels = struct.unpack(">BHHB", stream.read(6))
+            frame = stream.read(6)
+            if len(frame) < 6:
+                break
+            depth, height, width, channels = struct.unpack(">BHHB", frame)
             if depth != 8:
                 raise InputError(path, "", "8 bits per channel", f"{depth}")
             return ImageInfo(width, height, channels)

@@ -149,6 +149,8 @@ class HeadArrays:
                 raise InputError(file, f"landmarks[{name}]", f"a vertex below {vertices}", str(vertex))
 
     def _validate_skeleton(self, file: str | PathLike[str]) -> None:
+        if self.parents.dtype.kind not in "iu":
+            raise InputError(file, "parents", "integer joint indices", f"dtype {self.parents.dtype}")
         parents = [int(parent) for parent in self.parents]
         is_tree = parents[0] == -1 and all(
             0 <= parent < joint for joint, parent in enumerate(parents) if joint

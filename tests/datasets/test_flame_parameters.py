@@ -95,6 +95,14 @@ def test_rows_may_lack_the_batch_axis_and_nothing_else(tmp_path, shape):
             read_tracking(files, HEAD, "s")
 
 
+def test_numbers_that_overflow_float32_are_refused(tmp_path):
+    files = write_files(tmp_path)
+    arrays = dict(np.load(files[1]))
+    np.savez(files[1], **{**arrays, "expr": np.full((1, 5), 1e39)})
+    with pytest.raises(InputError, match=r"00001.npz, expr: expected finite float32 numbers, found 5"):
+        read_tracking(files, HEAD, "s")
+
+
 def test_teeth_policies():
     file, toothed = Path("x"), with_teeth(HEAD)
     more = len(toothed.template)

@@ -51,6 +51,13 @@ def test_every_truncation_is_found(tmp_path_factory, data, format):
         probe_image(path)
 
 
+def test_jpeg_that_ends_within_its_frame_header(tmp_path):
+    path = tmp_path / "image.jpg"
+    path.write_bytes(b"\xff\xd8" + b"\xff\xc0\x00\x11" + b"\x08\xff\xd9")
+    with pytest.raises(InputError, match="frame header"):
+        probe_image(path)
+
+
 def test_missing_and_foreign_files(tmp_path):
     with pytest.raises(InputError, match="no such file"):
         probe_image(tmp_path / "none.png")

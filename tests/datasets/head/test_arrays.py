@@ -36,6 +36,7 @@ BAD = {
     "loop in the tree": ("parents", {"parents": np.array([-1, 2, 1, 1, 1])}),
     "two roots": ("parents", {"parents": np.array([-1, 0, -1, 1, 1])}),
     "own parent": ("parents", {"parents": np.array([-1, 1, 1, 1, 1])}),
+    "parents that are no integers": ("parents", {"parents": np.array([-1, 0, 1, 1, np.nan])}),
     "no root": ("parents", {"parents": np.array([0, 0, 1, 1, 1])}),
     "weights": ("skinning_weights", {"skinning_weights": spoiled(HEAD.skinning_weights, (7, 0), 0.99)}),
     "eyelids": ("eyelid_basis", {"eyelid_basis": HEAD.eyelid_basis[:, :, :1]}),
