@@ -1,8 +1,11 @@
 """Settings of the methods, as frozen dataclasses. Light: neither torch nor numpy is imported here.
 
-The defaults are the published values (600,000 iterations). Moments in training are written on the published
-scale and mapped to the budget at hand as fractions (`training.schedule`); the ``min_...`` fields say how many
-iterations a thing needs in any run to do more good than harm, and rule only in runs much shorter than published.
+The defaults are the published values (600,000 iterations), but for published slips and for bounds wider than the
+head; there the published behaviour is an option, which the preset "paper" takes unless it leaks held-out data.
+
+Moments in training are written on the published scale and mapped to the budget at hand as fractions
+(`training.schedule`); the ``min_...`` fields say how many iterations a thing needs in any run to do more good than
+harm, and rule only in runs much shorter than published.
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ def _presets(short: Mapping[str, Any], paper: Mapping[str, Any]) -> dict[str, di
             **short,
             "splats": {**_SHORT_SPLATS, "max_splats": 60_000},
         },
-        "paper": {"budget": {"iterations": PAPER_ITERATIONS}, **paper},
+        "paper": {"budget": {"iterations": PAPER_ITERATIONS}, **paper, "splats": {"split_offsets": "world"}},
     }
 
 

@@ -32,6 +32,8 @@ def test_paper_presets_are_the_published_values():
     for spec in (OURS, GA):
         settings = dict(spec.presets["paper"])
         assert settings.pop("budget") == {"iterations": 600_000}
+        config = build(resolve(spec.config), settings, "preset")
+        assert config.splats == SplatTraining(split_offsets="world")
     splats = SplatTraining()
     rates = (
         splats.position_lr,
