@@ -15,7 +15,7 @@ import numpy as np
 from ..bench.contracts import Budget, Camera, Clip, FloatArray, Frame, HeadPose, Progress
 from ..bench.errors import InputError
 from ..bench.files import atomic_path
-from .avatar_files import is_finished, read_arrays, run_digest, write_arrays, write_record
+from .avatar_files import TRACKED, is_finished, read_arrays, run_digest, write_arrays, write_record
 from .clip_checks import check_training_split
 from .configs import NearestCameraConfig
 from .training.loop import Outcome
@@ -23,7 +23,6 @@ from .training.loop import Outcome
 MEAN_FILE = "mean.npz"
 INDEX_FILE = "index.npz"
 IMAGE_FOLDER = "images"
-DRIVING = ("expression", "rotation", "neck", "jaw", "eyes", "translation")
 
 
 def resize(image: FloatArray, width: int, height: int) -> FloatArray:
@@ -215,7 +214,7 @@ class NearestCamera:
 
 def driving_signal(pose: HeadPose) -> FloatArray:
     """All driving parameters in one float64 vector."""
-    return np.concatenate([np.asarray(getattr(pose, name), np.float64).ravel() for name in DRIVING])
+    return np.concatenate([np.asarray(getattr(pose, name), np.float64).ravel() for name in TRACKED])
 
 
 def image_path(folder: Path, number: int) -> Path:
