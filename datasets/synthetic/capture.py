@@ -28,7 +28,7 @@ from .scene import default_samples, sample_count
 from .take import Settings, Take, plan_take
 
 MANIFEST = "synthesis.json"
-_VERSION = 1
+_VERSION = 2
 _SMALL = 400_000  # pixels in all that are rendered sooner than another process starts
 _README = """This folder holds synthetic recordings made by `headbench synth`.
 

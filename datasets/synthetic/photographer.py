@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ...bench.contracts import ByteArray
+from ...bench.contracts import ByteArray, HeadPose
 from . import rig
-from .controls import CONTROLS
+from .controls import CONTROLS, Activations
 from .likeness import Likeness
 from .scene import Studio, develop
 from .take import Take
@@ -37,8 +37,11 @@ class Photographer:
     def pose(self, sequence: str, timestep: int) -> None:
         """Bring the subject into a moment of its performance."""
         take = self._take
-        activations = take.performed[sequence].activations[timestep]
-        for name, surface in self._likeness.surfaces(take.poses[sequence][timestep], activations).items():
+        self.show(take.poses[sequence][timestep], take.performed[sequence].activations[timestep])
+
+    def show(self, pose: HeadPose, activations: Activations) -> None:
+        """Bring the subject into any pose."""
+        for name, surface in self._likeness.surfaces(pose, activations).items():
             self._studio.move(name, surface.vertices, surface.albedo)
 
     def picture(self, camera: str, seed: int) -> tuple[ByteArray, ByteArray]:

@@ -32,8 +32,8 @@ _LOWER = {
 _ARC = np.radians(93.0)
 _RISE = np.radians(32.0)
 _DISTANCE = 1.0  # metres from the head's middle
-_FRAME_HEIGHT = 0.385  # metres of the scene that the image's height shows at the head's middle
-_FRAME_WIDTH = 0.264
+_FRAME_HEIGHT = 0.394  # metres of the scene that the image's height shows at the head's middle
+_FRAME_WIDTH = 0.270
 
 # The order in which fewer cameras are taken: the frontal one, then those that spread most.
 _SPREAD = (8, 0, 15, 3, 12, 6, 5, 10, 1, 14, 7, 9, 2, 13, 4, 11)

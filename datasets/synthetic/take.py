@@ -16,6 +16,7 @@ from ..head.model import HeadModel
 from . import rig
 from .anatomy import measure
 from .geometry import Geometry
+from .hair import STYLES, Style
 from .people import Person, person
 from .performance import HELD_OUT, Performed, perform, share_out
 from .tracking import with_tracking_noise
@@ -24,6 +25,7 @@ FIRST_SUBJECT = 900
 """Synthetic subjects count from here: no participant of NeRSemble has such a number."""
 
 _IDENTITY_SPREAD = 0.65  # standard deviations of the identity basis; 1 would draw rare faces too often
+_LOOK_BELOW = 0.004  # metres below the middle of the head
 
 
 @dataclass(frozen=True)
@@ -74,7 +76,7 @@ def plan_take(out: Path, index: int, geometry: Geometry, settings: Settings) -> 
     shape = rng.standard_normal(head.shape_basis.shape[2]) * _IDENTITY_SPREAD
     shape = np.clip(shape, -1.6, 1.6).astype(np.float32).astype(np.float64)
     width, height = settings.size
-    target = _middle(geometry, shape)
+    target = _middle(geometry, shape, STYLES[who.style])
     views = rig.cameras(settings.cameras, width, height, target, seed=settings.seed + 101 * index)
     performed, poses = {}, {}
     for sequence, count in share_out(settings.timesteps).items():
@@ -102,11 +104,17 @@ def plan_take(out: Path, index: int, geometry: Geometry, settings: Settings) -> 
     return Take(index, who, geometry, shape, views, performed, poses, CaptureWriter(out, plan), settings)
 
 
-def _middle(geometry: Geometry, shape: FloatArray) -> FloatArray:
-    """Where the cameras look: the middle of the head at rest, a little low so that hair has room."""
+def _middle(geometry: Geometry, shape: FloatArray, style: Style) -> FloatArray:
+    """Where the cameras look: the middle of the head with its hair, at rest, a little low so that the bust shows.
+
+    From the chin up only: neck and shoulders are no part of what must stay in the frame from every side.
+    """
     model = HeadModel(geometry.head, dtype=torch.float64)
-    anatomy = measure(geometry.head, model.canonical(torch.from_numpy(shape))[0].numpy())
-    height = 0.5 * (anatomy["vertex_top"][1] + anatomy["chin"][1])
-    return np.array(
-        [0.0, height - 0.024 * anatomy.scale, 0.5 * (anatomy["left_ear"][2] + anatomy["nose_tip"][2])]
-    )
+    neutral = model.canonical(torch.from_numpy(shape))[0].numpy()
+    anatomy = measure(geometry.head, neutral)
+    skin = neutral[np.unique(anatomy.skin_faces)]
+    above = skin[skin[:, 1] > anatomy["chin"][1]]
+    low, high = above.min(axis=0), above.max(axis=0)
+    low[2] -= (style.cap + style.rise) * anatomy.scale
+    middle = 0.5 * (low + high)
+    return middle - np.array([0.0, _LOOK_BELOW * anatomy.scale, 0.0])

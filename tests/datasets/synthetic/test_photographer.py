@@ -46,6 +46,21 @@ def test_matte_is_clean(photographer):
     assert picture[matte == 255].max(1).mean() < 235
 
 
+@pytest.mark.parametrize("size", [(72, 104), (69, 100)])  # the shapes of 144 x 208 and of 550 x 802
+def test_every_camera_holds_the_whole_head_with_a_margin(geometry, rest, size):
+    take = plan_take(Path("unused"), 0, geometry, Settings(1, 16, 8, size, "procedural", 0, 0.0, 9))
+    assert take.person.style == "bob"  # the widest hair
+    photographer = Photographer(take)
+    photographer.show(take.geometry.translation.pose(rest, "900", None), rest)
+    for camera in take.cameras:
+        _, matte = photographer.picture(camera, 1)
+        assert matte[: size[1] // 20].max() == 0, camera
+        assert max(matte[:, :2].max(), matte[:, -2:].max()) == 0, camera
+        assert (matte[-1] > 200).sum() > size[0] // 8, (
+            camera
+        )  # the bust is cut by the frame, not by its own end
+
+
 def test_tracked_skin_projects_into_the_matte(take, likeness, photographer):
     """The face's tracked triangles, projected here by hand, are covered; below the hair they fill the matte."""
     photographer.pose("FREE", 1)
@@ -78,14 +93,12 @@ def test_tracked_skin_projects_into_the_matte(take, likeness, photographer):
 
 
 def test_expression_is_seen_in_the_picture(photographer, take):
-    likeness = photographer._likeness
     rest = dict.fromkeys(take.performed["FREE"].activations[0], 0.0)
     pose = take.geometry.translation.pose(rest, "900", 0)
     raised = {**rest, "brow_inner_up": 1.0, "brow_outer_up_left": 1.0, "brow_outer_up_right": 1.0}
     pictures = []
     for activations in (rest, raised):
-        for name, surface in likeness.surfaces(pose, activations).items():
-            photographer._studio.move(name, surface.vertices, surface.albedo)
+        photographer.show(pose, activations)
         pictures.append(photographer.picture(FRONTAL, 1)[0].astype(int))
     assert (np.abs(pictures[0] - pictures[1]).max(2) >= 6).sum() >= 10
 
