@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import math
 import types
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -97,6 +98,26 @@ def build(cls: type[T], values: Mapping[str, Any], source: str, prefix: str = ""
         raise InputError(source, prefix.rstrip(".") or cls.__name__, "valid settings", str(error)) from error
 
 
+def build_arguments(
+    function: Callable[..., Any], values: Mapping[str, Any], source: str, *, harness: Collection[str] = ()
+) -> dict[str, Any]:
+    """Check settings that are to be passed to a function by keyword, and convert them to its annotations.
+
+    The first parameter and those of the names in ``harness`` are not settings: the caller gives them. Raises
+    `InputError` as `build` does.
+    """
+    parameters = list(inspect.signature(function).parameters.values())[1:]
+    known = {p.name for p in parameters if p.kind in (p.KEYWORD_ONLY, p.POSITIONAL_OR_KEYWORD)} - {*harness}
+    anything = any(p.kind == p.VAR_KEYWORD for p in parameters)
+    hints = get_type_hints(function)
+    arguments = {}
+    for key, value in values.items():
+        if key not in known and not (anything and key not in harness):
+            raise unknown(source, key, str(key), known)
+        arguments[key] = _convert(hints.get(key, Any) if key in known else Any, value, source, key)
+    return arguments
+
+
 def _scalar(value: Any) -> Any:
     """Read text that is a number as one: YAML 1.1 takes 1e-3 for text because it has no dot."""
     if not isinstance(value, str):
@@ -119,13 +140,17 @@ def _convert(hint: Any, value: Any, source: str, key: str) -> Any:
     if origin in (Union, types.UnionType):
         if value is None and type(None) in arguments:
             return None
-        inner = [a for a in arguments if a is not type(None)]
-        for candidate in inner[:-1]:
+        refusals = []
+        for candidate in (a for a in arguments if a is not type(None)):
             try:
                 return _convert(candidate, value, source, key)
-            except InputError:
-                continue
-        return _convert(inner[-1], value, source, key)
+            except InputError as error:
+                refusals.append(error)
+        if len(refusals) == 1:
+            raise refusals[0]
+        raise InputError(source, key, " or ".join(error.expected for error in refusals), _shown(value))
+    if origin is Sequence:
+        origin, arguments = tuple, (*arguments, Ellipsis)
     if origin is tuple:
         if isinstance(value, str):
             value = [_scalar(part.strip()) for part in value.split(",") if part.strip()]

@@ -9,31 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from .contracts import Avatar, Clip, Frame, HeadPose, no_progress
-from .errors import HeadbenchError, InputError
+from .errors import InputError
 from .files import digest_file
 from .run_config import ResolvedMethod
-
-
-class _TrainingOnly:
-    """A clip that raises when anything but the training split is looked at."""
-
-    def __init__(self, clip: Clip):
-        self._clip = clip
-        self._allowed = frozenset(clip.splits["train"])
-
-    def __getattr__(self, name: str):
-        return getattr(self._clip, name)
-
-    def image(self, key):
-        return self._clip.image(self._checked(key))
-
-    def mask(self, key):
-        return self._clip.mask(self._checked(key))
-
-    def _checked(self, key):
-        if key not in self._allowed:
-            raise HeadbenchError(f"the method read {key}, which is not a training frame")
-        return key
+from .training_view import TrainingView
 
 
 def check_method(method: ResolvedMethod, clip: Clip, out: Path, *, device: str = "cpu") -> list[str]:
@@ -57,7 +36,7 @@ def check_method(method: ResolvedMethod, clip: Clip, out: Path, *, device: str =
 
     instance = method.create()
     avatar: Avatar = instance.fit(
-        _TrainingOnly(clip), out, method.budget, device=device, seed=0, progress=record
+        TrainingView(clip), out, method.budget, device=device, seed=0, progress=record
     )
     breaches: list[str] = []
     if method.spec.presets and not calls:
@@ -69,7 +48,7 @@ def check_method(method: ResolvedMethod, clip: Clip, out: Path, *, device: str =
     breaches += _render_breaches(avatar, loaded, clip)
     before = {path: digest_file(path) for path in avatar.files()}
     again = method.create().fit(
-        _TrainingOnly(clip), out, method.budget, device=device, seed=0, progress=no_progress
+        TrainingView(clip), out, method.budget, device=device, seed=0, progress=no_progress
     )
     if {path: digest_file(path) for path in again.files()} != before:
         breaches.append("fitting a finished avatar again changed its files")

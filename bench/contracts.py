@@ -14,7 +14,7 @@ Conventions, fixed once here
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
@@ -323,26 +323,31 @@ class MetricSpec:
 class DatasetSpec:
     """A reader: ``implementation`` names a function ``(path, **settings) -> Clip``.
 
-    ``find`` names a function ``(root) -> list of paths`` that lists the captures under a folder.
+    ``find`` names a function ``(root) -> list of paths`` that lists the captures under a folder. A reader with
+    a keyword ``progress`` is given a `Progress`. ``reads`` is False for one that makes captures instead: its
+    function takes ``out`` and settings and writes what another reader reads.
     """
 
     name: str
     summary: str
     implementation: str
     find: str = ""
+    reads: bool = True
 
 
 @dataclass(frozen=True)
 class ReportSpec:
-    """A view of stored results: ``implementation`` names a function ``(run_folder, ...) -> files written``."""
+    """A view of stored results: ``implementation`` names a function ``(run_folder) -> files written``.
+
+    Every such report is written at the end of a run. ``writes`` is False for one that returns text for printing
+    instead, ``(run_folder, format) -> text``.
+    """
 
     name: str
     summary: str
     implementation: str
+    writes: bool = True
 
 
 def no_progress(done: int, total: int, note: str = "") -> None:
     """Report to nobody."""
-
-
-Factory = Callable[..., Any]

@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from .captures import open_clips
 from .contracts import Clip, MetricSpec
 from .errors import HeadbenchError, InputError, UnavailableError
 from .machine import machine_record, peak_memory_bytes
 from .progress import duration
 from .protocol import Protocol, make_protocol
-from .registry import get, resolve
+from .registry import discover, resolve
 from .run_config import ResolvedMethod, RunConfig, resolve_methods, resolve_metrics
 from .stages import Job, failed_rows, fit, measure, render
 from .store import RunFolder, write_rows
@@ -34,6 +35,8 @@ def run(config: RunConfig, **record: Any) -> pd.DataFrame:
     """
     start = time.perf_counter()
     methods, metrics = resolve_methods(config), resolve_metrics(config)
+    for method in methods:
+        method.create()  # an implementation that cannot be imported or made is not to be found out hours later
     clips = open_clips(config)
     protocols: dict[str, Protocol] = {
         task: make_protocol(task, clips, config.frames_per_task) for task in config.tasks
@@ -65,33 +68,17 @@ def run(config: RunConfig, **record: Any) -> pd.DataFrame:
     return rows
 
 
-def open_clips(config: RunConfig) -> list[Clip]:
-    """Open every capture under ``config.data`` and validate it whole."""
-    spec = get("datasets", config.reader)
-    root = Path(config.data)
-    if not root.exists():
-        raise InputError(root, "--data", "a capture folder", "no such folder")
-    paths: Sequence[Path] = resolve(spec.find)(root) if spec.find else [root]
-    if not paths:
-        raise InputError(root, "--data", f"captures that reader {spec.name!r} knows", "none")
-    read = resolve(spec.implementation)
-    try:
-        clips: list[Clip] = [read(path, **config.reader_settings) for path in paths]
-    except TypeError as error:
-        raise InputError(
-            f"reader {spec.name}", "reader_settings", "settings the reader knows", str(error)
-        ) from error
-    subjects = [clip.subject for clip in clips]
-    if len(set(subjects)) != len(subjects):
-        raise InputError(root, "subject", "a different subject in each capture", ", ".join(subjects))
-    return clips
-
-
 def write_reports(run_folder: Path) -> list[Path]:
-    """Write every registered report of a finished run."""
+    """Write every registered report of a finished run. One that fails is logged and the others are written."""
     written: list[Path] = []
-    for name in ("table", "contact-sheet"):
-        written += resolve(get("reports", name).implementation)(run_folder)
+    for name, plugin in discover("reports").items():
+        if plugin.spec is None:
+            log.warning("report %r of %s is broken: %s", name, plugin.origin, plugin.error)
+        elif plugin.spec.writes:
+            try:
+                written += resolve(plugin.spec.implementation)(run_folder)
+            except Exception:
+                log.exception("report %r of %s failed; the rows are complete", name, plugin.origin)
     return written
 
 

@@ -23,6 +23,7 @@ from .protocol import Protocol
 from .registry import resolve
 from .run_config import ResolvedMethod
 from .store import Cell, Row, read_rows, to_frame, write_rows
+from .training_view import TrainingView
 
 log = logging.getLogger(__name__)
 RESULT_FORMAT = 1  # raise when a stage changes what it leaves behind
@@ -49,7 +50,8 @@ class Job:
         return digest(RESULT_FORMAT, self.method.record(), self.seed, self.device, self.clip.fingerprint)
 
     def check(self) -> None:
-        """Refuse a folder that holds an avatar made of something else."""
+        """Refuse a clip the method cannot use, and a folder that holds an avatar made of something else."""
+        self._check_needs()
         state = self.cell.stage("fit")
         if state is not None and state.get("fingerprint") != self.fit_fingerprint:
             raise InputError(
@@ -60,29 +62,45 @@ class Job:
                 "Choose another --out, or delete that folder.",
             )
 
+    def _check_needs(self) -> None:
+        spec = self.method.spec
+        if spec.head_models and self.clip.head.version not in spec.head_models:
+            expected = f"a capture tracked with {' or '.join(spec.head_models)}"
+            raise InputError(f"method {spec.name}", "head_models", expected, self.clip.head.version)
+        train = self.clip.splits["train"]
+        views = len(train) - len({key.timestep for key in train})
+        if spec.monocular and views:
+            expected = "a single video, one training frame at a timestep"
+            raise InputError(f"method {spec.name}", "monocular", expected, f"{views} further views")
+
 
 def fit(job: Job) -> Avatar:
-    """Train, or continue, or read what was trained; return the avatar as read back from disk."""
+    """Train, or continue, or read what was trained; return the avatar as read back from disk.
+
+    A native method sees the images of the training split alone. An adapter gets the whole clip, since official
+    repositories want a whole capture. The record's ``seconds`` are those since the last of ``interruptions``.
+    """
     method = job.method.create()
     if not job.cell.is_done("fit", job.fit_fingerprint):
-        earlier = job.cell.stage("fit") or {}
-        spent = float(earlier.get("seconds", 0.0))
-        job.cell.begin("fit", job.fit_fingerprint)
+        earlier = job.cell.stage("fit")
+        interruptions = 0 if earlier is None else int(earlier.get("interruptions", 0)) + 1
+        job.cell.begin("fit", job.fit_fingerprint, interruptions=interruptions)
         start = time.perf_counter()
         with progress(f"{job.name}: training") as report:
             method.fit(
-                job.clip,
+                TrainingView(job.clip) if job.method.spec.native else job.clip,
                 job.cell.avatar,
                 job.method.budget,
                 device=job.device,
                 seed=job.seed,
                 progress=report,
             )
-        seconds = spent + time.perf_counter() - start
+        seconds = time.perf_counter() - start
         job.cell.finish(
             "fit",
             job.fit_fingerprint,
             seconds=round(seconds, 3),
+            interruptions=interruptions,
             peak_memory_bytes=peak_memory_bytes(),
             method=job.method.record(),
         )

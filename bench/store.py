@@ -108,9 +108,9 @@ class Cell:
         state = self.stage(name)
         return state is not None and state.get("fingerprint") == fingerprint and state.get("status") == "done"
 
-    def begin(self, name: str, fingerprint: str) -> None:
+    def begin(self, name: str, fingerprint: str, **record: Any) -> None:
         """Record that the stage works on these inputs."""
-        write_json(self.folder / f"{name}.json", {"fingerprint": fingerprint, "status": "started"})
+        write_json(self.folder / f"{name}.json", {"fingerprint": fingerprint, "status": "started", **record})
 
     def finish(self, name: str, fingerprint: str, **record: Any) -> None:
         """Record that the stage ended, with what it measured."""

@@ -13,4 +13,5 @@ SYNTHETIC = DatasetSpec(
     name="synthetic",
     summary="A path-traced procedural head with exact tracking, written in the same layout.",
     implementation="headbench.datasets.synthetic.capture:synthesize",
+    reads=False,
 )

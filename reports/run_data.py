@@ -12,12 +12,12 @@ from typing import Any
 import pandas as pd
 from PIL import Image, UnidentifiedImageError
 
+from ..bench.captures import open_clips
 from ..bench.configuration import build
 from ..bench.contracts import ByteArray, Clip, FrameKey, MetricSpec
 from ..bench.errors import InputError
 from ..bench.frames import read_png
 from ..bench.run_config import RunConfig
-from ..bench.runner import open_clips
 from ..bench.store import RunFolder, keys_of, read_rows
 
 

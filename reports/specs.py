@@ -14,6 +14,7 @@ TABLE_TEXT = ReportSpec(
     name="table-text",
     summary="The same comparison as text: Markdown, CSV or LaTeX.",
     implementation="headbench.reports.table_report:table_text",
+    writes=False,
 )
 
 CONTACT_SHEET = ReportSpec(

@@ -1,12 +1,16 @@
 """The harness on toy plug-ins: what a run leaves, resumes, refuses and records."""
 
+import dataclasses
 import json
 import math
+import types
 
 import pytest
 
 from headbench.bench import runner
-from headbench.bench.errors import InputError
+from headbench.bench.contracts import ReportSpec
+from headbench.bench.errors import HeadbenchError, InputError
+from headbench.bench.registry import Plugin
 from headbench.bench.run_config import RunConfig
 from headbench.bench.store import RunFolder, read_rows
 
@@ -32,9 +36,7 @@ def config(toy, capture, tmp_path, monkeypatch):
 
 
 def changed(config, **changes):
-    from dataclasses import replace
-
-    return replace(config, **changes)
+    return dataclasses.replace(config, **changes)
 
 
 def test_rows_hold_every_frame_of_every_task_keyed(config):
@@ -85,6 +87,67 @@ def test_a_run_killed_in_training_continues(config, toy, monkeypatch):
     toy.FITS.clear()
     assert runner.run(config).equals(whole)
     assert toy.FITS == ["subject2"]  # the first had been trained
+
+
+def test_the_record_of_training_says_how_often_it_was_interrupted(config, toy, monkeypatch):
+    def killed(self, *args, **kwargs):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(toy.ToyMethod, "fit", killed)
+        for _ in range(2):
+            with pytest.raises(KeyboardInterrupt):
+                runner.run(config)
+    runner.run(config)
+    folder = RunFolder(runner.Path(config.out))
+    assert folder.cell("subject1", "toy", 0).stage("fit")["interruptions"] == 2
+    assert folder.cell("subject2", "toy", 0).stage("fit")["interruptions"] == 0
+
+
+def test_a_method_that_looks_at_held_out_frames_fails(config):
+    rows = runner.run(changed(config, methods=("toy_plugin:PEEKING",)))
+    assert set(rows["status"]) == {"failed"}
+    assert rows["reason"].str.contains("not a training frame").all()
+
+
+def test_an_adapter_is_given_the_whole_capture(config, toy, monkeypatch):
+    monkeypatch.setattr(toy, "PEEKING", dataclasses.replace(toy.PEEKING, native=False))
+    rows = runner.run(changed(config, methods=("toy_plugin:PEEKING",)))
+    assert set(rows["status"]) == {"ok"}
+
+
+@pytest.mark.parametrize(
+    ("needs", "fits"),
+    [
+        ({"head_models": ("flame2020", "flame2023")}, False),
+        ({"head_models": ("toy",)}, True),
+        ({"monocular": True}, True),
+        ({"implementation": "toy_plugin:NoSuchClass"}, False),
+    ],
+)
+def test_what_a_method_needs_is_looked_for_before_training(config, toy, monkeypatch, needs, fits):
+    monkeypatch.setattr(toy.ToyClip, "head", types.SimpleNamespace(version="toy"))
+    monkeypatch.setattr(toy, "SAME_NAME", dataclasses.replace(toy.METHOD, name="needy", **needs))
+    both = changed(config, methods=("toy_plugin:METHOD", "toy_plugin:SAME_NAME"))
+    if fits:
+        assert set(runner.run(both)["status"]) == {"ok"}
+        return
+    with pytest.raises(HeadbenchError):
+        runner.run(both)
+    assert toy.FITS == []
+
+
+def test_a_monocular_method_refuses_several_views(config, toy, monkeypatch):
+    class TwoViews(toy.ToyClip):
+        def __init__(self, path):
+            super().__init__(path)
+            self.splits["train"] += tuple(key._replace(camera="c") for key in self.splits["train"])
+
+    monkeypatch.setattr(toy, "read", lambda path: TwoViews(path))
+    monkeypatch.setattr(toy, "METHOD", dataclasses.replace(toy.METHOD, monocular=True))
+    with pytest.raises(InputError, match="3 further views"):
+        runner.run(config)
+    assert toy.FITS == []
 
 
 def test_another_setting_in_the_same_folder_is_refused_before_work(config, toy):
@@ -186,3 +249,22 @@ def test_a_damaged_manifest_is_refused(tmp_path):
     folder.manifest.write_text(json.dumps({"format": 99}))
     with pytest.raises(InputError, match="format"):
         folder.read_manifest()
+
+
+def test_every_registered_report_is_written_and_a_failing_one_stops_no_other(
+    monkeypatch, toy, tmp_path, caplog
+):
+    caplog.set_level("WARNING", logger="headbench")
+    plugins = [
+        Plugin("broken", "other 1", None, "ImportError: no"),
+        Plugin("failing", "other 1", ReportSpec("failing", "", "toy_plugin:failing_report")),
+        Plugin("text", "other 1", ReportSpec("text", "", "toy_plugin:failing_report", writes=False)),
+        Plugin("mine", "other 1", ReportSpec("mine", "", "toy_plugin:report")),
+    ]
+    monkeypatch.setattr(runner, "discover", lambda group: {plugin.name: plugin for plugin in plugins})
+    assert runner.write_reports(tmp_path) == [tmp_path / "mine.txt"]
+    assert (tmp_path / "mine.txt").read_text() == "mine"
+    messages = [record.getMessage() for record in caplog.records]
+    assert len(messages) == 2
+    assert "'broken' of other 1 is broken: ImportError: no" in messages[0]
+    assert "'failing' of other 1 failed" in messages[1]

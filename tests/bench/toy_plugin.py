@@ -111,9 +111,19 @@ class ToyMethod:
         return ToyAvatar(path)
 
 
+class PeekingMethod(ToyMethod):
+    def fit(self, clip, out, budget, **arguments):
+        clip.image(clip.splits["train"][0])
+        clip.image(clip.splits["novel_view"][0])
+        return super().fit(clip, out, budget, **arguments)
+
+
 PRESETS = {"smoke": {"budget": {"iterations": 2}}, "fast": {"budget": {"iterations": 9}, "level": 0.25}}
 METHOD = MethodSpec("toy", "one grey level", "toy_plugin:ToyMethod", "toy_plugin:ToyConfig", PRESETS)
 SAME_NAME = MethodSpec("toy", "another of that name", "toy_plugin:ToyMethod", "toy_plugin:ToyConfig", PRESETS)
+PEEKING = MethodSpec(
+    "peeking", "looks at held-out frames", "toy_plugin:PeekingMethod", "toy_plugin:ToyConfig"
+)
 FAILING = MethodSpec(
     "failing", "always fails", "toy_plugin:ToyMethod", "toy_plugin:ToyConfig", {"smoke": {"fail": True}}
 )
@@ -135,3 +145,13 @@ def files_in_avatar(avatar, workload):
 ERROR = MetricSpec("error", "Error", "levels", False, 2, "toy_plugin:mean_error")
 NOT_HERE = MetricSpec("not_here", "Absent", "", True, 2, "toy_plugin:not_here")
 FILES = MetricSpec("files", "Files", "", False, 0, "toy_plugin:files_in_avatar", per_frame=False)
+
+
+def report(run_folder):
+    path = run_folder / "mine.txt"
+    path.write_text("mine")
+    return [path]
+
+
+def failing_report(run_folder):
+    raise RuntimeError("no ink")
