@@ -8,10 +8,13 @@ and not to every splat. The result is the same up to rounding, at a hundredth of
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
+
+from .networks import offset_network
+from .row_sums import sum_rows
 
 AXES = 3
 
@@ -27,23 +30,6 @@ class LinePosition(NamedTuple):
 
     rows: Tensor
     weights: Tensor
-
-
-class _SumRows(torch.autograd.Function):
-    """Weighted sums of table rows; the adjoint with respect to the table only."""
-
-    @staticmethod
-    def forward(ctx: Any, table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
-        ctx.save_for_backward(rows, weights)
-        ctx.height = len(table)
-        return torch.nn.functional.embedding_bag(rows, table, per_sample_weights=weights, mode="sum")
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        rows, weights = ctx.saved_tensors
-        # The table is short, so its adjoint is a dense product with the (3 L, N) matrix of weights.
-        spread = weights.new_zeros(len(rows), ctx.height).scatter_add_(1, rows, weights)
-        return spread.t() @ grads[0], None, None
 
 
 def line_position(points: Tensor, resolution: int) -> LinePosition:
@@ -80,10 +66,12 @@ def opacity_offsets(parameters: Parameters, blended: Tensor, position: LinePosit
     kinds, axes, resolution, channels = blended.shape
     first = normalised_weight(parameters, 0).view(-1, kinds, axes, channels)
     table = torch.einsum("kalc,hkac->alh", blended, first).reshape(axes * resolution, -1)
-    summed = _SumRows.apply(table, *position)  # type: ignore[no-untyped-call]
-    hidden = (summed + parameters["line_bias_0"]).relu_()
-    hidden = torch.addmm(parameters["line_bias_1"], hidden, normalised_weight(parameters, 1).t()).relu_()
-    return torch.addmm(parameters["line_bias_2"], hidden, normalised_weight(parameters, 2).t())[:, 0]
+    return offset_network(
+        sum_rows(table, *position),
+        *(parameters["line_bias_0"],),
+        *(normalised_weight(parameters, 1), parameters["line_bias_1"]),
+        *(normalised_weight(parameters, 2), parameters["line_bias_2"]),
+    )[:, 0]
 
 
 def normalised_weight(parameters: Parameters, layer: int) -> Tensor:

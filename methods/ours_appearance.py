@@ -23,8 +23,7 @@ from .ours_field import (
     line_box,
     plane_box,
     plane_features,
-    position_part,
-    shade_directions,
+    shade,
 )
 from .seeds import torch_generator
 from .subject_mesh import BoundedCache, SubjectMesh
@@ -97,7 +96,7 @@ class OursAppearance:
         positions = self.canonical.positions(binding, optimiser["means"])
         features = plane_features(optimiser, self.plane_box, positions)
         directions = canonical_directions(prepared.turns, binding, world.means, view.center)
-        colors = shade_directions(optimiser, position_part(optimiser, features), directions)
+        colors = shade(optimiser, features, directions)
         logits = optimiser["opacities"]
         if not self._config.lines or iteration <= self._lines_from:
             return Shading(colors, torch.sigmoid(logits), None)

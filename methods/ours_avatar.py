@@ -145,7 +145,7 @@ class OursAvatar:
         self._canonical = CanonicalFrames.of(mesh.frames(mesh.canonical))
         positions = self._canonical.positions(self._binding, self._means)
         features = plane_features(tensors, Box(*tensors["plane_box"]), positions)
-        self._from_position = position_part(tensors, torch.cat(features, dim=1))
+        self._from_position = position_part(tensors, features)
         self._jaw_bases = tensors["jaw_bases"].cpu().numpy().astype(np.float64)
         if "lines" in tensors:
             box = Box(*tensors["line_box"])

@@ -15,6 +15,7 @@ from torch import Tensor
 from .binding import Frames, apply_matrices
 from .configs import OursConfig
 from .feature_lines import Parameters, initial_line_network, uniform
+from .networks import color_network
 from .sh import C0
 from .triplane import ENCODING_SIZE, PAIRS, encode_directions, sample_triplane
 
@@ -91,20 +92,29 @@ def canonical_directions(turns: Tensor, binding: Tensor, means: Tensor, center: 
     return torch.nn.functional.normalize(apply_matrices(rows, directions), dim=1)
 
 
-def plane_features(parameters: Parameters, box: Box, positions: Tensor) -> Tensor:
-    """Features (N, C) of the planes at canonical positions."""
+def plane_features(parameters: Parameters, box: Box, positions: Tensor) -> tuple[Tensor, ...]:
+    """Features (N, C_k) of the three planes at canonical positions."""
     planes = {name: parameters[f"plane_{name}"] for name, _, _ in PAIRS}
     resolution = round(len(planes["xy"]) ** 0.5)
     return sample_triplane(planes, 2 * box.unit(positions) - 1, resolution)
 
 
-def position_part(parameters: Parameters, features: Tensor) -> Tensor:
-    """What plane features add to the hidden layer; for an avatar it never changes."""
-    return features @ parameters["color_weight_0"][:, : features.shape[1]].t()
+def shade(parameters: Parameters, features: tuple[Tensor, ...], directions: Tensor) -> Tensor:
+    """Colours (N, 3) >= 0 of plane features and canonical directions; the way of training."""
+    return color_network(parameters["color_weight_0"], parameters["color_weight_1"], features, directions)
+
+
+def position_part(parameters: Parameters, features: tuple[Tensor, ...]) -> Tensor:
+    """What plane features, (N, C_k) each, add to the hidden layer; for an avatar it never changes."""
+    joined = torch.cat(features, dim=1)
+    return joined @ parameters["color_weight_0"][:, : joined.shape[1]].t()
 
 
 def shade_directions(parameters: Parameters, from_position: Tensor, directions: Tensor) -> Tensor:
-    """Colours (N, 3) >= 0: hidden layer of position and encoded direction, ReLU, relu(0.5 + C0 * out)."""
+    """Colours (N, 3) >= 0: hidden layer of position and encoded direction, ReLU, relu(0.5 + C0 * out).
+
+    The same as `shade` up to rounding, where the part of the position is known beforehand.
+    """
     first, last = parameters["color_weight_0"], parameters["color_weight_1"]
     of_direction = first[:, first.shape[1] - ENCODING_SIZE :]
     hidden = torch.addmm(from_position, encode_directions(directions), of_direction.t()).relu_()

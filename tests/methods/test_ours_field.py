@@ -16,6 +16,7 @@ from headbench.methods.ours_field import (
     plane_box,
     plane_features,
     position_part,
+    shade,
     shade_directions,
 )
 
@@ -107,4 +108,6 @@ def test_colour_is_the_network_on_concatenated_features_and_encoding():
     encoded = [d] + [f(d * 2.0**k) for k in range(4) for f in (np.sin, np.cos)]
     hidden = np.concatenate(sampled + encoded, axis=1) @ parameters["color_weight_0"].numpy().T
     out = np.maximum(hidden, 0) @ parameters["color_weight_1"].numpy().T
-    np.testing.assert_allclose(found, np.maximum(0.5 + 0.28209479177387814 * out, 0), atol=1e-12)
+    expected = np.maximum(0.5 + 0.28209479177387814 * out, 0)
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+    np.testing.assert_allclose(shade(parameters, features, directions), expected, atol=1e-12)

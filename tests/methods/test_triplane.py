@@ -59,7 +59,7 @@ def test_planes_read_their_own_coordinates_width_first():
     # Each plane holds (its width coordinate, its height coordinate) as two channels.
     grid = torch.stack(torch.meshgrid(ramp, ramp, indexing="xy"), dim=-1).reshape(-1, 2)
     points = torch.rand(6, 3, dtype=torch.float64) * 2 - 1
-    features = sample_triplane({name: grid for name, _, _ in PAIRS}, points, RESOLUTION)
+    features = torch.cat(sample_triplane({name: grid for name, _, _ in PAIRS}, points, RESOLUTION), dim=1)
     x, y, z = points.T
     np.testing.assert_allclose(features, torch.stack([x, y, x, z, y, z], dim=1), atol=1e-12)
 
