@@ -8,7 +8,7 @@ from skimage.draw import polygon2mask
 from headbench.bench.contracts import Camera
 from headbench.bench.errors import InputError
 from headbench.datasets.synthetic.rig import lights
-from headbench.datasets.synthetic.scene import Studio, develop, sample_count
+from headbench.datasets.synthetic.scene import Studio, develop, sample_count, window
 
 
 def ball(center, radius, steps=24):
@@ -76,6 +76,47 @@ def test_moved_mesh_is_rendered_where_it_went():
     _, after = studio.image(camera, 0)
     shift = (after.sum(0) @ columns) / after.sum() - (before.sum(0) @ columns) / before.sum()
     assert shift == pytest.approx(10.0, abs=0.3)  # 0.1 m at 1 m and 100 px
+
+
+def test_only_the_part_that_can_show_is_rendered_and_it_lacks_nothing():
+    """The window is tight, and a far speck that widens it to the whole image leaves coverage where it was."""
+    world_to_camera = np.diag([1.0, -1.0, -1.0, 1.0])
+    world_to_camera[2, 3] = 1.0
+    K = np.array([[100.0, 0, 30.5], [0, 100.0, 26]], float)
+    camera = Camera("a", 64, 48, np.vstack([K, [0, 0, 1]]), world_to_camera)
+    vertices, faces = ball(np.array([0.08, 0.03, 0.0]), 0.05)
+    rows, columns = window(camera, vertices)
+    assert columns.start == pytest.approx(33.5, abs=4)
+    assert (columns.stop, rows.start, rows.stop) == (
+        pytest.approx(43.5 + 4, abs=4),
+        pytest.approx(16, abs=4),
+        pytest.approx(32, abs=4),
+    )
+    alphas = []
+    for corners in ((), ((-0.30, 0.26), (0.34, -0.22))):
+        studio = Studio(lights(), 289)
+        studio.add("ball", vertices, faces, np.full((len(vertices), 3), 0.5), "skin")
+        for index, (x, y) in enumerate(corners):
+            speck = np.array([[x, y, 0.0], [x + 1e-4, y, 0.0], [x, y + 1e-4, 0.0]])
+            studio.add(f"speck{index}", speck, np.array([[0, 1, 2]]), np.full((3, 3), 0.5), "cloth")
+        alphas.append(studio.image(camera, 0)[1])
+    inside = np.zeros(alphas[0].shape, bool)
+    inside[rows, columns] = True
+    assert alphas[0][~inside].max() == 0
+    difference = np.abs(alphas[0] - alphas[1])[2:-2, 2:-2]
+    assert difference.max() < 0.06
+    assert alphas[0].max() == 1
+
+
+def test_nothing_in_view_gives_an_empty_picture_and_no_error():
+    camera = Camera("a", 32, 24, np.array([[50.0, 0, 16], [0, 50.0, 12], [0, 0, 1]]), np.eye(4))
+    vertices, faces = ball(np.array([5.0, 0.0, 1.0]), 0.05)
+    studio = Studio(lights(), 9)
+    studio.add("ball", vertices, faces, np.full((len(vertices), 3), 0.5), "skin")
+    rgb, alpha = studio.image(camera, 0)
+    assert rgb.shape == (24, 32, 3)
+    assert not rgb.any()
+    assert not alpha.any()
 
 
 def test_develop_is_srgb_below_the_knee_and_composites_in_display_space():
