@@ -1,14 +1,141 @@
-"""The scene's extent, and what every clip is checked for."""
+"""What one iteration of mesh-bound training adds up and changes; the scene's extent; what clips are checked for."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
+from skimage.metrics import structural_similarity
 
 from headbench.bench.contracts import Camera
 from headbench.bench.errors import InputError
-from headbench.methods.bound_training import scene_extent
+from headbench.methods.binding import to_world
+from headbench.methods.bound_training import BoundTraining, Shading, scene_extent
 from headbench.methods.clip_checks import check_training_split
+from headbench.methods.configs import SplatTraining
+from headbench.methods.splats import rasterize
+from headbench.methods.subject_mesh import SubjectMesh
+from headbench.methods.training.schedule import Timeline
+
+PENALTY = 7.0
+
+
+class Grey:
+    """An `Appearance` of grey splats, with a penalty of its own."""
+
+    def __init__(self, clip):
+        self.mesh, self._poses = SubjectMesh(clip.head, clip.shape, clip.static_offset, "cpu"), clip.poses
+
+    def splat_parameters(self, count):
+        return {}
+
+    def parameters(self):
+        return {}
+
+    def begin(self, timeline):
+        pass
+
+    def frames(self, timestep, optimiser):
+        return self.mesh.frames(self.mesh.posed(self.mesh.arguments([self._poses[timestep]])))
+
+    def shade(self, world, frames, binding, view, timestep, optimiser, iteration):
+        colors = torch.full((len(binding), 3), 0.5)
+        return Shading(colors, torch.sigmoid(optimiser["opacities"]), torch.tensor(PENALTY))
+
+
+@pytest.fixture
+def training(clip):
+    """Training of grey splats, far along in a run of the published length, with local scales and means of all sizes."""
+    appearance = Grey(clip)
+    settings = SplatTraining(densify_gradient=1e9)
+    training = BoundTraining(
+        clip, settings, appearance, lambda iteration: 0, len(appearance.mesh.faces), "cpu", 0
+    )
+    training.begin(Timeline(600_000, 600_000))
+    generator = torch.Generator().manual_seed(0)
+    for name in ("means", "log_scales", "opacities"):
+        training.optimiser[name].data.normal_(generator=generator)
+    yield training
+    training.close()
+
+
+def test_the_loss_is_the_papers_sum_over_what_is_seen(training, clip):
+    index = 2
+    training.optimiser["means"].data[::3] *= 1000  # far away: unseen, and so not asked to stay
+    found = float(training.loss(1, index).detach())
+    key = clip.splits["train"][index]
+    camera, truth = clip.cameras[key.camera], clip.image(key) / 255.0
+    means, log_scales, quats, logits = (
+        training.optimiser[name].detach() for name in ("means", "log_scales", "quats", "opacities")
+    )
+    world = to_world(Grey(clip).frames(key.timestep, None), training.binding, means, log_scales, quats)
+    rendering = rasterize(
+        *world,
+        torch.sigmoid(logits),
+        torch.full((len(means), 3), 0.5),
+        camera.world_to_camera,
+        camera.K,
+        camera.width,
+        camera.height,
+        background=clip.background,
+    )
+    seen = rendering.radii.numpy() > 0
+    assert 0 < seen.sum() < len(seen)
+    image = rendering.image.double().numpy()
+    expected = 0.8 * np.abs(image - truth).mean() + PENALTY
+    # Zeros outside the image, as training has it: pad, compare, and keep the windows centred on its pixels.
+    padded = [np.pad(x, ((10, 10), (10, 10), (0, 0))) for x in (image, truth)]
+    _, similarity = structural_similarity(
+        *padded,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        data_range=1.0,
+        channel_axis=2,
+        full=True,
+    )
+    expected += 0.2 * (1 - similarity[10:-10, 10:-10].mean())
+    local, scales = means.double().numpy()[seen], np.exp(log_scales.double().numpy()[seen])
+    expected += 0.01 * np.maximum(np.linalg.norm(local, axis=1) - 1, 0).mean()
+    expected += np.linalg.norm(np.maximum(scales - 0.6, 0), axis=1).mean()
+    assert found == pytest.approx(expected, rel=1e-4)
+
+
+def step(training, iteration):
+    training.loss(iteration, 0).backward()
+    training.after_backward(iteration)
+    training.optimiser.zero_grad()
+
+
+def rate(training):
+    return training.optimiser.state()["means"]["lr"]
+
+
+def test_positions_move_with_the_scene_and_ever_slower(training, clip):
+    extent = scene_extent({k.camera: clip.cameras[k.camera] for k in clip.splits["train"]})
+    assert rate(training) == pytest.approx(5e-3 * extent)
+    step(training, 300_000)
+    assert rate(training) == pytest.approx(5e-4 * extent)
+    step(training, 600_000)
+    assert rate(training) == pytest.approx(5e-5 * extent)
+
+
+@pytest.mark.parametrize(("iteration", "cut"), [(59_999, False), (60_000, True), (10_000, True)])
+def test_opacities_are_reset_when_the_schedule_says(training, iteration, cut):
+    step(training, iteration)
+    largest = float(torch.sigmoid(training.optimiser["opacities"].detach()).max())
+    assert (largest <= 0.0100001) == cut
+
+
+def test_rounds_prune_what_is_faint(training):
+    before = len(training.binding)
+    extra = {name: training.optimiser[name].detach()[:1] for name in training.splat_names}
+    training._densifier._append({**extra, "opacities": torch.tensor([-9.0])}, training.binding[:1])
+    training._densifier._restart()
+    step(training, 11_999)
+    assert len(training.binding) == before + 1
+    step(training, 12_000)
+    assert len(training.binding) == before
 
 
 def camera_at(*center):
