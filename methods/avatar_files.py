@@ -17,6 +17,7 @@ from ..datasets.head.arrays import HeadArrays, read_head, read_npz, save_head
 from .training.loop import Outcome
 
 HEAD_FILE = "head_model.npz"
+SUBJECT_FILE = "subject.npz"
 RECORD_FILE = "training.json"
 TRACKED = ("expression", "rotation", "neck", "jaw", "eyes", "translation")
 
@@ -73,6 +74,34 @@ def read_arrays(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
         if name not in content:
             raise InputError(path, name, "an array of that name", f"only {', '.join(sorted(content))}")
     return content
+
+
+def write_subject(path: Path, subject: Subject) -> None:
+    """Write identity coefficients and static offset as float32 npz."""
+    arrays: dict[str, Any] = {
+        "name": np.array(subject.name),
+        "head_model": np.array(subject.head_model),
+        "shape": subject.shape.astype(np.float32),
+        "static_offset": subject.static_offset.astype(np.float32),
+    }
+    write_arrays(path, arrays)
+
+
+def read_subject(path: Path, head: HeadAsset) -> Subject:
+    """Read what `write_subject` wrote. Raises `InputError` where it does not fit the head model."""
+    arrays = read_arrays(path, ("name", "head_model", "shape", "static_offset"))
+    subject = Subject(
+        str(arrays["name"]), str(arrays["head_model"]), arrays["shape"], arrays["static_offset"]
+    )
+    if subject.head_model != head.version:
+        raise InputError(path, "head_model", repr(head.version), repr(subject.head_model))
+    expected = {"shape": head.shape_basis.shape[2:], "static_offset": head.template.shape}
+    for name, shape in expected.items():
+        values = arrays[name]
+        if values.shape != shape or values.dtype != np.float32 or not np.isfinite(values).all():
+            found = f"{values.dtype} of shape {values.shape}, or non-finite numbers"
+            raise InputError(path, name, f"finite float32 of shape {shape}", found)
+    return subject
 
 
 class RefinedTracking:

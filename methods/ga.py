@@ -14,28 +14,24 @@ from torch import Tensor
 
 from ..bench.contracts import Budget, Camera, Clip, Frame, HeadPose, Progress
 from .avatar_files import (
+    SUBJECT_FILE,
     TRACKED,
     RefinedTracking,
     Subject,
     is_finished,
     read_shared_head,
+    read_subject,
     run_digest,
     save_shared_head,
     write_record,
+    write_subject,
 )
 from .binding import Frames, WorldSplats, to_world
 from .bound_avatar import PosedSplats, posed_splats, render_splats
 from .bound_training import Shading, View, run_bound_training, view_of
 from .clip_checks import check_training_split
 from .configs import GAConfig
-from .ga_files import (
-    PLY_FILE,
-    SUBJECT_FILE,
-    read_ga_splats,
-    read_subject,
-    write_ga_splats,
-    write_subject,
-)
+from .ga_files import PLY_FILE, read_ga_splats, write_ga_splats
 from .seeds import torch_generator
 from .sh import coefficient_count, sh_to_rgb
 from .subject_mesh import BoundedCache, SubjectMesh

@@ -1,21 +1,16 @@
-"""GaussianAvatars' files: the PLY its viewers open, and the subject it needs."""
+"""GaussianAvatars' file: the PLY its viewers open."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from ..bench.contracts import HeadAsset
 from ..bench.errors import InputError
-from .avatar_files import Subject, read_arrays, write_arrays
 from .ply import read_ply, write_ply
 
 PLY_FILE = "point_cloud.ply"
-SUBJECT_FILE = "subject.npz"
 
 REST = 15  # coefficients of degrees 1 to 3
 COLUMNS = (
@@ -69,31 +64,3 @@ def read_ga_splats(path: Path, face_count: int, device: str) -> tuple[dict[str, 
         "sh_rest": rest.reshape(-1, 3, REST),
     }
     return {name: value.contiguous() for name, value in splats.items()}, binding.to(device)
-
-
-def write_subject(path: Path, subject: Subject) -> None:
-    """Write identity coefficients and static offset as float32 npz."""
-    arrays: dict[str, Any] = {
-        "name": np.array(subject.name),
-        "head_model": np.array(subject.head_model),
-        "shape": subject.shape.astype(np.float32),
-        "static_offset": subject.static_offset.astype(np.float32),
-    }
-    write_arrays(path, arrays)
-
-
-def read_subject(path: Path, head: HeadAsset) -> Subject:
-    """Read what `write_subject` wrote. Raises `InputError` where it does not fit the head model."""
-    arrays = read_arrays(path, ("name", "head_model", "shape", "static_offset"))
-    subject = Subject(
-        str(arrays["name"]), str(arrays["head_model"]), arrays["shape"], arrays["static_offset"]
-    )
-    if subject.head_model != head.version:
-        raise InputError(path, "head_model", repr(head.version), repr(subject.head_model))
-    expected = {"shape": head.shape_basis.shape[2:], "static_offset": head.template.shape}
-    for name, shape in expected.items():
-        values = arrays[name]
-        if values.shape != shape or values.dtype != np.float32 or not np.isfinite(values).all():
-            found = f"{values.dtype} of shape {values.shape}, or non-finite numbers"
-            raise InputError(path, name, f"finite float32 of shape {shape}", found)
-    return subject

@@ -13,11 +13,18 @@ import numpy as np
 from ..bench.contracts import Budget, Clip, Progress
 from ..datasets.head.regions import faces_in_region
 from ..datasets.steps.expression_clusters import cluster_expressions
-from .avatar_files import Subject, is_finished, run_digest, save_shared_head, write_record
+from .avatar_files import (
+    SUBJECT_FILE,
+    Subject,
+    is_finished,
+    run_digest,
+    save_shared_head,
+    write_record,
+    write_subject,
+)
 from .bound_training import BoundTraining, run_bound_training
 from .clip_checks import check_training_split
 from .configs import OursConfig
-from .ga_files import SUBJECT_FILE, write_subject
 from .ours_appearance import OursAppearance
 from .ours_avatar import FIELD_FILE, OursAvatar, write_field
 from .subject_mesh import SubjectMesh

@@ -15,12 +15,11 @@ from torch import Tensor
 from ..bench.contracts import Camera, Frame, HeadPose
 from ..bench.errors import InputError
 from ..bench.files import atomic_path
-from .avatar_files import read_shared_head
+from .avatar_files import SUBJECT_FILE, read_shared_head, read_subject
 from .binding import WorldSplats, to_world
 from .bound_avatar import PosedSplats, posed_splats, render_splats
 from .bound_training import view_of
 from .feature_lines import blend_lines, line_position, opacity_offsets
-from .ga_files import SUBJECT_FILE, read_subject
 from .ours_appearance import driving_coefficients
 from .ours_field import (
     Box,
