@@ -48,6 +48,8 @@ STYLES = {
     "swept": Style(0.068, 0.0100, 1300, 0.0100, 0.0035, 0.20, 0.15, 1.30, 0.16, 0.0),
 }
 
+_TOO_SHORT_TO_HANG = 0.02  # metres; such hair cannot hang into the face
+
 # Hairline: height above the brows (m) by azimuth from the front (degrees), for a head of average size.
 _AZIMUTH = np.radians([0.0, 25.0, 42.0, 54.0, 63.0, 74.0, 84.0, 100.0, 118.0, 180.0])
 _HEIGHT = np.array([0.060, 0.058, 0.050, 0.024, -0.008, -0.036, -0.026, -0.052, -0.085, -0.098])
@@ -69,7 +71,18 @@ def hair_share(person: Person, anatomy: Anatomy, points: FloatArray, ears: Float
     azimuth = np.arctan2(np.abs(points[:, 0]), points[:, 2] - middle_z)
     line = anatomy["glabella"][1] + s * np.interp(azimuth, _AZIMUTH, _HEIGHT)
     ragged = 0.0035 * s * fractal_noise(points, 0.012 * s, person.seed + 80, 3)
-    return ramp(points[:, 1] - line + ragged, -0.002 * s, 0.009 * s) * (1.0 - ears)
+    grown = ramp(points[:, 1] - line + ragged, -0.002 * s, 0.009 * s)
+    return grown * (1.0 - ears) * (1.0 - _around_lobes(points, ears, s))
+
+
+def _around_lobes(points: FloatArray, ears: FloatArray, s: float) -> FloatArray:
+    """1 close to the lower half of the ears, (N,): hair there would hang from the lobes like earrings."""
+    ear = points[ears > 0.5]
+    if not len(ear):
+        return np.zeros(len(points))
+    middle = ear[:, 1].mean()
+    distance, _ = cKDTree(ear[ear[:, 1] <= middle]).query(points)
+    return ramp(distance, 0.016 * s, 0.010 * s) * ramp(points[:, 1], middle + 0.004 * s, middle - 0.008 * s)
 
 
 def make_hair(
@@ -105,7 +118,8 @@ def make_hair(
         height = np.einsum("ni,ni->n", place - surface[nearest].mean(axis=1), normal)
         wanted = (0.0005 * s + style.rise * along) * layer
         place = place + np.maximum(wanted - height, 0.0)[:, None] * normal
-        place[:, 2] = np.minimum(place[:, 2], limit(place))
+        if style.length > _TOO_SHORT_TO_HANG:
+            place[:, 2] = np.minimum(place[:, 2], limit(place))
         return place
 
     parting = style.parting * s
