@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import os
 import sys
@@ -19,8 +21,9 @@ from .errors import HeadbenchError, InputError
 from .files import plain
 from .progress import log_to, progress
 from .registry import Group, discover, get, resolve
-from .run_config import RunConfig
+from .run_config import RunConfig, resolve_methods, resolve_metrics
 from .runner import run as run_comparison
+from .store import RunFolder
 
 EXIT_FAILED_CELL = 1
 EXIT_BAD_INPUT = 2
@@ -52,16 +55,20 @@ def demo(
         json: Print the result as JSON.
     """
     values = parse_assignments(set)
-    config = build(
-        DemoConfig, {"preset": preset, "seed": seed, "out": out, **values.pop("capture", {})}, "--set"
+    given = merge(
+        {"capture": {"preset": preset, "seed": seed, "out": out}}, {"capture": values.pop("capture", {})}
     )
+    config = build(DemoConfig, given["capture"], "--set", "capture.")
+    comparison = build(RunConfig, merge(demo_run_config(config), values), "--set")
+    # Errors before the capture is made, which takes minutes.
+    resolve_methods(comparison)
+    resolve_metrics(comparison)
+    RunFolder(Path(out)).prepare()
     with log_to(_log_file(Path(out))):
         start = time.perf_counter()
         _synthesise(config.capture_arguments())
         seconds = round(time.perf_counter() - start, 3)
-        return _run(
-            build(RunConfig, merge(demo_run_config(config), values), "--set"), json, capture_seconds=seconds
-        )
+        return _run(comparison, json, capture_seconds=seconds)
 
 
 def synth(
@@ -89,6 +96,7 @@ def synth(
         seed: Decides subjects and performances.
         tracking_noise: Noise on the tracked parameters, as a fraction of their standard deviation.
     """
+    RunFolder(Path(out)).prepare()
     with log_to(None):
         _synthesise(
             {
@@ -239,25 +247,38 @@ def _run(config: RunConfig, as_json: bool, **record: Any) -> int:
     rows = run_comparison(config, **record)
     failed = rows[rows["status"] == "failed"]
     if as_json:
-        means = rows.groupby(["task", "method", "metric"], sort=False)["value"].mean().reset_index()
-        _print_json(
-            {
-                "out": config.out,
-                "failed": sorted(set(failed["method"])),
-                "means": means.astype(object).where(means.notna(), None).to_dict("records"),
-            }
-        )
+        failures = sorted(set(failed["method"]))
+        _print_json({"out": config.out, "failed": failures, "means": _means(Path(config.out))})
     else:
         table(config.out)
         print(f"\nPictures, tables and everything else: {config.out}")
     return EXIT_FAILED_CELL if len(failed) else 0
 
 
+def _means(run_folder: Path) -> list[dict[str, Any]]:
+    """Numbers of the comparison table, so that a machine reads what a person does; None where there is none."""
+    render: Callable[[Path, str], str] = resolve(get("reports", "table-text").implementation)
+    means = []
+    for line in csv.DictReader(io.StringIO(render(run_folder, "csv"))):
+        for column in (name.removesuffix("/status") for name in line if name.endswith("/status")):
+            task, _, metric = column.rpartition("/")
+            means.append(
+                {
+                    "task": task,
+                    "method": line["method"],
+                    "metric": metric,
+                    "value": float(line[column]) if line[column] else None,
+                    "status": line[f"{column}/status"],
+                }
+            )
+    return means
+
+
 def _log_file(out: Path) -> Path | None:
     """Where to log; None where the folder cannot be made, which the run then reports properly."""
     try:
         out.mkdir(parents=True, exist_ok=True)
-    except OSError:
+    except (OSError, ValueError):
         return None
     return out / "run.log" if os.access(out, os.W_OK) else None
 

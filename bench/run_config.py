@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -54,6 +55,8 @@ class RunConfig:
                 raise ValueError(f"{name} is empty")
             if len(set(values)) != len(values):
                 raise ValueError(f"{name} names something twice: {', '.join(map(str, values))}")
+        if not re.fullmatch(r"(cpu|cuda|mps|xpu)(:\d+)?", self.device):
+            raise ValueError(f"device is {self.device!r}; cpu, cuda, cuda:1 and the like")
         if self.frames_per_task is not None and self.frames_per_task < 1:
             raise ValueError(f"frames_per_task is {self.frames_per_task}; at least 1, or none for all")
 

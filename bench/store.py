@@ -150,10 +150,9 @@ class RunFolder:
             with atomic_path(self.root / ".writable") as probe:
                 probe.write_bytes(b"")
             (self.root / ".writable").unlink()
-        except OSError as error:
-            raise InputError(
-                self.root, "--out", "a folder that can be written", error.strerror or str(error)
-            ) from error
+        except (OSError, ValueError) as error:  # ValueError: a name that no file can have
+            found = getattr(error, "strerror", None) or str(error)
+            raise InputError(self.root, "--out", "a folder that can be written", found) from error
 
     def write_manifest(self, record: Mapping[str, Any]) -> None:
         """Write ``run.json``."""

@@ -69,3 +69,40 @@ def test_smoke_shrinks_the_capture():
     small, full = DemoConfig(preset="smoke").capture_arguments(), DemoConfig().capture_arguments()
     assert small["cameras"] < full["cameras"]
     assert small["timesteps"] < full["timesteps"]
+
+
+@pytest.mark.parametrize(
+    ("setting", "found"),
+    [
+        ("methodss=ga", "Did you mean 'methods'"),
+        ("methods=gaa", "Did you mean 'ga'"),
+        ("capture=3", "a group of settings"),
+        ("capture.sizee=3", "capture.sizee"),
+        ("device=gpu7", "device"),
+    ],
+)
+def test_the_demo_checks_its_settings_before_it_makes_a_capture(
+    capsys, tmp_path, monkeypatch, setting, found
+):
+    monkeypatch.setattr(cli, "_synthesise", lambda arguments: pytest.fail("a capture was made"))
+    assert cli.main(["demo", "--out", str(tmp_path), "--set", setting]) == 2
+    assert found in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["demo", "synth"])
+def test_a_folder_that_cannot_be_written_is_refused_before_work(capsys, tmp_path, monkeypatch, command):
+    monkeypatch.setattr(cli, "_synthesise", lambda arguments: pytest.fail("a capture was made"))
+    (tmp_path / "file").write_text("")
+    for out in (tmp_path / "file" / "out", tmp_path / "a\0b"):
+        assert cli.main([command, "--out", str(out)]) == 2
+        assert "can be written" in capsys.readouterr().err
+
+
+def test_json_gives_the_numbers_of_the_table(monkeypatch, tmp_path):
+    text = "method,version,group,novel_view/psnr,novel_view/psnr/rank,novel_view/psnr/status,fps,fps/rank,fps/status\n"
+    text += "ga,1,,25.5,1,ok,,,missing\n"
+    monkeypatch.setattr(cli, "resolve", lambda reference: lambda folder, format: text)
+    assert cli._means(tmp_path) == [
+        {"task": "novel_view", "method": "ga", "metric": "psnr", "value": 25.5, "status": "ok"},
+        {"task": "", "method": "ga", "metric": "fps", "value": None, "status": "missing"},
+    ]
