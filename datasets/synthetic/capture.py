@@ -15,6 +15,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
@@ -122,6 +123,7 @@ _photographer: list[Photographer] = []
 
 
 def _begin(out: Path, index: int, settings: Settings) -> None:
+    torch.set_num_threads(1)  # the processes share the cores already
     _photographer.append(Photographer(plan_take(out, index, load_geometry(settings.head), settings)))
 
 
