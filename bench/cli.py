@@ -217,6 +217,9 @@ COMMANDS: dict[str, Callable[..., int]] = {
 
 def main(arguments: list[str] | None = None) -> int:
     """Entry point of the console script; returns the exit code."""
+    # OpenMP's workers spin by default while they wait. On a machine with any other work that makes several
+    # threads many times slower than one, so let them sleep; read once, when torch is first imported.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
         return tyro.extras.subcommand_cli_from_dict(
             COMMANDS,
