@@ -16,9 +16,10 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from .configuration import build, merge, parse_assignments, read_yaml
+from .contracts import Findings
 from .demo import DemoConfig, demo_run_config, parse_size
 from .errors import HeadbenchError, InputError
-from .files import plain
+from .files import plain, write_json
 from .progress import log_to, progress
 from .registry import Group, discover, get, resolve
 from .run_config import RunConfig, resolve_methods, resolve_metrics
@@ -169,10 +170,12 @@ def table(run: Annotated[str, tyro.conf.Positional], format: Literal["md", "csv"
 
 
 def list_(
-    what: Annotated[Literal["methods", "presets", "metrics", "datasets", "reports"], tyro.conf.Positional],
+    what: Annotated[
+        Literal["methods", "presets", "metrics", "datasets", "reports", "benchmarks"], tyro.conf.Positional
+    ],
     json: bool = False,
 ) -> int:
-    """List what is installed: methods, presets, metrics, dataset readers, reports.
+    """List what is installed: methods, presets, metrics, dataset readers, reports, benchmarks.
 
     Args:
         what: What to list.
@@ -206,12 +209,52 @@ def list_(
     return 0
 
 
+def bench(
+    part: Annotated[str, tyro.conf.Positional],
+    quick: bool = False,
+    tradeoffs: bool = False,
+    out: PathText = None,
+    json: bool = False,
+) -> int:
+    """Measure the speed of a part of headbench itself on this machine.
+
+    Times are processor times of one thread, the least of many runs, beside a portable anchor timed in the same run;
+    compare ratios, not milliseconds, between machines.
+
+    Args:
+        part: What to measure: splats, or what `headbench list benchmarks` shows.
+        quick: Fewer sizes, fewer runs.
+        tradeoffs: Instead of speed alone, what settings that give up accuracy for speed buy.
+        out: Also write the results to this JSON file.
+        json: Print JSON instead of tables.
+    """
+    return _measure(part, "tradeoffs" if tradeoffs else "speed", quick, out, json)
+
+
+def stress(
+    part: Annotated[str, tyro.conf.Positional], quick: bool = False, out: PathText = None, json: bool = False
+) -> int:
+    """Try a part of headbench at numerical extremes and print each case, what is expected and what came out.
+
+    Exit code 1 where a case does not behave as expected.
+
+    Args:
+        part: What to try: splats, or what `headbench list benchmarks` shows.
+        quick: Fewer cases where there are many.
+        out: Also write the results to this JSON file.
+        json: Print JSON instead of the table.
+    """
+    return _measure(part, "stress", quick, out, json)
+
+
 COMMANDS: dict[str, Callable[..., int]] = {
     "demo": demo,
     "synth": synth,
     "run": run,
     "table": table,
     "list": list_,
+    "bench": bench,
+    "stress": stress,
 }
 
 
@@ -275,6 +318,22 @@ def _means(run_folder: Path) -> list[dict[str, Any]]:
                 }
             )
     return means
+
+
+def _measure(part: str, kind: str, quick: bool, out: str | None, as_json: bool) -> int:
+    spec = get("benchmarks", part)
+    function = getattr(spec, kind)
+    if not function:
+        raise InputError("command line", "part", f"a benchmark with {kind}", f"{part}, which has none")
+    with log_to(None), progress(kind) as report:
+        findings: Findings = resolve(function)(quick, report)
+    if out is not None:
+        write_json(Path(out), findings.data)
+    if as_json:
+        _print_json(findings.data)
+    else:
+        print(findings.text)
+    return 0 if findings.passed else EXIT_FAILED_CELL
 
 
 def _log_file(out: Path) -> Path | None:

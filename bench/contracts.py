@@ -349,5 +349,31 @@ class ReportSpec:
     writes: bool = True
 
 
+class Findings(NamedTuple):
+    """What a benchmark of the toolkit itself found out."""
+
+    text: str
+    """Tables for a terminal."""
+    data: Mapping[str, Any]
+    """The same as plain values, for JSON."""
+    passed: bool = True
+    """False where something did not behave as expected."""
+
+
+@dataclass(frozen=True)
+class BenchmarkSpec:
+    """Measurements of a part of the toolkit itself, as opposed to those of avatars.
+
+    ``speed``, ``tradeoffs`` and ``stress`` each name a function ``(quick, progress) -> Findings``, or are "" where
+    there is none: how fast it is, what settings that give up accuracy for speed buy, how it behaves at extremes.
+    """
+
+    name: str
+    summary: str
+    speed: str = ""
+    tradeoffs: str = ""
+    stress: str = ""
+
+
 def no_progress(done: int, total: int, note: str = "") -> None:
     """Report to nobody."""

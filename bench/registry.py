@@ -13,15 +13,16 @@ from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Literal
 
-from .contracts import DatasetSpec, MethodSpec, MetricSpec, ReportSpec
+from .contracts import BenchmarkSpec, DatasetSpec, MethodSpec, MetricSpec, ReportSpec
 from .errors import HeadbenchError, InputError
 
-Group = Literal["methods", "datasets", "metrics", "reports"]
+Group = Literal["methods", "datasets", "metrics", "reports", "benchmarks"]
 SPEC_TYPES: dict[str, type] = {
     "methods": MethodSpec,
     "datasets": DatasetSpec,
     "metrics": MetricSpec,
     "reports": ReportSpec,
+    "benchmarks": BenchmarkSpec,
 }
 log = logging.getLogger(__name__)
 

@@ -134,7 +134,7 @@ def test_importing_specs_imports_neither_torch_nor_mitsuba():
     code = (
         "import sys\n"
         "from headbench.bench.registry import discover\n"
-        "for group in ('methods', 'datasets', 'metrics', 'reports'):\n"
+        "for group in ('methods', 'datasets', 'metrics', 'reports', 'benchmarks'):\n"
         "    broken = {n: p.error for n, p in discover(group).items() if p.error}\n"
         "    assert not broken, broken\n"
         "heavy = {'torch', 'mitsuba', 'pymeshlab', 'sklearn'} & set(sys.modules)\n"

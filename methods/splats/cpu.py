@@ -135,6 +135,16 @@ class _Rasterize(torch.autograd.Function):
         return (*gradients, grad_viewmat, None, None, None, None, None)
 
 
+def peak_flops(backend: str) -> float:
+    """Measured multiply-add rate of one thread in a backend's instruction set, floating-point operations a second."""
+    return _kernel().peak_flops(instruction_sets()[backend])
+
+
+def work(node: Any) -> tuple[int, int]:
+    """Pairs of splat and pixel tested, and drawn, in the frame of an autograd node of the kernel."""
+    return node.frame.work(*_arrays(*node.saved_tensors))
+
+
 def _kernel() -> ModuleType:
     module = load()
     assert isinstance(module, ModuleType)

@@ -7,7 +7,7 @@ from headbench.bench.demo import DemoConfig, parse_size
 from headbench.bench.errors import InputError
 
 
-@pytest.mark.parametrize("command", ["demo", "synth", "run", "table", "list"])
+@pytest.mark.parametrize("command", ["demo", "synth", "run", "table", "list", "bench", "stress"])
 def test_help_teaches_every_option(command, capsys):
     with pytest.raises(SystemExit) as caught:
         cli.main([command, "--help"])
@@ -106,3 +106,38 @@ def test_json_gives_the_numbers_of_the_table(monkeypatch, tmp_path):
         {"task": "novel_view", "method": "ga", "metric": "psnr", "value": 25.5, "status": "ok"},
         {"task": "", "method": "ga", "metric": "fps", "value": None, "status": "missing"},
     ]
+
+
+@pytest.fixture
+def toy_benchmark(monkeypatch, tmp_path):
+    (tmp_path / "toy_benchmark.py").write_text(
+        "from headbench.bench.contracts import BenchmarkSpec, Findings\n"
+        "def speed(quick, progress):\n"
+        "    return Findings('a table', {'quick': quick})\n"
+        "def stress(quick, progress):\n"
+        "    return Findings('a bad table', {}, passed=False)\n"
+        "SPEC = BenchmarkSpec('toy', 'a toy', speed='toy_benchmark:speed', stress='toy_benchmark:stress')\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+
+
+@pytest.mark.usefixtures("toy_benchmark")
+def test_a_benchmark_prints_tables_or_json_and_writes_a_file(capsys, tmp_path):
+    assert cli.main(["bench", "toy_benchmark:SPEC"]) == 0
+    assert capsys.readouterr().out == "a table\n"
+    out = tmp_path / "out.json"
+    assert cli.main(["bench", "toy_benchmark:SPEC", "--quick", "--json", "--out", str(out)]) == 0
+    assert json.loads(capsys.readouterr().out) == json.loads(out.read_text()) == {"quick": True}
+
+
+@pytest.mark.usefixtures("toy_benchmark")
+def test_a_benchmark_that_finds_a_fault_fails_the_command(capsys):
+    assert cli.main(["stress", "toy_benchmark:SPEC"]) == 1
+    assert capsys.readouterr().out == "a bad table\n"
+    assert cli.main(["bench", "toy_benchmark:SPEC", "--tradeoffs"]) == 2
+    assert "tradeoffs" in capsys.readouterr().err
+
+
+def test_the_splat_benchmark_is_listed(capsys):
+    assert cli.main(["list", "benchmarks"]) == 0
+    assert "splats" in capsys.readouterr().out

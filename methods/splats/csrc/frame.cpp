@@ -1,6 +1,9 @@
 #include "frame.h"
 
+#include <time.h>
+
 #include <algorithm>
+#include <chrono>
 #include <cstring>
 #include <limits>
 #include <stdexcept>
@@ -19,7 +22,31 @@ std::int64_t task_count(std::int64_t splats) { return (splats + kSplatsPerTask -
 
 std::size_t round_up(std::size_t value, std::size_t step) { return (value + step - 1) / step * step; }
 
+// Gives each stage the time since the one before it ended.
+class StageClock {
+ public:
+  explicit StageClock(std::array<double, kStageCount>& seconds) : seconds_(seconds), then_(thread_seconds()) {}
+  void ends(Stage stage) {
+    const double now = thread_seconds();
+    seconds_[stage] = now - then_;
+    then_ = now;
+  }
+
+ private:
+  std::array<double, kStageCount>& seconds_;
+  double then_;
+};
+
 }  // namespace
+
+double thread_seconds() {
+#ifdef CLOCK_THREAD_CPUTIME_ID
+  timespec now;
+  if (clock_gettime(CLOCK_THREAD_CPUTIME_ID, &now) == 0)
+    return static_cast<double>(now.tv_sec) + 1e-9 * static_cast<double>(now.tv_nsec);
+#endif
+  return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch()).count();
+}
 
 Frame::Frame(const View& view, const Splats& splats, const ImageOut& out, std::int32_t* radii,
              const Stages& stages, int threads)
@@ -28,6 +55,7 @@ Frame::Frame(const View& view, const Splats& splats, const ImageOut& out, std::i
       count_(splats.count),
       channels_(splats.channels),
       has_offset_(splats.offset != nullptr) {
+  StageClock clock(seconds_);
   const std::size_t count = static_cast<std::size_t>(splats.count);
   const std::size_t tiles = static_cast<std::size_t>(view.tiles_x) * view.tiles_y;
   // Records start on cache lines: drawing reads them at random.
@@ -46,10 +74,13 @@ Frame::Frame(const View& view, const Splats& splats, const ImageOut& out, std::i
     const std::int64_t begin = task * kSplatsPerTask;
     stages.project(view_, splats, data_, begin, std::min(begin + kSplatsPerTask, splats.count));
   });
+  clock.ends(kProject);
   list_visible(splats.count);
   sort_by_depth();
+  clock.ends(kSort);
   reserve_entries();
   fill_tiles(threads);
+  clock.ends(kFindPairs);
 
   const std::size_t scratch_stride = round_up(stages.scratch_floats(splats.channels), 16);
   Buffer<float> scratch;
@@ -57,6 +88,7 @@ Frame::Frame(const View& view, const Splats& splats, const ImageOut& out, std::i
   pool.run(static_cast<std::int64_t>(tiles), threads, [&](std::int64_t tile, int worker) {
     stages.draw_tile(view_, splats, data_, out, static_cast<int>(tile), scratch.data() + worker * scratch_stride);
   });
+  clock.ends(kDraw);
   // Of these the backward pass needs nothing.
   depths_.release();
   rects_.release();
@@ -157,6 +189,7 @@ void Frame::fill_tiles(int threads) {
 }
 
 void Frame::backward(const Splats& splats, Gradients grads, float* background, float* view_gradient, int threads) {
+  StageClock clock(seconds_);
   const std::int64_t tiles = static_cast<std::int64_t>(view_.tiles_x) * view_.tiles_y;
   const int channels = splats.channels;
   const std::size_t scratch_stride = round_up(stages_.scratch_floats(channels), 16);
@@ -171,6 +204,8 @@ void Frame::backward(const Splats& splats, Gradients grads, float* background, f
     stages_.draw_tile_backward(view_, splats, data_, grads, static_cast<int>(tile),
                                scratch.data() + worker * scratch_stride);
   });
+
+  clock.ends(kDrawBackward);
 
   // Tasks of a fixed size, added in order: sums do not depend on the number of threads.
   const std::int64_t tasks = task_count(visible_count_);
@@ -190,6 +225,16 @@ void Frame::backward(const Splats& splats, Gradients grads, float* background, f
     for (std::int64_t task = 0; task < tasks; ++task) sum += task_view[task * kViewGradient + k];
     view_gradient[k] = static_cast<float>(sum);
   }
+  clock.ends(kProjectBackward);
+}
+
+Work Frame::work(const Splats& splats) const {
+  Buffer<float> scratch;
+  scratch.resize(stages_.scratch_floats(splats.channels));
+  Work work;
+  for (int tile = 0; tile < view_.tiles_x * view_.tiles_y; ++tile)
+    stages_.count_work(view_, splats, data_, tile, scratch.data(), work);
+  return work;
 }
 
 }  // namespace headbench

@@ -7,6 +7,7 @@
 // order, so that results are equal bit for bit for any number of threads.
 #pragma once
 
+#include <array>
 #include <cstddef>
 #include <new>
 
@@ -38,6 +39,11 @@ class Buffer {
   T* data_ = nullptr;
 };
 
+// The stages of a frame that are timed.
+enum Stage { kProject, kSort, kFindPairs, kDraw, kDrawBackward, kProjectBackward, kStageCount };
+constexpr const char* kStageNames[kStageCount] = {"project", "sort",          "find pairs",
+                                                  "draw",    "draw backward", "project backward"};
+
 class Frame {
  public:
   // Draws at once. Throws std::length_error where splats touch more tiles than 32 bits can count.
@@ -48,10 +54,18 @@ class Frame {
   // `grads`, `background` (C,) and `view_gradient` (kViewGradient,) are overwritten.
   void backward(const Splats& splats, Gradients grads, float* background, float* view_gradient, int threads);
 
-  // Whether these inputs and this image size can be the ones drawn: arrays of the same sizes.
-  bool fits(const Splats& splats, std::size_t width, std::size_t height) const {
-    return splats.count == count_ && splats.channels == channels_ && (splats.offset != nullptr) == has_offset_ &&
-           width == static_cast<std::size_t>(view_.width) && height == static_cast<std::size_t>(view_.height);
+  // Processor time of the calling thread by stage, of the last pass each; with one thread that is all there was.
+  const std::array<double, kStageCount>& stage_seconds() const { return seconds_; }
+
+  // Count the work of drawing; `splats` as for `backward`.
+  Work work(const Splats& splats) const;
+
+  // Whether these inputs can be the ones drawn: arrays of the same sizes.
+  bool fits(const Splats& splats) const {
+    return splats.count == count_ && splats.channels == channels_ && (splats.offset != nullptr) == has_offset_;
+  }
+  bool fits(std::size_t width, std::size_t height) const {
+    return width == static_cast<std::size_t>(view_.width) && height == static_cast<std::size_t>(view_.height);
   }
 
  private:
@@ -73,6 +87,10 @@ class Frame {
   Buffer<std::uint64_t> entry_blocks_;
   Buffer<Pair> pairs_;
   std::size_t entries_ = 0;
+  std::array<double, kStageCount> seconds_{};
 };
+
+// Processor time of the calling thread, seconds; wall time where the system does not tell.
+double thread_seconds();
 
 }  // namespace headbench

@@ -1,14 +1,19 @@
 // The kernel as a Python module. Arrays are typed and contiguous; outputs are allocated by the caller.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/map.h>
+#include <nanobind/stl/pair.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/unique_ptr.h>
 #include <nanobind/stl/vector.h>
 
+#include <algorithm>
+#include <limits>
+#include <map>
 #include <memory>
-#include <optional>
 #include <stdexcept>
 #include <string>
+#include <utility>
 #include <vector>
 
 #include "frame.h"
@@ -110,7 +115,7 @@ void backward(Frame& frame, const Array<const float, -1, 3>& means, const Array<
       if (a.shape(i) != b.shape(i)) return false;
     return true;
   };
-  if (!frame.fits(splats, grad_image.shape(1), grad_image.shape(0)) || !same(grad_means, means) ||
+  if (!frame.fits(splats) || !frame.fits(grad_image.shape(1), grad_image.shape(0)) || !same(grad_means, means) ||
       !same(grad_quats, quats) || !same(grad_scales, scales) || !same(grad_opacities, opacities) ||
       !same(grad_colors, colors) || !same(grad_offset, offset) || !same(grad_background, background) ||
       grad_image.shape(2) != colors.shape(1) || grad_alpha.shape(0) != grad_image.shape(0) ||
@@ -136,6 +141,41 @@ void backward(Frame& frame, const Array<const float, -1, 3>& means, const Array<
   }
 }
 
+std::map<std::string, double> stage_seconds(const Frame& frame) {
+  std::map<std::string, double> named;
+  for (int stage = 0; stage < kStageCount; ++stage) named[kStageNames[stage]] = frame.stage_seconds()[stage];
+  return named;
+}
+
+std::pair<std::uint64_t, std::uint64_t> work(const Frame& frame, const Array<const float, -1, 3>& means,
+                                             const Array<const float, -1, 4>& quats,
+                                             const Array<const float, -1, 3>& scales,
+                                             const Array<const float, -1>& opacities,
+                                             const Array<const float, -1, -1>& colors,
+                                             const Array<const float, -1, 2>& offset,
+                                             const Array<const float, -1>& background) {
+  const Splats splats = Inputs{means, quats, scales, opacities, colors, offset, background}.splats();
+  if (!frame.fits(splats)) throw std::invalid_argument("inputs do not fit the frame");
+  const Work work = frame.work(splats);
+  return {work.tested, work.drawn};
+}
+
+// Fastest of several short runs, in floating-point operations per second of one thread.
+double peak_flops(const std::string& instruction_set) {
+  const Stages& stages = stages_by_name(instruction_set);
+  constexpr std::int64_t kRounds = 1 << 17;
+  constexpr int kRuns = 20;
+  double best = std::numeric_limits<double>::infinity();
+  volatile float keep;
+  for (int run = 0; run < kRuns; ++run) {
+    const double start = thread_seconds();
+    keep = stages.multiply_add(kRounds);
+    best = std::min(best, thread_seconds() - start);
+  }
+  static_cast<void>(keep);
+  return 2.0 * kRounds * stages.chains * stages.lanes / best;
+}
+
 std::vector<std::string> instruction_sets() {
   std::vector<std::string> names;
   for (const Stages* stages : runnable_stages()) names.emplace_back(stages->name);
@@ -150,7 +190,11 @@ NB_MODULE(_kernel, m) {
   // A tensor that is alive when the interpreter ends keeps its frame; that is no leak.
   nb::set_leak_warnings(false);
   m.doc() = "Gaussian splat rasteriser";
-  nb::class_<Frame>(m, "Frame", "A drawn frame: what its backward pass needs.");
+  nb::class_<Frame>(m, "Frame", "A drawn frame: what its backward pass needs.")
+      .def_prop_ro("stage_seconds", &stage_seconds, "Processor time of the calling thread by stage.")
+      .def("work", &work, "means"_a, "quats"_a, "scales"_a, "opacities"_a, "colors"_a, "offset"_a, "background"_a,
+           "Pairs of splat and pixel tested, and those drawn.");
+  m.def("peak_flops", &peak_flops, "instruction_set"_a, "Measured multiply-add rate of one thread, flops per second.");
   m.def("forward", &forward, "means"_a, "quats"_a, "scales"_a, "opacities"_a, "colors"_a, "offset"_a, "background"_a,
         "viewmat"_a, "K"_a, "near"_a, "far"_a, "eps2d"_a, "image"_a, "alpha"_a, "radii"_a, "instruction_set"_a,
         "threads"_a, "Draw into image, alpha and radii.");

@@ -101,6 +101,12 @@ struct Gradients {
   float* means2d;          // (N, 2) or null
 };
 
+// The work of drawing a frame, in pairs of a splat and a pixel.
+struct Work {
+  std::uint64_t tested = 0;  // alpha was computed
+  std::uint64_t drawn = 0;   // the splat contributed to the pixel
+};
+
 // The stages compiled for one instruction set.
 struct Stages {
   const char* name;
@@ -118,6 +124,10 @@ struct Stages {
   // view_gradient (kViewGradient numbers).
   void (*project_backward)(const View&, const Splats&, const FrameData&, const Gradients&,
                            std::int64_t begin, std::int64_t end, double* view_gradient);
+  // For the speed bench alone.
+  void (*count_work)(const View&, const Splats&, const FrameData&, int tile, float* scratch, Work& work);
+  float (*multiply_add)(std::int64_t rounds);  // `chains` vectors a round
+  int chains;
 };
 
 }  // namespace headbench

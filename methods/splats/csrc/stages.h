@@ -4,6 +4,7 @@
 #include "backward.h"
 #include "binning.h"
 #include "forward.h"
+#include "measure.h"
 #include "projection_backward.h"
 
 namespace headbench::HEADBENCH_ISA {
@@ -14,7 +15,8 @@ inline std::size_t scratch_floats(int channels) {
 }
 
 extern const Stages stages;
-const Stages stages = {HEADBENCH_ISA_NAME, W,         project,            find_pairs,
-                       scratch_floats,     draw_tile, draw_tile_backward, project_backward};
+const Stages stages = {HEADBENCH_ISA_NAME, W,          project,      find_pairs,     scratch_floats,
+                       draw_tile,          draw_tile_backward, project_backward, count_work,
+                       multiply_add,       kChains};
 
 }  // namespace headbench::HEADBENCH_ISA

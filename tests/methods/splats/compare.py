@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from headbench.methods.splats import Rendering, rasterize
-
-from .scenes import Scene
+from headbench.methods.splats.benchmark.scenes import Scene
 
 DIFFERENTIABLE = (
     "means",

@@ -12,7 +12,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from .scenes import Scene
+from headbench.methods.splats.benchmark.scenes import Scene
 
 
 class Dense(NamedTuple):

@@ -9,8 +9,7 @@ import torch
 
 from headbench.bench.errors import UnavailableError
 from headbench.methods.splats import available_backends, cpu, rasterize
-
-from .scenes import cloud
+from headbench.methods.splats.benchmark.scenes import cloud
 
 BAD = {
     "means": [

@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from headbench.methods.splats import rasterize
+from headbench.methods.splats.benchmark.scenes import Scene, cloud
 from headbench.methods.splats.reference import rotation_matrices
 
 from .compare import DIFFERENTIABLE, relative_error, render_with_gradients
 from .dense import render_dense
-from .scenes import Scene, cloud
 
 F64 = torch.float64
 FOCAL, DEPTH, SIZE = 40.0, 2.0, 21

@@ -1,0 +1,11 @@
+"""What there is to know of the benchmarks of this room before any of them is imported."""
+
+from __future__ import annotations
+
+from ..bench.contracts import BenchmarkSpec
+
+SPLATS = BenchmarkSpec(
+    name="splats",
+    summary="the splat renderer: time by image size, number of splats and backend",
+    speed="headbench.methods.splats.benchmark.speed:measure",
+)

@@ -1,0 +1,112 @@
+"""What the speed bench measured, and how it is shown."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from .layout import milliseconds, table
+from .timing import Times
+
+STAGES = ("project", "sort", "find pairs", "draw", "draw backward", "project backward")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One scene drawn by one backend on one thread. Pairs are of a splat and a pixel, of one frame."""
+
+    splats: int
+    width: int
+    height: int
+    backend: str
+    forward: Times
+    both: Times
+    tested: int | None = None
+    """Pairs whose alpha was computed."""
+    drawn: int | None = None
+    """Pairs that contributed."""
+    stages: dict[str, float] | None = None
+    """Seconds by stage, the least over the runs."""
+    peak_share: tuple[float, float] | None = None
+    """Arithmetic of the drawing stages, forward and backward, over the measured multiply-add rate."""
+    ratio_to_anchor: float | None = None
+    """The anchor's least time for both passes over this one's."""
+
+
+@dataclass(frozen=True)
+class Scaling:
+    """Wall seconds of both passes with one and two threads, the least of interleaved runs."""
+
+    splats: int
+    width: int
+    height: int
+    one_thread: float
+    two_threads: float
+
+
+def speed_tables(
+    cells: Sequence[Cell], peaks: dict[str, float], scaling: Sequence[Scaling], missing: str
+) -> str:
+    """Lay out the results; ``missing`` says why there is no anchor, ``peaks`` are flops a second by backend."""
+    parts = [
+        "Processor time of one thread in ms: least and median of the runs; spread is between the quartiles. A pair is "
+        "a splat\nand a pixel it contributes to; the ratio is to the anchor's time for both passes.\n\n"
+        + _times(cells)
+    ]
+    if missing:
+        parts.append(f"No anchor. {missing}")
+    kernels = [cell for cell in cells if cell.stages]
+    if kernels:
+        rates = ", ".join(f"{name} {1e-9 * peak:.0f}" for name, peak in peaks.items())
+        parts.append(
+            "Stages of the kernel, ms, least of the runs. The last columns are the arithmetic of the drawing stages (by "
+            f"count in\nthe source) over the multiply-add rate measured in this run ({rates} GFlop/s).\n\n"
+            + _stages(kernels)
+        )
+    if scaling:
+        parts.append("Wall time of both passes, ms, least of interleaved runs.\n\n" + _scaling(scaling))
+    return "\n\n".join(parts)
+
+
+def _times(cells: Sequence[Cell]) -> str:
+    header = (
+        *("splats", "image", "backend", "forward", "median", "spread", "with backward", "median", "spread"),
+        *("Mpairs/s forward", "both", "x anchor"),
+    )
+    return table(header, [_times_row(cell) for cell in cells])
+
+
+def _times_row(cell: Cell) -> tuple[str, ...]:
+    both = (cell.forward, cell.both)
+    return (
+        *_scene(cell),
+        cell.backend,
+        *(milliseconds(s) for times in both for s in (times.least, times.median, times.iqr)),
+        *("-" if cell.drawn is None else f"{1e-6 * cell.drawn / times.least:.0f}" for times in both),
+        "-" if cell.ratio_to_anchor is None else f"{cell.ratio_to_anchor:.1f}",
+    )
+
+
+def _stages(cells: Sequence[Cell]) -> str:
+    rows = []
+    for cell in cells:
+        times = [f"{1e3 * (cell.stages or {})[name]:.2f}" for name in STAGES]
+        shares = [f"{100 * share:.0f} %" for share in cell.peak_share or ()]
+        rows.append((*_scene(cell), cell.backend, *times, *shares))
+    return table(("splats", "image", "backend", *STAGES, "of peak: draw", "draw backward"), rows)
+
+
+def _scaling(scaling: Sequence[Scaling]) -> str:
+    rows = [
+        (
+            *_scene(one),
+            *(milliseconds(one.one_thread), milliseconds(one.two_threads)),
+            f"{one.one_thread / one.two_threads:.2f}",
+        )
+        for one in scaling
+    ]
+    return table(("splats", "image", "one thread", "two threads", "speed-up"), rows)
+
+
+def _scene(of: Cell | Scaling) -> tuple[str, str]:
+    return str(of.splats), f"{of.width}x{of.height}"

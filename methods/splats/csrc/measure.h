@@ -1,0 +1,50 @@
+// What the speed bench asks beside times: how much work a drawn frame was, and what the processor could do at best.
+#pragma once
+
+#include "tile.h"
+
+namespace headbench::HEADBENCH_ISA {
+
+// Count the work of drawing a tile that was drawn before.
+inline void count_work(const View& view, const Splats& splats, const FrameData& frame, int tile, float* scratch,
+                       Work& work) {
+  const Pair* pairs = frame.pairs + frame.tile_begin[tile];
+  const int count = static_cast<int>(frame.tile_begin[tile + 1] - frame.tile_begin[tile]);
+  for (int begin = 0; begin < count; begin += kChunk) {
+    const int end = begin + kChunk < count ? begin + kChunk : count;
+    Chunk chunk;
+    fill_chunk(splats, frame, pairs, begin, end, ~std::uint64_t{0}, scratch, chunk);
+    for (int b = 0; b < kBlocks; ++b) {
+      const Block block = block_of(view, tile, b);
+      if (!any(block.inside)) continue;  // never drawn, so that nothing is stored of it
+      const Real last = load(frame.last + static_cast<std::size_t>(tile) * kTilePixels + b * W);
+      for (int i = 0; i < chunk.listed[b]; ++i) {
+        const float* row = chunk.params + chunk.list[b * kChunk + i] * chunk.stride;
+        const Mask reached = last >= Real(row[kGeometry + splats.channels]);
+        if (!any(reached)) break;
+        alignas(64) float drawn[W];
+        store(drawn, zero_unless(alpha_of(row, block).passes & reached, 1.0f));
+        work.tested += W;
+        for (int lane = 0; lane < W; ++lane) work.drawn += drawn[lane] != 0.0f;
+      }
+    }
+  }
+}
+
+constexpr int kChains = 12;  // independent multiply-adds in flight: more than latency times ports
+
+// Do `rounds` * kChains vector multiply-adds; the result only keeps the compiler from dropping them.
+inline float multiply_add(std::int64_t rounds) {
+  Real chain[kChains];
+  for (int k = 0; k < kChains; ++k) chain[k] = static_cast<float>(k);
+  const Real factor = 0.999f, term = 0.001f;
+  for (std::int64_t round = 0; round < rounds; ++round)
+    for (int k = 0; k < kChains; ++k) chain[k] = fma(chain[k], factor, term);
+  Real sum = 0.0f;
+  for (int k = 0; k < kChains; ++k) sum = sum + chain[k];
+  alignas(64) float lanes[W];
+  store(lanes, sum);
+  return lanes[0];
+}
+
+}  // namespace headbench::HEADBENCH_ISA
