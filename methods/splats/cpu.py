@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import importlib
 import logging
+from collections.abc import Sequence
 from types import ModuleType
 from typing import Any
 
@@ -68,21 +69,26 @@ def rasterize_cpu(request: Request, backend: str, threads: int | None) -> Render
     threads = torch.get_num_threads() if threads is None else threads
     if not isinstance(threads, int) or threads < 1:
         raise ValueError(f"threads: expected a positive integer or None, found {threads!r}.")
-    offset = request.means2d_offset
+    none = request.means.new_empty(len(request.viewmats), 0, 2)
     image, alpha, radii = _Rasterize.apply(
         *(request.means, request.quats, request.scales, request.opacities, request.colors),
-        request.means.new_empty(0, 2) if offset is None else offset,
-        *(request.background, request.viewmat, request.K),
-        (request.near, request.far, request.eps2d),
+        none if request.means2d_offset is None else request.means2d_offset,
+        none if request.means2d_abs is None else request.means2d_abs,
+        *(request.backgrounds, request.viewmats, request.Ks),
+        (request.near, request.far, request.eps2d, request.antialiased),
         (request.height, request.width),
+        request.batched,
         available[backend],
         threads,
     )
-    return Rendering(image, alpha, radii)
+    return Rendering(image, alpha, radii, request.masked)
 
 
 class _Rasterize(torch.autograd.Function):
-    """The kernel's two passes. Arrays are handed over without copying where they are contiguous."""
+    """The kernel's two passes. Arrays are handed over without copying where they are contiguous.
+
+    Cameras are drawn one after the other, each with all threads; the kernel adds their gradients in that order.
+    """
 
     @staticmethod
     def forward(
@@ -93,46 +99,74 @@ class _Rasterize(torch.autograd.Function):
         opacities: Tensor,
         colors: Tensor,
         offset: Tensor,
-        background: Tensor,
-        viewmat: Tensor,
-        K: Tensor,
-        settings: tuple[float, float, float],
+        absolute: Tensor,
+        backgrounds: Tensor,
+        viewmats: Tensor,
+        Ks: Tensor,
+        settings: tuple[float, float, float, bool],
         size: tuple[int, int],
+        batched: bool,
         instruction_set: str,
         threads: int,
     ) -> tuple[Tensor, Tensor, Tensor]:
         inputs = [
-            value.contiguous() for value in (means, quats, scales, opacities, colors, offset, background)
+            value.contiguous() for value in (means, quats, scales, opacities, colors, offset, backgrounds)
         ]
-        image = means.new_empty(*size, colors.shape[1])
-        alpha = means.new_empty(*size)
-        radii = torch.empty(len(means), dtype=torch.int32)
-        ctx.frame = _kernel().forward(
-            *_arrays(*inputs, viewmat.contiguous(), K.contiguous()),
-            *settings,
-            *_arrays(image, alpha, radii),
-            instruction_set,
-            threads,
-        )
-        ctx.threads = threads
+        viewmats, Ks, views = viewmats.contiguous(), Ks.contiguous(), len(viewmats)
+        images = means.new_empty(views, *size, colors.shape[-1])
+        alphas = means.new_empty(views, *size)
+        radii = torch.empty(views, len(means), dtype=torch.int32)
+        ctx.frames = [
+            _kernel().forward(
+                *_of_view(_arrays(*inputs), view),
+                *_arrays(viewmats[view], Ks[view]),
+                *settings,
+                *_arrays(images[view], alphas[view], radii[view]),
+                instruction_set,
+                threads,
+            )
+            for view in range(views)
+        ]
+        ctx.threads, ctx.absolute_like = threads, absolute.shape
         ctx.save_for_backward(*inputs)
-        ctx.mark_non_differentiable(radii)
-        return image, alpha, radii
+        # Taking the one image out of a stack here and not outside spares autograd a copy of its gradient.
+        outputs = (images, alphas, radii) if batched else (images[0], alphas[0], radii[0])
+        ctx.mark_non_differentiable(outputs[2])
+        return outputs
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad_image: Tensor, grad_alpha: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, grad_images: Tensor, grad_alphas: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
         inputs = ctx.saved_tensors
-        # The kernel writes those of visible splats; culled ones have zero.
+        views = len(ctx.frames)
+        # The kernel adds to those of visible splats; culled ones have zero.
         gradients = [torch.zeros_like(value) for value in inputs]
-        grad_viewmat = inputs[0].new_zeros(4, 4)
-        _kernel().backward(
-            ctx.frame,
-            *_arrays(*inputs, grad_image.contiguous(), grad_alpha.contiguous()),
-            *_arrays(*gradients, grad_viewmat),
-            ctx.threads,
-        )
-        return (*gradients, grad_viewmat, None, None, None, None, None)
+        grad_viewmats, grad_Ks = inputs[0].new_zeros(views, 4, 4), inputs[0].new_zeros(views, 3, 3)
+        absolute = ctx.absolute_like if ctx.needs_input_grad[_ABSOLUTE] else (views, 0, 2)
+        grad_absolute = inputs[0].new_zeros(absolute)
+        grad_images = grad_images.contiguous().view(views, *grad_images.shape[-3:])
+        grad_alphas = grad_alphas.contiguous().view(views, *grad_alphas.shape[-2:])
+        for view, frame in enumerate(ctx.frames):
+            _kernel().backward(
+                frame,
+                *_of_view(_arrays(*inputs), view),
+                *_arrays(grad_images[view], grad_alphas[view]),
+                *_of_view(_arrays(*gradients), view),
+                *_arrays(grad_viewmats[view], grad_Ks[view], grad_absolute[view]),
+                ctx.threads,
+            )
+        *of_splats, grad_backgrounds = gradients
+        wanted = grad_absolute if ctx.needs_input_grad[_ABSOLUTE] else None
+        return (*of_splats, wanted, grad_backgrounds, grad_viewmats, grad_Ks, None, None, None, None, None)
+
+
+_ABSOLUTE = 6  # position among the inputs
+
+
+def _of_view(arrays: Sequence[Any], view: int) -> list[Any]:
+    """One camera's part of the inputs, in the kernel's order; colours may be common to all cameras."""
+    *geometry, colors, offset, background = arrays
+    return [*geometry, colors[view] if colors.ndim == 3 else colors, offset[view], background[view]]
 
 
 def peak_flops(backend: str) -> float:
@@ -141,8 +175,13 @@ def peak_flops(backend: str) -> float:
 
 
 def work(node: Any) -> tuple[int, int]:
-    """Pairs of splat and pixel tested, and drawn, in the frame of an autograd node of the kernel."""
-    return node.frame.work(*_arrays(*node.saved_tensors))
+    """Pairs of splat and pixel tested, and drawn, by the first camera of an autograd node of the kernel."""
+    return node.frames[0].work(*_of_view(_arrays(*node.saved_tensors), 0))
+
+
+def stage_seconds(node: Any) -> dict[str, float]:
+    """Processor time of the calling thread by stage, of the first camera of an autograd node of the kernel."""
+    return node.frames[0].stage_seconds
 
 
 def _kernel() -> ModuleType:

@@ -24,12 +24,15 @@ def rasterize(
     near: float = 0.01,
     far: float = 1e10,
     eps2d: float = 0.3,
+    antialiased: bool = False,
     means2d_offset: Tensor | None = None,
+    means2d_abs: Tensor | None = None,
     backend: str = "auto",
     threads: int | None = None,
     check_finite: bool = True,
+    mask_non_finite: bool = False,
 ) -> Rendering:
-    """Render 3D Gaussians into one camera; differentiable in every tensor but ``K``.
+    """Render 3D Gaussians into one camera or several; differentiable in every tensor.
 
     Names, meanings and constants are gsplat's. To render depth or features, pass them as colours.
 
@@ -39,24 +42,33 @@ def rasterize(
     quats : (N, 4) rotations, wxyz, of any length; zero means no rotation.
     scales : (N, 3) standard deviations along the splat's axes, metres, > 0 (not their logarithms).
     opacities : (N,) in [0, 1]. A splat below 1/255 is culled, so its gradient is zero.
-    colors : (N, C), any range, 1 <= C <= 32.
-    viewmat : (4, 4) world to camera, OpenCV axes, metres.
+    colors : (N, C), any range, 1 <= C <= 32; or (V, N, C), a set for each of V cameras.
+    viewmat : (4, 4) world to camera, OpenCV axes, metres; or (V, 4, 4). With a leading V in this or in ``K``, everything
+        that comes out has it, and gradients of what is common to the cameras are summed.
     K : (3, 3) pixels; focal lengths and principal point count, skew does not. The centre of the top left
-        pixel is at (0.5, 0.5).
-    width, height : image size, pixels.
-    background : (C,), black if None.
+        pixel is at (0.5, 0.5). Or (V, 3, 3).
+    width, height : image size, pixels, of all cameras.
+    background : (C,) or (V, C), black if None.
     near, far : splats with camera z outside this range (metres) are culled.
     eps2d : low-pass filter: variance added to both image axes, square pixels.
-    means2d_offset : (N, 2) pixels, added to the projected means. Zeros that require a gradient collect the
+    antialiased : multiply each opacity by the square root of the ratio of the 2D covariance's determinants without and
+        with ``eps2d``, so that the low-pass filter makes small splats faint, not bigger (gsplat's mode "antialiased";
+        Yu et al., "Mip-Splatting", CVPR 2024, eq. 9). The cut at 1/255 applies to the product.
+    means2d_offset : (N, 2), or (V, N, 2) with several cameras. Pixels, added to the projected means. Zeros that require a gradient collect the
         gradient by the 2D means, in pixel units as gsplat's; culled splats get zero.
+    means2d_abs : like ``means2d_offset``, but adds nothing. Where it requires a gradient it collects, as that, the sum
+        over pixels of the absolute gradients by the 2D mean, x and y apart (gsplat's absgrad; Ye et al., "AbsGS", ACM MM
+        2024): a measure for densification, not a derivative.
     backend : one of `available_backends`, or "auto": the kernel for float32 on the CPU, else the reference.
     threads : of the kernel; None takes ``torch.get_num_threads()``. Results are equal bit for bit for any number.
     check_finite : refuse NaN and infinity in any tensor. Without the check a non-finite geometry is culled
         and a non-finite colour spreads to the pixels about it.
+    mask_non_finite : leave out splats of which any value is not finite, and count them in the result's ``masked``;
+        cameras and background are checked all the same.
 
     Returns
     -------
-    `Rendering`: image (H, W, C), alpha (H, W), radii (N,).
+    `Rendering`: image (H, W, C), alpha (H, W), radii (N,), each with a leading V for several cameras.
 
     Raises
     ------
@@ -69,8 +81,11 @@ def rasterize(
         near=near,
         far=far,
         eps2d=eps2d,
+        antialiased=antialiased,
         means2d_offset=means2d_offset,
+        means2d_abs=means2d_abs,
         check_finite=check_finite,
+        mask_non_finite=mask_non_finite,
     )
     if backend == "auto":
         backend = "cpu" if cpu.supports(request) and cpu.usable_or_warn() else "reference"

@@ -9,7 +9,7 @@ recomputed in the backward pass, so memory grows with the image and the splats, 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -24,7 +24,7 @@ from .constants import (
     TILE,
     TRANSMITTANCE_MIN,
 )
-from .request import Rendering, Request
+from .request import Rendering, Request, View
 
 CHUNK = 1024
 """Splats composited at once within a tile."""
@@ -37,17 +37,28 @@ class Footprints(NamedTuple):
     covariances: Tensor  # (M, 3): xx, xy, yy, low-pass filter included
     determinants: Tensor  # (M,) of the covariances
     depths: Tensor  # (M,) camera z, metres
+    opacities: Tensor  # (M,) compensated for the low-pass filter where that is asked for
 
 
 def rasterize_reference(request: Request) -> Rendering:
     """Render ``request``; see `rasterize` for the meaning of every field."""
+    drawn = [_draw(request, request.view(index)) for index in range(len(request.viewmats))]
+    images, alphas, radii = (torch.stack(parts) for parts in zip(*drawn, strict=True))
+    return request.rendering(images, alphas, radii)
+
+
+def _draw(request: Request, view: View) -> tuple[Tensor, Tensor, Tensor]:
+    """Image, alpha and radii of one camera."""
     with torch.no_grad():
-        visible, radii, extents = _find_visible(request)
-    footprints = project(request, visible)
+        visible, radii, extents = _find_visible(request, view)
+    footprints = project(request, view, visible)
     order = torch.argsort(footprints.depths.detach(), stable=True)
     visible, extents = visible[order], extents[order]
     footprints = Footprints(*(value[order] for value in footprints))
-    opacities, colors = request.opacities[visible], request.colors[visible]
+    colors = view.colors[visible]
+    absolute = (
+        footprints.means.new_zeros(len(visible), 2) if view.means2d_abs is None else view.means2d_abs[visible]
+    )
 
     rows = []
     for top in range(0, request.height, TILE):
@@ -59,15 +70,15 @@ def rasterize_reference(request: Request) -> Rendering:
             pixels = _pixel_centers(left, top, right, bottom).to(request.means)
             tile = _composite_tile(
                 Footprints(*(value[touching] for value in footprints)),
-                opacities[touching],
                 colors[touching],
-                request.background,
+                absolute[touching],
+                view.background,
                 pixels,
             )
             row.append(tile.reshape(bottom - top, right - left, -1))
         rows.append(torch.cat(row, dim=1))
     image_and_alpha = torch.cat(rows, dim=0)
-    return Rendering(image_and_alpha[..., :-1], image_and_alpha[..., -1], radii)
+    return image_and_alpha[..., :-1], image_and_alpha[..., -1], radii
 
 
 def rotation_matrices(quats: Tensor) -> Tensor:
@@ -87,21 +98,21 @@ def rotation_matrices(quats: Tensor) -> Tensor:
     return torch.stack(entries, dim=-1).reshape(-1, 3, 3)
 
 
-def project(request: Request, subset: Tensor) -> Footprints:
-    """Project the splats ``subset`` (indices) of ``request`` onto the image plane.
+def project(request: Request, view: View, subset: Tensor) -> Footprints:
+    """Project the splats ``subset`` (indices) of ``request`` onto the image plane of ``view``.
 
     The covariance is factored as ``Q Qᵀ + eps2d I`` with ``Q = J W R S`` (EWA Splatting, eq. 24-31: J the
     Jacobian of the perspective division, W the camera's rotation, R S the splat's axes). By the
     Cauchy-Binet formula its determinant is a sum of squares, which needles do not cancel away:
     ``|q0 x q1|² + eps2d (|q0|² + |q1|²) + eps2d²``.
     """
-    rotation, translation = request.viewmat[:3, :3], request.viewmat[:3, 3]
-    fx, fy, cx, cy = request.K[0, 0], request.K[1, 1], request.K[0, 2], request.K[1, 2]
+    rotation, translation = view.viewmat[:3, :3], view.viewmat[:3, 3]
+    fx, fy, cx, cy = view.K[0, 0], view.K[1, 1], view.K[0, 2], view.K[1, 2]
 
     x, y, z = (request.means[subset] @ rotation.T + translation).unbind(-1)
     means = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=-1)
-    if request.means2d_offset is not None:
-        means = means + request.means2d_offset[subset]
+    if view.means2d_offset is not None:
+        means = means + view.means2d_offset[subset]
 
     # Far outside the image the linearisation degenerates; gsplat clamps the slopes it is taken at.
     margin_x = FRUSTUM_MARGIN * 0.5 * request.width / fx
@@ -123,28 +134,32 @@ def project(request: Request, subset: Tensor) -> Footprints:
     area = torch.linalg.cross(q0, q1).square().sum(-1)
     eps = request.eps2d
     determinants = area + eps * (xx + yy) + eps * eps
-    return Footprints(means, torch.stack([xx + eps, xy, yy + eps], dim=-1), determinants, z)
+    opacities = request.opacities[subset]
+    if request.antialiased:
+        opacities = opacities * torch.sqrt(area / determinants)
+    return Footprints(means, torch.stack([xx + eps, xy, yy + eps], dim=-1), determinants, z, opacities)
 
 
-def _find_visible(request: Request) -> tuple[Tensor, Tensor, Tensor]:
+def _find_visible(request: Request, view: View) -> tuple[Tensor, Tensor, Tensor]:
     """Indices (M,) of the splats to draw, radii (N,) of all, and half sizes (M, 2) of the bounding boxes.
 
     Conditions are stated positively, so that a NaN anywhere culls.
     """
     radii = torch.zeros(len(request.means), dtype=torch.int32, device=request.means.device)
-    depths = request.means @ request.viewmat[2, :3] + request.viewmat[2, 3]
+    depths = request.means @ view.viewmat[2, :3] + view.viewmat[2, 3]
     candidate = (depths > request.near) & (depths < request.far) & (request.opacities >= ALPHA_MIN)
     subset = candidate.nonzero().squeeze(-1)
-    footprints = project(request, subset)
+    footprints = project(request, view, subset)
 
     # alpha falls to ALPHA_MIN on the ellipse at Mahalanobis distance sqrt(2 ln(opacity / ALPHA_MIN)).
-    level = 2 * torch.log(request.opacities[subset] / ALPHA_MIN)
+    level = 2 * torch.log(footprints.opacities / ALPHA_MIN)
     extents = torch.sqrt(level[:, None].clamp(min=0) * footprints.covariances[:, [0, 2]])
     reach = torch.ceil(extents)
     size = torch.tensor([request.width, request.height], device=reach.device)
     inside = (footprints.means + reach > 0).all(-1) & (footprints.means - reach < size).all(-1)
     drawable = (footprints.determinants > 0) & torch.isfinite(footprints.determinants)
-    keep = inside & drawable & (reach.amax(-1) < RADIUS_MAX)
+    opaque = footprints.opacities >= ALPHA_MIN
+    keep = inside & drawable & opaque & (reach.amax(-1) < RADIUS_MAX)
     visible = subset[keep]
     radii[visible] = reach[keep].amax(-1).to(torch.int32)
     return visible, radii, extents[keep]
@@ -165,20 +180,23 @@ def _pixel_centers(left: int, top: int, right: int, bottom: int) -> Tensor:
 
 
 def _composite_tile(
-    splats: Footprints, opacities: Tensor, colors: Tensor, background: Tensor, pixels: Tensor
+    splats: Footprints, colors: Tensor, absolute: Tensor, background: Tensor, pixels: Tensor
 ) -> Tensor:
-    """Composite depth-sorted splats front to back onto ``pixels`` (P, 2); gives (P, C + 1), alpha last."""
+    """Composite depth-sorted splats front to back onto ``pixels`` (P, 2); gives (P, C + 1), alpha last.
+
+    ``absolute`` (M, 2) collects the absolute gradients of the means.
+    """
     image = pixels.new_zeros(len(pixels), colors.shape[1])
     transmittance = pixels.new_ones(len(pixels))
     running = torch.ones_like(transmittance, dtype=torch.bool)
     # Once even without splats: what is drawn depends on the inputs all the same, with zero gradient.
-    for start in range(0, max(len(opacities), 1), CHUNK):
+    for start in range(0, max(len(colors), 1), CHUNK):
         part = slice(start, start + CHUNK)
         image, transmittance, running = checkpoint(
             _composite_chunk,
             *(image, transmittance, running, pixels),
-            *(splats.means[part], splats.covariances[part], splats.determinants[part]),
-            *(opacities[part], colors[part]),
+            *(splats.means[part], absolute[part], splats.covariances[part], splats.determinants[part]),
+            *(splats.opacities[part], colors[part]),
             use_reentrant=False,
             preserve_rng_state=False,
         )
@@ -192,6 +210,7 @@ def _composite_chunk(
     running: Tensor,
     pixels: Tensor,
     means: Tensor,
+    absolute: Tensor,
     covariances: Tensor,
     determinants: Tensor,
     opacities: Tensor,
@@ -202,7 +221,8 @@ def _composite_chunk(
     The exponent ``dᵀ Σ⁻¹ d`` is written as the sum of squares ``Σ_yy/det (dx - Σ_xy/Σ_yy dy)² + dy²/Σ_yy``,
     which rounding cannot make negative.
     """
-    dx, dy = (pixels[:, None, :] - means).unbind(-1)
+    at_pixels = _CollectAbsolute.apply(means.expand(len(pixels), -1, -1), absolute)
+    dx, dy = (pixels[:, None, :] - at_pixels).unbind(-1)
     xy, yy = covariances[:, 1], covariances[:, 2]
     distance = yy / determinants * (dx - xy / yy * dy) ** 2 + dy * dy / yy
     alpha = (opacities * torch.exp(-0.5 * distance)).clamp(max=ALPHA_MAX)
@@ -214,3 +234,15 @@ def _composite_chunk(
     light = torch.cumprod(torch.cat([transmittance[:, None], 1 - alpha], dim=1), dim=1)
     running = torch.cat([running[:, None], drawn], dim=1)[:, -1]
     return image + (alpha * light[:, :-1]) @ colors, light[:, -1], running
+
+
+class _CollectAbsolute(torch.autograd.Function):
+    """Pass means (P, M, 2) through, and give a second input (M, 2) the sum of their absolute gradients over P."""
+
+    @staticmethod
+    def forward(ctx: Any, means: Tensor, absolute: Tensor) -> Tensor:
+        return means.view_as(means)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
+        return gradient, gradient.abs().sum(0)

@@ -16,7 +16,7 @@ ArrayLike = Tensor | np.ndarray | Sequence[Any]
 
 
 class Rendering(NamedTuple):
-    """A rendered image."""
+    """A rendered image, or V of them along a leading dimension where V cameras were asked for."""
 
     image: Tensor
     """(H, W, C), composited over the background."""
@@ -24,30 +24,60 @@ class Rendering(NamedTuple):
     """(H, W) in [0, 1]: one minus the transmittance."""
     radii: Tensor
     """(N,) int32, pixels: how far the splat reaches from its mean along the wider image axis; 0 where culled."""
+    masked: int = 0
+    """Splats left out because some value of theirs is not finite; counted with ``mask_non_finite`` alone."""
+
+
+class View(NamedTuple):
+    """What a request asks of one camera."""
+
+    viewmat: Tensor  # (4, 4)
+    K: Tensor  # (3, 3)
+    background: Tensor  # (C,)
+    colors: Tensor  # (N, C)
+    means2d_offset: Tensor | None  # (N, 2)
+    means2d_abs: Tensor | None  # (N, 2)
 
 
 @dataclass(frozen=True, eq=False)
 class Request:
-    """The checked arguments of `rasterize`: tensors of one floating dtype on one device."""
+    """The checked arguments of `rasterize`: tensors of one floating dtype on one device, V cameras."""
 
     means: Tensor
     quats: Tensor
     scales: Tensor
     opacities: Tensor
-    colors: Tensor
-    viewmat: Tensor
-    K: Tensor
-    background: Tensor
-    means2d_offset: Tensor | None
+    colors: Tensor  # (N, C) or (V, N, C)
+    viewmats: Tensor  # (V, 4, 4)
+    Ks: Tensor  # (V, 3, 3)
+    backgrounds: Tensor  # (V, C)
+    means2d_offset: Tensor | None  # (V, N, 2)
+    means2d_abs: Tensor | None  # (V, N, 2)
     width: int
     height: int
     near: float
     far: float
     eps2d: float
+    antialiased: bool
+    batched: bool
+    masked: int
 
-    def tensors(self) -> dict[str, Tensor]:
-        """The tensors by argument name."""
-        return {name: value for name, value in vars(self).items() if isinstance(value, Tensor)}
+    def view(self, index: int) -> View:
+        """The part of the request that differs by camera."""
+        return View(
+            self.viewmats[index],
+            self.Ks[index],
+            self.backgrounds[index],
+            self.colors[index] if self.colors.ndim == 3 else self.colors,
+            None if self.means2d_offset is None else self.means2d_offset[index],
+            None if self.means2d_abs is None else self.means2d_abs[index],
+        )
+
+    def rendering(self, images: Tensor, alphas: Tensor, radii: Tensor) -> Rendering:
+        """Give what was drawn, all with a leading V, the shape the caller expects."""
+        if self.batched:
+            return Rendering(images, alphas, radii, self.masked)
+        return Rendering(images[0], alphas[0], radii[0], self.masked)
 
 
 def make_request(
@@ -65,38 +95,51 @@ def make_request(
     near: float,
     far: float,
     eps2d: float,
+    antialiased: bool,
     means2d_offset: Tensor | None,
+    means2d_abs: Tensor | None,
     check_finite: bool,
+    mask_non_finite: bool,
 ) -> Request:
     """Check the arguments of `rasterize`. Raises ValueError naming the argument, what it must be and what it is."""
     splats = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors}
-    per_splat = dict(splats) if means2d_offset is None else {**splats, "means2d_offset": means2d_offset}
-    for name, value in per_splat.items():
+    collectors = {"means2d_offset": means2d_offset, "means2d_abs": means2d_abs}
+    tensors = {**splats, **{name: value for name, value in collectors.items() if value is not None}}
+    for name, value in tensors.items():
         if not isinstance(value, Tensor):
             raise _error(name, "a torch tensor", type(value).__name__)
     if means.dtype not in (torch.float32, torch.float64):
         raise _error("means", "dtype float32 or float64", str(means.dtype))
 
+    cameras = {
+        "viewmat": _as_like("viewmat", viewmat, (4, 4), means),
+        "K": _as_like("K", K, (3, 3), means),
+    }
+    batched, views = _count_views(cameras)
     count = len(means) if means.ndim else 0
-    channels = colors.shape[-1] if colors.ndim == 2 else 0
-    for name, value in per_splat.items():
-        shape = {
-            "means": (count, 3),
-            "quats": (count, 4),
-            "scales": (count, 3),
-            "opacities": (count,),
-            "colors": (count, channels),
-            "means2d_offset": (count, 2),
-        }[name]
-        _check_like(name, value, shape, means)
+    channels = colors.shape[-1] if colors.ndim in (2, 3) else 0
+    front = (views,) if batched else ()
+    shapes: dict[str, tuple[int, ...]] = {
+        "means": (count, 3),
+        "quats": (count, 4),
+        "scales": (count, 3),
+        "opacities": (count,),
+        "colors": (*front, count, channels) if colors.ndim == 3 and batched else (count, channels),
+        **dict.fromkeys(collectors, (*front, count, 2)),
+    }
+    for name, value in tensors.items():
+        _check_like(name, value, shapes[name], means)
     if not 1 <= channels <= CHANNELS_MAX:
         raise _error(
             "colors", f"shape (N, C) with C from 1 to {CHANNELS_MAX}", f"shape {tuple(colors.shape)}"
         )
 
-    view = _as_like("viewmat", viewmat, (4, 4), means)
-    intrinsics = _as_like("K", K, (3, 3), means)
-    over = means.new_zeros(channels) if background is None else background
+    over = _as_like(
+        "background", means.new_zeros(channels) if background is None else background, (channels,), means
+    )
+    if over.ndim == 2 and (not batched or len(over) != views):
+        shape = f"({views}, {channels})" if batched else f"({channels},)"
+        raise _error("background", f"shape {shape}", f"shape {tuple(over.shape)}")
     for name, size in {"width": width, "height": height}.items():
         if not isinstance(size, (int, np.integer)) or size < 1:
             raise _error(name, "a positive integer", repr(size))
@@ -105,28 +148,66 @@ def make_request(
     if not eps2d >= 0:
         raise _error("eps2d", "a number >= 0", repr(eps2d))
 
-    request = Request(
-        **splats,
-        means2d_offset=means2d_offset,
-        viewmat=view,
-        K=intrinsics,
-        background=_as_like("background", over, (channels,), means),
+    masked = 0
+    if mask_non_finite:
+        tensors, masked = _mask(tensors)
+    if check_finite or mask_non_finite:
+        for name, value in {**tensors, **cameras, "background": over}.items():
+            _check_finite(name, value)
+    return Request(
+        **{name: tensors[name] for name in splats},
+        means2d_offset=_leading(tensors.get("means2d_offset"), batched),
+        means2d_abs=_leading(tensors.get("means2d_abs"), batched),
+        viewmats=cameras["viewmat"].expand(views, 4, 4),
+        Ks=cameras["K"].expand(views, 3, 3),
+        backgrounds=over.expand(views, channels),
         width=int(width),
         height=int(height),
         near=float(near),
         far=float(far),
         eps2d=float(eps2d),
+        antialiased=antialiased,
+        batched=batched,
+        masked=masked,
     )
-    if check_finite:
-        for name, value in request.tensors().items():
-            _check_finite(name, value)
-    return request
+
+
+def _count_views(cameras: dict[str, Tensor]) -> tuple[bool, int]:
+    """Whether there is a leading dimension of cameras, and their number."""
+    counts = {name: len(value) for name, value in cameras.items() if value.ndim == 3}
+    if len(set(counts.values())) > 1:
+        raise _error("viewmat, K", "as many cameras in both", f"{counts['viewmat']} and {counts['K']}")
+    views = next(iter(counts.values()), 1)
+    if views < 1:
+        raise _error(next(iter(counts)), "at least one camera", "none")
+    return bool(counts), views
+
+
+def _leading(value: Tensor | None, batched: bool) -> Tensor | None:
+    return value if value is None or batched else value[None]
+
+
+def _mask(tensors: dict[str, Tensor]) -> tuple[dict[str, Tensor], int]:
+    """Make splats with any value that is not finite invisible: zeros, and so no opacity and no gradient."""
+    count = len(tensors["means"])
+    bad = torch.zeros(count, dtype=torch.bool, device=tensors["means"].device)
+    for value in tensors.values():
+        finite = torch.isfinite(value.detach())
+        finite = finite if value.ndim == 1 else finite.all(-1)
+        bad |= ~(finite if finite.ndim == 1 else finite.all(0))
+    masked = int(bad.sum())
+    if not masked:
+        return tensors, 0
+    return {
+        name: value.masked_fill(bad if value.ndim == 1 else bad[:, None], 0.0)  # also under a leading V
+        for name, value in tensors.items()
+    }, masked
 
 
 def _check_like(name: str, value: Tensor, shape: tuple[int, ...], means: Tensor) -> None:
     """Require a shape, and the dtype and device of ``means``."""
     if tuple(value.shape) != shape:
-        letters = {"colors": "(N, C)"}.get(name, str(shape))
+        letters = {"colors": "(N, C), or (V, N, C) with V cameras"}.get(name, str(shape))
         raise _error(
             name, f"shape {letters}, with N = {len(means)} from means", f"shape {tuple(value.shape)}"
         )
@@ -137,10 +218,11 @@ def _check_like(name: str, value: Tensor, shape: tuple[int, ...], means: Tensor)
 
 
 def _as_like(name: str, value: ArrayLike, shape: tuple[int, ...], means: Tensor) -> Tensor:
-    """Turn a small array into a tensor of the dtype and device of ``means``; gradients pass through."""
+    """Turn a small array, or a stack of them, into a tensor of ``means``' dtype and device; gradients pass through."""
     tensor = torch.as_tensor(value)
-    if tuple(tensor.shape) != shape:
-        raise _error(name, f"shape {shape}", f"shape {tuple(tensor.shape)}")
+    if tuple(tensor.shape[-len(shape) :]) != shape or tensor.ndim > len(shape) + 1:
+        stacked = ", ".join(["V", *map(str, shape)])
+        raise _error(name, f"shape {shape} or ({stacked})", f"shape {tuple(tensor.shape)}")
     return tensor.to(dtype=means.dtype, device=means.device)
 
 

@@ -87,7 +87,7 @@ def measure_kernel(scene: Scene, backend: str, peak: float, *, budget: float, le
 
     def frame(clock: Callable[[], float]) -> tuple[float, float]:
         forward, both, node = run(clock)
-        for name, seconds in node.frame.stage_seconds.items():
+        for name, seconds in cpu.stage_seconds(node).items():
             stages[name] = min(stages.get(name, seconds), seconds)
         return forward, both
 

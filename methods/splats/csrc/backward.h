@@ -18,16 +18,22 @@ enum BackField {
   kBack            // then the colour gradients
 };
 
-inline int gradient_stride(int channels) { return (kMoments + channels + W - 1) / W * W; }
+// Floats per gradient record, with or without the absolute gradients.
+constexpr int gradient_stride(int channels, bool absolute) {
+  return (kMoments + channels + (absolute ? kAbsolutes : 0) + W - 1) / W * W;
+}
 
 inline std::size_t backward_scratch(int channels) {
   return chunk_floats(channels) + static_cast<std::size_t>(kBlocks) * (kBack + channels) * W +
-         static_cast<std::size_t>(kChunk + 1) * gradient_stride(channels);
+         static_cast<std::size_t>(kChunk + 1) * gradient_stride(channels, true);
 }
 
-// Pixels' v and w of up to W splats, kept until they can be summed over pixels for W splats at once.
+// Pixels' v and w of up to W splats, kept until they can be summed over pixels for W splats at once; and what the
+// absolute gradients are sums of.
+template <bool Absolute>
 struct Batch {
   alignas(64) float v[W * W], w[W * W];
+  alignas(64) float absolute[kAbsolutes][Absolute ? W * W : 1];
   alignas(64) float mean_x[W], mean_y[W];
   float* target[W];
   int used = 0;
@@ -35,18 +41,20 @@ struct Batch {
 
 // Sum the batch over the block's pixels and add to the splats' gradient records. In a transposed batch a lane
 // is a splat and every pixel is one vector, so that the sums are plain vector arithmetic.
-template <int C>
-inline void flush(Batch& batch, const Block& block, int channels, const float* colors, float* spare) {
-  const int count = C ? C : channels, width = (kMoments + count + W - 1) / W * W;
+template <int C, bool Absolute>
+inline void flush(Batch<Absolute>& batch, const Block& block, int channels, const float* colors, float* spare) {
+  const int count = C ? C : channels, width = gradient_stride(count, Absolute);
   for (int i = batch.used; i < W; ++i) {
     store(batch.v + i * W, 0.0f);
     store(batch.w + i * W, 0.0f);
+    if constexpr (Absolute)
+      for (int k = 0; k < kAbsolutes; ++k) store(batch.absolute[k] + i * W, 0.0f);
     batch.mean_x[i] = batch.mean_y[i] = 0.0f;
     batch.target[i] = spare;
   }
   batch.used = 0;
 
-  constexpr int kRoom = C ? (kMoments + C + W - 1) / W * W : (kMoments + kChannelsMax + W - 1) / W * W;
+  constexpr int kRoom = gradient_stride(C ? C : kChannelsMax, Absolute);
   alignas(64) float sums[kRoom * W];
   Real pixels[W];
   load_transposed(batch.v, pixels);
@@ -83,7 +91,14 @@ inline void flush(Batch& batch, const Block& block, int channels, const float* c
     }
     store(sums + (kMoments + c) * W, even + odd);
   }
-  for (int k = kMoments + count; k < width; ++k) store(sums + k * W, 0.0f);
+  if constexpr (Absolute)
+    for (int k = 0; k < kAbsolutes; ++k) {
+      load_transposed(batch.absolute[k], pixels);
+      Real sum = pixels[0];
+      for (int lane = 1; lane < W; ++lane) sum = sum + pixels[lane];
+      store(sums + (kMoments + count + k) * W, sum);
+    }
+  for (int k = kMoments + count + (Absolute ? kAbsolutes : 0); k < width; ++k) store(sums + k * W, 0.0f);
 
   for (int part = 0; part < width; part += W) {
     load_transposed(sums + part * W, pixels);
@@ -92,7 +107,7 @@ inline void flush(Batch& batch, const Block& block, int channels, const float* c
 }
 
 // Walk one block's list from its end; `gradients` are the chunk's records, row by row, and one spare.
-template <int C>
+template <int C, bool Absolute>
 inline void composite_block_backward(const Chunk& chunk, int index, const Block& block, int channels,
                                      float* state, float* gradients, int gradient_floats) {
   constexpr int kColors = C ? C : 1;
@@ -104,7 +119,7 @@ inline void composite_block_backward(const Chunk& chunk, int index, const Block&
   Real g[kColors];
   if constexpr (C != 0)
     for (int c = 0; c < C; ++c) g[c] = load(colors + c * W);
-  Batch batch;
+  Batch<Absolute> batch;
   for (int i = chunk.listed[index] - 1; i >= 0; --i) {
     const float* row = chunk.params + list[i] * chunk.stride;
     const Mask reached = start >= Real(row[kGeometry + count]);
@@ -123,14 +138,20 @@ inline void composite_block_backward(const Chunk& chunk, int index, const Block&
     const Real dalpha = fnma(behind, inverse, transmittance * along);
     behind = fma(weight, along, behind);
     const Mask unclamped = Real(kAlphaMax) >= a.raw;
-    store(batch.v + batch.used * W, zero_unless(unclamped, alpha * dalpha));
+    const Real value = zero_unless(unclamped, alpha * dalpha);
+    store(batch.v + batch.used * W, value);
+    if constexpr (Absolute) {
+      store(batch.absolute[0] + batch.used * W, absolute(value * a.u));
+      const Real along_y = fma(row[kL21], a.u, Real(row[kL22]) * a.v);
+      store(batch.absolute[1] + batch.used * W, absolute(value * along_y));
+    }
     store(batch.w + batch.used * W, weight);
     batch.mean_x[batch.used] = row[kMeanX];
     batch.mean_y[batch.used] = row[kMeanY];
     batch.target[batch.used] = gradients + list[i] * gradient_floats;
-    if (++batch.used == W) flush<C>(batch, block, channels, colors, gradients + kChunk * gradient_floats);
+    if (++batch.used == W) flush<C, Absolute>(batch, block, channels, colors, gradients + kChunk * gradient_floats);
   }
-  if (batch.used) flush<C>(batch, block, channels, colors, gradients + kChunk * gradient_floats);
+  if (batch.used) flush<C, Absolute>(batch, block, channels, colors, gradients + kChunk * gradient_floats);
   store(state + kTransmittance * W, transmittance);
   store(state + kBehind * W, behind);
 }
@@ -166,7 +187,7 @@ inline int read_block(const View& view, const Splats& splats, const FrameData& f
   return static_cast<int>(furthest);
 }
 
-template <int C>
+template <int C, bool Absolute>
 inline void draw_tile_backward_with(const View& view, const Splats& splats, const FrameData& frame,
                                     const Gradients& grads, int tile, float* scratch) {
   const int channels = splats.channels, state_floats = (kBack + channels) * W, stride = grads.entry_stride;
@@ -197,7 +218,7 @@ inline void draw_tile_backward_with(const View& view, const Splats& splats, cons
       fill_chunk(splats, frame, pairs, begin, end, wanted, chunk_scratch, chunk);
       for (int b = 0; b < kBlocks; ++b)
         if (chunk.listed[b])
-          composite_block_backward<C>(chunk, b, block_of(view, tile, b), channels, states + b * state_floats,
+          composite_block_backward<C, Absolute>(chunk, b, block_of(view, tile, b), channels, states + b * state_floats,
                                       sums, stride);
     }
     for (int i = begin; i < end; ++i) {
@@ -207,14 +228,21 @@ inline void draw_tile_backward_with(const View& view, const Splats& splats, cons
   }
 }
 
-inline void draw_tile_backward(const View& view, const Splats& splats, const FrameData& frame,
+template <bool Absolute>
+inline void draw_tile_backward_as(const View& view, const Splats& splats, const FrameData& frame,
                                const Gradients& grads, int tile, float* scratch) {
   switch (splats.channels) {
-    case 1: return draw_tile_backward_with<1>(view, splats, frame, grads, tile, scratch);
-    case 3: return draw_tile_backward_with<3>(view, splats, frame, grads, tile, scratch);
-    case 4: return draw_tile_backward_with<4>(view, splats, frame, grads, tile, scratch);
-    default: return draw_tile_backward_with<0>(view, splats, frame, grads, tile, scratch);
+    case 1: return draw_tile_backward_with<1, Absolute>(view, splats, frame, grads, tile, scratch);
+    case 3: return draw_tile_backward_with<3, Absolute>(view, splats, frame, grads, tile, scratch);
+    case 4: return draw_tile_backward_with<4, Absolute>(view, splats, frame, grads, tile, scratch);
+    default: return draw_tile_backward_with<0, Absolute>(view, splats, frame, grads, tile, scratch);
   }
+}
+
+inline void draw_tile_backward(const View& view, const Splats& splats, const FrameData& frame,
+                               const Gradients& grads, int tile, float* scratch) {
+  if (grads.means2d_abs) return draw_tile_backward_as<true>(view, splats, frame, grads, tile, scratch);
+  draw_tile_backward_as<false>(view, splats, frame, grads, tile, scratch);
 }
 
 }  // namespace headbench::HEADBENCH_ISA

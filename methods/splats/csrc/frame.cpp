@@ -195,7 +195,7 @@ void Frame::backward(const Splats& splats, Gradients grads, float* background, f
   const std::size_t scratch_stride = round_up(stages_.scratch_floats(channels), 16);
   Buffer<float> scratch, entries;
   scratch.resize(scratch_stride * threads);
-  grads.entry_stride = static_cast<int>(round_up(kMoments + channels, stages_.lanes));
+  grads.entry_stride = static_cast<int>(round_up(kMoments + channels + (grads.means2d_abs ? kAbsolutes : 0), stages_.lanes));
   grads.entries = entries.resize(entries_ * grads.entry_stride);
   std::vector<double> tile_background(static_cast<std::size_t>(tiles) * channels);
   grads.background = tile_background.data();

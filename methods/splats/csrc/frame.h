@@ -50,8 +50,8 @@ class Frame {
   Frame(const View& view, const Splats& splats, const ImageOut& out, std::int32_t* radii, const Stages& stages,
         int threads);
 
-  // `splats` must hold the same values as when drawn. Entries of culled splats are left as they are; the rest of
-  // `grads`, `background` (C,) and `view_gradient` (kViewGradient,) are overwritten.
+  // `splats` must hold the same values as when drawn. Adds to the splats' gradients in `grads`, so that views can be
+  // summed; overwrites `background` (C,) and `view_gradient` (kViewGradient,).
   void backward(const Splats& splats, Gradients grads, float* background, float* view_gradient, int threads);
 
   // Processor time of the calling thread by stage, of the last pass each; with one thread that is all there was.

@@ -59,7 +59,7 @@ const Stages& stages_by_name(const std::string& name) {
 }
 
 View make_view(const Array<const float, 4, 4>& viewmat, const Array<const float, 3, 3>& K, float near, float far,
-               float eps2d, std::size_t width, std::size_t height) {
+               float eps2d, bool antialiased, std::size_t width, std::size_t height) {
   View view{};
   for (int i = 0; i < 3; ++i) {
     for (int j = 0; j < 3; ++j) view.rotation[3 * i + j] = viewmat(i, j);
@@ -72,6 +72,7 @@ View make_view(const Array<const float, 4, 4>& viewmat, const Array<const float,
   view.near = near;
   view.far = far;
   view.eps2d = eps2d;
+  view.antialiased = antialiased;
   constexpr std::size_t kSizeMax = std::size_t{1} << 19;  // tile indices have 16 bits
   if (width < 1 || height < 1 || width > kSizeMax || height > kSizeMax)
     throw std::invalid_argument("image sides must be from 1 to 2^19 pixels");
@@ -87,11 +88,11 @@ std::unique_ptr<Frame> forward(const Array<const float, -1, 3>& means, const Arr
                                const Array<const float, -1, -1>& colors, const Array<const float, -1, 2>& offset,
                                const Array<const float, -1>& background, const Array<const float, 4, 4>& viewmat,
                                const Array<const float, 3, 3>& K, float near, float far, float eps2d,
-                               const Array<float, -1, -1, -1>& image, const Array<float, -1, -1>& alpha,
+                               bool antialiased, const Array<float, -1, -1, -1>& image, const Array<float, -1, -1>& alpha,
                                const Array<std::int32_t, -1>& radii, const std::string& instruction_set,
                                int threads) {
   const Splats splats = Inputs{means, quats, scales, opacities, colors, offset, background}.splats();
-  const View view = make_view(viewmat, K, near, far, eps2d, image.shape(1), image.shape(0));
+  const View view = make_view(viewmat, K, near, far, eps2d, antialiased, image.shape(1), image.shape(0));
   if (image.shape(2) != colors.shape(1) || alpha.shape(0) != image.shape(0) || alpha.shape(1) != image.shape(1) ||
       radii.shape(0) != means.shape(0) || threads < 1)
     throw std::invalid_argument("outputs do not fit the inputs");
@@ -108,7 +109,8 @@ void backward(Frame& frame, const Array<const float, -1, 3>& means, const Array<
               const Array<float, -1, 4>& grad_quats, const Array<float, -1, 3>& grad_scales,
               const Array<float, -1>& grad_opacities, const Array<float, -1, -1>& grad_colors,
               const Array<float, -1, 2>& grad_offset, const Array<float, -1>& grad_background,
-              const Array<float, 4, 4>& grad_viewmat, int threads) {
+              const Array<float, 4, 4>& grad_viewmat, const Array<float, 3, 3>& grad_K,
+              const Array<float, -1, 2>& grad_absolute, int threads) {
   const Splats splats = Inputs{means, quats, scales, opacities, colors, offset, background}.splats();
   const auto same = [](const auto& a, const auto& b) {
     for (std::size_t i = 0; i < a.ndim(); ++i)
@@ -118,6 +120,7 @@ void backward(Frame& frame, const Array<const float, -1, 3>& means, const Array<
   if (!frame.fits(splats) || !frame.fits(grad_image.shape(1), grad_image.shape(0)) || !same(grad_means, means) ||
       !same(grad_quats, quats) || !same(grad_scales, scales) || !same(grad_opacities, opacities) ||
       !same(grad_colors, colors) || !same(grad_offset, offset) || !same(grad_background, background) ||
+      (grad_absolute.shape(0) != 0 && grad_absolute.shape(0) != means.shape(0)) ||
       grad_image.shape(2) != colors.shape(1) || grad_alpha.shape(0) != grad_image.shape(0) ||
       grad_alpha.shape(1) != grad_image.shape(1) || threads < 1)
     throw std::invalid_argument("gradients do not fit the inputs");
@@ -130,6 +133,7 @@ void backward(Frame& frame, const Array<const float, -1, 3>& means, const Array<
   grads.opacities = grad_opacities.data();
   grads.colors = grad_colors.data();
   grads.means2d = grad_offset.shape(0) ? grad_offset.data() : nullptr;
+  grads.means2d_abs = grad_absolute.shape(0) ? grad_absolute.data() : nullptr;
   float view_gradient[kViewGradient];
   {
     nb::gil_scoped_release unlocked;
@@ -138,6 +142,10 @@ void backward(Frame& frame, const Array<const float, -1, 3>& means, const Array<
   for (int i = 0; i < 3; ++i) {
     for (int j = 0; j < 3; ++j) grad_viewmat(i, j) = view_gradient[3 * i + j];
     grad_viewmat(i, 3) = view_gradient[9 + i];
+  }
+  for (int i = 0; i < 2; ++i) {
+    grad_K(i, i) = view_gradient[12 + i];
+    grad_K(i, 2) = view_gradient[14 + i];
   }
 }
 
@@ -196,11 +204,12 @@ NB_MODULE(_kernel, m) {
            "Pairs of splat and pixel tested, and those drawn.");
   m.def("peak_flops", &peak_flops, "instruction_set"_a, "Measured multiply-add rate of one thread, flops per second.");
   m.def("forward", &forward, "means"_a, "quats"_a, "scales"_a, "opacities"_a, "colors"_a, "offset"_a, "background"_a,
-        "viewmat"_a, "K"_a, "near"_a, "far"_a, "eps2d"_a, "image"_a, "alpha"_a, "radii"_a, "instruction_set"_a,
+        "viewmat"_a, "K"_a, "near"_a, "far"_a, "eps2d"_a, "antialiased"_a, "image"_a, "alpha"_a, "radii"_a, "instruction_set"_a,
         "threads"_a, "Draw into image, alpha and radii.");
   m.def("backward", &backward, "frame"_a, "means"_a, "quats"_a, "scales"_a, "opacities"_a, "colors"_a, "offset"_a,
         "background"_a, "grad_image"_a, "grad_alpha"_a, "grad_means"_a, "grad_quats"_a, "grad_scales"_a,
-        "grad_opacities"_a, "grad_colors"_a, "grad_offset"_a, "grad_background"_a, "grad_viewmat"_a, "threads"_a,
-        "Write the gradients of visible splats, background and camera.");
+        "grad_opacities"_a, "grad_colors"_a, "grad_offset"_a, "grad_background"_a, "grad_viewmat"_a, "grad_K"_a,
+        "grad_absolute"_a, "threads"_a,
+        "Add the gradients of visible splats; write those of background and camera. An empty grad_absolute asks for none.");
   m.def("instruction_sets", &instruction_sets, "Variants this machine can run, the fastest first.");
 }

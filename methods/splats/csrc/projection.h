@@ -41,6 +41,8 @@ struct Projection {
   Real axes[9];         // rotation times scales
   Real camera_axes[9];  // the same seen by the camera
   Real q0[3], q1[3];
+  Real cross[3];  // q0 x q1
+  Real area2;     // its square: the determinant without eps
   Real xx, xy, yy, det;
   Real l11, l21, l22;
 };
@@ -59,6 +61,12 @@ HEADBENCH_INLINE void rotation_matrix(const Real* q, Real* r) {
 }
 
 HEADBENCH_INLINE Real dot3(const Real* a, const Real* b) { return fma(a[0], b[0], fma(a[1], b[1], a[2] * b[2])); }
+
+HEADBENCH_INLINE void cross3(const Real* a, const Real* b, Real* out) {
+  out[0] = fnma(a[2], b[1], a[1] * b[2]);
+  out[1] = fnma(a[0], b[2], a[2] * b[0]);
+  out[2] = fnma(a[1], b[0], a[0] * b[1]);
+}
 
 HEADBENCH_INLINE Real absolute(Real a) { return max(a, Real(0.0f) - a); }
 
@@ -112,11 +120,11 @@ inline void project_lanes(const View& view, const SplatLanes& in, Projection& p)
     p.q0[j] = fx_z * fnma(p.slope_x, p.camera_axes[6 + j], p.camera_axes[j]);
     p.q1[j] = fy_z * fnma(p.slope_y, p.camera_axes[6 + j], p.camera_axes[3 + j]);
   }
-  const Real cross[3] = {fnma(p.q0[2], p.q1[1], p.q0[1] * p.q1[2]), fnma(p.q0[0], p.q1[2], p.q0[2] * p.q1[0]),
-                         fnma(p.q0[1], p.q1[0], p.q0[0] * p.q1[1])};
+  cross3(p.q0, p.q1, p.cross);
+  p.area2 = dot3(p.cross, p.cross);
   const Real xx = dot3(p.q0, p.q0), yy = dot3(p.q1, p.q1), eps = view.eps2d;
   p.xy = dot3(p.q0, p.q1);
-  p.det = fma(eps, xx + yy, fma(eps, eps, dot3(cross, cross)));
+  p.det = fma(eps, xx + yy, fma(eps, eps, p.area2));
   p.xx = xx + eps;
   p.yy = yy + eps;
   const Real root = sqrt(p.yy);
@@ -140,8 +148,11 @@ inline void project(const View& view, const Splats& splats, const FrameData& fra
     Projection p;
     project_lanes(view, in, p);
 
-    alignas(64) float level_log2[W];
-    for (int lane = 0; lane < W; ++lane) level_log2[lane] = log2f(in.opacity[lane]);
+    Real opacity = load(in.opacity);
+    if (view.antialiased) opacity = opacity * sqrt(p.area2 / p.det);
+    alignas(64) float opacities[W], level_log2[W];
+    store(opacities, opacity);
+    for (int lane = 0; lane < W; ++lane) level_log2[lane] = log2f(opacities[lane]);
     const Real log2_opacity = load(level_log2);
     const Real level = Real(2.0f * kLn2) * max(log2_opacity - Real(kLog2AlphaMin), 0.0f);
     const Real extent_x = sqrt(level * p.xx), extent_y = sqrt(level * p.yy);
@@ -153,7 +164,7 @@ inline void project(const View& view, const Splats& splats, const FrameData& fra
                           (Real(static_cast<float>(view.height)) > p.mean_y - reach_y);
     const Real largest = 3e38f;
     const Mask drawable = (p.det > Real(0.0f)) & (largest > p.det) & (largest > p.l11) &
-                          (Real(kRadiusMax) > radius) & (load(in.opacity) >= Real(kAlphaMin));
+                          (Real(kRadiusMax) > radius) & (opacity >= Real(kAlphaMin));
 
     alignas(64) float visible[W], field[kGeometry][W], depth[W], reach[W], half_x[W], half_y[W];
     store(visible, zero_unless(in_depth & in_image & drawable, 1.0f));

@@ -25,6 +25,20 @@ struct SplatGradients {
   Real mean2d[2], mean[3], quat[4], scale[3], opacity;
 };
 
+// Add the derivative of the antialiasing factor. Its logarithm is half of log area² - log det, and `along` is what
+// the logarithm of the opacity receives; 1/area² - 1/det is written without a difference of near equals.
+HEADBENCH_INLINE void compensation_backward(const View& view, const Projection& p, Real along, Real* dq0, Real* dq1) {
+  const Real eps = view.eps2d, gap = eps * (p.xx + p.yy - eps);
+  const Real by_area = along * gap / (p.area2 * p.det), by_det = along * eps / p.det;
+  Real beside0[3], beside1[3];
+  cross3(p.q1, p.cross, beside0);
+  cross3(p.cross, p.q0, beside1);
+  for (int j = 0; j < 3; ++j) {
+    dq0[j] = dq0[j] + fnma(by_det, p.q0[j], by_area * beside0[j]);
+    dq1[j] = dq1[j] + fnma(by_det, p.q1[j], by_area * beside1[j]);
+  }
+}
+
 // `moments` are sums over pixels of v, v dx, v dy, v dx², v dx dy, v dy² with v = alpha dL/dalpha (zero where
 // alpha was clamped) and (dx, dy) the pixel's centre minus the splat's mean. With A the inverse covariance,
 //   dL/dmean2d = A Σ v d,    dL/dcovariance = 1/2 A (Σ v d dᵀ) A,    A = 2 ln2 L Lᵀ.
@@ -53,6 +67,7 @@ inline void project_lanes_backward(const View& view, const Projection& p, const 
     dq0[j] = Real(2.0f) * fma(g00, p.q0[j], g01 * p.q1[j]);
     dq1[j] = Real(2.0f) * fma(g01, p.q0[j], g11 * p.q1[j]);
   }
+  if (view.antialiased) compensation_backward(view, p, moments[kSum], dq0, dq1);
   const Real fx_z = Real(view.fx) * p.inv_z, fy_z = Real(view.fy) * p.inv_z;
   const Real dslope_x = Real(0.0f) - fx_z * dot3(dq0, p.camera_axes + 6);
   const Real dslope_y = Real(0.0f) - fy_z * dot3(dq1, p.camera_axes + 6);
@@ -66,7 +81,7 @@ inline void project_lanes_backward(const View& view, const Projection& p, const 
   // Both rows of Q are proportional to 1/z; the means and unclamped slopes depend on x/z and y/z.
   const Real dratio_x = fma(view.fx, out.mean2d[0], zero_unless(p.free_x, dslope_x));
   const Real dratio_y = fma(view.fy, out.mean2d[1], zero_unless(p.free_y, dslope_y));
-  const Real shrink = dot3(dq0, p.q0) + dot3(dq1, p.q1);
+  const Real grow_x = dot3(dq0, p.q0), grow_y = dot3(dq1, p.q1), shrink = grow_x + grow_y;
   Real dcamera[3];
   dcamera[0] = dratio_x * p.inv_z;
   dcamera[1] = dratio_y * p.inv_z;
@@ -90,6 +105,14 @@ inline void project_lanes_backward(const View& view, const Projection& p, const 
       view_gradient[3 * i + j] = fma(dcamera[i], p.mean[j], dot3(daxes_camera + 3 * i, p.axes + 3 * j));
     view_gradient[9 + i] = dcamera[i];
   }
+  // The limits of clamped slopes are (a - c) / f with a constant a.
+  const Real inv_fx = 1.0f / view.fx, inv_fy = 1.0f / view.fy;
+  const Real limit_x = inv_fx * (dslope_x - zero_unless(p.free_x, dslope_x));
+  const Real limit_y = inv_fy * (dslope_y - zero_unless(p.free_y, dslope_y));
+  view_gradient[12] = fnma(limit_x, p.slope_x, fma(out.mean2d[0], p.x * p.inv_z, grow_x * inv_fx));
+  view_gradient[13] = fnma(limit_y, p.slope_y, fma(out.mean2d[1], p.y * p.inv_z, grow_y * inv_fy));
+  view_gradient[14] = out.mean2d[0] - limit_x;
+  view_gradient[15] = out.mean2d[1] - limit_y;
 }
 
 inline void project_backward(const View& view, const Splats& splats, const FrameData& frame,
@@ -99,17 +122,18 @@ inline void project_backward(const View& view, const Splats& splats, const Frame
   for (std::int64_t first = begin; first < end; first += W) {
     const int used = static_cast<int>(end - first < W ? end - first : W);
     SplatLanes in;
-    alignas(64) float moments[kMoments][W];
+    alignas(64) float moments[kMoments][W], absolutes[kAbsolutes][W];
     for (int lane = 0; lane < W; ++lane) {
       const std::int64_t splat = frame.visible[first + (lane < used ? lane : 0)];
       load_lane(splats, splat, lane, in);
       if (lane >= used) {
         for (int k = 0; k < kMoments; ++k) moments[k][lane] = 0.0f;
+        for (int k = 0; k < kAbsolutes; ++k) absolutes[k][lane] = 0.0f;
         continue;
       }
       // A splat's records are neighbours and are added in their order: the sum does not depend on who drew
       // the tiles.
-      alignas(64) float sum[kMoments + kChannelsMax + 2 * W];
+      alignas(64) float sum[kMoments + kChannelsMax + kAbsolutes + 2 * W];
       const float* record = grads.entries + static_cast<std::size_t>(frame.entry_begin[splat]) * stride;
       const std::uint32_t count = frame.entry_count[splat];
       for (int i = 0; i < vectors; ++i) {
@@ -119,7 +143,9 @@ inline void project_backward(const View& view, const Splats& splats, const Frame
         store(sum + i * W, total);
       }
       for (int k = 0; k < kMoments; ++k) moments[k][lane] = sum[k];
-      for (int c = 0; c < channels; ++c) grads.colors[splat * channels + c] = sum[kMoments + c];
+      for (int c = 0; c < channels; ++c) grads.colors[splat * channels + c] += sum[kMoments + c];
+      if (grads.means2d_abs)
+        for (int k = 0; k < kAbsolutes; ++k) absolutes[k][lane] = sum[kMoments + channels + k];
     }
 
     Projection p;
@@ -129,7 +155,8 @@ inline void project_backward(const View& view, const Splats& splats, const Frame
     SplatGradients g;
     project_lanes_backward(view, p, lanes, load(in.opacity), g, view_lanes);
 
-    alignas(64) float mean2d[2][W], mean[3][W], quat[4][W], scale[3][W], opacity[W], lane_view[W];
+    alignas(64) float mean2d[2][W], mean[3][W], quat[4][W], scale[3][W], opacity[W], l11[W], lane_view[W];
+    store(l11, p.l11);
     for (int k = 0; k < 2; ++k) store(mean2d[k], g.mean2d[k]);
     for (int k = 0; k < 3; ++k) store(mean[k], g.mean[k]);
     for (int k = 0; k < 4; ++k) store(quat[k], g.quat[k]);
@@ -141,12 +168,16 @@ inline void project_backward(const View& view, const Splats& splats, const Frame
     }
     for (int lane = 0; lane < used; ++lane) {
       const std::int64_t splat = frame.visible[first + lane];
-      for (int k = 0; k < 3; ++k) grads.means[3 * splat + k] = mean[k][lane];
-      for (int k = 0; k < 4; ++k) grads.quats[4 * splat + k] = quat[k][lane];
-      for (int k = 0; k < 3; ++k) grads.scales[3 * splat + k] = scale[k][lane];
-      grads.opacities[splat] = opacity[lane];
+      for (int k = 0; k < 3; ++k) grads.means[3 * splat + k] += mean[k][lane];
+      for (int k = 0; k < 4; ++k) grads.quats[4 * splat + k] += quat[k][lane];
+      for (int k = 0; k < 3; ++k) grads.scales[3 * splat + k] += scale[k][lane];
+      grads.opacities[splat] += opacity[lane];
       if (grads.means2d)
-        for (int k = 0; k < 2; ++k) grads.means2d[2 * splat + k] = mean2d[k][lane];
+        for (int k = 0; k < 2; ++k) grads.means2d[2 * splat + k] += mean2d[k][lane];
+      if (grads.means2d_abs) {
+        grads.means2d_abs[2 * splat] += 2.0f * kLn2 * l11[lane] * absolutes[0][lane];
+        grads.means2d_abs[2 * splat + 1] += 2.0f * kLn2 * absolutes[1][lane];
+      }
     }
   }
 }

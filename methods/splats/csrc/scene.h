@@ -25,15 +25,19 @@ constexpr int kChannelsMax = 32;
 // A record holds what drawing needs of a splat: kGeometry numbers, then the colour.
 enum RecordField { kMeanX, kMeanY, kL11, kL21, kL22, kLog2Opacity, kGeometry };
 
-// A gradient record holds moments of the alpha gradient over pixels, then the gradient of the colour.
+// A gradient record holds moments of the alpha gradient over pixels, then the gradient of the colour, then, where they
+// are asked for, two sums that become the absolute gradient of the 2D mean.
 enum GradientField { kSum, kSumX, kSumY, kSumXX, kSumXY, kSumYY, kMoments };
+constexpr int kAbsolutes = 2;
 
-constexpr int kViewGradient = 12;  // rows of the rotation, then the translation
+// Rows of the rotation, the translation, then fx, fy, cx, cy.
+constexpr int kViewGradient = 16;
 
 struct View {
   float rotation[9], translation[3];
   float fx, fy, cx, cy;
   float near, far, eps2d;
+  bool antialiased;  // opacities are multiplied by the square root of the ratio of determinants without and with eps2d
   int width, height;
   int tiles_x, tiles_y;
 };
@@ -99,6 +103,7 @@ struct Gradients {
   float* opacities;        // (N,)
   float* colors;           // (N, C)
   float* means2d;          // (N, 2) or null
+  float* means2d_abs;      // (N, 2) or null
 };
 
 // The work of drawing a frame, in pairs of a splat and a pixel.

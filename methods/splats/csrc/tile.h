@@ -113,6 +113,7 @@ HEADBENCH_INLINE Real exp2(Real x) {
 struct Alpha {
   Mask passes;  // alpha >= 1/255
   Real raw;     // before the clamp; meaningless where it does not pass
+  Real u, v;    // log2 alpha = log2 opacity - u² - v²
 };
 
 // Alpha of the splat in `row` at a block's pixels. Forward and backward both come here: were the two to differ
@@ -121,7 +122,7 @@ HEADBENCH_INLINE Alpha alpha_of(const float* row, const Block& block) {
   const Real dx = block.pixel_x - Real(row[kMeanX]), dy = block.pixel_y - Real(row[kMeanY]);
   const Real u = fma(row[kL11], dx, Real(row[kL21]) * dy), v = Real(row[kL22]) * dy;
   const Real exponent = fnma(v, v, fnma(u, u, row[kLog2Opacity]));
-  return {exponent >= Real(kLog2AlphaMin), exp2(exponent)};
+  return {exponent >= Real(kLog2AlphaMin), exp2(exponent), u, v};
 }
 
 }  // namespace headbench::HEADBENCH_ISA

@@ -17,8 +17,10 @@ DIFFERENTIABLE = (
     "opacities",
     "colors",
     "viewmat",
+    "K",
     "background",
     "means2d_offset",
+    "means2d_abs",
 )
 
 
@@ -36,18 +38,16 @@ def render_with_gradients(
 
     ``weights`` (H, W) scale it per pixel.
     """
-    leaves = {
-        name: value.detach().to(dtype).clone().requires_grad_()
-        for name, value in {**scene._asdict(), "means2d_offset": torch.zeros(len(scene.means), 2)}.items()
-        if name in DIFFERENTIABLE
-    }
+    zeros = torch.zeros(*scene.viewmat.shape[:-2], len(scene.means), 2)
+    values = {**scene._asdict(), "means2d_offset": zeros, "means2d_abs": zeros}
+    leaves = {name: values[name].detach().to(dtype).clone().requires_grad_() for name in DIFFERENTIABLE}
     result = rasterize(
-        *(leaves[name] for name in ("means", "quats", "scales", "opacities", "colors", "viewmat")),
-        scene.K,
+        *(leaves[name] for name in ("means", "quats", "scales", "opacities", "colors", "viewmat", "K")),
         scene.width,
         scene.height,
         background=leaves["background"],
         means2d_offset=leaves["means2d_offset"],
+        means2d_abs=leaves["means2d_abs"],
         **options,
     )
     rng = torch.Generator().manual_seed(seed)
@@ -56,7 +56,7 @@ def render_with_gradients(
     if weights is not None:
         on_image, on_alpha = on_image * weights[..., None], on_alpha * weights
     gradients = torch.autograd.grad((result.image, result.alpha), list(leaves.values()), (on_image, on_alpha))
-    detached = Rendering(result.image.detach(), result.alpha.detach(), result.radii)
+    detached = Rendering(result.image.detach(), result.alpha.detach(), result.radii, result.masked)
     return Outcome(detached, dict(zip(leaves, gradients, strict=True)))
 
 

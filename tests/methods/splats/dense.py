@@ -23,7 +23,7 @@ class Dense(NamedTuple):
     safe: Tensor  # (H, W) bool: no alpha or transmittance so near a threshold that float32 might fall on the other side
 
 
-def render_dense(scene: Scene, *, near: float = 0.01, eps2d: float = 0.3) -> Dense:
+def render_dense(scene: Scene, *, near: float = 0.01, eps2d: float = 0.3, antialiased: bool = False) -> Dense:
     """Render without gradients. Memory is (N, H W); keep both small."""
     s = Scene(*(v.detach().double() if isinstance(v, Tensor) else v for v in scene))
     camera = s.means @ s.viewmat[:3, :3].T + s.viewmat[:3, 3]
@@ -43,7 +43,11 @@ def render_dense(scene: Scene, *, near: float = 0.01, eps2d: float = 0.3) -> Den
     rotation = torch.from_numpy(Rotation.from_quat(quats.numpy()).as_matrix())
     covariance = rotation @ torch.diag_embed(s.scales[order] ** 2) @ rotation.transpose(1, 2)
     to_image = jacobian @ s.viewmat[:3, :3]
-    covariance = to_image @ covariance @ to_image.transpose(1, 2) + eps2d * torch.eye(2, dtype=torch.float64)
+    sharp = to_image @ covariance @ to_image.transpose(1, 2)
+    covariance = sharp + eps2d * torch.eye(2, dtype=torch.float64)
+    opacities = s.opacities[order]
+    if antialiased:
+        opacities = opacities * (torch.linalg.det(sharp) / torch.linalg.det(covariance)).clamp(min=0).sqrt()
     inverse = torch.linalg.inv(covariance)
     center = torch.stack([fx * x / z + cx, fy * y / z + cy], 1)
 
@@ -55,7 +59,7 @@ def render_dense(scene: Scene, *, near: float = 0.01, eps2d: float = 0.3) -> Den
     rows, columns = torch.meshgrid(*centers, indexing="ij")
     for k, splat in enumerate(order):
         d = torch.stack([columns - center[k, 0], rows - center[k, 1]], -1)
-        raw = s.opacities[splat] * torch.exp(-0.5 * ((d @ inverse[k]) * d).sum(-1))
+        raw = opacities[k] * torch.exp(-0.5 * ((d @ inverse[k]) * d).sum(-1))
         alpha = raw.clamp(max=0.99)
         passes = (alpha >= 1 / 255) & ~done
         after = light * (1 - alpha)

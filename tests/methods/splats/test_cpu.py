@@ -67,15 +67,22 @@ SCENES = {
 
 
 @kernels
+@pytest.mark.parametrize("antialiased", [False, True], ids=["plain", "antialiased"])
 @pytest.mark.parametrize("name", SCENES)
-def test_image_and_gradients_agree_with_the_reference(kernel, name):
+def test_image_and_gradients_agree_with_the_reference(kernel, name, antialiased):
     scene = SCENES[name]()
+    if antialiased and name == "smaller than pixels":
+        scene = scene._replace(scales=30 * scene.scales)  # else nothing would be left to see
     # Where an alpha lies on a threshold, float32 may take the other side: such pixels are compared loosely, and kept
     # out of the gradients.
-    safe = render_dense(scene).safe
+    safe = render_dense(scene, antialiased=antialiased).safe
     assert safe.float().mean() > 0.5
-    truth = render_with_gradients(scene, torch.float64, weights=safe.double(), backend="reference")
-    result = render_with_gradients(scene, torch.float32, weights=safe.float(), backend=kernel)
+    truth = render_with_gradients(
+        scene, torch.float64, weights=safe.double(), backend="reference", antialiased=antialiased
+    )
+    result = render_with_gradients(
+        scene, torch.float32, weights=safe.float(), backend=kernel, antialiased=antialiased
+    )
 
     assert truth.rendering.alpha.max() > 0.1, "an empty image would prove nothing"
     for field in ("image", "alpha"):
@@ -204,7 +211,7 @@ def test_any_number_of_threads_gives_the_same_bits(kernel):
     outcomes = [render_with_gradients(scene, torch.float32, backend=kernel, threads=n) for n in (1, 2, 3, 4)]
     first = outcomes[0]
     for other in outcomes[1:]:
-        for a, b in zip(first.rendering, other.rendering, strict=True):
+        for a, b in zip(first.rendering[:3], other.rendering[:3], strict=True):
             assert torch.equal(a, b)
         for name, gradient in first.gradients.items():
             assert torch.equal(gradient, other.gradients[name]), name

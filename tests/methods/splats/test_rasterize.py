@@ -11,6 +11,8 @@ from headbench.bench.errors import UnavailableError
 from headbench.methods.splats import available_backends, cpu, rasterize
 from headbench.methods.splats.benchmark.scenes import cloud
 
+from .compare import DIFFERENTIABLE, relative_error, render_with_gradients
+
 BAD = {
     "means": [
         (torch.zeros(5, 2), r"means: expected shape \(5, 3\)"),
@@ -150,3 +152,73 @@ def test_without_the_kernel_the_reference_draws_and_says_so_once(caplog):
     ]
     with pytest.raises(UnavailableError, match="no kernel here.*compiler"):
         rasterize(*scene[:9], backend="cpu")
+
+
+@pytest.mark.parametrize("backend", available_backends())
+@pytest.mark.parametrize("own_colors", [False, True])
+def test_several_cameras_in_one_call_are_as_many_calls(backend, own_colors):
+    scene = cloud(60, 33, 27, seed=5, size=0.1)
+    other = cloud(60, 33, 27, seed=6)
+    colors = torch.stack([scene.colors, other.colors]) if own_colors else scene.colors
+    batch = scene._replace(
+        colors=colors,
+        viewmat=torch.stack([scene.viewmat, other.viewmat]),
+        K=torch.stack([scene.K, scene.K + torch.tensor([[3.0, 0, 1], [0, -2, 2], [0, 0, 0]])]),
+        background=torch.stack([scene.background, other.background]),
+    )
+    together = render_with_gradients(batch, torch.float32, backend=backend, seed=1)
+    assert together.rendering.image.shape == (2, 27, 33, 3)
+    assert together.rendering.radii.shape == (2, 60)
+    leaves = [value.clone().requires_grad_() for value in batch[:7]]
+    backgrounds = batch.background.clone().requires_grad_()
+    offsets, absolutes = (torch.zeros(2, 60, 2, requires_grad=True) for _ in range(2))
+    rng = torch.Generator().manual_seed(1)
+    on_image, on_alpha = torch.randn(2, 27, 33, 3, generator=rng), torch.randn(2, 27, 33, generator=rng)
+    for view in range(2):
+        *splats, colors, viewmats, Ks = leaves
+        single = rasterize(
+            *splats,
+            colors[view] if own_colors else colors,
+            viewmats[view],
+            Ks[view],
+            33,
+            27,
+            background=backgrounds[view],
+            means2d_offset=offsets[view],
+            means2d_abs=absolutes[view],
+            backend=backend,
+        )
+        for one, many in zip(single[:3], together.rendering[:3], strict=True):
+            assert torch.equal(one, many[view])
+        torch.autograd.backward((single.image, single.alpha), (on_image[view], on_alpha[view]))
+    for name, leaf in zip(DIFFERENTIABLE, [*leaves, backgrounds, offsets, absolutes], strict=True):
+        assert relative_error(together.gradients[name], leaf.grad) < 1e-6, name
+
+
+def test_one_camera_in_a_batch_keeps_its_dimension():
+    scene = cloud(20, 9, 8)
+    result = rasterize(*scene[:6], scene.K[None], 9, 8, background=scene.background)
+    assert result.image.shape == (1, 8, 9, 3)
+    assert torch.equal(result.image[0], rasterize(*scene[:9], background=scene.background).image)
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        (
+            {"viewmat": torch.eye(4).expand(2, 4, 4), "K": torch.eye(3).expand(3, 3, 3)},
+            "viewmat, K: .*2 and 3",
+        ),
+        ({"viewmat": torch.zeros(0, 4, 4)}, "viewmat: expected at least one camera"),
+        ({"colors": torch.zeros(2, 5, 3)}, "colors: .*V cameras"),
+        ({"background": torch.zeros(2, 3)}, r"background: expected shape \(3,\)"),
+        (
+            {"viewmat": torch.eye(4).expand(2, 4, 4), "background": torch.zeros(3, 3)},
+            r"background: expected shape \(2, 3\)",
+        ),
+    ],
+)
+def test_batches_that_do_not_fit_are_named(parts, message):
+    scene = cloud(5, 8, 8)._replace(**parts)
+    with pytest.raises(ValueError, match=message):
+        rasterize(*scene[:9], background=scene.background)

@@ -59,6 +59,36 @@ def test_one_isotropic_splat_has_the_closed_form():
     assert result.radii.tolist() == [math.ceil(reach)]
 
 
+def test_antialiasing_makes_a_splat_faint_by_the_area_the_filter_adds():
+    scale, opacity = 0.02, 0.7
+    result = rasterize(*on_axis([DEPTH], [scale], [opacity], [[2.0]]), antialiased=True, backend="reference")
+    sharp = (FOCAL * scale / DEPTH) ** 2
+    assert result.alpha[10, 10].item() == pytest.approx(opacity * sharp / (sharp + 0.3), abs=1e-14)
+
+
+def test_absolute_gradients_are_sums_over_pixels():
+    scene = cloud(9, 7, 6, seed=2, size=0.2)
+    inputs = [value.double() for value in scene[:5]]
+    upstream = torch.randn(6, 7, 3, dtype=F64, generator=torch.Generator().manual_seed(0))
+
+    def gradients(upstream):
+        offset, absolute = (torch.zeros(9, 2, dtype=F64, requires_grad=True) for _ in range(2))
+        image = rasterize(
+            *inputs, *scene[5:9], background=scene.background, means2d_offset=offset, means2d_abs=absolute
+        ).image
+        image.backward(upstream)
+        return offset.grad, absolute.grad
+
+    wanted = torch.zeros(9, 2, dtype=F64)
+    for row in range(6):
+        for column in range(7):
+            one_pixel = torch.zeros_like(upstream)
+            one_pixel[row, column] = upstream[row, column]
+            wanted += gradients(one_pixel)[0].abs()
+    assert wanted.max() > 0
+    torch.testing.assert_close(gradients(upstream)[1], wanted)
+
+
 def test_nearer_splat_covers_the_farther_whatever_their_order():
     near_first = on_axis([2.0, 3.0], [0.1, 0.1], [0.6, 0.5], [[1.0, 0.0], [0.0, 1.0]])
     far_first = on_axis([3.0, 2.0], [0.1, 0.1], [0.5, 0.6], [[0.0, 1.0], [1.0, 0.0]])
@@ -106,7 +136,8 @@ def test_agrees_with_brute_force(seed):
     torch.testing.assert_close(result.alpha[truth.safe], truth.alpha[truth.safe], rtol=0, atol=1e-9)
 
 
-def test_gradients_agree_with_finite_differences():
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_gradients_agree_with_finite_differences(antialiased):
     # Faint wide splats: every one reaches every pixel, so no threshold makes the image jump.
     scene = cloud(6, 5, 4, seed=3, size=0.4, opacity=-1.0)
     scene = scene._replace(
@@ -115,17 +146,22 @@ def test_gradients_agree_with_finite_differences():
     )
     leaves = [
         value.double().requires_grad_()
-        for value in (*scene[:6], scene.background, torch.zeros(len(scene.means), 2))
+        for value in (*scene[:7], scene.background, torch.zeros(len(scene.means), 2))
     ]
 
     def render(*tensors):
         *geometry, background, offset = tensors
         result = rasterize(
-            *geometry, scene.K, scene.width, scene.height, background=background, means2d_offset=offset
+            *geometry,
+            scene.width,
+            scene.height,
+            background=background,
+            means2d_offset=offset,
+            antialiased=antialiased,
         )
         return result.image, result.alpha
 
-    assert len(leaves) == len(DIFFERENTIABLE)
+    assert len(leaves) == len(DIFFERENTIABLE) - 1, "all but means2d_abs, which is no derivative"
     assert torch.autograd.gradcheck(render, leaves, eps=1e-6, atol=1e-6)
 
 
@@ -137,11 +173,11 @@ def test_gradients_where_slopes_are_clamped():
         opacities=torch.tensor([0.8]),
         viewmat=torch.eye(4),
     )
-    leaves = [scene.means.double().requires_grad_(), scene.viewmat.double().requires_grad_()]
+    leaves = [value.double().requires_grad_() for value in (scene.means, scene.viewmat, scene.K)]
 
-    def render(means, viewmat):
+    def render(means, viewmat, K):
         rest = (v.double() for v in scene[1:5])
-        return rasterize(means, *rest, viewmat, scene.K, scene.width, scene.height).image
+        return rasterize(means, *rest, viewmat, K, scene.width, scene.height).image
 
     assert render(*leaves).abs().max() > 0.01
     assert torch.autograd.gradcheck(render, leaves, eps=1e-6, atol=1e-6)
