@@ -6,6 +6,7 @@ from ..bench.contracts import BenchmarkSpec
 
 SPLATS = BenchmarkSpec(
     name="splats",
-    summary="the splat renderer: time by image size, number of splats and backend",
+    summary="the splat renderer: time by image size, number of splats and backend; numerical extremes",
     speed="headbench.methods.splats.benchmark.speed:measure",
+    stress="headbench.methods.splats.benchmark.stress:measure",
 )

@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from headbench.methods.splats import available_backends, rasterize
+from headbench.methods.splats.benchmark.compare import relative_error, render_with_gradients
 from headbench.methods.splats.benchmark.scenes import Scene, cloud, head_shell
 
-from .compare import relative_error, render_with_gradients
 from .dense import render_dense
 
 KERNELS = [name for name in available_backends() if name.startswith("cpu-")]

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from headbench.methods.splats import rasterize
+from headbench.methods.splats.benchmark.compare import DIFFERENTIABLE, relative_error, render_with_gradients
 from headbench.methods.splats.benchmark.scenes import Scene, cloud
 from headbench.methods.splats.reference import rotation_matrices
 
-from .compare import DIFFERENTIABLE, relative_error, render_with_gradients
 from .dense import render_dense
 
 F64 = torch.float64

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from headbench.methods.splats import Rendering, rasterize
-from headbench.methods.splats.benchmark.scenes import Scene
+from ..rasterize import rasterize
+from ..request import Rendering
+from .scenes import Scene
 
 DIFFERENTIABLE = (
     "means",
@@ -32,7 +33,7 @@ class Outcome(NamedTuple):
 
 
 def render_with_gradients(
-    scene: Scene, dtype: torch.dtype, *, weights: Tensor | None = None, seed: int = 0, **options
+    scene: Scene, dtype: torch.dtype, *, weights: Tensor | None = None, seed: int = 0, **options: Any
 ) -> Outcome:
     """Render in ``dtype`` and differentiate a random linear function of image and alpha.
 
@@ -42,7 +43,13 @@ def render_with_gradients(
     values = {**scene._asdict(), "means2d_offset": zeros, "means2d_abs": zeros}
     leaves = {name: values[name].detach().to(dtype).clone().requires_grad_() for name in DIFFERENTIABLE}
     result = rasterize(
-        *(leaves[name] for name in ("means", "quats", "scales", "opacities", "colors", "viewmat", "K")),
+        leaves["means"],
+        leaves["quats"],
+        leaves["scales"],
+        leaves["opacities"],
+        leaves["colors"],
+        leaves["viewmat"],
+        leaves["K"],
         scene.width,
         scene.height,
         background=leaves["background"],
