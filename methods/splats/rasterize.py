@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from . import cpu
+from . import cpu, cuda
 from .reference import rasterize_reference
-from .request import ArrayLike, Rendering, make_request
+from .request import ArrayLike, Rendering, Request, make_request
 
 
 def rasterize(
@@ -59,7 +59,8 @@ def rasterize(
     means2d_abs : like ``means2d_offset``, but adds nothing. Where it requires a gradient it collects, as that, the sum
         over pixels of the absolute gradients by the 2D mean, x and y apart (gsplat's absgrad; Ye et al., "AbsGS", ACM MM
         2024): a measure for densification, not a derivative.
-    backend : one of `available_backends`, or "auto": the kernel for float32 on the CPU, else the reference.
+    backend : one of `available_backends`, or "auto": for float32 the kernel on the CPU and gsplat on a GPU, where they are
+        to be had, else the reference.
     threads : of the kernel; None takes ``torch.get_num_threads()``. Results are equal bit for bit for any number.
     check_finite : refuse NaN and infinity in any tensor. Without the check a non-finite geometry is culled
         and a non-finite colour spreads to the pixels about it.
@@ -88,12 +89,22 @@ def rasterize(
         mask_non_finite=mask_non_finite,
     )
     if backend == "auto":
-        backend = "cpu" if cpu.supports(request) and cpu.usable_or_warn() else "reference"
+        backend = _choose(request)
     if backend == "reference":
         return rasterize_reference(request)
+    if backend == "cuda":
+        return cuda.rasterize_cuda(request)
     return cpu.rasterize_cpu(request, backend, threads)
 
 
-def available_backends() -> tuple[str, ...]:
-    """Names `rasterize` accepts as ``backend`` on this machine, besides "auto"; the preferred one first."""
-    return (*cpu.instruction_sets(), "reference")
+def available_backends(device: str = "cpu") -> tuple[str, ...]:
+    """Names `rasterize` accepts as ``backend`` here for tensors on ``device``, besides "auto"; the preferred one first."""
+    if device == "cpu":
+        return (*cpu.instruction_sets(), "reference")
+    return ("cuda", "reference") if cuda.usable() else ("reference",)
+
+
+def _choose(request: Request) -> str:
+    if cpu.supports(request) and cpu.usable_or_warn():
+        return "cpu"
+    return "cuda" if cuda.supports(request) and cuda.usable() else "reference"

@@ -1,0 +1,245 @@
+"""The CUDA backend: against the reference where there is a GPU; everywhere, that it drives gsplat rightly."""
+
+from __future__ import annotations
+
+import logging
+
+import pytest
+import torch
+
+from headbench.bench.errors import UnavailableError
+from headbench.methods.splats import available_backends, cuda, rasterize
+from headbench.methods.splats.benchmark.compare import relative_error
+from headbench.methods.splats.benchmark.scenes import cloud, head_shell
+from headbench.methods.splats.rasterize import make_request
+
+needs_gpu = pytest.mark.skipif(not cuda.usable(), reason="needs a GPU and gsplat (extra `cuda`)")
+
+
+class FakeGsplat:
+    """gsplat's functions in plain torch on the CPU, of any dtype; draws every splat at every pixel."""
+
+    def __init__(self, clamp=0.99):
+        self.clamp = clamp
+
+    def fully_fused_projection(
+        self,
+        means,
+        covars,
+        quats,
+        scales,
+        viewmats,
+        Ks,
+        width,
+        height,
+        *,
+        eps2d,
+        near_plane,
+        far_plane,
+        calc_compensations,
+        opacities,
+    ):
+        assert covars is None
+        assert opacities.shape == (len(means),)
+        w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(1)
+        entries = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]
+        entries += [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]
+        entries += [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]
+        axes = torch.stack(entries, 1).view(-1, 3, 3) * scales[:, None]
+        camera = torch.einsum("vij,nj->vni", viewmats[:, :3, :3], means) + viewmats[:, None, :3, 3]
+        depths = camera[..., 2]
+        f = torch.stack([Ks[:, 0, 0], Ks[:, 1, 1]], -1)[:, None]
+        c = torch.stack([Ks[:, 0, 2], Ks[:, 1, 2]], -1)[:, None]
+        size = torch.tensor([width, height]).to(means)
+        ratio = camera[..., :2] / depths[..., None]
+        margin = 0.15 * size / f
+        slope = torch.maximum(torch.minimum(ratio, (size - c) / f + margin), -c / f - margin)
+        jacobian = torch.diag_embed(f / depths[..., None])
+        jacobian = torch.cat([jacobian, (-f * slope / depths[..., None])[..., None]], -1)
+        to_image = jacobian @ viewmats[:, None, :3, :3] @ axes
+        sharp = to_image @ to_image.mT
+        blurred = sharp + eps2d * torch.eye(2).to(means)
+        inverse = torch.linalg.inv(blurred)
+        conics = torch.stack([inverse[..., 0, 0], inverse[..., 0, 1], inverse[..., 1, 1]], -1)
+        factor = (torch.linalg.det(sharp) / torch.linalg.det(blurred)).clamp(min=0).sqrt()
+        seen = (depths > near_plane) & (depths < far_plane)
+        radii = torch.where(seen[..., None], torch.tensor([7, 9]), 0).to(torch.int32)
+        return radii, f * ratio + c, depths, conics, factor if calc_compensations else None
+
+    def isect_tiles(self, means2d, radii, depths, tile, columns, rows):
+        order = torch.where(radii[..., 0] > 0, depths, torch.inf).argsort(dim=1, stable=True)
+        return None, None, (order, (radii[..., 0] > 0).sum(1))
+
+    def isect_offset_encode(self, keys, views, columns, rows):
+        return torch.zeros(views, rows, columns, dtype=torch.int32)
+
+    def rasterize_to_pixels(
+        self, means2d, conics, colors, opacities, width, height, tile, offsets, lists, *, backgrounds, absgrad
+    ):
+        assert offsets.shape[1:] == (-(-height // tile), -(-width // tile))
+        images, alphas = [], []
+        centers = [torch.arange(n).to(means2d) + 0.5 for n in (height, width)]
+        y, x = torch.meshgrid(*centers, indexing="ij")
+        for view, (order, seen) in enumerate(zip(*lists, strict=True)):
+            light, running = (
+                torch.ones(height, width).to(means2d),
+                torch.ones(height, width, dtype=torch.bool),
+            )
+            image = torch.zeros(height, width, colors.shape[-1]).to(means2d)
+            for n in order[:seen]:
+                dx, dy = x - means2d[view, n, 0], y - means2d[view, n, 1]
+                a, b, c = conics[view, n]
+                raw = opacities[view, n] * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
+                alpha = torch.where(raw >= 1 / 255, raw.clamp(max=self.clamp), 0)
+                running = running & (light * (1 - alpha) > 1e-4)
+                alpha = torch.where(running, alpha, 0)
+                image = image + (alpha * light)[..., None] * colors[view, n]
+                light = light * (1 - alpha)
+            images.append(image + light[..., None] * backgrounds[view])
+            alphas.append(1 - light[..., None])
+        if absgrad:
+            means2d.absgrad = torch.full_like(means2d, 3.0)
+        return torch.stack(images), torch.stack(alphas)
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_gsplat_is_driven_to_draw_what_the_reference_draws(antialiased):
+    one, other = cloud(25, 19, 14, seed=1, size=0.1), cloud(25, 19, 14, seed=2)
+    names = ("means", "quats", "scales", "opacities", "colors", "viewmat", "offset")
+
+    def outcome(render):
+        leaves = [value.double().requires_grad_() for value in one[:5]]
+        leaves.append(torch.stack([one.viewmat, other.viewmat]).double().requires_grad_())
+        leaves.append(torch.zeros(2, 25, 2, dtype=torch.float64, requires_grad=True))
+        result = render(leaves, torch.stack([one.K, other.K]), one.background)
+        rng = torch.Generator().manual_seed(0)
+        upstream = torch.randn(result.image.shape, generator=rng).double()
+        return result, torch.autograd.grad((result.image, result.alpha), leaves, (upstream, upstream[..., 0]))
+
+    def through_gsplat(leaves, K, background):
+        request = make_request(
+            *leaves[:6],
+            K,
+            19,
+            14,
+            background=background,
+            near=0.2,
+            far=1e3,
+            eps2d=0.4,
+            antialiased=antialiased,
+            means2d_offset=leaves[6],
+            means2d_abs=None,
+            check_finite=True,
+            mask_non_finite=False,
+        )
+        return cuda.draw(FakeGsplat(), request)
+
+    def through_reference(leaves, K, background):
+        return rasterize(
+            *leaves[:6],
+            K,
+            19,
+            14,
+            background=background,
+            near=0.2,
+            far=1e3,
+            eps2d=0.4,
+            antialiased=antialiased,
+            means2d_offset=leaves[6],
+            backend="reference",
+        )
+
+    result, gradients = outcome(through_gsplat)
+    truth, true_gradients = outcome(through_reference)
+    assert result.radii.shape == (2, 25)
+    assert set(result.radii.unique().tolist()) <= {0, 9}, "the larger of the two axes"
+    torch.testing.assert_close(result.image, truth.image)
+    torch.testing.assert_close(result.alpha, truth.alpha)
+    for name, value, wanted in zip(names, gradients, true_gradients, strict=True):
+        assert relative_error(value, wanted) < 1e-6, name
+
+
+def test_absolute_gradients_are_taken_from_gsplat():
+    scene = cloud(6, 8, 8, seed=3, size=0.1)
+    absolute = torch.zeros(6, 2, requires_grad=True)
+    request = make_request(
+        *scene[:9],
+        background=None,
+        near=0.01,
+        far=1e10,
+        eps2d=0.3,
+        antialiased=False,
+        means2d_offset=torch.zeros(6, 2, requires_grad=True),
+        means2d_abs=absolute,
+        check_finite=True,
+        mask_non_finite=False,
+    )
+    cuda.draw(FakeGsplat(), request).image.sum().backward()
+    assert absolute.grad is not None
+    assert (absolute.grad == 3).all()
+
+
+@pytest.mark.parametrize("clamp", [0.99, 0.999])
+def test_another_clamp_is_measured_and_warned_of_once(monkeypatch, caplog, clamp):
+    monkeypatch.setattr(cuda, "load", lambda: FakeGsplat(clamp))
+    cuda.warn_of_clamp.cache_clear()
+    with caplog.at_level(logging.WARNING):
+        for _ in range(2):
+            cuda.warn_of_clamp("cpu")
+    cuda.warn_of_clamp.cache_clear()
+    assert cuda.clamp_of(FakeGsplat(clamp), "cpu") == pytest.approx(clamp)
+    assert [("0.999" in record.message) for record in caplog.records] == ([True] if clamp == 0.999 else [])
+
+
+def test_without_a_gpu_it_says_so(monkeypatch):
+    for cached in (cuda.usable, cuda.load):
+        cached.cache_clear()
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(UnavailableError, match=r"needs a GPU.*headbench\[cuda\]"):
+        rasterize(*cloud(3, 8, 8)[:9], backend="cuda")
+    assert available_backends("cuda") == ("reference",)
+    for cached in (cuda.usable, cuda.load):
+        cached.cache_clear()
+
+
+def test_what_gsplat_cannot_do_is_refused(monkeypatch):
+    scene = cloud(3, 8, 8)
+    monkeypatch.setattr(cuda, "load", FakeGsplat)
+    with pytest.raises(ValueError, match="float32 on a CUDA device.*cpu"):
+        rasterize(*scene[:9], backend="cuda")
+    monkeypatch.setattr(cuda, "supports", lambda request: True)
+    with pytest.raises(ValueError, match="K: expected no gradient"):
+        rasterize(*scene[:6], scene.K.clone().requires_grad_(), 8, 8, backend="cuda")
+
+
+@needs_gpu
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_gsplat_agrees_with_the_reference_on_a_gpu(antialiased):
+    scene = head_shell(3000, 120, 100)
+    scene = scene._replace(opacities=scene.opacities.clamp(max=0.98))  # whatever this release clamps at
+    upstream = torch.randn(100, 120, 3, generator=torch.Generator().manual_seed(0))
+
+    def outcome(device, dtype, backend):
+        leaves = [value.to(device, dtype).requires_grad_() for value in scene[:6]]
+        offset, absolute = (
+            torch.zeros(3000, 2, device=device, dtype=dtype, requires_grad=True) for _ in range(2)
+        )
+        result = rasterize(
+            *leaves,
+            scene.K,
+            120,
+            100,
+            background=scene.background,
+            antialiased=antialiased,
+            means2d_offset=offset,
+            means2d_abs=absolute,
+            backend=backend,
+        )
+        result.image.backward(upstream.to(device, dtype))
+        return result.image.detach().cpu().double(), [leaf.grad.cpu() for leaf in (*leaves, offset, absolute)]
+
+    image, gradients = outcome("cuda", torch.float32, "cuda")
+    truth, true_gradients = outcome("cpu", torch.float64, "reference")
+    assert (image - truth).abs().mean() < 1e-5
+    for value, wanted in zip(gradients, true_gradients, strict=True):
+        assert relative_error(value, wanted) < 5e-3
