@@ -29,80 +29,126 @@ inline std::size_t backward_scratch(int channels) {
 }
 
 // Pixels' v and w of up to W splats, kept until they can be summed over pixels for W splats at once; and what the
-// absolute gradients are sums of.
+// absolute gradients are sums of. The W splats are four groups of kBlockHeight. After the two transposes below, splat i
+// of the batch is at lane `place(i)`.
 template <bool Absolute>
 struct Batch {
   alignas(64) float v[W * W], w[W * W];
   alignas(64) float absolute[kAbsolutes][Absolute ? W * W : 1];
   alignas(64) float mean_x[W], mean_y[W];
   float* target[W];
-  int used = 0;
 };
 
-// Sum the batch over the block's pixels and add to the splats' gradient records. In a transposed batch a lane
-// is a splat and every pixel is one vector, so that the sums are plain vector arithmetic.
+HEADBENCH_INLINE int place(int splat) { return 4 * (splat % kBlockHeight) + splat / kBlockHeight; }
+
+// The rows of the block, for one group of splats: row r as vector r, splat by four floats, column by float.
+HEADBENCH_INLINE void load_rows(const float* pixels, int group, Real* rows) {
+  for (int r = 0; r < kBlockHeight; ++r) rows[r] = load(pixels + (group * kBlockHeight + r) * W);
+  transpose_rows(rows);
+}
+
+// Sum over columns: after transposing, each of the four groups is a column.
+HEADBENCH_INLINE Real sum_columns(Real* groups) {
+  transpose_quads(groups);
+  return (groups[0] + groups[3]) + (groups[1] + groups[2]);
+}
+
+// Sums over the block's pixels of v times 1, x, y, x², xy, y², in lane `place(i)` that of splat i. About the block's centre
+// first: small numbers, so that moving them to the splat's mean loses nothing.
+template <bool Absolute>
+HEADBENCH_INLINE void sum_moments(const Batch<Absolute>& batch, const Block& block, Real* out) {
+  Real plain[4], by_y[4], by_yy[4];
+  for (int group = 0; group < 4; ++group) {
+    Real rows[kBlockHeight];
+    load_rows(batch.v, group, rows);
+    plain[group] = by_y[group] = by_yy[group] = 0.0f;
+    for (int r = 0; r < kBlockHeight; ++r) {
+      const float y = static_cast<float>(r) - 0.5f * (kBlockHeight - 1);
+      plain[group] = plain[group] + rows[r];
+      by_y[group] = fma(y, rows[r], by_y[group]);
+      by_yy[group] = fma(y * y, rows[r], by_yy[group]);
+    }
+  }
+  transpose_quads(plain);
+  transpose_quads(by_y);
+  const Real outer = plain[0] + plain[3], inner = plain[1] + plain[2];
+  const Real m = outer + inner, mxx = fma(2.25f, outer, Real(0.25f) * inner), myy = sum_columns(by_yy);
+  const Real mx = fma(1.5f, plain[3] - plain[0], Real(0.5f) * (plain[2] - plain[1]));
+  const Real my = (by_y[0] + by_y[3]) + (by_y[1] + by_y[2]);
+  const Real mxy = fma(1.5f, by_y[3] - by_y[0], Real(0.5f) * (by_y[2] - by_y[1]));
+  const Real ox = Real(static_cast<float>(block.left) + 0.5f * kBlockWidth) - load(batch.mean_x);
+  const Real oy = Real(static_cast<float>(block.top) + 0.5f * kBlockHeight) - load(batch.mean_y);
+  const Real dx = fma(ox, m, mx), dy = fma(oy, m, my);
+  out[kSum] = m;
+  out[kSumX] = dx;
+  out[kSumY] = dy;
+  out[kSumXX] = fma(ox, mx + dx, mxx);
+  out[kSumXY] = fma(ox, my, fma(oy, dx, mxy));
+  out[kSumYY] = fma(oy, my + dy, myy);
+}
+
+// Sum the first `used` of the batch over the block's pixels and add to the splats' gradient records. `by_row` is
+// the block's colour gradients, channel by channel, each row four times over: see `repeat_rows`.
 template <int C, bool Absolute>
-inline void flush(Batch<Absolute>& batch, const Block& block, int channels, const float* colors, float* spare) {
+inline void flush(Batch<Absolute>& batch, int used, const Block& block, int channels, const float* by_row,
+                  float* spare) {
   const int count = C ? C : channels, width = gradient_stride(count, Absolute);
-  for (int i = batch.used; i < W; ++i) {
+  for (int i = used; i < W; ++i) {
     store(batch.v + i * W, 0.0f);
     store(batch.w + i * W, 0.0f);
     if constexpr (Absolute)
       for (int k = 0; k < kAbsolutes; ++k) store(batch.absolute[k] + i * W, 0.0f);
-    batch.mean_x[i] = batch.mean_y[i] = 0.0f;
+    batch.mean_x[place(i)] = batch.mean_y[place(i)] = 0.0f;
     batch.target[i] = spare;
   }
-  batch.used = 0;
 
   constexpr int kRoom = gradient_stride(C ? C : kChannelsMax, Absolute);
-  alignas(64) float sums[kRoom * W];
-  Real pixels[W];
-  load_transposed(batch.v, pixels);
-  // Moments about the block's centre first: small numbers, so that moving them to the mean loses nothing.
-  Real m = 0.0f, mx = 0.0f, my = 0.0f, mxx = 0.0f, mxy = 0.0f, myy = 0.0f;
-  for (int row = 0; row < kBlockHeight; ++row) {
-    const Real* v = pixels + kBlockWidth * row;
-    const Real outer = v[0] + v[3], inner = v[1] + v[2], s = outer + inner;
-    const Real sx = fma(1.5f, v[3] - v[0], Real(0.5f) * (v[2] - v[1]));
-    const float y = static_cast<float>(row) - 0.5f * (kBlockHeight - 1);
-    m = m + s;
-    mx = mx + sx;
-    my = fma(y, s, my);
-    mxx = fma(2.25f, outer, fma(0.25f, inner, mxx));
-    mxy = fma(y, sx, mxy);
-    myy = fma(y * y, s, myy);
-  }
-  const Real ox = Real(static_cast<float>(block.left) + 0.5f * kBlockWidth) - load(batch.mean_x);
-  const Real oy = Real(static_cast<float>(block.top) + 0.5f * kBlockHeight) - load(batch.mean_y);
-  const Real dx = fma(ox, m, mx), dy = fma(oy, m, my);
-  store(sums + kSum * W, m);
-  store(sums + kSumX * W, dx);
-  store(sums + kSumY * W, dy);
-  store(sums + kSumXX * W, fma(ox, mx + dx, mxx));
-  store(sums + kSumXY * W, fma(ox, my, fma(oy, dx, mxy)));
-  store(sums + kSumYY * W, fma(oy, my + dy, myy));
-
-  load_transposed(batch.w, pixels);
+  Real sums[kRoom];
+  sum_moments(batch, block, sums);
+  Real rows[4 * kBlockHeight];
+  for (int group = 0; group < 4; ++group) load_rows(batch.w, group, rows + group * kBlockHeight);
   for (int c = 0; c < count; ++c) {
-    Real even = 0.0f, odd = 0.0f;
-    for (int lane = 0; lane < W; lane += 2) {
-      even = fma(pixels[lane], colors[c * W + lane], even);
-      odd = fma(pixels[lane + 1], colors[c * W + lane + 1], odd);
+    Real groups[4];
+    for (int group = 0; group < 4; ++group) {
+      groups[group] = rows[group * kBlockHeight] * load(by_row + c * kBlockHeight * W);
+      for (int r = 1; r < kBlockHeight; ++r)
+        groups[group] = fma(rows[group * kBlockHeight + r], load(by_row + (c * kBlockHeight + r) * W), groups[group]);
     }
-    store(sums + (kMoments + c) * W, even + odd);
+    sums[kMoments + c] = sum_columns(groups);
   }
+  int filled = kMoments + count;
   if constexpr (Absolute)
     for (int k = 0; k < kAbsolutes; ++k) {
-      load_transposed(batch.absolute[k], pixels);
-      Real sum = pixels[0];
-      for (int lane = 1; lane < W; ++lane) sum = sum + pixels[lane];
-      store(sums + (kMoments + count + k) * W, sum);
+      Real groups[4];
+      for (int group = 0; group < 4; ++group) {
+        load_rows(batch.absolute[k], group, rows);
+        groups[group] = rows[0];
+        for (int r = 1; r < kBlockHeight; ++r) groups[group] = groups[group] + rows[r];
+      }
+      sums[filled++] = sum_columns(groups);
     }
-  for (int k = kMoments + count + (Absolute ? kAbsolutes : 0); k < width; ++k) store(sums + k * W, 0.0f);
+  while (filled < width) sums[filled++] = 0.0f;
 
-  for (int part = 0; part < width; part += W) {
-    load_transposed(sums + part * W, pixels);
-    for (int i = 0; i < W; ++i) store(batch.target[i] + part, load(batch.target[i] + part) + pixels[i]);
+  // Back to one record per splat, by the same two transposes.
+  for (int k = 0; k < width; k += 4) transpose_quads(sums + k);
+  for (int part = 0; part < width; part += W)
+    for (int group = 0; group < 4; ++group) {
+      for (int r = 0; r < kBlockHeight; ++r) rows[r] = sums[part + 4 * r + group];
+      transpose_rows(rows);
+      for (int r = 0; r < kBlockHeight; ++r) {
+        float* target = batch.target[group * kBlockHeight + r] + part;
+        store(target, load(target) + rows[r]);
+      }
+    }
+}
+
+// Every row of the block's colour gradients, four floats, repeated to fill a vector: transposing equal vectors does it.
+HEADBENCH_INLINE void repeat_rows(const float* colors, int channels, float* by_row) {
+  for (int c = 0; c < channels; ++c) {
+    Real rows[kBlockHeight];
+    for (int r = 0; r < kBlockHeight; ++r) rows[r] = load(colors + c * W);
+    transpose_rows(rows);
+    for (int r = 0; r < kBlockHeight; ++r) store(by_row + (c * kBlockHeight + r) * W, rows[r]);
   }
 }
 
@@ -114,12 +160,16 @@ inline void composite_block_backward(const Chunk& chunk, int index, const Block&
   const int count = C ? C : channels;
   const std::uint16_t* list = chunk.list + index * kChunk;
   const float* colors = state + kBack * W;
+  alignas(64) float by_row[(C ? C : kChannelsMax) * kBlockHeight * W];
+  repeat_rows(colors, count, by_row);
+  float* spare = gradients + kChunk * gradient_floats;
   Real transmittance = load(state + kTransmittance * W), behind = load(state + kBehind * W);
   const Real start = load(state + kStart * W);
   Real g[kColors];
   if constexpr (C != 0)
     for (int c = 0; c < C; ++c) g[c] = load(colors + c * W);
   Batch<Absolute> batch;
+  int used = 0;
   for (int i = chunk.listed[index] - 1; i >= 0; --i) {
     const float* row = chunk.params + list[i] * chunk.stride;
     const Mask reached = start >= Real(row[kGeometry + count]);
@@ -139,19 +189,22 @@ inline void composite_block_backward(const Chunk& chunk, int index, const Block&
     behind = fma(weight, along, behind);
     const Mask unclamped = Real(kAlphaMax) >= a.raw;
     const Real value = zero_unless(unclamped, alpha * dalpha);
-    store(batch.v + batch.used * W, value);
+    store(batch.v + used * W, value);
     if constexpr (Absolute) {
-      store(batch.absolute[0] + batch.used * W, absolute(value * a.u));
+      store(batch.absolute[0] + used * W, absolute(value * a.u));
       const Real along_y = fma(row[kL21], a.u, Real(row[kL22]) * a.v);
-      store(batch.absolute[1] + batch.used * W, absolute(value * along_y));
+      store(batch.absolute[1] + used * W, absolute(value * along_y));
     }
-    store(batch.w + batch.used * W, weight);
-    batch.mean_x[batch.used] = row[kMeanX];
-    batch.mean_y[batch.used] = row[kMeanY];
-    batch.target[batch.used] = gradients + list[i] * gradient_floats;
-    if (++batch.used == W) flush<C, Absolute>(batch, block, channels, colors, gradients + kChunk * gradient_floats);
+    store(batch.w + used * W, weight);
+    batch.mean_x[place(used)] = row[kMeanX];
+    batch.mean_y[place(used)] = row[kMeanY];
+    batch.target[used] = gradients + list[i] * gradient_floats;
+    if (++used == W) {
+      flush<C, Absolute>(batch, W, block, channels, by_row, spare);
+      used = 0;
+    }
   }
-  if (batch.used) flush<C, Absolute>(batch, block, channels, colors, gradients + kChunk * gradient_floats);
+  if (used) flush<C, Absolute>(batch, used, block, channels, by_row, spare);
   store(state + kTransmittance * W, transmittance);
   store(state + kBehind * W, behind);
 }
@@ -160,30 +213,37 @@ inline void composite_block_backward(const Chunk& chunk, int index, const Block&
 inline int read_block(const View& view, const Splats& splats, const FrameData& frame, const Gradients& grads,
                       int tile, int index, const Block& block, float* state, double* background) {
   const int channels = splats.channels;
-  const float* remaining = frame.transmittances + static_cast<std::size_t>(tile) * kTilePixels + index * W;
-  const float* last = frame.last + static_cast<std::size_t>(tile) * kTilePixels + index * W;
+  const std::size_t kept = static_cast<std::size_t>(tile) * kTilePixels + index * W;
+  const Real remaining = load(frame.transmittances + kept), last = load(frame.last + kept);
+  alignas(64) float alpha[W], lanes[W];
+  store(alpha, 0.0f);
   for (int c = 0; c < channels; ++c) store(state + (kBack + c) * W, 0.0f);
-  store(state + kBehind * W, 0.0f);
-  store(state + kTransmittance * W, load(remaining));
-  store(state + kStart * W, load(last));
   const int columns = view.width - block.left < kBlockWidth ? view.width - block.left : kBlockWidth;
   const int rows = view.height - block.top < kBlockHeight ? view.height - block.top : kBlockHeight;
-  float furthest = -1.0f;
   for (int row = 0; row < rows; ++row) {
     const std::size_t pixel = static_cast<std::size_t>(block.top + row) * view.width + block.left;
+    const float* image = grads.image + pixel * channels;
     for (int column = 0; column < columns; ++column) {
-      const int lane = row * kBlockWidth + column;
-      const float* image = grads.image + (pixel + column) * channels;
-      float through = -grads.alpha[pixel + column];
-      for (int c = 0; c < channels; ++c) {
-        state[(kBack + c) * W + lane] = image[c];
-        through += image[c] * splats.background[c];
-        background[c] += static_cast<double>(image[c]) * remaining[lane];
-      }
-      state[kBehind * W + lane] = through * remaining[lane];
-      furthest = last[lane] > furthest ? last[lane] : furthest;
+      alpha[row * kBlockWidth + column] = grads.alpha[pixel + column];
+      for (int c = 0; c < channels; ++c)
+        state[(kBack + c) * W + row * kBlockWidth + column] = image[column * channels + c];
     }
   }
+  Real through = Real(0.0f) - load(alpha);
+  for (int c = 0; c < channels; ++c) {
+    const Real g = load(state + (kBack + c) * W);
+    through = fma(g, splats.background[c], through);
+    store(lanes, g * remaining);
+    float sum = 0.0f;
+    for (int lane = 0; lane < W; ++lane) sum += lanes[lane];
+    background[c] += sum;
+  }
+  store(state + kBehind * W, through * remaining);
+  store(state + kTransmittance * W, remaining);
+  store(state + kStart * W, last);
+  store(lanes, last);
+  float furthest = -1.0f;
+  for (int lane = 0; lane < W; ++lane) furthest = lanes[lane] > furthest ? lanes[lane] : furthest;
   return static_cast<int>(furthest);
 }
 
@@ -221,7 +281,10 @@ inline void draw_tile_backward_with(const View& view, const Splats& splats, cons
           composite_block_backward<C, Absolute>(chunk, b, block_of(view, tile, b), channels, states + b * state_floats,
                                       sums, stride);
     }
+    constexpr int ahead = 16;
     for (int i = begin; i < end; ++i) {
+      if (i + ahead < end)
+        HEADBENCH_PREFETCH_WRITE(grads.entries + static_cast<std::size_t>(pairs[i + ahead].entry) * stride);
       float* entry = grads.entries + static_cast<std::size_t>(pairs[i].entry) * stride;
       for (int k = 0; k < stride; k += W) store(entry + k, load(sums + (i - begin) * stride + k));
     }

@@ -45,8 +45,7 @@ HEADBENCH_INLINE void find_spans(const View& view, const float* record, float ra
 
 // Enter the tiles of one tile row, whose bands' spans are given; gives the next free entry.
 HEADBENCH_INLINE std::uint32_t enter_tile_row(const View& view, const FrameData& frame, const Rect& rect, int tile_y,
-                                              const float* first, const float* last, std::uint32_t entry,
-                                              std::uint32_t* tile_counts) {
+                                              const float* first, const float* last, std::uint32_t entry) {
   int firsts[kBands], lasts[kBands];
   int leftmost = view.tiles_x * kColumns, rightmost = -1;
   for (int band = 0; band < kBands; ++band) {
@@ -77,39 +76,28 @@ HEADBENCH_INLINE std::uint32_t enter_tile_row(const View& view, const FrameData&
         columns[band] >>= kColumns;
       }
       if (!blocks) continue;
-      const std::uint32_t tile = static_cast<std::uint32_t>(tile_y * view.tiles_x + tile_x);
-      frame.entry_tiles[entry] = tile;
-      frame.entry_blocks[entry] = blocks;
-      ++entry;
-      ++tile_counts[tile];
+      frame.entries[entry++] = {blocks, static_cast<std::uint32_t>(tile_y * view.tiles_x + tile_x)};
     }
   }
   return entry;
 }
 
-inline void find_pairs(const View& view, const FrameData& frame, std::int64_t begin, std::int64_t end,
-                       std::uint32_t* tile_counts) {
-  constexpr int ahead = 8;
+inline void find_entries(const View& view, const FrameData& frame, std::int64_t begin, std::int64_t end) {
   for (std::int64_t i = begin; i < end; ++i) {
-    if (i + ahead < end) {
-      const std::size_t next = frame.order[i + ahead];
-      prefetch(frame.records + next * frame.record_stride);
-      prefetch(frame.rects + next);
-    }
-    const std::uint32_t splat = frame.order[i];
+    const std::uint32_t splat = frame.visible[i];
     const float* record = frame.records + static_cast<std::size_t>(splat) * frame.record_stride;
     const Rect rect = frame.rects[splat];
     // The slack keeps pixels that pass the drawing's own test by a rounding.
     const float radius2 = record[kLog2Opacity] - kLog2AlphaMin + 1e-5f;
-    std::uint32_t entry = frame.entry_begin[splat];
+    std::uint32_t entry = frame.ranges[splat].begin;
     for (int tile_y = rect.y0; tile_y <= rect.y1; tile_y += kTileRows) {
       Spans spans;
       find_spans(view, record, radius2, tile_y, spans);
       for (int row = 0; row < kTileRows && tile_y + row <= rect.y1; ++row)
         entry = enter_tile_row(view, frame, rect, tile_y + row, spans.first + row * kBands, spans.last + row * kBands,
-                               entry, tile_counts);
+                               entry);
     }
-    frame.entry_count[splat] = entry - frame.entry_begin[splat];
+    frame.ranges[splat].count = entry - frame.ranges[splat].begin;
   }
 }
 

@@ -10,6 +10,7 @@
 #include <utility>
 #include <vector>
 
+#include "inlining.h"
 #include "thread_pool.h"
 
 namespace headbench {
@@ -64,8 +65,7 @@ Frame::Frame(const View& view, const Splats& splats, const ImageOut& out, std::i
   data_.depths = depths_.resize(count);
   data_.radii = radii;
   data_.rects = rects_.resize(count);
-  data_.entry_begin = entry_begin_.resize(count);
-  data_.entry_count = entry_count_.resize(count);
+  data_.ranges = ranges_.resize(count);
   data_.transmittances = transmittances_.resize(tiles * kTilePixels);
   data_.last = last_.resize(tiles * kTilePixels);
 
@@ -93,8 +93,7 @@ Frame::Frame(const View& view, const Splats& splats, const ImageOut& out, std::i
   depths_.release();
   rects_.release();
   order_.release();
-  entry_tiles_.release();
-  entry_blocks_.release();
+  entries_.release();
   data_.radii = nullptr;
 }
 
@@ -144,25 +143,37 @@ void Frame::reserve_entries() {
   for (std::int64_t i = 0; i < visible_count_; ++i) {
     const std::uint32_t splat = data_.visible[i];
     const Rect& rect = data_.rects[splat];
-    data_.entry_begin[splat] = static_cast<std::uint32_t>(entries_);
-    entries_ += std::size_t{1} * (rect.x1 - rect.x0 + 1) * (rect.y1 - rect.y0 + 1);
-    if (entries_ > std::numeric_limits<std::uint32_t>::max())
+    data_.ranges[splat].begin = static_cast<std::uint32_t>(entry_count_);
+    entry_count_ += std::size_t{1} * (rect.x1 - rect.x0 + 1) * (rect.y1 - rect.y0 + 1);
+    if (entry_count_ > std::numeric_limits<std::uint32_t>::max())
       throw std::length_error("the splats touch more tiles than 32 bits can count");
   }
-  data_.entry_tiles = entry_tiles_.resize(entries_);
-  data_.entry_blocks = entry_blocks_.resize(entries_);
+  data_.entries = entries_.resize(entry_count_);
 }
 
 // Counting sort of the entries into tiles. Splats are dealt with in depth order, cut into as many pieces as there
 // are threads; a piece's pairs go behind those of the pieces before it, so the lists do not depend on the cut.
 void Frame::fill_tiles(int threads) {
-  const std::size_t tiles = static_cast<std::size_t>(view_.tiles_x) * view_.tiles_y;
-  const std::int64_t pieces = std::max<std::int64_t>(1, std::min<std::int64_t>(threads, task_count(visible_count_)));
-  const auto piece_begin = [&](std::int64_t piece) { return visible_count_ * piece / pieces; };
-  std::vector<std::uint32_t> places(static_cast<std::size_t>(pieces) * tiles, 0);
   ThreadPool& pool = ThreadPool::instance();
+  pool.run(task_count(visible_count_), threads, [&](std::int64_t task, int) {
+    const std::int64_t begin = task * kSplatsPerTask;
+    stages_.find_entries(view_, data_, begin, std::min(begin + kSplatsPerTask, visible_count_));
+  });
+
+  const std::size_t tiles = static_cast<std::size_t>(view_.tiles_x) * view_.tiles_y;
+  const std::int64_t pieces = std::max<std::int64_t>(1, std::min<std::int64_t>(threads, visible_count_ / kSplatsPerTask));
+  const auto piece_begin = [&](std::int64_t piece) { return visible_count_ * piece / pieces; };
+  std::vector<std::uint32_t> places(pieces * tiles, 0);
+  // All splats at once may be counted in any order: the one in which they lie in memory is the fastest.
+  const std::uint32_t* counted = pieces == 1 ? data_.visible : data_.order;
   pool.run(pieces, threads, [&](std::int64_t piece, int) {
-    stages_.find_pairs(view_, data_, piece_begin(piece), piece_begin(piece + 1), &places[piece * tiles]);
+    std::uint32_t* counts = &places[piece * tiles];
+    const std::int64_t end = piece_begin(piece + 1);
+    for (std::int64_t i = piece_begin(piece); i < end; ++i) {
+      const EntryRange range = fetch_entries(counted, i, end);
+      for (std::uint32_t entry = range.begin; entry < range.begin + range.count; ++entry)
+        ++counts[data_.entries[entry].tile];
+    }
   });
 
   data_.tile_begin = tile_begin_.resize(tiles + 1);
@@ -179,13 +190,21 @@ void Frame::fill_tiles(int threads) {
   data_.pairs = pairs_.resize(total);
   pool.run(pieces, threads, [&](std::int64_t piece, int) {
     std::uint32_t* place = &places[piece * tiles];
-    for (std::int64_t i = piece_begin(piece); i < piece_begin(piece + 1); ++i) {
-      const std::uint32_t splat = data_.order[i];
-      const std::uint32_t begin = data_.entry_begin[splat], end = begin + data_.entry_count[splat];
-      for (std::uint32_t entry = begin; entry < end; ++entry)
-        data_.pairs[place[data_.entry_tiles[entry]]++] = {data_.entry_blocks[entry], splat, entry};
+    const std::int64_t end = piece_begin(piece + 1);
+    for (std::int64_t i = piece_begin(piece); i < end; ++i) {
+      const EntryRange range = fetch_entries(data_.order, i, end);
+      for (std::uint32_t entry = range.begin; entry < range.begin + range.count; ++entry)
+        data_.pairs[place[data_.entries[entry].tile]++] = {data_.entries[entry].blocks, data_.order[i], entry};
     }
   });
+}
+
+// The entries of splat order[i], while those of the splats a little further on are already asked for.
+EntryRange Frame::fetch_entries(const std::uint32_t* order, std::int64_t i, std::int64_t end) const {
+  constexpr int kRangesAhead = 24, kEntriesAhead = 12;
+  if (i + kRangesAhead < end) HEADBENCH_PREFETCH(data_.ranges + order[i + kRangesAhead]);
+  if (i + kEntriesAhead < end) HEADBENCH_PREFETCH(data_.entries + data_.ranges[order[i + kEntriesAhead]].begin);
+  return data_.ranges[order[i]];
 }
 
 void Frame::backward(const Splats& splats, Gradients grads, float* background, float* view_gradient, int threads) {
@@ -196,7 +215,7 @@ void Frame::backward(const Splats& splats, Gradients grads, float* background, f
   Buffer<float> scratch, entries;
   scratch.resize(scratch_stride * threads);
   grads.entry_stride = static_cast<int>(round_up(kMoments + channels + (grads.means2d_abs ? kAbsolutes : 0), stages_.lanes));
-  grads.entries = entries.resize(entries_ * grads.entry_stride);
+  grads.entries = entries.resize(entry_count_ * grads.entry_stride);
   std::vector<double> tile_background(static_cast<std::size_t>(tiles) * channels);
   grads.background = tile_background.data();
   ThreadPool& pool = ThreadPool::instance();

@@ -1,7 +1,11 @@
 // One rendered frame: drives the stages, and keeps what the backward pass needs.
 //
-//   forward   project (splats) -> sort by depth -> find pairs (splats) -> fill tiles -> draw (tiles)
+//   forward   project (splats) -> sort by depth -> find pairs (splats) -> draw (tiles)
 //   backward  draw backward (tiles), a record for every pair -> gather and project backward (splats)
+//
+// Memory, with N splats, C <= 10 channels, P pairs, R >= P tiles in the splats' bounding rectangles: 84 N + 16 (P + R) +
+// 8 pixels bytes while drawing, of which 76 N + 16 P + 8 pixels are kept for the backward pass, and 64 R more during that
+// pass alone. Up to workspace::kKeptMax of it is kept for the frames to come.
 //
 // What stands in parentheses is dealt out to threads. No two threads write to one place, and every sum has a fixed
 // order, so that results are equal bit for bit for any number of threads.
@@ -9,9 +13,9 @@
 
 #include <array>
 #include <cstddef>
-#include <new>
 
 #include "scene.h"
+#include "workspace.h"
 
 namespace headbench {
 
@@ -26,17 +30,19 @@ class Buffer {
 
   T* resize(std::size_t count) {
     release();
-    data_ = static_cast<T*>(::operator new(count ? count * sizeof(T) : 1, std::align_val_t{64}));
+    data_ = static_cast<T*>(workspace::take(count * sizeof(T)));
+    bytes_ = count * sizeof(T);
     return data_;
   }
   void release() {
-    ::operator delete(data_, std::align_val_t{64});
+    workspace::give(data_, bytes_);
     data_ = nullptr;
   }
   T* data() const { return data_; }
 
  private:
   T* data_ = nullptr;
+  std::size_t bytes_ = 0;
 };
 
 // The stages of a frame that are timed.
@@ -73,6 +79,7 @@ class Frame {
   void sort_by_depth();
   void reserve_entries();
   void fill_tiles(int threads);
+  EntryRange fetch_entries(const std::uint32_t* order, std::int64_t i, std::int64_t end) const;
 
   const View view_;
   const Stages& stages_;
@@ -83,10 +90,11 @@ class Frame {
   std::int64_t visible_count_ = 0;
   Buffer<float> records_, depths_, transmittances_, last_;
   Buffer<Rect> rects_;
-  Buffer<std::uint32_t> entry_begin_, entry_count_, visible_, order_, tile_begin_, entry_tiles_;
-  Buffer<std::uint64_t> entry_blocks_;
+  Buffer<EntryRange> ranges_;
+  Buffer<Entry> entries_;
+  Buffer<std::uint32_t> visible_, order_, tile_begin_;
   Buffer<Pair> pairs_;
-  std::size_t entries_ = 0;
+  std::size_t entry_count_ = 0;
   std::array<double, kStageCount> seconds_{};
 };
 

@@ -8,3 +8,13 @@
 #else
 #define HEADBENCH_INLINE inline
 #endif
+
+// Ask for a cache line that will be read, or written, soon. Macros, so that no compiled copy can be shared between
+// instruction sets.
+#if defined(__GNUC__) || defined(__clang__)
+#define HEADBENCH_PREFETCH(address) __builtin_prefetch(address)
+#define HEADBENCH_PREFETCH_WRITE(address) __builtin_prefetch(address, 1)
+#else
+#define HEADBENCH_PREFETCH(address) static_cast<void>(address)
+#define HEADBENCH_PREFETCH_WRITE(address) static_cast<void>(address)
+#endif

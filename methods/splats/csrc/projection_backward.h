@@ -134,8 +134,8 @@ inline void project_backward(const View& view, const Splats& splats, const Frame
       // A splat's records are neighbours and are added in their order: the sum does not depend on who drew
       // the tiles.
       alignas(64) float sum[kMoments + kChannelsMax + kAbsolutes + 2 * W];
-      const float* record = grads.entries + static_cast<std::size_t>(frame.entry_begin[splat]) * stride;
-      const std::uint32_t count = frame.entry_count[splat];
+      const float* record = grads.entries + static_cast<std::size_t>(frame.ranges[splat].begin) * stride;
+      const std::uint32_t count = frame.ranges[splat].count;
       for (int i = 0; i < vectors; ++i) {
         Real total = 0.0f;
         for (std::uint32_t e = 0; e < count; ++e)

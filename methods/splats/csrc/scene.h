@@ -60,8 +60,19 @@ struct Rect {
   std::uint16_t x0, y0, x1, y1;
 };
 
-// A splat in a tile's list. Bit `4 band + column` of `blocks` tells whether the splat reaches that block of
-// the tile; `entry` is where the pair's gradient goes, the pairs of one splat being neighbours.
+// A tile that a splat reaches. Bit `4 band + column` of `blocks` tells whether the splat reaches that block of
+// the tile.
+struct Entry {
+  std::uint64_t blocks;
+  std::uint32_t tile;
+};
+
+// The entries of one splat, neighbours.
+struct EntryRange {
+  std::uint32_t begin, count;
+};
+
+// A splat in a tile's list. `entry` is where the pair's gradient goes.
 struct Pair {
   std::uint64_t blocks;
   std::uint32_t splat, entry;
@@ -74,10 +85,8 @@ struct FrameData {
   float* depths;                 // (N,) camera z, 0 where culled
   std::int32_t* radii;           // (N,)
   Rect* rects;                   // (N,)
-  std::uint32_t* entry_begin;    // (N,)
-  std::uint32_t* entry_count;    // (N,)
-  std::uint32_t* entry_tiles;    // tile and blocks of each entry, before they are sorted into pairs
-  std::uint64_t* entry_blocks;
+  EntryRange* ranges;            // (N,) set for visible splats
+  Entry* entries;                // before they are sorted into pairs
   const std::uint32_t* visible;  // (M,) ascending
   const std::uint32_t* order;    // (M,) by depth
   Pair* pairs;                   // (P,) tile by tile, each by depth
@@ -118,9 +127,8 @@ struct Stages {
   int lanes;
   // Project splats [begin, end): records, depths, radii, rects.
   void (*project)(const View&, const Splats&, const FrameData&, std::int64_t begin, std::int64_t end);
-  // Find the tiles and blocks that splats order[begin .. end) reach; count them by tile.
-  void (*find_pairs)(const View&, const FrameData&, std::int64_t begin, std::int64_t end,
-                     std::uint32_t* tile_counts);
+  // Find the tiles and blocks that splats visible[begin .. end) reach.
+  void (*find_entries)(const View&, const FrameData&, std::int64_t begin, std::int64_t end);
   std::size_t (*scratch_floats)(int channels);
   void (*draw_tile)(const View&, const Splats&, const FrameData&, const ImageOut&, int tile, float* scratch);
   void (*draw_tile_backward)(const View&, const Splats&, const FrameData&, const Gradients&, int tile,

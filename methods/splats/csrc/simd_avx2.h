@@ -53,27 +53,27 @@ HEADBENCH_INLINE Real round(Real a, Real& rest) {
 }
 
 // a 2^n for whole n from -126 to 127.
+constexpr bool kAnyPower = false;
 HEADBENCH_INLINE Real scale_by_power(Real a, Real n) {
   const __m256i exponent = _mm256_add_epi32(_mm256_cvtps_epi32(n.v), _mm256_set1_epi32(127));
   return a * Real(_mm256_castsi256_ps(_mm256_slli_epi32(exponent, 23)));
 }
 
-// The matrix whose rows lie at p, p + lanes, ...: its columns. Rows i and i + 4 share a register from the
-// start, so that what is left are two 4 x 4 transposes side by side.
-HEADBENCH_INLINE void load_transposed(const float* p, Real* columns) {
-  for (int half = 0; half < 2; ++half) {
-    __m256 r[4];
-    for (int i = 0; i < 4; ++i) {
-      const float* row = p + 8 * i + 4 * half;
-      r[i] = _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(row)), _mm_loadu_ps(row + 32), 1);
-    }
-    const __m256 a = _mm256_unpacklo_ps(r[0], r[1]), b = _mm256_unpackhi_ps(r[0], r[1]);
-    const __m256 c = _mm256_unpacklo_ps(r[2], r[3]), d = _mm256_unpackhi_ps(r[2], r[3]);
-    columns[4 * half + 0].v = _mm256_shuffle_ps(a, c, 0x44);
-    columns[4 * half + 1].v = _mm256_shuffle_ps(a, c, 0xee);
-    columns[4 * half + 2].v = _mm256_shuffle_ps(b, d, 0x44);
-    columns[4 * half + 3].v = _mm256_shuffle_ps(b, d, 0xee);
-  }
+// Of lanes / 4 vectors: the i-th four floats of vector j and the j-th of vector i change places.
+HEADBENCH_INLINE void transpose_rows(Real* r) {
+  const __m256 a = r[0].v;
+  r[0].v = _mm256_permute2f128_ps(a, r[1].v, 0x20);
+  r[1].v = _mm256_permute2f128_ps(a, r[1].v, 0x31);
+}
+
+// Within every four floats: element i of vector j and element j of vector i change places.
+HEADBENCH_INLINE void transpose_quads(Real* q) {
+  const __m256 a = _mm256_unpacklo_ps(q[0].v, q[1].v), b = _mm256_unpackhi_ps(q[0].v, q[1].v);
+  const __m256 c = _mm256_unpacklo_ps(q[2].v, q[3].v), d = _mm256_unpackhi_ps(q[2].v, q[3].v);
+  q[0].v = _mm256_shuffle_ps(a, c, 0x44);
+  q[1].v = _mm256_shuffle_ps(a, c, 0xee);
+  q[2].v = _mm256_shuffle_ps(b, d, 0x44);
+  q[3].v = _mm256_shuffle_ps(b, d, 0xee);
 }
 
 }  // namespace headbench::HEADBENCH_ISA

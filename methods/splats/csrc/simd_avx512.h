@@ -45,35 +45,34 @@ HEADBENCH_INLINE Real reciprocal(Real a) {
   return fma(r, fnma(a, r, 1.0f), r);
 }
 
-// Split x into the nearest whole number and the rest in [-1/2, 1/2].
+// Split x into the nearest whole number and the rest in [-1/2, 1/2]; exact, also for huge values.
 HEADBENCH_INLINE Real round(Real a, Real& rest) {
-  const Real whole = _mm512_roundscale_ps(a.v, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
-  rest = a - whole;
-  return whole;
+  rest = _mm512_reduce_ps(a.v, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
+  return a - rest;
 }
 
-// a 2^n for whole n.
+// a 2^n for any whole n: what is too small becomes zero.
+constexpr bool kAnyPower = true;
 HEADBENCH_INLINE Real scale_by_power(Real a, Real n) { return _mm512_scalef_ps(a.v, n.v); }
 
-// The matrix whose rows lie at p, p + lanes, ...: its columns. Quarters of rows i, i + 4, i + 8 and i + 12
-// share a register from the start, so that what is left are four 4 x 4 transposes side by side.
-HEADBENCH_INLINE void load_transposed(const float* p, Real* columns) {
-  for (int quarter = 0; quarter < 4; ++quarter) {
-    __m512 r[4];
-    for (int i = 0; i < 4; ++i) {
-      const float* row = p + 16 * i + 4 * quarter;
-      __m512 x = _mm512_castps128_ps512(_mm_loadu_ps(row));
-      x = _mm512_mask_broadcast_f32x4(x, 0x00f0, _mm_loadu_ps(row + 64));
-      x = _mm512_mask_broadcast_f32x4(x, 0x0f00, _mm_loadu_ps(row + 128));
-      r[i] = _mm512_mask_broadcast_f32x4(x, 0xf000, _mm_loadu_ps(row + 192));
-    }
-    const __m512 a = _mm512_unpacklo_ps(r[0], r[1]), b = _mm512_unpackhi_ps(r[0], r[1]);
-    const __m512 c = _mm512_unpacklo_ps(r[2], r[3]), d = _mm512_unpackhi_ps(r[2], r[3]);
-    columns[4 * quarter + 0].v = _mm512_shuffle_ps(a, c, 0x44);
-    columns[4 * quarter + 1].v = _mm512_shuffle_ps(a, c, 0xee);
-    columns[4 * quarter + 2].v = _mm512_shuffle_ps(b, d, 0x44);
-    columns[4 * quarter + 3].v = _mm512_shuffle_ps(b, d, 0xee);
-  }
+// Of lanes / 4 vectors: the i-th four floats of vector j and the j-th of vector i change places.
+HEADBENCH_INLINE void transpose_rows(Real* r) {
+  const __m512 a = _mm512_shuffle_f32x4(r[0].v, r[1].v, 0x44), b = _mm512_shuffle_f32x4(r[0].v, r[1].v, 0xee);
+  const __m512 c = _mm512_shuffle_f32x4(r[2].v, r[3].v, 0x44), d = _mm512_shuffle_f32x4(r[2].v, r[3].v, 0xee);
+  r[0].v = _mm512_shuffle_f32x4(a, c, 0x88);
+  r[1].v = _mm512_shuffle_f32x4(a, c, 0xdd);
+  r[2].v = _mm512_shuffle_f32x4(b, d, 0x88);
+  r[3].v = _mm512_shuffle_f32x4(b, d, 0xdd);
+}
+
+// Within every four floats: element i of vector j and element j of vector i change places.
+HEADBENCH_INLINE void transpose_quads(Real* q) {
+  const __m512 a = _mm512_unpacklo_ps(q[0].v, q[1].v), b = _mm512_unpackhi_ps(q[0].v, q[1].v);
+  const __m512 c = _mm512_unpacklo_ps(q[2].v, q[3].v), d = _mm512_unpackhi_ps(q[2].v, q[3].v);
+  q[0].v = _mm512_shuffle_ps(a, c, 0x44);
+  q[1].v = _mm512_shuffle_ps(a, c, 0xee);
+  q[2].v = _mm512_shuffle_ps(b, d, 0x44);
+  q[3].v = _mm512_shuffle_ps(b, d, 0xee);
 }
 
 }  // namespace headbench::HEADBENCH_ISA

@@ -61,6 +61,7 @@ HEADBENCH_INLINE Real round(Real a, Real& rest) {
 }
 
 // a 2^n for whole n from -126 to 127.
+constexpr bool kAnyPower = false;
 HEADBENCH_INLINE Real scale_by_power(Real a, Real n) {
   Real r;
   for (int i = 0; i < 4; ++i) {
@@ -72,10 +73,15 @@ HEADBENCH_INLINE Real scale_by_power(Real a, Real n) {
   return r;
 }
 
-// The matrix whose rows lie at p, p + lanes, ...: its columns.
-HEADBENCH_INLINE void load_transposed(const float* p, Real* columns) {
-  for (int j = 0; j < 4; ++j)
-    for (int i = 0; i < 4; ++i) columns[j].v[i] = p[4 * i + j];
+// Of one vector: nothing to do.
+HEADBENCH_INLINE void transpose_rows(Real*) {}
+
+// Within every four floats: element i of vector j and element j of vector i change places.
+HEADBENCH_INLINE void transpose_quads(Real* q) {
+  Real t[4];
+  for (int i = 0; i < 4; ++i)
+    for (int j = 0; j < 4; ++j) t[i].v[j] = q[j].v[i];
+  for (int i = 0; i < 4; ++i) q[i] = t[i];
 }
 
 }  // namespace headbench::HEADBENCH_ISA

@@ -61,13 +61,21 @@ HEADBENCH_INLINE Real round(Real a, Real& rest) {
 }
 
 // a 2^n for whole n from -126 to 127.
+constexpr bool kAnyPower = false;
 HEADBENCH_INLINE Real scale_by_power(Real a, Real n) {
   return a.v * (Float4)((__builtin_convertvector(n.v, Int4) + 127) << 23);
 }
 
-// The matrix whose rows lie at p, p + lanes, ...: its columns.
-HEADBENCH_INLINE void load_transposed(const float* p, Real* columns) {
-  for (int j = 0; j < 4; ++j) columns[j] = Float4{p[j], p[4 + j], p[8 + j], p[12 + j]};
+// Of one vector: nothing to do.
+HEADBENCH_INLINE void transpose_rows(Real*) {}
+
+// Within every four floats: element i of vector j and element j of vector i change places.
+HEADBENCH_INLINE void transpose_quads(Real* q) {
+  const Float4 a = q[0].v, b = q[1].v, c = q[2].v, d = q[3].v;
+  q[0] = Float4{a[0], b[0], c[0], d[0]};
+  q[1] = Float4{a[1], b[1], c[1], d[1]};
+  q[2] = Float4{a[2], b[2], c[2], d[2]};
+  q[3] = Float4{a[3], b[3], c[3], d[3]};
 }
 
 }  // namespace headbench::HEADBENCH_ISA

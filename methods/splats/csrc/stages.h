@@ -15,7 +15,7 @@ inline std::size_t scratch_floats(int channels) {
 }
 
 extern const Stages stages;
-const Stages stages = {HEADBENCH_ISA_NAME, W,          project,      find_pairs,     scratch_floats,
+const Stages stages = {HEADBENCH_ISA_NAME, W,          project,      find_entries,     scratch_floats,
                        draw_tile,          draw_tile_backward, project_backward, count_work,
                        multiply_add,       kChains};
 
