@@ -8,5 +8,6 @@ SPLATS = BenchmarkSpec(
     name="splats",
     summary="the splat renderer: time by image size, number of splats and backend; numerical extremes",
     speed="headbench.methods.splats.benchmark.speed:measure",
+    tradeoffs="headbench.methods.splats.benchmark.tradeoffs:measure",
     stress="headbench.methods.splats.benchmark.stress:measure",
 )
