@@ -144,17 +144,6 @@ def cluster_by_distance(distances: FloatArray, classes: int, *, seed: int = 0) -
     return labels.astype(np.int64)
 
 
-def balanced_probabilities(labels: Sequence[int] | IntArray) -> FloatArray:
-    """(N,) probabilities of drawing each item so that every class is drawn equally often; they sum to 1.
-
-    With one label per image, and as many images at each timestep, this is the paper's probability
-    proportional to 1 / (timesteps in the class).
-    """
-    _, inverse, counts = np.unique(np.asarray(labels), return_inverse=True, return_counts=True)
-    weights = 1.0 / counts[inverse]
-    return weights / weights.sum()
-
-
 def _face_vertices(head: HeadAsset) -> tuple[IntArray, torch.Tensor]:
     """Face vertices and their weights."""
     face = head.regions.get(FACE_REGION)

@@ -6,7 +6,6 @@ those settings, so a killed run continues where it stopped and ends with the sam
 
 from __future__ import annotations
 
-import json
 import multiprocessing
 import os
 from collections.abc import Iterator
@@ -19,7 +18,7 @@ import torch
 
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
-from ...bench.files import write_json, write_text
+from ...bench.files import read_json, write_json, write_text
 from ..image_files import probe_image
 from .geometry import load_geometry
 from .performance import share_out
@@ -174,17 +173,13 @@ def _claim(out: Path, settings: Settings, head: str) -> None:
         write_text(out / "README.txt", _README)
         write_json(manifest, wanted)
         return
-    try:
-        found = json.loads(manifest.read_text(encoding="utf-8"))
-    except json.JSONDecodeError as error:
-        raise InputError(manifest, "", "JSON", str(error), "Delete the folder and start anew.") from error
+    found = read_json(manifest)
     for key, value in wanted.items():
-        if not isinstance(found, dict) or found.get(key) != value:
-            had = found.get(key) if isinstance(found, dict) else found
+        if found.get(key) != value:
             raise InputError(
                 manifest,
                 key,
                 f"{value!r}, as asked for",
-                f"{had!r}",
+                f"{found.get(key)!r}",
                 "Take another folder, or the same settings.",
             )

@@ -7,15 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from sklearn.metrics import adjusted_rand_score
 
 from headbench.bench.errors import InputError
 from headbench.datasets.head.model import HeadModel
 from headbench.datasets.steps import expression_clusters as module
 from headbench.datasets.steps.expression_clusters import (
-    balanced_probabilities,
     cluster_by_distance,
     cluster_expressions,
     expression_displacements,
@@ -166,18 +163,6 @@ def test_spectral_clustering_tells_rings_apart_where_nearest_means_cannot():
     labels = cluster_by_distance(distances, 2)
     assert len(set(labels[:10])) == len(set(labels[10:])) == 1
     assert labels[0] != labels[10]
-
-
-@settings(deadline=None)
-@given(labels=st.lists(st.integers(0, 5), min_size=1, max_size=40))
-def test_balanced_probabilities_give_every_class_the_same_share(labels):
-    probabilities = balanced_probabilities(labels)
-    assert probabilities.sum() == pytest.approx(1)
-    classes = set(labels)
-    for label in classes:
-        members = probabilities[np.array(labels) == label]
-        assert members.sum() == pytest.approx(1 / len(classes))
-        assert np.ptp(members) == 0
 
 
 def test_head_without_a_face_region_is_refused():

@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.stats import chisquare
 
 from headbench.methods.training.sampling import BLOCK, ShuffledEpochs, Weighted, balanced_weights
@@ -41,3 +43,14 @@ def test_classes_have_equal_shares():
     weights = balanced_weights(timesteps, {0: 0, 1: 0, 2: 0, 3: 1})
     np.testing.assert_allclose(weights, [1 / 3] * 6 + [1] * 2)
     assert weights[:6].sum() == pytest.approx(weights[6:].sum())
+
+
+@given(labels=st.lists(st.integers(0, 5), min_size=1, max_size=40))
+def test_every_class_has_the_same_share(labels):
+    weights = balanced_weights(np.arange(len(labels)), dict(enumerate(labels)))
+    probabilities = weights / weights.sum()
+    classes = set(labels)
+    for label in classes:
+        members = probabilities[np.array(labels) == label]
+        assert members.sum() == pytest.approx(1 / len(classes))
+        assert np.ptp(members) == 0
