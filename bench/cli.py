@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from .commands import offered_commands, with_groups
 from .configuration import build, merge, parse_assignments, read_yaml
 from .contracts import Findings
 from .demo import DemoConfig, demo_run_config, parse_size
@@ -171,11 +172,12 @@ def table(run: Annotated[str, tyro.conf.Positional], format: Literal["md", "csv"
 
 def list_(
     what: Annotated[
-        Literal["methods", "presets", "metrics", "datasets", "reports", "benchmarks"], tyro.conf.Positional
+        Literal["methods", "presets", "metrics", "datasets", "reports", "benchmarks", "commands"],
+        tyro.conf.Positional,
     ],
     json: bool = False,
 ) -> int:
-    """List what is installed: methods, presets, metrics, dataset readers, reports, benchmarks.
+    """List what is installed: methods, presets, metrics, dataset readers, reports, benchmarks, commands.
 
     Args:
         what: What to list.
@@ -263,14 +265,14 @@ def main(arguments: list[str] | None = None) -> int:
     # OpenMP's workers spin by default while they wait. On a machine with any other work that makes several
     # threads many times slower than one, so let them sleep; read once, when torch is first imported.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    words = sys.argv[1:] if arguments is None else arguments
     try:
-        return tyro.extras.subcommand_cli_from_dict(
-            COMMANDS,
-            prog="headbench",
-            description="Benchmark of animatable 3D head avatars. Start with `headbench demo`.",
-            args=arguments,
-            config=(tyro.conf.FlagCreatePairsOff,),
-        )
+        offered = offered_commands()
+        group = offered.get(words[0]) if words else None
+        if isinstance(group, dict):
+            return _call(group, f"headbench {words[0]}", f"What to {words[0]}.", words[1:])
+        description = "Benchmark of animatable 3D head avatars. Start with `headbench demo`."
+        return _call({**with_groups(offered), **COMMANDS}, "headbench", description, words)
     except HeadbenchError as error:
         print(f"headbench: {error}", file=sys.stderr)
         return EXIT_BAD_INPUT
@@ -281,6 +283,12 @@ def main(arguments: list[str] | None = None) -> int:
         # The reader of our output has gone (`headbench list methods | head`): not an error of ours.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+
+
+def _call(commands: dict[str, Callable[..., int]], prog: str, description: str, words: list[str]) -> int:
+    return tyro.extras.subcommand_cli_from_dict(
+        commands, prog=prog, description=description, args=words, config=(tyro.conf.FlagCreatePairsOff,)
+    )
 
 
 def _synthesise(arguments: dict[str, Any]) -> None:

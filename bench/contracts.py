@@ -350,7 +350,7 @@ class ReportSpec:
 
 
 class Findings(NamedTuple):
-    """What a benchmark of the toolkit itself found out."""
+    """What a benchmark of the toolkit itself, or a command that a room offers, found out."""
 
     text: str
     """Tables for a terminal."""
@@ -373,6 +373,21 @@ class BenchmarkSpec:
     speed: str = ""
     tradeoffs: str = ""
     stress: str = ""
+
+
+@dataclass(frozen=True)
+class CommandSpec:
+    """A command of the command line that a room offers.
+
+    ``name`` may have two words ("prepare nersemble"). ``settings`` names a frozen dataclass in a module that is
+    light to import; its attributes, described in its docstring, become the options. ``implementation`` names a
+    function ``(settings, progress) -> Findings``; the exit code is 0, or 1 where it did not pass.
+    """
+
+    name: str
+    summary: str
+    implementation: str
+    settings: str
 
 
 def no_progress(done: int, total: int, note: str = "") -> None:

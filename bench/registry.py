@@ -13,16 +13,17 @@ from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Literal
 
-from .contracts import BenchmarkSpec, DatasetSpec, MethodSpec, MetricSpec, ReportSpec
+from .contracts import BenchmarkSpec, CommandSpec, DatasetSpec, MethodSpec, MetricSpec, ReportSpec
 from .errors import HeadbenchError, InputError
 
-Group = Literal["methods", "datasets", "metrics", "reports", "benchmarks"]
+Group = Literal["methods", "datasets", "metrics", "reports", "benchmarks", "commands"]
 SPEC_TYPES: dict[str, type] = {
     "methods": MethodSpec,
     "datasets": DatasetSpec,
     "metrics": MetricSpec,
     "reports": ReportSpec,
     "benchmarks": BenchmarkSpec,
+    "commands": CommandSpec,
 }
 log = logging.getLogger(__name__)
 

@@ -7,7 +7,7 @@ import pytest
 
 from headbench.bench.cli import COMMANDS
 from headbench.bench.conformance import check_method
-from headbench.bench.registry import get
+from headbench.bench.registry import discover, get
 from headbench.bench.run_config import resolve_method
 
 ROOT = Path(__file__).parents[1]
@@ -33,8 +33,11 @@ def test_the_example_method_keeps_the_contract(monkeypatch, tmp_path):
 
 
 def test_the_commands_are_those_of_the_command_line():
-    named = set(re.findall(r"^\| `headbench (\w+)`", README, re.MULTILINE))
-    assert named == set(COMMANDS)
+    named = set(re.findall(r"^\| `headbench (\w+(?: \w+)?)`", README, re.MULTILINE))
+    offered = {
+        plugin.spec.name for plugin in discover("commands").values() if plugin.origin.startswith("headbench ")
+    }
+    assert named == set(COMMANDS) | offered
 
 
 def test_make_targets_exist():
