@@ -1,0 +1,275 @@
+"""Pictures of meshes: an exact z-buffer over scanlines in numpy, Lambert shading, no graphics library.
+
+For figures, overlays and visibility tests, not for training. A head of 10,000 triangles at 400x600, supersampled
+twice, takes about a tenth of a second.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from ..bench.contracts import ByteArray, Camera, FloatArray, IntArray
+
+PAPER = (1.0, 1.0, 1.0)
+CLAY = (0.78, 0.76, 0.74)
+"""Colour of a mesh that has none of its own."""
+
+NEAR = 1e-3
+"""Metres before the camera within which nothing is drawn: a triangle that reaches into it is left out whole."""
+
+_LIGHT = (-0.30, -0.45, -0.84)  # camera axes: from the upper left, mostly from the viewer
+_AMBIENT = 0.25
+_BACK_FACE = 0.45  # how bright the inside of a surface is, seen through an opening
+
+
+class Fragments(NamedTuple):
+    """What each pixel's centre sees of a mesh."""
+
+    face: IntArray
+    """(H, W) int32 index of the triangle in front, -1 where there is none."""
+    weights: FloatArray
+    """(H, W, 3) float32 perspective-correct barycentric weights of its corners; 0 where there is none."""
+    depth: FloatArray
+    """(H, W) float32 camera-space z, metres; infinity where there is none."""
+
+
+def draw_mesh(
+    vertices: FloatArray,
+    faces: IntArray,
+    camera: Camera,
+    colors: FloatArray | None = None,
+    *,
+    background: Sequence[float] | FloatArray | ByteArray = PAPER,
+    opacity: float = 1.0,
+    shading: float = 1.0,
+    supersampling: int = 2,
+) -> ByteArray:
+    """Draw a shaded mesh; (H, W, 3) 8-bit sRGB of the camera's size.
+
+    Parameters
+    ----------
+    vertices : (V, 3) in the world, metres. Triangles with a corner that is not finite are left out.
+    faces : (F, 3), counter-clockwise from outside; the inside is drawn too, darker.
+    colors : (V, 3) display-referred colours in [0, 1]; default: `CLAY`.
+    background : (3,) colour in [0, 1], or an (H, W, 3) image, 8-bit or in [0, 1], to draw upon.
+    opacity : of the mesh over the background.
+    shading : 1 for Lambert shading, 0 for the colours as they are; between, a mixture.
+    supersampling : samples per pixel along each axis.
+    """
+    fine = resized_camera(camera, supersampling)
+    fragments = rasterize_mesh(vertices, faces, fine)
+    hit = fragments.face >= 0
+    tint = np.broadcast_to(
+        np.asarray(CLAY if colors is None else colors, dtype=np.float32), (len(vertices), 3)
+    )
+    light = 1 - shading + shading * _brightness(vertices, faces, camera)
+    lit = (light[..., None] * tint).reshape(-1, 3)
+    # One row of colours for the outside of each vertex, one for its inside.
+    corners = faces + len(vertices) * _seen_from_inside(vertices, faces, camera)[:, None]
+    shaded = _blend(lit, corners[fragments.face[hit]], fragments.weights[hit])
+    layer = np.zeros((*hit.shape, 4), dtype=np.float32)
+    layer[hit, :3] = np.clip(shaded, 0, 1)
+    layer[hit, 3] = 1
+    layer = cv2.resize(layer, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    # The layer is premultiplied: colours are 0 where nothing was hit, so the average needs no division.
+    ground = np.asarray(background)
+    ground = ground.astype(np.float32) / (255 if ground.dtype == np.uint8 else 1)
+    picture = opacity * layer[..., :3] + (1 - opacity * layer[..., 3:]) * ground
+    return (np.clip(picture, 0, 1) * 255 + 0.5).astype(np.uint8)
+
+
+def rasterize_mesh(vertices: FloatArray, faces: IntArray, camera: Camera) -> Fragments:
+    """Find the triangle in front at each pixel's centre, exactly and without gaps along shared edges.
+
+    A centre on an edge belongs to one of its two triangles. Among triangles at one depth (to float32) the one of
+    lowest index is in front. See `draw_mesh` for ``vertices`` and ``faces``; `NEAR` bounds the depth.
+    """
+    width, height = camera.width, camera.height
+    points, usable = _project(vertices, camera)
+    kept = np.flatnonzero(usable[faces].all(axis=1))
+    corners = points[faces[kept]]  # (n, 3, 3): x, y in pixels, 1/z
+    which, row, left, right = _spans(corners, width, height)
+    counts = right - left
+    fragment = np.repeat(np.arange(len(which)), counts)
+    column = np.arange(len(fragment)) - np.repeat(np.cumsum(counts) - counts, counts) + left[fragment]
+    # 1/z is linear over the image of a triangle, so along a span it takes a start and a slope.
+    slope, start = _inverse_depth(corners[which], row)
+    inverse = (start[fragment] + slope[fragment] * (column + 0.5)).astype(np.float32)
+    # Positive floats order as their bits do: depth above, triangle below, and the largest key is in front.
+    order = np.uint64(len(kept)) - which[fragment].astype(np.uint64)
+    keys = (np.maximum(inverse, 0).view(np.uint32).astype(np.uint64) << np.uint64(32)) | order
+    front = np.zeros(height * width, dtype=np.uint64)
+    np.maximum.at(front, row[fragment] * width + column, keys)
+    pixels = np.flatnonzero(front)
+    local = len(kept) - (front[pixels] & np.uint64(0xFFFFFFFF)).astype(np.int64)
+    weights = _weights(corners, local, pixels % width + 0.5, pixels // width + 0.5)
+    result = Fragments(
+        np.full(height * width, -1, dtype=np.int32),
+        np.zeros((height * width, 3), dtype=np.float32),
+        np.full(height * width, np.inf, dtype=np.float32),
+    )
+    result.face[pixels] = kept[local]
+    result.weights[pixels] = weights
+    result.depth[pixels] = 1 / (front[pixels] >> np.uint64(32)).astype(np.uint32).view(np.float32)
+    shape = (height, width)
+    return Fragments(
+        result.face.reshape(shape), result.weights.reshape(*shape, 3), result.depth.reshape(shape)
+    )
+
+
+def vertex_normals(vertices: FloatArray, faces: IntArray) -> FloatArray:
+    """(V, 3) unit normals, area-weighted means of the triangles around; 0 at vertices without any area."""
+    edges = vertices[faces[:, 1:]] - vertices[faces[:, :1]]
+    areas = np.cross(edges[:, 0], edges[:, 1])
+    sums = np.stack(
+        [np.bincount(faces.ravel(), np.repeat(areas[:, i], 3), len(vertices)) for i in range(3)], axis=1
+    )
+    return sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+
+
+def portrait_camera(
+    vertices: FloatArray,
+    width: int,
+    height: int,
+    *,
+    yaw: float = 0.0,
+    pitch: float = 0.0,
+    fill: float = 0.92,
+    distance: float = 1.2,
+) -> Camera:
+    """Place a camera before a head that looks along +z with +y up, so that all of it is in the picture.
+
+    Parameters
+    ----------
+    vertices : (V, 3) what has to be in the picture, metres; for pictures to be compared, all of their vertices.
+    yaw, pitch : radians; the camera walks to the head's left, and up.
+    fill : part of the picture that the head's projection spans along its longer side.
+    distance : from the middle of the vertices' bounding box, metres.
+    """
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    outward = np.array([np.sin(yaw) * np.cos(pitch), np.sin(pitch), np.cos(yaw) * np.cos(pitch)])
+    forward = -outward
+    right = np.cross(forward, [0.0, 1.0, 0.0])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    world_to_camera = np.eye(4)
+    world_to_camera[:3, :3] = rotation
+    world_to_camera[:3, 3] = -rotation @ ((low + high) / 2 + distance * outward)
+    seen = vertices @ rotation.T + world_to_camera[:3, 3]
+    slopes = seen[:, :2] / seen[:, 2:]
+    least, most = slopes.min(axis=0), slopes.max(axis=0)
+    focal = fill * float((np.array([width, height]) / (most - least)).min())
+    centre = np.array([width, height]) / 2 - focal * (least + most) / 2
+    intrinsics = np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1.0]])
+    return Camera("portrait", width, height, intrinsics, world_to_camera)
+
+
+def resized_camera(camera: Camera, factor: int) -> Camera:
+    """Camera of an image ``factor`` times as large along both axes."""
+    scale = np.diag([factor, factor, 1.0])
+    return Camera(
+        camera.id, camera.width * factor, camera.height * factor, scale @ camera.K, camera.world_to_camera
+    )
+
+
+def _project(vertices: FloatArray, camera: Camera) -> tuple[FloatArray, np.ndarray]:
+    """(V, 3) pixel x, pixel y and 1/z; and which vertices may be drawn."""
+    world = np.asarray(vertices, dtype=np.float64)
+    usable = np.asarray(np.isfinite(world).all(axis=1))
+    points = np.where(usable[:, None], world, 0.0) @ camera.world_to_camera[:3, :3].T
+    points += camera.world_to_camera[:3, 3]
+    usable &= points[:, 2] > NEAR
+    inverse = 1 / np.where(usable, points[:, 2], 1.0)
+    pixels = (points * inverse[:, None]) @ camera.K[:2].T
+    return np.column_stack([pixels, inverse]), usable
+
+
+def _spans(corners: FloatArray, width: int, height: int) -> tuple[IntArray, IntArray, IntArray, IntArray]:
+    """Triangle, row, first column and end column of every non-empty run of pixel centres inside a triangle.
+
+    A centre on the left or upper border is inside, one on the right or lower border is not. Each edge is cut from
+    its upper to its lower end, so that two triangles that share it find the same cut, to the last bit.
+    """
+    order = np.argsort(corners[:, :, 1], axis=1, kind="stable")
+    top, middle, bottom = (
+        np.take_along_axis(corners, order[:, i, None, None], axis=1)[:, 0] for i in range(3)
+    )
+    first = np.clip(np.ceil(top[:, 1] - 0.5), 0, height).astype(np.int64)
+    end = np.clip(np.ceil(bottom[:, 1] - 0.5), 0, height).astype(np.int64)
+    counts = np.maximum(end - first, 0)
+    which = np.repeat(np.arange(len(corners)), counts)
+    row = np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts) + first[which]
+    y = row + 0.5
+    long_edge = _cut(top[which], bottom[which], y)
+    upper = y < middle[which, 1]
+    start = np.where(upper[:, None], top[which], middle[which])
+    stop = np.where(upper[:, None], middle[which], bottom[which])
+    short_edge = _cut(start, stop, y)
+    low, high = np.minimum(long_edge, short_edge), np.maximum(long_edge, short_edge)
+    left = np.clip(np.ceil(low - 0.5), 0, width).astype(np.int64)
+    right = np.clip(np.ceil(high - 0.5), 0, width).astype(np.int64)
+    full = right > left
+    return which[full], row[full], left[full], right[full]
+
+
+def _cut(start: FloatArray, stop: FloatArray, y: FloatArray) -> FloatArray:
+    """x where the edges from ``start`` down to ``stop`` cross the heights ``y``."""
+    rise = stop[:, 1] - start[:, 1]
+    share = (y - start[:, 1]) / np.where(rise > 0, rise, 1.0)
+    return start[:, 0] + share * (stop[:, 0] - start[:, 0])
+
+
+def _inverse_depth(corners: FloatArray, row: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Slope along x of 1/z of each triangle, and its value at x = 0 in the middle of each row."""
+    edges = corners[:, 1:] - corners[:, :1]
+    area = edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]
+    area = np.where(area == 0, 1.0, area)
+    along_x = (edges[:, 0, 2] * edges[:, 1, 1] - edges[:, 1, 2] * edges[:, 0, 1]) / area
+    along_y = (edges[:, 1, 2] * edges[:, 0, 0] - edges[:, 0, 2] * edges[:, 1, 0]) / area
+    start = corners[:, 0, 2] + along_y * (row + 0.5 - corners[:, 0, 1]) - along_x * corners[:, 0, 0]
+    return along_x, start
+
+
+def _weights(corners: FloatArray, which: IntArray, x: FloatArray, y: FloatArray) -> FloatArray:
+    """(n, 3) perspective-correct barycentric weights of points, each in triangle ``which`` of ``corners``."""
+    px, py, inverse = np.moveaxis(corners, 2, 0)
+    after, before = [1, 2, 0], [2, 0, 1]
+    # Twice the area of point and opposite edge, over the depth: linear in x and y.
+    along_x = (py[:, after] - py[:, before]) * inverse
+    along_y = (px[:, before] - px[:, after]) * inverse
+    constant = (px[:, after] * py[:, before] - px[:, before] * py[:, after]) * inverse
+    weights = along_x[which] * x[:, None]
+    weights += along_y[which] * y[:, None]
+    weights += constant[which]
+    np.abs(weights, out=weights)
+    total = weights[:, 0] + weights[:, 1] + weights[:, 2]
+    weights *= (1 / np.maximum(total, np.finfo(np.float64).tiny))[:, None]
+    return weights.astype(np.float32)
+
+
+def _blend(values: FloatArray, corners: IntArray, weights: FloatArray) -> FloatArray:
+    """(n, C) values at the fragments."""
+    result = weights[:, :1] * values[corners[:, 0]]
+    for corner in (1, 2):
+        result += weights[:, corner : corner + 1] * values[corners[:, corner]]
+    return result
+
+
+def _brightness(vertices: FloatArray, faces: IntArray, camera: Camera) -> FloatArray:
+    """(2, V) float32 brightness in [0, 1] of the surface at each vertex: seen from outside, from inside."""
+    normals = vertex_normals(vertices, faces) @ camera.world_to_camera[:3, :3].T
+    light = np.array(_LIGHT) / np.linalg.norm(_LIGHT)
+    facing = normals @ light
+    bright = _AMBIENT + (1 - _AMBIENT) * np.maximum([facing, -facing], 0)
+    return (np.array([[1.0], [_BACK_FACE]]) * bright).astype(np.float32)
+
+
+def _seen_from_inside(vertices: FloatArray, faces: IntArray, camera: Camera) -> np.ndarray:
+    """(F,) which triangles turn their back on the camera."""
+    corners = vertices[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return np.einsum("ij,ij->i", normals, corners[:, 0] - camera.center) > 0
