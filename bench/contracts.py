@@ -15,7 +15,7 @@ Conventions, fixed once here
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
@@ -65,6 +65,17 @@ class Camera:
         """(3,) position of the camera in the world, metres."""
         rotation, translation = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
         return -rotation.T @ translation
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same view at another image size. ``K`` scales without an offset: pixel (0, 0) starts at (0, 0)."""
+        scale = np.diag([width / self.width, height / self.height, 1.0])
+        return replace(self, width=width, height=height, K=scale @ self.K)
+
+    def boxed(self, left: int, top: int, width: int, height: int) -> Camera:
+        """The view of a box of the image, in whole pixels; a box that reaches beyond the image pads it."""
+        K = np.array(self.K, dtype=np.float64)
+        K[:2, 2] -= left, top
+        return replace(self, width=width, height=height, K=K)
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,6 +282,46 @@ class AvatarMetric(Protocol):
 
 
 @dataclass(frozen=True)
+class ResolutionRule:
+    """The image size that a method works at, as declared by it. Metrics are taken at the protocol's size.
+
+    Applied in this order: reduction, square, enlargement. A capture of 550x802 becomes the 2048x2048 that a method
+    for 2K images wants by ``square="pad", size=(2048, 2048)``; one recorded at 2K loses the detail that other
+    methods do not see by ``divide=4, multiply=4``.
+
+    Attributes
+    ----------
+    divide : reduce by this factor, by the mean over the area that a pixel covers.
+    square : "pad" to the longer side with background, "crop" to the shorter one, or "" for neither; centred.
+        What a crop cuts off is scored as background.
+    multiply : enlarge by this factor, bicubic.
+    size : (width, height) to resize to at the end, antialiased, in place of ``multiply``.
+    speed_size : (width, height) at which frames per second are measured; None: the size rendered at.
+    """
+
+    divide: int = 1
+    square: Literal["", "pad", "crop"] = ""
+    multiply: int = 1
+    size: tuple[int, int] | None = None
+    speed_size: tuple[int, int] | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what has no meaning."""
+        sides = [self.divide, self.multiply, *(self.size or ()), *(self.speed_size or ())]
+        if min(sides) < 1 or self.square not in ("", "pad", "crop"):
+            raise ValueError(
+                f"{self}: factors and sides are whole numbers from 1, square is pad, crop or nothing"
+            )
+        if self.size is not None and self.multiply != 1:
+            raise ValueError(f"{self}: give multiply or size, not both")
+
+    @property
+    def native(self) -> bool:
+        """Whether images stay as they are."""
+        return self.divide == self.multiply == 1 and not self.square and self.size is None
+
+
+@dataclass(frozen=True)
 class MethodSpec:
     """What listing a method needs. Loading a spec imports neither torch nor the implementation.
 
@@ -282,7 +333,8 @@ class MethodSpec:
     config : "package.module:Class" of the frozen dataclass with its settings, or "" for a method without any.
     presets : settings by preset name. The key "budget" holds `Budget` fields; the rest are config fields.
     head_models : versions the method accepts; empty means any.
-    monocular : needs the views as one video.
+    monocular : needs the views as one video, one frame at a timestep, the head's rigid motion in the cameras.
+    resolution : the image size it works at.
     native : runs on our own implementation; False for an adapter to an official repository.
     source : the paper.
     trivial : a floor that every real method should beat; shown in tables, never ranked.
@@ -299,6 +351,7 @@ class MethodSpec:
     version: str = "1"
     source: str = ""
     trivial: bool = False
+    resolution: ResolutionRule = ResolutionRule()
 
 
 @dataclass(frozen=True)
@@ -326,6 +379,8 @@ class DatasetSpec:
     ``find`` names a function ``(root) -> list of paths`` that lists the captures under a folder. A reader with
     a keyword ``progress`` is given a `Progress`. ``reads`` is False for one that makes captures instead: its
     function takes ``out`` and settings and writes what another reader reads.
+
+    ``adapt`` names a function that brings clips into the form a method needs, see `adaptation`; "" for none.
     """
 
     name: str
@@ -333,6 +388,7 @@ class DatasetSpec:
     implementation: str
     find: str = ""
     reads: bool = True
+    adapt: str = ""
 
 
 @dataclass(frozen=True)

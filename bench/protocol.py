@@ -29,7 +29,7 @@ class Protocol:
     keys : the frames, sorted; every method renders exactly these.
     excluded : frames left out, with the reason.
     clips : fingerprint of each subject's clip (images, cameras and driving signal).
-    resolution : at which size metrics are taken.
+    resolution : at which size metrics are taken: WIDTHxHEIGHT of the truth, all that occur.
     background : colour that renders and truth are composited on.
     quantisation : how float renders become 8-bit frames.
     metric_profile : the named set of metric definitions.
@@ -39,7 +39,7 @@ class Protocol:
     keys: tuple[FrameKey, ...]
     excluded: tuple[tuple[FrameKey, str], ...]
     clips: tuple[tuple[str, str], ...]
-    resolution: str = "native"
+    resolution: str
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
     quantisation: str = "round-to-8-bit"
     metric_profile: str = "canonical"
@@ -67,6 +67,7 @@ def make_protocol(task: TaskName, clips: Sequence[Clip], max_frames: int | None 
     InputError : a clip without frames for the task, or one whose task frames are also training frames.
     """
     keys: list[FrameKey] = []
+    sizes: set[tuple[int, int]] = set()
     excluded: list[tuple[FrameKey, str]] = []
     for clip in clips:
         frames = sorted(clip.splits.get(task, ()))
@@ -80,7 +81,9 @@ def make_protocol(task: TaskName, clips: Sequence[Clip], max_frames: int | None 
                 "no frame of the training split",
                 f"{len(leaked)} shared, the first {min(leaked)}",
             )
-        keys += _evenly(frames, max_frames)
+        chosen = _evenly(frames, max_frames)
+        keys += chosen
+        sizes |= {(camera.width, camera.height) for camera in {clip.cameras[key.camera] for key in chosen}}
         excluded += sorted(clip.excluded.items())
     backgrounds = {tuple(float(v) for v in clip.background) for clip in clips}
     if len(backgrounds) != 1:
@@ -91,6 +94,7 @@ def make_protocol(task: TaskName, clips: Sequence[Clip], max_frames: int | None 
         keys=tuple(keys),
         excluded=tuple(excluded),
         clips=tuple(sorted((clip.subject, clip.fingerprint) for clip in clips)),
+        resolution=", ".join(f"{width}x{height}" for width, height in sorted(sizes)),
         background=(red, green, blue),
     )
 

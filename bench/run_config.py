@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+from .adaptation import MethodNeeds
 from .configuration import build, merge
 from .contracts import Budget, MethodSpec, MetricSpec, TaskName
 from .errors import InputError
@@ -32,6 +33,10 @@ class RunConfig:
     frames_per_task : score at most so many frames per subject and task, evenly spaced; None: all.
     device : "cpu", "cuda", ...
     settings : per method, over the preset; the key ``budget`` holds iterations and seconds.
+    divide : reduce all images by this factor, by area means, before anything else: the size that metrics are
+        taken at is then that of the reduced images.
+    heads : files of further head models by version, for methods that want another than a capture was tracked
+        with; their tracking is refitted.
     """
 
     data: str
@@ -46,6 +51,8 @@ class RunConfig:
     frames_per_task: int | None = None
     device: str = "cpu"
     settings: dict[str, dict[str, Any]] = field(default_factory=dict)
+    divide: int = 1
+    heads: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Refuse what could only fail later."""
@@ -57,6 +64,8 @@ class RunConfig:
                 raise ValueError(f"{name} names something twice: {', '.join(map(str, values))}")
         if not re.fullmatch(r"(cpu|cuda|mps|xpu)(:\d+)?", self.device):
             raise ValueError(f"device is {self.device!r}; cpu, cuda, cuda:1 and the like")
+        if self.divide < 1:
+            raise ValueError(f"divide is {self.divide}; a whole number from 1")
         if self.frames_per_task is not None and self.frames_per_task < 1:
             raise ValueError(f"frames_per_task is {self.frames_per_task}; at least 1, or none for all")
 
@@ -76,6 +85,7 @@ class ResolvedMethod:
 
     def record(self) -> dict[str, Any]:
         """Everything that decides what this method does, for fingerprint and manifest."""
+        needs = MethodNeeds.of(self.spec)
         return {
             "name": self.spec.name,
             "version": self.spec.version,
@@ -83,6 +93,7 @@ class ResolvedMethod:
             "trivial": self.spec.trivial,
             "config": None if self.config is None else asdict(self.config),
             "budget": asdict(self.budget),
+            **({} if needs == MethodNeeds() else {"needs": asdict(needs)}),
         }
 
 

@@ -12,13 +12,15 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from . import adaptation
+from .adaptation import AdaptedClip, MethodNeeds
 from .captures import open_clips
-from .contracts import Clip, MetricSpec
+from .contracts import Clip, DatasetSpec, MetricSpec, ResolutionRule
 from .errors import HeadbenchError, InputError, UnavailableError
 from .machine import machine_record, peak_memory_bytes
 from .progress import duration
 from .protocol import Protocol, make_protocol
-from .registry import discover, resolve
+from .registry import discover, get, resolve
 from .run_config import ResolvedMethod, RunConfig, resolve_methods, resolve_metrics
 from .stages import Job, failed_rows, fit, measure, render
 from .store import RunFolder, write_rows
@@ -37,18 +39,26 @@ def run(config: RunConfig, **record: Any) -> pd.DataFrame:
     methods, metrics = resolve_methods(config), resolve_metrics(config)
     for method in methods:
         method.create()  # an implementation that cannot be imported or made is not to be found out hours later
-    clips = open_clips(config)
+    opened = open_clips(config)
+    reader = get("datasets", config.reader)
+    folder = RunFolder(Path(config.out))
+    folder.prepare()
+    clips = [_reduced(clip, config, reader, folder.adapted / clip.subject) for clip in opened]
     protocols: dict[str, Protocol] = {
         task: make_protocol(task, clips, config.frames_per_task) for task in config.tasks
     }
-    folder = RunFolder(Path(config.out))
-    folder.prepare()
-    jobs = _jobs(config, methods, clips, protocols, folder)
+    adapted = _adapt(clips, methods, reader, config.heads, folder)
+    jobs = _jobs(config, methods, clips, protocols, folder, adapted)
     for job in jobs:
         job.check()
     _warn_of_missing_metrics(metrics, clips[0])
 
     manifest = {**_manifest(config, methods, metrics, clips, protocols), **record}
+    manifest["adapted"] = [
+        adaptation.record(job.clip, job.adapted, job.method.spec.name)
+        for job in jobs
+        if job.adapted is not None and job.seed == config.seeds[0]
+    ]
     folder.write_manifest({**manifest, "status": "started"})
     for protocol in protocols.values():
         log.info("%s, protocol %s: %d frames", protocol.task, protocol.hash, len(protocol.keys))
@@ -82,15 +92,60 @@ def write_reports(run_folder: Path) -> list[Path]:
     return written
 
 
+Adapted = Mapping[tuple[str, MethodNeeds], AdaptedClip]
+
+
+def _reduced(clip: Clip, config: RunConfig, reader: DatasetSpec, folder: Path) -> Clip:
+    """The clip at the size that metrics are taken at."""
+    if config.divide == 1:
+        return clip
+    needs = MethodNeeds(resolution=ResolutionRule(divide=config.divide))
+    planned = adaptation.plan(clip, needs, reader, {})
+    return (
+        clip
+        if planned is None
+        else adaptation.carry_out(planned, needs, folder, f"reducing {clip.subject}").clip
+    )
+
+
+def _adapt(
+    clips: Sequence[Clip],
+    methods: Sequence[ResolvedMethod],
+    reader: DatasetSpec,
+    heads: Mapping[str, str],
+    folder: RunFolder,
+) -> Adapted:
+    """Bring every clip into every form that a method needs, once each; first make sure that all can be had."""
+    planned = {}
+    for clip in clips:
+        for needs in {MethodNeeds.of(method.spec): None for method in methods}:
+            step = adaptation.plan(clip, needs, reader, heads)
+            if step is not None:
+                planned[clip.subject, needs] = step
+    return {
+        (subject, needs): adaptation.carry_out(step, needs, folder.adapted / subject, f"adapting {subject}")
+        for (subject, needs), step in planned.items()
+    }
+
+
 def _jobs(
     config: RunConfig,
     methods: Sequence[ResolvedMethod],
     clips: Sequence[Clip],
     protocols: Mapping[str, Protocol],
     folder: RunFolder,
+    adapted: Adapted,
 ) -> list[Job]:
     return [
-        Job(clip, method, seed, config.device, folder.cell(clip.subject, method.spec.name, seed), protocols)
+        Job(
+            clip,
+            method,
+            seed,
+            config.device,
+            folder.cell(clip.subject, method.spec.name, seed),
+            protocols,
+            adapted.get((clip.subject, MethodNeeds.of(method.spec))),
+        )
         for clip in clips
         for method in methods
         for seed in config.seeds

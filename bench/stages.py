@@ -13,6 +13,7 @@ from typing import Any
 
 import pandas as pd
 
+from .adaptation import AdaptedClip
 from .contracts import Avatar, Camera, Clip, FrameKey, HeadPose, Metric, MetricSpec
 from .errors import HeadbenchError, InputError, UnavailableError
 from .files import digest
@@ -31,7 +32,11 @@ RESULT_FORMAT = 1  # raise when a stage changes what it leaves behind
 
 @dataclass(frozen=True)
 class Job:
-    """One cell with all it needs."""
+    """One cell with all it needs.
+
+    ``clip`` is what is compared: the truth of every metric. ``adapted`` is its form for this method, None where
+    that is the clip itself.
+    """
 
     clip: Clip
     method: ResolvedMethod
@@ -39,6 +44,12 @@ class Job:
     device: str
     cell: Cell
     protocols: Mapping[str, Protocol]
+    adapted: AdaptedClip | None = None
+
+    @property
+    def form(self) -> AdaptedClip:
+        """The clip as the method sees it."""
+        return self.adapted or AdaptedClip(self.clip)
 
     @property
     def name(self) -> str:
@@ -47,11 +58,10 @@ class Job:
     @property
     def fit_fingerprint(self) -> str:
         """Digest of everything the trained avatar depends on."""
-        return digest(RESULT_FORMAT, self.method.record(), self.seed, self.device, self.clip.fingerprint)
+        return digest(RESULT_FORMAT, self.method.record(), self.seed, self.device, self.form.clip.fingerprint)
 
     def check(self) -> None:
-        """Refuse a clip the method cannot use, and a folder that holds an avatar made of something else."""
-        self._check_needs()
+        """Refuse a folder that holds an avatar made of something else."""
         state = self.cell.stage("fit")
         if state is not None and state.get("fingerprint") != self.fit_fingerprint:
             raise InputError(
@@ -61,17 +71,6 @@ class Job:
                 f"{str(state.get('fingerprint'))[:12]}, an avatar of other settings or data",
                 "Choose another --out, or delete that folder.",
             )
-
-    def _check_needs(self) -> None:
-        spec = self.method.spec
-        if spec.head_models and self.clip.head.version not in spec.head_models:
-            expected = f"a capture tracked with {' or '.join(spec.head_models)}"
-            raise InputError(f"method {spec.name}", "head_models", expected, self.clip.head.version)
-        train = self.clip.splits["train"]
-        views = len(train) - len({key.timestep for key in train})
-        if spec.monocular and views:
-            expected = "a single video, one training frame at a timestep"
-            raise InputError(f"method {spec.name}", "monocular", expected, f"{views} further views")
 
 
 def fit(job: Job) -> Avatar:
@@ -88,7 +87,7 @@ def fit(job: Job) -> Avatar:
         start = time.perf_counter()
         with progress(f"{job.name}: training") as report:
             method.fit(
-                TrainingView(job.clip) if job.method.spec.native else job.clip,
+                TrainingView(job.form.clip) if job.method.spec.native else job.form.clip,
                 job.cell.avatar,
                 job.method.budget,
                 device=job.device,
@@ -110,7 +109,8 @@ def fit(job: Job) -> Avatar:
 
 
 def render(job: Job, avatar: Avatar) -> None:
-    """Render every frame of every protocol to 8-bit PNG; frames already there are kept."""
+    """Render every frame of every protocol to 8-bit PNG of the protocol's size; frames already there are kept."""
+    form = job.form
     wanted = [
         (protocol, key)
         for protocol in job.protocols.values()
@@ -121,13 +121,14 @@ def render(job: Job, avatar: Avatar) -> None:
         for index, (protocol, key) in enumerate(wanted):
             path = job.cell.render(protocol.task, key)
             if not path.exists():
-                camera, pose = job.clip.cameras[key.camera], job.clip.poses[key.timestep]
+                seen = form.key(key)
+                camera, pose = form.clip.cameras[seen.camera], form.clip.poses[seen.timestep]
                 frame = avatar.render(camera, pose, protocol.background)
                 if frame.rgb.shape != (camera.height, camera.width, 3):
                     raise InputError(
                         job.name, str(key), f"shape {(camera.height, camera.width, 3)}", f"{frame.rgb.shape}"
                     )
-                write_png(path, quantise(frame.rgb))
+                write_png(path, quantise(form.restore(key, frame.rgb)))
             report(index + 1, len(wanted), protocol.task)
 
 
@@ -173,16 +174,21 @@ def failed_rows(job: Job, metrics: Sequence[MetricSpec], error: Exception) -> pd
     return to_frame(rows)
 
 
-def workload(clip: Clip, protocols: Mapping[str, Protocol]) -> list[tuple[Camera, HeadPose]]:
-    """Return a walk over the cameras and poses of the scored frames, a new camera and pose at every step."""
-    keys = [k for p in protocols.values() for k in p.keys if k.subject == clip.subject]
+def workload(
+    form: AdaptedClip, protocols: Mapping[str, Protocol], size: tuple[int, int] | None = None
+) -> list[tuple[Camera, HeadPose]]:
+    """Return a walk over the cameras and poses of the scored frames, a new camera and pose at every step.
+
+    ``size`` is the (width, height) that the cameras are brought to, None for their own.
+    """
+    clip = form.clip
+    keys = [form.key(k) for p in protocols.values() for k in p.keys if k.subject == clip.subject]
     timesteps = sorted({k.timestep for k in keys})
-    cameras = sorted(clip.cameras)
-    steps = max(len(timesteps), len(cameras), 2)
-    walk = [
-        (clip.cameras[cameras[i % len(cameras)]], clip.poses[timesteps[i % len(timesteps)]])
-        for i in range(steps)
+    cameras = [
+        camera if size is None else camera.resized(*size) for _, camera in sorted(clip.cameras.items())
     ]
+    steps = max(len(timesteps), len(cameras), 2)
+    walk = [(cameras[i % len(cameras)], clip.poses[timesteps[i % len(timesteps)]]) for i in range(steps)]
     first, last = walk[0], walk[-1]
     return walk[:-1] if len(walk) > 2 and first[0] is last[0] and first[1] is last[1] else walk
 
@@ -217,7 +223,7 @@ def _measure_avatar(
     job: Job, spec: MetricSpec, metric: Any, avatar: Avatar
 ) -> tuple[Row, Mapping[str, float]]:
     try:
-        measured = metric(avatar, workload(job.clip, job.protocols))
+        measured = metric(avatar, workload(job.form, job.protocols, job.method.spec.resolution.speed_size))
     except UnavailableError as error:
         return _row(job, spec, None, None, math.nan, "missing", str(error)), {}
     return _row(job, spec, None, None, measured.value, "ok", ""), measured.details

@@ -10,6 +10,7 @@
         avatar/                   what the method wrote
         renders/<task>/*.png      8-bit frames, named by key
         speed.json, rows.parquet
+    adapted/<subject>/            tracking refitted for methods that want another head model
     tables/, contact_sheet.png    views of the rows
 """
 
@@ -130,6 +131,11 @@ class RunFolder:
     @property
     def rows(self) -> Path:
         return self.root / "rows.parquet"
+
+    @property
+    def adapted(self) -> Path:
+        """Folder of what was computed to bring clips into the form that a method needs, by subject."""
+        return self.root / "adapted"
 
     @property
     def tables(self) -> Path:
