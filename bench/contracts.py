@@ -285,22 +285,22 @@ class AvatarMetric(Protocol):
 class ResolutionRule:
     """The image size that a method works at, as declared by it. Metrics are taken at the protocol's size.
 
-    Applied in this order: reduction, square, enlargement. A capture of 550x802 becomes the 2048x2048 that a method
+    Applied in this order: square, reduction, enlargement. A capture of 550x802 becomes the 2048x2048 that a method
     for 2K images wants by ``square="pad", size=(2048, 2048)``; one recorded at 2K loses the detail that other
     methods do not see by ``divide=4, multiply=4``.
 
     Attributes
     ----------
-    divide : reduce by this factor, by the mean over the area that a pixel covers.
     square : "pad" to the longer side with background, "crop" to the shorter one, or "" for neither; centred.
         What a crop cuts off is scored as background.
+    divide : reduce by this factor, by the mean over the area that a pixel covers.
     multiply : enlarge by this factor, bicubic.
     size : (width, height) to resize to at the end, antialiased, in place of ``multiply``.
     speed_size : (width, height) at which frames per second are measured; None: the size rendered at.
     """
 
-    divide: int = 1
     square: Literal["", "pad", "crop"] = ""
+    divide: int = 1
     multiply: int = 1
     size: tuple[int, int] | None = None
     speed_size: tuple[int, int] | None = None

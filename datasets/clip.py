@@ -2,24 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
 
 from ..bench.contracts import ByteArray, Camera, FloatArray, FrameKey, HeadPose, StepRecord
 from ..bench.errors import InputError
 from ..bench.files import digest
+from ..bench.frames import quantise
 from .head.arrays import HeadArrays
-from .images import ImageStore
+from .images import ImageStore, read_image, read_mask
 
 
 class FrameFiles(NamedTuple):
-    """Where a frame's pixels are."""
+    """Where a frame's pixels are, and which frame they were recorded as if a step gave it another key since."""
 
     image: Path
     mask: Path | None
+    recorded: FrameKey | None = None
+
+
+class FramePixels(NamedTuple):
+    """A frame on its way through pixel steps, not yet rounded to 8 bits."""
+
+    image: (
+        FloatArray  # (H, W, 3) float32 in [0, 1], composited on the clip's background as it is at that point
+    )
+    coverage: FloatArray | None  # (H, W) float32 in [0, 1]; None where the capture has no mask, and stays so
+
+
+PixelStep = Callable[[FrameKey, FramePixels], FramePixels]
+"""Changes the pixels of a frame; the key is that which the frame was recorded as."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,9 +45,12 @@ class CaptureClip:
 
     Attributes
     ----------
-    files : of every frame, those of excluded frames included.
+    files : of every frame, those of excluded frames included. Where there are pixel steps, what methods see
+        differs from what the files hold.
     source_fingerprint : digest of the content of all files behind the clip; does not depend on their place.
     store : decodes images and bounds the memory they take; shared by clips derived from one another.
+    pixel_steps : applied in order when a frame is read, with one rounding to 8 bits at the end.
+    read_background : what straight-alpha files are composited on before the pixel steps; None: `background`.
     """
 
     subject: str
@@ -46,6 +66,8 @@ class CaptureClip:
     files: Mapping[FrameKey, FrameFiles]
     source_fingerprint: str
     store: ImageStore
+    pixel_steps: tuple[PixelStep, ...] = ()
+    read_background: FloatArray | None = None
 
     @cached_property
     def fingerprint(self) -> str:
@@ -59,12 +81,16 @@ class CaptureClip:
 
         Raises `InputError` for a key the clip does not have.
         """
-        return self.store.image(self._files(key).image, self.background)
+        if not self.pixel_steps:
+            return self.store.image(self._files(key).image, self.background)
+        return self._processed(key, "image")
 
     def mask(self, key: FrameKey) -> ByteArray | None:
         """(H, W) 8-bit foreground coverage, read-only; None where the capture has none."""
         path = self._files(key).mask
-        return None if path is None else self.store.mask(path)
+        if path is None:
+            return None
+        return self._processed(key, "mask") if self.pixel_steps else self.store.mask(path)
 
     def timesteps(self, split: str) -> list[int]:
         """Distinct timesteps of a split, sorted."""
@@ -75,8 +101,42 @@ class CaptureClip:
         record = StepRecord(step, parameters, self.fingerprint)
         return replace(self, steps=(*self.steps, record), **changes)
 
+    def derive_pixels(
+        self, step: str, parameters: Mapping[str, Any], change: PixelStep, **changes: Any
+    ) -> CaptureClip:
+        """Copy whose frames pass through one more pixel step, on record."""
+        ground = self.background if self.read_background is None else self.read_background
+        steps = (*self.pixel_steps, change)
+        return self.derive(step, parameters, pixel_steps=steps, read_background=ground, **changes)
+
+    def recorded(self, key: FrameKey) -> FrameKey:
+        """The key that a frame was recorded as: the same unless a step renumbered the frames."""
+        return self._files(key).recorded or key
+
+    def _processed(self, key: FrameKey, part: Literal["image", "mask"]) -> ByteArray:
+        """Image or mask of a frame after all pixel steps, read-only; both are kept as one gives the other."""
+        found = self.store.find((self.fingerprint, key, part))
+        if found is not None:
+            return found
+        files = self._files(key)
+        ground = self.background if self.read_background is None else self.read_background
+        coverage = None if files.mask is None else _unit_range(read_mask(files.mask))
+        pixels = FramePixels(_unit_range(read_image(files.image, ground)), coverage)
+        for change in self.pixel_steps:
+            pixels = change(files.recorded or key, pixels)
+        parts = {"image": quantise(pixels.image)}
+        if pixels.coverage is not None:
+            parts["mask"] = quantise(pixels.coverage)
+        for name, array in parts.items():
+            self.store.keep((self.fingerprint, key, name), array)
+        return parts[part]
+
     def _files(self, key: FrameKey) -> FrameFiles:
         try:
             return self.files[key]
         except KeyError:
             raise InputError("clip", "frame key", f"a frame of subject {self.subject}", str(key)) from None
+
+
+def _unit_range(levels: ByteArray) -> FloatArray:
+    return levels.astype(np.float32) / np.float32(255)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Iterable
+from collections.abc import Hashable, Iterable
 from pathlib import Path
 
 import cv2
@@ -26,7 +26,7 @@ class ImageStore:
             raise InputError("image store", "limit_mb", "a number from 0", f"{limit_mb}")
         self._limit = int(limit_mb * 1e6)
         self._held = 0
-        self._arrays: OrderedDict[tuple[Path, tuple[float, ...] | None], ByteArray] = OrderedDict()
+        self._arrays: OrderedDict[Hashable, ByteArray] = OrderedDict()
         self._lock = threading.Lock()
 
     @property
@@ -44,11 +44,22 @@ class ImageStore:
 
     def _get(self, path: Path, background: tuple[float, ...] | None) -> ByteArray:
         key = (path, background)
+        array = self.find(key)
+        if array is None:
+            array = read_mask(path) if background is None else read_image(path, background)
+            self.keep(key, array)
+        return array
+
+    def find(self, key: Hashable) -> ByteArray | None:
+        """What was kept under a key, None where it was not or has gone since."""
         with self._lock:
-            if key in self._arrays:
-                self._arrays.move_to_end(key)
-                return self._arrays[key]
-        array = read_mask(path) if background is None else read_image(path, background)
+            if key not in self._arrays:
+                return None
+            self._arrays.move_to_end(key)
+            return self._arrays[key]
+
+    def keep(self, key: Hashable, array: ByteArray) -> None:
+        """Make an array read-only and keep it while there is room."""
         array.flags.writeable = False
         with self._lock:
             if key not in self._arrays and array.nbytes <= self._limit:
@@ -57,7 +68,6 @@ class ImageStore:
                 while self._held > self._limit:
                     _, oldest = self._arrays.popitem(last=False)
                     self._held -= oldest.nbytes
-        return array
 
 
 def read_image(path: Path, background: Iterable[float]) -> ByteArray:

@@ -1,0 +1,179 @@
+"""Resolution alignment: a clip at the size that a method declares, and renders back at the protocol's size."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from ...bench.contracts import Camera, FloatArray, FrameKey, ResolutionRule
+from ...bench.errors import InputError
+from ..clip import CaptureClip, FramePixels
+from ..resampling import resize_image
+
+Size = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Resize:
+    """To (width, height) pixels; covers the same extent."""
+
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box of an image in whole pixels; where it reaches beyond the image there is background."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """How images of one size become those of a `ResolutionRule`, pixel for pixel, and the way back.
+
+    Attributes
+    ----------
+    source : (width, height) of the images as they are.
+    moves : applied in this order.
+    """
+
+    source: Size
+    moves: tuple[Resize | Box, ...]
+
+    @classmethod
+    def of(cls, source: Size, rule: ResolutionRule) -> Alignment:
+        """Apply a rule to an image size. Moves that change nothing are left out.
+
+        A side that is no multiple of the divisor is rounded down, and its pixels grow by the rest.
+        """
+        moves: list[Resize | Box] = []
+        width, height = source
+        if rule.square and width != height:
+            side = max(width, height) if rule.square == "pad" else min(width, height)
+            moves.append(Box((width - side) // 2, (height - side) // 2, side, side))
+            width = height = side
+        if rule.divide > 1:
+            width, height = width // rule.divide, height // rule.divide
+            if min(width, height) < 1:
+                expected = f"images of at least {rule.divide} pixels on each side"
+                raise InputError("resolution rule", "divide", expected, f"{source[0]}x{source[1]}")
+            moves.append(Resize(width, height))
+        wanted = rule.size or (width * rule.multiply, height * rule.multiply)
+        if wanted != (width, height):
+            moves.append(Resize(*wanted))
+        return cls(source, tuple(moves))
+
+    @property
+    def aligned_size(self) -> Size:
+        """(width, height) of the aligned images."""
+        return (self.moves[-1].width, self.moves[-1].height) if self.moves else self.source
+
+    def camera(self, camera: Camera) -> Camera:
+        """The camera of the aligned images. Raises `InputError` for one of another size than `source`."""
+        _check_size(f"camera {camera.id}", self.source, (camera.width, camera.height))
+        for move in self.moves:
+            if isinstance(move, Resize):
+                camera = camera.resized(move.width, move.height)
+            else:
+                camera = camera.boxed(move.left, move.top, move.width, move.height)
+        return camera
+
+    def image(self, image: FloatArray, background: Sequence[float] | FloatArray) -> FloatArray:
+        """Align a composited float32 image (H, W, 3) in [0, 1]; boxes fill up with ``background``.
+
+        Coverage is aligned the same way as (H, W, 1) on background 0.
+        """
+        _check_size("image", self.source, (image.shape[1], image.shape[0]))
+        for move in self.moves:
+            if isinstance(move, Resize):
+                image = _resized(image, move.width, move.height)
+            else:
+                image = take_box(image, move, background)
+        return image
+
+    def restore(self, render: FloatArray, background: Sequence[float] | FloatArray) -> FloatArray:
+        """Bring an (H, W, 3) render of the aligned view back to the source's size, in one antialiased resizing.
+
+        What a crop cut off becomes ``background``. Raises `InputError` for a render that is not of
+        `aligned_size`.
+        """
+        _check_size("render", self.aligned_size, (render.shape[1], render.shape[0]))
+        boxes = [move for move in self.moves if isinstance(move, Box)]
+        box = boxes[0] if boxes else Box(0, 0, *self.source)
+        whole = _resized(np.asarray(render, np.float32), box.width, box.height)
+        return take_box(whole, Box(-box.left, -box.top, *self.source), background)
+
+
+def take_box(image: FloatArray, box: Box, background: Sequence[float] | FloatArray) -> FloatArray:
+    """Cut a box out of an image (H, W, C); (C,) ``background`` where the box reaches beyond it."""
+    height, width = image.shape[:2]
+    if (box.left, box.top, box.width, box.height) == (0, 0, width, height):
+        return image
+    result = np.empty((box.height, box.width, image.shape[2]), dtype=image.dtype)
+    result[:] = np.asarray(background, dtype=image.dtype)
+    left, right = max(box.left, 0), min(box.left + box.width, width)
+    top, bottom = max(box.top, 0), min(box.top + box.height, height)
+    if left < right and top < bottom:
+        inside = (slice(top - box.top, bottom - box.top), slice(left - box.left, right - box.left))
+        result[inside] = image[top:bottom, left:right]
+    return result
+
+
+def scale_camera(camera: Camera, factor: float) -> Camera:
+    """The same view at the nearest whole size to ``factor`` times the camera's; see `Camera.resized`."""
+    if not factor > 0:
+        raise InputError(f"camera {camera.id}", "factor", "a positive number", str(factor))
+    return camera.resized(max(1, round(camera.width * factor)), max(1, round(camera.height * factor)))
+
+
+def alignments(cameras: Mapping[str, Camera], rule: ResolutionRule) -> dict[str, Alignment]:
+    """How each camera's images are aligned, by camera id."""
+    return {name: Alignment.of((c.width, c.height), rule) for name, c in cameras.items()}
+
+
+def align_clip(clip: CaptureClip, rule: ResolutionRule) -> CaptureClip:
+    """The clip at the size of a rule: images and masks resized when they are read, intrinsics with them.
+
+    The composited image is resized, not straight colours and coverage apart: what lies under zero coverage is
+    arbitrary and must not bleed into edges. A clip that a rule leaves as it is comes back itself.
+    """
+    plans = alignments(clip.cameras, rule)
+    if not any(plan.moves for plan in plans.values()):
+        return clip
+    cameras = {name: plans[name].camera(camera) for name, camera in clip.cameras.items()}
+    recorded = {clip.recorded(key).camera: key.camera for key in clip.files}
+    by_recorded = {name: plans[current] for name, current in recorded.items()}
+    ground = np.asarray(clip.background, dtype=np.float32)
+
+    def align(key: FrameKey, pixels: FramePixels) -> FramePixels:
+        plan = by_recorded[key.camera]
+        coverage = pixels.coverage
+        if coverage is not None:
+            coverage = plan.image(coverage[..., None], (0.0,))[..., 0]
+        return FramePixels(plan.image(pixels.image, ground), coverage)
+
+    parameters = {"rule": asdict(rule), "sizes": _sizes(plans)}
+    return clip.derive_pixels("align_resolution", parameters, align, cameras=cameras)
+
+
+def _sizes(plans: Mapping[str, Alignment]) -> list[str]:
+    """What became of which size, for the record."""
+    pairs = {(plan.source, plan.aligned_size) for plan in plans.values()}
+    return [f"{a[0]}x{a[1]} to {b[0]}x{b[1]}" for a, b in sorted(pairs)]
+
+
+def _resized(image: FloatArray, width: int, height: int) -> FloatArray:
+    if (image.shape[1], image.shape[0]) == (width, height):
+        return image
+    return np.clip(resize_image(image, width, height), 0, 1)
+
+
+def _check_size(what: str, expected: Size, found: Size) -> None:
+    if expected != found:
+        raise InputError(what, "size", f"{expected[0]}x{expected[1]}", f"{found[0]}x{found[1]}")
