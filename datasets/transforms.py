@@ -54,10 +54,17 @@ def read_transforms(path: Path) -> list[FrameEntry]:
     frames = document.get("frames")
     if not isinstance(frames, list):
         raise InputError(path, "frames", "a list of frames", _kind(document, "frames"))
-    return [_parse_frame(path, f"frames[{i}]", frame, document) for i, frame in enumerate(frames)]
+    return [parse_frame(path, f"frames[{i}]", frame, document) for i, frame in enumerate(frames)]
 
 
-def _parse_frame(path: Path, where: str, frame: Any, document: Mapping[str, Any]) -> FrameEntry:
+def parse_frame(path: Path, where: str, frame: Any, document: Mapping[str, Any]) -> FrameEntry:
+    """Read and check one frame of the document at ``path``; see `read_transforms`.
+
+    Parameters
+    ----------
+    where : JSON path to the frame, for messages.
+    document : the whole document, which may state intrinsics for all frames.
+    """
     if not isinstance(frame, dict):
         raise InputError(path, where, "an object", type(frame).__name__)
     reader = _Reader(path, where, frame, document)

@@ -1,0 +1,35 @@
+"""All rules of the linter, in order of their codes."""
+
+from __future__ import annotations
+
+from . import (
+    checks_cameras,
+    checks_colour,
+    checks_files,
+    checks_images,
+    checks_mesh,
+    checks_splits,
+    checks_tracking,
+)
+from .rules import Rule
+
+GROUPS = {
+    "1": "files and frames",
+    "2": "splits",
+    "3": "backgrounds and mattes",
+    "4": "colour",
+    "5": "cameras",
+    "6": "head model and tracking",
+    "7": "mesh against images",
+}
+"""Subject by the code's first digit."""
+
+RULES: tuple[Rule, ...] = (
+    *checks_files.RULES,
+    *checks_splits.RULES,
+    *checks_images.RULES,
+    *checks_colour.RULES,
+    *checks_cameras.RULES,
+    *checks_tracking.RULES,
+    *checks_mesh.RULES,
+)

@@ -1,0 +1,353 @@
+"""HB5xx: where cameras stand, how they look, and how their pixels are counted."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from functools import partial
+from itertools import combinations
+
+import numpy as np
+
+from ...bench.contracts import Camera, FloatArray
+from .. import ga_layout as layout
+from ..capture_cameras import FOCAL_TOLERANCE, ROTATION_TOLERANCE
+from ..images import read_mask
+from ..principal_point import View, weigh_cy
+from ..transforms import FrameEntry
+from .checks_images import sound_mask
+from .evidence import Evidence, by_camera
+from .rules import Hit, Rule, several, some
+
+SAME_PLACE_M = 1e-3
+SAME_TURN = 2e-3
+"""Cameras closer than this in position (metres) and in every rotation entry are one."""
+
+NEAR_M, FAR_M = 0.15, 10.0
+"""Distances of a head from a camera between which heads are recorded, metres."""
+
+OFF_CENTRE = 0.25
+"""Share of the image's side from which a principal point is suspiciously far from the centre."""
+
+TELLING_PX = 1.0
+"""From this offset of cy on the two readings are so far apart (twice as much) that outlines may accuse one."""
+
+EXACT = 1e-4
+"""Pixels; a principal point this close to (w - 1) / 2 was computed as that."""
+
+
+def _not_rigid(evidence: Evidence) -> Iterator[Hit]:
+    broken = [error for error in evidence.frame_faults if error.key.endswith(".transform_matrix")]
+    if broken:
+        yield Hit(
+            f"{several(len(broken), 'frame')} with a transform_matrix that is no rigid motion: "
+            f"{broken[0].found}",
+            broken[0].file,
+            broken[0].key,
+        )
+
+
+def first_entries(evidence: Evidence) -> dict[str, FrameEntry]:
+    """First frame of each camera, in the first sequence that has it."""
+    return {camera: frames[0] for camera, frames in by_camera(evidence.entries).items()}
+
+
+def _same_camera(evidence: Evidence) -> Iterator[Hit]:
+    groups: dict[str, dict[str, FrameEntry]] = {}
+    for entry in evidence.entries:
+        groups.setdefault(entry.sequence_folder, {}).setdefault(entry.camera_id, entry)
+    seen: set[tuple[str, str]] = set()
+    for views in groups.values():
+        for one, other in combinations(sorted(views), 2):
+            difference = np.abs(views[one].camera_to_world - views[other].camera_to_world)
+            same = difference[:3, 3].max() < SAME_PLACE_M and difference[:3, :3].max() < SAME_TURN
+            if same and (one, other) not in seen:
+                seen.add((one, other))
+                yield Hit(
+                    f"cameras {one} and {other} stand at the same place and look the same way",
+                    views[other].file,
+                    f"{views[other].where}.transform_matrix",
+                )
+
+
+def _moving(evidence: Evidence) -> Iterator[Hit]:
+    first: dict[tuple[str, str], FrameEntry] = {}
+    moved: dict[str, FrameEntry] = {}
+    changed: dict[str, FrameEntry] = {}
+    for entry in evidence.entries:
+        other = first.setdefault((entry.sequence_folder, entry.camera_id), entry)
+        if np.abs(entry.camera_to_world - other.camera_to_world).max() > ROTATION_TOLERANCE:
+            moved.setdefault(entry.camera_id, entry)
+        if not _same_numbers(entry.intrinsics, other.intrinsics):
+            changed.setdefault(entry.camera_id, entry)
+    for found, what in ((moved, "moves"), (changed, "changes its intrinsics")):
+        for camera, entry in list(found.items())[:1]:
+            others = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
+            yield Hit(f"camera {camera}{others} {what} within a sequence", entry.file, entry.where)
+
+
+def _same_numbers(one: Mapping[str, float], other: Mapping[str, float]) -> bool:
+    return one.keys() == other.keys() and all(
+        math.isclose(one[key], other[key], rel_tol=1e-6, abs_tol=1e-9) for key in one
+    )
+
+
+def behind(evidence: Evidence) -> list[str]:
+    """Cameras that have the head behind them."""
+    return sorted({v.entry.camera_id for v in evidence.views if v.mesh is not None and v.mesh.depth <= 0})
+
+
+def upside_down(evidence: Evidence) -> list[str]:
+    """Cameras that see the head upside down, in most of their frames."""
+    seen: dict[str, list[float]] = {}
+    for view in evidence.views:
+        if view.mesh is not None and view.mesh.depth > 0:
+            seen.setdefault(view.entry.camera_id, []).append(view.mesh.upright)
+    return sorted(camera for camera, values in seen.items() if np.median(values) < -0.3)
+
+
+def _behind(evidence: Evidence) -> Iterator[Hit]:
+    yield from _cameras(evidence, behind(evidence), "have the head behind them")
+
+
+def _upside_down(evidence: Evidence) -> Iterator[Hit]:
+    yield from _cameras(evidence, upside_down(evidence), "see the head upside down")
+
+
+def _cameras(evidence: Evidence, cameras: Iterable[str], what: str) -> Iterator[Hit]:
+    names = list(cameras)
+    if names:
+        entry = first_entries(evidence)[names[0]]
+        key = f"{entry.where}.transform_matrix"
+        yield Hit(f"{several(len(names), 'camera')} {what}: {some(names)}", entry.file, key)
+
+
+def _distance(evidence: Evidence) -> Iterator[Hit]:
+    distances = [view.mesh.distance for view in evidence.views if view.mesh is not None]
+    if distances and not NEAR_M <= np.median(distances) <= FAR_M:
+        entry = evidence.entries[0]
+        yield Hit(
+            f"the head is {np.median(distances):.3g} m from the cameras (median)",
+            entry.file,
+            f"{entry.where}.transform_matrix",
+        )
+
+
+def _size(evidence: Evidence, entry: FrameEntry) -> tuple[int, int] | None:
+    info = evidence.headers.get(entry.image)
+    return (info.width, info.height) if info else None
+
+
+def _focal(evidence: Evidence) -> Iterator[Hit]:
+    wrong = []
+    for camera, entry in first_entries(evidence).items():
+        size = _size(evidence, entry)
+        if size is None or not {"fl_x", "camera_angle_x"} <= entry.intrinsics.keys():
+            continue
+        implied = size[0] / (2 * math.tan(entry.intrinsics["camera_angle_x"] / 2))
+        if abs(entry.intrinsics["fl_x"] / implied - 1) > FOCAL_TOLERANCE:
+            wrong.append((camera, entry, implied))
+    if wrong:
+        camera, entry, implied = wrong[0]
+        yield Hit(
+            f"in {several(len(wrong), 'camera')} fl_x and camera_angle_x disagree: {camera} has fl_x "
+            f"{entry.intrinsics['fl_x']:.6g} px where its angle and the image's width imply {implied:.6g}",
+            entry.file,
+            f"{entry.where}.fl_x",
+        )
+
+
+def principal_offsets(evidence: Evidence) -> dict[str, FloatArray]:
+    """(2,) pixels from the image's centre to the stated principal point, by camera; cameras that state one.
+
+    The vertical offset is as stated: where cy counts from the bottom, positive is up.
+    """
+    offsets: dict[str, FloatArray] = {}
+    for camera, entry in first_entries(evidence).items():
+        size = _size(evidence, entry)
+        if size is not None and {"cx", "cy"} <= entry.intrinsics.keys():
+            stated = np.array([entry.intrinsics["cx"], entry.intrinsics["cy"]])
+            offsets[camera] = stated - np.array(size) / 2
+    return offsets
+
+
+def _far_principal_point(evidence: Evidence) -> Iterator[Hit]:
+    entries = first_entries(evidence)
+    for camera, offset in principal_offsets(evidence).items():
+        size = _size(evidence, entries[camera])
+        if size is not None and (np.abs(offset) > OFF_CENTRE * np.array(size)).any():
+            entry = entries[camera]
+            yield Hit(
+                f"the principal point of camera {camera} is ({entry.intrinsics['cx']:.6g}, "
+                f"{entry.intrinsics['cy']:.6g}) in an image of {size[0]}x{size[1]}",
+                entry.file,
+                f"{entry.where}.cx",
+            )
+            return
+
+
+def _half_pixel(evidence: Evidence) -> Iterator[Hit]:
+    offsets = principal_offsets(evidence)
+    if offsets and all(np.abs(np.abs(offset) - 0.5).max() < EXACT for offset in offsets.values()):
+        entry = next(iter(first_entries(evidence).values()))
+        yield Hit(
+            "every principal point is exactly half a pixel from the image's centre",
+            entry.file,
+            f"{entry.where}.cx",
+        )
+
+
+def _convention(evidence: Evidence) -> str | None:
+    """What was asked for, else declared; None where neither says."""
+    if evidence.settings.cy != "auto":
+        return evidence.settings.cy
+    return evidence.declaration.cy if evidence.declaration else None
+
+
+def _centred(evidence: Evidence) -> Iterator[Hit]:
+    offsets = principal_offsets(evidence)
+    worst = max((float(np.linalg.norm(o)) for o in offsets.values()), default=0.0)
+    if _convention(evidence) == "centre" and worst > 0.5:
+        yield Hit(
+            f"the principal point is taken at the image's centre, the JSONs state it up to {worst:.2f} px off",
+            evidence.folder / layout.DECLARATION_FILE,
+            "cy",
+        )
+
+
+def _ignored(evidence: Evidence) -> Iterator[Hit]:
+    offsets = principal_offsets(evidence)
+    worst = max((float(np.linalg.norm(o)) for o in offsets.values()), default=0.0)
+    if _convention(evidence) != "centre" and worst > 1.0:
+        camera = max(offsets, key=lambda name: float(np.linalg.norm(offsets[name])))
+        entry = first_entries(evidence)[camera]
+        yield Hit(
+            f"the principal point is up to {worst:.1f} px off the centre (camera {camera})",
+            entry.file,
+            f"{entry.where}.cx",
+        )
+
+
+def cy_evidence_views(evidence: Evidence) -> list[View]:
+    """Views whose outlines may tell where cy counts from, with their cameras read from the top."""
+    views = []
+    for view in evidence.views:
+        mesh, path = view.mesh, view.entry.mask or view.entry.image
+        if mesh is None or mesh.depth <= 0 or not sound_mask(view) or "cy" not in view.entry.intrinsics:
+            continue
+        intrinsics = mesh.camera.K.copy()
+        intrinsics[0, 2], intrinsics[1, 2] = view.entry.intrinsics.get("cx", 0), view.entry.intrinsics["cy"]
+        camera = Camera(
+            mesh.camera.id, mesh.camera.width, mesh.camera.height, intrinsics, mesh.camera.world_to_camera
+        )
+        views.append(View(mesh.vertices, camera, partial(read_mask, path)))
+    return views
+
+
+def _other_edge(evidence: Evidence) -> Iterator[Hit]:
+    convention = _convention(evidence)
+    matters = any(abs(offset[1]) > TELLING_PX for offset in principal_offsets(evidence).values())
+    if convention not in ("top", "bottom") or not matters or evidence.subject is None:
+        return
+    if behind(evidence) or upside_down(evidence):
+        return
+    views = cy_evidence_views(evidence)
+    if not views:
+        return
+    found = weigh_cy(views, evidence.subject.head.faces)
+    if found.decision is not None and found.decision != convention:
+        yield Hit(
+            f"cy is read from the {convention}; outlines of mesh and foreground agree better with the "
+            f"{found.decision} ({found.top:.2f} with the top, {found.bottom:.2f} with the bottom)",
+            evidence.folder / layout.DECLARATION_FILE,
+            "cy",
+        )
+
+
+RULES = (
+    Rule(
+        "HB501",
+        "error",
+        "a camera's matrix is no rigid motion",
+        "Write camera-to-world with a right-handed rotation and no scale; put scale into the world instead.",
+        _not_rigid,
+    ),
+    Rule(
+        "HB502",
+        "error",
+        "two cameras are one",
+        "Correct the calibration, or drop one: with one held out, a novel view is a training view.",
+        _same_camera,
+    ),
+    Rule(
+        "HB503",
+        "error",
+        "the head is behind a camera",
+        "Write camera-to-world with OpenGL axes (looking along -z); OpenCV's matrix needs its columns 2 and 3 "
+        "negated, world-to-camera needs inverting.",
+        _behind,
+    ),
+    Rule(
+        "HB504",
+        "error",
+        "a camera sees the head upside down",
+        "Negate the y axis once, not twice: the layout's cameras have y up, OpenCV's y down.",
+        _upside_down,
+    ),
+    Rule(
+        "HB505",
+        "error",
+        "the head's distance is not in metres",
+        "Bring translations of cameras and tracking to metres; recordings are often in millimetres.",
+        _distance,
+    ),
+    Rule(
+        "HB506",
+        "error",
+        "focal length and angle of view disagree",
+        "Scale fl_x with the images; codes that read only camera_angle_x would see another camera.",
+        _focal,
+    ),
+    Rule(
+        "HB507",
+        "warning",
+        "a principal point lies far from the centre",
+        "Scale and crop cx, cy with the images, or make sure that the crop is meant.",
+        _far_principal_point,
+    ),
+    Rule(
+        "HB508",
+        "warning",
+        "principal points are off by half a pixel",
+        "Use w / 2, h / 2 for a centred camera: here the centre of the first pixel is at 0.5, not at 0.",
+        _half_pixel,
+    ),
+    Rule(
+        "HB509",
+        "warning",
+        "the stated principal point is dropped",
+        'Declare "top" or "bottom", unless the loss of GaussianAvatars\' centred camera is to be reproduced.',
+        _centred,
+    ),
+    Rule(
+        "HB510",
+        "note",
+        "official code would centre the principal point",
+        "GaussianAvatars and its heirs ignore cx, cy: their renders are shifted by as much against the images.",
+        _ignored,
+    ),
+    Rule(
+        "HB511",
+        "error",
+        "cy counts from the other edge",
+        "Declare the other convention: VHAP counts from the bottom since November 2024, from the top before.",
+        _other_edge,
+    ),
+    Rule(
+        "HB512",
+        "error",
+        "a camera moves within a sequence",
+        "Cameras of the layout stand still; for a moving camera move the head instead.",
+        _moving,
+    ),
+)

@@ -1,0 +1,335 @@
+"""HB1xx: what is there and what is not."""
+
+from __future__ import annotations
+
+import itertools
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator
+
+from ...bench.errors import InputError
+from .. import ga_layout as layout
+from .evidence import Evidence, Slot
+from .rules import Hit, Rule, several, some, spans
+
+GA_WIDTH = 1600
+"""Wider images are rescaled by the code of GaussianAvatars, unless it is told otherwise."""
+
+
+def _faults(errors: Iterable[InputError], noun: str) -> Iterator[Hit]:
+    """One hit for faults of one kind in one place: same key and same expectation, whatever the file."""
+    groups: dict[tuple[str, str], list[InputError]] = defaultdict(list)
+    for error in errors:
+        groups[(error.key.rpartition(".")[2], error.expected)].append(error)
+    for (_, expected), group in groups.items():
+        first = group[0]
+        more = f" ({several(len(group), noun)} like it)" if len(group) > 1 else ""
+        yield Hit(f"expected {expected}, found {first.found}{more}", first.file, first.key)
+
+
+def _refused(evidence: Evidence) -> Iterator[Hit]:
+    if evidence.refusal is not None:
+        error = evidence.refusal
+        text = f"expected {error.expected}, found {error.found}"
+        yield Hit(f"{text}. {error.remedy}" if error.remedy else text, error.file, error.key)
+
+
+def _broken_json(evidence: Evidence) -> Iterator[Hit]:
+    yield from _faults((*evidence.json_faults, *evidence.declaration_faults), "file")
+
+
+def _broken_frame(evidence: Evidence) -> Iterator[Hit]:
+    others = [error for error in evidence.frame_faults if not error.key.endswith(".transform_matrix")]
+    yield from _faults(others, "frame")
+
+
+def _missing_file(evidence: Evidence) -> Iterator[Hit]:
+    groups: dict[tuple[str, str], list[InputError]] = defaultdict(list)
+    for error in evidence.file_faults:
+        groups[(error.expected, error.found)].append(error)
+    for (expected, found), group in groups.items():
+        count = f" ({several(len(group), 'file')})" if len(group) > 1 else ""
+        yield Hit(f"expected {expected}, found {found}{count}", group[0].file)
+    damaged = [view.error for view in evidence.views if view.error is not None]
+    if damaged:
+        yield Hit(f"{several(len(damaged), 'image')} do not decode: {damaged[0].found}", damaged[0].file)
+    paths = {p.path: p.error for p in evidence.parameters.values() if p.error is not None and not p.arrays}
+    for error in list(paths.values())[:1]:
+        yield Hit(
+            f"expected {error.expected}, found {error.found} ({several(len(paths), 'file')})", error.file
+        )
+
+
+def _wrong_size(evidence: Evidence) -> Iterator[Hit]:
+    wrong = []
+    for entry in evidence.entries:
+        image = evidence.headers.get(entry.image)
+        for path in (entry.image, entry.mask):
+            info = evidence.headers.get(path) if path is not None else None
+            if info is None or image is None:
+                continue
+            expected = (entry.width or image.width, entry.height or image.height)
+            if (info.width, info.height) != expected:
+                wrong.append((path, (info.width, info.height), expected, entry))
+    if wrong:
+        path, found, expected, entry = wrong[0]
+        yield Hit(
+            f"{several(len(wrong), 'file')} of another size than stated: {found[0]}x{found[1]} pixels where "
+            f"{entry.where} of {entry.file.name} says {expected[0]}x{expected[1]}",
+            path or "",
+        )
+
+
+def _holes(evidence: Evidence) -> Iterator[Hit]:
+    slots = {Slot(e.timestep, e.camera_index) for e in evidence.entries} | evidence.unread
+    for folder, timesteps in evidence.sequences.items():
+        cameras = {e.camera_index for e in evidence.entries if e.sequence_folder == folder}
+        missing = [(t, c) for t in timesteps for c in sorted(cameras) if Slot(t, c) not in slots]
+        if missing:
+            worst = Counter(camera for _, camera in missing).most_common(1)[0][0]
+            where = spans(t for t, camera in missing if camera == worst)
+            yield Hit(
+                f"{several(len(missing), 'frame')} of sequence {evidence.names[folder]} missing from the grid of "
+                f"{len(timesteps)} timesteps and {len(cameras)} cameras, such as camera {worst} at {where}",
+                evidence.folder,
+                "frames",
+            )
+
+
+def _gap(evidence: Evidence) -> Iterator[Hit]:
+    present = {e.timestep for e in evidence.entries} | {slot.timestep for slot in evidence.unread}
+    missing = set(range(max(present, default=-1) + 1)) - present
+    if missing:
+        yield Hit(f"no frame of timesteps {spans(missing)}", evidence.folder, "timestep_index")
+
+
+def _frozen(evidence: Evidence) -> Iterator[Hit]:
+    """Consecutive timesteps whose images are the same files' content in every camera that has both."""
+    images: dict[int, dict[str, str]] = defaultdict(dict)
+    for entry in evidence.entries:
+        if entry.image in evidence.digests:
+            images[entry.timestep][entry.camera_id] = evidence.digests[entry.image]
+    frozen = []
+    for timesteps in evidence.sequences.values():
+        for before, after in itertools.pairwise(timesteps):
+            shared = images[before].keys() & images[after].keys()
+            if shared and all(images[before][camera] == images[after][camera] for camera in shared):
+                frozen.append(after)
+    if frozen:
+        yield Hit(
+            f"{several(len(frozen), 'timestep')} with the images of the timestep before: {spans(frozen)}",
+            evidence.folder,
+            "timestep_index",
+        )
+
+
+def _stray_exclusion(evidence: Evidence) -> Iterator[Hit]:
+    if evidence.declaration is None:
+        return
+    known = {e.timestep for e in evidence.entries} | {slot.timestep for slot in evidence.unread}
+    stray = sorted(set(evidence.declaration.excluded) - known)
+    if stray:
+        file = evidence.folder / layout.DECLARATION_FILE
+        yield Hit(f"timesteps {spans(stray)} are excluded and not in the capture", file, "excluded")
+
+
+def _unreasoned(evidence: Evidence) -> Iterator[Hit]:
+    if evidence.declaration is None:
+        return
+    bare = [t for t, reason in evidence.declaration.excluded.items() if not reason.strip()]
+    if bare:
+        file = evidence.folder / layout.DECLARATION_FILE
+        yield Hit(f"timesteps {spans(bare)} are excluded without a reason", file, "excluded")
+
+
+def _short_test(evidence: Evidence) -> Iterator[Hit]:
+    excluded = set(evidence.declaration.excluded) if evidence.declaration else set()
+    least = evidence.settings.min_test_timesteps
+    timesteps: dict[str, set[int]] = defaultdict(set)
+    for entry in evidence.splits.get("self_reenactment", ()):
+        timesteps[entry.sequence_folder].add(entry.timestep)
+    for folder, present in timesteps.items():
+        kept = len(present - excluded)
+        if kept < least:
+            left_out = f" ({len(present & excluded)} excluded)" if present & excluded else ""
+            yield Hit(
+                f"test sequence {evidence.names[folder]} has {several(kept, 'timestep')}{left_out}, "
+                f"fewer than {least}",
+                evidence.folder / layout.SPLIT_FILES["self_reenactment"],
+            )
+
+
+def _empty_split(evidence: Evidence) -> Iterator[Hit]:
+    # A file that does not read, or whose frames do not, is another fault.
+    faulty = {error.file for error in (*evidence.json_faults, *evidence.frame_faults)}
+    files = {name: evidence.folder / file for name, file in layout.SPLIT_FILES.items()}
+    empty = [
+        name for name, path in files.items() if not evidence.splits.get(name) and str(path) not in faulty
+    ]
+    if empty:
+        yield Hit(f"no frames in {some(empty)}", files[empty[0]], "frames")
+
+
+def _undeclared(evidence: Evidence) -> Iterator[Hit]:
+    if evidence.declaration is None and not evidence.declaration_faults:
+        yield Hit(
+            "no declaration of background, head model, principal point and sequence names: white, the given "
+            "head, the images' own evidence and the folders' names are taken",
+            evidence.folder / layout.DECLARATION_FILE,
+        )
+
+
+def _orphans(evidence: Evidence) -> Iterator[Hit]:
+    named = {entry.image for entry in evidence.entries}
+    folders = {entry.image.parent for entry in evidence.entries}
+    # Frames that do not parse name images too, and which is not known.
+    if evidence.unread or evidence.frame_faults or evidence.json_faults:
+        return
+    suffixes = {path.suffix for path in named}
+    known = {path.resolve() for path in named}
+    orphans = sorted(
+        path
+        for folder in folders
+        if folder.is_dir()
+        for path in folder.iterdir()
+        if path.suffix in suffixes and not path.name.startswith(".") and path.resolve() not in known
+    )
+    if orphans:
+        yield Hit(f"{several(len(orphans), 'image')} that no split names", orphans[0])
+
+
+def _uneven_masks(evidence: Evidence) -> Iterator[Hit]:
+    bare = [entry for entry in evidence.entries if entry.mask is None]
+    share = len(bare) / max(1, len(evidence.entries))
+    if 0 < share < 1:
+        yield Hit(
+            f"{several(len(bare), 'frame')} of {len(evidence.entries)} name no mask, the others do",
+            bare[0].file,
+            f"{bare[0].where}.fg_mask_path",
+        )
+
+
+def _size_limit(evidence: Evidence) -> Iterator[Hit]:
+    wide = [path for path, info in evidence.headers.items() if info.width > GA_WIDTH]
+    if wide:
+        info = evidence.headers[wide[0]]
+        yield Hit(
+            f"{several(len(wide), 'file')} wider than {GA_WIDTH} pixels, such as {info.width}x{info.height}",
+            wide[0],
+        )
+
+
+RULES = (
+    Rule(
+        "HB100",
+        "error",
+        "the reader refuses the capture",
+        "Mend what the other findings name; `headbench run` would stop at this one.",
+        _refused,
+    ),
+    Rule(
+        "HB101",
+        "error",
+        "a JSON of the capture is missing or broken",
+        "Export the capture again, or restore the file.",
+        _broken_json,
+    ),
+    Rule(
+        "HB102",
+        "error",
+        "a frame's entry is incomplete or of the wrong kind",
+        "Export the capture again, or mend the entry.",
+        _broken_frame,
+    ),
+    Rule(
+        "HB103",
+        "error",
+        "a file is missing, cut off or damaged",
+        "Copy or export the file again; a copy that was broken off leaves such files.",
+        _missing_file,
+    ),
+    Rule(
+        "HB104",
+        "error",
+        "an image or mask is of another size than stated",
+        "Scale the intrinsics and w, h with the images, or export both at one size.",
+        _wrong_size,
+    ),
+    Rule(
+        "HB105",
+        "warning",
+        "frames are missing from the grid of timesteps and cameras",
+        "Export the missing frames, or leave the timestep out altogether and say why.",
+        _holes,
+    ),
+    Rule(
+        "HB106",
+        "error",
+        "timesteps do not count from 0 without a gap",
+        "Number timesteps anew: readers of the layout index parameters by them, and a gap shifts all behind it.",
+        _gap,
+    ),
+    Rule(
+        "HB107",
+        "warning",
+        "timesteps repeat the images of the one before",
+        "Drop the repeated timesteps: frozen video counts one moment many times.",
+        _frozen,
+    ),
+    Rule(
+        "HB108",
+        "error",
+        "an exclusion names a timestep that is not there",
+        "Correct the timestep: probably counted within a sequence, or before the timesteps were renumbered.",
+        _stray_exclusion,
+    ),
+    Rule(
+        "HB109",
+        "warning",
+        "frames are excluded without a reason",
+        "State the reason in headbench.json, so that a reader of the results can judge it.",
+        _unreasoned,
+    ),
+    Rule(
+        "HB110",
+        "warning",
+        "a test sequence is short",
+        "Hold out a longer sequence: a mean over a few timesteps says little, and official code of "
+        "GaussianAvatars fails with fewer than 10 test frames.",
+        _short_test,
+    ),
+    Rule(
+        "HB111",
+        "warning",
+        "a split is empty",
+        "Hold out a camera for novel views and a sequence for self-reenactment.",
+        _empty_split,
+    ),
+    Rule(
+        "HB112",
+        "note",
+        "the capture leaves its conventions unsaid",
+        "Write headbench.json beside the JSONs (see the README), so that nothing has to be guessed.",
+        _undeclared,
+    ),
+    Rule(
+        "HB113",
+        "note",
+        "images lie there that no split names",
+        "Delete them, or add them to a split, if they were to be used.",
+        _orphans,
+    ),
+    Rule(
+        "HB114",
+        "warning",
+        "some frames have a mask and some have none",
+        "Export all masks: regions and masked metrics would cover a part of the frames only.",
+        _uneven_masks,
+    ),
+    Rule(
+        "HB115",
+        "note",
+        "images are wider than GaussianAvatars' limit",
+        "Its code rescales images wider than 1,600 pixels unless given -r 1; align the size beforehand.",
+        _size_limit,
+    ),
+)

@@ -1,0 +1,242 @@
+"""HB3xx: backgrounds and mattes.
+
+Roots before branches: a check says nothing of frames whose fault another one names already, so that an inverted
+mask is not reported as a wrong background too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from .evidence import Evidence
+from .rules import Hit, Rule, several
+from .views import BACKGROUND_LEVELS, MatteFacts, ViewFacts
+
+MOST = 0.5
+"""Share of the looked-at frames from which a fault is one of the export, not of single frames."""
+
+DIRTY = 0.02
+"""Share of pixels outside the mask that may differ from the background."""
+
+FRINGES = (0.65, 1.5)
+"""Fringes between these are a clean composite, see `MatteFacts.fringe`."""
+
+BLANK_COVERAGE = 0.001
+
+LIMITED_LOW, LIMITED_HIGH = (14, 24), (231, 237)
+"""Where the least and the largest level of limited-range images lie; resizing softens the ends a little."""
+
+
+def unit_range(evidence: Evidence) -> bool:
+    """Whether images hold 0 and 1 alone, as when floats in [0, 1] are cast to 8 bits."""
+    views = [view for view in evidence.views if view.error is None]
+    return bool(views) and max(view.high for view in views) == 1
+
+
+def _mattes(evidence: Evidence) -> list[tuple[ViewFacts, MatteFacts]]:
+    return [(view, view.matte) for view in evidence.views if view.matte is not None]
+
+
+def _unit_mask(matte: MatteFacts) -> bool:
+    return matte.high == 1
+
+
+def _empty(matte: MatteFacts) -> bool:
+    return matte.coverage < BLANK_COVERAGE and not _unit_mask(matte)
+
+
+def _full(matte: MatteFacts) -> bool:
+    return matte.low > 127
+
+
+def _inverted(matte: MatteFacts) -> bool:
+    return not _full(matte) and matte.inside_empty > 0.5 and matte.outside_off > 0.3
+
+
+def _sound(matte: MatteFacts) -> bool:
+    return not (_unit_mask(matte) or _empty(matte) or _full(matte) or _inverted(matte))
+
+
+def sound_mask(view: ViewFacts) -> bool:
+    """Whether a frame has a mask that the geometry can be held against."""
+    return view.matte is not None and _sound(view.matte)
+
+
+def _masks(evidence: Evidence, faulty: Sequence[ViewFacts], what: str) -> Iterator[Hit]:
+    if faulty:
+        path = faulty[0].entry.mask or faulty[0].entry.image
+        yield Hit(f"{what} in {len(faulty)} of {several(len(evidence.views), 'frame')} looked at", path)
+
+
+def _unit_masks(evidence: Evidence) -> Iterator[Hit]:
+    faulty = [view for view, matte in _mattes(evidence) if _unit_mask(matte)]
+    yield from _masks(evidence, faulty, "the mask holds 0 and 1 alone, out of 255,")
+
+
+def _empty_masks(evidence: Evidence) -> Iterator[Hit]:
+    faulty = [view for view, matte in _mattes(evidence) if _empty(matte)]
+    yield from _masks(evidence, faulty, "the mask covers nothing")
+
+
+def _full_masks(evidence: Evidence) -> Iterator[Hit]:
+    faulty = [view for view, matte in _mattes(evidence) if _full(matte)]
+    yield from _masks(evidence, faulty, "the mask covers the whole image")
+
+
+def _inverted_masks(evidence: Evidence) -> Iterator[Hit]:
+    faulty = [view for view, matte in _mattes(evidence) if _inverted(matte)]
+    yield from _masks(evidence, faulty, "the mask covers the background and leaves out the subject")
+
+
+def _blank_images(evidence: Evidence) -> Iterator[Hit]:
+    faulty = [view for view in evidence.views if view.error is None and view.low == view.high > 1]
+    if faulty:
+        yield Hit(
+            f"{len(faulty)} of {several(len(evidence.views), 'frame')} looked at are of one colour, level "
+            f"{faulty[0].low}",
+            faulty[0].entry.image,
+        )
+
+
+def outside_colours(evidence: Evidence) -> list[tuple[ViewFacts, np.ndarray, float]]:
+    """Frames that show what they were composited on: the median colour there, (3,), and the share of pixels
+    there that are not of the declared background's colour. Images with alpha show none."""
+    found = []
+    for view in evidence.views:
+        if view.error is not None or view.has_alpha or view.low == view.high:
+            continue
+        if view.matte is None and view.corners is not None:
+            found.append((view, np.asarray(view.corners), view.corners_off))
+        elif view.matte is not None and _sound(view.matte) and view.matte.outside is not None:
+            found.append((view, np.asarray(view.matte.outside), view.matte.outside_off))
+    return found
+
+
+def _foreign(evidence: Evidence, colour: np.ndarray) -> bool:
+    return bool(np.abs(colour - np.asarray(evidence.background) * 255).max() > BACKGROUND_LEVELS)
+
+
+def _wrong_background(evidence: Evidence) -> Iterator[Hit]:
+    if unit_range(evidence) or limited_range(evidence):
+        return
+    seen = outside_colours(evidence)
+    wrong = [(view, colour) for view, colour, _ in seen if _foreign(evidence, colour)]
+    if wrong:
+        found = np.median([colour for _, colour in wrong], axis=0).round().astype(int)
+        stated = np.round(np.asarray(evidence.background) * 255).astype(int)
+        uniform = np.ptp([colour for _, colour in wrong], axis=0).max() <= BACKGROUND_LEVELS
+        shown = f"level {tuple(found.tolist())}" if uniform else "no one colour"
+        yield Hit(
+            f"declared background is level {tuple(stated.tolist())}, outside the subject there is {shown} in "
+            f"{len(wrong)} of {several(len(seen), 'frame')} looked at",
+            wrong[0][0].entry.image,
+        )
+
+
+def _dirty_background(evidence: Evidence) -> Iterator[Hit]:
+    if unit_range(evidence) or limited_range(evidence):
+        return
+    seen = [entry for entry in outside_colours(evidence) if entry[0].matte is not None]
+    dirty = [(v, share) for v, colour, share in seen if share > DIRTY and not _foreign(evidence, colour)]
+    if len(dirty) > MOST * len(seen):
+        typical = float(np.median([share for _, share in dirty]))
+        yield Hit(
+            f"{typical:.0%} of the pixels outside the mask differ from the background, in {len(dirty)} of "
+            f"{several(len(seen), 'frame')} looked at",
+            dirty[0][0].entry.image,
+        )
+
+
+def _fringes(evidence: Evidence) -> Iterator[Hit]:
+    if unit_range(evidence) or any(_foreign(evidence, colour) for _, colour, _ in outside_colours(evidence)):
+        return
+    told = [
+        (view, matte.fringe)
+        for view, matte in _mattes(evidence)
+        if matte.fringe is not None and _sound(matte) and not view.has_alpha
+    ]
+    if len(told) < 4:
+        return
+    typical = float(np.median([fringe for _, fringe in told]))
+    if not FRINGES[0] <= typical <= FRINGES[1]:
+        what = (
+            "dark fringes, as of colours premultiplied twice"
+            if typical < FRINGES[0]
+            else ("bright fringes, as of colours never multiplied by the matte")
+        )
+        yield Hit(
+            f"{what}: where the mask is soft, the subject adds {typical:.2f} times the light it should (median "
+            f"over {several(len(told), 'frame')})",
+            told[0][0].entry.image,
+        )
+
+
+def limited_range(evidence: Evidence) -> bool:
+    """Whether levels lie within video's limited range and reach its ends, 16 and 235.
+
+    Those of whole images, or of the subject alone where the background was put in afterwards.
+    """
+    views = [view for view in evidence.views if view.error is None and view.low != view.high]
+    if not views:
+        return False
+    whole = (min(view.low for view in views), max(view.high for view in views))
+    subject = (min(view.subject_low for view in views), max(view.subject_high for view in views))
+    return _spans_limited(whole) or _spans_limited(subject)
+
+
+def _spans_limited(levels: tuple[int, int]) -> bool:
+    low, high = levels
+    return LIMITED_LOW[0] <= low <= LIMITED_LOW[1] and LIMITED_HIGH[0] <= high <= LIMITED_HIGH[1]
+
+
+RULES = (
+    Rule(
+        "HB301",
+        "error",
+        "images are not on the declared background",
+        "Declare the background they are on, or composite them on the declared one.",
+        _wrong_background,
+    ),
+    Rule(
+        "HB302",
+        "warning",
+        "the background is not clean outside the mask",
+        "Composite with the mask that is stored, or store the one that was used: masked metrics and alpha losses "
+        "see what the mask denies.",
+        _dirty_background,
+    ),
+    Rule(
+        "HB303",
+        "warning",
+        "fringes along the matte",
+        "Composite once, straight alpha: a F + (1 - a) B with the unmultiplied colour F.",
+        _fringes,
+    ),
+    Rule(
+        "HB304",
+        "error",
+        "a mask is empty",
+        "Run the matting again for these frames, or exclude them with a reason.",
+        _empty_masks,
+    ),
+    Rule(
+        "HB305",
+        "error",
+        "a mask is full",
+        "Run the matting again; a mask of 255 everywhere is what a failed matting leaves.",
+        _full_masks,
+    ),
+    Rule("HB306", "error", "a mask is inverted", "Invert it: 255 is the subject.", _inverted_masks),
+    Rule(
+        "HB307", "error", "a mask holds 0 and 1 out of 255", "Multiply it by 255 before saving.", _unit_masks
+    ),
+    Rule(
+        "HB308",
+        "error",
+        "an image is of one colour",
+        "Export the frame again, or exclude it with a reason.",
+        _blank_images,
+    ),
+)

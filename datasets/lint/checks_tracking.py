@@ -1,0 +1,316 @@
+"""HB6xx: the head model and the tracked parameters."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+
+import numpy as np
+
+from ...bench.errors import InputError
+from .. import ga_layout as layout
+from .evidence import Evidence
+from .motion import expression_reach, face_steps
+from .rules import Hit, Rule, several, some, spans
+
+STILL = 1e-4
+"""Radians, or coefficients: what moves by less over a capture does not move."""
+
+FEW = 5
+"""Timesteps from which something that never moves is remarkable."""
+
+REACH_M = 0.05
+"""Metres; no face moves so far by expression alone, without jaw and head."""
+
+JUMP_M, JUMP_TIMES = 0.03, 6.0
+"""A step of the face is a jump where it is longer than this and than so many times the sequence's median."""
+
+CHANGE = 1e-4
+
+
+def _version(evidence: Evidence) -> Iterator[Hit]:
+    for error in evidence.head_faults:
+        if error.key == "head_model":
+            yield Hit(
+                f"the head model given is {error.expected.split(',')[0]}, the capture was tracked with "
+                f"{error.found}",
+                error.file,
+                error.key,
+            )
+
+
+def _sequence_versions(evidence: Evidence) -> Iterator[Hit]:
+    if evidence.declaration is None:
+        return
+    for folder in sorted({entry.image.parent.parent for entry in evidence.entries} - {evidence.folder}):
+        try:
+            other = layout.Declaration.read(folder) if folder.is_dir() else None
+        except InputError:
+            continue
+        if other is not None and other.head_model != evidence.declaration.head_model:
+            yield Hit(
+                f"sequence {folder.name} was tracked with {other.head_model}, the union says "
+                f"{evidence.declaration.head_model}",
+                folder / layout.DECLARATION_FILE,
+                "head_model",
+            )
+
+
+def _no_head(evidence: Evidence) -> Iterator[Hit]:
+    for error in evidence.head_faults:
+        if error.key != "head_model":
+            yield Hit(f"expected {error.expected}, found {error.found}", error.file, error.key)
+
+
+def _unfit(evidence: Evidence) -> Iterator[Hit]:
+    wrong = [p for p in evidence.parameters.values() if p.error is not None and p.arrays and not p.not_finite]
+    if wrong and wrong[0].error is not None:
+        error = wrong[0].error
+        yield Hit(
+            f"{several(len(wrong), 'parameter file')} do not fit the head model: expected {error.expected}, found "
+            f"{error.found}",
+            error.file,
+            error.key,
+        )
+
+
+def _not_finite(evidence: Evidence) -> Iterator[Hit]:
+    wrong = [p for p in evidence.parameters.values() if p.not_finite]
+    if wrong:
+        yield Hit(
+            f"{some(wrong[0].not_finite)} not finite in {several(len(wrong), 'parameter file')}, timesteps "
+            f"{spans(p.timestep for p in wrong)}",
+            wrong[0].path,
+            wrong[0].not_finite[0],
+        )
+
+
+def _short_vectors(evidence: Evidence) -> Iterator[Hit]:
+    if evidence.subject is None:
+        return
+    head = evidence.subject.head
+    for key, basis in (("expr", head.expression_basis), ("shape", head.shape_basis)):
+        short = [
+            p
+            for p in evidence.parameters.values()
+            if p.pose is not None and p.arrays[key].size < basis.shape[2]
+        ]
+        if short:
+            yield Hit(
+                f"{key} has {short[0].arrays[key].size} coefficients, head model {head.version} has "
+                f"{basis.shape[2]}; the rest is taken as zero",
+                short[0].path,
+                key,
+            )
+
+
+def _eyelids(evidence: Evidence) -> Iterator[Hit]:
+    if evidence.subject is None or evidence.subject.head.eyelid_basis is not None:
+        return
+    used = [p for p in evidence.parameters.values() if np.any(p.arrays.get("eyelids", 0))]
+    if used:
+        yield Hit(
+            f"eyelids are tracked in {several(len(used), 'timestep')}, head model "
+            f"{evidence.subject.head.version} has no eyelid basis",
+            used[0].path,
+            "eyelids",
+        )
+
+
+def _still_jaw(evidence: Evidence) -> Iterator[Hit]:
+    if evidence.subject is None or evidence.subject.head.skinning_weights[:, 2].max() < 0.5:
+        return
+    poses = [p for p in evidence.parameters.values() if p.pose is not None]
+    jaws = np.array([p.pose.jaw for p in poses if p.pose is not None])
+    if len(poses) >= FEW and np.ptp(jaws, axis=0).max() < STILL:
+        yield Hit(
+            f"the jaw never turns over {several(len(poses), 'timestep')}", poses[0].path.parent, "jaw_pose"
+        )
+
+
+def _still_expression(evidence: Evidence) -> Iterator[Hit]:
+    poses = [p for p in evidence.parameters.values() if p.pose is not None]
+    expressions = np.array([p.pose.expression for p in poses if p.pose is not None])
+    if len(poses) >= FEW and np.ptp(expressions, axis=0).max(initial=0.0) < STILL:
+        yield Hit(
+            f"the expression never changes over {several(len(poses), 'timestep')}",
+            poses[0].path.parent,
+            "expr",
+        )
+
+
+def _far_expression(evidence: Evidence) -> Iterator[Hit]:
+    far = {t: reach for t, reach in expression_reach(evidence).items() if reach > REACH_M}
+    if far:
+        worst = max(far, key=lambda t: far[t])
+        yield Hit(
+            f"the expression moves vertices by up to {1000 * far[worst]:.0f} mm (timestep {worst}; more than "
+            f"{1000 * REACH_M:.0f} mm in {several(len(far), 'timestep')})",
+            evidence.parameters[worst].path,
+            "expr",
+        )
+
+
+def _changing_identity(evidence: Evidence) -> Iterator[Hit]:
+    posed = [p for p in evidence.parameters.values() if p.pose is not None]
+    if not posed:
+        return
+    first = posed[0].arrays["shape"].ravel()
+    shapes = [p.arrays["shape"].ravel() for p in posed]
+    change = max(float(np.abs(s - first).max(initial=0.0)) for s in shapes if s.shape == first.shape)
+    offset = max(p.offset_change_m for p in posed)
+    if change > CHANGE or offset > 1e-6:
+        yield Hit(
+            f"identity changes over time (shape by up to {change:.3g}, static offset by {1000 * offset:.3g} mm); "
+            "the first timestep's is taken for all",
+            posed[0].path.parent,
+            "shape",
+        )
+
+
+def _dynamic(evidence: Evidence) -> Iterator[Hit]:
+    largest = max((p.dynamic_m for p in evidence.parameters.values()), default=0.0)
+    if largest > 0:
+        path = next(p.path for p in evidence.parameters.values() if p.dynamic_m > 0)
+        yield Hit(
+            f"dynamic_offset moves vertices by up to {1000 * largest:.3g} mm and is not used",
+            path,
+            "dynamic_offset",
+        )
+
+
+def _repeated(evidence: Evidence) -> Iterator[Hit]:
+    images: dict[int, dict[str, str]] = {}
+    for entry in evidence.entries:
+        images.setdefault(entry.timestep, {})[entry.camera_id] = evidence.digests.get(entry.image, "")
+    repeated = []
+    for timesteps in evidence.sequences.values():
+        for before, after in itertools.pairwise(timesteps):
+            one, other = evidence.parameters[before].arrays, evidence.parameters[after].arrays
+            same = one.keys() == other.keys() and all(np.array_equal(one[k], other[k]) for k in one)
+            if one and same and images[before] != images[after]:
+                repeated.append(after)
+    if repeated:
+        yield Hit(
+            f"{several(len(repeated), 'timestep')} with the parameters of the one before and other images: "
+            f"{spans(repeated)}",
+            evidence.parameters[repeated[0]].path,
+        )
+
+
+def _jumps(evidence: Evidence) -> Iterator[Hit]:
+    for folder, (timesteps, steps) in face_steps(evidence).items():
+        if len(steps) < FEW:
+            continue
+        limit = max(JUMP_M, JUMP_TIMES * float(np.median(steps)))
+        jumps = np.flatnonzero(steps > limit)
+        if len(jumps):
+            yield Hit(
+                f"the face of {evidence.names[folder]} jumps by up to {1000 * steps.max():.0f} mm into timesteps "
+                f"{spans(timesteps[i + 1] for i in jumps)} (median step {1000 * np.median(steps):.1f} mm)",
+                evidence.parameters[timesteps[int(jumps[0]) + 1]].path,
+            )
+
+
+RULES = (
+    Rule(
+        "HB601",
+        "error",
+        "the head model is not the one the capture was tracked with",
+        "Give the declared version, or refit the tracking: coefficients of FLAME 2020 and 2023 are not "
+        "interchangeable, though they are as many.",
+        _version,
+    ),
+    Rule(
+        "HB602",
+        "error",
+        "the head model is missing or broken",
+        "Give its path with --head, or put it where headbench.json says.",
+        _no_head,
+    ),
+    Rule(
+        "HB603",
+        "error",
+        "parameters do not fit the head model",
+        "Give the head model the capture was tracked with.",
+        _unfit,
+    ),
+    Rule(
+        "HB604",
+        "error",
+        "parameters are not finite",
+        "Track these timesteps again, or leave them out with a reason.",
+        _not_finite,
+    ),
+    Rule(
+        "HB605",
+        "warning",
+        "there are fewer coefficients than the head model has",
+        "Make sure that the tracker used a cut basis of this very model, and not another one.",
+        _short_vectors,
+    ),
+    Rule(
+        "HB606",
+        "warning",
+        "eyelids are tracked that the head model lacks",
+        "Give the model the tracker used (FLAME 2020 with eyelids, in MICA's tracker), or refit.",
+        _eyelids,
+    ),
+    Rule(
+        "HB607",
+        "warning",
+        "the jaw never moves",
+        "Make sure of the version: in FLAME 2023 without jaw rotation the mouth opens by expression, and its "
+        "coefficients are those of no other model.",
+        _still_jaw,
+    ),
+    Rule(
+        "HB608",
+        "warning",
+        "expressions are larger than faces allow",
+        "Make sure of the version and of the coefficients' scale (standard deviations, metres).",
+        _far_expression,
+    ),
+    Rule(
+        "HB609",
+        "warning",
+        "identity changes over time",
+        "Track with one identity for all sequences, or take the union apart.",
+        _changing_identity,
+    ),
+    Rule(
+        "HB610",
+        "note",
+        "dynamic offsets are left out",
+        "Nothing, if methods are to be driven by coefficients; their tracking is then a little coarser.",
+        _dynamic,
+    ),
+    Rule(
+        "HB611",
+        "warning",
+        "tracking stands still while images go on",
+        "Track these timesteps again, or leave them out with a reason.",
+        _repeated,
+    ),
+    Rule(
+        "HB612",
+        "warning",
+        "tracking jumps",
+        "Look at the overlay (headbench inspect); track these timesteps again, or leave them out with a reason.",
+        _jumps,
+    ),
+    Rule(
+        "HB613",
+        "error",
+        "sequences were tracked with different head models",
+        "Refit one of them, or keep them in captures of their own.",
+        _sequence_versions,
+    ),
+    Rule(
+        "HB614",
+        "warning",
+        "the expression never changes",
+        "Make sure that expressions were tracked and exported.",
+        _still_expression,
+    ),
+)

@@ -1,0 +1,118 @@
+"""``headbench lint``: run every rule over a capture and report."""
+
+from __future__ import annotations
+
+import textwrap
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ...bench.contracts import Findings, Progress, no_progress
+from ...bench.errors import InputError
+from .catalogue import GROUPS, RULES
+from .evidence import Evidence, find_capture, gather
+from .rules import SEVERITIES, Finding, apply, several
+from .settings import LintSettings
+
+_WIDTH = 100
+
+
+def run(settings: LintSettings, progress: Progress = no_progress) -> Findings:
+    """Lint a capture, or explain the codes. Passed without errors; with ``strict``, without warnings too.
+
+    Raises `InputError` where there is no capture to look at, or a code to ignore does not exist.
+    """
+    unknown = sorted(set(settings.ignore) - {rule.code for rule in RULES})
+    if unknown:
+        raise InputError("--ignore", "", "codes that `headbench lint --list` shows", ", ".join(unknown))
+    if settings.list:
+        return _explained()
+    if not settings.clip:
+        raise InputError("command line", "CLIP", "the folder of a capture, or --list", "nothing")
+    evidence, findings = lint(settings, progress)
+    counts = Counter(finding.severity for finding in findings)
+    passed = not counts["error"] and not (settings.strict and counts["warning"])
+    data = {
+        "capture": evidence.folder.as_posix(),
+        "passed": passed,
+        "counts": {severity: counts[severity] for severity in SEVERITIES},
+        "looked_at": _looked_at(evidence),
+        "findings": [finding.as_dict() for finding in findings],
+    }
+    return Findings(_report(evidence, findings, passed), data, passed)
+
+
+def lint(settings: LintSettings, progress: Progress = no_progress) -> tuple[Evidence, list[Finding]]:
+    """Findings for a capture, worst first, and what they rest on."""
+    evidence = gather(find_capture(settings.clip), settings, progress)
+    return evidence, apply(RULES, evidence, settings.ignore, base=evidence.folder.parent)
+
+
+def _looked_at(evidence: Evidence) -> dict[str, Any]:
+    return {
+        "frames": len(evidence.entries),
+        "timesteps": len({entry.timestep for entry in evidence.entries}),
+        "cameras": len({entry.camera_id for entry in evidence.entries}),
+        "frames_decoded": len(evidence.views),
+        "frames_compared_for_near_duplicates": len(evidence.thumbnails),
+        "parameter_files": len(evidence.parameters),
+        "rules": len(RULES) - len(set(evidence.settings.ignore)),
+    }
+
+
+def _report(evidence: Evidence, findings: Sequence[Finding], passed: bool) -> str:
+    lines = []
+    for finding in findings:
+        place = finding.file + (f", {finding.key}" if finding.key else "")
+        lines += _filled(f"{finding.code} {finding.severity:<8}", finding.message)
+        lines += _filled("", place) if place else []
+        lines += [*_filled("", finding.remedy), ""]
+    counts = Counter(finding.severity for finding in findings)
+    found = ", ".join(several(counts[severity], severity) for severity in SEVERITIES)
+    seen = _looked_at(evidence)
+    lines += [
+        f"{Path(evidence.folder).name}: {found}.",
+        (
+            f"Looked at {seen['frames']} frames ({seen['timesteps']} timesteps, {seen['cameras']} cameras), decoded "
+            f"{seen['frames_decoded']}, compared {seen['frames_compared_for_near_duplicates']} for near-duplicates."
+        ),
+    ]
+    if not passed:
+        lines.append("Not fit for a comparison as it is.")
+    return "\n".join(lines)
+
+
+def _filled(head: str, text: str) -> list[str]:
+    return textwrap.wrap(
+        text,
+        _WIDTH,
+        initial_indent=f"{head:<16}",
+        subsequent_indent=" " * 16,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+
+
+def _explained() -> Findings:
+    lines = []
+    for digit, group in GROUPS.items():
+        lines += [f"HB{digit}xx {group}", ""]
+        for rule in RULES:
+            if rule.code[2] == digit:
+                lines += _filled(f"{rule.code} {rule.severity:<8}", rule.title)
+                lines += _filled("", rule.remedy)
+        lines.append("")
+    data = {
+        "rules": [
+            {
+                "code": rule.code,
+                "severity": rule.severity,
+                "subject": GROUPS[rule.code[2]],
+                "title": rule.title,
+                "remedy": rule.remedy,
+            }
+            for rule in RULES
+        ]
+    }
+    return Findings("\n".join(lines).rstrip(), data)

@@ -1,0 +1,252 @@
+"""Everything of a capture that can be read, and what could not: the ground the linter's checks stand on.
+
+Unlike `read_capture`, which stops at the first fault, this reads frame by frame and file by file and goes on
+behind each fault, so that one broken frame does not hide what else is wrong.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ...bench.contracts import Progress, no_progress
+from ...bench.errors import InputError
+from ...bench.files import read_json
+from .. import ga_layout as layout
+from ..capture_head import find_head
+from ..content_digests import content_digests
+from ..ga_reader import find_captures, read_capture
+from ..head.arrays import HeadArrays
+from ..image_files import ImageInfo, probe_image
+from ..splits import sequence_names
+from ..transforms import FrameEntry, parse_frame
+from .parameters import Parameters, Subject, read_parameters
+from .settings import LintSettings
+from .thumbnails import Thumbnail, make_thumbnails
+from .views import ViewFacts, look, pick_views
+
+
+class Slot(NamedTuple):
+    """Where a frame belongs in the grid of a capture."""
+
+    timestep: int
+    camera_index: int
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What a capture says of itself and what its files hold.
+
+    Attributes
+    ----------
+    folder : of the capture.
+    declaration : its ``headbench.json``, None where there is none or it is broken.
+    splits : frames that could be read, by split.
+    unread : slots of frames that a JSON lists and that could not be read.
+    declaration_faults, json_faults, frame_faults, file_faults, head_faults : why things could not be read.
+    headers : of the images and masks that are there, by path.
+    digests : of the content of every image that is there.
+    head : None where it could not be found or read.
+    parameters : by timestep.
+    subject : head and identity that fit the parameters; None where no file does.
+    views : decoded sample frames.
+    thumbnails : of the images searched for near-duplicates.
+    refusal : why `read_capture` refuses the capture, None where it does not.
+    """
+
+    folder: Path
+    settings: LintSettings
+    declaration: layout.Declaration | None
+    splits: Mapping[str, tuple[FrameEntry, ...]]
+    unread: frozenset[Slot]
+    declaration_faults: tuple[InputError, ...]
+    json_faults: tuple[InputError, ...]
+    frame_faults: tuple[InputError, ...]
+    file_faults: tuple[InputError, ...]
+    head_faults: tuple[InputError, ...]
+    headers: Mapping[Path, ImageInfo]
+    digests: Mapping[Path, str]
+    head: HeadArrays | None
+    parameters: Mapping[int, Parameters]
+    subject: Subject | None
+    views: tuple[ViewFacts, ...]
+    thumbnails: tuple[Thumbnail, ...]
+    refusal: InputError | None
+
+    @cached_property
+    def entries(self) -> tuple[FrameEntry, ...]:
+        """Frames of all splits."""
+        return tuple(entry for part in self.splits.values() for entry in part)
+
+    @cached_property
+    def names(self) -> Mapping[str, str]:
+        """Sequence name by sequence folder."""
+        return sequence_names(self.entries, self.declaration.sequences if self.declaration else {})
+
+    @property
+    def background(self) -> tuple[float, ...]:
+        """Declared background, else white."""
+        return self.declaration.background if self.declaration else (1.0, 1.0, 1.0)
+
+    @cached_property
+    def sequences(self) -> Mapping[str, tuple[int, ...]]:
+        """Timesteps by sequence folder, sorted."""
+        found: dict[str, set[int]] = {}
+        for entry in self.entries:
+            found.setdefault(entry.sequence_folder, set()).add(entry.timestep)
+        return {folder: tuple(sorted(timesteps)) for folder, timesteps in found.items()}
+
+
+def find_capture(path: str | Path) -> Path:
+    """The one capture at ``path``. Raises `InputError` where there is none or several."""
+    folder = Path(os.path.abspath(path))
+    captures = find_captures(folder) if folder.is_dir() else []
+    if len(captures) == 1:
+        return captures[0]
+    found = ", ".join(capture.name for capture in captures) or "none"
+    raise InputError(path, "", "one capture in the GaussianAvatars/VHAP layout", found, "Name one capture.")
+
+
+def gather(folder: Path, settings: LintSettings, progress: Progress = no_progress) -> Evidence:
+    """Read all that can be read of a capture."""
+    declaration, declaration_faults = _read_declaration(folder)
+    splits, unread, json_faults, frame_faults = _read_splits(folder)
+    entries = [entry for part in splits.values() for entry in part]
+    headers, file_faults = _probe(entries, progress)
+    images = {entry.image for entry in entries} & headers.keys()
+    digests = content_digests(folder, images, progress=progress)
+    head, head_faults = _find_head(folder, declaration, settings)
+    parameters, subject = read_parameters(entries, head, progress=progress)
+    background = declaration.background if declaration else (1.0, 1.0, 1.0)
+    whole = [entry for entry in entries if entry.image in headers]
+    chosen = whole if settings.thorough else pick_views(whole, settings.views)
+    cy = settings.cy if settings.cy != "auto" else (declaration.cy if declaration else "bottom")
+    views = look(chosen, headers, subject, parameters, background, cy, progress=progress)
+    limit = len(whole) if settings.thorough else settings.duplicates
+    thumbnails = make_thumbnails(
+        {name: [e for e in part if e.image in headers] for name, part in splits.items()},
+        background,
+        limit,
+        progress=progress,
+    )
+    return Evidence(
+        folder=folder,
+        settings=settings,
+        declaration=declaration,
+        splits=splits,
+        unread=frozenset(unread),
+        declaration_faults=tuple(declaration_faults),
+        json_faults=tuple(json_faults),
+        frame_faults=tuple(frame_faults),
+        file_faults=tuple(file_faults),
+        head_faults=tuple(head_faults),
+        headers=headers,
+        digests=digests,
+        head=head,
+        parameters=parameters,
+        subject=subject,
+        views=tuple(views),
+        thumbnails=tuple(thumbnails),
+        refusal=_refusal(folder, settings),
+    )
+
+
+def _read_declaration(folder: Path) -> tuple[layout.Declaration | None, list[InputError]]:
+    try:
+        return layout.Declaration.read(folder), []
+    except InputError as error:
+        return None, [error]
+
+
+def _read_splits(
+    folder: Path,
+) -> tuple[dict[str, tuple[FrameEntry, ...]], set[Slot], list[InputError], list[InputError]]:
+    """Frames by split, slots of frames that do not parse, faults of whole JSONs, faults of frames."""
+    files = {name: folder / file for name, file in layout.SPLIT_FILES.items()}
+    if not any(path.exists() for path in files.values()):
+        files = {"train": folder / layout.ALL_FRAMES_FILE}
+    splits: dict[str, tuple[FrameEntry, ...]] = {}
+    unread: set[Slot] = set()
+    json_faults: list[InputError] = []
+    frame_faults: list[InputError] = []
+    for name, path in files.items():
+        splits[name] = ()
+        try:
+            document = read_json(path)
+        except InputError as error:
+            json_faults.append(error)
+            continue
+        frames = document.get("frames")
+        if not isinstance(frames, list):
+            json_faults.append(InputError(path, "frames", "a list of frames", type(frames).__name__))
+            continue
+        entries = []
+        for index, frame in enumerate(frames):
+            try:
+                entries.append(parse_frame(path, f"frames[{index}]", frame, document))
+            except InputError as error:
+                frame_faults.append(error)
+                unread |= _slot(frame)
+        splits[name] = tuple(entries)
+    return splits, unread, json_faults, frame_faults
+
+
+def _slot(frame: Any) -> set[Slot]:
+    """Slot of a frame that does not parse, empty where it does not even say that."""
+    if not isinstance(frame, dict):
+        return set()
+    timestep, camera = frame.get("timestep_index"), frame.get("camera_index", 0)
+    return {Slot(timestep, camera)} if isinstance(timestep, int) and isinstance(camera, int) else set()
+
+
+def _probe(
+    entries: Sequence[FrameEntry], progress: Progress
+) -> tuple[dict[Path, ImageInfo], list[InputError]]:
+    headers: dict[Path, ImageInfo] = {}
+    faults: list[InputError] = []
+    paths = sorted({path for entry in entries for path in (entry.image, entry.mask) if path is not None})
+    for done, path in enumerate(paths, start=1):
+        try:
+            headers[path] = probe_image(path)
+        except InputError as error:
+            faults.append(error)
+        except ValueError as error:  # a name no file can have
+            faults.append(InputError(path, "", "an image file", str(error)))
+        progress(done, len(paths), "reading image headers")
+    return headers, faults
+
+
+def _find_head(
+    folder: Path, declaration: layout.Declaration | None, settings: LintSettings
+) -> tuple[HeadArrays | None, list[InputError]]:
+    """The head, also where its version is not the declared one: the geometry can still be looked at."""
+    try:
+        return find_head(folder, declaration, settings.head), []
+    except InputError as error:
+        faults = [error]
+    if declaration is None:
+        return None, faults
+    try:
+        return find_head(folder, None, settings.head or folder / declaration.head_file), faults
+    except InputError:
+        return None, faults
+
+
+def _refusal(folder: Path, settings: LintSettings) -> InputError | None:
+    try:
+        read_capture(folder, head=settings.head, cy=settings.cy, leaks="record")
+    except InputError as error:
+        return error
+    return None
+
+
+def by_camera(entries: Iterable[FrameEntry]) -> dict[str, list[FrameEntry]]:
+    """Frames by camera id, cameras in index order."""
+    found: dict[str, list[FrameEntry]] = {}
+    for entry in sorted(entries, key=lambda e: (e.camera_index, e.timestep)):
+        found.setdefault(entry.camera_id, []).append(entry)
+    return found

@@ -1,0 +1,147 @@
+"""How the tracked mesh lies in a frame: before the camera, upright, on the silhouette, on skin."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from ...bench.contracts import ByteArray, Camera, FloatArray, HeadPose, IntArray
+from ..mesh_pictures import rasterize_mesh
+from .parameters import Subject
+
+FACE = ("face", "forehead", "nose")
+"""Regions that neither hair nor cloth should cover: their mesh must lie within the foreground."""
+
+NOT_SKIN = ("lips", "eye_region", "left_eyeball", "right_eyeball", "mouth_socket", "teeth")
+
+SLACK = 0.03
+"""How far outside the foreground a vertex of the face may fall, as a share of the mesh's height in the image."""
+
+WORKING_HEIGHT = 400
+"""Meshes are filled at most this many pixels high: what is asked of them is coarse."""
+
+MIN_SKIN_PIXELS = 12
+
+
+@dataclass(frozen=True, eq=False)
+class MeshFacts:
+    """How the posed mesh of one frame lies before its camera.
+
+    Attributes
+    ----------
+    vertices : (V, 3) in the world of the frame's sequence, metres.
+    camera : as the frame states it, of the image's size.
+    distance : from the camera to the mesh's centre, metres.
+    depth : of that centre along the viewing direction; negative behind the camera.
+    upright : cosine between the image's and the head's upward directions.
+    facing : cosine between the face's direction and that from head to camera.
+    face_outside : share of the face's vertices that fall outside the foreground, None without a mask.
+    overlap : intersection over union of mesh and foreground, None without a mask.
+    size : area of the mesh over that of the foreground, None without a mask.
+    skin : median colour (3,) of the face's visible skin, 8-bit levels; None where little of it shows.
+    """
+
+    vertices: FloatArray
+    camera: Camera
+    distance: float
+    depth: float
+    upright: float
+    facing: float
+    face_outside: float | None = None
+    overlap: float | None = None
+    size: float | None = None
+    skin: FloatArray | None = None
+
+
+def lay_mesh(
+    subject: Subject, pose: HeadPose, camera: Camera, image: ByteArray, mask: ByteArray | None
+) -> MeshFacts:
+    """Pose the subject's mesh and hold it against an image, (H, W, 3) RGB, and its mask, (H, W)."""
+    vertices = subject.vertices([pose])[0]
+    turn = camera.world_to_camera[:3, :3]
+    centre = vertices.mean(axis=0)
+    towards = camera.center - centre
+    head = head_axes(subject, vertices)
+    distance = float(np.linalg.norm(towards))
+    plain = MeshFacts(
+        vertices=vertices,
+        camera=camera,
+        distance=distance,
+        depth=float((turn @ centre + camera.world_to_camera[:3, 3])[2]),
+        upright=float(-turn[1] @ head[1]),
+        facing=float(head[2] @ towards / max(distance, 1e-9)),
+    )
+    if plain.depth <= 0:
+        return plain
+    return _held_against(plain, subject, image, mask)
+
+
+def head_axes(subject: Subject, vertices: FloatArray) -> FloatArray:
+    """(3, 3) rows: where the template's x, y and z axes point for the posed mesh (Kabsch over the face)."""
+    members = _members(subject, FACE)
+    rest, posed = subject.head.template[members], vertices[members]
+    u, _, vt = np.linalg.svd((rest - rest.mean(axis=0)).T @ (posed - posed.mean(axis=0)))
+    flip = np.diag([1.0, 1.0, float(np.sign(np.linalg.det(u @ vt)) or 1.0)])
+    return np.asarray(u @ flip @ vt)
+
+
+def _members(subject: Subject, names: tuple[str, ...]) -> IntArray:
+    """Vertices of the regions by these names; all vertices where the head has none of them."""
+    regions = [subject.head.regions[name] for name in names if name in subject.head.regions]
+    return np.unique(np.concatenate(regions)) if regions else np.arange(len(subject.head.template))
+
+
+def _held_against(plain: MeshFacts, subject: Subject, image: ByteArray, mask: ByteArray | None) -> MeshFacts:
+    camera, vertices = plain.camera, plain.vertices
+    scale = min(1.0, WORKING_HEIGHT / camera.height)
+    width, height = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
+    stretch = np.diag([width / camera.width, height / camera.height, 1.0])
+    small = Camera(camera.id, width, height, stretch @ camera.K, camera.world_to_camera)
+    front = rasterize_mesh(vertices, subject.head.faces, small).face
+    filled = front >= 0
+    size = (width, height)
+    foreground = None
+    if mask is not None:
+        foreground = cv2.resize(mask, size, interpolation=cv2.INTER_AREA) > 127
+    picture = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
+    skin = _skin(subject, front, picture, foreground)
+    if foreground is None or not foreground.any():
+        return replace(plain, skin=skin)
+    return replace(
+        plain,
+        skin=skin,
+        overlap=float((filled & foreground).sum() / (filled | foreground).sum()),
+        size=float(filled.sum() / foreground.sum()),
+        face_outside=_face_outside(subject, vertices, small, filled, foreground),
+    )
+
+
+def _skin(
+    subject: Subject, front: IntArray, image: ByteArray, foreground: np.ndarray | None
+) -> FloatArray | None:
+    member = np.zeros(len(subject.head.template), dtype=bool)
+    member[_members(subject, FACE)] = True
+    for name in NOT_SKIN:
+        member[subject.head.regions.get(name, [])] = False
+    shows = (front >= 0) & member[subject.head.faces[np.maximum(front, 0)]].all(axis=2)
+    if foreground is not None:
+        shows &= foreground
+    return np.median(image[shows], axis=0) if shows.sum() >= MIN_SKIN_PIXELS else None
+
+
+def _face_outside(
+    subject: Subject, vertices: FloatArray, camera: Camera, filled: np.ndarray, foreground: np.ndarray
+) -> float:
+    points = vertices[_members(subject, FACE)]
+    points = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    pixels = (points @ camera.K.T)[:, :2] / np.maximum(points[:, 2:], 1e-6)
+    column, row = np.floor(np.clip(pixels, -1, 2**20)).astype(int).T
+    inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    if not inside.any():
+        return 1.0
+    distance = cv2.distanceTransform((~foreground).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    rows = np.flatnonzero(filled.any(axis=1))
+    slack = SLACK * (rows[-1] - rows[0] + 1) if len(rows) else 0.0
+    return float((distance[row[inside], column[inside]] > slack).mean())

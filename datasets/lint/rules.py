@@ -1,0 +1,104 @@
+"""What a check of the linter is made of: a rule, its hits, the findings made of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+if TYPE_CHECKING:
+    from .evidence import Evidence
+
+Severity = Literal["error", "warning", "note"]
+"""error: numbers of this capture would be wrong or it cannot be read; warning: they may be; note: know this."""
+
+SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
+
+
+class Hit(NamedTuple):
+    """One fault that a check saw: what, and where."""
+
+    message: str
+    file: Path | str = ""
+    key: str = ""
+
+
+@dataclass(frozen=True)
+class Rule:
+    """A check with its code.
+
+    Attributes
+    ----------
+    code : stable name, "HB" and three digits; the first digit is the subject (see `catalogue`).
+    title : the fault in a few words.
+    remedy : what to do about it.
+    check : evidence to hits; no hit where what it needs could not be read.
+    """
+
+    code: str
+    severity: Severity
+    title: str
+    remedy: str
+    check: Callable[[Evidence], Iterable[Hit]]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the linter's report."""
+
+    code: str
+    severity: Severity
+    message: str
+    remedy: str
+    file: str
+    key: str
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        return asdict(self)
+
+
+def apply(
+    rules: Sequence[Rule], evidence: Evidence, ignore: Collection[str] = (), *, base: Path | None = None
+) -> list[Finding]:
+    """Run the rules over the evidence; findings in order of severity, then code.
+
+    Paths below ``base`` are reported relative to it.
+    """
+    findings = [
+        Finding(rule.code, rule.severity, hit.message, rule.remedy, _relative(hit.file, base), hit.key)
+        for rule in rules
+        if rule.code not in ignore
+        for hit in rule.check(evidence)
+    ]
+    return sorted(findings, key=lambda f: (SEVERITIES.index(f.severity), f.code))
+
+
+def several(count: int, noun: str) -> str:
+    """ "1 image", "7 images"."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+def some(names: Iterable[Any], limit: int = 4) -> str:
+    """The first few names, and how many more there are."""
+    names = [str(name) for name in names]
+    rest = len(names) - limit
+    return ", ".join(names[:limit]) + (f" and {rest} more" if rest > 0 else "")
+
+
+def spans(numbers: Iterable[int], limit: int = 4) -> str:
+    """Whole numbers as runs: "0-3, 7, 9-10"."""
+    runs: list[list[int]] = []
+    for number in sorted(set(numbers)):
+        if runs and number == runs[-1][1] + 1:
+            runs[-1][1] = number
+        else:
+            runs.append([number, number])
+    return some((f"{a}" if a == b else f"{a}-{b}" for a, b in runs), limit)
+
+
+def _relative(file: Path | str, base: Path | None) -> str:
+    if base is not None and isinstance(file, Path) and file.is_relative_to(base):
+        return file.relative_to(base).as_posix()
+    return str(file)
