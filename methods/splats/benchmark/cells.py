@@ -33,20 +33,7 @@ class Cell:
     """The anchor's least time for both passes over this one's."""
 
 
-@dataclass(frozen=True)
-class Scaling:
-    """Wall seconds of both passes with one and two threads, the least of interleaved runs."""
-
-    splats: int
-    width: int
-    height: int
-    one_thread: float
-    two_threads: float
-
-
-def speed_tables(
-    cells: Sequence[Cell], peaks: dict[str, float], scaling: Sequence[Scaling], missing: str
-) -> str:
+def speed_tables(cells: Sequence[Cell], peaks: dict[str, float], missing: str) -> str:
     """Lay out the results; ``missing`` says why there is no anchor, ``peaks`` are flops a second by backend."""
     parts = [
         "Processor time of one thread in ms: least and median of the runs; spread is between the quartiles. A pair is "
@@ -63,8 +50,6 @@ def speed_tables(
             f"count in\nthe source) over the multiply-add rate measured in this run ({rates} GFlop/s).\n\n"
             + _stages(kernels)
         )
-    if scaling:
-        parts.append("Wall time of both passes, ms, least of interleaved runs.\n\n" + _scaling(scaling))
     return "\n\n".join(parts)
 
 
@@ -96,17 +81,5 @@ def _stages(cells: Sequence[Cell]) -> str:
     return table(("splats", "image", "backend", *STAGES, "of peak: draw", "draw backward"), rows)
 
 
-def _scaling(scaling: Sequence[Scaling]) -> str:
-    rows = [
-        (
-            *_scene(one),
-            *(milliseconds(one.one_thread), milliseconds(one.two_threads)),
-            f"{one.one_thread / one.two_threads:.2f}",
-        )
-        for one in scaling
-    ]
-    return table(("splats", "image", "one thread", "two threads", "speed-up"), rows)
-
-
-def _scene(of: Cell | Scaling) -> tuple[str, str]:
+def _scene(of: Cell) -> tuple[str, str]:
     return str(of.splats), f"{of.width}x{of.height}"

@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import asdict, replace
-from typing import Any
 
 import torch
-from torch import Tensor
 
 from ....bench.contracts import Findings, Progress
 from ....bench.errors import UnavailableError
 from ....bench.machine import machine_record
+from ....datasets.procedural.model import procedural_head
 from .. import cpu
-from ..rasterize import available_backends, rasterize
-from ..request import Rendering
+from ..rasterize import available_backends
 from . import anchor
-from .cells import Cell, Scaling, speed_tables
+from .cells import Cell, speed_tables
+from .order import Ordering, bound_head, measure_order, order_table
+from .passes import draw, leaves, one_torch_thread, passes
 from .scenes import Scene, head_shell
+from .threads import Scaling, measure_threads, threads_table
 from .timing import repeat
 
 DIAGONAL = ((5_000, 128, 184), (20_000, 275, 401), (60_000, 550, 802))
@@ -41,9 +40,8 @@ def measure(quick: bool, progress: Progress) -> Findings:
     except UnavailableError as error:
         anchor_passes, missing = None, str(error)
     peaks = {name: cpu.peak_flops(name) for name in kernels}
-    steps = len(scenes) * (len(kernels) + (anchor_passes is not None)) + len(DIAGONAL)
+    steps = len(scenes) * (len(kernels) + (anchor_passes is not None)) + (2 * len(DIAGONAL) if kernels else 0)
     cells: list[Cell] = []
-    scaling: list[Scaling] = []
     with one_torch_thread():
         for count, width, height in scenes:
             scene = head_shell(count, width, height)
@@ -56,28 +54,31 @@ def measure(quick: bool, progress: Progress) -> Findings:
                 row = [_with_ratio(cell, row[-1]) for cell in row]
             cells += row
             progress(len(cells), steps)
-        for count, width, height in DIAGONAL if kernels else ():
-            scaling.append(measure_threads(head_shell(count, width, height), budget=2 * budget))
-            progress(len(cells) + len(scaling), steps)
+        sizes = DIAGONAL if kernels else ()
+        scaling: list[Scaling] = []
+        orderings: list[Ordering] = []
+        for count, width, height in sizes:
+            progress(len(cells) + len(scaling), steps, f"{count} splats, threads")
+            scene = head_shell(count, width, height)
+            scaling.append(measure_threads(scene, budget=2 * budget, least_runs=least_runs))
+        head = procedural_head()
+        for count, width, height in sizes:
+            progress(len(cells) + len(scaling) + len(orderings), steps, f"{count} splats, order")
+            bound = bound_head(head, count, width, height)
+            orderings.append(measure_order(bound, budget=budget, least_runs=least_runs))
+        progress(steps, steps)
     data = {
         "machine": machine_record(),
         "peak_flops": peaks,
         "anchor_missing": missing,
         "cells": [asdict(cell) for cell in cells],
         "threads": [asdict(one) for one in scaling],
+        "order": [asdict(one) for one in orderings],
     }
-    return Findings(speed_tables(cells, peaks, scaling, missing), data)
-
-
-@contextmanager
-def one_torch_thread() -> Iterator[None]:
-    """Torch on one thread, so that its own work counts to the thread that is timed."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
+    parts = [speed_tables(cells, peaks, missing)]
+    if kernels:
+        parts += [threads_table(scaling), order_table(orderings)]
+    return Findings("\n\n".join(parts), data)
 
 
 def measure_kernel(scene: Scene, backend: str, peak: float, *, budget: float, least_runs: int) -> Cell:
@@ -102,49 +103,6 @@ def measure_kernel(scene: Scene, backend: str, peak: float, *, budget: float, le
         *(len(scene.means), scene.width, scene.height, backend, forward, both, tested, drawn, stages),
         (share(FORWARD_FLOPS, "draw"), share(BACKWARD_FLOPS, "draw backward")),
     )
-
-
-def passes(
-    scene: Scene, backend: str, threads: int, **options: Any
-) -> Callable[..., tuple[float, float, Any]]:
-    """Build a function that renders and differentiates, and gives both times and the forward pass's autograd node."""
-    inputs = leaves(scene)
-    upstream = torch.randn(scene.height, scene.width, scene.colors.shape[1])
-
-    def run(clock: Callable[[], float]) -> tuple[float, float, Any]:
-        for leaf in inputs:
-            leaf.grad = None
-        start = clock()
-        image = draw(scene, inputs, backend=backend, threads=threads, **options).image
-        forward = clock() - start
-        node = image.grad_fn
-        image.backward(upstream)
-        return forward, clock() - start, node
-
-    return run
-
-
-def leaves(scene: Scene) -> list[Tensor]:
-    """Copies of what describes the splats, to be differentiated by."""
-    return [value.clone().requires_grad_() for value in scene[:5]]
-
-
-def draw(scene: Scene, inputs: Sequence[Tensor], **options: Any) -> Rendering:
-    """Render ``inputs`` (means, quaternions, scales, opacities, colours) with the scene's camera."""
-    means, quats, scales, opacities, colors = inputs
-    camera = (scene.viewmat, scene.K, scene.width, scene.height)
-    return rasterize(means, quats, scales, opacities, colors, *camera, background=scene.background, **options)
-
-
-def measure_threads(scene: Scene, *, budget: float) -> Scaling:
-    """Wall time of both passes with one and with two threads, taken in turn so that both see the same machine."""
-    seconds: dict[int, list[float]] = {1: [], 2: []}
-    runs = {threads: passes(scene, "cpu", threads) for threads in seconds}
-    start = time.monotonic()
-    while len(seconds[1]) < 5 or time.monotonic() - start < budget:
-        for threads, run in runs.items():
-            seconds[threads].append(run(time.perf_counter)[1])
-    return Scaling(len(scene.means), scene.width, scene.height, min(seconds[1]), min(seconds[2]))
 
 
 def _measure_anchor(scene: Scene, passes: anchor.Anchor, row: list[Cell], *, budget: float) -> Cell:

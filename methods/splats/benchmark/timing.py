@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
+
+Key = TypeVar("Key", bound=Hashable)
 
 
 @dataclass(frozen=True)
@@ -46,3 +49,22 @@ def repeat(
         forward.append(first)
         both.append(whole)
     return summarise(forward), summarise(both)
+
+
+def take_turns(
+    runs: Mapping[Key, Callable[[], float]], *, budget: float, least_runs: int
+) -> dict[Key, list[float]]:
+    """Seconds of several things to compare, by key: one run of each in turn, so that all see the same machine.
+
+    A first round warms up and does not count. Each of ``runs`` gives its seconds. Goes on for about ``budget`` seconds,
+    ``least_runs`` rounds at the least.
+    """
+    for run in runs.values():
+        run()
+    seconds: dict[Key, list[float]] = {key: [] for key in runs}
+    start, rounds = time.monotonic(), 0
+    while rounds < least_runs or time.monotonic() - start < budget:
+        for key, run in runs.items():
+            seconds[key].append(run())
+        rounds += 1
+    return seconds

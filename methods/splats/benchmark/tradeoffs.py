@@ -16,8 +16,8 @@ from torch import Tensor
 from ....bench.contracts import Findings, Progress
 from ..rasterize import available_backends
 from .layout import milliseconds, table
+from .passes import draw, leaves, one_torch_thread, passes
 from .scenes import Scene, head_shell
-from .speed import draw, leaves, one_torch_thread, passes
 from .timing import repeat
 
 SCENE = (60_000, 550, 802)

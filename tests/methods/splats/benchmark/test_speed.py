@@ -10,6 +10,7 @@ from headbench.bench.files import plain
 from headbench.methods.splats import available_backends, cpu
 from headbench.methods.splats.benchmark import anchor, speed
 from headbench.methods.splats.benchmark.layout import table
+from headbench.methods.splats.benchmark.passes import draw, leaves
 from headbench.methods.splats.benchmark.scenes import cloud
 
 KERNELS = [name for name in available_backends() if name.startswith("cpu-")]
@@ -28,7 +29,7 @@ def test_tables_are_aligned():
 def test_contributing_pairs_are_those_with_a_colour_gradient(kernel):
     # One channel per splat, one splat per channel: a pixel's channel is non-zero where its splat contributes.
     scene = cloud(32, 40, 30, seed=4, size=0.1)._replace(colors=torch.eye(32), background=torch.zeros(32))
-    rendering = speed.draw(scene, speed.leaves(scene), backend=kernel, threads=1)
+    rendering = draw(scene, leaves(scene), backend=kernel, threads=1)
     tested, drawn = cpu.work(rendering.image.grad_fn)
     assert drawn == int((rendering.image > 0).sum())
     assert drawn < tested <= 32 * 48 * 32, "tested pairs come in whole blocks"
@@ -72,6 +73,9 @@ def test_every_cell_is_reported(monkeypatch, with_anchor):
         if cell["backend"] == speed.ANCHOR:
             assert cell["ratio_to_anchor"] == 1
     assert [t["width"] for t in data["threads"]] == [40, 33]
+    assert [t["splats"] for t in data["order"]] == [300, 500]
+    assert "Threads." in findings.text
+    assert "Order in memory" in findings.text
 
 
 def _missing():

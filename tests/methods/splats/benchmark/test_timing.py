@@ -2,7 +2,7 @@ import itertools
 
 import pytest
 
-from headbench.methods.splats.benchmark.timing import repeat, summarise
+from headbench.methods.splats.benchmark.timing import repeat, summarise, take_turns
 
 
 def test_summary_of_known_runs():
@@ -27,3 +27,25 @@ def test_runs_go_on_for_the_budget():
     forward, _ = repeat(lambda clock: (clock(), clock()), budget=0.02, least_runs=1)
     assert forward.runs > 1
     assert forward.least == pytest.approx(forward.median, abs=1)
+
+
+def test_runs_take_turns_after_a_round_that_does_not_count():
+    log = []
+
+    def of(name, costs):
+        costs = iter(costs)
+
+        def run():
+            log.append(name)
+            return next(costs)
+
+        return run
+
+    runs = {"a": of("a", [9.0, 1.0, 2.0]), "b": of("b", [9.0, 3.0, 4.0])}
+    assert take_turns(runs, budget=0, least_runs=2) == {"a": [1.0, 2.0], "b": [3.0, 4.0]}
+    assert log == ["a", "b"] * 3
+
+
+def test_turns_go_on_for_the_budget():
+    taken = take_turns({1: lambda: 0.5}, budget=0.02, least_runs=1)
+    assert len(taken[1]) > 1

@@ -8,8 +8,8 @@ import torch
 from headbench.bench.contracts import no_progress
 from headbench.methods.splats import available_backends
 from headbench.methods.splats.benchmark import tradeoffs
+from headbench.methods.splats.benchmark.passes import draw, leaves
 from headbench.methods.splats.benchmark.scenes import cloud
-from headbench.methods.splats.benchmark.speed import draw, leaves
 
 
 def test_a_splats_contribution_is_the_light_it_sends():
