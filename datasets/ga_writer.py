@@ -19,6 +19,7 @@ from ..bench.contracts import ByteArray, Camera, FloatArray, HeadPose
 from ..bench.errors import InputError
 from ..bench.files import atomic_path, write_json, write_text
 from . import ga_layout as layout
+from .ga_documents import camera_record, file_record, save_npz, split_of, transforms_document
 from .head.arrays import HeadArrays, save_head
 from .image_files import probe_image
 
@@ -177,7 +178,7 @@ class CaptureWriter:
         folder = self.sequence_folder(sequence.name)
         constant = self._constant_parameters()
         for timestep, pose in enumerate(sequence.poses):
-            _save_npz(folder / "flame_param" / f"{timestep:05d}.npz", pose_to_parameters(pose) | constant)
+            save_npz(folder / "flame_param" / f"{timestep:05d}.npz", pose_to_parameters(pose) | constant)
         self._write_canonical(folder)
         boundary = math.ceil(TRAIN_FRACTION * len(sequence.poses))
         frames = list(self._frames(sequence, 0, ""))
@@ -188,9 +189,10 @@ class CaptureWriter:
         held_out = {self._camera_index[camera] for camera in self.plan.novel_view_cameras}
         parts: dict[str, list[dict[str, Any]]] = {name: [] for name in layout.SPLIT_FILES}
         for record in frames:
-            parts[_split(record["timestep_index"] >= boundary, record["camera_index"] in held_out)].append(
-                record
+            split = split_of(
+                test=record["timestep_index"] >= boundary, held_out_camera=record["camera_index"] in held_out
             )
+            parts[split].append(record)
         self._declaration([sequence], f"../{self.union.name}/{layout.HEAD_FILE}").write(folder)
         for name, file in layout.SPLIT_FILES.items():
             self._write_transforms(folder / file, parts[name])
@@ -204,7 +206,8 @@ class CaptureWriter:
         start = 0
         for sequence in [*train, *test]:
             for record in self._frames(sequence, start, f"../{self.sequence_folder(sequence.name).name}/"):
-                parts[_split(sequence in test, record["camera_index"] in held_out)].append(record)
+                split = split_of(test=sequence in test, held_out_camera=record["camera_index"] in held_out)
+                parts[split].append(record)
             start += len(sequence.poses)
         for file, group in ((layout.TRAIN_SEQUENCES_FILE, train), (layout.TEST_SEQUENCES_FILE, test)):
             names = (self.sequence_folder(sequence.name).name for sequence in group)
@@ -220,31 +223,16 @@ class CaptureWriter:
         """Frame records, timestep outer, camera inner, with the key order of VHAP's union export."""
         for timestep in range(len(sequence.poses)):
             for index, camera in enumerate(self.plan.cameras):
-                name = layout.frame_name(timestep, index)
+                mask = self.mask_path(sequence.name, timestep, camera.id).exists()
                 yield {
                     "timestep_index": start + timestep,
-                    "camera_index": index,
-                    "camera_id": camera.id,
-                    **layout.intrinsics_to_json(camera, self.plan.cy),
-                    "transform_matrix": layout.extrinsics_to_json(camera.world_to_camera),
-                    "file_path": f"{prefix}images/{name}.png",
-                    **self._mask_entry(sequence.name, timestep, camera.id, f"{prefix}fg_masks/{name}.png"),
-                    "flame_param_path": f"{prefix}flame_param/{timestep:05d}.npz",
+                    **camera_record(camera, index, self.plan.cy),
+                    **file_record(timestep, index, prefix, mask=mask),
                 }
-
-    def _mask_entry(self, sequence: str, timestep: int, camera: str, path: str) -> dict[str, str]:
-        exists = self.mask_path(sequence, timestep, camera).exists()
-        return {"fg_mask_path": path} if exists else {}
 
     def _write_transforms(self, path: Path, frames: Sequence[Mapping[str, Any]]) -> None:
         shared = layout.intrinsics_to_json(self.plan.cameras[-1], self.plan.cy)
-        value = {
-            "frames": frames,
-            **shared,
-            "timestep_indices": sorted({frame["timestep_index"] for frame in frames}),
-            "camera_indices": sorted({frame["camera_index"] for frame in frames}),
-        }
-        write_json(path, value)
+        write_json(path, transforms_document(frames, shared))
 
     def _constant_parameters(self) -> dict[str, FloatArray]:
         return {
@@ -256,7 +244,7 @@ class CaptureWriter:
         pose = self.plan.sequences[0].poses[0]
         zeros = {key: np.zeros_like(value) for key, value in pose_to_parameters(pose).items()}
         zeros["jaw_pose"] = np.array([CANONICAL_JAW], dtype=np.float64)
-        _save_npz(folder / layout.CANONICAL_FILE, zeros | self._constant_parameters())
+        save_npz(folder / layout.CANONICAL_FILE, zeros | self._constant_parameters())
 
     def _declaration(self, sequences: Sequence[SequencePlan], head_file: str) -> layout.Declaration:
         starts = np.cumsum([0, *(len(sequence.poses) for sequence in sequences)])
@@ -299,14 +287,3 @@ def pose_to_parameters(pose: HeadPose) -> dict[str, FloatArray]:
     if pose.eyelids is not None:
         parameters["eyelids"] = pose.eyelids
     return {key: np.asarray(value, dtype=np.float32)[None] for key, value in parameters.items()}
-
-
-def _save_npz(path: Path, arrays: Mapping[str, FloatArray]) -> None:
-    with atomic_path(path) as temporary:
-        np.savez(temporary, allow_pickle=False, **arrays)
-
-
-def _split(test: bool, held_out_camera: bool) -> str:
-    if test:
-        return "self_reenactment"
-    return "novel_view" if held_out_camera else "train"

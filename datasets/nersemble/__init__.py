@@ -1,0 +1,1 @@
+"""NeRSemble recordings: read raw, written for tests, prepared as captures in the GaussianAvatars layout."""

@@ -1,0 +1,292 @@
+"""One recorded sequence: which frames each camera has, checked before anything is decoded."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import cv2
+
+from ...bench.errors import InputError
+from ..image_files import probe_image
+from .calibration import Calibration
+from .mp4 import check_boxes
+from .names import numbered, serial_of
+from .recording import Participant
+
+Source = Literal["auto", "video", "images"]
+"""Which frames to take: videos, or images beside them; "auto" takes images where they come with mattes."""
+
+EVERY_OF_73 = 3
+"""Every third frame of 73 per second makes the 24.33 per second that "24 fps" stands for."""
+
+_FRAME_FOLDER = re.compile(r"frame_(\d+)")
+_IMAGE_FOLDERS = ("images-2x", "images-2x-73fps")
+_MATTE_FOLDERS = ("alpha_map", "alpha_map-73fps")
+_IMAGE_SUFFIXES = (".jpg", ".png")
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What one camera recorded.
+
+    Attributes
+    ----------
+    serial : of the camera.
+    video : the video, or None where the frames are image files.
+    images : image file by frame number; empty for a video.
+    count : frames there are.
+    size : (width, height).
+    matte_video, mattes : foreground coverage in the same form as the frames, where there is any.
+    """
+
+    serial: str
+    video: Path | None
+    images: Mapping[int, Path]
+    count: int
+    size: tuple[int, int]
+    matte_video: Path | None = None
+    mattes: Mapping[int, Path] | None = None
+
+    @property
+    def has_mattes(self) -> bool:
+        """Whether every frame has its foreground coverage."""
+        return self.matte_video is not None or bool(self.mattes)
+
+    @property
+    def numbers(self) -> Sequence[int]:
+        """Numbers of the frames, ascending."""
+        return range(self.count) if self.video else sorted(self.images)
+
+    @property
+    def files(self) -> list[Path]:
+        """Every file of this view."""
+        videos = [path for path in (self.video, self.matte_video) if path]
+        return [*videos, *self.images.values(), *(self.mattes or {}).values()]
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedSequence:
+    """One sequence: its views by serial, all with the same frames, and the frames that were chosen.
+
+    ``numbers`` are frame numbers of the source; timestep t of a prepared capture is ``numbers[t]``.
+    """
+
+    subject: str
+    name: str
+    folder: Path
+    views: Mapping[str, View]
+    numbers: tuple[int, ...]
+
+    @property
+    def has_mattes(self) -> bool:
+        """Whether all views have mattes."""
+        return all(view.has_mattes for view in self.views.values())
+
+
+def read_sequence(
+    participant: Participant,
+    calibration: Calibration,
+    wanted: str,
+    *,
+    cameras: Sequence[str] = (),
+    source: Source = "auto",
+    every: int | None = None,
+    cut: bool = False,
+) -> RecordedSequence:
+    """Look into a sequence and check that all of it is there.
+
+    Parameters
+    ----------
+    wanted : its name or a unique prefix.
+    cameras : serials; empty for all cameras of the calibration.
+    every : keep the frames whose number this divides; None keeps every third of videos and of the 2023 frame
+        folders, which run at 73 per second, and all images that VHAP's preprocessing wrote (25 per second).
+    cut : where cameras differ in their frames, keep those that all have, instead of an error.
+
+    Raises
+    ------
+    InputError
+        For a camera without frames, frames without a camera, truncated videos, damaged headers, frame counts
+        that differ between cameras, mattes that are missing in part or of another size.
+    """
+    name = participant.match(wanted)
+    folder = participant.sequences[name]
+    serials = [*cameras] or calibration.serials
+    unknown = [serial for serial in serials if serial not in calibration.world_to_camera]
+    if unknown:
+        known = ", ".join(calibration.serials)
+        raise InputError(calibration.file, "world_2_cam", f"camera {unknown[0]}", f"cameras {known}")
+    views, rate = _collect(folder, serials, source)
+    stray = sorted(set(views) - set(calibration.serials))
+    if stray:
+        remedy = "Name the cameras to use."
+        expected = f"cameras that {calibration.file.name} knows"
+        raise InputError(
+            folder, stray[0], expected, "a recording of another camera", "" if cameras else remedy
+        )
+    views = {serial: _checked(folder, views.get(serial), serial, source) for serial in serials}
+    common = _common_numbers(folder, views, cut)
+    step = every or rate
+    if step < 1:
+        raise InputError("command line", "every", "a number from 1", f"{step}")
+    return RecordedSequence(
+        participant.subject, name, folder, views, tuple(n for n in common if n % step == 0)
+    )
+
+
+def _collect(folder: Path, serials: Sequence[str], source: Source) -> tuple[dict[str, View], int]:
+    """Unchecked views by serial (sizes still unknown), and which frames to keep by default."""
+    nested = _frame_folders(folder)
+    if nested and source != "video":
+        return nested, EVERY_OF_73
+    images = _numbered_views(folder, serials)
+    with_mattes = bool(images) and all(view.mattes for view in images.values())
+    if images and (source == "images" or (source == "auto" and with_mattes)):
+        return images, 1
+    videos = _videos(folder)
+    if videos and source != "images":
+        return videos, EVERY_OF_73
+    if images and source == "auto":
+        return images, 1
+    expected = "cam_SERIAL.mp4, images/cam_SERIAL.mp4, images/cam_SERIAL_000000.jpg or frame_00000/images-2x"
+    if source != "auto":
+        expected += f", as source={source} asks"
+    raise InputError(folder, "", expected, "none of them")
+
+
+def _videos(folder: Path) -> dict[str, View]:
+    views: dict[str, View] = {}
+    for parent in (folder, folder / "images"):
+        for path in sorted(parent.glob("cam_*.mp4")):
+            if serial := serial_of(path.stem, "cam"):
+                matte = folder / "alpha_maps" / path.name
+                views[serial] = View(serial, path, {}, 0, (0, 0), matte if matte.exists() else None)
+    return views
+
+
+def _numbered_views(folder: Path, serials: Sequence[str]) -> dict[str, View]:
+    """Views of VHAP's preprocessing; it drops the serial where it ran on one camera."""
+    images = _numbered(folder / "images", serials)
+    mattes = _numbered(folder / "alpha_maps", serials)
+    return {s: View(s, None, files, len(files), (0, 0), None, mattes.get(s)) for s, files in images.items()}
+
+
+def _numbered(folder: Path, serials: Sequence[str]) -> dict[str, dict[int, Path]]:
+    found: dict[str, dict[int, Path]] = {}
+    for path in sorted(folder.iterdir()) if folder.is_dir() else ():
+        parsed = numbered(path.stem) if path.suffix.lower() in _IMAGE_SUFFIXES else None
+        if parsed is None:
+            continue
+        serial = parsed[0] or (serials[0] if len(serials) == 1 else "")
+        if not serial:
+            expected = "names with a serial, cam_SERIAL_000000, or one camera to give them to"
+            raise InputError(path, "", expected, f"{len(serials)} cameras", "Name the camera they are of.")
+        found.setdefault(serial, {})[parsed[1]] = path
+    return found
+
+
+def _frame_folders(folder: Path) -> dict[str, View]:
+    """Views of the 2023 release: a folder per frame."""
+    images: dict[str, dict[int, Path]] = {}
+    mattes: dict[str, dict[int, Path]] = {}
+    for frame in sorted(folder.glob("frame_*")):
+        match = _FRAME_FOLDER.fullmatch(frame.name)
+        if match is None:
+            continue
+        for names, target in ((_IMAGE_FOLDERS, images), (_MATTE_FOLDERS, mattes)):
+            for path in (path for name in names for path in sorted((frame / name).glob("cam_*.png"))):
+                if serial := serial_of(path.stem, "cam"):
+                    target.setdefault(serial, {})[int(match[1])] = path
+    return {s: View(s, None, files, len(files), (0, 0), None, mattes.get(s)) for s, files in images.items()}
+
+
+def _checked(folder: Path, view: View | None, serial: str, source: Source) -> View:
+    """The view with its size and count, after a look at every file's header."""
+    if view is None:
+        kind = "a video" if source == "video" else "frames"
+        remedy = "Fetch them, or name the cameras to use."
+        raise InputError(
+            folder, f"camera {serial}", f"{kind}, as the calibration has this camera", "none", remedy
+        )
+    if view.video is not None:
+        count, size = probe_video(view.video)
+        if view.matte_video is not None:
+            _same_matte(view.matte_video, probe_video(view.matte_video), (count, size))
+        return replace(view, count=count, size=size)
+    size = _image_size(view.images.values())
+    if view.mattes:
+        missing = sorted(set(view.images) - set(view.mattes))
+        if missing:
+            path = view.images[missing[0]]
+            raise InputError(path, "", f"a matte for each of {view.count} images", f"{len(missing)} without")
+        mattes = {number: view.mattes[number] for number in view.images}
+        _same_matte(mattes[min(mattes)], (view.count, _image_size(mattes.values())), (view.count, size))
+        return replace(view, size=size, mattes=mattes)
+    return replace(view, size=size)
+
+
+def probe_video(path: Path) -> tuple[int, tuple[int, int]]:
+    """Frames that a video's index declares, and (width, height). Raises `InputError` for a broken file."""
+    check_boxes(path)
+    capture = open_video(path)
+    try:
+        count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        size = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
+    finally:
+        capture.release()
+    if count < 1 or min(size) < 1:
+        found = f"{count} frames of {size[0]}x{size[1]} pixels"
+        raise InputError(path, "", "a video with frames", found)
+    return count, size
+
+
+def open_video(path: Path) -> cv2.VideoCapture:
+    """Open a video on one decoding thread: streams run side by side. Raises `InputError` where it will not."""
+    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, 1])
+    if not capture.isOpened():
+        raise InputError(path, "", "a video that OpenCV can decode", "one it cannot open")
+    return capture
+
+
+def _image_size(files: Iterable[Path]) -> tuple[int, int]:
+    first: tuple[int, int] | None = None
+    for path in files:
+        info = probe_image(path)
+        size = info.width, info.height
+        if size != (first := first or size):
+            expected = f"{first[0]}x{first[1]} pixels, as other images of this camera"
+            raise InputError(path, "", expected, f"{size[0]}x{size[1]}")
+    assert first is not None, "a view has images"
+    return first
+
+
+def _same_matte(path: Path, matte: tuple[int, tuple[int, int]], frames: tuple[int, tuple[int, int]]) -> None:
+    for key, found, expected in (("frames", matte[0], frames[0]), ("size", matte[1], frames[1])):
+        if found != expected:
+            remedy = "Make mattes of the very frames."
+            raise InputError(path, key, f"{expected}, as the camera's frames", f"{found}", remedy)
+
+
+def _common_numbers(folder: Path, views: Mapping[str, View], cut: bool) -> list[int]:
+    numbers = {serial: tuple(view.numbers) for serial, view in views.items()}
+    groups = Counter(numbers.values())
+    if len(groups) > 1 and not cut:
+        usual = groups.most_common(1)[0][0]
+        odd = {serial: len(own) for serial, own in numbers.items() if own != usual}
+        listed = ", ".join(f"{count} for camera {serial}" for serial, count in odd.items())
+        raise InputError(
+            folder,
+            "frames",
+            f"the same frames for all cameras, {len(usual)} as most have",
+            listed,
+            "Fetch the file again, or keep what all cameras have with --cut.",
+        )
+    common = set.intersection(*(set(own) for own in numbers.values()))
+    if not common:
+        raise InputError(folder, "frames", "frames that all cameras have", "none")
+    return sorted(common)
