@@ -76,8 +76,8 @@ HEADBENCH_INLINE void sum_moments(const Batch<Absolute>& batch, const Block& blo
   const Real mx = fma(1.5f, plain[3] - plain[0], Real(0.5f) * (plain[2] - plain[1]));
   const Real my = (by_y[0] + by_y[3]) + (by_y[1] + by_y[2]);
   const Real mxy = fma(1.5f, by_y[3] - by_y[0], Real(0.5f) * (by_y[2] - by_y[1]));
-  const Real ox = Real(static_cast<float>(block.left) + 0.5f * kBlockWidth) - load(batch.mean_x);
-  const Real oy = Real(static_cast<float>(block.top) + 0.5f * kBlockHeight) - load(batch.mean_y);
+  const Real ox = Real(static_cast<float>(block.x) + 0.5f * kBlockWidth) - load(batch.mean_x);
+  const Real oy = Real(static_cast<float>(block.y) + 0.5f * kBlockHeight) - load(batch.mean_y);
   const Real dx = fma(ox, m, mx), dy = fma(oy, m, my);
   out[kSum] = m;
   out[kSumX] = dx;
@@ -172,7 +172,7 @@ inline void composite_block_backward(const Chunk& chunk, int index, const Block&
   int used = 0;
   for (int i = chunk.listed[index] - 1; i >= 0; --i) {
     const float* row = chunk.params + list[i] * chunk.stride;
-    const Mask reached = start >= Real(row[kGeometry + count]);
+    const Mask reached = start >= Real(row[kIndex]);
     const Alpha a = alpha_of(row, block);
     const Mask drawn = a.passes & reached;
     if (!any(drawn)) continue;
@@ -275,7 +275,7 @@ inline void draw_tile_backward_with(const View& view, const Splats& splats, cons
     for (int i = 0; i < (end - begin) * stride; i += W) store(sums + i, 0.0f);
     if (wanted) {
       Chunk chunk;
-      fill_chunk(splats, frame, pairs, begin, end, wanted, chunk_scratch, chunk);
+      fill_chunk(view, splats, frame, tile, begin, end, wanted, chunk_scratch, chunk);
       for (int b = 0; b < kBlocks; ++b)
         if (chunk.listed[b])
           composite_block_backward<C, Absolute>(chunk, b, block_of(view, tile, b), channels, states + b * state_floats,

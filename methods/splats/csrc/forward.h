@@ -43,7 +43,7 @@ inline bool composite_block(const Chunk& chunk, int index, const Block& block, i
       const Real weight = zero_unless(open_lanes, alpha * running);
       for (int c = 0; c < count; ++c) colors[c] = fma(weight, row[kGeometry + c], colors[c]);
       remaining = select(open_lanes, next, remaining);
-      last = select(open_lanes & a.passes, row[kGeometry + count], last);
+      last = select(open_lanes & a.passes, row[kIndex], last);
       running = next;
     }
     open = any(running > stop);
@@ -95,12 +95,11 @@ inline void draw_tile_with(const View& view, const Splats& splats, const FrameDa
   }
   const std::uint64_t drawn = open;
 
-  const Pair* pairs = frame.pairs + frame.tile_begin[tile];
   const int count = static_cast<int>(frame.tile_begin[tile + 1] - frame.tile_begin[tile]);
   for (int begin = 0; begin < count && open; begin += kChunk) {
     const int end = begin + kChunk < count ? begin + kChunk : count;
     Chunk chunk;
-    fill_chunk(splats, frame, pairs, begin, end, open, chunk_scratch, chunk);
+    fill_chunk(view, splats, frame, tile, begin, end, open, chunk_scratch, chunk);
     for (int b = 0; b < kBlocks; ++b) {
       if (!chunk.listed[b]) continue;
       if (!composite_block<C>(chunk, b, block_of(view, tile, b), channels, states + b * state_floats))

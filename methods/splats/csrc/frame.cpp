@@ -101,13 +101,13 @@ void Frame::list_visible(std::int64_t count) {
   std::uint32_t* visible = visible_.resize(static_cast<std::size_t>(count));
   for (std::int64_t splat = 0; splat < count; ++splat) {
     visible[visible_count_] = static_cast<std::uint32_t>(splat);
-    visible_count_ += data_.depths[splat] > 0.0f;
+    visible_count_ += data_.depths[splat] > 0.0;
   }
   data_.visible = visible;
 }
 
-// Radix sort, stable: splats at one depth keep the order of their indices. Depths are positive, so that their bits
-// sort as whole numbers do.
+// Stable: splats at one depth keep the order of their indices. A radix sort by depth rounded to float32, positive, so
+// that its bits sort as whole numbers do; then what is equal in float32 is sorted by the depth itself.
 void Frame::sort_by_depth() {
   constexpr int kBits = 11, kPasses = 3, kBins = 1 << kBits;
   const std::size_t count = static_cast<std::size_t>(visible_count_);
@@ -117,7 +117,8 @@ void Frame::sort_by_depth() {
   std::vector<std::uint32_t> bins(kPasses * kBins, 0);
   for (std::size_t i = 0; i < count; ++i) {
     values[i] = data_.visible[i];
-    std::memcpy(&keys[i], &data_.depths[values[i]], sizeof(float));
+    const float rounded = static_cast<float>(data_.depths[values[i]]);
+    std::memcpy(&keys[i], &rounded, sizeof rounded);
     for (int pass = 0; pass < kPasses; ++pass) ++bins[pass * kBins + (keys[i] >> (kBits * pass) & (kBins - 1))];
   }
   for (int pass = 0; pass < kPasses; ++pass) {
@@ -131,6 +132,13 @@ void Frame::sort_by_depth() {
     }
     std::swap(keys, next_keys);
     std::swap(values, next_values);
+  }
+  for (std::size_t begin = 0, end; begin < count; begin = end) {
+    for (end = begin + 1; end < count && keys[end] == keys[begin];) ++end;
+    if (end - begin > 1)
+      std::stable_sort(values + begin, values + end, [this](std::uint32_t a, std::uint32_t b) {
+        return data_.depths[a] < data_.depths[b];
+      });
   }
   // An odd number of passes ends in the other buffer.
   static_assert(kPasses % 2 == 1);

@@ -3,7 +3,7 @@
 //   forward   project (splats) -> sort by depth -> find pairs (splats) -> draw (tiles)
 //   backward  draw backward (tiles), a record for every pair -> gather and project backward (splats)
 //
-// Memory, with N splats, C <= 10 channels, P pairs, R >= P tiles in the splats' bounding rectangles: 92 N + 16 (P + R) +
+// Memory, with N splats, C <= 8 channels, P pairs, R >= P tiles in the splats' bounding rectangles: 96 N + 16 (P + R) +
 // 8 pixels bytes while drawing, of which 76 N + 16 P + 8 pixels are kept for the backward pass, and 64 R more during that
 // pass alone. Up to workspace::kKeptMax of it is kept for the frames to come.
 //
@@ -88,7 +88,8 @@ class Frame {
   const bool has_offset_;
   FrameData data_{};
   std::int64_t visible_count_ = 0;
-  Buffer<float> records_, depths_, transmittances_, last_;
+  Buffer<float> records_, transmittances_, last_;
+  Buffer<double> depths_;
   Buffer<Rect> rects_;
   Buffer<EntryRange> ranges_;
   Buffer<Entry> entries_;

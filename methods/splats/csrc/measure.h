@@ -8,19 +8,18 @@ namespace headbench::HEADBENCH_ISA {
 // Count the work of drawing a tile that was drawn before.
 inline void count_work(const View& view, const Splats& splats, const FrameData& frame, int tile, float* scratch,
                        Work& work) {
-  const Pair* pairs = frame.pairs + frame.tile_begin[tile];
   const int count = static_cast<int>(frame.tile_begin[tile + 1] - frame.tile_begin[tile]);
   for (int begin = 0; begin < count; begin += kChunk) {
     const int end = begin + kChunk < count ? begin + kChunk : count;
     Chunk chunk;
-    fill_chunk(splats, frame, pairs, begin, end, ~std::uint64_t{0}, scratch, chunk);
+    fill_chunk(view, splats, frame, tile, begin, end, ~std::uint64_t{0}, scratch, chunk);
     for (int b = 0; b < kBlocks; ++b) {
       const Block block = block_of(view, tile, b);
       if (!any(block.inside)) continue;  // never drawn, so that nothing is stored of it
       const Real last = load(frame.last + static_cast<std::size_t>(tile) * kTilePixels + b * W);
       for (int i = 0; i < chunk.listed[b]; ++i) {
         const float* row = chunk.params + chunk.list[b * kChunk + i] * chunk.stride;
-        const Mask reached = last >= Real(row[kGeometry + splats.channels]);
+        const Mask reached = last >= Real(row[kIndex]);
         if (!any(reached)) break;
         alignas(64) float drawn[W];
         store(drawn, zero_unless(alpha_of(row, block).passes & reached, 1.0f));

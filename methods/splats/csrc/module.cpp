@@ -58,7 +58,7 @@ const Stages& stages_by_name(const std::string& name) {
   throw std::invalid_argument("instruction set " + name + " is not available here");
 }
 
-View make_view(const Array<const float, 4, 4>& viewmat, const Array<const float, 3, 3>& K, float near, float far,
+View make_view(const Array<const float, 4, 4>& viewmat, const Array<const float, 3, 3>& K, double near, double far,
                float eps2d, bool antialiased, std::size_t width, std::size_t height) {
   View view{};
   for (int i = 0; i < 3; ++i) {
@@ -87,7 +87,7 @@ std::unique_ptr<Frame> forward(const Array<const float, -1, 3>& means, const Arr
                                const Array<const float, -1, 3>& scales, const Array<const float, -1>& opacities,
                                const Array<const float, -1, -1>& colors, const Array<const float, -1, 2>& offset,
                                const Array<const float, -1>& background, const Array<const float, 4, 4>& viewmat,
-                               const Array<const float, 3, 3>& K, float near, float far, float eps2d,
+                               const Array<const float, 3, 3>& K, double near, double far, float eps2d,
                                bool antialiased, const Array<float, -1, -1, -1>& image, const Array<float, -1, -1>& alpha,
                                const Array<std::int32_t, -1>& radii, const std::string& instruction_set,
                                int threads) {

@@ -28,11 +28,39 @@ HEADBENCH_INLINE void load_lane(const Splats& splats, std::int64_t splat, int la
   for (int k = 0; k < 2; ++k) out.offset[k][lane] = splats.offset ? splats.offset[2 * splat + k] : 0.0f;
 }
 
+// W splats' means as the camera sees them, in float64: splats are drawn in the order of z, and where float32 would make
+// two of them equal, whole pixels would show the wrong one in front.
+struct CameraLanes {
+  alignas(64) double x[W], y[W], z[W], ratio_x[W], ratio_y[W];  // ratios to z
+};
+
+HEADBENCH_INLINE void to_camera(const View& view, const SplatLanes& in, CameraLanes& out) {
+  double r[9], t[3];
+  for (int k = 0; k < 9; ++k) r[k] = view.rotation[k];
+  for (int k = 0; k < 3; ++k) t[k] = view.translation[k];
+  for (int lane = 0; lane < W; ++lane) {
+    const double x = in.mean[0][lane], y = in.mean[1][lane], z = in.mean[2][lane];
+    out.x[lane] = r[0] * x + r[1] * y + r[2] * z + t[0];
+    out.y[lane] = r[3] * x + r[4] * y + r[5] * z + t[1];
+    out.z[lane] = r[6] * x + r[7] * y + r[8] * z + t[2];
+  }
+  for (int lane = 0; lane < W; ++lane) {
+    const double inv_z = 1.0 / out.z[lane];
+    out.ratio_x[lane] = out.x[lane] * inv_z;
+    out.ratio_y[lane] = out.y[lane] * inv_z;
+  }
+}
+
+HEADBENCH_INLINE Real load_rounded(const double* p) {
+  alignas(64) float rounded[W];
+  for (int lane = 0; lane < W; ++lane) rounded[lane] = static_cast<float>(p[lane]);
+  return load(rounded);
+}
+
 // Every intermediate value the derivative needs.
 struct Projection {
   Real mean[3], scale[3];
-  Real x, y, z, inv_z;
-  Real mean_x, mean_y;
+  Real inv_z, ratio_x, ratio_y;
   Real slope_x, slope_y;
   Mask free_x, free_y;  // slope not clamped
   Real quat[4], inv_norm;
@@ -70,30 +98,21 @@ HEADBENCH_INLINE void cross3(const Real* a, const Real* b, Real* out) {
 
 HEADBENCH_INLINE Real absolute(Real a) { return max(a, Real(0.0f) - a); }
 
-inline void project_lanes(const View& view, const SplatLanes& in, Projection& p) {
+inline void project_lanes(const View& view, const SplatLanes& in, const CameraLanes& camera, Projection& p) {
   for (int k = 0; k < 3; ++k) p.mean[k] = load(in.mean[k]);
   for (int k = 0; k < 3; ++k) p.scale[k] = load(in.scale[k]);
-  Real camera[3];
-  for (int k = 0; k < 3; ++k) {
-    const float* r = view.rotation + 3 * k;
-    camera[k] = fma(r[0], p.mean[0], fma(r[1], p.mean[1], fma(r[2], p.mean[2], view.translation[k])));
-  }
-  p.x = camera[0];
-  p.y = camera[1];
-  p.z = camera[2];
-  p.inv_z = Real(1.0f) / p.z;
-  const Real ratio_x = p.x * p.inv_z, ratio_y = p.y * p.inv_z;
-  p.mean_x = fma(view.fx, ratio_x, view.cx) + load(in.offset[0]);
-  p.mean_y = fma(view.fy, ratio_y, view.cy) + load(in.offset[1]);
+  p.inv_z = Real(1.0f) / load_rounded(camera.z);
+  p.ratio_x = load_rounded(camera.ratio_x);
+  p.ratio_y = load_rounded(camera.ratio_y);
 
   const float margin_x = kFrustumMargin * 0.5f * view.width / view.fx;
   const float margin_y = kFrustumMargin * 0.5f * view.height / view.fy;
   const Real low_x = -view.cx / view.fx - margin_x, high_x = (view.width - view.cx) / view.fx + margin_x;
   const Real low_y = -view.cy / view.fy - margin_y, high_y = (view.height - view.cy) / view.fy + margin_y;
-  p.free_x = (ratio_x >= low_x) & (high_x >= ratio_x);
-  p.free_y = (ratio_y >= low_y) & (high_y >= ratio_y);
-  p.slope_x = min(max(ratio_x, low_x), high_x);
-  p.slope_y = min(max(ratio_y, low_y), high_y);
+  p.free_x = (p.ratio_x >= low_x) & (high_x >= p.ratio_x);
+  p.free_y = (p.ratio_y >= low_y) & (high_y >= p.ratio_y);
+  p.slope_x = min(max(p.ratio_x, low_x), high_x);
+  p.slope_y = min(max(p.ratio_y, low_y), high_y);
 
   // Dividing by the largest component first keeps every square in range; true divisions, because the largest
   // must become exactly 1 for the test below.
@@ -145,8 +164,16 @@ inline void project(const View& view, const Splats& splats, const FrameData& fra
     const int used = static_cast<int>(end - first < W ? end - first : W);
     SplatLanes in;
     for (int lane = 0; lane < W; ++lane) load_lane(splats, first + (lane < used ? lane : 0), lane, in);
+    CameraLanes camera;
+    to_camera(view, in, camera);
     Projection p;
-    project_lanes(view, in, p);
+    project_lanes(view, in, camera, p);
+    alignas(64) double mean_x[W], mean_y[W];
+    for (int lane = 0; lane < W; ++lane) {
+      mean_x[lane] = view.fx * camera.ratio_x[lane] + view.cx + in.offset[0][lane];
+      mean_y[lane] = view.fy * camera.ratio_y[lane] + view.cy + in.offset[1][lane];
+    }
+    const Real x = load_rounded(mean_x), y = load_rounded(mean_y);
 
     Real opacity = load(in.opacity);
     if (view.antialiased) opacity = opacity * sqrt(p.area2 / p.det);
@@ -158,40 +185,43 @@ inline void project(const View& view, const Splats& splats, const FrameData& fra
     const Real extent_x = sqrt(level * p.xx), extent_y = sqrt(level * p.yy);
     const Real reach_x = ceil(extent_x), reach_y = ceil(extent_y), radius = max(reach_x, reach_y);
     // All conditions positive: a NaN anywhere culls.
-    const Mask in_depth = (p.z > Real(view.near)) & (Real(view.far) > p.z);
-    const Mask in_image = (p.mean_x + reach_x > Real(0.0f)) & (p.mean_y + reach_y > Real(0.0f)) &
-                          (Real(static_cast<float>(view.width)) > p.mean_x - reach_x) &
-                          (Real(static_cast<float>(view.height)) > p.mean_y - reach_y);
+    const Mask in_image = (x + reach_x > Real(0.0f)) & (y + reach_y > Real(0.0f)) &
+                          (Real(static_cast<float>(view.width)) > x - reach_x) &
+                          (Real(static_cast<float>(view.height)) > y - reach_y);
     const Real largest = 3e38f;
     const Mask drawable = (p.det > Real(0.0f)) & (largest > p.det) & (largest > p.l11) &
                           (Real(kRadiusMax) > radius) & (opacity >= Real(kAlphaMin));
 
-    alignas(64) float visible[W], field[kGeometry][W], depth[W], reach[W], half_x[W], half_y[W];
-    store(visible, zero_unless(in_depth & in_image & drawable, 1.0f));
-    store(field[kMeanX], p.mean_x);
-    store(field[kMeanY], p.mean_y);
+    alignas(64) float visible[W], field[kGeometry][W], reach[W], half_x[W], half_y[W];
+    store(visible, zero_unless(in_image & drawable, 1.0f));
+    store(field[kMeanX], x);
+    store(field[kMeanY], y);
+    for (int lane = 0; lane < W; ++lane) {
+      field[kRestX][lane] = static_cast<float>(mean_x[lane] - field[kMeanX][lane]);
+      field[kRestY][lane] = static_cast<float>(mean_y[lane] - field[kMeanY][lane]);
+    }
     store(field[kL11], p.l11);
     store(field[kL21], p.l21);
     store(field[kL22], p.l22);
     store(field[kLog2Opacity], log2_opacity);
-    store(depth, p.z);
     store(reach, radius);
     store(half_x, extent_x);
     store(half_y, extent_y);
     for (int lane = 0; lane < used; ++lane) {
       const std::int64_t splat = first + lane;
-      if (visible[lane] == 0.0f) {
-        frame.depths[splat] = 0.0f;
+      const bool in_depth = camera.z[lane] > view.near && camera.z[lane] < view.far;
+      if (!in_depth || visible[lane] == 0.0f) {
+        frame.depths[splat] = 0.0;
         frame.radii[splat] = 0;
         continue;
       }
-      frame.depths[splat] = depth[lane];
+      frame.depths[splat] = camera.z[lane];
       frame.radii[splat] = static_cast<std::int32_t>(reach[lane]);
-      const float x = field[kMeanX][lane], y = field[kMeanY][lane];
       // A tenth of a pixel covers rounding; tiles that turn out untouched are dropped when pairs are found.
       const float w = half_x[lane] + 0.1f, h = half_y[lane] + 0.1f;
-      frame.rects[splat] = {tile_of(x - w, view.tiles_x), tile_of(y - h, view.tiles_y), tile_of(x + w, view.tiles_x),
-                            tile_of(y + h, view.tiles_y)};
+      const float center_x = field[kMeanX][lane], center_y = field[kMeanY][lane];
+      frame.rects[splat] = {tile_of(center_x - w, view.tiles_x), tile_of(center_y - h, view.tiles_y),
+                            tile_of(center_x + w, view.tiles_x), tile_of(center_y + h, view.tiles_y)};
       float* record = frame.records + splat * frame.record_stride;
       for (int k = 0; k < kGeometry; ++k) record[k] = field[k][lane];
       for (int c = 0; c < splats.channels; ++c) record[kGeometry + c] = splats.colors[splat * splats.channels + c];

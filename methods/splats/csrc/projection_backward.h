@@ -85,7 +85,7 @@ inline void project_lanes_backward(const View& view, const Projection& p, const 
   Real dcamera[3];
   dcamera[0] = dratio_x * p.inv_z;
   dcamera[1] = dratio_y * p.inv_z;
-  dcamera[2] = Real(0.0f) - p.inv_z * fma(dcamera[0], p.x, fma(dcamera[1], p.y, shrink));
+  dcamera[2] = Real(0.0f) - p.inv_z * fma(dratio_x, p.ratio_x, fma(dratio_y, p.ratio_y, shrink));
 
   Real daxes[9];
   for (int i = 0; i < 3; ++i) {
@@ -109,8 +109,8 @@ inline void project_lanes_backward(const View& view, const Projection& p, const 
   const Real inv_fx = 1.0f / view.fx, inv_fy = 1.0f / view.fy;
   const Real limit_x = inv_fx * (dslope_x - zero_unless(p.free_x, dslope_x));
   const Real limit_y = inv_fy * (dslope_y - zero_unless(p.free_y, dslope_y));
-  view_gradient[12] = fnma(limit_x, p.slope_x, fma(out.mean2d[0], p.x * p.inv_z, grow_x * inv_fx));
-  view_gradient[13] = fnma(limit_y, p.slope_y, fma(out.mean2d[1], p.y * p.inv_z, grow_y * inv_fy));
+  view_gradient[12] = fnma(limit_x, p.slope_x, fma(out.mean2d[0], p.ratio_x, grow_x * inv_fx));
+  view_gradient[13] = fnma(limit_y, p.slope_y, fma(out.mean2d[1], p.ratio_y, grow_y * inv_fy));
   view_gradient[14] = out.mean2d[0] - limit_x;
   view_gradient[15] = out.mean2d[1] - limit_y;
 }
@@ -148,8 +148,10 @@ inline void project_backward(const View& view, const Splats& splats, const Frame
         for (int k = 0; k < kAbsolutes; ++k) absolutes[k][lane] = sum[kMoments + channels + k];
     }
 
+    CameraLanes camera;
+    to_camera(view, in, camera);
     Projection p;
-    project_lanes(view, in, p);
+    project_lanes(view, in, camera, p);
     Real lanes[kMoments], view_lanes[kViewGradient];
     for (int k = 0; k < kMoments; ++k) lanes[k] = load(moments[k]);
     SplatGradients g;

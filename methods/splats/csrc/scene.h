@@ -22,8 +22,10 @@ constexpr float kQuaternionMin = 1e-12f;
 constexpr float kRadiusMax = 16777216.0f;
 constexpr int kChannelsMax = 32;
 
-// A record holds what drawing needs of a splat: kGeometry numbers, then the colour.
-enum RecordField { kMeanX, kMeanY, kL11, kL21, kL22, kLog2Opacity, kGeometry };
+// A record holds what drawing needs of a splat: kGeometry numbers, then the colour. A mean is the sum of a float and
+// a rest below its last digit: hundreds of pixels from the image's corner one float would be off by 3e-5 pixels, which
+// shows in sharp splats.
+enum RecordField { kMeanX, kMeanY, kL11, kL21, kL22, kLog2Opacity, kRestX, kRestY, kGeometry };
 
 // A gradient record holds moments of the alpha gradient over pixels, then the gradient of the colour, then, where they
 // are asked for, two sums that become the absolute gradient of the 2D mean.
@@ -36,7 +38,8 @@ constexpr int kViewGradient = 16;
 struct View {
   float rotation[9], translation[3];
   float fx, fy, cx, cy;
-  float near, far, eps2d;
+  double near, far;
+  float eps2d;
   bool antialiased;  // opacities are multiplied by the square root of the ratio of determinants without and with eps2d
   int width, height;
   int tiles_x, tiles_y;
@@ -82,7 +85,7 @@ struct Pair {
 struct FrameData {
   int record_stride;             // floats per record
   float* records;                // (N, record_stride), set for visible splats
-  float* depths;                 // (N,) camera z, 0 where culled
+  double* depths;                // (N,) camera z, 0 where culled
   std::int32_t* radii;           // (N,)
   Rect* rects;                   // (N,)
   EntryRange* ranges;            // (N,) set for visible splats

@@ -17,23 +17,28 @@ static_assert(kBlocks <= 64, "Pair::blocks has 64 bits");
 constexpr int kChunk = 256;
 
 struct Block {
-  int left, top;         // of the block, pixels
-  Real pixel_x, pixel_y;  // centres
+  int left, top;          // of the block, pixels of the image
+  int x, y;               // the same within the tile
+  Real pixel_x, pixel_y;  // centres within the tile
   Mask inside;            // lanes inside the image
 };
 
 HEADBENCH_INLINE Block block_of(const View& view, int tile, int index) {
   Block b;
-  b.left = tile % view.tiles_x * kTile + index % kColumns * kBlockWidth;
-  b.top = tile / view.tiles_x * kTile + index / kColumns * kBlockHeight;
+  const int tile_left = tile % view.tiles_x * kTile, tile_top = tile / view.tiles_x * kTile;
+  b.x = index % kColumns * kBlockWidth;
+  b.y = index / kColumns * kBlockHeight;
+  b.left = tile_left + b.x;
+  b.top = tile_top + b.y;
   alignas(64) float x[W], y[W];
   for (int lane = 0; lane < W; ++lane) {
-    x[lane] = static_cast<float>(b.left + lane % kBlockWidth) + 0.5f;
-    y[lane] = static_cast<float>(b.top + lane / kBlockWidth) + 0.5f;
+    x[lane] = static_cast<float>(b.x + lane % kBlockWidth) + 0.5f;
+    y[lane] = static_cast<float>(b.y + lane / kBlockWidth) + 0.5f;
   }
   b.pixel_x = load(x);
   b.pixel_y = load(y);
-  b.inside = (Real(static_cast<float>(view.width)) > b.pixel_x) & (Real(static_cast<float>(view.height)) > b.pixel_y);
+  b.inside = (Real(static_cast<float>(view.width - tile_left)) > b.pixel_x) &
+             (Real(static_cast<float>(view.height - tile_top)) > b.pixel_y);
   return b;
 }
 
@@ -48,24 +53,31 @@ HEADBENCH_INLINE int lowest_bit(std::uint64_t bits) {
 #endif
 }
 
+// A row of a chunk's parameters is the splat's record with the mean counted from the tile's corner, where a float
+// resolves it, and in place of its rest the index in the tile's list.
+constexpr int kIndex = kRestX;
+
 // A chunk of a tile's list: parameters side by side, and for every block the chunk's splats that reach it.
 struct Chunk {
   int stride;          // floats per row of params
-  float* params;       // (kChunk, stride): record, then the index in the tile's list
+  float* params;       // (kChunk, stride)
   std::uint16_t* list;  // (kBlocks, kChunk) rows of params
   int listed[kBlocks];
 };
 
-// Floats per row of parameters: a record and the index.
-inline int param_stride(int channels) { return (kGeometry + channels + 1 + 3) / 4 * 4; }
+// Floats per row of parameters.
+constexpr int param_stride(int channels) { return (kGeometry + channels + 3) / 4 * 4; }
 
 inline std::size_t chunk_floats(int channels) {
   return static_cast<std::size_t>(kChunk) * param_stride(channels) + kBlocks * kChunk / 2;
 }
 
 // Fill the chunk with pairs [begin, end) of the tile's list, for the blocks in `wanted`.
-inline void fill_chunk(const Splats& splats, const FrameData& frame, const Pair* tile_pairs, int begin, int end,
+inline void fill_chunk(const View& view, const Splats& splats, const FrameData& frame, int tile, int begin, int end,
                        std::uint64_t wanted, float* scratch, Chunk& chunk) {
+  const Pair* tile_pairs = frame.pairs + frame.tile_begin[tile];
+  const float left = static_cast<float>(tile % view.tiles_x * kTile);
+  const float top = static_cast<float>(tile / view.tiles_x * kTile);
   chunk.stride = param_stride(splats.channels);
   chunk.params = scratch;
   chunk.list = reinterpret_cast<std::uint16_t*>(scratch + kChunk * chunk.stride);
@@ -80,7 +92,9 @@ inline void fill_chunk(const Splats& splats, const FrameData& frame, const Pair*
     const float* record = frame.records + static_cast<std::size_t>(tile_pairs[i].splat) * frame.record_stride;
     float* row = chunk.params + (i - begin) * chunk.stride;
     for (int k = 0; k < used; ++k) row[k] = record[k];
-    row[used] = static_cast<float>(i);
+    row[kMeanX] = (record[kMeanX] - left) + record[kRestX];
+    row[kMeanY] = (record[kMeanY] - top) + record[kRestY];
+    row[kIndex] = static_cast<float>(i);
     for (; blocks; blocks &= blocks - 1) {
       const int b = lowest_bit(blocks);
       chunk.list[b * kChunk + chunk.listed[b]++] = static_cast<std::uint16_t>(i - begin);
