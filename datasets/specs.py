@@ -7,6 +7,7 @@ GA_LAYOUT = DatasetSpec(
     summary="A capture in the GaussianAvatars/VHAP layout: a UNION folder or a single sequence.",
     implementation="headbench.datasets.ga_reader:read_capture",
     find="headbench.datasets.ga_reader:find_captures",
+    adapt="headbench.datasets.steps.for_method:clip_for_method",
 )
 
 SYNTHETIC = DatasetSpec(

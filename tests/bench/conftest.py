@@ -10,4 +10,6 @@ def toy(monkeypatch):
     import toy_plugin
 
     toy_plugin.FITS.clear()
+    toy_plugin.ADAPTED.clear()
+    toy_plugin.WORKLOAD_SIZES.clear()
     return toy_plugin

@@ -1,11 +1,14 @@
 """A reader, three methods and three metrics small enough to see through, for the harness's own tests."""
 
-from dataclasses import dataclass
+import copy
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 
+from headbench.bench.adaptation import AdaptedClip
 from headbench.bench.contracts import (
     Camera,
     DatasetSpec,
@@ -15,8 +18,9 @@ from headbench.bench.contracts import (
     Measurement,
     MethodSpec,
     MetricSpec,
+    StepRecord,
 )
-from headbench.bench.errors import UnavailableError
+from headbench.bench.errors import InputError, UnavailableError
 
 SIZE = (8, 6)  # width, height
 
@@ -71,6 +75,45 @@ def find(root):
 READER = DatasetSpec("toy", "toy captures", "toy_plugin:read", find="toy_plugin:find")
 
 
+ADAPTED: list[str] = []
+
+
+def adapt(clip, needs, heads):
+    """Twice the size, timesteps numbered from 100 on, darker poses: everything a method could be given anew."""
+    if "impossible" in needs.head_models:
+        raise InputError(f"clip {clip.subject}", "head_models", "another head model", "none")
+
+    def work(folder, progress):
+        ADAPTED.append(clip.subject)
+        changed = copy.copy(clip)
+        changed.head = SimpleNamespace(version=(*needs.head_models, "toy")[0])
+        changed.fingerprint = f"{clip.fingerprint}-adapted"
+        changed.steps = (*clip.steps, StepRecord("adapt", {"heads": dict(heads)}, clip.fingerprint))
+        reduction = needs.resolution.divide
+        if reduction > 1:
+            sizes = [side // reduction for side in SIZE]
+            changed.cameras = {name: camera.resized(*sizes) for name, camera in clip.cameras.items()}
+            changed.image = lambda key: clip.image(key)[::reduction, ::reduction]
+            return AdaptedClip(changed)
+        size = needs.resolution.size or SIZE
+        changed.cameras = {name: camera.resized(*size) for name, camera in clip.cameras.items()}
+        changed.poses = {
+            100 + t: replace(pose, expression=pose.expression + 0.5) for t, pose in clip.poses.items()
+        }
+        changed.splits = {name: tuple(renumbered(key) for key in keys) for name, keys in clip.splits.items()}
+        step = size[0] // SIZE[0]
+        return AdaptedClip(changed, renumbered, lambda key, render: render[::step, ::step])
+
+    return work
+
+
+def renumbered(key):
+    return key._replace(timestep=100 + key.timestep)
+
+
+ADAPTING_READER = replace(READER, adapt="toy_plugin:adapt")
+
+
 @dataclass(frozen=True)
 class ToyConfig:
     level: float = 0.5
@@ -88,6 +131,14 @@ class ToyAvatar:
 
     def files(self):
         return [self.path / "level.txt"]
+
+
+class MirrorAvatar(ToyAvatar):
+    """Shows the expression coefficient it is driven with."""
+
+    def render(self, camera, pose, background=(1.0, 1.0, 1.0)):
+        rgb = np.full((camera.height, camera.width, 3), pose.expression[0], np.float32)
+        return Frame(rgb, np.ones(rgb.shape[:2], np.float32))
 
 
 FITS: list[str] = []
@@ -111,6 +162,11 @@ class ToyMethod:
         return ToyAvatar(path)
 
 
+class MirrorMethod(ToyMethod):
+    def load(self, path, *, device):
+        return MirrorAvatar(path)
+
+
 class PeekingMethod(ToyMethod):
     def fit(self, clip, out, budget, **arguments):
         clip.image(clip.splits["train"][0])
@@ -119,6 +175,9 @@ class PeekingMethod(ToyMethod):
 
 
 PRESETS = {"smoke": {"budget": {"iterations": 2}}, "fast": {"budget": {"iterations": 9}, "level": 0.25}}
+MIRROR = MethodSpec(
+    "mirror", "the driving signal", "toy_plugin:MirrorMethod", "toy_plugin:ToyConfig", PRESETS
+)
 METHOD = MethodSpec("toy", "one grey level", "toy_plugin:ToyMethod", "toy_plugin:ToyConfig", PRESETS)
 SAME_NAME = MethodSpec("toy", "another of that name", "toy_plugin:ToyMethod", "toy_plugin:ToyConfig", PRESETS)
 PEEKING = MethodSpec(
@@ -137,8 +196,12 @@ def not_here(image, truth):
     raise UnavailableError("The toy weights are not here.", "Put them there.")
 
 
+WORKLOAD_SIZES: set[tuple[int, int]] = set()
+
+
 def files_in_avatar(avatar, workload):
     assert all(a is not b for a, b in pairwise(workload))
+    WORKLOAD_SIZES.update((camera.width, camera.height) for camera, _ in workload)
     return Measurement(float(len(avatar.files())), {"frames": len(workload)})
 
 

@@ -1,0 +1,197 @@
+"""Alignment to a method's image size: where points land, that it can be undone, what clips look like after it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from headbench.bench.contracts import Camera, ResolutionRule
+from headbench.bench.errors import InputError
+from headbench.datasets.ga_reader import read_capture
+from headbench.datasets.steps.resolution import Alignment, Box, align_clip, scale_camera, take_box
+
+WHITE = (1.0, 1.0, 1.0)
+RULES = {
+    "reduced": ResolutionRule(divide=4),
+    "enlarged": ResolutionRule(multiply=3),
+    "native input of 2K": ResolutionRule(divide=4, multiply=4),
+    "square": ResolutionRule(square="pad", size=(512, 512)),
+    "cropped": ResolutionRule(square="crop", size=(300, 300)),
+    "uneven": ResolutionRule(size=(123, 287)),
+    "remainder": ResolutionRule(divide=3),
+}
+
+
+def view(width=240, height=344):
+    K = np.array([[700.0, 0, 117.3], [0, 705.0, 180.9], [0, 0, 1]])
+    return Camera("c", width, height, K, np.eye(4))
+
+
+def project(camera, point):
+    x, y, z = camera.K @ np.asarray(point)
+    return np.array([x / z, y / z])
+
+
+def disc(camera, point, radius):
+    """A dark disc at a point's projection on white, its rim a pixel soft: coverage by 8x8 samples per pixel."""
+    centre = project(camera, point)
+    samples = (np.arange(8) + 0.5) / 8
+    y = (np.arange(camera.height)[:, None] + samples).ravel()
+    x = (np.arange(camera.width)[:, None] + samples).ravel()
+    inside = (x[None] - centre[0]) ** 2 + (y[:, None] - centre[1]) ** 2 < radius**2
+    coverage = inside.reshape(camera.height, 8, camera.width, 8).mean((1, 3))
+    return np.repeat((1 - 0.8 * coverage)[..., None], 3, axis=2).astype(np.float32)
+
+
+def centroid(image):
+    darkness = (1 - image.astype(float)).mean(axis=2)
+    y, x = np.mgrid[: image.shape[0], : image.shape[1]] + 0.5
+    return np.array([(darkness * x).sum(), (darkness * y).sum()]) / darkness.sum()
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_a_disc_lands_where_the_aligned_camera_projects_its_centre(name):
+    point = (0.0137, -0.0211, 1.0)
+    camera = view()
+    image = disc(camera, point, 21.3)
+    assert np.abs(centroid(image) - project(camera, point)).max() < 0.01
+    plan = Alignment.of((camera.width, camera.height), RULES[name])
+    aligned = plan.camera(camera)
+    moved = plan.image(image, WHITE)
+    assert moved.shape == (aligned.height, aligned.width, 3)
+    assert (aligned.width, aligned.height) == plan.aligned_size
+    assert np.abs(centroid(moved) - project(aligned, point)).max() < 0.01
+    assert np.abs(centroid(plan.restore(moved, WHITE)) - project(camera, point)).max() < 0.01
+
+
+def test_half_a_pixel_of_offset_would_be_seen():
+    """The measurement above is sharp enough: the other convention for pixel centres misses by more."""
+    camera, point = view(), (0.0137, -0.0211, 1.0)
+    plan = Alignment.of((camera.width, camera.height), RULES["reduced"])
+    aligned = plan.camera(camera)
+    wrong = replace(aligned, K=aligned.K + np.array([[0, 0, 0.375], [0, 0, 0.375], [0, 0, 0]]))
+    moved = plan.image(disc(camera, point, 21.3), WHITE)
+    assert np.abs(centroid(moved) - project(wrong, point)).max() > 0.3
+
+
+def test_padding_to_a_square_is_undone_to_the_bit():
+    image = np.random.default_rng(0).random((40, 27, 3)).astype(np.float32)
+    plan = Alignment.of((27, 40), ResolutionRule(square="pad"))
+    padded = plan.image(image, (0.2, 0.4, 0.6))
+    assert padded.shape == (40, 40, 3)
+    assert padded[0, 0] == pytest.approx([0.2, 0.4, 0.6])
+    assert np.array_equal(plan.restore(padded, WHITE), image)
+
+
+def test_a_crop_gives_back_background_where_it_cut():
+    image = np.zeros((10, 6, 3), np.float32)
+    plan = Alignment.of((6, 10), ResolutionRule(square="crop"))
+    restored = plan.restore(plan.image(image, WHITE), WHITE)
+    assert restored[:, 0, 0].tolist() == [1, 1, 0, 0, 0, 0, 0, 0, 1, 1]
+
+
+def test_enlarging_is_undone_by_block_means():
+    """What a method renders four times as large is scored by the mean of each block."""
+    plan = Alignment.of((30, 20), ResolutionRule(multiply=4))
+    render = np.random.default_rng(1).random((80, 120, 3)).astype(np.float32)
+    expected = render.reshape(20, 4, 30, 4, 3).mean((1, 3))
+    assert np.abs(plan.restore(render, WHITE) - expected).max() < 1e-6
+
+
+def test_values_stay_in_range_where_the_cubic_overshoots():
+    image = np.zeros((8, 8, 3), np.float32)
+    image[:, 4:] = 1
+    plan = Alignment.of((8, 8), ResolutionRule(multiply=4))
+    aligned = plan.image(image, WHITE)
+    assert aligned.min() >= 0
+    assert aligned.max() <= 1
+
+
+def test_a_rule_that_changes_nothing_moves_nothing():
+    assert Alignment.of((64, 64), ResolutionRule(square="pad", size=(64, 64))).moves == ()
+
+
+def test_a_box_outside_the_image_is_background():
+    box = take_box(np.zeros((3, 3, 1), np.float32), Box(5, 5, 2, 2), (0.5,))
+    assert (box == 0.5).all()
+
+
+def test_wrong_sizes_are_refused():
+    plan = Alignment.of((30, 20), ResolutionRule(multiply=2))
+    with pytest.raises(InputError, match="render, size: expected 60x40, found 30x20"):
+        plan.restore(np.zeros((20, 30, 3), np.float32), WHITE)
+    with pytest.raises(InputError, match="camera c"):
+        plan.camera(view())
+    with pytest.raises(InputError, match="at least 50 pixels"):
+        Alignment.of((30, 60), ResolutionRule(divide=50))
+    with pytest.raises(InputError, match="factor"):
+        scale_camera(view(), 0.0)
+
+
+def test_scaling_a_camera_goes_to_whole_pixels():
+    scaled = scale_camera(view(241, 344), 0.25)
+    assert (scaled.width, scaled.height) == (60, 86)
+    assert scaled.K[0, 0] == pytest.approx(700 * 60 / 241)
+
+
+# ------------------------------------------------------------------ clips
+
+
+@pytest.fixture(scope="module")
+def clip(pristine_capture):
+    return read_capture(pristine_capture.union)
+
+
+def test_a_clip_is_resized_when_read(clip):
+    aligned = align_clip(clip, ResolutionRule(divide=2))
+    key = clip.splits["train"][3]
+    image, mask = aligned.image(key), aligned.mask(key)
+    truth = clip.image(key).reshape(32, 2, 24, 2, 3).astype(float).mean((1, 3))
+    assert image.dtype == np.uint8
+    assert np.abs(image - truth).max() <= 0.5 + 1e-4
+    assert np.abs(mask - clip.mask(key).reshape(32, 2, 24, 2).astype(float).mean((1, 3))).max() <= 0.5 + 1e-4
+    camera, before = aligned.cameras[key.camera], clip.cameras[key.camera]
+    assert (camera.width, camera.height) == (24, 32)
+    assert camera.K[:2] == pytest.approx(before.K[:2] / 2)
+    assert not image.flags.writeable
+    assert aligned.image(key) is image
+
+
+def test_the_step_is_on_record_and_changes_the_fingerprint(clip):
+    half, third = (align_clip(clip, ResolutionRule(divide=n)) for n in (2, 3))
+    assert len({clip.fingerprint, half.fingerprint, third.fingerprint}) == 3
+    step = half.steps[-1]
+    assert step.name == "align_resolution"
+    assert step.input_fingerprint == clip.fingerprint
+    assert step.parameters["rule"]["divide"] == 2
+    assert step.parameters["sizes"] == ["48x64 to 24x32"]
+
+
+def test_a_rule_without_effect_gives_the_clip_itself(clip):
+    assert align_clip(clip, ResolutionRule()) is clip
+    assert align_clip(clip, ResolutionRule(size=(48, 64), speed_size=(9, 9))) is clip
+
+
+def test_two_alignments_round_once(clip):
+    key = clip.splits["train"][0]
+    twice = align_clip(align_clip(clip, ResolutionRule(divide=4)), ResolutionRule(multiply=4))
+    once = align_clip(clip, ResolutionRule(divide=4, multiply=4))
+    assert np.array_equal(twice.image(key), once.image(key))
+    assert twice.cameras[key.camera].K == pytest.approx(once.cameras[key.camera].K)
+
+
+def test_memory_stays_bounded(pristine_capture):
+    clip = read_capture(pristine_capture.union, cache_mb=0.2)
+    aligned = align_clip(clip, ResolutionRule(multiply=2))
+    for key in clip.splits["train"]:
+        aligned.image(key)
+        assert aligned.store.held_bytes <= 200_000
+
+
+def test_padding_has_no_coverage(clip):
+    aligned = align_clip(clip, ResolutionRule(square="pad"))
+    key = clip.splits["train"][0]
+    assert aligned.mask(key).shape == (64, 64)
+    assert not aligned.mask(key)[:, :8].any()
+    assert (aligned.image(key)[:, :8] == 255).all()
+    assert np.array_equal(aligned.image(key)[:, 8:56], clip.image(key))

@@ -1,0 +1,88 @@
+"""Resizing against the definition of its kernel, block means, other libraries and properties."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from skimage.transform import downscale_local_mean
+
+from headbench.bench.errors import InputError
+from headbench.datasets.resampling import resize_image
+
+RNG = np.random.default_rng(7)
+
+
+def keys_cubic(x):
+    """Keys (1981), equation 4 with a = -1/2."""
+    x = np.abs(x)
+    near = 1.5 * x**3 - 2.5 * x**2 + 1
+    far = -0.5 * x**3 + 2.5 * x**2 - 4 * x + 2
+    return np.where(x < 1, near, np.where(x < 2, far, 0))
+
+
+def weights(before, after):
+    """(after, before) float64: the widened kernel at pixel centres, renormalised at the border."""
+    widening = max(1.0, before / after)
+    centres = (np.arange(after)[:, None] + 0.5) * before / after
+    values = keys_cubic((np.arange(before) + 0.5 - centres) / widening)
+    return values / values.sum(axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize(("width", "height"), [(40, 48), (13, 17), (31, 9), (20, 41), (25, 24)])
+def test_the_cubic_kernel_is_the_one_documented(width, height):
+    image = RNG.random((24, 20, 3)).astype(np.float32)
+    expected = np.einsum("yi,ijc,xj->yxc", weights(24, height), image.astype(float), weights(20, width))
+    assert np.abs(resize_image(image, width, height) - expected).max() < 2e-6
+
+
+def test_whole_factors_give_means_of_blocks():
+    image = RNG.random((48, 36, 3)).astype(np.float32)
+    expected = downscale_local_mean(image.astype(float), (4, 3, 1))
+    assert np.abs(resize_image(image, 12, 12) - expected).max() < 2e-7
+    assert resize_image(image[..., 0], 12, 12).shape == (12, 12)
+
+
+def test_reduced_by_four_and_enlarged_again_a_ramp_is_exact_inside():
+    y, x = np.mgrid[:64, :96] + 0.5
+    ramp = (0.1 + 0.004 * x + 0.007 * y).astype(np.float32)
+    again = resize_image(resize_image(ramp, 24, 16), 96, 64)
+    # The cubic reaches two reduced pixels, eight of these.
+    assert np.abs(again - ramp)[8:-8, 8:-8].max() < 1e-6
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(1, 60), st.integers(1, 60), st.floats(0, 1))
+def test_a_constant_stays_constant(width, height, value):
+    image = np.full((23, 31, 3), value, np.float32)
+    resized = resize_image(image, width, height)
+    assert resized.shape == (height, width, 3)
+    assert np.abs(resized - np.float32(value)).max() < 1e-6
+
+
+def test_mirroring_commutes_with_resizing():
+    """No shift: the kernels are centred on pixel centres."""
+    image = RNG.random((37, 41)).astype(np.float32)
+    for size in ((17, 12), (83, 90)):
+        mirrored = resize_image(image[::-1, ::-1], *size)[::-1, ::-1]
+        assert np.abs(mirrored - resize_image(image, *size)).max() < 2e-6
+
+
+def test_what_is_finer_than_the_pixels_does_not_alias():
+    stripes = np.broadcast_to((np.arange(300) % 2).astype(np.float32), (20, 300))
+    inner = resize_image(np.ascontiguousarray(stripes), 110, 20)[:, 8:-8]
+    assert np.abs(inner - 0.5).max() < 0.02  # dropping pixels instead would give 0 and 1
+
+
+@pytest.mark.parametrize(
+    ("image", "size"),
+    [
+        (np.zeros((4, 4), np.uint8), (2, 2)),
+        (np.zeros((4,), np.float32), (2, 2)),
+        (np.zeros((0, 4), np.float32), (2, 2)),
+        (np.zeros((4, 4), np.float32), (0, 2)),
+        (np.zeros((4, 4), np.float32), (2, 10**6)),
+    ],
+)
+def test_nonsense_is_refused(image, size):
+    with pytest.raises(InputError, match="resize"):
+        resize_image(image, *size)
