@@ -1,0 +1,76 @@
+"""Rigid motion of the head against skinned vertices, and its move into the camera."""
+
+import numpy as np
+import pytest
+import torch
+
+from headbench.bench.contracts import Camera, HeadPose
+from headbench.bench.errors import InputError
+from headbench.datasets.head.head_frame import BATCH, camera_in_head_frame, pose_in_head_frame, rigid_motions
+from headbench.datasets.head.model import HeadModel
+
+from .toy import toy_head
+
+
+@pytest.fixture(scope="module")
+def head():
+    return toy_head(16)
+
+
+def make_poses(head, count, seed=0, version="toy"):
+    rng = np.random.default_rng(seed)
+    return [
+        HeadPose(
+            version,
+            rng.normal(size=head.expression_basis.shape[2]),
+            rng.normal(size=3),
+            rng.normal(size=3),
+            0.2 * rng.normal(size=3),
+            0.1 * rng.normal(size=6),
+            rng.normal(size=3),
+        )
+        for _ in range(count)
+    ]
+
+
+def test_motions_carry_rigid_vertices_from_the_head_frame_to_the_world(head):
+    """By the whole model, for more poses than one batch holds; the neck's correctives are left out of it."""
+    rng = np.random.default_rng(1)
+    shape, offset = rng.normal(size=6), 0.002 * rng.normal(size=head.template.shape)
+    poses = make_poses(head, BATCH + 3)
+    motions = rigid_motions(head, shape, offset, poses)
+    assert motions.shape == (BATCH + 3, 4, 4)
+    model = HeadModel(head, dtype=torch.float64)
+    model.pose_matrix[:9] = 0
+    canonical = model.canonical(torch.tensor(shape), torch.tensor(offset))
+    rigid = head.skinning_weights[:, 1] > 1 - 1e-9
+
+    def vertices(poses):
+        return model(canonical=canonical, **model.pose_arguments(poses)).numpy()[:, rigid]
+
+    world = vertices(poses)
+    local = vertices([pose_in_head_frame(pose) for pose in poses])
+    carried = local @ motions[:, :3, :3].transpose(0, 2, 1) + motions[:, None, :3, 3]
+    assert np.abs(carried - world).max() < 1e-12
+
+
+def test_a_moved_camera_sees_the_head_frame_as_it_saw_the_world(head):
+    motion = rigid_motions(head, np.zeros(6), np.zeros_like(head.template), make_poses(head, 1))[0]
+    world_to_camera = np.eye(4)
+    world_to_camera[:3, 3] = [0.1, -0.2, 1.5]
+    camera = Camera("c", 10, 10, np.eye(3), world_to_camera)
+    moved = camera_in_head_frame(camera, motion)
+    point = np.array([0.03, 0.01, 0.08, 1.0])
+    assert moved.world_to_camera @ point == pytest.approx(world_to_camera @ (motion @ point))
+    assert (moved.id, moved.width) == ("c", 10)
+
+
+def test_without_motion_nothing_moves(head):
+    pose = pose_in_head_frame(make_poses(head, 1)[0])
+    motion = rigid_motions(head, np.ones(6), np.zeros_like(head.template), [pose])
+    assert motion[0] == pytest.approx(np.eye(4), abs=1e-15)
+
+
+def test_poses_of_another_head_model_are_refused(head):
+    with pytest.raises(InputError, match="head_model"):
+        rigid_motions(head, np.zeros(6), np.zeros_like(head.template), make_poses(head, 1, version="other"))

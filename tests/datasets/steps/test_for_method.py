@@ -1,0 +1,188 @@
+"""From what a method declares to the clip it gets: which steps run, in which order, and the way back."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from headbench.bench.adaptation import MethodNeeds, plan
+from headbench.bench.contracts import ResolutionRule, no_progress
+from headbench.bench.errors import InputError
+from headbench.datasets.ga_reader import read_capture
+from headbench.datasets.head.arrays import save_head
+from headbench.datasets.specs import GA_LAYOUT
+from headbench.datasets.steps import kept_refit
+from headbench.datasets.steps.for_method import clip_for_method
+
+from ..head.toy import toy_head
+
+OTHER = toy_head(16, version="other", expression_size=5, shape_size=4, eyelids=True)
+
+
+@pytest.fixture(scope="module")
+def clip(pristine_capture):
+    return read_capture(pristine_capture.union)
+
+
+@pytest.fixture
+def heads(tmp_path):
+    save_head(tmp_path / "other.npz", OTHER)
+    return {"other": str(tmp_path / "other.npz")}
+
+
+CALLS: list[str] = []
+
+
+def pretend_refit(clip, target, progress=no_progress):
+    """Stands in for the optimiser: coefficients that tell timesteps apart."""
+    CALLS.append(clip.subject)
+    poses = {
+        t: replace(
+            pose,
+            head_model=target.version,
+            expression=np.full(target.expression_basis.shape[2], t / 7),
+            eyelids=np.array([0.1, t / 3]),
+        )
+        for t, pose in clip.poses.items()
+    }
+    return clip.derive(
+        "pretend_refit",
+        {"target": target.version, "worst_mm": 0.1},
+        head=target,
+        shape=np.arange(target.shape_basis.shape[2]) / 3,
+        static_offset=np.zeros_like(target.template),
+        poses=poses,
+    )
+
+
+@pytest.fixture
+def refit(monkeypatch):
+    CALLS.clear()
+    monkeypatch.setattr(kept_refit, "resolve", lambda name: pretend_refit)
+    return CALLS
+
+
+def adapted(clip, folder, heads=None, **needs):
+    return clip_for_method(clip, MethodNeeds(**needs), heads or {})(folder, no_progress)
+
+
+def test_the_reader_names_it_and_a_method_without_needs_never_comes_here(clip):
+    assert GA_LAYOUT.adapt
+    assert plan(clip, MethodNeeds(), GA_LAYOUT, {}) is None
+    assert plan(clip, MethodNeeds(head_models=(clip.head.version,)), GA_LAYOUT, {}) is None
+    assert plan(clip, MethodNeeds(monocular=True), GA_LAYOUT, {}) is not None
+
+
+def test_needs_that_change_nothing_give_the_clip_itself(clip, tmp_path):
+    form = adapted(clip, tmp_path, resolution=ResolutionRule(speed_size=(64, 64)))
+    key = clip.splits["novel_view"][0]
+    assert form.clip is clip
+    assert form.key(key) == key
+    render = np.random.default_rng(0).random((64, 48, 3)).astype(np.float32)
+    assert np.array_equal(form.restore(key, render), render)
+
+
+def test_all_steps_in_their_order(clip, tmp_path, heads, refit):
+    form = adapted(
+        clip,
+        tmp_path / "kept",
+        heads,
+        head_models=("other",),
+        monocular=True,
+        resolution=ResolutionRule(square="pad", size=(128, 128)),
+    )
+    added = [step.name for step in form.clip.steps[len(clip.steps) :]]
+    assert added == ["pretend_refit", "align_resolution", "as_single_video"]
+    for key in [*clip.splits["train"], *clip.splits["self_reenactment"]]:
+        own = form.key(key)
+        pose, camera = form.clip.poses[own.timestep], form.clip.cameras[own.camera]
+        assert pose.head_model == "other"
+        assert pose.expression[0] == key.timestep / 7
+        assert (camera.width, camera.height) == (128, 128)
+        image = form.clip.image(own)
+        assert image.shape == (128, 128, 3)
+        # Twice as large and back: what a perfect method would be scored with.
+        back = form.restore(key, image.astype(np.float32) / 255)
+        assert (
+            np.abs(255 * back - clip.image(key)).mean() < 12
+        )  # noise of 52 levels, cubic and means soften it
+        assert back.shape == (64, 48, 3)
+
+
+def test_a_refit_is_kept_and_read_back_to_the_bit(clip, tmp_path, heads, refit):
+    first = adapted(clip, tmp_path, heads, head_models=("other",)).clip
+    (kept,) = tmp_path.glob("refit-*.npz")
+    before = kept.read_bytes()
+    second = adapted(clip, tmp_path, heads, head_models=("other",)).clip
+    assert len(refit) == 1
+    assert kept.read_bytes() == before
+    assert first.fingerprint == second.fingerprint
+    direct = pretend_refit(clip, OTHER)
+    assert first.fingerprint == direct.fingerprint
+    assert first.steps[-1].parameters == {"target": "other", "worst_mm": 0.1}
+    for t, pose in direct.poses.items():
+        for name in ("expression", "rotation", "neck", "jaw", "eyes", "translation", "eyelids"):
+            assert np.array_equal(getattr(second.poses[t], name), getattr(pose, name))
+        assert second.poses[t].timestep == t
+    assert np.array_equal(second.shape, direct.shape)
+
+
+def test_a_refit_of_another_clip_is_another_file(clip, tmp_path, heads, refit):
+    adapted(clip, tmp_path, heads, head_models=("other",))
+    changed = clip.derive("some step", {})
+    adapted(changed, tmp_path, heads, head_models=("other",))
+    assert len(refit) == 2
+
+
+@pytest.mark.parametrize(
+    ("damage", "match"),
+    [
+        (lambda content: content.pop("jaw"), "jaw: expected finite numbers"),
+        (lambda content: content["shape"].fill(np.nan), "shape: expected finite"),
+        (lambda content: content.update(timesteps=content["timesteps"] + 1), "those of the clip"),
+        (lambda content: content.update(steps=np.array("[]")), "at least one step"),
+        (lambda content: content.update(steps=np.array("{")), "the steps of a refit"),
+    ],
+)
+def test_a_damaged_refit_is_refused(clip, tmp_path, heads, refit, damage, match):
+    adapted(clip, tmp_path, heads, head_models=("other",))
+    (kept,) = tmp_path.glob("refit-*.npz")
+    with np.load(kept) as archive:
+        content = dict(archive)
+    damage(content)
+    np.savez(kept, **content)
+    with pytest.raises(InputError, match=match):
+        adapted(clip, tmp_path, heads, head_models=("other",))
+
+
+def test_the_file_of_a_refit_that_is_cut_off_is_refused(clip, tmp_path, heads, refit):
+    adapted(clip, tmp_path, heads, head_models=("other",))
+    (kept,) = tmp_path.glob("refit-*.npz")
+    kept.write_bytes(kept.read_bytes()[:-200])
+    with pytest.raises(InputError, match="unreadable content"):
+        adapted(clip, tmp_path, heads, head_models=("other",))
+
+
+def test_what_cannot_be_done_is_said_before_any_work(clip, heads, tmp_path):
+    with pytest.raises(InputError, match=r"--set heads.flame2020=PATH"):
+        clip_for_method(clip, MethodNeeds(head_models=("flame2020",)), heads)
+    with pytest.raises(InputError, match="expected 'flame2020', found 'other'"):
+        clip_for_method(clip, MethodNeeds(head_models=("flame2020",)), {"flame2020": heads["other"]})
+    with pytest.raises(InputError, match="no such file"):
+        clip_for_method(clip, MethodNeeds(head_models=("x",)), {"x": str(Path(tmp_path) / "none.npz")})
+    with pytest.raises(InputError, match="at least 60 pixels"):
+        clip_for_method(clip, MethodNeeds(resolution=ResolutionRule(divide=60)), {})
+
+
+def test_the_procedural_heads_need_no_file(clip, monkeypatch):
+    from headbench.datasets.steps import for_method
+
+    made = []
+    monkeypatch.setattr(for_method, "procedural_head", lambda version: made.append(version) or OTHER)
+    procedural = replace(clip, head=replace(clip.head, version="procedural2023"))
+    needs = MethodNeeds(head_models=("flame2020", "procedural2020"))
+    clip_for_method(procedural, needs, {})
+    assert made == ["procedural2020"]
+    with pytest.raises(InputError, match="head_models"):
+        clip_for_method(clip, needs, {})  # a FLAME capture is not refitted to the procedural head
