@@ -139,6 +139,8 @@ class OursConfig:
     penalty_face_mm, penalty_other_mm, penalty_other_weight : surface displacement under which opacity may not
         change, in the face region and elsewhere, and the weight elsewhere.
     balanced_sampling, expression_classes : draw images so that each class of expressions has an equal share.
+    expression_compatibility : "" parts the classes the same way every time and needs no comparison of all pairs of
+        timesteps; "tga" parts them as the published code does. Both see training timesteps alone.
     """
 
     splats: SplatTraining = field(default_factory=SplatTraining)
@@ -164,6 +166,7 @@ class OursConfig:
     penalty_other_weight: float = 10.0
     balanced_sampling: bool = True
     expression_classes: int = 16
+    expression_compatibility: Literal["", "tga"] = ""
 
     def __post_init__(self) -> None:
         if self.plane_resolution < 2 or self.line_resolution < 2:

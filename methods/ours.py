@@ -13,6 +13,7 @@ import numpy as np
 from ..bench.contracts import Budget, Clip, Progress
 from ..datasets.head.regions import faces_in_region
 from ..datasets.steps.expression_clusters import cluster_expressions
+from ..datasets.steps.jaw_bases import leaks
 from .avatar_files import (
     SUBJECT_FILE,
     Subject,
@@ -73,7 +74,14 @@ class Ours:
         self._write(out, training, appearance)
         write_subject(out / SUBJECT_FILE, subject)
         save_shared_head(out, clip.head)
-        write_record(out, run, outcome, splats=len(training.binding), jaw_bases=len(appearance.jaw_bases))
+        write_record(
+            out,
+            run,
+            outcome,
+            splats=len(training.binding),
+            jaw_bases=len(appearance.jaw_bases),
+            leaks=leaks(config.jaw_compatibility) if len(appearance.jaw_bases) else (),
+        )
         (out / CHECKPOINT).unlink(missing_ok=True)
         return self.load(out, device=device)
 
@@ -85,7 +93,12 @@ class Ours:
         keys = clip.splits["train"]
         if not self.config.balanced_sampling:
             return ShuffledEpochs(len(keys), seed)
-        clusters = cluster_expressions(clip, self.config.expression_classes, seed=seed)
+        clusters = cluster_expressions(
+            clip,
+            self.config.expression_classes,
+            seed=seed,
+            compatibility=self.config.expression_compatibility,
+        )
         timesteps = np.array([key.timestep for key in keys])
         return Weighted(balanced_weights(timesteps, clusters.by_timestep), seed)
 

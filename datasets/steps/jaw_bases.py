@@ -28,6 +28,11 @@ TGA_TEST_STRIDE = 16
 """The published code takes every 16th test frame: with 16 cameras, each timestep once."""
 
 
+def leaks(compatibility: str) -> tuple[str, ...]:
+    """What of the test signal the bases have seen; for records that stand beside results."""
+    return ("jaw bases drawn from held-out poses (published behaviour)",) if compatibility == "tga" else ()
+
+
 def jaw_quaternions(poses: Sequence[HeadPose]) -> FloatArray:
     """(N, 4) unit quaternions, real part first, of the poses' jaw rotations."""
     rotations = Rotation.from_rotvec(np.array([pose.jaw for pose in poses], dtype=np.float64).reshape(-1, 3))

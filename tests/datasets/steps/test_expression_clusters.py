@@ -1,23 +1,23 @@
-"""Expression classes against brute force and constructed groups."""
+"""Expression classes against constructed groups and the method of all pairs."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
-import torch
+from sklearn.cluster import SpectralClustering
 from sklearn.metrics import adjusted_rand_score
 
 from headbench.bench.errors import InputError
-from headbench.datasets.head.model import HeadModel
+from headbench.datasets.procedural.model import procedural_head
 from headbench.datasets.steps import expression_clusters as module
-from headbench.datasets.steps.expression_clusters import (
-    cluster_by_distance,
-    cluster_expressions,
-    expression_displacements,
-    mean_vertex_distances,
-)
+from headbench.datasets.steps.expression_clusters import cluster_by_distance, cluster_expressions
+from headbench.datasets.steps.face_distances import expression_displacements, mean_vertex_distances
+from headbench.datasets.steps.spectral import similarities
+from headbench.datasets.synthetic.geometry import load_geometry
+from headbench.datasets.synthetic.performance import HELD_OUT, perform, share_out
 
 from .clips import make_clip, with_poses
 
@@ -33,62 +33,16 @@ def grouped_clip(train: int, groups: int, noise: float = 0.02):
     return with_poses(base, expression=lambda t: centres[truth[t]] + wobble[t], **still), truth[:train]
 
 
-def test_displacements_are_unposed_face_minus_neutral_with_eyes_doubled():
-    clip = make_clip(3)
-    found = expression_displacements(clip, [0, 1, 2])
-    model = HeadModel(clip.head, dtype=torch.float64)
-    shape, offset = torch.from_numpy(clip.shape), torch.from_numpy(clip.static_offset)
-    zero = torch.zeros(3, dtype=torch.float64)
-    face, eyes = clip.head.regions["face"], set(clip.head.regions["eye_region"].tolist())
-    assert 0 < len(eyes & set(face.tolist())) < len(face)
-    for t in range(3):
-        parts = {n: torch.from_numpy(getattr(clip.poses[t], n)) for n in ("expression", "jaw", "eyes")}
-        still = {n: torch.zeros_like(value) for n, value in parts.items()}
-        common = {
-            "shape": shape,
-            "static_offset": offset,
-            "rotation": zero,
-            "neck": zero,
-            "translation": zero,
-        }
-        difference = (model(**common, **parts) - model(**common, **still))[0].numpy()
-        for column, vertex in enumerate(face):
-            weight = 2 if int(vertex) in eyes else 1
-            np.testing.assert_allclose(found[t, column], weight * difference[vertex], atol=2e-7)
-
-
-def test_rigid_motion_does_not_matter():
-    clip = make_clip(5)
-    moved = with_poses(
-        clip, rotation=lambda t: np.ones(3), neck=lambda t: np.ones(3), translation=lambda t: np.ones(3)
-    )
-    np.testing.assert_array_equal(
-        expression_displacements(moved, [0, 3]), expression_displacements(clip, [0, 3])
-    )
-
-
-@pytest.mark.parametrize("counts", [(5, 4), (130, 300), (1, 1)])
-def test_distances_equal_brute_force_across_blocks(counts):
-    rng = np.random.default_rng(0)
-    one, other = (rng.normal(size=(n, 7, 3)).astype(np.float32) for n in counts)
-    expected = np.linalg.norm(one[:, None].astype(float) - other[None].astype(float), axis=3).mean(axis=2)
-    np.testing.assert_allclose(mean_vertex_distances(one, other), expected, rtol=2e-6)
-    within = mean_vertex_distances(one)
-    np.testing.assert_allclose(
-        within,
-        np.linalg.norm(one[:, None].astype(float) - one[None], axis=3).mean(axis=2),
-        rtol=2e-6,
-        atol=1e-7,
-    )
-    np.testing.assert_array_equal(within, within.T)
-
-
-def test_small_distances_keep_their_digits():
-    """Neighbouring frames differ by micrometres, a millionth of a face's size."""
-    mesh = np.random.default_rng(0).normal(size=(1, 50, 3)).astype(np.float32) * 0.1
-    near = mesh + np.float32(1e-6) * np.array([1, 0, 0], np.float32)
-    expected = np.linalg.norm((near.astype(float) - mesh.astype(float))[0], axis=1).mean()
-    np.testing.assert_allclose(mean_vertex_distances(mesh, near)[0, 0], expected, rtol=1e-5)
+@cache
+def performance_clip(seed):
+    """300 training timesteps as a subject of the synthetic capture performs them."""
+    translate = load_geometry("procedural").translation.pose
+    poses = []
+    for name, count in share_out(360).items():
+        if name != HELD_OUT:
+            poses += [translate(moment, "s", 0) for moment in perform(name, count, seed).activations]
+    clip = make_clip(300, test=1, head=procedural_head())
+    return replace(clip, poses={t: replace(poses[min(t, 299)], timestep=t) for t in range(301)})
 
 
 def test_separate_groups_become_the_classes():
@@ -99,23 +53,79 @@ def test_separate_groups_become_the_classes():
     assert clusters.by_timestep[7] == clusters.labels[7]
 
 
-def test_landmarks_give_the_same_classes_without_all_pairs(monkeypatch):
-    clip, truth = grouped_clip(150, 4)
+@pytest.mark.parametrize("noise", [0.0, 0.02])
+def test_landmarks_give_the_same_classes_without_all_pairs(monkeypatch, noise):
+    clip, truth = grouped_clip(150, 4, noise)
     exact = cluster_expressions(clip, 4)
-    sizes = []
-    original = module.mean_vertex_distances
+    shapes = []
+    original = module.nystrom_embedding
 
-    def spy(*meshes):
-        result = original(*meshes)
-        sizes.append(result.size)
-        return result
+    def spy(columns, *arguments):
+        shapes.append(columns.shape)
+        return original(columns, *arguments)
 
-    monkeypatch.setattr(module, "mean_vertex_distances", spy)
+    def refuse(_):
+        raise AssertionError("all pairs compared")
+
+    monkeypatch.setattr(module, "nystrom_embedding", spy)
+    monkeypatch.setattr(module, "mean_vertex_distances", refuse)
     approximate = cluster_expressions(clip, 4, limit=40)
     assert (
         adjusted_rand_score(exact.labels, approximate.labels) == 1 == adjusted_rand_score(truth, exact.labels)
     )
-    assert max(sizes) <= max(40 * 40, module._ITEM_BLOCK * 40) < 150 * 150
+    assert approximate.landmarks <= 40
+    assert shapes == ([(150, approximate.landmarks)] if noise else [(150, 4)])
+    assert exact.landmarks == 150
+    assert exact.radius == 0
+    assert (approximate.radius > 0) == (noise > 0)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_landmarks_agree_with_all_pairs_better_than_the_published_method_with_itself(seed):
+    """300 performed timesteps, half of them landmarks; adjusted Rand index."""
+    clip = performance_clip(seed)
+    exact = cluster_expressions(clip)
+    approximate = [cluster_expressions(clip, limit=150, seed=start) for start in range(2)]
+    distances = mean_vertex_distances(expression_displacements(clip, list(range(300))))
+    affinity = similarities(distances, distances.max())
+    published = [
+        SpectralClustering(16, affinity="precomputed", random_state=start).fit_predict(affinity)
+        for start in range(3)
+    ]
+    own = [adjusted_rand_score(one, two) for i, one in enumerate(published) for two in published[:i]]
+    ours = [adjusted_rand_score(exact.labels, other.labels) for other in approximate]
+    assert np.mean(own) < 0.95  # else this compares nothing
+    assert min(ours) >= np.mean(own)
+
+
+def test_published_behaviour_is_that_of_scikit_learn():
+    clip = make_clip(50)
+    distances = mean_vertex_distances(expression_displacements(clip, list(range(50)))).astype(float)
+    expected = SpectralClustering(6, affinity="precomputed", random_state=5).fit_predict(
+        np.maximum(1 - distances / distances.max(), 1e-6)
+    )
+    found = cluster_expressions(clip, 6, seed=5, limit=10, compatibility="tga")  # all pairs nevertheless
+    assert adjusted_rand_score(expected, found.labels) == 1
+    assert found.record()["compatibility"] == "tga"
+    assert found.landmarks == 50
+
+
+def test_all_pairs_need_no_seed():
+    clip = make_clip(60)
+    first, second = (cluster_expressions(clip, 6, seed=seed).labels for seed in (0, 1))
+    np.testing.assert_array_equal(first, second)
+
+
+def test_medoids_are_members_of_their_classes_near_the_groups_centres():
+    clip, _ = grouped_clip(80, 4, noise=0.2)
+    clusters = cluster_expressions(clip, 4)
+    assert [clusters.by_timestep[t] for t in clusters.medoids.tolist()] == [0, 1, 2, 3]
+    assert clusters.record()["class_sizes"] == np.bincount(clusters.labels).tolist()
+    faces = expression_displacements(clip, list(range(80)))
+    for label, medoid in enumerate(clusters.medoids):
+        members = faces[clusters.labels == label]
+        spread = [np.linalg.norm(face - members.mean(axis=0)) for face in members]
+        assert np.linalg.norm(faces[medoid] - members.mean(axis=0)) <= np.median(spread)
 
 
 def test_held_out_poses_do_not_matter():
@@ -127,7 +137,8 @@ def test_held_out_poses_do_not_matter():
 def test_same_seed_same_classes():
     clip = make_clip(50)
     np.testing.assert_array_equal(
-        cluster_expressions(clip, 6, seed=3).labels, cluster_expressions(clip, 6, seed=3).labels
+        cluster_expressions(clip, 6, seed=3, limit=20).labels,
+        cluster_expressions(clip, 6, seed=3, limit=20).labels,
     )
 
 
@@ -139,17 +150,19 @@ def test_short_performances_have_no_more_classes_than_timesteps(train, classes):
     assert labels.max() == classes - 1
 
 
-def test_one_repeated_face_is_one_class():
+@pytest.mark.parametrize("limit", [5, 20])
+def test_one_repeated_face_is_one_class(limit):
     clip = with_poses(
         make_clip(20), expression=lambda t: np.ones(8), jaw=lambda t: np.zeros(3), eyes=lambda t: np.zeros(6)
     )
-    assert not cluster_expressions(clip).labels.any()
+    assert not cluster_expressions(clip, limit=limit).labels.any()
 
 
-def test_two_faces_are_two_classes_however_many_are_asked_for():
+@pytest.mark.parametrize("limit", [5, 20])
+def test_two_faces_are_two_classes_however_many_are_asked_for(limit):
     still = {"jaw": lambda t: np.zeros(3), "eyes": lambda t: np.zeros(6)}
     clip = with_poses(make_clip(20), expression=lambda t: np.full(8, float(t % 2)), **still)
-    labels = cluster_expressions(clip).labels
+    labels = cluster_expressions(clip, limit=limit).labels
     assert set(labels[::2]) != set(labels[1::2])
     assert len(set(labels)) == 2
 
@@ -160,7 +173,7 @@ def test_spectral_clustering_tells_rings_apart_where_nearest_means_cannot():
     for start in (0, 10):
         index = np.arange(10)
         distances[start : start + 10, start : start + 10] = np.abs(index[:, None] - index) * 0.5
-    labels = cluster_by_distance(distances, 2)
+    labels, _ = cluster_by_distance(distances, 2)
     assert len(set(labels[:10])) == len(set(labels[10:])) == 1
     assert labels[0] != labels[10]
 

@@ -1,0 +1,128 @@
+"""Face distances and farthest-point landmarks against brute force."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from headbench.bench.errors import InputError
+from headbench.datasets.head.model import HeadModel
+from headbench.datasets.steps.face_distances import (
+    expression_displacements,
+    farthest_meshes,
+    mean_vertex_distances,
+)
+
+from .clips import make_clip, with_poses
+
+
+def random_meshes(count, vertices=7, seed=0):
+    return np.random.default_rng(seed).normal(size=(count, 3, vertices)).astype(np.float32)
+
+
+def brute_force(one, other):
+    return np.linalg.norm(one[:, None].astype(float) - other[None].astype(float), axis=2).mean(axis=2)
+
+
+def test_displacements_are_unposed_face_minus_neutral_with_eyes_doubled():
+    clip = make_clip(3)
+    found = expression_displacements(clip, [0, 1, 2])
+    model = HeadModel(clip.head, dtype=torch.float64)
+    shape, offset = torch.from_numpy(clip.shape), torch.from_numpy(clip.static_offset)
+    zero = torch.zeros(3, dtype=torch.float64)
+    face, eyes = clip.head.regions["face"], set(clip.head.regions["eye_region"].tolist())
+    assert 0 < len(eyes & set(face.tolist())) < len(face)
+    for t in range(3):
+        parts = {n: torch.from_numpy(getattr(clip.poses[t], n)) for n in ("expression", "jaw", "eyes")}
+        still = {n: torch.zeros_like(value) for n, value in parts.items()}
+        common = {
+            "shape": shape,
+            "static_offset": offset,
+            "rotation": zero,
+            "neck": zero,
+            "translation": zero,
+        }
+        difference = (model(**common, **parts) - model(**common, **still))[0].numpy()
+        for column, vertex in enumerate(face):
+            weight = 2 if int(vertex) in eyes else 1
+            np.testing.assert_allclose(found[t, :, column], weight * difference[vertex], atol=2e-7)
+
+
+def test_rigid_motion_does_not_matter():
+    clip = make_clip(5)
+    moved = with_poses(
+        clip, rotation=lambda t: np.ones(3), neck=lambda t: np.ones(3), translation=lambda t: np.ones(3)
+    )
+    np.testing.assert_array_equal(
+        expression_displacements(moved, [0, 3]), expression_displacements(clip, [0, 3])
+    )
+
+
+@pytest.mark.parametrize("count", [1, 5, 16, 17, 130])
+@pytest.mark.parametrize("threads", [1, 3])
+def test_distances_equal_brute_force_across_blocks(count, threads):
+    meshes = random_meshes(count)
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        found = mean_vertex_distances(meshes)
+        landmarks = farthest_meshes(meshes, count)
+    finally:
+        torch.set_num_threads(before)
+    np.testing.assert_allclose(found, brute_force(meshes, meshes), rtol=2e-6, atol=1e-7)
+    np.testing.assert_array_equal(found, found.T)
+    np.testing.assert_allclose(
+        landmarks.distances, brute_force(meshes, meshes[landmarks.indices]), rtol=2e-6, atol=1e-7
+    )
+
+
+def test_small_distances_keep_their_digits():
+    """Neighbouring frames differ by micrometres, a millionth of a face's size."""
+    mesh = random_meshes(1, 50) * np.float32(0.1)
+    near = mesh + np.float32(1e-6) * np.array([1, 0, 0], np.float32)[:, None]
+    expected = np.linalg.norm((near.astype(float) - mesh.astype(float))[0], axis=0).mean()
+    np.testing.assert_allclose(mean_vertex_distances(np.vstack([mesh, near]))[0, 1], expected, rtol=1e-5)
+
+
+@settings(deadline=None, max_examples=40)
+@given(seed=st.integers(0, 1000), count=st.integers(1, 40), limit=st.integers(1, 45))
+def test_landmarks_are_the_farthest_points_by_definition(seed, count, limit):
+    meshes = random_meshes(count, seed=seed)
+    distances = mean_vertex_distances(meshes)
+    found = farthest_meshes(meshes, limit, seed=seed)
+    chosen = [int(found.indices[0])]
+    while len(chosen) < min(limit, count):
+        chosen.append(int(distances[chosen].min(axis=0).argmax()))
+    assert found.indices.tolist() == chosen
+    assert found.radius == distances[chosen].min(axis=0).max()
+    assert len(set(chosen)) == len(chosen)
+
+
+def test_landmarks_stop_at_the_tolerance_and_at_distinct_meshes():
+    meshes = random_meshes(6)[np.arange(60) % 6]
+    assert len(farthest_meshes(meshes, 50).indices) == 6
+    assert farthest_meshes(meshes, 50).radius == 0
+    meshes = random_meshes(400, 1) * np.float32(0.01)
+    few = farthest_meshes(meshes, 400, tolerance=0.2)
+    assert len(few.indices) < 100
+    assert few.radius <= 0.2 * few.distances.max()
+    fewer = farthest_meshes(meshes, len(few.indices) - 1, tolerance=0.2)
+    assert fewer.radius > 0.2 * fewer.distances.max()
+
+
+def test_landmarks_follow_the_seed():
+    meshes = random_meshes(80)
+    first = [farthest_meshes(meshes, 10, seed=seed).indices.tolist() for seed in (0, 0, 1)]
+    assert first[0] == first[1] != first[2]
+
+
+def test_head_without_a_face_region_is_refused():
+    clip = make_clip(3)
+    clip = replace(clip, head=replace(clip.head, regions={}))
+    with pytest.raises(InputError, match=r"regions\[face\].*FLAME_masks.pkl"):
+        expression_displacements(clip, [0])
