@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from ..bench.contracts import Budget, Camera, Clip, FrameKey, Progress
-from .binding import Frames, WorldSplats, to_world
+from .binding import Frames, WorldSplats
 from .configs import SplatTraining
 from .splats import rasterize
 from .training.densify import Densifier, logit
@@ -26,9 +26,10 @@ from .training.schedule import DensifySchedule, Timeline, log_linear
 GEOMETRY = ("means", "log_scales", "quats", "opacities")
 
 
-class Shading(NamedTuple):
-    """What a method adds to placed splats."""
+class Placed(NamedTuple):
+    """Splats as one camera sees them at one timestep."""
 
+    world: WorldSplats
     colors: Tensor  # (N, 3) >= 0
     opacities: Tensor  # (N,) in (0, 1)
     penalty: Tensor | None  # scalar added to the loss
@@ -62,17 +63,16 @@ class Appearance(Protocol):
     def frames(self, timestep: int, optimiser: Optimiser) -> Frames:
         """Triangle frames of a training timestep."""
 
-    def shade(
+    def place(
         self,
-        world: WorldSplats,
         frames: Frames,
         binding: Tensor,
         view: View,
         timestep: int,
         optimiser: Optimiser,
         iteration: int,
-    ) -> Shading:
-        """Colours and opacities of the splats as this camera sees them."""
+    ) -> Placed:
+        """Splats in the world with their colours and opacities as this camera sees them."""
 
 
 class BoundTraining:
@@ -136,13 +136,11 @@ class BoundTraining:
         truth = self._images.get(iteration, index)
         frames = self._appearance.frames(key.timestep, optimiser)
         means, log_scales = optimiser["means"], optimiser["log_scales"]
-        world = to_world(frames, self.binding, means, log_scales, optimiser["quats"])
-        shading = self._appearance.shade(
-            world, frames, self.binding, view, key.timestep, optimiser, iteration
-        )
+        placed = self._appearance.place(frames, self.binding, view, key.timestep, optimiser, iteration)
+        world = placed.world
         offset = means.new_zeros(len(means), 2).requires_grad_()
         rendering = rasterize(
-            *(world.means, world.quats, world.scales, shading.opacities, shading.colors),
+            *(world.means, world.quats, world.scales, placed.opacities, placed.colors),
             *(view.world_to_camera, view.K, view.camera.width, view.camera.height),
             background=self._background,
             means2d_offset=offset,
@@ -152,8 +150,8 @@ class BoundTraining:
         loss = photometric_loss(rendering.image, truth, settings.ssim_weight)
         loss = loss + settings.position_weight * position_penalty(means, visible, settings.position_threshold)
         loss = loss + settings.scale_weight * scale_penalty(log_scales, visible, settings.scale_threshold)
-        if shading.penalty is not None:
-            loss = loss + shading.penalty
+        if placed.penalty is not None:
+            loss = loss + placed.penalty
         self._seen = (offset, visible, view.camera, frames.size.detach())
         return loss
 

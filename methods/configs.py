@@ -119,6 +119,10 @@ class GAConfig:
             raise ValueError(f"sh_degree must be 0 to 3, found {self.sh_degree}")
 
 
+Dynamic = Literal["opacity", "position", "rotation", "scale", "color"]
+"""What an expression may change about a splat."""
+
+
 @dataclass(frozen=True)
 class OursConfig:
     """Compact tensorial Gaussian avatars (CVPR 2025): tri-plane colour, feature lines for opacity.
@@ -128,7 +132,11 @@ class OursConfig:
     plane_resolution, plane_channels : samples per side, and channels of the (x,y), (x,z) and (y,z) planes.
     plane_bounds : "mesh" fits the planes to the canonical mesh in all directions; "published" sets x to +-0.25 m
         as the paper does, which leaves half the samples in x unused on a head without long hair.
-    lines : dynamic opacity on or off.
+    color : "planes" reads colour from the tri-plane; "sh" gives every splat spherical harmonics of degree
+        ``sh_degree`` in canonical directions instead (an ablation).
+    lines : dynamic appearance on or off.
+    dynamic : what the lines change. The paper's method is opacity alone; position, rotation and scale are its
+        Table 4, colour our addition to that ablation.
     line_resolution, line_channels, expressions, jaw_bases : samples and channels per line; how many leading
         expression coefficients (as many as there are, if fewer) and jaw bases have lines.
     line_bounds : box in which splats have dynamic opacity: the "head" (whole mesh) or the "face" region.
@@ -150,7 +158,14 @@ class OursConfig:
     plane_lr: float = 2e-3
     color_mlp_lr: float = 1e-4
     hidden: int = 128
+    color: Literal["planes", "sh"] = "planes"
+    sh_degree: int = 3
+    sh_every: int = 1_000
+    min_sh_every: int = 100
+    sh_dc_lr: float = 0.0025
+    sh_rest_lr: float = 0.000125
     lines: bool = True
+    dynamic: tuple[Dynamic, ...] = ("opacity",)
     line_resolution: int = 64
     line_channels: int = 32
     expressions: int = 80
@@ -175,6 +190,10 @@ class OursConfig:
             raise ValueError("channel counts must be at least 1")
         if self.expressions < 0 or self.jaw_bases < 0:
             raise ValueError("expressions and jaw_bases must not be negative")
+        if not 0 <= self.sh_degree <= 3:
+            raise ValueError(f"sh_degree must be 0 to 3, found {self.sh_degree}")
+        if not self.dynamic or len(set(self.dynamic)) != len(self.dynamic):
+            raise ValueError(f"dynamic must name each thing once, and one at least, found {self.dynamic}")
 
 
 @dataclass(frozen=True)

@@ -58,8 +58,8 @@ def blend_lines(lines: Tensor, expression: Tensor, jaw: Tensor) -> Tensor:
     return blended.view(2, *lines.shape[1:])
 
 
-def opacity_offsets(parameters: Parameters, blended: Tensor, position: LinePosition) -> Tensor:
-    """(N,) offsets of the opacity logit: 6 C features -> hidden -> hidden -> 1, ReLU, weight-normalised.
+def line_offsets(parameters: Parameters, blended: Tensor, position: LinePosition) -> Tensor:
+    """(N, D) offsets: 6 C features -> hidden -> hidden -> D, ReLU, weight-normalised; D = 1 is the opacity logit.
 
     The features are [e_x e_y e_z j_x j_y j_z]; none of the inputs but the lines and the network has a gradient.
     """
@@ -71,7 +71,7 @@ def opacity_offsets(parameters: Parameters, blended: Tensor, position: LinePosit
         *(parameters["line_bias_0"],),
         *(normalised_weight(parameters, 1), parameters["line_bias_1"]),
         *(normalised_weight(parameters, 2), parameters["line_bias_2"]),
-    )[:, 0]
+    )
 
 
 def normalised_weight(parameters: Parameters, layer: int) -> Tensor:
@@ -82,9 +82,11 @@ def normalised_weight(parameters: Parameters, layer: int) -> Tensor:
     )
 
 
-def initial_line_network(channels: int, hidden: int, generator: torch.Generator) -> dict[str, Tensor]:
+def initial_line_network(
+    channels: int, hidden: int, outputs: int, generator: torch.Generator
+) -> dict[str, Tensor]:
     """Directions, gains and biases of the three layers, uniform within 1 / sqrt(fan-in)."""
-    sizes = [2 * AXES * channels, hidden, hidden, 1]
+    sizes = [2 * AXES * channels, hidden, hidden, outputs]
     network: dict[str, Tensor] = {}
     for layer, (fan_in, fan_out) in enumerate(pairwise(sizes)):
         direction = uniform((fan_out, fan_in), fan_in**-0.5, generator)

@@ -28,12 +28,12 @@ from .avatar_files import (
 )
 from .binding import Frames, WorldSplats, to_world
 from .bound_avatar import PosedSplats, posed_splats, render_splats
-from .bound_training import Shading, View, run_bound_training, view_of
+from .bound_training import Placed, View, run_bound_training, view_of
 from .clip_checks import check_training_split
 from .configs import GAConfig
 from .ga_files import PLY_FILE, read_ga_splats, write_ga_splats
 from .seeds import torch_generator
-from .sh import coefficient_count, sh_to_rgb
+from .sh import initial_coefficients, sh_to_rgb
 from .subject_mesh import BoundedCache, SubjectMesh
 from .training.loop import CHECKPOINT, check_budget
 from .training.optimiser import Optimiser
@@ -60,10 +60,9 @@ class GAAppearance:
 
     def splat_parameters(self, count: int) -> dict[str, tuple[Tensor, float]]:
         """Spherical harmonics: nearly zero at degree 0, zero above."""
-        generator = torch_generator(self._seed, "sh")
-        dc = torch.rand(count, 3, generator=generator).to(self._device) / 255
-        rest = torch.zeros(count, 3, coefficient_count(STORED_DEGREE) - 1, device=self._device)
-        return {"sh_dc": (dc, self._config.sh_dc_lr), "sh_rest": (rest, self._config.sh_rest_lr)}
+        rates = {"sh_dc": self._config.sh_dc_lr, "sh_rest": self._config.sh_rest_lr}
+        initial = initial_coefficients(count, STORED_DEGREE, torch_generator(self._seed, "sh"))
+        return {name: (value.to(self._device), rates[name]) for name, value in initial.items()}
 
     def parameters(self) -> dict[str, tuple[Tensor, float]]:
         """The tracked values of the training timesteps, (T, n) each, where they are refined."""
@@ -87,21 +86,21 @@ class GAAppearance:
         arguments |= {name: optimiser[name][row : row + 1] for name in TRACKED}
         return self._mesh.frames(self._mesh.posed(arguments))
 
-    def shade(
+    def place(
         self,
-        world: WorldSplats,
         frames: Frames,
         binding: Tensor,
         view: View,
         timestep: int,
         optimiser: Optimiser,
         iteration: int,
-    ) -> Shading:
+    ) -> Placed:
         """Colour by direction from the camera; opacity as it is."""
+        world = to_world(frames, binding, optimiser["means"], optimiser["log_scales"], optimiser["quats"])
         degree = min(self._config.sh_degree, iteration // self._degree_every)
         directions = torch.nn.functional.normalize(world.means - view.center, dim=1)
         colors = sh_to_rgb(optimiser["sh_dc"], optimiser["sh_rest"], directions, degree)
-        return Shading(colors, torch.sigmoid(optimiser["opacities"]), None)
+        return Placed(world, colors, torch.sigmoid(optimiser["opacities"]), None)
 
     def refined(self, subject: str, optimiser: Optimiser) -> RefinedTracking | None:
         """Tracking before and after, or None where it was left alone."""

@@ -112,4 +112,5 @@ class Ours:
             appearance.plane_box,
             appearance.line_box,
             appearance.jaw_bases,
+            self.config.dynamic,
         )

@@ -11,10 +11,11 @@ from torch import Tensor
 from ..bench.contracts import Clip, FloatArray, HeadPose
 from ..datasets.head.regions import faces_in_region
 from ..datasets.steps.jaw_bases import jaw_bases, jaw_quaternions, jaw_weights
-from .binding import Frames, WorldSplats
-from .bound_training import Shading, View
+from .binding import Frames, to_world
+from .bound_training import Placed, View
 from .configs import OursConfig
-from .feature_lines import blend_lines, line_position, opacity_offsets
+from .dynamics import LocalSplats, apply_offsets, changed_colors
+from .feature_lines import blend_lines, line_offsets, line_position
 from .ours_field import (
     Box,
     CanonicalFrames,
@@ -26,6 +27,7 @@ from .ours_field import (
     shade,
 )
 from .seeds import torch_generator
+from .sh import initial_coefficients, sh_to_rgb
 from .subject_mesh import BoundedCache, SubjectMesh
 from .training.optimiser import Optimiser
 from .training.schedule import Timeline
@@ -61,11 +63,16 @@ class OursAppearance:
             self._is_face[torch.from_numpy(faces_in_region(clip.head, "face")).to(device)] = True
         entries = config.splats.mesh_cache_mb * 2**20 // (4 * FLOATS_PER_FACE * len(mesh.faces))
         self._prepared = BoundedCache(self._prepare, entries)
-        self._lines_from = 0
+        self._lines_from, self._degree_every = 0, 1
 
     def splat_parameters(self, count: int) -> dict[str, tuple[Tensor, float]]:
-        """None: a splat has geometry and opacity only."""
-        return {}
+        """None: a splat has geometry and opacity only. Spherical harmonics where they replace the planes."""
+        if self._config.color == "planes":
+            return {}
+        rates = {"sh_dc": self._config.sh_dc_lr, "sh_rest": self._config.sh_rest_lr}
+        generator = torch_generator(self._seed, "sh")
+        initial = initial_coefficients(count, self._config.sh_degree, generator)
+        return {name: (value.to(self._device), rates[name]) for name, value in initial.items()}
 
     def parameters(self) -> dict[str, tuple[Tensor, float]]:
         """Planes, lines and networks."""
@@ -74,49 +81,53 @@ class OursAppearance:
         return {name: (value.to(self._device), rate) for name, (value, rate) in initial.items()}
 
     def begin(self, timeline: Timeline) -> None:
-        """Fit the start of the lines to the run."""
+        """Fit the start of the lines, and the steps of the harmonics' degree, to the run."""
         self._lines_from = timeline.at(self._config.lines_from)
+        self._degree_every = timeline.every(self._config.sh_every, self._config.min_sh_every)
 
     def frames(self, timestep: int, optimiser: Optimiser) -> Frames:
         """Triangle frames, without gradient."""
         return self._prepared(timestep).frames
 
-    def shade(
+    def place(
         self,
-        world: WorldSplats,
         frames: Frames,
         binding: Tensor,
         view: View,
         timestep: int,
         optimiser: Optimiser,
         iteration: int,
-    ) -> Shading:
-        """Colour by canonical position and direction; opacity with its offset once the lines are on."""
+    ) -> Placed:
+        """Colour by canonical position and direction; what the lines change, once they are on."""
         prepared = self._prepared(timestep)
         positions = self.canonical.positions(binding, optimiser["means"])
-        features = plane_features(optimiser, self.plane_box, positions)
-        directions = canonical_directions(prepared.turns, binding, world.means, view.center)
-        colors = shade(optimiser, features, directions)
-        logits = optimiser["opacities"]
-        if not self._config.lines or iteration <= self._lines_from:
-            return Shading(colors, torch.sigmoid(logits), None)
-        offsets = self.opacity_offsets(optimiser, positions.detach(), prepared.expression, prepared.jaw)
+        splats = LocalSplats(*(optimiser[name] for name in ("means", "log_scales", "quats", "opacities")))
         penalty = None
-        if self._config.penalty:
-            weights = prepared.penalty.index_select(0, binding)
-            penalty = self._config.penalty * (offsets.abs() * weights).mean()
-        return Shading(colors, torch.sigmoid(logits + offsets), penalty)
+        if self._config.lines and iteration > self._lines_from:
+            offsets = self.offsets(optimiser, positions.detach(), prepared.expression, prepared.jaw)
+            splats = apply_offsets(splats, offsets, self._config.dynamic)
+            if self._config.penalty:
+                weights = prepared.penalty.index_select(0, binding)
+                penalty = self._config.penalty * (offsets.abs() * weights[:, None]).mean()
+        world = to_world(frames, binding, splats.means, splats.log_scales, splats.quats)
+        directions = canonical_directions(prepared.turns, binding, world.means, view.center)
+        colors = self._colors(optimiser, positions, directions, iteration)
+        return Placed(world, changed_colors(colors, splats), torch.sigmoid(splats.logits), penalty)
 
-    def opacity_offsets(
-        self, optimiser: Optimiser, positions: Tensor, expression: Tensor, jaw: Tensor
-    ) -> Tensor:
-        """(N,) offsets; zero, and not computed, outside the lines' box."""
+    def offsets(self, optimiser: Optimiser, positions: Tensor, expression: Tensor, jaw: Tensor) -> Tensor:
+        """(N, D) offsets; zero, and not computed, outside the lines' box."""
         inside = self.line_box.contains(positions).nonzero().squeeze(1)
         unit = self.line_box.unit(positions.index_select(0, inside))
         blended = blend_lines(optimiser["lines"], expression, jaw)
         position = line_position(unit, self._config.line_resolution)
-        offsets = opacity_offsets(optimiser, blended, position)
-        return positions.new_zeros(len(positions)).index_copy(0, inside, offsets)
+        offsets = line_offsets(optimiser, blended, position)
+        return offsets.new_zeros(len(positions), offsets.shape[1]).index_copy(0, inside, offsets)
+
+    def _colors(self, optimiser: Optimiser, positions: Tensor, directions: Tensor, iteration: int) -> Tensor:
+        if self._config.color == "sh":
+            degree = min(self._config.sh_degree, iteration // self._degree_every)
+            return sh_to_rgb(optimiser["sh_dc"], optimiser["sh_rest"], -directions, degree)
+        return shade(optimiser, plane_features(optimiser, self.plane_box, positions), directions)
 
     @torch.no_grad()
     def _prepare(self, timestep: int) -> PreparedTimestep:

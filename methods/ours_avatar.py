@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple, cast
 
 import numpy as np
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
 from torch import Tensor
 
 from ..bench.contracts import Camera, Frame, HeadPose
@@ -19,7 +20,9 @@ from .avatar_files import SUBJECT_FILE, read_shared_head, read_subject
 from .binding import WorldSplats, to_world
 from .bound_avatar import PosedSplats, posed_splats, render_splats
 from .bound_training import view_of
-from .feature_lines import blend_lines, line_position, opacity_offsets
+from .configs import Dynamic
+from .dynamics import WIDTHS, LocalSplats, apply_offsets, changed_colors, offset_width
+from .feature_lines import blend_lines, line_offsets, line_position
 from .ours_appearance import driving_coefficients
 from .ours_field import (
     Box,
@@ -29,10 +32,14 @@ from .ours_field import (
     position_part,
     shade_directions,
 )
+from .sh import coefficient_count, sh_degree, sh_to_rgb
 from .subject_mesh import SubjectMesh
 from .triplane import ENCODING_SIZE, PAIRS
 
 FIELD_FILE = "avatar.safetensors"
+DYNAMIC = "dynamic"
+"""Key of the file's metadata: what the lines change, in the order of the offset network's outputs."""
+
 SPLAT_WIDTHS = {"means": 3, "opacities": 1, "log_scales": 3, "quats": 4, "binding": 1}
 """Columns of the (N, 12) float32 splat table, 48 bytes each; the triangle is exact up to 2^24."""
 
@@ -45,6 +52,7 @@ def write_field(
     plane_box: Box,
     line_box: Box,
     jaw_bases: np.ndarray,
+    dynamic: Sequence[Dynamic],
 ) -> None:
     """Write splats, planes, lines, networks, boxes and jaw bases as float32 safetensors."""
     columns = {**splats, "opacities": splats["opacities"][:, None], "binding": binding[:, None]}
@@ -56,18 +64,37 @@ def write_field(
         "line_box": torch.stack(list(line_box)).cpu(),
         "jaw_bases": torch.from_numpy(np.asarray(jaw_bases, dtype=np.float32)),
     }
+    tensors |= {
+        name: splats[name].detach().cpu().contiguous() for name in ("sh_dc", "sh_rest") if name in splats
+    }
     with atomic_path(path) as temporary:
-        save_file(tensors, temporary)
+        save_file(tensors, temporary, {DYNAMIC: ",".join(dynamic)})
 
 
-def read_field(path: Path, face_count: int, expression_size: int, device: str) -> dict[str, Tensor]:
+class Field(NamedTuple):
+    """What an avatar's file holds: its tensors by name, and what the lines change."""
+
+    tensors: dict[str, Tensor]
+    dynamic: tuple[Dynamic, ...]
+
+
+def read_field(path: Path, face_count: int, expression_size: int, device: str) -> Field:
     """Read and check what `write_field` wrote. Raises `InputError` where a tensor is missing or does not fit."""
     try:
-        tensors = load_file(path, device=device)
+        with safe_open(path, framework="pt", device=device) as file:
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
+            names = (file.metadata() or {}).get(DYNAMIC, "opacity")
     except (SafetensorError, OSError) as error:
         raise InputError(path, "", "a safetensors file", str(error)) from error
-    needed = ["splats", "plane_box", "line_box", "jaw_bases", "color_weight_0", "color_weight_1"]
-    needed += [f"plane_{name}" for name, _, _ in PAIRS]
+    given = names.split(",")
+    if len(set(given)) != len(given) or not set(given) <= set(WIDTHS):
+        raise InputError(path, DYNAMIC, f"names among {', '.join(WIDTHS)}, each once", repr(names)[:80])
+    dynamic = cast(tuple[Dynamic, ...], tuple(given))
+    needed = ["splats", "plane_box", "line_box", "jaw_bases"]
+    if "sh_dc" in tensors:
+        needed += ["sh_rest"]
+    else:
+        needed += ["color_weight_0", "color_weight_1", *(f"plane_{name}" for name, _, _ in PAIRS)]
     if "lines" in tensors:
         needed += [f"line_{part}_{layer}" for layer in range(3) for part in ("direction", "gain", "bias")]
     for name in needed:
@@ -76,11 +103,13 @@ def read_field(path: Path, face_count: int, expression_size: int, device: str) -
     for name, value in tensors.items():
         if value.dtype != torch.float32 or not torch.isfinite(value).all():
             raise InputError(path, name, "finite float32 numbers", f"{value.dtype} or non-finite numbers")
-    _check_shapes(path, tensors, face_count, expression_size)
-    return tensors
+    _check_shapes(path, tensors, face_count, expression_size, offset_width(dynamic))
+    return Field(tensors, dynamic)
 
 
-def _check_shapes(path: Path, tensors: Mapping[str, Tensor], face_count: int, expression_size: int) -> None:
+def _check_shapes(
+    path: Path, tensors: Mapping[str, Tensor], face_count: int, expression_size: int, outputs: int
+) -> None:
     """Raise `InputError` at the first tensor that does not fit the others, so that no rendering can."""
 
     def require(name: str, fits: bool, expected: str) -> None:
@@ -102,15 +131,24 @@ def _check_shapes(path: Path, tensors: Mapping[str, Tensor], face_count: int, ex
         if not (tensors[name][0] < tensors[name][1]).all():
             raise InputError(path, name, "a low corner below the high one", str(tensors[name].tolist()))
 
-    planes = [f"plane_{pair}" for pair, _, _ in PAIRS]
-    for name in planes:
-        plane = tensors[name]
-        square = plane.ndim == 2 and round(len(plane) ** 0.5) ** 2 == len(plane) >= 4
-        require(name, square and len(plane) == len(tensors[planes[0]]), "(R * R, C), R of all planes equal")
-    inputs = sum(tensors[name].shape[1] for name in planes) + ENCODING_SIZE
-    first = tensors["color_weight_0"]
-    require("color_weight_0", first.ndim == 2 and first.shape[1] == inputs, f"(H, {inputs})")
-    exactly("color_weight_1", 3, len(first))
+    if "sh_dc" in tensors:
+        exactly("sh_dc", len(splats), 3)
+        rest = tensors["sh_rest"]
+        counts = [coefficient_count(degree) - 1 for degree in range(4)]
+        fits = rest.shape[:2] == (len(splats), 3) and rest.ndim == 3 and rest.shape[2] in counts
+        require("sh_rest", fits, f"({len(splats)}, 3, K), K one of {counts}")
+    else:
+        planes = [f"plane_{pair}" for pair, _, _ in PAIRS]
+        for name in planes:
+            plane = tensors[name]
+            square = plane.ndim == 2 and round(len(plane) ** 0.5) ** 2 == len(plane) >= 4
+            require(
+                name, square and len(plane) == len(tensors[planes[0]]), "(R * R, C), R of all planes equal"
+            )
+        inputs = sum(tensors[name].shape[1] for name in planes) + ENCODING_SIZE
+        first = tensors["color_weight_0"]
+        require("color_weight_0", first.ndim == 2 and first.shape[1] == inputs, f"(H, {inputs})")
+        exactly("color_weight_1", 3, len(first))
 
     bases = tensors["jaw_bases"]
     require("jaw_bases", bases.ndim == 2 and bases.shape[1] == 4, "(J, 4)")
@@ -121,7 +159,7 @@ def _check_shapes(path: Path, tensors: Mapping[str, Tensor], face_count: int, ex
     require(
         "lines", fits and lines.shape[2] >= 2, f"(E + {jaws}, 3, L, C), E at most {expression_size}, L > 1"
     )
-    sizes = [6 * lines.shape[3], *(len(tensors[f"line_bias_{layer}"]) for layer in (0, 1)), 1]
+    sizes = [6 * lines.shape[3], *(len(tensors[f"line_bias_{layer}"]) for layer in (0, 1)), outputs]
     for layer, (fan_in, fan_out) in enumerate(pairwise(sizes)):
         exactly(f"line_direction_{layer}", fan_out, fan_in)
         exactly(f"line_gain_{layer}", fan_out, 1)
@@ -134,17 +172,21 @@ class OursAvatar:
     What depends on canonical position alone (plane features, places on the lines) is computed once when loaded.
     """
 
-    def __init__(self, folder: Path, mesh: SubjectMesh, tensors: Mapping[str, Tensor], device: str):
+    def __init__(self, folder: Path, mesh: SubjectMesh, field: Field, device: str):
+        tensors = field.tensors
         self._folder, self._mesh, self._tensors, self._device = folder, mesh, tensors, device
+        self._dynamic = field.dynamic
         table = tensors["splats"].split(list(SPLAT_WIDTHS.values()), dim=1)
         columns = {name: column.contiguous() for name, column in zip(SPLAT_WIDTHS, table)}
-        self._means, self._log_scales, self._quats = (columns[k] for k in ("means", "log_scales", "quats"))
-        self._logits = columns["opacities"][:, 0]
+        self._neutral = LocalSplats(
+            columns["means"], columns["log_scales"], columns["quats"], columns["opacities"][:, 0]
+        )
         self._binding = columns["binding"][:, 0].to(torch.int64)
         self._canonical = CanonicalFrames.of(mesh.frames(mesh.canonical))
-        positions = self._canonical.positions(self._binding, self._means)
-        features = plane_features(tensors, Box(*tensors["plane_box"]), positions)
-        self._from_position = position_part(tensors, features)
+        positions = self._canonical.positions(self._binding, self._neutral.means)
+        if "sh_dc" not in tensors:
+            features = plane_features(tensors, Box(*tensors["plane_box"]), positions)
+            self._from_position = position_part(tensors, features)
         self._jaw_bases = tensors["jaw_bases"].cpu().numpy().astype(np.float64)
         if "lines" in tensors:
             box = Box(*tensors["line_box"])
@@ -158,47 +200,51 @@ class OursAvatar:
         head = read_shared_head(folder)
         subject = read_subject(folder / SUBJECT_FILE, head)
         mesh = SubjectMesh(head, subject.shape, subject.static_offset, device)
-        tensors = read_field(folder / FIELD_FILE, len(mesh.faces), mesh.model.expression_size, device)
-        return cls(folder, mesh, tensors, device)
+        field = read_field(folder / FIELD_FILE, len(mesh.faces), mesh.model.expression_size, device)
+        return cls(folder, mesh, field, device)
 
     @torch.no_grad()
     def render(self, camera: Camera, pose: HeadPose, background: Sequence[float] = (1.0, 1.0, 1.0)) -> Frame:
         """Render one frame. Raises `InputError` where the pose is of another head model."""
-        world, turns = self._world(pose)
+        splats, world, turns = self._world(pose)
         view = view_of(camera, self._device)
-        colors = self._colors(world, turns, view.center)
-        return render_splats(world, self._opacities(pose), colors, view, background)
+        colors = self._colors(splats, world, turns, view.center)
+        return render_splats(world, torch.sigmoid(splats.logits), colors, view, background)
 
     @torch.no_grad()
     def splats(self, pose: HeadPose, camera: Camera | None = None) -> PosedSplats:
         """Splats of a pose in the world; with colours where a camera says from where they are seen."""
-        world, turns = self._world(pose)
+        splats, world, turns = self._world(pose)
         colors = None
         if camera is not None:
-            colors = self._colors(world, turns, view_of(camera, self._device).center)
-        return posed_splats(world, self._opacities(pose), colors)
+            colors = self._colors(splats, world, turns, view_of(camera, self._device).center)
+        return posed_splats(world, torch.sigmoid(splats.logits), colors)
 
     def files(self) -> Sequence[Path]:
         """The field with its splats, and the subject."""
         return [self._folder / FIELD_FILE, self._folder / SUBJECT_FILE]
 
-    def _world(self, pose: HeadPose) -> tuple[WorldSplats, Tensor]:
+    def _world(self, pose: HeadPose) -> tuple[LocalSplats, WorldSplats, Tensor]:
         frames = self._mesh.frames(self._mesh.posed(self._mesh.arguments([pose])))
-        world = to_world(frames, self._binding, self._means, self._log_scales, self._quats)
-        return world, self._canonical.turns(frames)
+        splats = self._changed(pose)
+        world = to_world(frames, self._binding, splats.means, splats.log_scales, splats.quats)
+        return splats, world, self._canonical.turns(frames)
 
-    def _colors(self, world: WorldSplats, turns: Tensor, center: Tensor) -> Tensor:
+    def _colors(self, splats: LocalSplats, world: WorldSplats, turns: Tensor, center: Tensor) -> Tensor:
         directions = canonical_directions(turns, self._binding, world.means, center)
-        return shade_directions(self._tensors, self._from_position, directions)
+        if "sh_dc" in self._tensors:
+            dc, rest = self._tensors["sh_dc"], self._tensors["sh_rest"]
+            colors = sh_to_rgb(dc, rest, -directions, sh_degree(rest))
+        else:
+            colors = shade_directions(self._tensors, self._from_position, directions)
+        return changed_colors(colors, splats)
 
-    def _opacities(self, pose: HeadPose) -> Tensor:
-        logits = self._logits
-        if "lines" in self._tensors:
-            lines = self._tensors["lines"]
-            expressions = len(lines) - len(self._jaw_bases)
-            blended = blend_lines(
-                lines, *driving_coefficients(pose, expressions, self._jaw_bases, self._device)
-            )
-            offsets = opacity_offsets(self._tensors, blended, self._line_position)
-            logits = logits.index_add(0, self._inside, offsets)
-        return torch.sigmoid(logits)
+    def _changed(self, pose: HeadPose) -> LocalSplats:
+        if "lines" not in self._tensors:
+            return self._neutral
+        lines = self._tensors["lines"]
+        expressions = len(lines) - len(self._jaw_bases)
+        blended = blend_lines(lines, *driving_coefficients(pose, expressions, self._jaw_bases, self._device))
+        inside = line_offsets(self._tensors, blended, self._line_position)
+        offsets = inside.new_zeros(len(self._binding), inside.shape[1]).index_copy(0, self._inside, inside)
+        return apply_offsets(self._neutral, offsets, self._dynamic)

@@ -14,7 +14,8 @@ from torch import Tensor
 
 from .binding import Frames, apply_matrices
 from .configs import OursConfig
-from .feature_lines import Parameters, initial_line_network, uniform
+from .dynamics import offset_width
+from .feature_lines import AXES, Parameters, initial_line_network, uniform
 from .networks import color_network
 from .sh import C0
 from .triplane import ENCODING_SIZE, PAIRS, encode_directions, sample_triplane
@@ -126,6 +127,19 @@ def initial_parameters(
 ) -> dict[str, tuple[Tensor, float]]:
     """Planes U(-0.1, 0.1), networks uniform within 1 / sqrt(fan-in), lines 0; each with its learning rate."""
     result: dict[str, tuple[Tensor, float]] = {}
+    if config.color == "planes":
+        result |= _initial_planes(config, generator)
+    if config.lines:
+        shape = (expressions + jaw_bases, AXES, config.line_resolution, config.line_channels)
+        result["lines"] = (torch.zeros(shape), config.line_lr)
+        outputs = offset_width(config.dynamic)
+        network = initial_line_network(config.line_channels, config.hidden, outputs, generator)
+        result |= {name: (value, config.line_mlp_lr) for name, value in network.items()}
+    return result
+
+
+def _initial_planes(config: OursConfig, generator: torch.Generator) -> dict[str, tuple[Tensor, float]]:
+    result: dict[str, tuple[Tensor, float]] = {}
     for (name, _, _), channels in zip(PAIRS, config.plane_channels):
         plane = uniform((config.plane_resolution**2, channels), 0.1, generator)
         result[f"plane_{name}"] = (plane, config.plane_lr)
@@ -134,10 +148,4 @@ def initial_parameters(
         uniform((config.hidden, inputs), inputs**-0.5, generator),
         uniform((3, config.hidden), config.hidden**-0.5, generator),
     ]
-    result |= {f"color_weight_{layer}": (w, config.color_mlp_lr) for layer, w in enumerate(weights)}
-    if config.lines:
-        shape = (expressions + jaw_bases, 3, config.line_resolution, config.line_channels)
-        result["lines"] = (torch.zeros(shape), config.line_lr)
-        network = initial_line_network(config.line_channels, config.hidden, generator)
-        result |= {name: (value, config.line_mlp_lr) for name, value in network.items()}
-    return result
+    return result | {f"color_weight_{layer}": (w, config.color_mlp_lr) for layer, w in enumerate(weights)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
@@ -16,6 +17,11 @@ C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901
 def coefficient_count(degree: int) -> int:
     """Number of coefficients up to a degree."""
     return (degree + 1) ** 2
+
+
+def sh_degree(rest: Tensor) -> int:
+    """Degree of (N, 3, K - 1) coefficients above degree 0."""
+    return math.isqrt(rest.shape[2] + 1) - 1
 
 
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
@@ -37,6 +43,17 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
         terms += [C3[3] * z * (2 * zz - 3 * xx - 3 * yy), -C3[2] * x * (4 * zz - xx - yy)]
         terms += [C3[4] * z * (xx - yy), -C3[0] * x * (xx - 3 * yy)]
     return torch.stack(terms, dim=1)
+
+
+def initial_coefficients(count: int, degree: int, generator: torch.Generator) -> dict[str, Tensor]:
+    """Coefficients to start training from, as 3DGS stores them: nearly zero at degree 0, zero above.
+
+    Returns
+    -------
+    ``sh_dc`` (N, 3) and ``sh_rest`` (N, 3, K - 1), K the `coefficient_count` of ``degree``.
+    """
+    dc = torch.rand(count, 3, generator=generator) / 255
+    return {"sh_dc": dc, "sh_rest": torch.zeros(count, 3, coefficient_count(degree) - 1)}
 
 
 class _Weigh(torch.autograd.Function):

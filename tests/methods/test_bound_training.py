@@ -10,7 +10,7 @@ from skimage.metrics import structural_similarity
 from headbench.bench.contracts import Camera
 from headbench.bench.errors import InputError
 from headbench.methods.binding import to_world
-from headbench.methods.bound_training import BoundTraining, Shading, scene_extent
+from headbench.methods.bound_training import BoundTraining, Placed, scene_extent
 from headbench.methods.clip_checks import check_training_split
 from headbench.methods.configs import SplatTraining
 from headbench.methods.splats import rasterize
@@ -38,9 +38,10 @@ class Grey:
     def frames(self, timestep, optimiser):
         return self.mesh.frames(self.mesh.posed(self.mesh.arguments([self._poses[timestep]])))
 
-    def shade(self, world, frames, binding, view, timestep, optimiser, iteration):
+    def place(self, frames, binding, view, timestep, optimiser, iteration):
+        world = to_world(frames, binding, *(optimiser[name] for name in ("means", "log_scales", "quats")))
         colors = torch.full((len(binding), 3), 0.5)
-        return Shading(colors, torch.sigmoid(optimiser["opacities"]), torch.tensor(PENALTY))
+        return Placed(world, colors, torch.sigmoid(optimiser["opacities"]), torch.tensor(PENALTY))
 
 
 @pytest.fixture

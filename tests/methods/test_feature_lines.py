@@ -8,17 +8,17 @@ from torch.nn.utils.parametrizations import weight_norm
 from headbench.methods.feature_lines import (
     blend_lines,
     initial_line_network,
+    line_offsets,
     line_position,
     normalised_weight,
-    opacity_offsets,
 )
 
-EXPRESSIONS, JAWS, SAMPLES, CHANNELS, HIDDEN, POINTS = 5, 3, 7, 4, 6, 11
+EXPRESSIONS, JAWS, SAMPLES, CHANNELS, HIDDEN, POINTS, OUTPUTS = 5, 3, 7, 4, 6, 11, 2
 
 
 def make():
     generator = torch.Generator().manual_seed(0)
-    network = initial_line_network(CHANNELS, HIDDEN, generator)
+    network = initial_line_network(CHANNELS, HIDDEN, OUTPUTS, generator)
     parameters = {name: value.double() for name, value in network.items()}
     # Gains away from the norms they start at, so that the normalisation matters.
     for layer in range(3):
@@ -63,9 +63,9 @@ def slow_network(parameters):
 def test_offsets_equal_the_slow_form():
     parameters, lines, expression, jaw, points = make()
     blended = blend_lines(lines, expression, jaw)
-    found = opacity_offsets(parameters, blended, line_position(points, SAMPLES))
+    found = line_offsets(parameters, blended, line_position(points, SAMPLES))
     features = slow_features(*(x.numpy() for x in (lines, expression, jaw, points)))
-    expected = slow_network(parameters)(torch.from_numpy(features))[:, 0]
+    expected = slow_network(parameters)(torch.from_numpy(features))
     np.testing.assert_allclose(found, expected.detach(), atol=1e-12)
 
 
@@ -75,7 +75,7 @@ def test_gradients_of_lines_and_network():
     position = line_position(points, SAMPLES)
 
     def offsets(lines, *values):
-        return opacity_offsets(dict(zip(names, values)), blend_lines(lines, expression, jaw), position)
+        return line_offsets(dict(zip(names, values)), blend_lines(lines, expression, jaw), position)
 
     inputs = [x.requires_grad_() for x in (lines, *(parameters[name] for name in names))]
     assert torch.autograd.gradcheck(offsets, inputs)
@@ -84,8 +84,8 @@ def test_gradients_of_lines_and_network():
 def test_zero_lines_give_one_constant_that_is_not_zero():
     parameters, lines, expression, jaw, points = make()
     blended = blend_lines(torch.zeros_like(lines), expression, jaw)
-    found = opacity_offsets(parameters, blended, line_position(points, SAMPLES))
-    assert found.std() < 1e-12
+    found = line_offsets(parameters, blended, line_position(points, SAMPLES))
+    assert found.std(0).max() < 1e-12
     assert found.abs().min() > 0
 
 
@@ -97,7 +97,7 @@ def test_ends_of_the_box_are_the_first_and_last_samples():
 
 
 def test_the_network_starts_within_its_fan_in_and_with_gains_of_its_norms():
-    network = initial_line_network(32, 128, torch.Generator().manual_seed(1))
+    network = initial_line_network(32, 128, 1, torch.Generator().manual_seed(1))
     direction = network["line_direction_0"]
     assert direction.shape == (128, 192)
     assert direction.abs().max() <= 192**-0.5

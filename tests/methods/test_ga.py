@@ -6,7 +6,6 @@ import torch
 from torch import nn
 
 from headbench.methods.avatar_files import TRACKED
-from headbench.methods.binding import to_world
 from headbench.methods.bound_training import view_of
 from headbench.methods.configs import GAConfig
 from headbench.methods.ga import GAAppearance
@@ -28,6 +27,11 @@ def make(clip, config=None):
     values["sh_dc"] = torch.randn(count, 3, generator=generator)
     values["sh_rest"][:, :, :3] = torch.randn(count, 3, 3, generator=generator)
     values["opacities"] = torch.randn(count, generator=generator)
+    values |= {
+        "means": torch.zeros(count, 3),
+        "log_scales": torch.zeros(count, 3),
+        "quats": torch.ones(count, 4),
+    }
     optimiser = Optimiser({n: nn.Parameter(v) for n, v in values.items()}, dict.fromkeys(values, 0.1))
     return appearance, optimiser, torch.arange(count)
 
@@ -36,11 +40,10 @@ def shade(clip, appearance, optimiser, binding, iteration):
     """World means and shading of one training image."""
     key = clip.splits["train"][1]
     frames = appearance.frames(key.timestep, optimiser)
-    count = len(binding)
-    world = to_world(frames, binding, torch.zeros(count, 3), torch.zeros(count, 3), torch.ones(count, 4))
     view = view_of(clip.cameras[key.camera], "cpu")
-    shading = appearance.shade(world, frames, binding, view, key.timestep, optimiser, iteration)
-    return key, world.means, shading
+    placed = appearance.place(frames, binding, view, key.timestep, optimiser, iteration)
+    # With zero local means every splat sits on its triangle's centroid.
+    return key, frames.center[binding], placed
 
 
 def test_colour_is_seen_along_the_ray_from_the_camera(clip):

@@ -5,58 +5,27 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from torch import nn
 
 from headbench.datasets.head.regions import faces_in_region
-from headbench.methods.avatar_files import Subject
-from headbench.methods.binding import to_world
-from headbench.methods.bound_training import view_of
 from headbench.methods.configs import OursConfig
-from headbench.methods.ours_appearance import OursAppearance, penalty_weights
-from headbench.methods.subject_mesh import SubjectMesh
-from headbench.methods.training.optimiser import Optimiser
-from headbench.methods.training.schedule import Timeline
+from headbench.methods.ours_appearance import penalty_weights
 
-SMALL = OursConfig(plane_resolution=8, plane_channels=(4, 2, 2), hidden=8, line_resolution=6, line_channels=3)
-
-
-def make(clip, config=SMALL):
-    subject = Subject.of(clip)
-    mesh = SubjectMesh(clip.head, subject.shape, subject.static_offset, "cpu")
-    appearance = OursAppearance(mesh, clip, config, "cpu", 0)
-    appearance.begin(Timeline(600_000, 600_000))
-    count = len(mesh.faces)
-    values = {name: value for name, (value, _) in appearance.parameters().items()}
-    values["means"] = 0.1 * torch.randn(count, 3, generator=torch.Generator().manual_seed(0))
-    values["opacities"] = torch.zeros(count)
-    if "lines" in values:
-        values["lines"] = torch.randn(values["lines"].shape, generator=torch.Generator().manual_seed(1))
-    optimiser = Optimiser({n: nn.Parameter(v) for n, v in values.items()}, dict.fromkeys(values, 0.1))
-    return appearance, optimiser, torch.arange(count)
-
-
-def shade(clip, appearance, optimiser, binding, iteration):
-    key = clip.splits["train"][0]
-    frames = appearance.frames(key.timestep, optimiser)
-    count = len(binding)
-    world = to_world(frames, binding, optimiser["means"], torch.zeros(count, 3), torch.ones(count, 4))
-    view = view_of(clip.cameras[key.camera], "cpu")
-    return appearance.shade(world, frames, binding, view, key.timestep, optimiser, iteration)
+from .toy_ours import SMALL, make, place
 
 
 def test_lines_start_after_their_iteration(clip):
     appearance, optimiser, binding = make(clip)
-    before = shade(clip, appearance, optimiser, binding, 60_000)
+    before = place(clip, appearance, optimiser, binding, 60_000)
     assert before.penalty is None
     np.testing.assert_array_equal(before.opacities.detach(), np.full(len(binding), 0.5))
-    after = shade(clip, appearance, optimiser, binding, 60_001)
+    after = place(clip, appearance, optimiser, binding, 60_001)
     assert after.opacities.detach().std() > 0
     assert after.penalty > 0
 
 
 def test_opacity_branch_is_detached_from_positions(clip):
     appearance, optimiser, binding = make(clip)
-    shading = shade(clip, appearance, optimiser, binding, 60_001)
+    shading = place(clip, appearance, optimiser, binding, 60_001)
     (shading.opacities.sum() + shading.penalty).backward()
     assert optimiser["means"].grad is None
     assert optimiser["lines"].grad.abs().sum() > 0
@@ -65,7 +34,7 @@ def test_opacity_branch_is_detached_from_positions(clip):
 
 def test_colour_branch_moves_positions(clip):
     appearance, optimiser, binding = make(clip)
-    shade(clip, appearance, optimiser, binding, 1).colors.sum().backward()
+    place(clip, appearance, optimiser, binding, 1).colors.sum().backward()
     assert optimiser["means"].grad.abs().sum() > 0
     assert optimiser["plane_xy"].grad.abs().sum() > 0
     assert optimiser["lines"].grad is None
@@ -74,7 +43,7 @@ def test_colour_branch_moves_positions(clip):
 def test_splats_outside_the_lines_box_have_no_offset(clip):
     appearance, optimiser, binding = make(clip)
     optimiser["means"].data[3] = torch.tensor([0.0, 1000.0, 0.0])
-    shading = shade(clip, appearance, optimiser, binding, 60_001)
+    shading = place(clip, appearance, optimiser, binding, 60_001)
     assert shading.opacities[3] == 0.5
     assert shading.opacities[4] != 0.5
 
@@ -83,7 +52,7 @@ def test_face_bounds_reach_fewer_splats_than_head_bounds(clip):
     moved = {}
     for bounds in ("head", "face"):
         appearance, optimiser, binding = make(clip, replace(SMALL, line_bounds=bounds))
-        shading = shade(clip, appearance, optimiser, binding, 60_001)
+        shading = place(clip, appearance, optimiser, binding, 60_001)
         moved[bounds] = int((shading.opacities != 0.5).sum())
     assert 0 < moved["face"] < moved["head"]
 
@@ -93,7 +62,7 @@ def test_switches(clip, switch):
     appearance, optimiser, binding = make(
         clip, replace(SMALL, **{switch: False if switch == "lines" else 0.0})
     )
-    shading = shade(clip, appearance, optimiser, binding, 60_001)
+    shading = place(clip, appearance, optimiser, binding, 60_001)
     assert shading.penalty is None
     assert (shading.opacities.detach().std() > 0) == (switch == "penalty")
     assert ("lines" in appearance.parameters()) == (switch == "penalty")
@@ -125,7 +94,7 @@ def test_penalty_weights_equal_a_loop_over_triangles(clip, head):
 
 def test_penalty_is_the_mean_over_all_splats(clip):
     appearance, optimiser, binding = make(clip)
-    shading = shade(clip, appearance, optimiser, binding, 60_001)
+    shading = place(clip, appearance, optimiser, binding, 60_001)
     offsets = torch.logit(shading.opacities.detach())
     weights = appearance._prepared(clip.splits["train"][0].timestep).penalty
     total = 0.0

@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from headbench.bench.contracts import Budget, no_progress
 from headbench.datasets.head.model import HeadModel
-from headbench.methods.binding import to_world
 from headbench.methods.bound_training import view_of
 from headbench.methods.configs import OursConfig, SplatTraining
 from headbench.methods.ours import Ours
@@ -136,16 +135,15 @@ def both(clip):
         values[plane] = 5 * values[plane]  # so that no colour is cut at 0 and all depend on their features
     values["means"] = 0.3 * torch.randn(len(binding), 3, generator=generator)
     values["opacities"] = torch.randn(len(binding), generator=generator)
+    still = {"log_scales": torch.zeros(len(binding), 3), "quats": torch.ones(len(binding), 4)}
     optimiser = Optimiser(
-        {name: torch.nn.Parameter(value.clone()) for name, value in values.items()},
-        dict.fromkeys(values, 0.1),
+        {name: torch.nn.Parameter(value.clone()) for name, value in {**values, **still}.items()},
+        dict.fromkeys([*values, *still], 0.1),
     )
     key = clip.splits["train"][1]
     frames = appearance.frames(key.timestep, optimiser)
-    still = torch.zeros(len(binding), 3), torch.ones(len(binding), 4)
-    world = to_world(frames, binding, optimiser["means"], *still)
     view = view_of(clip.cameras[key.camera], "cpu")
-    shading = appearance.shade(world, frames, binding, view, key.timestep, optimiser, 60_001)
+    shading = appearance.place(frames, binding, view, key.timestep, optimiser, 60_001)
     mix = torch.randn(len(binding), 4, generator=generator)
     ((shading.colors * mix[:, :3]).sum() + (shading.opacities * mix[:, 3]).sum()).backward()
 
