@@ -122,12 +122,24 @@ def _cameras(evidence: Evidence, cameras: Iterable[str], what: str) -> Iterator[
         yield Hit(f"{several(len(names), 'camera')} {what}: {some(names)}", entry.file, key)
 
 
-def _distance(evidence: Evidence) -> Iterator[Hit]:
+def implausible_distance(evidence: Evidence) -> float | None:
+    """Median distance of the head from the cameras, metres, where no capture is made at such a distance."""
     distances = [view.mesh.distance for view in evidence.views if view.mesh is not None]
-    if distances and not NEAR_M <= np.median(distances) <= FAR_M:
+    median = float(np.median(distances)) if distances else NEAR_M
+    return None if NEAR_M <= median <= FAR_M else median
+
+
+def misplaced(evidence: Evidence) -> bool:
+    """Whether cameras stand so wrong that images and mesh cannot be held against each other."""
+    return bool(behind(evidence) or upside_down(evidence) or implausible_distance(evidence) is not None)
+
+
+def _distance(evidence: Evidence) -> Iterator[Hit]:
+    median = implausible_distance(evidence)
+    if median is not None:
         entry = evidence.entries[0]
         yield Hit(
-            f"the head is {np.median(distances):.3g} m from the cameras (median)",
+            f"the head is {median:.3g} m from the cameras (median)",
             entry.file,
             f"{entry.where}.transform_matrix",
         )
@@ -249,7 +261,7 @@ def _other_edge(evidence: Evidence) -> Iterator[Hit]:
     matters = any(abs(offset[1]) > TELLING_PX for offset in principal_offsets(evidence).values())
     if convention not in ("top", "bottom") or not matters or evidence.subject is None:
         return
-    if behind(evidence) or upside_down(evidence):
+    if misplaced(evidence):
         return
     views = cy_evidence_views(evidence)
     if not views:

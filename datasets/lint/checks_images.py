@@ -174,16 +174,27 @@ def _fringes(evidence: Evidence) -> Iterator[Hit]:
 
 
 def limited_range(evidence: Evidence) -> bool:
-    """Whether levels lie within video's limited range and reach its ends, 16 and 235.
+    """Whether levels lie within video's limited range, 16 to 235, and something shows that this is no chance.
 
-    Those of whole images, or of the subject alone where the background was put in afterwards.
+    They reach both ends, in whole images or (where the background was put in afterwards) in the subject alone;
+    or the background has the level that the declared one has in that range.
     """
     views = [view for view in evidence.views if view.error is None and view.low != view.high]
     if not views:
         return False
     whole = (min(view.low for view in views), max(view.high for view in views))
     subject = (min(view.subject_low for view in views), max(view.subject_high for view in views))
-    return _spans_limited(whole) or _spans_limited(subject)
+    if _spans_limited(whole) or _spans_limited(subject):
+        return True
+    declared = np.asarray(evidence.background) * 255
+    squeezed = 16 + declared * 219 / 255
+    seen = [colour for _, colour, _ in outside_colours(evidence)]
+    return (
+        bool(seen)
+        and whole[1] <= LIMITED_HIGH[1]
+        and bool(np.abs(squeezed - declared).max() > BACKGROUND_LEVELS)
+        and bool(np.abs(np.median(seen, axis=0) - squeezed).max() <= 2)
+    )
 
 
 def _spans_limited(levels: tuple[int, int]) -> bool:

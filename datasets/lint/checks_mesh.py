@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from .checks_cameras import behind, upside_down
+from .checks_cameras import misplaced
 from .checks_images import sound_mask
 from .evidence import Evidence
 from .mesh_views import MeshFacts
@@ -22,7 +22,7 @@ SMALL = 0.2
 
 def _laid(evidence: Evidence) -> list[tuple[ViewFacts, MeshFacts, float]]:
     """Frames whose mesh can be held against a sound mask, with the share of the face outside."""
-    if behind(evidence) or upside_down(evidence):
+    if misplaced(evidence):
         return []
     return [
         (view, view.mesh, view.mesh.face_outside)

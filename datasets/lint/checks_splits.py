@@ -7,9 +7,10 @@ from collections.abc import Iterator
 from itertools import combinations
 
 from ..transforms import FrameEntry
+from .checks_images import unit_range
 from .evidence import Evidence
 from .rules import Hit, Rule, several, some, spans
-from .thumbnails import near_duplicates
+from .thumbnails import Thumbnail, near_duplicates
 
 
 def _same_images(evidence: Evidence) -> Iterator[Hit]:
@@ -33,7 +34,9 @@ def _same_images(evidence: Evidence) -> Iterator[Hit]:
 
 
 def _near_images(evidence: Evidence) -> Iterator[Hit]:
-    parts: dict[str, list] = defaultdict(list)
+    if unit_range(evidence):
+        return  # levels 0 and 1 are all nearly the same
+    parts: dict[str, list[Thumbnail]] = defaultdict(list)
     for thumbnail in evidence.thumbnails:
         parts[thumbnail.split].append(thumbnail)
     for one, other in combinations(parts, 2):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 
@@ -42,18 +43,22 @@ def _version(evidence: Evidence) -> Iterator[Hit]:
 def _sequence_versions(evidence: Evidence) -> Iterator[Hit]:
     if evidence.declaration is None:
         return
+    others: dict[str, Path] = {}
     for folder in sorted({entry.image.parent.parent for entry in evidence.entries} - {evidence.folder}):
         try:
             other = layout.Declaration.read(folder) if folder.is_dir() else None
         except InputError:
-            continue
+            continue  # the union's own declaration counts; that of a sequence is read for its version alone
         if other is not None and other.head_model != evidence.declaration.head_model:
-            yield Hit(
-                f"sequence {folder.name} was tracked with {other.head_model}, the union says "
-                f"{evidence.declaration.head_model}",
-                folder / layout.DECLARATION_FILE,
-                "head_model",
-            )
+            others[other.head_model] = folder
+    if others:
+        folder = next(iter(others.values()))
+        yield Hit(
+            f"sequence {folder.name} was tracked with {some(others)}, the union says "
+            f"{evidence.declaration.head_model}",
+            folder / layout.DECLARATION_FILE,
+            "head_model",
+        )
 
 
 def _no_head(evidence: Evidence) -> Iterator[Hit]:

@@ -16,7 +16,7 @@ FACE = ("face", "forehead", "nose")
 
 NOT_SKIN = ("lips", "eye_region", "left_eyeball", "right_eyeball", "mouth_socket", "teeth")
 
-SLACK = 0.03
+SLACK = 0.04
 """How far outside the foreground a vertex of the face may fall, as a share of the mesh's height in the image."""
 
 WORKING_HEIGHT = 400

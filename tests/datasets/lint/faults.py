@@ -1,0 +1,391 @@
+"""Faults to plant into a good capture: the code that must find each, and codes that may speak up with it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from headbench.datasets.ga_layout import Declaration
+from headbench.datasets.ga_writer import write_png
+
+from .good_capture import HEIGHT, WIDTH, GoodCapture
+
+Plant = Callable[[GoodCapture], None]
+
+
+@dataclass(frozen=True)
+class Fault:
+    """``code`` must be found; beside it only ``companions`` may be."""
+
+    name: str
+    code: str
+    plant: Plant
+    companions: tuple[str, ...] = ()
+
+
+REFUSED = ("HB100",)
+TRAIN, VAL, TEST = "transforms_train.json", "transforms_val.json", "transforms_test.json"
+
+
+def _declare(good: GoodCapture, **changes) -> None:
+    declaration = Declaration.read(good.union)
+    assert declaration is not None
+    replace(declaration, **changes).write(good.union)
+
+
+def _frame(good: GoodCapture, file: str, index: int, **changes) -> None:
+    good.edit(file, lambda value: value["frames"][index].update(changes))
+
+
+def _matrix(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[dict], None]:
+    def edit(frame: dict) -> None:
+        frame["transform_matrix"] = change(np.array(frame["transform_matrix"])).tolist()
+
+    return edit
+
+
+def _test_images(good: GoodCapture, timestep: int) -> list:
+    return sorted(good.writer.sequence_folder("FREE").glob(f"images/{timestep:05d}_*.png"))
+
+
+# ------------------------------------------------------------------ files
+
+
+def _rename_camera(good):
+    _frame(good, TRAIN, 4, camera_id="elsewhere")
+
+
+def _cut_json(good):
+    path = good.union / VAL
+    path.write_text(path.read_text()[:-20])
+
+
+def _drop_key(good):
+    good.edit(TRAIN, lambda value: value["frames"][3].pop("file_path"))
+
+
+def _delete_image(good):
+    _test_images(good, 2)[1].unlink()
+
+
+def _cut_image(good):
+    path = _test_images(good, 2)[1]
+    path.write_bytes(path.read_bytes()[:-30])
+
+
+def _damage_parameters(good):
+    good.files("flame_param")[4].write_bytes(b"PK\x03\x04 no archive")
+
+
+def _shrink_mask(good):
+    write_png(good.files("fg_masks")[7], np.full((HEIGHT // 2, WIDTH // 2), 255, np.uint8))
+
+
+def _drop_frame(good):
+    good.edit(TRAIN, lambda value: value["frames"].pop(5))
+
+
+def _shift_timesteps(good):
+    good.edit(
+        TEST, lambda v: [f.update(timestep_index=f["timestep_index"] + 1) for f in v["frames"]] and None
+    )
+
+
+def _freeze(good):
+    for source, target in zip(_test_images(good, 3), _test_images(good, 4)):
+        target.write_bytes(source.read_bytes())
+
+
+def _stray_exclusion(good):
+    _declare(good, excluded={99: "tongue out"})
+
+
+def _bare_exclusion(good):
+    _declare(good, excluded={3: " "})
+
+
+def _short_test(good):
+    _declare(good, excluded={12: "tongue out", 13: "tongue out"})
+
+
+def _empty_split(good):
+    good.edit(VAL, lambda value: value.update(frames=[]))
+
+
+def _no_declaration(good):
+    (good.union / "headbench.json").unlink()
+
+
+def _orphan(good):
+    path = good.files("images")[0]
+    path.with_name("00777_00.png").write_bytes(path.read_bytes())
+
+
+def _one_mask_less(good):
+    good.edit(TRAIN, lambda value: value["frames"][2].pop("fg_mask_path") and None)
+
+
+# ------------------------------------------------------------------ splits
+
+
+def _copy_to_test(good):
+    source = good.files("images")[0]
+    _test_images(good, 5)[0].write_bytes(source.read_bytes())
+
+
+def _nearly_copy_to_test(good):
+    image = cv2.imread(str(good.files("images")[0]))[..., ::-1].astype(int)
+    noise = np.random.default_rng(0).integers(-1, 2, size=image.shape)
+    write_png(_test_images(good, 5)[0], np.clip(image + noise, 0, 255).astype(np.uint8))
+
+
+def _move(source: str, index: int) -> Plant:
+    def plant(good):
+        moved = []
+        good.edit(source, lambda value: moved.append(value["frames"].pop(index)))
+        good.edit(TRAIN, lambda value: value["frames"].append(moved[0]))
+
+    return plant
+
+
+def _repeat_entry(good):
+    good.edit(TRAIN, lambda value: value["frames"].append(value["frames"][0]))
+
+
+# ------------------------------------------------------------------ images
+
+
+def _soil(image, mask):
+    spots = (np.random.default_rng(0).random(mask.shape) < 0.1) & (mask == 0)
+    return np.where(spots[..., None], 180, image).astype(np.uint8)
+
+
+def _premultiply_again(image, mask):
+    alpha = mask[..., None].astype(float) / 255
+    added = image - (1 - alpha) * 255
+    return np.clip(np.round(alpha * added + (1 - alpha) * 255), 0, 255).astype(np.uint8)
+
+
+def _never_multiplied(image, mask):
+    """Colours of the subject as they are, wherever the matte is not zero."""
+    alpha = mask[..., None].astype(float) / 255
+    colour = (image - (1 - alpha) * 255) / np.maximum(alpha, 0.02)
+    grounded = np.clip(colour, 0, 255) + (1 - alpha) * 255
+    return np.where(alpha > 0, np.clip(grounded, 0, 255), 255).round().astype(np.uint8)
+
+
+def _flat_mask(level: int) -> Plant:
+    def plant(good):
+        for image in _test_images(good, 4):
+            write_png(
+                image.parent.parent / "fg_masks" / image.name, np.full((HEIGHT, WIDTH), level, np.uint8)
+            )
+
+    return plant
+
+
+def _blank(good):
+    for path in _test_images(good, 4):
+        write_png(path, np.full((HEIGHT, WIDTH, 3), 128, np.uint8))
+
+
+def _images(change: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Plant:
+    return lambda good: good.each_image(change)
+
+
+def _masks(change: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Plant:
+    return lambda good: good.each_image(change, masks=True)
+
+
+def _limited(image, mask):
+    return np.round(16 + image * (219 / 255)).astype(np.uint8)
+
+
+def _limited_subject(image, mask):
+    """Decoded in limited range, then put on white; the skin is stretched first to reach black and white."""
+    alpha = mask[..., None].astype(float) / 255
+    colour = (image - (1 - alpha) * 255) / np.maximum(alpha, 0.02)
+    stretched = np.clip((colour - 120) * 4, 0, 255)
+    return np.round(alpha * (16 + stretched * 219 / 255) + (1 - alpha) * 255).astype(np.uint8)
+
+
+def _grey(image, mask):
+    return np.repeat(image.mean(axis=2, keepdims=True).round().astype(np.uint8), 3, axis=2)
+
+
+def _tint_one_camera(good):
+    for path in good.files("images"):
+        if path.stem.endswith("_01"):
+            image = cv2.imread(str(path))[..., ::-1].copy()
+            blue = image[..., 2].astype(float)
+            image[..., 2] = np.where(image.min(axis=2) < 250, np.clip(blue * 1.6, 0, 255), blue)
+            write_png(path, image)
+
+
+def _jpeg(good):
+    for path in good.files("images"):
+        cv2.imwrite(str(path.with_suffix(".jpg")), cv2.imread(str(path)), [cv2.IMWRITE_JPEG_QUALITY, 95])
+        path.unlink()
+    good.each_frame(lambda frame: frame.update(file_path=frame["file_path"].replace(".png", ".jpg")))
+
+
+# ------------------------------------------------------------------ cameras
+
+
+def _stretch_rotation(good):
+    good.edit(TRAIN, lambda v: _matrix(lambda m: m * np.array([2.0, 2, 2, 1]))(v["frames"][4]))
+
+
+def _same_camera(good):
+    matrices: dict[int, list] = {}
+    good.each_frame(lambda f: matrices.setdefault(f["camera_index"], f["transform_matrix"]) and None)
+    good.each_frame(lambda f: f.update(transform_matrix=matrices[0]) if f["camera_index"] == 1 else None)
+
+
+def _matrices(change: Callable[[np.ndarray], np.ndarray]) -> Plant:
+    return lambda good: good.each_frame(_matrix(change))
+
+
+def _millimetres(matrix):
+    return np.block([[matrix[:3, :3], 1000 * matrix[:3, 3:]], [matrix[3:]]])
+
+
+def _set_all(**values) -> Plant:
+    return lambda good: good.each_frame(lambda frame: frame.update(values))
+
+
+def _double_focal(good):
+    good.each_frame(lambda f: f.update(fl_x=2 * f["fl_x"], fl_y=2 * f["fl_y"]))
+
+
+def _nudge_one_frame(good):
+    def nudge(matrix):
+        matrix[0, 3] += 0.01
+        return matrix
+
+    good.edit(TRAIN, lambda v: _matrix(nudge)(v["frames"][10]))
+
+
+def _shift_one_camera(good):
+    def shift(matrix):
+        matrix[:3, 3] += 0.06 * matrix[:3, 0]
+        return matrix
+
+    good.each_frame(lambda f: _matrix(shift)(f) if f["camera_index"] == 3 else None)
+
+
+# ------------------------------------------------------------------ tracking
+
+
+def _parameters(**changes) -> Plant:
+    """``changes``: functions of (arrays, position of the file)."""
+    (change,) = changes.values()
+    return lambda good: good.each_parameters(change)
+
+
+def _one(position: int, change: Callable[[dict], None]) -> Plant:
+    return lambda good: good.parameters(good.files("flame_param")[position], change)
+
+
+def _sequence_version(good):
+    path = good.writer.sequence_folder("FREE") / "headbench.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"head_model": "flame2020"}))
+
+
+def _repeat_parameters(good):
+    files = sorted(good.writer.sequence_folder("FREE").glob("flame_param/*"))
+    files[6].write_bytes(files[5].read_bytes())
+
+
+def _jump(arrays):
+    arrays["translation"][0, 1] += 0.05
+
+
+def _shrink(good):
+    template = good.writer.plan.head.template.astype(np.float32)
+    good.each_parameters(lambda a, i: a.update(static_offset=a["static_offset"] - 0.8 * template))
+
+
+FAULTS = (
+    Fault("camera id changes", "HB100", _rename_camera, ("HB502",)),
+    Fault("JSON cut off", "HB101", _cut_json, REFUSED),
+    Fault("frame without its image's name", "HB102", _drop_key, REFUSED),
+    Fault("image deleted", "HB103", _delete_image, REFUSED),
+    Fault("image cut off", "HB103", _cut_image, REFUSED),
+    Fault("parameters damaged", "HB103", _damage_parameters, REFUSED),
+    Fault("mask of another size", "HB104", _shrink_mask, REFUSED),
+    Fault("frame left out", "HB105", _drop_frame, ("HB113",)),
+    Fault("gap in timesteps", "HB106", _shift_timesteps, REFUSED),
+    Fault("frozen images", "HB107", _freeze),
+    Fault("exclusion of nothing", "HB108", _stray_exclusion, REFUSED),
+    Fault("exclusion without reason", "HB109", _bare_exclusion),
+    Fault("short test", "HB110", _short_test),
+    Fault("empty split", "HB111", _empty_split, ("HB113",)),
+    Fault("no declaration", "HB112", _no_declaration),
+    Fault("orphan", "HB113", _orphan),
+    Fault("one mask less", "HB114", _one_mask_less),
+    Fault("image copied to the test", "HB201", _copy_to_test, ("HB702",)),
+    Fault("image nearly copied to the test", "HB202", _nearly_copy_to_test),
+    Fault("test frame in training", "HB203", _move(TEST, 4)),
+    Fault("novel view in training", "HB204", _move(VAL, 6)),
+    Fault("entry repeated", "HB205", _repeat_entry, REFUSED),
+    Fault("black declared", "HB301", lambda good: _declare(good, background=(0.0, 0.0, 0.0))),
+    Fault("soiled background", "HB302", _images(_soil)),
+    Fault("premultiplied twice", "HB303", _images(_premultiply_again)),
+    Fault("never premultiplied", "HB303", _images(_never_multiplied)),
+    Fault("empty masks", "HB304", _flat_mask(0)),
+    Fault("full masks", "HB305", _flat_mask(255)),
+    Fault("inverted masks", "HB306", _masks(lambda image, mask: 255 - mask)),
+    Fault("masks of 0 and 1", "HB307", _masks(lambda image, mask: mask // 255)),
+    Fault("blank images", "HB308", _blank),
+    Fault("limited range", "HB401", _images(_limited)),
+    Fault("limited range on white", "HB401", _images(_limited_subject)),
+    Fault("levels of 0 and 1", "HB402", _images(lambda image, mask: image // 255)),
+    Fault("grey", "HB403", _images(_grey)),
+    Fault("BGR", "HB404", _images(lambda image, mask: image[..., ::-1])),
+    Fault("one camera tinted", "HB405", _tint_one_camera),
+    Fault("JPEG", "HB406", _jpeg),
+    Fault("stretched rotation", "HB501", _stretch_rotation, REFUSED),
+    Fault("same camera twice", "HB502", _same_camera, ("HB702",)),
+    Fault("OpenCV axes", "HB503", _matrices(lambda m: m * np.array([1, -1, -1, 1.0]))),
+    Fault("upside down", "HB504", _matrices(lambda m: m * np.array([-1, -1, 1, 1.0]))),
+    Fault("millimetres", "HB505", _matrices(_millimetres)),
+    Fault("focal length of twice the size", "HB506", _double_focal, ("HB100", "HB701", "HB702")),
+    Fault("principal point of another size", "HB507", _set_all(cx=2.0), ("HB510", "HB701", "HB702")),
+    Fault("half a pixel", "HB508", _set_all(cx=(WIDTH - 1) / 2, cy=(HEIGHT - 1) / 2)),
+    Fault("principal point dropped", "HB509", lambda good: _declare(good, cy="centre")),
+    Fault("camera moves", "HB512", _nudge_one_frame, REFUSED),
+    Fault(
+        "other version declared",
+        "HB601",
+        lambda good: _declare(good, head_model="flame2020"),
+        ("HB100", "HB613"),
+    ),
+    Fault("no head", "HB602", lambda good: (good.union / "head_model.npz").unlink(), REFUSED),
+    Fault("too many coefficients", "HB603", _one(5, lambda a: a.update(expr=np.zeros((1, 99)))), REFUSED),
+    Fault("NaN", "HB604", _one(5, lambda a: a["expr"].fill(np.nan)), REFUSED),
+    Fault("few coefficients", "HB605", _parameters(change=lambda a, i: a.update(expr=a["expr"][:, :5]))),
+    Fault("eyelids", "HB606", _parameters(change=lambda a, i: a.update(eyelids=np.full((1, 2), 0.3)))),
+    Fault("jaw at rest", "HB607", _parameters(change=lambda a, i: a["jaw_pose"].fill(0.0))),
+    Fault(
+        "huge expressions",
+        "HB608",
+        _parameters(change=lambda a, i: a.update(expr=15 * a["expr"])),
+        ("HB701", "HB702", "HB612", "HB615"),
+    ),
+    Fault("identity changes", "HB609", _one(8, lambda a: a["shape"].__iadd__(0.01))),
+    Fault(
+        "dynamic offset", "HB610", _one(8, lambda a: a.update(dynamic_offset=a["static_offset"] * 0 + 1e-3))
+    ),
+    Fault("parameters repeated", "HB611", _repeat_parameters),
+    Fault("tracking jumps", "HB612", _one(15, _jump), ("HB702",)),
+    Fault("sequence of another version", "HB613", _sequence_version),
+    Fault("expression at rest", "HB614", _parameters(change=lambda a, i: a["expr"].fill(0.0))),
+    Fault("mesh aside", "HB701", _parameters(change=lambda a, i: a["translation"].__iadd__(0.04))),
+    Fault("one camera aside", "HB702", _shift_one_camera),
+    Fault("small mesh", "HB703", _shrink),
+)

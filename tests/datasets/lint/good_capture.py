@@ -1,0 +1,161 @@
+"""A small capture without any fault: a toy head with a painted skin, moving smoothly, softly matted."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+
+from headbench.bench.contracts import Camera, HeadPose
+from headbench.datasets.ga_writer import CapturePlan, CaptureWriter, SequencePlan, write_png
+from headbench.datasets.head.arrays import HeadArrays
+from headbench.datasets.head.model import HeadModel
+from headbench.datasets.mesh_pictures import rasterize_mesh, resized_camera
+
+from ..head.toy import toy_head
+from ..tiny_capture import look_at
+
+WIDTH, HEIGHT = 60, 80
+LENGTHS = {"EMO-1-shout+laugh": 6, "SEN-01-cramp_small_danger": 6, "FREE": 10}
+SERIALS = ("222200042", "222200040", "222200037", "222200049")
+FRONTAL = "222200037"
+SKIN = (205, 152, 124)
+
+
+def cameras(cx: float = WIDTH / 2 + 0.4, cy: float = HEIGHT / 2 - 0.6) -> list[Camera]:
+    """Four cameras on an arc of 90 degrees, a little above the head."""
+    return [
+        look_at(name, np.array([np.sin(a), 0.08, np.cos(a)]), WIDTH, HEIGHT, cx, cy)
+        for name, a in zip(SERIALS, np.radians([-50.0, -20.0, 10.0, 40.0]))
+    ]
+
+
+def smooth_poses(head: HeadArrays, count: int, phase: float) -> list[HeadPose]:
+    """Slow waves in every parameter."""
+    poses = []
+    for t in range(count):
+        angle = phase + 0.35 * t
+        waves = np.sin(angle * np.arange(1, head.expression_basis.shape[2] + 1) + phase)
+        poses.append(
+            HeadPose(
+                head_model=head.version,
+                expression=(0.8 * waves).astype(np.float32),
+                rotation=np.array([0.08 * np.sin(angle), 0.15 * np.cos(angle), 0.03], np.float32),
+                neck=np.array([0.02 * np.cos(angle), 0.0, 0.0], np.float32),
+                jaw=np.array([0.15 + 0.12 * np.sin(2 * angle), 0, 0], np.float32),
+                eyes=np.full(6, 0.1 * np.sin(angle), np.float32),
+                translation=np.array([0.003 * np.sin(angle), 0.004 * np.cos(angle), 0], np.float32),
+            )
+        )
+    return poses
+
+
+def good_plan(**changes: Any) -> CapturePlan:
+    """Two training sequences and FREE."""
+    head = changes.pop("head", None) or toy_head(16, version="flame-toy2023")
+    vertices, _, identities = head.shape_basis.shape
+    rng = np.random.default_rng(5)
+    settings: dict[str, Any] = {
+        "subject": "901",
+        "head": head,
+        "shape": rng.normal(size=identities).astype(np.float32),
+        "static_offset": (0.0005 * rng.normal(size=(vertices, 3))).astype(np.float32),
+        "cameras": cameras(),
+        "sequences": [SequencePlan(n, smooth_poses(head, c, i)) for i, (n, c) in enumerate(LENGTHS.items())],
+        "test_sequences": ("FREE",),
+        "novel_view_cameras": (FRONTAL,),
+    }
+    return CapturePlan(**(settings | changes))
+
+
+def paint(
+    plan: CapturePlan, vertices: np.ndarray, camera: Camera, fine: int = 4
+) -> tuple[np.ndarray, np.ndarray]:
+    """(H, W, 4) straight-alpha RGBA of the mesh in skin colours, one shade per triangle."""
+    front = rasterize_mesh(vertices, plan.head.faces, resized_camera(camera, fine)).face
+    shades = np.random.default_rng(1).integers(-30, 30, size=(len(plan.head.faces), 1)) + np.array(SKIN)
+    alpha = (front >= 0).astype(np.float32)
+    sums = cv2.resize(
+        alpha[..., None] * shades[front].astype(np.float32),
+        (camera.width, camera.height),
+        interpolation=cv2.INTER_AREA,
+    )
+    alpha = cv2.resize(alpha, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    return sums / np.maximum(alpha, 1e-6)[..., None], alpha
+
+
+def composite(colour: np.ndarray, alpha: np.ndarray, background: float = 1.0) -> np.ndarray:
+    """(H, W, 3) 8-bit."""
+    return np.round(colour * alpha[..., None] + 255 * background * (1 - alpha[..., None])).astype(np.uint8)
+
+
+@dataclass(frozen=True, eq=False)
+class GoodCapture:
+    """A written capture and ways to damage it."""
+
+    writer: CaptureWriter
+
+    @property
+    def union(self) -> Path:
+        return self.writer.union
+
+    def files(self, pattern: str) -> list[Path]:
+        """Files of the sequence folders, sorted: "images", "fg_masks" or "flame_param"."""
+        return sorted(self.writer.root.glob(f"901_*/{pattern}/*"))
+
+    def edit(self, file: str, change: Callable[[dict], None]) -> None:
+        """Apply ``change`` to a JSON of the union."""
+        path = self.union / file
+        value = json.loads(path.read_text())
+        change(value)
+        path.write_text(json.dumps(value))
+
+    def each_frame(self, change: Callable[[dict], None]) -> None:
+        """Apply ``change`` to every frame of every split."""
+        for split in ("train", "val", "test"):
+            self.edit(f"transforms_{split}.json", lambda value: [change(f) for f in value["frames"]] and None)
+
+    def each_image(
+        self, change: Callable[[np.ndarray, np.ndarray], np.ndarray], *, masks: bool = False
+    ) -> None:
+        """Replace every image (or mask) by what ``change`` makes of (H, W, 3) RGB and its (H, W) mask."""
+        for path in self.files("images"):
+            mask_path = path.parent.parent / "fg_masks" / path.name
+            image, mask = cv2.imread(str(path))[..., ::-1], cv2.imread(str(mask_path), 0)
+            write_png(mask_path if masks else path, change(image, mask))
+
+    def each_parameters(self, change: Callable[[dict[str, np.ndarray], int], None]) -> None:
+        """Apply ``change`` to the arrays of every parameter file, given its position in the order of files."""
+        for index, path in enumerate(self.files("flame_param")):
+            self.parameters(path, lambda arrays, index=index: change(arrays, index))
+
+    def parameters(self, path: Path, change: Callable[[dict[str, np.ndarray]], None]) -> None:
+        """Apply ``change`` to the arrays of one parameter file."""
+        with np.load(path) as archive:
+            arrays = {name: archive[name].copy() for name in archive.files}
+        change(arrays)
+        np.savez(path, allow_pickle=False, **arrays)
+
+
+def write_good_capture(root: Path, plan: CapturePlan | None = None) -> GoodCapture:
+    """Write a whole capture."""
+    plan = plan or good_plan()
+    writer = CaptureWriter(root, plan)
+    model = HeadModel(plan.head, dtype=torch.float64)
+    shape, offset = torch.tensor(plan.shape.astype(float)), torch.tensor(plan.static_offset.astype(float))
+    for sequence in plan.sequences:
+        arguments = model.pose_arguments(sequence.poses)
+        posed = model(canonical=model.canonical(shape, offset), **arguments).numpy()
+        for timestep, vertices in enumerate(posed):
+            for camera in plan.cameras:
+                colour, alpha = paint(plan, vertices, camera)
+                image, mask = composite(colour, alpha), np.round(alpha * 255).astype(np.uint8)
+                writer.write_frame(sequence.name, timestep, camera.id, image, mask)
+    writer.write_metadata()
+    return GoodCapture(writer)

@@ -1,0 +1,98 @@
+"""Every rule finds the fault it is there for, blames nothing else, and keeps quiet about a good capture."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from headbench.datasets.ga_layout import Declaration
+from headbench.datasets.image_files import ImageInfo
+from headbench.datasets.lint.catalogue import GROUPS, RULES
+from headbench.datasets.lint.command import lint
+from headbench.datasets.lint.rules import apply
+from headbench.datasets.lint.settings import LintSettings
+
+from .faults import FAULTS
+from .good_capture import HEIGHT, WIDTH, GoodCapture, cameras, good_plan, write_good_capture
+
+PLANTED_APART = {"HB115", "HB510", "HB511"}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _one_thread():
+    torch.set_num_threads(1)
+
+
+def codes(capture: GoodCapture, **settings) -> list[str]:
+    # Fewer views than by default: one per timestep of this capture.
+    _, findings = lint(LintSettings(str(capture.union), views=24, **settings))
+    return [finding.code for finding in findings]
+
+
+def test_a_good_capture_has_no_findings(pristine):
+    _, findings = lint(LintSettings(str(pristine.union)))
+    assert findings == []
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: f"{fault.code}: {fault.name}")
+def test_a_planted_fault_is_found_and_nothing_else(fault, good):
+    fault.plant(good)
+    found = codes(good)
+    assert fault.code in found
+    assert set(found) <= {fault.code, *fault.companions}
+    assert len(found) == len(set(found)), "one finding tells it, however many frames are at fault"
+
+
+def test_every_rule_is_tried():
+    assert {fault.code for fault in FAULTS} | PLANTED_APART == {rule.code for rule in RULES}
+
+
+def test_codes_are_distinct_in_order_and_of_a_group():
+    found = [rule.code for rule in RULES]
+    assert len(set(found)) == len(found)
+    assert all(code.startswith("HB") and code[2] in GROUPS and len(code) == 5 for code in found)
+    assert found == sorted(found)
+
+
+def test_an_off_centre_principal_point_is_noted(tmp_path):
+    plan = good_plan(cameras=cameras(WIDTH / 2 + 3.0, HEIGHT / 2 - 2.0))
+    assert codes(write_good_capture(tmp_path, plan)) == ["HB510"]
+
+
+def test_cy_from_the_other_edge(tmp_path):
+    capture = write_good_capture(tmp_path, good_plan(cameras=cameras(cy=HEIGHT / 2 - 3.0)))
+    declaration = Declaration.read(capture.union)
+    assert declaration is not None
+    replace(declaration, cy="top").write(capture.union)
+    found = codes(capture)
+    assert "HB511" in found
+    assert set(found) <= {"HB511", "HB510", "HB702", "HB701"}
+    assert "HB511" not in codes(capture, cy="bottom")
+
+
+def test_a_width_beyond_the_limit_of_gaussian_avatars(pristine):
+    evidence, _ = lint(LintSettings(str(pristine.union), views=1, duplicates=0))
+    path = next(iter(evidence.headers))
+    wide = replace(evidence, headers={path: ImageInfo(1604, 2000, 3)})
+    rule = next(rule for rule in RULES if rule.code == "HB115")
+    assert len(apply([rule], wide)) == 1
+    assert apply([rule], replace(evidence, headers={path: ImageInfo(1600, 2000, 3)})) == []
+
+
+def test_alpha_in_the_image_is_a_mask_and_has_no_background(good):
+    """RGBA over nothing: colours under transparent pixels are nobody's business."""
+    import cv2
+
+    from headbench.datasets.ga_writer import write_png
+
+    for path in good.files("images"):
+        mask = cv2.imread(str(path.parent.parent / "fg_masks" / path.name), 0)
+        image = cv2.imread(str(path))[..., ::-1].astype(float)
+        alpha = mask[..., None] / 255
+        colour = np.where(alpha > 0, (image - (1 - alpha) * 255) / np.maximum(alpha, 1e-3), 0)
+        write_png(path, np.dstack([np.clip(colour, 0, 255).round(), mask]).astype(np.uint8))
+    good.each_frame(lambda frame: frame.pop("fg_mask_path") and None)
+    assert codes(good) == []
