@@ -1,0 +1,272 @@
+"""Mattes: compositing on any background, edges without the old background's colour, nothing below the neck.
+
+Straight alpha throughout: a pixel of coverage a, foreground colour F and background B shows a F + (1 - a) B, in
+display-referred colours, as the field's tools composite.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from scipy.special import ndtr
+
+from ...bench.contracts import Camera, FloatArray, FrameKey, HeadAsset, IntArray
+from ...bench.errors import InputError
+from ..clip import CaptureClip, FramePixels
+from ..head.model import HeadModel
+
+Ground = Sequence[float] | FloatArray
+"""A colour (3,) in [0, 1], or an image (H, W, 3) of the empty set."""
+
+LEAST_COVERAGE = 0.1
+"""Below it a pixel's own foreground colour drowns in rounding and is taken from its neighbours instead."""
+
+NEIGHBOURS = 9
+"""Side of the window that colours are taken from, pixels."""
+
+SOFTNESS = 0.005
+"""Standard deviation of the edge below the neck, in image widths: VHAP blurs with a Gaussian kernel 3 % wide,
+which reaches about three deviations to either side."""
+
+_BATCH = 64
+_FLATTEST = (
+    0.25  # distance of the neck's sides in the image, in heights of the head, below which they give no line
+)
+
+
+def composite(foreground: FloatArray, coverage: FloatArray, background: Ground) -> FloatArray:
+    """(H, W, 3): straight foreground colours over a background, by (H, W) coverage."""
+    share = coverage[..., None]
+    return share * foreground + (1 - share) * np.asarray(background, dtype=foreground.dtype)
+
+
+def recomposite(image: FloatArray, coverage: FloatArray, old: Ground, new: Ground) -> FloatArray:
+    """Exchange the background of a composited image.
+
+    What the foreground contributes, image - (1 - a) old, lies between 0 and a for any real colour and is clamped to
+    that, so that rounding of the image or a background that was not quite ``old`` cannot shine through.
+    """
+    share = coverage[..., None]
+    contribution = np.clip(image - (1 - share) * np.asarray(old, dtype=image.dtype), 0, share)
+    return contribution + (1 - share) * np.asarray(new, dtype=image.dtype)
+
+
+def foreground_colours(image: FloatArray, coverage: FloatArray, background: Ground) -> FloatArray:
+    """(H, W, 3) foreground of an image that was recorded or composited over a known background.
+
+    Solves image = a F + (1 - a) background for F and clamps to [0, 1]. Where a is below `LEAST_COVERAGE` F is the
+    mean of the solved colours around, weighted by coverage; where there are none, the image's own colour.
+    """
+    share = coverage[..., None]
+    solved = image - (1 - share) * np.asarray(background, dtype=image.dtype)
+    reliable = coverage >= LEAST_COVERAGE
+    colours = np.where(reliable[..., None], solved / np.maximum(share, LEAST_COVERAGE), image)
+    colours = np.clip(colours, 0, 1).astype(np.float32)
+    if reliable.all():
+        return colours
+    weight = np.where(reliable, coverage, 0).astype(np.float32)
+    window = (NEIGHBOURS, NEIGHBOURS)
+    total = cv2.blur(weight, window)
+    around = cv2.blur(colours * weight[..., None], window) / np.maximum(total, 1e-6)[..., None]
+    near = ~reliable & (total > 1e-6)
+    return np.where(near[..., None], around, colours)
+
+
+def set_background(clip: CaptureClip, background: Sequence[float]) -> CaptureClip:
+    """The clip on another background. Raises `InputError` where a frame has no mask."""
+    colour = _colour(background)
+    if np.array_equal(colour, clip.background):
+        return clip
+    _check_masks(clip, "set_background")
+    parameters = {"background": colour.tolist(), "was": np.asarray(clip.background).tolist()}
+    if not clip.pixel_steps and all(files.mask == files.image for files in clip.files.values()):
+        # Straight colours on file: composited on the new background at once, without rounding in between.
+        return clip.derive("set_background", parameters, background=colour)
+    old = np.asarray(clip.background, dtype=np.float32)
+
+    def change(key: FrameKey, pixels: FramePixels) -> FramePixels:
+        assert pixels.coverage is not None
+        image = recomposite(pixels.image, pixels.coverage, old, colour.astype(np.float32))
+        return FramePixels(image, pixels.coverage)
+
+    return clip.derive_pixels("set_background", parameters, change, background=colour)
+
+
+def clean_edges(clip: CaptureClip, recorded_on: Sequence[float] | Mapping[str, FloatArray]) -> CaptureClip:
+    """Take the colour of the set out of soft edges.
+
+    A matte cut out of a recording leaves at its edges what was recorded, C = a F + (1 - a) S with S the set behind
+    the subject, and composites that as if it were the foreground. With S known, F is solved for and composited
+    instead. Without S there is nothing to solve: leave edges as they are.
+
+    Parameters
+    ----------
+    recorded_on : the set's colour, or an image (H, W, 3) float32 in [0, 1] of it by camera, of the size that images
+        have at this point.
+
+    Raises
+    ------
+    InputError
+        Where a frame has no mask, or a camera no image of its size.
+    """
+    _check_masks(clip, "clean_edges")
+    if isinstance(recorded_on, Mapping):
+        sets = {name: _set_image(camera, recorded_on) for name, camera in clip.cameras.items()}
+        by_recorded: dict[str, Ground] = {clip.recorded(key).camera: sets[key.camera] for key in clip.files}
+        said: object = "image by camera"
+    else:
+        colour = _colour(recorded_on).astype(np.float32)
+        by_recorded = {clip.recorded(key).camera: colour for key in clip.files}
+        said = colour.tolist()
+    ground = np.asarray(clip.background, dtype=np.float32)
+
+    def clean(key: FrameKey, pixels: FramePixels) -> FramePixels:
+        assert pixels.coverage is not None
+        cut_out = foreground_colours(pixels.image, pixels.coverage, ground)
+        colours = foreground_colours(cut_out, pixels.coverage, by_recorded[key.camera])
+        return FramePixels(composite(colours, pixels.coverage, ground), pixels.coverage)
+
+    return clip.derive_pixels("clean_edges", {"recorded_on": said}, clean)
+
+
+# ------------------------------------------------------------------ below the neck
+
+
+@dataclass(frozen=True)
+class NeckLine:
+    """A line across an image, pixels: a point on it, and the unit normal towards the head."""
+
+    point: tuple[float, float]
+    normal: tuple[float, float]
+
+    def weights(self, width: int, height: int, deviation: float) -> FloatArray:
+        """(H, W) float32: 1 on the head's side, 0 below, a half-plane blurred by a Gaussian (pixels)."""
+        x = np.arange(width) + 0.5 - self.point[0]
+        y = np.arange(height)[:, None] + 0.5 - self.point[1]
+        return ndtr((self.normal[0] * x + self.normal[1] * y) / deviation).astype(np.float32)
+
+
+def mask_below_neck(clip: CaptureClip, *, softness: float = SOFTNESS) -> CaptureClip:
+    """Turn what lies below the tracked neck into background, in images and masks, as VHAP's "below line" does.
+
+    The line goes through the projected front of the neck's lower boundary, parallel to the line through its left
+    and right; its edge is Gaussian. Trackers end there, and clothes below it move in ways no head model explains.
+
+    Parameters
+    ----------
+    softness : standard deviation of the edge, in image widths.
+
+    Raises
+    ------
+    InputError
+        Where the head model has no regions "boundary" or "neck", or softness is not positive.
+    """
+    if not softness > 0:
+        raise InputError(
+            "mask_below_neck", "softness", "a positive share of the image's width", str(softness)
+        )
+    anchors = neck_anchors(clip.head)
+    places = _posed(clip, anchors)
+    lines = {
+        clip.recorded(key): neck_line(clip.cameras[key.camera], places[key.timestep]) for key in clip.files
+    }
+    ground = np.asarray(clip.background, dtype=np.float32)
+
+    def cut(key: FrameKey, pixels: FramePixels) -> FramePixels:
+        line = lines[key]
+        if line is None:
+            return pixels
+        height, width = pixels.image.shape[:2]
+        weights = line.weights(width, height, softness * width)
+        coverage = None if pixels.coverage is None else pixels.coverage * weights
+        # a w F + (1 - a w) B equals w (a F + (1 - a) B) + (1 - w) B: no need to know F.
+        return FramePixels(composite(pixels.image, weights, ground), coverage)
+
+    return clip.derive_pixels("mask_below_neck", {"softness": softness, "anchors": anchors.tolist()}, cut)
+
+
+def neck_anchors(head: HeadAsset) -> IntArray:
+    """(4,) vertices: front, left and right of the neck's lower boundary, and the top of the head."""
+    for name in ("boundary", "neck"):
+        if name in head.regions and len(head.regions[name]):
+            members = np.asarray(head.regions[name])
+            break
+    else:
+        known = ", ".join(sorted(head.regions)) or "no regions"
+        raise InputError(f"head model {head.version}", "regions", "a region 'boundary' or 'neck'", known)
+    x, y, z = np.asarray(head.template, np.float64).T
+    lowest, highest = y[members].min(), y[members].max()
+    rim = members[y[members] <= lowest + 0.25 * (highest - lowest)]
+    return np.array([rim[np.argmax(z[rim])], rim[np.argmax(x[rim])], rim[np.argmin(x[rim])], np.argmax(y)])
+
+
+def neck_line(camera: Camera, anchors: FloatArray) -> NeckLine | None:
+    """The line in an image, given the (4, 3) world positions of `neck_anchors`; None where one is behind it.
+
+    Seen from the side the left and right of the neck fall together and say nothing; the line is then perpendicular
+    to the head's height.
+    """
+    points = anchors @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    if points[:, 2].min() <= 0:
+        return None
+    front, left, right, top = (points @ np.asarray(camera.K).T)[:, :2] / points[:, 2:]
+    up = top - front
+    height = float(np.hypot(*up))
+    across = left - right
+    if np.hypot(*across) < _FLATTEST * height:
+        normal = up
+    else:
+        normal = np.array([-across[1], across[0]])
+        normal = normal if normal @ up > 0 else -normal
+    length = float(np.hypot(*normal))
+    if not length > 0:
+        return None
+    return NeckLine(
+        (float(front[0]), float(front[1])), (float(normal[0] / length), float(normal[1] / length))
+    )
+
+
+def _posed(clip: CaptureClip, vertices: IntArray) -> dict[int, FloatArray]:
+    """World positions (n, 3) of some vertices at each timestep."""
+    model = HeadModel(clip.head)
+    canonical = model.canonical(
+        torch.from_numpy(np.asarray(clip.shape, np.float32)),
+        torch.from_numpy(np.asarray(clip.static_offset, np.float32)),
+    )
+    timesteps = sorted({key.timestep for key in clip.files})
+    places: dict[int, FloatArray] = {}
+    with torch.no_grad():
+        for start in range(0, len(timesteps), _BATCH):
+            part = timesteps[start : start + _BATCH]
+            arguments = model.pose_arguments([clip.poses[timestep] for timestep in part])
+            posed = model(canonical=canonical, **arguments)[:, vertices].numpy().astype(np.float64)
+            places.update(zip(part, posed))
+    return places
+
+
+def _colour(values: Sequence[float]) -> FloatArray:
+    colour = np.asarray(values, dtype=np.float64)
+    if colour.shape != (3,) or not ((colour >= 0) & (colour <= 1)).all():
+        raise InputError("matte", "background", "three numbers in [0, 1]", str(values))
+    return colour
+
+
+def _set_image(camera: Camera, images: Mapping[str, FloatArray]) -> FloatArray:
+    found = np.shape(images[camera.id]) if camera.id in images else "none"
+    if found != (camera.height, camera.width, 3):
+        expected = f"an image of shape {(camera.height, camera.width, 3)}"
+        raise InputError("clean_edges", f"recorded_on[{camera.id}]", expected, str(found))
+    return np.asarray(images[camera.id], dtype=np.float32)
+
+
+def _check_masks(clip: CaptureClip, step: str) -> None:
+    bare = [key for key, files in clip.files.items() if files.mask is None]
+    if bare:
+        found = f"{len(bare)} without, such as {bare[0]}"
+        raise InputError(
+            step, "masks", "a mask for every frame", found, "The step needs a matte to work with."
+        )
