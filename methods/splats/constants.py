@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 TILE = 16
 """Side of the square tiles splats are sorted into, pixels."""
 
 ALPHA_MIN = 1.0 / 255.0
 """A splat contributes nothing to pixels where its alpha is below this."""
 
-ALPHA_MAX = 0.99
-"""Alpha is clamped here; the gradient through the clamp is zero."""
+ALPHA_MAX = float(np.float32(0.99))
+"""Alpha is clamped here; the gradient through the clamp is zero.
+
+It is the float32 number in float64 too. What two opaque splats let through is then below `TRANSMITTANCE_MIN` in either
+precision, while 0.99 itself in float64 would let a second one be drawn that float32, gsplat's precision, leaves out.
+"""
 
 TRANSMITTANCE_MIN = 1e-4
 """The splat that would bring a pixel's transmittance to this or below is left out, with all behind it."""

@@ -93,6 +93,11 @@ def _clamped_alpha(outcome: Outcome) -> str:
     return "" if abs(highest - 0.99) < 1e-6 else f"alpha reaches {highest}, expected 0.99"
 
 
+def _first_alone(outcome: Outcome) -> str:
+    middle = outcome.rendering.alpha[8, 8].item()
+    return "" if abs(middle - 0.99) < 1e-6 else f"alpha of {middle} in the middle, expected 0.99"
+
+
 def _in_range(outcome: Outcome) -> str:
     low, high = float(outcome.rendering.alpha.min()), float(outcome.rendering.alpha.max())
     return "" if 0 <= low <= high <= 1 else f"alpha from {low} to {high}"
@@ -109,6 +114,35 @@ def _wide_outside() -> Scene:
         scales=[[0.9, 0.8, 0.7], [0.7, 0.9, 0.6]],
         opacities=[0.8, 0.7],
     )
+
+
+def _wide_beside_an_off_centre_image() -> Scene:
+    """The principal point is near a corner, so the slopes are clamped at other values on either side."""
+    scene = facing(
+        4,
+        means=[[2.3, 0.1, 1.0], [-1.05, 0.1, 1.0], [0.4, -2.4, 1.1], [0.3, 0.9, 1.0]],
+        scales=[[0.9, 0.8, 0.7], [0.7, 0.9, 0.6], [0.8, 0.7, 0.9], [0.6, 0.7, 0.8]],
+        opacities=[0.8, 0.7, 0.8, 0.7],
+    )
+    K = scene.K.clone()
+    K[0, 2], K[1, 2] = 0.1 * scene.width, 0.95 * scene.height
+    return scene._replace(K=K)
+
+
+def _far_from_a_turned_camera() -> Scene:
+    """Four means whose products with the camera's rotation overflow, of either sign; the others are in its sight."""
+    scene = facing(8)
+    viewmat = cloud(1, 8, 8).viewmat
+    means = (scene.means - viewmat[:3, 3]) @ viewmat[:3, :3]
+    means[:4] = 3e38 * torch.tensor([[1.0, 1, 1], [-1, 1, 1], [1, -1, 1], [1, 1, -1]])
+    return scene._replace(means=means, viewmat=viewmat)
+
+
+def _crowd(count: int) -> Scene:
+    """Faint splats of about a pixel, scattered over a quarter of a tile."""
+    scene = facing(count, 8, spread=0.0, scales=uneven(count, 0.003), opacities=[0.0045] * count)
+    place = torch.rand(count, 3, generator=torch.Generator().manual_seed(4)) - 0.5
+    return scene._replace(means=scene.means + place * torch.tensor([1.7, 1.7, 0.1]))
 
 
 def _one_splat(**fields: Any) -> Scene:
@@ -155,6 +189,13 @@ CASES = (
         complaint=culled(0, 1, 2, 3),
     ),
     Case(
+        "near plane at 0.2 m",
+        "culled before it",
+        lambda: facing(12, means=_depths([-1.0, 0.1, 0.199, 0.201, 0.25]), scales=[[1e-2] * 3] * 5),
+        options={"near": 0.2},
+        complaint=culled(0, 1, 2),
+    ),
+    Case(
         "beyond the far plane",
         "culled at and beyond it",
         lambda: facing(8, means=[[0.0, 0, 100.0], [0, 0, 101.0], [0, 0, 3e38]]),
@@ -174,10 +215,21 @@ CASES = (
         gradient=1e-3,
     ),
     Case(
+        "the same beside an image with its principal point near a corner",
+        "clamped by that point, not symmetrically",
+        _wide_beside_an_off_centre_image,
+    ),
+    Case(
         "splats far outside, 1e6 to 1e30 m aside",
         "culled, finite",
         lambda: facing(8, means=[[1e6, 0, 2.0], [0, -1e10, 0.02], [1e30, 1e30, 2.0]]),
         complaint=culled(0, 1, 2),
+    ),
+    Case(
+        "splats 3e38 m off in every axis, the camera turned",
+        "culled, finite",
+        _far_from_a_turned_camera,
+        complaint=culled(0, 1, 2, 3),
     ),
     Case(
         "far smaller than a pixel",
@@ -190,6 +242,12 @@ CASES = (
         lambda: facing(20, scales=uneven(20, 1e-6), opacities=[0.9] * 20),
         options={"antialiased": True},
         complaint=_background_alone,
+    ),
+    Case(
+        "a tenth of a pixel wide, antialiased",
+        "faint by the ratio of determinants",
+        lambda: facing(20, scales=uneven(20, 0.005), opacities=[0.9] * 20),
+        options={"antialiased": True},
     ),
     Case(
         "without the low-pass filter, half a pixel wide",
@@ -205,10 +263,16 @@ CASES = (
     ),
     Case(
         "needles 4000 px long, 0.55 px thin",
-        "alpha in [0, 1]; gradients limited by float32",
+        "drawn as exactly; gradients along the needle lose digits",
         lambda: _needles(60.0),
-        image=1e-3,
         gradient=2e-2,
+        complaint=_in_range,
+    ),
+    Case(
+        "needles 16000 px long, 0.55 px thin",
+        "drawn as exactly; gradients along the needle lose digits",
+        lambda: _needles(240.0),
+        gradient=0.2,
         complaint=_in_range,
     ),
     Case(
@@ -237,15 +301,16 @@ CASES = (
         lambda: facing(8, scales=[[0.0, 0, 0], [0.1, 0, 0], [1e-38] * 3, [0.1, 0.1, 0]]),
     ),
     Case(
-        "quaternions from 1e-14 to 1e20 long, and zero",
+        "quaternions from 1e-40 to 4e38 long, and zero",
         "direction alone counts; zero is the identity",
         lambda: facing(
-            7,
+            9,
             spread=0.2,
             quats=[
-                [0.5 * s, -0.3 * s, 0.7 * s, 0.4 * s] for s in (1.0, 1e20, 1e-6, 1e-11, 3e-13, 1e-14, 0.0)
+                [0.5 * s, -0.3 * s, 0.7 * s, 0.4 * s]
+                for s in (1.0, 4e38, 1e20, 1e-6, 1e-11, 3e-13, 1e-14, 1e-40, 0.0)
             ],
-            scales=[[0.2, 0.05, 0.1]] * 7,
+            scales=[[0.2, 0.05, 0.1]] * 9,
         ),
         gradient=2e-3,
         each_quaternion=True,
@@ -265,6 +330,12 @@ CASES = (
         complaint=_clamped_alpha,
     ),
     Case(
+        "opaque splats one behind the other",
+        "stops at the second, whose light would be 1e-4",
+        lambda: _layers(3, 1.0),
+        complaint=_first_alone,
+    ),
+    Case(
         "150 layers of alpha 0.05",
         "transmittance recovered by division loses little",
         lambda: _layers(150, 0.05),
@@ -280,6 +351,12 @@ CASES = (
         "long lists, thresholds everywhere",
         lambda: facing(1500, 16, spread=0.1, scales=uneven(1500, 0.6), opacities=[0.005] * 1500),
         image=2e-6,
+        gradient=5e-4,
+    ),
+    Case(
+        "66 000 splats in a tile",
+        "more than 16 bits count",
+        lambda: _crowd(66_000),
         gradient=5e-4,
     ),
     Case(
@@ -316,5 +393,11 @@ CASES = (
         "errors relative to them",
         lambda: _scaled_colors(facing(30), 1e6),
         image=1.0,
+    ),
+    Case(
+        "colours and background of 1e30 and -1e30",
+        "finite; errors relative to them",
+        lambda: _scaled_colors(facing(30), 1e30),
+        image=1e24,
     ),
 )
