@@ -33,9 +33,7 @@ SOFTNESS = 0.005
 which reaches about three deviations to either side."""
 
 _BATCH = 64
-_FLATTEST = (
-    0.25  # distance of the neck's sides in the image, in heights of the head, below which they give no line
-)
+_SIDEWAYS = 0.3  # foreshortening of the neck, against that of the head, beyond which its sides give no line
 
 
 def composite(foreground: FloatArray, coverage: FloatArray, background: Ground) -> FloatArray:
@@ -190,17 +188,19 @@ def mask_below_neck(clip: CaptureClip, *, softness: float = SOFTNESS) -> Capture
 
 
 def neck_anchors(head: HeadAsset) -> IntArray:
-    """(4,) vertices: front, left and right of the neck's lower boundary, and the top of the head."""
-    for name in ("boundary", "neck"):
-        if name in head.regions and len(head.regions[name]):
-            members = np.asarray(head.regions[name])
-            break
+    """(4,) vertices: front, left and right of the neck's lower boundary, and the top of the head.
+
+    The boundary is the region of that name, else the lower half of the neck.
+    """
+    x, y, z = np.asarray(head.template, np.float64).T
+    if len(head.regions.get("boundary", ())):
+        rim = np.asarray(head.regions["boundary"])
+    elif len(head.regions.get("neck", ())):
+        neck = np.asarray(head.regions["neck"])
+        rim = neck[y[neck] <= np.median(y[neck])]
     else:
         known = ", ".join(sorted(head.regions)) or "no regions"
         raise InputError(f"head model {head.version}", "regions", "a region 'boundary' or 'neck'", known)
-    x, y, z = np.asarray(head.template, np.float64).T
-    lowest, highest = y[members].min(), y[members].max()
-    rim = members[y[members] <= lowest + 0.25 * (highest - lowest)]
     return np.array([rim[np.argmax(z[rim])], rim[np.argmax(x[rim])], rim[np.argmin(x[rim])], np.argmax(y)])
 
 
@@ -214,10 +214,9 @@ def neck_line(camera: Camera, anchors: FloatArray) -> NeckLine | None:
     if points[:, 2].min() <= 0:
         return None
     front, left, right, top = (points @ np.asarray(camera.K).T)[:, :2] / points[:, 2:]
-    up = top - front
-    height = float(np.hypot(*up))
-    across = left - right
-    if np.hypot(*across) < _FLATTEST * height:
+    up, across = top - front, left - right
+    height, breadth = np.linalg.norm(anchors[3] - anchors[0]), np.linalg.norm(anchors[1] - anchors[2])
+    if np.hypot(*across) * height < _SIDEWAYS * np.hypot(*up) * breadth:
         normal = up
     else:
         normal = np.array([-across[1], across[0]])

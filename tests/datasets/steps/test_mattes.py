@@ -1,0 +1,277 @@
+"""Mattes on frames whose true colours are known, and the line below the neck against a filled half-plane."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.ndimage import gaussian_filter
+
+from headbench.bench.contracts import Camera
+from headbench.bench.errors import InputError
+from headbench.datasets.clip import FrameFiles
+from headbench.datasets.ga_reader import read_capture
+from headbench.datasets.head.model import HeadModel
+from headbench.datasets.images import ImageStore
+from headbench.datasets.steps.mattes import (
+    NeckLine,
+    clean_edges,
+    composite,
+    foreground_colours,
+    mask_below_neck,
+    neck_anchors,
+    neck_line,
+    recomposite,
+    set_background,
+)
+
+SIZE = 64
+GREEN, WHITE, BLUE = (0.1, 0.7, 0.2), (1.0, 1.0, 1.0), (0.0, 0.2, 0.9)
+
+
+def subject(size=SIZE):
+    """Smooth colours and a soft-edged disc: (foreground, coverage), float32."""
+    y, x = np.mgrid[:size, :size] / size
+    colours = np.stack([0.6 + 0.2 * np.sin(7 * x), 0.4 + 0.2 * y, 0.3 + 0.1 * x * y], axis=-1)
+    coverage = np.clip((0.32 - np.hypot(x - 0.5, y - 0.5)) / 0.08 + 0.5, 0, 1)
+    return colours.astype(np.float32), coverage.astype(np.float32)
+
+
+def rounded(image):
+    return np.round(image * 255).astype(np.uint8)
+
+
+# ------------------------------------------------------------------ arithmetic
+
+
+@settings(max_examples=50, deadline=None)
+@given(*[st.tuples(*[st.floats(0, 1)] * 3)] * 2)
+def test_exchanging_the_background_equals_compositing_on_the_new_one(old, new):
+    colours, coverage = subject(24)
+    exchanged = recomposite(composite(colours, coverage, old), coverage, old, new)
+    assert np.abs(exchanged - composite(colours, coverage, new)).max() < 1e-5
+
+
+def test_the_composite_is_the_formula():
+    colours, coverage = subject(8)
+    expected = [
+        [
+            [coverage[y, x] * colours[y, x, c] + (1 - coverage[y, x]) * BLUE[c] for c in range(3)]
+            for x in range(8)
+        ]
+        for y in range(8)
+    ]
+    assert np.abs(composite(colours, coverage, BLUE) - np.array(expected)).max() < 1e-6
+
+
+def test_a_background_that_was_not_quite_so_cannot_shine_through():
+    coverage = np.zeros((4, 4), np.float32)
+    nearly_white = np.full((4, 4, 3), 0.97, np.float32)
+    assert (recomposite(nearly_white, coverage, WHITE, (0.0, 0.0, 0.0)) == 0).all()
+
+
+def test_the_foreground_behind_a_known_background_is_found():
+    """From 8 bits, at soft edges, over one colour and over an image of the set."""
+    colours, coverage = subject()
+    stage = np.random.default_rng(0).random((SIZE, SIZE, 3)).astype(np.float32)
+    for ground in (GREEN, stage):
+        recorded = rounded(composite(colours, coverage, ground)).astype(np.float32) / 255
+        found = foreground_colours(recorded, coverage, ground)
+        reliable = coverage >= 0.1
+        allowed = 0.5 / 255 / coverage[reliable] + 1e-4
+        assert (np.abs(found - colours)[reliable] <= allowed[:, None]).all()
+        assert found.min() >= 0
+        assert found.max() <= 1
+        thin = (coverage > 0) & ~reliable
+        assert thin.sum() > 20
+        # From the neighbours: what remains of the error once composited is within two levels.
+        assert (np.abs(found - colours) * coverage[..., None])[thin].max() < 2 / 255
+
+
+def test_no_coverage_at_all_leaves_the_image_and_full_coverage_too():
+    image = np.random.default_rng(1).random((9, 9, 3)).astype(np.float32)
+    assert np.array_equal(foreground_colours(image, np.zeros((9, 9), np.float32), WHITE), image)
+    assert np.allclose(foreground_colours(image, np.ones((9, 9), np.float32), WHITE), image)
+
+
+# ------------------------------------------------------------------ clips
+
+
+@pytest.fixture(scope="module")
+def clip(pristine_capture):
+    return read_capture(pristine_capture.union)
+
+
+def with_pixels(clip, folder, image, mask):
+    """A clip whose frames all show one image (3 or 4 channels) with one mask."""
+    path, matte = folder / "image.png", folder / "mask.png"
+    order = [2, 1, 0, 3][: image.shape[2]]
+    cv2.imwrite(str(path), image[..., order])
+    if mask is not None:
+        cv2.imwrite(str(matte), mask)
+    files = {key: FrameFiles(path, path if mask is None else matte) for key in clip.files}
+    height, width = image.shape[:2]
+    cameras = {name: camera.resized(width, height) for name, camera in clip.cameras.items()}
+    return replace(clip, files=files, cameras=cameras, store=ImageStore())
+
+
+def test_a_clip_on_another_background(clip, tmp_path):
+    colours, coverage = subject()
+    levels = rounded(coverage)
+    shown = levels.astype(np.float32) / 255
+    opaque = with_pixels(clip, tmp_path, rounded(composite(colours, shown, WHITE)), levels)
+    key = clip.splits["train"][0]
+    changed = set_background(opaque, BLUE)
+    expected = 255 * composite(colours, shown, BLUE)
+    assert np.abs(changed.image(key) - expected).max() <= 1.01  # one rounding on file, one here
+    assert np.array_equal(changed.mask(key), levels)
+    assert changed.background == pytest.approx(BLUE)
+    assert changed.fingerprint != opaque.fingerprint
+    again = set_background(changed, WHITE)
+    assert np.abs(again.image(key).astype(int) - opaque.image(key)).max() <= 1
+    assert [step.name for step in again.steps[-2:]] == ["set_background", "set_background"]
+
+
+def test_straight_colours_on_file_are_composited_without_rounding_twice(clip, tmp_path):
+    colours, coverage = subject()
+    rgba = np.dstack([rounded(colours), rounded(coverage)])
+    straight = with_pixels(clip, tmp_path, rgba, None)
+    changed = set_background(straight, BLUE)
+    assert changed.pixel_steps == ()
+    key = clip.splits["train"][0]
+    expected = 255 * composite(rgba[..., :3] / 255, rgba[..., 3] / 255, np.array(BLUE))
+    assert np.abs(changed.image(key) - expected).max() <= 0.5 + 1e-3
+
+
+def test_the_same_background_is_the_same_clip(clip):
+    assert set_background(clip, WHITE) is clip
+
+
+@pytest.mark.parametrize("by_camera", [False, True])
+def test_the_colour_of_the_set_leaves_the_edges(clip, tmp_path, by_camera):
+    colours, coverage = subject()
+    levels = rounded(coverage)
+    shown = levels.astype(np.float32) / 255
+    recorded = composite(colours, shown, GREEN)  # in front of a green screen
+    cut_out = rounded(composite(recorded, shown, WHITE))  # and cut out with its matte, as it was recorded
+    spilled = with_pixels(clip, tmp_path, cut_out, levels)
+    screen = np.broadcast_to(np.float32(GREEN), (SIZE, SIZE, 3))
+    cleaned = clean_edges(spilled, dict.fromkeys(clip.cameras, screen) if by_camera else GREEN)
+    key = clip.splits["train"][0]
+    truth = 255 * composite(colours, shown, WHITE)
+    edge = (shown > 0.02) & (shown < 0.98)
+    before = np.abs(cut_out - truth)[edge]
+    after = np.abs(cleaned.image(key) - truth)[edge]
+    assert before.max() > 25
+    assert after.max() < 6
+    assert after.mean() < 1 < 10 < before.mean()  # levels; two roundings on file, amplified where it is soft
+    assert np.abs(cleaned.image(key).astype(int) - cut_out)[shown == 1].max() <= 1
+    assert np.array_equal(cleaned.mask(key), levels)
+
+
+def test_what_a_matte_step_needs_is_said(clip):
+    bare = replace(clip, files={key: files._replace(mask=None) for key, files in clip.files.items()})
+    with pytest.raises(InputError, match="a mask for every frame"):
+        set_background(bare, BLUE)
+    with pytest.raises(InputError, match="a mask for every frame"):
+        clean_edges(bare, GREEN)
+    with pytest.raises(InputError, match=r"three numbers in \[0, 1\]"):
+        set_background(clip, (1.0, 2.0, 0.0))
+    with pytest.raises(InputError, match=r"recorded_on\[222200037\]|recorded_on\[222200042\]"):
+        clean_edges(clip, {})
+    with pytest.raises(InputError, match="softness"):
+        mask_below_neck(clip, softness=0.0)
+
+
+# ------------------------------------------------------------------ below the neck
+
+
+def test_the_edge_is_a_half_plane_blurred_by_a_gaussian():
+    line = NeckLine((31.3, 40.2), (0.196116, -0.980581))
+    y, x = np.mgrid[: 64 * 8, : 64 * 8] / 8 + 1 / 16
+    hard = ((x - 31.3) * 0.196116 - (y - 40.2) * 0.980581 > 0).astype(float)
+    soft = gaussian_filter(hard, 3.0 * 8, mode="nearest")[4::8, 4::8]
+    found = line.weights(64, 64, 3.0)
+    inner = np.s_[10:-10, 10:-10]
+    assert np.abs(found - soft)[inner].max() < 0.01
+    assert found[5, 30] > 0.999
+    assert found[60, 30] < 0.001
+
+
+def project(camera, point):
+    p = camera.world_to_camera[:3, :3] @ point + camera.world_to_camera[:3, 3]
+    return (camera.K @ p)[:2] / p[2]
+
+
+def test_anchors_lie_where_their_names_say(clip):
+    front, left, right, top = clip.head.template[neck_anchors(clip.head)]
+    neck = clip.head.template[clip.head.regions["neck"]]
+    assert front[2] > 0.015
+    assert abs(front[0]) < 1e-6
+    assert left[0] > 0.015
+    assert right[0] < -0.015
+    assert top[1] == clip.head.template[:, 1].max()
+    assert max(front[1], left[1], right[1]) <= np.median(neck[:, 1])
+
+
+def test_images_and_masks_end_below_the_line_through_the_neck(clip, tmp_path):
+    noise = np.random.default_rng(0).integers(0, 200, (64, 48, 3)).astype(np.uint8)
+    clip = with_pixels(clip, tmp_path, noise, np.full((64, 48), 255, np.uint8))
+    cut = mask_below_neck(clip)
+    model = HeadModel(clip.head, dtype=torch.float64)
+    canonical = model.canonical(
+        torch.tensor(np.asarray(clip.shape, float)), torch.tensor(np.asarray(clip.static_offset, float))
+    )
+    anchors = neck_anchors(clip.head)
+    changed, tilts = 0, set()
+    for key in clip.splits["train"]:
+        camera, pose = clip.cameras[key.camera], clip.poses[key.timestep]
+        vertices = model(canonical=canonical, **model.pose_arguments([pose]))[0].numpy()[anchors]
+        front, left, right, _ = (project(camera, vertex) for vertex in vertices)
+        y, x = np.mgrid[:64, :48] + 0.5
+        slope = (left[1] - right[1]) / (left[0] - right[0])
+        tilts.add(round(float(slope), 3))
+        below = y - (front[1] + slope * (x - front[0]))  # pixels under the tilted line
+        image, mask = cut.image(key), cut.mask(key)
+        assert (image[below > 1.5] == 255).all()
+        assert (mask[below > 1.5] == 0).all()
+        above = below < -1.5
+        assert np.array_equal(image[above], clip.image(key)[above])
+        assert np.array_equal(mask[above], clip.mask(key)[above])
+        changed += int((clip.mask(key)[below > 1.5] > 0).sum())
+    assert changed > 50  # there was something to cut
+    assert max(tilts) - min(tilts) > 0.05
+    assert cut.steps[-1].name == "mask_below_neck"
+
+
+def test_a_head_upside_down_is_cut_on_its_own_neck():
+    anchors = np.array([[0.0, -0.1, 0.08], [0.06, -0.1, 0.0], [-0.06, -0.1, 0.0], [0.0, 0.12, 0.0]])
+    K = np.array([[500.0, 0, 50], [0, 500, 50], [0, 0, 1]])
+    upright = np.diag([1.0, -1, -1, 1])
+    upright[2, 3] = 1.0
+    rolled = np.diag([-1.0, -1, 1, 1]) @ upright
+    for matrix, sign in ((upright, -1), (rolled, 1)):
+        line = neck_line(Camera("c", 100, 100, K, matrix), anchors)
+        assert np.sign(line.normal[1]) == sign
+        assert abs(line.normal[0]) < 0.05
+
+
+def test_from_the_side_the_line_is_perpendicular_to_the_head():
+    anchors = np.array([[0.0, -0.1, 0.08], [0.06, -0.1, 0.0], [-0.06, -0.1, 0.0], [0.0, 0.12, 0.08]])
+    K = np.array([[500.0, 0, 50], [0, 500, 50], [0, 0, 1]])
+    side = np.array([[0.0, 0, -1, 0], [0, -1, 0, 0], [-1, 0, 0, 1], [0, 0, 0, 1]])
+    line = neck_line(Camera("c", 100, 100, K, side), anchors)
+    assert line.normal == pytest.approx((0, -1), abs=1e-9)
+
+
+def test_a_neck_behind_the_camera_gives_no_line():
+    camera = Camera("c", 100, 100, np.eye(3), np.eye(4))
+    assert neck_line(camera, np.array([[0.0, 0, -1]] * 4)) is None
+
+
+def test_a_head_without_a_neck_is_refused(clip):
+    with pytest.raises(InputError, match="a region 'boundary' or 'neck'"):
+        neck_anchors(replace(clip.head, regions={"face": np.arange(3)}))
