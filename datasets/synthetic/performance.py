@@ -25,7 +25,9 @@ HELD_OUT = "FREE"
 TONGUE = "tongue out"
 """Why a frame is left out of a comparison: no head model of FLAME's layout has a tongue."""
 
-_TONGUE_SEEN = 0.08
+TONGUE_SHOWS = 0.6
+"""`Performed.excluded` begins here unless the subject says better: see `tongue_labels`."""
+
 _PHRASE_SECONDS = 0.9
 
 
@@ -198,8 +200,11 @@ def share_out(timesteps: int) -> dict[str, int]:
     return {name: int(n) for name, n in zip(chosen, np.diff(ends, prepend=0))}
 
 
-def perform(name: str, timesteps: int, seed: int) -> Performed:
-    """Play a sequence, sampled evenly at ``timesteps`` moments. The same seed gives the same take."""
+def perform(name: str, timesteps: int, seed: int, tongue_shows: float = TONGUE_SHOWS) -> Performed:
+    """Play a sequence, sampled evenly at ``timesteps`` moments. The same seed gives the same take.
+
+    ``tongue_shows`` is the share in [0, 1] by which the tongue has to be out for a timestep to be labelled.
+    """
     number = list(SEQUENCES).index(name)
     rng = np.random.default_rng([seed, number])
     phrases = SEQUENCES[name]
@@ -224,7 +229,7 @@ def perform(name: str, timesteps: int, seed: int) -> Performed:
             values[f"blink_{side}"] + 0.35 * np.maximum(-values["gaze_up"], 0), 0, 1
         )
     activations = [{control: float(values[control][t]) for control in CONTROLS} for t in range(timesteps)]
-    excluded = {t: TONGUE for t, a in enumerate(activations) if a["tongue_out"] > _TONGUE_SEEN}
+    excluded = {t: TONGUE for t, a in enumerate(activations) if a["tongue_out"] >= tongue_shows}
     return Performed(name, activations, excluded)
 
 

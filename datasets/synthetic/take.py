@@ -14,11 +14,12 @@ from ...bench.files import digest
 from ..ga_writer import CapturePlan, CaptureWriter, SequencePlan
 from ..head.model import HeadModel
 from . import rig
-from .anatomy import measure
+from .anatomy import Anatomy, measure
 from .geometry import Geometry
 from .hair import STYLES, Style
 from .people import Person, person
 from .performance import HELD_OUT, Performed, perform, share_out
+from .tongue_labels import share_that_shows
 from .tracking import with_tracking_noise
 
 FIRST_SUBJECT = 900
@@ -76,11 +77,14 @@ def plan_take(out: Path, index: int, geometry: Geometry, settings: Settings) -> 
     shape = rng.standard_normal(head.shape_basis.shape[2]) * _IDENTITY_SPREAD
     shape = np.clip(shape, -1.6, 1.6).astype(np.float32).astype(np.float64)
     width, height = settings.size
-    target = _middle(geometry, shape, STYLES[who.style])
+    neutral = HeadModel(head, dtype=torch.float64).canonical(torch.from_numpy(shape))[0].numpy()
+    anatomy = measure(head, neutral)
+    target = _middle(anatomy, neutral, STYLES[who.style])
+    tongue_shows = share_that_shows(geometry.mouth(who, anatomy, shape), anatomy, neutral)
     views = rig.cameras(settings.cameras, width, height, target, seed=settings.seed + 101 * index)
     performed, poses = {}, {}
     for sequence, count in share_out(settings.timesteps).items():
-        performed[sequence] = perform(sequence, count, seed=settings.seed + 101 * index)
+        performed[sequence] = perform(sequence, count, settings.seed + 101 * index, tongue_shows)
         poses[sequence] = tuple(
             geometry.translation.pose(activations, name, timestep)
             for timestep, activations in enumerate(performed[sequence].activations)
@@ -104,14 +108,11 @@ def plan_take(out: Path, index: int, geometry: Geometry, settings: Settings) -> 
     return Take(index, who, geometry, shape, views, performed, poses, CaptureWriter(out, plan), settings)
 
 
-def _middle(geometry: Geometry, shape: FloatArray, style: Style) -> FloatArray:
+def _middle(anatomy: Anatomy, neutral: FloatArray, style: Style) -> FloatArray:
     """Where the cameras look: the middle of the head with its hair, at rest, a little low so that the bust shows.
 
     From the chin up only: neck and shoulders are no part of what must stay in the frame from every side.
     """
-    model = HeadModel(geometry.head, dtype=torch.float64)
-    neutral = model.canonical(torch.from_numpy(shape))[0].numpy()
-    anatomy = measure(geometry.head, neutral)
     skin = neutral[np.unique(anatomy.skin_faces)]
     above = skin[skin[:, 1] > anatomy["chin"][1]]
     low, high = above.min(axis=0), above.max(axis=0)

@@ -1,0 +1,52 @@
+"""The label's threshold against another rasteriser."""
+
+import numpy as np
+import pytest
+import torch
+
+from headbench.bench.contracts import Camera
+from headbench.datasets.head.model import HeadModel
+from headbench.datasets.mesh_pictures import rasterize_mesh
+from headbench.datasets.synthetic.anatomy import measure
+from headbench.datasets.synthetic.geometry import load_geometry
+from headbench.datasets.synthetic.people import person
+from headbench.datasets.synthetic.tongue_labels import HIDES, share_that_shows
+
+FAR = 50.0
+
+
+@pytest.fixture(scope="module", params=[0, 4])
+def subject(request):
+    geometry = load_geometry("procedural")
+    rng = np.random.default_rng(request.param)
+    shape = 0.6 * rng.standard_normal(geometry.head.shape_basis.shape[2])
+    neutral = HeadModel(geometry.head, dtype=torch.float64).canonical(torch.from_numpy(shape))[0].numpy()
+    anatomy = measure(geometry.head, neutral)
+    parts = geometry.mouth(person("900", 0, request.param), anatomy, shape)
+    return parts, anatomy, neutral
+
+
+def hidden_area(parts, anatomy, neutral, share):
+    """Square metres, from a distant camera in front."""
+    size, step = 300, 0.0004
+    middle = anatomy["mouth"]
+    world_to_camera = np.diag([1.0, -1.0, -1.0, 1.0])
+    world_to_camera[:3, 3] = [-middle[0], middle[1], middle[2] + FAR]
+    K = np.array([[FAR / step, 0, size / 2], [0, FAR / step, size / 2], [0, 0, 1.0]])
+    camera = Camera("front", size, size, K, world_to_camera)
+    (tongue,) = [part for part in parts if part.name == "tongue"]
+    skin = rasterize_mesh(neutral, anatomy.skin_faces, camera).depth
+    front = rasterize_mesh(tongue.at(share), tongue.faces, camera).depth
+    return float((np.isfinite(skin) & (front < skin)).sum()) * step**2
+
+
+def test_threshold_is_where_another_rasteriser_sees_the_area_hidden(subject):
+    share = share_that_shows(*subject)
+    assert 0.2 < share < 0.85  # a phrase puts the tongue out by 0.85 at least
+    assert hidden_area(*subject, share - 0.03) < HIDES < hidden_area(*subject, share + 0.03)
+
+
+def test_a_subject_without_a_tongue_never_shows_it(subject):
+    parts, anatomy, neutral = subject
+    rest = [part for part in parts if part.name != "tongue"]
+    assert share_that_shows(rest, anatomy, neutral) == float("inf")
