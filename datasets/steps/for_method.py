@@ -18,7 +18,7 @@ from ..capture_head import find_head
 from ..clip import CaptureClip
 from ..head.arrays import HeadArrays
 from ..procedural.model import VERSIONS, procedural_head
-from .kept_refit import refitted
+from ..refit.refit import refit_clip
 from .monocular import as_single_video
 from .resolution import align_clip, alignments
 
@@ -49,7 +49,7 @@ def clip_for_method(clip: CaptureClip, needs: MethodNeeds, heads: Mapping[str, s
 def _adapt(
     clip: CaptureClip, needs: MethodNeeds, target: HeadArrays | None, folder: Path, progress: Progress
 ) -> AdaptedClip:
-    tracked = clip if target is None else refitted(clip, target, folder, progress)
+    tracked = clip if target is None else refit_clip(clip, target, folder=folder, progress=progress)
     aligned = align_clip(tracked, needs.resolution)
     plans = alignments(tracked.cameras, needs.resolution)
     ground = np.asarray(clip.background, np.float32)

@@ -11,8 +11,9 @@ from headbench.bench.contracts import ResolutionRule, no_progress
 from headbench.bench.errors import InputError
 from headbench.datasets.ga_reader import read_capture
 from headbench.datasets.head.arrays import save_head
+from headbench.datasets.refit.block import BlockFitter
 from headbench.datasets.specs import GA_LAYOUT
-from headbench.datasets.steps import kept_refit
+from headbench.datasets.steps import for_method
 from headbench.datasets.steps.for_method import clip_for_method
 
 from ..head.toy import toy_head
@@ -31,12 +32,8 @@ def heads(tmp_path):
     return {"other": str(tmp_path / "other.npz")}
 
 
-CALLS: list[str] = []
-
-
-def pretend_refit(clip, target, progress=no_progress):
+def pretend_refit(clip, target, *, folder, progress):
     """Stands in for the optimiser: coefficients that tell timesteps apart."""
-    CALLS.append(clip.subject)
     poses = {
         t: replace(
             pose,
@@ -54,13 +51,6 @@ def pretend_refit(clip, target, progress=no_progress):
         static_offset=np.zeros_like(target.template),
         poses=poses,
     )
-
-
-@pytest.fixture
-def refit(monkeypatch):
-    CALLS.clear()
-    monkeypatch.setattr(kept_refit, "resolve", lambda name: pretend_refit)
-    return CALLS
 
 
 def adapted(clip, folder, heads=None, **needs):
@@ -83,7 +73,8 @@ def test_needs_that_change_nothing_give_the_clip_itself(clip, tmp_path):
     assert np.array_equal(form.restore(key, render), render)
 
 
-def test_all_steps_in_their_order(clip, tmp_path, heads, refit):
+def test_all_steps_in_their_order(clip, tmp_path, heads, monkeypatch):
+    monkeypatch.setattr(for_method, "refit_clip", pretend_refit)
     form = adapted(
         clip,
         tmp_path / "kept",
@@ -110,58 +101,18 @@ def test_all_steps_in_their_order(clip, tmp_path, heads, refit):
         assert back.shape == (64, 48, 3)
 
 
-def test_a_refit_is_kept_and_read_back_to_the_bit(clip, tmp_path, heads, refit):
+def test_a_refit_goes_on_where_it_was(clip, tmp_path, heads, monkeypatch):
+    """With the real refit: what it left in the folder is used by a second call, and gives the same clip."""
     first = adapted(clip, tmp_path, heads, head_models=("other",)).clip
-    (kept,) = tmp_path.glob("refit-*.npz")
-    before = kept.read_bytes()
+    assert first.head.version == "other"
+    assert all(pose.head_model == "other" for pose in first.poses.values())
+    monkeypatch.setattr(BlockFitter, "fit", lambda *_: pytest.fail("fitted again"))
     second = adapted(clip, tmp_path, heads, head_models=("other",)).clip
-    assert len(refit) == 1
-    assert kept.read_bytes() == before
-    assert first.fingerprint == second.fingerprint
-    direct = pretend_refit(clip, OTHER)
-    assert first.fingerprint == direct.fingerprint
-    assert first.steps[-1].parameters == {"target": "other", "worst_mm": 0.1}
-    for t, pose in direct.poses.items():
-        for name in ("expression", "rotation", "neck", "jaw", "eyes", "translation", "eyelids"):
-            assert np.array_equal(getattr(second.poses[t], name), getattr(pose, name))
-        assert second.poses[t].timestep == t
-    assert np.array_equal(second.shape, direct.shape)
-
-
-def test_a_refit_of_another_clip_is_another_file(clip, tmp_path, heads, refit):
-    adapted(clip, tmp_path, heads, head_models=("other",))
-    changed = clip.derive("some step", {})
-    adapted(changed, tmp_path, heads, head_models=("other",))
-    assert len(refit) == 2
-
-
-@pytest.mark.parametrize(
-    ("damage", "match"),
-    [
-        (lambda content: content.pop("jaw"), "jaw: expected finite numbers"),
-        (lambda content: content["shape"].fill(np.nan), "shape: expected finite"),
-        (lambda content: content.update(timesteps=content["timesteps"] + 1), "those of the clip"),
-        (lambda content: content.update(steps=np.array("[]")), "at least one step"),
-        (lambda content: content.update(steps=np.array("{")), "the steps of a refit"),
-    ],
-)
-def test_a_damaged_refit_is_refused(clip, tmp_path, heads, refit, damage, match):
-    adapted(clip, tmp_path, heads, head_models=("other",))
-    (kept,) = tmp_path.glob("refit-*.npz")
-    with np.load(kept) as archive:
-        content = dict(archive)
-    damage(content)
-    np.savez(kept, **content)
-    with pytest.raises(InputError, match=match):
-        adapted(clip, tmp_path, heads, head_models=("other",))
-
-
-def test_the_file_of_a_refit_that_is_cut_off_is_refused(clip, tmp_path, heads, refit):
-    adapted(clip, tmp_path, heads, head_models=("other",))
-    (kept,) = tmp_path.glob("refit-*.npz")
-    kept.write_bytes(kept.read_bytes()[:-200])
-    with pytest.raises(InputError, match="unreadable content"):
-        adapted(clip, tmp_path, heads, head_models=("other",))
+    assert second.fingerprint == first.fingerprint
+    for timestep, pose in first.poses.items():
+        assert np.array_equal(second.poses[timestep].expression, pose.expression)
+    with pytest.raises(pytest.fail.Exception):
+        adapted(clip, tmp_path / "elsewhere", heads, head_models=("other",))
 
 
 def test_what_cannot_be_done_is_said_before_any_work(clip, heads, tmp_path):
@@ -176,8 +127,6 @@ def test_what_cannot_be_done_is_said_before_any_work(clip, heads, tmp_path):
 
 
 def test_the_procedural_heads_need_no_file(clip, monkeypatch):
-    from headbench.datasets.steps import for_method
-
     made = []
     monkeypatch.setattr(for_method, "procedural_head", lambda version: made.append(version) or OTHER)
     procedural = replace(clip, head=replace(clip.head, version="procedural2023"))
