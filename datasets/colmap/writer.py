@@ -1,0 +1,175 @@
+"""Write a clip as a COLMAP dataset: images, masks, and a sparse model with the tracked mesh as its points.
+
+Layout of ``colmap`` itself and of the radiance-field codes that read it: ``images/``, ``masks/``, ``sparse/0/``.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import cv2
+import numpy as np
+import pycolmap
+import torch
+
+from ...bench.contracts import ByteArray, Camera, Clip, FloatArray, FrameKey, Progress, no_progress
+from ...bench.errors import InputError
+from ...bench.files import atomic_path
+from ..head.model import HeadModel
+from ..mesh_pictures import rasterize_mesh
+
+ModelFormat = Literal["bin", "txt"]
+_DEPTH_TOLERANCE = (
+    2e-3  # metres a vertex may lie behind the surface drawn at its pixel and still count as seen
+)
+_SKEW_TOLERANCE = 1e-9
+_UNSEEN = (128, 128, 128)
+
+
+class Exported(NamedTuple):
+    """What was written."""
+
+    cameras: int
+    images: int
+    points: int
+    observations: int
+
+
+class _View(NamedTuple):
+    """Which vertices an image sees, where, and in what colour."""
+
+    vertices: np.ndarray
+    pixels: FloatArray
+    colors: ByteArray
+
+
+def image_name(key: FrameKey) -> str:
+    """Name of a frame in the model and its path under ``images/``: subject/sequence/timestep/camera.png."""
+    return f"{key}.png"
+
+
+def export_model(
+    clip: Clip,
+    keys: Sequence[FrameKey],
+    out: Path,
+    *,
+    model_format: ModelFormat = "bin",
+    progress: Progress = no_progress,
+) -> Exported:
+    """Write frames of a clip as a COLMAP dataset.
+
+    The points are the vertices of the mesh at the earliest timestep among ``keys``; images of that timestep
+    observe the vertices they see, and the points' colours come from them. Images of other timesteps have poses and
+    no points: the head has moved.
+
+    Parameters
+    ----------
+    keys : frames to write, at least one; their cameras become the model's.
+
+    Raises
+    ------
+    InputError
+        Where there is no frame, or a camera has skew, which COLMAP's pinhole cannot express.
+    """
+    if not keys:
+        raise InputError("frames to export", "", "at least one", "none")
+    ids = sorted({key.camera for key in keys})
+    for name in ids:
+        if abs(clip.cameras[name].K[0, 1]) > _SKEW_TOLERANCE:
+            raise InputError("clip", f"camera {name}, K", "no skew", f"{clip.cameras[name].K[0, 1]:g} pixels")
+    first = min(key.timestep for key in keys)
+    vertices = _mesh(clip, first)
+    model = pycolmap.Reconstruction()
+    for number, name in enumerate(ids, start=1):
+        model.add_camera_with_trivial_rig(_pinhole(number, clip.cameras[name]))
+    views: dict[int, _View] = {}
+    for number, key in enumerate(sorted(keys), start=1):
+        camera, picture = clip.cameras[key.camera], clip.image(key)
+        if key.timestep == first:
+            views[number] = _observe(vertices, np.asarray(clip.head.faces), camera, picture)
+        pixels = views[number].pixels if number in views else np.zeros((0, 2))
+        image = pycolmap.Image(image_name(key), pixels, ids.index(key.camera) + 1, number)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(camera.world_to_camera[:3]))
+        _write_picture(out / "images" / image_name(key), picture[..., ::-1])
+        mask = clip.mask(key)
+        if mask is not None:
+            # COLMAP's own convention: the image's whole name and one more suffix, 0 for what to leave out.
+            _write_picture(out / "masks" / f"{image_name(key)}.png", mask)
+        progress(number, len(keys), str(key))
+    _add_points(model, vertices, views)
+    _write_model(model, out / "sparse" / "0", model_format)
+    return Exported(
+        model.num_cameras(), model.num_images(), model.num_points3D(), model.compute_num_observations()
+    )
+
+
+def _pinhole(number: int, camera: Camera) -> pycolmap.Camera:
+    intrinsics = camera.K
+    params = [intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]]
+    return pycolmap.Camera(
+        camera_id=number, model="PINHOLE", width=camera.width, height=camera.height, params=params
+    )
+
+
+def _mesh(clip: Clip, timestep: int) -> FloatArray:
+    """(V, 3) float64 tracked mesh in the world, metres."""
+    model = HeadModel(clip.head, dtype=torch.float64)
+    canonical = model.canonical(_tensor(clip.shape), _tensor(clip.static_offset))
+    with torch.no_grad():
+        return model(canonical=canonical, **model.pose_arguments([clip.poses[timestep]]))[0].numpy()
+
+
+def _observe(vertices: FloatArray, faces: np.ndarray, camera: Camera, picture: ByteArray) -> _View:
+    """Find the vertices in the picture that no part of the mesh hides."""
+    points = vertices @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    before = np.flatnonzero(points[:, 2] > 0)
+    pixels = points[before] @ camera.K.T
+    pixels = pixels[:, :2] / pixels[:, 2:]
+    column, row = np.floor(pixels).astype(int).T
+    inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    before, pixels, column, row = before[inside], pixels[inside], column[inside], row[inside]
+    surface = rasterize_mesh(vertices, faces, camera).depth[row, column]
+    seen = points[before, 2] <= surface + _DEPTH_TOLERANCE
+    return _View(before[seen], pixels[seen], picture[row[seen], column[seen]])
+
+
+def _add_points(model: pycolmap.Reconstruction, vertices: FloatArray, views: dict[int, _View]) -> None:
+    """Add all vertices, in order, with their mean colours and the images that observe them."""
+    sums, counts = np.zeros((len(vertices), 3)), np.zeros(len(vertices))
+    tracks: list[list[pycolmap.TrackElement]] = [[] for _ in vertices]
+    for number, view in views.items():
+        sums[view.vertices] += view.colors
+        counts[view.vertices] += 1
+        for index, vertex in enumerate(view.vertices.tolist()):
+            tracks[vertex].append(pycolmap.TrackElement(number, index))
+    means = np.where(counts[:, None] > 0, sums / np.maximum(counts, 1)[:, None], _UNSEEN)
+    colors = np.round(means).astype(np.uint8)
+    for vertex, track, color in zip(vertices, tracks, colors):
+        model.add_point3D(vertex, pycolmap.Track(track), color)
+    model.update_point_3d_errors()
+
+
+def _write_model(model: pycolmap.Reconstruction, folder: Path, model_format: ModelFormat) -> None:
+    """Write a model beside its place, then move its files there: none of them is ever half-written."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".model-") as temporary:
+        if model_format == "bin":
+            model.write_binary(temporary)
+        else:
+            model.write_text(temporary)
+        for file in sorted(Path(temporary).iterdir()):
+            os.replace(file, folder / file.name)
+
+
+def _write_picture(path: Path, picture: ByteArray) -> None:
+    with atomic_path(path) as temporary:
+        if not cv2.imwrite(str(temporary), picture):
+            raise OSError(f"{path}: could not be written")
+
+
+def _tensor(array: FloatArray) -> torch.Tensor:
+    return torch.from_numpy(np.asarray(array, dtype=np.float64))

@@ -1,0 +1,305 @@
+"""Models written are read back by pycolmap itself; models read are held against it; damage is refused."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from headbench.bench.contracts import no_progress
+from headbench.bench.errors import InputError
+from headbench.datasets.colmap.command import run
+from headbench.datasets.colmap.reader import model_cameras, model_lenses, read_model
+from headbench.datasets.colmap.settings import ExportColmapSettings
+from headbench.datasets.colmap.writer import export_model, image_name
+from headbench.datasets.ga_reader import read_capture
+from headbench.datasets.head.model import HeadModel
+
+FILES = ("cameras", "images")
+
+
+@pytest.fixture(scope="module")
+def clip(pristine_capture):
+    return read_capture(pristine_capture.union)
+
+
+@pytest.fixture(scope="module")
+def exported(clip, tmp_path_factory):
+    """Both formats of all frames."""
+    folders = {}
+    for kind in ("bin", "txt"):
+        folders[kind] = tmp_path_factory.mktemp(kind)
+        export_model(clip, list(clip.files), folders[kind], model_format=kind)
+    return folders
+
+
+def theirs(folder):
+    model = pycolmap.Reconstruction()
+    model.read(folder / "sparse" / "0")
+    return model
+
+
+def random_model(rng, folder: Path, model_name="PINHOLE", params=(50.0, 51.0, 20.3, 14.7)):
+    """Write a model of three images with points, by pycolmap, and return it."""
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(camera_id=7, model=model_name, width=40, height=30, params=params)
+    )
+    for number in (3, 5, 9):
+        quaternion = rng.normal(size=4)
+        rotation = pycolmap.Rotation3d(quaternion / np.linalg.norm(quaternion))
+        image = pycolmap.Image(
+            f"a b/{number}.png".replace(" ", ""), rng.uniform(0, 30, (number, 2)), 7, number
+        )
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(rotation, rng.normal(size=3)))
+    folder.mkdir(parents=True, exist_ok=True)
+    model.write_binary(folder)
+    model.write_text(folder)
+    return model
+
+
+@pytest.mark.parametrize("kind", ["bin", "txt"])
+def test_round_trip_of_cameras_is_exact(clip, exported, kind):
+    cameras = model_cameras(read_model(exported[kind]))
+    assert set(cameras) == {image_name(key) for key in clip.files}
+    for key in clip.files:
+        found, expected = cameras[image_name(key)], clip.cameras[key.camera]
+        assert (found.width, found.height) == (expected.width, expected.height)
+        np.testing.assert_allclose(found.world_to_camera, expected.world_to_camera, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(found.K, expected.K, rtol=1e-14)
+
+
+@pytest.mark.parametrize("kind", ["bin", "txt"])
+def test_pycolmap_reads_what_was_written_and_projects_as_we_do(clip, exported, kind):
+    model = theirs(exported[kind])
+    assert model.is_valid()
+    assert (model.num_cameras(), model.num_images()) == (len(clip.cameras), len(clip.files))
+    names = {image.name: image for image in model.images.values()}
+    vertices = np.array([model.points3D[number].xyz for number in sorted(model.points3D)])
+    for key in clip.files:
+        image, camera = names[image_name(key)], clip.cameras[key.camera]
+        np.testing.assert_allclose(image.cam_from_world().matrix(), camera.world_to_camera[:3], atol=1e-12)
+        pixels = (vertices @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]) @ camera.K.T
+        found = np.array([image.project_point(vertex) for vertex in vertices])
+        np.testing.assert_allclose(found, pixels[:, :2] / pixels[:, 2:], atol=1e-9)
+
+
+def test_points_are_the_mesh_and_observations_what_an_image_sees_of_it(clip, exported):
+    model = theirs(exported["bin"])
+    first = min(clip.poses)
+    head = HeadModel(clip.head, dtype=torch.float64)
+    mesh = head(
+        shape=torch.tensor(clip.shape, dtype=torch.float64),
+        static_offset=torch.tensor(clip.static_offset, dtype=torch.float64),
+        **head.pose_arguments([clip.poses[first]]),
+    )[0].numpy()
+    np.testing.assert_allclose(
+        [model.points3D[number].xyz for number in sorted(model.points3D)], mesh, rtol=0, atol=1e-12
+    )
+    assert model.compute_mean_reprojection_error() < 1e-9
+    at_first = {image_name(key): key for key in clip.files if key.timestep == first}
+    for image in model.images.values():
+        assert (image.num_points3D > 0) == (image.name in at_first)
+        assert image.num_points3D < len(mesh)  # the back of a closed head is hidden
+    for point in model.points3D.values():
+        seen = []
+        for element in point.track.elements:
+            image = model.images[element.image_id]
+            column, row = np.floor(image.points2D[element.point2D_idx].xy).astype(int)
+            seen.append(clip.image(at_first[image.name])[row, column])
+        expected = np.mean(seen, axis=0) if seen else [128, 128, 128]
+        assert np.abs(point.color.astype(float) - expected).max() <= 0.5
+
+
+def test_pictures_and_masks_lie_where_colmap_looks(clip, exported):
+    for key in clip.files:
+        image = cv2.imread(str(exported["bin"] / "images" / image_name(key)))
+        assert image is not None
+        np.testing.assert_array_equal(image[..., ::-1], clip.image(key))
+        mask = cv2.imread(str(exported["bin"] / "masks" / f"{image_name(key)}.png"), cv2.IMREAD_UNCHANGED)
+        np.testing.assert_array_equal(mask, clip.mask(key))
+
+
+@pytest.mark.parametrize("suffix", [".bin", ".txt"])
+def test_reader_equals_pycolmap_on_models_with_points(tmp_path, suffix):
+    model = random_model(np.random.default_rng(0), tmp_path)
+    for name in FILES:
+        (tmp_path / f"{name}{'.txt' if suffix == '.bin' else '.bin'}").unlink()
+    cameras = model_cameras(read_model(tmp_path))
+    assert set(cameras) == {"ab/3.png", "ab/5.png", "ab/9.png"}
+    for image in model.images.values():
+        found = cameras[image.name]
+        np.testing.assert_allclose(found.world_to_camera[:3], image.cam_from_world().matrix(), atol=1e-12)
+        np.testing.assert_allclose(found.K, model.cameras[7].calibration_matrix(), rtol=1e-14)
+        assert np.isclose(np.linalg.det(found.world_to_camera[:3, :3]), 1)
+
+
+@settings(deadline=None, max_examples=30)
+@given(
+    turn=st.lists(st.floats(-np.pi, np.pi), min_size=3, max_size=3),
+    shift=st.lists(st.floats(-1e3, 1e3), min_size=3, max_size=3),
+    focal=st.floats(1, 1e5),
+    centre=st.floats(-1e4, 1e4),
+)
+def test_any_pose_survives(tmp_path_factory, turn, shift, focal, centre):
+    matrix = np.column_stack([Rotation.from_rotvec(turn).as_matrix(), shift])
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(camera_id=1, model="PINHOLE", width=9, height=9, params=[focal, 1.0, centre, -centre])
+    )
+    model.add_image_with_trivial_frame(
+        pycolmap.Image("a.png", np.zeros((0, 2)), 1, 1), pycolmap.Rigid3d(matrix)
+    )
+    folder = tmp_path_factory.mktemp("model")
+    model.write_binary(folder)
+    camera = model_cameras(read_model(folder))["a.png"]
+    np.testing.assert_allclose(camera.world_to_camera[:3], matrix, rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(camera.K, [[focal, 0, centre], [0, 1, -centre], [0, 0, 1]])
+
+
+def test_simple_pinhole_and_distortion_of_zero_are_pinhole_cameras(tmp_path):
+    random_model(np.random.default_rng(0), tmp_path / "a", "SIMPLE_PINHOLE", [50.0, 20.0, 15.0])
+    random_model(np.random.default_rng(0), tmp_path / "b", "OPENCV", [50.0, 50.0, 20.0, 15.0, 0, 0, 0, 0])
+    random_model(np.random.default_rng(0), tmp_path / "c", "RADIAL", [50.0, 20.0, 15.0, 0, 0])
+    for folder in "abc":
+        camera = model_cameras(read_model(tmp_path / folder))["ab/3.png"]
+        np.testing.assert_array_equal(camera.K, [[50, 0, 20], [0, 50, 15], [0, 0, 1]])
+
+
+@pytest.mark.parametrize(
+    ("model", "params"),
+    [
+        ("OPENCV", [50.0, 50.0, 20.0, 15.0, 0.1, 0, 0, 0]),
+        ("SIMPLE_RADIAL", [50.0, 20.0, 15.0, -0.1]),
+        ("OPENCV_FISHEYE", [50.0, 50.0, 20.0, 15.0, 0, 0, 0, 0]),
+    ],
+)
+def test_distorted_cameras_are_refused_with_what_to_do(tmp_path, model, params):
+    random_model(np.random.default_rng(0), tmp_path, model, params)
+    with pytest.raises(InputError, match=f"camera 7.*{model}.*undistort"):
+        model_cameras(read_model(tmp_path))
+    cameras = model_cameras(read_model(tmp_path), distortion="left to the images")
+    np.testing.assert_array_equal(cameras["ab/3.png"].K, [[50, 0, 20], [0, 50, 15], [0, 0, 1]])
+
+
+def test_lenses_distort_as_pycolmap_does(tmp_path):
+    params = [50.0, 52.0, 20.3, 14.7, 0.1, -0.02, 0.003, -0.002]
+    model = random_model(np.random.default_rng(0), tmp_path, "OPENCV", params)
+    lens = model_lenses(read_model(tmp_path))["ab/5.png"]
+    places = lens.map_from(lens.K, 40, 30)
+    for column, row in [(0, 0), (12, 7), (39, 29)]:
+        ray = np.linalg.solve(lens.K, [column + 0.5, row + 0.5, 1.0])
+        np.testing.assert_allclose(places[row, column], model.cameras[7].img_from_cam(ray), atol=1e-4)
+
+
+def test_lenses_that_cannot_be_undone_are_named(tmp_path):
+    random_model(np.random.default_rng(0), tmp_path, "FOV", [50.0, 50.0, 20.0, 15.0, 0.1])
+    with pytest.raises(InputError, match="camera 7.*OPENCV.*FOV"):
+        model_lenses(read_model(tmp_path))
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_every_truncation_is_refused(tmp_path, name):
+    random_model(np.random.default_rng(0), tmp_path)
+    content = (tmp_path / f"{name}.bin").read_bytes()
+    for size in range(len(content)):
+        (tmp_path / f"{name}.bin").write_bytes(content[:size])
+        with pytest.raises(InputError, match=rf"{name}\.bin"):
+            read_model(tmp_path)
+    (tmp_path / f"{name}.bin").write_bytes(content + b"\0")
+    with pytest.raises(InputError, match="1 more bytes"):
+        read_model(tmp_path)
+
+
+@settings(deadline=None, max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data(), name=st.sampled_from(FILES), suffix=st.sampled_from([".bin", ".txt"]))
+def test_damaged_bytes_raise_nothing_but_input_errors(tmp_path, data, name, suffix):
+    """Huge counts among them: no allocation follows a number in the file."""
+    whole = tmp_path / "whole"
+    if not whole.exists():
+        random_model(np.random.default_rng(0), whole)
+    folder = tmp_path / "damaged"
+    folder.mkdir(exist_ok=True)
+    for part in FILES:
+        shutil.copy(whole / f"{part}{suffix}", folder)
+        (folder / f"{part}{'.txt' if suffix == '.bin' else '.bin'}").unlink(missing_ok=True)
+    content = bytearray((folder / f"{name}{suffix}").read_bytes())
+    place = data.draw(st.integers(0, len(content) - 1))
+    damage = data.draw(st.binary(min_size=1, max_size=8))
+    content[place : place + len(damage)] = damage
+    (folder / f"{name}{suffix}").write_bytes(content)
+    try:
+        cameras = model_cameras(read_model(folder))
+    except InputError:
+        return
+    for camera in cameras.values():
+        assert np.isfinite(camera.K).all()
+        np.testing.assert_allclose(np.linalg.det(camera.world_to_camera[:3, :3]), 1, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("find", "put", "found"),
+    [
+        ("ab/3.png", "../3.png", "image 3, name"),
+        ("ab/3.png", "/3.png", "image 3, name"),
+        ("ab/5.png", "ab/3.png", "again"),
+        (" 7 ab/3.png", " 8 ab/3.png", "image 3, camera"),
+        (" 7 ab/3.png", " 7", "10 words"),
+        ("\n3 ", "\n3 nan ", "10 words"),
+    ],
+)
+def test_faults_in_a_text_model_are_named(tmp_path, find, put, found):
+    random_model(np.random.default_rng(0), tmp_path)
+    for name in FILES:
+        (tmp_path / f"{name}.bin").unlink()
+    text = (tmp_path / "images.txt").read_text()
+    assert find in text
+    (tmp_path / "images.txt").write_text(text.replace(find, put, 1))
+    with pytest.raises(InputError, match=found):
+        model_cameras(read_model(tmp_path))
+
+
+def test_folder_without_a_model_is_refused(tmp_path):
+    with pytest.raises(InputError, match="COLMAP model"):
+        read_model(tmp_path)
+    with pytest.raises(InputError, match="COLMAP model"):
+        read_model(tmp_path / "none")
+
+
+def test_skew_and_empty_exports_are_refused(clip, tmp_path):
+    key = next(iter(clip.files))
+    camera = clip.cameras[key.camera]
+    skewed = type(camera)(
+        camera.id, camera.width, camera.height, camera.K + np.eye(3, k=1), camera.world_to_camera
+    )
+    with pytest.raises(InputError, match="no skew"):
+        export_model(
+            clip.derive("test", {}, cameras={**clip.cameras, key.camera: skewed}), [key], tmp_path / "o"
+        )
+    with pytest.raises(InputError, match="at least one"):
+        export_model(clip, [], tmp_path / "o")
+    assert not (tmp_path / "o").exists()
+
+
+def test_command_writes_the_first_training_timestep(capture, tmp_path):
+    out = tmp_path / "out"
+    findings = run(ExportColmapSettings(str(capture.union), str(out)), no_progress)
+    clip = read_capture(capture.union)
+    first = clip.timesteps("train")[0]
+    assert set(model_cameras(read_model(out))) == {
+        image_name(key) for key in clip.files if key.timestep == first
+    }
+    assert findings.data["images"] == len(clip.cameras)
+    with pytest.raises(InputError, match="--timesteps.*found 99"):
+        run(
+            ExportColmapSettings(str(capture.union), str(out), timesteps=(0, 99)),
+            no_progress,
+        )
