@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from ...bench.contracts import ByteArray
+from ...bench.contracts import ByteArray, FloatArray
 from .colour import Correction
 
 WHITE = 255
@@ -36,7 +36,7 @@ def prepare_pixels(
     weighted = cv2.cvtColor(_shrink(covered.astype(np.uint8, copy=False), size), cv2.COLOR_BGR2RGB)
     mask = _shrink(matte, size)
     coverage = mask[..., None].astype(np.float32) / 255
-    foreground = weighted.astype(np.float32)
+    foreground: FloatArray = weighted.astype(np.float32)
     if correct:
         straight = np.minimum(np.rint(foreground / np.maximum(coverage, 1 / 255)), 255).astype(np.uint8)
         foreground = correct(straight) * coverage

@@ -1,0 +1,81 @@
+"""``headbench prepare nersemble``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ...bench.contracts import Findings, Progress, no_progress
+from ...bench.errors import InputError
+from .plan import SubjectPlan, plan_subject
+from .prepare import SubjectResult, prepare
+from .presets import chosen_subjects
+from .settings import PrepareSettings
+from .unions import check_unions
+
+
+def run(settings: PrepareSettings, progress: Progress = no_progress) -> Findings:
+    """Prepare recordings, or check captures that were exported elsewhere.
+
+    Everything about every subject is checked before the first frame is decoded.
+    """
+    subjects = chosen_subjects(settings.subjects)
+    if bool(settings.root) == bool(settings.union_root):
+        found = "both" if settings.root else "neither"
+        raise InputError("command line", "--root", "--root or --union-root", found)
+    if settings.downscale < 1:
+        raise InputError("command line", "--downscale", "a number from 1", f"{settings.downscale}")
+    for key in ("every", "workers"):
+        if getattr(settings, key) < 0:
+            raise InputError("command line", f"--{key}", "a number from 0", f"{getattr(settings, key)}")
+    if settings.union_root:
+        return check_unions(Path(settings.union_root), subjects, rejoin=settings.rejoin, progress=progress)
+    plans = [plan_subject(settings, subject) for subject in subjects]
+    if settings.check:
+        return _checked(plans)
+    return _done(prepare(plans, workers=settings.workers, progress=progress), plans, settings)
+
+
+def _table(plans: list[SubjectPlan]) -> list[str]:
+    lines = [f"{'subject':8} {'sequence':34} {'timesteps':>9} {'cameras':>7}  mattes  colour  tracking"]
+    for plan in plans:
+        for job in plan.jobs:
+            test = " (test)" if job.recorded.name in plan.test else ""
+            marks = (job.recorded.has_mattes, bool(job.corrections), job.tracked is not None)
+            flags = "  ".join(f"{'yes' if mark else 'no':6}" for mark in marks)
+            lines.append(
+                f"{plan.subject:8} {job.recorded.name + test:34} {job.count:9} {len(job.cameras):7}  {flags}"
+            )
+    return lines
+
+
+def _checked(plans: list[SubjectPlan]) -> Findings:
+    images = sum(job.count * len(job.cameras) for plan in plans for job in plan.jobs)
+    text = "\n".join([*_table(plans), "", f"All there: {images} images to make."])
+    return Findings(text, {"images": images, "subjects": [plan.subject for plan in plans]})
+
+
+def _done(results: list[SubjectResult], plans: list[SubjectPlan], settings: PrepareSettings) -> Findings:
+    """Passed unless parameters were asked for and are missing."""
+    lines = _table(plans)
+    for result in results:
+        lines += ["", f"{result.subject}: {result.written} images written, {result.kept} there already."]
+        lines += [f"  {sentence}" for sentence in result.missing]
+        if result.union is not None:
+            splits = ", ".join(f"{count} {name}" for name, count in result.frames.items())
+            head = f" --head {settings.head}" if settings.head else " --head flame2023.pkl"
+            lines += [
+                f"  Frames: {splits}.",
+                f"  Use it: headbench run --data {result.union}{head} --out runs/{result.subject}",
+            ]
+    data = {
+        result.subject: {
+            "written": result.written,
+            "kept": result.kept,
+            "frames": result.frames,
+            "union": result.union,
+            "missing": list(result.missing),
+        }
+        for result in results
+    }
+    passed = not settings.tracking or all(result.union is not None for result in results)
+    return Findings("\n".join(lines), data, passed)

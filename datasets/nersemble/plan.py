@@ -1,0 +1,202 @@
+"""What there is to do for a subject, found out and checked whole before anything is decoded."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from ...bench.contracts import Camera
+from ...bench.errors import InputError
+from ...bench.files import digest
+from .. import ga_layout as layout
+from ..head.arrays import HeadArrays
+from ..head.loaders import load_head
+from .calibration import read_calibration
+from .colour import Correction
+from .export import CY, SequenceExport
+from .names import SEQUENCES, TONGUE_SEQUENCES
+from .presets import NOVEL_VIEW_CAMERA, PAPER_SEQUENCES, TEST_SEQUENCE, UNION10_SEQUENCES, union10_held_out
+from .recording import Participant, participant
+from .sequence import RecordedSequence, read_sequence
+from .settings import PrepareSettings
+from .tracking import TrackedSequence, find_tracked, read_tracked
+
+IMAGES_VERSION = 1
+"""Counted up when the same recording and settings make other images than before."""
+
+
+@dataclass(frozen=True, eq=False)
+class SequenceJob:
+    """One sequence to prepare.
+
+    Attributes
+    ----------
+    recorded : the raw frames.
+    cameras : in index order, of the prepared images, in the aligned world.
+    corrections : colour correction by serial; empty for none.
+    tracked : parameters, or None where there are none yet.
+    folder : to write.
+    """
+
+    recorded: RecordedSequence
+    cameras: Sequence[Camera]
+    corrections: Mapping[str, Correction]
+    tracked: TrackedSequence | None
+    folder: Path
+
+    @property
+    def count(self) -> int:
+        """Number of timesteps."""
+        return len(self.recorded.numbers)
+
+    @property
+    def export(self) -> SequenceExport:
+        """The metadata to write."""
+        recorded = self.recorded
+        return SequenceExport(
+            folder=self.folder,
+            subject=recorded.subject,
+            name=recorded.name,
+            cameras=self.cameras,
+            numbers=recorded.numbers,
+            masks=recorded.has_mattes,
+            held_out=(NOVEL_VIEW_CAMERA,),
+        )
+
+    def image_path(self, timestep: int, index: int) -> Path:
+        """File of an image."""
+        return self.folder / "images" / f"{layout.frame_name(timestep, index)}.png"
+
+    def mask_path(self, timestep: int, index: int) -> Path:
+        """File of a mask."""
+        return self.folder / "fg_masks" / f"{layout.frame_name(timestep, index)}.png"
+
+    @cached_property
+    def images_fingerprint(self) -> str:
+        """Digest of what decides the images and cameras: calibration, settings, and the files the frames come
+        from, by name and size."""
+        views = {
+            serial: [(path.name, path.stat().st_size) for path in view.files]
+            for serial, view in self.recorded.views.items()
+        }
+        corrections = {serial: repr(vars(c)["matrix"].tolist()) for serial, c in self.corrections.items()}
+        cameras = [[c.id, c.width, c.height, c.K.tolist(), c.world_to_camera.tolist()] for c in self.cameras]
+        return digest(IMAGES_VERSION, views, corrections, cameras, list(self.recorded.numbers))
+
+    def metadata_fingerprint(self, declaration: layout.Declaration) -> str:
+        """Digest of what decides the metadata beside the images: parameters and declaration."""
+        tracked = self.tracked
+        arrays = {} if tracked is None else {**tracked.frames, **tracked.constant}
+        return digest(*sorted(arrays), *(arrays[key] for key in sorted(arrays)), declaration)
+
+
+@dataclass(frozen=True, eq=False)
+class SubjectPlan:
+    """One subject to prepare: its sequences, those held out among them, and its head model if there is one."""
+
+    subject: str
+    jobs: Sequence[SequenceJob]
+    test: Sequence[str]
+    head: HeadArrays | None
+    head_model: str
+    union: Path
+
+    def declaration(self, jobs: Sequence[SequenceJob], head_file: str) -> layout.Declaration:
+        """``headbench.json`` for a folder with these sequences."""
+        return layout.Declaration(
+            subject=self.subject,
+            head_model=self.head_model,
+            head_file=head_file,
+            cy=CY,
+            sequences={job.folder.name: job.recorded.name for job in jobs},
+        )
+
+
+def plan_subject(settings: PrepareSettings, subject: str) -> SubjectPlan:
+    """Read everything about one subject but its pixels. Raises `InputError` for the first fault."""
+    one = participant(Path(settings.root), subject)
+    out = Path(os.path.abspath(settings.out))
+    calibration = read_calibration(one.calibration_file)
+    aligned = calibration.aligned()
+    head = load_head(settings.head) if settings.head else None
+    cameras = tuple(part.strip() for part in settings.cameras.split(",") if part.strip())
+    wanted, test = wanted_sequences(settings, one)
+    jobs = []
+    for name in wanted:
+        recorded = read_sequence(
+            one,
+            calibration,
+            name,
+            cameras=cameras,
+            source=settings.source,
+            every=settings.every or None,
+            cut=settings.cut,
+        )
+        sizes = {view.size for view in recorded.views.values()}
+        if len(sizes) > 1:
+            found = ", ".join(f"{width}x{height}" for width, height in sorted(sizes))
+            raise InputError(recorded.folder, "size", "cameras of one image size", found)
+        size = sizes.pop()
+        full = calibration.size or size
+        small = full[0] // settings.downscale, full[1] // settings.downscale
+        if min(small) < 1 or small[0] > size[0] or small[1] > size[1]:
+            expected = f"a factor that makes images smaller than {size[0]}x{size[1]}"
+            raise InputError("command line", "downscale", expected, f"{settings.downscale}")
+        serials = [*recorded.views]
+        jobs.append(
+            SequenceJob(
+                recorded=recorded,
+                cameras=[aligned.camera(serial, size, small) for serial in serials],
+                corrections=one.corrections(name, serials) if settings.colour == "auto" else {},
+                tracked=_tracked(settings, recorded, head),
+                folder=out / _folder_name(recorded, settings.downscale),
+            )
+        )
+    label = f"_v{len(jobs[0].cameras)}_DS{settings.downscale}"
+    union = out / f"UNION{len(jobs)}_{subject}{label}_{settings.split}-test"
+    version = head.version if head else settings.head_model
+    return SubjectPlan(subject, jobs, test, head, version, union)
+
+
+def wanted_sequences(settings: PrepareSettings, one: Participant) -> tuple[list[str], list[str]]:
+    """Full names of the sequences to prepare, and of those among them that are held out."""
+    if settings.sequences == "paper":
+        names = [*(PAPER_SEQUENCES if settings.split == "free" else UNION10_SEQUENCES)]
+    elif settings.sequences == "all":
+        left_out = (*TONGUE_SEQUENCES, "GLASSES")
+        names = [name for name in SEQUENCES if name in one.sequences and name not in left_out]
+    else:
+        names = [part.strip() for part in settings.sequences.split(",") if part.strip()]
+    matched = list(dict.fromkeys(one.match(name) for name in names))
+    held_out = TEST_SEQUENCE if settings.split == "free" else union10_held_out(one.subject)
+    if not set(matched) - {held_out}:
+        found = ", ".join(matched) or "none"
+        raise InputError("command line", "sequences", "at least one sequence to train on", found)
+    return matched, [name for name in matched if name == held_out]
+
+
+def _tracked(
+    settings: PrepareSettings, recorded: RecordedSequence, head: HeadArrays | None
+) -> TrackedSequence | None:
+    if not settings.tracking:
+        return None
+    root = Path(settings.tracking)
+    if not root.is_dir():
+        raise InputError(root, "", "a folder with VHAP's results", "a file" if root.exists() else "nothing")
+    file = find_tracked(root, recorded.subject, recorded.name)
+    return None if file is None else read_tracked(file, timesteps=len(recorded.numbers), head=head)
+
+
+def _folder_name(recorded: RecordedSequence, downscale: int) -> str:
+    background = "_whiteBg" if recorded.has_mattes else ""
+    return f"{recorded.subject}_{recorded.name}_v{len(recorded.views)}_DS{downscale}{background}"
+
+
+def describe_colour(job: SequenceJob) -> dict[str, Any]:
+    """How colours are corrected, for the record."""
+    kinds = sorted({type(correction).__name__ for correction in job.corrections.values()})
+    return {"colour": kinds[0] if kinds else "none"}

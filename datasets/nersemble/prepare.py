@@ -1,0 +1,233 @@
+"""Prepare a subject: images, cameras, parameters and splits in the GaussianAvatars/VHAP layout.
+
+Each sequence folder holds a record (`RECORD_FILE`) of what its images and its metadata were made from. A call
+continues what an earlier one left, does nothing where all is there, refuses to mix images of other settings,
+and writes parameters and JSONs anew when the tracking has changed. JSONs go first and come back last, so that
+no folder reads as a capture while it is half written.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from ...bench.contracts import Progress, no_progress
+from ...bench.errors import InputError
+from ...bench.files import digest, read_json, write_json
+from .. import ga_layout as layout
+from ..head.arrays import save_head
+from .export import write_union
+from .image_pool import write_images, writing
+from .plan import SequenceJob, SubjectPlan, describe_colour
+from .presets import NOVEL_VIEW_CAMERA
+
+RECORD_FILE = "headbench-prepare.json"
+RECORD_VERSION = 1
+
+_READABLE = (*layout.SPLIT_FILES.values(), layout.ALL_FRAMES_FILE)
+"""Files a folder is read as a capture by."""
+
+
+@dataclass(frozen=True)
+class SequenceState:
+    """What a sequence folder's record says. Empty fingerprints stand for things not there in whole."""
+
+    images: str = ""
+    images_complete: bool = False
+    metadata: str = ""
+
+
+@dataclass(frozen=True)
+class SubjectResult:
+    """What was done for a subject.
+
+    Attributes
+    ----------
+    written, kept : images.
+    frames : frames per split of the union; empty where there is none.
+    union : the folder to give to a reader, or None.
+    missing : what keeps the capture from being whole, one sentence each.
+    """
+
+    subject: str
+    written: int
+    kept: int
+    frames: dict[str, int]
+    union: Path | None
+    missing: tuple[str, ...]
+
+
+def prepare(
+    plans: Sequence[SubjectPlan], *, workers: int = 0, progress: Progress = no_progress
+) -> list[SubjectResult]:
+    """Prepare subjects. Raises `InputError` before the first image where a folder holds something else, and in
+    mid-run for videos that end early and for a full disk; another call then continues."""
+    states = {job.folder: _checked_state(job) for plan in plans for job in plan.jobs}
+    jobs = [job for plan in plans for job in plan.jobs]
+    open_jobs = [job for job in jobs if not _has_all_images(job, states[job.folder])]
+    for job in open_jobs:
+        started = replace(states[job.folder], images=job.images_fingerprint, images_complete=False)
+        with writing(job.folder / RECORD_FILE):
+            _write_state(job, started)
+            states[job.folder] = started
+    before = {job.folder: _count_images(job) for job in open_jobs}
+    write_images(open_jobs, workers=workers, progress=progress)
+    results = []
+    for plan in plans:
+        for job in plan.jobs:
+            with writing(job.folder):
+                _write_metadata(plan, job, states[job.folder])
+        with writing(plan.union):
+            frames = _write_union(plan)
+        total = sum(job.count * len(job.cameras) for job in plan.jobs)
+        kept = sum(before.get(job.folder, job.count * len(job.cameras)) for job in plan.jobs)
+        results.append(
+            SubjectResult(
+                plan.subject, total - kept, kept, frames, plan.union if frames else None, _missing(plan)
+            )
+        )
+    return results
+
+
+def _checked_state(job: SequenceJob) -> SequenceState:
+    """The record of a job's folder. Raises `InputError` where its images were made from something else."""
+    path = job.folder / RECORD_FILE
+    if not path.exists():
+        if (job.folder / "images").is_dir() and any((job.folder / "images").iterdir()):
+            found = "images of unknown origin"
+            raise InputError(job.folder, "images", "a folder of ours, or an empty one", found, _ELSEWHERE)
+        return SequenceState()
+    value = read_json(path)
+    texts = all(isinstance(value.get(key), str) for key in ("images", "metadata"))
+    if value.get("format_version") != RECORD_VERSION or not texts:
+        found = f"format_version {value.get('format_version')!r}"
+        raise InputError(path, "", f"a record of format_version {RECORD_VERSION}", found, _ELSEWHERE)
+    if value["images"] != job.images_fingerprint:
+        expected = "images made from these files with these settings"
+        raise InputError(path, "images", expected, "images made from others", _ELSEWHERE)
+    return SequenceState(value["images"], value.get("images_complete") is True, value["metadata"])
+
+
+_ELSEWHERE = "Give another --out, or delete the folder."
+
+
+def _write_state(job: SequenceJob, state: SequenceState) -> None:
+    recorded = job.recorded
+    videos = any(view.video for view in recorded.views.values())
+    value: dict[str, Any] = {
+        "format_version": RECORD_VERSION,
+        "images": state.images,
+        "images_complete": state.images_complete,
+        "metadata": state.metadata,
+        "subject": recorded.subject,
+        "sequence": recorded.name,
+        "source": "video" if videos else "images",
+        "frames": list(recorded.numbers),
+        "mattes": recorded.has_mattes,
+        **describe_colour(job),
+    }
+    write_json(job.folder / RECORD_FILE, value)
+
+
+def _has_all_images(job: SequenceJob, state: SequenceState) -> bool:
+    if not state.images_complete:
+        return False
+    expected = job.count * len(job.cameras)
+    masks = len(_names(job.folder / "fg_masks")) if job.recorded.has_mattes else expected
+    return _count_images(job) == expected == masks
+
+
+def _count_images(job: SequenceJob) -> int:
+    wanted = {
+        job.image_path(timestep, index).name
+        for timestep in range(job.count)
+        for index in range(len(job.cameras))
+    }
+    return len(wanted & _names(job.folder / "images"))
+
+
+def _names(folder: Path) -> set[str]:
+    return set(os.listdir(folder)) if folder.is_dir() else set()
+
+
+def _write_metadata(plan: SubjectPlan, job: SequenceJob, state: SequenceState) -> None:
+    """Write a sequence's JSONs and parameters, unless they are there already.
+
+    A call without tracking leaves the parameters that an earlier call wrote.
+    """
+    if job.tracked is None and (_is_readable(job) or (state.images_complete and state.metadata)):
+        if not state.images_complete:
+            _write_state(job, replace(state, images_complete=True))
+        return
+    declaration = plan.declaration([job], f"../{plan.union.name}/{layout.HEAD_FILE}")
+    fingerprint = job.metadata_fingerprint(declaration)
+    if state.images_complete and state.metadata == fingerprint and _is_readable(job):
+        return
+    for folder in (job.folder, plan.union):
+        for name in _READABLE:
+            (folder / name).unlink(missing_ok=True)
+    _write_state(job, replace(state, images_complete=True, metadata=""))
+    job.export.write_backup()
+    if job.tracked is not None:
+        job.export.write_tracked(job.tracked, declaration)
+    _write_state(job, replace(state, images_complete=True, metadata=fingerprint))
+
+
+def _is_readable(job: SequenceJob) -> bool:
+    """Whether the folder reads as a capture: images, parameters and JSONs are there."""
+    return all((job.folder / name).exists() for name in _READABLE)
+
+
+def _write_union(plan: SubjectPlan) -> dict[str, int]:
+    """Write the union where every sequence is tracked, unless it is there; frames per split."""
+    if not all(_is_readable(job) for job in plan.jobs):
+        return {}
+    train = [job for job in plan.jobs if job.recorded.name not in plan.test]
+    test = [job for job in plan.jobs if job.recorded.name in plan.test]
+    own_head = plan.head is not None and not plan.head.version.startswith("flame")
+    declaration = plan.declaration([*train, *test], layout.HEAD_FILE)
+    head = plan.head.fingerprint() if plan.head is not None and own_head else ""
+    members = [read_json(job.folder / RECORD_FILE)["metadata"] for job in (*train, *test)]
+    fingerprint = digest(declaration, members, plan.test, head)
+    record = plan.union / RECORD_FILE
+    readable = all((plan.union / name).exists() for name in layout.SPLIT_FILES.values())
+    if readable and record.exists():
+        value = read_json(record)
+        if value.get("metadata") == fingerprint and isinstance(value.get("frames"), dict):
+            return value["frames"]
+    if own_head and plan.head is not None:  # FLAME's licence forbids copies; readers are given its file
+        save_head(plan.union / layout.HEAD_FILE, plan.head)
+    folders = [job.folder for job in train], [job.folder for job in test]
+    frames = write_union(plan.union, *folders, (NOVEL_VIEW_CAMERA,), declaration)
+    write_json(record, {"format_version": RECORD_VERSION, "metadata": fingerprint, "frames": frames})
+    return frames
+
+
+def _missing(plan: SubjectPlan) -> tuple[str, ...]:
+    """What the capture lacks, one sentence each."""
+    untracked = [job.recorded.name for job in plan.jobs if not _is_readable(job)]
+    unmatted = [job.recorded.name for job in plan.jobs if not job.recorded.has_mattes]
+    plain = [job.recorded.name for job in plan.jobs if not job.corrections]
+    held_out = {camera.id for job in plan.jobs for camera in job.cameras}
+    lines = []
+    if untracked:
+        lines.append(
+            f"no tracked parameters for {', '.join(untracked)}: no {layout.ALL_FRAMES_FILE} and no union. Run "
+            "VHAP and call again with --tracking."
+        )
+    if unmatted:
+        lines.append(
+            f"no mattes for {', '.join(unmatted)}: images keep their background, and there are no masks. Make "
+            "alpha_maps (VHAP's preprocessing) and prepare into another folder; a difference to the BACKGROUND "
+            "stills is not good enough, as heads cast shadows and share the background's greys."
+        )
+    if plain:
+        lines.append(f"no colour correction for {', '.join(plain)}: colours are as recorded.")
+    if not plan.test:
+        lines.append("no held-out sequence among those prepared: nothing to test self-reenactment on.")
+    if NOVEL_VIEW_CAMERA not in held_out:
+        lines.append(f"no camera {NOVEL_VIEW_CAMERA}: nothing to test novel views on.")
+    return tuple(lines)

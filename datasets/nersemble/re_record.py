@@ -1,0 +1,92 @@
+"""Turn a capture, a synthetic one as a rule, back into the raw recording and tracking it could have come from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ...bench.contracts import Camera, FloatArray, FrameKey, HeadPose, Progress, no_progress
+from ..clip import CaptureClip
+from ..ga_writer import pose_to_parameters
+from .calibration import read_calibration
+from .writer import RecordingWriter, Release, write_tracked
+
+
+def re_record(
+    clip: CaptureClip,
+    root: Path,
+    *,
+    tracking: Path | None = None,
+    release: Release = "v2",
+    mattes: bool = True,
+    progress: Progress = no_progress,
+) -> list[str]:
+    """Write a clip's frames, cameras and parameters as a raw recording under ``root``; return its sequences.
+
+    Frames become images with mattes, as VHAP's preprocessing leaves them, or without ``mattes`` videos of three
+    frames per timestep, of which a reader keeps the first. Parameters go under ``tracking``, in the world that
+    VHAP turns the calibration into. Excluded frames are written like the others.
+    """
+    writer = RecordingWriter(root, clip.subject, [*clip.cameras.values()], release)
+    writer.write_calibration()
+    turn = _alignment(writer.calibration_file, next(iter(clip.cameras.values())))
+    by_sequence: dict[str, list[FrameKey]] = {}
+    for key in sorted(clip.files):
+        by_sequence.setdefault(key.sequence, []).append(key)
+    done = 0
+    for sequence, keys in by_sequence.items():
+        timesteps = sorted({key.timestep for key in keys})
+        for camera in clip.cameras:
+            own = [FrameKey(clip.subject, sequence, timestep, camera) for timestep in timesteps]
+            if mattes or release == "paper2023":
+                for number, key in enumerate(own):
+                    # The 2023 frame folders count at 73 frames per second.
+                    step = 3 if release == "paper2023" else 1
+                    writer.write_frame(sequence, camera, step * number, clip.image(key), clip.mask(key))
+            else:
+                writer.write_video(sequence, camera, (clip.image(key) for key in own for _ in range(3)))
+            done += len(own)
+            progress(done, len(clip.files), sequence)
+        if tracking is not None:
+            poses = [turned_pose(clip, clip.poses[timestep], turn) for timestep in timesteps]
+            folder = tracking / f"{clip.subject}_{sequence}" / "2000-01-01_00-00-00"
+            arrays = _stacked(poses) | {
+                "shape": clip.shape,
+                "static_offset": clip.static_offset[None],
+            }
+            write_tracked(folder / "tracked_flame_params_30.npz", arrays, range(len(poses)))
+    writer.write_metadata([*by_sequence])
+    return [*by_sequence]
+
+
+def _alignment(calibration_file: Path, camera: Camera) -> FloatArray:
+    """(3, 3) rotation from the recording's world to the aligned one."""
+    aligned = read_calibration(calibration_file).aligned().world_to_camera[camera.id]
+    rotation: FloatArray = aligned[:3, :3].T @ camera.world_to_camera[:3, :3]
+    return rotation
+
+
+def turned_pose(clip: CaptureClip, pose: HeadPose, turn: FloatArray) -> HeadPose:
+    """The pose in a world turned about its origin; the head itself turns about its root joint."""
+    root = root_joint(clip, pose)
+    rotation = Rotation.from_matrix(turn) * Rotation.from_rotvec(np.asarray(pose.rotation, np.float64))
+    translation = turn @ (root + pose.translation) - root
+    return replace(pose, rotation=rotation.as_rotvec(), translation=translation)
+
+
+def root_joint(clip: CaptureClip, pose: HeadPose) -> FloatArray:
+    """(3,) the joint that ``rotation`` turns about, metres: regressed from the mesh with shape, expression and
+    static offset."""
+    head = clip.head
+    shaped = head.template + head.shape_basis @ clip.shape + head.expression_basis @ pose.expression
+    joint: FloatArray = head.joint_regressor[0] @ (shaped + clip.static_offset)
+    return joint
+
+
+def _stacked(poses: Sequence[HeadPose]) -> dict[str, FloatArray]:
+    rows = [pose_to_parameters(pose) for pose in poses]
+    return {key: np.concatenate([row[key] for row in rows]) for key in rows[0]}

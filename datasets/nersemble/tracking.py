@@ -1,0 +1,165 @@
+"""Tracked FLAME parameters as VHAP writes them: found by subject and sequence, read and checked."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ...bench.contracts import FloatArray
+from ...bench.errors import InputError
+from ..flame_parameters import resolve_teeth
+from ..ga_layout import parse_sequence_folder
+from ..head.arrays import HeadArrays, read_npz
+
+PER_TIMESTEP = {"translation": 3, "rotation": 3, "neck_pose": 3, "jaw_pose": 3, "eyes_pose": 6}
+"""Arrays of shape (T, n) that every tracking has, in the order of an export; ``expr`` is (T, E)."""
+
+CANONICAL_JAW = (0.3, 0.0, 0.0)
+"""Axis-angle of the open mouth in an export's canonical parameters, radians."""
+
+_RESULT = re.compile(r"tracked_flame_params_(\d+)\.npz")
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedSequence:
+    """Parameters of T timesteps, in the aligned world.
+
+    Attributes
+    ----------
+    file : where they come from.
+    frames : arrays with T rows: those of `PER_TIMESTEP`, ``expr``, and ``dynamic_offset`` and ``eyelids`` where
+        there are any.
+    constant : ``shape`` (S,) and ``static_offset`` (1, V, 3), zeros where the tracker wrote none.
+    """
+
+    file: Path
+    frames: Mapping[str, FloatArray]
+    constant: Mapping[str, FloatArray]
+
+    @property
+    def count(self) -> int:
+        """Number of timesteps."""
+        return len(self.frames["translation"])
+
+    @property
+    def shift(self) -> FloatArray:
+        """(3,) mean translation, which an export subtracts from the poses and from the cameras."""
+        mean: FloatArray = self.frames["translation"].astype(np.float64).mean(axis=0)
+        return mean
+
+    def parameters(self, timestep: int) -> dict[str, FloatArray]:
+        """One ``flame_param`` file, float32, in the shifted world."""
+        rows = {key: values[timestep : timestep + 1] for key, values in self.frames.items()}
+        moved = rows["translation"].astype(np.float64) - self.shift
+        return {**rows, "translation": moved.astype(np.float32), **self.constant}
+
+    def canonical(self) -> dict[str, FloatArray]:
+        """``canonical_flame_param.npz``: zeros but for identity, static offset and an open jaw (float64)."""
+        zeros = {
+            key: np.zeros_like(values[:1]) for key, values in self.frames.items() if key != "dynamic_offset"
+        }
+        return {**zeros, "jaw_pose": np.array([CANONICAL_JAW], dtype=np.float64), **self.constant}
+
+
+def read_tracked(path: Path, *, timesteps: int, head: HeadArrays | None = None) -> TrackedSequence:
+    """Read ``tracked_flame_params_*.npz`` and check it against the frames and, where given, the head model.
+
+    Raises `InputError` for a file of another tracker, missing arrays, wrong shapes, numbers that are not finite,
+    a number of timesteps other than ``timesteps``, and coefficients that the head model has no basis for.
+    """
+    arrays = read_npz(path)
+    if "rotation_matrices" in arrays:
+        remedy = (
+            "The benchmark's tracking has Euler angles about the model's origin; run VHAP on the recording."
+        )
+        raise InputError(path, "rotation_matrices", "VHAP's arrays", "the benchmark's tracking", remedy)
+    frames = {key: _floats(path, arrays, key, (timesteps, size)) for key, size in PER_TIMESTEP.items()}
+    frames["expr"] = _floats(path, arrays, "expr", (timesteps, None))
+    for key, shape in (("dynamic_offset", (timesteps, None, 3)), ("eyelids", (timesteps, 2))):
+        if key in arrays:
+            frames[key] = _floats(path, arrays, key, shape)
+    identity = _floats(path, arrays, "shape", (None,))
+    offset = _floats(path, arrays, "static_offset", (1, None, 3)) if "static_offset" in arrays else None
+    if head is not None:
+        _check_head(path, head, len(identity), frames["expr"].shape[1], offset)
+    rows = offset if offset is not None else np.zeros((1, _rows(path, frames, head), 3), np.float32)
+    return TrackedSequence(path, frames, {"shape": identity, "static_offset": rows})
+
+
+def find_tracked(root: Path, subject: str, sequence: str) -> Path | None:
+    """Final parameters of a sequence under VHAP's output folder; None where there are none.
+
+    Looks in folders named as VHAP's scripts name them (``074_EMO-1_v16_DS4_wBg_staticOffset``) or plainly
+    ``074_EMO-1-shout+laugh``, takes the latest dated run inside, and its last epoch. Raises `InputError` where
+    two folders fit.
+    """
+    folders = sorted(path for path in root.iterdir() if path.is_dir()) if root.is_dir() else []
+    fitting = []
+    for folder in folders:
+        who, what = parse_sequence_folder(folder.name)
+        if who == subject and (sequence == what or sequence.startswith(f"{what}-")) and [*_results(folder)]:
+            fitting.append(folder)
+    if len(fitting) > 1:
+        found = ", ".join(folder.name for folder in fitting)
+        raise InputError(root, f"{subject} {sequence}", "one folder of tracked parameters", found)
+    return max(_results(fitting[0]))[2] if fitting else None
+
+
+def _results(folder: Path) -> Iterator[tuple[str, int, Path]]:
+    """Run, epoch and file of each result, in the folder or in the dated folders below."""
+    for path in (*folder.glob("*.npz"), *folder.glob("*/*.npz")):
+        if match := _RESULT.fullmatch(path.name):
+            yield (path.parent.name if path.parent != folder else "", int(match[1]), path)
+
+
+def _floats(
+    path: Path, arrays: Mapping[str, np.ndarray], key: str, shape: tuple[int | None, ...]
+) -> FloatArray:
+    """An array as float32; None in ``shape`` fits any size."""
+    if key not in arrays:
+        raise InputError(
+            path, key, "an array", f"only {', '.join(sorted(arrays))}", "Give VHAP's own output."
+        )
+    array = arrays[key]
+    if key == "shape" and array.ndim == 2 and len(array) == 1:
+        array = array[0]
+    wanted = tuple("any" if size is None else size for size in shape)
+    fits = array.ndim == len(shape) and all(s in (None, n) for s, n in zip(shape, array.shape))
+    if not fits or array.dtype.kind not in "fiu":
+        remedy = ""
+        if array.ndim and shape[0] is not None and array.shape[0] != shape[0]:
+            remedy = "Track the very frames that are prepared (mind every, and the frames VHAP extracted)."
+        raise InputError(path, key, f"numbers of shape {wanted}", f"{array.dtype} {array.shape}", remedy)
+    values = array.astype(np.float32)
+    if not np.isfinite(values).all():
+        raise InputError(path, key, "finite float32 numbers", "NaN or infinity")
+    return values
+
+
+def _check_head(
+    path: Path, head: HeadArrays, identities: int, expressions: int, offset: FloatArray | None
+) -> None:
+    remedy = "Give the head model the sequence was tracked with."
+    sizes = (
+        ("shape", identities, head.shape_basis.shape[2]),
+        ("expr", expressions, head.expression_basis.shape[2]),
+    )
+    for key, found, most in sizes:
+        if found > most:
+            expected = f"at most {most} coefficients, as head model {head.version} has"
+            raise InputError(path, key, expected, f"{found}", remedy)
+    resolve_teeth(head, None if offset is None else offset.shape[1], "auto", path)
+
+
+def _rows(path: Path, frames: Mapping[str, FloatArray], head: HeadArrays | None) -> int:
+    """Vertices of the tracked mesh, for a static offset of zeros, which GaussianAvatars insists on."""
+    if "dynamic_offset" in frames:
+        return frames["dynamic_offset"].shape[1]
+    if head is not None:
+        return len(resolve_teeth(head, None, "auto", path)[0].template)
+    remedy = "Give the head model, so that zeros of its size can be written."
+    raise InputError(path, "static_offset", "an array", "none", remedy)
