@@ -1,0 +1,45 @@
+"""Commands of this room. Light to import: implementations are named, not loaded."""
+
+from ..bench.contracts import CommandSpec
+
+EXPORT_COLMAP = CommandSpec(
+    name="export colmap",
+    summary="Write frames of a capture as a COLMAP dataset: images, masks and a sparse model.",
+    implementation="headbench.datasets.colmap.command:run",
+    settings="headbench.datasets.colmap.settings:ExportColmapSettings",
+)
+
+STEPS = CommandSpec(
+    name="steps",
+    summary="Draw the jaw bases and expression classes that a capture's training frames give, and their numbers.",
+    implementation="headbench.datasets.step_pictures.command:run",
+    settings="headbench.datasets.step_pictures.settings:StepsSettings",
+)
+
+LINT = CommandSpec(
+    name="lint",
+    summary="Search a capture for faults that make a comparison unfair or wrong; --list explains the codes.",
+    implementation="headbench.datasets.lint.command:run",
+    settings="headbench.datasets.lint.settings:LintSettings",
+)
+
+INSPECT = CommandSpec(
+    name="inspect",
+    summary="Draw what a capture holds: camera rig, splits, tracked mesh on images, motion by sequence.",
+    implementation="headbench.datasets.inspection.command:run",
+    settings="headbench.datasets.inspection.settings:InspectSettings",
+)
+
+PREPARE_NERSEMBLE = CommandSpec(
+    name="prepare nersemble",
+    summary="Turn raw NeRSemble recordings into captures that methods train on; continues after a kill.",
+    implementation="headbench.datasets.nersemble.command:run",
+    settings="headbench.datasets.nersemble.settings:PrepareSettings",
+)
+
+RECORD_NERSEMBLE = CommandSpec(
+    name="record nersemble",
+    summary="Write a synthetic capture as a raw NeRSemble recording with VHAP's tracking, to try prepare on.",
+    implementation="headbench.datasets.nersemble.re_record:run",
+    settings="headbench.datasets.nersemble.settings:RecordSettings",
+)

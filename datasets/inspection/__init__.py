@@ -1,0 +1,1 @@
+"""What a capture holds, on one picture and as numbers."""

@@ -1,0 +1,198 @@
+"""Numbers of a capture: what the splits hold and how faces move in each sequence."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+
+from ...bench.contracts import FloatArray, FrameKey, HeadPose
+from ..clip import CaptureClip
+from ..head.model import HeadModel
+from ..head.rotations import axis_angle_to_matrix
+
+KEPT_VARIANCE = 0.95
+
+
+@dataclass(frozen=True)
+class SplitRow:
+    """Sizes of one split."""
+
+    split: str
+    images: int
+    timesteps: int
+    cameras: int
+    sequences: int
+
+
+@dataclass(frozen=True)
+class SequenceRow:
+    """How one sequence moves. Excluded timesteps are counted and otherwise left out.
+
+    Attributes
+    ----------
+    held_out : whether it is the test of self-reenactment.
+    jaw_deg : least, median and largest opening of the jaw, degrees.
+    head_deg : largest turn of the head away from its mean direction, degrees.
+    head_mm : largest distance of the head from its mean place, millimetres.
+    expression_sigma : root mean square over timesteps of the coefficients' length over sqrt(E): 1 where every
+        coefficient scatters by its standard deviation of 1.
+    largest_coefficient : largest absolute coefficient.
+    reach_mm : median and largest displacement of the farthest-moving vertex by expression alone, millimetres.
+    """
+
+    sequence: str
+    held_out: bool
+    timesteps: int
+    excluded: int
+    jaw_deg: tuple[float, float, float]
+    head_deg: float
+    head_mm: float
+    expression_sigma: float
+    largest_coefficient: float
+    reach_mm: tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class ExpressionSpace:
+    """Principal components of the face's displacement by expression, over the training timesteps.
+
+    Attributes
+    ----------
+    timesteps : of the capture, excluded ones left out.
+    held_out : (T,) whether a timestep is tested on.
+    scores_mm : (T, K) root-mean-square displacement of the face's vertices along each component.
+    explained : (K,) share of the training variance.
+    novelty_mm : by held-out timestep, RMS distance of its face to the nearest training face.
+    """
+
+    timesteps: Sequence[int]
+    held_out: np.ndarray
+    scores_mm: FloatArray
+    explained: FloatArray
+    novelty_mm: Mapping[int, float]
+
+    @cached_property
+    def kept(self) -> int:
+        """Components that explain `KEPT_VARIANCE` of the training variance."""
+        return (
+            int(np.searchsorted(np.cumsum(self.explained), KEPT_VARIANCE) + 1) if len(self.explained) else 0
+        )
+
+
+def split_rows(clip: CaptureClip) -> list[SplitRow]:
+    """Sizes of every split, and of what is excluded where there is any."""
+    parts: dict[str, Sequence[FrameKey]] = {**clip.splits}
+    if clip.excluded:
+        parts["excluded"] = tuple(clip.excluded)
+    return [
+        SplitRow(
+            name,
+            len(keys),
+            len({key.timestep for key in keys}),
+            len({key.camera for key in keys}),
+            len({key.sequence for key in keys}),
+        )
+        for name, keys in parts.items()
+    ]
+
+
+def sequence_rows(clip: CaptureClip) -> list[SequenceRow]:
+    """One row per sequence, in the order of timesteps."""
+    held_out = {key.sequence for key in clip.splits.get("self_reenactment", ())}
+    excluded = {key.timestep for key in clip.excluded}
+    groups: dict[str, set[int]] = {}
+    for key in clip.files:
+        groups.setdefault(key.sequence, set()).add(key.timestep)
+    rows = []
+    for sequence, timesteps in sorted(groups.items(), key=lambda item: min(item[1])):
+        kept = sorted(timesteps - excluded)
+        if kept:
+            poses = [clip.poses[t] for t in kept]
+            rows.append(_row(clip, sequence, sequence in held_out, poses, len(timesteps) - len(kept)))
+    return rows
+
+
+def _row(
+    clip: CaptureClip, sequence: str, held_out: bool, poses: Sequence[HeadPose], excluded: int
+) -> SequenceRow:
+    expressions = np.stack([pose.expression for pose in poses]).astype(np.float64)
+    jaw = np.degrees(np.linalg.norm([pose.jaw for pose in poses], axis=1))
+    places = np.stack([pose.translation for pose in poses]).astype(np.float64)
+    reach = 1000 * _reach(clip, expressions)
+    return SequenceRow(
+        sequence=sequence,
+        held_out=held_out,
+        timesteps=len(poses),
+        excluded=excluded,
+        jaw_deg=(float(jaw.min()), float(np.median(jaw)), float(jaw.max())),
+        head_deg=_largest_turn(poses),
+        head_mm=float(1000 * np.linalg.norm(places - places.mean(axis=0), axis=1).max()),
+        expression_sigma=float(np.sqrt((expressions**2).mean())),
+        largest_coefficient=float(np.abs(expressions).max()),
+        reach_mm=(float(np.median(reach)), float(reach.max())),
+    )
+
+
+def _largest_turn(poses: Sequence[HeadPose]) -> float:
+    """Degrees between the head's rotation (root, then neck) and the mean one (chordal mean)."""
+    root = axis_angle_to_matrix(torch.from_numpy(np.stack([p.rotation for p in poses]).astype(np.float64)))
+    neck = axis_angle_to_matrix(torch.from_numpy(np.stack([p.neck for p in poses]).astype(np.float64)))
+    turns = (root @ neck).numpy()
+    u, _, vt = np.linalg.svd(turns.mean(axis=0))
+    mean = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    traces = np.einsum("tij,ij->t", turns, mean)
+    return float(np.degrees(np.arccos(np.clip((traces - 1) / 2, -1, 1))).max())
+
+
+def _reach(clip: CaptureClip, expressions: FloatArray) -> FloatArray:
+    """(T,) metres that the farthest-moving vertex moves by expression alone."""
+    basis = clip.head.expression_basis
+    matrix = np.asarray(basis, dtype=np.float64).reshape(-1, basis.shape[2])
+    return np.array([np.linalg.norm((matrix @ e).reshape(-1, 3), axis=1).max() for e in expressions])
+
+
+def expression_space(clip: CaptureClip) -> ExpressionSpace:
+    """See `ExpressionSpace`. Exact, and done in the space of coefficients: never V x T numbers at once."""
+    excluded = {key.timestep for key in clip.excluded}
+    test = {key.timestep for key in clip.splits.get("self_reenactment", ())}
+    timesteps = [t for t in sorted(clip.poses) if t not in excluded]
+    held_out = np.array([t in test for t in timesteps])
+    members = clip.head.regions.get("face", np.arange(len(clip.head.template)))
+    basis = clip.head.expression_basis[members].astype(np.float64)
+    # Distances between faces are distances between coefficients in the metric of the basis: B^T B / vertices.
+    gram = np.einsum("vie,vif->ef", basis, basis) / len(members)
+    values, vectors = np.linalg.eigh(gram)
+    root = vectors * np.sqrt(np.maximum(values, 0))
+    faces = 1000 * np.stack([clip.poses[t].expression for t in timesteps]).astype(np.float64) @ root
+    train = faces[~held_out]
+    centred = faces - train.mean(axis=0)
+    _, singular, axes = np.linalg.svd(centred[~held_out], full_matrices=False)
+    variance = singular**2
+    scores = centred @ axes.T
+    # A component's sign is arbitrary; the larger half of its skew points to the right.
+    scores = scores * np.where((scores[~held_out] ** 3).sum(axis=0) < 0, -1.0, 1.0)
+    novelty = {
+        t: float(np.linalg.norm(train - face, axis=1).min())
+        for t, face, new in zip(timesteps, faces, held_out)
+        if new
+    }
+    total = variance.sum()
+    return ExpressionSpace(
+        timesteps, held_out, scores, variance / total if total > 0 else variance[:0], novelty
+    )
+
+
+def posed_meshes(clip: CaptureClip, timesteps: Sequence[int]) -> FloatArray:
+    """(T, V, 3) tracked meshes in the clip's world, metres."""
+    model = HeadModel(clip.head, dtype=torch.float64)
+    canonical = model.canonical(
+        torch.from_numpy(clip.shape.astype(np.float64)),
+        torch.from_numpy(clip.static_offset.astype(np.float64)),
+    )
+    arguments = model.pose_arguments([clip.poses[t] for t in timesteps])
+    meshes: FloatArray = model(canonical=canonical, **arguments).numpy()
+    return meshes
