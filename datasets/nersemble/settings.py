@@ -1,9 +1,11 @@
-"""Options of ``headbench prepare nersemble``; light to import."""
+"""Options of the commands on NeRSemble recordings; light to import."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Literal
+
+import tyro
 
 
 @dataclass(frozen=True)
@@ -53,3 +55,22 @@ class PrepareSettings:
     check: bool = False
     union_root: str = ""
     rejoin: bool = False
+
+
+@dataclass(frozen=True)
+class RecordSettings:
+    """What to write as a raw recording.
+
+    Attributes
+    ----------
+    capture : Synthetic capture: a UNION folder, as `headbench synth` writes them.
+    out : Folder to write: ``recording`` goes to --root of `headbench prepare nersemble`, ``tracking`` to --tracking,
+        ``head_model.npz`` to --head.
+    release : Whose folders: of the second release, of the first, or of the 2023 paper.
+    frames : "images" with mattes, as VHAP's preprocessing leaves them, or "video" without.
+    """
+
+    capture: tyro.conf.Positional[str]
+    out: str
+    release: Literal["v2", "v1", "paper2023"] = "v2"
+    frames: Literal["images", "video"] = "images"
