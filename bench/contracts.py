@@ -130,7 +130,7 @@ class HeadAsset(Protocol):
     @property
     def parents(self) -> IntArray: ...  # (J,), root has -1
     @property
-    def eyelid_basis(self) -> FloatArray | None: ...  # (V, 3, 2), added after skinning
+    def eyelid_basis(self) -> FloatArray | None: ...  # (V, 3, 2), added after skinning, turned with the head
     @property
     def regions(self) -> Mapping[str, IntArray]:
         """Vertex indices by region: face, eye_region, lips, scalp, neck, left_eyeball, teeth, ..."""

@@ -42,7 +42,8 @@ class HeadArrays:
     joint_regressor : (J, V) dense; joints come from the shaped mesh.
     skinning_weights : (V, J), rows sum to 1.
     parents : (J,), the root has -1 and every joint comes after its parent.
-    eyelid_basis : (V, 3, 2) left and right, added after skinning; None where the model has none.
+    eyelid_basis : (V, 3, 2) left and right, added after skinning and turned with root and neck; None where the
+        model has none.
     regions : vertex indices by name, unique; sorted except for `RING_REGIONS`.
     landmarks : vertex index by name; may be empty.
     """

@@ -1,5 +1,7 @@
 """Rigid motion of the head against skinned vertices, and its move into the camera."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -40,8 +42,9 @@ def test_motions_carry_rigid_vertices_from_the_head_frame_to_the_world(head):
     poses = make_poses(head, BATCH + 3)
     motions = rigid_motions(head, shape, offset, poses)
     assert motions.shape == (BATCH + 3, 4, 4)
-    model = HeadModel(head, dtype=torch.float64)
-    model.pose_matrix[:9] = 0
+    correctives = head.pose_basis.copy()
+    correctives[:, :, :9] = 0
+    model = HeadModel(replace(head, pose_basis=correctives), dtype=torch.float64)
     canonical = model.canonical(torch.tensor(shape), torch.tensor(offset))
     rigid = head.skinning_weights[:, 1] > 1 - 1e-9
 

@@ -59,7 +59,7 @@ def loop_reference(head, one, offset=None, eyelids=None):
                     place += amount * head.pose_basis[vertex, :, 9 * (joint - 1) + 3 * row + column]
         blended = sum(head.skinning_weights[vertex, joint] * world[joint] for joint in range(5))
         result[vertex] = (blended @ np.append(place, 1))[:3] + one["translation"]
-    return result if eyelids is None else result + head.eyelid_basis @ eyelids
+    return result if eyelids is None else result + (head.eyelid_basis @ eyelids) @ (turns[0] @ turns[1]).T
 
 
 def test_agrees_with_smplx(tmp_path):
