@@ -6,20 +6,18 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from ...bench.contracts import FloatArray, HeadPose
 from ...bench.files import atomic_path, digest
 from ..clip import CaptureClip
 from ..head.arrays import HeadArrays, read_npz
-from ..head.model import HeadModel
 from .identity import EYEBALLS, FACE, Matching
 from .problem import FitProblem
 from .report import FrameResidual, RefitReport
-from .rigid import SubjectHead
 from .settings import RefitSettings
 from .solve import angle_bounds, solve_frame
-from .turns import matrices
+from .subject import Subject
+from .turns import axis_angles, matrices
 
 _FORMAT = 1  # of the blocks on disk; counts up when the fit changes
 _MILLIMETRES = 1e3
@@ -36,34 +34,30 @@ class BlockFitter:
     def __init__(
         self,
         clip: CaptureClip,
-        source: SubjectHead,
         target: HeadArrays,
         matching: Matching,
         offset: FloatArray,
         settings: RefitSettings,
     ):
         self.target, self.matching, self.settings = target, matching, settings
-        self._source = source
-        self._subject = SubjectHead(target, matching.shape, offset)
+        self._source = Subject(clip.head, clip.shape, clip.static_offset)
+        self._subject = Subject(target, matching.shape, offset)
         self._problem = FitProblem(
-            target, self._subject.canonical, matching.vertices, matching.weights, settings
+            target, self._subject.neutral, matching.vertices, matching.weights, settings
         )
-        self._source_model = HeadModel(clip.head, dtype=torch.float64)
-        self._target_model = HeadModel(target, dtype=torch.float64)
         self._to_source = np.linalg.inv(matching.alignment)
         eyeballs = [target.regions[name] for name in EYEBALLS if name in target.regions]
         self._eyeball = np.isin(matching.vertices, np.concatenate(eyeballs)) if eyeballs else None
         self._face = np.isin(matching.vertices, target.regions[FACE])
         self._input = digest(
-            *(clip.head.fingerprint(), target.fingerprint(), source.canonical, offset),
+            *(clip.head.fingerprint(), target.fingerprint(), self._source.neutral, offset),
             *(matching.shape, settings.record(), _FORMAT),
         )
 
     def fit(self, poses: Sequence[HeadPose]) -> dict[str, FloatArray]:
         """Fit a block; arrays by the names in `PER_TIMESTEP`, and the residuals' sums by vertex, (n,)."""
-        meshes = self._meshes(self._source_model, self._source.canonical, poses)
-        counterparts = self._on_surface(meshes)
-        motions = np.stack([self._source.motion(pose) for pose in poses]) @ self._to_source
+        counterparts = self._on_surface(self._source.meshes(poses))
+        motions = self._source.motions(poses) @ self._to_source
         local = np.einsum("tni,tij->tnj", counterparts - motions[:, None, :3, 3], motions[:, :3, :3])
         necks = self._necks(poses)
         frames = self._problem.frames(local, matrices(necks))
@@ -77,12 +71,11 @@ class BlockFitter:
             "angles": np.stack([solution.angles for solution in solutions]),
             "evaluations": np.array([solution.evaluations for solution in solutions]),
             "neck": necks,
-            "rotation": np.zeros((len(poses), 3)),
+            "rotation": axis_angles(motions[:, :3, :3] @ matrices(necks).transpose(0, 2, 1)),
             "translation": np.zeros((len(poses), 3)),
         }
-        for row, motion in enumerate(motions):
-            moved = self._subject.with_motion(self.pose(poses[row], None, columns, row), motion)
-            columns["rotation"][row], columns["translation"][row] = moved.rotation, moved.translation
+        turned = [self.pose(pose, None, columns, row) for row, pose in enumerate(poses)]
+        columns["translation"] = motions[:, :3, 3] - self._subject.motions(turned)[:, :3, 3]
         return columns | self._residuals(poses, columns, counterparts)
 
     def fit_once(self, poses: Sequence[HeadPose], folder: Path | None, index: int) -> dict[str, FloatArray]:
@@ -147,24 +140,18 @@ class BlockFitter:
         ]
         vertex_mm = np.full(len(self.target.template), np.nan)
         vertex_mm[self.matching.vertices] = vertex_sums / len(timesteps)
-        neutral = self.matching.counterparts @ self._source.canonical
+        neutral = self.matching.counterparts @ self._source.neutral
         aligned = neutral @ self.matching.alignment[:3, :3].T + self.matching.alignment[:3, 3]
-        gaps = np.linalg.norm(aligned - self._subject.canonical[self.matching.vertices], axis=1)
+        gaps = np.linalg.norm(aligned - self._subject.neutral[self.matching.vertices], axis=1)
         at_limit = np.abs(self.matching.shape) >= self.settings.coefficient_bound * (1 - 1e-9)
         return RefitReport(
-            source=self._source_model.version,
+            source=self._source.version,
             target=self.target.version,
             frames=frames,
             vertex_mm=vertex_mm,
             neutral_mm=_MILLIMETRES * float(gaps[self._face].mean()),
             shape_at_bound=tuple(f"shape[{i}]" for i in np.flatnonzero(at_limit)),
         )
-
-    def _meshes(self, model: HeadModel, canonical: FloatArray, poses: Sequence[HeadPose]) -> FloatArray:
-        """(T, V, 3) vertices in the world, float64."""
-        with torch.no_grad():
-            arguments = model.pose_arguments(poses)
-            return np.asarray(model(canonical=torch.from_numpy(canonical)[None], **arguments).numpy())
 
     def _on_surface(self, meshes: FloatArray) -> FloatArray:
         """(T, n, 3) counterparts of the fitted vertices on meshes (T, V source, 3)."""
@@ -184,7 +171,7 @@ class BlockFitter:
     ) -> dict[str, FloatArray]:
         """Distances of the finished meshes in the world, by the head model itself and not by the fit's algebra."""
         fitted = [self.pose(pose, None, columns, row) for row, pose in enumerate(poses)]
-        meshes = self._meshes(self._target_model, self._subject.canonical, fitted)
+        meshes = self._subject.meshes(fitted)
         gaps = _MILLIMETRES * np.linalg.norm(meshes[:, self.matching.vertices] - counterparts, axis=2)
         face = gaps[:, self._face]
         eyeballs = np.zeros(len(gaps))

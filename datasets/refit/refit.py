@@ -15,8 +15,8 @@ from ..head.teeth import with_teeth
 from .block import PER_TIMESTEP, BlockFitter
 from .identity import Matching, match, same_topology
 from .report import RefitReport
-from .rigid import SubjectHead
 from .settings import RefitSettings
+from .subject import Subject
 
 BLOCK = 64
 """Timesteps that are fitted, and kept on disk, together; the first of each starts from the source's angles."""
@@ -71,10 +71,10 @@ def refit(
     timesteps = sorted(clip.poses)
     _check_tracking(clip)
     target = _with_same_teeth(clip.head, target)
-    source = SubjectHead.of(clip)
-    matching = match(clip.head, source.canonical, target, settings)
-    offset = _static_offset(source, target, matching, settings)
-    fitter = BlockFitter(clip, source, target, matching, offset, settings)
+    neutral = Subject(clip.head, clip.shape, clip.static_offset).neutral
+    matching = match(clip.head, neutral, target, settings)
+    offset = _static_offset(clip.head, neutral, target, matching, settings)
+    fitter = BlockFitter(clip, target, matching, offset, settings)
 
     blocks: list[dict[str, FloatArray]] = []
     for start in range(0, len(timesteps), BLOCK):
@@ -128,15 +128,18 @@ def _with_same_teeth(source: HeadArrays, target: HeadArrays) -> HeadArrays:
 
 
 def _static_offset(
-    source: SubjectHead, target: HeadArrays, matching: Matching, settings: RefitSettings
+    source: HeadArrays,
+    neutral: FloatArray,
+    target: HeadArrays,
+    matching: Matching,
+    settings: RefitSettings,
 ) -> FloatArray:
     """(V, 3) float32, what the identity leaves of the neutral head, or zeros."""
     zero = np.zeros(target.template.shape, dtype=np.float32)
     if settings.static_offset == "zero":
         return zero
-    if not same_topology(source.head, target):
+    if not same_topology(source, target):
         remedy = "Set static_offset to zero."
         expected = "two head models over one topology, to keep a residual as static offset"
         raise InputError(f"head model {target.version!r}", "faces", expected, "different ones", remedy)
-    fitted = SubjectHead(target, matching.shape, zero).canonical
-    return (source.canonical - fitted).astype(np.float32)
+    return (neutral - Subject(target, matching.shape, zero).neutral).astype(np.float32)

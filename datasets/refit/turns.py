@@ -45,6 +45,6 @@ def matrices_and_derivatives(axis_angles: FloatArray) -> tuple[FloatArray, Float
     return rotation, np.einsum("nrs,isc,nik->nrck", rotation, _GENERATORS, jacobian, optimize=False)
 
 
-def axis_angle(matrix: FloatArray) -> FloatArray:
-    """(3,) axis-angle vector of a rotation matrix, of length at most pi."""
-    return np.asarray(Rotation.from_matrix(matrix).as_rotvec())
+def axis_angles(rotations: FloatArray) -> FloatArray:
+    """(n, 3) axis-angle vectors of rotation matrices (n, 3, 3), of length at most pi."""
+    return np.asarray(Rotation.from_matrix(rotations).as_rotvec())
