@@ -20,7 +20,7 @@ from ...bench.errors import InputError
 from ..ga_writer import write_png
 from ..image_files import probe_image
 from .frames import read_frames
-from .pixels import prepare_pixels
+from .pixels import prepare_pixels, read_still
 from .plan import SequenceJob
 
 _WRITE_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM)
@@ -82,12 +82,15 @@ def _run(stream: _Stream, reports: queue.SimpleQueue, stop: threading.Event) -> 
     job, index = stream.job, stream.index
     camera = job.cameras[index]
     correct = job.corrections.get(camera.id)
+    size = camera.width, camera.height
     numbers = [job.recorded.numbers[timestep] for timestep in stream.timesteps]
-    frames = read_frames(job.recorded.views[camera.id], numbers)
+    view = job.recorded.views[camera.id]
+    still = read_still(job.stills[camera.id], view.size) if camera.id in job.stills else None
+    frames = read_frames(view, numbers)
     for timestep, frame in zip(stream.timesteps, frames):
         if stop.is_set():
             return
-        image, mask = prepare_pixels(frame.bgr, frame.matte, (camera.width, camera.height), correct)
+        image, mask = prepare_pixels(frame.bgr, frame.matte, size, correct, still)
         with writing(job.image_path(timestep, index)):
             if mask is not None:
                 write_png(job.mask_path(timestep, index), mask)

@@ -38,6 +38,7 @@ class SequenceJob:
     recorded : the raw frames.
     cameras : in index order, of the prepared images, in the aligned world.
     corrections : colour correction by serial; empty for none.
+    stills : the empty set by serial, where its light is to be taken out of soft edges; empty for nowhere.
     tracked : parameters, or None where there are none yet.
     folder : to write.
     """
@@ -45,6 +46,7 @@ class SequenceJob:
     recorded: RecordedSequence
     cameras: Sequence[Camera]
     corrections: Mapping[str, Correction]
+    stills: Mapping[str, Path]
     tracked: TrackedSequence | None
     folder: Path
 
@@ -84,8 +86,9 @@ class SequenceJob:
             for serial, view in self.recorded.views.items()
         }
         corrections = {serial: repr(vars(c)["matrix"].tolist()) for serial, c in self.corrections.items()}
+        stills = {serial: path.stat().st_size for serial, path in self.stills.items()}
         cameras = [[c.id, c.width, c.height, c.K.tolist(), c.world_to_camera.tolist()] for c in self.cameras]
-        return digest(IMAGES_VERSION, views, corrections, cameras, list(self.recorded.numbers))
+        return digest(IMAGES_VERSION, views, corrections, stills, cameras, list(self.recorded.numbers))
 
     def metadata_fingerprint(self, declaration: layout.Declaration) -> str:
         """Digest of what decides the metadata beside the images: parameters and declaration."""
@@ -152,6 +155,7 @@ def plan_subject(settings: PrepareSettings, subject: str) -> SubjectPlan:
                 recorded=recorded,
                 cameras=[aligned.camera(serial, size, small) for serial in serials],
                 corrections=one.corrections(name, serials) if settings.colour == "auto" else {},
+                stills=_stills(settings, one, recorded),
                 tracked=_tracked(settings, recorded, head),
                 folder=out / _folder_name(recorded, settings.downscale),
             )
@@ -179,6 +183,13 @@ def wanted_sequences(settings: PrepareSettings, one: Participant) -> tuple[list[
     return matched, [name for name in matched if name == held_out]
 
 
+def _stills(settings: PrepareSettings, one: Participant, recorded: RecordedSequence) -> dict[str, Path]:
+    """Stills of all cameras in use; none where there are no mattes, or one of the stills is not there."""
+    known = {serial: one.backgrounds[serial] for serial in recorded.views if serial in one.backgrounds}
+    wanted = settings.edges == "unblend" and recorded.has_mattes and len(known) == len(recorded.views)
+    return known if wanted else {}
+
+
 def _tracked(
     settings: PrepareSettings, recorded: RecordedSequence, head: HeadArrays | None
 ) -> TrackedSequence | None:
@@ -196,7 +207,7 @@ def _folder_name(recorded: RecordedSequence, downscale: int) -> str:
     return f"{recorded.subject}_{recorded.name}_v{len(recorded.views)}_DS{downscale}{background}"
 
 
-def describe_colour(job: SequenceJob) -> dict[str, Any]:
-    """How colours are corrected, for the record."""
+def describe_pixels(job: SequenceJob) -> dict[str, Any]:
+    """How pixels are made, for the record."""
     kinds = sorted({type(correction).__name__ for correction in job.corrections.values()})
-    return {"colour": kinds[0] if kinds else "none"}
+    return {"colour": kinds[0] if kinds else "none", "edges": "unblend" if job.stills else "plain"}

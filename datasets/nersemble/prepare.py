@@ -21,7 +21,7 @@ from .. import ga_layout as layout
 from ..head.arrays import save_head
 from .export import write_union
 from .image_pool import write_images, writing
-from .plan import SequenceJob, SubjectPlan, describe_colour
+from .plan import SequenceJob, SubjectPlan, describe_pixels
 from .presets import NOVEL_VIEW_CAMERA
 
 RECORD_FILE = "headbench-prepare.json"
@@ -127,7 +127,7 @@ def _write_state(job: SequenceJob, state: SequenceState) -> None:
         "source": "video" if videos else "images",
         "frames": list(recorded.numbers),
         "mattes": recorded.has_mattes,
-        **describe_colour(job),
+        **describe_pixels(job),
     }
     write_json(job.folder / RECORD_FILE, value)
 

@@ -9,7 +9,16 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ...bench.contracts import Camera, Findings, FloatArray, FrameKey, HeadPose, Progress, no_progress
+from ...bench.contracts import (
+    ByteArray,
+    Camera,
+    Findings,
+    FloatArray,
+    FrameKey,
+    HeadPose,
+    Progress,
+    no_progress,
+)
 from ..clip import CaptureClip
 from ..ga_layout import HEAD_FILE
 from ..ga_reader import read_capture
@@ -31,12 +40,14 @@ def re_record(
 ) -> list[str]:
     """Write a clip's frames, cameras and parameters as a raw recording under ``root``; return its sequences.
 
-    Frames become images with mattes, as VHAP's preprocessing leaves them, or without ``mattes`` videos of three
+    The recording shows the subject before a grey wall (`studio`), where the clip has masks. Frames become images with mattes, as VHAP's preprocessing leaves them, or without ``mattes`` videos of three
     frames per timestep, of which a reader keeps the first. Parameters go under ``tracking``, in the world that
     VHAP turns the calibration into. Excluded frames are written like the others.
     """
     writer = RecordingWriter(root, clip.subject, [*clip.cameras.values()], release)
     writer.write_calibration()
+    for one in clip.cameras.values():
+        writer.write_background(one.id, studio(one))
     turn = _alignment(writer.calibration_file, next(iter(clip.cameras.values())))
     by_sequence: dict[str, list[FrameKey]] = {}
     for key in sorted(clip.files):
@@ -50,9 +61,13 @@ def re_record(
                 for number, key in enumerate(own):
                     # The 2023 frame folders count at 73 frames per second.
                     step = 3 if release == "paper2023" else 1
-                    writer.write_frame(sequence, camera, step * number, clip.image(key), clip.mask(key))
+                    writer.write_frame(
+                        sequence, camera, step * number, _before_wall(clip, key), clip.mask(key)
+                    )
             else:
-                writer.write_video(sequence, camera, (clip.image(key) for key in own for _ in range(3)))
+                writer.write_video(
+                    sequence, camera, (_before_wall(clip, key) for key in own for _ in range(3))
+                )
             done += len(own)
             progress(done, len(clip.files), sequence)
         if tracking is not None:
@@ -65,6 +80,24 @@ def re_record(
             write_tracked(folder / "tracked_flame_params_30.npz", arrays, range(len(poses)))
     writer.write_metadata([*by_sequence])
     return [*by_sequence]
+
+
+def studio(camera: Camera) -> ByteArray:
+    """(H, W, 3) the empty set: a grey wall, brighter towards the top."""
+    brightness = np.linspace(168, 120, camera.height)[:, None, None]
+    return np.broadcast_to(brightness, (camera.height, camera.width, 3)).round().astype(np.uint8)
+
+
+def _before_wall(clip: CaptureClip, key: FrameKey) -> ByteArray:
+    """The frame with the clip's background exchanged for the wall, exactly, by its mask."""
+    image, mask = clip.image(key), clip.mask(key)
+    if mask is None:
+        return image
+    behind = 1 - mask[..., None].astype(np.float32) / 255
+    exchanged = image + behind * (
+        studio(clip.cameras[key.camera]) - 255 * np.asarray(clip.background, np.float32)
+    )
+    return np.clip(np.rint(exchanged), 0, 255).astype(np.uint8)
 
 
 def _alignment(calibration_file: Path, camera: Camera) -> FloatArray:

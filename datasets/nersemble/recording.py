@@ -56,10 +56,10 @@ class Participant:
         try:
             return match_sequence(self.calibration_file, wanted, self.sequences)
         except InputError as error:
+            remedy = "Fetch it, or name the sequences to use with --sequences."
             recorded = [name for name in self.listed if name == wanted or name.startswith(wanted)]
-            if not recorded or any(name in self.sequences for name in recorded):
-                raise
-            remedy = f"{SEQUENCES_FILE} lists {', '.join(recorded)}: download it."
+            if recorded and not any(name in self.sequences for name in recorded):
+                remedy = f"{SEQUENCES_FILE} lists {', '.join(recorded)}. {remedy}"
             raise InputError(error.file, error.key, error.expected, error.found, remedy) from None
 
     def corrections(self, sequence: str, serials: Iterable[str]) -> dict[str, Correction]:

@@ -10,67 +10,62 @@ import tyro
 
 @dataclass(frozen=True)
 class PrepareSettings:
-    """What to prepare, from where, and how.
-
-    Attributes
-    ----------
-    root : Folder with raw recordings: the one that holds the participants' folders.
-    out : Folder for the captures.
-    subjects : Ids separated by commas, "paper" (the nine of the comparison) or "ablation" (306).
-    sequences : Names or unique prefixes separated by commas; "paper" (the ten of UNION10, and FREE), "all" (but
-        the tongue and GLASSES).
-    split : "free" holds out FREE for self-reenactment; "union10" holds out one of the ten sequences by VHAP's
-        seeded rule. The frontal camera is held out for novel views either way.
-    tracking : Folder with VHAP's results, or "" to write images and cameras only; call again once there are some.
-    head : Head model the tracking belongs to (flame2023.pkl, or npz); checked against it, never copied if FLAME's.
-    head_model : Version of that head model, where no head is given.
-    cameras : Serials separated by commas; "" takes all the calibration has.
-    downscale : Width and height are divided by this, averaging areas; 4 makes 802x550 of 3208x2200.
-    source : Take "video" or "images" where a sequence has both; "auto" takes images where they come with mattes.
-    every : Keep every so many frames; 0 takes 3 of the 73-per-second videos, 1 of VHAP's images.
-    colour : "auto" corrects colours where the recording has a calibration for that; "none" never.
-    cut : Keep the frames that all cameras have where their counts differ, instead of an error.
-    workers : Cameras worked on at one time; 0 takes one per processor core.
-    check : Only look whether everything needed is there.
-    union_root : Instead of preparing, check captures exported elsewhere (a folder of UNION folders, such as
-        GaussianAvatars' download).
-    rejoin : With `union_root`, also write unions of the paper's split (FREE held out) beside them.
-    """
+    """What to prepare, from where, and how."""
 
     root: str = ""
+    """Folder with raw recordings: the one that holds the participants' folders."""
     out: str = "nersemble-captures"
+    """Folder for the captures."""
     subjects: str = "paper"
+    """Ids separated by commas, "paper" (the nine of the comparison) or "ablation" (306)."""
     sequences: str = "paper"
+    """Names or unique prefixes separated by commas; "paper" (the ten of UNION10, and FREE); "all" (but the tongue
+    and GLASSES)."""
     split: Literal["free", "union10"] = "free"
+    """"free" holds out FREE for self-reenactment; "union10" holds out one of the ten sequences by VHAP's seeded
+    rule. The frontal camera is held out for novel views either way."""
     tracking: str = ""
+    """Folder with VHAP's results. Without it images and cameras are written; call again once there is one."""
     head: str = ""
+    """Head model the tracking belongs to (flame2023.pkl, or npz): checked against it, never copied if FLAME's."""
     head_model: str = "flame2023"
+    """Version of that head model, where --head is not given."""
     cameras: str = ""
+    """Serials separated by commas; default: all the calibration has."""
     downscale: int = 4
+    """Width and height are divided by this, averaging areas; 4 makes 550x802 of 2200x3208."""
     source: Literal["auto", "video", "images"] = "auto"
+    """What to take where a sequence has both; "auto" takes images where they come with mattes."""
     every: int = 0
+    """Keep every so many frames; 0 stands for 3 with the 73-per-second videos and 1 with VHAP's images."""
     colour: Literal["auto", "none"] = "auto"
+    """"auto" corrects colours where the recording has a calibration for that; "none" never."""
+    edges: Literal["unblend", "plain"] = "unblend"
+    """Soft edges with mattes: "unblend" takes the light of the BACKGROUND still out, where there are stills; "plain"
+    multiplies by the matte, as VHAP does, and leaves fringes."""
     cut: bool = False
+    """Keep the frames that all cameras have where their counts differ, instead of an error."""
     workers: int = 0
+    """Cameras worked on at one time; 0 stands for one per processor core."""
     check: bool = False
+    """Only look whether everything needed is there."""
     union_root: str = ""
+    """Instead of preparing, check captures exported elsewhere: a folder of UNION folders, such as GaussianAvatars'
+    download."""
     rejoin: bool = False
+    """With --union-root, also write unions of the paper's split (FREE held out) beside them; copies nothing."""
 
 
 @dataclass(frozen=True)
 class RecordSettings:
-    """What to write as a raw recording.
-
-    Attributes
-    ----------
-    capture : Synthetic capture: a UNION folder, as `headbench synth` writes them.
-    out : Folder to write: ``recording`` goes to --root of `headbench prepare nersemble`, ``tracking`` to --tracking,
-        ``head_model.npz`` to --head.
-    release : Whose folders: of the second release, of the first, or of the 2023 paper.
-    frames : "images" with mattes, as VHAP's preprocessing leaves them, or "video" without.
-    """
+    """What to write as a raw recording."""
 
     capture: tyro.conf.Positional[str]
+    """Synthetic capture: a UNION folder, as `headbench synth` writes them."""
     out: str
+    """Folder to write: recording/ is for --root of `headbench prepare nersemble`, tracking/ for --tracking,
+    head_model.npz for --head."""
     release: Literal["v2", "v1", "paper2023"] = "v2"
+    """Whose folders: of the second release, of the first, or of the 2023 paper."""
     frames: Literal["images", "video"] = "images"
+    """"images" with mattes, as VHAP's preprocessing leaves them, or "video" without."""

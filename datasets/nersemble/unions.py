@@ -134,7 +134,7 @@ def _notes(subject: str, test: Sequence[str], entries: dict[str, list[FrameEntry
     return notes
 
 
-_REJOINED = "_free-test"
+_REJOINED = "_rejoined"
 
 
 def rejoin_union(root: Path, subject: str, entries: Sequence[FrameEntry], free: str) -> str:
