@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import resource
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -15,6 +13,7 @@ from sklearn.cluster import KMeans, SpectralClustering
 from sklearn.metrics import adjusted_rand_score
 
 from ...bench.contracts import Findings, FloatArray, FrameKey, HeadPose, IntArray, Progress
+from ...bench.machine import peak_memory_bytes
 from ..clip import CaptureClip
 from ..images import ImageStore
 from ..synthetic.geometry import load_geometry
@@ -123,7 +122,7 @@ def _speed(timesteps: int) -> dict[str, Any]:
     start, wall = time.process_time(), time.perf_counter()
     record = cluster_expressions(clip).record()
     seconds, wall = time.process_time() - start, time.perf_counter() - wall
-    return {**record, "seconds": seconds, "wall_seconds": wall, "peak_gb": _peak_gb()}
+    return {**record, "seconds": seconds, "wall_seconds": wall, "peak_gb": peak_memory_bytes() / 1e9}
 
 
 def _agreement(seed: int) -> dict[str, float]:
@@ -160,9 +159,3 @@ def _published_labels(embedding: FloatArray, seed: int) -> IntArray:
 
 def _mean_index(pairs: Sequence[tuple[IntArray, IntArray]]) -> float:
     return float(np.mean([adjusted_rand_score(one, other) for one, other in pairs]))
-
-
-def _peak_gb() -> float:
-    """Largest memory the process ever held, 10^9 bytes."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak * (1 if sys.platform == "darwin" else 1024) / 1e9
