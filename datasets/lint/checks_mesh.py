@@ -16,7 +16,7 @@ from .views import ViewFacts
 OUTSIDE = 0.15
 """Share of the face's vertices outside the foreground from which a frame's mesh misses it."""
 
-SMALL = 0.25
+SMALL = 0.2
 """Area of the mesh over that of the foreground from which the mesh is too small, or the mask shows more."""
 
 

@@ -307,7 +307,7 @@ def _jump(arrays):
 
 def _shrink(good):
     template = good.writer.plan.head.template.astype(np.float32)
-    good.each_parameters(lambda a, i: a.update(static_offset=a["static_offset"] - 0.9 * template))
+    good.each_parameters(lambda a, i: a.update(static_offset=a["static_offset"] - 0.7 * template))
 
 
 FAULTS = (

@@ -58,7 +58,7 @@ def smooth_poses(head: HeadArrays, count: int, phase: float) -> list[HeadPose]:
 
 def good_plan(**changes: Any) -> CapturePlan:
     """Two training sequences and FREE."""
-    head = changes.pop("head", None) or toy_head(16, version="flame-toy2023")
+    head = changes.pop("head", None) or toy_head(16, version="toy2023")
     vertices, _, identities = head.shape_basis.shape
     rng = np.random.default_rng(5)
     settings: dict[str, Any] = {

@@ -1,0 +1,85 @@
+"""``headbench lint``: exit codes, JSON, list, places; and no false alarm on a synthetic capture."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from headbench.bench.cli import main
+from headbench.bench.errors import InputError
+from headbench.datasets.ga_layout import Declaration
+from headbench.datasets.lint.catalogue import RULES
+from headbench.datasets.lint.command import run
+from headbench.datasets.lint.settings import LintSettings
+from headbench.datasets.synthetic.capture import synthesize
+
+
+def _exclude(capture, excluded):
+    declaration = Declaration.read(capture.union)
+    assert declaration is not None
+    replace(declaration, excluded=excluded).write(capture.union)
+
+
+def test_clean_warning_and_strict(good):
+    settings = LintSettings(str(good.union), views=4, duplicates=20)
+    assert run(settings).passed
+    _exclude(good, {3: ""})
+    findings = run(settings)
+    assert findings.passed
+    assert findings.data["counts"] == {"error": 0, "warning": 1, "note": 0}
+    assert not run(replace(settings, strict=True)).passed
+    assert run(replace(settings, strict=True, ignore=("HB109",))).passed
+
+
+def test_an_error_does_not_pass_and_names_its_place(good):
+    _exclude(good, {77: "tongue out"})
+    findings = run(LintSettings(str(good.union), views=4, duplicates=20, ignore=("HB100",)))
+    assert not findings.passed
+    (found,) = findings.data["findings"]
+    assert (found["code"], found["severity"], found["key"]) == ("HB108", "error", "excluded")
+    assert found["file"] == f"{good.union.name}/headbench.json"
+    assert found["remedy"]
+    for text in ("HB108 error", "77", found["file"], "1 error, 0 warnings"):
+        assert text in findings.text
+
+
+def test_the_folder_of_one_union_will_do(good):
+    settings = LintSettings(str(good.writer.root), views=1, duplicates=0)
+    assert run(settings).data["capture"] == good.union.as_posix()
+
+
+def test_every_rule_is_explained():
+    findings = run(LintSettings(list=True))
+    assert [entry["code"] for entry in findings.data["rules"]] == [rule.code for rule in RULES]
+    assert all(rule.code in findings.text for rule in RULES)
+
+
+@pytest.mark.parametrize(
+    "settings", [LintSettings(), LintSettings("nowhere"), LintSettings("x", ignore=("HB999",))]
+)
+def test_bad_input(settings):
+    with pytest.raises(InputError):
+        run(settings)
+
+
+def test_exit_codes_and_json_on_the_command_line(good, capsys):
+    arguments = ["lint", str(good.union), "--json", "--views", "4"]
+    assert main(arguments) == 0
+    assert json.loads(capsys.readouterr().out)["findings"] == []
+    _exclude(good, {77: "tongue out"})
+    assert main(arguments) == 1
+    assert not json.loads(capsys.readouterr().out)["passed"]
+    assert main(["lint", str(good.union / "nothing")]) == 2
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+@pytest.mark.slow
+def test_a_synthetic_capture_has_no_errors(noise, tmp_path):
+    """Hair over the mesh, soft mattes, dark skin, tracking noise: nothing of that is an error."""
+    synthesize(
+        tmp_path, cameras=4, timesteps=16, size=(96, 136), seed=3, tracking_noise=noise, samples_per_pixel=9
+    )
+    findings = run(LintSettings(str(tmp_path))).data["findings"]
+    assert {finding["code"] for finding in findings} <= {"HB110"}
