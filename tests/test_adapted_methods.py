@@ -1,0 +1,92 @@
+"""Forms that methods declare, from a capture on disk to rows: what must not change does not."""
+
+import dataclasses
+import sys
+from types import ModuleType
+
+import cv2
+import pytest
+
+from headbench.bench import runner
+from headbench.bench.contracts import ResolutionRule
+from headbench.bench.run_config import RunConfig
+from headbench.bench.store import RunFolder, keys_of
+from headbench.methods.specs import MEAN_IMAGE
+
+from .datasets.tiny_capture import write_tiny_capture
+
+SQUARE = ResolutionRule(square="pad", size=(128, 128))
+FORMS = {
+    "VIDEO": {"name": "video", "monocular": True},
+    "SQUARE": {"name": "square", "resolution": SQUARE},
+    "BOTH": {"name": "both", "monocular": True, "resolution": SQUARE},
+}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A comparison of the mean image with itself in other forms."""
+    folder = tmp_path_factory.mktemp("forms")
+    capture = write_tiny_capture(folder / "data")
+    module = ModuleType("forms_of_the_mean")
+    for name, form in FORMS.items():
+        setattr(module, name, dataclasses.replace(MEAN_IMAGE, **form))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(sys.modules, module.__name__, module)
+        patch.setattr(runner, "write_reports", lambda out: [])
+        rows = runner.run(
+            RunConfig(
+                data=str(capture.union),
+                out=str(folder / "out"),
+                methods=("mean-image", *(f"{module.__name__}:{name}" for name in FORMS)),
+                preset="smoke",
+                metrics=("psnr",),
+            )
+        )
+    return RunFolder(folder / "out"), rows
+
+
+def values(rows, method):
+    chosen = rows[rows["method"] == method].sort_values(["task", "sequence", "timestep", "camera"])
+    assert (chosen["status"] == "ok").all()
+    return chosen.reset_index(drop=True)
+
+
+def test_the_mean_of_a_video_is_the_mean_of_its_views(run):
+    """To the bit but for the order of summation, and under the keys of the protocol."""
+    _, rows = run
+    plain, video = values(rows, "mean-image"), values(rows, "video")
+    keys = ["task", "sequence", "timestep", "camera", "protocol"]
+    assert video[keys].equals(plain[keys])
+    assert video["value"].to_numpy() == pytest.approx(plain["value"].to_numpy(), abs=1e-3)
+
+
+@pytest.mark.parametrize("name", ["square", "both"])
+def test_a_detour_over_another_size_costs_little(run, name):
+    _, rows = run
+    plain, detour = values(rows, "mean-image"), values(rows, name)
+    assert detour["protocol"].equals(plain["protocol"])
+    assert abs(detour["value"] - plain["value"]).max() < 0.5  # dB: softened, not shifted
+
+
+@pytest.mark.parametrize("name", ["mean-image", "video", "square", "both"])
+def test_every_render_has_the_size_of_the_protocol(run, name):
+    folder, _ = run
+    record = folder.read_manifest()
+    assert record["protocols"]["novel_view"]["resolution"] == "48x64"
+    cell = folder.cell("901", name, 0)
+    for task in record["protocols"]:
+        for key in keys_of(record, task):
+            assert cv2.imread(str(cell.render(task, key))).shape == (64, 48, 3)
+
+
+def test_the_manifest_tells_how_each_form_came_about(run):
+    folder, _ = run
+    steps = {
+        form["method"]: [step["name"] for step in form["steps"]] for form in folder.read_manifest()["adapted"]
+    }
+    assert steps == {
+        "video": ["as_single_video"],
+        "square": ["align_resolution"],
+        "both": ["align_resolution", "as_single_video"],
+    }
