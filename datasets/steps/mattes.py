@@ -16,6 +16,7 @@ from scipy.special import ndtr
 
 from ...bench.contracts import Camera, FloatArray, FrameKey, HeadAsset, IntArray
 from ...bench.errors import InputError
+from ...bench.files import digest
 from ..clip import CaptureClip, FramePixels
 from ..head.model import HeadModel
 
@@ -115,7 +116,7 @@ def clean_edges(clip: CaptureClip, recorded_on: Sequence[float] | Mapping[str, F
     if isinstance(recorded_on, Mapping):
         sets = {name: _set_image(camera, recorded_on) for name, camera in clip.cameras.items()}
         by_recorded: dict[str, Ground] = {clip.recorded(key).camera: sets[key.camera] for key in clip.files}
-        said: object = "image by camera"
+        said: object = {name: digest(image) for name, image in sorted(sets.items())}
     else:
         colour = _colour(recorded_on).astype(np.float32)
         by_recorded = {clip.recorded(key).camera: colour for key in clip.files}

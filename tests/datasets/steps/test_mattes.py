@@ -188,6 +188,14 @@ def test_the_colour_of_the_set_leaves_the_edges(clip, tmp_path, by_camera):
     assert np.array_equal(cleaned.mask(key), levels)
 
 
+def test_another_image_of_the_set_makes_another_clip(clip):
+    def cleaned(level):
+        return clean_edges(clip, {n: np.full((64, 48, 3), level, np.float32) for n in clip.cameras})
+
+    assert cleaned(0.2).fingerprint == cleaned(0.2).fingerprint
+    assert cleaned(0.2).fingerprint != cleaned(0.3).fingerprint
+
+
 def test_what_a_matte_step_needs_is_said(clip):
     bare = replace(clip, files={key: files._replace(mask=None) for key, files in clip.files.items()})
     with pytest.raises(InputError, match="a mask for every frame"):
