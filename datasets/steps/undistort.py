@@ -112,7 +112,7 @@ def _unfolded(places: FloatArray, K: FloatArray) -> np.ndarray:
     height, width = places.shape[:2]
     if min(width, height) < 2:
         return np.ones((height, width), dtype=bool)
-    down, across = np.gradient(places, axis=(0, 1))
+    down, across = (np.asarray(change) for change in np.gradient(places, axis=(0, 1)))
     upright = across[..., 0] * down[..., 1] - across[..., 1] * down[..., 0] > 0
     _, parts = cv2.connectedComponents(upright.astype(np.uint8), connectivity=4)
     x = int(np.clip(K[0, 2], 0, width - 1))
