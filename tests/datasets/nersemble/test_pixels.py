@@ -1,0 +1,96 @@
+"""Shrinking, compositing, un-blending, correcting: against float64 area means and a known composite."""
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis.extra.numpy import arrays
+
+from headbench.bench.errors import InputError
+from headbench.datasets.nersemble.colour import AffineCorrection
+from headbench.datasets.nersemble.pixels import prepare_pixels, read_still
+
+FRAMES = arrays(np.uint8, (8, 12, 3))
+
+
+def area_mean(image: np.ndarray, factor: int) -> np.ndarray:
+    height, width = image.shape[:2]
+    blocks = image.reshape(height // factor, factor, width // factor, factor, -1)
+    return blocks.astype(np.float64).mean(axis=(1, 3))
+
+
+@pytest.mark.parametrize("factor", [1, 2, 4])
+@settings(max_examples=25)
+@given(frame=FRAMES)
+def test_without_a_matte_pixels_are_area_means(factor, frame):
+    image, mask = prepare_pixels(frame, None, (12 // factor, 8 // factor))
+    assert mask is None
+    assert np.abs(image - area_mean(frame[..., ::-1], factor)).max() <= 0.5
+
+
+@settings(max_examples=25)
+@given(frame=FRAMES, matte=arrays(np.uint8, (8, 12)))
+def test_with_a_matte_the_weighted_foreground_stands_on_white(frame, matte):
+    coverage = matte[..., None] / 255
+    expected = area_mean(frame[..., ::-1] * coverage + 255 * (1 - coverage), 4)
+    image, mask = prepare_pixels(frame, matte, (3, 2))
+    # Products, means and the composite are rounded to 8 bits, one after the other.
+    assert np.abs(image - expected).max() <= 2
+    assert np.abs(mask - area_mean(matte, 4)[..., 0]).max() <= 0.5
+
+
+def test_full_and_empty_mattes_are_exact():
+    frame = np.random.default_rng(0).integers(0, 256, (8, 12, 3), dtype=np.uint8)
+    full, _ = prepare_pixels(frame, np.full((8, 12), 255, np.uint8), (12, 8))
+    np.testing.assert_array_equal(full, frame[..., ::-1])
+    for still in (None, 255 - frame):
+        empty, _ = prepare_pixels(frame, np.zeros((8, 12), np.uint8), (12, 8), None, still)
+        np.testing.assert_array_equal(empty, 255)
+
+
+@settings(max_examples=25)
+@given(foreground=FRAMES, wall=FRAMES, matte=arrays(np.uint8, (8, 12)))
+def test_the_still_takes_the_wall_out_of_soft_edges(foreground, wall, matte):
+    coverage = matte[..., None] / 255
+    frame = np.rint(foreground * coverage + wall * (1 - coverage)).astype(np.uint8)
+    wanted = (foreground * coverage + 255 * (1 - coverage))[..., ::-1]
+    image, _ = prepare_pixels(frame, matte, (12, 8), None, wall)
+    assert np.abs(image - wanted).max() <= 2
+
+
+def test_without_the_still_a_fringe_stays():
+    frame = np.full((4, 4, 3), 100, np.uint8)  # half foreground 0, half wall 200
+    matte = np.full((4, 4), 128, np.uint8)
+    image, _ = prepare_pixels(frame, matte, (4, 4))
+    clean, _ = prepare_pixels(frame, matte, (4, 4), None, np.full((4, 4, 3), 200, np.uint8))
+    assert image[0, 0, 0] - clean[0, 0, 0] == pytest.approx(200 * 0.5 * 0.5, abs=1.5)
+
+
+def test_colours_are_corrected_before_the_composite():
+    # Doubles the red of the foreground and lifts green; white stays white.
+    correction = AffineCorrection(np.array([[2.0, 0, 0, 0], [0, 1, 0, 0.2], [0, 0, 1, 0]]))
+    frame = np.full((4, 4, 3), (30, 40, 50), np.uint8)  # BGR
+    matte = np.zeros((4, 4), np.uint8)
+    matte[:, :2] = 255
+    image, mask = prepare_pixels(frame, matte, (2, 2), correction)
+    np.testing.assert_array_equal(image[0], [[100, 91, 30], [255, 255, 255]])
+    np.testing.assert_array_equal(mask[0], [255, 0])
+    plain, _ = prepare_pixels(frame, None, (2, 2), correction)
+    np.testing.assert_array_equal(plain[0, 0], [100, 91, 30])
+
+
+def test_stills_take_the_size_of_the_frames(tmp_path):
+    path = tmp_path / "image_1.png"
+    still = np.random.default_rng(0).integers(0, 256, (8, 12, 3), dtype=np.uint8)
+    cv2.imwrite(str(path), still)
+    np.testing.assert_array_equal(read_still(path, (12, 8)), still)
+    assert np.abs(read_still(path, (6, 4)) - area_mean(still, 2)).max() <= 0.5
+
+
+def test_damaged_stills_are_refused(tmp_path):
+    path = tmp_path / "image_1.jpg"
+    with pytest.raises(InputError, match="no such file"):
+        read_still(path, (4, 4))
+    path.write_bytes(b"\xff\xd8\xff")
+    with pytest.raises(InputError, match="damaged"):
+        read_still(path, (4, 4))

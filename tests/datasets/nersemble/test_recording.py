@@ -1,0 +1,103 @@
+"""Finding participants, sequences, colour files and stills in every layout."""
+
+import numpy as np
+import pytest
+
+from headbench.bench.errors import InputError
+from headbench.datasets.nersemble.calibration import read_calibration
+from headbench.datasets.nersemble.recording import participant, participants
+from headbench.datasets.nersemble.writer import RecordingWriter
+
+from .recordings import SEQUENCES, SUBJECT, world_cameras, write_recording
+
+
+@pytest.mark.parametrize("release", ["v2", "v1", "paper2023"])
+def test_every_release_is_found(release, tmp_path):
+    recording = write_recording(tmp_path, release=release)
+    one = participant(recording.root, SUBJECT)
+    assert sorted(one.sequences) == sorted(SEQUENCES)
+    calibration = read_calibration(one.calibration_file)
+    for camera in world_cameras():
+        np.testing.assert_allclose(calibration.world_to_camera[camera.id], camera.world_to_camera)
+        np.testing.assert_allclose(calibration.intrinsics[camera.id], camera.K)
+
+
+def test_unmerged_parts_of_the_first_release_are_found(tmp_path):
+    recording = write_recording(tmp_path, release="v1")
+    for number, name in enumerate(SEQUENCES, start=1):
+        part = recording.root / f"sequence_{name}_part-{number}" / SUBJECT
+        part.mkdir(parents=True)
+        (recording.root / SUBJECT / name).rename(part / name)
+    (recording.root / SUBJECT).rmdir()
+    assert sorted(participant(recording.root, SUBJECT).sequences) == sorted(SEQUENCES)
+
+
+@pytest.mark.parametrize("release", ["v2", "v1", "paper2023"])
+def test_colour_files_are_found_where_each_release_has_them(release, tmp_path):
+    cameras = world_cameras()
+    writer = RecordingWriter(tmp_path, SUBJECT, cameras, release)
+    writer.write_calibration()
+    writer.sequence_folder("FREE").mkdir(parents=True)
+    matrix = np.eye(3, 4) + 0.1 if release != "v2" else np.eye(3, 10) + 0.1
+    writer.write_colour({camera.id: matrix for camera in cameras}, "FREE")
+    corrections = participant(tmp_path, SUBJECT).corrections("FREE", [cameras[0].id])
+    np.testing.assert_allclose(corrections[cameras[0].id].matrix, matrix)
+
+
+def test_a_colour_calibration_without_one_of_the_cameras_is_an_error(tmp_path):
+    for release in ("v1", "v2"):
+        cameras = world_cameras()
+        writer = RecordingWriter(tmp_path / release, SUBJECT, cameras, release)
+        writer.write_calibration()
+        writer.sequence_folder("FREE").mkdir(parents=True)
+        writer.write_colour({cameras[0].id: np.eye(3, 4)})
+        with pytest.raises(InputError, match=cameras[1].id):
+            participant(tmp_path / release, SUBJECT).corrections("FREE", [c.id for c in cameras])
+
+
+def test_without_colour_files_there_is_no_correction(pristine_recording):
+    assert participant(pristine_recording.root, SUBJECT).corrections("FREE", ["222200037"]) == {}
+
+
+def test_stills_are_no_sequence(recording):
+    recording.writer.write_background("222200037", np.zeros((4, 4, 3), np.uint8))
+    one = participant(recording.root, SUBJECT)
+    assert "BACKGROUND" not in one.sequences
+    assert [*one.backgrounds] == ["222200037"]
+
+
+def test_the_metadata_says_what_to_fetch(recording):
+    recording.writer.write_metadata([*SEQUENCES, "HAIR"])
+    one = participant(recording.root, SUBJECT)
+    assert one.match("EMO-1") == "EMO-1-shout+laugh"
+    with pytest.raises(InputError, match="metadata_sequences.csv lists HAIR"):
+        one.match("HAIR")
+    with pytest.raises(InputError) as error:
+        one.match("GLASSES")
+    assert "lists" not in str(error.value)
+
+
+@pytest.mark.parametrize("content", [b"subject,EMO\n1,x\n", b"ID,EMO\n\xff\xfe,x\n"])
+def test_faulty_metadata_are_refused(content, recording):
+    path = recording.root / "metadata_sequences.csv"
+    path.write_bytes(content)
+    with pytest.raises(InputError) as error:
+        participants(recording.root)
+    assert error.value.file == str(path)
+
+
+def test_other_folders_are_refused(tmp_path):
+    with pytest.raises(InputError, match="nothing"):
+        participants(tmp_path / "nowhere")
+    (tmp_path / "images").mkdir()
+    with pytest.raises(InputError, match="three digits"):
+        participants(tmp_path)
+
+
+def test_missing_participants_and_calibrations_are_named(recording):
+    with pytest.raises(InputError) as error:
+        participant(recording.root, "902")
+    assert (error.value.key, error.value.found) == ("subject", "902")
+    recording.writer.calibration_file.unlink()
+    with pytest.raises(InputError, match="camera_params.json"):
+        participant(recording.root, SUBJECT)

@@ -1,0 +1,200 @@
+"""A sequence's frames: which are chosen, how they stream, and every fault found before or while decoding."""
+
+import cv2
+import numpy as np
+import pytest
+
+from headbench.bench.errors import InputError
+from headbench.datasets.nersemble import sequence as sequence_module
+from headbench.datasets.nersemble.calibration import read_calibration
+from headbench.datasets.nersemble.frames import read_frames
+from headbench.datasets.nersemble.recording import participant
+from headbench.datasets.nersemble.sequence import probe_video, read_sequence
+from headbench.datasets.nersemble.writer import write_video
+
+from .recordings import HEIGHT, SEQUENCES, SUBJECT, WIDTH, colour_of, matte, world_cameras, write_recording
+
+SERIALS = [camera.id for camera in world_cameras()]
+
+
+def look(recording, name="FREE", **settings):
+    one = participant(recording.root, SUBJECT)
+    return read_sequence(one, read_calibration(one.calibration_file), name, **settings)
+
+
+def check_streams(sequence, *, tolerance=4):
+    """Every frame shows the colour of its camera and its number."""
+    for index, serial in enumerate(sequence.views):
+        frames = [*read_frames(sequence.views[serial], sequence.numbers)]
+        assert [frame.number for frame in frames] == [*sequence.numbers]
+        for frame in frames:
+            middle = frame.bgr[HEIGHT // 2, WIDTH // 2, ::-1].astype(int)
+            assert np.abs(middle - colour_of(index, frame.number)).max() <= tolerance
+
+
+@pytest.mark.parametrize("release", ["v2", "v1", "paper2023"])
+@pytest.mark.parametrize("every", [1, 2, 3])
+def test_frames_of_images_are_those_asked_for(release, every, tmp_path):
+    sequence = look(write_recording(tmp_path, release=release), every=every)
+    assert sequence.numbers == tuple(range(0, SEQUENCES["FREE"], every))
+    assert sequence.has_mattes
+    check_streams(sequence)
+    frame = next(iter(read_frames(sequence.views[SERIALS[0]], [0])))
+    assert np.abs(frame.matte.astype(int) - matte()).max() <= 3
+
+
+@pytest.mark.parametrize("release", ["v2", "v1"])
+@pytest.mark.parametrize("every", [1, 2, 3])
+def test_frames_of_videos_are_those_asked_for(release, every, tmp_path):
+    sequence = look(write_recording(tmp_path, release=release, images=False), every=every)
+    assert sequence.numbers == tuple(range(0, SEQUENCES["FREE"], every))
+    assert not sequence.has_mattes
+    check_streams(sequence, tolerance=6)
+
+
+def test_by_default_videos_give_every_third_frame_and_images_all(pristine_videos, pristine_recording):
+    assert look(pristine_videos).numbers == (0, 3)
+    assert look(pristine_recording).numbers == tuple(range(6))
+
+
+def test_videos_of_mattes_are_read_with_the_frames(videos):
+    folder = videos.writer.sequence_folder("FREE")
+    for serial in SERIALS:
+        # What OpenCV's MPEG-4 keeps best is flat, so the mattes tell their number by a flat level.
+        levels = (np.full((HEIGHT, WIDTH), 40 * number, np.uint8) for number in range(6))
+        write_video(folder / "alpha_maps" / f"cam_{serial}.mp4", levels)
+    sequence = look(videos, every=2)
+    assert sequence.has_mattes
+    for frame in read_frames(sequence.views[SERIALS[1]], sequence.numbers):
+        assert np.abs(frame.matte.astype(int) - 40 * frame.number).max() <= 4
+
+
+def test_images_with_mattes_go_before_videos(recording):
+    for index, serial in enumerate(SERIALS):
+        frames = (np.full((HEIGHT, WIDTH, 3), colour_of(index, n), np.uint8) for n in range(12))
+        recording.writer.write_video("FREE", serial, frames)
+    assert look(recording).views[SERIALS[0]].video is None
+    assert look(recording, source="video", every=1).numbers == tuple(range(12))
+    for path in recording.root.rglob("alpha_maps/*"):
+        path.unlink()
+    assert look(recording).views[SERIALS[0]].video is not None
+    assert look(recording, source="images").views[SERIALS[0]].video is None
+
+
+def test_a_lone_camera_has_no_serial_in_its_files(recording):
+    folder = recording.writer.sequence_folder("FREE")
+    for kind in ("images", "alpha_maps"):
+        for path in (folder / kind).iterdir():
+            _, serial, number = path.stem.split("_")
+            path.rename(path.with_name(f"{number}.jpg")) if serial == SERIALS[1] else path.unlink()
+    assert [*look(recording, cameras=[SERIALS[1]]).views] == [SERIALS[1]]
+    with pytest.raises(InputError, match="Name the camera"):
+        look(recording)
+
+
+def test_a_missing_camera_is_named(videos):
+    path = videos.writer.sequence_folder("FREE") / "images" / f"cam_{SERIALS[2]}.mp4"
+    path.unlink()
+    with pytest.raises(InputError) as error:
+        look(videos)
+    assert error.value.key == f"camera {SERIALS[2]}"
+    assert [*look(videos, cameras=SERIALS[:2]).views] == SERIALS[:2]
+
+
+def test_an_unknown_camera_is_named(videos):
+    with pytest.raises(InputError, match="camera 123"):
+        look(videos, cameras=["123"])
+    folder = videos.writer.sequence_folder("FREE") / "images"
+    (folder / f"cam_{SERIALS[2]}.mp4").rename(folder / "cam_123.mp4")
+    with pytest.raises(InputError) as error:
+        look(videos)
+    assert error.value.key == "123"
+
+
+def test_frame_counts_that_differ_are_an_error_or_cut(videos):
+    frames = (np.zeros((HEIGHT, WIDTH, 3), np.uint8) for _ in range(4))
+    videos.writer.write_video("FREE", SERIALS[1], frames)
+    with pytest.raises(InputError) as error:
+        look(videos)
+    assert error.value.key == "frames"
+    assert f"4 for camera {SERIALS[1]}" in error.value.found
+    assert look(videos, cut=True, every=1).numbers == (0, 1, 2, 3)
+
+
+def test_a_missing_image_is_a_count_that_differs(recording):
+    folder = recording.writer.sequence_folder("FREE")
+    (folder / "images" / f"cam_{SERIALS[0]}_000002.jpg").unlink()
+    with pytest.raises(InputError, match="same frames"):
+        look(recording)
+    assert look(recording, cut=True).numbers == (0, 1, 3, 4, 5)
+
+
+def test_truncated_videos_are_found_before_decoding(videos, monkeypatch):
+    path = videos.writer.sequence_folder("FREE") / "images" / f"cam_{SERIALS[1]}.mp4"
+    path.write_bytes(path.read_bytes()[:-40])
+    monkeypatch.setattr(sequence_module, "open_video", None)  # so that opening it would be seen
+    with pytest.raises(InputError) as error:
+        probe_video(path)
+    assert error.value.file == str(path)
+
+
+def test_a_video_that_ends_early_is_found_when_decoding(videos):
+    sequence = look(videos, every=1)
+    view = sequence.views[SERIALS[0]]
+    with pytest.raises(InputError) as error:
+        [*read_frames(view, range(8))]
+    assert (error.value.file, error.value.key) == (str(view.video), "frame 6")
+
+
+def test_a_foreign_file_by_the_name_of_a_video_is_refused(videos):
+    path = videos.writer.sequence_folder("FREE") / "images" / f"cam_{SERIALS[1]}.mp4"
+    path.write_bytes(b"<html>not found</html>")
+    with pytest.raises(InputError) as error:
+        look(videos)
+    assert error.value.file == str(path)
+
+
+def test_mattes_of_another_size_are_named(recording):
+    folder = recording.writer.sequence_folder("FREE") / "alpha_maps"
+    for path in folder.glob(f"cam_{SERIALS[0]}_*"):
+        cv2.imwrite(str(path), np.zeros((HEIGHT // 2, WIDTH // 2), np.uint8))
+    with pytest.raises(InputError) as error:
+        look(recording)
+    assert error.value.key == "size"
+    assert error.value.file.startswith(str(folder))
+
+
+def test_a_missing_matte_is_named(recording):
+    folder = recording.writer.sequence_folder("FREE") / "alpha_maps"
+    (folder / f"cam_{SERIALS[0]}_000003.jpg").unlink()
+    with pytest.raises(InputError) as error:
+        look(recording)
+    assert error.value.file.endswith(f"cam_{SERIALS[0]}_000003.jpg")
+
+
+def test_a_truncated_image_is_named(recording):
+    path = recording.writer.sequence_folder("FREE") / "images" / f"cam_{SERIALS[0]}_000003.jpg"
+    path.write_bytes(path.read_bytes()[:100])
+    with pytest.raises(InputError) as error:
+        look(recording)
+    assert error.value.file == str(path)
+
+
+def test_an_image_damaged_in_the_middle_is_found_when_decoding(recording):
+    path = recording.writer.sequence_folder("FREE") / "images" / f"cam_{SERIALS[0]}_000003.jpg"
+    content = path.read_bytes()
+    header = content[: content.index(b"\xff\xdb")]
+    frame = content[content.index(b"\xff\xc0") : content.index(b"\xff\xc0") + 19]
+    path.write_bytes(header + frame + b"\xff\xd9")
+    view = look(recording).views[SERIALS[0]]
+    with pytest.raises(InputError) as error:
+        [*read_frames(view, [3])]
+    assert error.value.file == str(path)
+
+
+def test_an_empty_sequence_is_refused(recording):
+    recording.writer.sequence_folder("HAIR").mkdir()
+    with pytest.raises(InputError, match="none of them"):
+        look(recording, "HAIR")
+    with pytest.raises(InputError, match="source=video"):
+        look(recording, source="video")
