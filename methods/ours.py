@@ -27,7 +27,8 @@ from .bound_training import BoundTraining, run_bound_training
 from .clip_checks import check_training_split
 from .configs import OursConfig
 from .ours_appearance import OursAppearance
-from .ours_avatar import FIELD_FILE, OursAvatar, write_field
+from .ours_avatar import OursAvatar
+from .ours_storage import FIELD_FILE, write_field
 from .subject_mesh import SubjectMesh
 from .training.loop import CHECKPOINT, check_budget
 from .training.sampling import Sampler, ShuffledEpochs, Weighted, balanced_weights

@@ -10,7 +10,8 @@ from headbench.bench.errors import InputError
 from headbench.methods.avatar_files import SUBJECT_FILE, Subject, save_shared_head, write_subject
 from headbench.methods.configs import OursConfig
 from headbench.methods.dynamics import WIDTHS, LocalSplats, apply_offsets, changed_colors, offset_width
-from headbench.methods.ours_avatar import FIELD_FILE, OursAvatar, write_field
+from headbench.methods.ours_avatar import OursAvatar
+from headbench.methods.ours_storage import FIELD_FILE, write_field
 
 from .toy_ours import SMALL, make, place
 
