@@ -31,5 +31,4 @@ def draw_meshes(clip: Clip, meshes: FloatArray, width: int, height: int) -> list
     camera = portrait_camera(
         face.reshape(-1, 3).astype(np.float64), width, height, yaw=_YAW, pitch=_PITCH, fill=_FILL
     )
-    # The canvas shrinks what it is given: that is the antialiasing.
-    return [draw_mesh(mesh, np.asarray(clip.head.faces), camera, supersampling=1) for mesh in meshes]
+    return [draw_mesh(mesh, np.asarray(clip.head.faces), camera) for mesh in meshes]
