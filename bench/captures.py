@@ -6,8 +6,9 @@ import inspect
 from collections.abc import Sequence
 from pathlib import Path
 
+from .adaptation import MethodNeeds, carry_out, plan
 from .configuration import build_arguments
-from .contracts import Clip, DatasetSpec
+from .contracts import Clip, DatasetSpec, ResolutionRule
 from .errors import InputError
 from .files import check_name
 from .progress import progress
@@ -16,7 +17,7 @@ from .run_config import RunConfig
 
 
 def open_clips(config: RunConfig) -> list[Clip]:
-    """Open every capture under ``config.data``, each validated whole by its reader.
+    """Open every capture under ``config.data``, each validated whole by its reader, at the size to be measured at.
 
     Raises `InputError` for a folder without captures, a setting the reader does not know or of the wrong type,
     subjects that are not distinct, and whatever the reader finds wrong.
@@ -36,11 +37,20 @@ def open_clips(config: RunConfig) -> list[Clip]:
     for path in paths:
         with progress(f"reading {path.name}") as report:
             reported = {"progress": report} if "progress" in inspect.signature(read).parameters else {}
-            clips.append(_checked(read(path, **settings, **reported)))
+            clips.append(_reduced(_checked(read(path, **settings, **reported)), spec, config))
     subjects = [clip.subject for clip in clips]
     if len(set(subjects)) != len(subjects):
         raise InputError(root, "subject", "a different subject in each capture", ", ".join(subjects))
     return clips
+
+
+def _reduced(clip: Clip, reader: DatasetSpec, config: RunConfig) -> Clip:
+    """The clip at the size that metrics are taken at."""
+    needs = MethodNeeds(resolution=ResolutionRule(divide=config.divide))
+    planned = plan(clip, needs, reader, {})
+    if planned is None:
+        return clip
+    return carry_out(planned, needs, Path(config.out), f"reducing {clip.subject}").clip
 
 
 def _checked(clip: Clip) -> Clip:

@@ -15,7 +15,7 @@ import pandas as pd
 from . import adaptation
 from .adaptation import AdaptedClip, MethodNeeds
 from .captures import open_clips
-from .contracts import Clip, DatasetSpec, MetricSpec, ResolutionRule
+from .contracts import Clip, DatasetSpec, MetricSpec
 from .errors import HeadbenchError, InputError, UnavailableError
 from .machine import machine_record, peak_memory_bytes
 from .progress import duration
@@ -39,15 +39,13 @@ def run(config: RunConfig, **record: Any) -> pd.DataFrame:
     methods, metrics = resolve_methods(config), resolve_metrics(config)
     for method in methods:
         method.create()  # an implementation that cannot be imported or made is not to be found out hours later
-    opened = open_clips(config)
-    reader = get("datasets", config.reader)
-    folder = RunFolder(Path(config.out))
-    folder.prepare()
-    clips = [_reduced(clip, config, reader, folder.adapted / clip.subject) for clip in opened]
+    clips = open_clips(config)
     protocols: dict[str, Protocol] = {
         task: make_protocol(task, clips, config.frames_per_task) for task in config.tasks
     }
-    adapted = _adapt(clips, methods, reader, config.heads, folder)
+    folder = RunFolder(Path(config.out))
+    folder.prepare()
+    adapted = _adapt(clips, methods, config, folder)
     jobs = _jobs(config, methods, clips, protocols, folder, adapted)
     for job in jobs:
         job.check()
@@ -95,31 +93,18 @@ def write_reports(run_folder: Path) -> list[Path]:
 Adapted = Mapping[tuple[str, MethodNeeds], AdaptedClip]
 
 
-def _reduced(clip: Clip, config: RunConfig, reader: DatasetSpec, folder: Path) -> Clip:
-    """The clip at the size that metrics are taken at."""
-    if config.divide == 1:
-        return clip
-    needs = MethodNeeds(resolution=ResolutionRule(divide=config.divide))
-    planned = adaptation.plan(clip, needs, reader, {})
-    return (
-        clip
-        if planned is None
-        else adaptation.carry_out(planned, needs, folder, f"reducing {clip.subject}").clip
-    )
-
-
 def _adapt(
     clips: Sequence[Clip],
     methods: Sequence[ResolvedMethod],
-    reader: DatasetSpec,
-    heads: Mapping[str, str],
+    config: RunConfig,
     folder: RunFolder,
 ) -> Adapted:
     """Bring every clip into every form that a method needs, once each; first make sure that all can be had."""
+    reader: DatasetSpec = get("datasets", config.reader)
     planned = {}
     for clip in clips:
         for needs in {MethodNeeds.of(method.spec): None for method in methods}:
-            step = adaptation.plan(clip, needs, reader, heads)
+            step = adaptation.plan(clip, needs, reader, config.heads)
             if step is not None:
                 planned[clip.subject, needs] = step
     return {

@@ -7,6 +7,7 @@ import pytest
 
 from headbench.bench import runner
 from headbench.bench.adaptation import MethodNeeds, plan
+from headbench.bench.captures import open_clips
 from headbench.bench.contracts import Camera, ResolutionRule
 from headbench.bench.errors import InputError
 from headbench.bench.files import digest
@@ -116,7 +117,11 @@ def test_a_reduced_comparison_has_another_size_and_another_hash(config, toy):
     for divide in (1, 2):
         chosen = dataclasses.replace(config, divide=divide, out=f"{config.out}{divide}")
         assert (runner.run(chosen)["status"] == "ok").all()
-        record[divide] = RunFolder(runner.Path(chosen.out)).read_manifest()["protocols"]["novel_view"]
+        manifest = RunFolder(runner.Path(chosen.out)).read_manifest()
+        record[divide] = manifest["protocols"]["novel_view"]
+        # Whoever opens the captures of a run anew, as reports do, sees what was measured.
+        (clip,) = open_clips(chosen)
+        assert clip.fingerprint == manifest["clips"][0]["fingerprint"]
     assert record[1]["resolution"] == "8x6"
     assert record[2]["resolution"] == "4x3"
     assert record[1]["hash"] != record[2]["hash"]
