@@ -36,6 +36,11 @@ def colour_of(camera: int, number: int) -> tuple[int, int, int]:
     return 40 + 60 * camera, 30 + 12 * number, 200 - 9 * number
 
 
+def tone(sequence: str, number: int) -> int:
+    """What stands for the frame number in `colour_of`: no two frames of `SEQUENCES` look alike."""
+    return number if sequence == "FREE" else number + 8
+
+
 def frame(camera: int, number: int, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
     """(H, W, 3) flat frame."""
     return np.broadcast_to(np.uint8(colour_of(camera, number)), (height, width, 3)).copy()
@@ -100,7 +105,7 @@ def write_recording(
     save_head(folder / "head.npz", head)
     for name, count in (sequences or SEQUENCES).items():
         for index, camera in enumerate(cameras):
-            frames = [frame(index, number, *size) for number in range(count)]
+            frames = [frame(index, tone(name, number), *size) for number in range(count)]
             if images:
                 for number, pixels in enumerate(frames):
                     writer.write_frame(name, camera.id, number, pixels, matte(*size))

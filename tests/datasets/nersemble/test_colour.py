@@ -145,7 +145,16 @@ def test_damaged_affine_files_are_refused(content, tmp_path):
 
 @pytest.mark.parametrize(
     "value",
-    [None, 1, "M", [[1, 2, 3]], np.eye(3, 6).tolist(), [[1, 2], [3]], [[[1]]], np.full((3, 3), np.inf).tolist()],
+    [
+        None,
+        1,
+        "M",
+        [[1, 2, 3]],
+        np.eye(3, 6).tolist(),
+        [[1, 2], [3]],
+        [[[1]]],
+        np.full((3, 3), np.inf).tolist(),
+    ],
 )
 def test_faulty_polynomials_are_refused(value, tmp_path):
     with pytest.raises(InputError) as error:

@@ -25,7 +25,11 @@ FTYP, MOOV, MDAT = box(b"ftyp", b"isom"), box(b"moov", bytes(40)), box(b"mdat", 
 
 @pytest.mark.parametrize(
     "content",
-    [FTYP + MDAT + MOOV, FTYP + MOOV + large_box(b"mdat", bytes(9)), FTYP + MOOV + open_ended_box(b"mdat", b"x")],
+    [
+        FTYP + MDAT + MOOV,
+        FTYP + MOOV + large_box(b"mdat", bytes(9)),
+        FTYP + MOOV + open_ended_box(b"mdat", b"x"),
+    ],
 )
 def test_whole_files_pass(content, tmp_path):
     path = tmp_path / "video.mp4"
@@ -42,7 +46,9 @@ def test_every_truncation_is_found(order, tmp_path):
             check_boxes(path)
 
 
-@pytest.mark.parametrize("content", [b"\xff\xd8\xff\xe0 a JPEG of some kind", box(b"\x00\x01\x02\x03", b""), b"<html>"])
+@pytest.mark.parametrize(
+    "content", [b"\xff\xd8\xff\xe0 a JPEG of some kind", box(b"\x00\x01\x02\x03", b""), b"<html>"]
+)
 def test_other_files_are_refused(content, tmp_path):
     path = tmp_path / "video.mp4"
     path.write_bytes(content)

@@ -1,0 +1,401 @@
+"""The whole way from raw recordings to captures: what comes out, resuming, refusing, full disks."""
+
+import errno
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from headbench.bench.errors import InputError
+from headbench.datasets.content_digests import CACHE_FILE
+from headbench.datasets.ga_reader import read_capture
+from headbench.datasets.head.arrays import read_head, save_head
+from headbench.datasets.nersemble import export, image_pool, sequence
+from headbench.datasets.nersemble.calibration import read_calibration
+from headbench.datasets.nersemble.command import run
+from headbench.datasets.nersemble.prepare import RECORD_FILE
+from headbench.datasets.nersemble.presets import UNION10_SEQUENCES, union10_held_out
+
+from .recordings import HEIGHT, SEQUENCES, SUBJECT, WIDTH, colour_of, tone, world_cameras, write_recording
+
+IMAGES = 3 * sum(SEQUENCES.values())
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Every file below a folder by its name, but what the reader remembers."""
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name != CACHE_FILE)
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
+def prepared(recording, out, **changes):
+    findings = run(recording.settings(out, **changes))
+    return findings.data[SUBJECT], findings
+
+
+@pytest.fixture(scope="session")
+def whole(pristine_recording, tmp_path_factory):
+    """A prepared capture that tests only read: folder and findings."""
+    out = tmp_path_factory.mktemp("whole")
+    return out, prepared(pristine_recording, out)[1]
+
+
+@pytest.fixture(scope="session")
+def clip(whole):
+    return read_capture(whole[1].data[SUBJECT]["union"])
+
+
+def test_free_is_the_test_and_the_frontal_camera_the_novel_view(clip, whole):
+    assert whole[1].passed
+    assert whole[1].data[SUBJECT]["missing"] == [
+        "no colour correction for EMO-1-shout+laugh, FREE: colours are as recorded."
+    ]
+    train, free = SEQUENCES["EMO-1-shout+laugh"], SEQUENCES["FREE"]
+    counts = {name: len(keys) for name, keys in clip.splits.items()}
+    assert counts == {"train": 2 * train, "novel_view": train, "self_reenactment": 3 * free}
+    assert {key.sequence for key in clip.splits["self_reenactment"]} == {"FREE"}
+    assert {key.camera for key in clip.splits["novel_view"]} == {"222200037"}
+    assert clip.subject == SUBJECT
+
+
+def test_images_are_the_frames_on_white(clip):
+    for key in clip.files:
+        first = 0 if key.sequence != "FREE" else SEQUENCES["EMO-1-shout+laugh"]
+        colour = colour_of([*clip.cameras].index(key.camera), tone(key.sequence, key.timestep - first))
+        image, mask = clip.image(key), clip.mask(key)
+        assert image.shape == (HEIGHT // 2, WIDTH // 2, 3)
+        assert np.abs(image[HEIGHT // 4, WIDTH // 4].astype(int) - colour).max() <= 4
+        assert (image[:6] >= 250).all()
+        assert mask[HEIGHT // 4, WIDTH // 4] >= 252
+        assert (mask[:6] <= 5).all()
+
+
+def test_cameras_and_poses_stand_to_each_other_as_in_the_tracked_world(clip, pristine_recording):
+    aligned = read_calibration(pristine_recording.writer.calibration_file).aligned()
+    files = pristine_recording.tracking.rglob("*EMO-1*/**/*.npz")
+    tracked = np.load(next(files), allow_pickle=False)
+    for timestep in range(SEQUENCES["EMO-1-shout+laugh"]):
+        pose = clip.poses[timestep]
+        for serial, camera in clip.cameras.items():
+            # The tracked origin of the head, seen by each camera, before and after.
+            expected = aligned.world_to_camera[serial] @ [*tracked["translation"][timestep], 1.0]
+            found = camera.world_to_camera @ [*pose.translation, 1.0]
+            np.testing.assert_allclose(found, expected, atol=1e-6)
+        np.testing.assert_array_equal(pose.expression, tracked["expr"][timestep])
+
+
+def test_sequences_of_one_camera_set_meet_in_one_world(clip, pristine_recording):
+    # Each sequence was shifted by a mean of its own; the reader brings them together again.
+    emo, free = (
+        np.load(next(pristine_recording.tracking.rglob(f"*{name}*/**/*.npz")), allow_pickle=False)[
+            "translation"
+        ]
+        for name in ("EMO-1", "FREE")
+    )
+    first = SEQUENCES["EMO-1-shout+laugh"]
+    found = clip.poses[first].translation - clip.poses[0].translation
+    np.testing.assert_allclose(found, free[0] - emo[0], atol=1e-6)
+
+
+def test_keys_of_the_jsons_are_those_of_vhap(whole):
+    out, findings = whole
+    folder = next(out.glob(f"{SUBJECT}_FREE_*"))
+    document = json.loads((folder / "transforms.json").read_text())
+    shared = ["cx", "cy", "fl_x", "fl_y", "h", "w", "camera_angle_x", "camera_angle_y"]
+    frame = ["timestep_index", "timestep_index_original", "timestep_id", "camera_index", "camera_id", *shared]
+    frame += ["transform_matrix", "file_path", "fg_mask_path", "flame_param_path"]
+    assert [*document] == ["frames", *shared, "timestep_indices", "camera_indices"]
+    assert [*document["frames"][0]] == frame
+    union = json.loads((findings.data[SUBJECT]["union"] / "transforms_test.json").read_text())
+    assert [*union["frames"][0]] == [
+        key for key in frame if not key.startswith("timestep_i") or key == frame[0]
+    ]
+    backup = json.loads((folder / "transforms_backup.json").read_text())
+    assert [*backup["frames"][0]] == frame[:-1]
+    # cy counts from the bottom edge of the calibration's image.
+    K = world_cameras()[0].K
+    assert document["frames"][0]["cy"] == pytest.approx((HEIGHT - K[1, 2]) / 2)
+    names = {path.name for path in folder.iterdir()}
+    assert {"images", "fg_masks", "flame_param", "canonical_flame_param.npz", "transforms_val.json"} <= names
+
+
+def test_a_finished_call_does_nothing(whole, pristine_recording, monkeypatch):
+    out, first = whole
+    before = contents(out)
+    stamps = {path: path.stat().st_mtime_ns for path in out.rglob("*")}
+    monkeypatch.setattr(image_pool, "read_frames", None)  # decoding would fail
+    again, _ = prepared(pristine_recording, out)
+    assert (again["written"], again["kept"]) == (0, IMAGES)
+    assert contents(out) == before
+    assert {path: path.stat().st_mtime_ns for path in out.rglob("*")} == stamps
+    assert again["frames"] == first.data[SUBJECT]["frames"]
+
+
+@pytest.mark.parametrize("workers", [1, 4])
+def test_the_same_bytes_come_out_however_it_runs(workers, whole, pristine_recording, tmp_path):
+    prepared(pristine_recording, tmp_path / "again", workers=workers)
+    assert contents(tmp_path / "again") == contents(whole[0])
+
+
+def test_a_broken_run_continues_and_ends_the_same(whole, pristine_recording, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    calls = []
+
+    def write_png(path, image, _write=image_pool.write_png):
+        calls.append(path)
+        if len(calls) > 20:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        _write(path, image)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(image_pool, "write_png", write_png)
+        with pytest.raises(InputError) as error:
+            prepared(pristine_recording, out)
+    assert "No space left" in error.value.found
+    assert error.value.file.endswith(".png")
+    assert "start again" in str(error.value)
+    assert not [*out.rglob("transforms*.json")], "nothing half done reads as a capture"
+    with pytest.raises(InputError):
+        read_capture(next(out.glob(f"{SUBJECT}_EMO*")))
+    there = len([*out.rglob("images/*.png")])
+    again, _ = prepared(pristine_recording, out)
+    assert 0 < there < IMAGES
+    assert (again["written"], again["kept"]) == (IMAGES - there, there)
+    assert contents(out) == contents(whole[0])
+
+
+def test_a_full_disk_while_metadata_are_written_leaves_no_capture(
+    pristine_recording, whole, tmp_path, monkeypatch
+):
+    def full(path, value):
+        if path.name == "transforms_val.json":
+            raise OSError(errno.ENOSPC, "No space left on device")
+        original(path, value)
+
+    original = export.write_json
+    out = tmp_path / "out"
+    with monkeypatch.context() as patch:
+        patch.setattr(export, "write_json", full)
+        with pytest.raises(InputError, match="No space left"):
+            prepared(pristine_recording, out)
+    assert not [*out.glob("UNION*/transforms*.json")]
+    with pytest.raises(InputError):
+        read_capture(next(out.glob(f"{SUBJECT}_EMO*")))
+    prepared(pristine_recording, out)
+    assert contents(out) == contents(whole[0])
+
+
+def test_broken_and_missing_images_are_made_again(whole, pristine_recording, tmp_path):
+    out = tmp_path / "out"
+    prepared(pristine_recording, out)
+    folder = next(out.glob(f"{SUBJECT}_FREE_*"))
+    (folder / "images" / "00001_01.png").unlink()
+    (folder / "fg_masks" / "00002_01.png").unlink()
+    again, _ = prepared(pristine_recording, out)
+    assert again["written"] >= 1
+    assert contents(out) == contents(whole[0])
+    # A machine that went down can leave a name without content; without a record of completion it is noticed.
+    record = folder / RECORD_FILE
+    value = json.loads(record.read_text())
+    record.write_text(json.dumps(value | {"images_complete": False}))
+    (folder / "images" / "00003_02.png").write_bytes(b"")
+    prepared(pristine_recording, out)
+    assert contents(out) == contents(whole[0])
+
+
+def test_leftovers_of_a_killed_call_are_removed(whole, pristine_recording, tmp_path):
+    out = tmp_path / "out"
+    folder = out / next(whole[0].glob(f"{SUBJECT}_FREE_*")).name
+    prepared(pristine_recording, out)
+    (folder / "images" / ".00001_01-abc.png").write_bytes(b"half")
+    (folder / "images" / "00001_01.png").unlink()
+    prepared(pristine_recording, out)
+    assert contents(out) == contents(whole[0])
+
+
+@pytest.mark.parametrize("change", [{"downscale": 4}, {"every": 2}, {"edges": "plain"}, {"colour": "none"}])
+def test_other_settings_never_mix_with_images_that_are_there(change, recording, tmp_path):
+    out = tmp_path / "out"
+    matrices = {camera.id: np.eye(3) * 0.9 for camera in world_cameras()}
+    recording.writer.write_colour(matrices)
+    for camera in world_cameras():
+        recording.writer.write_background(camera.id, np.full((HEIGHT, WIDTH, 3), 128, np.uint8))
+    prepared(recording, out, tracking="")
+    before = contents(out)
+    if "downscale" in change:  # the folder's name tells
+        assert prepared(recording, out, tracking="", **change)[0]["written"] == IMAGES
+        assert before.items() <= contents(out).items()
+        return
+    with pytest.raises(InputError) as error:
+        prepared(recording, out, tracking="", **change)
+    assert error.value.file.endswith(RECORD_FILE)
+    assert contents(out) == before
+
+
+def test_a_folder_of_another_tool_is_left_alone(pristine_recording, whole, tmp_path):
+    name = next(whole[0].glob(f"{SUBJECT}_FREE_*")).name
+    image = tmp_path / "out" / name / "images" / "00000_00.png"
+    image.parent.mkdir(parents=True)
+    cv2.imwrite(str(image), np.zeros((4, 4, 3), np.uint8))
+    with pytest.raises(InputError, match="unknown origin"):
+        prepared(pristine_recording, tmp_path / "out")
+    assert not [*(tmp_path / "out").rglob(RECORD_FILE)]
+
+
+def test_without_tracking_images_come_first_and_parameters_later(whole, pristine_recording, tmp_path):
+    out = tmp_path / "out"
+    first, findings = prepared(pristine_recording, out, tracking="")
+    assert findings.passed
+    assert first["union"] is None
+    assert "no tracked parameters" in first["missing"][0]
+    assert len([*out.rglob("transforms_backup.json")]) == 2
+    assert not [*out.rglob("transforms.json")]
+    second, _ = prepared(pristine_recording, out)
+    assert (second["written"], second["kept"]) == (0, IMAGES)
+    assert contents(out) == contents(whole[0])
+    third, _ = prepared(pristine_recording, out, tracking="")
+    assert third["union"] is not None
+    assert contents(out) == contents(whole[0])
+
+
+def test_tracking_of_some_sequences_only_does_not_pass(recording, tmp_path):
+    folder = next(recording.tracking.glob("*FREE*"))
+    folder.rename(folder.with_name("902_FREE"))
+    result, findings = prepared(recording, tmp_path / "out")
+    assert not findings.passed
+    assert "FREE" in result["missing"][0]
+    assert result["union"] is None
+
+
+def test_new_tracking_replaces_the_old_and_keeps_the_images(recording, whole, tmp_path):
+    out = tmp_path / "out"
+    prepared(recording, out)
+    file = next(recording.tracking.rglob("*FREE*/**/*.npz"))
+    arrays = dict(np.load(file, allow_pickle=False))
+    np.savez(file, **(arrays | {"translation": arrays["translation"] + np.float32([0, 0.5, 0])}))
+    result, _ = prepared(recording, out)
+    assert result["written"] == 0
+    moved, still = (read_capture(next(folder.glob("UNION*"))) for folder in (out, whole[0]))
+    first = SEQUENCES["EMO-1-shout+laugh"]
+    shift = moved.poses[first].translation - still.poses[first].translation
+    np.testing.assert_allclose(shift, [0, 0.5, 0], atol=1e-6)
+    np.testing.assert_array_equal(moved.poses[0].translation, still.poses[0].translation)
+
+
+def test_the_wrong_head_model_is_refused_before_any_work(recording, tmp_path):
+    head = read_head(recording.head)
+    smaller = replace(head, expression_basis=head.expression_basis[..., :3])
+    save_head(recording.head, smaller)
+    with pytest.raises(InputError) as error:
+        prepared(recording, tmp_path / "out")
+    assert error.value.key == "expr"
+    assert "the head model the sequence was tracked with" in str(error.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_capture_declared_for_another_head_model_is_refused_by_the_reader(recording, tmp_path):
+    result, _ = prepared(recording, tmp_path / "out", head="", head_model="flame2023")
+    with pytest.raises(InputError) as error:
+        read_capture(result["union"], head=recording.head)
+    assert error.value.key == "head_model"
+
+
+def test_flame_itself_is_never_copied(recording, tmp_path):
+    save_head(recording.head, replace(read_head(recording.head), version="flame2023"))
+    result, _ = prepared(recording, tmp_path / "out")
+    assert not [*(tmp_path / "out").rglob("head_model.npz")]
+    with pytest.raises(InputError, match="flame2023"):
+        read_capture(result["union"])
+    assert read_capture(result["union"], head=recording.head).head.version == "flame2023"
+
+
+def test_tracking_of_other_frames_is_refused(recording, tmp_path):
+    with pytest.raises(InputError) as error:
+        prepared(recording, tmp_path / "out", every=2)
+    assert error.value.key == "translation"
+    assert "very frames" in str(error.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_videos_without_mattes_say_so_and_write_no_masks(videos, tmp_path):
+    result, _ = prepared(videos, tmp_path / "out", every=1)
+    assert any("no mattes" in sentence for sentence in result["missing"])
+    assert not [*(tmp_path / "out").rglob("fg_masks")]
+    clip = read_capture(result["union"])
+    assert clip.mask(clip.splits["train"][0]) is None
+
+
+def test_a_video_that_ends_early_stops_the_run_and_the_next_continues(videos, tmp_path, monkeypatch):
+    true_probe = sequence.probe_video
+
+    def lying_index(path):
+        count, size = true_probe(path)
+        return count + 2, size
+
+    monkeypatch.setattr(sequence, "probe_video", lying_index)
+    with pytest.raises(InputError) as error:
+        prepared(videos, tmp_path / "out", tracking="")
+    assert error.value.key in ("frame 4", "frame 6")
+    assert error.value.file.endswith(".mp4")
+    assert not [*(tmp_path / "out").rglob("transforms*.json")]
+
+
+def test_colours_are_corrected(recording, tmp_path):
+    swap = [[0, 1.0, 0], [1.0, 0, 0], [0, 0, 1.0]]
+    recording.writer.write_colour({camera.id: swap for camera in world_cameras()})
+    result, _ = prepared(recording, tmp_path / "out")
+    assert result["missing"] == []
+    clip = read_capture(result["union"])
+    red, green, blue = colour_of(0, tone("EMO-1-shout+laugh", 0))
+    pixel = clip.image(clip.splits["train"][0])[HEIGHT // 4, WIDTH // 4].astype(int)
+    assert np.abs(pixel - [green, red, blue]).max() <= 4
+
+
+def test_union10_holds_out_by_the_seeded_rule(tmp_path):
+    recording = write_recording(tmp_path, sequences=dict.fromkeys(UNION10_SEQUENCES, 2), size=(16, 16))
+    result, _ = prepared(recording, tmp_path / "out", sequences="paper", split="union10")
+    assert result["union"].name.startswith(f"UNION10_{SUBJECT}_")
+    clip = read_capture(result["union"], leaks="record")  # images so small are all white
+    assert {key.sequence for key in clip.splits["self_reenactment"]} == {union10_held_out(SUBJECT)}
+
+
+def test_progress_reaches_its_end(pristine_recording, tmp_path):
+    calls = []
+    run(
+        pristine_recording.settings(tmp_path / "out"),
+        lambda done, total, note="": calls.append((done, total, note)),
+    )
+    assert [done for done, _, _ in calls] == [*range(1, IMAGES + 1)]
+    assert {total for _, total, _ in calls} == {IMAGES}
+    assert {note for _, _, note in calls} == {f"{SUBJECT} {name}" for name in SEQUENCES}
+
+
+def test_a_check_writes_nothing(pristine_recording, tmp_path):
+    findings = run(pristine_recording.settings(tmp_path / "out", check=True))
+    assert findings.data["images"] == IMAGES
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "key"),
+    [
+        ({"downscale": 0}, "--downscale"),
+        ({"downscale": 100}, "downscale"),
+        ({"every": -1}, "--every"),
+        ({"workers": -1}, "--workers"),
+        ({"union_root": "x"}, "--root"),
+        ({"root": ""}, "--root"),
+        ({"sequences": "FREE"}, "sequences"),
+        ({"sequences": ""}, "sequences"),
+        ({"sequences": "EXP-1"}, "sequence"),
+        ({"tracking": "nowhere"}, ""),
+        ({"cameras": "1"}, "world_2_cam"),
+    ],
+)
+def test_bad_options_are_named(change, key, pristine_recording, tmp_path):
+    with pytest.raises(InputError) as error:
+        run(pristine_recording.settings(tmp_path / "out", **change))
+    assert error.value.key == key
+    assert not (tmp_path / "out").exists()

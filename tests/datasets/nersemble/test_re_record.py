@@ -1,0 +1,81 @@
+"""There and back: a capture recorded raw and prepared again shows the same head in the same pixels."""
+
+import numpy as np
+import pytest
+import torch
+
+from headbench.datasets.ga_reader import read_capture
+from headbench.datasets.head.arrays import save_head
+from headbench.datasets.head.model import HeadModel
+from headbench.datasets.nersemble.command import run as prepare
+from headbench.datasets.nersemble.re_record import re_record, run
+from headbench.datasets.nersemble.settings import PrepareSettings, RecordSettings
+
+from ..tiny_capture import make_plan, rig, write_tiny_capture
+
+SEQUENCES = "EMO-1,SEN-01,FREE"
+
+
+@pytest.fixture(scope="session")
+def clip(tmp_path_factory):
+    # Even sizes for videos; the rig looks down a little, so that alignment turns the world.
+    plan = make_plan(cameras=rig(96, 128, 49.4, 58.6))
+    return read_capture(write_tiny_capture(tmp_path_factory.mktemp("capture"), plan).union)
+
+
+def projected(clip, timestep, camera):
+    """(V, 2) pixels of the posed mesh."""
+    model = HeadModel(clip.head, dtype=torch.float64)
+    identity = torch.tensor(clip.shape.astype(float)), torch.tensor(clip.static_offset.astype(float))
+    vertices = model(canonical=model.canonical(*identity), **model.pose_arguments([clip.poses[timestep]]))[0]
+    view = clip.cameras[camera]
+    points = vertices.numpy() @ view.world_to_camera[:3, :3].T + view.world_to_camera[:3, 3]
+    pixels = points @ view.K.T
+    return pixels[:, :2] / pixels[:, 2:]
+
+
+@pytest.mark.parametrize(("release", "frames"), [("v2", "images"), ("v1", "video"), ("paper2023", "images")])
+def test_there_and_back(release, frames, clip, tmp_path):
+    re_record(
+        clip,
+        tmp_path / "raw",
+        tracking=tmp_path / "tracking",
+        release=release,
+        mattes=frames == "images",
+    )
+    save_head(tmp_path / "head.npz", clip.head)
+    findings = prepare(
+        PrepareSettings(
+            root=str(tmp_path / "raw"),
+            out=str(tmp_path / "out"),
+            subjects=clip.subject,
+            sequences=SEQUENCES,
+            tracking=str(tmp_path / "tracking"),
+            head=str(tmp_path / "head.npz"),
+            downscale=1,
+        )
+    )
+    again = read_capture(findings.data[clip.subject]["union"])
+    assert again.timesteps("train") == clip.timesteps("train")
+    assert [*again.cameras] == [*clip.cameras]
+    for key in again.files:
+        moved = np.abs(projected(again, key.timestep, key.camera) - projected(clip, key.timestep, key.camera))
+        assert moved.max() < 1e-4
+        assert key in clip.files
+        if frames == "images":
+            # The wall is taken out again; noise and JPEG leave a few levels.
+            assert np.abs(again.image(key).astype(int) - clip.image(key)).mean() < 12
+            outside = clip.mask(key) == 0
+            assert np.abs(again.image(key)[outside].astype(int) - 255).mean() < 2
+
+
+def test_the_command_says_how_to_prepare(clip, tmp_path):
+    source = clip.files[clip.splits["train"][0]].image.parents[2] / "UNION3_901"
+    findings = run(RecordSettings(str(source), str(tmp_path / "raw")))
+    assert "--subjects 901" in findings.text
+    assert {entry.name for entry in (tmp_path / "raw").iterdir()} == {
+        "recording",
+        "tracking",
+        "head_model.npz",
+    }
+    assert (tmp_path / "raw" / "recording" / "901" / "sequences" / "BACKGROUND").is_dir()

@@ -1,0 +1,113 @@
+"""Captures exported elsewhere: checked, listed, joined anew for the paper's split."""
+
+import json
+import shutil
+
+import pytest
+
+from headbench.bench.errors import InputError
+from headbench.datasets.ga_layout import DECLARATION_FILE
+from headbench.datasets.ga_reader import read_capture
+from headbench.datasets.nersemble.command import run
+from headbench.datasets.nersemble.prepare import RECORD_FILE
+from headbench.datasets.nersemble.presets import UNION10_SEQUENCES, union10_held_out
+from headbench.datasets.nersemble.settings import PrepareSettings
+
+from .recordings import SUBJECT, write_recording
+
+SEQUENCES = {**dict.fromkeys(UNION10_SEQUENCES, 1), "FREE": 2}
+
+
+@pytest.fixture(scope="session")
+def pristine_download(tmp_path_factory):
+    """What a download holds: a UNION10 and its sequences with FREE, and none of our own files."""
+    folder = tmp_path_factory.mktemp("download")
+    recording = write_recording(folder / "raw", sequences=SEQUENCES, size=(40, 40))
+    out = folder / "captures"
+    run(recording.settings(out, sequences="paper"))
+    run(recording.settings(out, sequences="paper", split="union10"))
+    shutil.rmtree(next(out.glob("UNION11_*")))
+    for path in [*out.rglob(RECORD_FILE), *out.rglob(DECLARATION_FILE), *out.rglob("head_model.npz")]:
+        path.unlink()
+    return out, recording.head
+
+
+@pytest.fixture
+def download(pristine_download, tmp_path):
+    shutil.copytree(pristine_download[0], tmp_path / "captures")
+    return tmp_path / "captures"
+
+
+def check(root, subjects=SUBJECT, **settings):
+    return run(PrepareSettings(union_root=str(root), subjects=subjects, **settings))
+
+
+def test_a_whole_download_passes(download):
+    findings = check(download)
+    report = findings.data[SUBJECT]
+    assert findings.passed, findings.text
+    assert report["test"] == (union10_held_out(SUBJECT),)
+    assert report["notes"] == ()
+    assert (report["timesteps"], report["cameras"]) == (10, 3)
+    assert report["free"].startswith(f"{SUBJECT}_FREE_")
+    assert sorted(path.name for path in download.glob("UNION*")) == [report["folder"]]
+
+
+def test_the_papers_split_is_joined_from_the_same_files(download, pristine_download):
+    findings = check(download, rejoin=True)
+    assert findings.passed, findings.text
+    union = download / findings.data[SUBJECT]["rejoined"]
+    clip = read_capture(union, head=pristine_download[1], cy="bottom", leaks="record")
+    assert {key.sequence for key in clip.splits["self_reenactment"]} == {"FREE"}
+    assert {key.sequence for key in clip.splits["train"]} == set(UNION10_SEQUENCES)
+    assert {key.camera for key in clip.splits["novel_view"]} == {"222200037"}
+    assert not [*union.rglob("*.png")]
+    # A second check still looks at the download's own union, and a second join changes nothing.
+    before = {path: path.read_bytes() for path in union.iterdir()}
+    again = check(download, rejoin=True)
+    assert again.data == findings.data
+    assert {path: path.read_bytes() for path in union.iterdir() if path in before} == before
+
+
+def test_without_free_there_is_no_such_split(download):
+    shutil.rmtree(next(download.glob(f"{SUBJECT}_FREE_*")))
+    assert check(download).passed
+    findings = check(download, rejoin=True)
+    assert not findings.passed
+    assert "FREE" in findings.data[SUBJECT]["fault"]
+
+
+def test_missing_subjects_are_named(download):
+    findings = check(download, "paper")
+    assert not findings.passed
+    assert "UNION10_074" in findings.data["074"]["fault"]
+
+
+@pytest.mark.parametrize("damage", ["image", "json"])
+def test_damage_is_found(damage, download):
+    if damage == "image":
+        path = next(download.glob(f"{SUBJECT}_EMO-1*/images/*.png"))
+        path.write_bytes(path.read_bytes()[:-20])
+    else:
+        path = next(download.glob("UNION10*")) / "transforms_val.json"
+        path.write_text(path.read_text()[:-20])
+    findings = check(download)
+    assert not findings.passed
+    assert str(path.name) in findings.data[SUBJECT]["fault"]
+
+
+def test_another_test_sequence_is_noted(download):
+    union = next(download.glob("UNION10*"))
+    train, test = union / "transforms_train.json", union / "transforms_test.json"
+    documents = [json.loads(path.read_text()) for path in (train, test)]
+    documents[0]["frames"], documents[1]["frames"] = documents[1]["frames"], documents[0]["frames"]
+    for path, document in zip((train, test), documents):
+        path.write_text(json.dumps(document))
+    findings = check(download)
+    assert findings.passed
+    assert any(union10_held_out(SUBJECT) in note for note in findings.data[SUBJECT]["notes"])
+
+
+def test_a_folder_that_is_not_there_is_an_error(tmp_path):
+    with pytest.raises(InputError):
+        check(tmp_path / "nowhere")
