@@ -7,3 +7,16 @@ CLUSTERS = BenchmarkSpec(
     summary="expression classes: time and memory by timesteps; landmarks against all pairs",
     speed="headbench.datasets.steps.cluster_benchmark:measure",
 )
+
+HEAD = BenchmarkSpec(
+    name="head",
+    summary="the head model: time of a forward pass beside smplx; numerical extremes",
+    speed="headbench.datasets.head.benchmark.speed:measure",
+    stress="headbench.datasets.head.benchmark.stress:measure",
+)
+
+REFIT = BenchmarkSpec(
+    name="refit",
+    summary="the refit to another head model: residuals, timesteps a second beside scipy's least_squares",
+    speed="headbench.datasets.refit.benchmark:measure",
+)

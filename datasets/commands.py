@@ -43,3 +43,17 @@ RECORD_NERSEMBLE = CommandSpec(
     implementation="headbench.datasets.nersemble.re_record:run",
     settings="headbench.datasets.nersemble.settings:RecordSettings",
 )
+
+REFIT = CommandSpec(
+    name="refit",
+    summary="Carry a capture's tracking over to another head model; residuals in millimetres, a heat map.",
+    implementation="headbench.datasets.refit.command:run",
+    settings="headbench.datasets.refit.settings:RefitCommandSettings",
+)
+
+TONGUE = CommandSpec(
+    name="tongue",
+    summary="Find the frames that show the tongue; scores, reasons, your overrides, and a contact sheet to review.",
+    implementation="headbench.datasets.tongue.command:run",
+    settings="headbench.datasets.tongue.settings:TongueSettings",
+)

@@ -52,7 +52,8 @@ def run(settings: RefitCommandSettings, progress: Progress = no_progress) -> Fin
         "vertices_mm": [None if np.isnan(value) else round(float(value), 6) for value in report.vertex_mm],
     }
     write_json(out / "refit.json", data)
-    return Findings(f"{report.text()}\n{_bounds(report, clip)}\nCapture: {union}", data)
+    lines = [report.text(), *_bounds(report, clip), f"Capture: {union}"]
+    return Findings("\n".join(lines), data)
 
 
 def target_head(name: str) -> HeadArrays:
@@ -65,7 +66,7 @@ def target_head(name: str) -> HeadArrays:
     return load_head(name)
 
 
-def _bounds(report: RefitReport, clip: CaptureClip) -> str:
+def _bounds(report: RefitReport, clip: CaptureClip) -> list[str]:
     """The first few timesteps with parameters at a bound, by sequence."""
     sequence = {key.timestep: key.sequence for key in clip.files}
     bounded = [frame for frame in report.frames if frame.at_bound]
@@ -74,4 +75,4 @@ def _bounds(report: RefitReport, clip: CaptureClip) -> str:
         for f in bounded[:5]
     ]
     more = len(bounded) - len(lines)
-    return "\n".join(lines + [f"  and {more} timesteps more"] * (more > 0))
+    return lines + [f"  and {more} timesteps more"] * (more > 0)

@@ -188,13 +188,24 @@ class FitProblem:
 
     def fitted(self, frame: Frame, angles: FloatArray, coefficients: FloatArray) -> FloatArray:
         """(n, 3) vertices in the frame of the head, metres, for angles (9,) and coefficients (E + L,)."""
-        rotations, _ = matrices_and_derivatives(angles.reshape(-1, 3))
-        bends = rotations - np.eye(3)
+        bends = matrices_and_derivatives(angles.reshape(-1, 3))[0] - np.eye(3)
+        return self._skinned(frame, bends, np.concatenate([coefficients, self._fixed(frame, bends)]))
+
+    def directions(self, frame: Frame, angles: FloatArray) -> FloatArray:
+        """(n, 3, E + L) how the fitted vertices move with the coefficients at angles (9,), metres.
+
+        The dense matrix that `evaluate` never makes; for checks and for solvers that need it.
+        """
+        bends = matrices_and_derivatives(angles.reshape(-1, 3))[0] - np.eye(3)
+        size = self._plain.shape[2]
+        return self._skinned(frame, bends, np.eye(size)[:, : self._free_size])
+
+    def _skinned(self, frame: Frame, bends: FloatArray, whole: FloatArray) -> FloatArray:
+        """Vertices of values of z, (N,) or (N, m), metres."""
         turns = {ROOT: frame.neck.T - np.eye(3)} | dict(zip(SEARCHED, bends))
-        whole = np.concatenate([coefficients, self._fixed(frame, bends)])
         result = self._plain @ whole
         for joint, (rows, turned) in zip(self._turning, self._turned):
-            result[rows] += (turned @ whole) @ turns[joint].T
+            result[rows] += np.einsum("rc,nc...->nr...", turns[joint], turned @ whole)
         return np.asarray(result / _MILLIMETRES)
 
     def _columns(self, head: HeadAsset, canonical: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
