@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
@@ -11,13 +10,11 @@ from sklearn.cluster import SpectralClustering
 from sklearn.metrics import adjusted_rand_score
 
 from headbench.bench.errors import InputError
-from headbench.datasets.procedural.model import procedural_head
 from headbench.datasets.steps import expression_clusters as module
+from headbench.datasets.steps.cluster_benchmark import performed_clip
 from headbench.datasets.steps.expression_clusters import cluster_by_distance, cluster_expressions
 from headbench.datasets.steps.face_distances import expression_displacements, mean_vertex_distances
 from headbench.datasets.steps.spectral import similarities
-from headbench.datasets.synthetic.geometry import load_geometry
-from headbench.datasets.synthetic.performance import HELD_OUT, perform, share_out
 
 from .clips import make_clip, with_poses
 
@@ -31,18 +28,6 @@ def grouped_clip(train: int, groups: int, noise: float = 0.02):
     wobble = noise * rng.normal(size=(train + 1, 8))
     still = {"jaw": lambda t: np.zeros(3), "eyes": lambda t: np.zeros(6)}
     return with_poses(base, expression=lambda t: centres[truth[t]] + wobble[t], **still), truth[:train]
-
-
-@cache
-def performance_clip(seed):
-    """300 training timesteps as a subject of the synthetic capture performs them."""
-    translate = load_geometry("procedural").translation.pose
-    poses = []
-    for name, count in share_out(360).items():
-        if name != HELD_OUT:
-            poses += [translate(moment, "s", 0) for moment in perform(name, count, seed).activations]
-    clip = make_clip(300, test=1, head=procedural_head())
-    return replace(clip, poses={t: replace(poses[min(t, 299)], timestep=t) for t in range(301)})
 
 
 def test_separate_groups_become_the_classes():
@@ -83,7 +68,7 @@ def test_landmarks_give_the_same_classes_without_all_pairs(monkeypatch, noise):
 @pytest.mark.parametrize("seed", range(2))
 def test_landmarks_agree_with_all_pairs_better_than_the_published_method_with_itself(seed):
     """300 performed timesteps, half of them landmarks; adjusted Rand index."""
-    clip = performance_clip(seed)
+    clip = performed_clip(300, seed)
     exact = cluster_expressions(clip)
     approximate = [cluster_expressions(clip, limit=150, seed=start) for start in range(2)]
     distances = mean_vertex_distances(expression_displacements(clip, list(range(300))))
