@@ -94,16 +94,17 @@ def rasterize_mesh(vertices: FloatArray, faces: IntArray, camera: Camera) -> Fra
     corners = points[faces[kept]]  # (n, 3, 3): x, y in pixels, 1/z
     which, row, left, right = _spans(corners, width, height)
     counts = right - left
-    fragment = np.repeat(np.arange(len(which)), counts)
-    column = np.arange(len(fragment)) - np.repeat(np.cumsum(counts) - counts, counts) + left[fragment]
+    # Fragments lie one span after another; what a span has in common is repeated over its fragments.
+    first = np.repeat(np.cumsum(counts) - counts, counts)
+    along = np.arange(len(first)) - first
     # 1/z is linear over the image of a triangle, so along a span it takes a start and a slope.
-    slope, start = _inverse_depth(corners[which], row)
-    inverse = (start[fragment] + slope[fragment] * (column + 0.5)).astype(np.float32)
+    slope, start = _inverse_depth(corners[which], row, left)
+    inverse = (np.repeat(start, counts) + np.repeat(slope, counts) * along).astype(np.float32)
     # Positive floats order as their bits do: depth above, triangle below, and the largest key is in front.
-    order = np.uint64(len(kept)) - which[fragment].astype(np.uint64)
+    order = np.repeat(np.uint64(len(kept)) - which.astype(np.uint64), counts)
     keys = (np.maximum(inverse, 0).view(np.uint32).astype(np.uint64) << np.uint64(32)) | order
     front = np.zeros(height * width, dtype=np.uint64)
-    np.maximum.at(front, row[fragment] * width + column, keys)
+    np.maximum.at(front, np.repeat(row * width + left, counts) + along, keys)
     pixels = np.flatnonzero(front)
     local = len(kept) - (front[pixels] & np.uint64(0xFFFFFFFF)).astype(np.int64)
     weights = _weights(corners, local, pixels % width + 0.5, pixels // width + 0.5)
@@ -223,15 +224,15 @@ def _cut(start: FloatArray, stop: FloatArray, y: FloatArray) -> FloatArray:
     return start[:, 0] + share * (stop[:, 0] - start[:, 0])
 
 
-def _inverse_depth(corners: FloatArray, row: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Slope along x of 1/z of each triangle, and its value at x = 0 in the middle of each row."""
+def _inverse_depth(corners: FloatArray, row: IntArray, left: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Slope along x of 1/z of each span's triangle, and its value in the middle of the span's first pixel."""
     edges = corners[:, 1:] - corners[:, :1]
     area = edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]
     area = np.where(area == 0, 1.0, area)
     along_x = (edges[:, 0, 2] * edges[:, 1, 1] - edges[:, 1, 2] * edges[:, 0, 1]) / area
     along_y = (edges[:, 1, 2] * edges[:, 0, 0] - edges[:, 0, 2] * edges[:, 1, 0]) / area
-    start = corners[:, 0, 2] + along_y * (row + 0.5 - corners[:, 0, 1]) - along_x * corners[:, 0, 0]
-    return along_x, start
+    x, y = left + 0.5 - corners[:, 0, 0], row + 0.5 - corners[:, 0, 1]
+    return along_x, corners[:, 0, 2] + along_x * x + along_y * y
 
 
 def _weights(corners: FloatArray, which: IntArray, x: FloatArray, y: FloatArray) -> FloatArray:
