@@ -20,3 +20,9 @@ REFIT = BenchmarkSpec(
     summary="the refit to another head model: residuals, timesteps a second beside scipy's least_squares",
     speed="headbench.datasets.refit.benchmark:measure",
 )
+
+PREPARE = BenchmarkSpec(
+    name="prepare",
+    summary="raw recordings to captures: images a second beside a plain OpenCV loop, peak memory by length",
+    speed="headbench.datasets.nersemble.benchmark:measure",
+)

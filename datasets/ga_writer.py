@@ -267,8 +267,9 @@ class CaptureWriter:
 def write_png(path: Path, image: ByteArray) -> None:
     """Write (H, W), (H, W, 3) RGB or (H, W, 4) RGBA, 8-bit, as PNG, atomically."""
     if image.ndim == 3:
-        order = [2, 1, 0, 3][: image.shape[2]]  # OpenCV encodes BGR(A)
-        image = np.ascontiguousarray(image[..., order])
+        # OpenCV encodes BGR(A).
+        order = cv2.COLOR_RGB2BGR if image.shape[2] == 3 else cv2.COLOR_RGBA2BGRA
+        image = cv2.cvtColor(image, order).astype(np.uint8, copy=False)
     _, data = cv2.imencode(".png", image)
     with atomic_path(path) as temporary:
         temporary.write_bytes(data.tobytes())

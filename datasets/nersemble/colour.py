@@ -72,6 +72,15 @@ def linear_to_srgb(values: FloatArray) -> FloatArray:
 _LINEAR = srgb_to_linear(np.arange(256) / 255).astype(np.float32)
 _LINEAR.flags.writeable = False
 
+_STEPS = 2**16 - 1
+"""Steps of linear values in `_ENCODED`. Where sRGB is steepest a level spans 20 of them, so that results are within
+0.53 levels of the exact ones instead of 0.5."""
+
+_ENCODED = (
+    np.rint(255 * linear_to_srgb((np.arange(_STEPS + 1) / _STEPS).reshape(1, -1, 1))).astype(np.uint8).ravel()
+)
+_ENCODED.flags.writeable = False
+
 
 @dataclass(frozen=True, eq=False)
 class AffineCorrection:
@@ -106,8 +115,9 @@ class PolynomialCorrection:
         linear = _LINEAR[image]
         height, width, _ = image.shape
         terms = self._expand(linear).reshape(-1, height * width)
-        mapped = (self.matrix.astype(np.float32) @ terms).T.reshape(height, width, 3)
-        return _to_bytes(255 * linear_to_srgb(mapped))
+        planes = self.matrix.astype(np.float32) @ terms
+        steps = np.clip(planes * _STEPS + 0.5, 0, _STEPS).astype(np.uint16)
+        return cv2.merge([*_ENCODED[steps].reshape(3, height, width)]).astype(np.uint8, copy=False)
 
     @property
     def is_identity(self) -> bool:

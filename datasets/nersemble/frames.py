@@ -30,9 +30,11 @@ def read_frames(view: View, numbers: Sequence[int]) -> Iterator[RawFrame]:
     """
     if view.video is None:
         for number in numbers:
-            matte = _decode_image(view.mattes[number], view.size, cv2.IMREAD_COLOR) if view.mattes else None
+            matte = (
+                _decode_image(view.mattes[number], view.size, cv2.IMREAD_GRAYSCALE) if view.mattes else None
+            )
             bgr = _decode_image(view.images[number], view.size, cv2.IMREAD_COLOR)
-            yield RawFrame(number, bgr, _one_channel(matte))
+            yield RawFrame(number, bgr, matte)
         return
     frames = _decode_video(view.video, view, numbers)
     if view.matte_video is None:
@@ -43,9 +45,9 @@ def read_frames(view: View, numbers: Sequence[int]) -> Iterator[RawFrame]:
         yield RawFrame(number, bgr, _one_channel(matte))
 
 
-def _one_channel(matte: ByteArray | None) -> ByteArray | None:
-    """First channel: mattes are grey, and videos and JPEGs have it thrice."""
-    return None if matte is None else cv2.extractChannel(matte, 0).astype("uint8", copy=False)
+def _one_channel(matte: ByteArray) -> ByteArray:
+    """First channel: mattes are grey, and videos have it thrice."""
+    return cv2.extractChannel(matte, 0).astype("uint8", copy=False)
 
 
 def _decode_image(path: Path, size: tuple[int, int], flags: int) -> ByteArray:

@@ -7,11 +7,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ...bench.contracts import ByteArray, FloatArray
+from ...bench.contracts import ByteArray
 from ...bench.errors import InputError
 from .colour import Correction
-
-WHITE = 255
 
 
 def prepare_pixels(
@@ -44,13 +42,12 @@ def prepare_pixels(
         return (correct(rgb) if correct else rgb), None
     weighted = cv2.cvtColor(_shrink(_foreground_share(bgr, matte, still), size), cv2.COLOR_BGR2RGB)
     mask = _shrink(matte, size)
-    coverage = mask[..., None].astype(np.float32) / 255
-    foreground: FloatArray = weighted.astype(np.float32)
+    coverage = cv2.merge([mask] * 3)
     if correct:
-        straight = np.minimum(np.rint(foreground / np.maximum(coverage, 1 / 255)), 255).astype(np.uint8)
-        foreground = correct(straight) * coverage
-    on_white = np.rint(foreground + WHITE * (1 - coverage))
-    return np.minimum(on_white, 255).astype(np.uint8), mask
+        straight = cv2.divide(weighted, coverage, scale=255).astype(np.uint8, copy=False)
+        weighted = cv2.multiply(correct(straight), coverage, scale=1 / 255)
+    white_share = cv2.bitwise_not(coverage)
+    return cv2.add(weighted, white_share).astype(np.uint8, copy=False), mask
 
 
 def _foreground_share(bgr: ByteArray, matte: ByteArray, still: ByteArray | None) -> ByteArray:

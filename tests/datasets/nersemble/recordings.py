@@ -43,7 +43,7 @@ def tone(sequence: str, number: int) -> int:
 
 def frame(camera: int, number: int, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
     """(H, W, 3) flat frame."""
-    return np.broadcast_to(np.uint8(colour_of(camera, number)), (height, width, 3)).copy()
+    return np.full((height, width, 3), colour_of(camera, number), np.uint8)
 
 
 def matte(width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:

@@ -274,7 +274,7 @@ def test_new_tracking_replaces_the_old_and_keeps_the_images(recording, whole, tm
     prepared(recording, out)
     file = next(recording.tracking.rglob("*FREE*/**/*.npz"))
     arrays = dict(np.load(file, allow_pickle=False))
-    np.savez(file, **(arrays | {"translation": arrays["translation"] + np.float32([0, 0.5, 0])}))
+    np.savez(file, **(arrays | {"translation": arrays["translation"] + np.array([0, 0.5, 0], np.float32)}))
     result, _ = prepared(recording, out)
     assert result["written"] == 0
     moved, still = (read_capture(next(folder.glob("UNION*"))) for folder in (out, whole[0]))
