@@ -142,6 +142,8 @@ def undistort_camera(camera: Camera, lens: Lens) -> Camera:
 def undistort_clip(clip: CaptureClip, lenses: Mapping[str, Lens]) -> CaptureClip:
     """The clip with distortion taken out of images and masks; pixels that no lens saw are background.
 
+    Each different lens holds a map of 8 bytes per pixel while the clip lives.
+
     Parameters
     ----------
     lenses : by camera id; cameras without one have no distortion.
