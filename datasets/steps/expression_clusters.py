@@ -79,7 +79,7 @@ def cluster_expressions(
 
     Up to ``limit`` timesteps all pairs are compared. Beyond, farthest-point landmarks stand for all and the
     clustering is Nyström's (see `spectral`); memory then grows with T times ``limit`` and T times the size of a
-    face, never with T squared. There are never more classes than distinct faces.
+    face, never with T squared. There are never more classes than distinct faces (landmarks, beyond ``limit``).
 
     Parameters
     ----------

@@ -7,9 +7,10 @@ import pytest
 
 from headbench.bench.conformance import check_method
 from headbench.bench.contracts import MethodSpec, no_progress
-from headbench.bench.files import digest_file
+from headbench.bench.files import digest_file, read_json
 from headbench.bench.registry import discover
 from headbench.bench.run_config import resolve_method
+from headbench.methods.avatar_files import RECORD_FILE
 
 from .toy_clip import toy_pose
 
@@ -71,3 +72,10 @@ def test_nothing_held_out_reaches_the_avatar(name, clip, altered, tmp_path):
 def test_the_published_leak_would_be_noticed(clip, altered, tmp_path):
     leaky = resolved("ours", jaw_compatibility="tga")
     assert stored(leaky, clip, tmp_path / "one") != stored(leaky, altered, tmp_path / "other")
+
+
+def test_the_published_leak_is_on_the_avatars_record(clip, tmp_path):
+    for compatibility in ("", "tga"):
+        stored(resolved("ours", jaw_compatibility=compatibility), clip, tmp_path / f"a{compatibility}")
+        leaks = read_json(tmp_path / f"a{compatibility}" / RECORD_FILE)["leaks"]
+        assert bool(leaks) == (compatibility == "tga")
