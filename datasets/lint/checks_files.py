@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import itertools
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
+from itertools import pairwise
 
 from ...bench.errors import InputError
 from .. import ga_layout as layout
@@ -97,9 +97,13 @@ def _holes(evidence: Evidence) -> Iterator[Hit]:
 
 def _gap(evidence: Evidence) -> Iterator[Hit]:
     present = {e.timestep for e in evidence.entries} | {slot.timestep for slot in evidence.unread}
-    missing = set(range(max(present, default=-1) + 1)) - present
-    if missing:
-        yield Hit(f"no frame of timesteps {spans(missing)}", evidence.folder, "timestep_index")
+    gaps = [
+        f"{before + 1}-{after - 1}" if after - before > 2 else f"{before + 1}"
+        for before, after in pairwise([-1, *sorted(present)])
+        if after - before > 1
+    ]
+    if gaps:
+        yield Hit(f"no frame of timesteps {some(gaps)}", evidence.folder, "timestep_index")
 
 
 def _frozen(evidence: Evidence) -> Iterator[Hit]:
@@ -110,7 +114,7 @@ def _frozen(evidence: Evidence) -> Iterator[Hit]:
             images[entry.timestep][entry.camera_id] = evidence.digests[entry.image]
     frozen = []
     for timesteps in evidence.sequences.values():
-        for before, after in itertools.pairwise(timesteps):
+        for before, after in pairwise(timesteps):
             shared = images[before].keys() & images[after].keys()
             if shared and all(images[before][camera] == images[after][camera] for camera in shared):
                 frozen.append(after)

@@ -31,13 +31,14 @@ def _laid(evidence: Evidence) -> list[tuple[ViewFacts, MeshFacts, float]]:
     ]
 
 
-def _misses(evidence: Evidence) -> bool:
+def mesh_misses(evidence: Evidence) -> bool:
+    """Whether the face of the mesh falls outside the foreground in most frames."""
     laid = _laid(evidence)
     return bool(laid) and float(np.median([outside for _, _, outside in laid])) > OUTSIDE
 
 
 def _missed(evidence: Evidence) -> Iterator[Hit]:
-    if _misses(evidence):
+    if mesh_misses(evidence):
         laid = _laid(evidence)
         outside = float(np.median([share for _, _, share in laid]))
         overlap = float(np.median([mesh.overlap or 0.0 for _, mesh, _ in laid]))
@@ -49,7 +50,7 @@ def _missed(evidence: Evidence) -> Iterator[Hit]:
 
 
 def _missed_once(evidence: Evidence) -> Iterator[Hit]:
-    if _misses(evidence):
+    if mesh_misses(evidence):
         return
     laid = _laid(evidence)
     lost = [(view, outside) for view, _, outside in laid if outside > OUTSIDE]

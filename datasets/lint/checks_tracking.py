@@ -10,6 +10,8 @@ import numpy as np
 
 from ...bench.errors import InputError
 from .. import ga_layout as layout
+from .checks_cameras import misplaced
+from .checks_mesh import mesh_misses
 from .evidence import Evidence
 from .motion import expression_reach, face_steps
 from .rules import Hit, Rule, several, some, spans
@@ -25,6 +27,9 @@ REACH_M = 0.05
 
 JUMP_M, JUMP_TIMES = 0.03, 6.0
 """A step of the face is a jump where it is longer than this and than so many times the sequence's median."""
+
+WORSE = 1.03
+"""Expressions that fit the images by so much worse than none are not these images' expressions."""
 
 CHANGE = 1e-4
 
@@ -217,6 +222,19 @@ def _jumps(evidence: Evidence) -> Iterator[Hit]:
             )
 
 
+def _unexplained(evidence: Evidence) -> Iterator[Hit]:
+    fit = evidence.expression_fit
+    if fit is None or misplaced(evidence) or mesh_misses(evidence):
+        return
+    if min(fit.mean, fit.median) > WORSE:
+        yield Hit(
+            f"the skin's colours at the mesh's vertices vary {fit.mean:.2f} times as much over time as with a face at "
+            f"rest ({fit.vertices} vertices, {several(fit.frames, 'frame')} of camera {fit.camera})",
+            evidence.folder,
+            "expr",
+        )
+
+
 RULES = (
     Rule(
         "HB601",
@@ -317,5 +335,13 @@ RULES = (
         "the expression never changes",
         "Make sure that expressions were tracked and exported.",
         _still_expression,
+    ),
+    Rule(
+        "HB615",
+        "warning",
+        "expressions fit the images worse than a face at rest",
+        "Make sure of the head model's version (FLAME 2020 and 2023 are not interchangeable), and that parameters and "
+        "images are of the same timesteps; refit the tracking to the model that is to be used.",
+        _unexplained,
     ),
 )

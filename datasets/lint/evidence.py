@@ -24,6 +24,7 @@ from ..head.arrays import HeadArrays
 from ..image_files import ImageInfo, probe_image
 from ..splits import sequence_names
 from ..transforms import FrameEntry, parse_frame
+from .expression_fit import ExpressionFit, weigh_expression
 from .parameters import Parameters, Subject, read_parameters
 from .settings import LintSettings
 from .thumbnails import Thumbnail, make_thumbnails
@@ -55,6 +56,7 @@ class Evidence:
     subject : head and identity that fit the parameters; None where no file does.
     views : decoded sample frames.
     thumbnails : of the images searched for near-duplicates.
+    expression_fit : how well expressions explain the images; None where that cannot be told.
     refusal : why `read_capture` refuses the capture, None where it does not.
     """
 
@@ -75,6 +77,7 @@ class Evidence:
     subject: Subject | None
     views: tuple[ViewFacts, ...]
     thumbnails: tuple[Thumbnail, ...]
+    expression_fit: ExpressionFit | None
     refusal: InputError | None
 
     @cached_property
@@ -151,6 +154,7 @@ def gather(folder: Path, settings: LintSettings, progress: Progress = no_progres
         subject=subject,
         views=tuple(views),
         thumbnails=tuple(thumbnails),
+        expression_fit=weigh_expression(whole, views, headers, subject, parameters, background, cy),
         refusal=_refusal(folder, settings),
     )
 

@@ -174,7 +174,7 @@ def _never_multiplied(image, mask):
     """Colours of the subject as they are, wherever the matte is not zero."""
     alpha = mask[..., None].astype(float) / 255
     colour = (image - (1 - alpha) * 255) / np.maximum(alpha, 0.02)
-    grounded = np.clip(colour, 0, 255) + (1 - alpha) * 255
+    grounded = 0.4 * np.clip(colour, 0, 255) + (1 - alpha) * 255  # a dark subject, which white cannot swamp
     return np.where(alpha > 0, np.clip(grounded, 0, 255), 255).round().astype(np.uint8)
 
 

@@ -28,10 +28,17 @@ FRONTAL = "222200037"
 SKIN = (205, 152, 124)
 
 
-def cameras(cx: float = WIDTH / 2 + 0.4, cy: float = HEIGHT / 2 - 0.6) -> list[Camera]:
-    """Four cameras on an arc of 90 degrees, a little above the head."""
+def cameras(cx: float = WIDTH / 2 + 0.4, cy: float = HEIGHT / 2 - 0.6, scale: int = 1) -> list[Camera]:
+    """Four cameras on an arc of 90 degrees, a little above the head; images ``scale`` times as large."""
     return [
-        look_at(name, np.array([np.sin(a), 0.08, np.cos(a)]), WIDTH, HEIGHT, cx, cy)
+        look_at(
+            name,
+            np.array([np.sin(a), 0.08, np.cos(a)]),
+            scale * WIDTH,
+            scale * HEIGHT,
+            scale * cx,
+            scale * cy,
+        )
         for name, a in zip(SERIALS, np.radians([-50.0, -20.0, 10.0, 40.0]))
     ]
 
@@ -77,9 +84,11 @@ def good_plan(**changes: Any) -> CapturePlan:
 def paint(
     plan: CapturePlan, vertices: np.ndarray, camera: Camera, fine: int = 4
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W, 4) straight-alpha RGBA of the mesh in skin colours, one shade per triangle."""
+    """Colours (H, W, 3) and coverage (H, W) of the mesh, its skin darker and lighter in patches of 2 cm."""
     front = rasterize_mesh(vertices, plan.head.faces, resized_camera(camera, fine)).face
-    shades = np.random.default_rng(1).integers(-30, 30, size=(len(plan.head.faces), 1)) + np.array(SKIN)
+    middle = plan.head.template[plan.head.faces].mean(axis=1)
+    patches = 18 * np.sin(150 * middle[:, 0]) + 18 * np.sin(150 * middle[:, 1] + 40 * middle[:, 2])
+    shades = patches[:, None] + np.array(SKIN)
     alpha = (front >= 0).astype(np.float32)
     sums = cv2.resize(
         alpha[..., None] * shades[front].astype(np.float32),

@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
 
 from headbench.datasets.ga_layout import Declaration
+from headbench.datasets.ga_writer import CaptureWriter, write_png
+from headbench.datasets.head.arrays import save_head
 from headbench.datasets.image_files import ImageInfo
 from headbench.datasets.lint.catalogue import GROUPS, RULES
 from headbench.datasets.lint.command import lint
 from headbench.datasets.lint.rules import apply
 from headbench.datasets.lint.settings import LintSettings
 
+from ..head.toy import toy_head
 from .faults import FAULTS
 from .good_capture import HEIGHT, WIDTH, GoodCapture, cameras, good_plan, write_good_capture
 
-PLANTED_APART = {"HB115", "HB510", "HB511"}
+PLANTED_APART = {"HB115", "HB510", "HB511", "HB615"}
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -84,10 +89,6 @@ def test_a_width_beyond_the_limit_of_gaussian_avatars(pristine):
 
 def test_alpha_in_the_image_is_a_mask_and_has_no_background(good):
     """RGBA over nothing: colours under transparent pixels are nobody's business."""
-    import cv2
-
-    from headbench.datasets.ga_writer import write_png
-
     for path in good.files("images"):
         mask = cv2.imread(str(path.parent.parent / "fg_masks" / path.name), 0)
         image = cv2.imread(str(path))[..., ::-1].astype(float)
@@ -96,3 +97,44 @@ def test_alpha_in_the_image_is_a_mask_and_has_no_background(good):
         write_png(path, np.dstack([np.clip(colour, 0, 255).round(), mask]).astype(np.uint8))
     good.each_frame(lambda frame: frame.pop("fg_mask_path") and None)
     assert codes(good) == []
+
+
+@pytest.fixture(scope="module")
+def detailed(tmp_path_factory) -> GoodCapture:
+    """A finer head in larger images, so that colours say where the skin is."""
+    head = toy_head(48, version="toy2023")
+    plan = good_plan(head=head, cameras=cameras(WIDTH / 2, HEIGHT / 2, scale=2)[1:3])
+    return write_good_capture(tmp_path_factory.mktemp("detailed"), plan)
+
+
+def test_right_expressions_explain_the_images(detailed):
+    evidence, findings = lint(LintSettings(str(detailed.union), views=8))
+    assert [finding.code for finding in findings] == []
+    assert evidence.expression_fit is not None
+    assert evidence.expression_fit.mean < 0.3
+    assert evidence.expression_fit.median < 0.3
+
+
+@pytest.mark.parametrize("seed", [7, 8])
+def test_coefficients_of_another_basis(detailed, tmp_path, seed):
+    """As many coefficients, the declared version: only the images tell that the basis is another one."""
+    shutil.copytree(detailed.writer.root, tmp_path / "mixed")
+    mixed = GoodCapture(CaptureWriter(tmp_path / "mixed", detailed.writer.plan))
+    head = detailed.writer.plan.head
+    other = toy_head(48, seed=seed).expression_basis
+    save_head(mixed.union / "head_model.npz", replace(head, expression_basis=other))
+    evidence, findings = lint(LintSettings(str(mixed.union), views=8))
+    assert [finding.code for finding in findings] == ["HB615"]
+    assert evidence.expression_fit is not None
+    assert min(evidence.expression_fit.mean, evidence.expression_fit.median) > 1.1
+
+
+def test_parameters_of_other_timesteps(detailed, tmp_path):
+    shutil.copytree(detailed.writer.root, tmp_path / "shifted")
+    shifted = GoodCapture(CaptureWriter(tmp_path / "shifted", detailed.writer.plan))
+    files = shifted.files("flame_param")
+    expressions = [np.load(path)["expr"] for path in files]
+    for index, path in enumerate(files):
+        late = expressions[(index + 7) % len(files)]
+        shifted.parameters(path, lambda arrays, late=late: arrays.update(expr=late))
+    assert "HB615" in codes(shifted)

@@ -1,0 +1,173 @@
+"""Whether the expression coefficients explain the images, whatever head model they are said to belong to.
+
+FLAME 2020 and 2023 have as many coefficients each, and the same coefficients make another face in the other; no
+number in the files shows the mix-up. Images do. A point of the skin keeps its colour over time, but for shading.
+So the colours that the mesh's vertices pick up from the images of one camera vary less with the expression than
+with a face at rest (jaw, head and eyes moving as tracked), if the expression is right. With the coefficients of
+another basis, of other timesteps or of other units they vary more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from ...bench.contracts import ByteArray, Camera, FloatArray
+from ...bench.errors import InputError
+from ..ga_layout import CyConvention
+from ..image_files import ImageInfo
+from ..images import read_image
+from ..mesh_pictures import vertex_normals
+from ..transforms import FrameEntry
+from .parameters import Parameters, Subject
+from .views import ViewFacts, entry_camera
+
+FRAMES = 16
+"""Frames to judge by."""
+
+FEWEST_FRAMES, FEWEST_VERTICES = 6, 50
+"""With less nothing is said."""
+
+FACING = 0.5
+"""Least cosine between a vertex's normal and the direction to the camera."""
+
+MOVES_PX = 0.5
+"""Vertices whose projection the expression never moves by so much tell nothing."""
+
+_NOT_SKIN = ("mouth_socket", "left_eyeball", "right_eyeball", "teeth")
+
+
+class ExpressionFit(NamedTuple):
+    """Variance over time of the face's colours with the expression, over that with a face at rest.
+
+    ``mean`` and ``median`` compare the mean and the median over ``vertices`` vertices in ``frames`` frames of
+    ``camera``: below 1 where the expression explains the images.
+    """
+
+    camera: str
+    frames: int
+    vertices: int
+    mean: float
+    median: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Picked:
+    """What the face's vertices pick up from one frame."""
+
+    colours: FloatArray  # (F, 3)
+    seen: np.ndarray  # (F,)
+    pixels: FloatArray  # (F, 2)
+
+
+def weigh_expression(
+    entries: Sequence[FrameEntry],
+    views: Sequence[ViewFacts],
+    headers: Mapping[Path, ImageInfo],
+    subject: Subject | None,
+    parameters: Mapping[int, Parameters],
+    background: Sequence[float],
+    cy: CyConvention,
+) -> ExpressionFit | None:
+    """Compare the expression with a face at rest; None where there is too little to compare.
+
+    Parameters
+    ----------
+    entries : frames whose images are there.
+    views : sample frames; the camera that they show to look most into the face is taken.
+    """
+    camera = _facing_camera(views)
+    if subject is None or camera is None:
+        return None
+    usable = [e for e in entries if e.camera_id == camera and parameters[e.timestep].pose is not None]
+    if not usable:
+        return None
+    usable.sort(key=lambda entry: entry.timestep)
+    picks = np.unique(np.linspace(0, len(usable) - 1, FRAMES).round().astype(int))
+    members = _members(subject)
+    moving: list[_Picked] = []
+    resting: list[_Picked] = []
+    for entry in (usable[i] for i in picks):
+        pose = parameters[entry.timestep].pose
+        if pose is None:
+            continue
+        try:
+            image = read_image(entry.image, background)
+        except InputError:
+            continue  # reported as a damaged file
+        still = replace(pose, expression=np.zeros_like(pose.expression))
+        place = entry_camera(entry, headers[entry.image], cy)
+        for kept, mesh in zip((moving, resting), subject.vertices([pose, still])):
+            kept.append(_pick(mesh, subject, members, place, image))
+    return _compare(camera, moving, resting)
+
+
+def _facing_camera(views: Sequence[ViewFacts]) -> str | None:
+    facing: dict[str, list[float]] = {}
+    for view in views:
+        if view.mesh is not None and view.mesh.depth > 0:
+            facing.setdefault(view.entry.camera_id, []).append(view.mesh.facing)
+    return max(facing, key=lambda name: float(np.median(facing[name]))) if facing else None
+
+
+def _members(subject: Subject) -> np.ndarray:
+    regions = subject.head.regions
+    face = regions.get("face", np.arange(len(subject.head.template)))
+    return np.setdiff1d(
+        face, np.concatenate([regions.get(name, np.empty(0, np.int64)) for name in _NOT_SKIN])
+    )
+
+
+def _pick(
+    vertices: FloatArray, subject: Subject, members: np.ndarray, camera: Camera, image: ByteArray
+) -> _Picked:
+    points = vertices[members]
+    outward = vertex_normals(vertices, subject.head.faces)[members]
+    towards = camera.center - points
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    seen = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    pixels = (seen @ camera.K.T)[:, :2] / np.maximum(seen[:, 2:], 1e-6)
+    where = (pixels - 0.5).astype(np.float32)  # OpenCV's pixel centres are at integers
+    picked = cv2.remap(image.astype(np.float32), where[:, :1], where[:, 1:], cv2.INTER_LINEAR)
+    colours = picked[:, 0].astype(np.float64)
+    within = ((pixels > 0) & (pixels < [camera.width, camera.height])).all(axis=1)
+    return _Picked(colours, ((outward * towards).sum(axis=1) > FACING) & within, pixels)
+
+
+def _compare(camera: str, moving: Sequence[_Picked], resting: Sequence[_Picked]) -> ExpressionFit | None:
+    if len(moving) < FEWEST_FRAMES:
+        return None
+    # Only what both see is compared, so that neither gains by looking elsewhere.
+    seen = np.array([one.seen & other.seen for one, other in zip(moving, resting)])
+    moved = np.array(
+        [np.linalg.norm(one.pixels - other.pixels, axis=1) for one, other in zip(moving, resting)]
+    )
+    telling = (seen.sum(axis=0) >= FEWEST_FRAMES) & (moved.max(axis=0) >= MOVES_PX)
+    if telling.sum() < FEWEST_VERTICES:
+        return None
+    ours = _variance(moving, seen)[telling]
+    rest = _variance(resting, seen)[telling]
+    if rest.mean() <= 0 or np.median(rest) <= 0:
+        return None  # a face of one colour
+    return ExpressionFit(
+        camera,
+        len(moving),
+        int(telling.sum()),
+        float(ours.mean() / rest.mean()),
+        float(np.median(ours) / np.median(rest)),
+    )
+
+
+def _variance(picked: Sequence[_Picked], seen: np.ndarray) -> FloatArray:
+    """(F,) variance of each vertex's colour over the frames that see it, mean over channels."""
+    weight = seen[..., None].astype(np.float64)
+    colours = np.array([one.colours for one in picked])
+    count = np.maximum(weight.sum(axis=0), 1)
+    mean = (colours * weight).sum(axis=0) / count
+    variance: FloatArray = ((((colours - mean) ** 2) * weight).sum(axis=0) / count).mean(axis=1)
+    return variance

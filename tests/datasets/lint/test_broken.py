@@ -1,0 +1,136 @@
+"""Whatever is in the files, the linter ends with findings, never with an exception."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from itertools import count
+
+import numpy as np
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from headbench.bench.errors import InputError
+from headbench.datasets.ga_writer import CaptureWriter
+from headbench.datasets.lint.command import run
+from headbench.datasets.lint.settings import LintSettings
+
+from .good_capture import GoodCapture
+
+JUNK = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.integers(-(10**30), 10**30),
+    st.floats(),
+    st.text(max_size=8),
+    st.just([]),
+    st.just({}),
+    st.just("../../../../etc/passwd"),
+    st.just([[1.0] * 4] * 4),
+    st.just(1e-300),
+)
+KEYS = [
+    "timestep_index",
+    "camera_index",
+    "camera_id",
+    "cx",
+    "cy",
+    "fl_x",
+    "fl_y",
+    "h",
+    "w",
+    "camera_angle_x",
+    "transform_matrix",
+    "file_path",
+    "fg_mask_path",
+    "flame_param_path",
+]
+ARRAYS = ["translation", "rotation", "neck_pose", "jaw_pose", "eyes_pose", "shape", "expr", "static_offset"]
+_numbers = count()
+
+fuzz = settings(
+    max_examples=8,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+    derandomize=True,
+)
+
+
+def copy(pristine, tmp_path) -> GoodCapture:
+    root = tmp_path / f"copy{next(_numbers)}"
+    shutil.copytree(pristine.writer.root, root)
+    return GoodCapture(CaptureWriter(root, pristine.writer.plan))
+
+
+def outcome(capture: GoodCapture) -> list[str]:
+    findings = run(LintSettings(str(capture.union), views=3, duplicates=6))
+    json.dumps(findings.data)
+    return [finding["code"] for finding in findings.data["findings"]]
+
+
+@fuzz
+@given(key=st.sampled_from(KEYS), junk=JUNK, everywhere=st.booleans())
+def test_junk_in_a_frame(pristine, tmp_path, key, junk, everywhere):
+    capture = copy(pristine, tmp_path)
+
+    def spoil(value):
+        for frame in value["frames"][:: 1 if everywhere else len(value["frames"])]:
+            frame[key] = junk
+
+    capture.edit("transforms_train.json", spoil)
+    outcome(capture)
+
+
+@fuzz
+@given(
+    key=st.sampled_from(["subject", "head_model", "head_file", "background", "cy", "sequences", "excluded"]),
+    junk=JUNK,
+)
+def test_junk_in_the_declaration(pristine, tmp_path, key, junk):
+    capture = copy(pristine, tmp_path)
+    capture.edit("headbench.json", lambda value: value.update({key: junk}))
+    outcome(capture)
+
+
+@fuzz
+@given(
+    key=st.sampled_from(ARRAYS),
+    shape=st.sampled_from([(), (0,), (1, 3), (3,), (2, 2, 2), (1, 500)]),
+    value=st.sampled_from([0.0, 1e30, -1e38, np.nan, np.inf]),
+    kind=st.sampled_from(["f4", "f8", "i8", "U3", "c8"]),
+)
+def test_junk_in_parameters(pristine, tmp_path, key, shape, value, kind):
+    capture = copy(pristine, tmp_path)
+    finite = value if np.isfinite(value) or kind in ("f4", "f8") else 7
+    array = np.full(shape, finite if kind != "i8" else int(min(max(finite, -(2**62)), 2**62))).astype(kind)
+    capture.parameters(capture.files("flame_param")[3], lambda arrays: arrays.update({key: array}))
+    outcome(capture)
+
+
+@fuzz
+@given(data=st.data())
+def test_files_cut_off_or_overwritten(pristine, tmp_path, data):
+    capture = copy(pristine, tmp_path)
+    files = sorted(
+        path
+        for path in capture.writer.root.rglob("*")
+        if path.is_file() and "transforms.json" not in path.name
+    )
+    path = files[data.draw(st.integers(0, len(files) - 1))]
+    content = path.read_bytes()
+    end = data.draw(st.integers(0, max(0, len(content) - 1)))
+    path.write_bytes(content[:end] + data.draw(st.binary(max_size=20)))
+    try:
+        outcome(capture)
+    except InputError:
+        raise AssertionError(f"{path.name} cut off at {end} stops the linter") from None
+
+
+def test_only_one_json_left(good):
+    """No train JSON, no parameters, no head: the images of the rest are still looked at."""
+    (good.union / "transforms_train.json").unlink()
+    (good.union / "head_model.npz").unlink()
+    for path in good.files("flame_param"):
+        path.unlink()
+    found = outcome(good)
+    assert {"HB100", "HB101", "HB103", "HB602"} <= set(found)
