@@ -10,6 +10,7 @@ from ...bench.contracts import FrameKey
 from ...bench.errors import InputError
 from ...bench.files import read_json
 from ..clip import CaptureClip
+from .exclusion_file import read_exclusions
 
 
 def exclude_timesteps(
@@ -55,3 +56,31 @@ def read_labels(path: Path) -> dict[int, str]:
             raise InputError(path, key, expected, f"{key!r}: {reason!r}"[:80])
         labels[int(key)] = reason
     return labels
+
+
+def read_reasons(path: Path, clip: CaptureClip) -> dict[int, str]:
+    """Reasons by timestep for a clip: from the YAML of `exclusion_file`, or from JSON labels by the suffix.
+
+    Raises
+    ------
+    InputError
+        Where the file says nothing of the clip's subject, or numbers timesteps as another capture does.
+    """
+    if path.suffix.lower() == ".json":
+        return read_labels(path)
+    subjects = read_exclusions(path)
+    if clip.subject not in subjects:
+        found = ", ".join(subjects) or "no subjects"
+        raise InputError(path, "subjects", clip.subject, found, "Run `headbench tongue` on this capture too.")
+    decided = subjects[clip.subject]
+    sequences = {key.timestep: key.sequence for key in clip.files}
+    for timestep, frame in decided.frames.items():
+        if sequences.get(timestep, frame.sequence) != frame.sequence:
+            raise InputError(
+                path,
+                f"subjects.{clip.subject}.frames.{timestep}.sequence",
+                f"{sequences[timestep]}, as the capture has it",
+                frame.sequence,
+                "The file was made for a capture that numbers its timesteps otherwise.",
+            )
+    return decided.reasons()

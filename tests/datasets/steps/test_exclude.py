@@ -6,7 +6,8 @@ import pytest
 
 from headbench.bench.contracts import FrameKey
 from headbench.bench.errors import InputError
-from headbench.datasets.steps.exclude import exclude_timesteps, read_labels
+from headbench.datasets.steps.exclude import exclude_timesteps, read_labels, read_reasons
+from headbench.datasets.steps.exclusion_file import Exclusions, FrameDecision, write_exclusions
 
 from .clips import make_clip
 
@@ -59,3 +60,30 @@ def test_labels_are_read_from_json(tmp_path):
         path.write_text(text)
         with pytest.raises(InputError):
             read_labels(path)
+
+
+def _decisions(path, *, subject="s", sequence="q"):
+    frames = {
+        1: FrameDecision(sequence, 80.0, True, "tongue out"),
+        2: FrameDecision(sequence, 0.0, False, ""),
+    }
+    write_exclusions(path, {subject: Exclusions(35.0, "given", ("a",), frames, {2: "blur"})})
+    return path
+
+
+def test_reasons_come_from_a_file_of_exclusions_or_of_labels(tmp_path):
+    clip = make_clip(4)
+    assert read_reasons(_decisions(tmp_path / "tongue.yaml"), clip) == {1: "tongue out", 2: "blur"}
+    labels = tmp_path / "labels.json"
+    labels.write_text('{"3": "blur"}')
+    assert read_reasons(labels, clip) == {3: "blur"}
+
+
+def test_exclusions_of_another_subject_or_numbering_are_refused(tmp_path):
+    clip = make_clip(4)
+    with pytest.raises(InputError, match="headbench tongue") as caught:
+        read_reasons(_decisions(tmp_path / "a.yaml", subject="t"), clip)
+    assert caught.value.key == "subjects"
+    with pytest.raises(InputError, match="numbers its timesteps") as caught:
+        read_reasons(_decisions(tmp_path / "b.yaml", sequence="other"), clip)
+    assert caught.value.key == "subjects.s.frames.1.sequence"
