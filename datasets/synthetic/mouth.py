@@ -18,6 +18,7 @@ _TEETH = np.array([0.80, 0.74, 0.63])
 _GUMS = np.array([0.42, 0.13, 0.12])
 _TONGUE = np.array([0.45, 0.15, 0.14])
 _NECK_JOINT, _JAW_JOINT = 1, 2
+_LIP_ON_JAW = 0.9  # how much of the jaw's motion the lower lip, and the tongue on it, follow
 _TRACKED: Mapping[str, tuple[FloatArray, str]] = {
     "teeth": (_TEETH, "teeth"),
     "gums_and_tongue": (_GUMS, "gums"),
@@ -29,7 +30,8 @@ class MouthPart:
     """A mesh in the mouth that the tracked mesh lacks.
 
     ``vertices`` (n, 3) at rest and ``out`` (n, 3), the same with the tongue put out; ``weights`` (n, J) bind
-    it to the joints; ``albedo`` (n, 3) is linear.
+    it to the joints; ``albedo`` (n, 3) is linear. ``lift`` is how far (metres) the way out arches over the
+    straight line from one to the other.
     """
 
     name: str
@@ -39,10 +41,12 @@ class MouthPart:
     albedo: FloatArray
     weights: FloatArray
     material: str
+    lift: float = 0.0
 
     def at(self, tongue_out: float) -> FloatArray:
         """Rest vertices for a tongue that is out by a share in [0, 1]."""
-        return self.vertices + tongue_out * (self.out - self.vertices)
+        arch = np.array([0.0, 4.0 * tongue_out * (1.0 - tongue_out) * self.lift, 0.0])
+        return self.vertices + tongue_out * (self.out - self.vertices) + arch
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,8 +94,9 @@ def tongue(person: Person, anatomy: Anatomy, joints: int) -> MouthPart:
         x = half_width * section * np.cos(pp)
         return back + s * np.stack([x, y + thick * np.cos(turn), z + thick * np.sin(turn)], axis=1)
 
-    inside = body(mouth + np.array([0.0, -0.014, -0.062]) * s, 0.043, 0.0, 0.019, 0.007)
-    out = body(mouth + np.array([0.0, -0.0045, -0.050]) * s, 0.084, 1.15, 0.0180, 0.0050)
+    inside = body(mouth + np.array([0.0, -0.010, -0.062]) * s, 0.043, 0.0, 0.019, 0.007)
+    # Its underside slides over the lower lip's rim, which ends where the lips meet, and not through the lip.
+    out = body(mouth + np.array([0.0, 0.006, -0.050]) * s, 0.084, 1.15, 0.0180, 0.0050)
     index = np.arange(along * around).reshape(along, around)
     a, b = index[:-1], index[1:]
     a1, b1 = np.roll(a, -1, axis=1), np.roll(b, -1, axis=1)
@@ -100,9 +105,9 @@ def tongue(person: Person, anatomy: Anatomy, joints: int) -> MouthPart:
     )
     buds = 1.0 + 0.14 * value_noise(inside / (0.0014 * s), person.seed + 95)
     weights = np.zeros((len(inside), joints))
-    weights[:, _JAW_JOINT] = ramp(uu, -0.3, 0.35)
+    weights[:, _JAW_JOINT] = _LIP_ON_JAW * ramp(uu, -0.3, 0.35)
     weights[:, _NECK_JOINT] = 1.0 - weights[:, _JAW_JOINT]
-    return MouthPart("tongue", inside, out, faces, _TONGUE * buds[:, None], weights, "tongue")
+    return MouthPart("tongue", inside, out, faces, _TONGUE * buds[:, None], weights, "tongue", 0.008 * s)
 
 
 def procedural_parts(person: Person, head: HeadAsset, shape: FloatArray) -> tuple[MouthPart, ...]:

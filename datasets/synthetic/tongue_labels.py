@@ -11,7 +11,7 @@ from .anatomy import Anatomy, front_depth
 from .mouth import MouthPart
 
 HIDES = 20e-6
-"""Square metres of lips and chin, seen from straight ahead, that a tongue hides when it counts as out: 4 x 5 mm."""
+"""Square metres of lower lip and chin, seen from straight ahead, that a tongue hides when it is out: 4 x 5 mm."""
 
 _STEP = 0.0005  # metres between lines of sight
 _AROUND = np.array(
@@ -23,8 +23,9 @@ _BISECTIONS = 7
 def share_that_shows(parts: Sequence[MouthPart], anatomy: Anatomy, neutral: FloatArray) -> float:
     """The least ``tongue_out`` at which the tongue among ``parts`` hides `HIDES` of the neutral skin, to 1 %.
 
-    Tongue and lower lip both follow the jaw, so the closed mouth stands for the open one. Infinity for a
-    subject without a tongue, or with one that stays behind the lips.
+    Tongue and lower lip both follow the jaw, so the closed mouth stands for the open one; the upper lip, which
+    the tongue would then cross, is left out. Infinity for a subject without a tongue, or with one that stays
+    behind the lips.
     """
     tongues = [part for part in parts if part.name == "tongue"]
     low = anatomy["mouth"][:2] + _AROUND[0] * anatomy.scale
