@@ -29,7 +29,7 @@ from .image_files import ImageInfo
 from .images import ImageStore
 from .principal_point import settle_cy
 from .splits import check_disjoint, sequence_names, split_by_holding_out
-from .steps.exclude import exclude_timesteps, read_labels
+from .steps.exclude import exclude_timesteps, read_reasons
 from .transforms import FrameEntry, read_transforms
 from .validate import LeakPolicy, check_images, check_leaks, check_timesteps, find_leaks
 
@@ -48,7 +48,7 @@ def read_capture(
     background: Sequence[float] | None = None,
     held_out_sequences: Sequence[str] = (),
     held_out_cameras: Sequence[str] = (),
-    excluded: Mapping[int, str] | str | Path | None = None,
+    exclude: Mapping[int, str] | str | Path | None = None,
     leaks: LeakPolicy = "error",
     decode: bool = False,
     cache_mb: float = 512.0,
@@ -72,7 +72,8 @@ def read_capture(
     held_out_sequences, held_out_cameras : make the splits anew instead of taking the JSONs': all frames of
         these sequences (full names or unique prefixes) are self-reenactment, these cameras' other frames
         novel view, the rest training.
-    excluded : reason by timestep, or a file for `read_labels`; added to what ``headbench.json`` declares.
+    exclude : frames to leave out, added to what ``headbench.json`` declares: reason by timestep, or a file for
+        `read_reasons`, such as the one that ``headbench tongue`` writes.
     leaks : "error" refuses splits that share data; "record" notes it in the step record.
     decode : decode every image when checking; finds damage in the middle of files.
     cache_mb : bound of the decoded images held in memory, in 10^6 bytes.
@@ -133,9 +134,9 @@ def read_capture(
     )
     if declaration and declaration.excluded:
         clip = exclude_timesteps(clip, declaration.excluded, source=folder / layout.DECLARATION_FILE)
-    if isinstance(excluded, (str, Path)):
-        return exclude_timesteps(clip, read_labels(Path(excluded)), source=excluded)
-    return exclude_timesteps(clip, excluded) if excluded else clip
+    if isinstance(exclude, (str, Path)):
+        return exclude_timesteps(clip, read_reasons(Path(exclude), clip), source=exclude)
+    return exclude_timesteps(clip, exclude) if exclude else clip
 
 
 def find_captures(root: Path) -> list[Path]:

@@ -332,7 +332,7 @@ def test_fingerprint_follows_content_and_not_place(capture, pristine_capture):
     original = read_capture(pristine_capture.union)
     assert read_capture(capture.union).fingerprint == original.fingerprint
     assert read_capture(capture.union, cy="centre").fingerprint != original.fingerprint
-    assert read_capture(capture.union, excluded={0: "blur"}).fingerprint != original.fingerprint
+    assert read_capture(capture.union, exclude={0: "blur"}).fingerprint != original.fingerprint
     path = capture.writer.image_path("FREE", 0, FRONTAL)
     write_png(path, 255 - np.asarray(original.image(FrameKey("901", "FREE", 4, FRONTAL))))
     assert read_capture(capture.union).fingerprint != original.fingerprint

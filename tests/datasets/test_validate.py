@@ -321,7 +321,7 @@ def test_declaration_that_is_no_object(capture):
 
 
 def test_excluded_timestep_that_does_not_exist(capture):
-    assert "99" in fault(capture, excluded={99: "blur"}).found
+    assert "99" in fault(capture, exclude={99: "blur"}).found
     capture.edit(
         "headbench.json", lambda document: document["excluded"].append({"timestep": 99, "reason": ""})
     )
