@@ -30,6 +30,7 @@ from .images import ImageStore
 from .principal_point import settle_cy
 from .splits import check_disjoint, sequence_names, split_by_holding_out
 from .steps.exclude import exclude_timesteps, read_reasons
+from .steps.mattes import mask_below_neck, set_background
 from .transforms import FrameEntry, read_transforms
 from .validate import LeakPolicy, check_images, check_leaks, check_timesteps, find_leaks
 
@@ -46,6 +47,7 @@ def read_capture(
     cy: layout.CyConvention | Literal["auto"] = "auto",
     teeth: TeethPolicy = "auto",
     background: Sequence[float] | None = None,
+    below_neck: bool = True,
     held_out_sequences: Sequence[str] = (),
     held_out_cameras: Sequence[str] = (),
     exclude: Mapping[int, str] | str | Path | None = None,
@@ -67,8 +69,9 @@ def read_capture(
         tracked mesh with the masks; where the images do not decide and it matters, that is an `InputError`.
         "centre" puts the principal point at the image centre, as GaussianAvatars does.
     teeth : see `read_tracking`.
-    background : (r, g, b) in [0, 1] for RGBA images; None takes the declared one, else white. Images without
-        alpha cannot change theirs.
+    background : (r, g, b) in [0, 1]; None takes the declared one, else white. For images without alpha it is
+        exchanged by their masks, see `set_background`.
+    below_neck : keep what lies below the tracked neck; False turns it into background, see `mask_below_neck`.
     held_out_sequences, held_out_cameras : make the splits anew instead of taking the JSONs': all frames of
         these sequences (full names or unique prefixes) are self-reenactment, these cameras' other frames
         novel view, the rest training.
@@ -90,7 +93,7 @@ def read_capture(
     check_timesteps(folder, everything)
     infos = check_images(everything, decode=decode, progress=progress)
     rig = collect_cameras(everything, infos)
-    ground = _background(folder, declaration, background, all(info.has_alpha for info in infos.values()))
+    ground, wanted = _backgrounds(folder, declaration, background, everything, infos)
     asset = find_head(folder, declaration, head, masks=masks, regions=regions)
     subject = check_name(subject or _subject(folder, declaration, everything), folder, "subject")
     files = {entry.timestep: entry.parameters for entry in everything}
@@ -132,6 +135,9 @@ def read_capture(
         source_fingerprint=source,
         store=ImageStore(cache_mb),
     )
+    clip = set_background(clip, wanted)
+    if not below_neck:
+        clip = mask_below_neck(clip)
     if declaration and declaration.excluded:
         clip = exclude_timesteps(clip, declaration.excluded, source=folder / layout.DECLARATION_FILE)
     if isinstance(exclude, (str, Path)):
@@ -177,20 +183,27 @@ def _subject(folder: Path, declaration: layout.Declaration | None, entries: Sequ
     return named or folder.name
 
 
-def _background(
-    folder: Path, declaration: layout.Declaration | None, wanted: Sequence[float] | None, alpha: bool
-) -> tuple[float, ...]:
+def _backgrounds(
+    folder: Path,
+    declaration: layout.Declaration | None,
+    wanted: Sequence[float] | None,
+    entries: Iterable[FrameEntry],
+    infos: Mapping[Path, ImageInfo],
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """What images are read on, and what the clip is to be on: another where images are composited already."""
     declared = declaration.background if declaration else WHITE
     if wanted is None:
-        return declared
+        return declared, declared
     colour = tuple(float(c) for c in wanted)
     if len(colour) != 3 or not all(0 <= c <= 1 for c in colour):
         raise InputError("read_capture", "background", "three numbers in [0, 1]", f"{colour}")
-    if colour != declared and not alpha:
-        raise InputError(
-            folder, "background", f"{declared}, as images without alpha are composited already", f"{colour}"
-        )
-    return colour
+    if colour == declared or all(info.has_alpha for info in infos.values()):
+        return colour, colour
+    bare = [entry.image for entry in entries if entry.mask is None and not infos[entry.image].has_alpha]
+    if bare:
+        expected = f"{declared}, which images are composited on, where one has neither mask nor alpha"
+        raise InputError(folder, "background", expected, f"{colour}, and no mask for {bare[0].name}")
+    return declared, colour
 
 
 def _shift_poses(

@@ -323,9 +323,32 @@ def test_rgba_is_composited_on_the_background_asked_for(tmp_path):
         np.testing.assert_array_equal(clip.mask(key), rgba[..., 3])
 
 
-def test_rgb_images_keep_their_background(capture):
-    with pytest.raises(InputError, match="background: expected .*composited already"):
+def test_rgb_images_change_their_background_by_their_masks(capture):
+    clip = read_capture(capture.union, background=(0, 0, 1))
+    np.testing.assert_array_equal(clip.background, [0, 0, 1])
+    assert [step.name for step in clip.steps][1] == "set_background"
+    plain = read_capture(capture.union)
+    for key in list(clip.files)[:4]:
+        inside = clip.mask(key) == 255
+        np.testing.assert_array_equal(clip.image(key)[inside], plain.image(key)[inside])
+        assert (clip.image(key)[~inside] == [0, 0, 255]).all()
+
+
+def test_rgb_images_without_masks_keep_their_background(capture):
+    def forget_masks(document):
+        for frame in document["frames"]:
+            del frame["fg_mask_path"]
+
+    for file in ("transforms_train.json", "transforms_val.json", "transforms_test.json"):
+        capture.edit(file, forget_masks)
+    with pytest.raises(InputError, match="background: expected .*neither mask nor alpha"):
         read_capture(capture.union, background=(0, 0, 0))
+
+
+def test_what_lies_below_the_neck_can_be_left_out(capture):
+    clip = read_capture(capture.union, below_neck=False)
+    assert [step.name for step in clip.steps][1] == "mask_below_neck"
+    assert read_capture(capture.union).fingerprint != clip.fingerprint
 
 
 def test_fingerprint_follows_content_and_not_place(capture, pristine_capture):
