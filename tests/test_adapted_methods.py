@@ -4,11 +4,11 @@ import dataclasses
 import sys
 from types import ModuleType
 
-import cv2
 import pytest
 
 from headbench.bench import runner
 from headbench.bench.contracts import ResolutionRule
+from headbench.bench.frames import read_png
 from headbench.bench.run_config import RunConfig
 from headbench.bench.store import RunFolder, keys_of
 from headbench.methods.specs import MEAN_IMAGE
@@ -77,7 +77,7 @@ def test_every_render_has_the_size_of_the_protocol(run, name):
     cell = folder.cell("901", name, 0)
     for task in record["protocols"]:
         for key in keys_of(record, task):
-            assert cv2.imread(str(cell.render(task, key))).shape == (64, 48, 3)
+            assert read_png(cell.render(task, key)).shape == (64, 48, 3)
 
 
 def test_the_manifest_tells_how_each_form_came_about(run):

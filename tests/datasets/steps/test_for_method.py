@@ -128,7 +128,12 @@ def test_what_cannot_be_done_is_said_before_any_work(clip, heads, tmp_path):
 
 def test_the_procedural_heads_need_no_file(clip, monkeypatch):
     made = []
-    monkeypatch.setattr(for_method, "procedural_head", lambda version: made.append(version) or OTHER)
+
+    def make(version):
+        made.append(version)
+        return OTHER
+
+    monkeypatch.setattr(for_method, "procedural_head", make)
     procedural = replace(clip, head=replace(clip.head, version="procedural2023"))
     needs = MethodNeeds(head_models=("flame2020", "procedural2020"))
     clip_for_method(procedural, needs, {})

@@ -173,7 +173,7 @@ def test_the_colour_of_the_set_leaves_the_edges(clip, tmp_path, by_camera):
     recorded = composite(colours, shown, GREEN)  # in front of a green screen
     cut_out = rounded(composite(recorded, shown, WHITE))  # and cut out with its matte, as it was recorded
     spilled = with_pixels(clip, tmp_path, cut_out, levels)
-    screen = np.broadcast_to(np.float32(GREEN), (SIZE, SIZE, 3))
+    screen = np.broadcast_to(np.array(GREEN, np.float32), (SIZE, SIZE, 3))
     cleaned = clean_edges(spilled, dict.fromkeys(clip.cameras, screen) if by_camera else GREEN)
     key = clip.splits["train"][0]
     truth = 255 * composite(colours, shown, WHITE)
