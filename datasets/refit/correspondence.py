@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from ...bench.contracts import FloatArray, IntArray
 
-_FIRST_CANDIDATES = 16
+_FIRST_CANDIDATES = 12
 
 
 class ClosestPoints(NamedTuple):
@@ -32,33 +32,56 @@ class ClosestPoints(NamedTuple):
 def closest_points(points: FloatArray, vertices: FloatArray, faces: IntArray) -> ClosestPoints:
     """Exact closest points on a triangle mesh; degenerate triangles count as segments or points.
 
-    Triangles are tried in the order of their centres' distance until no further one can be nearer: none whose
-    centre is farther than the best distance plus the largest distance from a centre to a corner.
+    Triangles of like size are searched together, those of the smallest last: in the order of their centres'
+    distance, until the next centre is farther than the best distance so far plus the largest distance from a
+    centre to a corner among them.
     """
     corners = vertices[faces]
     centres = corners.mean(axis=1)
-    reach = float(np.linalg.norm(corners - centres[:, None], axis=2).max())
+    radii = np.linalg.norm(corners - centres[:, None], axis=2).max(axis=1)
+    size = np.floor(np.log2(np.maximum(radii, 1e-3 * radii.max() + np.finfo(float).tiny))).astype(np.int64)
+    found = ClosestPoints(
+        np.zeros(len(points), dtype=np.int64), np.zeros((len(points), 3)), np.full(len(points), np.inf)
+    )
+    for alike in np.unique(size)[::-1]:
+        members = np.flatnonzero(size == alike)
+        _search(points, corners[members], centres[members], float(radii[members].max()), members, found)
+    return found
+
+
+def _search(
+    points: FloatArray,
+    corners: FloatArray,
+    centres: FloatArray,
+    reach: float,
+    names: IntArray,
+    found: ClosestPoints,
+) -> None:
+    """Enter into ``found`` what is nearer than what it holds."""
     tree = cKDTree(centres)
-    face = np.zeros(len(points), dtype=np.int64)
-    weights = np.zeros((len(points), 3))
-    distance = np.zeros(len(points))
-    open_points, tried = np.arange(len(points)), min(_FIRST_CANDIDATES, len(faces))
-    while len(open_points):
-        away, candidates = tree.query(points[open_points], k=tried)
+    rest, tried = np.arange(len(points)), min(_FIRST_CANDIDATES, len(centres))
+    while len(rest):
+        away, candidates = tree.query(points[rest], k=tried)
         away, candidates = away.reshape(-1, tried), candidates.reshape(-1, tried)
-        barycentric = _on_triangles(points[open_points, None], corners[candidates])
-        nearest = np.einsum("nkc,nkci->nki", barycentric, corners[candidates])
-        gaps = np.linalg.norm(points[open_points, None] - nearest, axis=2)
-        best = gaps.argmin(axis=1)
-        rows = np.arange(len(open_points))
-        face[open_points] = candidates[rows, best]
-        weights[open_points] = barycentric[rows, best]
-        distance[open_points] = gaps[rows, best]
-        unsure = away[:, -1] < gaps[rows, best] + reach
-        if tried == len(faces):
-            break
-        open_points, tried = open_points[unsure], min(4 * tried, len(faces))
-    return ClosestPoints(face, weights, distance)
+        # Most candidates are too far to matter: only those that may be nearest are measured.
+        row, column = np.nonzero(
+            away <= (np.minimum(found.distance[rest], away[:, 0] + reach) + reach)[:, None]
+        )
+        triangle = candidates[row, column]
+        place = rest[row]
+        barycentric = _on_triangles(points[place], corners[triangle])
+        nearest = np.einsum("nc,nci->ni", barycentric, corners[triangle])
+        gaps = np.linalg.norm(points[place] - nearest, axis=1)
+        best = np.full(len(rest), np.inf)
+        np.minimum.at(best, row, gaps)
+        wins = np.flatnonzero((gaps == best[row]) & (gaps < found.distance[place]))
+        found.face[place[wins]] = names[triangle[wins]]
+        found.weights[place[wins]] = barycentric[wins]
+        found.distance[place[wins]] = gaps[wins]
+        if tried == len(centres):
+            return
+        rest = rest[away[:, -1] <= found.distance[rest] + reach]
+        tried = min(4 * tried, len(centres))
 
 
 def _on_triangles(points: FloatArray, corners: FloatArray) -> FloatArray:

@@ -19,8 +19,11 @@ FACE = "face"
 EYEBALLS = ("left_eyeball", "right_eyeball")
 _LANDMARK_REGIONS = (*EYEBALLS, "lips", "nose")
 
-_ROUNDS = 12
-"""Of closest points and identity in turn, for models of different topology."""
+_ROUNDS = 25
+"""At most so many of closest points and identity in turn, for models of different topology."""
+
+_SETTLED = 1e-5
+"""Metres; the rounds end when the fitted face moves less than this on average."""
 
 FARTHEST = 0.010
 """Metres; a vertex whose closest point is farther has no counterpart."""
@@ -111,6 +114,9 @@ def match(source: HeadAsset, neutral: FloatArray, target: HeadAsset, settings: R
         alignment = rigid_alignment(rows @ neutral, fitted[chosen], weights[kept])
         wanted = (rows @ neutral) @ alignment[:3, :3].T + alignment[:3, 3]
         shape = fit_shape(target, chosen, weights[kept], wanted, settings)
+        moved = np.asarray(target.shape_basis[chosen] @ shape + target.template[chosen]) - fitted[chosen]
+        if np.linalg.norm(moved, axis=1).mean() < _SETTLED:
+            break
     return Matching(chosen, weights[kept], csr_array(rows), alignment, shape)
 
 

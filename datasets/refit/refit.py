@@ -71,9 +71,13 @@ def refit(
     timesteps = sorted(clip.poses)
     _check_tracking(clip)
     target = _with_same_teeth(clip.head, target)
+    if settings.static_offset == "residual" and not same_topology(clip.head, target):
+        expected = "two head models over one topology, to keep a residual as static offset"
+        remedy = "Set static_offset to zero."
+        raise InputError(f"head model {target.version!r}", "faces", expected, "different ones", remedy)
     neutral = Subject(clip.head, clip.shape, clip.static_offset).neutral
     matching = match(clip.head, neutral, target, settings)
-    offset = _static_offset(clip.head, neutral, target, matching, settings)
+    offset = _static_offset(neutral, target, matching, settings)
     fitter = BlockFitter(clip, target, matching, offset, settings)
 
     blocks: list[dict[str, FloatArray]] = []
@@ -128,7 +132,6 @@ def _with_same_teeth(source: HeadArrays, target: HeadArrays) -> HeadArrays:
 
 
 def _static_offset(
-    source: HeadArrays,
     neutral: FloatArray,
     target: HeadArrays,
     matching: Matching,
@@ -138,8 +141,4 @@ def _static_offset(
     zero = np.zeros(target.template.shape, dtype=np.float32)
     if settings.static_offset == "zero":
         return zero
-    if not same_topology(source, target):
-        remedy = "Set static_offset to zero."
-        expected = "two head models over one topology, to keep a residual as static offset"
-        raise InputError(f"head model {target.version!r}", "faces", expected, "different ones", remedy)
     return (neutral - Subject(target, matching.shape, zero).neutral).astype(np.float32)
