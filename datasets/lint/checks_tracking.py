@@ -28,7 +28,7 @@ REACH_M = 0.05
 JUMP_M, JUMP_TIMES = 0.03, 6.0
 """A step of the face is a jump where it is longer than this and than so many times the sequence's median."""
 
-WORSE = 1.03
+WORSE = 1.05
 """Expressions that fit the images by so much worse than none are not these images' expressions."""
 
 CHANGE = 1e-4
@@ -226,9 +226,9 @@ def _unexplained(evidence: Evidence) -> Iterator[Hit]:
     fit = evidence.expression_fit
     if fit is None or misplaced(evidence) or mesh_misses(evidence):
         return
-    if min(fit.mean, fit.median) > WORSE:
+    if fit.ratio > WORSE:
         yield Hit(
-            f"the skin's colours at the mesh's vertices vary {fit.mean:.2f} times as much over time as with a face at "
+            f"the skin's colours at the mesh's vertices vary {fit.ratio:.2f} times as much over time as with a face at "
             f"rest ({fit.vertices} vertices, {several(fit.frames, 'frame')} of camera {fit.camera})",
             evidence.folder,
             "expr",

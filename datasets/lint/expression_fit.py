@@ -9,6 +9,7 @@ another basis, of other timesteps or of other units they vary more.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -54,6 +55,11 @@ class ExpressionFit(NamedTuple):
     vertices: int
     mean: float
     median: float
+
+    @property
+    def ratio(self) -> float:
+        """Geometric mean of both: the mean sees the few vertices that move much, the median the many."""
+        return math.sqrt(self.mean * self.median)
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -99,6 +100,8 @@ def spans(numbers: Iterable[int], limit: int = 4) -> str:
 
 
 def _relative(file: Path | str, base: Path | None) -> str:
-    if base is not None and isinstance(file, Path) and file.is_relative_to(base):
-        return file.relative_to(base).as_posix()
-    return str(file)
+    """Path below ``base``, without detours by way of ".."; anything else as it is."""
+    if base is None or not str(file):
+        return str(file)
+    path = Path(os.path.normpath(file))
+    return path.relative_to(base).as_posix() if path.is_relative_to(base) else str(file)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 
-import cv2
 import pytest
 
 from headbench.bench.errors import InputError
 from headbench.datasets.inspection.command import NUMBERS, PICTURE, run
 from headbench.datasets.inspection.settings import InspectSettings
+
+from ..lint.good_capture import read_rgb
 
 
 def test_picture_numbers_and_text(capture, clip, tmp_path):
@@ -18,7 +19,7 @@ def test_picture_numbers_and_text(capture, clip, tmp_path):
     findings = run(settings, lambda *arguments: calls.append(arguments))
     assert findings.passed
     assert calls
-    picture = cv2.imread(str(tmp_path / "out" / PICTURE))
+    picture = read_rgb(tmp_path / "out" / PICTURE)
     assert picture.shape[1] == 1600
     numbers = json.loads((tmp_path / "out" / NUMBERS).read_text())
     assert numbers["fingerprint"] == clip.fingerprint

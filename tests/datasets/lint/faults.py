@@ -12,7 +12,7 @@ import numpy as np
 from headbench.datasets.ga_layout import Declaration
 from headbench.datasets.ga_writer import write_png
 
-from .good_capture import HEIGHT, WIDTH, GoodCapture
+from .good_capture import HEIGHT, WIDTH, GoodCapture, read_rgb
 
 Plant = Callable[[GoodCapture], None]
 
@@ -138,7 +138,7 @@ def _copy_to_test(good):
 
 
 def _nearly_copy_to_test(good):
-    image = cv2.imread(str(good.files("images")[0]))[..., ::-1].astype(int)
+    image = read_rgb(good.files("images")[0]).astype(int)
     noise = np.random.default_rng(0).integers(-1, 2, size=image.shape)
     write_png(_test_images(good, 5)[0], np.clip(image + noise, 0, 255).astype(np.uint8))
 
@@ -220,7 +220,7 @@ def _grey(image, mask):
 def _tint_one_camera(good):
     for path in good.files("images"):
         if path.stem.endswith("_01"):
-            image = cv2.imread(str(path))[..., ::-1].copy()
+            image = read_rgb(path).copy()
             blue = image[..., 2].astype(float)
             image[..., 2] = np.where(image.min(axis=2) < 250, np.clip(blue * 1.6, 0, 255), blue)
             write_png(path, image)
@@ -228,7 +228,7 @@ def _tint_one_camera(good):
 
 def _jpeg(good):
     for path in good.files("images"):
-        cv2.imwrite(str(path.with_suffix(".jpg")), cv2.imread(str(path)), [cv2.IMWRITE_JPEG_QUALITY, 95])
+        cv2.imwrite(str(path.with_suffix(".jpg")), read_rgb(path)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])
         path.unlink()
     good.each_frame(lambda frame: frame.update(file_path=frame["file_path"].replace(".png", ".jpg")))
 

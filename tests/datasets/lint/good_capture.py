@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -104,6 +105,24 @@ def composite(colour: np.ndarray, alpha: np.ndarray, background: float = 1.0) ->
     return np.round(colour * alpha[..., None] + 255 * background * (1 - alpha[..., None])).astype(np.uint8)
 
 
+def _with_index(change: Callable[[dict, int], None], index: int, arrays: dict) -> None:
+    change(arrays, index)
+
+
+def read_rgb(path: Path) -> np.ndarray:
+    """(H, W, 3) 8-bit."""
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    assert image is not None, path
+    return image[..., ::-1]
+
+
+def read_grey(path: Path) -> np.ndarray:
+    """(H, W) 8-bit."""
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    assert image is not None, path
+    return image
+
+
 @dataclass(frozen=True, eq=False)
 class GoodCapture:
     """A written capture and ways to damage it."""
@@ -127,8 +146,13 @@ class GoodCapture:
 
     def each_frame(self, change: Callable[[dict], None]) -> None:
         """Apply ``change`` to every frame of every split."""
+
+        def change_all(value: dict) -> None:
+            for frame in value["frames"]:
+                change(frame)
+
         for split in ("train", "val", "test"):
-            self.edit(f"transforms_{split}.json", lambda value: [change(f) for f in value["frames"]] and None)
+            self.edit(f"transforms_{split}.json", change_all)
 
     def each_image(
         self, change: Callable[[np.ndarray, np.ndarray], np.ndarray], *, masks: bool = False
@@ -136,13 +160,13 @@ class GoodCapture:
         """Replace every image (or mask) by what ``change`` makes of (H, W, 3) RGB and its (H, W) mask."""
         for path in self.files("images"):
             mask_path = path.parent.parent / "fg_masks" / path.name
-            image, mask = cv2.imread(str(path))[..., ::-1], cv2.imread(str(mask_path), 0)
+            image, mask = read_rgb(path), read_grey(mask_path)
             write_png(mask_path if masks else path, change(image, mask))
 
     def each_parameters(self, change: Callable[[dict[str, np.ndarray], int], None]) -> None:
         """Apply ``change`` to the arrays of every parameter file, given its position in the order of files."""
         for index, path in enumerate(self.files("flame_param")):
-            self.parameters(path, lambda arrays, index=index: change(arrays, index))
+            self.parameters(path, partial(_with_index, change, index))
 
     def parameters(self, path: Path, change: Callable[[dict[str, np.ndarray]], None]) -> None:
         """Apply ``change`` to the arrays of one parameter file."""

@@ -86,7 +86,7 @@ def test_synthetic_captures_without_and_with_a_mix_up_of_versions(tmp_path):
     for noise in (0.0, 0.3):
         root = tmp_path / f"{noise}"
         synthesize(
-            root, cameras=3, timesteps=16, size=(96, 136), seed=3, tracking_noise=noise, samples_per_pixel=9
+            root, cameras=2, timesteps=16, size=(96, 136), seed=3, tracking_noise=noise, samples_per_pixel=9
         )
         findings = run(LintSettings(str(root))).data["findings"]
         assert {finding["code"] for finding in findings} <= {"HB110"}

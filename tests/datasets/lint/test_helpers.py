@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -14,11 +13,13 @@ from headbench.datasets.lint.thumbnails import make_thumbnails, near_duplicates
 from headbench.datasets.lint.views import _fringe, pick_views
 from headbench.datasets.transforms import read_transforms
 
+from .good_capture import read_rgb
+
 
 @given(st.sets(st.integers(0, 60)))
 def test_spans_name_every_number_once(numbers):
     text = spans(numbers, limit=1000)
-    named = []
+    named: list[int] = []
     for part in filter(None, text.split(", ")):
         first, _, last = part.partition("-")
         named += range(int(first), int(last or first) + 1)
@@ -60,7 +61,7 @@ def test_near_duplicates_survive_noise_and_not_motion(good, noise, shift, twins)
     original = make_thumbnails({"one": entries}, (1, 1, 1), 100)
     rng = np.random.default_rng(0)
     for entry in entries:
-        image = cv2.imread(str(entry.image))[..., ::-1].astype(int)
+        image = read_rgb(entry.image).astype(int)
         image = (
             np.roll(image, shift, axis=1)
             + rng.integers(-1, 2, size=(20, 15, 1)).repeat(4, 0).repeat(4, 1) * noise

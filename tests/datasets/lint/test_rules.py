@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import shutil
 from dataclasses import replace
+from functools import partial
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -21,7 +21,16 @@ from headbench.datasets.lint.settings import LintSettings
 
 from ..head.toy import toy_head
 from .faults import FAULTS
-from .good_capture import HEIGHT, WIDTH, GoodCapture, cameras, good_plan, write_good_capture
+from .good_capture import (
+    HEIGHT,
+    WIDTH,
+    GoodCapture,
+    cameras,
+    good_plan,
+    read_grey,
+    read_rgb,
+    write_good_capture,
+)
 
 PLANTED_APART = {"HB115", "HB510", "HB511", "HB615"}
 
@@ -90,8 +99,8 @@ def test_a_width_beyond_the_limit_of_gaussian_avatars(pristine):
 def test_alpha_in_the_image_is_a_mask_and_has_no_background(good):
     """RGBA over nothing: colours under transparent pixels are nobody's business."""
     for path in good.files("images"):
-        mask = cv2.imread(str(path.parent.parent / "fg_masks" / path.name), 0)
-        image = cv2.imread(str(path))[..., ::-1].astype(float)
+        mask = read_grey(path.parent.parent / "fg_masks" / path.name)
+        image = read_rgb(path).astype(float)
         alpha = mask[..., None] / 255
         colour = np.where(alpha > 0, (image - (1 - alpha) * 255) / np.maximum(alpha, 1e-3), 0)
         write_png(path, np.dstack([np.clip(colour, 0, 255).round(), mask]).astype(np.uint8))
@@ -136,5 +145,5 @@ def test_parameters_of_other_timesteps(detailed, tmp_path):
     expressions = [np.load(path)["expr"] for path in files]
     for index, path in enumerate(files):
         late = expressions[(index + 7) % len(files)]
-        shifted.parameters(path, lambda arrays, late=late: arrays.update(expr=late))
+        shifted.parameters(path, partial(dict.update, expr=late))
     assert "HB615" in codes(shifted)
