@@ -6,6 +6,7 @@ triangle and barycentric weights), so that a pixel means one place of the skin, 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +24,7 @@ PITCH = 0.0015
 _SIDE, _ABOVE, _BELOW = 0.75, 0.30, 1.0  # of the mouth's width, from its middle
 _REACH = 2.4  # widths of the mouth; what lies farther away cannot hide it from a camera in front
 _FRONT = 0.25  # z of the neutral normal from which on a surface counts as facing front
+_INNER = ("mouth_socket", "teeth", "gums_and_tongue")  # regions that are behind the lips, seen from outside
 _FAR = 50.0  # metres; from there perspective is below a tenth of a millimetre
 
 
@@ -113,6 +115,7 @@ def mouth_atlas(clip: Clip) -> MouthAtlas:
     rows = np.arange(camera.height)[:, None] + 0.5
     height = (row_line[None] - rows) * PITCH * 1e3
     close = np.linalg.norm(neutral[head.faces].mean(axis=1) - centre, axis=1) < _REACH * width
+    close &= ~_in_regions(head, _INNER)[head.faces].all(axis=1)
     return MouthAtlas(
         inside, corners, weights, lip_map, inside & (height < 0), height, head.faces[np.flatnonzero(close)]
     )
@@ -138,13 +141,17 @@ def _map_camera(centre: FloatArray, mouth: float) -> Camera:
 
 def _outer_faces(head: HeadAsset, neutral: FloatArray) -> IntArray:
     """Triangles of the face's outside that face front, without the mouth's wall."""
-    skin = np.zeros(len(neutral), dtype=bool)
-    for name in ("face", "lips"):
-        skin[head.regions[name]] = True
-    for name in ("mouth_socket", "teeth", "gums_and_tongue"):
-        skin[head.regions.get(name, np.array([], dtype=int))] = False
+    skin = _in_regions(head, ("face", "lips")) & ~_in_regions(head, _INNER)
     skin &= vertex_normals(neutral, head.faces)[:, 2] > _FRONT
     return np.flatnonzero(skin[head.faces].all(axis=1))
+
+
+def _in_regions(head: HeadAsset, names: Iterable[str]) -> np.ndarray:
+    """(V,) vertices that are in one of the regions; a region that the head does not have is empty."""
+    inside = np.zeros(len(head.template), dtype=bool)
+    for name in names:
+        inside[head.regions.get(name, np.array([], dtype=int))] = True
+    return inside
 
 
 def _lip_line(lips: np.ndarray, lower: np.ndarray, camera: Camera) -> FloatArray:

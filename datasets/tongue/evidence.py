@@ -24,7 +24,7 @@ from .sampling import MouthColours
 FORGIVEN = 0.003
 """Metres within which the canonical map is searched for a pixel's colour: three times a tracker's usual error."""
 
-LOOKS = 4.0
+LOOKS = 3.0
 """Standard deviations from which on a pixel counts as covered."""
 
 CONNECTED = 8.0
@@ -73,7 +73,8 @@ def find_evidence(colours: MouthColours, atlas: MouthAtlas) -> Evidence:
         strength, known = _camera_strength(colours.colours[:, camera], colours.seen[:, camera], atlas)
         total += strength
         looks += known
-    strength = total / np.sqrt(np.maximum(looks, 1))
+    # The mean, of values that are bounded: what one camera alone sees before the skin is not upon it.
+    strength = total / np.maximum(looks, 1)
     patches = np.stack([mouth_patch(part, atlas) for part in strength])
     areas = patches.sum(axis=(1, 2)) * (PITCH * 1e3) ** 2
     lip = atlas.lips & atlas.below
