@@ -66,6 +66,16 @@ def test_without_the_still_a_fringe_stays():
     assert image[0, 0, 0] - clean[0, 0, 0] == pytest.approx(200 * 0.5 * 0.5, abs=1.5)
 
 
+def test_nothing_outside_the_matte_is_averaged_in():
+    frame = np.full((2, 2, 3), 255, np.uint8)
+    frame[0, 0] = 0
+    matte = np.zeros((2, 2), np.uint8)
+    matte[0, 0] = 255
+    for still in (None, np.zeros((2, 2, 3), np.uint8)):
+        image, _ = prepare_pixels(frame, matte, (1, 1), None, still)
+        np.testing.assert_allclose(image, 191, atol=1)
+
+
 def test_colours_are_corrected_before_the_composite():
     # Doubles the red of the foreground and lifts green; white stays white.
     correction = AffineCorrection(np.array([[2.0, 0, 0, 0], [0, 1, 0, 0.2], [0, 0, 1, 0]]))

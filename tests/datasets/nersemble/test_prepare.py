@@ -201,6 +201,7 @@ def test_broken_and_missing_images_are_made_again(whole, pristine_recording, tmp
     value = json.loads(record.read_text())
     record.write_text(json.dumps(value | {"images_complete": False}))
     (folder / "images" / "00003_02.png").write_bytes(b"")
+    cv2.imwrite(str(folder / "images" / "00004_00.png"), np.zeros((4, 4, 3), np.uint8))
     prepared(pristine_recording, out)
     assert contents(out) == contents(whole[0])
 
@@ -282,6 +283,43 @@ def test_new_tracking_replaces_the_old_and_keeps_the_images(recording, whole, tm
     shift = moved.poses[first].translation - still.poses[first].translation
     np.testing.assert_allclose(shift, [0, 0.5, 0], atol=1e-6)
     np.testing.assert_array_equal(moved.poses[0].translation, still.poses[0].translation)
+
+
+def test_new_tracking_that_breaks_off_leaves_no_capture_of_old_and_new(recording, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    union = prepared(recording, out)[0]["union"]
+    file = next(recording.tracking.rglob("*FREE*/**/*.npz"))
+    arrays = dict(np.load(file, allow_pickle=False))
+    np.savez(file, **(arrays | {"expr": arrays["expr"] + np.float32(1)}))
+
+    def full(path, values):
+        if path.name == "00003.npz":
+            raise OSError(errno.ENOSPC, "No space left on device")
+        original(path, values)
+
+    original = export.save_npz
+    with monkeypatch.context() as patch:
+        patch.setattr(export, "save_npz", full)
+        with pytest.raises(InputError, match="No space left"):
+            prepared(recording, out)
+    for folder in (union, next(out.glob(f"{SUBJECT}_FREE_*"))):
+        with pytest.raises(InputError):
+            read_capture(folder)
+    prepared(recording, out)
+    first = SEQUENCES["EMO-1-shout+laugh"]
+    np.testing.assert_array_equal(
+        read_capture(union).poses[first].expression, arrays["expr"][0] + np.float32(1)
+    )
+
+
+def test_images_are_never_enlarged(recording, tmp_path):
+    path = recording.writer.calibration_file
+    value = json.loads(path.read_text())
+    path.write_text(json.dumps(value | {"height": 2 * HEIGHT, "width": 2 * WIDTH}))
+    with pytest.raises(InputError) as error:
+        prepared(recording, tmp_path / "out", downscale=1)
+    assert error.value.key == "downscale"
+    assert prepared(recording, tmp_path / "out", downscale=2)[0]["written"] == IMAGES
 
 
 def test_the_wrong_head_model_is_refused_before_any_work(recording, tmp_path):
