@@ -27,14 +27,15 @@ from ..tiny_capture import make_plan, write_tiny_capture
 def finished(tmp_path_factory):
     """A capture, its head under another name as target, and what the command made of them."""
     root = tmp_path_factory.mktemp("refit")
-    tiny = write_tiny_capture(root / "capture", make_plan())
+    offset = np.zeros_like(make_plan().static_offset)
+    tiny = write_tiny_capture(root / "capture", make_plan(static_offset=offset))
     save_head(root / "other.npz", replace(tiny.writer.plan.head, version="other"))
     settings = RefitCommandSettings(str(tiny.union), str(root / "other.npz"), str(root / "out"))
     return root, settings, run(settings)
 
 
 def test_the_new_capture_holds_the_same_frames_with_other_tracking(finished):
-    root, settings, findings = finished
+    _, settings, findings = finished
     old, new = read_capture(settings.capture), read_capture(findings.data["capture"])
     assert new.head.version == "other"
     assert {name: set(keys) for name, keys in new.splits.items()} == {
@@ -47,7 +48,7 @@ def test_the_new_capture_holds_the_same_frames_with_other_tracking(finished):
     for name, camera in old.cameras.items():
         np.testing.assert_allclose(new.cameras[name].K, camera.K, atol=1e-6)
     for timestep, pose in old.poses.items():
-        np.testing.assert_allclose(new.poses[timestep].jaw, pose.jaw, atol=0.02)
+        np.testing.assert_allclose(new.poses[timestep].jaw, pose.jaw, atol=0.01)
 
 
 def test_report_and_picture(finished):
@@ -55,7 +56,7 @@ def test_report_and_picture(finished):
     stored = json.loads((root / "out" / "refit.json").read_text())
     assert stored["timesteps"] == len(stored["frames"]) == 7
     assert stored["mean_mm"] == pytest.approx(np.mean([frame["mean_mm"] for frame in stored["frames"]]))
-    assert stored["mean_mm"] < 0.6  # a static offset of 1 mm noise that the identity cannot express
+    assert stored["mean_mm"] < 0.15
     assert f"mean {stored['mean_mm']:.3f}" in findings.text
     assert sum(value is None for value in stored["vertices_mm"]) > 0
     picture = cv2.imread(str(root / "out" / "heat_map.png"))
