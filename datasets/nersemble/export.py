@@ -32,7 +32,6 @@ class SequenceExport:
     Attributes
     ----------
     folder : of the sequence; its images are there.
-    subject, name : of the sequence.
     cameras : in index order, in the aligned world.
     numbers : frame number in the source by timestep.
     masks : whether every image has a mask.
@@ -40,8 +39,6 @@ class SequenceExport:
     """
 
     folder: Path
-    subject: str
-    name: str
     cameras: Sequence[Camera]
     numbers: Sequence[int]
     masks: bool

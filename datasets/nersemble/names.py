@@ -57,8 +57,8 @@ def numbered(stem: str) -> tuple[str, int] | None:
 def match_sequence(file: str | PathLike[str], wanted: str, available: Iterable[str]) -> str:
     """The available sequence of that name, or the only one whose name starts so.
 
-    Raises `InputError` where none or several fit. ``EXP-1`` and the like mean what stands before the next
-    hyphen, so ``SEN-1`` does not fit ``SEN-10-port_strong_smokey``'s neighbours by accident.
+    A prefix that ends where a name has a hyphen goes before others: ``SEN-1`` would be ``SEN-1-...`` and not
+    ``SEN-10-...``. Raises `InputError` where none or several fit.
     """
     names = sorted(set(available))
     if wanted in names:

@@ -58,14 +58,11 @@ class SequenceJob:
     @property
     def export(self) -> SequenceExport:
         """The metadata to write."""
-        recorded = self.recorded
         return SequenceExport(
             folder=self.folder,
-            subject=recorded.subject,
-            name=recorded.name,
             cameras=self.cameras,
-            numbers=recorded.numbers,
-            masks=recorded.has_mattes,
+            numbers=self.recorded.numbers,
+            masks=self.recorded.has_mattes,
             held_out=(NOVEL_VIEW_CAMERA,),
         )
 

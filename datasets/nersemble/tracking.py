@@ -13,13 +13,11 @@ from ...bench.contracts import FloatArray
 from ...bench.errors import InputError
 from ..flame_parameters import resolve_teeth
 from ..ga_layout import parse_sequence_folder
+from ..ga_writer import CANONICAL_JAW
 from ..head.arrays import HeadArrays, read_npz
 
 PER_TIMESTEP = {"translation": 3, "rotation": 3, "neck_pose": 3, "jaw_pose": 3, "eyes_pose": 6}
 """Arrays of shape (T, n) that every tracking has, in the order of an export; ``expr`` is (T, E)."""
-
-CANONICAL_JAW = (0.3, 0.0, 0.0)
-"""Axis-angle of the open mouth in an export's canonical parameters, radians."""
 
 _RESULT = re.compile(r"tracked_flame_params_(\d+)\.npz")
 
