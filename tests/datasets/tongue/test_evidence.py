@@ -55,9 +55,9 @@ def test_darkness_teeth_and_the_subjects_own_skin_are_no_tongue(colour):
     assert found[-1] < NEVER
 
 
-def test_area_follows_what_is_covered():
+def test_area_is_that_of_what_covers_the_closed_mouth():
     sizes = np.array([0.009, 0.012, 0.015])
-    moments = [Moment({"jaw_open": 0.2}, blob=TONGUE, drop=r + 0.001, radius=r) for r in sizes]
+    moments = [Moment(blob=TONGUE, drop=radius + 0.001, radius=radius) for radius in sizes]
     found, _ = areas(moments, yaws=(0.0,))
-    # All three overhang the opened mouth by about the same; what they hide more is what they are larger by.
-    np.testing.assert_allclose(np.diff(found[-3:]), np.diff(np.pi * sizes**2) * 1e6, rtol=0.3)
+    # A rim of about half a pixel of the map is added by its smoothing.
+    np.testing.assert_allclose(found[-3:], np.pi * sizes**2 * 1e6, rtol=0.25)
