@@ -60,6 +60,7 @@ def test_report_and_picture(finished):
     assert f"mean {stored['mean_mm']:.3f}" in findings.text
     assert sum(value is None for value in stored["vertices_mm"]) > 0
     picture = cv2.imread(str(root / "out" / "heat_map.png"))
+    assert picture is not None
     assert picture.shape == (484, 880, 3)
     middle = picture[66:426, 320:560].reshape(-1, 3).astype(int)
     coloured = np.ptp(middle, axis=1) > 60

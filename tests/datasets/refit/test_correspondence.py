@@ -50,6 +50,6 @@ def test_the_matrix_takes_vertices_to_the_closest_points():
     faces = np.array([[0, 1, 2]])
     found = closest_points(np.array([[0.2, 0.3, 1.0], [2.0, -1.0, 0.0]]), vertices, faces)
     matrix = found.matrix(faces, 4, np.array([0, 2]), 4)
-    expected = [[0.2, 0.3, 0], [0, 0, 0], [1, 0, 0], [0, 0, 0]]
+    expected = np.array([[0.2, 0.3, 0], [0, 0, 0], [1, 0, 0], [0, 0, 0]])
     np.testing.assert_allclose(matrix @ vertices, expected, atol=1e-15)
     np.testing.assert_allclose(found.distance, [1.0, np.sqrt(2)])

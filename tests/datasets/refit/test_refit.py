@@ -204,9 +204,14 @@ def test_a_second_call_continues_at_the_first_block_that_is_missing(tmp_path, mo
     whole = refit_clip(clip, TARGET, folder=tmp_path)
     assert len(list(tmp_path.iterdir())) == 3
     (tmp_path / "refit-00001.npz").unlink()
-    solved = []
+    solved: list[object] = []
     solve = block.solve_frame
-    monkeypatch.setattr(block, "solve_frame", lambda *a: solved.append(1) or solve(*a))
+
+    def counted(problem, frame, *rest):
+        solved.append(frame)
+        return solve(problem, frame, *rest)
+
+    monkeypatch.setattr(block, "solve_frame", counted)
     again = refit_clip(clip, TARGET, folder=tmp_path)
     assert len(solved) == BLOCK
     for t, pose in whole.poses.items():
