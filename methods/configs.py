@@ -149,6 +149,8 @@ class OursConfig:
     balanced_sampling, expression_classes : draw images so that each class of expressions has an equal share.
     expression_compatibility : "" parts the classes the same way every time and needs no comparison of all pairs of
         timesteps; "tga" parts them as the published code does. Both see training timesteps alone.
+    storage : "exact" keeps the avatar as float32; "compact" writes a quantised file beside it (`compact.file`), which
+        is what is then loaded, rendered, measured and counted.
     """
 
     splats: SplatTraining = field(default_factory=SplatTraining)
@@ -182,6 +184,7 @@ class OursConfig:
     balanced_sampling: bool = True
     expression_classes: int = 16
     expression_compatibility: Literal["", "tga"] = ""
+    storage: Literal["exact", "compact"] = "exact"
 
     def __post_init__(self) -> None:
         if self.plane_resolution < 2 or self.line_resolution < 2:

@@ -63,15 +63,20 @@ def line_offsets(parameters: Parameters, blended: Tensor, position: LinePosition
 
     The features are [e_x e_y e_z j_x j_y j_z]; none of the inputs but the lines and the network has a gradient.
     """
-    kinds, axes, resolution, channels = blended.shape
-    first = normalised_weight(parameters, 0).view(-1, kinds, axes, channels)
-    table = torch.einsum("kalc,hkac->alh", blended, first).reshape(axes * resolution, -1)
+    table = line_table(blended, normalised_weight(parameters, 0))
     return offset_network(
         sum_rows(table, *position),
         *(parameters["line_bias_0"],),
         *(normalised_weight(parameters, 1), parameters["line_bias_1"]),
         *(normalised_weight(parameters, 2), parameters["line_bias_2"]),
     )
+
+
+def line_table(blended: Tensor, first: Tensor) -> Tensor:
+    """(3 L, H): what each sample of the (2, 3, L, C) blended lines adds to the first layer of (H, 6 C) weights."""
+    kinds, axes, resolution, channels = blended.shape
+    weights = first.view(-1, kinds, axes, channels)
+    return torch.einsum("kalc,hkac->alh", blended, weights).reshape(axes * resolution, -1)
 
 
 def normalised_weight(parameters: Parameters, layer: int) -> Tensor:

@@ -25,6 +25,9 @@ from .avatar_files import (
 )
 from .bound_training import BoundTraining, run_bound_training
 from .clip_checks import check_training_split
+from .compact.file import COMPACT_FILE, write_compact
+from .compact.precision import Precision
+from .compact.simplify import simplify, training_poses
 from .configs import OursConfig
 from .ours_appearance import OursAppearance
 from .ours_avatar import OursAvatar
@@ -75,6 +78,8 @@ class Ours:
         self._write(out, training, appearance)
         write_subject(out / SUBJECT_FILE, subject)
         save_shared_head(out, clip.head)
+        if config.storage == "compact":
+            self._write_compact(out, clip, device)
         write_record(
             out,
             run,
@@ -102,6 +107,11 @@ class Ours:
         )
         timesteps = np.array([key.timestep for key in keys])
         return Weighted(balanced_weights(timesteps, clusters.by_timestep), seed)
+
+    def _write_compact(self, out: Path, clip: Clip, device: str) -> None:
+        exact, precision = OursAvatar.read(out, device, exact=True), Precision()
+        field = simplify(exact, training_poses(clip), precision)
+        write_compact(out / COMPACT_FILE, field, exact.subject, clip.head, precision)
 
     def _write(self, out: Path, training: BoundTraining, appearance: OursAppearance) -> None:
         optimiser = training.optimiser

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,21 +10,16 @@ import torch
 from torch import Tensor
 
 from ..bench.contracts import Camera, Frame, HeadPose
-from .avatar_files import SUBJECT_FILE, read_shared_head, read_subject
+from .avatar_files import SUBJECT_FILE, Subject, read_shared_head, read_subject
 from .binding import WorldSplats, to_world
 from .bound_avatar import PosedSplats, posed_splats, render_splats
 from .bound_training import view_of
+from .compact.file import COMPACT_FILE, read_compact
 from .dynamics import LocalSplats, apply_offsets, changed_colors
-from .feature_lines import blend_lines, line_offsets, line_position
+from .known_poses import KnownPoses
 from .ours_appearance import driving_coefficients
-from .ours_field import (
-    Box,
-    CanonicalFrames,
-    canonical_directions,
-    plane_features,
-    position_part,
-    shade_directions,
-)
+from .ours_field import Box, CanonicalFrames, canonical_directions, plane_features, position_part
+from .ours_inference import LineOffsets, PlaneColors, Posed
 from .ours_storage import FIELD_FILE, SPLAT_WIDTHS, Field, read_field
 from .sh import sh_degree, sh_to_rgb
 from .subject_mesh import SubjectMesh
@@ -34,12 +29,20 @@ class OursAvatar:
     """A trained head: splats without colour, planes, lines and two small networks.
 
     What depends on canonical position alone (plane features, places on the lines) is computed once when loaded.
+    A folder holds the exact file, the compact one or both, in which case the compact one is read unless the other is
+    asked for.
+
+    Attributes
+    ----------
+    subject, field : whom it shows, and what its file holds.
     """
 
-    def __init__(self, folder: Path, mesh: SubjectMesh, field: Field, device: str):
+    def __init__(
+        self, stored: Sequence[Path], mesh: SubjectMesh, subject: Subject, field: Field, device: str
+    ):
         tensors = field.tensors
-        self._folder, self._mesh, self._tensors, self._device = folder, mesh, tensors, device
-        self._dynamic = field.dynamic
+        self.subject, self.field = subject, field
+        self._stored, self._mesh, self._device = stored, mesh, device
         table = tensors["splats"].split(list(SPLAT_WIDTHS.values()), dim=1)
         columns = {name: column.contiguous() for name, column in zip(SPLAT_WIDTHS, table)}
         self._neutral = LocalSplats(
@@ -48,24 +51,42 @@ class OursAvatar:
         self._binding = columns["binding"][:, 0].to(torch.int64)
         self._canonical = CanonicalFrames.of(mesh.frames(mesh.canonical))
         positions = self._canonical.positions(self._binding, self._neutral.means)
+        self._plane_colors, self._line_offsets = None, None
         if "sh_dc" not in tensors:
             features = plane_features(tensors, Box(*tensors["plane_box"]), positions)
-            self._from_position = position_part(tensors, features)
-        self._jaw_bases = tensors["jaw_bases"].cpu().numpy().astype(np.float64)
+            weights = tensors["color_weight_0"], tensors["color_weight_1"]
+            self._plane_colors = PlaneColors(*weights, position_part(tensors, features))
         if "lines" in tensors:
-            box = Box(*tensors["line_box"])
-            self._inside = box.contains(positions).nonzero().squeeze(1)
-            unit = box.unit(positions.index_select(0, self._inside))
-            self._line_position = line_position(unit, tensors["lines"].shape[2])
+            self._line_offsets = LineOffsets(tensors, positions)
+        self._jaw_bases = tensors["jaw_bases"].cpu().numpy().astype(np.float64)
+        self._known = KnownPoses(self._posed, 0)
 
     @classmethod
-    def read(cls, folder: Path, device: str) -> OursAvatar:
-        """Read an avatar from its folder. Raises `InputError` for damaged or foreign files."""
+    def read(cls, folder: Path, device: str, *, exact: bool = False) -> OursAvatar:
+        """Read an avatar from its folder; ``exact`` reads the exact file where there is a compact one as well.
+
+        Raises `InputError` for damaged or foreign files.
+        """
         head = read_shared_head(folder)
+        compact = folder / COMPACT_FILE
+        if compact.exists() and not exact:
+            faces, expressions = len(head.faces), head.expression_basis.shape[2]
+            subject, field = read_compact(compact, head, faces, expressions, device)
+            mesh = SubjectMesh(head, subject.shape, subject.static_offset, device)
+            return cls([compact], mesh, subject, field, device)
         subject = read_subject(folder / SUBJECT_FILE, head)
         mesh = SubjectMesh(head, subject.shape, subject.static_offset, device)
         field = read_field(folder / FIELD_FILE, len(mesh.faces), mesh.model.expression_size, device)
-        return cls(folder, mesh, field, device)
+        return cls([folder / FIELD_FILE, folder / SUBJECT_FILE], mesh, subject, field, device)
+
+    def prepare(self, poses: Iterable[HeadPose], megabytes: float = 512.0) -> int:
+        """Compute meshes, triangle frames and jaw weights of known poses beforehand, within a bound of memory.
+
+        Frames of these poses are then drawn faster, and equal bit for bit. Nothing is prepared unless asked for, so a
+        measured frame time includes them. Returns how many poses fitted; what was prepared before is forgotten.
+        """
+        self._known = KnownPoses(self._posed, int(megabytes * 2**20))
+        return self._known.prepare(poses)
 
     @torch.no_grad()
     def render(self, camera: Camera, pose: HeadPose, background: Sequence[float] = (1.0, 1.0, 1.0)) -> Frame:
@@ -81,34 +102,47 @@ class OursAvatar:
         splats, world, turns = self._world(pose)
         colors = None
         if camera is not None:
-            colors = self._colors(splats, world, turns, view_of(camera, self._device).center)
+            # A copy: the avatar keeps its own for the next frame.
+            colors = self._colors(splats, world, turns, view_of(camera, self._device).center).clone()
         return posed_splats(world, torch.sigmoid(splats.logits), colors)
 
+    @torch.no_grad()
+    def static_logits(self) -> Tensor:
+        """(N,) logits of the opacities when all driving coefficients are 0."""
+        if self._line_offsets is None:
+            return self._neutral.logits
+        still = self._neutral.logits.new_zeros
+        expressions = len(self.field.tensors["lines"]) - len(self._jaw_bases)
+        offsets = self._line_offsets(still(expressions), still(len(self._jaw_bases)))
+        return apply_offsets(self._neutral, offsets, self.field.dynamic).logits
+
     def files(self) -> Sequence[Path]:
-        """The field with its splats, and the subject."""
-        return [self._folder / FIELD_FILE, self._folder / SUBJECT_FILE]
+        """The file read, and the subject's where that file does not hold it."""
+        return self._stored
+
+    def _posed(self, pose: HeadPose) -> Posed:
+        frames = self._mesh.frames(self._mesh.posed(self._mesh.arguments([pose])))
+        expressions = 0
+        if self._line_offsets is not None:
+            expressions = len(self.field.tensors["lines"]) - len(self._jaw_bases)
+        coefficients = driving_coefficients(pose, expressions, self._jaw_bases, self._device)
+        return Posed(frames, self._canonical.turns(frames), *coefficients)
 
     def _world(self, pose: HeadPose) -> tuple[LocalSplats, WorldSplats, Tensor]:
-        frames = self._mesh.frames(self._mesh.posed(self._mesh.arguments([pose])))
-        splats = self._changed(pose)
-        world = to_world(frames, self._binding, splats.means, splats.log_scales, splats.quats)
-        return splats, world, self._canonical.turns(frames)
+        posed = self._known(pose)
+        splats = self._neutral
+        if self._line_offsets is not None:
+            splats = apply_offsets(
+                splats, self._line_offsets(posed.expression, posed.jaw), self.field.dynamic
+            )
+        world = to_world(posed.frames, self._binding, splats.means, splats.log_scales, splats.quats)
+        return splats, world, posed.turns
 
     def _colors(self, splats: LocalSplats, world: WorldSplats, turns: Tensor, center: Tensor) -> Tensor:
         directions = canonical_directions(turns, self._binding, world.means, center)
-        if "sh_dc" in self._tensors:
-            dc, rest = self._tensors["sh_dc"], self._tensors["sh_rest"]
-            colors = sh_to_rgb(dc, rest, -directions, sh_degree(rest))
+        if self._plane_colors is not None:
+            colors = self._plane_colors(directions)
         else:
-            colors = shade_directions(self._tensors, self._from_position, directions)
+            dc, rest = self.field.tensors["sh_dc"], self.field.tensors["sh_rest"]
+            colors = sh_to_rgb(dc, rest, -directions, sh_degree(rest))
         return changed_colors(colors, splats)
-
-    def _changed(self, pose: HeadPose) -> LocalSplats:
-        if "lines" not in self._tensors:
-            return self._neutral
-        lines = self._tensors["lines"]
-        expressions = len(lines) - len(self._jaw_bases)
-        blended = blend_lines(lines, *driving_coefficients(pose, expressions, self._jaw_bases, self._device))
-        inside = line_offsets(self._tensors, blended, self._line_position)
-        offsets = inside.new_zeros(len(self._binding), inside.shape[1]).index_copy(0, self._inside, inside)
-        return apply_offsets(self._neutral, offsets, self._dynamic)

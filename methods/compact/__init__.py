@@ -1,0 +1,1 @@
+"""Avatars of "ours" in a tenth of the bytes."""

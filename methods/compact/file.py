@@ -1,0 +1,127 @@
+"""A compact avatar: subject and field in one small file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ...bench.contracts import HeadAsset
+from ...bench.errors import InputError
+from ..avatar_files import Subject
+from ..ours_field import CanonicalFrames
+from ..ours_storage import SPLAT_WIDTHS, Field, checked_field
+from ..subject_mesh import SubjectMesh
+from .coded import Arrays, coded
+from .container import Content, packed_sizes, read_content, write_content
+from .fields import MATRICES, PLANES, decode_field, encode_field
+from .precision import Precision
+from .splats import HARMONICS, decode_splats, encode_splats
+
+COMPACT_FILE = "compact.safetensors"
+
+PARTS: Mapping[str, tuple[str, ...]] = {
+    "positions": ("positions",),
+    "scales": ("log_scales",),
+    "rotations": ("rotations",),
+    "opacities": ("logits",),
+    "triangles": ("triangles",),
+    "harmonics": HARMONICS,
+    "planes": PLANES,
+    "lines": ("lines",),
+    "networks": (*MATRICES, "line_gain", "line_bias"),
+    "subject": ("shape", "static_offset"),
+}
+"""Parts of an avatar by the beginnings of their arrays' names; what is in none of them is "other"."""
+
+
+def encode(field: Field, subject: Subject, head: HeadAsset, precision: Precision) -> Content:
+    """Content of the compact file of an avatar whose splats are sorted by triangle (`simplify`)."""
+    tensors = {name: value.cpu() for name, value in field.tensors.items()}
+    splats, steps = encode_splats(tensors, precision, "rotation" in field.dynamic)
+    person = {
+        "shape": subject.shape.astype(np.float32),
+        "static_offset": coded(subject.static_offset.T, precision.subject),
+    }
+    steps["subject"] = precision.subject
+    text = {
+        "name": subject.name,
+        "head_model": subject.head_model,
+        "dynamic": ",".join(field.dynamic),
+    }
+    # Where the reader will put the splats decides which samples of the planes they need.
+    read = Arrays(Path(), Content({**splats, **person}, text, steps))
+    table = decode_splats(read)["splats"]
+    mesh = _mesh(_subject(read, head), head)
+    frames = CanonicalFrames.of(mesh.frames(mesh.canonical))
+    positions = frames.positions(table[:, -1].to(torch.int64), table[:, : SPLAT_WIDTHS["means"]])
+    shared = encode_field(tensors, positions, precision)
+    coded_names = {"splats", *HARMONICS, *PLANES, "lines", *MATRICES}
+    other = {name: value.numpy() for name, value in tensors.items() if name not in coded_names}
+    return Content({**splats, **shared, **person, **other}, text, steps)
+
+
+def decode(
+    path: Path, content: Content, head: HeadAsset, face_count: int, expression_size: int, device: str
+) -> tuple[Subject, Field]:
+    """Subject and field of such a content. Raises `InputError`, which names ``path``, where it does not fit."""
+    arrays = Arrays(path, content)
+    subject = _subject(arrays, head)
+    tensors = {**decode_splats(arrays), **decode_field(arrays)}
+    for name, values in arrays.rest().items():
+        tensors[name] = torch.from_numpy(np.array(values))
+    names = content.text.get("dynamic", "")
+    field = checked_field(path, tensors, names, face_count, expression_size)
+    return subject, field._replace(tensors={name: value.to(device) for name, value in tensors.items()})
+
+
+def write_compact(path: Path, field: Field, subject: Subject, head: HeadAsset, precision: Precision) -> None:
+    """Write a compact file whole or not at all."""
+    write_content(path, encode(field, subject, head, precision))
+
+
+def read_compact(
+    path: Path, head: HeadAsset, face_count: int, expression_size: int, device: str
+) -> tuple[Subject, Field]:
+    """Read what `write_compact` wrote. Raises `InputError` for anything else, before it takes more memory."""
+    return decode(path, read_content(path), head, face_count, expression_size, device)
+
+
+def part_sizes(content: Content) -> dict[str, int]:
+    """Bytes by part, as packed; the file has a header of a few kB besides."""
+    return _by_part(packed_sizes(content.arrays))
+
+
+def exact_sizes(field: Field, subject: Subject) -> dict[str, int]:
+    """Bytes by part of the exact files, without their headers."""
+    sizes = {name: value.nbytes for name, value in field.tensors.items() if name != "splats"}
+    widths = {"opacities": "logits", "means": "positions", "quats": "rotations", "binding": "triangles"}
+    count = len(field.tensors["splats"])
+    sizes |= {widths.get(name, name): 4 * width * count for name, width in SPLAT_WIDTHS.items()}
+    return _by_part({**sizes, "shape": subject.shape.nbytes, "static_offset": subject.static_offset.nbytes})
+
+
+def _by_part(sizes: Mapping[str, int]) -> dict[str, int]:
+    result = dict.fromkeys([*PARTS, "other"], 0)
+    for name, size in sizes.items():
+        part = next((part for part, starts in PARTS.items() if name.startswith(starts)), "other")
+        result[part] += size
+    return {part: size for part, size in result.items() if size}
+
+
+def _subject(arrays: Arrays, head: HeadAsset) -> Subject:
+    for key in ("name", "head_model"):
+        if key not in arrays.text:
+            raise InputError(arrays.path, f"text, {key}", "a string", "none")
+    name, version = arrays.text["name"], arrays.text["head_model"]
+    if version != head.version:
+        raise InputError(arrays.path, "head_model", repr(head.version), repr(version)[:80])
+    shape = arrays.floats("shape", head.shape_basis.shape[2])
+    offset = arrays.decoded("static_offset", arrays.step("subject"), 3, len(head.template))
+    return Subject(name, version, shape, np.ascontiguousarray(offset.T))
+
+
+def _mesh(subject: Subject, head: HeadAsset) -> SubjectMesh:
+    return SubjectMesh(head, subject.shape, subject.static_offset, "cpu")

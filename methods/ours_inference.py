@@ -1,0 +1,126 @@
+"""What a stored avatar of "ours" computes per frame, prepared as far as it does not depend on the frame.
+
+Each of these is the fast twin of what `ours_appearance` trains with; `tests/methods/test_ours_formula.py` compares
+both with the definition in float64.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from .binding import Frames
+from .feature_lines import LinePosition, blend_lines, line_position, line_table, normalised_weight
+from .networks import offset_network
+from .ours_field import Box
+from .row_sums import sum_rows
+from .sh import C0
+from .triplane import ENCODING_SIZE, FREQUENCIES
+
+
+class Posed(NamedTuple):
+    """What a pose decides before any splat is looked at."""
+
+    frames: Frames
+    turns: Tensor
+    """(F, 3, 3) world directions to canonical ones."""
+    expression: Tensor
+    """(E,) coefficients of the lines."""
+    jaw: Tensor
+    """(J,) weights of the jaw's lines."""
+
+    @property
+    def bytes(self) -> int:
+        """Memory it takes."""
+        return sum(value.nbytes for value in (*self.frames, self.turns, self.expression, self.jaw))
+
+
+class LineOffsets:
+    """Offsets of the splats inside the lines' box; the others have none.
+
+    Parameters
+    ----------
+    tensors : of a field with lines.
+    positions : (N, 3) canonical positions.
+    """
+
+    def __init__(self, tensors: Mapping[str, Tensor], positions: Tensor):
+        self._lines, self._count = tensors["lines"], len(positions)
+        box = Box(*tensors["line_box"])
+        self.inside = box.contains(positions).nonzero().squeeze(1)
+        unit = box.unit(positions.index_select(0, self.inside))
+        self._position: LinePosition = line_position(unit, self._lines.shape[2])
+        self._first = normalised_weight(tensors, 0)
+        self._rest = (
+            tensors["line_bias_0"],
+            *(normalised_weight(tensors, 1), tensors["line_bias_1"]),
+            *(normalised_weight(tensors, 2), tensors["line_bias_2"]),
+        )
+
+    def __call__(self, expression: Tensor, jaw: Tensor) -> Tensor:
+        """(N, D) offsets of all splats for a frame's coefficients."""
+        table = line_table(blend_lines(self._lines, expression, jaw), self._first)
+        offsets = offset_network(sum_rows(table, *self._position), *self._rest)
+        if len(self.inside) == self._count:
+            return offsets
+        return offsets.new_zeros(self._count, offsets.shape[1]).index_copy_(0, self.inside, offsets)
+
+
+class PlaneColors:
+    """Colours of the planes as directions ask for them, where the part of the position is known.
+
+    Parameters
+    ----------
+    first, last : (H, C + 27) and (3, H) weights of the colour network.
+    from_position : (N, H), what the planes add to the hidden layer: `ours_field.position_part`.
+    """
+
+    def __init__(self, first: Tensor, last: Tensor, from_position: Tensor):
+        self._from_position = from_position
+        self._of_direction = first[:, first.shape[1] - ENCODING_SIZE :].t().contiguous()
+        self._last = last.t().contiguous()
+        self._half = last.new_tensor(0.5)
+        self._known: tuple[Tensor, Tensor] | None = None
+
+    def __call__(self, directions: Tensor) -> Tensor:
+        """Colours (N, 3) >= 0 of (N, 3) canonical directions.
+
+        The colours of the last call are kept: where no more than half of the directions differ from that call's, bit
+        for bit, only theirs are computed.
+        """
+        if self._known is None:
+            colors = self._shade(self._from_position, directions)
+        else:
+            changed = (directions != self._known[0]).any(1).nonzero().squeeze(1)
+            if 2 * len(changed) > len(directions):
+                colors = self._shade(self._from_position, directions)
+            else:
+                rows = self._from_position.index_select(0, changed)
+                some = self._shade(rows, directions.index_select(0, changed))
+                colors = self._known[1].index_copy(0, changed, some)
+        self._known = directions, colors
+        return colors
+
+    def _shade(self, from_position: Tensor, directions: Tensor) -> Tensor:
+        encoded = encode_columns(directions)
+        hidden = torch.addmm(from_position, encoded.t(), self._of_direction).relu_()
+        return torch.addmm(self._half, hidden, self._last, alpha=C0).relu_()
+
+
+def encode_columns(directions: Tensor) -> Tensor:
+    """(27, N), the transpose of `triplane.encode_directions`, from one sine and one cosine per coordinate.
+
+    The frequencies double, so the other waves follow by sin 2a = 2 sin a cos a and cos 2a = 1 - 2 sin^2 a; each step
+    doubles the rounding error, to 1e-6 at frequency 8 in float32.
+    """
+    angles = directions.t().contiguous()
+    encoded = angles.new_empty(ENCODING_SIZE // 3, *angles.shape)
+    encoded[0] = angles
+    sine, cosine = torch.sin(angles), torch.cos(angles)
+    for number in range(len(FREQUENCIES)):
+        encoded[1 + 2 * number], encoded[2 + 2 * number] = sine, cosine
+        sine, cosine = 2 * sine * cosine, 1 - 2 * sine * sine
+    return encoded.flatten(0, 1)
