@@ -108,7 +108,7 @@ def test_a_stored_avatar_shows_the_definition(clip, tmp_path):
     )
     key = clip.splits["self_reenactment"][0]
     found = avatar.splats(clip.poses[key.timestep], clip.cameras[key.camera])
-    stored = {name: value.double() for name, value in avatar._tensors.items()}
+    stored = {name: value.double() for name, value in avatar.field.tensors.items()}
     some = torch.arange(0, len(found.means), 7)
     table = stored["splats"][some]
     splats = {"means": table[:, :3], "opacities": table[:, 3], "binding": table[:, 11]}
