@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 from scipy.optimize import least_squares
+from threadpoolctl import threadpool_limits
 
 from ...bench.contracts import Findings, FloatArray, FrameKey, HeadPose, Progress
 from ..clip import CaptureClip, FrameFiles
@@ -60,7 +61,7 @@ def measure(quick: bool, progress: Progress) -> Findings:
         f"{timesteps} timesteps, {torch.get_num_threads()} threads of torch; rates by processor seconds.",
         _line(("case", "mean mm", "95 % mm", "worst", "per s", "evaluations", "solver", "scipy")),
         *(_line((row["case"], *(_cell(row, *column) for column in _COLUMNS))) for row in rows),
-        "solver, scipy: timesteps a second of the search alone, here and by scipy.optimize.least_squares.",
+        "solver, scipy: timesteps a second of the search alone, here and by scipy.optimize.least_squares; one thread.",
         *faults,
     ]
     return Findings("\n".join(lines), {"timesteps": timesteps, "rows": rows}, passed=not faults)
@@ -80,7 +81,10 @@ def measure_case(source: HeadArrays, target: HeadArrays, timesteps: int, scipy_f
         "timesteps_per_second": timesteps / seconds,
         "evaluations": float(np.mean([frame.evaluations for frame in report.frames])),
     }
-    return row | _against_scipy(clip, target, settings, scipy_frames) if scipy_frames else row
+    if not scipy_frames:
+        return row
+    with threadpool_limits(1, user_api="blas"):
+        return row | _against_scipy(clip, target, settings, scipy_frames)
 
 
 def performance(head: HeadArrays, timesteps: int, *, seed: int = 0, strength: float = 1.0) -> CaptureClip:
