@@ -13,6 +13,8 @@ from torch import Tensor
 from ..datasets.head.rotations import matrix_to_quaternion, quaternion_multiply
 
 NORM_FLOOR = 1e-10
+NORMAL = 1
+"""Column of a frame's rotation that is the triangle's normal."""
 
 
 class Frames(NamedTuple):

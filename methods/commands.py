@@ -8,3 +8,17 @@ COMPACT = CommandSpec(
     implementation="headbench.methods.compact.command:run",
     settings="headbench.methods.compact.settings:CompactSettings",
 )
+
+EXPORT_PLY = CommandSpec(
+    name="export ply",
+    summary="Write an avatar in one pose as a 3D Gaussian splatting PLY that common viewers open.",
+    implementation="headbench.methods.gaussian_ply.command:run",
+    settings="headbench.methods.gaussian_ply.settings:ExportPlySettings",
+)
+
+IMPORT_GA = CommandSpec(
+    name="import ga",
+    summary="Make an avatar of a GaussianAvatars PLY and the capture it was trained on.",
+    implementation="headbench.methods.gaussian_ply.import_command:run",
+    settings="headbench.methods.gaussian_ply.settings:ImportGASettings",
+)

@@ -161,6 +161,10 @@ class GAAvatar:
         colors = None if camera is None else self._colors(world, view_of(camera, self._device))
         return posed_splats(world, self._opacities(), colors)
 
+    def harmonics(self) -> tuple[Tensor, Tensor]:
+        """(N, 3) and (N, 3, 15) spherical harmonics along world directions; the pose does not change them."""
+        return self._splats["sh_dc"], self._splats["sh_rest"]
+
     def files(self) -> Sequence[Path]:
         """The PLY and the subject."""
         return [self._folder / PLY_FILE, self._folder / SUBJECT_FILE]

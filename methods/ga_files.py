@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from ..bench.errors import InputError
-from .ply import read_ply, write_ply
+from .ply import read_names, read_ply, write_ply
+from .sh import coefficient_count
 
 PLY_FILE = "point_cloud.ply"
 
@@ -46,21 +47,38 @@ def write_ga_splats(path: Path, splats: dict[str, Tensor], binding: Tensor) -> N
 def read_ga_splats(path: Path, face_count: int, device: str) -> tuple[dict[str, Tensor], Tensor]:
     """Read what GaussianAvatars or `write_ga_splats` wrote: per-splat tensors by name, and the binding.
 
-    Raises `InputError` for another layout or a triangle the mesh does not have.
+    Harmonics of degree 0 to 2 are filled up with zeros. Raises `InputError` for another layout, a number of harmonics
+    that is of no degree, or a triangle the mesh does not have.
     """
-    table = torch.from_numpy(read_ply(path, COLUMNS))
-    binding = table[:, -1].to(torch.int64)
+    normals = ("nx", "ny", "nz")
+    rest_names = tuple(name for name in COLUMNS if name.startswith("f_rest_"))
+    needed = tuple(name for name in COLUMNS if name not in (*normals, *rest_names))
+    degree_rest = _rest_count(path)
+    table = torch.from_numpy(read_ply(path, (*needed, *rest_names[: 3 * degree_rest])))
+    binding = table[:, needed.index("binding_0")].to(torch.int64)
     if len(binding) and not (0 <= int(binding.min()) and int(binding.max()) < face_count):
         found = f"{int(binding.min())} to {int(binding.max())}"
         raise InputError(path, "binding_0", f"triangles 0 to {face_count - 1}", found)
-    widths = [3, 3, 3, 3 * REST, 1, 3, 4, 1]
-    means, _, dc, rest, opacity, log_scales, quats, _ = table.to(device).split(widths, dim=1)
+    means, dc, opacity, log_scales, quats, _, rest = table.to(device).split(
+        [3, 3, 1, 3, 4, 1, 3 * degree_rest], dim=1
+    )
+    filled = rest.new_zeros(len(rest), 3, REST)
+    filled[:, :, :degree_rest] = rest.reshape(len(rest), 3, degree_rest)
     splats = {
         "means": means,
         "log_scales": log_scales,
         "quats": quats,
         "opacities": opacity[:, 0],
         "sh_dc": dc,
-        "sh_rest": rest.reshape(-1, 3, REST),
+        "sh_rest": filled,
     }
     return {name: value.contiguous() for name, value in splats.items()}, binding.to(device)
+
+
+def _rest_count(path: Path) -> int:
+    """Coefficients per channel above degree 0 that a file has: those of degree 0, 1, 2 or 3."""
+    found = sum(name.startswith("f_rest_") for name in read_names(path))
+    counts = [3 * (coefficient_count(degree) - 1) for degree in range(4)]
+    if found not in counts:
+        raise InputError(path, "f_rest", f"{', '.join(map(str, counts))} columns", str(found))
+    return found // 3

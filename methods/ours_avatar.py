@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from ..bench.contracts import Camera, Frame, HeadPose
 from .avatar_files import SUBJECT_FILE, Subject, read_shared_head, read_subject
-from .binding import WorldSplats, to_world
+from .binding import NORMAL, WorldSplats, to_world
 from .bound_avatar import PosedSplats, posed_splats, render_splats
 from .bound_training import view_of
 from .compact.file import COMPACT_FILE, read_compact
@@ -23,6 +24,15 @@ from .ours_inference import LineOffsets, PlaneColors, Posed
 from .ours_storage import FIELD_FILE, SPLAT_WIDTHS, Field, read_field
 from .sh import sh_degree, sh_to_rgb
 from .subject_mesh import SubjectMesh
+
+
+class SeenFrom(NamedTuple):
+    """Colours of one pose's splats as a function of where they are seen from."""
+
+    normals: Tensor
+    """(N, 3) unit vectors out of the surface, in the world."""
+    radiance: Callable[[Tensor], Tensor]
+    """Maps a unit vector (3,) from the splats to the camera, in the world, to colours (N, 3) >= 0."""
 
 
 class OursAvatar:
@@ -107,6 +117,18 @@ class OursAvatar:
         return posed_splats(world, torch.sigmoid(splats.logits), colors)
 
     @torch.no_grad()
+    def seen_from(self, pose: HeadPose) -> SeenFrom:
+        """Colours of a pose by world direction."""
+        posed = self._known(pose)
+        splats = self._changed(posed)
+
+        @torch.no_grad()
+        def radiance(direction: Tensor) -> Tensor:
+            return self._shaded(splats, self._canonical_direction(posed.turns, direction))
+
+        return SeenFrom(posed.frames.rotation[:, :, NORMAL].index_select(0, self._binding), radiance)
+
+    @torch.no_grad()
     def static_logits(self) -> Tensor:
         """(N,) logits of the opacities when all driving coefficients are 0."""
         if self._line_offsets is None:
@@ -138,8 +160,22 @@ class OursAvatar:
         world = to_world(posed.frames, self._binding, splats.means, splats.log_scales, splats.quats)
         return splats, world, posed.turns
 
+    def _changed(self, posed: Posed) -> LocalSplats:
+        if self._line_offsets is None:
+            return self._neutral
+        return apply_offsets(
+            self._neutral, self._line_offsets(posed.expression, posed.jaw), self.field.dynamic
+        )
+
+    def _canonical_direction(self, turns: Tensor, direction: Tensor) -> Tensor:
+        """(N, 3) canonical directions of one world direction, common to all splats."""
+        turned = torch.nn.functional.normalize(turns @ direction.to(turns), dim=1)
+        return turned.index_select(0, self._binding)
+
     def _colors(self, splats: LocalSplats, world: WorldSplats, turns: Tensor, center: Tensor) -> Tensor:
-        directions = canonical_directions(turns, self._binding, world.means, center)
+        return self._shaded(splats, canonical_directions(turns, self._binding, world.means, center))
+
+    def _shaded(self, splats: LocalSplats, directions: Tensor) -> Tensor:
         if self._plane_colors is not None:
             colors = self._plane_colors(directions)
         else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,18 @@ from ..bench.contracts import FloatArray
 from ..bench.errors import InputError
 from ..bench.files import atomic_path
 
-FLOAT_NAMES = ("float", "float32")
+SCALARS = {
+    **dict.fromkeys(("char", "int8"), "<i1"),
+    **dict.fromkeys(("uchar", "uint8"), "<u1"),
+    **dict.fromkeys(("short", "int16"), "<i2"),
+    **dict.fromkeys(("ushort", "uint16"), "<u2"),
+    **dict.fromkeys(("int", "int32"), "<i4"),
+    **dict.fromkeys(("uint", "uint32"), "<u4"),
+    **dict.fromkeys(("float", "float32"), "<f4"),
+    **dict.fromkeys(("double", "float64"), "<f8"),
+}
+"""Types of a property, by both of their names."""
+BEGIN, END = re.compile(rb"ply\r?\n"), re.compile(rb"\nend_header\r?\n")
 HEADER_LIMIT = 65536  # bytes; a longer header is no file of ours
 
 
@@ -27,35 +39,56 @@ def write_ply(path: Path, names: tuple[str, ...], table: FloatArray) -> None:
 
 
 def read_ply(path: Path, names: tuple[str, ...]) -> FloatArray:
-    """Read the named columns of a binary little-endian float32 vertex table as (N, len(names)).
+    """Read columns of a binary little-endian vertex table by name, as (N, len(names)) float32.
 
-    Raises `InputError` where the file is no such PLY, lacks a column, is cut short, or holds non-finite numbers.
+    Other columns may be there, of any scalar type. Raises `InputError` where the file is no such PLY, lacks a column,
+    is cut short, or holds numbers that are not finite in float32.
     """
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise InputError(path, "", "a PLY file", error.strerror or str(error)) from error
-    marker = b"end_header\n"
-    end = content.find(marker, 0, HEADER_LIMIT)
-    if not content.startswith(b"ply\n") or end < 0:
-        raise InputError(path, "header", "a PLY header", "none")
-    count, columns = _parse_header(path, content[:end].decode("ascii", errors="replace").splitlines())
+    content = _content(path, -1)
+    count, columns, start = _header(path, content)
     missing = [name for name in names if name not in columns]
     if missing:
         raise InputError(path, missing[0], "a property of that name", f"{len(columns)} others")
-    body = content[end + len(marker) :]
-    size = count * len(columns) * 4
-    if len(body) != size:
-        raise InputError(path, "vertex data", f"{size} bytes", f"{len(body)}")
-    table = np.frombuffer(body, dtype="<f4").reshape(count, len(columns))
-    chosen = table[:, [columns.index(name) for name in names]].astype(np.float32)
+    row = np.dtype(list(columns.items()))
+    size = count * row.itemsize
+    if len(content) - start != size:
+        raise InputError(path, "vertex data", f"{size} bytes", f"{len(content) - start}")
+    table = np.frombuffer(content, dtype=row, offset=start)
+    chosen = np.empty((count, len(names)), np.float32)
+    with np.errstate(over="ignore"):
+        for column, name in enumerate(names):
+            chosen[:, column] = table[name]
     if not np.isfinite(chosen).all():
         raise InputError(path, "vertex data", "finite numbers", "NaN or infinity")
     return chosen
 
 
-def _parse_header(path: Path, lines: list[str]) -> tuple[int, list[str]]:
-    count, columns = -1, []
+def read_names(path: Path) -> tuple[str, ...]:
+    """The columns a PLY file has, by its header alone. Raises `InputError` as `read_ply` does."""
+    return tuple(_header(path, _content(path, HEADER_LIMIT))[1])
+
+
+def _content(path: Path, limit: int) -> bytes:
+    try:
+        with path.open("rb") as stream:
+            return stream.read(limit)
+    except OSError as error:
+        raise InputError(path, "", "a PLY file", error.strerror or str(error)) from error
+
+
+def _header(path: Path, content: bytes) -> tuple[int, dict[str, str], int]:
+    """Number of vertices, types of their properties by name, and where the data starts."""
+    end = END.search(content, 0, HEADER_LIMIT)
+    if not BEGIN.match(content) or end is None:
+        raise InputError(path, "header", "a PLY header", "none")
+    lines = content[: end.start()].decode("ascii", errors="replace").splitlines()
+    return *_parse_header(path, lines), end.end()
+
+
+def _parse_header(path: Path, lines: list[str]) -> tuple[int, dict[str, str]]:
+    """Number of vertices, and types of their properties by name, in order."""
+    count = -1
+    columns: dict[str, str] = {}
     for line in lines[1:]:
         words = line.split()
         if not words or words[0] in ("comment", "obj_info"):
@@ -64,15 +97,15 @@ def _parse_header(path: Path, lines: list[str]) -> tuple[int, list[str]]:
             if words[1:] != ["binary_little_endian", "1.0"]:
                 raise InputError(path, "format", "binary_little_endian 1.0", " ".join(words[1:]))
         elif words[0] == "element":
-            if len(words) != 3 or words[1] != "vertex" or count >= 0 or not words[2].isdigit():
+            if len(words) != 3 or words[1] != "vertex" or count >= 0 or not words[2].isdecimal():
                 raise InputError(path, "element", "one vertex element", line)
             count = int(words[2])
         elif words[0] == "property":
-            if len(words) != 3 or words[1] not in FLOAT_NAMES:
-                raise InputError(path, "property", "a float property", line)
-            columns.append(words[2])
+            if len(words) != 3 or words[1] not in SCALARS or words[2] in columns or count < 0:
+                raise InputError(path, "property", "a scalar property of the vertices, each name once", line)
+            columns[words[2]] = SCALARS[words[1]]
         else:
             raise InputError(path, "header", "format, element and property lines", line)
-    if count < 0:
-        raise InputError(path, "element", "one vertex element", "none")
+    if count < 0 or not columns:
+        raise InputError(path, "element", "one vertex element with properties", "none")
     return count, columns

@@ -1,10 +1,12 @@
 """PLY reading and writing."""
 
+import struct
+
 import numpy as np
 import pytest
 
 from headbench.bench.errors import InputError
-from headbench.methods.ply import read_ply, write_ply
+from headbench.methods.ply import read_names, read_ply, write_ply
 
 TABLE = np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32)
 
@@ -24,6 +26,16 @@ def test_another_program_reads_the_positions(tmp_path):
     np.testing.assert_allclose(meshes.current_mesh().vertex_matrix(), TABLE, rtol=1e-6)
 
 
+def test_columns_of_other_types_and_line_ends_are_read(tmp_path):
+    """As other programs rewrite such files; the row is packed by hand."""
+    header = b"ply\r\nformat binary_little_endian 1.0\r\ncomment by hand\r\nelement vertex 2\r\n"
+    header += b"property double x\r\nproperty uchar red\r\nproperty int binding_0\r\nend_header\r\n"
+    path = tmp_path / "a.ply"
+    path.write_bytes(header + struct.pack("<dBi", 1.5, 7, 16777215) + struct.pack("<dBi", -2.25, 255, 3))
+    np.testing.assert_array_equal(read_ply(path, ("binding_0", "x")), [[16777215, 1.5], [3, -2.25]])
+    assert read_names(path) == ("x", "red", "binding_0")
+
+
 HEADER = "ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nend_header\n"
 
 
@@ -35,8 +47,11 @@ HEADER = "ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float
         (HEADER.replace("binary_little_endian", "ascii").encode() + b"1.0\n", "binary_little_endian"),
         (HEADER.encode() + b"\0" * 3, "4 bytes"),
         (HEADER.encode() + b"\0" * 8, "4 bytes"),
-        (HEADER.replace("float x", "list uchar int x").encode() + b"\0" * 4, "float property"),
-        (HEADER.replace("float x", "double x").encode() + b"\0" * 8, "float property"),
+        (HEADER.replace("float x", "list uchar int x").encode() + b"\0" * 4, "scalar property"),
+        (HEADER.replace("float x", "half x").encode() + b"\0" * 2, "scalar property"),
+        (HEADER.replace("float x\n", "float x\nproperty float x\n").encode() + b"\0" * 8, "each name once"),
+        (HEADER.replace("property float x\n", "").encode(), "with properties"),
+        (HEADER.replace("float x", "double x").encode() + np.float64(1e300).tobytes(), "finite"),
         (HEADER.replace("float x", "float y").encode() + b"\0" * 4, "property of that name"),
         (HEADER.replace("vertex 1", "vertex 99999999999").encode() + b"\0" * 4, "bytes"),
         (HEADER.encode() + np.float32(np.nan).tobytes(), "finite"),

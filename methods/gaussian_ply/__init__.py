@@ -1,0 +1,1 @@
+"""Avatars as splat PLY files: out to common viewers, in from GaussianAvatars."""

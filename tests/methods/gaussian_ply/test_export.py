@@ -1,0 +1,168 @@
+"""Avatars as standard splat files, read back by a parser that knows nothing of ours, and drawn."""
+
+import struct
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.special import sph_harm_y
+
+from headbench.bench.errors import InputError
+from headbench.methods.bound_training import view_of
+from headbench.methods.gaussian_ply.command import neutral_pose, run
+from headbench.methods.gaussian_ply.harmonics_fit import BEHIND, fit_harmonics, sphere
+from headbench.methods.gaussian_ply.settings import ExportPlySettings
+from headbench.methods.ours_avatar import OursAvatar
+from headbench.methods.sh import sh_basis
+from headbench.methods.splats import rasterize
+
+from ...datasets.tiny_capture import write_tiny_capture
+from ..stored_toy import store
+from ..toy_ours import SMALL
+
+NAMES = [
+    *("x", "y", "z", "nx", "ny", "nz"),
+    *(f"f_dc_{i}" for i in range(3)),
+    *(f"f_rest_{i}" for i in range(45)),
+    *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+]
+
+
+def parse(path):
+    """(N, 62) of a standard file, byte by byte; nothing but the exact layout passes."""
+    content = path.read_bytes()
+    header, body = content.split(b"end_header\n", 1)
+    lines = header.decode("ascii").split("\n")
+    assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
+    count = int(lines[2].removeprefix("element vertex "))
+    assert lines[3:] == [f"property float {name}" for name in NAMES] + [""]
+    assert len(body) == count * 248
+    return np.array([struct.unpack("<62f", body[248 * i : 248 * (i + 1)]) for i in range(count)])
+
+
+def viewed(table, camera):
+    """What a viewer of 3DGS does with such a table."""
+    values = torch.from_numpy(table.astype(np.float32))
+    view = view_of(camera, "cpu")
+    means, logits, scales, quats = values[:, :3], values[:, 54], values[:, 55:58].exp(), values[:, 58:]
+    harmonics = torch.cat([values[:, 6:9, None], values[:, 9:54].view(-1, 3, 15)], dim=2)
+    directions = torch.nn.functional.normalize(means - view.center, dim=1)
+    colors = torch.relu(0.5 + (harmonics * sh_basis(directions, 3)[:, None]).sum(2))
+    return rasterize(
+        *(means, quats, scales, torch.sigmoid(logits), colors),
+        *(view.world_to_camera, view.K, camera.width, camera.height),
+        background=torch.ones(3),
+    ).image.numpy()
+
+
+def soft(values):
+    """Colours that vary little enough with direction for harmonics, and are not cut at 0."""
+    values["color_weight_0"][:, -27:] *= 0.3
+    values["color_weight_1"] *= 0.5
+
+
+@pytest.mark.parametrize("color", ["planes", "sh"])
+def test_a_viewer_shows_what_the_avatar_shows(color, clip, tmp_path):
+    config = replace(SMALL, color=color, sh_degree=2)
+    folder = store(clip, tmp_path / "avatar", config, (lambda _: None) if color == "sh" else soft)
+    findings = run(ExportPlySettings(str(folder), out=str(tmp_path / "x.ply"), directions=128))
+    table = parse(tmp_path / "x.ply")
+    avatar, pose = OursAvatar.read(folder, "cpu"), neutral_pose(clip.head)
+    splats = avatar.splats(pose)
+    assert findings.data["splats"] == len(table) == len(splats.means)
+    np.testing.assert_array_equal(table[:, :3], splats.means)
+    np.testing.assert_array_equal(table[:, 58:], splats.quats)
+    np.testing.assert_allclose(np.exp(table[:, 55:58]), splats.scales, rtol=1e-5)
+    np.testing.assert_allclose(1 / (1 + np.exp(-table[:, 54])), splats.opacities, atol=1e-6)
+    assert not table[:, 3:6].any()
+    assert findings.data["residual_rms"] < 0.05
+    for camera in clip.cameras.values():
+        error = np.mean((viewed(table, camera).clip(0, 1) - avatar.render(camera, pose).rgb) ** 2)
+        assert -10 * np.log10(error) > 32
+
+
+def test_the_pose_of_a_capture_is_written(tmp_path):
+    from headbench.bench.contracts import Budget, no_progress
+    from headbench.datasets.ga_reader import read_capture
+    from headbench.methods.configs import GAConfig
+    from headbench.methods.ga import GA
+
+    capture = write_tiny_capture(tmp_path / "capture").union
+    clip = read_capture(capture)
+    avatar = GA(GAConfig(refine_tracking=False)).fit(
+        clip, tmp_path / "ga", Budget(iterations=3), device="cpu", seed=0, progress=no_progress
+    )
+    timestep = clip.timesteps("self_reenactment")[0]
+    run(
+        ExportPlySettings(
+            str(tmp_path / "ga"), out=str(tmp_path / "x.ply"), capture=str(capture), timestep=timestep
+        )
+    )
+    table = parse(tmp_path / "x.ply")
+    np.testing.assert_array_equal(table[:, :3], avatar.splats(clip.poses[timestep]).means)
+    camera = next(iter(clip.cameras.values()))
+    difference = viewed(table, camera).clip(0, 1) - avatar.render(camera, clip.poses[timestep]).rgb
+    assert np.abs(difference).max() < 1e-4
+    with pytest.raises(InputError, match="timestep"):
+        run(ExportPlySettings(str(tmp_path / "ga"), out="x", capture=str(capture), timestep=10**6))
+    with pytest.raises(InputError, match="an avatar"):
+        run(ExportPlySettings(str(tmp_path / "capture"), out="x"))
+
+
+def test_colours_that_are_harmonics_are_found_exactly():
+    """Against scipy's complex harmonics, of degree 3: any real combination of them must be fitted without residual."""
+    directions = sphere(128)
+    rng = np.random.default_rng(0)
+    weights = rng.normal(size=(5, 3, 16, 2)) * 0.1
+
+    def radiance(direction):
+        x, y, z = direction.double().numpy()
+        values = [
+            sph_harm_y(degree, order, np.arccos(z), np.arctan2(y, x))
+            for degree in range(4)
+            for order in range(-degree, degree + 1)
+        ]
+        parts = np.stack([np.real(values), np.imag(values)], axis=1)
+        return torch.from_numpy(0.5 + (weights * parts).sum((2, 3))).float()
+
+    normals = torch.nn.functional.normalize(torch.from_numpy(rng.normal(size=(5, 3))).float(), dim=1)
+    fit = fit_harmonics(radiance, normals, directions)
+    assert fit.residual.max() < 1e-4
+    unseen = torch.nn.functional.normalize(torch.from_numpy(rng.normal(size=(20, 3))).float(), dim=1)
+    basis = sh_basis(-unseen, 3)
+    found = 0.5 + torch.einsum("mk,nck->nmc", basis, torch.cat([fit.dc[:, :, None], fit.rest], dim=2))
+    expected = torch.stack([radiance(direction) for direction in unseen], dim=1)
+    np.testing.assert_allclose(found, expected, atol=2e-3)
+
+
+def test_directions_from_behind_hardly_count():
+    directions = sphere(200)
+    normals = torch.tensor([[0.0, 0.0, 1.0]])
+
+    def radiance(direction):
+        return torch.full((1, 3), 0.7 if direction[2] > 0 else 0.1)
+
+    fit = fit_harmonics(radiance, normals, directions)
+    front = 0.5 + sh_basis(-normals, 3) @ torch.cat([fit.dc[:, :, None], fit.rest], dim=2)[0].t()
+    assert abs(float(front[0, 0]) - 0.7) < 0.03
+    even = fit_harmonics(
+        radiance, torch.zeros(1, 3), directions
+    )  # no direction is in front: all weigh the same
+    assert fit.residual[0] < 0.6 * even.residual[0]
+    assert BEHIND < 0.1
+
+
+def test_directions_spread_evenly():
+    directions = sphere(96).double()
+    np.testing.assert_allclose(torch.linalg.vector_norm(directions, dim=1), 1, atol=1e-6)
+    moment = directions.t() @ directions / 96
+    np.testing.assert_allclose(moment, np.eye(3) / 3, atol=0.01)
+    assert torch.linalg.vector_norm(directions.mean(0)) < 0.01
+
+
+def test_a_timestep_needs_a_capture():
+    with pytest.raises(ValueError, match="capture"):
+        ExportPlySettings("a", out="b", timestep=3)
+    with pytest.raises(ValueError, match="32"):
+        ExportPlySettings("a", out="b", directions=16)
