@@ -11,3 +11,9 @@ SPLATS = BenchmarkSpec(
     tradeoffs="headbench.methods.splats.benchmark.tradeoffs:measure",
     stress="headbench.methods.splats.benchmark.stress:measure",
 )
+
+AVATAR = BenchmarkSpec(
+    name="avatar",
+    summary="a frame of an avatar of ours: time by step, and what each saving saves",
+    speed="headbench.methods.avatar_benchmark.speed:measure",
+)

@@ -47,13 +47,13 @@ def render_splats(
 
 
 def posed_splats(world: WorldSplats, opacities: Tensor, colors: Tensor | None) -> PosedSplats:
-    """Copy to numpy."""
+    """Copy to numpy: avatars keep tensors for the next frame."""
     return PosedSplats(
-        _numpy(world.means),
-        _numpy(world.quats),
-        _numpy(world.scales),
-        _numpy(opacities),
-        None if colors is None else _numpy(colors),
+        _numpy(world.means).copy(),
+        _numpy(world.quats).copy(),
+        _numpy(world.scales).copy(),
+        _numpy(opacities).copy(),
+        None if colors is None else _numpy(colors).copy(),
     )
 
 

@@ -35,7 +35,7 @@ class KnownPoses(Generic[Value]):
         """Compute the values of poses in order for as long as they fit into ``limit`` bytes; returns how many do."""
         taken, count = 0, 0
         for pose in poses:
-            key = _key(pose)
+            key = pose_key(pose)
             if key not in self._values:
                 value = self._compute(pose)
                 taken += value.bytes
@@ -47,11 +47,12 @@ class KnownPoses(Generic[Value]):
 
     def __call__(self, pose: HeadPose) -> Value:
         """The value of a pose, computed if it is not known; then it is not kept."""
-        value = self._values.get(_key(pose)) if self._values else None
+        value = self._values.get(pose_key(pose)) if self._values else None
         return self._compute(pose) if value is None else value
 
 
-def _key(pose: HeadPose) -> bytes:
+def pose_key(pose: HeadPose) -> bytes:
+    """All the numbers of a pose; equal keys pose alike."""
     parts = [pose.head_model.encode()]
     for name in DRIVING:
         values = getattr(pose, name)

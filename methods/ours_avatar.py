@@ -17,10 +17,10 @@ from .bound_avatar import PosedSplats, posed_splats, render_splats
 from .bound_training import view_of
 from .compact.file import COMPACT_FILE, read_compact
 from .dynamics import LocalSplats, apply_offsets, changed_colors
-from .known_poses import KnownPoses
+from .known_poses import KnownPoses, pose_key
 from .ours_appearance import driving_coefficients
 from .ours_field import Box, CanonicalFrames, canonical_directions, plane_features, position_part
-from .ours_inference import LineOffsets, PlaneColors, Posed
+from .ours_inference import LineOffsets, Placed, PlaneColors, Posed
 from .ours_storage import FIELD_FILE, SPLAT_WIDTHS, Field, read_field
 from .sh import sh_degree, sh_to_rgb
 from .subject_mesh import SubjectMesh
@@ -45,6 +45,9 @@ class OursAvatar:
     Attributes
     ----------
     subject, field : whom it shows, and what its file holds.
+    mesh : the subject's.
+    neutral : the splats before an expression changes them.
+    line_offsets, plane_colors : what the lines and planes give; None where there are none.
     """
 
     def __init__(
@@ -52,24 +55,26 @@ class OursAvatar:
     ):
         tensors = field.tensors
         self.subject, self.field = subject, field
-        self._stored, self._mesh, self._device = stored, mesh, device
+        self._stored, self.mesh, self._device = stored, mesh, device
         table = tensors["splats"].split(list(SPLAT_WIDTHS.values()), dim=1)
         columns = {name: column.contiguous() for name, column in zip(SPLAT_WIDTHS, table)}
-        self._neutral = LocalSplats(
+        self.neutral = LocalSplats(
             columns["means"], columns["log_scales"], columns["quats"], columns["opacities"][:, 0]
         )
         self._binding = columns["binding"][:, 0].to(torch.int64)
         self._canonical = CanonicalFrames.of(mesh.frames(mesh.canonical))
-        positions = self._canonical.positions(self._binding, self._neutral.means)
-        self._plane_colors, self._line_offsets = None, None
+        positions = self._canonical.positions(self._binding, self.neutral.means)
+        self.plane_colors: PlaneColors | None = None
+        self.line_offsets: LineOffsets | None = None
         if "sh_dc" not in tensors:
             features = plane_features(tensors, Box(*tensors["plane_box"]), positions)
             weights = tensors["color_weight_0"], tensors["color_weight_1"]
-            self._plane_colors = PlaneColors(*weights, position_part(tensors, features))
+            self.plane_colors = PlaneColors(*weights, position_part(tensors, features))
         if "lines" in tensors:
-            self._line_offsets = LineOffsets(tensors, positions)
+            self.line_offsets = LineOffsets(tensors, positions)
         self._jaw_bases = tensors["jaw_bases"].cpu().numpy().astype(np.float64)
         self._known = KnownPoses(self._posed, 0)
+        self._last: tuple[bytes, Placed] | None = None
 
     @classmethod
     def read(cls, folder: Path, device: str, *, exact: bool = False) -> OursAvatar:
@@ -90,7 +95,7 @@ class OursAvatar:
         return cls([folder / FIELD_FILE, folder / SUBJECT_FILE], mesh, subject, field, device)
 
     def prepare(self, poses: Iterable[HeadPose], megabytes: float = 512.0) -> int:
-        """Compute meshes, triangle frames and jaw weights of known poses beforehand, within a bound of memory.
+        """Compute meshes, triangle frames, jaw weights and offsets of known poses beforehand, within a bound of memory.
 
         Frames of these poses are then drawn faster, and equal bit for bit. Nothing is prepared unless asked for, so a
         measured frame time includes them. Returns how many poses fitted; what was prepared before is forgotten.
@@ -101,7 +106,7 @@ class OursAvatar:
     @torch.no_grad()
     def render(self, camera: Camera, pose: HeadPose, background: Sequence[float] = (1.0, 1.0, 1.0)) -> Frame:
         """Render one frame. Raises `InputError` where the pose is of another head model."""
-        splats, world, turns = self._world(pose)
+        splats, world, turns = self._placed(pose)
         view = view_of(camera, self._device)
         colors = self._colors(splats, world, turns, view.center)
         return render_splats(world, torch.sigmoid(splats.logits), colors, view, background)
@@ -109,11 +114,10 @@ class OursAvatar:
     @torch.no_grad()
     def splats(self, pose: HeadPose, camera: Camera | None = None) -> PosedSplats:
         """Splats of a pose in the world; with colours where a camera says from where they are seen."""
-        splats, world, turns = self._world(pose)
+        splats, world, turns = self._placed(pose)
         colors = None
         if camera is not None:
-            # A copy: the avatar keeps its own for the next frame.
-            colors = self._colors(splats, world, turns, view_of(camera, self._device).center).clone()
+            colors = self._colors(splats, world, turns, view_of(camera, self._device).center)
         return posed_splats(world, torch.sigmoid(splats.logits), colors)
 
     @torch.no_grad()
@@ -131,41 +135,40 @@ class OursAvatar:
     @torch.no_grad()
     def static_logits(self) -> Tensor:
         """(N,) logits of the opacities when all driving coefficients are 0."""
-        if self._line_offsets is None:
-            return self._neutral.logits
-        still = self._neutral.logits.new_zeros
+        if self.line_offsets is None:
+            return self.neutral.logits
+        still = self.neutral.logits.new_zeros
         expressions = len(self.field.tensors["lines"]) - len(self._jaw_bases)
-        offsets = self._line_offsets(still(expressions), still(len(self._jaw_bases)))
-        return apply_offsets(self._neutral, offsets, self.field.dynamic).logits
+        offsets = self.line_offsets(still(expressions), still(len(self._jaw_bases)))
+        return apply_offsets(self.neutral, offsets, self.field.dynamic).logits
 
     def files(self) -> Sequence[Path]:
         """The file read, and the subject's where that file does not hold it."""
         return self._stored
 
     def _posed(self, pose: HeadPose) -> Posed:
-        frames = self._mesh.frames(self._mesh.posed(self._mesh.arguments([pose])))
-        expressions = 0
-        if self._line_offsets is not None:
+        frames = self.mesh.frames(self.mesh.posed(self.mesh.arguments([pose])))
+        offsets = None
+        if self.line_offsets is not None:
             expressions = len(self.field.tensors["lines"]) - len(self._jaw_bases)
-        coefficients = driving_coefficients(pose, expressions, self._jaw_bases, self._device)
-        return Posed(frames, self._canonical.turns(frames), *coefficients)
+            coefficients = driving_coefficients(pose, expressions, self._jaw_bases, self._device)
+            offsets = self.line_offsets(*coefficients)
+        return Posed(frames, self._canonical.turns(frames), offsets)
 
-    def _world(self, pose: HeadPose) -> tuple[LocalSplats, WorldSplats, Tensor]:
-        posed = self._known(pose)
-        splats = self._neutral
-        if self._line_offsets is not None:
-            splats = apply_offsets(
-                splats, self._line_offsets(posed.expression, posed.jaw), self.field.dynamic
-            )
-        world = to_world(posed.frames, self._binding, splats.means, splats.log_scales, splats.quats)
-        return splats, world, posed.turns
+    def _placed(self, pose: HeadPose) -> Placed:
+        """Splats of a pose in the world; those of the last pose are kept, as several cameras often look at one."""
+        key = pose_key(pose)
+        if self._last is None or self._last[0] != key:
+            posed = self._known(pose)
+            splats = self._changed(posed)
+            world = to_world(posed.frames, self._binding, splats.means, splats.log_scales, splats.quats)
+            self._last = key, Placed(splats, world, posed.turns)
+        return self._last[1]
 
     def _changed(self, posed: Posed) -> LocalSplats:
-        if self._line_offsets is None:
-            return self._neutral
-        return apply_offsets(
-            self._neutral, self._line_offsets(posed.expression, posed.jaw), self.field.dynamic
-        )
+        if posed.offsets is None:
+            return self.neutral
+        return apply_offsets(self.neutral, posed.offsets, self.field.dynamic)
 
     def _canonical_direction(self, turns: Tensor, direction: Tensor) -> Tensor:
         """(N, 3) canonical directions of one world direction, common to all splats."""
@@ -176,8 +179,8 @@ class OursAvatar:
         return self._shaded(splats, canonical_directions(turns, self._binding, world.means, center))
 
     def _shaded(self, splats: LocalSplats, directions: Tensor) -> Tensor:
-        if self._plane_colors is not None:
-            colors = self._plane_colors(directions)
+        if self.plane_colors is not None:
+            colors = self.plane_colors(directions)
         else:
             dc, rest = self.field.tensors["sh_dc"], self.field.tensors["sh_rest"]
             colors = sh_to_rgb(dc, rest, -directions, sh_degree(rest))

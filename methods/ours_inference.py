@@ -12,7 +12,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .binding import Frames
+from .binding import Frames, WorldSplats
+from .dynamics import LocalSplats
 from .feature_lines import LinePosition, blend_lines, line_position, line_table, normalised_weight
 from .networks import offset_network
 from .ours_field import Box
@@ -22,20 +23,28 @@ from .triplane import ENCODING_SIZE, FREQUENCIES
 
 
 class Posed(NamedTuple):
-    """What a pose decides before any splat is looked at."""
+    """What a pose decides, as far as it is worth keeping for known poses."""
 
     frames: Frames
     turns: Tensor
     """(F, 3, 3) world directions to canonical ones."""
-    expression: Tensor
-    """(E,) coefficients of the lines."""
-    jaw: Tensor
-    """(J,) weights of the jaw's lines."""
+    offsets: Tensor | None
+    """(N, D) of the lines; None without lines."""
 
     @property
     def bytes(self) -> int:
         """Memory it takes."""
-        return sum(value.nbytes for value in (*self.frames, self.turns, self.expression, self.jaw))
+        tensors = (*self.frames, self.turns, *(() if self.offsets is None else (self.offsets,)))
+        return sum(value.nbytes for value in tensors)
+
+
+class Placed(NamedTuple):
+    """Splats of a pose in the world, before a camera looks at them."""
+
+    splats: LocalSplats
+    world: WorldSplats
+    turns: Tensor
+    """(F, 3, 3) world directions to canonical ones."""
 
 
 class LineOffsets:
@@ -79,7 +88,7 @@ class PlaneColors:
     """
 
     def __init__(self, first: Tensor, last: Tensor, from_position: Tensor):
-        self._from_position = from_position
+        self.from_position = from_position
         self._of_direction = first[:, first.shape[1] - ENCODING_SIZE :].t().contiguous()
         self._last = last.t().contiguous()
         self._half = last.new_tensor(0.5)
@@ -92,21 +101,21 @@ class PlaneColors:
         for bit, only theirs are computed.
         """
         if self._known is None:
-            colors = self._shade(self._from_position, directions)
+            colors = self.shade(directions)
         else:
             changed = (directions != self._known[0]).any(1).nonzero().squeeze(1)
             if 2 * len(changed) > len(directions):
-                colors = self._shade(self._from_position, directions)
+                colors = self.shade(directions)
             else:
-                rows = self._from_position.index_select(0, changed)
-                some = self._shade(rows, directions.index_select(0, changed))
+                some = self.shade(directions.index_select(0, changed), changed)
                 colors = self._known[1].index_copy(0, changed, some)
         self._known = directions, colors
         return colors
 
-    def _shade(self, from_position: Tensor, directions: Tensor) -> Tensor:
-        encoded = encode_columns(directions)
-        hidden = torch.addmm(from_position, encoded.t(), self._of_direction).relu_()
+    def shade(self, directions: Tensor, rows: Tensor | None = None) -> Tensor:
+        """The same for some splats (their numbers) or all, whatever is known."""
+        known = self.from_position if rows is None else self.from_position.index_select(0, rows)
+        hidden = torch.addmm(known, encode_columns(directions).t(), self._of_direction).relu_()
         return torch.addmm(self._half, hidden, self._last, alpha=C0).relu_()
 
 
