@@ -25,7 +25,7 @@ constexpr int gradient_stride(int channels, bool absolute) {
 
 inline std::size_t backward_scratch(int channels) {
   return chunk_floats(channels) + static_cast<std::size_t>(kBlocks) * (kBack + channels) * W +
-         static_cast<std::size_t>(kChunk + 1) * gradient_stride(channels, true);
+         gradient_stride(channels, true);
 }
 
 // Pixels' v and w of up to W splats, kept until they can be summed over pixels for W splats at once; and what the
@@ -152,17 +152,16 @@ HEADBENCH_INLINE void repeat_rows(const float* colors, int channels, float* by_r
   }
 }
 
-// Walk one block's list from its end; `gradients` are the chunk's records, row by row, and one spare.
+// Walk one block's list from its end; `gradients` are the chunk's records, row by row. Nothing is made of what is added
+// to `spare`.
 template <int C, bool Absolute>
 inline void composite_block_backward(const Chunk& chunk, int index, const Block& block, int channels,
-                                     float* state, float* gradients, int gradient_floats) {
+                                     float* state, float* gradients, float* spare) {
   constexpr int kColors = C ? C : 1;
-  const int count = C ? C : channels;
-  const std::uint16_t* list = chunk.list + index * kChunk;
+  const int count = C ? C : channels, stride = record_stride(count), width = gradient_stride(count, Absolute);
   const float* colors = state + kBack * W;
   alignas(64) float by_row[(C ? C : kChannelsMax) * kBlockHeight * W];
   repeat_rows(colors, count, by_row);
-  float* spare = gradients + kChunk * gradient_floats;
   Real transmittance = load(state + kTransmittance * W), behind = load(state + kBehind * W);
   const Real start = load(state + kStart * W);
   Real g[kColors];
@@ -170,38 +169,42 @@ inline void composite_block_backward(const Chunk& chunk, int index, const Block&
     for (int c = 0; c < C; ++c) g[c] = load(colors + c * W);
   Batch<Absolute> batch;
   int used = 0;
-  for (int i = chunk.listed[index] - 1; i >= 0; --i) {
-    const float* row = chunk.params + list[i] * chunk.stride;
-    const Mask reached = start >= Real(row[kIndex]);
-    const Alpha a = alpha_of(row, block);
-    const Mask drawn = a.passes & reached;
-    if (!any(drawn)) continue;
-    const Real alpha = zero_unless(drawn, min(a.raw, kAlphaMax));
-    const Real inverse = reciprocal(Real(1.0f) - alpha);
-    transmittance = transmittance * inverse;
-    const Real weight = alpha * transmittance;
-    Real along = 0.0f;
-    for (int c = 0; c < count; ++c) {
-      if constexpr (C != 0) along = fma(row[kGeometry + c], g[c], along);
-      else along = fma(row[kGeometry + c], load(colors + c * W), along);
-    }
-    const Real dalpha = fnma(behind, inverse, transmittance * along);
-    behind = fma(weight, along, behind);
-    const Mask unclamped = Real(kAlphaMax) >= a.raw;
-    const Real value = zero_unless(unclamped, alpha * dalpha);
-    store(batch.v + used * W, value);
-    if constexpr (Absolute) {
-      store(batch.absolute[0] + used * W, absolute(value * a.u));
-      const Real along_y = fma(row[kL21], a.u, Real(row[kL22]) * a.v);
-      store(batch.absolute[1] + used * W, absolute(value * along_y));
-    }
-    store(batch.w + used * W, weight);
-    batch.mean_x[place(used)] = row[kMeanX];
-    batch.mean_y[place(used)] = row[kMeanY];
-    batch.target[used] = gradients + list[i] * gradient_floats;
-    if (++used == W) {
-      flush<C, Absolute>(batch, W, block, channels, by_row, spare);
-      used = 0;
+  for (int word = chunk.words - 1; word >= 0; --word) {
+    for (std::uint64_t hits = chunk.hits_of(index)[word]; hits;) {
+      const int bit = highest_bit(hits), in_chunk = word * kWordBits + bit;
+      hits ^= std::uint64_t{1} << bit;
+      const float* row = chunk.params + in_chunk * stride;
+      const Mask reached = start >= Real(row[kIndex]);
+      const Alpha a = alpha_of(row, block);
+      const Mask drawn = a.passes & reached;
+      if (!any(drawn)) continue;
+      const Real alpha = zero_unless(drawn, min(a.raw, kAlphaMax));
+      const Real inverse = reciprocal(Real(1.0f) - alpha);
+      transmittance = transmittance * inverse;
+      const Real weight = alpha * transmittance;
+      Real along = 0.0f;
+      for (int c = 0; c < count; ++c) {
+        if constexpr (C != 0) along = fma(row[kGeometry + c], g[c], along);
+        else along = fma(row[kGeometry + c], load(colors + c * W), along);
+      }
+      const Real dalpha = fnma(behind, inverse, transmittance * along);
+      behind = fma(weight, along, behind);
+      const Mask unclamped = Real(kAlphaMax) >= a.raw;
+      const Real value = zero_unless(unclamped, alpha * dalpha);
+      store(batch.v + used * W, value);
+      if constexpr (Absolute) {
+        store(batch.absolute[0] + used * W, absolute(value * a.u));
+        const Real along_y = fma(row[kL21], a.u, Real(row[kL22]) * a.v);
+        store(batch.absolute[1] + used * W, absolute(value * along_y));
+      }
+      store(batch.w + used * W, weight);
+      batch.mean_x[place(used)] = row[kMeanX];
+      batch.mean_y[place(used)] = row[kMeanY];
+      batch.target[used] = gradients + in_chunk * width;
+      if (++used == W) {
+        flush<C, Absolute>(batch, W, block, channels, by_row, spare);
+        used = 0;
+      }
     }
   }
   if (used) flush<C, Absolute>(batch, used, block, channels, by_row, spare);
@@ -209,13 +212,14 @@ inline void composite_block_backward(const Chunk& chunk, int index, const Block&
   store(state + kBehind * W, behind);
 }
 
-// Read a block's gradients into its state; gives the index of the last splat any of its pixels drew, or -1.
-inline int read_block(const View& view, const Splats& splats, const FrameData& frame, const Gradients& grads,
-                      int tile, int index, const Block& block, float* state, double* background) {
-  const int channels = splats.channels;
+// Read a block's gradients into its state, and add those of the background, lane by lane, to `background`.
+template <int C>
+inline void read_block(const View& view, const Splats& splats, const FrameData& frame, const Gradients& grads,
+                       int tile, int index, const Block& block, float* state, Real* background) {
+  const int channels = C ? C : splats.channels;
   const std::size_t kept = static_cast<std::size_t>(tile) * kTilePixels + index * W;
   const Real remaining = load(frame.transmittances + kept), last = load(frame.last + kept);
-  alignas(64) float alpha[W], lanes[W];
+  alignas(64) float alpha[W];
   store(alpha, 0.0f);
   for (int c = 0; c < channels; ++c) store(state + (kBack + c) * W, 0.0f);
   const int columns = view.width - block.left < kBlockWidth ? view.width - block.left : kBlockWidth;
@@ -233,61 +237,58 @@ inline int read_block(const View& view, const Splats& splats, const FrameData& f
   for (int c = 0; c < channels; ++c) {
     const Real g = load(state + (kBack + c) * W);
     through = fma(g, splats.background[c], through);
-    store(lanes, g * remaining);
-    float sum = 0.0f;
-    for (int lane = 0; lane < W; ++lane) sum += lanes[lane];
-    background[c] += sum;
+    background[c] = fma(g, remaining, background[c]);
   }
   store(state + kBehind * W, through * remaining);
   store(state + kTransmittance * W, remaining);
   store(state + kStart * W, last);
-  store(lanes, last);
-  float furthest = -1.0f;
-  for (int lane = 0; lane < W; ++lane) furthest = lanes[lane] > furthest ? lanes[lane] : furthest;
-  return static_cast<int>(furthest);
 }
 
 template <int C, bool Absolute>
 inline void draw_tile_backward_with(const View& view, const Splats& splats, const FrameData& frame,
                                     const Gradients& grads, int tile, float* scratch) {
-  const int channels = splats.channels, state_floats = (kBack + channels) * W, stride = grads.entry_stride;
+  const int channels = C ? C : splats.channels, state_floats = (kBack + channels) * W;
+  const int width = gradient_stride(channels, Absolute);
   float* states = scratch;
-  float* sums = states + kBlocks * state_floats;
-  float* chunk_scratch = sums + (kChunk + 1) * stride;
+  float* spare = states + kBlocks * state_floats;
+  Chunk chunk;
+  chunk.params = spare + width;
 
-  double* background = grads.background + static_cast<std::size_t>(tile) * channels;
-  for (int c = 0; c < channels; ++c) background[c] = 0.0;
-  int furthest[kBlocks];
+  // The next tile's gradients come while this one is worked on.
+  prefetch_tile(view, grads.image, channels, tile + 1);
+  prefetch_tile(view, grads.alpha, 1, tile + 1);
+  Real background[C ? C : kChannelsMax];
+  for (int c = 0; c < channels; ++c) background[c] = 0.0f;
   for (int b = 0; b < kBlocks; ++b) {
     const Block block = block_of(view, tile, b);
-    furthest[b] = any(block.inside) ? read_block(view, splats, frame, grads, tile, b, block,
-                                                 states + b * state_floats, background)
-                                    : -1;
+    float* state = states + b * state_floats;
+    if (any(block.inside)) read_block<C>(view, splats, frame, grads, tile, b, block, state, background);
+    else store(state + kStart * W, -1.0f);
+  }
+  for (int c = 0; c < channels; ++c) {
+    alignas(64) float lanes[W];
+    store(lanes, background[c]);
+    double sum = 0.0;
+    for (int lane = 0; lane < W; ++lane) sum += lanes[lane];
+    grads.background[static_cast<std::size_t>(tile) * channels + c] = sum;
   }
 
-  const Pair* pairs = frame.pairs + frame.tile_begin[tile];
+  float* records = grads.records + static_cast<std::size_t>(frame.tile_begin[tile]) * width;
   const int count = static_cast<int>(frame.tile_begin[tile + 1] - frame.tile_begin[tile]);
   for (int begin = (count - 1) / kChunk * kChunk; begin >= 0 && count; begin -= kChunk) {
     const int end = begin + kChunk < count ? begin + kChunk : count;
+    const Real first = static_cast<float>(begin);
     std::uint64_t wanted = 0;
     for (int b = 0; b < kBlocks; ++b)
-      if (furthest[b] >= begin) wanted |= std::uint64_t{1} << b;
-    for (int i = 0; i < (end - begin) * stride; i += W) store(sums + i, 0.0f);
-    if (wanted) {
-      Chunk chunk;
-      fill_chunk(view, splats, frame, tile, begin, end, wanted, chunk_scratch, chunk);
-      for (int b = 0; b < kBlocks; ++b)
-        if (chunk.listed[b])
-          composite_block_backward<C, Absolute>(chunk, b, block_of(view, tile, b), channels, states + b * state_floats,
-                                      sums, stride);
-    }
-    constexpr int ahead = 16;
-    for (int i = begin; i < end; ++i) {
-      if (i + ahead < end)
-        HEADBENCH_PREFETCH_WRITE(grads.entries + static_cast<std::size_t>(pairs[i + ahead].entry) * stride);
-      float* entry = grads.entries + static_cast<std::size_t>(pairs[i].entry) * stride;
-      for (int k = 0; k < stride; k += W) store(entry + k, load(sums + (i - begin) * stride + k));
-    }
+      if (any(load(states + b * state_floats + kStart * W) >= first)) wanted |= std::uint64_t{1} << b;
+    float* sums = records + static_cast<std::size_t>(begin) * width;
+    for (int i = 0; i < (end - begin) * width; i += W) store(sums + i, 0.0f);
+    if (!wanted) continue;
+    fill_chunk<C>(view, splats, frame, tile, begin, end, wanted, chunk);
+    for (int b = 0; b < kBlocks; ++b)
+      if (chunk.reaches(b))
+        composite_block_backward<C, Absolute>(chunk, b, block_of(view, tile, b), channels, states + b * state_floats,
+                                              sums, spare);
   }
 }
 

@@ -43,49 +43,59 @@ HEADBENCH_INLINE void find_spans(const View& view, const float* record, float ra
   }
 }
 
-// Enter the tiles of one tile row, whose bands' spans are given; gives the next free entry.
-HEADBENCH_INLINE std::uint32_t enter_tile_row(const View& view, const FrameData& frame, const Rect& rect, int tile_y,
-                                              const float* first, const float* last, std::uint32_t entry) {
-  int firsts[kBands], lasts[kBands];
-  int leftmost = view.tiles_x * kColumns, rightmost = -1;
-  for (int band = 0; band < kBands; ++band) {
-    firsts[band] = static_cast<int>(first[band]);
-    lasts[band] = static_cast<int>(last[band]);
-    leftmost = firsts[band] < leftmost ? firsts[band] : leftmost;
-    rightmost = lasts[band] > rightmost ? lasts[band] : rightmost;
+// Tiles whose columns of blocks are worked on at a time: as whole numbers up to 2^24 floats are exact sets of bits.
+constexpr int kGroup = 24 / kColumns;
+
+// Columns of blocks that each band touches, a bit each, from column `left` on; false where there are none.
+HEADBENCH_INLINE bool find_columns(const Spans& spans, int left, float* columns) {
+  const Real offset = static_cast<float>(left), one = 1.0f;
+  bool found = false;
+  for (int band = 0; band < kSpans; band += W) {
+    const Real lo = max(load(spans.first + band) - offset, 0.0f);
+    const Real end = max(min(load(spans.last + band) - offset + one, static_cast<float>(kGroup * kColumns)), 0.0f);
+    const Mask touched = end > lo;
+    const Real run = scale_by_power(one, end) - scale_by_power(one, min(lo, end));
+    store(columns + band, zero_unless(touched, run));
+    found = found || any(touched);
   }
-  if (rightmost < 0) return entry;
-  // Rounding must not carry an entry past the places reserved for the rectangle.
-  const int begin = leftmost / kColumns > rect.x0 ? leftmost / kColumns : rect.x0;
-  const int end = rightmost / kColumns < rect.x1 ? rightmost / kColumns : rect.x1;
-  // As many tiles at a time as a word has bits for: the columns a band touches are a run of them.
-  constexpr int kGroup = 64 / kColumns;
-  constexpr std::uint64_t kAll = ~std::uint64_t{0};
-  for (int group = begin; group <= end; group += kGroup) {
-    std::uint64_t columns[kBands];
-    for (int band = 0; band < kBands; ++band) {
-      const int a = firsts[band] - group * kColumns, b = lasts[band] - group * kColumns;
-      const int lo = a > 0 ? a : 0, hi = b < 63 ? b : 63;
-      columns[band] = lo <= hi ? kAll >> (63 - hi) & kAll << lo : 0;
-    }
-    const int group_end = group + kGroup - 1 < end ? group + kGroup - 1 : end;
-    for (int tile_x = group; tile_x <= group_end; ++tile_x) {
+  return found;
+}
+
+// Enter the tiles of up to kTileRows tile rows whose bands' spans are given; gives the next free entry.
+HEADBENCH_INLINE std::uint32_t enter_tile_rows(const View& view, const FrameData& frame, const Rect& rect, int tile_y,
+                                               const Spans& spans, std::uint32_t entry) {
+  const int rows = rect.y1 - tile_y + 1 < kTileRows ? rect.y1 - tile_y + 1 : kTileRows;
+  for (int group = rect.x0; group <= rect.x1; group += kGroup) {
+    alignas(64) float columns[kSpans];
+    if (!find_columns(spans, group * kColumns, columns)) continue;
+    const int width = rect.x1 - group + 1 < kGroup ? rect.x1 - group + 1 : kGroup;
+    // One loop over all tiles, as its end is hard to foresee; an untouched tile's entry is written over.
+    int x = 0;
+    const float* row = columns;
+    std::uint32_t tile = static_cast<std::uint32_t>(tile_y * view.tiles_x + group);
+    for (int tiles = rows * width; tiles > 0; --tiles) {
       std::uint64_t blocks = 0;
       for (int band = 0; band < kBands; ++band) {
-        blocks |= (columns[band] & ((1 << kColumns) - 1)) << (kColumns * band);
-        columns[band] >>= kColumns;
+        const std::uint32_t run = static_cast<std::uint32_t>(static_cast<std::int32_t>(row[band]));
+        blocks |= static_cast<std::uint64_t>(run >> (x * kColumns) & ((1u << kColumns) - 1)) << (kColumns * band);
       }
-      if (!blocks) continue;
-      frame.entries[entry++] = {blocks, static_cast<std::uint32_t>(tile_y * view.tiles_x + tile_x)};
+      frame.entries[entry] = {blocks, tile + static_cast<std::uint32_t>(x)};
+      entry += blocks != 0;
+      const bool row_ends = ++x == width;
+      x = row_ends ? 0 : x;
+      row += row_ends ? kBands : 0;
+      tile += row_ends ? static_cast<std::uint32_t>(view.tiles_x) : 0;
     }
   }
   return entry;
 }
 
-inline void find_entries(const View& view, const FrameData& frame, std::int64_t begin, std::int64_t end) {
+inline void find_entries(const View& view, const Splats& splats, const FrameData& frame, std::int64_t begin,
+                         std::int64_t end) {
+  const int stride = record_stride(splats.channels);
   for (std::int64_t i = begin; i < end; ++i) {
     const std::uint32_t splat = frame.visible[i];
-    const float* record = frame.records + static_cast<std::size_t>(splat) * frame.record_stride;
+    const float* record = frame.records + static_cast<std::size_t>(splat) * stride;
     const Rect rect = frame.rects[splat];
     // The slack keeps pixels that pass the drawing's own test by a rounding.
     const float radius2 = record[kLog2Opacity] - kLog2AlphaMin + 1e-5f;
@@ -93,9 +103,7 @@ inline void find_entries(const View& view, const FrameData& frame, std::int64_t 
     for (int tile_y = rect.y0; tile_y <= rect.y1; tile_y += kTileRows) {
       Spans spans;
       find_spans(view, record, radius2, tile_y, spans);
-      for (int row = 0; row < kTileRows && tile_y + row <= rect.y1; ++row)
-        entry = enter_tile_row(view, frame, rect, tile_y + row, spans.first + row * kBands, spans.last + row * kBands,
-                               entry);
+      entry = enter_tile_rows(view, frame, rect, tile_y, spans, entry);
     }
     frame.ranges[splat].count = entry - frame.ranges[splat].begin;
   }

@@ -23,19 +23,18 @@ template <int C>
 inline bool composite_block(const Chunk& chunk, int index, const Block& block, int channels, float* state) {
   constexpr int kColors = C ? C : kChannelsMax;
   constexpr int kStep = 8;  // splats between two looks at whether the block is finished
-  const int count = C ? C : channels;
-  const std::uint16_t* list = chunk.list + index * kChunk;
-  const int listed = chunk.listed[index];
+  const int count = C ? C : channels, stride = record_stride(count);
   const Real stop = kTransmittanceMin;
   Real running = load(state + kRunning * W), remaining = load(state + kRemaining * W);
   Real last = load(state + kLastDrawn * W);
   Real colors[kColors];
   for (int c = 0; c < count; ++c) colors[c] = load(state + (kFront + c) * W);
   bool open = true;
-  for (int i = 0; i < listed && open;) {
-    const int step_end = i + kStep < listed ? i + kStep : listed;
-    for (; i < step_end; ++i) {
-      const float* row = chunk.params + list[i] * chunk.stride;
+  for (int word = 0; word < chunk.words && open; ++word) {
+    const float* rows = chunk.params + word * kWordBits * stride;
+    int step = kStep;
+    for (std::uint64_t hits = chunk.hits_of(index)[word]; hits && open; hits &= hits - 1) {
+      const float* row = rows + lowest_bit(hits) * stride;
       const Alpha a = alpha_of(row, block);
       const Real alpha = zero_unless(a.passes, min(a.raw, kAlphaMax));
       const Real next = fnma(alpha, running, running);
@@ -45,10 +44,12 @@ inline bool composite_block(const Chunk& chunk, int index, const Block& block, i
       remaining = select(open_lanes, next, remaining);
       last = select(open_lanes & a.passes, row[kIndex], last);
       running = next;
+      if (--step) continue;
+      step = kStep;
+      open = any(running > stop);
+      // Far below the stop, but out of reach of slow denormal arithmetic.
+      running = max(running, 1e-12f);
     }
-    open = any(running > stop);
-    // Far below the stop, but out of reach of slow denormal arithmetic.
-    running = max(running, 1e-12f);
   }
   store(state + kRunning * W, running);
   store(state + kRemaining * W, remaining);
@@ -57,11 +58,18 @@ inline bool composite_block(const Chunk& chunk, int index, const Block& block, i
   return open;
 }
 
+template <int C>
 inline void write_block(const View& view, const Splats& splats, const FrameData& frame, const ImageOut& out,
-                        int tile, int index, const Block& block, const float* state) {
-  const int channels = splats.channels;
-  float* kept = frame.transmittances + static_cast<std::size_t>(tile) * kTilePixels + index * W;
-  store(kept, load(state + kRemaining * W));
+                        int tile, int index, const Block& block, float* state) {
+  const int channels = C ? C : splats.channels;
+  const Real remaining = load(state + kRemaining * W);
+  store(frame.transmittances + static_cast<std::size_t>(tile) * kTilePixels + index * W, remaining);
+  for (int c = 0; c < channels; ++c) {
+    float* color = state + (kFront + c) * W;
+    store(color, fma(remaining, splats.background[c], load(color)));
+  }
+  alignas(64) float alpha[W];
+  store(alpha, Real(1.0f) - remaining);
   store(frame.last + static_cast<std::size_t>(tile) * kTilePixels + index * W, load(state + kLastDrawn * W));
   const int columns = view.width - block.left < kBlockWidth ? view.width - block.left : kBlockWidth;
   const int rows = view.height - block.top < kBlockHeight ? view.height - block.top : kBlockHeight;
@@ -70,9 +78,8 @@ inline void write_block(const View& view, const Splats& splats, const FrameData&
     for (int column = 0; column < columns; ++column) {
       const int lane = row * kBlockWidth + column;
       float* image = out.image + (pixel + column) * channels;
-      for (int c = 0; c < channels; ++c)
-        image[c] = state[(kFront + c) * W + lane] + kept[lane] * splats.background[c];
-      out.alpha[pixel + column] = 1.0f - kept[lane];
+      for (int c = 0; c < channels; ++c) image[c] = state[(kFront + c) * W + lane];
+      out.alpha[pixel + column] = alpha[lane];
     }
   }
 }
@@ -82,7 +89,8 @@ inline void draw_tile_with(const View& view, const Splats& splats, const FrameDa
                            int tile, float* scratch) {
   const int channels = splats.channels, state_floats = (kFront + channels) * W;
   float* states = scratch;
-  float* chunk_scratch = scratch + kBlocks * state_floats;
+  Chunk chunk;
+  chunk.params = scratch + kBlocks * state_floats;
   std::uint64_t open = 0;
   for (int b = 0; b < kBlocks; ++b) {
     const Block block = block_of(view, tile, b);
@@ -94,21 +102,22 @@ inline void draw_tile_with(const View& view, const Splats& splats, const FrameDa
     if (any(block.inside)) open |= std::uint64_t{1} << b;
   }
   const std::uint64_t drawn = open;
+  prefetch_tile(view, out.image, channels, tile);
+  prefetch_tile(view, out.alpha, 1, tile);
 
   const int count = static_cast<int>(frame.tile_begin[tile + 1] - frame.tile_begin[tile]);
   for (int begin = 0; begin < count && open; begin += kChunk) {
     const int end = begin + kChunk < count ? begin + kChunk : count;
-    Chunk chunk;
-    fill_chunk(view, splats, frame, tile, begin, end, open, chunk_scratch, chunk);
+    fill_chunk<C>(view, splats, frame, tile, begin, end, open, chunk);
     for (int b = 0; b < kBlocks; ++b) {
-      if (!chunk.listed[b]) continue;
+      if (!chunk.reaches(b)) continue;
       if (!composite_block<C>(chunk, b, block_of(view, tile, b), channels, states + b * state_floats))
         open &= ~(std::uint64_t{1} << b);
     }
   }
   for (int b = 0; b < kBlocks; ++b)
     if (drawn >> b & 1)
-      write_block(view, splats, frame, out, tile, b, block_of(view, tile, b), states + b * state_floats);
+      write_block<C>(view, splats, frame, out, tile, b, block_of(view, tile, b), states + b * state_floats);
 }
 
 inline void draw_tile(const View& view, const Splats& splats, const FrameData& frame, const ImageOut& out,

@@ -59,9 +59,7 @@ Frame::Frame(const View& view, const Splats& splats, const ImageOut& out, std::i
   StageClock clock(seconds_);
   const std::size_t count = static_cast<std::size_t>(splats.count);
   const std::size_t tiles = static_cast<std::size_t>(view.tiles_x) * view.tiles_y;
-  // Records start on cache lines: drawing reads them at random.
-  data_.record_stride = static_cast<int>(round_up(kGeometry + splats.channels, 16));
-  data_.records = records_.resize(count * data_.record_stride);
+  data_.records = records_.resize(count * round_up(kGeometry + splats.channels, kRecordUnit));
   data_.depths = depths_.resize(count);
   data_.radii = radii;
   data_.rects = rects_.resize(count);
@@ -79,7 +77,7 @@ Frame::Frame(const View& view, const Splats& splats, const ImageOut& out, std::i
   sort_by_depth();
   clock.ends(kSort);
   reserve_entries();
-  fill_tiles(threads);
+  fill_tiles(splats, threads);
   clock.ends(kFindPairs);
 
   const std::size_t scratch_stride = round_up(stages.scratch_floats(splats.channels), 16);
@@ -161,11 +159,11 @@ void Frame::reserve_entries() {
 
 // Counting sort of the entries into tiles. Splats are dealt with in depth order, cut into as many pieces as there
 // are threads; a piece's pairs go behind those of the pieces before it, so the lists do not depend on the cut.
-void Frame::fill_tiles(int threads) {
+void Frame::fill_tiles(const Splats& splats, int threads) {
   ThreadPool& pool = ThreadPool::instance();
   pool.run(task_count(visible_count_), threads, [&](std::int64_t task, int) {
     const std::int64_t begin = task * kSplatsPerTask;
-    stages_.find_entries(view_, data_, begin, std::min(begin + kSplatsPerTask, visible_count_));
+    stages_.find_entries(view_, splats, data_, begin, std::min(begin + kSplatsPerTask, visible_count_));
   });
 
   const std::size_t tiles = static_cast<std::size_t>(view_.tiles_x) * view_.tiles_y;
@@ -196,13 +194,17 @@ void Frame::fill_tiles(int threads) {
   data_.tile_begin[tiles] = total;
 
   data_.pairs = pairs_.resize(total);
+  data_.places = places_.resize(entry_count_);
   pool.run(pieces, threads, [&](std::int64_t piece, int) {
     std::uint32_t* place = &places[piece * tiles];
     const std::int64_t end = piece_begin(piece + 1);
     for (std::int64_t i = piece_begin(piece); i < end; ++i) {
       const EntryRange range = fetch_entries(data_.order, i, end);
-      for (std::uint32_t entry = range.begin; entry < range.begin + range.count; ++entry)
-        data_.pairs[place[data_.entries[entry].tile]++] = {data_.entries[entry].blocks, data_.order[i], entry};
+      for (std::uint32_t entry = range.begin; entry < range.begin + range.count; ++entry) {
+        const std::uint32_t to = place[data_.entries[entry].tile]++;
+        data_.pairs[to] = {data_.entries[entry].blocks, data_.order[i]};
+        data_.places[entry] = to;
+      }
     }
   });
 }
@@ -220,10 +222,10 @@ void Frame::backward(const Splats& splats, Gradients grads, float* background, f
   const std::int64_t tiles = static_cast<std::int64_t>(view_.tiles_x) * view_.tiles_y;
   const int channels = splats.channels;
   const std::size_t scratch_stride = round_up(stages_.scratch_floats(channels), 16);
-  Buffer<float> scratch, entries;
+  Buffer<float> scratch, records;
   scratch.resize(scratch_stride * threads);
-  grads.entry_stride = static_cast<int>(round_up(kMoments + channels + (grads.means2d_abs ? kAbsolutes : 0), stages_.lanes));
-  grads.entries = entries.resize(entry_count_ * grads.entry_stride);
+  grads.record_stride = static_cast<int>(round_up(kMoments + channels + (grads.means2d_abs ? kAbsolutes : 0), stages_.lanes));
+  grads.records = records.resize(data_.tile_begin[tiles] * std::size_t{1} * grads.record_stride);
   std::vector<double> tile_background(static_cast<std::size_t>(tiles) * channels);
   grads.background = tile_background.data();
   ThreadPool& pool = ThreadPool::instance();

@@ -3,9 +3,9 @@
 //   forward   project (splats) -> sort by depth -> find pairs (splats) -> draw (tiles)
 //   backward  draw backward (tiles), a record for every pair -> gather and project backward (splats)
 //
-// Memory, with N splats, C <= 8 channels, P pairs, R >= P tiles in the splats' bounding rectangles: 96 N + 16 (P + R) +
-// 8 pixels bytes while drawing, of which 76 N + 16 P + 8 pixels are kept for the backward pass, and 64 R more during that
-// pass alone. Up to workspace::kKeptMax of it is kept for the frames to come.
+// Memory, with N splats, C <= 8 channels, P pairs, R >= P tiles in the splats' bounding rectangles: 96 N + 16 P + 20 R +
+// 8 pixels bytes while drawing, of which 76 N + 16 P + 4 R + 8 pixels are kept for the backward pass, and 64 P more during
+// that pass alone. Up to workspace::kKeptMax of it is kept for the frames to come.
 //
 // What stands in parentheses is dealt out to threads. No two threads write to one place, and every sum has a fixed
 // order, so that results are equal bit for bit for any number of threads.
@@ -78,7 +78,7 @@ class Frame {
   void list_visible(std::int64_t count);
   void sort_by_depth();
   void reserve_entries();
-  void fill_tiles(int threads);
+  void fill_tiles(const Splats& splats, int threads);
   EntryRange fetch_entries(const std::uint32_t* order, std::int64_t i, std::int64_t end) const;
 
   const View view_;
@@ -93,7 +93,7 @@ class Frame {
   Buffer<Rect> rects_;
   Buffer<EntryRange> ranges_;
   Buffer<Entry> entries_;
-  Buffer<std::uint32_t> visible_, order_, tile_begin_;
+  Buffer<std::uint32_t> visible_, order_, tile_begin_, places_;
   Buffer<Pair> pairs_;
   std::size_t entry_count_ = 0;
   std::array<double, kStageCount> seconds_{};

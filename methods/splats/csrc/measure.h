@@ -9,16 +9,19 @@ namespace headbench::HEADBENCH_ISA {
 inline void count_work(const View& view, const Splats& splats, const FrameData& frame, int tile, float* scratch,
                        Work& work) {
   const int count = static_cast<int>(frame.tile_begin[tile + 1] - frame.tile_begin[tile]);
+  const int stride = record_stride(splats.channels);
+  Chunk chunk;
+  chunk.params = scratch;
   for (int begin = 0; begin < count; begin += kChunk) {
     const int end = begin + kChunk < count ? begin + kChunk : count;
-    Chunk chunk;
-    fill_chunk(view, splats, frame, tile, begin, end, ~std::uint64_t{0}, scratch, chunk);
+    fill_chunk<0>(view, splats, frame, tile, begin, end, ~std::uint64_t{0}, chunk);
     for (int b = 0; b < kBlocks; ++b) {
       const Block block = block_of(view, tile, b);
       if (!any(block.inside)) continue;  // never drawn, so that nothing is stored of it
       const Real last = load(frame.last + static_cast<std::size_t>(tile) * kTilePixels + b * W);
-      for (int i = 0; i < chunk.listed[b]; ++i) {
-        const float* row = chunk.params + chunk.list[b * kChunk + i] * chunk.stride;
+      for (int i = 0; i < end - begin; ++i) {
+        if (!(chunk.hits_of(b)[i / kWordBits] >> i % kWordBits & 1)) continue;
+        const float* row = chunk.params + i * stride;
         const Mask reached = last >= Real(row[kIndex]);
         if (!any(reached)) break;
         alignas(64) float drawn[W];

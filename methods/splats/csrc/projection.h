@@ -15,6 +15,11 @@ constexpr float kLog2e = 1.4426950408889634f;
 constexpr float kLn2 = 0.6931471805599453f;
 constexpr float kSqrtHalfLog2e = 0.8493218002880191f;
 
+// Floats per record.
+constexpr int record_stride(int channels) {
+  return (kGeometry + channels + kRecordUnit - 1) / kRecordUnit * kRecordUnit;
+}
+
 // W splats, component by component. Lanes without a splat hold a copy of the first.
 struct SplatLanes {
   alignas(64) float mean[3][W], quat[4][W], scale[3][W], opacity[W], offset[2][W];
@@ -222,7 +227,7 @@ inline void project(const View& view, const Splats& splats, const FrameData& fra
       const float center_x = field[kMeanX][lane], center_y = field[kMeanY][lane];
       frame.rects[splat] = {tile_of(center_x - w, view.tiles_x), tile_of(center_y - h, view.tiles_y),
                             tile_of(center_x + w, view.tiles_x), tile_of(center_y + h, view.tiles_y)};
-      float* record = frame.records + splat * frame.record_stride;
+      float* record = frame.records + splat * record_stride(splats.channels);
       for (int k = 0; k < kGeometry; ++k) record[k] = field[k][lane];
       for (int c = 0; c < splats.channels; ++c) record[kGeometry + c] = splats.colors[splat * splats.channels + c];
     }

@@ -115,31 +115,43 @@ inline void project_lanes_backward(const View& view, const Projection& p, const 
   view_gradient[15] = out.mean2d[1] - limit_y;
 }
 
+// Ask for the gradient records of splats visible[begin .. end).
+HEADBENCH_INLINE void prefetch_records(const FrameData& frame, const Gradients& grads, std::int64_t begin,
+                                       std::int64_t end) {
+  for (std::int64_t i = begin; i < end; ++i) {
+    const EntryRange range = frame.ranges[frame.visible[i]];
+    for (std::uint32_t e = range.begin; e < range.begin + range.count; ++e) {
+      const float* record = grads.records + static_cast<std::size_t>(frame.places[e]) * grads.record_stride;
+      for (int k = 0; k < grads.record_stride; k += 16) HEADBENCH_PREFETCH(record + k);
+    }
+  }
+}
+
 inline void project_backward(const View& view, const Splats& splats, const FrameData& frame,
                              const Gradients& grads, std::int64_t begin, std::int64_t end,
                              double* view_gradient) {
-  const int stride = grads.entry_stride, vectors = stride / W, channels = splats.channels;
+  const int stride = grads.record_stride, vectors = stride / W, channels = splats.channels;
   for (std::int64_t first = begin; first < end; first += W) {
     const int used = static_cast<int>(end - first < W ? end - first : W);
+    if (first == begin) prefetch_records(frame, grads, begin, begin + used);
     SplatLanes in;
     alignas(64) float moments[kMoments][W], absolutes[kAbsolutes][W];
     for (int lane = 0; lane < W; ++lane) {
       const std::int64_t splat = frame.visible[first + (lane < used ? lane : 0)];
       load_lane(splats, splat, lane, in);
+      if (first + W + lane < end) prefetch_records(frame, grads, first + W + lane, first + W + lane + 1);
       if (lane >= used) {
         for (int k = 0; k < kMoments; ++k) moments[k][lane] = 0.0f;
         for (int k = 0; k < kAbsolutes; ++k) absolutes[k][lane] = 0.0f;
         continue;
       }
-      // A splat's records are neighbours and are added in their order: the sum does not depend on who drew
-      // the tiles.
+      // A splat's records are added in the order of its entries: the sum does not depend on who drew the tiles.
       alignas(64) float sum[kMoments + kChannelsMax + kAbsolutes + 2 * W];
-      const float* record = grads.entries + static_cast<std::size_t>(frame.ranges[splat].begin) * stride;
-      const std::uint32_t count = frame.ranges[splat].count;
+      const EntryRange range = frame.ranges[splat];
       for (int i = 0; i < vectors; ++i) {
         Real total = 0.0f;
-        for (std::uint32_t e = 0; e < count; ++e)
-          total = total + load(record + static_cast<std::size_t>(e) * stride + i * W);
+        for (std::uint32_t e = range.begin; e < range.begin + range.count; ++e)
+          total = total + load(grads.records + static_cast<std::size_t>(frame.places[e]) * stride + i * W);
         store(sum + i * W, total);
       }
       for (int k = 0; k < kMoments; ++k) moments[k][lane] = sum[k];

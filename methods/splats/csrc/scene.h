@@ -25,6 +25,7 @@ constexpr int kChannelsMax = 32;
 // A record holds what drawing needs of a splat: kGeometry numbers, then the colour. A mean is the sum of a float and
 // a rest below its last digit: hundreds of pixels from the image's corner one float would be off by 3e-5 pixels, which
 // shows in sharp splats.
+constexpr int kRecordUnit = 16;  // floats: records are whole cache lines, as drawing reads them at random
 enum RecordField { kMeanX, kMeanY, kL11, kL21, kL22, kLog2Opacity, kRestX, kRestY, kGeometry };
 
 // A gradient record holds moments of the alpha gradient over pixels, then the gradient of the colour, then, where they
@@ -75,16 +76,15 @@ struct EntryRange {
   std::uint32_t begin, count;
 };
 
-// A splat in a tile's list. `entry` is where the pair's gradient goes.
+// A splat in a tile's list.
 struct Pair {
   std::uint64_t blocks;
-  std::uint32_t splat, entry;
+  std::uint32_t splat;
 };
 
 // What the stages hand on to each other.
 struct FrameData {
-  int record_stride;             // floats per record
-  float* records;                // (N, record_stride), set for visible splats
+  float* records;                // (N, record_stride(C)), set for visible splats
   double* depths;                // (N,) camera z, 0 where culled
   std::int32_t* radii;           // (N,)
   Rect* rects;                   // (N,)
@@ -93,6 +93,7 @@ struct FrameData {
   const std::uint32_t* visible;  // (M,) ascending
   const std::uint32_t* order;    // (M,) by depth
   Pair* pairs;                   // (P,) tile by tile, each by depth
+  std::uint32_t* places;         // of each entry among the pairs
   std::uint32_t* tile_begin;     // (tiles + 1,)
   float* transmittances;         // (tiles, 256) in block order
   float* last;                   // (tiles, 256) index in the tile's list of the pixel's last splat, or -1
@@ -106,8 +107,8 @@ struct ImageOut {
 struct Gradients {
   const float* image;      // (H, W, C)
   const float* alpha;      // (H, W)
-  int entry_stride;        // floats per gradient record
-  float* entries;          // gradient records, by Pair::entry
+  int record_stride;       // floats per gradient record
+  float* records;          // (P, record_stride) gradient records of the pairs
   double* background;      // (tiles, C)
   float* means;            // (N, 3)
   float* quats;            // (N, 4)
@@ -131,7 +132,7 @@ struct Stages {
   // Project splats [begin, end): records, depths, radii, rects.
   void (*project)(const View&, const Splats&, const FrameData&, std::int64_t begin, std::int64_t end);
   // Find the tiles and blocks that splats visible[begin .. end) reach.
-  void (*find_entries)(const View&, const FrameData&, std::int64_t begin, std::int64_t end);
+  void (*find_entries)(const View&, const Splats&, const FrameData&, std::int64_t begin, std::int64_t end);
   std::size_t (*scratch_floats)(int channels);
   void (*draw_tile)(const View&, const Splats&, const FrameData&, const ImageOut&, int tile, float* scratch);
   void (*draw_tile_backward)(const View&, const Splats&, const FrameData&, const Gradients&, int tile,

@@ -5,6 +5,8 @@
 
 #include <immintrin.h>
 
+#include <cstdint>
+
 namespace headbench::HEADBENCH_ISA {
 
 struct Real {
@@ -74,6 +76,17 @@ HEADBENCH_INLINE void transpose_quads(Real* q) {
   q[1].v = _mm256_shuffle_ps(a, c, 0xee);
   q[2].v = _mm256_shuffle_ps(b, d, 0x44);
   q[3].v = _mm256_shuffle_ps(b, d, 0xee);
+}
+
+// Hand `take` for each of the lowest `bits` bits which of the W words have it set.
+constexpr bool kTestsBits = true;
+template <int bits, class Take>
+HEADBENCH_INLINE void test_bits(const std::uint32_t* words, const Take& take) {
+  __m256i w = _mm256_slli_epi32(_mm256_loadu_si256(reinterpret_cast<const __m256i*>(words)), 32 - bits);
+  for (int b = bits - 1; b >= 0; --b) {
+    take(b, static_cast<unsigned>(_mm256_movemask_ps(_mm256_castsi256_ps(w))));
+    w = _mm256_add_epi32(w, w);
+  }
 }
 
 }  // namespace headbench::HEADBENCH_ISA

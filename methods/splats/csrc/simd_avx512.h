@@ -5,6 +5,8 @@
 
 #include <immintrin.h>
 
+#include <cstdint>
+
 namespace headbench::HEADBENCH_ISA {
 
 struct Real {
@@ -73,6 +75,14 @@ HEADBENCH_INLINE void transpose_quads(Real* q) {
   q[1].v = _mm512_shuffle_ps(a, c, 0xee);
   q[2].v = _mm512_shuffle_ps(b, d, 0x44);
   q[3].v = _mm512_shuffle_ps(b, d, 0xee);
+}
+
+// Hand `take` for each of the lowest `bits` bits which of the W words have it set.
+constexpr bool kTestsBits = true;
+template <int bits, class Take>
+HEADBENCH_INLINE void test_bits(const std::uint32_t* words, const Take& take) {
+  const __m512i w = _mm512_loadu_si512(words);
+  for (int b = 0; b < bits; ++b) take(b, _mm512_test_epi32_mask(w, _mm512_set1_epi32(1 << b)));
 }
 
 }  // namespace headbench::HEADBENCH_ISA

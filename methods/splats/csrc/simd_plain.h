@@ -84,4 +84,9 @@ HEADBENCH_INLINE void transpose_quads(Real* q) {
   for (int i = 0; i < 4; ++i) q[i] = t[i];
 }
 
+// No instruction gathers the same bit of several words.
+constexpr bool kTestsBits = false;
+template <int bits, class Take>
+HEADBENCH_INLINE void test_bits(const std::uint32_t*, const Take&) {}
+
 }  // namespace headbench::HEADBENCH_ISA

@@ -78,4 +78,9 @@ HEADBENCH_INLINE void transpose_quads(Real* q) {
   q[3] = Float4{a[3], b[3], c[3], d[3]};
 }
 
+// No instruction gathers the same bit of several words.
+constexpr bool kTestsBits = false;
+template <int bits, class Take>
+HEADBENCH_INLINE void test_bits(const std::uint32_t*, const Take&) {}
+
 }  // namespace headbench::HEADBENCH_ISA
