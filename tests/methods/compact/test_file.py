@@ -150,12 +150,12 @@ def test_lines_of_zeros_become_a_part_of_the_opacities(clip, tmp_path):
 
 def test_single_lines_of_zeros_cost_nothing(clip, tmp_path):
     def silence(values):
-        values["lines"][1:] = 0
+        values["lines"][::2] = 0
 
     before, after = compacted(store(clip, tmp_path, change=silence), Precision())
-    assert not after.field.tensors["lines"][1:].any()
-    assert after.field.tensors["lines"][0].any()
-    assert after.field.tensors["lines"].shape == before.field.tensors["lines"].shape
+    assert not after.field.tensors["lines"][::2].any()
+    np.testing.assert_allclose(after.field.tensors["lines"], before.field.tensors["lines"], atol=0.02)
+    assert before.field.tensors["lines"].abs().max() > 1
     with safe_open(tmp_path / COMPACT_FILE, "np") as file:
         assert "line_direction_0" in file.keys()  # noqa: SIM118 - not a mapping
 
