@@ -53,18 +53,19 @@ def triangle_frames(vertices: Tensor, faces: Tensor) -> Frames:
     vertices : (V, 3).
     faces : (F, 3) int64.
     """
-    corners = vertices.index_select(0, faces.reshape(-1)).view(-1, 3, 3)
+    # Coordinates apart, (3, F) each: several times faster on the CPU than rows of three.
+    corners = vertices.t().contiguous().index_select(1, faces.t().reshape(-1)).view(3, 3, -1)
     origin = corners[:, 0]
     base = corners[:, 1] - origin
     side = corners[:, 2] - origin
-    base_length = torch.linalg.vector_norm(base, dim=1, keepdim=True)
-    along = base / base_length.clamp_min(NORM_FLOOR)
-    normal = _unit(torch.linalg.cross(along, side))
-    across = -_unit(torch.linalg.cross(normal, along))
-    height = (across * side).sum(1).abs()
-    rotation = torch.stack([along, normal, across], dim=2)
-    size = 0.5 * (base_length[:, 0] + height)
-    return Frames(rotation, corners.mean(1), size, matrix_to_quaternion(rotation))
+    base_length = _length(base)
+    along = base / base_length
+    normal = _unit(_cross(along, side))
+    across = -_unit(_cross(normal, along))
+    height = (across * side).sum(0).abs()
+    rotation = torch.stack([along, normal, across], dim=1).permute(2, 0, 1).contiguous()
+    size = 0.5 * (base_length + height)
+    return Frames(rotation, corners.mean(1).t().contiguous(), size, matrix_to_quaternion(rotation))
 
 
 def to_world(
@@ -95,5 +96,16 @@ def apply_matrices(rows: Tensor, vectors: Tensor) -> Tensor:
     return torch.bmm(rows.view(-1, 3, 3), vectors[:, :, None])[:, :, 0]
 
 
+def _cross(a: Tensor, b: Tensor) -> Tensor:
+    """Cross products of (3, F) vectors."""
+    (ax, ay, az), (bx, by, bz) = a.unbind(0), b.unbind(0)
+    return torch.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+
+
+def _length(vectors: Tensor) -> Tensor:
+    """(F,) lengths of (3, F) vectors, `NORM_FLOOR` at least, where the gradient is 0."""
+    return vectors.square().sum(0).clamp_min(NORM_FLOOR**2).sqrt()
+
+
 def _unit(vectors: Tensor) -> Tensor:
-    return vectors / torch.linalg.vector_norm(vectors, dim=1, keepdim=True).clamp_min(NORM_FLOOR)
+    return vectors / _length(vectors)

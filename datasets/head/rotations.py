@@ -100,18 +100,26 @@ def matrix_to_quaternion(matrix: Tensor) -> Tensor:
     A rotation matrix gives all products of the quaternion's components, 4 q q^T, without a root. Its row with
     the largest diagonal has length at least 2, so normalising that row is well conditioned everywhere.
     """
-    (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in matrix.unbind(-2))
-    products = [
-        *(1 + a + e + i, h - f, c - g, d - b),
-        *(h - f, 1 + a - e - i, b + d, c + g),
-        *(c - g, b + d, 1 - a + e - i, f + h),
-        *(d - b, c + g, f + h, 1 - a - e + i),
-    ]
-    outer = torch.stack(products, dim=-1).unflatten(-1, (4, 4))
-    largest = outer.diagonal(dim1=-2, dim2=-1).argmax(-1)
-    row = outer.gather(-2, largest[..., None, None].expand(*largest.shape, 1, 4)).squeeze(-2)
-    unit = normalize(row, dim=-1)
-    return torch.where(unit[..., :1] < 0, -unit, unit)
+    # Components apart, each contiguous, and no gather: several times faster than rows of four.
+    a, b, c, d, e, f, g, h, i = matrix.flatten(-2).movedim(-1, 0).contiguous().unbind(0)
+    x, y, z = h - f, c - g, d - b
+    p, q, r = b + d, c + g, f + h
+    diagonal = (1 + a + e + i, 1 + a - e - i, 1 - a + e - i, 1 - a - e + i)
+    rows = (
+        (diagonal[0], x, y, z),
+        (x, diagonal[1], p, q),
+        (y, p, diagonal[2], r),
+        (z, q, r, diagonal[3]),
+    )
+    largest, row = diagonal[0], rows[0]
+    for value, other in zip(diagonal[1:], rows[1:]):
+        above = value > largest
+        row = tuple(torch.where(above, new, old) for new, old in zip(other, row))  # type: ignore[assignment]
+        largest = torch.where(above, value, largest)
+    chosen = torch.stack(row)
+    # The diagonal adds up to 4, so its largest entry is 1 at least, whatever the matrix: no division by 0.
+    unit = chosen / chosen.square().sum(0).sqrt()
+    return torch.where(unit[:1] < 0, -unit, unit).movedim(0, -1).contiguous()
 
 
 def matrix_to_axis_angle(matrix: Tensor) -> Tensor:
