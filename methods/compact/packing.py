@@ -1,8 +1,9 @@
 """Arrays to few bytes and back, without loss; what is read is untrusted.
 
 The coder is LZMA without its container, its literal model without context (``lc = lp = pb = 0``): an adaptive
-binary range coder, which on numbers without repeats comes within a few per cent of their entropy. On the planes,
-lines and splats of a trained avatar it took 92 to 98 % of the bytes of Huffman coding (zlib), 94 % of bzip2's.
+binary range coder, which on numbers without repeats comes within a few per cent of their entropy. On all arrays of
+two trained avatars (20,000 and 60,000 splats) together it took 88 % of the bytes of Huffman coding alone, 93 % of
+zlib's (level 9) and 94 to 96 % of bzip2's.
 """
 
 from __future__ import annotations

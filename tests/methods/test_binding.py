@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from headbench.methods.binding import apply_matrices, to_world, triangle_frames
+from headbench.methods.binding import apply_matrices, left_products, to_world, triangle_frames
 
 
 def random_mesh(seed, faces=7):
@@ -113,3 +113,16 @@ def test_apply_matrices():
     matrices, vectors = rng.normal(size=(5, 3, 3)), rng.normal(size=(5, 3))
     found = apply_matrices(torch.from_numpy(matrices.reshape(5, 9)), torch.from_numpy(vectors))
     np.testing.assert_allclose(found, np.einsum("nij,nj->ni", matrices, vectors), atol=1e-12)
+
+
+def test_left_products_are_hamilton_products():
+    rng = np.random.default_rng(0)
+    left, right = (rng.normal(size=(20, 4)) for _ in range(2))
+    found = torch.bmm(left_products(torch.from_numpy(left)), torch.from_numpy(right)[:, :, None])[:, :, 0]
+    length = np.linalg.norm(left, axis=1) * np.linalg.norm(right, axis=1)
+    turns = [Rotation.from_quat(values[:, [1, 2, 3, 0]]) for values in (left, right)]
+    expected = length[:, None] * (turns[0] * turns[1]).as_quat()[:, [3, 0, 1, 2]]
+    sign = np.sign((found.numpy() * expected).sum(1, keepdims=True))
+    np.testing.assert_allclose(found, sign * expected, atol=1e-12)
+    unit = torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64)
+    np.testing.assert_array_equal(left_products(unit)[0], np.eye(4))
