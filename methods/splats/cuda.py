@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from ...bench.errors import UnavailableError
-from .constants import ALPHA_MAX, TILE
+from .constants import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN
 from .request import Rendering, Request
 
 log = logging.getLogger(__name__)
@@ -46,14 +46,28 @@ def load() -> ModuleType:
 
 
 def supports(request: Request) -> bool:
-    """Tell whether gsplat takes this request's dtype and device."""
-    return request.means.dtype == torch.float32 and request.means.device.type == "cuda"
+    """Tell whether gsplat takes this request's dtype, device and cut-offs."""
+    return _takes(request.means) and _exact(request)
+
+
+def _takes(means: Tensor) -> bool:
+    return means.dtype == torch.float32 and means.device.type == "cuda"
+
+
+def _exact(request: Request) -> bool:
+    """The cut-offs are those compiled into gsplat."""
+    return (request.alpha_min, request.transmittance_min) == (ALPHA_MIN, TRANSMITTANCE_MIN)
 
 
 def rasterize_cuda(request: Request) -> Rendering:
     """Render with gsplat; see `rasterize`. Gives no gradient of ``K``, as gsplat does not: refused, not dropped."""
     gsplat = load()
-    if not supports(request):
+    if not _exact(request):
+        found = f"{request.alpha_min!r}, {request.transmittance_min!r}"
+        raise ValueError(
+            f"alpha_min, transmittance_min: expected the defaults for backend 'cuda', found {found}."
+        )
+    if not _takes(request.means):
         found = f"{request.means.dtype} on {request.means.device}"
         raise ValueError(f"means: expected torch.float32 on a CUDA device for backend 'cuda', found {found}.")
     if request.Ks.requires_grad:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from . import cpu, cuda
+from .constants import ALPHA_MIN, TRANSMITTANCE_MIN
 from .reference import rasterize_reference
 from .request import ArrayLike, Rendering, Request, make_request
 
@@ -25,6 +26,8 @@ def rasterize(
     far: float = 1e10,
     eps2d: float = 0.3,
     antialiased: bool = False,
+    alpha_min: float = ALPHA_MIN,
+    transmittance_min: float = TRANSMITTANCE_MIN,
     means2d_offset: Tensor | None = None,
     means2d_abs: Tensor | None = None,
     backend: str = "auto",
@@ -41,7 +44,7 @@ def rasterize(
     means : (N, 3) metres, float32 or float64; everything that comes out has its dtype.
     quats : (N, 4) rotations, wxyz, of any length; zero means no rotation.
     scales : (N, 3) standard deviations along the splat's axes, metres, > 0 (not their logarithms).
-    opacities : (N,) in [0, 1]. A splat below 1/255 is culled, so its gradient is zero.
+    opacities : (N,) in [0, 1]. A splat below ``alpha_min`` is culled, so its gradient is zero.
     colors : (N, C), any range, 1 <= C <= 32; or (V, N, C), a set for each of V cameras.
     viewmat : (4, 4) world to camera, OpenCV axes, metres; or (V, 4, 4). With a leading V in this or in ``K``, everything
         that comes out has it, and gradients of what is common to the cameras are summed.
@@ -53,7 +56,11 @@ def rasterize(
     eps2d : low-pass filter: variance added to both image axes, square pixels.
     antialiased : multiply each opacity by the square root of the ratio of the 2D covariance's determinants without and
         with ``eps2d``, so that the low-pass filter makes small splats faint, not bigger (gsplat's mode "antialiased";
-        Yu et al., "Mip-Splatting", CVPR 2024, eq. 9). The cut at 1/255 applies to the product.
+        Yu et al., "Mip-Splatting", CVPR 2024, eq. 9). The cut at ``alpha_min`` applies to the product.
+    alpha_min : a splat is left out of pixels where its alpha is below this, and altogether where its opacity is. The
+        default, 1/255, is gsplat's; more is faster and less exact (``headbench bench splats --tradeoffs`` measures it).
+    transmittance_min : the splat that would bring a pixel's transmittance to this or below is left out, with all behind
+        it. The default, 1e-4, is gsplat's; more is faster and less exact. Backend "cuda" has the defaults alone.
     means2d_offset : (N, 2), or (V, N, 2) with several cameras. Pixels, added to the projected means. Zeros that require a gradient collect the
         gradient by the 2D means, in pixel units as gsplat's; culled splats get zero.
     means2d_abs : like ``means2d_offset``, but adds nothing. Where it requires a gradient it collects, as that, the sum
@@ -83,6 +90,8 @@ def rasterize(
         far=far,
         eps2d=eps2d,
         antialiased=antialiased,
+        alpha_min=alpha_min,
+        transmittance_min=transmittance_min,
         means2d_offset=means2d_offset,
         means2d_abs=means2d_abs,
         check_finite=check_finite,

@@ -17,12 +17,10 @@ from torch.utils.checkpoint import checkpoint
 
 from .constants import (
     ALPHA_MAX,
-    ALPHA_MIN,
     FRUSTUM_MARGIN,
     QUATERNION_MIN,
     RADIUS_MAX,
     TILE,
-    TRANSMITTANCE_MIN,
 )
 from .request import Rendering, Request, View
 
@@ -74,6 +72,7 @@ def _draw(request: Request, view: View) -> tuple[Tensor, Tensor, Tensor]:
                 absolute[touching],
                 view.background,
                 pixels,
+                (request.alpha_min, request.transmittance_min),
             )
             row.append(tile.reshape(bottom - top, right - left, -1))
         rows.append(torch.cat(row, dim=1))
@@ -147,18 +146,18 @@ def _find_visible(request: Request, view: View) -> tuple[Tensor, Tensor, Tensor]
     """
     radii = torch.zeros(len(request.means), dtype=torch.int32, device=request.means.device)
     depths = request.means @ view.viewmat[2, :3] + view.viewmat[2, 3]
-    candidate = (depths > request.near) & (depths < request.far) & (request.opacities >= ALPHA_MIN)
+    candidate = (depths > request.near) & (depths < request.far) & (request.opacities >= request.alpha_min)
     subset = candidate.nonzero().squeeze(-1)
     footprints = project(request, view, subset)
 
-    # alpha falls to ALPHA_MIN on the ellipse at Mahalanobis distance sqrt(2 ln(opacity / ALPHA_MIN)).
-    level = 2 * torch.log(footprints.opacities / ALPHA_MIN)
+    # alpha falls to alpha_min on the ellipse at Mahalanobis distance sqrt(2 ln(opacity / alpha_min)).
+    level = 2 * torch.log(footprints.opacities / request.alpha_min)
     extents = torch.sqrt(level[:, None].clamp(min=0) * footprints.covariances[:, [0, 2]])
     reach = torch.ceil(extents)
     size = torch.tensor([request.width, request.height], device=reach.device)
     inside = (footprints.means + reach > 0).all(-1) & (footprints.means - reach < size).all(-1)
     drawable = (footprints.determinants > 0) & torch.isfinite(footprints.determinants)
-    opaque = footprints.opacities >= ALPHA_MIN
+    opaque = footprints.opacities >= request.alpha_min
     keep = inside & drawable & opaque & (reach.amax(-1) < RADIUS_MAX)
     visible = subset[keep]
     radii[visible] = reach[keep].amax(-1).to(torch.int32)
@@ -180,11 +179,16 @@ def _pixel_centers(left: int, top: int, right: int, bottom: int) -> Tensor:
 
 
 def _composite_tile(
-    splats: Footprints, colors: Tensor, absolute: Tensor, background: Tensor, pixels: Tensor
+    splats: Footprints,
+    colors: Tensor,
+    absolute: Tensor,
+    background: Tensor,
+    pixels: Tensor,
+    cut_offs: tuple[float, float],
 ) -> Tensor:
     """Composite depth-sorted splats front to back onto ``pixels`` (P, 2); gives (P, C + 1), alpha last.
 
-    ``absolute`` (M, 2) collects the absolute gradients of the means.
+    ``absolute`` (M, 2) collects the absolute gradients of the means; ``cut_offs`` are the least alpha and transmittance.
     """
     image = pixels.new_zeros(len(pixels), colors.shape[1])
     transmittance = pixels.new_ones(len(pixels))
@@ -196,7 +200,7 @@ def _composite_tile(
             _composite_chunk,
             *(image, transmittance, running, pixels),
             *(splats.means[part], absolute[part], splats.covariances[part], splats.determinants[part]),
-            *(splats.opacities[part], colors[part]),
+            *(splats.opacities[part], colors[part], cut_offs),
             use_reentrant=False,
             preserve_rng_state=False,
         )
@@ -215,6 +219,7 @@ def _composite_chunk(
     determinants: Tensor,
     opacities: Tensor,
     colors: Tensor,
+    cut_offs: tuple[float, float],
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Blend one chunk over what is there (3D Gaussian Splatting, eq. 3).
 
@@ -226,10 +231,11 @@ def _composite_chunk(
     xy, yy = covariances[:, 1], covariances[:, 2]
     distance = yy / determinants * (dx - xy / yy * dy) ** 2 + dy * dy / yy
     alpha = (opacities * torch.exp(-0.5 * distance)).clamp(max=ALPHA_MAX)
-    alpha = torch.where(alpha >= ALPHA_MIN, alpha, 0)
+    alpha_min, transmittance_min = cut_offs
+    alpha = torch.where(alpha >= alpha_min, alpha, 0)
 
     after = transmittance.detach()[:, None] * torch.cumprod(1 - alpha.detach(), dim=1)
-    drawn = running[:, None] & (after > TRANSMITTANCE_MIN)
+    drawn = running[:, None] & (after > transmittance_min)
     alpha = torch.where(drawn, alpha, 0)
     light = torch.cumprod(torch.cat([transmittance[:, None], 1 - alpha], dim=1), dim=1)
     running = torch.cat([running[:, None], drawn], dim=1)[:, -1]

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .constants import CHANNELS_MAX
+from .constants import ALPHA_MAX, ALPHA_MIN, CHANNELS_MAX, TRANSMITTANCE_MIN
 
 ArrayLike = Tensor | np.ndarray | Sequence[Any]
 
@@ -61,6 +61,8 @@ class Request:
     antialiased: bool
     batched: bool
     masked: int
+    alpha_min: float = ALPHA_MIN
+    transmittance_min: float = TRANSMITTANCE_MIN
 
     def view(self, index: int) -> View:
         """The part of the request that differs by camera."""
@@ -100,6 +102,8 @@ def make_request(
     means2d_abs: Tensor | None,
     check_finite: bool,
     mask_non_finite: bool,
+    alpha_min: float = ALPHA_MIN,
+    transmittance_min: float = TRANSMITTANCE_MIN,
 ) -> Request:
     """Check the arguments of `rasterize`. Raises ValueError naming the argument, what it must be and what it is."""
     splats = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors}
@@ -147,6 +151,12 @@ def make_request(
         raise _error("near, far", "0 < near < far", f"{near}, {far}")
     if not eps2d >= 0:
         raise _error("eps2d", "a number >= 0", repr(eps2d))
+    if not ALPHA_MIN <= alpha_min < ALPHA_MAX:
+        raise _error("alpha_min", f"a number from 1/255 to below {ALPHA_MAX}", repr(alpha_min))
+    if not TRANSMITTANCE_MIN <= transmittance_min < 1:
+        raise _error(
+            "transmittance_min", f"a number from {TRANSMITTANCE_MIN} to below 1", repr(transmittance_min)
+        )
 
     masked = 0
     if mask_non_finite:
@@ -169,6 +179,8 @@ def make_request(
         antialiased=antialiased,
         batched=batched,
         masked=masked,
+        alpha_min=float(alpha_min),
+        transmittance_min=float(transmittance_min),
     )
 
 

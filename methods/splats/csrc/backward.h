@@ -155,8 +155,8 @@ HEADBENCH_INLINE void repeat_rows(const float* colors, int channels, float* by_r
 // Walk one block's list from its end; `gradients` are the chunk's records, row by row. Nothing is made of what is added
 // to `spare`.
 template <int C, bool Absolute>
-inline void composite_block_backward(const Chunk& chunk, int index, const Block& block, int channels,
-                                     float* state, float* gradients, float* spare) {
+inline void composite_block_backward(const View& view, const Chunk& chunk, int index, const Block& block,
+                                     int channels, float* state, float* gradients, float* spare) {
   constexpr int kColors = C ? C : 1;
   const int count = C ? C : channels, stride = record_stride(count), width = gradient_stride(count, Absolute);
   const float* colors = state + kBack * W;
@@ -175,7 +175,7 @@ inline void composite_block_backward(const Chunk& chunk, int index, const Block&
       hits ^= std::uint64_t{1} << bit;
       const float* row = chunk.params + in_chunk * stride;
       const Mask reached = start >= Real(row[kIndex]);
-      const Alpha a = alpha_of(row, block);
+      const Alpha a = alpha_of(view, row, block);
       const Mask drawn = a.passes & reached;
       if (!any(drawn)) continue;
       const Real alpha = zero_unless(drawn, min(a.raw, kAlphaMax));
@@ -287,8 +287,8 @@ inline void draw_tile_backward_with(const View& view, const Splats& splats, cons
     fill_chunk<C>(view, splats, frame, tile, begin, end, wanted, chunk);
     for (int b = 0; b < kBlocks; ++b)
       if (chunk.reaches(b))
-        composite_block_backward<C, Absolute>(chunk, b, block_of(view, tile, b), channels, states + b * state_floats,
-                                              sums, spare);
+        composite_block_backward<C, Absolute>(view, chunk, b, block_of(view, tile, b), channels,
+                                              states + b * state_floats, sums, spare);
   }
 }
 

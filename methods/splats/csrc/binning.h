@@ -1,5 +1,5 @@
 // Which blocks of which tiles a splat reaches, exactly: row by row, the span of pixels inside the ellipse
-// where alpha >= 1/255.
+// where alpha >= alpha_min.
 #pragma once
 
 #include "tile.h"
@@ -98,7 +98,7 @@ inline void find_entries(const View& view, const Splats& splats, const FrameData
     const float* record = frame.records + static_cast<std::size_t>(splat) * stride;
     const Rect rect = frame.rects[splat];
     // The slack keeps pixels that pass the drawing's own test by a rounding.
-    const float radius2 = record[kLog2Opacity] - kLog2AlphaMin + 1e-5f;
+    const float radius2 = record[kLog2Opacity] - view.log2_alpha_min + 1e-5f;
     std::uint32_t entry = frame.ranges[splat].begin;
     for (int tile_y = rect.y0; tile_y <= rect.y1; tile_y += kTileRows) {
       Spans spans;

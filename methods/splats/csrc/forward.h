@@ -20,11 +20,11 @@ inline std::size_t forward_scratch(int channels) {
 // Composite one block's list over its state; false once no pixel lets light through. C = 0 means that the
 // number of channels is known only at run time.
 template <int C>
-inline bool composite_block(const Chunk& chunk, int index, const Block& block, int channels, float* state) {
+inline bool composite_block(const View& view, const Chunk& chunk, int index, const Block& block, int channels, float* state) {
   constexpr int kColors = C ? C : kChannelsMax;
   constexpr int kStep = 8;  // splats between two looks at whether the block is finished
   const int count = C ? C : channels, stride = record_stride(count);
-  const Real stop = kTransmittanceMin;
+  const Real stop = view.transmittance_min;
   Real running = load(state + kRunning * W), remaining = load(state + kRemaining * W);
   Real last = load(state + kLastDrawn * W);
   Real colors[kColors];
@@ -35,7 +35,7 @@ inline bool composite_block(const Chunk& chunk, int index, const Block& block, i
     int step = kStep;
     for (std::uint64_t hits = chunk.hits_of(index)[word]; hits && open; hits &= hits - 1) {
       const float* row = rows + lowest_bit(hits) * stride;
-      const Alpha a = alpha_of(row, block);
+      const Alpha a = alpha_of(view, row, block);
       const Real alpha = zero_unless(a.passes, min(a.raw, kAlphaMax));
       const Real next = fnma(alpha, running, running);
       const Mask open_lanes = next > stop;
@@ -111,7 +111,7 @@ inline void draw_tile_with(const View& view, const Splats& splats, const FrameDa
     fill_chunk<C>(view, splats, frame, tile, begin, end, open, chunk);
     for (int b = 0; b < kBlocks; ++b) {
       if (!chunk.reaches(b)) continue;
-      if (!composite_block<C>(chunk, b, block_of(view, tile, b), channels, states + b * state_floats))
+      if (!composite_block<C>(view, chunk, b, block_of(view, tile, b), channels, states + b * state_floats))
         open &= ~(std::uint64_t{1} << b);
     }
   }

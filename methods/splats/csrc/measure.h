@@ -25,7 +25,7 @@ inline void count_work(const View& view, const Splats& splats, const FrameData& 
         const Mask reached = last >= Real(row[kIndex]);
         if (!any(reached)) break;
         alignas(64) float drawn[W];
-        store(drawn, zero_unless(alpha_of(row, block).passes & reached, 1.0f));
+        store(drawn, zero_unless(alpha_of(view, row, block).passes & reached, 1.0f));
         work.tested += W;
         for (int lane = 0; lane < W; ++lane) work.drawn += drawn[lane] != 0.0f;
       }

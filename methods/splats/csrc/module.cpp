@@ -8,6 +8,7 @@
 #include <nanobind/stl/vector.h>
 
 #include <algorithm>
+#include <cmath>
 #include <limits>
 #include <map>
 #include <memory>
@@ -59,7 +60,7 @@ const Stages& stages_by_name(const std::string& name) {
 }
 
 View make_view(const Array<const float, 4, 4>& viewmat, const Array<const float, 3, 3>& K, double near, double far,
-               float eps2d, bool antialiased, std::size_t width, std::size_t height) {
+               float eps2d, bool antialiased, double alpha_min, double transmittance_min, std::size_t width, std::size_t height) {
   View view{};
   for (int i = 0; i < 3; ++i) {
     for (int j = 0; j < 3; ++j) view.rotation[3 * i + j] = viewmat(i, j);
@@ -73,6 +74,9 @@ View make_view(const Array<const float, 4, 4>& viewmat, const Array<const float,
   view.far = far;
   view.eps2d = eps2d;
   view.antialiased = antialiased;
+  view.alpha_min = static_cast<float>(alpha_min);
+  view.log2_alpha_min = static_cast<float>(std::log2(alpha_min));
+  view.transmittance_min = static_cast<float>(transmittance_min);
   constexpr std::size_t kSizeMax = std::size_t{1} << 19;  // tile indices have 16 bits
   if (width < 1 || height < 1 || width > kSizeMax || height > kSizeMax)
     throw std::invalid_argument("image sides must be from 1 to 2^19 pixels");
@@ -88,11 +92,13 @@ std::unique_ptr<Frame> forward(const Array<const float, -1, 3>& means, const Arr
                                const Array<const float, -1, -1>& colors, const Array<const float, -1, 2>& offset,
                                const Array<const float, -1>& background, const Array<const float, 4, 4>& viewmat,
                                const Array<const float, 3, 3>& K, double near, double far, float eps2d,
-                               bool antialiased, const Array<float, -1, -1, -1>& image, const Array<float, -1, -1>& alpha,
+                               bool antialiased, double alpha_min, double transmittance_min,
+                               const Array<float, -1, -1, -1>& image, const Array<float, -1, -1>& alpha,
                                const Array<std::int32_t, -1>& radii, const std::string& instruction_set,
                                int threads) {
   const Splats splats = Inputs{means, quats, scales, opacities, colors, offset, background}.splats();
-  const View view = make_view(viewmat, K, near, far, eps2d, antialiased, image.shape(1), image.shape(0));
+  const View view = make_view(viewmat, K, near, far, eps2d, antialiased, alpha_min, transmittance_min, image.shape(1),
+                              image.shape(0));
   if (image.shape(2) != colors.shape(1) || alpha.shape(0) != image.shape(0) || alpha.shape(1) != image.shape(1) ||
       radii.shape(0) != means.shape(0) || threads < 1)
     throw std::invalid_argument("outputs do not fit the inputs");
@@ -204,7 +210,8 @@ NB_MODULE(_kernel, m) {
            "Pairs of splat and pixel tested, and those drawn.");
   m.def("peak_flops", &peak_flops, "instruction_set"_a, "Measured multiply-add rate of one thread, flops per second.");
   m.def("forward", &forward, "means"_a, "quats"_a, "scales"_a, "opacities"_a, "colors"_a, "offset"_a, "background"_a,
-        "viewmat"_a, "K"_a, "near"_a, "far"_a, "eps2d"_a, "antialiased"_a, "image"_a, "alpha"_a, "radii"_a, "instruction_set"_a,
+        "viewmat"_a, "K"_a, "near"_a, "far"_a, "eps2d"_a, "antialiased"_a, "alpha_min"_a,
+        "transmittance_min"_a, "image"_a, "alpha"_a, "radii"_a, "instruction_set"_a,
         "threads"_a, "Draw into image, alpha and radii.");
   m.def("backward", &backward, "frame"_a, "means"_a, "quats"_a, "scales"_a, "opacities"_a, "colors"_a, "offset"_a,
         "background"_a, "grad_image"_a, "grad_alpha"_a, "grad_means"_a, "grad_quats"_a, "grad_scales"_a,

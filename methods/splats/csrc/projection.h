@@ -186,7 +186,7 @@ inline void project(const View& view, const Splats& splats, const FrameData& fra
     store(opacities, opacity);
     for (int lane = 0; lane < W; ++lane) level_log2[lane] = log2f(opacities[lane]);
     const Real log2_opacity = load(level_log2);
-    const Real level = Real(2.0f * kLn2) * max(log2_opacity - Real(kLog2AlphaMin), 0.0f);
+    const Real level = Real(2.0f * kLn2) * max(log2_opacity - Real(view.log2_alpha_min), 0.0f);
     const Real extent_x = sqrt(level * p.xx), extent_y = sqrt(level * p.yy);
     const Real reach_x = ceil(extent_x), reach_y = ceil(extent_y), radius = max(reach_x, reach_y);
     // All conditions positive: a NaN anywhere culls.
@@ -195,7 +195,7 @@ inline void project(const View& view, const Splats& splats, const FrameData& fra
                           (Real(static_cast<float>(view.height)) > y - reach_y);
     const Real largest = 3e38f;
     const Mask drawable = (p.det > Real(0.0f)) & (largest > p.det) & (largest > p.l11) &
-                          (Real(kRadiusMax) > radius) & (opacity >= Real(kAlphaMin));
+                          (Real(kRadiusMax) > radius) & (opacity >= Real(view.alpha_min));
 
     alignas(64) float visible[W], field[kGeometry][W], reach[W], half_x[W], half_y[W];
     store(visible, zero_unless(in_image & drawable, 1.0f));

@@ -13,10 +13,7 @@ namespace headbench {
 // The constants of methods/splats/constants.py.
 constexpr int kTile = 16;
 constexpr int kTilePixels = kTile * kTile;
-constexpr float kAlphaMin = 1.0f / 255.0f;
-constexpr float kLog2AlphaMin = -7.994353436858858f;
 constexpr float kAlphaMax = 0.99f;
-constexpr float kTransmittanceMin = 1e-4f;
 constexpr float kFrustumMargin = 0.3f;
 constexpr float kQuaternionMin = 1e-12f;
 constexpr float kRadiusMax = 16777216.0f;
@@ -41,6 +38,7 @@ struct View {
   float fx, fy, cx, cy;
   double near, far;
   float eps2d;
+  float alpha_min, log2_alpha_min, transmittance_min;
   bool antialiased;  // opacities are multiplied by the square root of the ratio of determinants without and with eps2d
   int width, height;
   int tiles_x, tiles_y;

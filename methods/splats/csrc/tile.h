@@ -165,18 +165,18 @@ HEADBENCH_INLINE Real exp2(Real x) {
 }
 
 struct Alpha {
-  Mask passes;  // alpha >= 1/255
+  Mask passes;  // alpha >= alpha_min
   Real raw;     // before the clamp; meaningless where it does not pass
   Real u, v;    // log2 alpha = log2 opacity - u² - v²
 };
 
 // Alpha of the splat in `row` at a block's pixels. Forward and backward both come here: were the two to differ
 // by a rounding, pixels at a threshold would get gradients of another image.
-HEADBENCH_INLINE Alpha alpha_of(const float* row, const Block& block) {
+HEADBENCH_INLINE Alpha alpha_of(const View& view, const float* row, const Block& block) {
   const Real dx = block.pixel_x - Real(row[kMeanX]), dy = block.pixel_y - Real(row[kMeanY]);
   const Real u = fma(row[kL11], dx, Real(row[kL21]) * dy), v = Real(row[kL22]) * dy;
   const Real exponent = fnma(v, v, fnma(u, u, row[kLog2Opacity]));
-  return {exponent >= Real(kLog2AlphaMin), exp2(exponent), u, v};
+  return {exponent >= Real(view.log2_alpha_min), exp2(exponent), u, v};
 }
 
 }  // namespace headbench::HEADBENCH_ISA

@@ -23,7 +23,15 @@ class Dense(NamedTuple):
     safe: Tensor  # (H, W) bool: no alpha or transmittance so near a threshold that float32 might fall on the other side
 
 
-def render_dense(scene: Scene, *, near: float = 0.01, eps2d: float = 0.3, antialiased: bool = False) -> Dense:
+def render_dense(
+    scene: Scene,
+    *,
+    near: float = 0.01,
+    eps2d: float = 0.3,
+    antialiased: bool = False,
+    alpha_min: float = 1 / 255,
+    transmittance_min: float = 1e-4,
+) -> Dense:
     """Render without gradients. Memory is (N, H W); keep both small."""
     s = Scene(*(v.detach().double() if isinstance(v, Tensor) else v for v in scene))
     camera = s.means @ s.viewmat[:3, :3].T + s.viewmat[:3, 3]
@@ -61,12 +69,16 @@ def render_dense(scene: Scene, *, near: float = 0.01, eps2d: float = 0.3, antial
         d = torch.stack([columns - center[k, 0], rows - center[k, 1]], -1)
         raw = opacities[k] * torch.exp(-0.5 * ((d @ inverse[k]) * d).sum(-1))
         alpha = raw.clamp(max=0.99)
-        passes = (alpha >= 1 / 255) & ~done
+        passes = (alpha >= alpha_min) & ~done
         after = light * (1 - alpha)
-        for value, threshold, matters in ((raw, 1 / 255, ~done), (raw, 0.99, ~done), (after, 1e-4, passes)):
+        for value, threshold, matters in (
+            (raw, alpha_min, ~done),
+            (raw, 0.99, ~done),
+            (after, transmittance_min, passes),
+        ):
             distance = (value / threshold - 1).abs()
             margin = torch.where(matters, torch.minimum(margin, distance), margin)
-        done |= passes & (after <= 1e-4)
+        done |= passes & (after <= transmittance_min)
         drawn = passes & ~done
         image += torch.where(drawn, alpha * light, 0)[..., None] * s.colors[splat]
         light = torch.where(drawn, after, light)

@@ -36,6 +36,13 @@ def test_curves_begin_exact_and_errors_grow_with_what_is_left_out(monkeypatch):
         errors = [point["mean_error"] for point in curve]
         assert errors == sorted(errors)
         assert errors[-1] > 0
+    for knob in ("least alpha", "least transmittance"):
+        curve = [point for point in points if point["knob"] == knob]
+        assert len(curve) == 3
+        assert {p["splats"] for p in curve} == {600}
+        errors = [point["mean_error"] for point in curve]
+        assert errors == sorted(errors)
+        assert 0 < errors[0] < curve[0]["max_error"]
     half = points[-1]
     assert half["splats"] == 600
     assert 0 < half["mean_error"] < 2**-11, "rounding to 11 bits"
