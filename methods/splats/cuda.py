@@ -47,11 +47,8 @@ def load() -> ModuleType:
 
 def supports(request: Request) -> bool:
     """Tell whether gsplat takes this request's dtype, device and cut-offs."""
-    return _takes(request.means) and _exact(request)
-
-
-def _takes(means: Tensor) -> bool:
-    return means.dtype == torch.float32 and means.device.type == "cuda"
+    on_gpu = request.means.dtype == torch.float32 and request.means.device.type == "cuda"
+    return on_gpu and _exact(request)
 
 
 def _exact(request: Request) -> bool:
@@ -67,7 +64,7 @@ def rasterize_cuda(request: Request) -> Rendering:
         raise ValueError(
             f"alpha_min, transmittance_min: expected the defaults for backend 'cuda', found {found}."
         )
-    if not _takes(request.means):
+    if not supports(request):
         found = f"{request.means.dtype} on {request.means.device}"
         raise ValueError(f"means: expected torch.float32 on a CUDA device for backend 'cuda', found {found}.")
     if request.Ks.requires_grad:
