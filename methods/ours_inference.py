@@ -15,7 +15,7 @@ from torch import Tensor
 from .binding import Frames, WorldSplats
 from .dynamics import LocalSplats
 from .feature_lines import LinePosition, blend_lines, line_position, line_table, normalised_weight
-from .networks import offset_network
+from .networks import CPU_BLOCK
 from .ours_field import Box
 from .row_sums import sum_rows
 from .sh import C0
@@ -62,20 +62,33 @@ class LineOffsets:
         self.inside = box.contains(positions).nonzero().squeeze(1)
         unit = box.unit(positions.index_select(0, self.inside))
         self._position: LinePosition = line_position(unit, self._lines.shape[2])
-        self._first = normalised_weight(tensors, 0)
-        self._rest = (
-            tensors["line_bias_0"],
-            *(normalised_weight(tensors, 1), tensors["line_bias_1"]),
-            *(normalised_weight(tensors, 2), tensors["line_bias_2"]),
-        )
+        self._first, self._first_bias = normalised_weight(tensors, 0), tensors["line_bias_0"]
+        # Transposed once, as the products below want them.
+        self._layers = [
+            (normalised_weight(tensors, layer).t().contiguous(), tensors[f"line_bias_{layer}"])
+            for layer in (1, 2)
+        ]
 
     def __call__(self, expression: Tensor, jaw: Tensor) -> Tensor:
         """(N, D) offsets of all splats for a frame's coefficients."""
         table = line_table(blend_lines(self._lines, expression, jaw), self._first)
-        offsets = offset_network(sum_rows(table, *self._position), *self._rest)
+        # The two weights of an axis add up to 1, so the bias on the rows of one axis reaches each splat once.
+        table[: self._lines.shape[2]] += self._first_bias
+        (second, second_bias), (last, last_bias) = self._layers
+        rows, weights = self._position
+        inside = table.new_empty(len(rows), len(last_bias))
+        # Blocks whose activations stay in cache; one for other devices.
+        step = CPU_BLOCK if rows.device.type == "cpu" else max(len(rows), 1)
+        hidden = table.new_empty(min(step, len(rows)), second.shape[1])
+        for start in range(0, len(rows), step):
+            block = slice(start, min(start + step, len(rows)))
+            first = sum_rows(table, rows[block], weights[block]).relu_()
+            out = hidden[: len(first)]
+            torch.addmm(second_bias, first, second, out=out).relu_()
+            torch.addmm(last_bias, out, last, out=inside[block])
         if len(self.inside) == self._count:
-            return offsets
-        return offsets.new_zeros(self._count, offsets.shape[1]).index_copy_(0, self.inside, offsets)
+            return inside
+        return inside.new_zeros(self._count, inside.shape[1]).index_copy_(0, self.inside, inside)
 
 
 class PlaneColors:
