@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from .accuracy import Accuracy
 from .layout import milliseconds, table
 from .timing import Times
 
@@ -31,13 +32,16 @@ class Cell:
     """Arithmetic of the drawing stages, forward and backward, over the measured multiply-add rate."""
     ratio_to_anchor: float | None = None
     """The anchor's least time for both passes over this one's."""
+    accuracy: Accuracy | None = None
+    """Errors against the reference in float64, where they were measured."""
 
 
 def speed_tables(cells: Sequence[Cell], peaks: dict[str, float], missing: str) -> str:
     """Lay out the results; ``missing`` says why there is no anchor, ``peaks`` are flops a second by backend."""
     parts = [
         "Processor time of one thread in ms: least and median of the runs; spread is between the quartiles. A pair is "
-        "a splat\nand a pixel it contributes to; the ratio is to the anchor's time for both passes.\n\n"
+        "a splat\nand a pixel it contributes to; the ratio is to the anchor's time for both passes. Errors are against "
+        "float64: the\nimage's mean, the share of pixels off by more than 1e-5, and the worst gradient's, relative.\n\n"
         + _times(cells)
     ]
     if missing:
@@ -56,7 +60,7 @@ def speed_tables(cells: Sequence[Cell], peaks: dict[str, float], missing: str) -
 def _times(cells: Sequence[Cell]) -> str:
     header = (
         *("splats", "image", "backend", "forward", "median", "spread", "with backward", "median", "spread"),
-        *("Mpairs/s forward", "both", "x anchor"),
+        *("Mpairs/s forward", "both", "x anchor", "image error", "pixels off", "gradient error"),
     )
     return table(header, [_times_row(cell) for cell in cells])
 
@@ -69,7 +73,15 @@ def _times_row(cell: Cell) -> tuple[str, ...]:
         *(milliseconds(s) for times in both for s in (times.least, times.median, times.iqr)),
         *("-" if cell.drawn is None else f"{1e-6 * cell.drawn / times.least:.0f}" for times in both),
         "-" if cell.ratio_to_anchor is None else f"{cell.ratio_to_anchor:.1f}",
+        *_errors(cell.accuracy),
     )
+
+
+def _errors(accuracy: Accuracy | None) -> tuple[str, str, str]:
+    if accuracy is None:
+        return "-", "-", "-"
+    worst = max(accuracy.gradients.values())
+    return f"{accuracy.image_mean:.1e}", f"{100 * (1 - accuracy.pixels_equal):.4f} %", f"{worst:.1e}"
 
 
 def _stages(cells: Sequence[Cell]) -> str:

@@ -14,6 +14,7 @@ from ....datasets.procedural.model import procedural_head
 from .. import cpu
 from ..rasterize import available_backends
 from . import anchor
+from .accuracy import compare_with, float64_truth
 from .cells import Cell, speed_tables
 from .order import Ordering, bound_head, measure_order, order_table
 from .passes import draw, leaves, one_torch_thread, passes
@@ -32,13 +33,17 @@ BACKWARD_FLOPS = (40, 4)
 
 
 def measure(quick: bool, progress: Progress) -> Findings:
-    """Run the speed bench: the whole grid of sizes, or with ``quick`` its diagonal with few runs."""
+    """Run the speed bench: the whole grid of sizes, or with ``quick`` its diagonal with few runs.
+
+    Errors are measured on the diagonal, with ``quick`` without its largest scene, which takes float64 half a minute.
+    """
     scenes, budget, least_runs = (DIAGONAL, 0.3, 3) if quick else (GRID, 1.5, 7)
     kernels = [name for name in available_backends() if name.startswith("cpu-")]
     try:
         anchor_passes, missing = anchor.load(), ""
     except UnavailableError as error:
         anchor_passes, missing = None, str(error)
+    checked = DIAGONAL[:-1] if quick else DIAGONAL
     peaks = {name: cpu.peak_flops(name) for name in kernels}
     steps = len(scenes) * (len(kernels) + (anchor_passes is not None)) + (2 * len(DIAGONAL) if kernels else 0)
     cells: list[Cell] = []
@@ -49,6 +54,10 @@ def measure(quick: bool, progress: Progress) -> Findings:
             for name in kernels:
                 progress(len(cells) + len(row), steps, f"{count} splats, {name}")
                 row.append(measure_kernel(scene, name, peaks[name], budget=budget, least_runs=least_runs))
+            if kernels and (count, width, height) in checked:
+                progress(len(cells) + len(row), steps, f"{count} splats, float64")
+                truth = float64_truth(scene)
+                row = [replace(cell, accuracy=compare_with(truth, scene, cell.backend)) for cell in row]
             if anchor_passes is not None:
                 row.append(_measure_anchor(scene, anchor_passes, row, budget=budget))
                 row = [_with_ratio(cell, row[-1]) for cell in row]

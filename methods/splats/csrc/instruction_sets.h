@@ -11,6 +11,12 @@ namespace portable {
 extern const Stages stages;
 }
 
+#ifdef HEADBENCH_NEON
+namespace neon {
+extern const Stages stages;
+}
+#endif
+
 #ifdef HEADBENCH_X86
 namespace avx2 {
 extern const Stages stages;
@@ -29,6 +35,9 @@ inline std::vector<const Stages*> runnable_stages() {
       __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512vl"))
     found.push_back(&avx512::stages);
   if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma")) found.push_back(&avx2::stages);
+#endif
+#ifdef HEADBENCH_NEON
+  found.push_back(&neon::stages);  // part of every 64-bit ARM processor
 #endif
   found.push_back(&portable::stages);
   return found;

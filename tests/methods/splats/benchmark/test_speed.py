@@ -72,6 +72,12 @@ def test_every_cell_is_reported(monkeypatch, with_anchor):
         assert (cell["ratio_to_anchor"] is not None) == with_anchor
         if cell["backend"] == speed.ANCHOR:
             assert cell["ratio_to_anchor"] == 1
+        checked = cell["splats"] == 300 and cell["backend"] != speed.ANCHOR
+        assert (cell["accuracy"] is not None) == checked, "all but the largest scene"
+        if checked:
+            assert 0 < cell["accuracy"]["image_mean"] < 1e-6
+            assert f"{cell['accuracy']['image_mean']:.1e}" in findings.text
+            assert 0 < max(cell["accuracy"]["gradients"].values()) < 1e-4
     assert [t["width"] for t in data["threads"]] == [40, 33]
     assert [t["splats"] for t in data["order"]] == [300, 500]
     assert "Threads." in findings.text
