@@ -2,6 +2,12 @@
 
 Each of these is the fast twin of what `ours_appearance` trains with; `tests/methods/test_ours_formula.py` compares
 both with the definition in float64.
+
+Measured and left out, since they save less than they cost. A splat's offset cannot matter where the Lipschitz bound
+|W2| |W1|_2 |h(frame) - h(rest)| of the offset network changes its opacity by less than a tolerance: at 1e-3 this held
+for 0.02 to 6 % of the splats of two trained avatars. Splats that the projection culls, with the head in view: 0.2 and
+1.4 %; whose colour reaches no pixel, known only after drawing: 9 and 15 %. The middle layer in bfloat16: no faster,
+conversions included.
 """
 
 from __future__ import annotations
