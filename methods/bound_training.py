@@ -108,6 +108,7 @@ class BoundTraining:
             {name: nn.Parameter(value) for name, (value, _) in initial.items()},
             {name: rate for name, (_, rate) in initial.items()},
         )
+        self._rates = {name: rate for name, (_, rate) in initial.items() if name != "means"}
         binding = torch.arange(face_count, device=device)
         self._densifier = Densifier(
             settings, self._optimiser, self.splat_names, binding, face_count, self.extent, seed
@@ -169,6 +170,10 @@ class BoundTraining:
             settings.position_lr, settings.position_lr_final, self._timeline.fraction(iteration)
         )
         self._optimiser.set_learning_rate("means", rate * self.extent)
+        if settings.final_rate < 1:
+            decay = log_linear(1.0, settings.final_rate, max(0.0, 2 * self._timeline.fraction(iteration) - 1))
+            for name, initial in self._rates.items():
+                self._optimiser.set_learning_rate(name, decay * initial)
 
     def state(self) -> dict[str, Any]:
         """Parameters, moments, binding and densification statistics."""

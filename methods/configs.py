@@ -22,6 +22,8 @@ class SplatTraining:
     ----------
     schedule_length : iterations of the published run; every ``..._from``, ``..._every`` below is on its scale.
     position_lr, position_lr_final : log-linear from one to the other over the run, times the scene extent.
+    final_rate : part of their learning rate that all other tensors end with, log-linearly over the last half of
+        the run; 1 keeps them constant, as published. A short run has not the steps to average Adam's noise away.
     ssim_weight : the loss is ``(1 - w) L1 + w (1 - SSIM)``.
     position_weight, position_threshold : penalty on local positions longer than the threshold (triangle sizes).
     scale_weight, scale_threshold : penalty on local scales above the threshold (triangle sizes).
@@ -49,6 +51,7 @@ class SplatTraining:
     opacity_lr: float = 0.05
     scale_lr: float = 0.017
     rotation_lr: float = 1e-3
+    final_rate: float = 1.0
     ssim_weight: float = 0.2
     position_weight: float = 0.01
     position_threshold: float = 1.0
@@ -86,6 +89,8 @@ class SplatTraining:
                 raise ValueError(f"{name} must be at least 1, found {getattr(self, name)}")
         if not 0 < self.initial_opacity < 1 or not 0 < self.reset_opacity < 1:
             raise ValueError("initial_opacity and reset_opacity must lie between 0 and 1")
+        if not 0 < self.final_rate <= 1:
+            raise ValueError(f"final_rate must lie in (0, 1], found {self.final_rate}")
         if not 0 <= self.ssim_weight <= 1:
             raise ValueError(f"ssim_weight must lie in [0, 1], found {self.ssim_weight}")
         if self.max_splats is not None and self.max_splats < 1:
@@ -132,6 +137,9 @@ class OursConfig:
     plane_resolution, plane_channels : samples per side, and channels of the (x,y), (x,z) and (y,z) planes.
     plane_bounds : "mesh" fits the planes to the canonical mesh in all directions; "published" sets x to +-0.25 m
         as the paper does, which leaves half the samples in x unused on a head without long hair.
+    direction_noise : standard deviation, radians, of a random turn of all view directions in each iteration. What
+        a colour does between the training cameras no image says; of the order of the cameras' spacing, noise keeps
+        it from being anything but smooth. 0 as published.
     color : "planes" reads colour from the tri-plane; "sh" gives every splat spherical harmonics of degree
         ``sh_degree`` in canonical directions instead (an ablation).
     lines : dynamic appearance on or off.
@@ -160,6 +168,7 @@ class OursConfig:
     plane_lr: float = 2e-3
     color_mlp_lr: float = 1e-4
     hidden: int = 128
+    direction_noise: float = 0.0
     color: Literal["planes", "sh"] = "planes"
     sh_degree: int = 3
     sh_every: int = 1_000

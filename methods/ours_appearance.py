@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ..bench.contracts import Clip, FloatArray, HeadPose
 from ..datasets.head.regions import faces_in_region
+from ..datasets.head.rotations import axis_angle_to_matrix
 from ..datasets.steps.jaw_bases import jaw_bases, jaw_quaternions, jaw_weights
 from .binding import Frames, to_world
 from .bound_training import Placed, View
@@ -111,6 +112,8 @@ class OursAppearance:
                 penalty = self._config.penalty * (offsets.abs() * weights[:, None]).mean()
         world = to_world(frames, binding, splats.means, splats.log_scales, splats.quats)
         directions = canonical_directions(prepared.turns, binding, world.means, view.center)
+        if self._config.direction_noise:
+            directions = directions @ self._turn(iteration).t()
         colors = self._colors(optimiser, positions, directions, iteration)
         return Placed(world, changed_colors(colors, splats), torch.sigmoid(splats.logits), penalty)
 
@@ -122,6 +125,12 @@ class OursAppearance:
         position = line_position(unit, self._config.line_resolution)
         offsets = line_offsets(optimiser, blended, position)
         return offsets.new_zeros(len(positions), offsets.shape[1]).index_copy(0, inside, offsets)
+
+    def _turn(self, iteration: int) -> Tensor:
+        """(3, 3) small random rotation of this iteration."""
+        generator = torch_generator(self._seed, "directions", iteration)
+        angles = self._config.direction_noise * torch.randn(1, 3, generator=generator)
+        return axis_angle_to_matrix(angles)[0].to(self._device)
 
     def _colors(self, optimiser: Optimiser, positions: Tensor, directions: Tensor, iteration: int) -> Tensor:
         if self._config.color == "sh":

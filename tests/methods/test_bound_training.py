@@ -176,3 +176,35 @@ def test_a_sound_clip_passes(clip):
 def test_an_unsound_clip_is_refused(clip, change, says):
     with pytest.raises(InputError, match=says):
         check_training_split(replace(clip, **change(clip)))
+
+
+def test_rates_are_constant_as_published_and_fall_in_a_short_run(clip):
+    def rates(final_rate):
+        appearance = Grey(clip)
+        settings = SplatTraining(final_rate=final_rate, densify_gradient=1e9)
+        training = BoundTraining(
+            clip, settings, appearance, lambda iteration: 0, len(appearance.mesh.faces), "cpu", 0
+        )
+        training.begin(Timeline(100, 100))
+        found = {}
+        for iteration in (1, 50, 75, 100):
+            training.loss(iteration, 0).backward()
+            training.after_backward(iteration)
+            found[iteration] = {name: group["lr"] for name, group in training.optimiser.state().items()}
+            training.optimiser.zero_grad()
+        training.close()
+        return found
+
+    published, falling = rates(1.0), rates(0.01)
+    for name in ("opacities", "log_scales", "quats"):
+        assert len({row[name] for row in published.values()}) == 1
+        start = published[1][name]
+        expected = [start, start, 0.1 * start, 0.01 * start]
+        assert [row[name] for row in falling.values()] == pytest.approx(expected, rel=1e-9)
+    for iteration, row in falling.items():
+        assert row["means"] == published[iteration]["means"]
+
+
+def test_a_rate_that_ends_at_nothing_is_refused():
+    with pytest.raises(ValueError, match="final_rate"):
+        SplatTraining(final_rate=0.0)

@@ -109,3 +109,21 @@ def test_capacity_follows_the_clip(clip, head):
     assert 1 <= len(appearance.jaw_bases) <= len(clip.poses)
     lines = appearance.parameters()["lines"][0]
     assert len(lines) == appearance.expressions + len(appearance.jaw_bases)
+
+
+def test_view_directions_waver_in_training_and_only_they(clip):
+    steady, optimiser, binding = make(clip)
+    wavering = make(clip, replace(SMALL, direction_noise=0.2))[0]
+    one, other = (place(clip, wavering, optimiser, binding, i) for i in (1, 2))
+    again = place(clip, wavering, optimiser, binding, 1)
+    straight = place(clip, steady, optimiser, binding, 1)
+    assert torch.equal(one.colors, again.colors)  # so that a resumed run draws the same
+    assert not torch.equal(one.colors, other.colors)
+    assert not torch.equal(one.colors, straight.colors)
+    for left, right in zip(one.world, straight.world):
+        assert torch.equal(left, right)
+    turns = torch.stack([wavering._turn(i) for i in range(1, 2001)])
+    np.testing.assert_allclose(turns @ turns.transpose(1, 2), np.tile(np.eye(3), (2000, 1, 1)), atol=1e-5)
+    # Each of three angles has the deviation asked for: the mean squared angle is three times its square.
+    angles = torch.acos(((turns.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2).clamp(-1, 1))
+    assert float(angles.square().mean()) == pytest.approx(3 * 0.2**2, rel=0.1)
