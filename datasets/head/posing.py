@@ -118,6 +118,8 @@ class FastPosing(torch.nn.Module):
         """(B, 3, V) neutral head, expression and pose correctives."""
         count = self._expression_size
         neutral = canonical.transpose(1, 2).flatten(1)
+        # addmm spreads what it adds to over the batch, not the product: that has to be done before.
+        expression = expression.expand(max(len(expression), len(neutral)), -1)
         moving = [index for index, column in enumerate(self._correctives) if not still[column // 9 + 1]]
         if not moving:
             return torch.addmm(neutral, expression, self.directions[:count]).unflatten(1, (3, -1))
@@ -130,6 +132,7 @@ class FastPosing(torch.nn.Module):
             coefficients = torch.cat([expression.expand(batch, -1), entries.expand(batch, -1)], 1)
             return torch.addmm(neutral, coefficients, self.directions[: count + last]).unflatten(1, (3, -1))
         moved = torch.addmm(neutral, expression, self.directions[:count])
+        entries = entries.expand(max(len(entries), len(moved)), -1)
         return torch.addmm(moved, entries, correctives).unflatten(1, (3, -1))
 
     def _tensor(self, values: FloatArray) -> Tensor:
