@@ -120,12 +120,12 @@ def write_union(
     shared: dict[str, Any] = {}
     for folder in (*train, *test):
         path = folder / layout.ALL_FRAMES_FILE
-        read_transforms(path)  # checks it whole
+        entries = read_transforms(path)
         document = read_json(path)
         shared = {k: v for k, v in document.items() if k not in ("frames", *_INDEX_KEYS)}
-        for frame in document["frames"]:
+        for entry, frame in zip(entries, document["frames"], strict=True):
             record = _renumbered(frame, start, folder.name)
-            is_held_out = str(record.get("camera_id", "")) in held_out
+            is_held_out = entry.camera_id in held_out
             parts[split_of(test=folder in test, held_out_camera=is_held_out)].append(record)
         start += 1 + max((frame["timestep_index"] for frame in document["frames"]), default=-1)
     for file, group in ((layout.TRAIN_SEQUENCES_FILE, train), (layout.TEST_SEQUENCES_FILE, test)):

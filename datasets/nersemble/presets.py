@@ -19,7 +19,10 @@ ABLATION_SUBJECT = "306"
 """Subject of the paper's Table 4; not one of the nine."""
 
 NOVEL_VIEW_CAMERA = "222200037"
-"""The frontal camera, held out for novel views; index 8 of the rig."""
+"""The frontal camera, held out for novel views."""
+
+FRONTAL_INDEX = 8
+"""Its index in the rig, by which exports without serials name it."""
 
 TEST_SEQUENCE = "FREE"
 """The unscripted performance, held out for self-reenactment."""

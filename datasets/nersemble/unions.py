@@ -17,7 +17,7 @@ from ..transforms import FrameEntry, read_transforms, timesteps_of
 from ..validate import check_images, check_timesteps
 from .export import write_union
 from .names import match_sequence
-from .presets import NOVEL_VIEW_CAMERA, TEST_SEQUENCE, UNION10_SEQUENCES, union10_held_out
+from .presets import FRONTAL_INDEX, NOVEL_VIEW_CAMERA, TEST_SEQUENCE, UNION10_SEQUENCES, union10_held_out
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,8 @@ def _notes(subject: str, test: Sequence[str], entries: dict[str, list[FrameEntry
         notes.append(f"test holds {', '.join(test) or 'nothing'}; VHAP's rule would hold out {expected}")
     views = {entry.camera_id for entry in entries["novel_view"]}
     # Older exports name cameras by their index alone.
-    if views and NOVEL_VIEW_CAMERA not in views and {e.camera_index for e in entries["novel_view"]} != {8}:
+    indices = {entry.camera_index for entry in entries["novel_view"]}
+    if views and NOVEL_VIEW_CAMERA not in views and indices != {FRONTAL_INDEX}:
         notes.append(f"novel views are of {', '.join(sorted(views))}, not of the frontal {NOVEL_VIEW_CAMERA}")
     if not views:
         notes.append("no novel views")
@@ -150,5 +151,12 @@ def rejoin_union(root: Path, subject: str, entries: Sequence[FrameEntry], free: 
     order = {match_sequence(root, name, UNION10_SEQUENCES): folder for name, folder in named.items()}
     train = [root / order[name] for name in UNION10_SEQUENCES if name in order]
     union = root / f"UNION{len(train) + 1}_{subject}{_REJOINED}"
-    write_union(union, train, [root / free], (NOVEL_VIEW_CAMERA,), None)
+    write_union(union, train, [root / free], _frontal(entries), None)
     return union.name
+
+
+def _frontal(entries: Sequence[FrameEntry]) -> list[str]:
+    """Ids of the camera for novel views: its serial, else the index that VHAP holds out."""
+    by_index = {entry.camera_id for entry in entries if entry.camera_index == FRONTAL_INDEX}
+    known = {entry.camera_id for entry in entries}
+    return [NOVEL_VIEW_CAMERA] if NOVEL_VIEW_CAMERA in known else sorted(by_index)

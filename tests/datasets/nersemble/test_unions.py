@@ -69,6 +69,27 @@ def test_the_papers_split_is_joined_from_the_same_files(download, pristine_downl
     assert {path: path.read_bytes() for path in union.iterdir() if path in before} == before
 
 
+@pytest.mark.parametrize("named", [None, "08"], ids=["no id", "id by index"])
+def test_a_held_out_camera_that_is_named_by_its_index_is_not_trained_on(named, download, pristine_download):
+    """Older exports lack serials: there the frontal camera is the one of index 8."""
+    for path in download.glob("*/transforms*.json"):
+        document = json.loads(path.read_text())
+        for frame in document["frames"]:
+            if frame["camera_id"] == "222200037":
+                frame["camera_index"] = 8
+            if named is None:
+                del frame["camera_id"]
+            else:
+                frame["camera_id"] = f"{frame['camera_index']:02d}"
+        path.write_text(json.dumps(document))
+    findings = check(download, rejoin=True)
+    assert findings.passed, findings.text
+    union = download / findings.data[SUBJECT]["rejoined"]
+    clip = read_capture(union, head=pristine_download[1], cy="bottom", leaks="record")
+    assert {key.camera for key in clip.splits["novel_view"]} == {"08"}
+    assert "08" not in {key.camera for key in clip.splits["train"]}
+
+
 def test_without_free_there_is_no_such_split(download):
     shutil.rmtree(next(download.glob(f"{SUBJECT}_FREE_*")))
     assert check(download).passed
