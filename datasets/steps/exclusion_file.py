@@ -18,6 +18,7 @@ a frame; any other text leaves it out and is the reason.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -31,6 +32,9 @@ from ...bench.files import check_name, write_text
 FORMAT = "headbench-exclusions-1"
 KEEP = "keep"
 UNIT = "mm2 of lip and chin that look covered"
+
+_YAML_INTEGER = "tag:yaml.org,2002:int"
+_DECIMAL = re.compile(r"-?(0|[1-9][0-9]*)")
 
 _HEADER = """\
 # Frames with the tongue out, found by `headbench tongue`. Leave them out with
@@ -99,7 +103,10 @@ def write_exclusions(path: Path, subjects: Mapping[str, Exclusions]) -> None:
 def read_exclusions(path: Path) -> dict[str, Exclusions]:
     """Read the file: decisions by subject. Raises `InputError` for anything that is not one."""
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        loader = yaml.SafeLoader(path.read_text(encoding="utf-8"))
+        root = loader.get_single_node()
+        _check_keys(path, root)
+        content = None if root is None else loader.construct_document(root)
     except FileNotFoundError as error:
         remedy = "Make one with `headbench tongue`."
         raise InputError(path, "", "a file of exclusions", "no such file", remedy) from error
@@ -114,6 +121,30 @@ def read_exclusions(path: Path) -> dict[str, Exclusions]:
     return {
         check_name(str(s), path, "subjects"): _subject(path, str(s), value) for s, value in subjects.items()
     }
+
+
+def _check_keys(path: Path, root: yaml.Node | None) -> None:
+    """Refuse keys that YAML takes otherwise than they look: 057 is 47 to it, 1:30 is 90, and of two equal keys
+    the last one counts."""
+    waiting, known = [root], set()
+    while waiting:
+        node = waiting.pop()
+        if node is None or id(node) in known:
+            continue
+        known.add(id(node))
+        if isinstance(node, yaml.SequenceNode):
+            waiting += node.value
+        if isinstance(node, yaml.MappingNode):
+            seen: set[tuple[str, str]] = set()
+            for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
+                line = f"line {key.start_mark.line + 1}"
+                if key.tag == _YAML_INTEGER and not _DECIMAL.fullmatch(key.value):
+                    expected = "numbers without leading zeros, other names in quotes"
+                    raise InputError(path, line, expected, key.value[:80])
+                if (key.tag, key.value) in seen:
+                    raise InputError(path, line, "each key once", f"{key.value[:80]} again")
+                seen.add((key.tag, key.value))
+            waiting += [value for _, value in node.value]
 
 
 def _subject(path: Path, subject: str, value: Any) -> Exclusions:
@@ -134,7 +165,7 @@ def _subject(path: Path, subject: str, value: Any) -> Exclusions:
         str(entry.get("threshold_from", "")),
         tuple(cameras),
         {t: _frame(path, f"{where}.frames", t, frame) for t, frame in frames.items()},
-        dict(overrides),
+        {t: KEEP if word.strip().lower() == KEEP else word for t, word in overrides.items()},
     )
 
 

@@ -19,7 +19,9 @@ FRAMES = st.dictionaries(
     st.builds(FrameDecision, TEXT, st.floats(0, 1e6), st.booleans(), TEXT),
     max_size=5,
 )
-WORDS = st.dictionaries(st.integers(0, 10**6), TEXT.filter(str.strip), max_size=3)
+WORDS = st.dictionaries(
+    st.integers(0, 10**6), TEXT.filter(lambda word: word.strip().lower() not in ("", "keep")), max_size=3
+)
 DECIDED = Exclusions(
     35.0,
     "given",
@@ -97,6 +99,35 @@ def test_other_content_is_refused(tmp_path, text):
     path.write_text(text)
     with pytest.raises(InputError):
         read_exclusions(path)
+
+
+@pytest.mark.parametrize("line", ["057: keep", "00057: keep", "0x39: keep", "5_7: keep", "1:30: keep"])
+def test_numbers_that_yaml_reads_otherwise_are_refused(tmp_path, line):
+    """A timestep copied with its zeros, 00057, would be the octal 47, and another frame kept."""
+    path = tmp_path / "tongue.yaml"
+    text = _faulty(lambda top, subject: subject.update(overrides={12345: "keep"}))
+    path.write_text(text.replace("12345: keep", line))
+    assert line in path.read_text()
+    with pytest.raises(InputError, match="leading zeros") as caught:
+        read_exclusions(path)
+    assert caught.value.key.startswith("line ")
+
+
+def test_a_timestep_decided_twice_is_refused(tmp_path):
+    path = tmp_path / "tongue.yaml"
+    text = _faulty(lambda top, subject: subject.update(overrides={12345: "keep"}))
+    path.write_text(text.replace("12345: keep", "12345: keep\n      12345: hand"))
+    with pytest.raises(InputError, match="12345 again"):
+        read_exclusions(path)
+
+
+@pytest.mark.parametrize("word", ["Keep", "KEEP", " keep "])
+def test_keep_is_keep_however_it_is_written(tmp_path, word):
+    path = tmp_path / "tongue.yaml"
+    path.write_text(_faulty(lambda top, subject: subject.update(overrides={1: word})))
+    found = read_exclusions(path)["900"]
+    assert found.overrides == {1: "keep"}
+    assert found.reasons() == {}
 
 
 def test_a_missing_file_says_how_to_make_one(tmp_path):
