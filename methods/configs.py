@@ -128,6 +128,12 @@ Dynamic = Literal["opacity", "position", "rotation", "scale", "color"]
 """What an expression may change about a splat."""
 
 
+Planned = Literal[
+    "expressions", "jaw_bases", "line_bounds", "line_resolution", "plane_resolution", "max_splats"
+]
+"""Sizes that a capacity plan decides."""
+
+
 @dataclass(frozen=True)
 class OursConfig:
     """Compact tensorial Gaussian avatars (CVPR 2025): tri-plane colour, feature lines for opacity.
@@ -159,6 +165,10 @@ class OursConfig:
         timesteps; "tga" parts them as the published code does. Both see training timesteps alone.
     storage : "exact" keeps the avatar as float32; "compact" writes a quantised file beside it (`compact.file`), which
         is what is then loaded, rendered, measured and counted.
+    capacity : "fixed" takes the sizes above as they are. "auto" takes them as upper limits and decides from the
+        training data how much of them the scene requires: see `capacity.plan`.
+    capacity_tolerance : pixels; motion of the surface below it counts as none.
+    capacity_keep : sizes that "auto" leaves as they are.
     """
 
     splats: SplatTraining = field(default_factory=SplatTraining)
@@ -194,8 +204,13 @@ class OursConfig:
     expression_classes: int = 16
     expression_compatibility: Literal["", "tga"] = ""
     storage: Literal["exact", "compact"] = "exact"
+    capacity: Literal["fixed", "auto"] = "fixed"
+    capacity_tolerance: float = 0.25
+    capacity_keep: tuple[Planned, ...] = ()
 
     def __post_init__(self) -> None:
+        if not self.capacity_tolerance > 0:
+            raise ValueError(f"capacity_tolerance must be above 0 pixels, found {self.capacity_tolerance}")
         if self.plane_resolution < 2 or self.line_resolution < 2:
             raise ValueError("plane_resolution and line_resolution must be at least 2")
         if min(self.plane_channels) < 1 or self.line_channels < 1 or self.hidden < 1:

@@ -6,6 +6,7 @@ arXiv 2504.14967. What the paper does not change is as in GaussianAvatars (`boun
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ from .avatar_files import (
     write_subject,
 )
 from .bound_training import BoundTraining, run_bound_training
+from .capacity.plan import plan_capacity
 from .clip_checks import check_training_split
 from .compact.file import COMPACT_FILE, write_compact
 from .compact.precision import Precision
@@ -35,6 +37,8 @@ from .ours_storage import FIELD_FILE, write_field
 from .subject_mesh import SubjectMesh
 from .training.loop import CHECKPOINT, check_budget
 from .training.sampling import Sampler, ShuffledEpochs, Weighted, balanced_weights
+
+log = logging.getLogger(__name__)
 
 
 class Ours:
@@ -56,12 +60,22 @@ class Ours:
             faces_in_region(
                 clip.head, "face"
             )  # raises before the long work where the head has no face region
-        run = run_digest(self.name, self.version, config, clip, budget, seed)
-        if is_finished(out, run):
-            return self.load(out, device=device)
         subject = Subject.of(clip)
         mesh = SubjectMesh(clip.head, subject.shape, subject.static_offset, device)
-        appearance = OursAppearance(mesh, clip, config, device, seed)
+        plan = None
+        if config.capacity == "auto":
+            plan = plan_capacity(clip, mesh, config)
+            config = plan.apply(config)
+        # The sizes, and not the measurements behind them, whose last digits depend on the number of threads.
+        planned = self.config if plan is None else (self.config, config)
+        run = run_digest(self.name, self.version, planned, clip, budget, seed)
+        if is_finished(out, run):
+            return self.load(out, device=device)
+        if plan is not None:
+            log.info("%s", "; ".join(plan.lines_of_text()))
+            progress(0, budget.iterations or 1, plan.lines_of_text()[0])
+        within = None if plan is None else plan.box(device)
+        appearance = OursAppearance(mesh, clip, config, device, seed, lines_within=within)
         training, outcome = run_bound_training(
             clip,
             config.splats,
@@ -87,6 +101,7 @@ class Ours:
             splats=len(training.binding),
             jaw_bases=len(appearance.jaw_bases),
             leaks=leaks(config.jaw_compatibility) if len(appearance.jaw_bases) else (),
+            capacity=None if plan is None else plan.record(),
         )
         (out / CHECKPOINT).unlink(missing_ok=True)
         return self.load(out, device=device)

@@ -29,7 +29,7 @@ from .ours_field import (
 )
 from .seeds import torch_generator
 from .sh import initial_coefficients, sh_to_rgb
-from .subject_mesh import BoundedCache, SubjectMesh
+from .subject_mesh import BoundedCache, SubjectMesh, centroid_displacements
 from .training.optimiser import Optimiser
 from .training.schedule import Timeline
 
@@ -48,13 +48,25 @@ class PreparedTimestep:
 
 
 class OursAppearance:
-    """Tri-plane colour and feature-line opacity; tracking is left as it is."""
+    """Tri-plane colour and feature-line opacity; tracking is left as it is.
 
-    def __init__(self, mesh: SubjectMesh, clip: Clip, config: OursConfig, device: str, seed: int):
+    ``lines_within`` bounds the lines in place of the box that ``config.line_bounds`` names.
+    """
+
+    def __init__(
+        self,
+        mesh: SubjectMesh,
+        clip: Clip,
+        config: OursConfig,
+        device: str,
+        seed: int,
+        *,
+        lines_within: Box | None = None,
+    ):
         self._mesh, self._clip, self._config, self._device, self._seed = mesh, clip, config, device, seed
         self.canonical = CanonicalFrames.of(mesh.frames(mesh.canonical))
         self.plane_box = plane_box(mesh.canonical, config.plane_bounds)
-        self.line_box = _line_box(mesh, clip, config)
+        self.line_box = lines_within or _line_box(mesh, clip, config)
         self.expressions = min(config.expressions, clip.head.expression_basis.shape[2])
         self.jaw_bases: FloatArray = np.zeros((0, 4))
         if config.lines and config.jaw_bases:
@@ -177,10 +189,9 @@ def penalty_weights(
     unposed, canonical : (V, 3) metres, with and without expression, jaw and eyes.
     is_face : (F,) triangles of the face region.
     """
-    moved = (unposed - canonical).index_select(0, faces.reshape(-1)).view(-1, 3, 3).mean(1)
-    millimetres = 1000 * torch.linalg.vector_norm(moved, dim=1)
-    still_face = (millimetres < config.penalty_face_mm).to(moved.dtype)
-    still_other = config.penalty_other_weight * (millimetres < config.penalty_other_mm).to(moved.dtype)
+    millimetres = 1000 * centroid_displacements(unposed, canonical, faces)
+    still_face = (millimetres < config.penalty_face_mm).to(millimetres.dtype)
+    still_other = config.penalty_other_weight * (millimetres < config.penalty_other_mm).to(millimetres.dtype)
     return torch.where(is_face, still_face, still_other)
 
 

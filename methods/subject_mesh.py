@@ -62,6 +62,12 @@ class SubjectMesh:
         return triangle_frames(vertices, self.faces)
 
 
+def centroid_displacements(one: Tensor, other: Tensor, faces: Tensor) -> Tensor:
+    """(F,) metres between the centroids of the triangles of two (V, 3) meshes."""
+    moved = (one - other).index_select(0, faces.reshape(-1)).view(-1, 3, 3).mean(1)
+    return torch.linalg.vector_norm(moved, dim=1)
+
+
 class BoundedCache(Generic[Value]):
     """Values by key, computed when asked for, the least recently used dropped beyond a number of entries."""
 

@@ -1,0 +1,1 @@
+"""How large an avatar of "ours" has to be, decided from its training data."""
