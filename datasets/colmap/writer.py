@@ -154,14 +154,21 @@ def _add_points(model: pycolmap.Reconstruction, vertices: FloatArray, views: dic
 
 
 def _write_model(model: pycolmap.Reconstruction, folder: Path, model_format: ModelFormat) -> None:
-    """Write a model beside its place, then move its files there: none of them is ever half-written."""
+    """Write a model beside its place, then move its files there: none of them is ever half-written.
+
+    Files of the other format go first: readers take the binary ones before the others, whichever is newer.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".model-") as temporary:
         if model_format == "bin":
             model.write_binary(temporary)
         else:
             model.write_text(temporary)
-        for file in sorted(Path(temporary).iterdir()):
+        other = ".txt" if model_format == "bin" else ".bin"
+        files = sorted(Path(temporary).iterdir())
+        for file in files:
+            (folder / file.with_suffix(other).name).unlink(missing_ok=True)
+        for file in files:
             os.replace(file, folder / file.name)
 
 

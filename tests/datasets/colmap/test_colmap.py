@@ -274,6 +274,16 @@ def test_folder_without_a_model_is_refused(tmp_path):
         read_model(tmp_path / "none")
 
 
+@pytest.mark.parametrize(("first", "second"), [("bin", "txt"), ("txt", "bin")])
+def test_another_format_replaces_the_model_that_was_there(clip, tmp_path, first, second):
+    keys = sorted(clip.files)
+    export_model(clip, keys[:3], tmp_path, model_format=first)
+    export_model(clip, keys[-2:], tmp_path, model_format=second)
+    assert set(read_model(tmp_path).images) == {1, 2}
+    assert {image.name for image in theirs(tmp_path).images.values()} == {image_name(k) for k in keys[-2:]}
+    assert {file.suffix for file in (tmp_path / "sparse" / "0").iterdir()} == {f".{second}"}
+
+
 def test_skew_and_empty_exports_are_refused(clip, tmp_path):
     key = next(iter(clip.files))
     camera = clip.cameras[key.camera]
