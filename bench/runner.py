@@ -45,8 +45,8 @@ def run(config: RunConfig, **record: Any) -> pd.DataFrame:
     }
     folder = RunFolder(Path(config.out))
     folder.prepare()
-    adapted = _adapt(clips, methods, config, folder)
-    jobs = _jobs(config, methods, clips, protocols, folder, adapted)
+    adapted = adapt(clips, methods, config, folder)
+    jobs = make_jobs(config, methods, clips, protocols, folder, adapted)
     for job in jobs:
         job.check()
     _warn_of_missing_metrics(metrics, clips[0])
@@ -93,7 +93,7 @@ def write_reports(run_folder: Path) -> list[Path]:
 Adapted = Mapping[tuple[str, MethodNeeds], AdaptedClip]
 
 
-def _adapt(
+def adapt(
     clips: Sequence[Clip],
     methods: Sequence[ResolvedMethod],
     config: RunConfig,
@@ -113,7 +113,7 @@ def _adapt(
     }
 
 
-def _jobs(
+def make_jobs(
     config: RunConfig,
     methods: Sequence[ResolvedMethod],
     clips: Sequence[Clip],

@@ -64,10 +64,12 @@ class Pen:
         self._reserve(1)
         self._draw.line((left, self.y, right, self.y), fill=RULE)
 
-    def frame(self, left: int, width: int, height: int) -> None:
-        """Draw a hairline around an image, outside its pixels: white images need an edge on white paper."""
-        self._reserve(height + 1)
-        self._draw.rectangle((left - 1, self.y - 1, left + width, self.y + height), outline=RULE)
+    def frame(self, left: int, width: int, height: int, colour: Colour = RULE, thickness: int = 1) -> None:
+        """Draw a line around an image, outside its pixels: white images need an edge on white paper."""
+        self._reserve(height + thickness)
+        t = thickness
+        box = (left - t, self.y - t, left + width - 1 + t, self.y + height - 1 + t)
+        self._draw.rectangle(box, outline=colour, width=thickness)
 
     def grey_box(self, left: int, width: int, height: int, text: str, size: int) -> None:
         """Draw a grey box with wrapped text in its middle, as much of it as fits."""

@@ -1,0 +1,1 @@
+"""Trained avatars beyond what was recorded: views, expressions and drivers without ground truth."""

@@ -1,0 +1,10 @@
+"""Commands of this room. Light to import: implementations are named, not loaded."""
+
+from ..bench.contracts import CommandSpec
+
+EXTREMES = CommandSpec(
+    name="extremes",
+    summary="Try a run's avatars on views and expressions beyond those of training: limits held or not, contact sheet.",
+    implementation="headbench.reports.robustness.extremes_command:run",
+    settings="headbench.bench.robustness.settings:ExtremesSettings",
+)

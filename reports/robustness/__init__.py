@@ -1,0 +1,1 @@
+"""Commands that show how avatars bear views, expressions and drivers without ground truth."""

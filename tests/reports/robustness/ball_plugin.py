@@ -1,0 +1,145 @@
+"""A rig, a head and avatars simple enough to know what a trial must find: a ball that bears anything, or bursts."""
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from headbench.bench.contracts import Camera, DatasetSpec, Frame, FrameKey, HeadPose, MethodSpec
+from headbench.bench.robustness.viewpoints import look_at
+
+RADIUS = 0.1
+SIZE = (24, 30)
+
+
+class BallClip:
+    """Five cameras around a head whose vertices are the corners of a cube; expressions vary along two directions."""
+
+    static_offset = np.zeros((8, 3))
+    shape = np.zeros(1)
+    background = np.ones(3)
+    steps = ()
+
+    def __init__(self, path, progress=None):
+        self.subject = path.name
+        self.excluded = {}
+        self.fingerprint = f"ball-{path.name}"
+        corners = RADIUS * np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), axis=-1).reshape(8, 3)
+        self.head = SimpleNamespace(
+            version="ball",
+            template=corners,
+            shape_basis=np.zeros((8, 3, 1)),
+            expression_basis=np.zeros((8, 3, 3)),
+            joint_regressor=np.full((1, 8), 1 / 8),
+        )
+        K = np.array([[100.0, 0, SIZE[0] / 2], [0, 100.0, SIZE[1] / 2], [0, 0, 1]])
+        place = len(path.name) + np.zeros(3)  # every subject stands somewhere else
+        self.cameras = {
+            f"{i}": Camera(
+                f"{i}", *SIZE, K, look_at(place + [np.sin(a), 0, np.cos(a)], place, np.array([0.0, 1, 0]))
+            )
+            for i, a in enumerate(np.radians([-60, -30, 0, 30, 60]))
+        }
+        zero = np.zeros(3)
+        expressions = [[-1, 0, 0.5], [1, 0, 0.5], [0, -0.2, 0.5], [0, 0.2, 0.5], [0, 0, 0.5], [1, 0.2, 0.5]]
+        self.poses = {
+            t: HeadPose("ball", np.array(e), zero, zero, zero, np.zeros(6), place, None, self.subject, t)
+            for t, e in enumerate(expressions)
+        }
+
+        def keys(sequence, timesteps, cameras):
+            return tuple(FrameKey(self.subject, sequence, t, c) for t in timesteps for c in cameras)
+
+        self.splits = {
+            "train": keys("EMO", range(4), "0134"),
+            "novel_view": keys("EMO", range(4), "2"),
+            "self_reenactment": keys("FREE", (4, 5), "01234"),
+        }
+
+    def image(self, key):
+        return np.full((SIZE[1], SIZE[0], 3), 40 * key.timestep, np.uint8)
+
+    def mask(self, key):
+        return None
+
+
+def find(root):
+    return sorted(path for path in root.iterdir() if path.name.startswith("ball"))
+
+
+class Ball:
+    """A ball at the pose's translation. ``bursts`` names what happens where the first coefficient passes 1.5."""
+
+    bursts = ""
+
+    def __init__(self, path):
+        self.path = path
+
+    def render(self, camera, pose, background=(1.0, 1.0, 1.0)):
+        extreme = abs(pose.expression[0]) > 1.5
+        center = camera.world_to_camera @ [*pose.translation, 1.0]
+        radius = RADIUS * (3.0 if extreme and self.bursts == "size" else 1.0)
+        v, u = np.mgrid[: camera.height, : camera.width] + 0.5
+        x = (u - camera.K[0, 2]) / camera.K[0, 0] * center[2] - center[0]
+        y = (v - camera.K[1, 2]) / camera.K[1, 1] * center[2] - center[1]
+        alpha = (np.hypot(x, y) < radius).astype(np.float32)
+        rgb = np.repeat(1.0 - alpha[..., None] / 2, 3, axis=2)
+        if extreme and self.bursts == "nan":
+            rgb[0, 0, 0] = np.nan
+        return Frame(rgb, alpha)
+
+    def files(self):
+        return [self.path / "ball.txt"]
+
+
+class Bursting(Ball):
+    bursts = "size"
+
+
+class Broken(Ball):
+    bursts = "nan"
+
+
+class Splatty(Ball):
+    """Gives splats too, one of which grows."""
+
+    def splats(self, pose):
+        grown = 0.2 if abs(pose.expression[0]) > 1.5 else 0.002
+        return SimpleNamespace(
+            means=np.asarray(pose.translation, np.float32)[None],
+            quats=np.array([[1.0, 0, 0, 0]]),
+            scales=np.array([[0.001, 0.001, grown]]),
+            opacities=np.array([0.9]),
+        )
+
+
+class BallMethod:
+    avatar = Ball
+
+    def fit(self, clip, out, budget, *, device, seed, progress):
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "ball.txt").write_text("ball")
+        return self.load(out, device=device)
+
+    def load(self, path, *, device):
+        return self.avatar(path)
+
+
+class BurstingMethod(BallMethod):
+    avatar = Bursting
+
+
+class BrokenMethod(BallMethod):
+    avatar = Broken
+
+
+class SplattyMethod(BallMethod):
+    avatar = Splatty
+
+
+def _spec(name, trivial=False):
+    return MethodSpec(name, name, f"ball_plugin:{name.capitalize()}Method", trivial=trivial)
+
+
+READER = DatasetSpec("balls", "balls", "ball_plugin:BallClip", find="ball_plugin:find")
+BALL, BURSTING, BROKEN, SPLATTY = map(_spec, ("ball", "bursting", "broken", "splatty"))
+FLOOR = MethodSpec("floor", "a floor", "ball_plugin:BallMethod", trivial=True)

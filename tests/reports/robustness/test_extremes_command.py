@@ -1,0 +1,124 @@
+"""``headbench extremes`` on avatars whose behaviour at extremes is known beforehand."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from headbench.bench.errors import InputError
+from headbench.bench.robustness.settings import ExtremesSettings
+from headbench.bench.robustness.trial import RECORD_FILE, ROWS_FILE, SHEET_FILE
+from headbench.bench.store import read_rows
+from headbench.reports.robustness.extremes_command import run
+from headbench.reports.robustness.extremes_sheet import BROKEN, EXTRAPOLATED
+
+VIEWS, COMPONENTS, STEPS = 6, 2, 6
+
+
+def settings(folder, **changes):
+    return ExtremesSettings(str(folder), views=VIEWS, **changes)
+
+
+def colours(path):
+    return {tuple(pixel) for pixel in np.asarray(Image.open(path)).reshape(-1, 3)}
+
+
+def test_an_avatar_that_nothing_moves_passes_and_every_pair_has_its_rows(ball_run):
+    folder = ball_run("BALL", "FLOOR")
+    found = run(settings(folder))
+    assert found.passed
+    rows = read_rows(folder / "extremes" / ROWS_FILE)
+    frames = VIEWS * (1 + COMPONENTS * STEPS)  # the third coefficient never varies: no third component
+    assert set(rows["method"]) == {"ball"}
+    assert set(rows["task"]) == {"extremes"}
+    assert len(rows) == 2 * 5 * frames  # subjects, measures
+    coverage = rows[rows["metric"] == "coverage"]
+    assert coverage["status"].eq("ok").all()
+    assert coverage["value"].between(0.9, 1.1).all()
+    without = rows[rows["metric"].isin(["largest_splat", "mean_opacity"])]
+    assert without["status"].eq("missing").all()
+    assert without["reason"].str.contains("no splats").all()
+    assert rows.groupby("subject")["protocol"].nunique().eq(1).all()
+    shown = colours(folder / "extremes" / SHEET_FILE)
+    assert EXTRAPOLATED in shown
+
+
+def test_a_burst_is_found_where_it_is_and_nowhere_else(ball_run):
+    folder = ball_run("BURSTING", "BALL")
+    found = run(settings(folder))
+    assert not found.passed
+    rows = read_rows(folder / "extremes" / ROWS_FILE)
+    failed = rows[rows["status"] == "failed"]
+    # The first coefficient has a deviation of 0.82 about 0: two and three of them are beyond 1.5.
+    assert set(failed["sequence"]) == {"pc1-3", "pc1-2", "pc1+2", "pc1+3"}
+    assert set(failed["method"]) == {"bursting"}
+    assert set(failed["metric"]) == {"coverage"}
+    assert len(failed) == 2 * 4 * VIEWS
+    assert failed["value"].gt(2).all()  # the larger ball fills the frame
+    assert failed["reason"].str.contains("limits 0.8 to 1.25").all()
+    record = json.loads((folder / "extremes" / RECORD_FILE).read_text())
+    by_method = {(a["subject"], a["method"]): a["frames_broken"] for a in record["avatars"]}
+    assert by_method["ball-a", "bursting"] == 4 * VIEWS
+    assert by_method["ball-a", "ball"] == 0
+
+
+def test_values_that_are_no_numbers_break_a_limit_and_leave_a_grey_box(ball_run):
+    folder = ball_run("BROKEN")
+    found = run(settings(folder))
+    assert not found.passed
+    assert "non_finite is" in found.text
+    first = folder / "extremes" / "ball-a" / "broken" / "seed-0"
+    assert not (first / "pc1+3_turntable-00.png").exists()
+    assert (first / "pc1+1_turntable-00.png").exists()
+
+
+def test_a_splat_that_grows_is_found_in_the_splats_alone(ball_run):
+    folder = ball_run("SPLATTY")
+    rows = run(settings(folder)) and read_rows(folder / "extremes" / ROWS_FILE)
+    failed = rows[rows["status"] == "failed"]
+    assert set(failed["metric"]) == {"largest_splat"}
+    assert set(failed["sequence"]) == {"pc1-3", "pc1-2", "pc1+2", "pc1+3"}
+    # three deviations of 0.2 m, focal length 100 pixels, 1 m away, 30 pixels high
+    assert np.allclose(failed["value"], 3 * 0.2 * 100 / 30, rtol=0.01)
+    assert BROKEN in colours(folder / "extremes" / SHEET_FILE)
+
+
+def test_extrapolated_views_are_those_beyond_the_rig(ball_run):
+    folder = ball_run("BALL")
+    run(settings(folder, beyond=30.0))
+    (a, *_) = json.loads((folder / "extremes" / RECORD_FILE).read_text())["avatars"]
+    assert [v["azimuth"] for v in a["views"]] == pytest.approx(np.linspace(-90, 90, VIEWS), abs=0.01)
+    assert [v["extrapolated"] for v in a["views"]] == [True, False, False, False, False, True]
+
+
+def test_what_is_not_there_is_refused_before_any_work(ball_run, tmp_path):
+    folder = ball_run("BALL", "FLOOR")
+    with pytest.raises(InputError, match=r"run\.json"):
+        run(settings(tmp_path))
+    with pytest.raises(InputError, match="methods"):
+        run(settings(folder, methods=("absent",)))
+    (tmp_path / "moved" / "ball-other").mkdir(parents=True)
+    with pytest.raises(InputError, match="the capture of the run"):
+        run(settings(folder, data=str(tmp_path / "moved")))
+    fit = folder / "ball-a" / "ball" / "seed-0" / "fit.json"
+    fit.write_text(fit.read_text().replace('"done"', '"started"'))
+    with pytest.raises(InputError, match="training did not end"):
+        run(settings(folder))
+    fit.unlink()
+    with pytest.raises(InputError, match="a trained avatar"):
+        run(settings(folder))
+    assert not (folder / "extremes").exists()
+
+
+def test_a_run_of_floors_alone_has_nothing_to_try(ball_run):
+    folder = ball_run("FLOOR")
+    with pytest.raises(InputError, match="no floor"):
+        run(settings(folder))
+    assert run(settings(folder, methods=("floor",))).passed
+
+
+@pytest.mark.parametrize("changes", [{"views": 0}, {"beyond": 180.0}, {"sigmas": (0.0, 1.0)}, {"sigmas": ()}])
+def test_settings_without_meaning_are_refused(changes):
+    with pytest.raises(ValueError, match=next(iter(changes))):
+        ExtremesSettings("run", **changes)
