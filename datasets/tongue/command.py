@@ -95,7 +95,8 @@ def _summary(subject: str, decided: Exclusions) -> str:
     )
     sequences: dict[str, list[int]] = {}
     for timestep in reasons:
-        sequences.setdefault(decided.frames[timestep].sequence, []).append(timestep)
+        frame = decided.frames.get(timestep)  # None where people left out what none of the cameras recorded
+        sequences.setdefault(frame.sequence if frame else "in no camera", []).append(timestep)
     lines += [f"  {name}: {_ranges(timesteps)}" for name, timesteps in sequences.items()]
     if near := _near(decided):
         lines.append(f"  Worth a look, near the threshold: {_ranges(near)}")
