@@ -82,6 +82,7 @@ def synth(
     head: str = "procedural",
     seed: int = 0,
     tracking_noise: float = 0.0,
+    performance: Literal["full", "expressions", "still"] = "full",
 ) -> int:
     """Render a synthetic multi-view capture in the GaussianAvatars/VHAP layout.
 
@@ -97,6 +98,7 @@ def synth(
         head: `procedural`, or the path of a head model (ICT-FaceKit npz).
         seed: Decides subjects and performances.
         tracking_noise: Noise on the tracked parameters, as a fraction of their standard deviation.
+        performance: `expressions` leaves out jaw and tongue, `still` moves only head, neck and eyes.
     """
     RunFolder(Path(out)).prepare()
     with log_to(None):
@@ -110,6 +112,7 @@ def synth(
                 "head": head,
                 "seed": seed,
                 "tracking_noise": tracking_noise,
+                "performance": performance,
             }
         )
     print(out)

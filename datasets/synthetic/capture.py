@@ -10,7 +10,6 @@ import multiprocessing
 import os
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +20,7 @@ from ...bench.errors import InputError
 from ...bench.files import read_json, write_json, write_text
 from ..image_files import probe_image
 from .geometry import load_geometry
-from .performance import share_out
+from .performance import KINDS, Kind, share_out
 from .photographer import Photographer
 from .rig import SERIALS
 from .scene import default_samples, sample_count
@@ -49,6 +48,7 @@ def synthesize(
     seed: int = 0,
     tracking_noise: float = 0.0,
     samples_per_pixel: int | None = None,
+    performance: Kind = "full",
     workers: int | None = None,
     progress: Progress = no_progress,
 ) -> list[Path]:
@@ -65,6 +65,7 @@ def synthesize(
         parameter's own standard deviation over the subject's timesteps. Images show the exact poses.
     samples_per_pixel : rounded up to a count that the sampler takes; by default enough for 40 dB between two
         renders of a frame.
+    performance : see `performance.Kind`; with less than all of it, captures for which less has to be modelled.
     workers : processes that render; by default as many as there are cores, or one where there is little to do.
 
     Raises
@@ -73,7 +74,10 @@ def synthesize(
         Before rendering, for settings out of range or a folder that holds a capture of other settings.
     """
     samples = default_samples(*size) if samples_per_pixel is None else sample_count(samples_per_pixel)
-    settings = Settings(subjects, cameras, timesteps, (size[0], size[1]), head, seed, tracking_noise, samples)
+    pixels = (size[0], size[1])
+    settings = Settings(
+        subjects, cameras, timesteps, pixels, head, seed, tracking_noise, samples, performance
+    )
     _check(settings)
     geometry = load_geometry(head)
     out = Path(out)
@@ -154,6 +158,8 @@ def _check(settings: Settings) -> None:
         raise InputError(
             "--cameras", "", f"2 to {len(SERIALS)}, as the frontal one is held out", str(settings.cameras)
         )
+    if settings.performance not in KINDS:
+        raise InputError("--performance", "", f"one of {', '.join(KINDS)}", repr(settings.performance))
     share_out(settings.timesteps)
     if min(settings.size) < 16:
         raise InputError("--size", "", "at least 16 pixels each way", "x".join(map(str, settings.size)))
@@ -163,7 +169,12 @@ def _check(settings: Settings) -> None:
 
 def _claim(out: Path, settings: Settings, head: str) -> None:
     """Mark the folder as this capture's, or refuse one that is another's."""
-    wanted = {"version": _VERSION, **asdict(settings), "size": list(settings.size), "head_fingerprint": head}
+    wanted = {
+        "version": _VERSION,
+        **settings.described(),
+        "size": list(settings.size),
+        "head_fingerprint": head,
+    }
     # The same file may lie elsewhere: its content counts, not its path.
     wanted["head"] = Path(settings.head).name
     manifest = out / MANIFEST
@@ -174,7 +185,8 @@ def _claim(out: Path, settings: Settings, head: str) -> None:
         write_json(manifest, wanted)
         return
     found = read_json(manifest)
-    for key, value in wanted.items():
+    for key in {**wanted, **found}:
+        value = wanted.get(key)
         if found.get(key) != value:
             raise InputError(
                 manifest,

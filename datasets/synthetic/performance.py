@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
@@ -15,9 +16,20 @@ from scipy.interpolate import PchipInterpolator
 from ...bench.contracts import FloatArray
 from ...bench.errors import InputError
 from .anatomy import SIDES
-from .controls import CONTROLS
+from .controls import CONTROLS, EXPRESSION_CONTROLS
 
 Face = Mapping[str, float]
+
+Kind = Literal["full", "expressions", "still"]
+"""How much of the performance is played: all; without jaw and tongue; head, neck and gaze alone."""
+
+_JAW = ("jaw_open", "jaw_side", "tongue_out")
+_MUTED: Mapping[Kind, frozenset[str]] = {
+    "full": frozenset(),
+    "expressions": frozenset(_JAW),
+    "still": frozenset((*_JAW, *EXPRESSION_CONTROLS)),
+}
+KINDS = tuple(_MUTED)
 
 HELD_OUT = "FREE"
 """The sequence kept for self-reenactment."""
@@ -200,10 +212,13 @@ def share_out(timesteps: int) -> dict[str, int]:
     return {name: int(n) for name, n in zip(chosen, np.diff(ends, prepend=0))}
 
 
-def perform(name: str, timesteps: int, seed: int, tongue_shows: float = TONGUE_SHOWS) -> Performed:
+def perform(
+    name: str, timesteps: int, seed: int, tongue_shows: float = TONGUE_SHOWS, kind: Kind = "full"
+) -> Performed:
     """Play a sequence, sampled evenly at ``timesteps`` moments. The same seed gives the same take.
 
-    ``tongue_shows`` is the share in [0, 1] by which the tongue has to be out for a timestep to be labelled.
+    ``tongue_shows`` is the share in [0, 1] by which the tongue has to be out for a timestep to be labelled. What
+    ``kind`` leaves out stays at rest; everything else moves as in the full performance.
     """
     number = list(SEQUENCES).index(name)
     rng = np.random.default_rng([seed, number])
@@ -228,6 +243,7 @@ def perform(name: str, timesteps: int, seed: int, tongue_shows: float = TONGUE_S
         values[f"blink_{side}"] = np.clip(
             values[f"blink_{side}"] + 0.35 * np.maximum(-values["gaze_up"], 0), 0, 1
         )
+    values |= {control: np.zeros(timesteps) for control in _MUTED[kind]}
     activations = [{control: float(values[control][t]) for control in CONTROLS} for t in range(timesteps)]
     excluded = {t: TONGUE for t, a in enumerate(activations) if a["tongue_out"] >= tongue_shows}
     return Performed(name, activations, excluded)

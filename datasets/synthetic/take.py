@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,7 +19,7 @@ from .anatomy import Anatomy, measure
 from .geometry import Geometry
 from .hair import STYLES, Style
 from .people import Person, person
-from .performance import HELD_OUT, Performed, perform, share_out
+from .performance import HELD_OUT, Kind, Performed, perform, share_out
 from .tongue_labels import share_that_shows
 from .tracking import with_tracking_noise
 
@@ -41,6 +42,14 @@ class Settings:
     seed: int
     tracking_noise: float
     samples_per_pixel: int
+    performance: Kind = "full"
+
+    def described(self) -> dict[str, Any]:
+        """The settings for records, as they were before there was a choice of performance where it is full."""
+        described = asdict(self)
+        if self.performance == "full":
+            del described["performance"]
+        return described
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +93,9 @@ def plan_take(out: Path, index: int, geometry: Geometry, settings: Settings) -> 
     views = rig.cameras(settings.cameras, width, height, target, seed=settings.seed + 101 * index)
     performed, poses = {}, {}
     for sequence, count in share_out(settings.timesteps).items():
-        performed[sequence] = perform(sequence, count, settings.seed + 101 * index, tongue_shows)
+        performed[sequence] = perform(
+            sequence, count, settings.seed + 101 * index, tongue_shows, settings.performance
+        )
         poses[sequence] = tuple(
             geometry.translation.pose(activations, name, timestep)
             for timestep, activations in enumerate(performed[sequence].activations)
@@ -103,7 +114,7 @@ def plan_take(out: Path, index: int, geometry: Geometry, settings: Settings) -> 
         ],
         test_sequences=[HELD_OUT],
         novel_view_cameras=[rig.FRONTAL],
-        synthetic={**asdict(settings), "head": geometry.source, "style": who.style},
+        synthetic={**settings.described(), "head": geometry.source, "style": who.style},
     )
     return Take(index, who, geometry, shape, views, performed, poses, CaptureWriter(out, plan), settings)
 

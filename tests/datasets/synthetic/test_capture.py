@@ -59,6 +59,16 @@ def test_killed_run_continues_to_the_same_images(capture):
 def test_other_settings_are_refused(capture):
     with pytest.raises(InputError, match="seed"):
         synthesize(capture[0], **SMALL, seed=5)
+    with pytest.raises(InputError, match="performance"):
+        synthesize(capture[0], **SMALL, performance="still")
+
+
+def test_a_folder_of_part_of_the_performance_is_not_continued_with_all_of_it(capture, tmp_path):
+    settings = json.loads((capture[0] / "synthesis.json").read_text())
+    assert "performance" not in settings  # as captures were recorded before there was a choice
+    (tmp_path / "synthesis.json").write_text(json.dumps({**settings, "performance": "still"}))
+    with pytest.raises(InputError, match="performance"):
+        synthesize(tmp_path, **SMALL)
 
 
 def test_foreign_folder_is_refused(tmp_path):
@@ -76,6 +86,7 @@ def test_foreign_folder_is_refused(tmp_path):
         {"size": (8, 8)},
         {"tracking_noise": -0.1},
         {"subjects": 0},
+        {"performance": "asleep"},
     ],
 )
 def test_bad_settings_are_refused_before_anything_is_written(tmp_path, change):

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from headbench.bench.errors import InputError
-from headbench.datasets.synthetic.controls import CONTROLS
+from headbench.datasets.synthetic.controls import CONTROLS, EXPRESSION_CONTROLS
 from headbench.datasets.synthetic.performance import HELD_OUT, SEQUENCES, perform, share_out
 
 
@@ -45,3 +45,14 @@ def test_tongue_is_out_in_free_alone_and_labelled_exactly_there():
         assert all("tongue" in reason for reason in played.excluded.values())
         assert bool(out) == (name == HELD_OUT)
         assert len(out) < 60
+
+
+@pytest.mark.parametrize("name", SEQUENCES)
+def test_what_a_performance_leaves_out_rests_and_the_rest_is_the_same(name):
+    full = perform(name, 60, seed=3).activations
+    jaw = {"jaw_open", "jaw_side", "tongue_out"}
+    for kind, muted in (("expressions", jaw), ("still", jaw | set(EXPRESSION_CONTROLS))):
+        played = perform(name, 60, seed=3, kind=kind)
+        assert not played.excluded
+        for before, after in zip(full, played.activations):
+            assert after == {control: 0.0 if control in muted else before[control] for control in CONTROLS}
