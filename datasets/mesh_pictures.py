@@ -60,7 +60,7 @@ def draw_mesh(
     shading : 1 for Lambert shading, 0 for the colours as they are; between, a mixture.
     supersampling : samples per pixel along each axis.
     """
-    fine = resized_camera(camera, supersampling)
+    fine = camera.resized(supersampling * camera.width, supersampling * camera.height)
     fragments = rasterize_mesh(vertices, faces, fine)
     hit = fragments.face >= 0
     tint = np.broadcast_to(
@@ -167,14 +167,6 @@ def portrait_camera(
     centre = np.array([width, height]) / 2 - focal * (least + most) / 2
     intrinsics = np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1.0]])
     return Camera("portrait", width, height, intrinsics, world_to_camera)
-
-
-def resized_camera(camera: Camera, factor: int) -> Camera:
-    """Camera of an image ``factor`` times as large along both axes."""
-    scale = np.diag([factor, factor, 1.0])
-    return Camera(
-        camera.id, camera.width * factor, camera.height * factor, scale @ camera.K, camera.world_to_camera
-    )
 
 
 def _project(vertices: FloatArray, camera: Camera) -> tuple[FloatArray, np.ndarray]:

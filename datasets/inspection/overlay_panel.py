@@ -60,8 +60,7 @@ def overlay(
     scaled = cv2.resize(
         image, (width, height), interpolation=cv2.INTER_AREA if smaller else cv2.INTER_CUBIC
     ).astype(np.uint8, copy=False)
-    stretch = np.diag([width / camera.width, height / camera.height, 1.0])
-    fitted = Camera(camera.id, width, height, stretch @ camera.K, camera.world_to_camera)
+    fitted = camera.resized(width, height)
     filled = (rasterize_mesh(vertices, faces, fitted).face >= 0).astype(np.uint8)
     contours, _ = cv2.findContours(filled, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     outlined = scaled.copy()

@@ -18,7 +18,7 @@ _FAR_M = 100.0
 
 
 def head_frame(vertices: FloatArray, template: FloatArray, members: IntArray) -> FloatArray:
-    """(4, 4) world to head: origin in the middle of the members, axes those of the template (Kabsch)."""
+    """(4, 4) world to head: origin at the mean of the vertices, axes those of the template (Kabsch)."""
     rest, posed = template[members], vertices[members]
     u, _, vt = np.linalg.svd((rest - rest.mean(axis=0)).T @ (posed - posed.mean(axis=0)))
     rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt

@@ -97,8 +97,7 @@ def _held_against(plain: MeshFacts, subject: Subject, image: ByteArray, mask: By
     camera, vertices = plain.camera, plain.vertices
     scale = min(1.0, WORKING_HEIGHT / camera.height)
     width, height = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
-    stretch = np.diag([width / camera.width, height / camera.height, 1.0])
-    small = Camera(camera.id, width, height, stretch @ camera.K, camera.world_to_camera)
+    small = camera.resized(width, height)
     front = rasterize_mesh(vertices, subject.head.faces, small).face
     filled = front >= 0
     size = (width, height)

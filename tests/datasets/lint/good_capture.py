@@ -17,7 +17,7 @@ from headbench.bench.contracts import Camera, HeadPose
 from headbench.datasets.ga_writer import CapturePlan, CaptureWriter, SequencePlan, write_png
 from headbench.datasets.head.arrays import HeadArrays
 from headbench.datasets.head.model import HeadModel
-from headbench.datasets.mesh_pictures import rasterize_mesh, resized_camera
+from headbench.datasets.mesh_pictures import rasterize_mesh
 
 from ..head.toy import toy_head
 from ..tiny_capture import look_at
@@ -86,7 +86,9 @@ def paint(
     plan: CapturePlan, vertices: np.ndarray, camera: Camera, fine: int = 4
 ) -> tuple[np.ndarray, np.ndarray]:
     """Colours (H, W, 3) and coverage (H, W) of the mesh, its skin darker and lighter in patches of 2 cm."""
-    front = rasterize_mesh(vertices, plan.head.faces, resized_camera(camera, fine)).face
+    front = rasterize_mesh(
+        vertices, plan.head.faces, camera.resized(fine * camera.width, fine * camera.height)
+    ).face
     middle = plan.head.template[plan.head.faces].mean(axis=1)
     patches = 18 * np.sin(150 * middle[:, 0]) + 18 * np.sin(150 * middle[:, 1] + 40 * middle[:, 2])
     shades = patches[:, None] + np.array(SKIN)
