@@ -70,6 +70,6 @@ def solve_frame(
     search.set_maxeval(settings.evaluations)
     try:
         search.optimize(first)
-    except nlopt.RoundoffLimited:
-        pass  # No step is small enough to descend further: the best point so far is the answer.
+    except (nlopt.RoundoffLimited, nlopt.runtime_error):
+        pass  # No step descends further, or a line search gave up: the best point so far is the answer.
     return best[0]._replace(evaluations=count)

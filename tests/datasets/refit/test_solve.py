@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import nlopt
 import numpy as np
 import pytest
 
@@ -63,6 +64,25 @@ def test_angles_stay_in_their_bounds_and_reach_them():
     assert (np.abs(found.angles) <= angle_bounds(settings) + 1e-15).all()
     assert found.angles[0] == pytest.approx(0.2)
     assert np.isfinite(found.value)
+
+
+@pytest.mark.parametrize("failure", [nlopt.runtime_error, nlopt.RoundoffLimited])
+def test_a_line_search_that_gives_up_leaves_the_best_point(failure, monkeypatch):
+    """nlopt reports it as a failure of the whole search, which would end the refit of a whole clip."""
+    settings = RefitSettings(neck="keep", algorithm="lbfgs")
+    problem = make(settings)
+    _, frame = reachable(problem)
+    whole = solve_frame(problem, frame, np.zeros(9), ANGLES, settings)
+    search = nlopt.opt.optimize
+
+    def give_up(self, start):
+        search(self, start)
+        raise failure("nlopt failure")
+
+    monkeypatch.setattr(nlopt.opt, "optimize", give_up)
+    found = solve_frame(problem, frame, np.zeros(9), ANGLES, settings)
+    assert found.value == whole.value
+    np.testing.assert_array_equal(found.angles, whole.angles)
 
 
 def test_angles_without_targets_keep_their_values():
