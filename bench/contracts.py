@@ -293,7 +293,7 @@ class ResolutionRule:
     ----------
     square : "pad" to the longer side with background, "crop" to the shorter one, or "" for neither; centred.
         What a crop cuts off is scored as background.
-    divide : reduce by this factor, by the mean over the area that a pixel covers.
+    divide : reduce by this factor: block means where it divides both sides, else antialiased bicubic.
     multiply : enlarge by this factor, bicubic.
     size : (width, height) to resize to at the end, antialiased, in place of ``multiply``.
     speed_size : (width, height) at which frames per second are measured; None: the size rendered at.
