@@ -8,3 +8,10 @@ EXTREMES = CommandSpec(
     implementation="headbench.reports.robustness.extremes_command:run",
     settings="headbench.bench.robustness.settings:ExtremesSettings",
 )
+
+REENACT = CommandSpec(
+    name="reenact",
+    summary="Drive a run's avatars with another subject's expressions: limits held or not, frames, contact sheet.",
+    implementation="headbench.reports.robustness.reenact_command:run",
+    settings="headbench.bench.robustness.settings:ReenactSettings",
+)

@@ -94,7 +94,7 @@ def _draw_avatar(pen: Pen, folder: Path, avatar: Mapping[str, Any], panel_width:
                 pen.grey_box(left, panel_width, panel_width, "not finite", SMALL)
                 height = max(height, panel_width)
                 continue
-            image = _fitted(read_png(path), panel_width)
+            image = fitted(read_png(path), panel_width)
             height = max(height, image.shape[0])
             pen.image(left, image)
             if key in broken:
@@ -117,7 +117,7 @@ def _steps(names: Sequence[str]) -> list[str]:
     return ["", *sorted(steps, key=lambda step: (abs(float(step)), -float(step)))]
 
 
-def _fitted(image: ByteArray, width: int) -> ByteArray:
+def fitted(image: ByteArray, width: int) -> ByteArray:
     """The image at a panel's width, by area where that is smaller."""
     size = (width, max(1, round(image.shape[0] * width / image.shape[1])))
     larger = width > image.shape[1]
