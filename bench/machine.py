@@ -22,11 +22,17 @@ RECORDED_PACKAGES = (
 )
 
 
+def processor_count() -> int:
+    """Processor cores this process may use."""
+    available = getattr(os, "sched_getaffinity", None)  # not on every system
+    return len(available(0)) if available else os.cpu_count() or 1
+
+
 def machine_record() -> dict[str, Any]:
     """Processor, memory, system and the versions of packages that influence results."""
     return {
         "processor": _processor(),
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "cores": processor_count(),
         "memory_bytes": psutil.virtual_memory().total,
         "system": f"{platform.system()} {platform.release()}",
         "python": platform.python_version(),

@@ -22,6 +22,9 @@ RING_REGIONS = ("lip_outside_ring_upper", "lip_outside_ring_lower")
 FORMAT = "headbench-head-1"
 WEIGHT_TOLERANCE = 1e-4
 
+MAX_BYTES = 4 * 2**30
+"""Most an npz may hold unpacked: tracked parameters of ten thousand timesteps, and ten times any head model."""
+
 _ARRAYS = ("template", "faces", "shape_basis", "expression_basis", "pose_basis", "joint_regressor")
 _STORED = (*_ARRAYS, "skinning_weights", "parents")
 
@@ -224,17 +227,23 @@ def read_head(path: Path) -> HeadArrays:
 
 
 def read_npz(path: Path) -> dict[str, np.ndarray]:
-    """Read every member of an npz without ever unpickling.
+    """Read every member of an npz without ever unpickling, `MAX_BYTES` in all once unpacked.
 
     Raises
     ------
     InputError
-        Where the file is missing, damaged, no npz, or holds pickled objects.
+        Where the file is missing, damaged, too large, no npz, or holds pickled objects.
     """
     try:
         with np.load(path, allow_pickle=False) as archive:
+            # Before anything is unpacked: a few kB of zeros can declare terabytes.
+            unpacked = sum(member.file_size for member in archive.zip.infolist())
+            if unpacked > MAX_BYTES:
+                raise InputError(path, "", f"at most {MAX_BYTES} bytes of arrays", f"{unpacked} bytes")
             return {name: archive[name] for name in archive.files}
     except FileNotFoundError as error:
         raise InputError(path, "", "a file", "none") from error
+    except InputError:
+        raise
     except Exception as error:  # a damaged archive makes zipfile and numpy raise almost anything
         raise InputError(path, "", "an npz file of plain arrays", f"unreadable content ({error})") from error

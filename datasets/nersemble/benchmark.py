@@ -19,9 +19,9 @@ import cv2
 import numpy as np
 
 from ...bench.contracts import ByteArray, Camera, Findings, Progress, no_progress
+from ...bench.machine import processor_count
 from ..synthetic.rig import cameras
 from .command import run
-from .image_pool import processor_count
 from .settings import PrepareSettings
 from .writer import RecordingWriter, video_codec
 

@@ -17,6 +17,7 @@ from pathlib import Path
 
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
+from ...bench.machine import processor_count
 from ..ga_writer import write_png
 from ..image_files import probe_image
 from .frames import read_frames
@@ -33,12 +34,6 @@ class _Stream:
     job: SequenceJob
     index: int
     timesteps: tuple[int, ...]
-
-
-def processor_count() -> int:
-    """Processor cores this process may use."""
-    available = getattr(os, "sched_getaffinity", None)
-    return len(available(0)) if available else os.cpu_count() or 1
 
 
 def write_images(

@@ -7,7 +7,6 @@ those settings, so a killed run continues where it stopped and ends with the sam
 from __future__ import annotations
 
 import multiprocessing
-import os
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
@@ -18,6 +17,7 @@ import torch
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.files import read_json, write_json, write_text
+from ...bench.machine import processor_count
 from ..image_files import probe_image
 from .geometry import load_geometry
 from .performance import KINDS, Kind, share_out
@@ -104,7 +104,7 @@ def _photograph(out: Path, take: Take, work: list[Job], workers: int | None) -> 
     """Render the jobs; give (sequence, number of images) as each is written."""
     images = sum(len(cameras) for _, _, cameras in work)
     small = images * take.settings.size[0] * take.settings.size[1] < _SMALL
-    count = min(workers or (1 if small else len(os.sched_getaffinity(0))), len(work))
+    count = min(workers or (1 if small else processor_count()), len(work))
     if count <= 1:
         photographer = Photographer(take) if work else None
         for job in work:

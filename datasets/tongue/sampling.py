@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ import torch
 
 from ...bench.contracts import ByteArray, Camera, Clip, FloatArray, FrameKey, Progress, no_progress
 from ...bench.errors import InputError
+from ...bench.machine import processor_count
 from ..head.model import HeadModel
 from ..mesh_pictures import rasterize_mesh
 from .atlas import PITCH, MouthAtlas
@@ -109,7 +109,7 @@ def sample_clip(
                 colours[row, column], seen[row, column] = picture, visible
 
     done = 0
-    with ThreadPoolExecutor(min(len(os.sched_getaffinity(0)), 8)) as pool:
+    with ThreadPoolExecutor(min(processor_count(), 8)) as pool:
         batch: list[tuple[int, FloatArray]] = []
         for row, (_, vertices) in enumerate(posed_meshes(clip, timesteps)):
             batch.append((row, vertices))

@@ -7,6 +7,7 @@ import pytest
 
 from headbench.bench.contracts import HeadAsset
 from headbench.bench.errors import InputError
+from headbench.datasets.head import arrays
 from headbench.datasets.head.arrays import read_head, save_head
 
 from .toy import toy_head
@@ -159,3 +160,12 @@ def test_flipped_bytes_are_refused_or_harmless(tmp_path):
         except InputError:
             refused += 1
     assert refused > 60
+
+
+def test_an_archive_that_declares_too_much_is_refused_before_it_is_unpacked(tmp_path, monkeypatch):
+    path = tmp_path / "zeros.npz"
+    np.savez_compressed(path, zeros=np.zeros(100_000))
+    assert path.stat().st_size < 2_000
+    monkeypatch.setattr(arrays, "MAX_BYTES", 100_000)
+    with pytest.raises(InputError, match="at most 100000 bytes"):
+        arrays.read_npz(path)
