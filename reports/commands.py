@@ -15,3 +15,10 @@ REENACT = CommandSpec(
     implementation="headbench.reports.robustness.reenact_command:run",
     settings="headbench.bench.robustness.settings:ReenactSettings",
 )
+
+PARETO = CommandSpec(
+    name="pareto",
+    summary="Quality against size and frame time over finished runs: CSV, and a plot with the Pareto front marked.",
+    implementation="headbench.reports.pareto.command:run",
+    settings="headbench.reports.pareto.settings:ParetoSettings",
+)

@@ -1,0 +1,87 @@
+"""``headbench pareto``: reads finished runs, writes a table and a plot."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import asdict, fields
+from pathlib import Path
+
+from ...bench.contracts import Findings, Progress, no_progress
+from ...bench.files import atomic_path
+from ...bench.store import RunFolder
+from .front import pareto_front
+from .plot import Panel, write_plot
+from .points import Point, read_points
+from .settings import ParetoSettings
+
+COSTS = {"megabytes": "Size, MB", "milliseconds": "Frame time, ms"}
+
+
+def run(settings: ParetoSettings, progress: Progress = no_progress) -> Findings:
+    """Write ``points.csv`` and ``pareto.png``. Raises `InputError` for runs that cannot be compared."""
+    out = Path(settings.out)
+    points, left_out, metric = read_points([Path(r) for r in settings.runs], settings.task, settings.metric)
+    RunFolder(out).prepare()
+    sign = 1.0 if metric.higher_is_better else -1.0
+    fronts = {cost: _front(points, cost, sign) for cost in COSTS}
+    with (
+        atomic_path(out / "points.csv") as temporary,
+        temporary.open("w", newline="", encoding="utf-8") as stream,
+    ):
+        writer = csv.writer(stream)
+        names = [field.name for field in fields(Point)]
+        writer.writerow([*names, *(f"on_front_of_{cost}" for cost in COSTS)])
+        for index, point in enumerate(points):
+            marks = [int(index in fronts[cost]) for cost in COSTS]
+            writer.writerow([*(asdict(point)[name] for name in names), *marks])
+    unit = f", {metric.unit}" if metric.unit else ""
+    panels = [
+        Panel(
+            label,
+            [getattr(p, cost) for p in points],
+            [p.quality for p in points],
+            fronts[cost],
+            _series(points),
+        )
+        for cost, label in COSTS.items()
+    ]
+    machines = ", ".join(sorted({point.machine for point in points}))
+    write_plot(
+        out / "pareto.png", panels, f"{metric.label}{unit}, {settings.task.replace('_', ' ')}", machines
+    )
+    data = {
+        "out": out,
+        "points": [asdict(point) for point in points],
+        "fronts": fronts,
+        "left_out": left_out,
+    }
+    return Findings(_text(points, fronts, left_out, metric.label, metric.digits), data)
+
+
+def _front(points: Sequence[Point], cost: str, sign: float) -> list[int]:
+    """Indices of the front among the points whose cost was measured."""
+    known = [i for i, point in enumerate(points) if getattr(point, cost) is not None]
+    front = pareto_front([getattr(points[i], cost) for i in known], [sign * points[i].quality for i in known])
+    return [known[i] for i in front]
+
+
+def _series(points: Sequence[Point]) -> list[str]:
+    return [point.method for point in points]
+
+
+def _text(
+    points: Sequence[Point],
+    fronts: dict[str, list[int]],
+    left_out: Sequence[str],
+    label: str,
+    digits: int,
+) -> str:
+    lines = [f"{'method':<16}{label:>10}{'MB':>12}{'ms':>12}  run (* on the front of size, of time)"]
+    for index, point in enumerate(points):
+        cells = [
+            f"{'-' if value is None else f'{value:.2f}':>10} {'*' if index in fronts[cost] else ' '}"
+            for cost, value in (("megabytes", point.megabytes), ("milliseconds", point.milliseconds))
+        ]
+        lines.append(f"{point.method:<16}{point.quality:>10.{digits}f}{''.join(cells)}  {point.run}")
+    return "\n".join([*lines, *(f"left out: {text}" for text in left_out)])

@@ -1,0 +1,72 @@
+"""Points of quality, size and frame time from the rows of finished runs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from ...bench.contracts import MetricSpec
+from ...bench.errors import InputError
+from ..aggregate import check_rows, summarise
+from ..run_data import RunData
+
+SIZE, SPEED = "storage", "fps"
+
+
+@dataclass(frozen=True)
+class Point:
+    """One method of one run, means over frames, subjects and seeds.
+
+    ``megabytes`` and ``milliseconds`` are None where the run did not measure them.
+    """
+
+    run: str
+    method: str
+    quality: float
+    megabytes: float | None
+    milliseconds: float | None
+    machine: str
+
+
+def read_points(folders: Sequence[Path], task: str, metric: str) -> tuple[list[Point], list[str], MetricSpec]:
+    """Read every method of every run that is no floor; return points, what was left out and why, and the metric.
+
+    Raises `InputError` where runs were not scored on the same frames by the same protocol, where one lacks the
+    task or the metric, and where nothing is left to show.
+    """
+    points: list[Point] = []
+    left_out: list[str] = []
+    protocols: dict[str, Path] = {}
+    spec = None
+    for folder in folders:
+        data = RunData.read(folder)
+        check_rows(data.rows)
+        if task not in data.tasks:
+            raise InputError(folder, "task", ", ".join(data.tasks), task)
+        found = next((m for m in data.metrics if m.name == metric and m.per_frame), None)
+        if found is None:
+            names = ", ".join(m.name for m in data.metrics if m.per_frame)
+            raise InputError(folder, "metric", f"a metric of frames: {names}", metric)
+        spec = spec or found
+        protocol = str(data.manifest["protocols"][task]["hash"])
+        protocols.setdefault(protocol, folder)
+        if len(protocols) > 1:
+            first = next(iter(protocols))
+            expected = f"protocol {first}, that of {protocols[first]}"
+            raise InputError(folder, f"protocol of {task}", expected, protocol, "Score the same frames.")
+        for method in data.methods:
+            if method in data.trivial:
+                continue
+            own = data.rows[data.rows["method"] == method]
+            quality, size, speed = (
+                summarise(data.rows, own, *wanted) for wanted in ((task, metric), ("", SIZE), ("", SPEED))
+            )
+            if quality.value is None:
+                left_out.append(f"{method} of {folder}: {quality.reason}")
+                continue
+            time = None if not speed.value else 1000.0 / speed.value
+            points.append(Point(str(folder), method, quality.value, size.value, time, data.machine))
+    if spec is None or not points:
+        raise InputError("runs", "", "a method that is no floor, with a value", "; ".join(left_out) or "none")
+    return points, left_out, spec

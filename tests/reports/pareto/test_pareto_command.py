@@ -1,0 +1,101 @@
+"""``headbench pareto`` on run folders with known rows."""
+
+import csv
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from headbench.bench.contracts import MetricSpec
+from headbench.bench.errors import InputError
+from headbench.bench.files import plain
+from headbench.bench.store import Row, RunFolder, to_frame, write_rows
+from headbench.reports.pareto.command import run
+from headbench.reports.pareto.plot import log_ticks, ticks
+from headbench.reports.pareto.settings import ParetoSettings
+
+METRICS = [
+    MetricSpec("psnr", "PSNR", "dB", True, 2, "m:psnr"),
+    MetricSpec("lpips", "LPIPS", "", False, 3, "m:lpips"),
+    MetricSpec("storage", "Storage", "MB", False, 2, "m:storage", per_frame=False),
+    MetricSpec("fps", "Speed", "FPS", True, 1, "m:fps", per_frame=False),
+]
+
+
+@pytest.fixture
+def make_run(tmp_path):
+    """A finished run; methods give (psnr, lpips, megabytes, frames per second)."""
+
+    def make(name, protocol="p1", **methods):
+        folder = RunFolder(tmp_path / name)
+        rows = []
+        for method, (psnr, lpips, size, fps) in methods.items():
+            for t, change in enumerate((-1.0, 1.0)):
+                frame = (method, "1", 0, "novel_view", "s", "EMO", t, "a", "full")
+                rows += [Row(*frame, "psnr", psnr + change, protocol), Row(*frame, "lpips", lpips, protocol)]
+            avatar = (method, "1", 0, "", "s", "", -1, "", "full")
+            rows += [Row(*avatar, "storage", size, ""), Row(*avatar, "fps", fps, "")]
+        write_rows(folder.rows, to_frame(rows))
+        folder.write_manifest(
+            {
+                "metrics": [plain(m) for m in METRICS],
+                "methods": [{"name": m, "trivial": m == "floor"} for m in methods],
+                "protocols": {"novel_view": {"hash": protocol}},
+                "machine": {"processor": "abacus"},
+            }
+        )
+        return str(folder.root)
+
+    return make
+
+
+def table(folder):
+    with open(folder / "points.csv", newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def test_points_of_several_runs_and_which_are_on_the_front(make_run, tmp_path):
+    small = make_run("small", ours=(28.0, 0.10, 1.0, 200.0), ga=(27.0, 0.05, 2.0, 400.0))
+    large = make_run(
+        "large", ours=(30.0, 0.04, 4.0, 50.0), ga=(29.0, 0.06, 4.0, 100.0), floor=(50.0, 0, 0.1, 1e4)
+    )
+    found = run(ParetoSettings((small, large), str(tmp_path / "out")))
+    rows = {(r["run"].rsplit("/", 1)[-1], r["method"]): r for r in table(tmp_path / "out")}
+    assert set(rows) == {("small", "ours"), ("small", "ga"), ("large", "ours"), ("large", "ga")}
+    on_size = {key for key, r in rows.items() if r["on_front_of_megabytes"] == "1"}
+    on_time = {key for key, r in rows.items() if r["on_front_of_milliseconds"] == "1"}
+    assert on_size == {("small", "ours"), ("large", "ours")}
+    assert on_time == set(rows)  # every faster one is worse
+    assert float(rows["small", "ours"]["milliseconds"]) == pytest.approx(5.0)
+    assert float(rows["small", "ours"]["quality"]) == pytest.approx(28.0)
+    picture = np.asarray(Image.open(tmp_path / "out" / "pareto.png"))
+    assert ((picture == (0, 114, 178)).all(axis=2)).any()
+    assert found.passed
+
+
+def test_a_metric_where_less_is_better_turns_the_front_round(make_run, tmp_path):
+    folder = make_run(
+        "r", ours=(28.0, 0.10, 1.0, 200.0), ga=(27.0, 0.05, 2.0, 400.0), gbs=(30.0, 0.2, 3.0, 9.0)
+    )
+    run(ParetoSettings((folder,), str(tmp_path / "out"), metric="lpips"))
+    marks = {r["method"]: r["on_front_of_megabytes"] for r in table(tmp_path / "out")}
+    assert marks == {"ours": "1", "ga": "1", "gbs": "0"}
+
+
+def test_runs_on_other_frames_are_refused(make_run, tmp_path):
+    one = make_run("one", ours=(28.0, 0.1, 1.0, 200.0))
+    other = make_run("other", protocol="p2", ours=(28.0, 0.1, 1.0, 200.0))
+    with pytest.raises(InputError, match="protocol"):
+        run(ParetoSettings((one, other), str(tmp_path / "out")))
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("changes", [{"task": "extremes"}, {"metric": "fps"}])
+def test_an_unknown_task_or_metric_is_refused(make_run, tmp_path, changes):
+    with pytest.raises(InputError, match=next(iter(changes))):
+        run(ParetoSettings((make_run("r", ours=(1.0, 1.0, 1.0, 1.0)),), str(tmp_path / "out"), **changes))
+
+
+def test_ticks_are_round_and_within():
+    assert ticks(27.3, 30.2) == [28.0, 29.0, 30.0]
+    assert log_ticks(0.8, 25) == [1, 2, 5, 10, 20]
