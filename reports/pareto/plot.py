@@ -69,7 +69,7 @@ def _draw(
     draw: ImageDraw.ImageDraw, panel: Panel, left: int, quality: str, colours: dict[str, Colour]
 ) -> None:
     x0, x1, y0, y1 = left + LEFT, left + WIDTH - RIGHT, HEIGHT - BOTTOM, TOP
-    _text(draw, x0, 16, f"{quality} over {panel.label.lower()}", TEXT, INK)
+    _text(draw, x0, 16, quality, TEXT, INK)
     known = [(i, cost) for i, cost in enumerate(panel.costs) if cost is not None]
     if not known:
         _text(draw, x0, TOP, "not measured in these runs", SMALL, MUTED)
