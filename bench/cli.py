@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import io
 import json
 import os
@@ -29,6 +30,8 @@ from .store import RunFolder
 
 EXIT_FAILED_CELL = 1
 EXIT_BAD_INPUT = 2
+WRITE_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
+"""What the system says of a disk that takes no more; a fault of the place, not of the program."""
 
 Preset = Literal["smoke", "demo", "fast", "paper"]
 Text = Annotated[str | None, tyro.conf.arg(metavar="TEXT")]
@@ -223,8 +226,8 @@ def bench(
 ) -> int:
     """Measure the speed of a part of headbench itself on this machine.
 
-    Times are processor times of one thread, the least of many runs, beside a portable anchor timed in the same run;
-    compare ratios, not milliseconds, between machines.
+    Times are the least of many runs, beside an anchor timed in the same run, and each table says whether they are
+    processor times or by the clock, and of how many threads; compare ratios, not milliseconds, between machines.
 
     Args:
         part: What to measure: splats, or what `headbench list benchmarks` shows.
@@ -286,6 +289,17 @@ def main(arguments: list[str] | None = None) -> int:
         # The reader of our output has gone (`headbench list methods | head`): not an error of ours.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except OSError as error:
+        if error.errno not in WRITE_FAULTS:
+            raise
+        where = f"{error.filename}: " if error.filename else ""
+        reason = error.strerror or str(error)
+        remedy = "Make room (or let it be written) and start again."
+        print(
+            f"headbench: {where}expected a file that can be written, found: {reason}. {remedy}",
+            file=sys.stderr,
+        )
+        return EXIT_BAD_INPUT
 
 
 def _call(commands: dict[str, Callable[..., int]], prog: str, description: str, words: list[str]) -> int:

@@ -4,7 +4,7 @@ from ..bench.contracts import CommandSpec
 
 COMPACT = CommandSpec(
     name="compact",
-    summary="Store an avatar of ours in a tenth of its bytes; with a capture, measure what each part costs in quality.",
+    summary="Store an avatar of ours in about a fifteenth of its bytes; with a capture, measure what each part costs in quality.",
     implementation="headbench.methods.compact.command:run",
     settings="headbench.methods.compact.settings:CompactSettings",
 )

@@ -173,9 +173,9 @@ def _write_model(model: pycolmap.Reconstruction, folder: Path, model_format: Mod
 
 
 def _write_picture(path: Path, picture: ByteArray) -> None:
+    _, data = cv2.imencode(path.suffix, picture)
     with atomic_path(path) as temporary:
-        if not cv2.imwrite(str(temporary), picture):
-            raise OSError(f"{path}: could not be written")
+        temporary.write_bytes(data.tobytes())  # tells why where it cannot, unlike OpenCV
 
 
 def _tensor(array: FloatArray) -> torch.Tensor:

@@ -1,1 +1,1 @@
-"""Avatars of "ours" in a tenth of the bytes."""
+"""Avatars of "ours" in about a fifteenth of the bytes."""

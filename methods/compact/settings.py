@@ -11,7 +11,7 @@ from .precision import Precision
 
 @dataclass(frozen=True)
 class CompactSettings:
-    """Store an avatar of ours in a tenth of its bytes."""
+    """Store an avatar of ours in about a fifteenth of its bytes."""
 
     avatar: tyro.conf.Positional[str]
     """Folder of the avatar, with its exact file."""

@@ -1,3 +1,4 @@
+import errno
 import json
 
 import pytest
@@ -141,3 +142,24 @@ def test_a_benchmark_that_finds_a_fault_fails_the_command(capsys):
 def test_the_splat_benchmark_is_listed(capsys):
     assert cli.main(["list", "benchmarks"]) == 0
     assert "splats" in capsys.readouterr().out
+
+
+def test_a_full_disk_is_told_in_a_line_with_its_remedy(capsys, monkeypatch):
+    def full(*arguments, **settings):
+        raise OSError(errno.ENOSPC, "No space left on device", "somewhere/rows.parquet")
+
+    monkeypatch.setattr(cli, "_call", full)
+    assert cli.main(["table", "run"]) == 2
+    told = capsys.readouterr().err
+    assert "somewhere/rows.parquet" in told
+    assert "No space left" in told
+    assert "Make room" in told
+
+
+def test_other_faults_of_the_system_are_not_hidden(monkeypatch):
+    def broken(*arguments, **settings):
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(cli, "_call", broken)
+    with pytest.raises(OSError, match="Input/output"):
+        cli.main(["table", "run"])
