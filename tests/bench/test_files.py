@@ -1,3 +1,4 @@
+import errno
 import os
 
 import numpy as np
@@ -119,3 +120,10 @@ def test_an_accepted_name_stays_directly_in_its_folder(tmp_path_factory, name):
 @pytest.mark.parametrize("name", ["074", "EMO-1-shout+laugh", "222200037", "Kopf 3 (neu)", "面", "a..b"])
 def test_names_of_the_field_are_accepted(name):
     assert check_name(name, "", "") == name
+
+
+def test_a_disk_that_fills_up_is_told_with_the_file_meant(tmp_path):
+    with pytest.raises(OSError, match="a.png") as caught, atomic_path(tmp_path / "a.png"):
+        raise OSError(errno.ENOSPC, "No space left on device")
+    assert caught.value.filename == str(tmp_path / "a.png")
+    assert list(tmp_path.iterdir()) == []
