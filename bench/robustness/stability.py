@@ -148,13 +148,12 @@ def judge(found: Measures, reference: Measures, limits: Limits) -> list[Verdict]
     Coverage and mean opacity are given as ratios to the reference. A reference that shows nothing makes the ratio
     infinite, or 1 where the frame shows nothing either.
     """
-    splat = None if found.largest_splat is None else found.largest_splat
     largest = max(limits.splat_share, limits.splat_growth * (reference.largest_splat or 0.0))
     return [
         Verdict("non_finite", found.non_finite, 0.0, 0.0),
         Verdict("coverage", _ratio(found.coverage, reference.coverage), *limits.coverage),
         Verdict("translucent", found.translucent, 0.0, reference.translucent + limits.translucent_rise),
-        Verdict("largest_splat", splat, 0.0, largest),
+        Verdict("largest_splat", found.largest_splat, 0.0, largest),
         Verdict("mean_opacity", _ratio(found.mean_opacity, reference.mean_opacity), *limits.opacity),
     ]
 
