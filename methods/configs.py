@@ -168,6 +168,8 @@ class OursConfig:
     capacity : "fixed" takes the sizes above as they are. "auto" takes them as upper limits and decides from the
         training data how much of them the scene requires: see `capacity.plan`.
     capacity_tolerance : pixels; motion of the surface below it counts as none.
+    capacity_detail : samples of the planes per pixel, along the longest side of their box. 1 keeps PSNR and LPIPS;
+        0.5 keeps PSNR alone, in half the bytes (`capacity.plan` has the figures).
     capacity_keep : sizes that "auto" leaves as they are.
     """
 
@@ -206,11 +208,14 @@ class OursConfig:
     storage: Literal["exact", "compact"] = "exact"
     capacity: Literal["fixed", "auto"] = "fixed"
     capacity_tolerance: float = 0.25
+    capacity_detail: float = 1.0
     capacity_keep: tuple[Planned, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.capacity_tolerance > 0:
             raise ValueError(f"capacity_tolerance must be above 0 pixels, found {self.capacity_tolerance}")
+        if not self.capacity_detail > 0:
+            raise ValueError(f"capacity_detail must be above 0, found {self.capacity_detail}")
         if self.plane_resolution < 2 or self.line_resolution < 2:
             raise ValueError("plane_resolution and line_resolution must be at least 2")
         if min(self.plane_channels) < 1 or self.line_channels < 1 or self.hidden < 1:

@@ -64,6 +64,8 @@ def test_paper_presets_are_the_published_values():
         (GAConfig, {"sh_degree": 4}),
         (OursConfig, {"plane_resolution": 1}),
         (OursConfig, {"expressions": -1}),
+        (OursConfig, {"capacity_tolerance": 0.0}),
+        (OursConfig, {"capacity_detail": 0.0}),
     ],
 )
 def test_settings_out_of_range_are_refused(config, wrong):

@@ -121,6 +121,12 @@ def test_doubling_the_images_raises_planes_and_splats(clip):
     assert chosen(clip)["plane_resolution"] < 40
 
 
+def test_half_the_detail_halves_the_planes_samples(sharp):
+    whole = chosen(sharp, replace(SMALL, plane_resolution=10**6))["plane_resolution"] - 1
+    half = chosen(sharp, replace(SMALL, plane_resolution=10**6, capacity_detail=0.5))["plane_resolution"] - 1
+    assert 2 * half - 1 <= whole <= 2 * half
+
+
 @settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.floats(0.05, 50), st.floats(1, 10))
 def test_more_tolerance_never_asks_for_more(sharp, tolerance, factor):
