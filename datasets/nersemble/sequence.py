@@ -225,7 +225,7 @@ def _checked(folder: Path, view: View | None, serial: str, source: Source) -> Vi
             path = view.images[missing[0]]
             raise InputError(path, "", f"a matte for each of {view.count} images", f"{len(missing)} without")
         mattes = {number: view.mattes[number] for number in view.images}
-        _same_matte(mattes[min(mattes)], (view.count, _image_size(mattes.values())), (view.count, size))
+        _image_size(mattes.values(), size)
         return replace(view, size=size, mattes=mattes)
     return replace(view, size=size)
 
@@ -253,16 +253,18 @@ def open_video(path: Path) -> cv2.VideoCapture:
     return capture
 
 
-def _image_size(files: Iterable[Path]) -> tuple[int, int]:
-    first: tuple[int, int] | None = None
-    for path in files:
-        info = probe_image(path)
-        size = info.width, info.height
-        if size != (first := first or size):
-            expected = f"{first[0]}x{first[1]} pixels, as other images of this camera"
-            raise InputError(path, "", expected, f"{size[0]}x{size[1]}")
-    assert first is not None, "a view has images"
-    return first
+def _image_size(files: Iterable[Path], wanted: tuple[int, int] | None = None) -> tuple[int, int]:
+    """The size that all files have. ``wanted`` is that of the images the files are mattes of; without it most
+    files decide, so that one of another size is the one to be blamed."""
+    sizes = {path: (info.width, info.height) for path in files for info in (probe_image(path),)}
+    size = wanted or Counter(sizes.values()).most_common(1)[0][0]
+    for path, found in sizes.items():
+        if found != size:
+            whose = "the camera's images" if wanted else "other images of this camera"
+            expected = f"{size[0]}x{size[1]} pixels, as {whose}"
+            remedy = "Make mattes of the very frames." if wanted else ""
+            raise InputError(path, "size", expected, f"{found[0]}x{found[1]}", remedy)
+    return size
 
 
 def _same_matte(path: Path, matte: tuple[int, tuple[int, int]], frames: tuple[int, tuple[int, int]]) -> None:
@@ -273,20 +275,42 @@ def _same_matte(path: Path, matte: tuple[int, tuple[int, int]], frames: tuple[in
 
 
 def _common_numbers(folder: Path, views: Mapping[str, View], cut: bool) -> list[int]:
-    numbers = {serial: tuple(view.numbers) for serial, view in views.items()}
-    groups = Counter(numbers.values())
-    if len(groups) > 1 and not cut:
-        usual = groups.most_common(1)[0][0]
-        odd = {serial: len(own) for serial, own in numbers.items() if own != usual}
-        listed = ", ".join(f"{count} for camera {serial}" for serial, count in odd.items())
+    numbers = {serial: set(view.numbers) for serial, view in views.items()}
+    everything = set.union(*numbers.values())
+    common = set.intersection(*numbers.values())
+    if len(common) < len(everything) and not cut:
         raise InputError(
             folder,
             "frames",
-            f"the same frames for all cameras, {len(usual)} as most have",
-            listed,
+            f"the same frames for all cameras, {len(everything)} as they have together",
+            _lacking({serial: everything - own for serial, own in numbers.items()}),
             "Fetch the file again, or keep what all cameras have with --cut.",
         )
-    common = set.intersection(*(set(own) for own in numbers.values()))
     if not common:
         raise InputError(folder, "frames", "frames that all cameras have", "none")
     return sorted(common)
+
+
+def _lacking(missing: Mapping[str, set[int]]) -> str:
+    """Which cameras lack which frames, cameras that lack the same ones together."""
+    groups: dict[str, list[str]] = {}
+    for serial, numbers in missing.items():
+        if numbers:
+            groups.setdefault(_ranges(sorted(numbers)), []).append(serial)
+    return "; ".join(
+        f"camera{'s' if len(serials) > 1 else ''} {', '.join(serials)} without {listed}"
+        for listed, serials in groups.items()
+    )
+
+
+def _ranges(numbers: Sequence[int], most: int = 8) -> str:
+    """Ascending numbers as "2, 4-7"; those after ``most`` ranges are only counted."""
+    runs: list[list[int]] = []
+    for number in numbers:
+        if runs and number == runs[-1][-1] + 1:
+            runs[-1].append(number)
+        else:
+            runs.append([number])
+    listed = ", ".join(f"{run[0]}-{run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs[:most])
+    rest = sum(len(run) for run in runs[most:])
+    return f"{listed} and {rest} more" if rest else listed

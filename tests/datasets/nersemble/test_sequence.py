@@ -117,7 +117,7 @@ def test_frame_counts_that_differ_are_an_error_or_cut(videos):
     with pytest.raises(InputError) as error:
         look(videos)
     assert error.value.key == "frames"
-    assert f"4 for camera {SERIALS[1]}" in error.value.found
+    assert error.value.found == f"camera {SERIALS[1]} without 4-5"
     assert look(videos, cut=True, every=1).numbers == (0, 1, 2, 3)
 
 
@@ -127,6 +127,21 @@ def test_a_missing_image_is_a_count_that_differs(recording):
     with pytest.raises(InputError, match="same frames"):
         look(recording)
     assert look(recording, cut=True).numbers == (0, 1, 3, 4, 5)
+
+
+def test_cameras_that_lack_other_frames_are_told_by_their_frames(recording):
+    folder = recording.writer.sequence_folder("FREE") / "images"
+    for serial, number in zip(SERIALS, (2, 4, 4), strict=True):
+        (folder / f"cam_{serial}_{number:06d}.jpg").unlink()
+    with pytest.raises(InputError) as error:
+        look(recording)
+    assert error.value.found == f"camera {SERIALS[0]} without 2; cameras {SERIALS[1]}, {SERIALS[2]} without 4"
+    (folder / f"cam_{SERIALS[2]}_000005.jpg").unlink()
+    with pytest.raises(InputError) as error:
+        look(recording)
+    assert error.value.found == "; ".join(
+        f"camera {serial} without {lacks}" for serial, lacks in zip(SERIALS, ("2", "4", "4-5"), strict=True)
+    )
 
 
 def test_truncated_videos_are_found_before_decoding(videos, monkeypatch):
@@ -162,6 +177,18 @@ def test_mattes_of_another_size_are_named(recording):
         look(recording)
     assert error.value.key == "size"
     assert error.value.file.startswith(str(folder))
+
+
+@pytest.mark.parametrize("kind", ["alpha_maps", "images"])
+@pytest.mark.parametrize("number", [0, 3])
+def test_the_one_file_of_another_size_is_blamed(kind, number, recording):
+    path = recording.writer.sequence_folder("FREE") / kind / f"cam_{SERIALS[0]}_{number:06d}.jpg"
+    cv2.imwrite(str(path), np.zeros((HEIGHT // 2, WIDTH // 2), np.uint8))
+    with pytest.raises(InputError) as error:
+        look(recording)
+    assert error.value.file == str(path)
+    assert f"{WIDTH}x{HEIGHT}" in error.value.expected
+    assert error.value.found == f"{WIDTH // 2}x{HEIGHT // 2}"
 
 
 def test_a_missing_matte_is_named(recording):
