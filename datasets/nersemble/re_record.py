@@ -20,6 +20,7 @@ from ...bench.contracts import (
     no_progress,
 )
 from ..clip import CaptureClip
+from ..full_grid import require_full_grid
 from ..ga_layout import HEAD_FILE
 from ..ga_reader import read_capture
 from ..ga_writer import pose_to_parameters
@@ -36,14 +37,23 @@ def re_record(
     tracking: Path | None = None,
     release: Release = "v2",
     mattes: bool = True,
+    source: str | Path = "",
     progress: Progress = no_progress,
 ) -> list[str]:
     """Write a clip's frames, cameras and parameters as a raw recording under ``root``; return its sequences.
 
-    The recording shows the subject before a grey wall (`studio`), where the clip has masks. Frames become images with mattes, as VHAP's preprocessing leaves them, or without ``mattes`` videos of three
-    frames per timestep, of which a reader keeps the first. Parameters go under ``tracking``, in the world that
-    VHAP turns the calibration into. Excluded frames are written like the others.
+    The recording shows the subject before a grey wall (`studio`), where the clip has masks. Frames become images
+    with mattes, as VHAP's preprocessing leaves them, or without ``mattes`` videos of three frames per timestep,
+    of which a reader keeps the first. Parameters go under ``tracking``, in the world that VHAP turns the
+    calibration into. Excluded frames are written like the others.
+
+    Raises
+    ------
+    InputError
+        Where a camera has no frame at some timestep, before anything is written; ``source``, the capture the
+        clip was read from, is named.
     """
+    require_full_grid(clip, source)
     writer = RecordingWriter(root, clip.subject, [*clip.cameras.values()], release)
     writer.write_calibration()
     for one in clip.cameras.values():
@@ -140,6 +150,7 @@ def run(settings: RecordSettings, progress: Progress = no_progress) -> Findings:
         tracking=out / "tracking",
         release=settings.release,
         mattes=mattes,
+        source=settings.capture,
         progress=progress,
     )
     save_head(out / HEAD_FILE, clip.head)

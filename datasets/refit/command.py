@@ -38,7 +38,7 @@ def run(settings: RefitCommandSettings, progress: Progress = no_progress) -> Fin
         raise InputError(
             "command line", "--target", f"another head model than {clip.head.version}", target.version
         )
-    capture_plan(clip)  # What cannot be written again is found before the fit.
+    capture_plan(clip, settings.capture)  # What cannot be written again is found before the fit.
     if any(Path(out).resolve() in path.image.resolve().parents for path in clip.files.values()):
         raise InputError("command line", "--out", "a folder apart from the capture", str(out))
     refitted = refit(clip, target, settings.settings, folder=out / BLOCKS_FOLDER, progress=progress)

@@ -10,6 +10,7 @@ from ...bench.contracts import FrameKey, Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.files import atomic_path
 from ..clip import CaptureClip
+from ..full_grid import require_full_grid
 from ..ga_writer import CapturePlan, CaptureWriter, SequencePlan
 
 _SUFFIX = ".png"
@@ -24,7 +25,8 @@ def write_capture(clip: CaptureClip, out: Path, progress: Progress = no_progress
     ------
     InputError
         Where the layout cannot hold the clip: images that are no PNG or are changed by pixel steps, a camera
-        without a frame at some timestep, splits other than by held-out sequences and cameras.
+        without a frame at some timestep, splits other than by held-out sequences and cameras, exclusions
+        other than of whole timesteps.
     """
     plan, first = capture_plan(clip)
     writer = CaptureWriter(out, plan)
@@ -37,13 +39,15 @@ def write_capture(clip: CaptureClip, out: Path, progress: Progress = no_progress
     return writer.write_metadata()
 
 
-def capture_plan(clip: CaptureClip) -> tuple[CapturePlan, dict[str, int]]:
+def capture_plan(clip: CaptureClip, source: str | Path = "") -> tuple[CapturePlan, dict[str, int]]:
     """Plan of the capture a clip makes, and the first timestep of each sequence.
 
-    Raises `InputError` as `write_capture` does.
+    Raises `InputError` as `write_capture` does, naming ``source``, the capture the clip was read from.
     """
-    where = f"clip of {clip.subject}"
+    where = str(source) or f"clip of {clip.subject}"
     _check_files(clip, where)
+    require_full_grid(clip, where)
+    _check_excluded(clip, where)
     timesteps: dict[str, list[int]] = {}
     for key in clip.files:
         timesteps.setdefault(key.sequence, []).append(key.timestep)
@@ -113,3 +117,19 @@ def _check_files(clip: CaptureClip, where: str) -> None:
         for path in (files.image, files.mask):
             if path is not None and path.suffix.lower() != _SUFFIX:
                 raise InputError(path, "", "a PNG file, to be linked as it is", f"{path.suffix} of {key}")
+
+
+def _check_excluded(clip: CaptureClip, where: str) -> None:
+    """The layout excludes timesteps, each for one reason: whatever else would exclude frames anew, or lose a
+    reason."""
+    of_timestep: dict[int, FrameKey] = {}
+    for key in sorted(clip.files):
+        first = of_timestep.setdefault(key.timestep, key)
+        found, other = clip.excluded.get(key), clip.excluded.get(first)
+        if found != other:
+            expected = f"timestep {key.timestep} excluded with all its cameras for one reason, or not at all"
+            told = " and ".join(
+                f"{one} {f'excluded: {why}' if why is not None else 'kept'}"
+                for one, why in ((first, other), (key, found))
+            )
+            raise InputError(where, "excluded", expected, told)

@@ -1,9 +1,13 @@
 """There and back: a capture recorded raw and prepared again shows the same head in the same pixels."""
 
+import json
+import shutil
+
 import numpy as np
 import pytest
 import torch
 
+from headbench.bench.errors import InputError
 from headbench.datasets.ga_reader import read_capture
 from headbench.datasets.head.arrays import save_head
 from headbench.datasets.head.model import HeadModel
@@ -79,3 +83,18 @@ def test_the_command_says_how_to_prepare(clip, tmp_path):
         "head_model.npz",
     }
     assert (tmp_path / "raw" / "recording" / "901" / "sequences" / "BACKGROUND").is_dir()
+
+
+def test_a_frame_missing_from_the_capture_is_named_before_anything_is_written(clip, tmp_path):
+    source = clip.files[clip.splits["train"][0]].image.parents[2]
+    shutil.copytree(source, tmp_path / "capture")
+    union = tmp_path / "capture" / "UNION3_901"
+    path = union / "transforms_train.json"
+    value = json.loads(path.read_text())
+    gone = value["frames"].pop(1)
+    path.write_text(json.dumps(value))
+    with pytest.raises(InputError, match="no such frame") as caught:
+        run(RecordSettings(str(union), str(tmp_path / "raw")))
+    assert caught.value.file == str(union)
+    assert caught.value.key.endswith(f"/{gone['timestep_index']:05d}/{gone['camera_id']}")
+    assert not (tmp_path / "raw").exists()

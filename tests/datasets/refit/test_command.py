@@ -92,6 +92,49 @@ def test_targets_by_name():
         target_head("no-such-head")
 
 
+def test_a_hole_in_the_grid_is_refused_before_the_fit(finished, tmp_path, monkeypatch):
+    """A frame no JSON lists, its image still on disk: the layout written has no place to say so."""
+    root, settings, _ = finished
+    shutil.copytree(root / "capture", tmp_path / "capture")
+    union = next((tmp_path / "capture").glob("UNION*"))
+    path = union / "transforms_train.json"
+    value = json.loads(path.read_text())
+    gone = value["frames"].pop(1)
+    path.write_text(json.dumps(value))
+    lost = {*read_capture(settings.capture).files} - {*read_capture(union).files}
+    monkeypatch.setattr(block, "solve_frame", lambda *_: pytest.fail("fitted"))
+    with pytest.raises(InputError) as caught:
+        run(replace(settings, capture=str(union), out=str(tmp_path / "out")))
+    assert caught.value.file == str(union)
+    assert caught.value.key == f"frame {lost.pop()}"
+    assert f"/{gone['timestep_index']:05d}/{gone['camera_id']}" in caught.value.key
+    assert "no such frame" in caught.value.found
+    assert not lost
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("other", [None, "another reason"])
+def test_exclusions_of_part_of_a_timestep_are_refused(other, finished):
+    """The layout excludes whole timesteps for one reason: one camera's exclusion would become all cameras'."""
+    _, settings, _ = finished
+    clip = read_capture(settings.capture)
+    capture_plan(clip)
+    keys = sorted(clip.excluded)
+    assert len(keys) == len(clip.cameras) > 1
+    excluded = dict(clip.excluded)
+    splits = dict(clip.splits)
+    if other is None:
+        del excluded[keys[1]]
+        splits["self_reenactment"] = (*splits["self_reenactment"], keys[1])
+    else:
+        excluded[keys[1]] = other
+    with pytest.raises(InputError) as caught:
+        capture_plan(replace(clip, excluded=excluded, splits=splits), settings.capture)
+    assert caught.value.key == "excluded"
+    assert str(keys[0]) in caught.value.found
+    assert f"{keys[1]} {f'excluded: {other}' if other else 'kept'}" in caught.value.found
+
+
 def test_splits_the_layout_cannot_hold_are_refused(finished):
     _, settings, _ = finished
     clip = read_capture(settings.capture)
