@@ -164,7 +164,8 @@ def draw_scatter(canvas: Canvas, box: Box, expressions: FloatArray, held_out: np
 
 def space_summary(space: ExpressionSpace) -> str:
     """One sentence on how rich the training faces are and how new the test's."""
-    parts = [f"{space.kept} components explain {KEPT_VARIANCE:.0%} of the training faces"]
+    components = "1 component explains" if space.kept == 1 else f"{space.kept} components explain"
+    parts = [f"{components} {KEPT_VARIANCE:.0%} of the training faces"]
     if space.novelty_mm:
         new = np.array([*space.novelty_mm.values()])
         parts.append(

@@ -58,7 +58,7 @@ def measure(quick: bool, progress: Progress) -> Findings:
     progress(len(cases), len(cases), "")
     faults = [fault for row in rows for fault in _faults(row)]
     lines = [
-        f"{timesteps} timesteps, {torch.get_num_threads()} threads of torch; rates by processor seconds.",
+        f"{timesteps} timesteps; torch threads: {torch.get_num_threads()}; rates by processor seconds.",
         _line(("case", "mean mm", "95 % mm", "worst", "per s", "evaluations", "solver", "scipy")),
         *(_line((row["case"], *(_cell(row, *column) for column in _COLUMNS))) for row in rows),
         "solver, scipy: timesteps a second of the search alone, here and by scipy.optimize.least_squares; one thread.",

@@ -10,10 +10,12 @@ import pytest
 
 from headbench.bench.contracts import FrameKey
 from headbench.datasets.inspection.canvas import HELD_OUT, TRAIN, Canvas
+from headbench.datasets.inspection.expression_panel import space_summary
 from headbench.datasets.inspection.figure import WIDTH, draw_figure
 from headbench.datasets.inspection.overlay_panel import OUTLINE, overlay, pick_cameras, pick_timesteps
 from headbench.datasets.inspection.rig_panel import draw_rig, head_frame
 from headbench.datasets.inspection.statistics import (
+    ExpressionSpace,
     expression_space,
     posed_meshes,
     sequence_rows,
@@ -116,3 +118,12 @@ def test_a_clip_with_holes_and_without_tests_is_drawn(clip):
     )
     assert picture.shape[1] == WIDTH
     assert len(np.argwhere((picture == 238).all(axis=2))) > 500, "the missing frame is a grey field"
+
+
+@pytest.mark.parametrize(
+    ("explained", "begins"),
+    [((0.97, 0.03), "1 component explains 95%"), ((0.8, 0.2), "2 components explain 95%")],
+)
+def test_the_summary_of_expressions_counts_in_singular_and_plural(explained, begins):
+    space = ExpressionSpace([0], np.zeros(1, bool), np.zeros((1, 2)), np.array(explained), {})
+    assert space_summary(space).startswith(begins)
