@@ -8,7 +8,8 @@ from ...bench.contracts import Findings, Progress, no_progress
 from ...bench.errors import InputError
 from .plan import SubjectPlan, plan_subject
 from .prepare import SubjectResult, prepare
-from .presets import chosen_subjects
+from .presets import SUBJECT_NAMES, chosen_subjects
+from .recording import participants
 from .settings import PrepareSettings
 from .unions import check_unions
 
@@ -29,10 +30,22 @@ def run(settings: PrepareSettings, progress: Progress = no_progress) -> Findings
             raise InputError("command line", f"--{key}", "a number from 0", f"{getattr(settings, key)}")
     if settings.union_root:
         return check_unions(Path(settings.union_root), subjects, rejoin=settings.rejoin, progress=progress)
+    _check_named(settings, subjects)
     plans = [plan_subject(settings, subject) for subject in subjects]
     if settings.check:
         return _checked(plans)
     return _done(prepare(plans, workers=settings.workers, progress=progress), plans, settings)
+
+
+def _check_named(settings: PrepareSettings, subjects: list[str]) -> None:
+    """Raise `InputError` where a name stands for subjects of which none is there."""
+    known = participants(Path(settings.root))
+    if settings.subjects not in SUBJECT_NAMES or set(subjects) & set(known):
+        return
+    remedy = f"Name those to prepare, as in --subjects {next(iter(known))}"
+    remedy += ': it defaults to "paper".' if settings.subjects == "paper" else "."
+    expected = f'folders of "{settings.subjects}", which is {", ".join(subjects)}'
+    raise InputError(settings.root, "--subjects", expected, ", ".join(known), remedy)
 
 
 def _table(plans: list[SubjectPlan]) -> list[str]:
@@ -57,12 +70,13 @@ def _checked(plans: list[SubjectPlan]) -> Findings:
 def _done(results: list[SubjectResult], plans: list[SubjectPlan], settings: PrepareSettings) -> Findings:
     """Passed unless parameters were asked for and are missing."""
     lines = _table(plans)
-    for result in results:
+    for plan, result in zip(plans, results, strict=True):
         lines += ["", f"{result.subject}: {result.written} images written, {result.kept} there already."]
         lines += [f"  {sentence}" for sentence in result.missing]
         if result.union is not None:
             splits = ", ".join(f"{count} {name}" for name, count in result.frames.items())
-            head = f" --head {settings.head}" if settings.head else " --head flame2023.pkl"
+            suffix = "pkl" if plan.head_model.startswith("flame") else "npz"
+            head = f" --head {settings.head or f'{plan.head_model}.{suffix}'}"
             lines += [
                 f"  Frames: {splits}.",
                 f"  Use it: headbench run --data {result.union}{head} --out runs/{result.subject}",

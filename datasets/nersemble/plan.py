@@ -15,6 +15,7 @@ from ...bench.files import digest
 from .. import ga_layout as layout
 from ..head.arrays import HeadArrays
 from ..head.loaders import load_head
+from ..procedural.model import VERSIONS
 from .calibration import read_calibration
 from .colour import Correction
 from .export import CY, SequenceExport
@@ -27,6 +28,9 @@ from .tracking import TrackedSequence, find_tracked, read_tracked
 
 IMAGES_VERSION = 1
 """Counted up when the same recording and settings make other images than before."""
+
+_USUAL_HEAD = "flame2023"
+_FLAME_VERSIONS = ("flame2020", _USUAL_HEAD, "flame2023_no_jaw")
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +127,7 @@ def plan_subject(settings: PrepareSettings, subject: str) -> SubjectPlan:
     calibration = read_calibration(one.calibration_file)
     aligned = calibration.aligned()
     head = load_head(settings.head) if settings.head else None
+    version = _head_version(settings, head)
     cameras = tuple(part.strip() for part in settings.cameras.split(",") if part.strip())
     wanted, test = wanted_sequences(settings, one)
     jobs = []
@@ -159,8 +164,23 @@ def plan_subject(settings: PrepareSettings, subject: str) -> SubjectPlan:
         )
     label = f"_v{len(jobs[0].cameras)}_DS{settings.downscale}"
     union = out / f"UNION{len(jobs)}_{subject}{label}_{settings.split}-test"
-    version = head.version if head else settings.head_model
     return SubjectPlan(subject, jobs, test, head, version, union)
+
+
+def _head_version(settings: PrepareSettings, head: HeadArrays | None) -> str:
+    """Version a capture is declared for: that of the head model given, or else a known one by name."""
+    stated = settings.head_model
+    if head is not None:
+        if stated not in ("", head.version):
+            expected = f"{head.version!r}, the version of {settings.head}"
+            raise InputError("command line", "--head-model", expected, repr(stated), "Leave it out.")
+        return head.version
+    known = (*_FLAME_VERSIONS, *VERSIONS)
+    if stated and stated not in known:
+        expected = f"one of {', '.join(known)}"
+        remedy = "Give the file of another head model with --head."
+        raise InputError("command line", "--head-model", expected, repr(stated), remedy)
+    return stated or _USUAL_HEAD
 
 
 def wanted_sequences(settings: PrepareSettings, one: Participant) -> tuple[list[str], list[str]]:
@@ -196,7 +216,11 @@ def _tracked(
     if not root.is_dir():
         raise InputError(root, "", "a folder with VHAP's results", "a file" if root.exists() else "nothing")
     file = find_tracked(root, recorded.subject, recorded.name)
-    return None if file is None else read_tracked(file, timesteps=len(recorded.numbers), head=head)
+    if file is None:
+        return None
+    numbers = set(recorded.numbers)
+    kept = [number in numbers for number in recorded.uncut]
+    return read_tracked(file, timesteps=len(numbers), head=head, kept=kept)
 
 
 def _folder_name(recorded: RecordedSequence, downscale: int) -> str:

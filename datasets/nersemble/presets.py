@@ -18,6 +18,9 @@ SUBJECTS = ("074", "104", "165", "175", "210", "218", "264", "302", "304")
 ABLATION_SUBJECT = "306"
 """Subject of the paper's Table 4; not one of the nine."""
 
+SUBJECT_NAMES = {"paper": SUBJECTS, "ablation": (ABLATION_SUBJECT,)}
+"""What names stand for where subjects are asked for."""
+
 NOVEL_VIEW_CAMERA = "222200037"
 """The frontal camera, held out for novel views."""
 
@@ -50,9 +53,8 @@ def chosen_subjects(text: str, key: str = "--subjects") -> list[str]:
 
     Numbers are padded to three digits, so 74 is 074. Raises `InputError` for anything else and for twins.
     """
-    named = {"paper": list(SUBJECTS), "ablation": [ABLATION_SUBJECT]}
-    if text in named:
-        return named[text]
+    if text in SUBJECT_NAMES:
+        return [*SUBJECT_NAMES[text]]
     ids = [part.strip() for part in text.split(",") if part.strip()]
     if not ids or not all(part.isascii() and part.isdigit() for part in ids):
         raise InputError(

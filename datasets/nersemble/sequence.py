@@ -73,7 +73,8 @@ class View:
 class RecordedSequence:
     """One sequence: its views by serial, all with the same frames, and the frames that were chosen.
 
-    ``numbers`` are frame numbers of the source; timestep t of a prepared capture is ``numbers[t]``.
+    ``numbers`` are frame numbers of the source; timestep t of a prepared capture is ``numbers[t]``. ``uncut``
+    has those too that were chosen but are left out, as not all cameras have them.
     """
 
     subject: str
@@ -81,6 +82,7 @@ class RecordedSequence:
     folder: Path
     views: Mapping[str, View]
     numbers: tuple[int, ...]
+    uncut: tuple[int, ...]
 
     @property
     def has_mattes(self) -> bool:
@@ -130,12 +132,17 @@ def read_sequence(
             folder, stray[0], expected, "a recording of another camera", "" if cameras else remedy
         )
     views = {serial: _checked(folder, views.get(serial), serial, source) for serial in serials}
-    common = _common_numbers(folder, views, cut)
+    common, everything = _common_numbers(folder, views, cut)
     step = every or rate
     if step < 1:
         raise InputError("command line", "every", "a number from 1", f"{step}")
     return RecordedSequence(
-        participant.subject, name, folder, views, tuple(n for n in common if n % step == 0)
+        participant.subject,
+        name,
+        folder,
+        views,
+        tuple(n for n in common if n % step == 0),
+        tuple(n for n in everything if n % step == 0),
     )
 
 
@@ -274,7 +281,8 @@ def _same_matte(path: Path, matte: tuple[int, tuple[int, int]], frames: tuple[in
             raise InputError(path, key, f"{expected}, as the camera's frames", f"{found}", remedy)
 
 
-def _common_numbers(folder: Path, views: Mapping[str, View], cut: bool) -> list[int]:
+def _common_numbers(folder: Path, views: Mapping[str, View], cut: bool) -> tuple[list[int], list[int]]:
+    """Frames that all cameras have, and those that any has; ascending."""
     numbers = {serial: set(view.numbers) for serial, view in views.items()}
     everything = set.union(*numbers.values())
     common = set.intersection(*numbers.values())
@@ -288,7 +296,7 @@ def _common_numbers(folder: Path, views: Mapping[str, View], cut: bool) -> list[
         )
     if not common:
         raise InputError(folder, "frames", "frames that all cameras have", "none")
-    return sorted(common)
+    return sorted(common), sorted(everything)
 
 
 def _lacking(missing: Mapping[str, set[int]]) -> str:

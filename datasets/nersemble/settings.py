@@ -28,8 +28,8 @@ class PrepareSettings:
     """Folder with VHAP's results. Without it images and cameras are written; call again once there is one."""
     head: str = ""
     """Head model the tracking belongs to (flame2023.pkl, or npz): checked against it, never copied if FLAME's."""
-    head_model: str = "flame2023"
-    """Version of that head model, where --head is not given."""
+    head_model: str = ""
+    """Version of the head model the tracking belongs to; default: that of --head, or flame2023 without --head."""
     cameras: str = ""
     """Serials separated by commas; default: all the calibration has."""
     downscale: int = 4
@@ -44,7 +44,8 @@ class PrepareSettings:
     """Soft edges with mattes: "unblend" takes the light of the BACKGROUND still out, where there are stills; "plain"
     multiplies by the matte, as VHAP does, and leaves fringes."""
     cut: bool = False
-    """Keep the frames that all cameras have where their counts differ, instead of an error."""
+    """Keep the frames that all cameras have where they differ, instead of an error; tracking of all frames is cut
+    with them."""
     workers: int = 0
     """Cameras worked on at one time; 0 stands for one per processor core."""
     check: bool = False

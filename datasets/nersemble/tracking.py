@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -63,8 +63,13 @@ class TrackedSequence:
         return {**zeros, "jaw_pose": np.array([CANONICAL_JAW], dtype=np.float64), **self.constant}
 
 
-def read_tracked(path: Path, *, timesteps: int, head: HeadArrays | None = None) -> TrackedSequence:
+def read_tracked(
+    path: Path, *, timesteps: int, head: HeadArrays | None = None, kept: Sequence[bool] = ()
+) -> TrackedSequence:
     """Read ``tracked_flame_params_*.npz`` and check it against the frames and, where given, the head model.
+
+    ``kept`` says of each frame before a cut whether it is among the ``timesteps``; parameters of all those frames
+    are cut with them.
 
     Raises `InputError` for a file of another tracker, missing arrays, wrong shapes, numbers that are not finite,
     a number of timesteps other than ``timesteps``, and coefficients that the head model has no basis for.
@@ -75,6 +80,8 @@ def read_tracked(path: Path, *, timesteps: int, head: HeadArrays | None = None) 
             "The benchmark's tracking has Euler angles about the model's origin; run VHAP on the recording."
         )
         raise InputError(path, "rotation_matrices", "VHAP's arrays", "the benchmark's tracking", remedy)
+    if len(kept) > timesteps:
+        arrays = _cut(path, arrays, timesteps, np.asarray(kept, dtype=bool))
     frames = {key: _floats(path, arrays, key, (timesteps, size)) for key, size in PER_TIMESTEP.items()}
     frames["expr"] = _floats(path, arrays, "expr", (timesteps, None))
     for key, shape in (("dynamic_offset", (timesteps, None, 3)), ("eyelids", (timesteps, 2))):
@@ -112,6 +119,29 @@ def _results(folder: Path) -> Iterator[tuple[str, int, Path]]:
     for path in (*folder.glob("*.npz"), *folder.glob("*/*.npz")):
         if match := _RESULT.fullmatch(path.name):
             yield (path.parent.name if path.parent != folder else "", int(match[1]), path)
+
+
+def _cut(
+    path: Path, arrays: dict[str, np.ndarray], timesteps: int, kept: np.ndarray
+) -> dict[str, np.ndarray]:
+    """The arrays with the rows of the frames that were kept, where they have rows for all frames."""
+    rows = arrays["translation"].shape[:1] if "translation" in arrays else ()
+    if rows == (len(kept),):
+        moving = {*PER_TIMESTEP, "expr", "dynamic_offset", "eyelids"}
+        return {
+            key: array[kept] if key in moving and array.shape[:1] == rows else array
+            for key, array in arrays.items()
+        }
+    if rows and rows != (timesteps,):
+        raise InputError(
+            path,
+            "translation",
+            f"{timesteps} timesteps, as the frames kept, or {len(kept)}, as before --cut",
+            f"{rows[0]}",
+            "Name the cameras that have all frames with --cameras, mind --every, or prepare the images without "
+            "--tracking and track these frames.",
+        )
+    return arrays
 
 
 def _floats(
