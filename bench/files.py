@@ -39,7 +39,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
         os.replace(temporary, path)
     except OSError as error:
         # A full disk says so in the middle of writing, where the system no longer tells of which file.
-        if error.filename in (None, name):
+        if error.errno is not None and error.filename in (None, name):
             error.filename = str(path)
         raise
     finally:

@@ -127,3 +127,8 @@ def test_a_disk_that_fills_up_is_told_with_the_file_meant(tmp_path):
         raise OSError(errno.ENOSPC, "No space left on device")
     assert caught.value.filename == str(tmp_path / "a.png")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_an_error_of_ones_own_keeps_its_words(tmp_path):
+    with pytest.raises(OSError, match="^nothing of the system$"), atomic_path(tmp_path / "a.png"):
+        raise OSError("nothing of the system")
