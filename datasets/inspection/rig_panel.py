@@ -7,6 +7,7 @@ from collections.abc import Callable, Collection, Mapping
 import numpy as np
 
 from ...bench.contracts import Camera, FloatArray, IntArray
+from ..head.rigid import rigid_alignment
 from ..mesh_pictures import draw_mesh
 from .canvas import FINE, HELD_OUT, INK, MUTED, TRAIN, Canvas, Point, nice_ticks
 
@@ -18,10 +19,8 @@ _FAR_M = 100.0
 
 
 def head_frame(vertices: FloatArray, template: FloatArray, members: IntArray) -> FloatArray:
-    """(4, 4) world to head: origin at the mean of the vertices, axes those of the template (Kabsch)."""
-    rest, posed = template[members], vertices[members]
-    u, _, vt = np.linalg.svd((rest - rest.mean(axis=0)).T @ (posed - posed.mean(axis=0)))
-    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    """(4, 4) world to head: origin at the mean of the vertices, axes those of the template."""
+    rotation = rigid_alignment(vertices[members], template[members])[:3, :3]
     frame = np.eye(4)
     frame[:3, :3], frame[:3, 3] = rotation, -rotation @ vertices.mean(axis=0)
     return frame

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from ...bench.contracts import ByteArray, Camera, FloatArray, HeadPose, IntArray
+from ..head.rigid import rigid_alignment
 from ..mesh_pictures import rasterize_mesh
 from .parameters import Subject
 
@@ -79,12 +80,9 @@ def lay_mesh(
 
 
 def head_axes(subject: Subject, vertices: FloatArray) -> FloatArray:
-    """(3, 3) rows: where the template's x, y and z axes point for the posed mesh (Kabsch over the face)."""
+    """(3, 3) rows: where the template's x, y and z axes point for the posed mesh, by the face."""
     members = _members(subject, FACE)
-    rest, posed = subject.head.template[members], vertices[members]
-    u, _, vt = np.linalg.svd((rest - rest.mean(axis=0)).T @ (posed - posed.mean(axis=0)))
-    flip = np.diag([1.0, 1.0, float(np.sign(np.linalg.det(u @ vt)) or 1.0)])
-    return np.asarray(u @ flip @ vt)
+    return rigid_alignment(vertices[members], subject.head.template[members])[:3, :3]
 
 
 def _members(subject: Subject, names: tuple[str, ...]) -> IntArray:

@@ -10,6 +10,7 @@ from scipy.sparse import csr_array, eye_array
 from ...bench.contracts import FloatArray, HeadAsset, IntArray
 from ...bench.errors import InputError
 from ..head.regions import faces_in_region
+from ..head.rigid import rigid_alignment
 from ..mesh_pictures import vertex_normals
 from .bounded import solve_bounded
 from .correspondence import closest_points
@@ -133,22 +134,6 @@ def fit_shape(
     return solve_bounded(normal, weighted.T @ missing, np.full(len(normal), settings.coefficient_bound))
 
 
-def rigid_alignment(points: FloatArray, wanted: FloatArray, weights: FloatArray) -> FloatArray:
-    """(4, 4) rigid motion that takes points (n, 3) nearest to ``wanted``, by weighted squared distance.
-
-    Kabsch, "A solution for the best rotation to relate two sets of vectors", Acta Cryst. A32, 1976; with the
-    sign that excludes reflections.
-    """
-    share = (weights / weights.sum())[:, None]
-    middle, wanted_middle = (share * points).sum(axis=0), (share * wanted).sum(axis=0)
-    u, _, vt = np.linalg.svd((share * (points - middle)).T @ (wanted - wanted_middle))
-    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    motion = np.eye(4)
-    motion[:3, :3] = (u @ sign @ vt).T
-    motion[:3, 3] = wanted_middle - motion[:3, :3] @ middle
-    return motion
-
-
 def _first_alignment(source: HeadAsset, neutral: FloatArray, target: HeadAsset) -> FloatArray:
     names = [name for name in _LANDMARK_REGIONS if name in source.regions and name in target.regions]
     if len(names) < 3:
@@ -156,7 +141,7 @@ def _first_alignment(source: HeadAsset, neutral: FloatArray, target: HeadAsset) 
         raise InputError(f"head model {source.version!r}", "regions", expected, ", ".join(names) or "none")
     here = np.array([neutral[source.regions[name]].mean(axis=0) for name in names])
     there = np.array([target.template[target.regions[name]].mean(axis=0) for name in names])
-    return rigid_alignment(here, there, np.ones(len(names)))
+    return rigid_alignment(here, there)
 
 
 def _counterparts(
