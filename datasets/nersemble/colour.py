@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from ...bench.contracts import ByteArray, FloatArray
 from ...bench.errors import InputError
+from ..srgb import srgb_to_linear
 
 Correction = Callable[[ByteArray], ByteArray]
 """From (H, W, 3) 8-bit RGB to the same."""
@@ -55,11 +56,6 @@ _BEYOND_LINEAR: dict[int, tuple[str, ...]] = {
 POLYNOMIALS = {count: (*_CHANNELS, *beyond) for count, beyond in _BEYOND_LINEAR.items()}
 """Terms by their number, each a product of channels ("rrg" is R R G, "" the constant 1): the augmented
 matrices of Cheung, Westland, Connah, Ripamonti (2004), in colour-science's order."""
-
-
-def srgb_to_linear(values: FloatArray) -> FloatArray:
-    """Decode sRGB in [0, 1] (IEC 61966-2-1)."""
-    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
 
 
 def linear_to_srgb(values: FloatArray) -> FloatArray:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...bench.contracts import FloatArray
+from ..srgb import srgb_to_linear
 
 # Display colours (sRGB); the skin tones run roughly through Fitzpatrick's types I to VI.
 _SKIN = ("#eac6b2", "#e2b49a", "#d3a083", "#b98363", "#8f5f43", "#6a4430")
@@ -19,7 +20,7 @@ def linear(color: str | FloatArray) -> FloatArray:
     """Display colour (``#rrggbb`` or sRGB in [0, 1]) to linear light, (3,)."""
     if isinstance(color, str):
         color = np.array([int(color[i : i + 2], 16) for i in (1, 3, 5)]) / 255.0
-    return np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
+    return srgb_to_linear(color)
 
 
 @dataclass(frozen=True, eq=False)

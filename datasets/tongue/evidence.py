@@ -18,6 +18,7 @@ import numpy as np
 from scipy import ndimage
 
 from ...bench.contracts import ByteArray, FloatArray
+from ..srgb import srgb_to_linear
 from .atlas import PITCH, MouthAtlas
 from .sampling import MouthColours
 
@@ -139,8 +140,7 @@ def _strength(values: dict[str, FloatArray], known: np.ndarray) -> FloatArray:
 def _features(colours: ByteArray, seen: np.ndarray) -> dict[str, FloatArray]:
     """(T, H, W) float32 log ratios of smoothed linear colours: ``pink`` (green to blue), ``red`` (red to green),
     and ``light`` (brightness)."""
-    shares = np.arange(256) / 255
-    linear = np.where(shares <= 0.04045, shares / 12.92, ((shares + 0.055) / 1.055) ** 2.4).astype(np.float32)
+    linear = srgb_to_linear(np.arange(256) / 255).astype(np.float32)
     weight = seen.astype(np.float32)
     total = ndimage.uniform_filter(weight, (0, 3, 3))
     channels = [

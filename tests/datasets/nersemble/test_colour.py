@@ -16,8 +16,8 @@ from headbench.datasets.nersemble.colour import (
     affine_correction,
     linear_to_srgb,
     polynomial_correction,
-    srgb_to_linear,
 )
+from headbench.datasets.srgb import srgb_to_linear
 
 # sum over i of (i + 1) * term i of colour-science 0.4.7's matrix_augmented_Cheung2004 at RGB (0.7, 0.3, 0.11).
 WEIGHTED_SUMS = {
