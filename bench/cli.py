@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import errno
 import io
 import json
 import os
@@ -21,7 +20,7 @@ from .configuration import build, merge, parse_assignments, read_yaml
 from .contracts import Findings
 from .demo import DemoConfig, demo_run_config, parse_size
 from .errors import HeadbenchError, InputError
-from .files import plain, write_json
+from .files import WRITE_FAULTS, plain, write_json
 from .progress import log_to, progress
 from .registry import Group, discover, get, resolve
 from .run_config import RunConfig, resolve_methods, resolve_metrics
@@ -30,8 +29,6 @@ from .store import RunFolder
 
 EXIT_FAILED_CELL = 1
 EXIT_BAD_INPUT = 2
-WRITE_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
-"""What the system says of a disk that takes no more; a fault of the place, not of the program."""
 
 Preset = Literal["smoke", "demo", "fast", "paper"]
 Text = Annotated[str | None, tyro.conf.arg(metavar="TEXT")]

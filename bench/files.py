@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
@@ -18,6 +19,9 @@ from .errors import InputError
 
 MAX_NAME_BYTES = 120
 """Longest name of a subject, a sequence or a camera; a file name made of several has to fit into 255 bytes."""
+
+WRITE_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
+"""What the system says of a disk that takes no more; a fault of the place, not of the program."""
 
 
 @contextmanager

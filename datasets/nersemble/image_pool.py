@@ -17,6 +17,7 @@ from pathlib import Path
 
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
+from ...bench.files import WRITE_FAULTS
 from ...bench.machine import processor_count
 from ..ga_writer import write_png
 from ..image_files import probe_image
@@ -24,7 +25,7 @@ from .frames import read_frames
 from .pixels import prepare_pixels, read_still
 from .plan import SequenceJob
 
-_WRITE_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM)
+_WRITE_FAULTS = (*WRITE_FAULTS, errno.EACCES, errno.EPERM)
 
 
 @dataclass(frozen=True, eq=False)
