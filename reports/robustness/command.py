@@ -1,0 +1,35 @@
+"""What ``headbench extremes`` and ``headbench reenact`` have in common: avatars of a run, a folder, a sheet, limits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+from ...bench.contracts import Findings, Progress
+from ...bench.robustness.avatars import trained
+from ...bench.robustness.settings import ExtremesSettings, ReenactSettings
+from ...bench.robustness.trial import SHEET_FILE, table
+from ...bench.stages import Job
+from ...bench.store import RunFolder
+
+Settings = TypeVar("Settings", ExtremesSettings, ReenactSettings)
+
+
+def try_run(
+    settings: Settings,
+    default_folder: str,
+    attempt: Callable[[Sequence[Job], Settings, Path, Progress], list[dict[str, Any]]],
+    write_sheet: Callable[[Path], Any],
+    progress: Progress,
+) -> Findings:
+    """Try the avatars of a run, write the contact sheet; did not pass where a limit is broken."""
+    folder = Path(settings.run)
+    out = Path(settings.out) if settings.out else folder / default_folder
+    jobs = trained(folder, settings.methods, settings.data)
+    RunFolder(out).prepare()
+    summaries = attempt(jobs, settings, out, progress)
+    write_sheet(out)
+    text = f"{table(summaries)}\n{out / SHEET_FILE}"
+    passed = all(summary["frames_broken"] == 0 for summary in summaries)
+    return Findings(text, {"out": out, "avatars": summaries}, passed)
