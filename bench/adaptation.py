@@ -16,10 +16,11 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from .contracts import Clip, DatasetSpec, FloatArray, FrameKey, MethodSpec, Progress, ResolutionRule
+from .contracts import Clip, FloatArray, FrameKey, Progress
 from .errors import InputError
 from .progress import progress
 from .registry import resolve
+from .specs import DatasetSpec, MethodSpec, ResolutionRule
 
 
 @dataclass(frozen=True)

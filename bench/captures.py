@@ -8,12 +8,13 @@ from pathlib import Path
 
 from .adaptation import MethodNeeds, carry_out, plan
 from .configuration import build_arguments
-from .contracts import Clip, DatasetSpec, ResolutionRule
+from .contracts import Clip
 from .errors import InputError
 from .files import check_name
 from .progress import progress
 from .registry import get, resolve
 from .run_config import RunConfig
+from .specs import DatasetSpec, ResolutionRule
 
 
 def open_clips(config: RunConfig) -> list[Clip]:

@@ -17,7 +17,6 @@ import tyro
 
 from .commands import offered_commands, with_groups
 from .configuration import build, merge, parse_assignments, read_yaml
-from .contracts import Findings
 from .demo import DemoConfig, demo_run_config, parse_size
 from .errors import HeadbenchError, InputError
 from .files import WRITE_FAULTS, plain, write_json
@@ -25,6 +24,7 @@ from .progress import log_to, progress
 from .registry import Group, discover, get, resolve
 from .run_config import RunConfig, resolve_methods, resolve_metrics
 from .runner import run as run_comparison
+from .specs import Findings
 from .store import RunFolder
 
 EXIT_FAILED_CELL = 1

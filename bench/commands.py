@@ -8,11 +8,11 @@ from typing import Annotated, Any
 
 import tyro
 
-from .contracts import CommandSpec, Findings
 from .errors import HeadbenchError
 from .files import plain
 from .progress import log_to, progress
 from .registry import discover, resolve
+from .specs import CommandSpec, Findings
 
 EXIT_NOT_PASSED = 1
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Literal
 
-from .contracts import BenchmarkSpec, CommandSpec, DatasetSpec, MethodSpec, MetricSpec, ReportSpec
 from .errors import HeadbenchError, InputError
+from .specs import BenchmarkSpec, CommandSpec, DatasetSpec, MethodSpec, MetricSpec, ReportSpec
 
 Group = Literal["methods", "datasets", "metrics", "reports", "benchmarks", "commands"]
 SPEC_TYPES: dict[str, type] = {

@@ -10,10 +10,11 @@ from typing import Any
 
 from .adaptation import MethodNeeds
 from .configuration import build, merge
-from .contracts import Budget, MethodSpec, MetricSpec, TaskName
+from .contracts import Budget, TaskName
 from .errors import InputError
 from .files import check_name
 from .registry import get, resolve, unknown
+from .specs import MethodSpec, MetricSpec
 
 
 @dataclass(frozen=True)

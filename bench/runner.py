@@ -15,13 +15,14 @@ import pandas as pd
 from . import adaptation
 from .adaptation import AdaptedClip, MethodNeeds
 from .captures import open_clips
-from .contracts import Clip, DatasetSpec, MetricSpec
+from .contracts import Clip
 from .errors import HeadbenchError, InputError, UnavailableError
 from .machine import machine_record, peak_memory_bytes
 from .progress import duration
 from .protocol import Protocol, make_protocol
 from .registry import discover, get, resolve
 from .run_config import ResolvedMethod, RunConfig, resolve_methods, resolve_metrics
+from .specs import DatasetSpec, MetricSpec
 from .stages import Job, failed_rows, fit, measure, render
 from .store import RunFolder, write_rows
 

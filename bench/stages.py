@@ -14,7 +14,7 @@ from typing import Any
 import pandas as pd
 
 from .adaptation import AdaptedClip
-from .contracts import Avatar, Camera, Clip, FrameKey, HeadPose, Metric, MetricSpec
+from .contracts import Avatar, Camera, Clip, FrameKey, HeadPose, Metric
 from .errors import HeadbenchError, InputError, UnavailableError
 from .files import digest
 from .frames import quantise, read_png, write_png
@@ -23,6 +23,7 @@ from .progress import duration, progress
 from .protocol import Protocol
 from .registry import resolve
 from .run_config import ResolvedMethod
+from .specs import MetricSpec
 from .store import Cell, Row, read_rows, to_frame, write_rows
 from .training_view import TrainingView
 

@@ -1,6 +1,6 @@
 """Benchmarks of this room. Light to import: implementations are named, not loaded."""
 
-from ..bench.contracts import BenchmarkSpec
+from ..bench.specs import BenchmarkSpec
 
 CLUSTERS = BenchmarkSpec(
     name="clusters",

@@ -1,6 +1,6 @@
 """Captures that headbench reads or makes. Light to import: implementations are named, not loaded."""
 
-from ..bench.contracts import DatasetSpec
+from ..bench.specs import DatasetSpec
 
 GA_LAYOUT = DatasetSpec(
     name="ga",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..bench.contracts import BenchmarkSpec
+from ..bench.specs import BenchmarkSpec
 
 SPLATS = BenchmarkSpec(
     name="splats",

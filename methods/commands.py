@@ -1,6 +1,6 @@
 """Commands of this room. Light to import: implementations are named, not loaded."""
 
-from ..bench.contracts import CommandSpec
+from ..bench.specs import CommandSpec
 
 COMPACT = CommandSpec(
     name="compact",

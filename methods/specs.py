@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from ..bench.contracts import MethodSpec
+from ..bench.specs import MethodSpec
 
 PAPER_ITERATIONS = 600_000
 

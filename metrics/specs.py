@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..bench.contracts import MetricSpec
+from ..bench.specs import MetricSpec
 
 PSNR = MetricSpec(
     name="psnr",

@@ -14,10 +14,11 @@ from PIL import Image, UnidentifiedImageError
 
 from ..bench.captures import open_clips
 from ..bench.configuration import build
-from ..bench.contracts import ByteArray, Clip, FrameKey, MetricSpec
+from ..bench.contracts import ByteArray, Clip, FrameKey
 from ..bench.errors import InputError
 from ..bench.frames import read_png
 from ..bench.run_config import RunConfig
+from ..bench.specs import MetricSpec
 from ..bench.store import RunFolder, keys_of, read_rows
 
 

@@ -7,8 +7,9 @@ from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
-from ..bench.contracts import FrameKey, MetricSpec
+from ..bench.contracts import FrameKey
 from ..bench.protocol import TASK_TITLES
+from ..bench.specs import MetricSpec
 from .contact_sheet import Missing, Picture, SheetRow, contact_sheet
 from .run_data import RunData
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..bench.contracts import ReportSpec
+from ..bench.specs import ReportSpec
 
 TABLE = ReportSpec(
     name="table",

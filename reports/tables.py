@@ -12,9 +12,9 @@ from typing import Literal
 
 import pandas as pd
 
-from ..bench.contracts import MetricSpec
 from ..bench.errors import InputError
 from ..bench.protocol import TASK_TITLES
+from ..bench.specs import MetricSpec
 from .aggregate import Aggregate, check_rows, summarise, task_frames
 
 AVATAR_TITLE = "Avatar"

@@ -7,9 +7,9 @@ from types import ModuleType
 import pytest
 
 from headbench.bench import runner
-from headbench.bench.contracts import ResolutionRule
 from headbench.bench.frames import read_png
 from headbench.bench.run_config import RunConfig
+from headbench.bench.specs import ResolutionRule
 from headbench.bench.store import RunFolder, keys_of
 from headbench.methods.specs import MEAN_IMAGE
 

@@ -83,10 +83,11 @@ def test_a_lawful_import_passes(path, source):
     assert violations(ROOT / path, source) == []
 
 
-def test_contracts_need_numpy_and_the_standard_library_only():
+@pytest.mark.parametrize("name", ["contracts.py", "specs.py"])
+def test_contracts_need_numpy_and_the_standard_library_only(name):
     import sys
 
-    path = ROOT / "bench" / "contracts.py"
+    path = ROOT / "bench" / name
     roots = {name.split(".")[0] for name in imports(path, ast.parse(path.read_text()))}
     assert roots <= {"numpy"} | set(sys.stdlib_module_names)
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ...bench.contracts import Findings, Progress
+from ...bench.contracts import Progress
 from ...bench.errors import InputError
+from ...bench.specs import Findings
 from ..ga_reader import read_capture
 from .settings import ExportColmapSettings
 from .writer import export_model

@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from ...bench.contracts import Findings, Progress, no_progress
+from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.files import write_json
+from ...bench.specs import Findings
 from ..clip import CaptureClip
 from ..ga_reader import read_capture
 from ..ga_writer import write_png

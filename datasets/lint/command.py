@@ -8,8 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ...bench.contracts import Findings, Progress, no_progress
+from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
+from ...bench.specs import Findings
 from .catalogue import GROUPS, RULES
 from .evidence import Evidence, find_capture, gather
 from .rules import SEVERITIES, Finding, apply, several

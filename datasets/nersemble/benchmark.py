@@ -18,8 +18,9 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from ...bench.contracts import ByteArray, Camera, Findings, Progress, no_progress
+from ...bench.contracts import ByteArray, Camera, Progress, no_progress
 from ...bench.machine import processor_count
+from ...bench.specs import Findings
 from ..synthetic.rig import cameras
 from .command import run
 from .settings import PrepareSettings

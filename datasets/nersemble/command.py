@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ...bench.contracts import Findings, Progress, no_progress
+from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
+from ...bench.specs import Findings
 from .plan import SubjectPlan, plan_subject
 from .prepare import SubjectResult, prepare
 from .presets import SUBJECT_NAMES, chosen_subjects

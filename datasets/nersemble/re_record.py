@@ -9,16 +9,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ...bench.contracts import (
-    ByteArray,
-    Camera,
-    Findings,
-    FloatArray,
-    FrameKey,
-    HeadPose,
-    Progress,
-    no_progress,
-)
+from ...bench.contracts import ByteArray, Camera, FloatArray, FrameKey, HeadPose, Progress, no_progress
+from ...bench.specs import Findings
 from ..clip import CaptureClip
 from ..full_grid import require_full_grid
 from ..ga_layout import HEAD_FILE

@@ -10,8 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ...bench.contracts import Findings, Progress, no_progress
+from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
+from ...bench.specs import Findings
 from .. import ga_layout as layout
 from ..transforms import FrameEntry, read_transforms, timesteps_of
 from ..validate import check_images, check_timesteps

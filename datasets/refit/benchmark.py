@@ -13,7 +13,8 @@ import torch
 from scipy.optimize import least_squares
 from threadpoolctl import threadpool_limits
 
-from ...bench.contracts import Findings, FloatArray, FrameKey, HeadPose, Progress
+from ...bench.contracts import FloatArray, FrameKey, HeadPose, Progress
+from ...bench.specs import Findings
 from ..clip import CaptureClip, FrameFiles
 from ..head.arrays import HeadArrays
 from ..head.benchmark.sized import FLAME_SIZES, sized_head

@@ -12,8 +12,9 @@ import numpy as np
 from sklearn.cluster import KMeans, SpectralClustering
 from sklearn.metrics import adjusted_rand_score
 
-from ...bench.contracts import Findings, FloatArray, FrameKey, HeadPose, IntArray, Progress
+from ...bench.contracts import FloatArray, FrameKey, HeadPose, IntArray, Progress
 from ...bench.machine import peak_memory_bytes
+from ...bench.specs import Findings
 from ..clip import CaptureClip
 from ..images import ImageStore
 from ..synthetic.geometry import load_geometry

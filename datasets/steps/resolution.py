@@ -7,8 +7,9 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from ...bench.contracts import Camera, FloatArray, FrameKey, ResolutionRule
+from ...bench.contracts import Camera, FloatArray, FrameKey
 from ...bench.errors import InputError
+from ...bench.specs import ResolutionRule
 from ..clip import CaptureClip, FramePixels
 from ..resampling import resize_image
 

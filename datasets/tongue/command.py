@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ...bench.contracts import Findings, Progress
+from ...bench.contracts import Progress
 from ...bench.errors import InputError
+from ...bench.specs import Findings
 from ..clip import CaptureClip
 from ..ga_reader import find_captures, read_capture
 from ..steps.exclusion_file import KEEP, Exclusions, read_exclusions, write_exclusions

@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
-from ...bench.contracts import Findings, Progress, no_progress
+from ...bench.contracts import Progress, no_progress
+from ...bench.specs import Findings
 from ...datasets.procedural.model import procedural_head
 from ..splats.benchmark.layout import table
 from .savings import Bench

@@ -8,8 +8,9 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
-from ...bench.contracts import Clip, Findings, HeadAsset, Progress, no_progress
+from ...bench.contracts import Clip, HeadAsset, Progress, no_progress
 from ...bench.errors import InputError
+from ...bench.specs import Findings
 from ...datasets.ga_reader import read_capture
 from ..avatar_files import read_shared_head, save_shared_head
 from ..ours_avatar import OursAvatar

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from ...bench.contracts import Findings, HeadAsset, HeadPose, Progress, no_progress
+from ...bench.contracts import HeadAsset, HeadPose, Progress, no_progress
 from ...bench.errors import InputError
+from ...bench.specs import Findings
 from ...datasets.ga_reader import read_capture
 from ..avatar_files import read_shared_head
 from ..compact.file import COMPACT_FILE

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ...bench.contracts import Findings, Progress, no_progress
+from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
+from ...bench.specs import Findings
 from ...datasets.ga_reader import read_capture
 from ..avatar_files import SUBJECT_FILE, Subject, save_shared_head, write_subject
 from ..ga_files import PLY_FILE, read_ga_splats, write_ga_splats

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 
-from ...bench.contracts import Findings, Progress, no_progress
+from ...bench.contracts import Progress, no_progress
 from ...bench.files import atomic_path
+from ...bench.specs import Findings
 from ...bench.store import RunFolder
 from .front import pareto_front
 from .plot import Panel, write_plot

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ...bench.contracts import MetricSpec
 from ...bench.errors import InputError
+from ...bench.specs import MetricSpec
 from ..aggregate import check_rows, summarise
 from ..run_data import RunData
 

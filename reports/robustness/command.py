@@ -6,10 +6,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from ...bench.contracts import Findings, Progress
+from ...bench.contracts import Progress
 from ...bench.robustness.avatars import trained
 from ...bench.robustness.settings import ExtremesSettings, ReenactSettings
 from ...bench.robustness.trial import SHEET_FILE, table
+from ...bench.specs import Findings
 from ...bench.stages import Job
 from ...bench.store import RunFolder
 

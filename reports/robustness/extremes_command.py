@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from ...bench.contracts import Findings, Progress, no_progress
+from ...bench.contracts import Progress, no_progress
 from ...bench.robustness.extremes import TASK, try_extremes
 from ...bench.robustness.settings import ExtremesSettings
+from ...bench.specs import Findings
 from .command import try_run
 from .extremes_sheet import write_extremes_sheet
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from ...bench.contracts import Findings, Progress, no_progress
+from ...bench.contracts import Progress, no_progress
 from ...bench.robustness.reenactment import TASK, reenact
 from ...bench.robustness.settings import ReenactSettings
+from ...bench.specs import Findings
 from .command import try_run
 from .reenact_sheet import write_reenact_sheet
 

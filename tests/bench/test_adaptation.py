@@ -8,11 +8,12 @@ import pytest
 from headbench.bench import runner
 from headbench.bench.adaptation import MethodNeeds, plan
 from headbench.bench.captures import open_clips
-from headbench.bench.contracts import Camera, ResolutionRule
+from headbench.bench.contracts import Camera
 from headbench.bench.errors import InputError
 from headbench.bench.files import digest
 from headbench.bench.frames import read_png
 from headbench.bench.run_config import RunConfig
+from headbench.bench.specs import ResolutionRule
 from headbench.bench.store import RunFolder
 
 TWICE = ResolutionRule(size=(16, 12), speed_size=(32, 24))

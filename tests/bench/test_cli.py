@@ -112,7 +112,7 @@ def test_json_gives_the_numbers_of_the_table(monkeypatch, tmp_path):
 @pytest.fixture
 def toy_benchmark(monkeypatch, tmp_path):
     (tmp_path / "toy_benchmark.py").write_text(
-        "from headbench.bench.contracts import BenchmarkSpec, Findings\n"
+        "from headbench.bench.specs import BenchmarkSpec, Findings\n"
         "def speed(quick, progress):\n"
         "    return Findings('a table', {'quick': quick})\n"
         "def stress(quick, progress):\n"

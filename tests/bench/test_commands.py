@@ -5,13 +5,13 @@ import json
 import pytest
 
 from headbench.bench import cli, commands
-from headbench.bench.contracts import CommandSpec
 from headbench.bench.registry import Plugin
+from headbench.bench.specs import CommandSpec
 
 TOY = """
 from dataclasses import dataclass
 import tyro
-from headbench.bench.contracts import Findings
+from headbench.bench.specs import Findings
 from headbench.bench.errors import InputError
 
 @dataclass(frozen=True)

@@ -3,8 +3,8 @@ from importlib.metadata import EntryPoint
 import pytest
 
 from headbench.bench import registry
-from headbench.bench.contracts import MetricSpec
 from headbench.bench.errors import HeadbenchError, InputError
+from headbench.bench.specs import MetricSpec
 
 
 def with_entries(monkeypatch, *entries):

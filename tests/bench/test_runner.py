@@ -8,10 +8,10 @@ import types
 import pytest
 
 from headbench.bench import runner
-from headbench.bench.contracts import ReportSpec
 from headbench.bench.errors import HeadbenchError, InputError
 from headbench.bench.registry import Plugin
 from headbench.bench.run_config import RunConfig
+from headbench.bench.specs import ReportSpec
 from headbench.bench.store import RunFolder, read_rows
 
 

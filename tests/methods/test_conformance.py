@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from headbench.bench.conformance import check_method
-from headbench.bench.contracts import MethodSpec, no_progress
+from headbench.bench.contracts import no_progress
 from headbench.bench.files import digest_file, read_json
 from headbench.bench.registry import discover
 from headbench.bench.run_config import resolve_method
+from headbench.bench.specs import MethodSpec
 from headbench.methods.avatar_files import RECORD_FILE
 
 from .toy_clip import toy_pose

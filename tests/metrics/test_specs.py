@@ -3,8 +3,8 @@ import sys
 
 import pytest
 
-from headbench.bench.contracts import MetricSpec
 from headbench.bench.registry import resolve
+from headbench.bench.specs import MetricSpec
 from headbench.metrics import specs
 
 SPECS = [value for value in vars(specs).values() if isinstance(value, MetricSpec)]

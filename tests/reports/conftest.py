@@ -4,8 +4,8 @@ from pathlib import Path
 import pytest
 
 from headbench.bench import runner
-from headbench.bench.contracts import MetricSpec
 from headbench.bench.run_config import RunConfig
+from headbench.bench.specs import MetricSpec
 from headbench.bench.store import Row, to_frame
 
 PSNR = MetricSpec("psnr", "PSNR", "dB", True, 2, "m:psnr")

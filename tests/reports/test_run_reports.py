@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from headbench.bench.contracts import ReportSpec
 from headbench.bench.errors import InputError
 from headbench.bench.registry import resolve
+from headbench.bench.specs import ReportSpec
 from headbench.bench.store import RunFolder, read_rows
 from headbench.reports import specs
 from headbench.reports.run_data import RunData

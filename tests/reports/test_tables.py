@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from headbench.bench.contracts import MetricSpec
 from headbench.bench.errors import InputError
+from headbench.bench.specs import MetricSpec
 from headbench.bench.store import Row, to_frame
 from headbench.reports.tables import build_table
 

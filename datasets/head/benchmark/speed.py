@@ -12,8 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ....bench.contracts import Findings, Progress
+from ....bench.contracts import Progress
 from ....bench.errors import UnavailableError
+from ....bench.specs import Findings
 from ..model import HeadModel
 from .sized import FLAME_SIZES, sized_head
 from .smplx_flame import smplx_forward

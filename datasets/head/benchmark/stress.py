@@ -9,7 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ....bench.contracts import Findings, Progress
+from ....bench.contracts import Progress
+from ....bench.specs import Findings
 from ...procedural.model import procedural_head
 from ..arrays import HeadArrays
 from ..model import HeadModel

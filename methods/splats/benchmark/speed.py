@@ -7,9 +7,10 @@ from dataclasses import asdict, replace
 
 import torch
 
-from ....bench.contracts import Findings, Progress
+from ....bench.contracts import Progress
 from ....bench.errors import UnavailableError
 from ....bench.machine import machine_record
+from ....bench.specs import Findings
 from ....datasets.procedural.model import procedural_head
 from .. import cpu
 from ..rasterize import available_backends

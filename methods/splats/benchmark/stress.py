@@ -7,7 +7,8 @@ from dataclasses import asdict, dataclass
 import torch
 from torch import Tensor
 
-from ....bench.contracts import Findings, Progress
+from ....bench.contracts import Progress
+from ....bench.specs import Findings
 from ..rasterize import available_backends, rasterize
 from .compare import Outcome, relative_error, render_with_gradients
 from .extremes import CASES, Case, facing, uneven

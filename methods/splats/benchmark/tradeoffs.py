@@ -18,7 +18,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ....bench.contracts import Findings, Progress
+from ....bench.contracts import Progress
+from ....bench.specs import Findings
 from ..rasterize import available_backends
 from .layout import milliseconds, table
 from .passes import draw, leaves, one_torch_thread, passes

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from headbench.bench.adaptation import MethodNeeds, plan
-from headbench.bench.contracts import ResolutionRule, no_progress
+from headbench.bench.contracts import no_progress
 from headbench.bench.errors import InputError
+from headbench.bench.specs import ResolutionRule
 from headbench.datasets.ga_reader import read_capture
 from headbench.datasets.head.arrays import save_head
 from headbench.datasets.refit.block import BlockFitter

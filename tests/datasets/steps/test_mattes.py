@@ -10,8 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
 
-from headbench.bench.contracts import Camera, ResolutionRule
+from headbench.bench.contracts import Camera
 from headbench.bench.errors import InputError
+from headbench.bench.specs import ResolutionRule
 from headbench.datasets.clip import FrameFiles
 from headbench.datasets.ga_reader import read_capture
 from headbench.datasets.head.model import HeadModel

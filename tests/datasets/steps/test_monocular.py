@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from headbench.bench.contracts import ResolutionRule
+from headbench.bench.specs import ResolutionRule
 from headbench.datasets.ga_reader import read_capture
 from headbench.datasets.head.model import HeadModel
 from headbench.datasets.steps.monocular import as_single_video

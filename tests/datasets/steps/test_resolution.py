@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from headbench.bench.contracts import Camera, ResolutionRule
+from headbench.bench.contracts import Camera
 from headbench.bench.errors import InputError
+from headbench.bench.specs import ResolutionRule
 from headbench.datasets.ga_reader import read_capture
 from headbench.datasets.steps.resolution import Alignment, Box, align_clip, scale_camera, take_box
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from headbench.bench.contracts import MetricSpec
 from headbench.bench.errors import InputError
 from headbench.bench.files import plain
+from headbench.bench.specs import MetricSpec
 from headbench.bench.store import Row, RunFolder, to_frame, write_rows
 from headbench.reports.pareto.command import run
 from headbench.reports.pareto.plot import log_ticks, ticks

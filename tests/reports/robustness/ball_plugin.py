@@ -4,8 +4,9 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from headbench.bench.contracts import Camera, DatasetSpec, Frame, FrameKey, HeadPose, MethodSpec
+from headbench.bench.contracts import Camera, Frame, FrameKey, HeadPose
 from headbench.bench.robustness.viewpoints import look_at
+from headbench.bench.specs import DatasetSpec, MethodSpec
 
 RADIUS = 0.1
 SIZE = (24, 30)

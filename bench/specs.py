@@ -1,0 +1,176 @@
+"""What the registry lists: light descriptions of methods, readers, metrics, reports, benchmarks and commands.
+
+Loading a spec imports neither torch nor what it describes; that is named as ``"package.module:Object"`` and
+resolved when it is used. The behaviours behind the names are in `contracts`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, NamedTuple
+
+
+@dataclass(frozen=True)
+class ResolutionRule:
+    """The image size that a method works at, as declared by it. Metrics are taken at the protocol's size.
+
+    Applied in this order: square, reduction, enlargement. A capture of 550x802 becomes the 2048x2048 that a method
+    for 2K images wants by ``square="pad", size=(2048, 2048)``; one recorded at 2K loses the detail that other
+    methods do not see by ``divide=4, multiply=4``.
+
+    Attributes
+    ----------
+    square : "pad" to the longer side with background, "crop" to the shorter one, or "" for neither; centred.
+        What a crop cuts off is scored as background.
+    divide : reduce by this factor: block means where it divides both sides, else antialiased bicubic.
+    multiply : enlarge by this factor, bicubic.
+    size : (width, height) to resize to at the end, antialiased, in place of ``multiply``.
+    speed_size : (width, height) at which frames per second are measured; None: the size rendered at.
+    """
+
+    square: Literal["", "pad", "crop"] = ""
+    divide: int = 1
+    multiply: int = 1
+    size: tuple[int, int] | None = None
+    speed_size: tuple[int, int] | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what has no meaning."""
+        sides = [self.divide, self.multiply, *(self.size or ()), *(self.speed_size or ())]
+        if min(sides) < 1 or self.square not in ("", "pad", "crop"):
+            raise ValueError(
+                f"{self}: factors and sides are whole numbers from 1, square is pad, crop or nothing"
+            )
+        if self.size is not None and self.multiply != 1:
+            raise ValueError(f"{self}: give multiply or size, not both")
+
+    @property
+    def native(self) -> bool:
+        """Whether images stay as they are."""
+        return self.divide == self.multiply == 1 and not self.square and self.size is None
+
+
+@dataclass(frozen=True)
+class MethodSpec:
+    """What listing a method needs. Loading a spec imports neither torch nor the implementation.
+
+    Attributes
+    ----------
+    name : as typed on the command line and shown in tables.
+    summary : one sentence.
+    implementation : "package.module:Class"; the class takes the resolved configuration.
+    config : "package.module:Class" of the frozen dataclass with its settings, or "" for a method without any.
+    presets : settings by preset name. The key "budget" holds `Budget` fields; the rest are config fields.
+    head_models : versions the method accepts; empty means any.
+    monocular : needs the views as one video, one frame at a timestep, the head's rigid motion in the cameras.
+    resolution : the image size it works at.
+    native : runs on our own implementation; False for an adapter to an official repository.
+    source : the paper.
+    trivial : a floor that every real method should beat; shown in tables, never ranked.
+    """
+
+    name: str
+    summary: str
+    implementation: str
+    config: str = ""
+    presets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    head_models: tuple[str, ...] = ()
+    monocular: bool = False
+    native: bool = True
+    version: str = "1"
+    source: str = ""
+    trivial: bool = False
+    resolution: ResolutionRule = ResolutionRule()
+
+
+@dataclass(frozen=True)
+class MetricSpec:
+    """What a table needs to know of a metric.
+
+    ``implementation`` is "package.module:function" of a `Metric`, or of an `AvatarMetric` where ``per_frame``
+    is False; a class there is made without arguments.
+    """
+
+    name: str
+    label: str
+    unit: str
+    higher_is_better: bool
+    digits: int
+    implementation: str
+    summary: str = ""
+    per_frame: bool = True
+
+
+@dataclass(frozen=True)
+class DatasetSpec:
+    """A reader: ``implementation`` names a function ``(path, **settings) -> Clip``.
+
+    ``find`` names a function ``(root) -> list of paths`` that lists the captures under a folder. A reader with
+    a keyword ``progress`` is given a `Progress`. ``reads`` is False for one that makes captures instead: its
+    function takes ``out`` and settings and writes what another reader reads.
+
+    ``adapt`` names a function that brings clips into the form a method needs, see `adaptation`; "" for none.
+    """
+
+    name: str
+    summary: str
+    implementation: str
+    find: str = ""
+    reads: bool = True
+    adapt: str = ""
+
+
+@dataclass(frozen=True)
+class ReportSpec:
+    """A view of stored results: ``implementation`` names a function ``(run_folder) -> files written``.
+
+    Every such report is written at the end of a run. ``writes`` is False for one that returns text for printing
+    instead, ``(run_folder, format) -> text``.
+    """
+
+    name: str
+    summary: str
+    implementation: str
+    writes: bool = True
+
+
+class Findings(NamedTuple):
+    """What a benchmark of the toolkit itself, or a command that a room offers, found out."""
+
+    text: str
+    """Tables for a terminal."""
+    data: Mapping[str, Any]
+    """The same as plain values, for JSON."""
+    passed: bool = True
+    """False where something did not behave as expected."""
+
+
+@dataclass(frozen=True)
+class BenchmarkSpec:
+    """Measurements of a part of the toolkit itself, as opposed to those of avatars.
+
+    ``speed``, ``tradeoffs`` and ``stress`` each name a function ``(quick, progress) -> Findings``, or are "" where
+    there is none: how fast it is, what settings that give up accuracy for speed buy, how it behaves at extremes.
+    """
+
+    name: str
+    summary: str
+    speed: str = ""
+    tradeoffs: str = ""
+    stress: str = ""
+
+
+@dataclass(frozen=True)
+class CommandSpec:
+    """A command of the command line that a room offers.
+
+    ``name`` may have two words ("prepare nersemble"). ``settings`` names a frozen dataclass in a module that is
+    light to import; its attributes, described in its docstring, become the options. ``implementation`` names a
+    function ``(settings, progress) -> Findings``; the exit code is 0, or 1 where it did not pass.
+    """
+
+    name: str
+    summary: str
+    implementation: str
+    settings: str
