@@ -161,15 +161,20 @@ def run(
         return _run(settings, json)
 
 
-def table(run: Annotated[str, tyro.conf.Positional], format: Literal["md", "csv", "latex"] = "md") -> int:
-    """Print the comparison table of a finished run.
+def table(
+    run: Annotated[str, tyro.conf.Positional],
+    format: Literal["md", "csv", "latex"] = "md",
+    layout: str = "comparison",
+) -> int:
+    """Print a table of a finished run.
 
     Args:
         run: Folder of the run.
         format: Markdown, CSV, or LaTeX (booktabs).
+        layout: Which table: comparison, speed (latency, throughput, stages), cost (storage, training).
     """
-    render: Callable[[Path, str], str] = resolve(get("reports", "table-text").implementation)
-    print(render(Path(run), format))
+    render: Callable[[Path, str, str], str] = resolve(get("reports", "table-text").implementation)
+    print(render(Path(run), format, layout))
     return 0
 
 

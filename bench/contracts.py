@@ -16,7 +16,7 @@ Conventions, fixed once here
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
@@ -233,6 +233,39 @@ class Avatar(Protocol):
         """
 
 
+STAGES = ("drive", "deform", "raster", "post")
+"""Stages of a frame, in order: driving signal to mesh and features; mesh to primitives as the camera sees them;
+primitives to image; whatever changes the image afterwards (a decoder, clipping)."""
+
+
+@runtime_checkable
+class StagedAvatar(Avatar, Protocol):
+    """An avatar whose frame can be timed stage by stage, and drawn ahead of being read back. Optional.
+
+    Its `render` is ``read_back(draw(camera, pose, background))``.
+    """
+
+    def draw(
+        self, camera: Camera, pose: HeadPose, background: Sequence[float], done: Callable[[str], None]
+    ) -> Any:
+        """Draw a frame where the avatar computes, without waiting for it; what comes out `read_back` understands.
+
+        Calls ``done`` with the name of a stage as soon as its work was handed over, in the order of `STAGES`; a stage
+        that this avatar does not have is left out.
+        """
+
+    def read_back(self, drawn: Any) -> Frame:
+        """Wait for what `draw` gave and bring it into host memory."""
+
+
+@runtime_checkable
+class SharingAvatar(Avatar, Protocol):
+    """An avatar that needs assets which all avatars of its kind share, such as the head model. Optional."""
+
+    def shared_files(self) -> Sequence[Path]:
+        """Files needed besides `files`, the same for every subject; not counted as an avatar's storage."""
+
+
 class Progress(Protocol):
     """Where long work reports to. A no-op is a valid implementation."""
 
@@ -266,7 +299,10 @@ class Metric(Protocol):
 
 
 class Measurement(NamedTuple):
-    """One number for an avatar as a whole, and what else was learnt in measuring it."""
+    """One number for an avatar as a whole, and what else was learnt in measuring it.
+
+    Metrics of the same implementation are one measurement: `MetricSpec.detail` says which of its numbers each shows.
+    """
 
     value: float
     details: Mapping[str, float]
@@ -278,6 +314,21 @@ class AvatarMetric(Protocol):
 
     def __call__(self, avatar: Avatar, workload: Sequence[tuple[Camera, HeadPose]]) -> Measurement:
         """Measure an avatar; ``workload`` is a walk over cameras and poses, neighbours always different."""
+
+
+@runtime_checkable
+class TrainingMetric(Protocol):
+    """One number of how an avatar was trained (time, memory)."""
+
+    def __call__(self, record: Mapping[str, Any]) -> Measurement:
+        """Take it from the record of the fit: ``seconds``, ``interruptions``, ``peak_memory_bytes``.
+
+        Raises `UnavailableError` where the record does not tell it.
+        """
+
+
+def no_stage(name: str) -> None:
+    """Take note of no stage."""
 
 
 def no_progress(done: int, total: int, note: str = "") -> None:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import csv
 import os
 import platform
 import resource
+import shutil
+import subprocess
 import sys
+import threading
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import psutil
 
@@ -20,6 +24,9 @@ RECORDED_PACKAGES = (
     "scikit-image",
     "mitsuba",
 )
+ACCELERATOR_FIELDS = ("name", "driver_version", "memory.total", "power.limit", "clocks.sm", "clocks.max.sm")
+RUSAGE_UNIT = 1 if sys.platform == "darwin" else 1024
+STATUS, RESET_PEAK = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
 def processor_count() -> int:
@@ -37,15 +44,85 @@ def machine_record() -> dict[str, Any]:
         "system": f"{platform.system()} {platform.release()}",
         "python": platform.python_version(),
         "packages": {name: _version(name) for name in RECORDED_PACKAGES},
+        "accelerators": accelerators(),
     }
+
+
+def accelerators() -> list[dict[str, str]]:
+    """NVIDIA devices with driver, memory, power limit and clocks, as their driver tells; none without it."""
+    program = shutil.which("nvidia-smi")
+    if program is None:
+        return []
+    command = [program, f"--query-gpu={','.join(ACCELERATOR_FIELDS)}", "--format=csv,noheader"]
+    try:
+        told = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout
+    except (OSError, subprocess.SubprocessError):
+        return []
+    rows = csv.reader(told.splitlines(), skipinitialspace=True)
+    return [dict(zip(ACCELERATOR_FIELDS, row)) for row in rows]
+
+
+class PeakMemory:
+    """Context that finds the largest resident memory of this process while it lasts.
+
+    Linux keeps that maximum, and lets a process begin it anew; elsewhere a thread looks every 20 ms, which can miss a
+    short spike. A child that ended meanwhile counts singly, if it was the largest so far: no other is told apart.
+
+    Attributes
+    ----------
+    before : bytes resident when it was entered.
+    peak : largest resident bytes until it was left.
+    """
+
+    def __init__(self) -> None:
+        self.before = self.peak = 0
+        self._ended = threading.Event()
+        self._watcher: threading.Thread | None = None
+        self._process = psutil.Process()
+
+    def __enter__(self) -> Self:
+        self._children = _children_peak()
+        self.before = self.peak = self._process.memory_info().rss
+        try:
+            RESET_PEAK.write_text("5", encoding="ascii")
+        except OSError:
+            self._watcher = threading.Thread(target=self._watch, daemon=True)
+            self._watcher.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self._watcher is None:
+            self.peak = max(self.before, _resident_peak())
+        else:
+            self._ended.set()
+            self._watcher.join()
+        children = _children_peak()
+        if children > self._children:
+            self.peak = max(self.peak, children)
+
+    def _watch(self) -> None:
+        while True:
+            self.peak = max(self.peak, self._process.memory_info().rss)
+            if self._ended.wait(0.02):
+                return
 
 
 def peak_memory_bytes() -> int:
     """Return the largest resident memory of this process so far, its finished children counted singly."""
-    unit = 1 if sys.platform == "darwin" else 1024
-    own = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    children = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
-    return max(own, children) * unit
+    own = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * RUSAGE_UNIT
+    return max(own, _children_peak())
+
+
+def _children_peak() -> int:
+    return resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * RUSAGE_UNIT
+
+
+def _resident_peak() -> int:
+    """Largest resident memory of this process since it was last begun anew (Linux)."""
+    for line in STATUS.read_text(encoding="ascii", errors="replace").splitlines():
+        if line.startswith("VmHWM:"):
+            return int(line.split()[1]) * 1024
+    return 0
 
 
 def _processor() -> str:

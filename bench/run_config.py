@@ -16,6 +16,14 @@ from .files import check_name
 from .registry import get, resolve, unknown
 from .specs import MethodSpec, MetricSpec
 
+COST_METRICS = (
+    *("latency_p50", "latency_p95", "latency_p99", "latency_still", "processor_time", "throughput"),
+    *("stage_drive", "stage_deform", "stage_raster", "stage_post", "stage_read_back"),
+    *("storage_packed", "storage_shared", "primitives", "primitive_bytes", "driving_rate"),
+    *("training_time", "training_memory"),
+)
+"""Further numbers of the measurements of speed and storage, and of training: tables of their own show them."""
+
 
 @dataclass(frozen=True)
 class RunConfig:
@@ -46,7 +54,7 @@ class RunConfig:
     preset: str = "fast"
     seeds: tuple[int, ...] = (0,)
     tasks: tuple[TaskName, ...] = ("novel_view", "self_reenactment")
-    metrics: tuple[str, ...] = ("psnr", "ssim", "lpips", "storage", "fps")
+    metrics: tuple[str, ...] = ("psnr", "ssim", "lpips", "storage", "fps", *COST_METRICS)
     reader: str = "ga"
     reader_settings: dict[str, Any] = field(default_factory=dict)
     frames_per_task: int | None = None

@@ -88,8 +88,14 @@ class MethodSpec:
 class MetricSpec:
     """What a table needs to know of a metric.
 
-    ``implementation`` is "package.module:function" of a `Metric`, or of an `AvatarMetric` where ``per_frame``
-    is False; a class there is made without arguments.
+    Attributes
+    ----------
+    implementation : "package.module:function" of a `Metric`, or where ``per_frame`` is False of an `AvatarMetric`; a
+        class there is made without arguments.
+    training : the implementation is a `TrainingMetric` instead (``per_frame`` is False as well).
+    detail : which of the measurement's details is the value, in ``unit``; "" for its value. Metrics of an avatar that
+        name the same implementation are measured once, together.
+    tables : names of the tables that show it.
     """
 
     name: str
@@ -100,6 +106,9 @@ class MetricSpec:
     implementation: str
     summary: str = ""
     per_frame: bool = True
+    training: bool = False
+    detail: str = ""
+    tables: tuple[str, ...] = ("comparison",)
 
 
 @dataclass(frozen=True)

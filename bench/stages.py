@@ -14,11 +14,11 @@ from typing import Any
 import pandas as pd
 
 from .adaptation import AdaptedClip
-from .contracts import Avatar, Camera, Clip, FrameKey, HeadPose, Metric
+from .contracts import Avatar, Camera, Clip, FrameKey, HeadPose, Measurement, Metric
 from .errors import HeadbenchError, InputError, UnavailableError
 from .files import digest
 from .frames import quantise, read_png, write_png
-from .machine import peak_memory_bytes
+from .machine import PeakMemory
 from .progress import duration, progress
 from .protocol import Protocol
 from .registry import resolve
@@ -86,7 +86,7 @@ def fit(job: Job) -> Avatar:
         interruptions = 0 if earlier is None else int(earlier.get("interruptions", 0)) + 1
         job.cell.begin("fit", job.fit_fingerprint, interruptions=interruptions)
         start = time.perf_counter()
-        with progress(f"{job.name}: training") as report:
+        with PeakMemory() as memory, progress(f"{job.name}: training") as report:
             method.fit(
                 TrainingView(job.form.clip) if job.method.spec.native else job.form.clip,
                 job.cell.avatar,
@@ -101,7 +101,8 @@ def fit(job: Job) -> Avatar:
             job.fit_fingerprint,
             seconds=round(seconds, 3),
             interruptions=interruptions,
-            peak_memory_bytes=peak_memory_bytes(),
+            peak_memory_bytes=memory.peak,
+            memory_before_bytes=memory.before,
             method=job.method.record(),
         )
         log.info("%s: trained in %s", job.name, duration(seconds))
@@ -134,23 +135,31 @@ def render(job: Job, avatar: Avatar) -> None:
 
 
 def measure(job: Job, avatar: Avatar, metrics: Sequence[MetricSpec]) -> pd.DataFrame:
-    """Score the stored frames and the avatar as a whole; what was measured already is read back."""
+    """Score the stored frames and the avatar as a whole; what was measured already is read back.
+
+    Metrics of one implementation are one measurement: they are read back, or taken anew, together. A measurement that
+    gave any number is read back; one that could not be had is tried again.
+    """
     stage = job.cell.stage("measure") or {}
     known, details = stage.get("fingerprints", {}), dict(stage.get("details", {}))
     old = read_rows(job.cell.rows) if job.cell.rows.exists() else to_frame([])
     fingerprints = {spec.name: _measure_fingerprint(job, spec) for spec in metrics}
+    had = {spec.implementation for spec in metrics if "ok" in set(_rows_of(old, spec)["status"])}
+    new = {spec.implementation for spec in metrics if known.get(spec.name) != fingerprints[spec.name]}
     parts: list[pd.DataFrame] = []
+    measured: dict[str, Measurement | UnavailableError] = {}
     for spec in metrics:
-        kept = old[old["metric"] == spec.name]
-        if known.get(spec.name) == fingerprints[spec.name] and len(kept) and (kept["status"] == "ok").all():
-            parts.append(kept)
+        if spec.implementation in had - new:
+            parts.append(_rows_of(old, spec))
             continue
-        metric = _instance(spec)
         if spec.per_frame:
+            metric = _instance(spec)
             rows = [row for protocol in job.protocols.values() for row in _score(job, spec, metric, protocol)]
         else:
-            row, details[spec.name] = _measure_avatar(job, spec, metric, avatar)
-            rows = [row]
+            if spec.implementation not in measured:
+                measured[spec.implementation] = outcome = _measure_avatar(job, spec, avatar)
+                details[spec.name] = outcome.details if isinstance(outcome, Measurement) else {}
+            rows = [_avatar_row(job, spec, measured[spec.implementation])]
         parts.append(to_frame(rows))
     result = pd.concat(parts, ignore_index=True)
     write_rows(job.cell.rows, result)
@@ -158,10 +167,14 @@ def measure(job: Job, avatar: Avatar, metrics: Sequence[MetricSpec]) -> pd.DataF
     return result
 
 
+def _rows_of(rows: pd.DataFrame, spec: MetricSpec) -> pd.DataFrame:
+    return rows[rows["metric"] == spec.name]
+
+
 def _measure_fingerprint(job: Job, spec: MetricSpec) -> str:
     """Digest of everything a metric's values depend on."""
     protocols = sorted(protocol.hash for protocol in job.protocols.values())
-    return digest(RESULT_FORMAT, job.fit_fingerprint, protocols, spec.name, spec.implementation)
+    return digest(RESULT_FORMAT, job.fit_fingerprint, protocols, spec.name, spec.implementation, spec.detail)
 
 
 def failed_rows(job: Job, metrics: Sequence[MetricSpec], error: Exception) -> pd.DataFrame:
@@ -220,14 +233,27 @@ def _score(job: Job, spec: MetricSpec, metric: Metric, protocol: Protocol) -> li
     return [_row(job, spec, protocol, key, value, "ok", "") for key, value in zip(keys, values)]
 
 
-def _measure_avatar(
-    job: Job, spec: MetricSpec, metric: Any, avatar: Avatar
-) -> tuple[Row, Mapping[str, float]]:
+def _measure_avatar(job: Job, spec: MetricSpec, avatar: Avatar) -> Measurement | UnavailableError:
+    metric = _instance(spec)
     try:
-        measured = metric(avatar, workload(job.form, job.protocols, job.method.spec.resolution.speed_size))
+        if spec.training:
+            measured: Measurement = metric(job.cell.stage("fit") or {})
+        else:
+            size = job.method.spec.resolution.speed_size
+            measured = metric(avatar, workload(job.form, job.protocols, size))
     except UnavailableError as error:
-        return _row(job, spec, None, None, math.nan, "missing", str(error)), {}
-    return _row(job, spec, None, None, measured.value, "ok", ""), measured.details
+        return error
+    return measured
+
+
+def _avatar_row(job: Job, spec: MetricSpec, outcome: Measurement | UnavailableError) -> Row:
+    if isinstance(outcome, UnavailableError):
+        return _row(job, spec, None, None, math.nan, "missing", str(outcome))
+    if not spec.detail:
+        return _row(job, spec, None, None, outcome.value, "ok", "")
+    if spec.detail not in outcome.details:
+        return _row(job, spec, None, None, math.nan, "missing", "This avatar does not tell it.")
+    return _row(job, spec, None, None, float(outcome.details[spec.detail]), "ok", "")
 
 
 def _row(

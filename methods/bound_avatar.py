@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ..bench.contracts import FloatArray, Frame
+from ..bench.contracts import FloatArray, Frame, no_stage
 from .binding import WorldSplats
 from .bound_training import View
 from .splats import rasterize
@@ -33,17 +34,46 @@ class PosedSplats:
     colors: FloatArray | None
 
 
-def render_splats(
-    world: WorldSplats, opacities: Tensor, colors: Tensor, view: View, background: Sequence[float]
-) -> Frame:
-    """Rasterise to a numpy frame, clipped to [0, 1]."""
+class Drawn(NamedTuple):
+    """A drawn frame, still where it was computed."""
+
+    image: Tensor
+    """(H, W, 3) in [0, 1]."""
+    alpha: Tensor
+    """(H, W) in [0, 1]."""
+
+
+def draw_splats(
+    world: WorldSplats,
+    opacities: Tensor,
+    colors: Tensor,
+    view: View,
+    background: Sequence[float],
+    done: Callable[[str], None] = no_stage,
+) -> Drawn:
+    """Rasterise and clip to [0, 1]: the last two stages of `StagedAvatar.draw`."""
     rendering = rasterize(
         *(world.means, world.quats, world.scales, opacities, colors),
         *(view.world_to_camera, view.K, view.camera.width, view.camera.height),
         background=world.means.new_tensor([float(channel) for channel in background]),
         check_finite=False,
     )
-    return Frame(_numpy(rendering.image.clamp(0, 1)), _numpy(rendering.alpha.clamp(0, 1)))
+    done("raster")
+    drawn = Drawn(rendering.image.clamp(0, 1), rendering.alpha.clamp(0, 1))
+    done("post")
+    return drawn
+
+
+def read_back(drawn: Drawn) -> Frame:
+    """Bring a drawn frame into host memory, as numpy."""
+    return Frame(_numpy(drawn.image), _numpy(drawn.alpha))
+
+
+def render_splats(
+    world: WorldSplats, opacities: Tensor, colors: Tensor, view: View, background: Sequence[float]
+) -> Frame:
+    """Rasterise to a numpy frame, clipped to [0, 1]."""
+    return read_back(draw_splats(world, opacities, colors, view, background))
 
 
 def posed_splats(world: WorldSplats, opacities: Tensor, colors: Tensor | None) -> PosedSplats:

@@ -5,15 +5,16 @@ Qian et al., "GaussianAvatars: Photorealistic Head Avatars with Rigged 3D Gaussi
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ..bench.contracts import Budget, Camera, Clip, Frame, HeadPose, Progress
+from ..bench.contracts import Budget, Camera, Clip, Frame, HeadPose, Progress, no_stage
 from .avatar_files import (
+    HEAD_FILE,
     SUBJECT_FILE,
     TRACKED,
     RefinedTracking,
@@ -27,7 +28,7 @@ from .avatar_files import (
     write_subject,
 )
 from .binding import Frames, WorldSplats, to_world
-from .bound_avatar import PosedSplats, posed_splats, render_splats
+from .bound_avatar import Drawn, PosedSplats, draw_splats, posed_splats, read_back
 from .bound_training import Placed, View, run_bound_training, view_of
 from .clip_checks import check_training_split
 from .configs import GAConfig
@@ -147,17 +148,35 @@ class GAAvatar:
         refined = RefinedTracking.read(driving) if driving.exists() else None
         return cls(folder, mesh, splats, binding, refined, device)
 
-    @torch.no_grad()
     def render(self, camera: Camera, pose: HeadPose, background: Sequence[float] = (1.0, 1.0, 1.0)) -> Frame:
         """Render one frame. Raises `InputError` where the pose is of another head model."""
-        world = self._world(pose)
+        return self.read_back(self.draw(camera, pose, background))
+
+    @torch.no_grad()
+    def draw(
+        self,
+        camera: Camera,
+        pose: HeadPose,
+        background: Sequence[float],
+        done: Callable[[str], None] = no_stage,
+    ) -> Drawn:
+        """Draw one frame, stage by stage; see `StagedAvatar`."""
+        frames = self._frames(pose)
+        done("drive")
+        world = self._world(frames)
         view = view_of(camera, self._device)
-        return render_splats(world, self._opacities(), self._colors(world, view), view, background)
+        opacities, colors = self._opacities(), self._colors(world, view)
+        done("deform")
+        return draw_splats(world, opacities, colors, view, background, done)
+
+    def read_back(self, drawn: Drawn) -> Frame:
+        """A drawn frame in host memory."""
+        return read_back(drawn)
 
     @torch.no_grad()
     def splats(self, pose: HeadPose, camera: Camera | None = None) -> PosedSplats:
         """Splats of a pose in the world; with colours where a camera says from where they are seen."""
-        world = self._world(pose)
+        world = self._world(self._frames(pose))
         colors = None if camera is None else self._colors(world, view_of(camera, self._device))
         return posed_splats(world, self._opacities(), colors)
 
@@ -169,10 +188,16 @@ class GAAvatar:
         """The PLY and the subject."""
         return [self._folder / PLY_FILE, self._folder / SUBJECT_FILE]
 
-    def _world(self, pose: HeadPose) -> WorldSplats:
+    def shared_files(self) -> Sequence[Path]:
+        """The head model."""
+        return [self._folder / HEAD_FILE]
+
+    def _frames(self, pose: HeadPose) -> Frames:
         if self._refined is not None:
             pose = self._refined(pose)
-        frames = self._mesh.frames(self._mesh.posed(self._mesh.arguments([pose])))
+        return self._mesh.frames(self._mesh.posed(self._mesh.arguments([pose])))
+
+    def _world(self, frames: Frames) -> WorldSplats:
         s = self._splats
         return to_world(frames, self._binding, s["means"], s["log_scales"], s["quats"])
 

@@ -10,10 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..bench.contracts import Camera, Frame, HeadPose
-from .avatar_files import SUBJECT_FILE, Subject, read_shared_head, read_subject
+from ..bench.contracts import Camera, Frame, HeadPose, no_stage
+from .avatar_files import HEAD_FILE, SUBJECT_FILE, Subject, read_shared_head, read_subject
 from .binding import NORMAL, WorldSplats, to_world
-from .bound_avatar import PosedSplats, posed_splats, render_splats
+from .bound_avatar import Drawn, PosedSplats, draw_splats, posed_splats, read_back
 from .bound_training import view_of
 from .compact.file import COMPACT_FILE, read_compact
 from .dynamics import LocalSplats, apply_offsets, changed_colors
@@ -103,13 +103,29 @@ class OursAvatar:
         self._known = KnownPoses(self._posed, int(megabytes * 2**20))
         return self._known.prepare(poses)
 
-    @torch.no_grad()
     def render(self, camera: Camera, pose: HeadPose, background: Sequence[float] = (1.0, 1.0, 1.0)) -> Frame:
         """Render one frame. Raises `InputError` where the pose is of another head model."""
-        splats, world, turns = self._placed(pose)
+        return self.read_back(self.draw(camera, pose, background))
+
+    @torch.no_grad()
+    def draw(
+        self,
+        camera: Camera,
+        pose: HeadPose,
+        background: Sequence[float],
+        done: Callable[[str], None] = no_stage,
+    ) -> Drawn:
+        """Draw one frame, stage by stage; see `StagedAvatar`. The lines' offsets belong to the first."""
+        splats, world, turns = self._placed(pose, done)
         view = view_of(camera, self._device)
         colors = self._colors(splats, world, turns, view.center)
-        return render_splats(world, torch.sigmoid(splats.logits), colors, view, background)
+        opacities = torch.sigmoid(splats.logits)
+        done("deform")
+        return draw_splats(world, opacities, colors, view, background, done)
+
+    def read_back(self, drawn: Drawn) -> Frame:
+        """A drawn frame in host memory."""
+        return read_back(drawn)
 
     @torch.no_grad()
     def splats(self, pose: HeadPose, camera: Camera | None = None) -> PosedSplats:
@@ -146,6 +162,10 @@ class OursAvatar:
         """The file read, and the subject's where that file does not hold it."""
         return self._stored
 
+    def shared_files(self) -> Sequence[Path]:
+        """The head model."""
+        return [path.parent / HEAD_FILE for path in self._stored[:1]]
+
     def _posed(self, pose: HeadPose) -> Posed:
         frames = self.mesh.frames(self.mesh.posed(self.mesh.arguments([pose])))
         offsets = None
@@ -155,11 +175,12 @@ class OursAvatar:
             offsets = self.line_offsets(*coefficients)
         return Posed(frames, self._canonical.turns(frames), offsets)
 
-    def _placed(self, pose: HeadPose) -> Placed:
+    def _placed(self, pose: HeadPose, driven: Callable[[str], None] = no_stage) -> Placed:
         """Splats of a pose in the world; those of the last pose are kept, as several cameras often look at one."""
         key = pose_key(pose)
         if self._last is None or self._last[0] != key:
             posed = self._known(pose)
+            driven("drive")
             splats = self._changed(posed)
             world = to_world(posed.frames, self._binding, splats.means, splats.log_scales, splats.quats)
             self._last = key, Placed(splats, world, posed.turns)

@@ -1,61 +1,157 @@
-"""Speed: how fast an avatar is animated, driven and seen anew every frame."""
+"""Speed: how fast an avatar is animated, driven and seen anew every frame.
+
+One measurement, in this order: warm-up until frame times are stationary; latency, waiting for every frame; throughput,
+with several frames under way; the stages of a frame; and the same frame over and over, which shows what is kept
+between frames. Latency and throughput are told apart as in MLPerf's single-stream and offline scenarios (Reddi et al.,
+"MLPerf Inference Benchmark", ISCA 2020).
+"""
 
 from __future__ import annotations
 
+import os
+import sys
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import count, repeat
+from typing import Any, Protocol
 
 import numpy as np
 
-from ..bench.contracts import Avatar, Camera, HeadPose, Measurement
+from ..bench.contracts import (
+    STAGES,
+    Avatar,
+    Camera,
+    FloatArray,
+    HeadPose,
+    Measurement,
+    StagedAvatar,
+    no_stage,
+)
 from ..bench.errors import InputError
+
+WHITE = (1.0, 1.0, 1.0)
+READ_BACK = "read_back"
+NUDGE = 1e-5  # added to every expression coefficient per lap of the workload: too little to see, a new signal
+
+Clock = Callable[[], float]
+Walk = Iterator[tuple[Camera, HeadPose]]
+
+
+class Drawing(Protocol):
+    """The part of `StagedAvatar` that is timed."""
+
+    def draw(
+        self, camera: Camera, pose: HeadPose, background: Sequence[float], done: Callable[[str], None]
+    ) -> Any: ...
+    def read_back(self, drawn: Any) -> Any: ...
+
+
+class WholeFrames:
+    """An avatar without stages: all of a frame happens in drawing it."""
+
+    def __init__(self, avatar: Avatar):
+        self._avatar = avatar
+
+    def draw(
+        self, camera: Camera, pose: HeadPose, background: Sequence[float], done: Callable[[str], None]
+    ) -> Any:
+        """Render the frame, on the avatar's own background."""
+        return self._avatar.render(camera, pose)
+
+    def read_back(self, drawn: Any) -> Any:
+        """Nothing is left to do."""
+        return drawn
 
 
 @dataclass(frozen=True)
-class Speed:
-    """Distribution of the time per frame, milliseconds of wall clock, over ``frames`` timed frames."""
+class SpeedProtocol:
+    """How much is timed. Every loop ends at its number of frames or, after one frame at least, at its seconds.
 
-    frames: int
-    mean_ms: float
-    median_ms: float
-    p5_ms: float
-    p95_ms: float
+    Attributes
+    ----------
+    warm_up : at least so many frames, then until the median of the last ``window`` lies within ``steady`` (relative)
+        of the median of the ``window`` before.
+    depth : frames under way in the throughput loop.
+    """
 
-    @property
-    def fps(self) -> float:
-        """Frames per second: 1000 / mean time. The mean of per-frame rates would flatter a jittery method."""
-        return 1000.0 / self.mean_ms
+    warm_up: int = 30
+    warm_up_limit: int = 200
+    warm_up_s: float = 5.0
+    window: int = 10
+    steady: float = 0.02
+    latency: int = 300
+    latency_s: float = 10.0
+    throughput: int = 300
+    throughput_s: float = 4.0
+    depth: int = 8
+    stages: int = 60
+    stages_s: float = 3.0
+    still: int = 40
+    still_s: float = 2.0
+
+
+def fps(avatar: Avatar, workload: Sequence[tuple[Camera, HeadPose]]) -> Measurement:
+    """Frames per second: 1000 / mean latency in ms over ``workload``, driving signal to image in host memory.
+
+    The mean of per-frame rates would flatter a jittery method. Details, all of wall clock unless said: ``frames``,
+    ``mean_ms``, ``p5_ms``, ``p50_ms``, ``p95_ms``, ``p99_ms``, ``iqr_ms``, ``max_ms`` and ``processor_ms`` (mean time
+    of all threads) of the latency; ``throughput_fps``; ``<stage>_ms``, the median of each stage where the avatar tells
+    stages; ``still_ms``, the median where neither camera nor pose changes; ``warm_up_frames``; ``stationary`` (1 or
+    0); ``load``, the mean number of busy processes of the last minute; ``threads``. Numbers of different machines do
+    not compare.
+
+    Raises `InputError` for a workload whose neighbours do not differ.
+    """
+    return measure_speed(avatar, workload)
 
 
 def measure_speed(
-    render: Callable[[Camera, HeadPose], Any],
+    avatar: Avatar,
     workload: Sequence[tuple[Camera, HeadPose]],
-    *,
-    frames: int = 300,
-    warm_up: int = 10,
-    limit_s: float | None = None,
-    clock: Callable[[], float] = time.perf_counter,
-) -> Speed:
-    """Time ``render`` from driving signal to image in host memory, one frame after the other.
+    protocol: SpeedProtocol | None = None,
+    clock: Clock = time.perf_counter,
+) -> Measurement:
+    """The measurement of `fps` to another protocol or by another clock (seconds, monotonic)."""
+    plan = protocol or SpeedProtocol()
+    check_workload(workload)
+    staged = isinstance(avatar, StagedAvatar)
+    drawing: Drawing = avatar if isinstance(avatar, StagedAvatar) else WholeFrames(avatar)
+    walk = fresh_walk(workload)
+    warm_up_frames, stationary = warm_up(drawing, walk, plan, clock)
+    processor = time.process_time()
+    milliseconds = latencies(drawing, walk, plan.latency, plan.latency_s, clock)
+    processor_ms = 1000 * (time.process_time() - processor) / len(milliseconds)
+    p5, p25, p50, p75, p95, p99 = map(float, np.percentile(milliseconds, [5, 25, 50, 75, 95, 99]))
+    details: dict[str, float] = {
+        "frames": len(milliseconds),
+        "mean_ms": float(milliseconds.mean()),
+        "p5_ms": p5,
+        "p50_ms": p50,
+        "p95_ms": p95,
+        "p99_ms": p99,
+        "iqr_ms": p75 - p25,
+        "max_ms": float(milliseconds.max()),
+        "processor_ms": processor_ms,
+        "throughput_fps": throughput(drawing, walk, plan.throughput, plan.throughput_s, plan.depth, clock),
+    }
+    if staged:
+        medians = stage_times(drawing, walk, plan.stages, plan.stages_s, clock)
+        details |= {f"{stage}_ms": value for stage, value in medians.items()}
+    still = latencies(drawing, repeat(next(walk)), plan.still, plan.still_s, clock)
+    details |= {
+        "still_ms": float(np.median(still)),
+        "warm_up_frames": warm_up_frames,
+        "stationary": float(stationary),
+        "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan"),
+        "threads": _threads(),
+    }
+    return Measurement(1000 / details["mean_ms"], {k: v for k, v in details.items() if np.isfinite(v)})
 
-    The workload is walked in order, over and over, through warm-up and measurement alike, so that every frame
-    brings a camera and a pose other than the last: nothing cached for the last frame can be used again.
 
-    Parameters
-    ----------
-    render : renders one frame and returns when it is in host memory (`Avatar.render` does).
-    workload : cameras and poses; neighbours must differ (the last and the first are neighbours, too).
-    frames : how many frames to time, at least 1.
-    warm_up : frames rendered before, untimed.
-    limit_s : stop early once the timed frames took this long, with however many were timed (at least 1).
-    clock : seconds, monotonic; wall clock by default.
-    """
-    if frames < 1 or warm_up < 0:
-        raise InputError(
-            "speed", "frames", "at least 1 timed frame, warm-up of 0 or more", f"{frames}, {warm_up}"
-        )
+def check_workload(workload: Sequence[tuple[Camera, HeadPose]]) -> None:
+    """Raise `InputError` where a frame repeats its neighbour; the last and the first are neighbours, too."""
     if len(workload) < 2:
         raise InputError("speed", "workload", "two or more pairs of camera and pose", str(len(workload)))
     for index, (camera, pose) in enumerate(workload):
@@ -63,27 +159,115 @@ def measure_speed(
         if camera is previous_camera and pose is previous_pose:
             found = f"entries {(index - 1) % len(workload)} and {index} are the same"
             raise InputError("speed", "workload", "a new camera or pose every frame", found)
-    for index in range(warm_up):
-        render(*workload[index % len(workload)])
-    times: list[float] = []
-    total = 0.0
-    for index in range(warm_up, warm_up + frames):
-        start = clock()
-        render(*workload[index % len(workload)])
-        times.append(clock() - start)
-        total += times[-1]
-        if limit_s is not None and total >= limit_s:
-            break
-    milliseconds = 1000.0 * np.asarray(times)
-    p5, median, p95 = np.percentile(milliseconds, [5, 50, 95])
-    return Speed(len(times), float(milliseconds.mean()), float(median), float(p5), float(p95))
 
 
-def fps(avatar: Avatar, workload: Sequence[tuple[Camera, HeadPose]]) -> Measurement:
-    """Frames per second of `Avatar.render` over ``workload``: up to 300 frames, or those of 10 s if fewer.
+def fresh_walk(workload: Sequence[tuple[Camera, HeadPose]]) -> Walk:
+    """The workload over and over, without end, as a live signal: no pose comes twice.
 
-    What counts is all that animation takes: driving signal to mesh, mesh to primitives, rasterisation, and the
-    image in host memory. Details: the fields of `Speed`. Numbers of different machines do not compare.
+    Every lap adds `NUDGE` to the expression once more, and no pose tells subject and timestep, so that nothing kept
+    for a known or earlier pose can be used.
     """
-    speed = measure_speed(avatar.render, workload, warm_up=3, limit_s=10.0)
-    return Measurement(speed.fps, asdict(speed))
+    for lap in count(1):
+        for camera, pose in workload:
+            expression = np.asarray(pose.expression) + lap * NUDGE
+            yield camera, replace(pose, expression=expression, subject="", timestep=None)
+
+
+def warm_up(drawing: Drawing, walk: Walk, plan: SpeedProtocol, clock: Clock) -> tuple[int, bool]:
+    """Draw until frame times are stationary; return after how many frames, and whether they were."""
+    times: list[float] = []
+    synchronise = synchroniser()
+    begin = clock()
+    while len(times) < plan.warm_up_limit:
+        times.append(_timed(drawing, next(walk), clock, synchronise))
+        if len(times) >= max(plan.warm_up, 2 * plan.window):
+            last = float(np.median(times[-plan.window :]))
+            before = float(np.median(times[-2 * plan.window : -plan.window]))
+            if abs(last - before) <= plan.steady * before:
+                return len(times), True
+        if clock() - begin >= plan.warm_up_s:
+            break
+    return len(times), False
+
+
+def latencies(drawing: Drawing, walk: Walk, frames: int, limit_s: float, clock: Clock) -> FloatArray:
+    """Milliseconds of each frame from driving signal to host memory, one waited for after the other."""
+    times: list[float] = []
+    synchronise = synchroniser()
+    begin = clock()
+    while len(times) < frames:
+        times.append(_timed(drawing, next(walk), clock, synchronise))
+        if clock() - begin >= limit_s:
+            break
+    return 1000 * np.asarray(times)
+
+
+def throughput(drawing: Drawing, walk: Walk, frames: int, limit_s: float, depth: int, clock: Clock) -> float:
+    """Frames per second where up to ``depth`` frames are under way before the oldest is waited for."""
+    under_way: deque[Any] = deque()
+    drawn = 0
+    synchroniser()()
+    begin = clock()
+    while drawn < frames and (not drawn or clock() - begin < limit_s):
+        under_way.append(drawing.draw(*next(walk), WHITE, no_stage))
+        drawn += 1
+        if len(under_way) > depth:
+            drawing.read_back(under_way.popleft())
+    while under_way:
+        drawing.read_back(under_way.popleft())
+    return drawn / (clock() - begin)
+
+
+def stage_times(drawing: Drawing, walk: Walk, frames: int, limit_s: float, clock: Clock) -> dict[str, float]:
+    """Median milliseconds of each stage and of reading back, each waited for.
+
+    Waiting keeps stages from overlapping, so that together they may take longer than a frame. Raises `InputError` for
+    a stage that is none of `STAGES`.
+    """
+    times: dict[str, list[float]] = {}
+    synchronise = synchroniser()
+    begin = last = clock()
+
+    def done(stage: str) -> None:
+        nonlocal last
+        if stage not in (*STAGES, READ_BACK):
+            raise InputError("avatar", "draw, stage", ", ".join(STAGES), repr(stage))
+        synchronise()
+        times.setdefault(stage, []).append(1000 * (clock() - last))
+        last = clock()
+
+    for _ in range(frames):
+        camera, pose = next(walk)
+        synchronise()
+        last = clock()
+        drawn = drawing.draw(camera, pose, WHITE, done)
+        last = clock()
+        drawing.read_back(drawn)
+        done(READ_BACK)
+        if clock() - begin >= limit_s:
+            break
+    return {stage: float(np.median(values)) for stage, values in times.items()}
+
+
+def synchroniser() -> Callable[[], None]:
+    """What waits for the work handed to an accelerator; nothing to wait for where torch has begun no such work."""
+    torch = sys.modules.get("torch")
+    if torch is not None and torch.cuda.is_available() and torch.cuda.is_initialized():
+        wait: Callable[[], None] = torch.cuda.synchronize
+        return wait
+    return lambda: None
+
+
+def _timed(
+    drawing: Drawing, frame: tuple[Camera, HeadPose], clock: Clock, synchronise: Callable[[], None]
+) -> float:
+    synchronise()
+    start = clock()
+    drawing.read_back(drawing.draw(*frame, WHITE, no_stage))
+    return clock() - start
+
+
+def _threads() -> int:
+    """Threads of torch, where an avatar uses it, or else 1."""
+    torch = sys.modules.get("torch")
+    return 1 if torch is None else int(torch.get_num_threads())

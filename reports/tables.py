@@ -130,6 +130,7 @@ def build_table(
     region: str = "full",
     image_size: str = "",
     machine: str = "",
+    avatar_title: str = AVATAR_TITLE,
 ) -> Table:
     """Build the comparison table.
 
@@ -146,6 +147,7 @@ def build_table(
     protocol_ids : readable name of each task's protocol, for the caption.
     region : which region's rows are shown.
     image_size, machine : for the caption.
+    avatar_title : heading of the columns that are of no task.
 
     Raises
     ------
@@ -156,7 +158,7 @@ def build_table(
     present = set(rows["task"]) - {""}
     known = [task for task in TASK_TITLES if task in present]
     tasks = [*known, *sorted(present - set(known))] if tasks is None else tasks
-    columns = _columns(metrics, tasks)
+    columns = _columns(metrics, tasks, avatar_title)
     summaries = [_task_summary(rows, task, (protocol_ids or {}).get(task, "")) for task in tasks]
 
     notes: list[str] = []
@@ -182,14 +184,14 @@ def build_table(
     )
 
 
-def _columns(metrics: Sequence[MetricSpec], tasks: Sequence[str]) -> tuple[Column, ...]:
+def _columns(metrics: Sequence[MetricSpec], tasks: Sequence[str], avatar_title: str) -> tuple[Column, ...]:
     def column(spec: MetricSpec, task: str, title: str) -> Column:
         return Column(task, title, spec.name, spec.label, spec.unit, spec.digits, spec.higher_is_better)
 
     per_frame = [
         column(m, task, TASK_TITLES.get(task, task)) for task in tasks for m in metrics if m.per_frame
     ]
-    return (*per_frame, *(column(m, "", AVATAR_TITLE) for m in metrics if not m.per_frame))
+    return (*per_frame, *(column(m, "", avatar_title) for m in metrics if not m.per_frame))
 
 
 def _task_summary(rows: pd.DataFrame, task: str, protocol_id: str) -> TaskSummary:

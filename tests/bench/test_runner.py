@@ -200,6 +200,33 @@ def test_what_was_missing_is_measured_once_it_is_there_and_nothing_else_again(co
     assert len(counted) == 1  # the check before training, nothing else
 
 
+def test_metrics_of_one_measurement_are_taken_together_and_once(config, toy, monkeypatch):
+    counted = []
+    original = toy.files_in_avatar
+    monkeypatch.setattr(toy, "files_in_avatar", lambda *arguments: counted.append(1) or original(*arguments))
+    group = ("toy_plugin:FILES_NONE", "toy_plugin:FILES", "toy_plugin:FILES_LOAD")
+    rows = runner.run(changed(config, metrics=group)).set_index(["subject", "metric"])
+    assert len(counted) == 2  # subjects
+    assert rows.loc[("subject1", "files"), "value"] == 1.0
+    assert rows.loc[("subject1", "files_load"), "value"] == 4.0  # frames of the workload
+    assert rows.loc[("subject1", "files_none"), "status"] == "missing"
+    again = runner.run(changed(config, metrics=group)).set_index(["subject", "metric"])
+    assert again.equals(rows)
+    assert len(counted) == 2
+    runner.run(changed(config, out=config.out + "-less", metrics=group[1:2]))
+    assert len(counted) == 4
+    runner.run(changed(config, out=config.out + "-less", metrics=group))
+    assert len(counted) == 6  # another number of it: all of it anew
+
+
+def test_a_metric_of_training_sees_the_record_of_the_fit(config):
+    rows = runner.run(changed(config, metrics=("toy_plugin:STEPS",)))
+    assert rows["value"].tolist() == [2.0, 2.0]
+    folder = RunFolder(runner.Path(config.out))
+    measured = folder.cell("subject1", "toy", 0).stage("measure")["details"]["steps"]
+    assert measured["peak"] >= folder.cell("subject1", "toy", 0).stage("fit")["memory_before_bytes"] > 0
+
+
 def test_a_preset_and_settings_reach_the_method(config):
     runner.run(changed(config, preset="fast", settings={"toy": {"budget": {"iterations": 3}}}))
     record = RunFolder(runner.Path(config.out)).read_manifest()

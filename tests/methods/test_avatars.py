@@ -8,7 +8,15 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from headbench.bench.contracts import Avatar, Budget, Method, no_progress
+from headbench.bench.contracts import (
+    STAGES,
+    Avatar,
+    Budget,
+    Method,
+    SharingAvatar,
+    StagedAvatar,
+    no_progress,
+)
 from headbench.bench.errors import InputError
 from headbench.methods.configs import GAConfig, OursConfig, SplatTraining
 from headbench.methods.ga import GA
@@ -92,6 +100,33 @@ def test_splats_of_a_pose(fitted, clip):
     assert splats.scales.min() > 0
     np.testing.assert_allclose(np.linalg.norm(splats.quats, axis=1), 1, atol=1e-5)
     assert avatar.splats(pose, camera).colors.shape == (count, 3)
+
+
+def test_a_frame_drawn_by_stages_is_the_rendered_one(fitted, clip):
+    _, method, folder, avatar = fitted
+    assert isinstance(avatar, StagedAvatar)
+    fresh, stages = method.load(folder, device="cpu"), []
+    camera, pose = first(clip)
+    drawn = fresh.draw(camera, pose, (0.0, 0.5, 1.0), stages.append)
+    assert tuple(stages) == STAGES
+    fresh.draw(
+        *first(clip, "self_reenactment"), (1.0, 1.0, 1.0), stages.append
+    )  # another under way changes nothing
+    expected = avatar.render(camera, pose, (0.0, 0.5, 1.0))
+    assert all(np.array_equal(a, b) for a, b in zip(fresh.read_back(drawn), expected))
+
+
+def test_shared_files_are_the_rest_of_what_rendering_needs(fitted, tmp_path):
+    _, method, _, avatar = fitted
+    assert isinstance(avatar, SharingAvatar)
+    needed = [*avatar.files(), *avatar.shared_files()]
+    assert not set(avatar.files()) & set(avatar.shared_files())
+    for path in needed:
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    assert method.load(tmp_path, device="cpu").files()
+    (tmp_path / avatar.shared_files()[0].name).unlink()
+    with pytest.raises(InputError):
+        method.load(tmp_path, device="cpu")
 
 
 def test_a_second_fit_of_the_same_run_loads_and_of_another_is_refused(fitted, clip):

@@ -1,19 +1,63 @@
 import subprocess
 import sys
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
+from headbench.bench.contracts import STAGES, HeadPose
 from headbench.bench.registry import resolve
+from headbench.bench.run_config import COST_METRICS
 from headbench.bench.specs import MetricSpec
 from headbench.metrics import specs
 
 SPECS = [value for value in vars(specs).values() if isinstance(value, MetricSpec)]
 
 
-def test_every_metric_is_specified_once():
-    assert [s.name for s in SPECS] == ["psnr", "ssim", "lpips", "storage", "fps"]
-    assert {s.name for s in SPECS if not s.per_frame} == {"storage", "fps"}
-    assert {s.name for s in SPECS if s.higher_is_better} == {"psnr", "ssim", "fps"}
+def test_metrics_have_names_of_their_own_and_those_of_frames_are_compared():
+    names = [spec.name for spec in SPECS]
+    assert len(set(names)) == len(names)
+    assert {"psnr", "ssim", "lpips"} <= {s.name for s in SPECS if s.per_frame}
+    assert {s.name for s in SPECS if not s.per_frame and "comparison" in s.tables} == {"storage", "fps"}
+    assert {s.name for s in SPECS if s.training} == {"training_time", "training_memory"}
+
+
+def test_more_is_better_of_rates_alone_among_what_avatars_cost():
+    rising = {s.name for s in SPECS if s.higher_is_better and not s.per_frame}
+    assert rising == {"fps", "throughput"}
+
+
+def test_a_run_measures_every_cost_unless_told_otherwise():
+    assert set(COST_METRICS) | {"storage", "fps"} == {s.name for s in SPECS if not s.per_frame}
+
+
+def test_details_are_among_those_that_the_measurement_gives(tmp_path):
+    class Avatar:
+        def render(self, camera, pose, background=(1.0, 1.0, 1.0)):
+            return None
+
+        def draw(self, camera, pose, background, done):
+            for stage in STAGES:
+                done(stage)
+
+        def read_back(self, drawn):
+            return None
+
+        def files(self):
+            return [tmp_path / "file"]
+
+        shared_files = files
+
+        def splats(self, pose):
+            return SimpleNamespace(means=np.zeros((1, 3)))
+
+    (tmp_path / "file").write_bytes(b"1")
+    zero = np.zeros(3)
+    pose = HeadPose("toy", zero, zero, zero, zero, zero, zero)
+    for implementation in (specs.STORAGE.implementation, specs.FPS.implementation):
+        details = resolve(implementation)(Avatar(), [("a", pose), ("b", pose)]).details
+        asked = {s.detail for s in SPECS if s.implementation == implementation} - {""}
+        assert asked <= set(details)
 
 
 @pytest.mark.parametrize("spec", SPECS, ids=lambda s: s.name)

@@ -1,12 +1,36 @@
+"""The measurement of speed against renderers that last as long as they are told, on a clock of their own."""
+
+from dataclasses import replace
+from itertools import pairwise
+
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from headbench.bench.contracts import STAGES, HeadPose, StagedAvatar
 from headbench.bench.errors import InputError
-from headbench.metrics.speed import fps, measure_speed
+from headbench.metrics.speed import (
+    SpeedProtocol,
+    WholeFrames,
+    fps,
+    fresh_walk,
+    latencies,
+    measure_speed,
+    stage_times,
+    throughput,
+    warm_up,
+)
+
+ZERO = np.zeros(3)
+POSES = [
+    HeadPose("toy", np.array([i, 0.5]), ZERO, ZERO, ZERO, np.zeros(6), ZERO, None, "s", i) for i in range(3)
+]
+WALK = [("a", POSES[0]), ("b", POSES[1]), ("c", POSES[2])]
 
 
-class Stage:
-    """A renderer whose frames last as long as it is told, on a clock of its own."""
+class Renderer:
+    """An avatar whose frames last as long as it is told."""
 
     def __init__(self, durations):
         self.now, self.seen, self.durations = 0.0, [], iter(durations)
@@ -19,44 +43,140 @@ class Stage:
         self.now += next(self.durations)
 
 
-WALK = [("a", 0), ("b", 1), ("c", 2)]
+class Staged(Renderer):
+    """Every stage lasts its own time; a frame drawn is ready only 8 ms later, whoever waits for it."""
+
+    def __init__(self):
+        super().__init__([])
+        self.costs = {"drive": 0.001, "deform": 0.002, "raster": 0.004}
+
+    def draw(self, camera, pose, background, done):
+        self.seen.append((camera, pose))
+        for stage, cost in self.costs.items():
+            self.now += cost
+            done(stage)
+        return self.now + 0.008
+
+    def read_back(self, drawn):
+        self.now = max(self.now, drawn)
+
+    def render(self, camera, pose, background=(1.0, 1.0, 1.0)):
+        self.read_back(self.draw(camera, pose, background, lambda stage: None))
+
+    def files(self):
+        return []
 
 
-def test_statistics_of_known_durations_without_the_warm_up():
-    milliseconds = [2.0, 2.0, 2.0, 20.0]
-    stage = Stage([5.0, 5.0, *(t / 1000 for t in milliseconds)])
-    speed = measure_speed(stage.render, WALK, frames=4, warm_up=2, clock=stage.clock)
-    assert speed.frames == 4
-    assert speed.fps == pytest.approx(4 / 0.026)  # not 387, the mean of 1/t
-    assert speed.median_ms == pytest.approx(2.0)
-    assert (speed.p5_ms, speed.p95_ms) == pytest.approx(tuple(np.percentile(milliseconds, [5, 95])))
+def constant(seconds):
+    while True:
+        yield seconds
 
 
-def test_every_frame_brings_a_new_camera_and_pose_across_the_warm_up():
-    stage = Stage([0.001] * 12)
-    measure_speed(stage.render, WALK, frames=8, warm_up=4, clock=stage.clock)
-    assert stage.seen == [WALK[i % 3] for i in range(12)]
+def test_latencies_are_those_of_known_durations():
+    renderer = Renderer([0.002, 0.002, 0.002, 0.020])
+    found = latencies(WholeFrames(renderer), fresh_walk(WALK), 4, 99.0, renderer.clock)
+    assert found == pytest.approx([2, 2, 2, 20])
 
 
-def test_a_slow_renderer_stops_at_the_limit_and_says_how_many():
-    stage = Stage([1.0] * 100)
-    assert measure_speed(stage.render, WALK, frames=99, warm_up=1, limit_s=2.5, clock=stage.clock).frames == 3
+def test_speed_is_that_of_the_mean_time_not_the_mean_of_rates():
+    quick = SpeedProtocol(warm_up=2, warm_up_limit=2, latency=4, throughput=1, stages=1, still=2)
+    durations = [0.005, 0.005, 0.002, 0.002, 0.002, 0.020, 0.1, 0.001, 0.003]
+    renderer = Renderer(durations)
+    measured = measure_speed(renderer, WALK, quick, renderer.clock)
+    assert measured.value == pytest.approx(4 / 0.026)  # not 387
+    details = measured.details
+    expected = np.percentile([2, 2, 2, 20], [5, 50, 95, 99])
+    assert [details[f"p{p}_ms"] for p in (5, 50, 95, 99)] == pytest.approx(list(expected))
+    assert (details["frames"], details["max_ms"]) == (4, pytest.approx(20))
+    assert details["throughput_fps"] == pytest.approx(10)
+    assert details["still_ms"] == pytest.approx(2)  # of 1 and 3
+    assert "raster_ms" not in details
+    assert (details["warm_up_frames"], details["stationary"]) == (2, 0)
+
+
+def test_the_still_frames_alone_repeat_and_no_pose_ever_comes_twice_before():
+    quick = SpeedProtocol(warm_up=4, warm_up_limit=4, latency=8, throughput=3, still=5)
+    renderer = Renderer(constant(0.001))
+    measure_speed(renderer, WALK, quick, renderer.clock)
+    moving, still = renderer.seen[:-5], renderer.seen[-5:]
+    assert len(moving) == 4 + 8 + 3
+    assert [camera for camera, _ in moving] == [WALK[i % 3][0] for i in range(len(moving))]
+    signals = {pose.expression.tobytes() for _, pose in moving}
+    assert len(signals) == len(moving)
+    assert len({id(pose) for _, pose in still}) == 1
+
+
+@given(st.integers(2, 7), st.integers(1, 40))
+def test_a_live_signal_is_new_every_frame_and_next_to_the_recorded_one(length, frames):
+    walk = [(i, replace(POSES[0], expression=np.array([float(i), -1.0]))) for i in range(length)]
+    found = [pair for pair, _ in zip(fresh_walk(walk), range(frames))]
+    assert len({pose.expression.tobytes() for _, pose in found}) == frames
+    for number, (camera, pose) in enumerate(found):
+        assert camera == number % length
+        assert np.abs(pose.expression - walk[camera][1].expression).max() < 1e-3
+        assert (pose.subject, pose.timestep) == ("", None)
+    assert all(a is not b for a, b in pairwise(found))
 
 
 @pytest.mark.parametrize(
-    "walk", [[], [("a", 0)], [("a", 0), ("a", 0), ("b", 1)], [("a", 0), ("b", 1), ("a", 0)]]
+    ("durations", "frames", "steady"),
+    [
+        ([0.001] * 99, 30, True),
+        ([0.1] * 25 + [0.001] * 99, 41, True),  # most of the earlier ten have to be of the new kind
+        ([0.001 * 1.01**i for i in range(99)], 60, False),  # 10 % more from ten frames to the next
+    ],
+)
+def test_warm_up_ends_when_times_stand_still(durations, frames, steady):
+    renderer = Renderer(durations)
+    plan = SpeedProtocol(warm_up_limit=60, warm_up_s=99)
+    assert warm_up(WholeFrames(renderer), fresh_walk(WALK), plan, renderer.clock) == (frames, steady)
+
+
+def test_a_slow_renderer_stops_at_the_limits():
+    renderer = Renderer([1.0] * 100)
+    plan = SpeedProtocol(warm_up_s=1.5, latency_s=2.5, throughput_s=3.5, still_s=0.5)
+    measured = measure_speed(renderer, WALK, plan, renderer.clock)
+    assert len(renderer.seen) == 2 + 3 + 4 + 1
+    assert (measured.details["warm_up_frames"], measured.details["frames"]) == (2, 3)
+    assert measured.value == pytest.approx(1)
+
+
+def test_stages_are_told_apart_and_reading_back_is_the_last():
+    renderer = Staged()
+    assert isinstance(renderer, StagedAvatar)
+    found = stage_times(renderer, fresh_walk(WALK), 5, 99.0, renderer.clock)
+    assert found == pytest.approx({"drive": 1, "deform": 2, "raster": 4, "read_back": 8})
+    measured = measure_speed(renderer, WALK, clock=renderer.clock)
+    assert measured.details["p50_ms"] == pytest.approx(15)
+    assert measured.details["deform_ms"] == pytest.approx(2)
+
+
+def test_throughput_does_not_wait_for_each_frame():
+    renderer = Staged()
+    found = throughput(renderer, fresh_walk(WALK), 100, 99.0, 8, renderer.clock)
+    assert found == pytest.approx(100 / (100 * 0.007 + 0.008))  # waiting for each: 1 / 0.015
+    renderer = Staged()
+    waiting = throughput(renderer, fresh_walk(WALK), 100, 99.0, 0, renderer.clock)
+    assert waiting == pytest.approx(1 / 0.015)
+
+
+def test_a_stage_of_another_name_is_refused():
+    renderer = Staged()
+    renderer.costs = {"think": 1.0}
+    with pytest.raises(InputError, match=r"'think'") as error:
+        stage_times(renderer, fresh_walk(WALK), 5, 99.0, renderer.clock)
+    assert all(stage in str(error.value) for stage in STAGES)
+
+
+@pytest.mark.parametrize(
+    "walk", [[], WALK[:1], [WALK[0], WALK[0], WALK[1]], [WALK[0], WALK[1], WALK[0]]], ids=len
 )
 def test_a_workload_that_repeats_a_frame_is_refused(walk):
     with pytest.raises(InputError, match="workload"):
-        measure_speed(lambda camera, pose: None, walk)
+        fps(Renderer(constant(0.001)), walk)
 
 
-def test_no_frames_are_refused():
-    with pytest.raises(InputError, match="frames"):
-        measure_speed(lambda camera, pose: None, WALK, frames=0)
-
-
-def test_the_metric_times_the_avatar():
+def test_the_metric_times_the_avatar_by_the_wall_clock():
     class Avatar:
         calls = 0
 
@@ -65,5 +185,8 @@ def test_the_metric_times_the_avatar():
 
     avatar = Avatar()
     measured = fps(avatar, WALK)
-    assert avatar.calls == measured.details["frames"] + 3 == 303
+    plan = SpeedProtocol()
+    loops = plan.latency + plan.throughput + plan.still
+    assert avatar.calls == measured.details["warm_up_frames"] + loops
     assert measured.value == pytest.approx(1000 / measured.details["mean_ms"])
+    assert all(np.isfinite(value) for value in measured.details.values())

@@ -13,7 +13,7 @@ from headbench.bench.store import RunFolder, read_rows
 from headbench.reports import specs
 from headbench.reports.run_data import RunData
 from headbench.reports.sheet_report import evenly_spaced, write_contact_sheet
-from headbench.reports.table_report import table_of, table_text, write_tables
+from headbench.reports.table_report import layouts, table_of, table_text, write_tables
 
 
 def change_manifest(folder, change):
@@ -42,6 +42,19 @@ def test_tables_of_a_run(toy_run):
         assert data.manifest["protocols"][task]["hash"] in table.caption
     for file, name in zip(files, ("md", "csv", "latex")):
         assert file.read_text() == table_text(toy_run, name)
+
+
+def test_metrics_of_another_table_are_shown_there_and_only_there(toy_run):
+    change_manifest(toy_run, lambda m: m["metrics"][-1].update(tables=["cost"]))
+    data = RunData.read(toy_run)
+    assert layouts(data) == ("comparison", "cost")
+    (column,) = table_of(data, "cost").columns
+    assert (column.metric, column.title) == ("files", "Storage and training")
+    assert "files" not in {column.metric for column in table_of(data).columns}
+    assert "protocol" not in table_text(toy_run, "md", "cost")  # it is about no frames
+    assert [f.name for f in write_tables(toy_run)][3:] == ["cost.md", "cost.csv", "cost.tex"]
+    with pytest.raises(InputError, match="comparison, cost"):
+        table_text(toy_run, "md", "speed")
 
 
 def test_an_unknown_format_is_refused(toy_run):

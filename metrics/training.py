@@ -1,0 +1,40 @@
+"""What training an avatar took, from the record of its fit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from ..bench.contracts import Measurement
+from ..bench.errors import UnavailableError
+
+
+def training_time(record: Mapping[str, Any]) -> Measurement:
+    """Minutes of wall clock from the start of the fit to its end. Details: ``seconds``.
+
+    Raises `UnavailableError` where the training was interrupted, since the record has the last part alone.
+    """
+    interruptions = int(record.get("interruptions", 0))
+    if interruptions:
+        times = "once" if interruptions == 1 else f"{interruptions} times"
+        raise UnavailableError(f"The training was interrupted {times}.", "Train it in one go for its time.")
+    seconds = _number(record, "seconds")
+    return Measurement(seconds / 60, {"seconds": seconds})
+
+
+def training_memory(record: Mapping[str, Any]) -> Measurement:
+    """Largest resident memory of the training process, in gigabytes (SI), its interpreter and libraries included.
+
+    Details: ``bytes``; ``before_bytes``, what was resident when the training began, by earlier cells of a run too.
+    """
+    peak = _number(record, "peak_memory_bytes")
+    details = {"bytes": peak}
+    if "memory_before_bytes" in record:
+        details["before_bytes"] = _number(record, "memory_before_bytes")
+    return Measurement(peak / 1e9, details)
+
+
+def _number(record: Mapping[str, Any], key: str) -> float:
+    if key not in record:
+        raise UnavailableError(f"The record of the training has no {key}.", "Train the avatar again.")
+    return float(record[key])
