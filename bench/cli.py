@@ -18,8 +18,10 @@ import tyro
 from .commands import offered_commands, with_groups
 from .configuration import build, merge, parse_assignments, read_yaml
 from .demo import DemoConfig, demo_run_config, parse_size
+from .device import check_device
 from .errors import HeadbenchError, InputError
 from .files import WRITE_FAULTS, plain, write_json
+from .lock import locked
 from .progress import log_to, progress
 from .registry import Group, discover, get, resolve
 from .run_config import RunConfig, resolve_methods, resolve_metrics
@@ -65,10 +67,12 @@ def demo(
     # Errors before the capture is made, which takes minutes.
     resolve_methods(comparison)
     resolve_metrics(comparison)
+    check_device(comparison.device)
     RunFolder(Path(out)).prepare()
     with log_to(_log_file(Path(out))):
         start = time.perf_counter()
-        _synthesise(config.capture_arguments())
+        with locked(Path(out)):
+            _synthesise(config.capture_arguments())
         seconds = round(time.perf_counter() - start, 3)
         return _run(comparison, json, capture_seconds=seconds)
 
@@ -101,7 +105,7 @@ def synth(
         performance: `expressions` leaves out jaw and tongue, `still` moves only head, neck and eyes.
     """
     RunFolder(Path(out)).prepare()
-    with log_to(None):
+    with log_to(None), locked(Path(out)):
         _synthesise(
             {
                 "out": Path(out),

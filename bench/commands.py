@@ -58,6 +58,8 @@ def _command(spec: CommandSpec) -> Command:
         with log_to(None), progress(spec.name) as report:
             findings: Findings = implementation(settings, report)
         print(json_module.dumps(findings.data, indent=1, default=plain) if json else findings.text)
+        if findings.code is not None:
+            return findings.code
         return 0 if findings.passed else EXIT_NOT_PASSED
 
     # The options are those of this command's own settings, which only its specification knows.

@@ -16,7 +16,9 @@ from . import adaptation
 from .adaptation import AdaptedClip, MethodNeeds
 from .captures import open_clips
 from .contracts import Clip
+from .device import check_device
 from .errors import HeadbenchError, InputError, UnavailableError
+from .lock import locked
 from .machine import machine_record, peak_memory_bytes
 from .progress import duration
 from .protocol import Protocol, make_protocol
@@ -32,20 +34,32 @@ log = logging.getLogger(__name__)
 def run(config: RunConfig, **record: Any) -> pd.DataFrame:
     """Run a comparison into ``config.out`` and return its rows; ``record`` is added to the manifest.
 
-    Everything that can be checked is checked before the first long step: settings, methods, captures, the
-    output folder. A method that fails is recorded as failed and the others go on. Started again with the same
-    configuration after a kill, it keeps what is done and continues what is not.
+    Everything that can be checked is checked before the first long step: settings, device, methods, captures, the
+    output folder, and that no other process works in it. A method that fails is recorded as failed and the others
+    go on. Started again with the same configuration after a kill, it keeps what is done and continues what is not.
     """
-    start = time.perf_counter()
     methods, metrics = resolve_methods(config), resolve_metrics(config)
+    check_device(config.device)
+    folder = RunFolder(Path(config.out))
+    folder.prepare()
+    with locked(folder.root):
+        return _run(config, methods, metrics, folder, record)
+
+
+def _run(
+    config: RunConfig,
+    methods: Sequence[ResolvedMethod],
+    metrics: Sequence[MetricSpec],
+    folder: RunFolder,
+    record: Mapping[str, Any],
+) -> pd.DataFrame:
+    start = time.perf_counter()
     for method in methods:
         method.create()  # an implementation that cannot be imported or made is not to be found out hours later
     clips = open_clips(config)
     protocols: dict[str, Protocol] = {
         task: make_protocol(task, clips, config.frames_per_task) for task in config.tasks
     }
-    folder = RunFolder(Path(config.out))
-    folder.prepare()
     adapted = adapt(clips, methods, config, folder)
     jobs = make_jobs(config, methods, clips, protocols, folder, adapted)
     for job in jobs:

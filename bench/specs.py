@@ -96,6 +96,8 @@ class MetricSpec:
     detail : which of the measurement's details is the value, in ``unit``; "" for its value. Metrics of an avatar that
         name the same implementation are measured once, together.
     tables : names of the tables that show it.
+    machine_bound : the number says as much of the machine as of the avatar (speed, memory): it compares on one
+        machine alone, and measuring it again gives another.
     """
 
     name: str
@@ -109,6 +111,7 @@ class MetricSpec:
     training: bool = False
     detail: str = ""
     tables: tuple[str, ...] = ("comparison",)
+    machine_bound: bool = False
 
 
 @dataclass(frozen=True)
@@ -153,6 +156,8 @@ class Findings(NamedTuple):
     """The same as plain values, for JSON."""
     passed: bool = True
     """False where something did not behave as expected."""
+    code: int | None = None
+    """Exit code of a command that tells more than passed (0) from not passed (1) apart; None for those two."""
 
 
 @dataclass(frozen=True)
@@ -176,7 +181,8 @@ class CommandSpec:
 
     ``name`` may have two words ("prepare nersemble"). ``settings`` names a frozen dataclass in a module that is
     light to import; its attributes, described in its docstring, become the options. ``implementation`` names a
-    function ``(settings, progress) -> Findings``; the exit code is 0, or 1 where it did not pass.
+    function ``(settings, progress) -> Findings``; the exit code is 0, or 1 where it did not pass, unless the findings
+    give one.
     """
 
     name: str

@@ -58,6 +58,7 @@ FPS = MetricSpec(
     summary="Frames per second from driving signal to image in host memory, a new camera and pose every frame.",
     per_frame=False,
     tables=("comparison", "speed"),
+    machine_bound=True,
 )
 
 
@@ -161,6 +162,7 @@ TRAINING_TIME = MetricSpec(
     per_frame=False,
     training=True,
     tables=("cost",),
+    machine_bound=True,
 )
 
 TRAINING_MEMORY = MetricSpec(
@@ -174,4 +176,5 @@ TRAINING_MEMORY = MetricSpec(
     per_frame=False,
     training=True,
     tables=("cost",),
+    machine_bound=True,
 )

@@ -24,7 +24,8 @@ class Settings:
 def run(settings, progress):
     if settings.limit < 0:
         raise InputError("command line", "limit", "at least 0", str(settings.limit))
-    return Findings(f"looked at {settings.path}", {"limit": settings.limit}, passed=settings.limit < 1)
+    code = 3 if settings.limit == 3 else None
+    return Findings(f"looked at {settings.path}", {"limit": settings.limit}, settings.limit < 1, code)
 """
 
 
@@ -54,6 +55,11 @@ def test_what_does_not_pass_is_one_and_bad_input_is_two(offer, capsys):
     assert cli.main(["look", "here", "--limit", "2"]) == 1
     assert cli.main(["look", "here", "--limit", "-1"]) == 2
     assert "at least 0" in capsys.readouterr().err
+
+
+def test_findings_may_give_an_exit_code_of_their_own(offer):
+    offer("look")
+    assert cli.main(["look", "here", "--limit", "3"]) == 3
 
 
 def test_two_words_share_the_first(offer, capsys):

@@ -9,6 +9,7 @@ import pytest
 
 from headbench.bench import runner
 from headbench.bench.errors import HeadbenchError, InputError
+from headbench.bench.lock import locked
 from headbench.bench.registry import Plugin
 from headbench.bench.run_config import RunConfig
 from headbench.bench.specs import ReportSpec
@@ -260,6 +261,24 @@ def test_an_unwritable_output_is_refused_before_training(config, toy, tmp_path):
     with pytest.raises(InputError, match="can be written"):
         runner.run(changed(config, out=str(tmp_path / "file" / "out")))
     assert toy.FITS == []
+
+
+def test_a_device_that_is_not_there_is_refused_once_before_training(config, toy, monkeypatch):
+    torch = pytest.importorskip("torch")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(InputError, match="cuda"):
+        runner.run(changed(config, device="cuda:0"))
+    assert toy.FITS == []
+
+
+def test_two_runs_in_one_folder_are_refused_before_training(config, toy):
+    folder = RunFolder(runner.Path(config.out))
+    folder.prepare()
+    with locked(folder.root), pytest.raises(InputError, match="no other process works in"):
+        runner.run(config)
+    assert toy.FITS == []
+    runner.run(config)
+    assert not (folder.root / "run.lock").exists()
 
 
 def test_settings_that_contradict_themselves_are_refused():
