@@ -22,3 +22,10 @@ PARETO = CommandSpec(
     implementation="headbench.reports.pareto.command:run",
     settings="headbench.reports.pareto.settings:ParetoSettings",
 )
+
+COMPARE = CommandSpec(
+    name="compare",
+    summary="Paired differences between methods of finished runs: interval, exact test over subjects, Holm's correction.",
+    implementation="headbench.reports.comparison.command:run",
+    settings="headbench.reports.comparison.settings:CompareSettings",
+)

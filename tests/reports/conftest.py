@@ -67,3 +67,25 @@ def toy_run(toy, tmp_path, monkeypatch):
     )
     runner.run(config)
     return tmp_path / "out"
+
+
+@pytest.fixture
+def make_run(toy, tmp_path, monkeypatch):
+    """Run a toy comparison over two subjects into a folder of that name; changes are settings of the run."""
+    monkeypatch.setattr(runner, "write_reports", lambda folder: [])
+    for subject in ("subject1", "subject2"):
+        (tmp_path / "data" / subject).mkdir(parents=True)
+
+    def make(name, **changes):
+        settings = {
+            "data": str(tmp_path / "data"),
+            "out": str(tmp_path / name),
+            "methods": ("toy_plugin:METHOD",),
+            "metrics": ("toy_plugin:ERROR", "toy_plugin:FILES"),
+            "reader": "toy_plugin:READER",
+            "preset": "smoke",
+        }
+        runner.run(RunConfig(**{**settings, **changes}))
+        return tmp_path / name
+
+    return make

@@ -1,0 +1,115 @@
+"""``headbench compare``: reads finished runs, prints paired differences."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import asdict
+from itertools import combinations
+from pathlib import Path
+
+from ...bench.contracts import Progress, no_progress
+from ...bench.errors import InputError
+from ...bench.protocol import TASK_TITLES
+from ...bench.specs import Findings, MetricSpec
+from ..run_set import RunSet
+from ..statistics.comparisons import Comparison, compare
+from ..tables import AVATAR_TITLE
+from .settings import CompareSettings
+
+REGION = "full"
+FIELDS = (
+    *("task", "metric", "first", "second", "difference", "low", "high", "effect", "p", "p_holm"),
+    *("family", "subjects", "wins", "seeds_first", "seeds_second", "verdict", "reason"),
+)
+
+
+def run(settings: CompareSettings, progress: Progress = no_progress) -> Findings:
+    """Compare methods on every metric. Raises `InputError` for runs, methods and metrics that do not fit."""
+    runs = RunSet.read([Path(folder) for folder in settings.runs])
+    pairs = method_pairs(runs, settings.against, settings.floors)
+    metrics = [spec for spec in runs.metrics if not settings.metrics or spec.name in settings.metrics]
+    strange = sorted(set(settings.metrics) - {spec.name for spec in runs.metrics})
+    if strange:
+        names = ", ".join(spec.name for spec in runs.metrics)
+        raise InputError("command line", "--metrics", f"metrics of the runs: {names}", ", ".join(strange))
+    rows = runs.rows[runs.rows["region"] == REGION]
+    columns = [(task, spec) for task in runs.tasks for spec in metrics if spec.per_frame]
+    columns += [("", spec) for spec in metrics if not spec.per_frame]
+    found: list[tuple[MetricSpec, list[Comparison]]] = []
+    for index, (task, spec) in enumerate(columns):
+        higher = spec.higher_is_better
+        comparisons = compare(rows, pairs, task, spec.name, higher_is_better=higher, level=settings.level)
+        found.append((spec, comparisons))
+        progress(index + 1, len(columns), spec.label)
+    every = [comparison for _, comparisons in found for comparison in comparisons]
+    text = _csv(every) if settings.format == "csv" else "\n\n".join(_text(spec, c) for spec, c in found)
+    return Findings(text, {"level": settings.level, "comparisons": [_plain(c) for c in every]})
+
+
+def method_pairs(runs: RunSet, against: str | None, floors: bool) -> list[tuple[str, str]]:
+    """Return the pairs to compare: all, or every method with one."""
+    methods = runs.methods if floors else runs.ranked
+    if against is None:
+        pairs = list(combinations(methods, 2))
+    elif against in runs.methods:
+        pairs = [(method, against) for method in methods if method != against]
+    else:
+        raise InputError("command line", "--against", f"one of {', '.join(runs.methods)}", against)
+    if not pairs:
+        raise InputError("runs", "methods", "two methods to compare", ", ".join(methods) or "none")
+    return pairs
+
+
+def _plain(comparison: Comparison) -> dict[str, object]:
+    """Everything a comparison holds and says, as plain values."""
+    return {
+        **asdict(comparison),
+        "differences": dict(comparison.differences),
+        "subjects": comparison.subjects,
+        "wins": comparison.wins,
+        "verdict": comparison.verdict,
+    }
+
+
+def _csv(comparisons: Sequence[Comparison]) -> str:
+    stream = io.StringIO()
+    writer = csv.DictWriter(stream, FIELDS, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    for comparison in comparisons:
+        values = _plain(comparison)
+        values["seeds_first"], values["seeds_second"] = comparison.seeds
+        writer.writerow({key: "" if value is None else value for key, value in values.items()})
+    return stream.getvalue().rstrip()
+
+
+def _text(spec: MetricSpec, comparisons: Sequence[Comparison]) -> str:
+    """One metric's comparisons as a table for a terminal."""
+    first = comparisons[0]
+    title = TASK_TITLES.get(first.task, first.task) if first.task else AVATAR_TITLE
+    unit = f"{spec.unit}, " if spec.unit else ""
+    better = "higher" if spec.higher_is_better else "lower"
+    family = max(c.family for c in comparisons)
+    head = f"{title}, {spec.label} ({unit}{better} is better)"
+    if family:
+        subjects = max(c.subjects for c in comparisons)
+        counted = "1 subject" if subjects == 1 else f"{subjects} subjects"
+        head += f": {counted}, exact sign-flip test, Holm over {family} comparison{'s' * (family > 1)}"
+    confidence = f"{100 * (1 - first.level):g} % interval"
+    lines = [["first", "second", "first - second", confidence, "p", "Holm", "first better", ""]]
+    for c in comparisons:
+        if c.difference is None or c.p is None or c.p_holm is None:
+            lines.append([c.first, c.second, "-", "", "", "", "", f"{c.verdict}: {c.reason}"])
+            continue
+        # A digit more than the table: differences are smaller than values.
+        digits = spec.digits + 1
+        bounds = "-" if c.low is None or c.high is None else f"{c.low:+.{digits}f} {c.high:+.{digits}f}"
+        numbers = [f"{c.difference:+.{digits}f}", bounds, f"{c.p:.4f}", f"{c.p_holm:.4f}"]
+        lines.append([c.first, c.second, *numbers, f"{c.wins} of {c.subjects}", c.verdict])
+    widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
+    body = [
+        "  ".join(t.ljust(w) if i in (0, 1, 7) else t.rjust(w) for i, (t, w) in enumerate(zip(line, widths)))
+        for line in lines
+    ]
+    return "\n".join([head, *(f"  {line}".rstrip() for line in body)])

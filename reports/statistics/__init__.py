@@ -1,0 +1,1 @@
+"""Inference from rows: the subject is the unit, pairs share their keys. Numpy, scipy and pandas alone."""

@@ -1,0 +1,139 @@
+import csv
+import io
+import json
+
+import pandas as pd
+import pytest
+
+from headbench.bench import cli
+from headbench.bench.errors import InputError
+from headbench.bench.store import Row, RunFolder, to_frame, write_rows
+from headbench.reports.comparison.command import run
+from headbench.reports.comparison.settings import CompareSettings
+
+SUBJECTS = 7
+ERRORS = {"good": 1.0, "bad": 3.0, "floor": 9.0}
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A finished run of seven subjects: error good < bad < floor on every subject, by other amounts."""
+    tasks, seeds = ("novel_view", "self_reenactment"), (0, 1)
+    folder = RunFolder(tmp_path / "run")
+    metric = {
+        "label": "Error",
+        "unit": "levels",
+        "higher_is_better": False,
+        "digits": 2,
+        "implementation": "m:e",
+    }
+    folder.write_manifest(
+        {
+            "metrics": [{"name": "error", **metric}, {"name": "size", **metric, "per_frame": False}],
+            "methods": [{"name": name, "trivial": name == "floor"} for name in ERRORS],
+            "protocols": {task: {"hash": f"hash-{task}", "keys": []} for task in tasks},
+            "configuration": {"seeds": seeds},
+        }
+    )
+    rows = [
+        Row(
+            name,
+            "1",
+            seed,
+            task,
+            f"s{s}",
+            "EMO",
+            0,
+            "a",
+            "full",
+            "error",
+            level * (1 + s / 10) + seed,
+            f"hash-{task}",
+        )
+        for name, level in ERRORS.items()
+        for s in range(SUBJECTS)
+        for seed in seeds
+        for task in tasks
+    ]
+    rows += [
+        Row(name, "1", seed, "", f"s{s}", "", -1, "", "full", "size", 2.0, "")
+        for name in ERRORS
+        for s in range(SUBJECTS)
+        for seed in seeds
+    ]
+    write_rows(folder.rows, to_frame(rows))
+    return folder.root
+
+
+def test_text_tells_size_interval_test_and_verdict(folder):
+    text = run(CompareSettings((str(folder),))).text
+    novel, reenacted, size = text.split("\n\n")
+    head, names, line = novel.splitlines()
+    assert head == (
+        "Novel view, Error (levels, lower is better): 7 subjects, exact sign-flip test, Holm over 1 comparison"
+    )
+    assert names.split("  ")[1] == "first"
+    assert "95 % interval" in names
+    # Mean of 2 (1 + s/10) over seven subjects: 2.6, good below bad; all of one sign: p = 2/2^7.
+    for part in ("good", "bad", "-2.600", "0.0156", "7 of 7", "good is better"):
+        assert part in line
+    assert reenacted.startswith("Self-reenactment")
+    assert "+0.000" in size
+    assert "cannot be told apart" in size
+
+
+def test_json_has_every_subject(folder):
+    (first, *_) = run(CompareSettings((str(folder),), metrics=("error",))).data["comparisons"]
+    assert first["differences"] == pytest.approx({f"s{s}": -2 * (1 + s / 10) for s in range(SUBJECTS)})
+    assert first["low"] < first["difference"] < first["high"]
+    assert first["seeds"] == (2, 2)
+    assert json.dumps(first)
+
+
+def test_csv_reads_back(folder):
+    text = run(CompareSettings((str(folder),), floors=True, format="csv")).text
+    table = pd.read_csv(io.StringIO(text), keep_default_na=False)
+    assert len(table) == 3 * 3
+    assert set(table["family"]) == {3}
+    row = next(csv.DictReader(io.StringIO(text)))
+    assert (row["first"], row["second"], row["verdict"]) == ("good", "bad", "good is better")
+    assert float(row["difference"]) == pytest.approx(-2.6)
+
+
+def test_one_reference_makes_fewer_comparisons(folder):
+    found = run(CompareSettings((str(folder),), against="floor")).data["comparisons"]
+    assert {(c["first"], c["second"]) for c in found} == {("good", "floor"), ("bad", "floor")}
+    assert {c["family"] for c in found} == {2}
+
+
+def test_other_levels_are_kept(folder):
+    strict = run(CompareSettings((str(folder),), level=0.001, metrics=("error",)))
+    assert "99.9 % interval" in strict.text
+    assert "not testable with 7 subjects (it takes 11)" in strict.text
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"), [({"against": "nobody"}, "nobody"), ({"metrics": ("error", "jod")}, "jod")]
+)
+def test_what_is_not_there_is_refused(folder, changes, message):
+    with pytest.raises(InputError, match=message):
+        run(CompareSettings((str(folder),), **changes))
+
+
+def test_settings_are_checked():
+    with pytest.raises(ValueError, match="between 0 and 1"):
+        CompareSettings(("run",), level=5)
+    with pytest.raises(ValueError, match="at least one"):
+        CompareSettings(())
+
+
+def test_a_failed_method_has_a_reason(make_run, capsys):
+    folder = make_run("a", methods=("toy_plugin:METHOD", "toy_plugin:FAILING"))
+    assert cli.main(["compare", str(folder)]) == 0
+    out = capsys.readouterr().out
+    assert "no comparison: failing: RuntimeError: the training diverged" in out
+
+
+def test_one_method_alone_has_nothing_to_be_compared_with(make_run, capsys):
+    assert cli.main(["compare", str(make_run("a"))]) == 2
+    assert "two methods" in capsys.readouterr().err

@@ -1,0 +1,99 @@
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from headbench.reports.statistics.bootstrap import block_length, interval
+from headbench.reports.statistics.pairs import SequencePairs, SubjectPairs
+from headbench.reports.statistics.simulation import Population
+
+
+def subjects_of(values):
+    """Subjects of one value each: nothing varies within them."""
+    one = np.ones(1)
+    return [
+        SubjectPairs(str(i), (SequencePairs(v * one[None], 0 * one[None], one),))
+        for i, v in enumerate(values)
+    ]
+
+
+def test_many_normal_subjects_have_students_interval():
+    values = np.random.default_rng(1).normal(3, 2, 60)
+    expected = stats.t.interval(0.95, 59, values.mean(), stats.sem(values))
+    assert interval(subjects_of(values), replicates=20_000) == pytest.approx(expected, abs=0.06)
+
+
+def test_skew_moves_the_interval_as_the_studentised_bootstrap_should():
+    # For a long tail to the right the mean is underestimated more often, so the interval reaches further up.
+    values = np.random.default_rng(0).exponential(1, 40)
+    low, high = interval(subjects_of(values))
+    assert high - values.mean() > 1.1 * (values.mean() - low)
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.floats(-100, 100), st.floats(0.01, 100))
+def test_follows_shift_and_unit(shift, scale):
+    population = Population(5, sequences=2, timesteps=20)
+    subjects = population.draw(np.random.default_rng(4))
+    low, high = interval(subjects, replicates=300)
+
+    def changed(sequence):
+        return dataclasses.replace(
+            sequence,
+            first=scale * (sequence.first + shift * sequence.cameras),
+            second=scale * sequence.second,
+        )
+
+    moved = [SubjectPairs(s.subject, tuple(map(changed, s.sequences))) for s in subjects]
+    assert interval(moved, replicates=300) == pytest.approx(
+        (scale * (low + shift), scale * (high + shift)), abs=1e-6 * scale
+    )
+
+
+def test_exchanging_the_methods_mirrors_it():
+    subjects = Population(40, sequences=2, timesteps=10, mean=1.0).draw(np.random.default_rng(2))
+    swapped = [
+        SubjectPairs(s.subject, tuple(SequencePairs(q.second, q.first, q.cameras) for q in s.sequences))
+        for s in subjects
+    ]
+    low, high = interval(subjects)
+    assert interval(swapped) == pytest.approx((-high, -low), abs=0.02)
+
+
+def test_the_same_input_gives_the_same_interval():
+    subjects = Population(6, seeds=3, seed_sd=0.2).draw(np.random.default_rng(0))
+    assert interval(subjects) == interval(subjects)
+    assert interval(subjects) != interval(subjects, seed=1)
+
+
+def test_too_few_subjects_have_none():
+    subjects = Population(3).draw(np.random.default_rng(0))
+    assert interval(subjects) is not None
+    assert interval(subjects[:2]) is None
+    assert interval(subjects_of([1.0, 2.0, 4.0])) is None  # a ninth of the replicates has one subject alone
+    assert interval(subjects_of([2.0] * 3)) == (2.0, 2.0)
+
+
+def test_less_confidence_is_narrower():
+    subjects = Population(9).draw(np.random.default_rng(0))
+    wide, narrow = interval(subjects, level=0.05), interval(subjects, level=0.5)
+    assert wide[0] < narrow[0] < narrow[1] < wide[1]
+
+
+@pytest.mark.parametrize(("correlation", "length"), [(0.0, 1), (0.5, 10), (0.95, 44)])
+def test_blocks_are_as_long_as_the_correlation_asks(correlation, length):
+    # (sqrt(6) r / (1 - r^2))^(2/3) T^(1/3) at T = 150: 0, 7.3, 44.1; estimates of r scatter.
+    subjects = Population(30, sequences=4, subject_sd=0, sequence_sd=0, correlation=correlation).draw(
+        np.random.default_rng(0)
+    )
+    found = np.mean([block_length(s.sequences) for s in subjects])
+    assert length / 2 <= found <= length * 1.3 + 1
+
+
+def test_blocks_are_at_most_a_third_and_at_least_one_timestep():
+    (subject,) = Population(1, timesteps=30, correlation=0.99).draw(np.random.default_rng(0))
+    assert block_length(subject.sequences) == 10
+    assert block_length(subjects_of([1.0])[0].sequences) == 1
