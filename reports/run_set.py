@@ -122,9 +122,9 @@ def _metrics(runs: Sequence[RunData]) -> tuple[MetricSpec, ...]:
     return tuple(metrics.values())
 
 
-def _meaning(spec: MetricSpec) -> tuple[str, bool, str, bool]:
+def _meaning(spec: MetricSpec) -> tuple[str, bool, str, str]:
     """Return what makes values of a metric comparable; its words and digits may change."""
-    return spec.unit, spec.higher_is_better, spec.implementation, spec.per_frame
+    return spec.unit, spec.higher_is_better, spec.implementation, spec.detail
 
 
 def _labels(runs: Sequence[RunData]) -> dict[tuple[int, str], str]:

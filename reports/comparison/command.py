@@ -15,6 +15,7 @@ from ...bench.protocol import TASK_TITLES
 from ...bench.specs import Findings, MetricSpec
 from ..run_set import RunSet
 from ..statistics.comparisons import Comparison, compare
+from ..table_report import COMPARISON
 from ..tables import AVATAR_TITLE
 from .settings import CompareSettings
 
@@ -29,7 +30,11 @@ def run(settings: CompareSettings, progress: Progress = no_progress) -> Findings
     """Compare methods on every metric. Raises `InputError` for runs, methods and metrics that do not fit."""
     runs = RunSet.read([Path(folder) for folder in settings.runs])
     pairs = method_pairs(runs, settings.against, settings.floors)
-    metrics = [spec for spec in runs.metrics if not settings.metrics or spec.name in settings.metrics]
+    metrics = [
+        spec
+        for spec in runs.metrics
+        if (spec.name in settings.metrics if settings.metrics else COMPARISON in spec.tables)
+    ]
     strange = sorted(set(settings.metrics) - {spec.name for spec in runs.metrics})
     if strange:
         names = ", ".join(spec.name for spec in runs.metrics)

@@ -20,7 +20,7 @@ class CompareSettings:
     """Compare every method with this one alone, instead of all pairs: fewer comparisons, so fewer subjects needed."""
 
     metrics: tuple[str, ...] = ()
-    """Metrics to compare; default: all of the runs."""
+    """Metrics to compare; default: those of the comparison table."""
 
     floors: bool = False
     """Compare the floors (mean image, nearest camera), too."""
