@@ -184,12 +184,12 @@ def table(
 
 def list_(
     what: Annotated[
-        Literal["methods", "presets", "metrics", "datasets", "reports", "benchmarks", "commands"],
+        Literal["methods", "presets", "metrics", "profiles", "datasets", "reports", "benchmarks", "commands"],
         tyro.conf.Positional,
     ],
     json: bool = False,
 ) -> int:
-    """List what is installed: methods, presets, metrics, dataset readers, reports, benchmarks, commands.
+    """List what is installed: methods, presets, metrics, their profiles, readers, reports, benchmarks, commands.
 
     Args:
         what: What to list.

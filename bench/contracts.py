@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.floating[Any]]
 ByteArray = NDArray[np.uint8]
 IntArray = NDArray[np.integer[Any]]
+BoolArray = NDArray[np.bool_]
 
 
 # ------------------------------------------------------------------ values
@@ -197,6 +198,16 @@ class Clip(Protocol):
         """(H, W) 8-bit foreground coverage, or None where the capture has none."""
 
 
+@runtime_checkable
+class RegionalClip(Protocol):
+    """What a clip may offer besides: where the parts of the head are in a frame."""
+
+    @property
+    def region_names(self) -> Sequence[str]: ...
+    def region_masks(self, key: FrameKey, names: Sequence[str]) -> Mapping[str, BoolArray]:
+        """(H, W) masks of the pixels in which each region is seen; all False where it is not."""
+
+
 @dataclass(frozen=True)
 class Budget:
     """How much training may cost: iterations, or seconds, or both (whichever ends first).
@@ -292,10 +303,34 @@ class Method(Protocol):
 
 @runtime_checkable
 class Metric(Protocol):
-    """One number per frame; never a mean."""
+    """One number per frame; never a mean.
+
+    A metric that is faster on many frames also offers ``batched(pairs) -> iterator of values``: the values in
+    order, the pairs of image and truth read lazily.
+    """
 
     def __call__(self, image: ByteArray, truth: ByteArray) -> float:
         """Compare two (H, W, 3) 8-bit images. Raises `UnavailableError` where it cannot be had."""
+
+
+@runtime_checkable
+class RegionalMetric(Metric, Protocol):
+    """A metric that can also be taken over a part of the frame (`MetricSpec.regions`)."""
+
+    def in_regions(
+        self, image: ByteArray, truth: ByteArray, masks: Mapping[str, BoolArray]
+    ) -> Mapping[str, float]:
+        """Value over each (H, W) mask; masks without a pixel are left out."""
+
+
+@runtime_checkable
+class TemporalMetric(Protocol):
+    """One number per frame and its neighbour in time, of one camera and sequence (`MetricSpec.temporal`)."""
+
+    def __call__(
+        self, image: ByteArray, truth: ByteArray, other_image: ByteArray, other_truth: ByteArray
+    ) -> float:
+        """Compare how the image changes to its neighbour with how the truth does; (H, W, 3) 8-bit each."""
 
 
 class Measurement(NamedTuple):

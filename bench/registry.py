@@ -14,13 +14,14 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Literal
 
 from .errors import HeadbenchError, InputError
-from .specs import BenchmarkSpec, CommandSpec, DatasetSpec, MethodSpec, MetricSpec, ReportSpec
+from .specs import BenchmarkSpec, CommandSpec, DatasetSpec, MethodSpec, MetricSpec, ProfileSpec, ReportSpec
 
-Group = Literal["methods", "datasets", "metrics", "reports", "benchmarks", "commands"]
+Group = Literal["methods", "datasets", "metrics", "profiles", "reports", "benchmarks", "commands"]
 SPEC_TYPES: dict[str, type] = {
     "methods": MethodSpec,
     "datasets": DatasetSpec,
     "metrics": MetricSpec,
+    "profiles": ProfileSpec,
     "reports": ReportSpec,
     "benchmarks": BenchmarkSpec,
     "commands": CommandSpec,

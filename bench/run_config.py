@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from .adaptation import MethodNeeds
@@ -14,7 +14,10 @@ from .contracts import Budget, TaskName
 from .errors import InputError
 from .files import check_name
 from .registry import get, resolve, unknown
-from .specs import MethodSpec, MetricSpec
+from .specs import MethodSpec, MetricSpec, ProfileSpec
+
+CANONICAL = "canonical"
+"""The metric profile that bare metric names belong to."""
 
 COST_METRICS = (
     *("latency_p50", "latency_p95", "latency_p99", "latency_still", "processor_time", "throughput"),
@@ -37,6 +40,9 @@ class RunConfig:
     preset : settings by name: smoke, demo, fast, paper.
     seeds : one avatar is trained for each.
     tasks, metrics : what is measured.
+    metric_profiles : sets of definitions to take the metrics by, see ``headbench list profiles``.
+    regions : parts of the frame to measure beside the whole of it, where a metric can; None: the face, where the
+        capture's reader knows it.
     reader : which dataset reader opens the captures.
     reader_settings : passed to it (for example ``head``: path of the head model).
     frames_per_task : score at most so many frames per subject and task, evenly spaced; None: all.
@@ -55,6 +61,8 @@ class RunConfig:
     seeds: tuple[int, ...] = (0,)
     tasks: tuple[TaskName, ...] = ("novel_view", "self_reenactment")
     metrics: tuple[str, ...] = ("psnr", "ssim", "lpips", "storage", "fps", *COST_METRICS)
+    metric_profiles: tuple[str, ...] = ("canonical",)
+    regions: tuple[str, ...] | None = None
     reader: str = "ga"
     reader_settings: dict[str, Any] = field(default_factory=dict)
     frames_per_task: int | None = None
@@ -65,7 +73,7 @@ class RunConfig:
 
     def __post_init__(self) -> None:
         """Refuse what could only fail later."""
-        for name in ("methods", "seeds", "tasks", "metrics"):
+        for name in ("methods", "seeds", "tasks", "metrics", "metric_profiles"):
             values = getattr(self, name)
             if not values:
                 raise ValueError(f"{name} is empty")
@@ -140,5 +148,30 @@ def resolve_method(spec: MethodSpec, preset: str, settings: Mapping[str, Any]) -
 
 
 def resolve_metrics(config: RunConfig) -> list[MetricSpec]:
-    """Resolve the metrics of a run by name."""
-    return [get("metrics", name) for name in config.metrics]
+    """Resolve the metrics of a run by name, in every profile asked for that defines them.
+
+    Metrics of the avatar as a whole, and those that no profile defines, are taken as they are registered. The first
+    profile's stand in the comparison table, each further profile's in a table of its name.
+
+    Raises
+    ------
+    InputError : an unknown metric or profile, a metric that none of the profiles asked for defines.
+    """
+    profiles: list[ProfileSpec] = [get("profiles", name) for name in config.metric_profiles]
+    defined = {metric.name for metric in get("profiles", CANONICAL).metrics}
+    found: list[MetricSpec] = []
+    for name in config.metrics:
+        spec: MetricSpec = get("metrics", name)
+        if spec.name not in defined:
+            found.append(spec)
+            continue
+        named = [f"{spec.name}@{profile.name}" for profile in profiles]
+        of_profiles = [m for p in profiles for m in p.metrics if m.name == spec.name or m.name in named]
+        if not of_profiles:
+            expected = f"one that the profiles {', '.join(config.metric_profiles)} define"
+            raise InputError("metrics", spec.name, expected, "none of them does", "Leave it out.")
+        found += of_profiles
+    first = profiles[0].name
+    return [
+        replace(m, tables=("comparison", *m.tables)) if m.profile == first != CANONICAL else m for m in found
+    ]

@@ -24,6 +24,7 @@ from .progress import duration
 from .protocol import Protocol, make_protocol
 from .registry import discover, get, resolve
 from .run_config import ResolvedMethod, RunConfig, resolve_methods, resolve_metrics
+from .scoring import check_regions, make_metric
 from .specs import DatasetSpec, MetricSpec
 from .stages import Job, failed_rows, fit, measure, render
 from .store import RunFolder, write_rows
@@ -60,8 +61,9 @@ def _run(
     protocols: dict[str, Protocol] = {
         task: make_protocol(task, clips, config.frames_per_task) for task in config.tasks
     }
+    regions = {clip.subject: check_regions(clip, config.regions) for clip in clips}
     adapted = adapt(clips, methods, config, folder)
-    jobs = make_jobs(config, methods, clips, protocols, folder, adapted)
+    jobs = make_jobs(config, methods, clips, protocols, folder, adapted, regions)
     for job in jobs:
         job.check()
     _warn_of_missing_metrics(metrics, clips[0])
@@ -135,6 +137,7 @@ def make_jobs(
     protocols: Mapping[str, Protocol],
     folder: RunFolder,
     adapted: Adapted,
+    regions: Mapping[str, tuple[str, ...]] | None = None,
 ) -> list[Job]:
     return [
         Job(
@@ -145,6 +148,7 @@ def make_jobs(
             folder.cell(clip.subject, method.spec.name, seed),
             protocols,
             adapted.get((clip.subject, MethodNeeds.of(method.spec))),
+            (regions or {}).get(clip.subject, ()),
         )
         for clip in clips
         for method in methods
@@ -170,12 +174,11 @@ def _warn_of_missing_metrics(metrics: Sequence[MetricSpec], clip: Clip) -> None:
     """Say before the training, not after it, which metric cannot be had."""
     image = clip.image(clip.splits["train"][0])
     for spec in metrics:
-        implementation = resolve(spec.implementation)
+        metric = make_metric(spec)
         if not spec.per_frame:
             continue
-        metric = implementation() if isinstance(implementation, type) else implementation
         try:
-            value = metric(image, image)
+            value = metric(image, image, image, image) if spec.temporal else metric(image, image)
         except UnavailableError as error:
             log.warning("%s will be missing: %s", spec.label, error)
         else:

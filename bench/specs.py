@@ -98,6 +98,10 @@ class MetricSpec:
     tables : names of the tables that show it.
     machine_bound : the number says as much of the machine as of the avatar (speed, memory): it compares on one
         machine alone, and measuring it again gives another.
+    profile : the set of definitions it belongs to, see `ProfileSpec`. Other profiles than the canonical one stand in
+        the metric's name, too, behind an "@": a row names its profile, ``ssim@3dgs`` is never taken for ``ssim``.
+    regions : the implementation is a `RegionalMetric`.
+    temporal : the implementation is a `TemporalMetric`.
     """
 
     name: str
@@ -112,6 +116,27 @@ class MetricSpec:
     detail: str = ""
     tables: tuple[str, ...] = ("comparison",)
     machine_bound: bool = False
+    profile: str = "canonical"
+    regions: bool = False
+    temporal: bool = False
+
+
+@dataclass(frozen=True)
+class ProfileSpec:
+    """A named set of metric definitions: what a library or the code of a paper prints under the usual names.
+
+    Attributes
+    ----------
+    name : as settings and metric names have it.
+    summary : one sentence.
+    source : which code, at which version, prints these numbers.
+    metrics : each named ``<metric>@<profile>``, but for the canonical profile, whose names are bare.
+    """
+
+    name: str
+    summary: str
+    source: str
+    metrics: tuple[MetricSpec, ...]
 
 
 @dataclass(frozen=True)

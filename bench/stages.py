@@ -4,25 +4,23 @@ from __future__ import annotations
 
 import logging
 import math
-import os
 import time
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
 import pandas as pd
 
 from .adaptation import AdaptedClip
-from .contracts import Avatar, Camera, Clip, FrameKey, HeadPose, Measurement, Metric
+from .contracts import Avatar, Camera, Clip, FrameKey, HeadPose, Measurement
 from .errors import HeadbenchError, InputError, UnavailableError
 from .files import digest
 from .frames import quantise, read_png, write_png
 from .machine import PeakMemory
 from .progress import duration, progress
 from .protocol import Protocol
-from .registry import resolve
 from .run_config import ResolvedMethod
+from .scoring import FULL, Frames, make_metric, score_frames
 from .specs import MetricSpec
 from .store import Cell, Row, read_rows, to_frame, write_rows
 from .training_view import TrainingView
@@ -36,7 +34,7 @@ class Job:
     """One cell with all it needs.
 
     ``clip`` is what is compared: the truth of every metric. ``adapted`` is its form for this method, None where
-    that is the clip itself.
+    that is the clip itself. ``regions`` are measured beside the whole frame.
     """
 
     clip: Clip
@@ -46,6 +44,7 @@ class Job:
     cell: Cell
     protocols: Mapping[str, Protocol]
     adapted: AdaptedClip | None = None
+    regions: tuple[str, ...] = ()
 
     @property
     def form(self) -> AdaptedClip:
@@ -146,15 +145,17 @@ def measure(job: Job, avatar: Avatar, metrics: Sequence[MetricSpec]) -> pd.DataF
     fingerprints = {spec.name: _measure_fingerprint(job, spec) for spec in metrics}
     had = {spec.implementation for spec in metrics if "ok" in set(_rows_of(old, spec)["status"])}
     new = {spec.implementation for spec in metrics if known.get(spec.name) != fingerprints[spec.name]}
+    wanted = [spec for spec in metrics if spec.implementation not in had - new]
+    per_frame = [spec for spec in wanted if spec.per_frame]
+    scored = [_score(job, per_frame, protocol) for protocol in job.protocols.values() if per_frame]
     parts: list[pd.DataFrame] = []
     measured: dict[str, Measurement | UnavailableError] = {}
     for spec in metrics:
-        if spec.implementation in had - new:
+        if spec not in wanted:
             parts.append(_rows_of(old, spec))
             continue
         if spec.per_frame:
-            metric = _instance(spec)
-            rows = [row for protocol in job.protocols.values() for row in _score(job, spec, metric, protocol)]
+            rows = [row for of_protocol in scored for row in of_protocol[spec.name]]
         else:
             if spec.implementation not in measured:
                 measured[spec.implementation] = outcome = _measure_avatar(job, spec, avatar)
@@ -174,7 +175,8 @@ def _rows_of(rows: pd.DataFrame, spec: MetricSpec) -> pd.DataFrame:
 def _measure_fingerprint(job: Job, spec: MetricSpec) -> str:
     """Digest of everything a metric's values depend on."""
     protocols = sorted(protocol.hash for protocol in job.protocols.values())
-    return digest(RESULT_FORMAT, job.fit_fingerprint, protocols, spec.name, spec.implementation, spec.detail)
+    what = spec.name, spec.implementation, spec.detail, job.regions if spec.regions else ()
+    return digest(RESULT_FORMAT, job.fit_fingerprint, protocols, *what)
 
 
 def failed_rows(job: Job, metrics: Sequence[MetricSpec], error: Exception) -> pd.DataFrame:
@@ -207,34 +209,23 @@ def workload(
     return walk[:-1] if len(walk) > 2 and first[0] is last[0] and first[1] is last[1] else walk
 
 
-def _instance(spec: MetricSpec) -> Any:
-    implementation = resolve(spec.implementation)
-    return implementation() if isinstance(implementation, type) else implementation
-
-
-def _score(job: Job, spec: MetricSpec, metric: Metric, protocol: Protocol) -> list[Row]:
+def _score(job: Job, specs: Sequence[MetricSpec], protocol: Protocol) -> dict[str, list[Row]]:
+    """Rows of each metric over a protocol's frames of the job's subject."""
     keys = [key for key in protocol.keys if key.subject == job.clip.subject]
-
-    def score(key: FrameKey) -> float:
-        return metric(read_png(job.cell.render(protocol.task, key)), job.clip.image(key))
-
-    try:
-        first = score(keys[0])
-    except UnavailableError as error:
-        return [_row(job, spec, protocol, key, math.nan, "missing", str(error)) for key in keys]
-    values = [first]
-    with (
-        progress(f"{job.name}: {spec.label} of {protocol.task}") as report,
-        ThreadPoolExecutor(os.cpu_count()) as pool,
-    ):
-        for value in pool.map(score, keys[1:]):
-            values.append(value)
-            report(len(values), len(keys))
-    return [_row(job, spec, protocol, key, value, "ok", "") for key, value in zip(keys, values)]
+    frames = Frames(lambda key: read_png(job.cell.render(protocol.task, key)), job.clip)
+    by_name = {spec.name: spec for spec in specs}
+    with progress(f"{job.name}: measuring {protocol.task}") as report:
+        scored = score_frames(keys, frames, specs, job.regions, report)
+    return {
+        name: [
+            _row(job, by_name[name], protocol, s.key, s.value, s.status, s.reason, s.region) for s in scores
+        ]
+        for name, scores in scored.items()
+    }
 
 
 def _measure_avatar(job: Job, spec: MetricSpec, avatar: Avatar) -> Measurement | UnavailableError:
-    metric = _instance(spec)
+    metric = make_metric(spec)
     try:
         if spec.training:
             measured: Measurement = metric(job.cell.stage("fit") or {})
@@ -264,6 +255,7 @@ def _row(
     value: float,
     status: str,
     reason: str,
+    region: str = FULL,
 ) -> Row:
     if status == "ok" and not math.isfinite(value):
         raise HeadbenchError(f"{job.name}: {spec.name} of {key} is {value}; a metric must be finite")
@@ -276,7 +268,7 @@ def _row(
         sequence=key.sequence if key else "",
         timestep=key.timestep if key else -1,
         camera=key.camera if key else "",
-        region="full",
+        region=region,
         metric=spec.name,
         value=value,
         protocol=protocol.hash if protocol else "",

@@ -3,13 +3,14 @@
 Zhang, Isola, Efros, Shechtman, Wang, "The unreasonable effectiveness of deep features as a perceptual metric",
 CVPR 2018, equation 1, version 0.1 (with the scaling layer). Inputs are brought to [-1, 1], as the scaling
 layer's constants expect. Feeding [0, 1] instead, as some published avatar code does, gives lower numbers; the
-two do not compare.
+two do not compare. `Lpips` can do both, under names that tell them apart.
 """
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 
@@ -36,6 +37,7 @@ class Lpips:
     net : "alex" (customary for reporting), "squeeze" or "vgg".
     weights : file with the backbone, or folder to look in; see `headbench.metrics.weights` for the default.
     device : where the network runs; always in float32.
+    scaled : bring images to [-1, 1], as the constants expect; False feeds [0, 1].
 
     Attributes
     ----------
@@ -47,8 +49,11 @@ class Lpips:
     InputError : weights that are not those of the network.
     """
 
-    def __init__(self, net: str = "alex", *, weights: Path | None = None, device: str = "cpu") -> None:
+    def __init__(
+        self, net: str = "alex", *, weights: Path | None = None, device: str = "cpu", scaled: bool = True
+    ) -> None:
         self.spec = network_spec(net)
+        self.scaled = scaled
         backbone = load_backbone(self.spec, find_backbone(self.spec, weights))
         linear = load_linear(self.spec)
         self.fingerprint = digest(*(value.numpy() for value in (*backbone.values(), *linear)))
@@ -93,26 +98,47 @@ class Lpips:
         """Unit-length features of each tapped layer, (N, C, h, w)."""
         # A copy: images of a clip may be read-only, or views of negative stride; tensors can be neither.
         x = torch.from_numpy(images.copy()).to(self.device)
-        x = x.permute(0, 3, 1, 2).to(torch.float32) / 127.5 - 1.0
+        x = x.permute(0, 3, 1, 2).to(torch.float32)
+        x = x / 127.5 - 1.0 if self.scaled else x / 255.0
         outputs = self._network((x - self._shift) / self._scale)
         return [out / (out.square().sum(dim=1, keepdim=True).sqrt() + EPSILON) for out in outputs]
 
 
-def lpips(image: ByteArray, truth: ByteArray) -> float:
-    """LPIPS (AlexNet, on the CPU) of two (H, W, 3) 8-bit images; the weights are loaded once.
+@dataclass(frozen=True)
+class SharedLpips:
+    """LPIPS on the CPU whose weights are loaded when first used, once in a process.
 
-    Raises `UnavailableError`, at every call, where the weights cannot be had.
+    Every use raises `UnavailableError` where the weights cannot be had. Attributes: see `Lpips`.
     """
-    loaded = _default()
-    if isinstance(loaded, UnavailableError):
-        raise UnavailableError(loaded.what, loaded.remedy)
-    return loaded(image, truth)
+
+    net: str = "alex"
+    scaled: bool = True
+
+    def __call__(self, image: ByteArray, truth: ByteArray) -> float:
+        """LPIPS of two (H, W, 3) 8-bit images."""
+        return self._loaded()(image, truth)
+
+    def batched(self, pairs: Iterable[tuple[ByteArray, ByteArray]]) -> Iterator[float]:
+        """Distances of many pairs of one size, in order; ``pairs`` is read lazily."""
+        return self._loaded().batched(pairs)
+
+    def _loaded(self) -> Lpips:
+        loaded = _load(self.net, self.scaled)
+        if isinstance(loaded, UnavailableError):
+            raise UnavailableError(loaded.what, loaded.remedy)
+        return loaded
 
 
 @functools.cache
-def _default() -> Lpips | UnavailableError:
-    """The network of `lpips`, or why there is none: remembered either way."""
+def _load(net: str, scaled: bool) -> Lpips | UnavailableError:
+    """The network, or why there is none: remembered either way."""
     try:
-        return Lpips()
+        return Lpips(net, scaled=scaled)
     except UnavailableError as error:
         return error
+
+
+lpips = SharedLpips()
+lpips_vgg = SharedLpips("vgg")
+lpips_unscaled = SharedLpips(scaled=False)
+lpips_vgg_unscaled = SharedLpips("vgg", scaled=False)

@@ -1,11 +1,16 @@
-"""The one check that every image metric makes before it computes."""
+"""The checks that every image metric makes before it computes."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
+from numpy.typing import NDArray
 
 from ..bench.contracts import ByteArray
 from ..bench.errors import InputError
+
+Mask = NDArray[np.bool_]
 
 
 def check_pair(image: ByteArray, truth: ByteArray, smallest: int = 1) -> None:
@@ -23,3 +28,18 @@ def check_pair(image: ByteArray, truth: ByteArray, smallest: int = 1) -> None:
             )
     if image.shape != truth.shape:
         raise InputError("metric", "image", f"the shape of the truth, {truth.shape}", str(image.shape))
+
+
+def stack_masks(masks: Mapping[str, Mask], truth: ByteArray) -> ByteArray:
+    """(R, H, W) 8-bit stack of the masks of regions, 1 inside.
+
+    Raises `InputError` for one that is not boolean or not of the truth's size.
+    """
+    size = truth.shape[:2]
+    for name, mask in masks.items():
+        if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_ or mask.shape != size:
+            found = f"{getattr(mask, 'dtype', type(mask).__name__)} {getattr(mask, 'shape', '')}"
+            raise InputError("metric", f"mask of {name}", f"a boolean array of shape {size}", found)
+    if not masks:
+        return np.empty((0, *size), np.uint8)
+    return np.stack([mask.view(np.uint8) for mask in masks.values()])

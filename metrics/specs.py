@@ -13,7 +13,8 @@ PSNR = MetricSpec(
     higher_is_better=True,
     digits=2,
     implementation="headbench.metrics.psnr:psnr",
-    summary="Peak signal-to-noise ratio over the full 8-bit frame, capped at 100 dB.",
+    summary="Peak signal-to-noise ratio over the 8-bit frame, or over a region of it, capped at 100 dB.",
+    regions=True,
 )
 
 SSIM = MetricSpec(
@@ -24,6 +25,7 @@ SSIM = MetricSpec(
     digits=4,
     implementation="headbench.metrics.ssim:ssim",
     summary="Structural similarity, Gaussian window 11 x 11 of sigma 1.5, valid windows, mean over channels.",
+    regions=True,
 )
 
 LPIPS = MetricSpec(
@@ -34,6 +36,14 @@ LPIPS = MetricSpec(
     digits=4,
     implementation="headbench.metrics.lpips:lpips",
     summary="Learned perceptual distance v0.1, AlexNet, inputs scaled to [-1, 1].",
+)
+
+LPIPS_VGG = replace(
+    LPIPS,
+    name="lpips-vgg",
+    label="LPIPS VGG",
+    implementation="headbench.metrics.lpips:lpips_vgg",
+    summary="Learned perceptual distance v0.1, VGG-16, inputs scaled to [-1, 1].",
 )
 
 STORAGE = MetricSpec(

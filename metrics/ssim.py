@@ -1,57 +1,174 @@
-"""Structural similarity of one frame: the canonical form, which is one of several in use.
+"""Structural similarity of one frame, in the forms that are in use: one pair of images, several numbers.
 
 Wang, Bovik, Sheikh, Simoncelli, "Image quality assessment: from error visibility to structural similarity",
-IEEE TIP 2004, equation 13 with K1 = 0.01, K2 = 0.03 and L = 255, under the paper's window: an 11 x 11 Gaussian
-of standard deviation 1.5, weights summing to one. Only windows that lie wholly inside the image count
-("valid"); channels are compared one by one, then all are averaged. This equals scikit-image with
-``gaussian_weights=True, sigma=1.5, use_sample_covariance=False``; it differs from torchmetrics since 1.4.2
-(reflected border), from the training loss of 3D Gaussian splatting (zero border), and from scikit-image's
-default (7 x 7 uniform window).
+IEEE TIP 2004, equation 13 with K1 = 0.01, K2 = 0.03 and L = 255. Channels are compared one by one, then all are
+averaged. Libraries differ in the window and in what it sees beyond the image, see `SsimForm`.
 """
 
 from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
 
 import cv2
 import numpy as np
 
 from ..bench.contracts import ByteArray, FloatArray
-from .pairs import check_pair
+from .pairs import Mask, check_pair, stack_masks
+from .structural import instruction_sets, kernel
 
-RADIUS = 5
-SIGMA = 1.5
 C1, C2 = (0.01 * 255.0) ** 2, (0.03 * 255.0) ** 2
 
-
-def gaussian_window() -> FloatArray:
-    """(11,) float64 weights of the separable window; they sum to one."""
-    offsets = np.arange(-RADIUS, RADIUS + 1, dtype=np.float64)
-    weights = np.exp(-0.5 * (offsets / SIGMA) ** 2)
-    return weights / weights.sum()
+Border = Literal["valid", "reflect", "zero"]
+_KERNEL_BORDERS: Mapping[Border, int] = {"valid": 0, "reflect": 1, "zero": 2}
+_CV_BORDERS = {"valid": cv2.BORDER_REFLECT, "reflect": cv2.BORDER_REFLECT_101, "zero": cv2.BORDER_CONSTANT}
 
 
-def ssim_map(image: ByteArray, truth: ByteArray) -> FloatArray:
-    """(H - 10, W - 10, 3) float64 local similarity of two (H, W, 3) 8-bit images, at most 1.
+@dataclass(frozen=True)
+class SsimForm:
+    """What one implementation of SSIM does differently from another.
 
-    Entry (i, j) belongs to the window centred on pixel (i + 5, j + 5).
+    Attributes
+    ----------
+    window : "gaussian", 11 x 11 of standard deviation 1.5, weights summing to one; or "uniform", 7 x 7.
+    border : "valid" counts only windows that lie wholly inside the image; "reflect" mirrors the image about its
+        outermost pixels, "zero" surrounds it with black, and both count a window for every pixel.
+    sample_covariance : variances and covariance of a sample, n / (n - 1) times those of the window.
+    downsample : first average blocks of ``round(min(H, W) / 256)`` pixels a side (Wang's own suggestion for large
+        images), where that is more than one.
     """
-    check_pair(image, truth, smallest=2 * RADIUS + 1)
-    window = gaussian_window()
+
+    window: Literal["gaussian", "uniform"] = "gaussian"
+    border: Border = "valid"
+    sample_covariance: bool = False
+    downsample: bool = False
+
+    @cached_property
+    def weights(self) -> FloatArray:
+        """(2 radius + 1,) float64 weights of the separable window; they sum to one."""
+        if self.window == "uniform":
+            return np.full(7, 1 / 7)
+        offsets = np.arange(-5, 6, dtype=np.float64)
+        weights = np.exp(-0.5 * (offsets / 1.5) ** 2)
+        return weights / weights.sum()
+
+    @property
+    def radius(self) -> int:
+        """Pixels from the window's centre to its edge."""
+        return len(self.weights) // 2
+
+    @property
+    def covariance_scale(self) -> float:
+        """What variances and covariance are multiplied by."""
+        count = len(self.weights) ** 2
+        return count / (count - 1) if self.sample_covariance else 1.0
+
+    @property
+    def smallest(self) -> int:
+        """Pixels that height and width must have."""
+        return {"valid": 2 * self.radius + 1, "reflect": self.radius + 1, "zero": 1}[self.border]
+
+    @property
+    def inset(self) -> int:
+        """Pixels along each side of the image that no counted window is centred on."""
+        return self.radius if self.border == "valid" else 0
+
+
+@dataclass(frozen=True)
+class Ssim:
+    """SSIM of 8-bit images in one of its forms: mean of `ssim_map`, in [-1, 1]; 1 for identical images."""
+
+    form: SsimForm = SsimForm()
+
+    def __call__(self, image: ByteArray, truth: ByteArray) -> float:
+        """Mean over all windows of two (H, W, 3) images."""
+        check_pair(image, truth, self.form.smallest)
+        if kernel() is None or _blocks(self.form, truth) > 1:
+            return float(ssim_map(image, truth, self.form).mean())
+        inset = self.form.inset
+        windows = (image.shape[0] - 2 * inset) * (image.shape[1] - 2 * inset)
+        return self._sums(image, truth, stack_masks({}, truth))[0] / (3 * windows)
+
+    def in_regions(self, image: ByteArray, truth: ByteArray, masks: Mapping[str, Mask]) -> dict[str, float]:
+        """Mean over the windows centred in each (H, W) boolean mask; regions without one are left out."""
+        check_pair(image, truth, self.form.smallest)
+        stack = stack_masks(masks, truth)
+        inset, blocks = self.form.inset, _blocks(self.form, truth)
+        if blocks > 1:
+            stack = np.stack([_block_means(mask, blocks) >= 0.5 for mask in stack]).astype(np.uint8)
+        centres = stack[:, inset : stack.shape[1] - inset, inset : stack.shape[2] - inset] != 0
+        counts = dict(zip(masks, centres.sum(axis=(1, 2))))
+        if kernel() is None or blocks > 1:
+            local = ssim_map(image, truth, self.form).sum(axis=2)
+            sums = [float(local[inside].sum()) for inside in centres]
+        else:
+            sums = self._sums(image, truth, stack)[1:]
+        return {name: total / (3 * int(count)) for (name, count), total in zip(counts.items(), sums) if count}
+
+    def _sums(self, image: ByteArray, truth: ByteArray, masks: ByteArray) -> list[float]:
+        """Sum of the local similarities of the image, then inside each mask, by the kernel."""
+        module = kernel()
+        assert module is not None
+        form = self.form
+        arrays = (np.ascontiguousarray(array) for array in (image, truth, masks))
+        taps = np.ascontiguousarray(form.weights[form.radius :])
+        border = _KERNEL_BORDERS[form.border]
+        sums: list[float] = module.similarity(
+            *arrays, taps, border, form.covariance_scale, C1, C2, instruction_sets()[0]
+        )
+        return sums
+
+
+def ssim_map(image: ByteArray, truth: ByteArray, form: SsimForm = SsimForm()) -> FloatArray:
+    """(H', W', 3) float64 local similarity of two (H, W, 3) 8-bit images, at most 1. The kernel's definition.
+
+    For the border "valid" H' = H - 2 radius, and entry (i, j) belongs to the window centred on pixel (i + radius,
+    j + radius); otherwise there is an entry for every pixel.
+    """
+    check_pair(image, truth, form.smallest)
+    blocks, window, inset = _blocks(form, truth), form.weights, form.inset
 
     def blur(values: FloatArray) -> FloatArray:
-        blurred = cv2.sepFilter2D(values, cv2.CV_64F, window, window, borderType=cv2.BORDER_REFLECT)
-        return np.asarray(blurred[RADIUS:-RADIUS, RADIUS:-RADIUS], dtype=np.float64)
+        blurred = cv2.sepFilter2D(values, cv2.CV_64F, window, window, borderType=_CV_BORDERS[form.border])
+        height, width = values.shape[:2]
+        return np.asarray(blurred[inset : height - inset, inset : width - inset], dtype=np.float64)
 
     # Only the sum of the two variances enters the formula, so four filters do instead of five.
-    x, y = image.astype(np.float64), truth.astype(np.float64)
+    x, y = (_block_means(array, blocks) for array in (image, truth))
     mean_x, mean_y = blur(x), blur(y)
     mean_product = mean_x * mean_y
     mean_squares = mean_x * mean_x + mean_y * mean_y
-    covariance = blur(x * y) - mean_product
-    variances = blur(x * x + y * y) - mean_squares
+    covariance = form.covariance_scale * (blur(x * y) - mean_product)
+    variances = form.covariance_scale * (blur(x * x + y * y) - mean_squares)
     numerator = (2.0 * mean_product + C1) * (2.0 * covariance + C2)
     return numerator / ((mean_squares + C1) * (variances + C2))
 
 
-def ssim(image: ByteArray, truth: ByteArray) -> float:
-    """Mean of `ssim_map` over windows and channels, in [-1, 1]; 1 for identical images."""
-    return float(ssim_map(image, truth).mean())
+def _blocks(form: SsimForm, image: ByteArray) -> int:
+    """Side of the blocks that are averaged first."""
+    return max(1, round(min(image.shape[:2]) / 256)) if form.downsample else 1
+
+
+def _block_means(array: ByteArray, side: int) -> FloatArray:
+    """Means over whole blocks, float64; rows and columns left over at the end are dropped."""
+    values = array.astype(np.float64)
+    if side == 1:
+        return values
+    height, width = array.shape[0] // side, array.shape[1] // side
+    values = values[: height * side, : width * side]
+    return values.reshape(height, side, width, side, *array.shape[2:]).mean(axis=(1, 3))
+
+
+ssim = Ssim()
+"""The canonical form; scikit-image with ``gaussian_weights=True, sigma=1.5, use_sample_covariance=False``, torchmetrics
+before 1.4.2, dm_pix, pytorch-msssim."""
+ssim_zero_border = Ssim(SsimForm(border="zero"))
+"""Training loss and ``metrics.py`` of 3D Gaussian splatting and what derives from it."""
+ssim_reflected = Ssim(SsimForm(border="reflect"))
+"""torchmetrics from 1.4.2."""
+ssim_uniform = Ssim(SsimForm(window="uniform", sample_covariance=True))
+"""scikit-image's default with ``channel_axis=2, data_range=255``."""
+ssim_downsampled = Ssim(SsimForm(downsample=True))
+"""piq's default."""

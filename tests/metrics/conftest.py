@@ -4,7 +4,15 @@ import pytest
 import torch
 
 from headbench.metrics import weights
-from headbench.metrics.lpips import _default
+from headbench.metrics.lpips import _load
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
 @pytest.fixture
@@ -30,7 +38,7 @@ def bare_machine(tmp_path, monkeypatch):
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path / "hub"))
     monkeypatch.setattr("urllib.request.urlopen", refuse)
     weights._fetch.cache_clear()
-    _default.cache_clear()
+    _load.cache_clear()
     yield asked
     weights._fetch.cache_clear()
-    _default.cache_clear()
+    _load.cache_clear()

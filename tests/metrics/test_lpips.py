@@ -10,14 +10,6 @@ from headbench.metrics.networks import NETWORKS
 from headbench.metrics.weights import VARIABLE
 
 
-@pytest.fixture(autouse=True)
-def one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
 @pytest.fixture
 def random_weights(tmp_path):
     """A folder with random weights for every network: enough for whatever does not depend on their values."""

@@ -8,7 +8,8 @@ from hypothesis.extra import numpy as npst
 from skimage.metrics import peak_signal_noise_ratio
 
 from headbench.bench.errors import InputError
-from headbench.metrics.psnr import CAP, psnr
+from headbench.metrics import structural
+from headbench.metrics.psnr import CAP, psnr, psnr_by_channel, psnr_floored
 
 PAIRS = st.tuples(st.integers(1, 12), st.integers(1, 12)).flatmap(
     lambda size: st.tuples(*[npst.arrays(np.uint8, (*size, 3))] * 2)
@@ -76,3 +77,74 @@ def test_the_order_of_pixels_does_not_matter(pair, random):
 def test_what_is_not_a_pair_of_frames_is_refused(image, truth, expected):
     with pytest.raises(InputError, match=expected):
         psnr(image, truth)
+
+
+@settings(deadline=None)
+@given(PAIRS)
+def test_by_channel_is_the_mean_of_three_and_never_below(pair):
+    image, truth = pair
+    single = [psnr(*(np.repeat(a[..., c : c + 1], 3, axis=2) for a in pair)) for c in range(3)]
+    assert psnr_by_channel(image, truth) == pytest.approx(np.mean(single), abs=1e-9)
+    assert psnr_by_channel(image, truth) >= psnr(image, truth) - 1e-9
+
+
+def test_the_floored_form_ends_at_80_db():
+    grey = np.full((4, 4, 3), 9, np.uint8)
+    assert psnr_floored(grey, grey) == pytest.approx(80.0)
+    assert psnr_floored(grey, grey + np.uint8(51)) == pytest.approx(-10 * math.log10(0.04 + 1e-8))
+
+
+@settings(deadline=None)
+@given(PAIRS, st.integers(0, 2**32 - 1))
+def test_a_region_is_scored_by_its_own_pixels(pair, seed):
+    image, truth = pair
+    inside = np.random.default_rng(seed).random(image.shape[:2]) < 0.5
+    values = psnr.in_regions(image, truth, {"part": inside, "none": inside & ~inside, "all": inside | True})
+    assert values["all"] == psnr(image, truth)
+    assert "none" not in values
+    assert ("part" in values) == inside.any()
+    if inside.any():
+        assert values["part"] == psnr(image[inside][None], truth[inside][None])
+
+
+def test_a_white_surround_dilutes_the_frame_and_not_the_region():
+    """A tenth of the pixels differ: the frame's error is a tenth of the region's, 10 dB."""
+    truth = np.full((10, 100, 3), 255, np.uint8)
+    image = truth.copy()
+    inside = np.zeros((10, 100), bool)
+    inside[:, :10] = True
+    image[inside] -= 20
+    assert psnr(image, truth) - psnr.in_regions(image, truth, {"face": inside})["face"] == pytest.approx(10.0)
+
+
+@settings(deadline=None)
+@given(PAIRS, st.integers(0, 3), st.integers(0, 2**32 - 1))
+def test_the_kernel_equals_numpy_exactly(pair, regions, seed):
+    masks = np.random.default_rng(seed).integers(0, 2, (regions, *pair[0].shape[:2]), dtype=np.uint8)
+    expected = structural.squared_errors_numpy(*pair, masks)
+    np.testing.assert_array_equal(structural.squared_errors(*pair, masks), expected)
+
+
+def test_without_the_kernel_numpy_gives_the_same(monkeypatch):
+    rng = np.random.default_rng(0)
+    image, truth = rng.integers(0, 256, (2, 9, 14, 3), dtype=np.uint8)
+    expected = psnr(image, truth)
+    monkeypatch.setattr(structural, "kernel", lambda: None)
+    assert psnr(image, truth) == expected
+
+
+def test_sums_beyond_32_bits_are_exact():
+    white = np.full((3000, 2000, 3), 255, np.uint8)
+    sums = structural.squared_errors(np.zeros_like(white), white, np.ones((1, 3000, 2000), np.uint8))
+    assert (sums == 255**2 * 6_000_000).all()
+
+
+def test_one_pixel_is_an_image():
+    image, truth = np.full((1, 1, 3), 10, np.uint8), np.full((1, 1, 3), 0, np.uint8)
+    assert psnr(image, truth) == pytest.approx(20 * math.log10(25.5))
+
+
+@pytest.mark.parametrize("dtype", [np.uint16, np.float32, np.float64, np.int8, bool])
+def test_other_than_8_bit_frames_are_refused_with_the_remedy(dtype):
+    with pytest.raises(InputError, match="quantise"):
+        psnr(np.zeros((4, 4, 3), dtype), np.zeros((4, 4, 3), np.uint8))

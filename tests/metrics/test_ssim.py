@@ -1,11 +1,34 @@
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from skimage.metrics import structural_similarity
+from torch.nn import functional
 
 from headbench.bench.errors import InputError
-from headbench.metrics.ssim import gaussian_window, ssim, ssim_map
+from headbench.metrics import structural
+from headbench.metrics.ssim import (
+    Ssim,
+    SsimForm,
+    ssim,
+    ssim_downsampled,
+    ssim_map,
+    ssim_reflected,
+    ssim_uniform,
+    ssim_zero_border,
+)
+
+FORMS = {
+    "valid": ssim,
+    "zero": ssim_zero_border,
+    "reflect": ssim_reflected,
+    "uniform": ssim_uniform,
+    "downsampled": ssim_downsampled,
+    "uniform-zero": Ssim(SsimForm("uniform", "zero")),
+}
+EVERY_FORM = pytest.mark.parametrize("form", FORMS.values(), ids=FORMS)
+PAIRS = given(st.integers(0, 2**32 - 1), st.integers(11, 40), st.integers(11, 70), st.floats(0, 90))
 
 
 def noisy_pair(seed, height=24, width=19, noise=25.0):
@@ -46,7 +69,7 @@ def test_equals_scikit_image_and_is_symmetric(seed, height, width, noise):
     image, truth = noisy_pair(seed, height, width, noise)
     options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
     expected = structural_similarity(image, truth, channel_axis=2, data_range=255, **options)
-    assert ssim(image, truth) == pytest.approx(expected, abs=1e-6)
+    assert ssim(image, truth) == pytest.approx(expected, abs=1e-10)
     assert ssim(image, truth) == pytest.approx(ssim(truth, image), abs=1e-12)
     assert ssim(image, truth) <= 1.0 + 1e-12
 
@@ -71,7 +94,7 @@ def test_constant_images_have_a_closed_form(a, b):
 
 
 def test_the_window_is_a_normalised_gaussian():
-    window = gaussian_window()
+    window = SsimForm().weights
     assert window.shape == (11,)
     assert window.sum() == pytest.approx(1.0, abs=1e-15)
     assert window[5] / window[8] == pytest.approx(np.exp(9 / (2 * 2.25)))
@@ -81,3 +104,156 @@ def test_an_image_smaller_than_the_window_is_refused():
     small = np.zeros((10, 40, 3), np.uint8)
     with pytest.raises(InputError, match="at least 11 pixels"):
         ssim(small, small)
+
+
+@EVERY_FORM
+@settings(deadline=None, max_examples=15)
+@PAIRS
+def test_the_kernel_equals_numpy(form, seed, height, width, noise):
+    image, truth = noisy_pair(seed, height, width, noise)
+    assert form(image, truth) == pytest.approx(ssim_map(image, truth, form.form).mean(), abs=1e-12)
+
+
+@EVERY_FORM
+@settings(deadline=None, max_examples=15)
+@PAIRS
+def test_regions_are_means_of_the_map_and_add_up(form, seed, height, width, noise):
+    image, truth = noisy_pair(seed, height, width, noise)
+    inside = np.random.default_rng(seed).random((height, width)) < 0.3
+    values = form.in_regions(image, truth, {"a": inside, "b": ~inside, "all": inside | True})
+    inset = form.form.inset
+    local = ssim_map(image, truth, form.form).mean(axis=2)
+    centres = inside[inset : height - inset, inset : width - inset]
+    if centres.any():
+        assert values["a"] == pytest.approx(local[centres].mean(), abs=1e-12)
+    assert values["all"] == pytest.approx(form(image, truth), abs=1e-12)
+
+
+@pytest.mark.parametrize("name", FORMS)
+def test_without_the_kernel_numpy_gives_the_same(name, monkeypatch):
+    image, truth = noisy_pair(5, 30, 47)
+    masks = {"corner": np.indices((30, 47)).sum(axis=0) < 30}
+    expected = FORMS[name](image, truth), FORMS[name].in_regions(image, truth, masks)
+    monkeypatch.setattr("headbench.metrics.ssim.kernel", lambda: None)
+    assert FORMS[name](image, truth) == pytest.approx(expected[0], abs=1e-12)
+    assert FORMS[name].in_regions(image, truth, masks) == pytest.approx(expected[1], abs=1e-12)
+
+
+def padded_map(image, truth, weights, pad):
+    """SSIM of every pixel in plain torch float64: convolutions of a padded image, as training losses write it."""
+    x, y = (torch.tensor(a, dtype=torch.float64).permute(2, 0, 1)[:, None] / 255 for a in (image, truth))
+    window = torch.tensor(np.outer(weights, weights))[None, None]
+
+    def mean(values):
+        return functional.conv2d(pad(values), window)
+
+    mx, my = mean(x), mean(y)
+    vx, vy, cov = mean(x * x) - mx * mx, mean(y * y) - my * my, mean(x * y) - mx * my
+    top = (2 * mx * my + 0.01**2) * (2 * cov + 0.03**2)
+    return top / ((mx * mx + my * my + 0.01**2) * (vx + vy + 0.03**2))
+
+
+@pytest.mark.parametrize(
+    ("form", "mode"), [(ssim_zero_border, "constant"), (ssim_reflected, "reflect")], ids=["zero", "reflect"]
+)
+@settings(deadline=None, max_examples=15)
+@given(st.integers(0, 2**32 - 1), st.integers(6, 30), st.integers(6, 60))
+def test_borders_equal_a_padded_convolution(form, mode, seed, height, width):
+    image, truth = noisy_pair(seed, height, width)
+    weights = SsimForm().weights
+    expected = padded_map(image, truth, weights, lambda v: functional.pad(v, (5, 5, 5, 5), mode=mode)).mean()
+    assert form(image, truth) == pytest.approx(float(expected), abs=1e-10)
+
+
+@settings(deadline=None, max_examples=15)
+@PAIRS
+def test_the_uniform_form_is_the_default_of_scikit_image(seed, height, width, noise):
+    image, truth = noisy_pair(seed, height, width, noise)
+    expected = structural_similarity(image, truth, channel_axis=2, data_range=255)
+    assert ssim_uniform(image, truth) == pytest.approx(expected, abs=1e-10)
+
+
+@EVERY_FORM
+def test_identical_images_have_exactly_one(form):
+    image, _ = noisy_pair(3, 40, 60)
+    assert form(image, image) == pytest.approx(1.0, abs=1e-15)
+
+
+@EVERY_FORM
+def test_black_on_white_has_a_closed_form(form):
+    black, white = np.zeros((30, 40, 3), np.uint8), np.full((30, 40, 3), 255, np.uint8)
+    if form.form.border == "zero":
+        assert form(black, white) < 0.01
+        return
+    c1 = (0.01 * 255) ** 2
+    assert form(black, white) == pytest.approx(c1 / (255**2 + c1), rel=1e-9)
+
+
+@EVERY_FORM
+def test_the_smallest_image_is_scored_and_one_pixel_less_is_refused(form):
+    side = form.form.smallest
+    image, truth = noisy_pair(1, side, side)
+    assert form(image, truth) == pytest.approx(ssim_map(image, truth, form.form).mean(), abs=1e-12)
+    if side > 1:
+        with pytest.raises(InputError, match=f"at least {side} pixels"):
+            form(image[:, 1:], truth[:, 1:])
+
+
+def test_a_pixel_is_enough_where_black_surrounds_the_image():
+    """Closed form: one sample under the window's centre weight, the rest 0."""
+    image, truth = np.full((1, 1, 3), 200, np.uint8), np.full((1, 1, 3), 100, np.uint8)
+    w = SsimForm().weights[5] ** 2
+    mx, my, c1, c2 = w * 200, w * 100, (0.01 * 255) ** 2, (0.03 * 255) ** 2
+    vx, vy, cov = w * 200**2 - mx**2, w * 100**2 - my**2, w * 200 * 100 - mx * my
+    expected = (2 * mx * my + c1) * (2 * cov + c2) / ((mx**2 + my**2 + c1) * (vx + vy + c2))
+    assert ssim_zero_border(image, truth) == pytest.approx(expected, abs=1e-12)
+
+
+def test_a_mask_of_one_pixel_is_one_window_and_an_empty_one_is_left_out():
+    image, truth = noisy_pair(2, 30, 30)
+    one, none, edge = (np.zeros((30, 30), bool) for _ in range(3))
+    one[12, 17] = edge[0, 0] = True
+    values = ssim.in_regions(image, truth, {"one": one, "none": none, "edge": edge})
+    assert values == {"one": pytest.approx(ssim_map(image, truth)[7, 12].mean(), abs=1e-12)}
+
+
+def test_a_mask_that_does_not_fit_is_refused():
+    image, truth = noisy_pair(2, 30, 30)
+    for mask in (np.zeros((30, 29), bool), np.zeros((30, 30), np.uint8), None):
+        with pytest.raises(InputError, match="mask of face"):
+            ssim.in_regions(image, truth, {"face": mask})
+
+
+def test_arrays_of_any_layout_have_one_value():
+    image, truth = noisy_pair(4, 33, 41)
+    expected = ssim(image, truth)
+    assert ssim(np.asfortranarray(image), truth) == expected
+    assert ssim(image[:, ::-1], truth[:, ::-1]) == pytest.approx(expected, abs=1e-12)
+    image.flags.writeable = False
+    assert ssim(image, truth) == expected
+
+
+@pytest.mark.slow
+def test_an_8k_frame_equals_numpy():
+    image, truth = noisy_pair(0, 4320, 7680)
+    assert ssim(image, truth) == pytest.approx(ssim_map(image, truth).mean(), abs=1e-11)
+
+
+def test_every_instruction_set_gives_the_same_bits():
+    if structural.kernel() is None:
+        pytest.skip("needs the compiled kernel")
+    image, truth = noisy_pair(0, 61, 83)
+    masks = np.zeros((1, 61, 83), np.uint8)
+    masks[0, 10:40, 20:60] = 1
+    taps = SsimForm().weights[5:].copy()
+    sums = {
+        tuple(structural.kernel().similarity(image, truth, masks, taps, border, 1.0, 6.5, 58.5, name))
+        for border in (0,)
+        for name in structural.instruction_sets()
+    }
+    assert len(sums) == 1
+    errors = {
+        tuple(structural.kernel().squared_error(image, truth, masks, name))
+        for name in structural.instruction_sets()
+    }
+    assert errors == {tuple(structural.squared_errors_numpy(image, truth, masks).ravel())}

@@ -1,0 +1,3 @@
+#define HEADBENCH_ISA avx512
+#define HEADBENCH_ISA_NAME "avx512"
+#include "loops.h"
