@@ -131,6 +131,7 @@ def resolve_method(spec: MethodSpec, preset: str, settings: Mapping[str, Any]) -
     """Lay ``settings`` over a preset. A method without presets takes any preset name."""
     if spec.presets and preset not in spec.presets:
         raise unknown(f"method {spec.name}", "preset", preset, spec.presets)
+    spec = spec.at_preset(preset)
     source = f"settings of {spec.name}"
     if not isinstance(settings, Mapping):
         raise InputError(source, "", "a group of settings", repr(settings))

@@ -7,7 +7,7 @@ resolved when it is used. The behaviours behind the names are in `contracts`.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
 
 
@@ -65,6 +65,7 @@ class MethodSpec:
     head_models : versions the method accepts; empty means any.
     monocular : needs the views as one video, one frame at a timestep, the head's rigid motion in the cameras.
     resolution : the image size it works at.
+    preset_resolutions : the same by preset name, for presets that work at another size; see `at_preset`.
     native : runs on our own implementation; False for an adapter to an official repository.
     source : the paper.
     trivial : a floor that every real method should beat; shown in tables, never ranked.
@@ -82,6 +83,12 @@ class MethodSpec:
     source: str = ""
     trivial: bool = False
     resolution: ResolutionRule = ResolutionRule()
+    preset_resolutions: Mapping[str, ResolutionRule] = field(default_factory=dict)
+
+    def at_preset(self, preset: str) -> MethodSpec:
+        """This method with the image size of a preset."""
+        rule = self.preset_resolutions.get(preset, self.resolution)
+        return self if rule == self.resolution else replace(self, resolution=rule)
 
 
 @dataclass(frozen=True)

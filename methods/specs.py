@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from ..bench.specs import MethodSpec
+from ..bench.specs import MethodSpec, ResolutionRule
+from .gha.presets import GHA_SHORT
 
 PAPER_ITERATIONS = 600_000
 
@@ -84,4 +85,16 @@ NEAREST_CAMERA = MethodSpec(
     trivial=True,
     config="headbench.methods.configs:NearestCameraConfig",
     presets={name: {"budget": {"iterations": 1}} for name in ("smoke", "demo", "fast", "paper")},
+)
+
+GHA = MethodSpec(
+    name="gha",
+    summary="Gaussian Head Avatar: splats driven by networks, drawn as features, sharpened by another network.",
+    implementation="headbench.methods.gha.method:GHA",
+    config="headbench.methods.gha.config:GHAConfig",
+    presets={**GHA_SHORT, "paper": {"budget": {"iterations": PAPER_ITERATIONS}}},
+    preset_resolutions={
+        "paper": ResolutionRule(square="pad", size=(2048, 2048), speed_size=(1024, 1024)),
+    },
+    source="Gaussian Head Avatar: Ultra High-fidelity Head Avatar via Dynamic Gaussians, CVPR 2024, arXiv 2312.03029",
 )

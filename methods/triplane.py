@@ -41,9 +41,14 @@ def sample_triplane(planes: dict[str, Tensor], points: Tensor, resolution: int) 
     )
 
 
-def encode_directions(directions: Tensor) -> Tensor:
-    """(N, 27) positional encoding of (N, 3) unit vectors: identity, then sin and cos at 1, 2, 4, 8 (no pi)."""
-    frequencies = directions.new_tensor(FREQUENCIES)
-    angles = frequencies[:, None] * directions[:, None, :]
+def encode(values: Tensor) -> Tensor:
+    """(N, 9 D) positional encoding of (N, D) values: identity, then sin and cos at 1, 2, 4, 8 (no pi)."""
+    frequencies = values.new_tensor(FREQUENCIES)
+    angles = frequencies[:, None] * values[:, None, :]
     waves = torch.stack([torch.sin(angles), torch.cos(angles)], dim=2)
-    return torch.cat([directions, waves.flatten(1)], dim=1)
+    return torch.cat([values, waves.flatten(1)], dim=1)
+
+
+def encode_directions(directions: Tensor) -> Tensor:
+    """(N, 27) positional encoding of (N, 3) unit vectors."""
+    return encode(directions)

@@ -20,6 +20,8 @@ TRAINED = {
     # Rounds at 8 and 16, resets at 10 and 20.
     "splats": {"min_densify_every": 8, "min_reset_every": 10, "min_settle": 2, "checkpoint_every_s": 0.0},
 }
+OWN_TRAINING = {"gha": {"budget": {"iterations": 24}, "grid_vertices": 3_000, "start_steps": 20}}
+"""Methods that do not train splats bound to the mesh, with their own short settings."""
 SMALL = {"ours": {"plane_resolution": 16, "line_resolution": 8, "line_channels": 4, "hidden": 16}}
 SPECS = {
     name: plugin.spec
@@ -30,7 +32,7 @@ SPECS = {
 
 def resolved(name, **more):
     """The method at its smoke preset, shorter and smaller where it trains."""
-    settings = {} if SPECS[name].trivial else TRAINED
+    settings = {} if SPECS[name].trivial else OWN_TRAINING.get(name, TRAINED)
     return resolve_method(SPECS[name], "smoke", {**settings, **SMALL.get(name, {}), **more})
 
 

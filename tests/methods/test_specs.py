@@ -5,10 +5,12 @@ import pytest
 from headbench.bench.configuration import build
 from headbench.bench.contracts import Budget
 from headbench.bench.registry import resolve
+from headbench.bench.run_config import resolve_method
 from headbench.methods.configs import GAConfig, OursConfig, SplatTraining
-from headbench.methods.specs import GA, MEAN_IMAGE, NEAREST_CAMERA, OURS
+from headbench.methods.gha.config import GHAConfig
+from headbench.methods.specs import GA, GHA, MEAN_IMAGE, NEAREST_CAMERA, OURS
 
-SPECS = {spec.name: spec for spec in (OURS, GA, MEAN_IMAGE, NEAREST_CAMERA)}
+SPECS = {spec.name: spec for spec in (OURS, GA, GHA, MEAN_IMAGE, NEAREST_CAMERA)}
 PRESETS = ("smoke", "demo", "fast", "paper")
 
 
@@ -54,6 +56,16 @@ def test_paper_presets_are_the_published_values():
     assert published.lines_from == 60_000
 
 
+def test_the_paper_preset_of_gha_is_the_published_design():
+    paper = resolve_method(GHA, "paper", {})
+    assert paper.config == GHAConfig()
+    rule = paper.spec.resolution
+    assert (rule.square, rule.size, rule.speed_size) == ("pad", (2048, 2048), (1024, 1024))
+    assert 2048 / paper.config.upscale == 512
+    for preset in ("smoke", "demo", "fast"):
+        assert resolve_method(GHA, preset, {}).spec.resolution.native
+
+
 @pytest.mark.parametrize(
     ("config", "wrong"),
     [
@@ -62,6 +74,12 @@ def test_paper_presets_are_the_published_values():
         (SplatTraining, {"ssim_weight": 1.5}),
         (SplatTraining, {"max_splats": 0}),
         (GAConfig, {"sh_degree": 4}),
+        (GHAConfig, {"channels": 33}),
+        (GHAConfig, {"mesh_fraction": 1.0}),
+        (GHAConfig, {"near_squared": 0.3}),
+        (GHAConfig, {"sr_widths": ()}),
+        (GHAConfig, {"max_points": 0}),
+        (GHAConfig, {"unit": 0.0}),
         (OursConfig, {"plane_resolution": 1}),
         (OursConfig, {"expressions": -1}),
         (OursConfig, {"capacity_tolerance": 0.0}),

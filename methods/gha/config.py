@@ -1,0 +1,122 @@
+"""Settings of GHA. Light: neither torch nor numpy is imported here."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class GHAConfig:
+    """Gaussian Head Avatar (CVPR 2024). The defaults are the published values.
+
+    Lengths are canonical units: the head's own frame, ``unit`` metres each.
+
+    Attributes
+    ----------
+    schedule_length : iterations of the published run, both stages.
+    mesh_fraction : part of the budget that the mesh stage takes.
+    unit : metres of one canonical unit.
+    landmarks : how many points of the tracked face say where expression rules.
+    near_squared, far_squared : squared distances from the nearest landmark up to which expression alone rules, and
+        from which on head pose alone does (0.1 and 0.25 units squared are 3.2 and 5 cm).
+    start : what the signed distance is fitted to before the mesh stage. "sphere" as published; "mesh", the tracked
+        mesh, saves a short run the way from the sphere to a head.
+    start_steps : steps of that fit.
+    grid_vertices : vertices of the tetrahedral grid about the head.
+    subdivide : take the Gaussians from a grid of half the spacing, as published.
+    max_points : thin the points taken from the mesh to this number; None keeps them all.
+    mouth_points : further points, drawn in a box behind the lips.
+    features, channels : features of a point, and channels of what is splatted; the first three are a colour.
+    geometry_hidden, expression_color_hidden, ... : widths of the networks' hidden layers.
+    sr_widths : widths of the super-resolution network's blocks. The first works at the splatted size, each further
+        one at twice the size before: their number decides by how much splats are drawn smaller than the image.
+    scale_expression : divide each driving value by its root mean square over the training timesteps. The published
+        networks take the raw values, and in a short run hardly notice the jaw's tenths of a radian.
+    displacement_scale, attribute_scale : factors of the networks' outputs.
+    initial_opacity : of all Gaussians.
+    mesh_views, mesh_size : views of a timestep in one iteration of the mesh stage, and the longer side of their images
+        in pixels; smaller images stay as they are.
+    mesh_lr, landmark_lr : learning rates of the mesh stage.
+    network_lr, position_lr, feature_lr, rotation_lr, scale_lr, opacity_lr, correction_lr : of the Gaussian stage, the
+        last one for the corrections of the tracked head pose, one for each training timestep.
+    final_rate : part of their learning rate that the Gaussian stage's tensors end with, log-linearly over the last
+        half of the stage; 1 keeps them constant, as published.
+    low_weight, structure_weight : weights of the L1 loss at the splatted size and of 1 - SSIM at the full one.
+        The latter stands for the published 0.1 LPIPS, whose backbone is not ours to ship.
+    low_truth : "mean" compares the splatted colours with area means of the image; "gha" is the compatibility option
+        for the published code, which takes every fourth pixel.
+    augment : rescale the feature image by 0.8 to 1.25 before super-resolution, as published.
+    checkpoint_every_s : seconds between checkpoints.
+    """
+
+    schedule_length: int = 600_000
+    mesh_fraction: float = 0.05
+    unit: float = 0.1
+    landmarks: int = 424
+    near_squared: float = 0.1
+    far_squared: float = 0.25
+    start: Literal["sphere", "mesh"] = "sphere"
+    start_steps: int = 300
+    grid_vertices: int = 277_410
+    subdivide: bool = True
+    max_points: int | None = None
+    mouth_points: int = 3_000
+    features: int = 128
+    channels: int = 32
+    geometry_hidden: tuple[int, ...] = (256,) * 5
+    expression_color_hidden: tuple[int, ...] = (256, 256)
+    pose_color_hidden: tuple[int, ...] = (128,)
+    expression_deform_hidden: tuple[int, ...] = (256,) * 5
+    pose_deform_hidden: tuple[int, ...] = (256, 256)
+    expression_attribute_hidden: tuple[int, ...] = (256, 256, 256)
+    pose_attribute_hidden: tuple[int, ...] = (128, 128)
+    sr_widths: tuple[int, ...] = (128, 64, 32)
+    scale_expression: bool = False
+    displacement_scale: float = 0.3
+    attribute_scale: float = 0.2
+    initial_opacity: float = 0.3
+    mesh_views: int = 4
+    mesh_size: int = 256
+    mesh_lr: float = 1e-3
+    landmark_lr: float = 1e-4
+    network_lr: float = 1e-4
+    position_lr: float = 1e-5
+    feature_lr: float = 1e-5
+    rotation_lr: float = 1e-5
+    scale_lr: float = 3e-5
+    opacity_lr: float = 1e-4
+    correction_lr: float = 1e-5
+    final_rate: float = 1.0
+    low_weight: float = 1.0
+    structure_weight: float = 0.1
+    low_truth: Literal["mean", "gha"] = "mean"
+    augment: bool = True
+    checkpoint_every_s: float = 120.0
+
+    def __post_init__(self) -> None:
+        counts = ("schedule_length", "landmarks", "grid_vertices", "features", "mesh_views", "mesh_size")
+        for name in counts:
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, found {getattr(self, name)}")
+        if not 3 <= self.channels <= 32:
+            raise ValueError(f"channels must be 3 to 32, found {self.channels}")
+        if not 0 < self.mesh_fraction < 1 or not 0 < self.initial_opacity < 1:
+            raise ValueError("mesh_fraction and initial_opacity must lie between 0 and 1")
+        if not 0 <= self.near_squared < self.far_squared:
+            raise ValueError("near_squared must not be negative and far_squared must be larger")
+        if not 0 < self.final_rate <= 1:
+            raise ValueError(f"final_rate must lie in (0, 1], found {self.final_rate}")
+        if not self.sr_widths or min(self.sr_widths) < 1:
+            raise ValueError(f"sr_widths must name one width at least, all above 0, found {self.sr_widths}")
+        if self.max_points is not None and self.max_points < 1:
+            raise ValueError(f"max_points must be at least 1 or null, found {self.max_points}")
+        if not self.unit > 0:
+            raise ValueError(f"unit must be above 0 metres, found {self.unit}")
+        if min(self.mouth_points, self.start_steps) < 0:
+            raise ValueError("mouth_points and start_steps must not be negative")
+
+    @property
+    def upscale(self) -> int:
+        """How many times smaller than the image splats are drawn."""
+        return 2 ** (len(self.sr_widths) - 1)

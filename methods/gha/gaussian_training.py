@@ -1,0 +1,237 @@
+"""The Gaussian stage: points, networks, super-resolution and head poses from single images."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor, nn
+
+from ...bench.contracts import Camera
+from ...bench.errors import InputError
+from ..seeds import torch_generator
+from ..training.densify import logit
+from ..training.images import TrainingImages
+from ..training.losses import mean_ssim
+from ..training.optimiser import Optimiser
+from ..training.sampling import Sampler
+from ..training.schedule import Timeline, log_linear
+from .config import GHAConfig
+from .driving import POSE_SIZE
+from .gaussian_head import Drawn, GaussianHead
+from .landmarks import mouth_box
+from .mesh_head import MeshHead, Surface
+from .mesh_training import grid_about
+from .networks import Weights
+from .scene import Scene
+
+NEIGHBOURS = 3
+SMALLEST_SQUARED = 1e-7
+"""Squared distance to neighbours that a first scale stands for at least."""
+
+ZOOM = (0.8, 1.25)
+"""Range of the random rescaling before super-resolution."""
+
+ALMOST_ONE = 1 - 1e-6
+"""Features of the mesh are kept within this, so that their inverse tanh is finite."""
+
+
+class GaussianTraining:
+    """A `Trainable` that starts from a trained mesh head.
+
+    Parameters
+    ----------
+    mesh : tensors that the mesh stage left: its networks and landmarks.
+    """
+
+    def __init__(
+        self, scene: Scene, head: GaussianHead, mesh_head: MeshHead, mesh: Weights, sampler: Sampler
+    ):
+        self._scene, self._head = scene, head
+        config = self._config = head.config
+        self._images = TrainingImages(scene.clip, scene.keys, sampler, scene.device)
+        initial = first_points(scene, config, mesh_head, mesh)
+        self._rates = {
+            "points": config.position_lr,
+            "features": config.feature_lr,
+            "log_scales": config.scale_lr,
+            "quats": config.rotation_lr,
+            "opacities": config.opacity_lr,
+            "corrections": config.correction_lr,
+        }
+        generator = torch_generator(scene.seed, "gha-gaussians")
+        for network in head.controllers.of_gaussians:
+            initial |= network.initial(generator, scene.device)
+        initial |= head.super_resolution.initial(generator, scene.device)
+        for network in head.controllers.of_mesh:
+            initial |= {name: mesh[name].detach().clone() for name in network.shapes()}
+        initial["corrections"] = torch.zeros(len(scene.timesteps), POSE_SIZE, device=scene.device)
+        for name in initial:
+            self._rates.setdefault(name, config.network_lr)
+        self._landmarks = mesh["landmarks"].detach().clone()
+        self._optimiser = Optimiser({name: nn.Parameter(v) for name, v in initial.items()}, self._rates)
+
+    @property
+    def optimiser(self) -> Optimiser:
+        """Adam over everything trained."""
+        return self._optimiser
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Points, networks and landmarks: what an avatar is made of."""
+        names = [name for name in self._rates if name != "corrections"]
+        return {**{name: self._optimiser[name].detach() for name in names}, "landmarks": self._landmarks}
+
+    def begin(self, timeline: Timeline) -> None:
+        """Fit schedules to the length of the run."""
+        self._timeline = timeline
+
+    def loss(self, iteration: int, index: int) -> Tensor:
+        """L1 at the splatted size, L1 and SSIM at the full one."""
+        scene, head, config = self._scene, self._head, self._config
+        key = scene.keys[index]
+        row = scene.row[key.timestep]
+        view = scene.views[key.camera]
+        truth = self._images.get(iteration, index)
+        tensors = _With(self._optimiser, self._landmarks)
+        signal = scene.signals[row]
+        motion = scene.driver.motion(signal, self._optimiser["corrections"][row])
+        drawn = head.draw(head.splats(tensors, signal, motion), view.camera, scene.background)
+        padded = _padded(truth, view.camera, config.upscale, scene.background)
+        small = reduced(padded, config.upscale, config.low_truth)
+        loss = config.low_weight * (drawn.features[..., :3] - small).abs().mean()
+        if config.augment:
+            drawn, padded = zoomed(drawn, padded, config.upscale, _zoom(scene.seed, iteration))
+        image = head.sharpen(tensors, drawn, scene.background)
+        loss = loss + (image - padded).abs().mean()
+        if config.structure_weight:
+            planes = (values.permute(2, 0, 1).contiguous() for values in (image, padded))
+            loss = loss + config.structure_weight * (1 - mean_ssim(*planes))
+        return loss
+
+    def after_backward(self, iteration: int) -> None:
+        """Learning rates over the last half of a short run."""
+        if self._config.final_rate < 1:
+            late = max(0.0, 2 * self._timeline.fraction(iteration) - 1)
+            decay = log_linear(1.0, self._config.final_rate, late)
+            for name, rate in self._rates.items():
+                self._optimiser.set_learning_rate(name, decay * rate)
+
+    def state(self) -> dict[str, Any]:
+        """Parameters and moments."""
+        return {"optimiser": self._optimiser.state()}
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Take over what `state` gave."""
+        self._optimiser.load_state(state["optimiser"])
+
+    def note(self) -> str:
+        """Number of Gaussians."""
+        return f"{len(self._optimiser['points'])} Gaussians"
+
+    def close(self) -> None:
+        """Stop background work."""
+        self._images.close()
+
+
+class _With:
+    """The optimiser's tensors and the frozen landmarks under one roof."""
+
+    def __init__(self, tensors: Weights, landmarks: Tensor):
+        self._tensors, self._landmarks = tensors, landmarks
+
+    def __getitem__(self, name: str, /) -> Tensor:
+        return self._landmarks if name == "landmarks" else self._tensors[name]
+
+
+@torch.no_grad()
+def first_points(scene: Scene, config: GHAConfig, mesh_head: MeshHead, mesh: Weights) -> dict[str, Tensor]:
+    """Gaussians on the neutral surface of the mesh stage, with its features, and some inside the mouth.
+
+    Raises
+    ------
+    InputError
+        Where the mesh stage ended without a surface.
+    """
+    device = scene.device
+    neutral = scene.driver.canonical(scene.driver.neutral)
+    grid = grid_about(neutral, config, device, finer=2 if config.subdivide else 1)
+    surface: Surface = mesh_head.surface(mesh, grid)
+    if not len(surface.vertices):
+        raise InputError(
+            f"clip of {scene.clip.subject}",
+            "mesh stage",
+            "a surface",
+            "none: the signed distance has one sign all over",
+            "Train longer, or start from the tracked mesh (start=mesh).",
+        )
+    points, features = surface.vertices, surface.features
+    if config.max_points is not None and len(points) > config.max_points:
+        order = torch.randperm(len(points), generator=torch_generator(scene.seed, "gha-thin"))
+        rows = order[: config.max_points].sort().values.to(device)
+        points, features = points[rows], features[rows]
+    lips = scene.clip.head.regions.get("lips")
+    if lips is not None and config.mouth_points:
+        center, half = mouth_box(neutral[torch.as_tensor(np.asarray(lips))].cpu().double().numpy())
+        draws = torch.rand(config.mouth_points, 3, generator=torch_generator(scene.seed, "gha-mouth"))
+        inside = torch.as_tensor(center + half * (2 * draws.double().numpy() - 1)).to(points)
+        points = torch.cat([points, inside])
+        features = torch.cat([features, features.new_zeros(len(inside), features.shape[1])])
+    places = points.cpu().double().numpy()
+    distances = cKDTree(places).query(places, k=min(NEIGHBOURS + 1, len(places)))[0].reshape(len(places), -1)
+    squared = np.maximum(np.square(distances[:, 1:]).mean(1), SMALLEST_SQUARED)
+    quats = torch.zeros(len(points), 4, device=device)
+    quats[:, 0] = 1
+    return {
+        "points": points,
+        "features": torch.atanh(features.clamp(-ALMOST_ONE, ALMOST_ONE)),
+        "log_scales": torch.as_tensor(0.5 * np.log(squared)).to(points)[:, None].repeat(1, 3),
+        "quats": quats,
+        "opacities": torch.full((len(points),), logit(config.initial_opacity), device=device),
+    }
+
+
+def reduced(image: Tensor, factor: int, how: str) -> Tensor:
+    """(h, w, 3) of a (u h, u w, 3) image: area means, or for "gha" the first pixel of each block."""
+    if how == "gha":
+        return image[::factor, ::factor]
+    height, width = image.shape[0] // factor, image.shape[1] // factor
+    return image.view(height, factor, width, factor, 3).mean((1, 3))
+
+
+def zoomed(drawn: Drawn, truth: Tensor, upscale: int, factor: float) -> tuple[Drawn, Tensor]:
+    """Feature image and truth rescaled about their middle and cut or padded to their size before.
+
+    By the nearest pixel, as published; what is padded is one throughout, and drawn by nobody.
+    """
+    height, width = drawn.alpha.shape
+    features = _zoomed(drawn.features, height, width, factor)
+    alpha = _zoomed(drawn.alpha[..., None], height, width, factor, 0.0)[..., 0]
+    return Drawn(features, alpha), _zoomed(truth, height * upscale, width * upscale, factor)
+
+
+def _zoomed(values: Tensor, height: int, width: int, factor: float, outside: float = 1.0) -> Tensor:
+    def places(size: int) -> tuple[Tensor, Tensor]:
+        middle = 0.5 * size
+        place = ((torch.arange(size, device=values.device) + 0.5 - middle) / factor + middle).floor().long()
+        return place.clamp(0, size - 1), (place >= 0) & (place < size)
+
+    (rows, rows_in), (columns, columns_in) = places(height), places(width)
+    moved = values.index_select(0, rows).index_select(1, columns)
+    return torch.where((rows_in[:, None] & columns_in)[..., None], moved, moved.new_tensor(outside))
+
+
+def _zoom(seed: int, iteration: int) -> float:
+    draw = torch.rand((), generator=torch_generator(seed, "gha-zoom", iteration)).item()
+    return ZOOM[0] + (ZOOM[1] - ZOOM[0]) * draw
+
+
+def _padded(image: Tensor, camera: Camera, upscale: int, background: Tensor) -> Tensor:
+    """(u h, u w, 3): the image with background to the right and below, up to whole pixels of the feature image."""
+    right, below = -camera.width % upscale, -camera.height % upscale
+    if not right and not below:
+        return image
+    padded = background.expand(camera.height + below, camera.width + right, 3).clone()
+    padded[: camera.height, : camera.width] = image
+    return padded

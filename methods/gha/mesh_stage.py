@@ -1,0 +1,69 @@
+"""The mesh stage as a step of its own: its result is kept until the avatar is whole, so that a kill loses none of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from torch import Tensor
+
+from ...bench.contracts import Budget, Progress
+from ..training.checkpoint import load_checkpoint, save_checkpoint
+from ..training.loop import CHECKPOINT, train
+from ..training.sampling import ShuffledEpochs
+from .mesh_head import MeshHead
+from .mesh_training import MeshTraining, Scene
+
+FOLDER, RESULT_FILE = "mesh", "mesh.pt"
+
+
+class MeshResult(NamedTuple):
+    """What the mesh stage leaves: its tensors by name, iterations done, and seconds spent."""
+
+    tensors: Mapping[str, Tensor]
+    iterations: int
+    seconds: float
+
+
+def mesh_stage(
+    scene: Scene, head: MeshHead, budget: Budget, out: Path, run: str, progress: Progress
+) -> MeshResult:
+    """Train the mesh head, continue its training, or read what a finished one left under ``out``."""
+    folder = out / FOLDER
+    stored = load_checkpoint(folder / RESULT_FILE, run, scene.device)
+    if stored is None:
+        stored = _trained(scene, head, budget, folder, run, progress)
+        save_checkpoint(folder / RESULT_FILE, run, stored)
+        (folder / CHECKPOINT).unlink(missing_ok=True)
+    return MeshResult(stored["tensors"], stored["iterations"], stored["seconds"])
+
+
+def remove_mesh_stage(out: Path) -> None:
+    """Take away what the mesh stage left; the avatar no longer needs it."""
+    folder = out / FOLDER
+    for name in (RESULT_FILE, CHECKPOINT):
+        (folder / name).unlink(missing_ok=True)
+    if folder.exists():
+        folder.rmdir()
+
+
+def _trained(
+    scene: Scene, head: MeshHead, budget: Budget, folder: Path, run: str, progress: Progress
+) -> dict[str, Any]:
+    training = MeshTraining(scene, head, fitted=not (folder / CHECKPOINT).exists())
+    config = head.config
+    outcome = train(
+        training,
+        ShuffledEpochs(len(scene.keys), scene.seed),
+        published_length=max(1, round(config.schedule_length * config.mesh_fraction)),
+        budget=budget,
+        folder=folder,
+        run=run,
+        device=scene.device,
+        progress=progress,
+        checkpoint_every_s=config.checkpoint_every_s,
+    )
+    names = [*(name for network in head.networks for name in network.shapes()), "landmarks"]
+    tensors = {name: training.optimiser[name].detach() for name in names}
+    return {"tensors": tensors, "iterations": outcome.iterations, "seconds": outcome.seconds}

@@ -1,0 +1,111 @@
+"""Small networks over points and one condition, as functions of named tensors.
+
+The published networks take each point's inputs side by side with a condition (expression, pose) that is the same for
+all points. Here the condition's part of a layer is computed once and added as a bias: the same numbers for a fraction
+of the work.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+SLOPE = 0.01
+"""Of the leaky ReLU between layers."""
+
+
+class Weights(Protocol):
+    """Tensors by name: a dict or an `Optimiser`."""
+
+    def __getitem__(self, name: str, /) -> Tensor: ...
+
+
+@dataclass(frozen=True)
+class Mlp:
+    """A perceptron whose inputs come in once more half way: at layer ``len(widths) // 2``, after the hidden values.
+
+    Attributes
+    ----------
+    name : prefix of its tensors, ``NAME.weight_K`` (out, in) and ``NAME.bias_K`` (out,).
+    point_inputs, condition_inputs : sizes of the two parts of the input, in this order.
+    hidden, outputs : widths of the layers.
+    """
+
+    name: str
+    point_inputs: int
+    condition_inputs: int
+    hidden: tuple[int, ...]
+    outputs: int
+
+    @property
+    def widths(self) -> tuple[int, ...]:
+        """Width of the input and of each layer's output, as published."""
+        return (self.point_inputs + self.condition_inputs, *self.hidden, self.outputs)
+
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shape of every tensor, by name."""
+        widths = self.widths
+        shapes: dict[str, tuple[int, ...]] = {}
+        for layer in range(len(widths) - 1):
+            again = widths[0] if layer == len(widths) // 2 else 0
+            shapes[f"{self.name}.weight_{layer}"] = (widths[layer + 1], widths[layer] + again)
+            shapes[f"{self.name}.bias_{layer}"] = (widths[layer + 1],)
+        return shapes
+
+    def initial(self, generator: torch.Generator, device: str = "cpu") -> dict[str, Tensor]:
+        """Weights and biases uniform within 1 / sqrt(inputs) of a layer."""
+        return uniform(self.shapes(), generator, device)
+
+    def __call__(
+        self, weights: Weights, points: Tensor, condition: Tensor | None = None, outputs: int | None = None
+    ) -> Tensor:
+        """(N, outputs) of (N, point_inputs) and (condition_inputs,).
+
+        ``outputs`` asks for so many of the first outputs only.
+        """
+        count, size = len(self.widths) - 1, self.point_inputs
+        values = points
+        for layer in range(count):
+            weight, bias = weights[f"{self.name}.weight_{layer}"], weights[f"{self.name}.bias_{layer}"]
+            if layer == count - 1 and outputs is not None:
+                weight, bias = weight[:outputs], bias[:outputs]
+            again = layer > 0 and layer == len(self.widths) // 2
+            if layer == 0 or again:
+                start = self.widths[layer] if again else 0
+                if condition is not None:
+                    bias = torch.addmv(bias, weight[:, start + size :], condition)
+                if again:
+                    bias = F.linear(values, weight[:, :start], bias)
+                by_points = weight[:, start : start + size].t()
+                values = torch.addmm(bias, points, by_points)
+            else:
+                values = F.linear(values, weight, bias)
+            if layer < count - 1:
+                values = F.leaky_relu(values, SLOPE)
+        return values
+
+
+def uniform(
+    shapes: Mapping[str, Sequence[int]], generator: torch.Generator, device: str
+) -> dict[str, Tensor]:
+    """Tensors uniform within 1 / sqrt(fan-in); a bias has the fan-in of the weight before it."""
+    tensors, bound = {}, 0.0
+    for name, shape in shapes.items():
+        if len(shape) > 1:
+            fan_in = 1
+            for side in shape[1:]:
+                fan_in *= side
+            bound = fan_in**-0.5
+        values = (2 * torch.rand(*shape, generator=generator, dtype=torch.float64) - 1) * bound
+        tensors[name] = values.to(device, torch.float32)
+    return tensors
+
+
+def parameter_count(shapes: Mapping[str, Sequence[int]]) -> int:
+    """Numbers in tensors of these shapes."""
+    return sum(int(torch.Size(shape).numel()) for shape in shapes.values())

@@ -1,0 +1,46 @@
+"""Presets of GHA that scale with the capture, for CPUs. Light: nothing is imported.
+
+The published design (`config`) splats 32 channels at 512 pixels for images of 2048, with networks of 836,000 numbers
+over some 100,000 Gaussians: hours on a GPU. These presets keep the capture's own size and splat at half of it, with
+fewer Gaussians than the capture has pixels and networks to match; the proportions of the design stay.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+_SHORT: dict[str, Any] = {
+    "start": "mesh",
+    "mesh_fraction": 0.15,
+    "start_steps": 100,
+    "grid_vertices": 12_000,
+    "max_points": 6_000,
+    "mouth_points": 300,
+    "features": 32,
+    "channels": 16,
+    "geometry_hidden": (64, 64, 64),
+    "expression_color_hidden": (64, 64),
+    "pose_color_hidden": (32,),
+    "expression_deform_hidden": (64, 64, 64),
+    "pose_deform_hidden": (64, 64),
+    "expression_attribute_hidden": (64, 64),
+    "pose_attribute_hidden": (32,),
+    "sr_widths": (32, 16),
+    "scale_expression": True,
+    "mesh_views": 2,
+    "mesh_size": 96,
+    "network_lr": 2e-3,
+    "position_lr": 5e-4,
+    "feature_lr": 5e-3,
+    "rotation_lr": 5e-3,
+    "scale_lr": 1e-2,
+    "opacity_lr": 2e-2,
+    "final_rate": 0.1,
+    "augment": False,
+}
+
+GHA_SHORT: dict[str, dict[str, Any]] = {
+    "smoke": {"budget": {"iterations": 60}, **_SHORT, "max_points": 2_000},
+    "demo": {"budget": {"iterations": 1_200}, **_SHORT},
+    "fast": {"budget": {"iterations": 8_000}, **_SHORT},
+}

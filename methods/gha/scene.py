@@ -1,0 +1,91 @@
+"""What both stages of training know of a clip."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...bench.contracts import Clip, FrameKey, IntArray
+from ..avatar_files import Subject
+from ..bound_training import View, view_of
+from .config import GHAConfig
+from .driving import Driver, Signal, expression_codes
+from .landmarks import landmark_vertices
+
+SMALLEST_SCALE = 0.05
+"""Least divisor of a driving value, so that one which hardly moves in training is not magnified more than 20 times."""
+
+
+class Scene(NamedTuple):
+    """A clip made ready.
+
+    Attributes
+    ----------
+    keys : training frames.
+    timesteps : of the training frames, ascending; ``row`` gives the place of each.
+    signals : by row.
+    tracked : driving arguments by name, (T, n) each.
+    views : training cameras.
+    background : (3,).
+    landmark_rows : (L,) vertices of the head model.
+    expression_scale : (E,) that expression codes are divided by.
+    """
+
+    clip: Clip
+    driver: Driver
+    keys: tuple[FrameKey, ...]
+    timesteps: list[int]
+    row: Mapping[int, int]
+    signals: list[Signal]
+    tracked: Mapping[str, Tensor]
+    views: Mapping[str, View]
+    background: Tensor
+    landmark_rows: IntArray
+    expression_scale: Tensor
+    device: str
+    seed: int
+
+    def frame(self) -> dict[str, Tensor]:
+        """What an avatar keeps of it: origin of the canonical frame, background and scale of the expression."""
+        return {
+            "origin": self.driver.origin,
+            "background": self.background,
+            "expression_scale": self.expression_scale,
+        }
+
+
+def scene_of(clip: Clip, config: GHAConfig, device: str, seed: int) -> Scene:
+    """Make a clip ready. Raises `InputError` where its head model has no face region."""
+    subject = Subject.of(clip)
+    identity = (clip.head, subject.shape, subject.static_offset)
+    plain = Driver(*identity, np.zeros(3), 1.0, None, device)
+    neutral = plain.neutral.cpu().numpy()
+    rows = landmark_vertices(clip.head, neutral, config.landmarks)
+    timesteps = sorted({key.timestep for key in clip.splits["train"]})
+    tracked = plain.arguments([clip.poses[timestep] for timestep in timesteps])
+    codes = expression_codes(tracked)
+    scale = torch.ones_like(codes[0])
+    if config.scale_expression:
+        scale = codes.square().mean(0).sqrt().clamp_min(SMALLEST_SCALE)
+    driver = Driver(*identity, neutral[rows].mean(0), config.unit, scale, device)
+    return Scene(
+        clip=clip,
+        driver=driver,
+        keys=tuple(clip.splits["train"]),
+        timesteps=timesteps,
+        row={timestep: row for row, timestep in enumerate(timesteps)},
+        signals=driver.signals(tracked),
+        tracked=tracked,
+        views={
+            name: view_of(clip.cameras[name], device) for name in {k.camera for k in clip.splits["train"]}
+        },
+        background=torch.as_tensor(np.asarray(clip.background), dtype=torch.float32, device=device),
+        landmark_rows=rows,
+        expression_scale=scale,
+        device=device,
+        seed=seed,
+    )

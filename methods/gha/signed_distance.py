@@ -1,0 +1,47 @@
+"""Signed distance to a tracked mesh that need not be closed."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from ...bench.contracts import FloatArray, IntArray
+
+INNER_PARTS = ("left_eyeball", "right_eyeball", "teeth", "mouth_socket")
+"""Regions behind the skin: what lies about them says nothing of inside and outside."""
+
+
+class TangentDistance:
+    """Distance to the nearest vertex, signed by the side of its tangent plane that a point is on; positive outside.
+
+    Hoppe et al., "Surface reconstruction from unorganized points", SIGGRAPH 1992, section 3.3. Where a mesh ends (the
+    neck's lower edge) its walls continue, which is what a bust wants.
+
+    Parameters
+    ----------
+    vertices : (V, 3).
+    faces : (F, 3), counter-clockwise seen from outside.
+    keep : (K,) vertices that count.
+    """
+
+    def __init__(self, vertices: FloatArray, faces: IntArray, keep: IntArray):
+        normals = vertex_normals(np.asarray(vertices, np.float64), np.asarray(faces))
+        self._points, self._normals = np.asarray(vertices, np.float64)[keep], normals[keep]
+        self._tree = cKDTree(self._points)
+
+    def __call__(self, places: FloatArray) -> FloatArray:
+        """(N,) distances of (N, 3) places."""
+        distance, nearest = self._tree.query(places)
+        side = np.einsum("ni,ni->n", places - self._points[nearest], self._normals[nearest])
+        return np.where(side < 0, -distance, distance)
+
+
+def vertex_normals(vertices: FloatArray, faces: IntArray) -> FloatArray:
+    """(V, 3) unit normals, triangles weighted by area; zero for vertices without a triangle."""
+    corners = vertices[faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = np.zeros_like(vertices)
+    for corner in range(3):
+        np.add.at(normals, faces[:, corner], across)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return normals / np.maximum(length, 1e-30)

@@ -1,0 +1,67 @@
+"""From a feature image to a colour image of up to four times its size, by a small convolutional network."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from .networks import Weights, uniform
+
+VARIANCE_FLOOR = 1e-5
+
+
+@dataclass(frozen=True)
+class SuperResolution:
+    """Blocks of two 3x3 convolutions, each normalised over the image and rectified; a 1x1 convolution; a sigmoid.
+
+    The first block works at the size of the features, each further one at twice the size before it.
+
+    Attributes
+    ----------
+    channels : of the feature image.
+    widths : channels of the blocks.
+    """
+
+    channels: int
+    widths: tuple[int, ...]
+
+    @property
+    def upscale(self) -> int:
+        """Size of the output over that of the input."""
+        return 2 ** (len(self.widths) - 1)
+
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shape of every tensor, by name. Convolutions have no bias but for the last one."""
+        shapes: dict[str, tuple[int, ...]] = {}
+        before = self.channels
+        for block, width in enumerate(self.widths):
+            shapes[f"sr.conv_{block}_0"] = (width, before, 3, 3)
+            shapes[f"sr.conv_{block}_1"] = (width, width, 3, 3)
+            before = width
+        return {**shapes, "sr.color": (3, before, 1, 1), "sr.color_bias": (3,)}
+
+    def initial(self, generator: torch.Generator, device: str) -> dict[str, Tensor]:
+        """Weights uniform within 1 / sqrt(fan-in)."""
+        return uniform(self.shapes(), generator, device)
+
+    def __call__(self, weights: Weights, features: Tensor) -> Tensor:
+        """(u H, u W, 3) colours in (0, 1) of an (H, W, C) feature image."""
+        values = features.permute(2, 0, 1)[None]
+        for block in range(len(self.widths)):
+            if block:
+                height, width = values.shape[2:]
+                values = F.interpolate(values, (2 * height, 2 * width), mode="bilinear", align_corners=True)
+            for layer in range(2):
+                values = F.conv2d(values, weights[f"sr.conv_{block}_{layer}"], padding=1)
+                values = F.relu(_normalised(values))
+        colors = F.conv2d(values, weights["sr.color"], weights["sr.color_bias"])
+        return torch.sigmoid(colors)[0].permute(1, 2, 0)
+
+
+def _normalised(values: Tensor) -> Tensor:
+    """Each channel with mean 0 and variance 1 over the image, of one pixel too (then 0)."""
+    variance, mean = torch.var_mean(values, dim=(2, 3), correction=0, keepdim=True)
+    return (values - mean) * torch.rsqrt(variance + VARIANCE_FLOOR)

@@ -1,0 +1,257 @@
+"""The method from clip to avatar: resumed bit for bit, stored in the published bytes, bounded at extremes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+
+from headbench.bench.contracts import Budget, no_progress
+from headbench.bench.errors import InputError
+from headbench.bench.files import read_json
+from headbench.methods.avatar_files import RECORD_FILE
+from headbench.methods.gha.avatar import DRIVING_FILE, GHAAvatar
+from headbench.methods.gha.gaussian_head import feature_camera
+from headbench.methods.gha.mesh_stage import FOLDER, RESULT_FILE
+from headbench.methods.gha.method import GHA, parted
+from headbench.methods.gha.storage import AVATAR_FILE
+from headbench.methods.training.loop import CHECKPOINT
+
+from .small import SMALL, small_config
+
+BUDGET = Budget(iterations=30)  # 12 of the mesh stage
+
+
+class Killed(Exception):
+    pass
+
+
+def fit(clip, folder, progress=no_progress, seed=3, **more):
+    method = GHA(small_config(**more))
+    return method.fit(clip, folder, BUDGET, device="cpu", seed=seed, progress=progress)
+
+
+def content(avatar):
+    return {path.name: path.read_bytes() for path in avatar.files()}
+
+
+def views(clip):
+    key = clip.splits["train"][0]
+    return clip.cameras[key.camera], clip.poses[key.timestep]
+
+
+@pytest.fixture(scope="module")
+def trained(clip, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("gha")
+    return fit(clip, folder), folder
+
+
+# Within the mesh stage, right after it, right before its result is used, within the Gaussian stage, and all of them.
+@pytest.mark.parametrize("kills", [(5,), (12,), (13,), (25,), (3, 12, 13, 29)])
+def test_interrupted_and_continued_is_the_same_bit_for_bit(trained, clip, tmp_path, kills):
+    for kill in kills:
+
+        def killer(done, total, note="", kill=kill):
+            if done == kill:
+                raise Killed
+
+        with pytest.raises(Killed):
+            fit(clip, tmp_path, killer)
+    seen = []
+    avatar = fit(clip, tmp_path, lambda done, total, note="": seen.append((done, total)))
+    # The last step of the mesh stage is done again where its result was not yet written.
+    assert seen[0][0] in (kills[-1], kills[-1] + 1)
+    assert {total for _, total in seen} == {30}
+    assert content(avatar) == content(trained[0])
+    assert not (tmp_path / CHECKPOINT).exists()
+    assert not (tmp_path / FOLDER).exists()
+
+
+def test_between_the_stages_the_mesh_is_kept(clip, tmp_path):
+    def killer(done, total, note=""):
+        if done == 13:
+            raise Killed
+
+    with pytest.raises(Killed):
+        fit(clip, tmp_path, killer)
+    assert (tmp_path / FOLDER / RESULT_FILE).exists()
+    assert not (tmp_path / FOLDER / CHECKPOINT).exists()
+
+
+def test_another_seed_gives_another_avatar(trained, clip, tmp_path):
+    assert content(fit(clip, tmp_path, seed=4)) != content(trained[0])
+
+
+def test_a_gaussian_is_stored_in_its_floats_and_no_more(trained):
+    avatar, folder = trained
+    table = load_file(folder / AVATAR_FILE)["table"]
+    assert table.shape[1] == 11 + SMALL["features"]
+    with safe_open(folder / AVATAR_FILE, framework="pt") as file:
+        floats = sum(file.get_tensor(name).numel() for name in file.keys())  # noqa: SIM118 - not a mapping
+    overhead = (folder / AVATAR_FILE).stat().st_size - 4 * floats
+    assert 0 < overhead < 8_000  # names, shapes and settings
+    assert [path.name for path in avatar.files()] == [AVATAR_FILE, "subject.npz"]
+    assert (
+        read_json(folder / RECORD_FILE)["splats"] == len(table) <= SMALL["max_points"] + SMALL["mouth_points"]
+    )
+
+
+def test_corrections_of_the_head_pose_serve_their_own_timestep_alone(trained, clip):
+    avatar, folder = trained
+    _, pose = views(clip)
+    driving = np.load(folder / DRIVING_FILE)
+    assert not np.array_equal(driving["refined_rotation"], driving["tracked_rotation"])
+    assert np.array_equal(driving["refined_expression"], driving["tracked_expression"])
+    foreign = avatar.splats(replace(pose, timestep=None)).means
+    assert not np.array_equal(avatar.splats(pose).means, foreign)
+    np.testing.assert_allclose(avatar.splats(pose).means, foreign, atol=1e-2)
+
+
+def test_a_turned_and_shifted_head_takes_its_splats_along(trained, clip):
+    """Where expression alone rules, head pose is a rigid motion and nothing else."""
+    avatar, folder = trained
+    tensors = load_file(folder / AVATAR_FILE)
+    points = tensors["table"][:, :3]
+    near = (torch.cdist(points, tensors["landmarks"]).amin(1).square() < 0.1).numpy()
+    assert near.sum() > 20
+    _, pose = views(clip)
+    plain = replace(pose, subject="", timestep=None)
+    moved = replace(plain, translation=np.asarray(plain.translation) + np.array([0.0, 0.0, 0.5], np.float32))
+    before, after = avatar.splats(plain), avatar.splats(moved)
+    shift = after.means[near] - before.means[near]
+    np.testing.assert_allclose(shift, np.broadcast_to([0, 0, 0.5], shift.shape), atol=2e-5)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 2), (640, 360)])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {},
+        {"jaw": np.zeros(3)},
+        {"jaw": np.array([40.0, -3.0, 7.0])},
+        {"jaw": np.array([1e8, 0.0, 0.0])},
+        {"eyes": np.full(6, -9.0)},
+        {"expression": np.full(8, 3.0)},
+        {"expression": np.full(8, -300.0)},
+        {"translation": np.array([0.0, 0.0, 0.45])},
+        {"rotation": np.array([0.0, np.pi, 0.0])},
+    ],
+)
+def test_frames_stay_bounded_at_extremes(trained, clip, size, change):
+    avatar, _ = trained
+    camera, pose = views(clip)
+    frame = avatar.render(camera.resized(*size), replace(pose, **change), (0.2, 0.4, 0.6))
+    assert frame.rgb.shape == (size[1], size[0], 3)
+    for values in frame:
+        assert np.isfinite(values).all()
+        assert values.min() >= 0
+        assert values.max() <= 1
+
+
+def test_jaw_angles_are_known_up_to_whole_turns(trained, clip):
+    avatar, _ = trained
+    camera, pose = views(clip)
+    small = replace(pose, jaw=np.array([0.3, 0.0, 0.0]))
+    round_again = replace(pose, jaw=np.array([0.3 + 2 * np.pi, 0.0, 0.0]))
+    np.testing.assert_allclose(
+        avatar.render(camera, small).rgb, avatar.render(camera, round_again).rgb, atol=1e-3
+    )
+
+
+def test_another_background_shows_where_nothing_is_drawn(trained, clip):
+    avatar, _ = trained
+    camera, pose = views(clip)
+    away = replace(pose, translation=np.array([5.0, 0.0, 0.0]))
+    frame = avatar.render(camera, away, (0.25, 0.5, 0.75))
+    assert frame.alpha.max() == 0
+    np.testing.assert_allclose(frame.rgb, np.broadcast_to([0.25, 0.5, 0.75], frame.rgb.shape), atol=1e-6)
+
+
+def test_the_feature_camera_sees_the_same_points():
+    from ..toy_clip import look_at
+
+    camera = look_at(np.array([0.1, 0.2, 0.6]), np.zeros(3), "c", 37, 50)
+    small = feature_camera(camera, 4)
+    assert (small.width, small.height) == (10, 13)
+    points = np.random.default_rng(0).normal(size=(9, 3)) * 0.05
+    seen = [c.K @ (c.world_to_camera[:3, :3] @ points.T + c.world_to_camera[:3, 3:]) for c in (camera, small)]
+    full, quarter = (s[:2] / s[2] for s in seen)
+    np.testing.assert_allclose(full / 4, quarter)
+
+
+def test_budgets_are_parted_without_loss():
+    assert parted(Budget(iterations=600_000), 0.05) == (Budget(iterations=30_000), Budget(iterations=570_000))
+    assert parted(Budget(seconds=10.0), 0.25) == (Budget(seconds=2.5), Budget(seconds=7.5))
+
+
+def test_seconds_bound_a_run_and_the_avatar_is_whole(clip, tmp_path):
+    seen = []
+    avatar = GHA(small_config()).fit(
+        clip,
+        tmp_path,
+        Budget(seconds=2.0),
+        device="cpu",
+        seed=0,
+        progress=lambda d, t, n="": seen.append((d, t)),
+    )
+    assert seen == sorted(seen)
+    assert all(done <= total for done, total in seen)
+    assert avatar.render(*views(clip)).rgb.shape[2] == 3
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("table", lambda tensor: tensor[:, :-1]),
+        ("table", lambda tensor: tensor.fill_(float("nan"))),
+        ("landmarks", lambda tensor: tensor[:0]),
+        ("expression_color.weight_0", lambda tensor: tensor[:-1]),
+        ("sr.color", lambda tensor: None),
+        ("expression_scale", lambda tensor: tensor * 0),
+        ("background", lambda tensor: tensor.double()),
+    ],
+)
+def test_a_damaged_file_is_refused_by_name(trained, tmp_path, name, change):
+    _, folder = trained
+    for path in folder.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    with safe_open(folder / AVATAR_FILE, framework="pt") as file:
+        metadata = file.metadata()
+    tensors = load_file(folder / AVATAR_FILE)
+    changed = change(tensors.pop(name))
+    if changed is not None:
+        tensors[name] = changed.contiguous()
+    save_file(tensors, tmp_path / AVATAR_FILE, metadata)
+    with pytest.raises(InputError, match=name):
+        GHAAvatar.read(tmp_path, "cpu")
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"unit": 0.1}', "null"])
+def test_damaged_settings_are_refused(trained, tmp_path, text):
+    _, folder = trained
+    for path in folder.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    save_file(load_file(folder / AVATAR_FILE), tmp_path / AVATAR_FILE, {"config": text})
+    with pytest.raises(InputError, match="config"):
+        GHAAvatar.read(tmp_path, "cpu")
+
+
+def test_a_head_without_a_face_is_refused_before_any_work(clip, tmp_path):
+    bare = replace(clip, head=replace(clip.head, regions={"lips": clip.head.regions["lips"]}))
+    with pytest.raises(InputError, match="face"):
+        fit(bare, tmp_path)
+    assert not any(tmp_path.iterdir())
+
+
+def test_training_moves_everything_it_should(trained, clip, tmp_path):
+    """No tensor that an avatar keeps is left as it was started."""
+    _, folder = trained
+    more = load_file(folder / AVATAR_FILE)
+    short = GHA(small_config())
+    short.fit(clip, tmp_path, Budget(iterations=13), device="cpu", seed=3, progress=no_progress)
+    less = load_file(tmp_path / AVATAR_FILE)
+    fixed = {"origin", "background", "expression_scale"}
+    for name in set(more) - fixed - {"table", "landmarks"}:
+        assert not torch.equal(more[name], less[name]), name

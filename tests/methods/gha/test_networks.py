@@ -1,0 +1,134 @@
+"""The networks have the published sizes, and compute what the plain layers side by side do."""
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from headbench.methods.gha.config import GHAConfig
+from headbench.methods.gha.controllers import Controllers, encode_pose, encoded_size
+from headbench.methods.gha.gaussian_head import POINTS, GaussianHead
+from headbench.methods.gha.mesh_head import MeshHead
+from headbench.methods.gha.networks import Mlp, parameter_count
+from headbench.methods.gha.super_resolution import SuperResolution
+
+PUBLISHED_EXPRESSION = 64  # coefficients of the published face model
+
+
+def plain(mlp, weights, points, condition):
+    """The layers one after the other on inputs side by side."""
+    inputs = points
+    if condition is not None:
+        inputs = torch.cat([points, condition.expand(len(points), -1)], dim=1)
+    values, count = inputs, len(mlp.widths) - 1
+    for layer in range(count):
+        if layer and layer == len(mlp.widths) // 2:
+            values = torch.cat([values, inputs], dim=1)
+        values = values @ weights[f"{mlp.name}.weight_{layer}"].t() + weights[f"{mlp.name}.bias_{layer}"]
+        if layer < count - 1:
+            values = torch.where(values > 0, values, 0.01 * values)
+    return values
+
+
+def test_paper_networks_have_the_published_widths():
+    controllers = Controllers.of(GHAConfig(), PUBLISHED_EXPRESSION)
+    assert [mlp.widths for mlp in controllers.of_gaussians] == [
+        (192, 256, 256, 32),
+        (182, 128, 32),
+        (91, 256, 256, 256, 256, 256, 3),
+        (81, 256, 256, 3),
+        (192, 256, 256, 256, 8),
+        (182, 128, 128, 8),
+    ]
+    mesh = MeshHead.of(GHAConfig(), PUBLISHED_EXPRESSION)
+    assert mesh.geometry.widths == (27, 256, 256, 256, 256, 256, 132)
+
+
+def test_paper_networks_have_the_published_numbers_of_parameters():
+    head = GaussianHead.of(GHAConfig(), PUBLISHED_EXPRESSION)
+    controllers = sum(parameter_count(mlp.shapes()) for mlp in head.controllers.of_gaussians)
+    assert controllers == 836_153
+    assert parameter_count(head.super_resolution.shapes()) == pytest.approx(322_700, abs=50)
+    assert 4 * (sum(POINTS.values()) + head.config.features) == 556  # bytes of a Gaussian
+    assert head.config.upscale == 4
+
+
+@given(
+    sizes=st.tuples(st.integers(1, 5), st.integers(0, 4), st.integers(1, 3)),
+    hidden=st.lists(st.integers(1, 7), max_size=5).map(tuple),
+    seed=st.integers(0, 99),
+)
+@settings(max_examples=40, deadline=None)
+def test_a_condition_once_is_a_condition_at_every_point(sizes, hidden, seed):
+    points_size, condition_size, outputs = sizes
+    mlp = Mlp("m", points_size, condition_size, hidden, outputs)
+    generator = torch.Generator().manual_seed(seed)
+    weights = {name: value.double() for name, value in mlp.initial(generator).items()}
+    points = torch.randn(6, points_size, generator=generator, dtype=torch.float64)
+    condition = (
+        torch.randn(condition_size, generator=generator, dtype=torch.float64) if condition_size else None
+    )
+    expected = plain(mlp, weights, points, condition)
+    assert torch.allclose(mlp(weights, points, condition), expected, atol=1e-12)
+    assert torch.allclose(mlp(weights, points, condition, 1), expected[:, :1], atol=1e-12)
+
+
+def test_network_gradients_agree_with_finite_differences():
+    mlp = Mlp("m", 3, 2, (5, 4), 2)
+    generator = torch.Generator().manual_seed(0)
+    weights = {name: value.double().requires_grad_() for name, value in mlp.initial(generator).items()}
+    points = torch.randn(4, 3, generator=generator, dtype=torch.float64, requires_grad=True)
+    condition = torch.randn(2, generator=generator, dtype=torch.float64, requires_grad=True)
+
+    def run(points, condition, *tensors):
+        return mlp(dict(zip(weights, tensors)), points, condition)
+
+    assert torch.autograd.gradcheck(run, (points, condition, *weights.values()))
+
+
+def test_initial_weights_stay_within_their_bound():
+    mlp = Mlp("m", 30, 34, (50,), 7)
+    tensors = mlp.initial(torch.Generator().manual_seed(1))
+    for layer, inputs in ((0, 64), (1, 50 + 64)):
+        for kind in ("weight", "bias"):
+            values = tensors[f"m.{kind}_{layer}"].abs()
+            assert 0.5 * inputs**-0.5 < values.max() <= inputs**-0.5
+
+
+def test_the_encoding_of_a_pose_has_nine_numbers_for_each_of_its_own():
+    code = torch.tensor([0.1, -0.2, 0.3, 1.0, 2.0, -3.0], dtype=torch.float64)
+    encoded = encode_pose(code)
+    assert encoded.shape == (54,) == (encoded_size(6),)
+    parts = [code]
+    for frequency in (1, 2, 4, 8):
+        parts += [torch.sin(frequency * code), torch.cos(frequency * code)]
+    assert torch.allclose(encoded, torch.cat(parts))
+
+
+@pytest.mark.parametrize("widths", [(4,), (5, 3), (6, 4, 3)])
+def test_super_resolution_is_torchs_layers(widths):
+    network = SuperResolution(3, widths)
+    generator = torch.Generator().manual_seed(2)
+    weights = {name: value.double() for name, value in network.initial(generator, "cpu").items()}
+    features = torch.randn(5, 7, 3, generator=generator, dtype=torch.float64)
+    values = features.permute(2, 0, 1)[None]
+    for block in range(len(widths)):
+        if block:
+            values = torch.nn.Upsample(scale_factor=2, mode="bilinear", align_corners=True)(values)
+        for layer in range(2):
+            values = F.conv2d(values, weights[f"sr.conv_{block}_{layer}"], padding="same")
+            values = torch.relu(torch.nn.InstanceNorm2d(values.shape[1])(values))
+    expected = torch.sigmoid(F.conv2d(values, weights["sr.color"], weights["sr.color_bias"]))[0]
+    image = network(weights, features)
+    assert image.shape == (5 * network.upscale, 7 * network.upscale, 3)
+    assert torch.allclose(image, expected.permute(1, 2, 0), atol=1e-10)
+
+
+def test_super_resolution_of_one_pixel_is_finite():
+    network = SuperResolution(3, (4, 4, 4))
+    weights = network.initial(torch.Generator().manual_seed(3), "cpu")
+    image = network(weights, torch.full((1, 1, 3), 1e6))
+    assert image.shape == (4, 4, 3)
+    assert np.isfinite(image.numpy()).all()
