@@ -81,6 +81,23 @@ def read_rows(path: Path) -> pd.DataFrame:
     return frame
 
 
+def check_protocols(
+    rows: pd.DataFrame, source: Path | str, expected: Mapping[str, str] | None = None
+) -> None:
+    """Raise `InputError` where rows of one task come from several protocols, or from another than ``expected``.
+
+    Numbers of different protocols do not compare. ``expected`` holds the hash of each task's protocol.
+    """
+    for task, hashes in rows[rows["task"] != ""].groupby("task")["protocol"].unique().items():
+        found = sorted(map(str, hashes))
+        if len(found) > 1:
+            wanted = "one protocol: numbers of different protocols do not compare"
+            remedy = "Take the rows of each protocol for themselves."
+            raise InputError(source, f"protocol of {task}", wanted, ", ".join(found), remedy)
+        if expected is not None and found != [expected.get(str(task))]:
+            raise InputError(source, f"protocol of {task}", str(expected.get(str(task))), found[0])
+
+
 @dataclass(frozen=True)
 class Cell:
     """The folder of one avatar: a subject, a method, a seed."""

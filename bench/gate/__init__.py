@@ -1,0 +1,1 @@
+"""The regression gate: results held against a committed baseline."""

@@ -1,0 +1,68 @@
+"""``headbench gate``."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+
+from ..contracts import Progress, no_progress
+from ..errors import InputError
+from ..files import write_text
+from ..specs import Findings
+from .baseline import Baseline
+from .results import read_results
+from .settings import GateSettings
+from .verdicts import INVALID, environment_changes, exit_code, judge
+from .writers import to_junit, to_markdown, to_text
+
+
+def run(settings: GateSettings, progress: Progress = no_progress) -> Findings:
+    """Judge results, or write them into the baseline.
+
+    Results or a baseline that are missing or invalid are a finding too, with exit code 3, so that CI can tell them
+    from a usage error. Nothing is written then but the reports asked for.
+    """
+    try:
+        return _update(settings) if settings.update else _judge(settings)
+    except InputError as error:
+        for path in (settings.junit, settings.markdown):
+            if path is not None:
+                Path(path).unlink(missing_ok=True)  # a report of an earlier run would pass for this one's
+        return Findings(f"Gate: missing or invalid: {error}", {"error": str(error)}, False, INVALID)
+
+
+def _judge(settings: GateSettings) -> Findings:
+    baseline, results = Baseline.read(Path(settings.baseline)), read_results(Path(settings.results))
+    verdicts = judge(results, baseline)
+    code = exit_code(verdicts)
+    changes = environment_changes(baseline.environment, results.environment)
+    notes = [f"Environment changed: {change}." for change in changes]
+    if baseline.captures == "remade":
+        notes.append("Captures were made anew for these results, as the baseline declares.")
+    if any(verdict.outcome in ("improved", "new") for verdict in verdicts) and code == 0:
+        notes.append("The baseline can be brought up to date with --update.")
+    if settings.junit is not None:
+        write_text(Path(settings.junit), to_junit(verdicts, notes))
+    if settings.markdown is not None:
+        write_text(Path(settings.markdown), to_markdown(verdicts, code, notes))
+    data = {
+        "code": code,
+        "verdicts": [{**asdict(v), "place": str(v.place), "change": v.change} for v in verdicts],
+        "environment_changes": changes,
+    }
+    return Findings(to_text(verdicts, code, notes), data, code == 0, code)
+
+
+def _update(settings: GateSettings) -> Findings:
+    path = Path(settings.baseline)
+    earlier = Baseline.read(path) if path.exists() else None
+    results = read_results(Path(settings.results))
+    baseline = Baseline.of(results, earlier, settings.captures)
+    verdicts = judge(results, earlier) if earlier else []
+    gone = sorted(earlier.values.keys() - baseline.values.keys()) if earlier else []
+    baseline.write(path)
+    lines = [f"{path}: {len(baseline.values)} numbers written."]
+    lines += [f"  was: {verdict}" for verdict in verdicts if verdict.outcome not in ("pass", "missing")]
+    lines += [f"  gone: {place}" for place in gone]
+    data = {"baseline": path, "values": len(baseline.values), "gone": [str(place) for place in gone]}
+    return Findings("\n".join(lines), data, True, 0)

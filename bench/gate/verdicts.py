@@ -1,0 +1,134 @@
+"""Results against a baseline: a verdict for every number."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from .baseline import Baseline, Tolerance
+from .results import Place, Results
+
+Outcome = Literal["pass", "regressed", "improved", "missing", "new", "unjudged"]
+ORDER: tuple[Outcome, ...] = ("missing", "regressed", "improved", "new", "unjudged", "pass")
+ROUNDING = 1e-9
+"""Share of a tolerance that is rounding: a number moved by exactly the tolerance passes."""
+
+OK, REGRESSED, INVALID = 0, 1, 3
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What became of one number. ``unjudged``: bound to a machine, and measured on another one."""
+
+    place: Place
+    outcome: Outcome
+    found: float | None = None
+    baseline: float | None = None
+    tolerance: Tolerance | None = None
+    reason: str = ""
+
+    @property
+    def change(self) -> float | None:
+        """Found minus baseline."""
+        return None if self.found is None or self.baseline is None else self.found - self.baseline
+
+    def __str__(self) -> str:
+        place = self.place
+        region = "" if place.region == "full" else f" ({place.region})"
+        what = f"{place.metric}{region} of {place.method}, subject {place.subject}, {place.task}"
+        if self.outcome == "missing" or self.found is None:
+            return f"{what}: missing: {self.reason}"
+        digits, unit = (self.tolerance.digits, self.tolerance.unit) if self.tolerance else (4, "")
+        unit = f" {unit}" if unit else ""
+        if self.baseline is None or self.tolerance is None:
+            return f"{what}: new: {self.found:.{digits}f}{unit}"
+        moved = self.found - self.baseline
+        allowed = self.tolerance.allowed(self.baseline)
+        return (
+            f"{what}: {self.outcome}: {self.baseline:.{digits}f} to {self.found:.{digits}f}{unit}, "
+            f"{moved:+.{digits + 1}f}{unit} (tolerance {allowed:.{digits + 1}f}){self.reason and ': ' + self.reason}"
+        )
+
+
+def judge(results: Results, baseline: Baseline) -> list[Verdict]:
+    """Give every number of baseline and results its verdict, the gravest first.
+
+    Numbers of a task whose protocol is not the baseline's are missing: they were measured, but of something else.
+    """
+    other = _other_protocols(results, baseline)
+    same_machine = baseline.same_machine(results.environment)
+    verdicts = []
+    for place, expected in baseline.values.items():
+        tolerance = baseline.tolerances[place.metric]
+        found = results.values.get(place)
+        if place.task in other:
+            verdicts.append(Verdict(place, "missing", None, expected, tolerance, other[place.task]))
+        elif found is None:
+            reason = results.problems.get(place) or "no rows; was it measured?"
+            verdicts.append(Verdict(place, "missing", None, expected, tolerance, reason))
+        elif tolerance.machine_bound and not same_machine:
+            reason = "measured on another machine"
+            verdicts.append(Verdict(place, "unjudged", found, expected, tolerance, reason))
+        else:
+            verdicts.append(Verdict(place, _outcome(found, expected, tolerance), found, expected, tolerance))
+    for place in {**results.values, **results.problems}.keys() - baseline.values.keys():
+        tolerance = Tolerance.default(results.metrics[place.metric])
+        if place in results.problems:
+            reason = f"{results.problems[place]} (not in the baseline either)"
+            verdicts.append(Verdict(place, "missing", None, None, tolerance, reason))
+        else:
+            verdicts.append(Verdict(place, "new", results.values[place], None, tolerance))
+    return sorted(verdicts, key=lambda verdict: (ORDER.index(verdict.outcome), verdict.place))
+
+
+def exit_code(verdicts: Sequence[Verdict]) -> int:
+    """3 where a number is missing, since what cannot be compared is not judged; else 1 where one regressed."""
+    outcomes = {verdict.outcome for verdict in verdicts}
+    if "missing" in outcomes or not verdicts:
+        return INVALID
+    return REGRESSED if "regressed" in outcomes else OK
+
+
+def environment_changes(baseline: Mapping[str, Any], found: Mapping[str, Any]) -> list[str]:
+    """What differs between two environments, as "name: before to now"."""
+    before, now = _flat(baseline), _flat(found)
+    return [
+        f"{name}: {before.get(name)} to {now.get(name)}"
+        for name in sorted(before.keys() | now.keys())
+        if before.get(name) != now.get(name)
+    ]
+
+
+def _outcome(found: float, expected: float, tolerance: Tolerance) -> Outcome:
+    better = found - expected if tolerance.higher_is_better else expected - found
+    allowed = tolerance.allowed(expected) * (1.0 + ROUNDING) + ROUNDING * abs(expected)
+    if better < -allowed:
+        return "regressed"
+    return "improved" if better > allowed else "pass"
+
+
+def _other_protocols(results: Results, baseline: Baseline) -> dict[str, str]:
+    """Tasks measured by another protocol than the baseline's, and how it differs."""
+    other = {}
+    for task, expected in baseline.protocols.items():
+        found = results.protocols.get(task)
+        if found is None:
+            continue  # its numbers are missing one by one
+        agrees = found.hash == expected.hash
+        if baseline.captures == "remade":
+            agrees = found.design == expected.design
+        if not agrees:
+            what = "other captures" if found.design == expected.design else "other frames or settings"
+            other[task] = f"protocol {found.hash}, the baseline's is {expected.hash}: {what}"
+    return other
+
+
+def _flat(record: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for name, value in record.items():
+        if isinstance(value, Mapping):
+            flat |= _flat(value, f"{prefix}{name}.")
+        else:
+            flat[f"{prefix}{name}"] = value
+    return flat

@@ -1,0 +1,256 @@
+"""The gate from its command line: a run made worse on purpose, a noise-level change, holes, usage."""
+
+import dataclasses
+import json
+import math
+from xml.etree import ElementTree
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from headbench.bench import cli, runner
+from headbench.bench.files import read_json, write_json
+from headbench.bench.store import RunFolder, read_rows, write_rows
+
+
+@pytest.fixture
+def baseline(run, tmp_path, capsys):
+    path = tmp_path / "baseline.json"
+    assert cli.main(["gate", str(run), "--baseline", str(path), "--update"]) == 0
+    capsys.readouterr()
+    return path
+
+
+def gate(run, baseline, *options):
+    return cli.main(["gate", str(run), "--baseline", str(baseline), *options])
+
+
+def worse_by(decibels):
+    """Brighten just so many pixels of a frame that its PSNR drops by so much."""
+
+    def change(image):
+        # Brighter than the truth already: a pixel 40 levels brighter adds ((d + 40)^2 - d^2) / n to the mean squared
+        # error, d its error before, n the number of pixels. A drop by x dB is a growth by the factor 10^(x / 10).
+        flat = image.reshape(-1, 3).astype(int).copy()
+        errors = flat - TRUTH_LEVEL
+        mse = float(np.mean(errors**2))
+        target = mse * 10 ** (decibels / 10)
+        gain = np.sort(((errors + 40) ** 2 - errors**2).mean(axis=1) / len(flat))[::-1]
+        count = int(np.searchsorted(np.cumsum(gain), target - mse)) + 1
+        flat[:count] += 40
+        return flat.reshape(image.shape).astype(np.uint8)
+
+    return change
+
+
+TRUTH_LEVEL = 40 + 30  # of the toy's self-reenactment frames, camera a
+
+
+def psnr_of(rows, subject, task):
+    own = rows[(rows["subject"] == subject) & (rows["task"] == task) & (rows["metric"] == "psnr")]
+    return own.groupby("sequence")["value"].mean().mean()
+
+
+def test_an_unchanged_run_passes(run, baseline, capsys):
+    assert gate(run, baseline) == 0
+    assert "nothing got worse (6 pass)" in capsys.readouterr().out
+
+
+def test_a_run_worse_by_0_3_db_fails_naming_metric_subject_and_size(run, baseline, remeasured, capsys):
+    before = psnr_of(read_rows(RunFolder(run).rows), "subject2", "self_reenactment")
+    rows = remeasured("subject2", "self_reenactment", worse_by(0.3))
+    loss = before - psnr_of(rows, "subject2", "self_reenactment")
+    assert 0.3 <= loss < 0.5  # by whole pixels of a tiny image
+    assert gate(run, baseline) == 1
+    out = capsys.readouterr().out
+    assert "1 regressed, 5 pass" in out
+    assert "psnr of toy, subject subject2, self_reenactment: regressed" in out
+    assert f"{-loss:.3f} dB" in out
+
+
+def test_a_noise_level_change_passes(run, baseline, remeasured, capsys):
+    before = read_rows(RunFolder(run).rows)
+
+    def change(image):
+        image[0, 0, 0] += 1  # one channel of one pixel by one level
+        return image
+
+    rows = remeasured("subject2", "self_reenactment", change)
+    assert not rows.equals(before)
+    assert gate(run, baseline) == 0
+    assert "6 pass" in capsys.readouterr().out
+
+
+def test_an_improvement_passes_and_says_how_to_keep_it(run, baseline, remeasured, capsys):
+    remeasured("subject1", "novel_view", lambda image: np.full_like(image, 50))
+    assert gate(run, baseline) == 0
+    out = capsys.readouterr().out
+    assert "1 improved, 5 pass" in out
+    assert "--update" in out
+    assert gate(run, baseline, "--update") == 0
+    capsys.readouterr()
+    assert gate(run, baseline) == 0
+    assert "6 pass" in capsys.readouterr().out
+
+
+def test_a_missing_subject_is_code_3(run, baseline, capsys):
+    folder = RunFolder(run)
+    rows = read_rows(folder.rows)
+    write_rows(folder.rows, rows[rows["subject"] != "subject2"])
+    assert gate(run, baseline) == 3
+    out = capsys.readouterr().out
+    assert "3 missing, 3 pass" in out
+    assert "subject subject2" in out
+
+
+def test_a_regression_beside_something_missing_is_code_3_and_both_are_told(run, baseline, remeasured, capsys):
+    remeasured("subject1", "novel_view", lambda image: image + 20)
+    folder = RunFolder(run)
+    rows = read_rows(folder.rows)
+    write_rows(folder.rows, rows[rows["subject"] != "subject2"])
+    assert gate(run, baseline) == 3
+    assert "3 missing, 1 regressed" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("spoil", "why"),
+    [
+        (lambda rows: rows.iloc[1:], "values, 3 expected"),
+        (
+            lambda rows: rows.assign(status=["failed", *rows["status"][1:]], reason="no gold"),
+            "failed: no gold",
+        ),
+        (lambda rows: rows.assign(value=[math.inf, *rows["value"][1:]]), "not finite"),
+        (lambda rows: pd.concat([rows, rows.iloc[:1]]), "measured twice"),
+    ],
+)
+def test_rows_with_holes_give_no_number(run, baseline, spoil, why, capsys):
+    folder = RunFolder(run)
+    write_rows(folder.rows, spoil(read_rows(folder.rows)))
+    assert gate(run, baseline) == 3
+    assert why in capsys.readouterr().out
+    assert gate(run, baseline, "--update") == 3  # a baseline with holes would hide them
+
+
+def test_another_protocol_is_code_3_not_a_comparison(run, baseline, config, capsys):
+    runner.run(dataclasses.replace(config, frames_per_task=1))
+    assert gate(run, baseline) == 3
+    assert "other frames or settings" in capsys.readouterr().out
+
+
+def test_remade_captures_compare_where_the_baseline_says_so(run, baseline, config, toy, monkeypatch, capsys):
+    remade = toy.ToyClip
+
+    def read(path):
+        clip = remade(path)
+        clip.fingerprint = f"remade-{clip.subject}"
+        return clip
+
+    monkeypatch.setattr(toy, "read", read)
+    other = dataclasses.replace(config, out=config.out + "-other")
+    runner.run(other)
+    assert gate(other.out, baseline) == 3
+    assert "other captures" in capsys.readouterr().out
+    assert gate(run, baseline, "--update", "--captures", "remade") == 0
+    assert gate(other.out, baseline) == 0
+    assert "made anew" in capsys.readouterr().out
+
+
+def test_speed_is_judged_on_its_own_machine_alone(run, baseline, capsys):
+    record = read_json(baseline)
+    record["tolerances"]["files"]["machine_bound"] = True
+    record["values"] = {k: v - 100 if k.endswith("files") else v for k, v in record["values"].items()}
+    write_json(baseline, record)
+    assert gate(run, baseline) == 1  # more files than before, on this machine
+    record["environment"]["processor"] = "abacus"
+    write_json(baseline, record)
+    assert gate(run, baseline) == 0
+    out = capsys.readouterr().out
+    assert "2 unjudged, 4 pass" in out
+    assert "Environment changed: processor: abacus to" in out
+
+
+def test_a_new_number_is_told_and_passes(run, baseline, capsys):
+    record = read_json(baseline)
+    record["values"] = {k: v for k, v in record["values"].items() if "/subject1/" in k}
+    write_json(baseline, record)
+    assert gate(run, baseline) == 0
+    assert "3 new, 3 pass" in capsys.readouterr().out
+
+
+def test_junit_and_markdown_say_the_same(run, baseline, remeasured, tmp_path, capsys):
+    remeasured("subject2", "self_reenactment", lambda image: image + 20)
+    junit, markdown = tmp_path / "gate.xml", tmp_path / "gate.md"
+    assert gate(run, baseline, "--junit", str(junit), "--markdown", str(markdown)) == 1
+    suites = {suite.get("name"): suite for suite in ElementTree.parse(junit).getroot()}
+    assert {name: (s.get("tests"), s.get("failures")) for name, s in suites.items()} == {
+        "self_reenactment": ("2", "1"),
+        "novel_view": ("2", "0"),
+        "avatar": ("2", "0"),
+    }
+    failed = suites["self_reenactment"].find("testcase/failure/..")
+    assert failed.get("name") == "psnr full subject subject2"
+    assert failed.get("classname") == "self_reenactment.toy"
+    text = markdown.read_text()
+    assert text.startswith("### Gate: regressed (1 regressed, 5 pass)")
+    assert "| regressed | self\\_reenactment | toy | subject2 | psnr (dB) |" in text
+    assert "<details><summary>5 passed</summary>" in text
+
+
+def test_results_that_are_none_are_code_3_and_leave_no_stale_report(run, baseline, tmp_path, capsys):
+    junit = tmp_path / "gate.xml"
+    assert gate(run, baseline, "--junit", str(junit)) == 0
+    assert gate(tmp_path / "nowhere", baseline, "--junit", str(junit)) == 3
+    assert not junit.exists()
+    assert gate(run, tmp_path / "no-baseline.json") == 3
+    RunFolder(run).write_manifest({**RunFolder(run).read_manifest(), "status": "started"})
+    assert gate(run, baseline) == 3
+    assert "Start the run again" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        (lambda r: r.update(format=9), "format"),
+        (lambda r: r.pop("values"), "values"),
+        (lambda r: r["values"].update({"a/b": 1.0}), "task/method/subject/region/metric"),
+        (lambda r: r["values"].update({"a/b/c/d/psnr": math.nan}), "a finite number"),
+        (lambda r: r["values"].update({"a/b/c/d/unheard": 1.0}), "an entry 'unheard'"),
+        (lambda r: r["tolerances"]["psnr"].update(absolute=-1.0), "a finite number from 0"),
+        (lambda r: r["tolerances"]["psnr"].update(absolut=1.0), "Did you mean 'absolute'"),
+        (lambda r: r.update(captures="some"), "captures"),
+        (lambda r: r.update(protocols=[]), "protocols"),
+    ],
+)
+def test_a_baseline_that_makes_no_sense_is_code_3_naming_what(run, baseline, change, match, capsys):
+    record = read_json(baseline)
+    change(record)
+    baseline.write_text(json.dumps(record))
+    assert gate(run, baseline) == 3
+    assert match in capsys.readouterr().out
+
+
+def test_wrong_usage_is_code_2(run, baseline, capsys):
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["gate", str(run)])
+    assert stop.value.code == 2
+    with pytest.raises(SystemExit) as stop:
+        gate(run, baseline, "--captures", "remade")
+    assert stop.value.code == 2
+
+
+def test_update_keeps_tolerances_that_were_set_by_hand(run, baseline):
+    record = read_json(baseline)
+    assert record["tolerances"]["psnr"] == {
+        "higher_is_better": True,
+        "absolute": 0.1,
+        "relative": 0.0,
+        "machine_bound": False,
+        "unit": "dB",
+        "digits": 2,
+    }
+    record["tolerances"]["psnr"]["absolute"] = 0.02
+    write_json(baseline, record)
+    assert gate(run, baseline, "--update") == 0
+    assert read_json(baseline)["tolerances"]["psnr"]["absolute"] == 0.02
