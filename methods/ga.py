@@ -35,6 +35,7 @@ from .configs import GAConfig
 from .ga_files import PLY_FILE, read_ga_splats, write_ga_splats
 from .seeds import torch_generator
 from .sh import initial_coefficients, sh_to_rgb
+from .stored_splats import Carrier, HarmonicColors
 from .subject_mesh import BoundedCache, SubjectMesh
 from .training.loop import CHECKPOINT, check_budget
 from .training.optimiser import Optimiser
@@ -134,8 +135,10 @@ class GAAvatar:
         refined: RefinedTracking | None,
         device: str,
     ):
-        self._folder, self._mesh, self._splats, self._binding = folder, mesh, splats, binding
+        self._folder, self._mesh, self._splats = folder, mesh, splats
         self._refined, self._device = refined, device
+        self._carry = Carrier(binding, splats["log_scales"], splats["quats"])
+        self._shade = HarmonicColors(splats["sh_dc"], splats["sh_rest"])
 
     @classmethod
     def read(cls, folder: Path, device: str) -> GAAvatar:
@@ -199,14 +202,13 @@ class GAAvatar:
 
     def _world(self, frames: Frames) -> WorldSplats:
         s = self._splats
-        return to_world(frames, self._binding, s["means"], s["log_scales"], s["quats"])
+        return self._carry(frames, s["means"], s["log_scales"], s["quats"])
 
     def _opacities(self) -> Tensor:
         return torch.sigmoid(self._splats["opacities"])
 
     def _colors(self, world: WorldSplats, view: View) -> Tensor:
-        directions = torch.nn.functional.normalize(world.means - view.center, dim=1)
-        return sh_to_rgb(self._splats["sh_dc"], self._splats["sh_rest"], directions, STORED_DEGREE)
+        return self._shade(world.means, view.center)
 
 
 class GA:

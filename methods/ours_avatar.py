@@ -12,17 +12,17 @@ from torch import Tensor
 
 from ..bench.contracts import Camera, Frame, HeadPose, no_stage
 from .avatar_files import HEAD_FILE, SUBJECT_FILE, Subject, read_shared_head, read_subject
-from .binding import NORMAL, WorldSplats, to_world
+from .binding import NORMAL, WorldSplats
 from .bound_avatar import Drawn, PosedSplats, draw_splats, posed_splats, read_back
 from .bound_training import view_of
 from .compact.file import COMPACT_FILE, read_compact
 from .dynamics import LocalSplats, apply_offsets, changed_colors
 from .known_poses import KnownPoses, pose_key
 from .ours_appearance import driving_coefficients
-from .ours_field import Box, CanonicalFrames, canonical_directions, plane_features, position_part
+from .ours_field import Box, CanonicalFrames, plane_features, position_part
 from .ours_inference import LineOffsets, Placed, PlaneColors, Posed
 from .ours_storage import FIELD_FILE, SPLAT_WIDTHS, Field, read_field
-from .sh import sh_degree, sh_to_rgb
+from .stored_splats import Carrier, HarmonicColors
 from .subject_mesh import SubjectMesh
 
 
@@ -47,7 +47,8 @@ class OursAvatar:
     subject, field : whom it shows, and what its file holds.
     mesh : the subject's.
     neutral : the splats before an expression changes them.
-    line_offsets, plane_colors : what the lines and planes give; None where there are none.
+    line_offsets : what the lines give; None where there are none.
+    colors : what the planes, or spherical harmonics, give.
     """
 
     def __init__(
@@ -64,12 +65,15 @@ class OursAvatar:
         self._binding = columns["binding"][:, 0].to(torch.int64)
         self._canonical = CanonicalFrames.of(mesh.frames(mesh.canonical))
         positions = self._canonical.positions(self._binding, self.neutral.means)
-        self.plane_colors: PlaneColors | None = None
+        self._carry = Carrier(self._binding, self.neutral.log_scales, self.neutral.quats)
+        self.colors: PlaneColors | HarmonicColors
         self.line_offsets: LineOffsets | None = None
         if "sh_dc" not in tensors:
             features = plane_features(tensors, Box(*tensors["plane_box"]), positions)
             weights = tensors["color_weight_0"], tensors["color_weight_1"]
-            self.plane_colors = PlaneColors(*weights, position_part(tensors, features))
+            self.colors = PlaneColors(*weights, position_part(tensors, features))
+        else:
+            self.colors = HarmonicColors(tensors["sh_dc"], tensors["sh_rest"])
         if "lines" in tensors:
             self.line_offsets = LineOffsets(tensors, positions)
         self._jaw_bases = tensors["jaw_bases"].cpu().numpy().astype(np.float64)
@@ -144,7 +148,8 @@ class OursAvatar:
 
         @torch.no_grad()
         def radiance(direction: Tensor) -> Tensor:
-            return self._shaded(splats, self._canonical_direction(posed.turns, direction))
+            along = -self._canonical_direction(posed.turns, direction)
+            return changed_colors(self.colors.along(along), splats)
 
         return SeenFrom(posed.frames.rotation[:, :, NORMAL].index_select(0, self._binding), radiance)
 
@@ -182,7 +187,7 @@ class OursAvatar:
             posed = self._known(pose)
             driven("drive")
             splats = self._changed(posed)
-            world = to_world(posed.frames, self._binding, splats.means, splats.log_scales, splats.quats)
+            world = self._carry(posed.frames, splats.means, splats.log_scales, splats.quats)
             self._last = key, Placed(splats, world, posed.turns)
         return self._last[1]
 
@@ -197,12 +202,4 @@ class OursAvatar:
         return turned.index_select(0, self._binding)
 
     def _colors(self, splats: LocalSplats, world: WorldSplats, turns: Tensor, center: Tensor) -> Tensor:
-        return self._shaded(splats, canonical_directions(turns, self._binding, world.means, center))
-
-    def _shaded(self, splats: LocalSplats, directions: Tensor) -> Tensor:
-        if self.plane_colors is not None:
-            colors = self.plane_colors(directions)
-        else:
-            dc, rest = self.field.tensors["sh_dc"], self.field.tensors["sh_rest"]
-            colors = sh_to_rgb(dc, rest, -directions, sh_degree(rest))
-        return changed_colors(colors, splats)
+        return changed_colors(self.colors(world.means, center, turns, self._binding), splats)

@@ -18,11 +18,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from . import avatar_kernel
 from .binding import Frames, WorldSplats
 from .dynamics import LocalSplats
-from .feature_lines import LinePosition, blend_lines, line_position, line_table, normalised_weight
+from .feature_lines import AXES, LinePosition, blend_lines, line_position, line_table, normalised_weight
 from .networks import CPU_BLOCK
-from .ours_field import Box
+from .ours_field import Box, canonical_directions
 from .row_sums import sum_rows
 from .sh import C0
 from .triplane import ENCODING_SIZE, FREQUENCIES
@@ -65,36 +66,86 @@ class LineOffsets:
     def __init__(self, tensors: Mapping[str, Tensor], positions: Tensor):
         self._lines, self._count = tensors["lines"], len(positions)
         box = Box(*tensors["line_box"])
-        self.inside = box.contains(positions).nonzero().squeeze(1)
-        unit = box.unit(positions.index_select(0, self.inside))
-        self._position: LinePosition = line_position(unit, self._lines.shape[2])
+        inside = box.contains(positions).nonzero().squeeze(1)
+        unit = box.unit(positions.index_select(0, inside))
+        position = line_position(unit, self._lines.shape[2])
+        # Neighbours on the lines beside each other: they read the same rows, and turn the same units on.
+        order = _lexicographic(position.rows[:, :AXES], self._lines.shape[2])
+        self.inside = inside[order]
+        self._position = LinePosition(*(part[order] for part in position))
         self._first, self._first_bias = normalised_weight(tensors, 0), tensors["line_bias_0"]
         # Transposed once, as the products below want them.
-        self._layers = [
-            (normalised_weight(tensors, layer).t().contiguous(), tensors[f"line_bias_{layer}"])
-            for layer in (1, 2)
-        ]
+        self._second, self._last = (normalised_weight(tensors, layer).t().contiguous() for layer in (1, 2))
+        self._biases = tensors["line_bias_1"], tensors["line_bias_2"]
+        self._kernel: KernelOffsets | None = None
+        if avatar_kernel.usable(positions):
+            self._kernel = KernelOffsets(self.inside, self._position, self._second, self._last, self._biases)
 
     def __call__(self, expression: Tensor, jaw: Tensor) -> Tensor:
         """(N, D) offsets of all splats for a frame's coefficients."""
+        table = self.table(expression, jaw)
+        out = table.new_empty if len(self.inside) == self._count else table.new_zeros
+        offsets = out(self._count, self._last.shape[1])
+        if self._kernel is not None:
+            self._kernel(offsets, table)
+        else:
+            offsets.index_copy_(0, self.inside, self.by_torch(table))
+        return offsets
+
+    def table(self, expression: Tensor, jaw: Tensor) -> Tensor:
+        """(3 L, H) first layer at the samples of a frame's blended lines."""
         table = line_table(blend_lines(self._lines, expression, jaw), self._first)
         # The two weights of an axis add up to 1, so the bias on the rows of one axis reaches each splat once.
         table[: self._lines.shape[2]] += self._first_bias
-        (second, second_bias), (last, last_bias) = self._layers
+        return table
+
+    def by_torch(self, table: Tensor) -> Tensor:
+        """(M, D) offsets of the splats inside."""
+        second_bias, last_bias = self._biases
         rows, weights = self._position
         inside = table.new_empty(len(rows), len(last_bias))
         # Blocks whose activations stay in cache; one for other devices.
         step = CPU_BLOCK if rows.device.type == "cpu" else max(len(rows), 1)
-        hidden = table.new_empty(min(step, len(rows)), second.shape[1])
+        hidden = table.new_empty(min(step, len(rows)), self._second.shape[1])
         for start in range(0, len(rows), step):
             block = slice(start, min(start + step, len(rows)))
             first = sum_rows(table, rows[block], weights[block]).relu_()
             out = hidden[: len(first)]
-            torch.addmm(second_bias, first, second, out=out).relu_()
-            torch.addmm(last_bias, out, last, out=inside[block])
-        if len(self.inside) == self._count:
-            return inside
-        return inside.new_zeros(self._count, inside.shape[1]).index_copy_(0, self.inside, inside)
+            torch.addmm(second_bias, first, self._second, out=out).relu_()
+            torch.addmm(last_bias, out, self._last, out=inside[block])
+        return inside
+
+
+class KernelOffsets:
+    """The offset network as the kernel reads it, made once."""
+
+    def __init__(
+        self,
+        inside: Tensor,
+        position: LinePosition,
+        second: Tensor,
+        last: Tensor,
+        biases: tuple[Tensor, Tensor],
+    ):
+        rows = position.rows[:, :AXES].to(torch.int32).contiguous()
+        self._splats = inside, rows, position.weights[:, AXES:].contiguous()
+        self._second = avatar_kernel.pad_units(second, 1)
+        self._second_bias = avatar_kernel.pad_units(biases[0], 0)
+        self._last, self._last_bias = avatar_kernel.pad_units(last.t(), 1), biases[1]
+
+    def __call__(self, out: Tensor, table: Tensor) -> None:
+        """Write the offsets of a frame's (3 L, H) table into (N, D) ``out``."""
+        splats, rows, fractions = self._splats
+        avatar_kernel.offsets_into(
+            *(out, splats, table, rows, fractions),
+            *(self._second, self._second_bias, self._last, self._last_bias),
+        )
+
+
+def _lexicographic(rows: Tensor, resolution: int) -> Tensor:
+    """(N,) order of (N, 3) rows by their last number, then the middle one, then the first."""
+    x, y, z = rows.unbind(1)
+    return torch.argsort((z * AXES * resolution + y) * AXES * resolution + x, stable=True)
 
 
 class PlaneColors:
@@ -107,35 +158,40 @@ class PlaneColors:
     """
 
     def __init__(self, first: Tensor, last: Tensor, from_position: Tensor):
-        self.from_position = from_position
-        self._of_direction = first[:, first.shape[1] - ENCODING_SIZE :].t().contiguous()
-        self._last = last.t().contiguous()
-        self._half = last.new_tensor(0.5)
-        self._known: tuple[Tensor, Tensor] | None = None
+        of_direction = first[:, first.shape[1] - ENCODING_SIZE :].t().contiguous()
+        self._fast = avatar_kernel.usable(from_position)
+        if self._fast:
+            from_position, of_direction, last = (
+                avatar_kernel.pad_units(values, 1) for values in (from_position, of_direction, last)
+            )
+        self.from_position, self._of_direction, self._last = from_position, of_direction, last
+        self._known: tuple[Tensor, Tensor, Tensor] | None = None
 
-    def __call__(self, directions: Tensor) -> Tensor:
-        """Colours (N, 3) >= 0 of (N, 3) canonical directions.
+    def __call__(self, means: Tensor, center: Tensor, turns: Tensor, binding: Tensor) -> Tensor:
+        """Colours (N, 3) >= 0 of splats at (N, 3) means as a camera at ``center`` sees them.
 
-        The colours of the last call are kept: where no more than half of the directions differ from that call's, bit
-        for bit, only theirs are computed.
+        Parameters
+        ----------
+        turns : (F, 3, 3) world directions to canonical ones, by triangle.
+        binding : (N,) int64, the triangle of each splat.
+
+        The colours of the last call are kept, and given again for the same tensor of means seen from the same place.
         """
-        if self._known is None:
-            colors = self.shade(directions)
+        if self._known is not None and self._known[0] is means and torch.equal(self._known[1], center):
+            return self._known[2]
+        if self._fast:
+            network = self.from_position, self._of_direction, self._last
+            colors = avatar_kernel.shade_network(*network, means, center, turns, binding)
         else:
-            changed = (directions != self._known[0]).any(1).nonzero().squeeze(1)
-            if 2 * len(changed) > len(directions):
-                colors = self.shade(directions)
-            else:
-                some = self.shade(directions.index_select(0, changed), changed)
-                colors = self._known[1].index_copy(0, changed, some)
-        self._known = directions, colors
+            colors = self.along(-canonical_directions(turns, binding, means, center))
+        self._known = means, center, colors
         return colors
 
-    def shade(self, directions: Tensor, rows: Tensor | None = None) -> Tensor:
-        """The same for some splats (their numbers) or all, whatever is known."""
-        known = self.from_position if rows is None else self.from_position.index_select(0, rows)
-        hidden = torch.addmm(known, encode_columns(directions).t(), self._of_direction).relu_()
-        return torch.addmm(self._half, hidden, self._last, alpha=C0).relu_()
+    def along(self, directions: Tensor) -> Tensor:
+        """Colours (N, 3) >= 0 along (N, 3) canonical unit vectors from the camera to the splats."""
+        encoded = encode_columns(-directions).t()
+        hidden = torch.addmm(self.from_position, encoded, self._of_direction).relu_()
+        return torch.addmm(hidden.new_tensor(0.5), hidden, self._last.t(), alpha=C0).relu_()
 
 
 def encode_columns(directions: Tensor) -> Tensor:

@@ -21,9 +21,18 @@ from ..feature_lines import LinePosition, blend_lines, line_offsets, line_positi
 from ..networks import offset_network
 from ..ours_appearance import driving_coefficients
 from ..ours_avatar import OursAvatar
-from ..ours_field import Box, CanonicalFrames, canonical_directions, plane_features, shade, shade_directions
+from ..ours_field import (
+    Box,
+    CanonicalFrames,
+    canonical_directions,
+    plane_features,
+    position_part,
+    shade,
+    shade_directions,
+)
 from ..row_sums import sum_rows
 from ..splats.benchmark.timing import take_turns
+from ..stored_splats import Carrier
 from .untrained import cameras_around, random_poses, untrained_avatar
 
 Run = Callable[[], Any]
@@ -66,8 +75,10 @@ class Bench:
         yield self._blended()
         yield self._lines()
         yield self._outside()
+        yield self._units()
         yield self._folded()
-        yield self._waves()
+        yield self._network()
+        yield self._carried()
 
     def stages(self) -> list[tuple[str, float]]:
         """Milliseconds of the steps of one frame."""
@@ -148,9 +159,24 @@ class Bench:
             "planes folded into the first colour layer", parts.colors_by_planes, parts.colors_direct
         )
 
-    def _waves(self) -> Pair:
+    def _units(self) -> Pair:
         parts = _Parts(self.avatar, self.poses[0], self.cameras[0])
-        return self._pair("waves of directions by doubling", parts.colors_direct, parts.colors)
+        return self._pair(
+            "offset network in one pass, without units that are off",
+            parts.offsets_by_torch,
+            parts.offsets,
+            f"{parts.units_on():.0%} on",
+        )
+
+    def _network(self) -> Pair:
+        parts = _Parts(self.avatar, self.poses[0], self.cameras[0])
+        return self._pair(
+            "colour network in one pass, directions included", parts.colors_direct, parts.colors
+        )
+
+    def _carried(self) -> Pair:
+        parts = _Parts(self.avatar, self.poses[0], self.cameras[0])
+        return self._pair("splats to the world in one pass", parts.world_by_torch, parts.world)
 
 
 class _Parts:
@@ -171,13 +197,14 @@ class _Parts:
             self._inside = self._box.contains(self._positions).nonzero().squeeze(1)
             unit = self._box.unit(self._positions.index_select(0, self._inside))
             self._place = line_position(unit, self._tensors["lines"].shape[2])
+            features = plane_features(self._tensors, Box(*self._tensors["plane_box"]), self._positions)
+            self._from_position = position_part(self._tensors, features)
+            splats = avatar.neutral
+            self._carrier = Carrier(self._binding, splats.log_scales, splats.quats)
             self._coefficients = self._driving()
             self._offsets = self.offsets()
             self._splats = self._changed(self._offsets)
             self._world = self.world()
-            self._directions = canonical_directions(
-                self._turns, self._binding, self._world.means, self._view.center
-            )
             self._shown = self.colors()
 
     def mesh(self) -> Tensor:
@@ -189,6 +216,17 @@ class _Parts:
     def offsets(self) -> Tensor:
         assert self._avatar.line_offsets is not None
         return self._avatar.line_offsets(*self._coefficients)
+
+    def offsets_by_torch(self) -> Tensor:
+        """With the first layer on the blended lines, all units of all layers."""
+        assert self._avatar.line_offsets is not None
+        return self._avatar.line_offsets.by_torch(self._avatar.line_offsets.table(*self._coefficients))
+
+    def units_on(self) -> float:
+        """Part of the first layer's units that are on, over all splats inside."""
+        assert self._avatar.line_offsets is not None
+        table = self._avatar.line_offsets.table(*self._coefficients)
+        return float((sum_rows(table, *self._place) > 0).float().mean())
 
     def offsets_by_line(self) -> Tensor:
         """Every line sampled at each splat, and the samples blended there."""
@@ -215,21 +253,27 @@ class _Parts:
 
     def world(self) -> Any:
         splats = self._splats
+        return self._carrier(self._frames, splats.means, splats.log_scales, splats.quats)
+
+    def world_by_torch(self) -> Any:
+        splats = self._splats
         return to_world(self._frames, self._binding, splats.means, splats.log_scales, splats.quats)
 
     def colors(self) -> Tensor:
-        assert self._avatar.plane_colors is not None
-        return self._avatar.plane_colors.shade(self._directions)
+        # A copy of the means: for the same tensor the last colours would be given again.
+        means = self._world.means.view_as(self._world.means)
+        return self._avatar.colors(means, self._view.center, self._turns, self._binding)
 
     def colors_direct(self) -> Tensor:
-        """With the part of the position known, the waves each by its own sine and cosine."""
-        assert self._avatar.plane_colors is not None
-        return shade_directions(self._tensors, self._avatar.plane_colors.from_position, self._directions)
+        """By torch, with the part of the position known."""
+        directions = canonical_directions(self._turns, self._binding, self._world.means, self._view.center)
+        return shade_directions(self._tensors, self._from_position, directions)
 
     def colors_by_planes(self) -> Tensor:
         """Planes sampled and all layers at each splat."""
         features = plane_features(self._tensors, Box(*self._tensors["plane_box"]), self._positions)
-        return shade(self._tensors, features, self._directions)
+        directions = canonical_directions(self._turns, self._binding, self._world.means, self._view.center)
+        return shade(self._tensors, features, directions)
 
     def raster(self) -> Any:
         opacities = torch.sigmoid(self._splats.logits)
@@ -246,8 +290,6 @@ class _Parts:
         offsets = inside.new_zeros(len(self._binding), inside.shape[1]).index_copy(0, self._inside, inside)
         self._splats = self._changed(offsets)
         self._world = self.world()
-        center = self._view.center
-        self._directions = canonical_directions(self._turns, self._binding, self._world.means, center)
         self._shown = self.colors_by_planes()
         return self.raster()
 

@@ -43,32 +43,22 @@ def test_colours_are_those_of_the_whole_network():
     given = directions(200, dtype=torch.float64)
     colors = PlaneColors(first, last, features @ first[:, :13].t())
     expected = shade({"color_weight_0": first, "color_weight_1": last}, (features,), given)
-    np.testing.assert_allclose(colors(given), expected, atol=1e-12)
+    np.testing.assert_allclose(colors.along(-given), expected, atol=1e-12)
 
 
-@pytest.mark.parametrize("changed", [0, 1, 60, 99, 101, 200])
-def test_known_colours_are_used_where_the_direction_is_the_same_and_only_there(changed):
-    first, last, features = planes()
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_colours_are_kept_for_the_same_place_and_no_other(dtype):
+    first, last, features = planes(dtype=dtype)
     colors = PlaneColors(first, last, features @ first[:, :13].t())
-    shaded = []
-    whole = colors.shade
-
-    def watched(given, rows=None):
-        shaded.append(len(given))
-        return whole(given, rows)
-
-    colors.shade = watched
-    before = directions(200, dtype=torch.float64)
-    now = before.clone()
-    now[torch.randperm(200, generator=torch.Generator().manual_seed(2))[:changed], 1] *= -1
-    old = colors(before).clone()
-    found = colors(now)
-    np.testing.assert_allclose(found, whole(now), atol=1e-13)
-    assert shaded[1] == (changed if changed <= 100 else 200)
-    colors(now)
-    assert shaded[2] == 0
-    # And back: what is kept is the last call's, not a mixture.
-    np.testing.assert_allclose(colors(before), old, atol=1e-13)
+    means, center = directions(200, seed=3, dtype=dtype), torch.tensor([0.0, 0, 4], dtype=dtype)
+    turns, binding = torch.eye(3, dtype=dtype)[None], torch.zeros(200, dtype=torch.int64)
+    one = colors(means, center, turns, binding)
+    assert colors(means, center.clone(), turns, binding) is one
+    for moved, place in ((means + 0.5, center), (means, center + 0.5)):
+        expected = colors.along(torch.nn.functional.normalize(moved - place, dim=1))
+        np.testing.assert_allclose(colors(moved, place, turns, binding), expected, atol=1e-5)
+        assert (colors(moved, place, turns, binding) - one).abs().max() > 0.01
+    np.testing.assert_array_equal(colors(means, center, turns, binding), one)
 
 
 def test_offsets_are_those_of_training(clip, tmp_path):
@@ -88,6 +78,9 @@ def test_offsets_are_those_of_training(clip, tmp_path):
     position = line_position(box.unit(points[inside]), tensors["lines"].shape[2])
     np.testing.assert_allclose(found[inside], line_offsets(tensors, blended, position), atol=1e-5)
     assert not found[~inside].any()
+    exact = {name: value.double() for name, value in tensors.items()}
+    slow = LineOffsets(exact, points.double())(expression.double(), jaw.double())
+    np.testing.assert_allclose(found, slow, atol=1e-5)
 
 
 CASES = {

@@ -17,13 +17,20 @@
 #include <utility>
 #include <vector>
 
+#include "avatar_module.h"
 #include "frame.h"
-#include "instruction_sets.h"
 
 namespace nb = nanobind;
 using namespace nb::literals;
 
 namespace headbench {
+
+const Stages& stages_by_name(const std::string& name) {
+  for (const Stages* stages : runnable_stages())
+    if (name == stages->name) return *stages;
+  throw std::invalid_argument("instruction set " + name + " is not available here");
+}
+
 namespace {
 
 template <class T, nb::ssize_t... Shape>
@@ -52,12 +59,6 @@ struct Inputs {
             background.data()};
   }
 };
-
-const Stages& stages_by_name(const std::string& name) {
-  for (const Stages* stages : runnable_stages())
-    if (name == stages->name) return *stages;
-  throw std::invalid_argument("instruction set " + name + " is not available here");
-}
 
 View make_view(const Array<const float, 4, 4>& viewmat, const Array<const float, 3, 3>& K, double near, double far,
                float eps2d, bool antialiased, double alpha_min, double transmittance_min, std::size_t width, std::size_t height) {
@@ -203,7 +204,7 @@ NB_MODULE(_kernel, m) {
   using namespace headbench;
   // A tensor that is alive when the interpreter ends keeps its frame; that is no leak.
   nb::set_leak_warnings(false);
-  m.doc() = "Gaussian splat rasteriser";
+  m.doc() = "Gaussian splat rasteriser, and what avatars compute before it";
   nb::class_<Frame>(m, "Frame", "A drawn frame: what its backward pass needs.")
       .def_prop_ro("stage_seconds", &stage_seconds, "Processor time of the calling thread by stage.")
       .def("work", &work, "means"_a, "quats"_a, "scales"_a, "opacities"_a, "colors"_a, "offset"_a, "background"_a,
@@ -218,5 +219,6 @@ NB_MODULE(_kernel, m) {
         "grad_opacities"_a, "grad_colors"_a, "grad_offset"_a, "grad_background"_a, "grad_viewmat"_a, "grad_K"_a,
         "grad_absolute"_a, "threads"_a,
         "Add the gradients of visible splats; write those of background and camera. An empty grad_absolute asks for none.");
+  bind_avatar(m);
   m.def("instruction_sets", &instruction_sets, "Variants this machine can run, the fastest first.");
 }

@@ -8,6 +8,8 @@
 #include <cstddef>
 #include <cstdint>
 
+#include "avatar.h"
+
 namespace headbench {
 
 // The constants of methods/splats/constants.py.
@@ -143,6 +145,13 @@ struct Stages {
   void (*count_work)(const View&, const Splats&, const FrameData&, int tile, float* scratch, Work& work);
   float (*multiply_add)(std::int64_t rounds);  // `chains` vectors a round
   int chains;
+  // Of avatars, for splats [begin, end).
+  void (*carry)(const Carry&, std::int64_t begin, std::int64_t end);
+  void (*shade)(const Harmonics&, std::int64_t begin, std::int64_t end);
+  std::size_t (*color_scratch)(int hidden);
+  void (*color_network)(const ColorNetwork&, std::int64_t begin, std::int64_t end, float* scratch);
+  std::size_t (*offset_scratch)(int units, int hidden);
+  void (*offset_network)(const OffsetNetwork&, std::int64_t begin, std::int64_t end, float* scratch);
 };
 
 }  // namespace headbench

@@ -3,8 +3,12 @@
 
 #include "backward.h"
 #include "binning.h"
+#include "carry.h"
+#include "color_network.h"
 #include "forward.h"
+#include "harmonics.h"
 #include "measure.h"
+#include "offset_network.h"
 #include "projection_backward.h"
 
 namespace headbench::HEADBENCH_ISA {
@@ -17,6 +21,7 @@ inline std::size_t scratch_floats(int channels) {
 extern const Stages stages;
 const Stages stages = {HEADBENCH_ISA_NAME, W,          project,      find_entries,     scratch_floats,
                        draw_tile,          draw_tile_backward, project_backward, count_work,
-                       multiply_add,       kChains};
+                       multiply_add,       kChains,    carry,        shade,
+                       color_scratch,      color_network, offset_scratch,   offset_network};
 
 }  // namespace headbench::HEADBENCH_ISA

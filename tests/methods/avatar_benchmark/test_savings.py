@@ -20,6 +20,12 @@ def test_both_sides_of_each_pair_give_the_same(bench):
         assert offsets.abs().max() > 0.01
         np.testing.assert_allclose(parts.offsets_by_splat(), offsets, atol=1e-5)
         np.testing.assert_allclose(parts.offsets_by_line(), offsets, atol=1e-5)
+        assert bench.avatar.line_offsets is not None
+        inside = offsets[bench.avatar.line_offsets.inside]
+        np.testing.assert_allclose(parts.offsets_by_torch(), inside, atol=1e-5)
+        assert 0.1 < parts.units_on() < 0.9
+        for one, other in zip(parts.world(), parts.world_by_torch()):
+            np.testing.assert_allclose(one, other, atol=1e-6)
         np.testing.assert_allclose(parts.colors_direct(), parts.colors(), atol=1e-5)
         np.testing.assert_allclose(parts.colors_by_planes(), parts.colors(), atol=1e-5)
         plain = parts.plain()
@@ -32,7 +38,7 @@ def test_every_step_and_saving_is_timed(bench):
     stages = dict(bench.stages())
     assert len(stages) == 6
     pairs = list(bench.pairs())
-    assert len({pair.name for pair in pairs}) == len(pairs) == 9
+    assert len({pair.name for pair in pairs}) == len(pairs) == 11
     assert all(ms > 0 for ms in stages.values())
     assert all(pair.before > 0 < pair.after for pair in pairs)
     # What takes a hundredth of the multiplications is faster even at this size.

@@ -1,0 +1,159 @@
+// What avatars compute of a pose, as functions of the Python module: splats are dealt out to threads, no two of which
+// write to one place, so that results are equal bit for bit for any number of them.
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/string.h>
+
+#include <algorithm>
+#include <stdexcept>
+#include <string>
+
+#include "avatar_module.h"
+#include "frame.h"
+#include "thread_pool.h"
+
+namespace nb = nanobind;
+using namespace nb::literals;
+
+namespace headbench {
+namespace {
+
+template <class T, nb::ssize_t... Shape>
+using Array = nb::ndarray<T, nb::shape<Shape...>, nb::c_contig, nb::device::cpu>;
+
+constexpr std::int64_t kSplatsPerTask = 1024;
+static_assert(kSplatsPerTask % kHarmonicsBlock == 0);
+
+// Shapes are checked in Python; this only keeps memory safe.
+void require(bool fit) {
+  if (!fit) throw std::invalid_argument("arrays do not fit together");
+}
+
+template <class T>
+bool below(const T* values, std::size_t count, std::size_t limit) {
+  bool all = true;
+  for (std::size_t i = 0; i < count; ++i) all &= values[i] >= 0 && static_cast<std::size_t>(values[i]) < limit;
+  return all;
+}
+
+template <class Body>
+void for_splats(std::size_t count, int threads, const Body& body) {
+  const std::int64_t splats = static_cast<std::int64_t>(count);
+  ThreadPool::instance().run((splats + kSplatsPerTask - 1) / kSplatsPerTask, std::max(threads, 1),
+                             [&](std::int64_t task, int worker) {
+                               const std::int64_t begin = task * kSplatsPerTask;
+                               body(begin, std::min(begin + kSplatsPerTask, splats), worker);
+                             });
+}
+
+// Memory of each worker's own.
+class Scratch {
+ public:
+  Scratch(std::size_t floats, int threads) : stride_((floats + 15) / 16 * 16) {
+    memory_.resize(stride_ * static_cast<std::size_t>(std::max(threads, 1)));
+  }
+  float* of(int worker) const { return memory_.data() + stride_ * static_cast<std::size_t>(worker); }
+
+ private:
+  std::size_t stride_;
+  Buffer<float> memory_;
+};
+
+void carry(const Array<const std::int64_t, -1>& binding, const Array<const float, -1, 3, 3>& rotations,
+           const Array<const float, -1, 3>& centers, const Array<const float, -1>& sizes,
+           const Array<const float, -1, 4>& quaternions, const Array<const float, -1, 3>& means,
+           const Array<const float, -1, 4>& quats, const Array<const float, -1, 3>& scales,
+           const Array<float, -1, 3>& world_means, const Array<float, -1, 4>& world_quats,
+           const Array<float, -1, 3>& world_scales, const std::string& instruction_set, int threads) {
+  const std::size_t count = binding.shape(0), triangles = sizes.shape(0);
+  require(rotations.shape(0) == triangles && centers.shape(0) == triangles && quaternions.shape(0) == triangles);
+  require(means.shape(0) == count && quats.shape(0) == count && scales.shape(0) == count);
+  require(world_means.shape(0) == count && world_quats.shape(0) == count && world_scales.shape(0) == count);
+  require(below(binding.data(), count, triangles));
+  const Carry in{binding.data(), rotations.data(), centers.data(),     sizes.data(),       quaternions.data(),  means.data(),
+                 quats.data(),   scales.data(),    world_means.data(), world_quats.data(), world_scales.data()};
+  const Stages& stages = stages_by_name(instruction_set);
+  nb::gil_scoped_release unlocked;
+  for_splats(count, threads, [&](std::int64_t begin, std::int64_t end, int) { stages.carry(in, begin, end); });
+}
+
+void shade(const Array<const float, -1, 3, -1, kHarmonicsBlock>& coefficients, const Array<const float, -1, 3>& means,
+           const Array<const float, -1, 3, 3>& turns, const Array<const std::int64_t, -1>& binding,
+           const Array<const float, 3>& center, const Array<float, -1, 3>& colors, const std::string& instruction_set,
+           int threads) {
+  const std::size_t count = means.shape(0);
+  Harmonics in{0, coefficients.data(), means.data(), nullptr, nullptr, {}, colors.data()};
+  while (in.degree < kDegreeMax && static_cast<std::size_t>((in.degree + 1) * (in.degree + 1)) < coefficients.shape(2))
+    ++in.degree;
+  require(static_cast<std::size_t>((in.degree + 1) * (in.degree + 1)) == coefficients.shape(2));
+  require(coefficients.shape(0) * kHarmonicsBlock >= count && colors.shape(0) == count);
+  if (turns.shape(0)) {
+    require(binding.shape(0) == count && below(binding.data(), count, turns.shape(0)));
+    in.turns = turns.data();
+    in.binding = binding.data();
+  }
+  for (int k = 0; k < 3; ++k) in.center[k] = center(k);
+  const Stages& stages = stages_by_name(instruction_set);
+  nb::gil_scoped_release unlocked;
+  for_splats(count, threads, [&](std::int64_t begin, std::int64_t end, int) { stages.shade(in, begin, end); });
+}
+
+void color_network(const Array<const float, -1, -1>& positions, const Array<const float, kEncoding, -1>& second,
+                   const Array<const float, 3, -1>& last, const Array<const float, -1, 3>& means,
+                   const Array<const float, -1, 3, 3>& turns, const Array<const std::int64_t, -1>& binding,
+                   const Array<const float, 3>& center, const Array<float, -1, 3>& colors,
+                   const std::string& instruction_set, int threads) {
+  const std::size_t count = means.shape(0), hidden = positions.shape(1);
+  require(hidden % kUnitsStep == 0 && second.shape(1) == hidden && last.shape(1) == hidden);
+  require(positions.shape(0) == count && binding.shape(0) == count && colors.shape(0) == count);
+  require(below(binding.data(), count, turns.shape(0)));
+  ColorNetwork net{static_cast<int>(hidden), positions.data(), second.data(), last.data(),  means.data(),
+                   turns.data(),             binding.data(),   {},            colors.data()};
+  for (int k = 0; k < 3; ++k) net.center[k] = center(k);
+  const Stages& stages = stages_by_name(instruction_set);
+  nb::gil_scoped_release unlocked;
+  const Scratch scratch(stages.color_scratch(net.hidden), threads);
+  for_splats(count, threads, [&](std::int64_t begin, std::int64_t end, int worker) {
+    stages.color_network(net, begin, end, scratch.of(worker));
+  });
+}
+
+void offset_network(const Array<const float, -1, -1>& table, const Array<const std::int32_t, -1, 3>& rows,
+                    const Array<const float, -1, 3>& fractions, const Array<const float, -1, -1>& second,
+                    const Array<const float, -1>& second_bias, const Array<const float, -1, -1>& last,
+                    const Array<const float, -1>& last_bias, const Array<const std::int64_t, -1>& splats,
+                    const Array<float, -1, -1>& offsets, const std::string& instruction_set, int threads) {
+  const std::size_t count = splats.shape(0), units = table.shape(1), hidden = second.shape(1);
+  require(units % kUnitsStep == 0 && hidden % kUnitsStep == 0 && second.shape(0) == units);
+  require(second_bias.shape(0) == hidden && last.shape(1) == hidden && last_bias.shape(0) == last.shape(0));
+  require(rows.shape(0) == count && fractions.shape(0) == count && offsets.shape(1) == last.shape(0));
+  require(count == 0 || table.shape(0) > 1);
+  require(below(rows.data(), 3 * count, table.shape(0) - 1) && below(splats.data(), count, offsets.shape(0)));
+  const OffsetNetwork net{static_cast<int>(units), static_cast<int>(hidden), static_cast<int>(last.shape(0)),
+                          table.data(),            rows.data(),              fractions.data(),
+                          second.data(),           second_bias.data(),       last.data(),
+                          last_bias.data(),        splats.data(),            offsets.data()};
+  const Stages& stages = stages_by_name(instruction_set);
+  nb::gil_scoped_release unlocked;
+  const Scratch scratch(stages.offset_scratch(net.units, net.hidden), threads);
+  for_splats(count, threads, [&](std::int64_t begin, std::int64_t end, int worker) {
+    stages.offset_network(net, begin, end, scratch.of(worker));
+  });
+}
+
+}  // namespace
+
+void bind_avatar(nb::module_& m) {
+  m.def("carry", &carry, "binding"_a, "rotations"_a, "centers"_a, "sizes"_a, "quaternions"_a, "means"_a, "quats"_a,
+        "scales"_a, "world_means"_a, "world_quats"_a, "world_scales"_a, "instruction_set"_a, "threads"_a,
+        "Write the splats' means, quaternions and scales in the world.");
+  m.def("shade", &shade, "coefficients"_a, "means"_a, "turns"_a, "binding"_a, "center"_a, "colors"_a,
+        "instruction_set"_a, "threads"_a, "Write the colours of spherical harmonics; empty turns turn nothing.");
+  m.def("color_network", &color_network, "positions"_a, "second"_a, "last"_a, "means"_a, "turns"_a, "binding"_a,
+        "center"_a, "colors"_a, "instruction_set"_a, "threads"_a, "Write the colours of the colour network.");
+  m.def("offset_network", &offset_network, "table"_a, "rows"_a, "fractions"_a, "second"_a, "second_bias"_a, "last"_a,
+        "last_bias"_a, "splats"_a, "offsets"_a, "instruction_set"_a, "threads"_a,
+        "Write the offsets of the splats named, those of no others.");
+}
+
+}  // namespace headbench
