@@ -87,6 +87,7 @@ def synth(
     seed: int = 0,
     tracking_noise: float = 0.0,
     performance: Literal["full", "expressions", "still"] = "full",
+    dynamics: float = 1.0,
 ) -> int:
     """Render a synthetic multi-view capture in the GaussianAvatars/VHAP layout.
 
@@ -103,6 +104,7 @@ def synth(
         seed: Decides subjects and performances.
         tracking_noise: Noise on the tracked parameters, as a fraction of their standard deviation.
         performance: `expressions` leaves out jaw and tongue, `still` moves only head, neck and eyes.
+        dynamics: Scales what expressions do to skin beyond moving it (wrinkles, blush), 0 to 3.
     """
     RunFolder(Path(out)).prepare()
     with log_to(None), locked(Path(out)):
@@ -117,6 +119,7 @@ def synth(
                 "seed": seed,
                 "tracking_noise": tracking_noise,
                 "performance": performance,
+                "dynamics": dynamics,
             }
         )
     print(out)

@@ -49,6 +49,7 @@ def synthesize(
     tracking_noise: float = 0.0,
     samples_per_pixel: int | None = None,
     performance: Kind = "full",
+    dynamics: float = 1.0,
     workers: int | None = None,
     progress: Progress = no_progress,
 ) -> list[Path]:
@@ -66,6 +67,7 @@ def synthesize(
     samples_per_pixel : rounded up to a count that the sampler takes; by default enough for 40 dB between two
         renders of a frame.
     performance : see `performance.Kind`; with less than all of it, captures for which less has to be modelled.
+    dynamics : scales wrinkles and blush, 0 to 3: 0 leaves skin as it is at rest, wherever it moves.
     workers : processes that render; by default as many as there are cores, or one where there is little to do.
 
     Raises
@@ -76,7 +78,7 @@ def synthesize(
     samples = default_samples(*size) if samples_per_pixel is None else sample_count(samples_per_pixel)
     pixels = (size[0], size[1])
     settings = Settings(
-        subjects, cameras, timesteps, pixels, head, seed, tracking_noise, samples, performance
+        subjects, cameras, timesteps, pixels, head, seed, tracking_noise, samples, performance, dynamics
     )
     _check(settings)
     geometry = load_geometry(head)
@@ -160,6 +162,8 @@ def _check(settings: Settings) -> None:
         )
     if settings.performance not in KINDS:
         raise InputError("--performance", "", f"one of {', '.join(KINDS)}", repr(settings.performance))
+    if not 0.0 <= settings.dynamics <= 3.0:
+        raise InputError("--dynamics", "", "0 to 3", str(settings.dynamics))
     share_out(settings.timesteps)
     if min(settings.size) < 16:
         raise InputError("--size", "", "at least 16 pixels each way", "x".join(map(str, settings.size)))

@@ -27,7 +27,8 @@ def linear(color: str | FloatArray) -> FloatArray:
 class Person:
     """Traits of one subject. Colours are linear-light RGB.
 
-    ``freckles``, ``stubble`` and ``lines`` (how strongly skin folds and colours) are in [0, 1]-ish shares.
+    ``freckles``, ``stubble`` and ``lines`` (how strongly skin folds) are in [0, 1]-ish shares; ``dynamics`` scales all
+    that expressions do to skin beyond moving it: 0 for nothing, 1 as drawn.
     """
 
     name: str
@@ -41,9 +42,10 @@ class Person:
     freckles: float
     stubble: float
     lines: float
+    dynamics: float = 1.0
 
 
-def person(name: str, index: int, seed: int) -> Person:
+def person(name: str, index: int, seed: int, dynamics: float = 1.0) -> Person:
     """Draw subject number ``index`` of a capture made with ``seed``.
 
     Tones and hair styles walk through their lists, so that a few subjects already differ; the rest is drawn.
@@ -68,4 +70,5 @@ def person(name: str, index: int, seed: int) -> Person:
         freckles=float(rng.choice([0.0, 0.3, 1.0])) if tone < 3 else 0.0,
         stubble=float(rng.choice([0.0, 0.5, 1.0])),
         lines=float(rng.uniform(0.85, 1.25)),
+        dynamics=dynamics,
     )

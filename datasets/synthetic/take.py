@@ -43,12 +43,14 @@ class Settings:
     tracking_noise: float
     samples_per_pixel: int
     performance: Kind = "full"
+    dynamics: float = 1.0
 
     def described(self) -> dict[str, Any]:
-        """The settings for records, as they were before there was a choice of performance where it is full."""
+        """The settings for records; those that came later are left out where they have their default."""
         described = asdict(self)
-        if self.performance == "full":
-            del described["performance"]
+        for name, usual in (("performance", "full"), ("dynamics", 1.0)):
+            if described[name] == usual:
+                del described[name]
         return described
 
 
@@ -80,7 +82,7 @@ class Take:
 def plan_take(out: Path, index: int, geometry: Geometry, settings: Settings) -> Take:
     """Plan subject number ``index``: nothing is rendered or written."""
     name = f"{FIRST_SUBJECT + index}"
-    who = person(name, index, settings.seed)
+    who = person(name, index, settings.seed, settings.dynamics)
     rng = np.random.default_rng([settings.seed, index, 3])
     head = geometry.head
     shape = rng.standard_normal(head.shape_basis.shape[2]) * _IDENTITY_SPREAD

@@ -111,11 +111,13 @@ def make_folds(
     """
     sketch = _Sketch(person, anatomy, points)
     groups = sketch.groups()
-    height = np.stack([groups[name][0] for name in _FOLDS]) * person.lines
-    shade = np.stack([groups[name][1] for name in _FOLDS]) * np.minimum(person.lines, 1.15)
+    height = np.stack([groups[name][0] for name in _FOLDS]) * (person.lines * person.dynamics)
+    shade = np.stack([groups[name][1] for name in _FOLDS]) * (
+        np.minimum(person.lines, 1.15) * person.dynamics
+    )
     keep = (1.0 - 0.9 * lips) * bare
     keep_lip_lines = np.where(np.array([name == "lip_lines" for name in _FOLDS])[:, None], 1.0, keep)
-    flush = np.stack([sketch.flush(name, lips) for name in _FLUSHES]) * bare
+    flush = np.stack([sketch.flush(name, lips) for name in _FLUSHES]) * (bare * person.dynamics)
     tint = np.array(list(_FLUSHES.values()))
     return Folds(height * keep_lip_lines, shade * keep_lip_lines, flush, tint)
 

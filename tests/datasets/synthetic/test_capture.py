@@ -87,6 +87,8 @@ def test_foreign_folder_is_refused(tmp_path):
         {"tracking_noise": -0.1},
         {"subjects": 0},
         {"performance": "asleep"},
+        {"dynamics": -0.5},
+        {"dynamics": float("nan")},
     ],
 )
 def test_bad_settings_are_refused_before_anything_is_written(tmp_path, change):

@@ -8,6 +8,7 @@ import pytest
 
 from headbench.datasets.synthetic.controls import CONTROLS, EXPRESSION_CONTROLS
 from headbench.datasets.synthetic.likeness import Likeness
+from headbench.datasets.synthetic.wrinkles import make_folds
 
 
 def test_tracked_vertices_lie_on_the_skin_that_is_rendered(take, likeness, rest):
@@ -95,3 +96,22 @@ def test_other_person_looks_different_on_the_same_head(take, likeness):
 def test_controls_are_complete_and_distinct():
     assert len(set(CONTROLS)) == len(CONTROLS)
     assert set(EXPRESSION_CONTROLS) < set(CONTROLS)
+
+
+def test_dynamics_scale_what_expressions_do_to_skin_beyond_moving_it(take, likeness, rest):
+    """Folds and logarithms of colour factors are proportional to it; at 0 skin stays as it is."""
+    points = likeness._rest_points[::50]
+    lips = np.linspace(0.0, 1.0, len(points))
+
+    def change(factor):
+        person = replace(take.person, dynamics=factor)
+        folds = make_folds(person, likeness.anatomy, points, lips, np.ones(len(points)))
+        lift, albedo = folds.apply({**rest, "brow_inner_up": 0.4}, np.full((len(points), 3), 0.1))
+        return lift, np.log(albedo / 0.1)
+
+    still, once, twice = change(0.0), change(1.0), change(2.0)
+    assert all(np.abs(part).max() < 1e-12 for part in still)
+    np.testing.assert_allclose(twice[0], 2 * once[0], atol=1e-15)
+    flushed = (once[1] > 0.02).all(1)  # paler: blood alone, no shade of folds
+    assert flushed.sum() > 20
+    np.testing.assert_allclose(twice[1][flushed], 2 * once[1][flushed], rtol=0.01)
