@@ -15,7 +15,7 @@ from ..bench.contracts import Budget, Camera, Clip, FrameKey, Progress
 from .binding import Frames, WorldSplats
 from .configs import SplatTraining
 from .splats import rasterize
-from .training.densify import Densifier, logit
+from .training.densify import Densifier
 from .training.images import TrainingImages
 from .training.loop import Outcome, train
 from .training.losses import photometric_loss, position_penalty, scale_penalty
@@ -75,10 +75,32 @@ class Appearance(Protocol):
         """Splats in the world with their colours and opacities as this camera sees them."""
 
 
+class Start(NamedTuple):
+    """Where training begins: splats of their triangle's size.
+
+    Attributes
+    ----------
+    binding : (N,) int64, the triangle of each; every triangle once at least.
+    means : (N, 3) in the triangles' frames, units of the triangle's size.
+    opacities : (N,) in (0, 1).
+    """
+
+    binding: Tensor
+    means: Tensor
+    opacities: Tensor
+
+
+def one_per_triangle(face_count: int, opacity: float, device: str) -> Start:
+    """The published start: a splat at the centroid of each triangle."""
+    means = torch.zeros(face_count, 3, device=device)
+    opacities = torch.full((face_count,), opacity, device=device)
+    return Start(torch.arange(face_count, device=device), means, opacities)
+
+
 class BoundTraining:
     """A `Trainable`: splats on the triangles of a mesh, seen in the training images of a clip.
 
-    One splat per triangle at the start, of the triangle's size, at its centroid.
+    ``start`` holds each of the ``face_count`` triangles at least once; None: `one_per_triangle`.
     """
 
     def __init__(
@@ -90,6 +112,8 @@ class BoundTraining:
         face_count: int,
         device: str,
         seed: int,
+        *,
+        start: Start | None = None,
     ):
         self._settings, self._appearance, self._seed = settings, appearance, seed
         self.keys: Sequence[FrameKey] = clip.splits["train"]
@@ -99,8 +123,9 @@ class BoundTraining:
         self._background = torch.as_tensor(np.asarray(clip.background), dtype=torch.float32, device=device)
         self.extent = scene_extent(cameras)
 
-        geometry = _initial_geometry(face_count, settings, self.extent, device)
-        own = appearance.splat_parameters(face_count)
+        start = start or one_per_triangle(face_count, settings.initial_opacity, device)
+        geometry = _initial_geometry(start, settings, self.extent)
+        own = appearance.splat_parameters(len(start.binding))
         shared = appearance.parameters()
         self.splat_names = (*geometry, *own)
         initial = {**geometry, **own, **shared}
@@ -109,9 +134,8 @@ class BoundTraining:
             {name: rate for name, (_, rate) in initial.items()},
         )
         self._rates = {name: rate for name, (_, rate) in initial.items() if name != "means"}
-        binding = torch.arange(face_count, device=device)
         self._densifier = Densifier(
-            settings, self._optimiser, self.splat_names, binding, face_count, self.extent, seed
+            settings, self._optimiser, self.splat_names, start.binding, face_count, self.extent, seed
         )
 
     @property
@@ -200,6 +224,7 @@ def run_bound_training(
     sampler: Sampler,
     face_count: int,
     *,
+    start: Start | None = None,
     budget: Budget,
     folder: Path,
     run: str,
@@ -208,7 +233,7 @@ def run_bound_training(
     progress: Progress,
 ) -> tuple[BoundTraining, Outcome]:
     """Train splats bound to a mesh of ``face_count`` triangles; arguments as those of `training.loop.train`."""
-    training = BoundTraining(clip, settings, appearance, sampler, face_count, device, seed)
+    training = BoundTraining(clip, settings, appearance, sampler, face_count, device, seed, start=start)
     try:
         outcome = train(
             training,
@@ -249,14 +274,13 @@ def view_of(camera: Camera, device: str) -> View:
 
 
 def _initial_geometry(
-    count: int, settings: SplatTraining, extent: float, device: str
+    start: Start, settings: SplatTraining, extent: float
 ) -> dict[str, tuple[Tensor, float]]:
-    quats = torch.zeros(count, 4, device=device)
+    quats = start.means.new_zeros(len(start.means), 4)
     quats[:, 0] = 1
-    opacities = torch.full((count,), logit(settings.initial_opacity), device=device)
     return {
-        "means": (torch.zeros(count, 3, device=device), settings.position_lr * extent),
-        "log_scales": (torch.zeros(count, 3, device=device), settings.scale_lr),
+        "means": (start.means, settings.position_lr * extent),
+        "log_scales": (torch.zeros_like(start.means), settings.scale_lr),
         "quats": (quats, settings.rotation_lr),
-        "opacities": (opacities, settings.opacity_lr),
+        "opacities": (torch.logit(start.opacities), settings.opacity_lr),
     }

@@ -158,6 +158,10 @@ class OursConfig:
     jaw_compatibility : "" takes jaw bases from training poses, seeded with the identity. "tga" reproduces the
         published code, which draws them from held-out poses: a leak, for comparison with it only.
     penalty : weight of the adaptive truncated opacity penalty; 0 turns it off.
+    shells, shell_gap, shell_opacity : splats more at the start over each face triangle that training expressions
+        move, outwards, metres apart (`shells`); 0 as published.
+    penalty_softness : offsets under which the penalty's |offset| is rounded off to a parabola (Huber 1964), so that
+        it does not chatter around 0 and drown what images say in the optimiser's second moments; 0 as published.
     penalty_face_mm, penalty_other_mm, penalty_other_weight : surface displacement under which opacity may not
         change, in the face region and elsewhere, and the weight elsewhere.
     balanced_sampling, expression_classes : draw images so that each class of expressions has an equal share.
@@ -199,6 +203,10 @@ class OursConfig:
     line_lr: float = 2e-3
     line_mlp_lr: float = 1e-4
     penalty: float = 1.0
+    penalty_softness: float = 0.0
+    shells: int = 0
+    shell_gap: float = 1.5e-3
+    shell_opacity: float = 0.1
     penalty_face_mm: float = 1.0
     penalty_other_mm: float = 2.0
     penalty_other_weight: float = 10.0
@@ -220,8 +228,10 @@ class OursConfig:
             raise ValueError("plane_resolution and line_resolution must be at least 2")
         if min(self.plane_channels) < 1 or self.line_channels < 1 or self.hidden < 1:
             raise ValueError("channel counts must be at least 1")
-        if self.expressions < 0 or self.jaw_bases < 0:
-            raise ValueError("expressions and jaw_bases must not be negative")
+        if self.expressions < 0 or self.jaw_bases < 0 or self.shells < 0 or self.penalty_softness < 0:
+            raise ValueError("expressions, jaw_bases, shells and penalty_softness must not be negative")
+        if not 0 < self.shell_opacity < 1 or not self.shell_gap > 0:
+            raise ValueError("shell_opacity must lie between 0 and 1, shell_gap above 0 metres")
         if not 0 <= self.sh_degree <= 3:
             raise ValueError(f"sh_degree must be 0 to 3, found {self.sh_degree}")
         if not self.dynamic or len(set(self.dynamic)) != len(self.dynamic):

@@ -34,6 +34,7 @@ from .configs import OursConfig
 from .ours_appearance import OursAppearance
 from .ours_avatar import OursAvatar
 from .ours_storage import FIELD_FILE, write_field
+from .shells import shell_start
 from .subject_mesh import SubjectMesh
 from .training.loop import CHECKPOINT, check_budget
 from .training.sampling import Sampler, ShuffledEpochs, Weighted, balanced_weights
@@ -82,6 +83,7 @@ class Ours:
             appearance,
             self._sampler(clip, seed),
             len(mesh.faces),
+            start=shell_start(mesh, clip, config, device),
             budget=budget,
             folder=out,
             run=run,

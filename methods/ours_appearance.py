@@ -121,7 +121,8 @@ class OursAppearance:
             splats = apply_offsets(splats, offsets, self._config.dynamic)
             if self._config.penalty:
                 weights = prepared.penalty.index_select(0, binding)
-                penalty = self._config.penalty * (offsets.abs() * weights[:, None]).mean()
+                size = softened(offsets, self._config.penalty_softness)
+                penalty = self._config.penalty * (size * weights[:, None]).mean()
         world = to_world(frames, binding, splats.means, splats.log_scales, splats.quats)
         directions = canonical_directions(prepared.turns, binding, world.means, view.center)
         if self._config.direction_noise:
@@ -174,6 +175,16 @@ def driving_coefficients(
     if len(bases):
         jaw = jaw_weights(jaw_quaternions([pose]), bases)[0]
     return expression.to(device), torch.as_tensor(jaw, dtype=torch.float32).to(device)
+
+
+def softened(offsets: Tensor, softness: float) -> Tensor:
+    """|offset|, below ``softness`` a parabola that meets it with the same slope (Huber 1964): offset^2 / (2 softness)."""
+    if softness == 0:
+        return offsets.abs()
+    return (
+        torch.nn.functional.huber_loss(offsets, torch.zeros_like(offsets), reduction="none", delta=softness)
+        / softness
+    )
 
 
 def penalty_weights(

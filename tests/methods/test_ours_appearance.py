@@ -8,7 +8,7 @@ import torch
 
 from headbench.datasets.head.regions import faces_in_region
 from headbench.methods.configs import OursConfig
-from headbench.methods.ours_appearance import penalty_weights
+from headbench.methods.ours_appearance import penalty_weights, softened
 
 from .toy_ours import SMALL, make, place
 
@@ -127,3 +127,12 @@ def test_view_directions_waver_in_training_and_only_they(clip):
     # Each of three angles has the deviation asked for: the mean squared angle is three times its square.
     angles = torch.acos(((turns.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2).clamp(-1, 1))
     assert float(angles.square().mean()) == pytest.approx(3 * 0.2**2, rel=0.1)
+
+
+def test_a_softened_penalty_is_the_published_one_but_for_a_parabola_around_nothing():
+    offsets = torch.tensor([-3.0, -0.1, -0.05, 0.0, 0.02, 0.1, 0.5], dtype=torch.float64, requires_grad=True)
+    np.testing.assert_array_equal(softened(offsets, 0.0).detach(), offsets.detach().abs())
+    soft = softened(offsets, 0.1)
+    soft.sum().backward()
+    np.testing.assert_allclose(soft.detach(), [2.95, 0.05, 0.0125, 0.0, 0.002, 0.05, 0.45])
+    np.testing.assert_allclose(offsets.grad, [-1, -1, -0.5, 0, 0.2, 1, 1], atol=1e-12)
