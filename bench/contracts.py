@@ -244,6 +244,17 @@ class Avatar(Protocol):
         """
 
 
+class Variant(NamedTuple):
+    """An avatar that can be derived from a trained one without training, such as one with fewer splats."""
+
+    name: str
+    """Unique among the variants of an avatar, fit for a folder."""
+    summary: str
+    """What is changed."""
+    make: Callable[[Path], Avatar]
+    """Writes its files under a folder and returns the avatar as read back from them."""
+
+
 STAGES = ("drive", "deform", "raster", "post")
 """Stages of a frame, in order: driving signal to mesh and features; mesh to primitives as the camera sees them;
 primitives to image; whatever changes the image afterwards (a decoder, clipping)."""

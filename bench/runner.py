@@ -68,7 +68,7 @@ def _run(
         job.check()
     _warn_of_missing_metrics(metrics, clips[0])
 
-    manifest = {**_manifest(config, methods, metrics, clips, protocols), **record}
+    manifest = {**describe(config, methods, metrics, clips, protocols), **record}
     manifest["adapted"] = [
         adaptation.record(job.clip, job.adapted, job.method.spec.name)
         for job in jobs
@@ -186,13 +186,14 @@ def _warn_of_missing_metrics(metrics: Sequence[MetricSpec], clip: Clip) -> None:
                 raise HeadbenchError(f"metric {spec.name} gives {value} for identical images")
 
 
-def _manifest(
+def describe(
     config: RunConfig,
     methods: Sequence[ResolvedMethod],
     metrics: Sequence[MetricSpec],
     clips: Sequence[Clip],
     protocols: Mapping[str, Protocol],
 ) -> dict[str, Any]:
+    """What the manifest of a run tells: everything that made its numbers."""
     return {
         "configuration": asdict(config),
         "methods": [method.record() for method in methods],

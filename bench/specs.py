@@ -69,6 +69,8 @@ class MethodSpec:
     native : runs on our own implementation; False for an adapter to an official repository.
     source : the paper.
     trivial : a floor that every real method should beat; shown in tables, never ranked.
+    variants : "package.module:function" of ``(avatar folder, clip, device) -> Iterator[Variant]``: what can be derived
+        from a trained avatar without training (``headbench sweep``); "" for nothing.
     """
 
     name: str
@@ -82,6 +84,7 @@ class MethodSpec:
     version: str = "1"
     source: str = ""
     trivial: bool = False
+    variants: str = ""
     resolution: ResolutionRule = ResolutionRule()
     preset_resolutions: Mapping[str, ResolutionRule] = field(default_factory=dict)
 

@@ -14,6 +14,7 @@ from ..bench.contracts import FloatArray, Frame, no_stage
 from .binding import WorldSplats
 from .bound_training import View
 from .splats import rasterize
+from .splats.constants import ALPHA_MIN, TRANSMITTANCE_MIN
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +35,17 @@ class PosedSplats:
     colors: FloatArray | None
 
 
+class Cutoffs(NamedTuple):
+    """Below what the renderer leaves work out; see `rasterize`. More is faster and less exact."""
+
+    alpha_min: float = ALPHA_MIN
+    transmittance_min: float = TRANSMITTANCE_MIN
+
+
+USUAL = Cutoffs()
+"""The renderer's defaults."""
+
+
 class Drawn(NamedTuple):
     """A drawn frame, still where it was computed."""
 
@@ -50,12 +62,15 @@ def draw_splats(
     view: View,
     background: Sequence[float],
     done: Callable[[str], None] = no_stage,
+    cutoffs: Cutoffs = USUAL,
 ) -> Drawn:
     """Rasterise and clip to [0, 1]: the last two stages of `StagedAvatar.draw`."""
     rendering = rasterize(
         *(world.means, world.quats, world.scales, opacities, colors),
         *(view.world_to_camera, view.K, view.camera.width, view.camera.height),
         background=world.means.new_tensor([float(channel) for channel in background]),
+        alpha_min=cutoffs.alpha_min,
+        transmittance_min=cutoffs.transmittance_min,
         check_finite=False,
     )
     done("raster")

@@ -28,13 +28,13 @@ from .avatar_files import (
     write_subject,
 )
 from .binding import Frames, WorldSplats, to_world
-from .bound_avatar import Drawn, PosedSplats, draw_splats, posed_splats, read_back
+from .bound_avatar import USUAL, Cutoffs, Drawn, PosedSplats, draw_splats, posed_splats, read_back
 from .bound_training import Placed, View, run_bound_training, view_of
 from .clip_checks import check_training_split
 from .configs import GAConfig
 from .ga_files import PLY_FILE, read_ga_splats, write_ga_splats
 from .seeds import torch_generator
-from .sh import initial_coefficients, sh_to_rgb
+from .sh import coefficient_count, initial_coefficients, occupied_degree, sh_to_rgb
 from .stored_splats import Carrier, HarmonicColors
 from .subject_mesh import BoundedCache, SubjectMesh
 from .training.loop import CHECKPOINT, check_budget
@@ -124,21 +124,31 @@ class GAAvatar:
 
     Files: ``point_cloud.ply`` in GaussianAvatars' layout and ``subject.npz`` count as storage; beside them lie
     the shared head model, and the refined tracking of the training timesteps, which is driving signal.
+
+    Attributes
+    ----------
+    mesh, subject : the subject's.
+    splat_tensors, binding : per-splat tensors by name, and the triangle of each.
+    refined : the tracking refined in training, None where it was left alone.
     """
 
     def __init__(
         self,
-        folder: Path,
+        stored: Sequence[Path],
         mesh: SubjectMesh,
+        subject: Subject,
         splats: dict[str, Tensor],
         binding: Tensor,
         refined: RefinedTracking | None,
         device: str,
+        cutoffs: Cutoffs = USUAL,
     ):
-        self._folder, self._mesh, self._splats = folder, mesh, splats
-        self._refined, self._device = refined, device
+        self.mesh, self.subject, self.refined = mesh, subject, refined
+        self.splat_tensors, self.binding = splats, binding
+        self._stored, self._device, self._cutoffs = stored, device, cutoffs
         self._carry = Carrier(binding, splats["log_scales"], splats["quats"])
-        self._shade = HarmonicColors(splats["sh_dc"], splats["sh_rest"])
+        occupied = coefficient_count(occupied_degree(splats["sh_rest"])) - 1
+        self._shade = HarmonicColors(splats["sh_dc"], splats["sh_rest"][:, :, :occupied].contiguous())
 
     @classmethod
     def read(cls, folder: Path, device: str) -> GAAvatar:
@@ -149,7 +159,8 @@ class GAAvatar:
         splats, binding = read_ga_splats(folder / PLY_FILE, len(mesh.faces), device)
         driving = folder / DRIVING_FILE
         refined = RefinedTracking.read(driving) if driving.exists() else None
-        return cls(folder, mesh, splats, binding, refined, device)
+        stored = [folder / PLY_FILE, folder / SUBJECT_FILE]
+        return cls(stored, mesh, subject, splats, binding, refined, device)
 
     def render(self, camera: Camera, pose: HeadPose, background: Sequence[float] = (1.0, 1.0, 1.0)) -> Frame:
         """Render one frame. Raises `InputError` where the pose is of another head model."""
@@ -170,7 +181,7 @@ class GAAvatar:
         view = view_of(camera, self._device)
         opacities, colors = self._opacities(), self._colors(world, view)
         done("deform")
-        return draw_splats(world, opacities, colors, view, background, done)
+        return draw_splats(world, opacities, colors, view, background, done, self._cutoffs)
 
     def read_back(self, drawn: Drawn) -> Frame:
         """A drawn frame in host memory."""
@@ -185,27 +196,27 @@ class GAAvatar:
 
     def harmonics(self) -> tuple[Tensor, Tensor]:
         """(N, 3) and (N, 3, 15) spherical harmonics along world directions; the pose does not change them."""
-        return self._splats["sh_dc"], self._splats["sh_rest"]
+        return self.splat_tensors["sh_dc"], self.splat_tensors["sh_rest"]
 
     def files(self) -> Sequence[Path]:
         """The PLY and the subject."""
-        return [self._folder / PLY_FILE, self._folder / SUBJECT_FILE]
+        return self._stored
 
     def shared_files(self) -> Sequence[Path]:
         """The head model."""
-        return [self._folder / HEAD_FILE]
+        return [path.parent / HEAD_FILE for path in self._stored[:1]]
 
     def _frames(self, pose: HeadPose) -> Frames:
-        if self._refined is not None:
-            pose = self._refined(pose)
-        return self._mesh.frames(self._mesh.posed(self._mesh.arguments([pose])))
+        if self.refined is not None:
+            pose = self.refined(pose)
+        return self.mesh.frames(self.mesh.posed(self.mesh.arguments([pose])))
 
     def _world(self, frames: Frames) -> WorldSplats:
-        s = self._splats
+        s = self.splat_tensors
         return self._carry(frames, s["means"], s["log_scales"], s["quats"])
 
     def _opacities(self) -> Tensor:
-        return torch.sigmoid(self._splats["opacities"])
+        return torch.sigmoid(self.splat_tensors["opacities"])
 
     def _colors(self, world: WorldSplats, view: View) -> Tensor:
         return self._shade(world.means, view.center)

@@ -28,20 +28,24 @@ channel), logit of opacity, log-scales, quaternion wxyz, triangle."""
 
 
 def write_ga_splats(path: Path, splats: dict[str, Tensor], binding: Tensor) -> None:
-    """Write splats in GaussianAvatars' layout. Triangle indices are exact in float32 up to 2^24."""
-    count = len(binding)
+    """Write splats in GaussianAvatars' layout, or with fewer columns where the harmonics are of a lower degree.
+
+    Triangle indices are exact in float32 up to 2^24.
+    """
+    count, rest = len(binding), 3 * splats["sh_rest"].shape[2]
+    left_out = {f"f_rest_{i}" for i in range(rest, 3 * REST)}
     columns = [
         splats["means"],
         torch.zeros(count, 3),
         splats["sh_dc"],
-        splats["sh_rest"].reshape(count, 3 * REST),
+        splats["sh_rest"].reshape(count, rest),
         splats["opacities"][:, None],
         splats["log_scales"],
         splats["quats"],
         binding[:, None].to(torch.float32),
     ]
     table = torch.cat([column.detach().to("cpu", torch.float32) for column in columns], dim=1)
-    write_ply(path, COLUMNS, table.numpy())
+    write_ply(path, tuple(name for name in COLUMNS if name not in left_out), table.numpy())
 
 
 def read_ga_splats(path: Path, face_count: int, device: str) -> tuple[dict[str, Tensor], Tensor]:

@@ -13,7 +13,7 @@ from torch import Tensor
 from ..bench.contracts import Camera, Frame, HeadPose, no_stage
 from .avatar_files import HEAD_FILE, SUBJECT_FILE, Subject, read_shared_head, read_subject
 from .binding import NORMAL, WorldSplats
-from .bound_avatar import Drawn, PosedSplats, draw_splats, posed_splats, read_back
+from .bound_avatar import USUAL, Cutoffs, Drawn, PosedSplats, draw_splats, posed_splats, read_back
 from .bound_training import view_of
 from .compact.file import COMPACT_FILE, read_compact
 from .dynamics import LocalSplats, apply_offsets, changed_colors
@@ -52,11 +52,17 @@ class OursAvatar:
     """
 
     def __init__(
-        self, stored: Sequence[Path], mesh: SubjectMesh, subject: Subject, field: Field, device: str
+        self,
+        stored: Sequence[Path],
+        mesh: SubjectMesh,
+        subject: Subject,
+        field: Field,
+        device: str,
+        cutoffs: Cutoffs = USUAL,
     ):
         tensors = field.tensors
         self.subject, self.field = subject, field
-        self._stored, self.mesh, self._device = stored, mesh, device
+        self._stored, self.mesh, self._device, self._cutoffs = stored, mesh, device, cutoffs
         table = tensors["splats"].split(list(SPLAT_WIDTHS.values()), dim=1)
         columns = {name: column.contiguous() for name, column in zip(SPLAT_WIDTHS, table)}
         self.neutral = LocalSplats(
@@ -125,7 +131,7 @@ class OursAvatar:
         colors = self._colors(splats, world, turns, view.center)
         opacities = torch.sigmoid(splats.logits)
         done("deform")
-        return draw_splats(world, opacities, colors, view, background, done)
+        return draw_splats(world, opacities, colors, view, background, done, self._cutoffs)
 
     def read_back(self, drawn: Drawn) -> Frame:
         """A drawn frame in host memory."""

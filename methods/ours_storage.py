@@ -52,8 +52,7 @@ def write_field(
     tensors |= {
         name: splats[name].detach().cpu().contiguous() for name in ("sh_dc", "sh_rest") if name in splats
     }
-    with atomic_path(path) as temporary:
-        save_file(tensors, temporary, {DYNAMIC: ",".join(dynamic)})
+    save_field(path, Field(tensors, tuple(dynamic)))
 
 
 class Field(NamedTuple):
@@ -61,6 +60,13 @@ class Field(NamedTuple):
 
     tensors: dict[str, Tensor]
     dynamic: tuple[Dynamic, ...]
+
+
+def save_field(path: Path, field: Field) -> None:
+    """Write the exact file of a field, whole or not at all."""
+    tensors = {name: value.cpu().contiguous() for name, value in field.tensors.items()}
+    with atomic_path(path) as temporary:
+        save_file(tensors, temporary, {DYNAMIC: ",".join(field.dynamic)})
 
 
 def read_field(path: Path, face_count: int, expression_size: int, device: str) -> Field:

@@ -24,6 +24,14 @@ def sh_degree(rest: Tensor) -> int:
     return math.isqrt(rest.shape[2] + 1) - 1
 
 
+def occupied_degree(rest: Tensor) -> int:
+    """Highest degree of which (N, 3, K - 1) coefficients above degree 0 have any other than zero."""
+    degree = sh_degree(rest)
+    while degree and not rest[:, :, coefficient_count(degree - 1) - 1 :].any():
+        degree -= 1
+    return degree
+
+
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
     """Real spherical harmonics of unit directions, (N, (degree+1)^2).
 

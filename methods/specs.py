@@ -62,6 +62,7 @@ OURS = MethodSpec(
     summary="Mesh-bound splats with tri-plane colour and expression-driven opacity along feature lines.",
     implementation="headbench.methods.ours:Ours",
     config="headbench.methods.configs:OursConfig",
+    variants="headbench.methods.derived.ours_variants:variants",
     presets=_presets(_SHORT_OURS, {"plane_bounds": "published"}),
     source="3D Gaussian Head Avatars with Expressive Dynamic Appearances by Compact Tensorial Representations, "
     "CVPR 2025, arXiv 2504.14967",
@@ -72,6 +73,7 @@ GA = MethodSpec(
     summary="GaussianAvatars: splats with spherical harmonics rigged to the triangles of the tracked mesh.",
     implementation="headbench.methods.ga:GA",
     config="headbench.methods.configs:GAConfig",
+    variants="headbench.methods.derived.ga_variants:variants",
     presets=_presets(_SHORT_GA, {}),
     source="GaussianAvatars: Photorealistic Head Avatars with Rigged 3D Gaussians, CVPR 2024, arXiv 2312.02069",
 )

@@ -16,6 +16,13 @@ REENACT = CommandSpec(
     settings="headbench.bench.robustness.settings:ReenactSettings",
 )
 
+SWEEP = CommandSpec(
+    name="sweep",
+    summary="Derive smaller and faster avatars from a run's without training: quality against size and frame time.",
+    implementation="headbench.reports.pareto.sweep_command:run",
+    settings="headbench.bench.sweep.settings:SweepSettings",
+)
+
 PARETO = CommandSpec(
     name="pareto",
     summary="Quality against size and frame time over finished runs: CSV, and a plot with the Pareto front marked.",

@@ -65,6 +65,12 @@ class RunData:
         return cls(folder, manifest, read_rows(folder.rows), metrics, methods, trivial, tasks)
 
     @property
+    def derived(self) -> dict[str, Mapping[str, Any]]:
+        """Of methods whose avatars were derived from trained ones: from which, the variant, what was changed."""
+        entries = self.manifest["methods"]
+        return {str(entry["name"]): entry["derived"] for entry in entries if entry.get("derived")}
+
+    @property
     def protocol_ids(self) -> dict[str, str]:
         """Readable name of each task's protocol."""
         return {task: str(self.manifest["protocols"][task].get("id", "")) for task in self.tasks}

@@ -41,26 +41,19 @@ def encode(field: Field, subject: Subject, head: HeadAsset, precision: Precision
     """Content of the compact file of an avatar whose splats are sorted by triangle (`simplify`)."""
     tensors = {name: value.cpu() for name, value in field.tensors.items()}
     splats, steps = encode_splats(tensors, precision, "rotation" in field.dynamic)
-    person = {
-        "shape": subject.shape.astype(np.float32),
-        "static_offset": coded(subject.static_offset.T, precision.subject),
-    }
-    steps["subject"] = precision.subject
-    text = {
-        "name": subject.name,
-        "head_model": subject.head_model,
-        "dynamic": ",".join(field.dynamic),
-    }
+    person = encode_subject(subject, precision)
+    steps |= person.steps
+    text = {**person.text, "dynamic": ",".join(field.dynamic)}
     # Where the reader will put the splats decides which samples of the planes they need.
-    read = Arrays(Path(), Content({**splats, **person}, text, steps))
+    read = Arrays(Path(), Content({**splats, **person.arrays}, text, steps))
     table = decode_splats(read)["splats"]
-    mesh = _mesh(_subject(read, head), head)
+    mesh = _mesh(decode_subject(read, head), head)
     frames = CanonicalFrames.of(mesh.frames(mesh.canonical))
     positions = frames.positions(table[:, -1].to(torch.int64), table[:, : SPLAT_WIDTHS["means"]])
     shared = encode_field(tensors, positions, precision)
     coded_names = {"splats", *HARMONICS, *PLANES, "lines", *MATRICES}
     other = {name: value.numpy() for name, value in tensors.items() if name not in coded_names}
-    return Content({**splats, **shared, **person, **other}, text, steps)
+    return Content({**splats, **shared, **person.arrays, **other}, text, steps)
 
 
 def decode(
@@ -68,7 +61,7 @@ def decode(
 ) -> tuple[Subject, Field]:
     """Subject and field of such a content. Raises `InputError`, which names ``path``, where it does not fit."""
     arrays = Arrays(path, content)
-    subject = _subject(arrays, head)
+    subject = decode_subject(arrays, head)
     tensors = {**decode_splats(arrays), **decode_field(arrays)}
     for name, values in arrays.rest().items():
         tensors[name] = torch.from_numpy(np.array(values))
@@ -111,7 +104,18 @@ def _by_part(sizes: Mapping[str, int]) -> dict[str, int]:
     return {part: size for part, size in result.items() if size}
 
 
-def _subject(arrays: Arrays, head: HeadAsset) -> Subject:
+def encode_subject(subject: Subject, precision: Precision) -> Content:
+    """The part of a compact file that says whom it shows."""
+    arrays = {
+        "shape": subject.shape.astype(np.float32),
+        "static_offset": coded(subject.static_offset.T, precision.subject),
+    }
+    text = {"name": subject.name, "head_model": subject.head_model}
+    return Content(arrays, text, {"subject": precision.subject})
+
+
+def decode_subject(arrays: Arrays, head: HeadAsset) -> Subject:
+    """Whom a compact file shows. Raises `InputError` where that does not fit the head model."""
     for key in ("name", "head_model"):
         if key not in arrays.text:
             raise InputError(arrays.path, f"text, {key}", "a string", "none")

@@ -11,6 +11,7 @@ from ...bench.contracts import Progress, no_progress
 from ...bench.files import atomic_path
 from ...bench.specs import Findings
 from ...bench.store import RunFolder
+from ...bench.sweep.sweep import MARK
 from .front import pareto_front
 from .plot import Panel, write_plot
 from .points import Point, read_points
@@ -22,7 +23,9 @@ COSTS = {"megabytes": "Size, MB", "milliseconds": "Frame time, ms"}
 def run(settings: ParetoSettings, progress: Progress = no_progress) -> Findings:
     """Write ``points.csv`` and ``pareto.png``. Raises `InputError` for runs that cannot be compared."""
     out = Path(settings.out)
-    points, left_out, metric = read_points([Path(r) for r in settings.runs], settings.task, settings.metric)
+    points, left_out, metric = read_points(
+        [Path(r) for r in settings.runs], settings.task, settings.metric, settings.time
+    )
     RunFolder(out).prepare()
     sign = 1.0 if metric.higher_is_better else -1.0
     fronts = {cost: _front(points, cost, sign) for cost in COSTS}
@@ -37,6 +40,7 @@ def run(settings: ParetoSettings, progress: Progress = no_progress) -> Findings:
             marks = [int(index in fronts[cost]) for cost in COSTS]
             writer.writerow([*(asdict(point)[name] for name in names), *marks])
     unit = f", {metric.unit}" if metric.unit else ""
+    labels = {**COSTS, **({"milliseconds": f"{settings.time}, ms"} if settings.time else {})}
     panels = [
         Panel(
             label,
@@ -44,8 +48,9 @@ def run(settings: ParetoSettings, progress: Progress = no_progress) -> Findings:
             [p.quality for p in points],
             fronts[cost],
             _series(points),
+            [point.variant for point in points],
         )
-        for cost, label in COSTS.items()
+        for cost, label in labels.items()
     ]
     machines = ", ".join(sorted({point.machine for point in points}))
     write_plot(
@@ -68,7 +73,7 @@ def _front(points: Sequence[Point], cost: str, sign: float) -> list[int]:
 
 
 def _series(points: Sequence[Point]) -> list[str]:
-    return [point.method for point in points]
+    return [point.derived_from or point.method for point in points]
 
 
 def _text(
@@ -78,11 +83,14 @@ def _text(
     label: str,
     digits: int,
 ) -> str:
-    lines = [f"{'method':<16}{label:>10}{'MB':>12}{'ms':>12}  run (* on the front of size, of time)"]
+    wide = max([16, *(len(point.method) + 2 for point in points)])
+    lines = [f"{'method':<{wide}}{label:>10}{'MB':>12}{'ms':>12}  run (* on the front of size, of time)"]
     for index, point in enumerate(points):
         cells = [
             f"{'-' if value is None else f'{value:.2f}':>10} {'*' if index in fronts[cost] else ' '}"
             for cost, value in (("megabytes", point.megabytes), ("milliseconds", point.milliseconds))
         ]
-        lines.append(f"{point.method:<16}{point.quality:>10.{digits}f}{''.join(cells)}  {point.run}")
+        lines.append(f"{point.method:<{wide}}{point.quality:>10.{digits}f}{''.join(cells)}  {point.run}")
+    if any(point.derived_from for point in points):
+        lines.append(f"METHOD{MARK}VARIANT was derived from the trained avatar, without training.")
     return "\n".join([*lines, *(f"left out: {text}" for text in left_out)])

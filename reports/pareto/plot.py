@@ -22,18 +22,24 @@ COLOURS: tuple[Colour, ...] = (  # Okabe and Ito's, told apart with any colour v
     (86, 180, 233),
 )
 WIDTH, HEIGHT, LEFT, BOTTOM, TOP, RIGHT = 620, 460, 80, 70, 70, 30
-DOT, TEXT, SMALL, FINE = 6, 16, 13, 2
+DOT, TEXT, SMALL, FAINT, FINE = 6, 16, 13, 11, 2
+
+Box = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
 class Panel:
-    """One plot. ``costs`` (None: not measured), ``qualities`` and ``series`` go together, ``front`` indexes them."""
+    """One plot. ``costs`` (None: not measured), ``qualities``, ``series``, ``variants`` go together, ``front`` indexes them.
+
+    A variant's name stands beside its point on the front; "" for a trained avatar, drawn as a square.
+    """
 
     label: str
     costs: Sequence[float | None]
     qualities: Sequence[float]
     front: Sequence[int]
     series: Sequence[str]
+    variants: Sequence[str]
 
 
 def write_plot(path: Path, panels: Sequence[Panel], quality: str, note: str) -> None:
@@ -47,7 +53,10 @@ def write_plot(path: Path, panels: Sequence[Panel], quality: str, note: str) -> 
     colours = {name: COLOURS[i % len(COLOURS)] for i, name in enumerate(names)}
     for number, panel in enumerate(panels):
         _draw(draw, panel, number * WIDTH, quality, colours)
-    _text(draw, LEFT, HEIGHT + 4, f"Filled and joined: the Pareto front. Measured on {note}.", SMALL, MUTED)
+    derived = any(variant for panel in panels for variant in panel.variants)
+    shapes = " Squares: trained; circles: derived from them without training." if derived else ""
+    text = f"Filled and joined: the Pareto front.{shapes} Measured on {note}."
+    _text(draw, LEFT, HEIGHT + 4, text, SMALL, MUTED)
     with atomic_path(path) as temporary:
         image.save(temporary, optimize=True)
 
@@ -98,16 +107,38 @@ def _draw(
     corners = [place(panel.costs[i] or low, panel.qualities[i]) for i in panel.front]
     for (ax, ay), (bx, by) in itertools.pairwise(corners):
         _line(draw, [(ax, ay), (bx, ay), (bx, by)], INK, 1)
-    for index, cost in known:
-        x, y = place(cost, panel.qualities[index])
+    placed = {index: place(cost, panel.qualities[index]) for index, cost in known}
+    for index, (x, y) in placed.items():
         colour = colours[panel.series[index]]
-        box = tuple(FINE * v for v in (x - DOT, y - DOT, x + DOT, y + DOT))
-        draw.ellipse(box, fill=colour if index in panel.front else PAPER, outline=colour, width=2 * FINE)
+        shape = draw.ellipse if panel.variants[index] else draw.rectangle
+        mark = tuple(FINE * v for v in (x - DOT, y - DOT, x + DOT, y + DOT))
+        shape(mark, fill=colour if index in panel.front else PAPER, outline=colour, width=2 * FINE)
+    taken = [(x - DOT, y - DOT, x + DOT, y + DOT) for x, y in placed.values()]
+    for index in panel.front:
+        if panel.variants[index] and (box := free(*placed[index], panel.variants[index], taken, (x0, x1))):
+            taken.append(box)
+            _text(draw, box[0], box[1], panel.variants[index], FAINT, MUTED)
     x = float(x0)
     for name in dict.fromkeys(panel.series):
         draw.ellipse(tuple(FINE * v for v in (x, 44, x + 10, 54)), fill=colours[name])
         _text(draw, x + 16, 41, name, SMALL, INK)
         x += 36 + text_width(name, SMALL)
+
+
+def free(x: float, y: float, text: str, taken: Sequence[Box], sides: tuple[float, float]) -> Box | None:
+    """Where beside a point a text fits between the sides without touching what is taken, or None."""
+    width, gap = text_width(text, FAINT), DOT + 3
+    for left, top in (
+        (x + gap, y + 2),
+        (x - gap - width, y - FAINT - 4),
+        (x + gap, y - FAINT - 4),
+        (x - gap - width, y + 2),
+    ):
+        box = (left, top, left + width, top + FAINT + 2)
+        clear = all(box[2] < t[0] or t[2] < box[0] or box[3] < t[1] or t[3] < box[1] for t in taken)
+        if clear and sides[0] <= box[0] and box[2] <= sides[1] + RIGHT:
+            return box
+    return None
 
 
 def _line(

@@ -11,26 +11,34 @@ from ...bench.specs import MetricSpec
 from ..aggregate import check_rows, summarise
 from ..run_data import RunData
 
-SIZE, SPEED = "storage", "fps"
+SIZE, SPEED, LATENCY = "storage", "fps", "latency_p50"
 
 
 @dataclass(frozen=True)
 class Point:
     """One method of one run, means over frames, subjects and seeds.
 
-    ``megabytes`` and ``milliseconds`` are None where the run did not measure them.
+    ``megabytes`` and ``milliseconds`` are None where the run did not measure them. Milliseconds are the median time of
+    a frame, or those of the mean rate where a run has no median. ``derived_from`` and ``variant`` are "" for a trained
+    avatar.
     """
 
     run: str
     method: str
+    derived_from: str
+    variant: str
     quality: float
     megabytes: float | None
     milliseconds: float | None
     machine: str
 
 
-def read_points(folders: Sequence[Path], task: str, metric: str) -> tuple[list[Point], list[str], MetricSpec]:
+def read_points(
+    folders: Sequence[Path], task: str, metric: str, time: str = ""
+) -> tuple[list[Point], list[str], MetricSpec]:
     """Read every method of every run that is no floor; return points, what was left out and why, and the metric.
+
+    ``time`` names the metric of milliseconds; "" the median latency, or what the frames per second give.
 
     Raises `InputError` where runs were not scored on the same frames by the same protocol, where one lacks the
     task or the metric, and where nothing is left to show.
@@ -48,6 +56,10 @@ def read_points(folders: Sequence[Path], task: str, metric: str) -> tuple[list[P
         if found is None:
             names = ", ".join(m.name for m in data.metrics if m.per_frame)
             raise InputError(folder, "metric", f"a metric of frames: {names}", metric)
+        units = {m.name: m.unit for m in data.metrics}
+        if time and units.get(time) != "ms":
+            names = ", ".join(name for name, unit in units.items() if unit == "ms") or "none"
+            raise InputError(folder, "time", f"a metric in ms: {names}", time)
         spec = spec or found
         protocol = str(data.manifest["protocols"][task]["hash"])
         protocols.setdefault(protocol, folder)
@@ -59,14 +71,30 @@ def read_points(folders: Sequence[Path], task: str, metric: str) -> tuple[list[P
             if method in data.trivial:
                 continue
             own = data.rows[data.rows["method"] == method]
-            quality, size, speed = (
-                summarise(data.rows, own, *wanted) for wanted in ((task, metric), ("", SIZE), ("", SPEED))
+            quality, size, speed, latency = (
+                summarise(data.rows, own, *wanted)
+                for wanted in ((task, metric), ("", SIZE), ("", SPEED), ("", time or LATENCY))
             )
             if quality.value is None:
                 left_out.append(f"{method} of {folder}: {quality.reason}")
                 continue
-            time = None if not speed.value else 1000.0 / speed.value
-            points.append(Point(str(folder), method, quality.value, size.value, time, data.machine))
+            milliseconds = latency.value
+            if milliseconds is None and not time and speed.value:
+                milliseconds = 1000.0 / speed.value
+            derived = data.derived.get(method, {})
+            source, variant = str(derived.get("from", "")), str(derived.get("variant", ""))
+            points.append(
+                Point(
+                    str(folder),
+                    method,
+                    source,
+                    variant,
+                    quality.value,
+                    size.value,
+                    milliseconds,
+                    data.machine,
+                )
+            )
     if spec is None or not points:
         raise InputError("runs", "", "a method that is no floor, with a value", "; ".join(left_out) or "none")
     return points, left_out, spec

@@ -23,6 +23,9 @@ class ParetoSettings:
     metric: str = "psnr"
     """Metric of quality."""
 
+    time: str = ""
+    """Metric of frame time, in ms: latency_p50 (default, or what frames per second give), processor_time, ..."""
+
     def __post_init__(self) -> None:
         if not self.runs:
             raise ValueError("runs: at least one folder")

@@ -2,6 +2,7 @@
 
 import copy
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from headbench.bench.adaptation import AdaptedClip
-from headbench.bench.contracts import Camera, Frame, FrameKey, HeadPose, Measurement, StepRecord
+from headbench.bench.contracts import Camera, Frame, FrameKey, HeadPose, Measurement, StepRecord, Variant
 from headbench.bench.errors import InputError, UnavailableError
 from headbench.bench.specs import DatasetSpec, MethodSpec, MetricSpec
 
@@ -170,6 +171,23 @@ MIRROR = MethodSpec(
     "mirror", "the driving signal", "toy_plugin:MirrorMethod", "toy_plugin:ToyConfig", PRESETS
 )
 METHOD = MethodSpec("toy", "one grey level", "toy_plugin:ToyMethod", "toy_plugin:ToyConfig", PRESETS)
+
+
+def levels(folder, clip, device):
+    """Other grey levels, as variants."""
+
+    def make(out, level):
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "level.txt").write_text(str(level))
+        MADE.append(level)
+        return ToyAvatar(out)
+
+    for name, level in (("dark", 0.25), ("light", 0.75)):
+        yield Variant(name, f"level {level}", partial(make, level=level))
+
+
+MADE: list[float] = []
+VARYING = replace(METHOD, name="varying", variants="toy_plugin:levels")
 SAME_NAME = MethodSpec("toy", "another of that name", "toy_plugin:ToyMethod", "toy_plugin:ToyConfig", PRESETS)
 PEEKING = MethodSpec(
     "peeking", "looks at held-out frames", "toy_plugin:PeekingMethod", "toy_plugin:ToyConfig"

@@ -1,17 +1,20 @@
 """``headbench pareto`` on run folders with known rows."""
 
 import csv
+import json
+from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 from PIL import Image
 
 from headbench.bench.errors import InputError
 from headbench.bench.files import plain
 from headbench.bench.specs import MetricSpec
-from headbench.bench.store import Row, RunFolder, to_frame, write_rows
+from headbench.bench.store import Row, RunFolder, read_rows, to_frame, write_rows
 from headbench.reports.pareto.command import run
-from headbench.reports.pareto.plot import log_ticks, ticks
+from headbench.reports.pareto.plot import free, log_ticks, ticks
 from headbench.reports.pareto.settings import ParetoSettings
 
 METRICS = [
@@ -94,6 +97,46 @@ def test_runs_on_other_frames_are_refused(make_run, tmp_path):
 def test_an_unknown_task_or_metric_is_refused(make_run, tmp_path, changes):
     with pytest.raises(InputError, match=next(iter(changes))):
         run(ParetoSettings((make_run("r", ours=(1.0, 1.0, 1.0, 1.0)),), str(tmp_path / "out"), **changes))
+
+
+def test_frame_time_is_the_metric_asked_for_and_the_median_before_the_mean_rate(make_run, tmp_path):
+    folder = make_run("r", ours=(28.0, 0.1, 1.0, 200.0))
+    rows = read_rows(RunFolder(tmp_path / "r").rows)
+    median = rows[rows["metric"] == "fps"].assign(metric="latency_p50", value=4.0)
+    processor = median.assign(metric="processor_time", value=9.0)
+    write_rows(RunFolder(tmp_path / "r").rows, pd.concat([rows, median, processor], ignore_index=True))
+    run(ParetoSettings((folder,), str(tmp_path / "out")))
+    assert float(table(tmp_path / "out")[0]["milliseconds"]) == 4.0
+    with pytest.raises(InputError, match="metric in ms: none"):
+        run(ParetoSettings((folder,), str(tmp_path / "out"), time="processor_time"))
+    manifest = json.loads((tmp_path / "r" / "run.json").read_text())
+    manifest["metrics"].append(plain(replace(METRICS[3], name="processor_time", unit="ms")))
+    (tmp_path / "r" / "run.json").write_text(json.dumps(manifest))
+    run(ParetoSettings((folder,), str(tmp_path / "out"), time="processor_time"))
+    assert float(table(tmp_path / "out")[0]["milliseconds"]) == 9.0
+
+
+def test_derived_avatars_are_told_from_trained_ones(make_run, tmp_path):
+    folder = make_run("r", **{"ga": (28.0, 0.1, 4.0, 100.0), "ga+half": (27.9, 0.1, 2.0, 100.0)})
+    manifest = json.loads((tmp_path / "r" / "run.json").read_text())
+    manifest["methods"][1]["derived"] = {"from": "ga", "variant": "half", "change": "16-bit floats"}
+    (tmp_path / "r" / "run.json").write_text(json.dumps(manifest))
+    text = run(ParetoSettings((folder,), str(tmp_path / "out"))).text
+    assert "derived from the trained avatar" in text
+    trained, derived = table(tmp_path / "out")
+    assert (trained["derived_from"], trained["variant"]) == ("", "")
+    assert (derived["derived_from"], derived["variant"]) == ("ga", "half")
+
+
+def test_labels_touch_neither_points_nor_each_other():
+    taken = [(94.0, 94.0, 106.0, 106.0)]
+    for _ in range(4):
+        box = free(100, 100, "half", taken, (0, 620))
+        assert box is not None
+        for other in taken:
+            assert box[2] < other[0] or other[2] < box[0] or box[3] < other[1] or other[3] < box[1]
+        taken.append(box)
+    assert free(100, 100, "half", taken, (0, 620)) is None
 
 
 def test_ticks_are_round_and_within():

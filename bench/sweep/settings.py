@@ -1,0 +1,43 @@
+"""Settings of ``headbench sweep``. Light to import."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import tyro
+
+
+@dataclass(frozen=True)
+class SweepSettings:
+    """Quality against size and frame time of what can be derived from a run's avatars without training."""
+
+    run: tyro.conf.Positional[str]
+    """Folder of a finished run."""
+
+    out: str | None = None
+    """Folder to write, a run folder itself; default: `sweep` in the folder of the run."""
+
+    methods: tuple[str, ...] = ()
+    """Methods to derive from; default: all that know how."""
+
+    variants: tuple[str, ...] = ()
+    """Variants to derive, by name; default: all. The trained avatar itself is always measured."""
+
+    data: str | None = None
+    """The capture, where it was moved since the run."""
+
+    frames: int | None = None
+    """Score at most so many frames per subject and task, evenly spaced; default: those of the run."""
+
+    task: str = "novel_view"
+    """Task whose frames tell the quality in the plot."""
+
+    metric: str = "psnr"
+    """Metric of quality in the plot."""
+
+    time: str = ""
+    """Metric of frame time in the plot, in ms: latency_p50 (default), processor_time on a machine with other work."""
+
+    def __post_init__(self) -> None:
+        if self.frames is not None and self.frames < 1:
+            raise ValueError(f"frames is {self.frames}; at least 1")

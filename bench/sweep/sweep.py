@@ -1,0 +1,123 @@
+"""Derives variants of a run's avatars, renders and measures them, and leaves a run folder of them."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from ..contracts import Progress, Variant
+from ..errors import InputError
+from ..files import check_name, digest
+from ..protocol import Protocol, make_protocol
+from ..registry import resolve
+from ..robustness.avatars import load, run_configuration, trained
+from ..run_config import resolve_metrics
+from ..runner import describe
+from ..specs import MetricSpec
+from ..stages import Job, measure, render
+from ..store import RunFolder, write_rows
+from .settings import SweepSettings
+
+log = logging.getLogger(__name__)
+NEEDED = ("storage", "fps", "latency_p50", "processor_time")
+"""Metrics of a sweep, whether the run took them or not."""
+MARK = "+"
+"""Between the name of a method and that of a variant."""
+
+
+def sweep(settings: SweepSettings, out: Path, progress: Progress) -> pd.DataFrame:
+    """Derive, render and measure; return the rows of the run folder that it writes to ``out``.
+
+    The trained avatars are measured anew beside their variants, so that frame times were taken in one go. Started
+    again, it keeps what is measured.
+
+    Raises
+    ------
+    InputError
+        For a folder that is no finished run, a method that derives nothing, a variant that none of them has.
+    """
+    jobs = trained(Path(settings.run), settings.methods, settings.data)
+    able = [job for job in jobs if job.method.spec.variants]
+    unable = sorted({job.method.spec.name for job in jobs} - {job.method.spec.name for job in able})
+    if not able or (settings.methods and unable):
+        found = ", ".join(unable) or "none"
+        raise InputError(settings.run, "methods", "methods that derive variants", found)
+    config = run_configuration(Path(settings.run))
+    if settings.data is not None:
+        config = replace(config, data=settings.data)
+    if settings.frames is not None:
+        config = replace(config, frames_per_task=settings.frames)
+    clips = list({job.clip.subject: job.clip for job in able}.values())
+    protocols: dict[str, Protocol] = {
+        task: make_protocol(task, clips, config.frames_per_task) for task in config.tasks
+    }
+    config = replace(config, metrics=tuple(dict.fromkeys((*config.metrics, *NEEDED))))
+    metrics = [spec for spec in resolve_metrics(config) if not spec.training]
+    folder = RunFolder(out)
+    derived = [(job, list(_chosen(job, settings.variants))) for job in able]
+    known = {variant.name for _, variants in derived for variant in variants}
+    for name in settings.variants:
+        if name not in known:
+            raise InputError("sweep", "variants", "a variant of these methods", repr(name))
+
+    frames: list[pd.DataFrame] = []
+    records: dict[str, dict[str, Any]] = {}
+    total = sum(len(variants) + 1 for _, variants in derived)
+    for base, variants in derived:
+        for variant in (None, *variants):
+            job = _derived(base, variant, protocols, folder)
+            progress(len(frames), total, job.name)
+            frames.append(_measured(job, base, variant, metrics))
+            records[job.method.spec.name] = _record(job, base, variant)
+    rows = pd.concat(frames, ignore_index=True)
+    write_rows(folder.rows, rows)
+    manifest = describe(replace(config, out=str(out)), [], metrics, clips, protocols)
+    manifest |= {"methods": list(records.values()), "sweep_of": settings.run, "status": "done"}
+    folder.write_manifest(manifest)
+    return rows
+
+
+def _chosen(job: Job, names: Sequence[str]) -> Iterator[Variant]:
+    """Variants of a job's avatar, those named or all."""
+    derive = resolve(job.method.spec.variants)
+    for variant in derive(job.cell.avatar, job.form.clip, job.device):
+        check_name(variant.name, job.method.spec.variants, "name of a variant")
+        if not names or variant.name in names:
+            yield variant
+
+
+def _derived(base: Job, variant: Variant | None, protocols: Mapping[str, Protocol], folder: RunFolder) -> Job:
+    """The cell of a variant in the sweep's folder; of the trained avatar itself where there is none."""
+    spec = base.method.spec
+    name = spec.name if variant is None else f"{spec.name}{MARK}{variant.name}"
+    return replace(
+        base,
+        method=replace(base.method, spec=replace(spec, name=name)),
+        protocols=protocols,
+        cell=folder.cell(base.clip.subject, name, base.seed),
+    )
+
+
+def _measured(job: Job, base: Job, variant: Variant | None, metrics: Sequence[MetricSpec]) -> pd.DataFrame:
+    job.check()
+    avatar = load(base) if variant is None else variant.make(job.cell.avatar)
+    trained_from = base.cell.stage("fit") or {}
+    job.cell.finish("fit", job.fit_fingerprint, derived_from=digest(trained_from.get("fingerprint")))
+    render(job, avatar)
+    return measure(job, avatar, metrics)
+
+
+def _record(job: Job, base: Job, variant: Variant | None) -> dict[str, Any]:
+    """As a run records a method, and what it was derived from."""
+    record = job.method.record()
+    if variant is None:
+        return record
+    return {
+        **record,
+        "derived": {"from": base.method.spec.name, "variant": variant.name, "change": variant.summary},
+    }

@@ -1,0 +1,27 @@
+"""``headbench sweep``: variants of a run's avatars, their table and their plot."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ...bench.contracts import Progress, no_progress
+from ...bench.lock import locked
+from ...bench.specs import Findings
+from ...bench.store import RunFolder
+from ...bench.sweep.settings import SweepSettings
+from ...bench.sweep.sweep import sweep
+from .command import run as compare
+from .settings import ParetoSettings
+
+
+def run(settings: SweepSettings, progress: Progress = no_progress) -> Findings:
+    """Derive, measure, and write ``points.csv`` and ``pareto.png`` as `headbench pareto` does.
+
+    Raises `InputError` for a folder that is no finished run, and for methods and variants that there are not.
+    """
+    out = Path(settings.out) if settings.out else Path(settings.run) / "sweep"
+    RunFolder(out).prepare()
+    with locked(out):
+        sweep(settings, out, progress)
+        what = settings.task, settings.metric, settings.time
+        return compare(ParetoSettings((str(out),), str(out), *what), progress)
