@@ -8,3 +8,17 @@ GATE = CommandSpec(
     implementation="headbench.bench.gate.command:run",
     settings="headbench.bench.gate.settings:GateSettings",
 )
+
+VERIFY = CommandSpec(
+    name="verify",
+    summary="Recompute a run's hashes and metrics from the frames it left; exit code 1 where anything differs.",
+    implementation="headbench.bench.audit.verify:run",
+    settings="headbench.bench.audit.settings:VerifySettings",
+)
+
+EVALUATE = CommandSpec(
+    name="evaluate",
+    summary="Score a folder of images named by key: a method is compared without a plug-in.",
+    implementation="headbench.bench.audit.evaluate:run",
+    settings="headbench.bench.audit.settings:EvaluateSettings",
+)

@@ -14,6 +14,7 @@ import pandas as pd
 
 from . import adaptation
 from .adaptation import AdaptedClip, MethodNeeds
+from .audit.digests import record_digests
 from .captures import open_clips
 from .contracts import Clip
 from .device import check_device
@@ -161,7 +162,9 @@ def _run_cell(job: Job, metrics: Sequence[MetricSpec]) -> pd.DataFrame:
     try:
         avatar = fit(job)
         render(job, avatar)
-        return measure(job, avatar, metrics)
+        rows = measure(job, avatar, metrics)
+        record_digests(job, avatar)
+        return rows
     except InputError as error:
         log.error("%s failed: %s", job.name, error)
         return failed_rows(job, metrics, error)

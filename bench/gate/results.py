@@ -11,6 +11,7 @@ import pandas as pd
 
 from ..errors import InputError
 from ..files import digest
+from ..scoring import FULL
 from ..specs import MetricSpec
 from ..store import RunFolder, check_protocols, read_rows
 
@@ -126,6 +127,9 @@ def _lacking(own: pd.DataFrame, frames: int, seeds: set[int]) -> str:
         return f"{first['status']}: {' '.join(str(first['reason']).split())}"
     if not own["value"].map(lambda value: abs(value) < float("inf")).all():
         return "a value that is not finite"
+    regional = (own["region"] != FULL).all()  # seen in some frames only, which ones is the truth's matter
+    if regional:
+        frames = own.groupby(["sequence", "timestep", "camera"]).ngroups
     measured = own.drop_duplicates(["seed", "sequence", "timestep", "camera"])
     if len(measured) != len(own):
         return "frames measured twice"

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from ..scoring import FULL
 from .baseline import Baseline, Tolerance
 from .results import Place, Results
 
@@ -35,7 +36,7 @@ class Verdict:
 
     def __str__(self) -> str:
         place = self.place
-        region = "" if place.region == "full" else f" ({place.region})"
+        region = "" if place.region == FULL else f" ({place.region})"
         what = f"{place.metric}{region} of {place.method}, subject {place.subject}, {place.task}"
         if self.outcome == "missing" or self.found is None:
             return f"{what}: missing: {self.reason}"

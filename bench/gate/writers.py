@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Sequence
 from xml.etree import ElementTree
 
+from ..scoring import FULL
 from .verdicts import ORDER, Verdict
 
 SHOWN = 20
@@ -80,7 +81,7 @@ def _table(verdicts: Sequence[Verdict]) -> list[str]:
     for verdict in verdicts:
         place, tolerance = verdict.place, verdict.tolerance
         digits = tolerance.digits if tolerance else 4
-        metric = place.metric if place.region == "full" else f"{place.metric} ({place.region})"
+        metric = place.metric if place.region == FULL else f"{place.metric} ({place.region})"
         unit = f" ({tolerance.unit})" if tolerance and tolerance.unit else ""
         allowed = None
         if tolerance is not None and verdict.baseline is not None:

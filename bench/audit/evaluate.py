@@ -1,0 +1,120 @@
+"""``headbench evaluate``: scores a folder of images as if a method of a run had rendered them."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import pandas as pd
+
+from ..captures import open_clips
+from ..contracts import Avatar, Budget, Camera, Frame, FrameKey, HeadPose, Progress, no_progress
+from ..errors import HeadbenchError, InputError
+from ..files import atomic_path, check_name, digest, digest_file
+from ..lock import locked
+from ..protocol import Protocol, make_protocol
+from ..registry import discover, get, resolve
+from ..robustness.avatars import run_configuration
+from ..run_config import ResolvedMethod, RunConfig, resolve_metrics
+from ..runner import describe, make_jobs, write_reports
+from ..scoring import check_regions
+from ..specs import Findings, MethodSpec
+from ..stages import Job, measure
+from ..store import RunFolder, write_rows
+from .digests import record_digests
+from .folder_images import find_images
+from .settings import EvaluateSettings
+
+
+class NoAvatar:
+    """Stands where a run has an avatar; images of a folder have none, and no metric of one is taken."""
+
+    def render(self, camera: Camera, pose: HeadPose, background: Sequence[float] = (1.0, 1.0, 1.0)) -> Frame:
+        """There is nothing to render."""
+        raise HeadbenchError("images of a folder have no avatar")
+
+    def files(self) -> Sequence[Path]:
+        """There is nothing to store."""
+        return []
+
+
+def images_method(label: str, version: str) -> ResolvedMethod:
+    """A method that is nothing but its images; ``version`` is their digest."""
+    return ResolvedMethod(MethodSpec(label, "images of a folder", "", version=version), None, Budget())
+
+
+def run(settings: EvaluateSettings, progress: Progress = no_progress) -> Findings:
+    """Check everything, copy the images into the layout of a run, score them, write rows, manifest and reports.
+
+    Raises `InputError` for whatever is wrong with settings, capture or images, before anything is written.
+    """
+    config = _configuration(settings)
+    metrics = [metric for metric in resolve_metrics(config) if metric.per_frame]
+    if not metrics:
+        raise InputError("metrics", "", "at least one metric of frames", ", ".join(config.metrics))
+    clips = open_clips(config)
+    protocols: dict[str, Protocol] = {
+        task: make_protocol(task, clips, config.frames_per_task) for task in config.tasks
+    }
+    images = find_images(Path(settings.folder), clips, protocols)
+    digests = [[task, str(key), digest_file(path)] for (task, key), path in sorted(images.items())]
+    method = images_method(config.methods[0], digest(digests)[:12])
+    folder = RunFolder(Path(config.out))
+    folder.prepare()
+    with locked(folder.root):
+        regions = {clip.subject: check_regions(clip, config.regions) for clip in clips}
+        jobs = make_jobs(config, [method], clips, protocols, folder, {}, regions)
+        manifest = describe(config, [method], metrics, clips, protocols)
+        manifest["evaluated"] = str(Path(settings.folder))
+        folder.write_manifest({**manifest, "status": "started"})
+        parts = []
+        avatar: Avatar = NoAvatar()
+        for index, job in enumerate(jobs):
+            _copy(images, job)
+            parts.append(measure(job, avatar, metrics))
+            record_digests(job, avatar)
+            progress(index + 1, len(jobs), job.name)
+        rows = pd.concat(parts, ignore_index=True)
+        write_rows(folder.rows, rows)
+        folder.write_manifest({**manifest, "status": "done"})
+        write_reports(folder.root)
+    text = resolve(get("reports", "table-text").implementation)(folder.root, "md")
+    data = {"out": folder.root, "method": method.spec.name, "version": method.spec.version, "rows": len(rows)}
+    return Findings(f"{text}\n{folder.root}", data)
+
+
+def _configuration(settings: EvaluateSettings) -> RunConfig:
+    label = check_name(settings.label, "command line", "--label")
+    if label in discover("methods"):
+        expected = "a name that no registered method has"
+        raise InputError("command line", "--label", expected, repr(label), f"For example {label}-official.")
+    if settings.like is not None:
+        config = run_configuration(Path(settings.like))
+        config = replace(config, data=settings.clip or config.data)
+    else:
+        config = RunConfig(
+            data=str(settings.clip),
+            out=settings.out,
+            tasks=settings.tasks,
+            metrics=settings.metrics,
+            reader=settings.reader,
+            reader_settings={} if settings.head is None else {"head": settings.head},
+            frames_per_task=settings.frames_per_task,
+        )
+    if Path(settings.out).resolve() == Path(settings.like or "").resolve():
+        raise InputError("command line", "--out", "a folder of its own", "that of the run")
+    return replace(
+        config, out=settings.out, methods=(label,), seeds=(0,), settings={}, heads={}, device="cpu"
+    )
+
+
+def _copy(images: Mapping[tuple[str, FrameKey], Path], job: Job) -> None:
+    """Bring the images of a subject to where a run has its renders."""
+    for (task, key), source in images.items():
+        target = job.cell.render(task, key)
+        if key.subject != job.clip.subject or (target.exists() and target.samefile(source)):
+            continue
+        with atomic_path(target) as temporary:
+            shutil.copyfile(source, temporary)

@@ -1,0 +1,246 @@
+"""``headbench verify``: everything that a run claims, computed again from the files it left."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from ..captures import open_clips
+from ..contracts import Avatar, Clip, Progress, no_progress
+from ..errors import HeadbenchError, InputError
+from ..files import digest_file, plain
+from ..protocol import Protocol, make_protocol
+from ..robustness.avatars import load, run_configuration
+from ..run_config import ResolvedMethod, RunConfig, resolve_methods, resolve_metrics
+from ..runner import adapt, make_jobs
+from ..scoring import check_regions
+from ..specs import Findings, MetricSpec
+from ..stages import Job, measure
+from ..store import Cell, RunFolder, check_protocols, read_rows
+from .digests import STAGE, frame_paths
+from .evaluate import NoAvatar, images_method
+from .settings import VerifySettings
+
+KEY = ["method", "seed", "task", "subject", "sequence", "timestep", "camera", "region", "metric"]
+SHOWN = 20
+
+
+@dataclass(frozen=True)
+class Mismatch:
+    """Something that is not what it claims to be."""
+
+    file: Path
+    key: str
+    expected: str
+    found: str
+
+    def __str__(self) -> str:
+        where = f"{self.file}, {self.key}" if self.key else str(self.file)
+        return f"{where}: expected {self.expected}, found {self.found}"
+
+
+@dataclass
+class _Report:
+    """What was looked at, and what was found."""
+
+    mismatches: list[Mismatch]
+    files: int = 0
+    values: int = 0
+    unverified: int = 0
+
+
+def run(settings: VerifySettings, progress: Progress = no_progress) -> Findings:
+    """Verify a run; did not pass where anything differs.
+
+    Recomputed: fingerprints of the captures, hashes of the protocols, fingerprint of what each avatar was made of,
+    digests of frames and avatar files, every metric of frames and those of avatars that are not bound to a machine.
+    A value may differ by a tenth of the last digit that tables show, for networks that round otherwise elsewhere.
+
+    Raises `InputError` for a folder that is no finished run, and a capture that cannot be opened.
+    """
+    folder = RunFolder(Path(settings.run))
+    manifest = folder.read_manifest()
+    if manifest.get("status") != "done":
+        raise InputError(
+            folder.manifest, "status", "'done'", repr(manifest.get("status")), "Start the run again."
+        )
+    config = run_configuration(folder.root)
+    if settings.data is not None:
+        config = replace(config, data=settings.data)
+    rows = read_rows(folder.rows)
+    methods = _methods(config, manifest)
+    metrics = resolve_metrics(config) if _has_avatars(methods) else _of_frames(resolve_metrics(config))
+    clips = open_clips(config)
+    protocols: dict[str, Protocol] = {
+        task: make_protocol(task, clips, config.frames_per_task) for task in config.tasks
+    }
+    report = _Report([*_clips(folder, manifest, clips), *_protocols(folder, manifest, protocols)])
+    if not report.mismatches:
+        check_protocols(rows, folder.rows, {task: protocol.hash for task, protocol in protocols.items()})
+        regions = {clip.subject: check_regions(clip, config.regions) for clip in clips}
+        adapted = adapt(clips, methods, config, folder) if _has_avatars(methods) else {}
+        jobs = make_jobs(config, methods, clips, protocols, folder, adapted, regions)
+        for index, job in enumerate(jobs):
+            _verify_cell(job, metrics, rows, folder.rows, report)
+            progress(index + 1, len(jobs), job.name)
+    told = [f"  {mismatch}" for mismatch in report.mismatches[:SHOWN]]
+    if len(report.mismatches) > SHOWN:
+        told.append(f"  and {len(report.mismatches) - SHOWN} more")
+    verdict = f"{len(report.mismatches)} mismatches" if report.mismatches else "as recorded"
+    looked = f"{report.files} files and {report.values} values recomputed"
+    left = f"; {report.unverified} values bound to a machine or absent are not recomputed" * bool(
+        report.unverified
+    )
+    data = {
+        "mismatches": [asdict(mismatch) for mismatch in report.mismatches],
+        "files": report.files,
+        "values": report.values,
+        "unverified": report.unverified,
+    }
+    text = "\n".join([f"{folder.root}: {verdict}: {looked}{left}.", *told])
+    return Findings(text, data, not report.mismatches)
+
+
+def _methods(config: RunConfig, manifest: Mapping[str, Any]) -> list[ResolvedMethod]:
+    entries = manifest["methods"]
+    if any(entry["implementation"] for entry in entries):
+        return resolve_methods(config)
+    return [images_method(str(entry["name"]), str(entry["version"])) for entry in entries]
+
+
+def _has_avatars(methods: Sequence[ResolvedMethod]) -> bool:
+    return any(method.spec.implementation for method in methods)
+
+
+def _of_frames(metrics: Sequence[MetricSpec]) -> list[MetricSpec]:
+    return [metric for metric in metrics if metric.per_frame]
+
+
+def _clips(folder: RunFolder, manifest: Mapping[str, Any], clips: Sequence[Clip]) -> Iterator[Mismatch]:
+    found = {clip.subject: clip.fingerprint for clip in clips}
+    for entry in manifest["clips"]:
+        subject, expected = str(entry["subject"]), str(entry["fingerprint"])
+        if found.get(subject) != expected:
+            there = found.get(subject, "no such capture")
+            yield Mismatch(folder.manifest, f"clips, fingerprint of {subject}", expected[:12], there[:12])
+
+
+def _protocols(
+    folder: RunFolder, manifest: Mapping[str, Any], protocols: Mapping[str, Protocol]
+) -> Iterator[Mismatch]:
+    """The recorded protocols, field by field, against those that captures and settings give."""
+    for task, protocol in protocols.items():
+        wanted = {"id": protocol.id, "hash": protocol.hash, **asdict(protocol)}
+        expected = json.loads(json.dumps(wanted, default=plain))
+        recorded = manifest["protocols"].get(task, {})
+        for name, value in expected.items():
+            if recorded.get(name) != value:
+                key = f"protocols.{task}.{name}"
+                yield Mismatch(folder.manifest, key, _short(value), _short(recorded.get(name)))
+
+
+def _verify_cell(
+    job: Job, metrics: Sequence[MetricSpec], rows: pd.DataFrame, file: Path, report: _Report
+) -> None:
+    method = job.method.spec
+    own = rows[
+        (rows["method"] == method.name) & (rows["subject"] == job.clip.subject) & (rows["seed"] == job.seed)
+    ]
+    if len(own) and (own["status"] == "failed").all():
+        report.unverified += len(own)
+        return  # recorded as failed: there is nothing it claims
+    report.mismatches += _files(job, report)
+    missing = [path for path in frame_paths(job) if not path.is_file()]
+    if missing:
+        return  # each is told above
+    if not method.implementation:
+        avatar: Avatar = NoAvatar()
+    else:
+        state = job.cell.stage("fit") or {}
+        if state.get("fingerprint") != job.fit_fingerprint:
+            found = _short(state.get("fingerprint"))
+            report.mismatches.append(
+                Mismatch(job.cell.folder / "fit.json", "fingerprint", job.fit_fingerprint[:12], found)
+            )
+        avatar = load(job)
+    report.mismatches += _values(_measured_anew(job, avatar, metrics), own, metrics, file, report)
+
+
+def _files(job: Job, report: _Report) -> Iterator[Mismatch]:
+    """Digests of frames and avatar files; every scored frame has to have one."""
+    record = job.cell.folder / f"{STAGE}.json"
+    digests = dict((job.cell.stage(STAGE) or {}).get("files", {}))
+    for path in frame_paths(job):
+        name = path.relative_to(job.cell.folder).as_posix()
+        if name not in digests:
+            yield Mismatch(record, f"files, {name}", "a digest", "none")
+    for name, expected in digests.items():
+        path = job.cell.folder / name
+        if not path.is_file():
+            yield Mismatch(path, "", f"a file of digest {str(expected)[:12]}", "no such file")
+            continue
+        report.files += 1
+        found = digest_file(path)
+        if found != expected:
+            yield Mismatch(path, "digest", str(expected)[:12], found[:12])
+
+
+def _measured_anew(job: Job, avatar: Avatar, metrics: Sequence[MetricSpec]) -> pd.DataFrame:
+    """Measure the stored frames as if for the first time, beside the run."""
+    stable = [metric for metric in metrics if not metric.machine_bound]
+    with tempfile.TemporaryDirectory() as name:
+        scratch = Cell(Path(name))
+        (scratch.folder / "renders").symlink_to((job.cell.folder / "renders").resolve())
+        return measure(replace(job, cell=scratch), avatar, stable)
+
+
+def _values(
+    anew: pd.DataFrame, own: pd.DataFrame, metrics: Sequence[MetricSpec], file: Path, report: _Report
+) -> Iterator[Mismatch]:
+    recorded, found = _by_place(own), _by_place(anew)
+    if len(recorded) != len(own):
+        twice = own[own.duplicated(KEY)][KEY].iloc[0].tolist()
+        yield Mismatch(file, _place(twice), "one row", "several")
+        return
+    tolerances = {metric.name: 10.0 ** -(metric.digits + 1) for metric in metrics}
+    bound = {metric.name for metric in metrics if metric.machine_bound}
+    for place, (status, value, _) in recorded.items():
+        metric = str(place[-1])
+        again = found.pop(place, None)
+        if metric in bound or status == "missing":
+            report.unverified += 1
+        elif again is None:
+            yield Mismatch(file, _place(place), "no row: nothing asks for it", f"{value:.9g}")
+        elif again[0] != "ok":
+            raise HeadbenchError(f"{_place(place)} was measured, and cannot be now: {again[2]}")
+        else:
+            report.values += 1
+            if not abs(again[1] - value) <= tolerances[metric]:
+                yield Mismatch(file, _place(place), f"{again[1]:.9g}", f"{value:.9g}")
+    for place, (status, value, _) in found.items():
+        if status == "ok":
+            yield Mismatch(file, _place(place), f"a row with {value:.9g}", "none")
+
+
+def _by_place(rows: pd.DataFrame) -> dict[tuple[Any, ...], tuple[str, float, str]]:
+    """Status, value and reason of each row, by what it is of."""
+    places = rows[KEY].itertuples(index=False, name=None)
+    content = rows[["status", "value", "reason"]].itertuples(index=False, name=None)
+    return {place: (str(s), float(v), str(r)) for place, (s, v, r) in zip(places, content)}
+
+
+def _place(key: Sequence[Any]) -> str:
+    parts = dict(zip(KEY, key))
+    frame = f"{parts['sequence']} {parts['timestep']} {parts['camera']}" if parts["task"] else "avatar"
+    return f"{parts['metric']} ({parts['region']}) of {parts['method']}, {parts['subject']} {frame}"
+
+
+def _short(value: Any) -> str:
+    text = str(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."

@@ -1,0 +1,139 @@
+"""Folders of images by key: scored as a run scores its own, in every layout; what is wrong is told before work."""
+
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+
+from headbench.bench import cli
+from headbench.bench.audit.evaluate import run as evaluate
+from headbench.bench.audit.settings import EvaluateSettings
+from headbench.bench.errors import InputError
+from headbench.bench.frames import read_png, write_png
+from headbench.bench.store import COLUMNS, RunFolder, read_rows
+
+
+@pytest.fixture
+def renders(run):
+    """Renders of the run's one cell, by task."""
+    return RunFolder(run).cell("subject1", "toy", 0).folder / "renders"
+
+
+@pytest.fixture
+def images(renders, tmp_path):
+    """The same images as a stranger would hand them over: in one folder, named by key."""
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for path in renders.glob("*/*.png"):
+        shutil.copy(path, folder / path.name)
+    return folder
+
+
+def scored(folder, run, out, label="theirs"):
+    evaluate(EvaluateSettings(str(folder), out=str(out), like=str(run), label=label))
+    rows = read_rows(RunFolder(out).rows)
+    return rows[rows["metric"] == "psnr"].reset_index(drop=True)
+
+
+def test_images_of_a_run_score_as_in_the_run_under_their_own_label(run, images, tmp_path):
+    theirs = scored(images, run, tmp_path / "out")
+    rows = read_rows(RunFolder(run).rows)
+    own = rows[rows["metric"] == "psnr"].reset_index(drop=True)
+    assert set(theirs["method"]) == {"theirs"}
+    same = [column for column in COLUMNS if column not in ("method", "version")]
+    assert theirs[same].equals(own[same])
+
+
+@pytest.mark.parametrize("layout", ["{task}/{name}", "renders/{task}/{name}", "subject1/{task}/{name}"])
+def test_every_layout_gives_the_same_rows(run, renders, images, tmp_path, layout):
+    other = tmp_path / "other"
+    for path in renders.glob("*/*.png"):
+        target = other / layout.format(task=path.parent.name, name=path.name)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(path, target)
+    assert scored(other, run, tmp_path / "a").equals(scored(images, run, tmp_path / "b"))
+
+
+def test_a_cell_of_a_run_is_a_folder_of_images(run, renders, images, tmp_path):
+    assert scored(renders.parent, run, tmp_path / "a").equals(scored(images, run, tmp_path / "b"))
+
+
+def test_the_rows_stand_in_one_table_with_the_runs_and_verify(run, images, tmp_path):
+    from headbench.reports.run_set import RunSet
+
+    worse = tmp_path / "worse"
+    shutil.copytree(images, worse)
+    for path in worse.iterdir():
+        write_png(path, read_png(path) + 9)
+    scored(worse, run, tmp_path / "out")
+    together = RunSet.read([run, tmp_path / "out"])
+    assert together.methods == ("toy", "theirs")
+    means = together.rows[together.rows["metric"] == "psnr"].groupby("method")["value"].mean()
+    assert means["theirs"] < means["toy"]
+    assert cli.main(["verify", str(tmp_path / "out")]) == 0
+    frame = next((tmp_path / "out").glob("subject1/theirs/seed-0/renders/novel_view/*.png"))
+    write_png(frame, read_png(frame) + 1)
+    assert cli.main(["verify", str(tmp_path / "out")]) == 1
+
+
+def test_changed_images_are_scored_anew_in_the_same_folder(run, images, tmp_path):
+    before = scored(images, run, tmp_path / "out")
+    for path in images.iterdir():
+        write_png(path, read_png(path) + 9)
+    after = scored(images, run, tmp_path / "out")
+    assert (after["value"] < before["value"]).all()
+    assert set(after["version"]) != set(before["version"])
+
+
+def test_missing_images_are_counted_before_anything_is_written(run, images, tmp_path):
+    gone = sorted(images.iterdir())[:2]
+    for path in gone:
+        path.unlink()
+    with pytest.raises(
+        InputError, match=r"an image for each of 5 frames, found 2 without.*looked for as subject1/"
+    ):
+        scored(images, run, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def jpeg(path, image):
+    path.write_bytes(cv2.imencode(".jpg", image)[1].tobytes())
+
+
+def png(path, image):
+    path.write_bytes(cv2.imencode(".png", image)[1].tobytes())
+
+
+@pytest.mark.parametrize(
+    ("spoil", "match"),
+    [
+        (lambda p: png(p, np.zeros((7, 8, 3), np.uint8)), "8 x 6 pixels, as the truth, found 8 x 7"),
+        (lambda p: png(p, np.zeros((6, 8, 4), np.uint8)), "Composite it on the background"),
+        (lambda p: png(p, np.zeros((6, 8), np.uint8)), "8-bit RGB"),
+        (lambda p: jpeg(p, np.zeros((6, 8, 3), np.uint8)), "lossless"),
+        (lambda p: p.write_bytes(b"no image"), "cannot be read"),
+    ],
+)
+def test_images_that_would_mislead_are_refused_by_name(run, images, tmp_path, spoil, match):
+    path = sorted(images.iterdir())[3]
+    spoil(path)
+    with pytest.raises(InputError, match=match) as refused:
+        scored(images, run, tmp_path / "out")
+    assert path.name in str(refused.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_registered_name_is_no_label(run, images, tmp_path):
+    with pytest.raises(InputError, match="ga-official"):
+        scored(images, run, tmp_path / "out", label="ga")
+
+
+def test_the_runs_own_folder_is_no_place_to_write(run, images):
+    with pytest.raises(InputError, match="a folder of its own"):
+        scored(images, run, run)
+
+
+def test_what_to_score_against_has_to_be_said(images, tmp_path):
+    with pytest.raises(ValueError, match="--clip"):
+        EvaluateSettings(str(images), out=str(tmp_path / "out"))
