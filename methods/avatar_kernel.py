@@ -23,12 +23,25 @@ UNITS_STEP = 16
 
 def available() -> bool:
     """Tell whether the kernel is there; one built from older sources, in an editable installation, counts as none."""
-    return hasattr(load(), "offset_network")
+    return hasattr(load(), "triangles")
 
 
 def usable(like: Tensor) -> bool:
     """Tell whether the kernel is there and takes tensors like this one."""
     return like.dtype == torch.float32 and like.device.type == "cpu" and available()
+
+
+def triangles(vertices: Tensor, faces: Tensor, backend: str = "cpu") -> Frames:
+    """Frames of the triangles of a mesh: the twin of `binding.triangle_frames`.
+
+    Parameters
+    ----------
+    vertices, faces : (V, 3), and (F, 3) int64.
+    """
+    count, empty = len(faces), vertices.new_empty
+    frames = Frames(empty(count, 3, 3), empty(count, 3), empty(count), empty(count, 4))
+    _call("triangles", vertices, faces, *frames, backend=backend)
+    return frames
 
 
 def carry(

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ..bench.contracts import FloatArray, HeadAsset, HeadPose
 from ..datasets.head.model import HeadModel
+from . import avatar_kernel
 from .binding import Frames, triangle_frames
 
 Value = TypeVar("Value")
@@ -58,7 +59,9 @@ class SubjectMesh:
         return self.posed({**arguments, **still})
 
     def frames(self, vertices: Tensor) -> Frames:
-        """Triangle frames of a mesh."""
+        """Triangle frames of a mesh; differentiable in its vertices."""
+        if avatar_kernel.usable(vertices) and not (vertices.requires_grad and torch.is_grad_enabled()):
+            return avatar_kernel.triangles(vertices, self.faces)
         return triangle_frames(vertices, self.faces)
 
 

@@ -41,6 +41,44 @@ def unit(vectors):
 
 @settings(max_examples=20, deadline=None)
 @given(count=COUNTS, seed=st.integers(0, 1000))
+def test_frames_of_triangles_are_those_of_their_definition(backend, count, seed):
+    """Turned any way, so that each of the quaternion's four numbers is the largest somewhere."""
+    vertices = 0.1 * numbers(seed)(30, 3)
+    faces = torch.stack(
+        [torch.randperm(30, generator=torch.Generator().manual_seed(n))[:3] for n in range(count)]
+        or [torch.empty(0, dtype=torch.int64)]
+    ).view(-1, 3)
+    found = avatar_kernel.triangles(vertices, faces, backend)
+    expected = triangle_frames(vertices.double(), faces)
+    # A thin triangle's normal and the quaternion of a half turn are known less well.
+    corners = vertices.double()[faces]
+    edges = corners - corners.roll(1, 1)
+    area = torch.linalg.cross(edges[:, 0], edges[:, 1]).norm(dim=1)
+    tolerance = 1e-6 + 1e-6 * (edges.square().sum((1, 2)) / area).numpy()
+    off = (found.rotation - expected.rotation).abs().flatten(1).amax(1).numpy() if count else np.zeros(0)
+    assert (off < tolerance).all()
+    np.testing.assert_allclose(found.center, expected.center, atol=1e-7)
+    np.testing.assert_allclose(found.size, expected.size, rtol=1e-5)
+    alike = (found.quaternion.double() * expected.quaternion).sum(1).abs().numpy()
+    assert (1 - alike < tolerance).all()
+    np.testing.assert_allclose(found.quaternion.norm(dim=1), 1, atol=1e-6)
+
+
+def test_a_triangle_without_area_has_a_finite_frame(backend):
+    vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
+    faces = torch.tensor([[0, 1, 2], [0, 0, 0]])
+    for one, other in zip(
+        avatar_kernel.triangles(vertices, faces, backend), triangle_frames(vertices, faces)
+    ):
+        assert torch.isfinite(one).all()
+        np.testing.assert_allclose(one, other, atol=1e-6)
+    for number in (-1, 3):
+        with pytest.raises(ValueError, match="fit"):
+            avatar_kernel.triangles(vertices, torch.tensor([[0, 1, number]]), backend)
+
+
+@settings(max_examples=20, deadline=None)
+@given(count=COUNTS, seed=st.integers(0, 1000))
 def test_splats_are_carried_as_defined(backend, count, seed):
     normal = numbers(seed)
     frames = mesh(normal, 40)

@@ -1,4 +1,4 @@
-// What avatars compute of a pose, as functions of the Python module: splats are dealt out to threads, no two of which
+// What avatars compute of a pose, as functions of the Python module: triangles and splats are dealt out to threads, no two of which
 // write to one place, so that results are equal bit for bit for any number of them.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
@@ -21,8 +21,8 @@ namespace {
 template <class T, nb::ssize_t... Shape>
 using Array = nb::ndarray<T, nb::shape<Shape...>, nb::c_contig, nb::device::cpu>;
 
-constexpr std::int64_t kSplatsPerTask = 1024;
-static_assert(kSplatsPerTask % kHarmonicsBlock == 0);
+constexpr std::int64_t kPerTask = 1024;
+static_assert(kPerTask % kHarmonicsBlock == 0);
 
 // Shapes are checked in Python; this only keeps memory safe.
 void require(bool fit) {
@@ -37,12 +37,12 @@ bool below(const T* values, std::size_t count, std::size_t limit) {
 }
 
 template <class Body>
-void for_splats(std::size_t count, int threads, const Body& body) {
-  const std::int64_t splats = static_cast<std::int64_t>(count);
-  ThreadPool::instance().run((splats + kSplatsPerTask - 1) / kSplatsPerTask, std::max(threads, 1),
+void share_out(std::size_t count, int threads, const Body& body) {
+  const std::int64_t all = static_cast<std::int64_t>(count);
+  ThreadPool::instance().run((all + kPerTask - 1) / kPerTask, std::max(threads, 1),
                              [&](std::int64_t task, int worker) {
-                               const std::int64_t begin = task * kSplatsPerTask;
-                               body(begin, std::min(begin + kSplatsPerTask, splats), worker);
+                               const std::int64_t begin = task * kPerTask;
+                               body(begin, std::min(begin + kPerTask, all), worker);
                              });
 }
 
@@ -59,6 +59,19 @@ class Scratch {
   Buffer<float> memory_;
 };
 
+void triangles(const Array<const float, -1, 3>& vertices, const Array<const std::int64_t, -1, 3>& faces,
+               const Array<float, -1, 3, 3>& rotations, const Array<float, -1, 3>& centers,
+               const Array<float, -1>& sizes, const Array<float, -1, 4>& quaternions, const std::string& instruction_set,
+               int threads) {
+  const std::size_t count = faces.shape(0);
+  require(rotations.shape(0) == count && centers.shape(0) == count && sizes.shape(0) == count);
+  require(quaternions.shape(0) == count && below(faces.data(), 3 * count, vertices.shape(0)));
+  const Triangles in{vertices.data(), faces.data(), rotations.data(), centers.data(), sizes.data(), quaternions.data()};
+  const Stages& stages = stages_by_name(instruction_set);
+  nb::gil_scoped_release unlocked;
+  share_out(count, threads, [&](std::int64_t begin, std::int64_t end, int) { stages.triangles(in, begin, end); });
+}
+
 void carry(const Array<const std::int64_t, -1>& binding, const Array<const float, -1, 3, 3>& rotations,
            const Array<const float, -1, 3>& centers, const Array<const float, -1>& sizes,
            const Array<const float, -1, 4>& quaternions, const Array<const float, -1, 3>& means,
@@ -74,7 +87,7 @@ void carry(const Array<const std::int64_t, -1>& binding, const Array<const float
                  quats.data(),   scales.data(),    world_means.data(), world_quats.data(), world_scales.data()};
   const Stages& stages = stages_by_name(instruction_set);
   nb::gil_scoped_release unlocked;
-  for_splats(count, threads, [&](std::int64_t begin, std::int64_t end, int) { stages.carry(in, begin, end); });
+  share_out(count, threads, [&](std::int64_t begin, std::int64_t end, int) { stages.carry(in, begin, end); });
 }
 
 void shade(const Array<const float, -1, 3, -1, kHarmonicsBlock>& coefficients, const Array<const float, -1, 3>& means,
@@ -95,7 +108,7 @@ void shade(const Array<const float, -1, 3, -1, kHarmonicsBlock>& coefficients, c
   for (int k = 0; k < 3; ++k) in.center[k] = center(k);
   const Stages& stages = stages_by_name(instruction_set);
   nb::gil_scoped_release unlocked;
-  for_splats(count, threads, [&](std::int64_t begin, std::int64_t end, int) { stages.shade(in, begin, end); });
+  share_out(count, threads, [&](std::int64_t begin, std::int64_t end, int) { stages.shade(in, begin, end); });
 }
 
 void color_network(const Array<const float, -1, -1>& positions, const Array<const float, kEncoding, -1>& second,
@@ -113,7 +126,7 @@ void color_network(const Array<const float, -1, -1>& positions, const Array<cons
   const Stages& stages = stages_by_name(instruction_set);
   nb::gil_scoped_release unlocked;
   const Scratch scratch(stages.color_scratch(net.hidden), threads);
-  for_splats(count, threads, [&](std::int64_t begin, std::int64_t end, int worker) {
+  share_out(count, threads, [&](std::int64_t begin, std::int64_t end, int worker) {
     stages.color_network(net, begin, end, scratch.of(worker));
   });
 }
@@ -136,7 +149,7 @@ void offset_network(const Array<const float, -1, -1>& table, const Array<const s
   const Stages& stages = stages_by_name(instruction_set);
   nb::gil_scoped_release unlocked;
   const Scratch scratch(stages.offset_scratch(net.units, net.hidden), threads);
-  for_splats(count, threads, [&](std::int64_t begin, std::int64_t end, int worker) {
+  share_out(count, threads, [&](std::int64_t begin, std::int64_t end, int worker) {
     stages.offset_network(net, begin, end, scratch.of(worker));
   });
 }
@@ -144,6 +157,8 @@ void offset_network(const Array<const float, -1, -1>& table, const Array<const s
 }  // namespace
 
 void bind_avatar(nb::module_& m) {
+  m.def("triangles", &triangles, "vertices"_a, "faces"_a, "rotations"_a, "centers"_a, "sizes"_a, "quaternions"_a,
+        "instruction_set"_a, "threads"_a, "Write the frames of a mesh's triangles.");
   m.def("carry", &carry, "binding"_a, "rotations"_a, "centers"_a, "sizes"_a, "quaternions"_a, "means"_a, "quats"_a,
         "scales"_a, "world_means"_a, "world_quats"_a, "world_scales"_a, "instruction_set"_a, "threads"_a,
         "Write the splats' means, quaternions and scales in the world.");

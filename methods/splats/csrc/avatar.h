@@ -8,6 +8,16 @@
 
 namespace headbench {
 
+// Frames of the triangles of a mesh of V vertices.
+struct Triangles {
+  const float* vertices;      // (V, 3)
+  const std::int64_t* faces;  // (F, 3)
+  float* rotations;           // (F, 3, 3)
+  float* centers;             // (F, 3)
+  float* sizes;               // (F,)
+  float* quaternions;         // (F, 4)
+};
+
 // Splats from their triangles' frames to the world; the formulas of binding.py, `to_world`.
 struct Carry {
   const std::int64_t* binding;  // (N,) triangles

@@ -64,12 +64,14 @@ inline void color_network(const ColorNetwork& net, std::int64_t begin, std::int6
       const float* starts[kSplatGroup];
       for (int s = 0; s < kSplatGroup; ++s) starts[s] = net.positions + (splat + (s < used ? s : 0)) * net.hidden;
       dense_layer(starts, net.second, net.hidden, encoded + offset, kBatch, rows, kEncoding, scratch);
-      for (int s = 0; s < used; ++s)
-        for (int channel = 0; channel < 3; ++channel) {
-          const float sum = dot(scratch + s * net.hidden, net.last + channel * net.hidden, net.hidden);
-          const float color = 0.5f + 0.28209479177387814f * sum;
+      for (int channel = 0; channel < 3; ++channel) {
+        float sums[kSplatGroup];
+        dots(scratch, net.last + channel * net.hidden, net.hidden, sums);
+        for (int s = 0; s < used; ++s) {
+          const float color = 0.5f + 0.28209479177387814f * sums[s];
           net.colors[3 * (splat + s) + channel] = color > 0.0f ? color : 0.0f;
         }
+      }
     }
   }
 }

@@ -39,14 +39,24 @@ inline void dense_layer(const float* const* starts, const float* weights, int wi
     dense_columns<1>(starts, weights, width, inputs, stride, rows, count, column, out);
 }
 
-HEADBENCH_INLINE float dot(const float* a, const float* b, int count) {
-  Real sum = 0.0f;
-  for (int k = 0; k < count; k += W) sum = fma(load(a + k), load(b + k), sum);
-  alignas(64) float lanes[W];
-  store(lanes, sum);
-  for (int half = W / 2; half > 0; half /= 2)
-    for (int lane = 0; lane < half; ++lane) lanes[lane] += lanes[lane + half];
-  return lanes[0];
+// Products of each row of a group, `width` numbers, with the same weights.
+HEADBENCH_INLINE void dots(const float* rows, const float* weights, int width, float* out) {
+  static_assert(kSplatGroup % 4 == 0);
+  for (int s = 0; s < kSplatGroup; s += 4) {
+    Real sums[4] = {0.0f, 0.0f, 0.0f, 0.0f};
+    for (int k = 0; k < width; k += W) {
+      const Real weight = load(weights + k);
+      for (int i = 0; i < 4; ++i) sums[i] = fma(load(rows + (s + i) * width + k), weight, sums[i]);
+    }
+    transpose_quads(sums);
+    alignas(64) float lanes[W];
+    store(lanes, (sums[0] + sums[1]) + (sums[2] + sums[3]));
+    for (int i = 0; i < 4; ++i) {
+      float sum = lanes[i];
+      for (int quad = 4; quad < W; quad += 4) sum += lanes[quad + i];
+      out[s + i] = sum;
+    }
+  }
 }
 
 }  // namespace headbench::HEADBENCH_ISA

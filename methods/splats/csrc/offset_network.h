@@ -57,10 +57,12 @@ inline void offset_network(const OffsetNetwork& net, std::int64_t begin, std::in
     const float* starts[kSplatGroup];
     for (int s = 0; s < kSplatGroup; ++s) starts[s] = net.second_bias;
     dense_layer(starts, net.second, net.hidden, on, kSplatGroup, units, count, second);
-    for (int s = 0; s < used; ++s)
-      for (int output = 0; output < net.outputs; ++output)
-        net.offsets[net.splats[start + s] * net.outputs + output] =
-            dot(second + s * net.hidden, net.last + output * net.hidden, net.hidden) + net.last_bias[output];
+    for (int output = 0; output < net.outputs; ++output) {
+      float sums[kSplatGroup];
+      dots(second, net.last + static_cast<std::size_t>(output) * net.hidden, net.hidden, sums);
+      for (int s = 0; s < used; ++s)
+        net.offsets[net.splats[start + s] * net.outputs + output] = sums[s] + net.last_bias[output];
+    }
   }
 }
 

@@ -145,7 +145,8 @@ struct Stages {
   void (*count_work)(const View&, const Splats&, const FrameData&, int tile, float* scratch, Work& work);
   float (*multiply_add)(std::int64_t rounds);  // `chains` vectors a round
   int chains;
-  // Of avatars, for splats [begin, end).
+  // Of avatars, for triangles or splats [begin, end).
+  void (*triangles)(const Triangles&, std::int64_t begin, std::int64_t end);
   void (*carry)(const Carry&, std::int64_t begin, std::int64_t end);
   void (*shade)(const Harmonics&, std::int64_t begin, std::int64_t end);
   std::size_t (*color_scratch)(int hidden);

@@ -10,6 +10,7 @@
 #include "measure.h"
 #include "offset_network.h"
 #include "projection_backward.h"
+#include "triangles.h"
 
 namespace headbench::HEADBENCH_ISA {
 
@@ -21,7 +22,7 @@ inline std::size_t scratch_floats(int channels) {
 extern const Stages stages;
 const Stages stages = {HEADBENCH_ISA_NAME, W,          project,      find_entries,     scratch_floats,
                        draw_tile,          draw_tile_backward, project_backward, count_work,
-                       multiply_add,       kChains,    carry,        shade,
+                       multiply_add,       kChains,    triangles,    carry,        shade,
                        color_scratch,      color_network, offset_scratch,   offset_network};
 
 }  // namespace headbench::HEADBENCH_ISA
