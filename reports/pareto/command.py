@@ -28,7 +28,7 @@ def run(settings: ParetoSettings, progress: Progress = no_progress) -> Findings:
     )
     RunFolder(out).prepare()
     sign = 1.0 if metric.higher_is_better else -1.0
-    fronts = {cost: _front(points, cost, sign) for cost in COSTS}
+    fronts = {cost: _front(points, cost, sign, range(len(points))) for cost in COSTS}
     with (
         atomic_path(out / "points.csv") as temporary,
         temporary.open("w", newline="", encoding="utf-8") as stream,
@@ -40,7 +40,10 @@ def run(settings: ParetoSettings, progress: Progress = no_progress) -> Findings:
             marks = [int(index in fronts[cost]) for cost in COSTS]
             writer.writerow([*(asdict(point)[name] for name in names), *marks])
     unit = f", {metric.unit}" if metric.unit else ""
-    labels = {**COSTS, **({"milliseconds": f"{settings.time}, ms"} if settings.time else {})}
+    labels = {
+        **COSTS,
+        **({"milliseconds": f"{settings.time.replace('_', ' ').capitalize()}, ms"} if settings.time else {}),
+    }
     panels = [
         Panel(
             label,
@@ -49,6 +52,10 @@ def run(settings: ParetoSettings, progress: Progress = no_progress) -> Findings:
             fronts[cost],
             _series(points),
             [point.variant for point in points],
+            {
+                name: _front(points, cost, sign, [i for i, own in enumerate(_series(points)) if own == name])
+                for name in _series(points)
+            },
         )
         for cost, label in labels.items()
     ]
@@ -65,9 +72,9 @@ def run(settings: ParetoSettings, progress: Progress = no_progress) -> Findings:
     return Findings(_text(points, fronts, left_out, metric.label, metric.digits), data)
 
 
-def _front(points: Sequence[Point], cost: str, sign: float) -> list[int]:
-    """Indices of the front among the points whose cost was measured."""
-    known = [i for i, point in enumerate(points) if getattr(point, cost) is not None]
+def _front(points: Sequence[Point], cost: str, sign: float, among: Sequence[int]) -> list[int]:
+    """Indices of the front of some points, those whose cost was measured."""
+    known = [i for i in among if getattr(points[i], cost) is not None]
     front = pareto_front([getattr(points[i], cost) for i in known], [sign * points[i].quality for i in known])
     return [known[i] for i in front]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,9 +29,9 @@ Box = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class Panel:
-    """One plot. ``costs`` (None: not measured), ``qualities``, ``series``, ``variants`` go together, ``front`` indexes them.
+    """One plot. ``costs`` (None: not measured), ``qualities``, ``series``, ``variants`` go together.
 
-    A variant's name stands beside its point on the front; "" for a trained avatar, drawn as a square.
+    ``front`` indexes the front of all points, ``own_fronts`` that of each series. A variant's name stands beside its point on the front; "" for a trained avatar, drawn as a square.
     """
 
     label: str
@@ -40,12 +40,14 @@ class Panel:
     front: Sequence[int]
     series: Sequence[str]
     variants: Sequence[str]
+    own_fronts: Mapping[str, Sequence[int]]
 
 
 def write_plot(path: Path, panels: Sequence[Panel], quality: str, note: str) -> None:
     """Draw the panels side by side and write a PNG, atomically. Costs are on a logarithmic axis.
 
-    Points of the front are filled and joined by steps: what is the best to be had at a cost.
+    Steps join the front of each series: what is the best to be had of it at a cost. Points that no point of any
+    series beats are filled.
     """
     image = Image.new("RGB", (FINE * WIDTH * len(panels), FINE * (HEIGHT + 30)), PAPER)
     draw = ImageDraw.Draw(image)
@@ -55,7 +57,7 @@ def write_plot(path: Path, panels: Sequence[Panel], quality: str, note: str) -> 
         _draw(draw, panel, number * WIDTH, quality, colours)
     derived = any(variant for panel in panels for variant in panel.variants)
     shapes = " Squares: trained; circles: derived from them without training." if derived else ""
-    text = f"Filled and joined: the Pareto front.{shapes} Measured on {note}."
+    text = f"Lines: Pareto front of each method; filled: of all.{shapes} Measured on {note}."
     _text(draw, LEFT, HEIGHT + 4, text, SMALL, MUTED)
     with atomic_path(path) as temporary:
         image.save(temporary, optimize=True)
@@ -104,9 +106,10 @@ def _draw(
         _text(draw, x - text_width(f"{cost:g}", SMALL) / 2, y0 + 9, f"{cost:g}", SMALL, MUTED)
     _line(draw, [(x0, y0), (x1, y0)], INK, 1)
     _text(draw, (x0 + x1 - text_width(panel.label, SMALL)) / 2, y0 + 32, panel.label, SMALL, INK)
-    corners = [place(panel.costs[i] or low, panel.qualities[i]) for i in panel.front]
-    for (ax, ay), (bx, by) in itertools.pairwise(corners):
-        _line(draw, [(ax, ay), (bx, ay), (bx, by)], INK, 1)
+    for name, own_front in panel.own_fronts.items():
+        corners = [place(panel.costs[i] or low, panel.qualities[i]) for i in own_front]
+        for (ax, ay), (bx, by) in itertools.pairwise(corners):
+            _line(draw, [(ax, ay), (bx, ay), (bx, by)], colours[name], 1)
     placed = {index: place(cost, panel.qualities[index]) for index, cost in known}
     for index, (x, y) in placed.items():
         colour = colours[panel.series[index]]
@@ -114,7 +117,8 @@ def _draw(
         mark = tuple(FINE * v for v in (x - DOT, y - DOT, x + DOT, y + DOT))
         shape(mark, fill=colour if index in panel.front else PAPER, outline=colour, width=2 * FINE)
     taken = [(x - DOT, y - DOT, x + DOT, y + DOT) for x, y in placed.values()]
-    for index in panel.front:
+    # Names of the front of all come first, those of the methods' own where there is room.
+    for index in dict.fromkeys([*panel.front, *itertools.chain(*panel.own_fronts.values())]):
         if panel.variants[index] and (box := free(*placed[index], panel.variants[index], taken, (x0, x1))):
             taken.append(box)
             _text(draw, box[0], box[1], panel.variants[index], FAINT, MUTED)

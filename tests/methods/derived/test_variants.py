@@ -55,7 +55,7 @@ def test_recipes_have_names_of_their_own():
     for recipes in (GA, OURS):
         assert len({recipe.name for recipe in recipes}) == len(recipes)
         assert all(recipe.summary and recipe.name for recipe in recipes)
-    assert Recipe(0.5, 1, storage="compact", cutoffs=EARLY).name == "splats50-sh1-compact-cut4"
+    assert Recipe(0.5, 1, storage="compact", cutoffs=EARLY).name == "splats50-sh1-compact-cut2"
 
 
 @pytest.mark.parametrize("kind", ["ga", "ours"])
@@ -74,14 +74,14 @@ def test_every_variant_is_read_back_from_files_of_its_own_that_are_smaller(kind,
         avatar = variant.make(tmp_path / name)
         files = [*avatar.files(), *avatar.shared_files()]
         assert all(path.parent == tmp_path / name and path.is_file() for path in files)
-        changed = name not in ("cut4", "cut8")  # which change no file
+        changed = name not in ("cut2", "cut4")  # which change no file
         assert (size(avatar) < size(whole)) == changed
         quality[name] = psnr(picture(avatar, clip), expected)
     assert quality["half"] > 45
     assert quality["compact"] > 25
     assert quality["splats75"] >= quality["splats50"] >= quality["splats25"]
     assert quality["half"] > quality["8bit"]
-    assert quality["cut4"] >= quality["cut8"]
+    assert quality["cut2"] >= quality["cut4"]
 
 
 def test_pruning_keeps_what_contributes(ga, clip, tmp_path):

@@ -72,7 +72,12 @@ def test_points_of_several_runs_and_which_are_on_the_front(make_run, tmp_path):
     assert float(rows["small", "ours"]["milliseconds"]) == pytest.approx(5.0)
     assert float(rows["small", "ours"]["quality"]) == pytest.approx(28.0)
     picture = np.asarray(Image.open(tmp_path / "out" / "pareto.png"))
-    assert ((picture == (0, 114, 178)).all(axis=2)).any()
+    # Steps of the front in each method's colour: a long horizontal line of it in either panel.
+    for colour in ((0, 114, 178), (213, 94, 0)):
+        own = (picture == colour).all(axis=2)
+        half = own.shape[1] // 2
+        assert max(own[:, :half].sum(1)) > 150
+        assert max(own[:, half:].sum(1)) > 150
     assert found.passed
 
 
