@@ -133,6 +133,7 @@ def run(
     preset: Preset | None = None,
     config: PathText = None,
     head: PathText = None,
+    seeds: Text = None,
     set: Assignments = (),
     json: bool = False,
 ) -> int:
@@ -150,12 +151,13 @@ def run(
         preset: How much training: smoke (seconds), demo (minutes), fast, paper (the published schedule).
         config: YAML file with any settings of a run.
         head: Head model for captures that bring none: FLAME pickle or npz.
-        set: Any setting, for example `seeds=0,1,2`, `frames_per_task=50`, `settings.ga.budget.iterations=5000`;
+        seeds: Seeds of the training, separated by commas: an avatar is trained for each. Default: 0.
+        set: Any setting, for example `frames_per_task=50`, `settings.ga.budget.iterations=5000`;
             repeatable.
         json: Print the result as JSON.
     """
     values: dict[str, Any] = read_yaml(Path(config)) if config else {}
-    given = {"data": data, "out": out, "methods": methods, "preset": preset}
+    given = {"data": data, "out": out, "methods": methods, "preset": preset, "seeds": seeds}
     values = merge(values, {key: value for key, value in given.items() if value is not None})
     if head is not None:
         values = merge(values, {"reader_settings": {"head": head}})
@@ -169,19 +171,24 @@ def run(
 
 
 def table(
-    run: Annotated[str, tyro.conf.Positional],
-    format: Literal["md", "csv", "latex"] = "md",
+    runs: Annotated[tuple[str, ...], tyro.conf.Positional],
+    format: Literal["md", "csv", "latex", "html", "json"] = "md",
     layout: str = "comparison",
+    published: bool = False,
 ) -> int:
-    """Print a table of a finished run.
+    """Print a table of finished runs on the same frames.
+
+    Several runs make one table: other seeds of the same settings join, other settings are rows of their own.
 
     Args:
-        run: Folder of the run.
-        format: Markdown, CSV, or LaTeX (booktabs).
-        layout: Which table: comparison, speed (latency, throughput, stages), cost (storage, training).
+        runs: Folders of the runs.
+        format: Markdown, CSV, LaTeX (booktabs), a page of HTML, or JSON.
+        layout: Which table: comparison, speed (latency, throughput, stages), cost (storage, training), or the paper's:
+            paper-1 (all methods), paper-3 (INSTA and ours), paper-4 (what an expression may change: a run each).
+        published: Add columns with the figures that papers printed, where a layout has some.
     """
-    render: Callable[[Path, str, str], str] = resolve(get("reports", "table-text").implementation)
-    print(render(Path(run), format, layout))
+    render: Callable[..., str] = resolve(get("reports", "table-text").implementation)
+    print(render([Path(run) for run in runs], format, layout, published))
     return 0
 
 
@@ -330,16 +337,16 @@ def _run(config: RunConfig, as_json: bool, **record: Any) -> int:
         failures = sorted(set(failed["method"]))
         _print_json({"out": config.out, "failed": failures, "means": _means(Path(config.out))})
     else:
-        table(config.out)
+        table((config.out,))
         print(f"\nPictures, tables and everything else: {config.out}")
     return EXIT_FAILED_CELL if len(failed) else 0
 
 
 def _means(run_folder: Path) -> list[dict[str, Any]]:
     """Numbers of the comparison table, so that a machine reads what a person does; None where there is none."""
-    render: Callable[[Path, str], str] = resolve(get("reports", "table-text").implementation)
+    render: Callable[..., str] = resolve(get("reports", "table-text").implementation)
     means = []
-    for line in csv.DictReader(io.StringIO(render(run_folder, "csv"))):
+    for line in csv.DictReader(io.StringIO(render([run_folder], "csv"))):
         for column in (name.removesuffix("/status") for name in line if name.endswith("/status")):
             task, _, metric = column.rpartition("/")
             means.append(

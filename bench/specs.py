@@ -173,7 +173,7 @@ class ReportSpec:
     """A view of stored results: ``implementation`` names a function ``(run_folder) -> files written``.
 
     Every such report is written at the end of a run. ``writes`` is False for one that returns text for printing
-    instead, ``(run_folder, format) -> text``.
+    instead, ``(run_folders, format, ...) -> text``.
     """
 
     name: str

@@ -17,11 +17,15 @@ STATUSES = ("ok", "missing", "failed")
 
 @dataclass(frozen=True)
 class Aggregate:
-    """A mean, or why there is none (``value`` None, ``reason`` says it)."""
+    """A mean, or why there is none (``value`` None, ``reason`` says it).
+
+    ``spread`` is the standard deviation of the mean from seed to seed; None with one seed.
+    """
 
     status: Literal["ok", "missing", "failed"]
     value: float | None
     reason: str = ""
+    spread: float | None = None
 
 
 def check_rows(rows: pd.DataFrame) -> None:
@@ -84,18 +88,27 @@ def summarise(rows: pd.DataFrame, own: pd.DataFrame, task: str, metric: str) -> 
         what = "frames" if task else "avatars"
         reason = f"{gap} of {len(expected) * len(seeds)} {what} have no value: run the comparison to its end."
         return Aggregate("missing", None, reason)
-    return Aggregate("ok", macro_mean(mine))
+    by_seed = _subject_means(mine).groupby(level="seed").mean()
+    spread = float(by_seed.std(ddof=1)) if len(by_seed) > 1 else None
+    return Aggregate("ok", macro_mean(mine), spread=spread)
 
 
 def macro_mean(rows: pd.DataFrame) -> float:
     """Mean over frames of a sequence, then over sequences, then over subjects, then over seeds."""
+    return float(_subject_means(rows).groupby(level="seed").mean().mean())
+
+
+def subject_means(rows: pd.DataFrame) -> dict[str, float]:
+    """Mean of each subject: over frames of a sequence, then over sequences, then over seeds."""
+    means = _subject_means(rows).groupby(level="subject").mean()
+    return {str(subject): float(value) for subject, value in means.items()}
+
+
+def _subject_means(rows: pd.DataFrame) -> pd.Series[float]:
+    """Means over frames and sequences, by seed and subject."""
     values = rows.assign(value=rows["value"].astype(float))
-    levels = ["seed", "subject", "sequence"]
-    means = values.groupby(levels)["value"].mean()
-    while len(levels) > 1:
-        levels = levels[:-1]
-        means = means.groupby(level=levels).mean()
-    return float(means.mean())
+    sequences = values.groupby(["seed", "subject", "sequence"])["value"].mean()
+    return sequences.groupby(level=["seed", "subject"]).mean()
 
 
 def _because(rows: pd.DataFrame) -> str:

@@ -6,7 +6,7 @@ import re
 import unicodedata
 from itertools import groupby
 
-from .tables import Table, TableCell
+from .table_model import Table, TableCell
 
 ESCAPES = {
     "\\": r"\textbackslash{}",
@@ -36,12 +36,24 @@ ESCAPES = {
     "µ": r"$\mu$",
 }
 
+MACROS = {
+    "tabfirst": r"\textbf{#1}",
+    "tabsecond": r"\underline{#1}",
+    "tabthird": r"\textit{#1}",
+    "tabspread": r"{\scriptsize\,$\pm$\,#1}",
+    "tabpublished": r"\textsf{#1}",
+}
+RANK_MACROS = {1: "tabfirst", 2: "tabsecond", 3: "tabthird"}
+NARROW = 8
+"""Columns up to which a table keeps the distance between them."""
+
 
 def to_latex(table: Table, label: str = "tab:headbench") -> str:
     r"""Write a ``table*`` environment.
 
-    It needs the package booktabs. The macros ``\best`` and ``\second`` are provided only if the author has not
-    defined them before; redefine them to restyle every table at once. The protocol stands in a comment, too.
+    It needs the packages booktabs and graphicx; a table wider than the page is scaled to fit it. The macros
+    ``\tabfirst``, ``\tabsecond``, ``\tabthird``, ``\tabspread`` and ``\tabpublished`` are provided only if the author
+    has not defined them before; define them to restyle every table at once. The protocol stands in a comment, too.
     """
     columns = table.columns
     width = len(columns) + 1
@@ -54,7 +66,8 @@ def to_latex(table: Table, label: str = "tab:headbench") -> str:
     names = ["Method"]
     for column in columns:
         unit = rf"\,({escape(column.unit)})" if column.unit else ""
-        names.append(f"{escape(column.label)}{unit} {escape(column.arrow)}")
+        measured = f"{escape(column.label)}{unit} {escape(column.arrow)}"
+        names.append(r"\tabpublished{\scriptsize published}" if column.published else measured)
     body: list[str] = []
     for index, (title, rows) in enumerate(table.groups):
         body += [r"\midrule"] if index else []
@@ -65,13 +78,15 @@ def to_latex(table: Table, label: str = "tab:headbench") -> str:
     return "\n".join(
         [
             *(_comment(f"{t.title}: protocol {t.protocol_id} {t.protocol_hash}") for t in table.tasks),
-            r"\providecommand{\best}[1]{\textbf{#1}}",
-            r"\providecommand{\second}[1]{\underline{#1}}",
+            "% For coloured cells load colortbl and, before this file:",
+            r"% \newcommand{\tabfirst}[1]{\cellcolor[rgb]{1,0.6,0.6}#1}, likewise \tabsecond and \tabthird.",
+            *(rf"\providecommand{{\{name}}}[1]{{{style}}}" for name, style in MACROS.items()),
             r"\begin{table*}[t]",
             r"\centering",
+            *([r"\setlength{\tabcolsep}{3pt}"] if len(columns) > NARROW else []),
             rf"\caption{{{escape(table.caption)}}}",
             rf"\label{{{re.sub(r'[^A-Za-z0-9:.-]', '-', label)}}}",
-            rf"\begin{{tabular}}{{l{'r' * len(columns)}}}",
+            rf"\sbox{{0}}{{\begin{{tabular}}{{l{'r' * len(columns)}}}",
             r"\toprule",
             " & ".join(heads) + r" \\",
             " ".join(rules),
@@ -79,7 +94,8 @@ def to_latex(table: Table, label: str = "tab:headbench") -> str:
             r"\midrule",
             *body,
             r"\bottomrule",
-            r"\end{tabular}",
+            r"\end{tabular}}",
+            r"\ifdim\wd0>\linewidth\resizebox{\linewidth}{!}{\usebox{0}}\else\usebox{0}\fi\par",
             *(
                 [r"\begin{minipage}{\linewidth}", r"\footnotesize", *notes, r"\end{minipage}"]
                 if notes
@@ -110,10 +126,9 @@ def _escaped(character: str) -> str:
 
 def _cell(cell: TableCell) -> str:
     text = escape(cell.text)
-    if cell.rank == 1:
-        text = rf"\best{{{text}}}"
-    elif cell.rank == 2:
-        text = rf"\second{{{text}}}"
+    macro = "tabpublished" if cell.status == "published" else RANK_MACROS.get(cell.rank or 0)
+    text = rf"\{macro}{{{text}}}" if macro else text
+    text += rf"\tabspread{{{escape(cell.spread)}}}" if cell.spread else ""
     return text if cell.note is None else rf"{text}\textsuperscript{{{cell.note + 1}}}"
 
 

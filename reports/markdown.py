@@ -4,17 +4,24 @@ from __future__ import annotations
 
 import re
 
-from .tables import Table, TableCell
+from .table_model import Table, TableCell
+
+MARKS = {1: ("**", "**"), 2: ("<ins>", "</ins>"), 3: ("*", "*")}
 
 
 def to_markdown(table: Table) -> str:
-    """Write a pipe table. Header: tasks, first body row: metrics; best bold, second underlined (``<ins>``)."""
+    """Write a pipe table. Header: tasks, first body row: metrics.
+
+    First bold, second underlined (``<ins>``), third italic.
+    """
     tasks, names = [""], ["**Method**"]
     for index, column in enumerate(table.columns):
         follows = index > 0 and table.columns[index - 1].title == column.title
         tasks.append("" if follows else escape(column.title))
         unit = f" ({escape(column.unit)})" if column.unit else ""
-        names.append(f"**{escape(column.label)}**{unit} {column.arrow}")
+        names.append(
+            "*published*" if column.published else f"**{escape(column.label)}**{unit} {column.arrow}"
+        )
     lines = [tasks, names]
     for title, rows in table.groups:
         if len(table.groups) > 1:
@@ -37,11 +44,10 @@ def escape(text: str) -> str:
 
 
 def _cell(cell: TableCell) -> str:
-    text = escape(cell.text)
-    if cell.rank == 1:
-        text = f"**{text}**"
-    elif cell.rank == 2:
-        text = f"<ins>{text}</ins>"
+    text = escape(cell.shown)
+    if cell.rank in MARKS:
+        before, after = MARKS[cell.rank]
+        text = f"{before}{text}{after}"
     return text if cell.note is None else f"{text}<sup>{cell.note + 1}</sup>"
 
 

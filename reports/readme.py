@@ -51,7 +51,7 @@ def block(gallery: Path) -> str:
         f"{record['peak_memory_bytes'] / 1e9:.1f} GB."
     )
     picture = f"![Ground truth, renders and error maps of every method]({GALLERY}/{PICTURE})"
-    return f"{picture}\n\n{table_text(gallery, 'md').strip()}\n\n{cost}"
+    return f"{picture}\n\n{table_text([gallery], 'md').strip()}\n\n{cost}"
 
 
 if __name__ == "__main__":

@@ -58,7 +58,7 @@ def test_trained_methods_beat_the_mean_image_even_after_seconds(run):
 
 
 def test_tables_and_pictures_are_left_to_look_at(run, capsys):
-    assert {path.suffix for path in run.tables.iterdir()} == {".md", ".csv", ".tex"}
+    assert {path.suffix for path in run.tables.iterdir()} == {".md", ".csv", ".tex", ".html", ".json"}
     sheet = cv2.imread(str(run.contact_sheet))
     assert sheet.shape[0] > 300
     assert sheet.std() > 10

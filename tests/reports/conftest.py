@@ -6,7 +6,7 @@ import pytest
 from headbench.bench import runner
 from headbench.bench.run_config import RunConfig
 from headbench.bench.specs import MetricSpec
-from headbench.bench.store import Row, to_frame
+from headbench.bench.store import Row, RunFolder, to_frame, write_rows
 
 PSNR = MetricSpec("psnr", "PSNR", "dB", True, 2, "m:psnr")
 LPIPS = MetricSpec("lpips", "LPIPS", "", False, 3, "m:lpips")
@@ -89,3 +89,45 @@ def make_run(toy, tmp_path, monkeypatch):
         return tmp_path / name
 
     return make
+
+
+@pytest.fixture
+def write_run(tmp_path):
+    """Write a finished run of four subjects by hand: each method at its PSNR; settings by method."""
+    # Offset and slope of each metric over the PSNR.
+    lines = {"psnr": (0, 1), "ssim": (0, 0.025), "lpips": (0.1, -0.001), "storage": (5, 0.1), "fps": (100, 1)}
+
+    def write(name, methods, settings=None):
+        folder = RunFolder(tmp_path / name)
+        specs = [
+            {"label": metric.upper(), "unit": "", "digits": 4, "implementation": "m:m", "name": metric}
+            | {
+                "higher_is_better": metric not in ("lpips", "storage"),
+                "per_frame": metric not in ("storage", "fps"),
+            }
+            for metric in lines
+        ]
+        tasks = ("novel_view", "self_reenactment")
+        folder.write_manifest(
+            {
+                "metrics": specs,
+                "methods": [
+                    {"name": m, "trivial": m == "mean-image", "config": (settings or {}).get(m)}
+                    for m in methods
+                ],
+                "protocols": {task: {"hash": f"hash-{task}", "keys": []} for task in tasks},
+                "configuration": {"seeds": [0]},
+            }
+        )
+        rows = []
+        for (method, level), subject, spec in itertools.product(methods.items(), "abcd", specs):
+            offset, slope = lines[spec["name"]]
+            number = offset + slope * level
+            for task in tasks if spec["per_frame"] else ("",):
+                place = (subject, "EMO", 0, "c") if task else (subject, "", -1, "")
+                protocol = f"hash-{task}" if task else ""
+                rows.append(Row(method, "1", 0, task, *place, "full", spec["name"], number, protocol))
+        write_rows(folder.rows, to_frame(rows))
+        return folder.root
+
+    return write

@@ -12,6 +12,7 @@ from headbench.bench.specs import ReportSpec
 from headbench.bench.store import RunFolder, read_rows
 from headbench.reports import specs
 from headbench.reports.run_data import RunData
+from headbench.reports.run_set import RunSet
 from headbench.reports.sheet_report import evenly_spaced, write_contact_sheet
 from headbench.reports.table_report import layouts, table_of, table_text, write_tables
 
@@ -25,9 +26,10 @@ def change_manifest(folder, change):
 
 def test_tables_of_a_run(toy_run):
     files = write_tables(toy_run)
-    assert [f.name for f in files] == ["comparison.md", "comparison.csv", "comparison.tex"]
+    assert [f.suffix for f in files] == [".md", ".csv", ".tex", ".html", ".json"]
+    assert {f.stem for f in files} == {"comparison"}
     data = RunData.read(toy_run)
-    table = table_of(data)
+    table = table_of(RunSet.read([toy_run]))
     good, failing = table.rows
     rows = read_rows(toy_run / "rows.parquet")
     error = rows[(rows["metric"] == "error") & (rows["task"] == "novel_view") & (rows["method"] == "toy")]
@@ -40,26 +42,26 @@ def test_tables_of_a_run(toy_run):
     assert "Images of 8 x 6 pixels" in table.caption
     for task in ("novel_view", "self_reenactment"):
         assert data.manifest["protocols"][task]["hash"] in table.caption
-    for file, name in zip(files, ("md", "csv", "latex")):
-        assert file.read_text() == table_text(toy_run, name)
+    for file, name in zip(files, ("md", "csv", "latex", "html", "json")):
+        assert file.read_text() == table_text([toy_run], name)
 
 
 def test_metrics_of_another_table_are_shown_there_and_only_there(toy_run):
     change_manifest(toy_run, lambda m: m["metrics"][-1].update(tables=["cost"]))
-    data = RunData.read(toy_run)
-    assert layouts(data) == ("comparison", "cost")
-    (column,) = table_of(data, "cost").columns
+    runs = RunSet.read([toy_run])
+    assert layouts(runs) == ("comparison", "cost")
+    (column,) = table_of(runs, "cost").columns
     assert (column.metric, column.title) == ("files", "Storage and training")
-    assert "files" not in {column.metric for column in table_of(data).columns}
-    assert "protocol" not in table_text(toy_run, "md", "cost")  # it is about no frames
-    assert [f.name for f in write_tables(toy_run)][3:] == ["cost.md", "cost.csv", "cost.tex"]
+    assert "files" not in {column.metric for column in table_of(runs).columns}
+    assert "protocol" not in table_text([toy_run], "md", "cost")  # it is about no frames
+    assert [f.name for f in write_tables(toy_run)][5:8] == ["cost.md", "cost.csv", "cost.tex"]
     with pytest.raises(InputError, match="comparison, cost"):
-        table_text(toy_run, "md", "speed")
+        table_text([toy_run], "md", "speed")
 
 
 def test_an_unknown_format_is_refused(toy_run):
-    with pytest.raises(InputError, match="md, csv, latex"):
-        table_text(toy_run, "html")
+    with pytest.raises(InputError, match="md, csv, latex, html, json"):
+        table_text([toy_run], "xlsx")
 
 
 def test_contact_sheet_of_a_run(toy_run):
@@ -90,7 +92,7 @@ def test_a_damaged_render_is_named(toy_run):
     path = next((toy_run / "subject1" / "toy").rglob("*.png"))
     path.write_bytes(b"no image")
     with pytest.raises(InputError, match=path.name):
-        table_text(toy_run)
+        table_text([toy_run])
 
 
 def test_frames_are_spread_evenly():

@@ -89,10 +89,10 @@ def test_latex_is_a_balanced_booktabs_table(table):
     for rule in (r"\toprule", r"\midrule", r"\bottomrule", r"\cmidrule(lr){2-3} \cmidrule(lr){4-5}"):
         assert rule in text
     assert r"PSNR\,(dB) $\uparrow$ & LPIPS $\downarrow$" in text
-    assert r"\best{30.13}" in text
-    assert r"\second{25.50}" in text
+    assert r"\tabfirst{30.13}" in text
+    assert r"\tabsecond{25.50}" in text
     assert r"--\textsuperscript{1}" in text
-    assert r"\providecommand{\best}" in text
+    assert r"\providecommand{\tabfirst}" in text
     assert r"No 100\% weights\_file." in text
 
 

@@ -1,0 +1,105 @@
+import pytest
+
+from headbench.bench.errors import InputError
+from headbench.reports.published import published_rows, with_published
+from headbench.reports.run_set import RunSet
+from headbench.reports.table_report import table_of, table_text
+
+METRICS = ("psnr", "ssim", "lpips", "storage", "fps")
+OPACITY, GEOMETRY = {"dynamic": ["opacity"]}, {"dynamic": ["position", "rotation", "scale"]}
+
+
+def labels(table):
+    return [row.method for row in table.rows]
+
+
+def test_paper_1_shows_every_method_in_the_papers_words_and_ours_last(write_run):
+    folder = write_run("a", {"ours": 33.0, "mine": 32.0, "ga": 31.0, "insta": 28.0, "mean-image": 17.0})
+    table = table_of(RunSet.read([folder]), "paper-1")
+    assert labels(table) == ["INSTA", "GaussianAvatars", "mine", "Ours"]
+    assert [(c.title, c.metric, c.digits) for c in table.columns] == [
+        ("Novel view", "psnr", 2),
+        ("Novel view", "ssim", 3),
+        ("Novel view", "lpips", 3),
+        ("Self-reenactment", "psnr", 2),
+        ("Self-reenactment", "ssim", 3),
+        ("Self-reenactment", "lpips", 3),
+        ("Avatar", "storage", 1),
+        ("Avatar", "fps", 0),
+    ]
+    assert table.rows[-1].cells[0].text == "33.00"
+
+
+def test_paper_3_compares_insta_and_ours_with_published_columns_apart(write_run):
+    folder = write_run("a", {"ours": 33.0, "ga": 31.0, "insta": 28.0}, {"ours": OPACITY})
+    table = table_of(RunSet.read([folder]), "paper-3", published=True)
+    assert labels(table) == ["INSTA", "Ours"]
+    assert [c.published for c in table.columns] == [False, True] * 8
+    insta, ours = (row.cells[1::2] for row in table.rows)
+    assert [c.text for c in insta] == ["27.97", "0.92", "0.11", "27.50", "0.92", "0.103", "53", "25"]
+    assert [c.text for c in ours] == ["32.97", "0.95", "0.059", "28.07", "0.93", "0.077", "10", "300"]
+    for cell in (*insta, *ours):
+        assert (cell.status, cell.rank) == ("published", None)
+        assert "Table 3 (nine NeRSemble subjects)" in table.notes[cell.note]
+        assert "arXiv 2504.14967" in table.notes[cell.note]
+    assert table.rows[1].cells[0].text == "33.00"
+    assert "not comparable" in table.caption
+
+
+def test_paper_4_puts_settings_of_ours_from_runs_side_by_side(write_run):
+    opacity = write_run("opacity", {"ours": 35.0}, {"ours": OPACITY})
+    geometry = write_run("geometry", {"ours": 36.0, "ga": 30.0}, {"ours": GEOMETRY})
+    table = table_of(RunSet.read([opacity, geometry]), "paper-4", published=True)
+    assert labels(table) == ["Ours (dynamic=opacity)", "Ours (dynamic=position+rotation+scale)"]
+    assert {c.metric for c in table.columns} == {"psnr", "ssim", "lpips"}
+    first, second = (row.cells[1::2] for row in table.rows)
+    assert [c.text for c in first] == ["35.16", "0.97", "0.026", "31.64", "0.96", "0.036"]
+    assert [c.text for c in second] == ["36.39", "0.97", "0.018", "30.97", "0.96", "0.030"]
+
+
+def test_another_setting_of_a_method_is_not_given_the_papers_figures(write_run):
+    folder = write_run("a", {"ours": 33.0, "insta": 28.0}, {"ours": {"dynamic": ["color"]}})
+    table = table_of(RunSet.read([folder]), "paper-3", published=True)
+    assert {c.status for c in table.rows[1].cells[1::2]} == {"none"}
+    assert {c.text for c in table.rows[1].cells[1::2]} == {""}
+
+
+def test_published_figures_change_nothing_measured(write_run):
+    folder = write_run("a", {"ours": 33.0, "insta": 28.0}, {"ours": OPACITY})
+    runs = RunSet.read([folder])
+    plain, beside = table_of(runs, "paper-3"), table_of(runs, "paper-3", published=True)
+    assert [row.cells for row in plain.rows] == [row.cells[::2] for row in beside.rows]
+    assert (
+        with_published(plain, "comparison", {"INSTA": {"name": "insta"}, "Ours": {"name": "ours"}}) == plain
+    )
+
+
+@pytest.mark.parametrize("format", ["md", "latex", "html"])
+def test_a_published_figure_stands_under_that_word(write_run, format):
+    folder = write_run("a", {"ours": 33.0, "insta": 28.0}, {"ours": OPACITY})
+    text = table_text([folder], format, "paper-3", published=True)
+    assert "32.97" in text
+    assert text.lower().count("published") >= 8
+    assert "32.97" not in table_text([folder], format, "paper-3")
+
+
+def test_layouts_that_a_run_cannot_fill_are_refused(write_run, make_run):
+    with pytest.raises(InputError, match="metrics of layout paper-1"):
+        table_text([make_run("toy")], "md", "paper-1")
+    folder = write_run("a", {"ga": 31.0, "gbs": 30.0})
+    with pytest.raises(InputError, match="insta, ours"):
+        table_text([folder], "md", "paper-3")
+    with pytest.raises(InputError, match="figures that papers printed"):
+        table_text([folder], "md", "paper-1", published=True)
+    with pytest.raises(InputError, match="paper-4"):
+        table_text([folder], "md", "paper-5")
+
+
+def test_every_published_row_has_its_source_and_numbers():
+    rows = published_rows()
+    assert len(rows) == 4
+    for row, source in rows:
+        assert "arXiv" in source
+        assert row.table.startswith("Table ")
+        assert all(float(value) > 0 for value in row.values.values())
+        assert {name.rpartition("/")[2] for name in row.values} <= set(METRICS)
