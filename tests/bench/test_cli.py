@@ -163,3 +163,14 @@ def test_other_faults_of_the_system_are_not_hidden(monkeypatch):
     monkeypatch.setattr(cli, "_call", broken)
     with pytest.raises(OSError, match="Input/output"):
         cli.main(["table", "run"])
+
+
+def test_seeds_are_given_as_a_list(monkeypatch, tmp_path):
+    seen = []
+    monkeypatch.setattr(cli, "_run", lambda settings, json: seen.append(settings.seeds) or 0)
+    arguments = ["run", "--data", str(tmp_path), "--out", str(tmp_path / "out")]
+    assert cli.main(arguments) == 0
+    assert cli.main([*arguments, "--seeds", "3,1,4"]) == 0
+    assert cli.main([*arguments, "--seeds", "7"]) == 0
+    assert seen == [(0,), (3, 1, 4), (7,)]
+    assert cli.main([*arguments, "--seeds", "one"]) == 2

@@ -147,3 +147,60 @@ def test_ranks_agree_with_a_count_of_better_displayed_values(values, higher, dig
     for row, own in zip(table.rows, shown):
         better = {other for other in shown if (other > own if higher else other < own)}
         assert row.cells[0].rank == 1 + len(better)
+
+
+def many_subjects(methods, subjects=9, seeds=(0,), spread=0.0):
+    """Rows of methods at levels, each subject and method a little off; ``spread`` moves whole seeds."""
+    generator = np.random.default_rng(1)
+    return to_frame(
+        Row(m, "1", seed, "novel_view", f"s{s}", "q", t, "a", "full", "m", level + noise + spread * seed, "h")
+        for m, level in methods.items()
+        for s in range(subjects)
+        for noise in [generator.normal(0, 0.2)]
+        for seed in seeds
+        for t in range(2)
+    )
+
+
+METRIC = MetricSpec("m", "M", "", True, 2, "m:m")
+
+
+def test_all_that_cannot_be_told_from_the_best_are_marked_best():
+    levels = {"a": 30.0, "b": 30.02, "c": 28.0, "d": 25.0}
+    table = build_table(many_subjects(levels), [METRIC], list(levels))
+    assert len({row.cells[0].text for row in table.rows}) == 4
+    assert ranks(table, "novel_view", "m") == {"a": 1, "b": 1, "c": 2, "d": 3}
+    assert "every method that cannot be told from the best" in table.caption
+    assert "exact sign-flip test over 9 subjects, each method against all others, Holm, 5%" in table.caption
+    assert "third italic" in table.caption
+
+
+def test_with_few_subjects_the_digits_alone_decide_and_the_caption_says_so():
+    levels = {"a": 30.0, "b": 30.5, "c": 28.0, "d": 25.0}
+    table = build_table(many_subjects(levels, 5), [METRIC], list(levels))
+    assert sorted(ranks(table, "novel_view", "m").values()) == [1, 2, 3, 4]
+    assert (
+        "by the digits shown alone: with 5 subjects no test can tell the best (it takes 7)" in table.caption
+    )
+
+
+def test_a_column_with_too_few_subjects_for_its_test_is_named(metrics):
+    # Six subjects are enough for two methods, not for three; the third has no LPIPS.
+    rows = many_subjects({"a": 30.0, "b": 28.0, "c": 25.0}, 6)
+    both = pd.concat([rows.assign(metric="psnr"), rows.assign(metric="lpips")], ignore_index=True)
+    both = both[~((both["metric"] == "lpips") & (both["method"] == "c"))]
+    table = build_table(both, metrics[:2], ["a", "b", "c"])
+    assert ranks(table, "novel_view", "psnr") == {"a": 1, "b": 2, "c": 3}
+    assert "Too few subjects for the test, so that the digits alone decide: Novel view PSNR." in table.caption
+    assert "sign-flip test over 6 subjects" in table.caption
+
+
+def test_seeds_have_their_spread_and_subjects_theirs_not():
+    levels = {"a": 30.0, "b": 28.0}
+    table = build_table(many_subjects(levels, seeds=(0, 1, 2), spread=0.5), [METRIC], list(levels))
+    one = table.rows[0].cells[0]
+    assert one.spread == "0.500"  # of 0, 0.5 and 1: no part of it from the subjects, which differ by 0.2
+    assert one.shown == f"{one.text} ± 0.500"
+    assert "mean of 3 seeds ± its standard deviation from seed to seed" in table.caption
+    single = build_table(many_subjects(levels), [METRIC], list(levels))
+    assert {row.cells[0].spread for row in single.rows} == {""}

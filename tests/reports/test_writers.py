@@ -108,3 +108,12 @@ def test_latex_text_has_no_live_character(text):
     bare = re.sub(r"\$\\[a-z]+\$|\\[a-zA-Z]+|\\[{}$&#%_]", "", escaped)
     assert not set(bare) & set("\\$&#%_^~\n")
     assert all(ord(c) < 256 for c in escaped)
+
+
+def test_a_spread_stands_beside_its_mean_in_every_format(make_rows, metrics):
+    rows = make_rows({"a": lambda metric, seed, *frame: 20.0 + seed, "b": 18.0}, seeds=(0, 1))
+    table = build_table(rows, metrics, ["a", "b"])
+    assert "**20.50 ± 0.707**" in to_markdown(table)
+    assert r"\tabfirst{20.50}\tabspread{0.707}" in to_latex(table)
+    first = next(csv.DictReader(io.StringIO(to_csv(table))))
+    assert (first["novel_view/psnr"], first["novel_view/psnr/spread"]) == ("20.5", "0.707")
