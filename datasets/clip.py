@@ -10,12 +10,13 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from ..bench.contracts import ByteArray, Camera, FloatArray, FrameKey, HeadPose, StepRecord
+from ..bench.contracts import BoolArray, ByteArray, Camera, FloatArray, FrameKey, HeadPose, StepRecord
 from ..bench.errors import InputError
 from ..bench.files import digest
 from ..bench.frames import quantise
 from .head.arrays import HeadArrays
 from .images import ImageStore, read_image, read_mask
+from .region_masks import FOREGROUND, HeadRegions, select
 
 
 class FrameFiles(NamedTuple):
@@ -92,6 +93,21 @@ class CaptureClip:
             return None
         return self._processed(key, "mask") if self.pixel_steps else self.store.mask(path)
 
+    @cached_property
+    def region_names(self) -> tuple[str, ...]:
+        """Regions that `region_masks` knows here, see `region_masks` the module."""
+        matted = all(files.mask is not None for files in self.files.values())
+        return ((FOREGROUND,) if matted else ()) + self._head_regions.names
+
+    def region_masks(self, key: FrameKey, names: Sequence[str]) -> dict[str, BoolArray]:
+        """(H, W) masks of the pixels in which each region is seen; all False where it is not."""
+        labels = self.store.find((self.fingerprint, key, "regions"))
+        if labels is None:
+            camera, pose = self.cameras[key.camera], self.poses[key.timestep]
+            labels = self._head_regions.labels(camera, pose, self.mask(key))
+            self.store.keep((self.fingerprint, key, "regions"), labels)
+        return {name: select(labels, name) for name in names}
+
     def timesteps(self, split: str) -> list[int]:
         """Distinct timesteps of a split, sorted."""
         return sorted({key.timestep for key in self.splits[split]})
@@ -112,6 +128,10 @@ class CaptureClip:
     def recorded(self, key: FrameKey) -> FrameKey:
         """The key that a frame was recorded as: the same unless a step renumbered the frames."""
         return self._files(key).recorded or key
+
+    @cached_property
+    def _head_regions(self) -> HeadRegions:
+        return HeadRegions(self.head, self.shape, self.static_offset)
 
     def _processed(self, key: FrameKey, part: Literal["image", "mask"]) -> ByteArray:
         """Image or mask of a frame after all pixel steps, read-only; both are kept as one gives the other."""

@@ -96,17 +96,17 @@ NETWORKS = {spec.name: spec for spec in (ALEX, SQUEEZE, VGG)}
 def _alexnet() -> TappedNetwork:
     layers: list[nn.Module] = [
         nn.Conv2d(3, 64, 11, stride=4, padding=2),
-        nn.ReLU(),
+        nn.ReLU(inplace=True),
         nn.MaxPool2d(3, 2),
         nn.Conv2d(64, 192, 5, padding=2),
-        nn.ReLU(),
+        nn.ReLU(inplace=True),
         nn.MaxPool2d(3, 2),
         nn.Conv2d(192, 384, 3, padding=1),
-        nn.ReLU(),
+        nn.ReLU(inplace=True),
         nn.Conv2d(384, 256, 3, padding=1),
-        nn.ReLU(),
+        nn.ReLU(inplace=True),
         nn.Conv2d(256, 256, 3, padding=1),
-        nn.ReLU(),
+        nn.ReLU(inplace=True),
     ]
     return TappedNetwork(layers, (1, 4, 7, 9, 11))
 
@@ -114,7 +114,7 @@ def _alexnet() -> TappedNetwork:
 def _squeezenet() -> TappedNetwork:
     layers: list[nn.Module] = [
         nn.Conv2d(3, 64, 3, stride=2),
-        nn.ReLU(),
+        nn.ReLU(inplace=True),
         nn.MaxPool2d(3, 2, ceil_mode=True),
         Fire(64, 16, 64),
         Fire(128, 16, 64),
@@ -137,6 +137,6 @@ def _vgg16() -> TappedNetwork:
         if block:
             layers.append(nn.MaxPool2d(2, 2))
         for _ in range(repeats):
-            layers += [nn.Conv2d(inputs, channels, 3, padding=1), nn.ReLU()]
+            layers += [nn.Conv2d(inputs, channels, 3, padding=1), nn.ReLU(inplace=True)]
             inputs = channels
     return TappedNetwork(layers, (3, 8, 15, 22, 29))

@@ -46,6 +46,28 @@ LPIPS_VGG = replace(
     summary="Learned perceptual distance v0.1, VGG-16, inputs scaled to [-1, 1].",
 )
 
+FLIP = MetricSpec(
+    name="flip",
+    label="FLIP",
+    unit="",
+    higher_is_better=False,
+    digits=4,
+    implementation="headbench.metrics.flip:flip",
+    summary="Difference seen when flipping between the images, LDR, 67.02 pixels per degree, mean of the map.",
+    regions=True,
+)
+
+FLICKER = MetricSpec(
+    name="flicker",
+    label="Flicker",
+    unit="levels",
+    higher_is_better=False,
+    digits=3,
+    implementation="headbench.metrics.flicker:flicker",
+    summary="Change between neighbouring frames that the truth does not have, root mean square, 8-bit levels.",
+    temporal=True,
+)
+
 STORAGE = MetricSpec(
     name="storage",
     label="Storage",

@@ -1,0 +1,26 @@
+"""Flicker: how much the image changes over time in other ways than the truth does."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ..bench.contracts import ByteArray
+from .pairs import check_pair
+
+
+def flicker(image: ByteArray, truth: ByteArray, other_image: ByteArray, other_truth: ByteArray) -> float:
+    """Root mean square, in 8-bit levels, of ``(image - other_image) - (truth - other_truth)``.
+
+    ``other`` is a neighbour in time, from the same camera; which of the two comes first does not matter. What an
+    avatar gets wrong alike in both frames (a wrong colour, a blur that moves along) cancels; what appears in one of
+    them does not. 0 for a render that changes as the truth does. All are (H, W, 3) 8-bit images of one size.
+    """
+    check_pair(image, truth)
+    check_pair(other_image, other_truth)
+    check_pair(image, other_image)
+    change = np.subtract(image, other_image, dtype=np.int32)
+    change -= truth
+    change += other_truth
+    return math.sqrt(np.square(change).sum(dtype=np.int64) / change.size)

@@ -1,0 +1,123 @@
+"""Regions of frames, on a toy head whose parts' places in the image follow from its own vertices."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from headbench.bench.contracts import HeadPose, RegionalClip
+from headbench.bench.scoring import check_regions
+from headbench.datasets.ga_reader import read_capture
+from headbench.datasets.head.arrays import HeadArrays
+from headbench.datasets.region_masks import HeadRegions, select
+
+from .head.toy import toy_head
+from .tiny_capture import look_at, posed_vertices, silhouette
+
+HEAD = toy_head(24)
+SHAPE, OFFSET = np.zeros(HEAD.shape_basis.shape[2]), np.zeros_like(HEAD.template)
+WIDTH, HEIGHT = 96, 128
+
+
+def camera(x, y, z):
+    return look_at("c", np.array([x, y, z], float), WIDTH, HEIGHT, WIDTH / 2, HEIGHT / 2)
+
+
+FRONT, BACK = camera(0, 0, 1), camera(0, 0, -1)
+
+
+def pose(jaw=0.0):
+    zero = np.zeros(3)
+    expression = np.zeros(HEAD.expression_basis.shape[2])
+    return HeadPose("toy", expression, zero, zero, np.array([jaw, 0, 0]), np.zeros(6), zero)
+
+
+def labels(view=FRONT, matte=None, head: HeadArrays = HEAD, jaw=0.0):
+    return HeadRegions(head, SHAPE, OFFSET).labels(view, pose(jaw), matte)
+
+
+def pixel(view, point):
+    """Row and column of a point of the world."""
+    seen = view.K @ (view.world_to_camera[:3, :3] @ point + view.world_to_camera[:3, 3])
+    return int(seen[1] / seen[2]), int(seen[0] / seen[2])
+
+
+def test_parts_are_where_their_vertices_are_seen():
+    found = labels()
+    for part, region in [
+        ("mouth", "lips"),
+        ("eyes", "left_eyeball"),
+        ("eyes", "right_eyeball"),
+        ("face", "face"),
+    ]:
+        vertices = HEAD.template[HEAD.regions[region]]
+        foremost = vertices[vertices[:, 2].argmax()]
+        assert select(found, part)[pixel(FRONT, foremost)], part
+
+
+def test_nothing_of_the_face_is_seen_from_behind():
+    found = labels(BACK)
+    assert (found != 0).any()
+    assert not any(select(found, part).any() for part in ("face", "mouth", "eyes"))
+    assert select(found, "hair").any()
+
+
+def test_mouth_and_eyes_lie_in_the_face_and_the_hair_beside_it():
+    found = labels(camera(0.3, 0.1, 0.9))
+    face, hair = select(found, "face"), select(found, "hair")
+    for part in ("mouth", "eyes"):
+        assert select(found, part).any()
+        assert not (select(found, part) & ~face).any()
+    assert hair.any()
+    assert not (face & hair).any()
+
+
+def test_the_opening_between_the_lips_belongs_to_the_mouth():
+    upper, lower = (HEAD.template[HEAD.regions[f"lip_outside_ring_{side}"]] for side in ("upper", "lower"))
+    middle = 0.5 * (upper[len(upper) // 2] + lower[len(lower) // 2])
+    assert select(labels(), "mouth")[pixel(FRONT, middle)]
+
+
+def test_no_part_leaves_the_silhouette_without_a_matte():
+    covered = silhouette(HEAD.template, HEAD.faces, FRONT)
+    found = labels()
+    assert not ((found != 0) & ~covered).sum() > 5  # centres on an edge may fall either way
+    assert not select(found, "foreground").any()
+
+
+def test_the_foreground_is_the_matte_from_a_half_on_and_bounds_the_hair_beyond_the_mesh():
+    matte = np.zeros((HEIGHT, WIDTH), np.uint8)
+    matte[10:, 20:76] = 255
+    matte[10:, 76:80] = 127
+    found = labels(matte=matte)
+    np.testing.assert_array_equal(select(found, "foreground"), matte >= 128)
+    covered = silhouette(HEAD.template, HEAD.faces, FRONT)
+    beyond = select(found, "hair") & ~covered
+    assert beyond[12, 48]  # above the crown
+    assert not (beyond & (matte < 128)).any()
+    assert not beyond[HEIGHT - 4, 48]  # below the chin: nearest to the neck
+
+
+def test_parts_are_offered_where_the_head_has_their_regions():
+    bare = replace(HEAD, regions={"lips": HEAD.regions["lips"]})
+    assert HeadRegions(HEAD, SHAPE, OFFSET).names == ("face", "mouth", "eyes", "hair")
+    assert HeadRegions(bare, SHAPE, OFFSET).names == ("mouth",)
+
+
+@pytest.mark.parametrize("threads", [1, 4])
+def test_a_clip_gives_its_regions_by_key_to_any_thread(pristine_capture, threads):
+    clip = read_capture(pristine_capture.union)
+    assert isinstance(clip, RegionalClip)
+    assert check_regions(clip, None) == ("face",)
+    keys = sorted(clip.files)[:6]
+    with ThreadPoolExecutor(threads) as pool:
+        found = list(pool.map(lambda key: clip.region_masks(key, ["face", "foreground"]), keys * 2))
+    for key, masks in zip(keys * 2, found):
+        np.testing.assert_array_equal(masks["foreground"], clip.mask(key) >= 128)
+        vertices = posed_vertices(pristine_capture.writer.plan, clip.poses[key.timestep])
+        covered = silhouette(vertices, clip.head.faces, clip.cameras[key.camera])
+        assert 0 < masks["face"].sum() <= covered.sum()
+        assert (masks["face"] & ~covered).mean() < 0.002
