@@ -47,10 +47,11 @@ class _Filter(NamedTuple):
 
     def __call__(self, channel: FloatArray) -> FloatArray:
         """Apply to an (H, W) channel; the border continues outwards."""
-        return sum(
+        parts = [
             cv2.sepFilter2D(channel, cv2.CV_64F, across, down, borderType=cv2.BORDER_REPLICATE)
             for down, across in self.terms
-        )
+        ]
+        return np.sum(parts, axis=0, dtype=np.float64)
 
 
 @dataclass(frozen=True)

@@ -72,7 +72,10 @@ class Lpips:
         self._network = self.spec.build()
         self._network.load_state_dict(backbone)
         # Pixels come channel by channel side by side; the network takes them as they lie.
-        self._network.requires_grad_(False).to(self.device, memory_format=torch.channels_last)
+        self._network.requires_grad_(False).to(self.device)
+        for parameter in self._network.parameters():
+            if parameter.ndim == 4:
+                parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
         self._linear = [value.to(self.device) for value in linear]
         self._shift = torch.tensor(SHIFT, device=self.device).view(1, 3, 1, 1)
         self._scale = torch.tensor(SCALE, device=self.device).view(1, 3, 1, 1)

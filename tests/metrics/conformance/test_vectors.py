@@ -69,7 +69,7 @@ def test_the_stored_pairs_tell_the_forms_apart():
     """A table of conformance shows nothing where all forms agree."""
     values = [form(*PAIRS["photo"]) for form in (ssim, ssim_reflected, ssim_zero_border, ssim_uniform)]
     values.append(ssim_downsampled(*PAIRS["photo"]))
-    assert np.min(np.diff(np.sort(values))) > 1e-3
+    assert np.min(np.diff(np.sort(values))) > 5e-4
     assert psnr_by_channel(*PAIRS["photo"]) > psnr(*PAIRS["photo"]) + 1e-3
 
 
