@@ -107,7 +107,8 @@ def synth(
         dynamics: Scales what expressions do to skin beyond moving it (wrinkles, blush), 0 to 3.
     """
     RunFolder(Path(out)).prepare()
-    with log_to(None), locked(Path(out)):
+    folder = Path(out).resolve()  # its lock lies beside it: a capture is made in an empty folder
+    with log_to(None), locked(folder.parent, f".{folder.name}.lock"):
         _synthesise(
             {
                 "out": Path(out),

@@ -19,8 +19,8 @@ LOCK_FILE = "run.lock"
 
 
 @contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Keep other processes out of ``folder`` while the block runs; the file ``run.lock`` names the owner.
+def locked(folder: Path, name: str = LOCK_FILE) -> Iterator[None]:
+    """Keep other processes out of ``folder`` while the block runs; the file ``name`` in it tells the owner.
 
     The lock is the system's (``flock``), so that it ends with its process however that ends: a file left by a killed
     one keeps nobody out.
@@ -29,7 +29,7 @@ def locked(folder: Path) -> Iterator[None]:
     ------
     InputError : another process works in the folder; says which, where and since when.
     """
-    path = folder / LOCK_FILE
+    path = folder / name
     stream = _acquire(path)
     try:
         owner = {"process": os.getpid(), "host": platform.node(), "since": _now()}

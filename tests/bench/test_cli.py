@@ -56,6 +56,20 @@ def test_a_table_of_nothing_is_refused(capsys, tmp_path):
     assert "run.json" in capsys.readouterr().err
 
 
+def test_a_capture_is_made_in_an_empty_folder_by_one_process(monkeypatch, tmp_path):
+    seen = []
+
+    def make(*, out, **arguments):
+        seen.append((list(out.iterdir()), [path.name for path in tmp_path.iterdir()]))
+
+    monkeypatch.setattr(cli, "resolve", lambda reference: make)
+    assert cli.main(["synth", "--out", str(tmp_path / "capture")]) == 0
+    ((inside, beside),) = seen
+    assert inside == []
+    assert set(beside) == {"capture", ".capture.lock"}
+    assert [path.name for path in tmp_path.iterdir()] == ["capture"]
+
+
 @pytest.mark.parametrize("text", ["550", "550x", "axb", "0x10", "-5x20", "5x5", "1e3x20"])
 def test_a_malformed_size_is_refused(text):
     with pytest.raises(InputError):
