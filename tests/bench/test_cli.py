@@ -188,3 +188,17 @@ def test_seeds_are_given_as_a_list(monkeypatch, tmp_path):
     assert cli.main([*arguments, "--seeds", "7"]) == 0
     assert seen == [(0,), (3, 1, 4), (7,)]
     assert cli.main([*arguments, "--seeds", "one"]) == 2
+
+
+def test_a_synthetic_capture_is_given_a_folder_as_empty_as_it_was(tmp_path, monkeypatch):
+    from headbench.datasets.synthetic import capture
+
+    found = []
+
+    def synthesize(out, **settings):
+        found.append((list(out.iterdir()), settings["dynamics"]))
+        return []
+
+    monkeypatch.setattr(capture, "synthesize", synthesize)
+    assert cli.main(["synth", "--out", str(tmp_path / "new"), "--dynamics", "2"]) == 0
+    assert found == [([], 2.0)]
