@@ -78,6 +78,46 @@ GA = MethodSpec(
     source="GaussianAvatars: Photorealistic Head Avatars with Rigged 3D Gaussians, CVPR 2024, arXiv 2312.02069",
 )
 
+_SHORT_INSTA: dict[str, Any] = {
+    "levels": 8,
+    "level_features": 4,
+    "log2_table": 15,
+    "finest_resolution": 384,
+    "hidden": 32,
+    "density_layers": 1,
+    "color_layers": 2,
+    "density_bias": 4.5,
+    "prior_depth": 4.0,
+    "step": 0.003,
+    "shell_outside": 0.04,
+    "shell_inside": 0.01,
+    "occupancy_resolution": 80,
+    "occupancy_every": 8,
+    "occupancy_decay": 0.8,
+    "occupancy_threshold": 0.005,
+    "samples_per_iteration": 2**14,
+    "first_rays": 1024,
+    "images_per_iteration": 8,
+    "round_samples": 24,
+    "learning_rate": 1e-2,
+    "final_rate": 0.05,
+}
+
+INSTA = MethodSpec(
+    name="insta",
+    summary="INSTA: a canonical hash-grid radiance field, warped by the nearest triangle of the tracked mesh.",
+    implementation="headbench.methods.insta.method:Insta",
+    config="headbench.methods.insta.config:InstaConfig",
+    presets={
+        "smoke": {"budget": {"iterations": 40}, **_SHORT_INSTA},
+        "demo": {"budget": {"iterations": 600}, **_SHORT_INSTA},
+        "fast": {"budget": {"iterations": 3_000}, **_SHORT_INSTA},
+        "paper": {"budget": {"iterations": 20_000}},
+    },
+    monocular=True,
+    source="Instant Volumetric Head Avatars, CVPR 2023, arXiv 2211.12499",
+)
+
 MEAN_IMAGE = MethodSpec(
     name="mean-image",
     summary="The mean of all training images, whatever is asked for: the floor of every table.",

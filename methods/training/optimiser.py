@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 
 class Optimiser:
-    """One Adam (eps 1e-15, default betas, dense) over named parameters.
+    """One Adam (eps 1e-15, dense) over named parameters.
 
     Densification replaces per-splat parameters by longer or shorter ones; `select` and `append` carry the moments
     along, with zeros for new rows. A replaced parameter has no gradient, so it sits out the step that follows,
@@ -20,11 +20,17 @@ class Optimiser:
     ----------
     parameters : name -> parameter.
     learning_rates : name -> initial learning rate.
+    betas : decay of the two moments.
     """
 
-    def __init__(self, parameters: Mapping[str, nn.Parameter], learning_rates: Mapping[str, float]):
+    def __init__(
+        self,
+        parameters: Mapping[str, nn.Parameter],
+        learning_rates: Mapping[str, float],
+        betas: tuple[float, float] = (0.9, 0.999),
+    ):
         groups = [{"params": [p], "lr": learning_rates[name], "name": name} for name, p in parameters.items()]
-        self._adam = torch.optim.Adam(groups, eps=1e-15, fused=True)
+        self._adam = torch.optim.Adam(groups, betas=betas, eps=1e-15, fused=True)
         self._groups: dict[str, dict[str, Any]] = {g["name"]: g for g in self._adam.param_groups}
 
     def __getitem__(self, name: str) -> nn.Parameter:

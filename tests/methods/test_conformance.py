@@ -13,6 +13,7 @@ from headbench.bench.run_config import resolve_method
 from headbench.bench.specs import MethodSpec
 from headbench.methods.avatar_files import RECORD_FILE
 
+from .insta.small import SMALL as SMALL_INSTA
 from .toy_clip import toy_pose
 
 TRAINED = {
@@ -20,7 +21,10 @@ TRAINED = {
     # Rounds at 8 and 16, resets at 10 and 20.
     "splats": {"min_densify_every": 8, "min_reset_every": 10, "min_settle": 2, "checkpoint_every_s": 0.0},
 }
-OWN_TRAINING = {"gha": {"budget": {"iterations": 24}, "grid_vertices": 3_000, "start_steps": 20}}
+OWN_TRAINING = {
+    "gha": {"budget": {"iterations": 24}, "grid_vertices": 3_000, "start_steps": 20},
+    "insta": {"budget": {"iterations": 24}, "checkpoint_every_s": 0.0, **SMALL_INSTA},
+}
 """Methods that do not train splats bound to the mesh, with their own short settings."""
 SMALL = {"ours": {"plane_resolution": 16, "line_resolution": 8, "line_channels": 4, "hidden": 16}}
 SPECS = {
@@ -57,7 +61,7 @@ def altered(clip, head):
 
 
 def test_our_methods_are_registered():
-    assert {"ours", "ga", "mean-image", "nearest-camera"} <= set(SPECS)
+    assert {"ours", "ga", "insta", "mean-image", "nearest-camera"} <= set(SPECS)
 
 
 @pytest.mark.parametrize("name", SPECS)

@@ -8,9 +8,9 @@ from headbench.bench.registry import resolve
 from headbench.bench.run_config import resolve_method
 from headbench.methods.configs import GAConfig, OursConfig, SplatTraining
 from headbench.methods.gha.config import GHAConfig
-from headbench.methods.specs import GA, GHA, MEAN_IMAGE, NEAREST_CAMERA, OURS
+from headbench.methods.specs import GA, GHA, INSTA, MEAN_IMAGE, NEAREST_CAMERA, OURS
 
-SPECS = {spec.name: spec for spec in (OURS, GA, GHA, MEAN_IMAGE, NEAREST_CAMERA)}
+SPECS = {spec.name: spec for spec in (OURS, GA, GHA, INSTA, INSTA, MEAN_IMAGE, NEAREST_CAMERA)}
 PRESETS = ("smoke", "demo", "fast", "paper")
 
 

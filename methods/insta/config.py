@@ -1,0 +1,123 @@
+"""Settings of INSTA. Light: neither torch nor numpy is imported here."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+INSTANT_NGP_STEP = math.sqrt(3) / 1024
+
+
+@dataclass(frozen=True)
+class InstaConfig:
+    """INSTA (Zielonka, Bolkart, Thies, CVPR 2023). The defaults are the published values.
+
+    Moments in training (``..._from``) are on the scale of ``schedule_length`` and mapped to the budget at hand.
+
+    Attributes
+    ----------
+    schedule_length : iterations of the published run.
+    levels, level_features, log2_table, base_resolution, finest_resolution : multi-resolution hash encoding
+        (Mueller et al., SIGGRAPH 2022): levels, features each (1, 2, 4 or 8), largest rows per level, samples per
+        side of the unit cube on the first and the last level.
+    hidden, density_layers, color_layers, latent : width and number of hidden layers of the two networks, and what
+        the first hands to the second.
+    conditions : leading expression coefficients that the density network sees where the nearest triangle is of the
+        mouth. Elsewhere it sees ones.
+    density_bias, prior_depth, prior_scale : added to the logarithm of the density per metre is ``density_bias -
+        min(distance / prior_scale, prior_depth)``, with the distance from the mesh in metres. Not published (0 there):
+        a short run has not the time to find the surface, and so starts with a fog that is thickest at the mesh.
+    step : metres between samples of a ray.
+    shell_outside, shell_inside : metres from the surface within which there may be density, on both of its sides.
+    jaw_opening : radians that the jaw of the canonical mesh is opened, so that lips are apart.
+    warp_compatibility : "" carries points by the mean of the transforms of the nearest triangle and of those across
+        its edges, weighted by exp(-4 d) in metres, each with the root of the ratio of areas as its scale (paper,
+        section 3.2). "code" is the authors' program: means in the face region alone, exp(-d) for the own
+        triangle, and a scale only in the eye region, by the ratio itself.
+    occupancy_resolution, occupancy_every, occupancy_decay, occupancy_threshold : cells along the longest side of the
+        canonical box; iterations between refreshes; how much of an old value stays; optical thickness per ``step``
+        above which a cell is marched through.
+    samples_per_iteration, first_rays : samples the number of rays is adapted to, and how many rays to begin with.
+    images_per_iteration : training images that share an iteration's rays.
+    round_samples, stop_transmittance : samples per ray that are evaluated before rays with less transmittance than
+        this stop.
+    huber : where the colour loss turns from square to linear.
+    mouth_weight, mouth_from : weight of pixels that show lips or teeth, from then on.
+    depth_weight : of the distance between the expected depth and the mesh, metres, outside hair and neck. 0 for none.
+    target_compatibility : "" composites the truth over the random background as the prediction is, in sRGB. "code"
+        does it in linear light, which differs where masks are soft.
+    learning_rate, final_rate, betas, weight_decay, ema : Adam; part of the rate that is left at the end, log-linearly
+        over the last half; decay of the networks' weights; of the running mean of parameters that is kept as the
+        avatar.
+    mesh_cache_mb, image_cache_mb : memory for posed meshes and for training images.
+    checkpoint_every_s : seconds between checkpoints.
+    """
+
+    schedule_length: int = 20_000
+    levels: int = 16
+    level_features: int = 8
+    log2_table: int = 18
+    base_resolution: int = 16
+    finest_resolution: int = 2048
+    hidden: int = 64
+    density_layers: int = 2
+    color_layers: int = 3
+    latent: int = 16
+    conditions: int = 16
+    density_bias: float = 0.0
+    prior_depth: float = 0.0
+    prior_scale: float = 0.004
+    step: float = INSTANT_NGP_STEP
+    shell_outside: float = 0.05
+    shell_inside: float = 0.02
+    jaw_opening: float = 0.2094
+    warp_compatibility: Literal["", "code"] = ""
+    occupancy_resolution: int = 128
+    occupancy_every: int = 16
+    occupancy_decay: float = 0.95
+    occupancy_threshold: float = 0.01
+    samples_per_iteration: int = 2**18
+    first_rays: int = 4096
+    images_per_iteration: int = 16
+    round_samples: int = 16
+    stop_transmittance: float = 1e-3
+    huber: float = 0.1
+    mouth_weight: float = 40.0
+    mouth_from: int = 500
+    depth_weight: float = 1.25
+    target_compatibility: Literal["", "code"] = ""
+    learning_rate: float = 1.75e-3
+    final_rate: float = 1.0
+    betas: tuple[float, float] = (0.9, 0.99)
+    weight_decay: float = 1e-6
+    ema: float = 0.95
+    mesh_cache_mb: int = 512
+    image_cache_mb: int = 512
+    checkpoint_every_s: float = 120.0
+
+    def __post_init__(self) -> None:
+        if self.level_features not in (1, 2, 4, 8):
+            raise ValueError(f"level_features must be 1, 2, 4 or 8, found {self.level_features}")
+        if not 1 <= self.log2_table <= 24:
+            raise ValueError(f"log2_table must lie between 1 and 24, found {self.log2_table}")
+        if not 2 <= self.base_resolution <= self.finest_resolution:
+            raise ValueError("base_resolution must be at least 2 and at most finest_resolution")
+        for name in (
+            *("schedule_length", "levels", "hidden", "density_layers", "color_layers", "latent"),
+            *("occupancy_resolution", "occupancy_every", "samples_per_iteration", "first_rays"),
+            *("images_per_iteration", "round_samples"),
+        ):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, found {getattr(self, name)}")
+        for name in ("step", "shell_outside", "shell_inside", "prior_scale", "huber", "learning_rate"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be above 0, found {getattr(self, name)}")
+        for name in ("conditions", "mouth_weight", "depth_weight", "weight_decay", "prior_depth"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} must not be negative, found {getattr(self, name)}")
+        for name in ("occupancy_decay", "occupancy_threshold", "ema", "stop_transmittance"):
+            if not 0 <= getattr(self, name) < 1:
+                raise ValueError(f"{name} must lie in [0, 1), found {getattr(self, name)}")
+        if not 0 < self.final_rate <= 1:
+            raise ValueError(f"final_rate must lie in (0, 1], found {self.final_rate}")

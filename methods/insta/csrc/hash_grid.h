@@ -1,0 +1,23 @@
+// Multi-resolution hash encoding, forward and backward.
+#pragma once
+
+#include <cstdint>
+#include <vector>
+
+namespace headbench::insta {
+
+struct Level {
+  float scale;                // cells per unit length
+  std::int32_t resolution;    // samples per side
+  std::int64_t first, count;  // rows of the table
+};
+
+// (N, levels features) values at (N, 3) positions in [0, 1].
+void encode(const float* positions, std::int64_t count, const float* table, const std::vector<Level>& levels,
+            int features, float* out, int threads);
+
+// Add the gradient by the table. Every level belongs to one thread, so sums do not depend on their number.
+void encode_backward(const float* positions, std::int64_t count, const float* gradient,
+                     const std::vector<Level>& levels, int features, float* table_gradient, int threads);
+
+}  // namespace headbench::insta

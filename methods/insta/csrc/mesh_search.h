@@ -1,0 +1,115 @@
+// Nearest triangle and first hit on a posed mesh, exact, by a tree of boxes that is built once and refitted.
+#pragma once
+
+#include <cstdint>
+#include <limits>
+#include <memory>
+#include <vector>
+
+namespace headbench::insta {
+
+struct Vec3 {
+  float x, y, z;
+};
+
+inline Vec3 operator+(Vec3 a, Vec3 b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
+inline Vec3 operator-(Vec3 a, Vec3 b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
+inline Vec3 operator*(float s, Vec3 a) { return {s * a.x, s * a.y, s * a.z}; }
+inline float dot(Vec3 a, Vec3 b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+inline Vec3 cross(Vec3 a, Vec3 b) { return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x}; }
+
+struct Box {
+  Vec3 low{std::numeric_limits<float>::infinity(), std::numeric_limits<float>::infinity(),
+           std::numeric_limits<float>::infinity()};
+  Vec3 high{-std::numeric_limits<float>::infinity(), -std::numeric_limits<float>::infinity(),
+            -std::numeric_limits<float>::infinity()};
+  void add(Vec3 p);
+  void add(const Box& other);
+};
+
+// The left child of an inner node follows it; a leaf has triangles [first, first + count) of the tree's order.
+struct Node {
+  std::int32_t right;
+  std::int32_t first;
+  std::int32_t count;  // 0 for an inner node
+};
+
+constexpr int kLanes = 4;
+
+// Up to four nodes of the tree side by side. A child is a wide node, or the leaf ~child; unused lanes have the node
+// -1 and a box that nothing is near to.
+struct WideNode {
+  std::int32_t child[kLanes];
+  std::int32_t node[kLanes];
+};
+
+// Which triangles lie together. Made from one pose of the mesh; poses that differ moderately keep it tight.
+class Tree {
+ public:
+  Tree(const std::int32_t* faces, std::int64_t face_count, const float* vertices, std::int64_t vertex_count);
+
+  std::int64_t face_count() const { return static_cast<std::int64_t>(order_.size()); }
+  std::int64_t vertex_count() const { return vertex_count_; }
+  const std::vector<Node>& nodes() const { return nodes_; }
+  const std::vector<std::int32_t>& order() const { return order_; }
+  const std::vector<std::int32_t>& faces() const { return faces_; }
+  const std::vector<WideNode>& wide() const { return wide_; }
+  const std::vector<std::int32_t>& leaves() const { return leaves_; }  // nodes
+
+ private:
+  void build(std::vector<Vec3>& centroids, std::int32_t first, std::int32_t count);
+  std::int32_t widen(std::int32_t node);
+
+  std::vector<std::int32_t> faces_, order_, leaves_;
+  std::vector<Node> nodes_;
+  std::vector<WideNode> wide_;
+  std::int64_t vertex_count_;
+};
+
+struct Triangle {
+  Vec3 a, b, c;
+};
+
+// Boxes and triangles of four lanes, coordinate by coordinate.
+struct WideBox {
+  float low[3][kLanes], high[3][kLanes];
+};
+
+struct WideTriangles {
+  float a[3][kLanes], ab[3][kLanes], ac[3][kLanes], normal[3][kLanes];
+  float by_ab[kLanes], by_ac[kLanes], by_bc[kLanes];  // one over squared lengths of the edges, 0 for none
+  float by_area[kLanes];                              // one over the normal's square, 0 for none
+  std::int32_t index[kLanes];                         // -1 for an unused lane
+};
+
+struct Hit {
+  std::int32_t triangle = -1;
+  float value = std::numeric_limits<float>::infinity();  // squared distance, or distance along the ray
+};
+
+// The tree fitted to one pose.
+class Posed {
+ public:
+  Posed(std::shared_ptr<const Tree> tree, const float* vertices);
+
+  const Tree& tree() const { return *tree_; }
+  const std::vector<Box>& boxes() const { return boxes_; }
+
+  // Nearest triangle of those at most sqrt(limit) away; of equally near ones (a shared edge or corner) that whose
+  // plane is farthest, so that the space around a convex edge is parted along the bisector and not by rounding.
+  // `hint` is a triangle to try first, or -1.
+  Hit nearest(Vec3 point, float limit, std::int32_t hint) const;
+
+  // First triangle hit at a distance above 0, from either side. `direction` need not have unit length.
+  Hit first_hit(Vec3 origin, Vec3 direction) const;
+
+ private:
+  std::shared_ptr<const Tree> tree_;
+  std::vector<Triangle> by_face_;   // in the order of faces
+  std::vector<Triangle> by_order_;  // in the tree's order
+  std::vector<Box> boxes_;
+  std::vector<WideBox> wide_;
+  std::vector<WideTriangles> leaves_;
+};
+
+}  // namespace headbench::insta

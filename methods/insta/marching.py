@@ -1,0 +1,211 @@
+"""The mesh as the field's guide: which samples of a ray lie near it, and where they are in canonical space."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...bench.contracts import HeadAsset
+from . import kernel
+from .triangles import Found, first_hits, nearest_triangles
+from .warp import Blend, Compatibility, blended, canonical_from_posed
+
+Backend = Literal["auto", "kernel", "reference"]
+
+
+class Rays(NamedTuple):
+    """Rays as float32 numpy arrays. Sample k of ray r lies at ``(k + jitter[r]) * step`` metres from its origin."""
+
+    origins: np.ndarray  # (R, 3)
+    directions: np.ndarray  # (R, 3) unit length
+    jitter: np.ndarray  # (R,) in [0, 1)
+
+
+class Samples(NamedTuple):
+    """Samples of rays near the surface, ray by ray in order of distance."""
+
+    positions: np.ndarray  # (N, 3) float32, canonical metres
+    directions: np.ndarray  # (N, 3) float32, canonical, unit length
+    distances: np.ndarray  # (N,) float32 metres from the posed surface
+    rays: np.ndarray  # (N,) int32
+    indices: np.ndarray  # (N,) int32 numbers k of the samples
+    triangles: np.ndarray  # (N,) int32
+    next: np.ndarray  # (R,) int32, k to go on at; -1 for a ray that has left the surface behind
+
+
+@dataclass(frozen=True, eq=False)
+class Space:
+    """Where there may be density.
+
+    Attributes
+    ----------
+    reach : (F,) float32 metres from each triangle; negative for nowhere.
+    low : (3,) float32 corner of the occupancy grid, canonical metres.
+    cell : size of its cubic cells, metres.
+    occupied : (X, Y, Z) uint8.
+    """
+
+    reach: np.ndarray
+    low: np.ndarray
+    cell: float
+    occupied: np.ndarray
+
+
+class Surface:
+    """The canonical mesh of a subject, and what all its poses share.
+
+    Parameters
+    ----------
+    canonical : (V, 3) vertices, metres.
+    backend : "kernel" is compiled, "reference" tries every triangle in torch; "auto" takes what there is.
+    """
+
+    def __init__(
+        self, head: HeadAsset, canonical: Tensor, compatibility: Compatibility = "", backend: Backend = "auto"
+    ):
+        self.canonical = canonical.detach().cpu()
+        self.faces = torch.from_numpy(np.asarray(head.faces, dtype=np.int64))
+        self.blend = Blend.of(head, compatibility)
+        self.module = None if backend == "reference" else kernel.load()
+        if backend == "kernel" and self.module is None:
+            raise ValueError("backend 'kernel': not installed; 'reference' is")
+        self.tree: Any = None
+        if self.module is not None:
+            faces = np.ascontiguousarray(head.faces, dtype=np.int32)
+            self.tree = self.module.tree(faces, _array(self.canonical.float()))
+        self.rest = self.pose(self.canonical)
+
+    def pose(self, vertices: Tensor) -> PosedSurface:
+        """The surface in one pose, (V, 3) vertices in metres."""
+        return PosedSurface(self, vertices.detach().cpu())
+
+    def threads(self) -> int:
+        """Threads for the kernel: as many as torch uses."""
+        return torch.get_num_threads()
+
+
+class PosedSurface:
+    """One pose of the surface."""
+
+    def __init__(self, surface: Surface, vertices: Tensor):
+        self.surface, self.vertices = surface, vertices
+        self.matrices = canonical_from_posed(surface.canonical, vertices, surface.faces, surface.blend)
+        self.corners = vertices[surface.faces]
+        self.centroids = self.corners.mean(1)
+        self._mesh: Any = None
+        if surface.module is not None:
+            self._mesh = surface.module.posed(surface.tree, _array(vertices.float()))
+
+    @property
+    def bytes(self) -> int:
+        """Memory, nearly: matrices, corners twice in the kernel, boxes."""
+        return 4 * (self.matrices.numel() + 4 * self.corners.numel())
+
+    def nearest(self, points: np.ndarray) -> Found:
+        """Nearest triangle of (N, 3) float32 points, and its squared distance."""
+        points = np.ascontiguousarray(points, dtype=np.float32)
+        if self._mesh is None:
+            return nearest_triangles(torch.from_numpy(points), self.corners.float())
+        triangles, squared = np.empty(len(points), np.int32), np.empty(len(points), np.float32)
+        module, threads = self.surface.module, self.surface.threads()
+        assert module is not None
+        module.nearest(self._mesh, points, triangles, squared, threads)
+        return Found(torch.from_numpy(triangles).long(), torch.from_numpy(squared))
+
+    def first_hit(self, rays: Rays) -> Found:
+        """First triangle of each ray and its distance, metres."""
+        origins, directions = np.ascontiguousarray(rays.origins), np.ascontiguousarray(rays.directions)
+        if self._mesh is None:
+            return first_hits(torch.from_numpy(origins), torch.from_numpy(directions), self.corners.float())
+        triangles, distances = np.empty(len(origins), np.int32), np.empty(len(origins), np.float32)
+        module, threads = self.surface.module, self.surface.threads()
+        assert module is not None
+        module.first_hit(self._mesh, origins, directions, triangles, distances, threads)
+        return Found(torch.from_numpy(triangles).long(), torch.from_numpy(distances))
+
+    def march(self, rays: Rays, first: np.ndarray, step: float, samples_max: int, space: Space) -> Samples:
+        """Samples of rays that may have density, at most ``samples_max`` of each ray.
+
+        Parameters
+        ----------
+        first : (R,) int32 numbers of the samples to start at; -1 for rays that are done.
+        """
+        if self._mesh is None:
+            return self._march_reference(rays, first, step, samples_max, space)
+        blend, module = self.surface.blend, self.surface.module
+        assert module is not None
+        return Samples(
+            *module.march(
+                self._mesh,
+                *(np.ascontiguousarray(rays.origins), np.ascontiguousarray(rays.directions)),
+                *(first, np.ascontiguousarray(rays.jitter), step, samples_max, space.reach),
+                *(_array(self.matrices.float()), _array(self.centroids.float()), blend.neighbours),
+                *(blend.own_falloff, blend.neighbour_falloff, space.low, 1 / space.cell, space.occupied),
+                self.surface.threads(),
+            )
+        )
+
+    def _march_reference(
+        self, rays: Rays, first: np.ndarray, step: float, samples_max: int, space: Space
+    ) -> Samples:
+        """Twin of the kernel: every sample that is not behind the mesh, its nearest triangle of all."""
+        low, high = self.vertices.min(0).values.numpy(), self.vertices.max(0).values.numpy()
+        padding = max(float(space.reach.max()), 0.0)
+        farthest = np.linalg.norm(0.5 * (low + high) - rays.origins, axis=1).max(initial=0.0)
+        farthest += 0.5 * np.linalg.norm(high - low) + padding
+        numbers = np.arange(int(farthest / step) + 2)
+        parts, following = [], np.full(len(first), -1, np.int32)
+        for ray in np.flatnonzero(first >= 0):
+            indices = numbers[first[ray] :]
+            distances = ((indices + rays.jitter[ray]) * np.float32(step)).astype(np.float32)
+            points = rays.origins[ray] + distances[:, None] * rays.directions[ray]
+            close = ((points >= low - padding) & (points <= high + padding)).all(1)
+            indices, points = indices[close], points[close]
+            found = self.nearest(points)
+            triangles = found.triangles.numpy()
+            near = found.values.numpy() <= np.maximum(space.reach[triangles], 0) ** 2
+            near &= space.reach[triangles] >= 0
+            away = np.sqrt(found.values.numpy()[near])
+            indices, points, triangles = indices[near], points[near], triangles[near]
+            positions, directions = self.to_canonical(points, triangles, rays.directions[ray])
+            kept = np.flatnonzero(occupied_at(space, positions))
+            if len(kept) > samples_max:
+                following[ray] = indices[kept[samples_max]]
+                kept = kept[:samples_max]
+            owner = np.full(len(positions), ray)
+            columns = (positions, directions, away, owner, indices, triangles)
+            parts.append(tuple(column[kept] for column in columns))
+        if not parts:
+            parts = [(np.empty((0, 3)), np.empty((0, 3)), *[np.empty(0)] * 4)]
+        joined = [np.concatenate(column) for column in zip(*parts)]
+        types = (np.float32, np.float32, np.float32, np.int32, np.int32, np.int32)
+        return Samples(*(c.astype(t) for c, t in zip(joined, types)), next=following)
+
+    def to_canonical(
+        self, points: np.ndarray, triangles: np.ndarray, direction: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Canonical positions of (N, 3) points by their nearest triangles, and of one direction at each of them."""
+        own = torch.from_numpy(np.asarray(points)).to(self.matrices)
+        matrices = blended(
+            own, torch.from_numpy(triangles).long(), self.matrices, self.centroids, self.surface.blend
+        )
+        positions = (matrices[:, :, :3] @ own[:, :, None])[:, :, 0] + matrices[:, :, 3]
+        turned = matrices[:, :, :3] @ torch.from_numpy(np.asarray(direction)).to(own)
+        return positions.numpy(), torch.nn.functional.normalize(turned, dim=1).numpy()
+
+
+def occupied_at(space: Space, positions: np.ndarray) -> np.ndarray:
+    """(N,) bool: whether canonical positions lie in an occupied cell."""
+    size = np.array(space.occupied.shape)
+    cells = np.floor((positions - space.low) * np.float32(1 / space.cell)).astype(np.int64)
+    inside = ((cells >= 0) & (cells < size)).all(1)
+    x, y, z = np.clip(cells, 0, size - 1).T
+    return inside & (space.occupied[x, y, z] > 0)
+
+
+def _array(values: Tensor) -> np.ndarray:
+    return np.ascontiguousarray(values.numpy())

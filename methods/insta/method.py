@@ -1,0 +1,70 @@
+"""INSTA: Zielonka, Bolkart, Thies, "Instant Volumetric Head Avatars", CVPR 2023, arXiv 2211.12499."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ...bench.contracts import Budget, Clip, Progress
+from ..avatar_files import (
+    SUBJECT_FILE,
+    Subject,
+    is_finished,
+    run_digest,
+    save_shared_head,
+    write_record,
+    write_subject,
+)
+from ..clip_checks import check_training_split
+from ..subject_mesh import SubjectMesh
+from ..training.loop import CHECKPOINT, check_budget, train
+from ..training.sampling import ShuffledEpochs
+from .avatar import InstaAvatar
+from .canonical import canonical_surface
+from .config import InstaConfig
+from .storage import FIELD_FILE, SETTINGS_FILE, write_field, write_settings
+from .training import InstaTraining
+
+
+class Insta:
+    """The method: see the module."""
+
+    name, version = "insta", "1"
+
+    def __init__(self, config: InstaConfig | None = None):
+        self.config = config or InstaConfig()
+
+    def fit(
+        self, clip: Clip, out: Path, budget: Budget, *, device: str, seed: int, progress: Progress
+    ) -> InstaAvatar:
+        """Train on the training split and write the avatar under ``out``; continues a killed run."""
+        check_budget(budget)
+        check_training_split(clip)
+        run = run_digest(self.name, self.version, self.config, clip, budget, seed)
+        if is_finished(out, run):
+            return self.load(out, device=device)
+        subject = Subject.of(clip)
+        mesh = SubjectMesh(clip.head, subject.shape, subject.static_offset, "cpu")
+        surface = canonical_surface(clip.head, mesh, self.config)
+        training = InstaTraining(clip, mesh, surface, self.config, device, seed)
+        outcome = train(
+            training,
+            ShuffledEpochs(len(training.keys), seed),
+            published_length=self.config.schedule_length,
+            budget=budget,
+            folder=out,
+            run=run,
+            device=device,
+            progress=progress,
+            checkpoint_every_s=self.config.checkpoint_every_s,
+        )
+        write_field(out / FIELD_FILE, training.parameters(), training.space.occupied)
+        write_settings(out / SETTINGS_FILE, self.config)
+        write_subject(out / SUBJECT_FILE, subject)
+        save_shared_head(out, clip.head)
+        write_record(out, run, outcome, occupied_cells=int(training.space.occupied.sum()))
+        (out / CHECKPOINT).unlink(missing_ok=True)
+        return self.load(out, device=device)
+
+    def load(self, path: Path, *, device: str) -> InstaAvatar:
+        """Read an avatar that `fit` wrote."""
+        return InstaAvatar.read(path, device)

@@ -1,0 +1,68 @@
+"""The file of an INSTA avatar: parameters in half precision, occupied cells as bits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...bench.configuration import build
+from ...bench.errors import HeadbenchError, InputError
+from ...bench.files import read_json, write_json
+from ..avatar_files import read_arrays, write_arrays
+from .config import InstaConfig
+from .field import Architecture
+
+FIELD_FILE = "field.npz"
+SETTINGS_FILE = "field.json"
+OCCUPIED = "occupied"
+
+
+def write_settings(path: Path, config: InstaConfig) -> None:
+    """Write the settings that decide how the field is read and rendered."""
+    write_json(path, asdict(config))
+
+
+def read_settings(path: Path) -> InstaConfig:
+    """Read what `write_settings` wrote. Raises `InputError` for settings that are unknown or out of range."""
+    try:
+        config: InstaConfig = build(InstaConfig, read_json(path), str(path))
+    except InputError:
+        raise
+    except (HeadbenchError, TypeError, ValueError) as error:
+        raise InputError(path, "", "settings of INSTA", str(error)) from error
+    return config
+
+
+def write_field(path: Path, parameters: Mapping[str, Tensor], occupied: np.ndarray) -> None:
+    """Write parameters, and (X, Y, Z) occupancy."""
+    arrays = {name: value.detach().cpu().half().numpy() for name, value in parameters.items()}
+    bits = np.packbits(occupied.reshape(-1) > 0)
+    write_arrays(path, {**arrays, OCCUPIED: bits})
+
+
+def read_field(
+    path: Path, architecture: Architecture, size: tuple[int, ...], device: str
+) -> tuple[dict[str, Tensor], np.ndarray]:
+    """Read what `write_field` wrote: float32 parameters, and flat numbers of occupied cells.
+
+    Raises `InputError` where an array is missing, not finite or of another shape or type.
+    """
+    shapes = architecture.shapes()
+    arrays = read_arrays(path, (*shapes, OCCUPIED))
+    for name, shape in shapes.items():
+        values = arrays[name]
+        if values.shape != shape or values.dtype != np.float16 or not np.isfinite(values).all():
+            found = f"{values.dtype} of shape {values.shape}, or non-finite numbers"
+            raise InputError(path, name, f"finite float16 of shape {shape}", found)
+    bits, cells = arrays[OCCUPIED], math.prod(size)
+    if bits.dtype != np.uint8 or bits.shape != (-(-cells // 8),):
+        expected = f"uint8 of shape {(-(-cells // 8),)}"
+        raise InputError(path, OCCUPIED, expected, f"{bits.dtype} of shape {bits.shape}")
+    parameters = {name: torch.from_numpy(arrays[name].astype(np.float32)).to(device) for name in shapes}
+    return parameters, np.flatnonzero(np.unpackbits(bits, count=cells))

@@ -1,0 +1,239 @@
+"""Training of the field: rays of several images, adapted in number to the samples they cost."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ...bench.contracts import Clip, FrameKey
+from ...bench.errors import InputError
+from ..known_poses import pose_key
+from ..seeds import numpy_generator
+from ..subject_mesh import BoundedCache, SubjectMesh
+from ..training.optimiser import Optimiser
+from ..training.schedule import Timeline, log_linear
+from .config import InstaConfig
+from .field import Architecture, Field, Prior
+from .losses import color_loss, depth_loss, true_colors
+from .marching import PosedSurface, Rays, Space, Surface
+from .occupancy import Occupancy
+from .parts import bare_triangles, mouth_triangles
+from .rays import box_corners, camera_rays, pixels_of_hull
+from .rendering import Marching, Rendered, Scene, render_rays
+
+WHOLE_REFRESHES_UNTIL = 256  # published iterations in which every refresh visits all cells
+RAYS_MIN, RAYS_MAX = 64, 1 << 18
+
+
+class Batch(NamedTuple):
+    """Rays of one iteration and what they should see."""
+
+    scenes: list[Scene]
+    image: Tensor  # (R, 3) in [0, 1]
+    coverage: Tensor  # (R, 1)
+    mouth: Tensor  # (R,) bool
+    depth: Tensor  # (R,) metres along the ray, infinite where unknown
+
+
+class InstaTraining:
+    """A `Trainable`. The loop's index names the first image of an iteration; the others are drawn beside it."""
+
+    def __init__(
+        self, clip: Clip, mesh: SubjectMesh, surface: Surface, config: InstaConfig, device: str, seed: int
+    ):
+        self._clip, self._mesh, self._surface = clip, mesh, surface
+        self._config, self._device, self._seed = config, device, seed
+        self.keys: Sequence[FrameKey] = clip.splits["train"]
+        self.occupancy = Occupancy(surface, config)
+        architecture = Architecture.of(config, mesh.model.expression_size)
+        self.field = Field(architecture, self.occupancy.box(device), Prior.of(config))
+        initial = architecture.initial(seed)
+        self._optimiser = Optimiser(
+            {name: nn.Parameter(value.to(device)) for name, value in initial.items()},
+            dict.fromkeys(initial, config.learning_rate),
+            betas=config.betas,
+        )
+        self._names = tuple(initial)
+        self._mean = {name: torch.zeros_like(self._optimiser[name]) for name in self._names}
+        self._steps = 0
+        self._rays = max(config.first_rays, RAYS_MIN)
+        self.mouth = mouth_triangles(clip.head)
+        self._bare = bare_triangles(clip.head)
+        self._ground = torch.as_tensor(np.asarray(clip.background), dtype=torch.float32)
+        self._marching = Marching(config.step, config.round_samples, config.stop_transmittance)
+        self._images = BoundedCache(self._image, self._entries(config.image_cache_mb, self._image_bytes()))
+        # Frames of one timestep often share their pose; so do frames of a video made of several views.
+        self._alike: dict[bytes, int] = {}
+        bytes_of_pose = 2 * surface.rest.bytes
+        self._poses = BoundedCache(self._posed, self._entries(config.mesh_cache_mb, bytes_of_pose))
+        self._space = self.occupancy.space()
+
+    @property
+    def optimiser(self) -> Optimiser:
+        """Adam over everything trained."""
+        return self._optimiser
+
+    @property
+    def space(self) -> Space:
+        """Where rays are sampled now."""
+        return self._space
+
+    def parameters(self) -> dict[str, Tensor]:
+        """What the avatar is made of: the running mean of the parameters."""
+        if not self._steps or not self._config.ema:
+            return {name: self._optimiser[name].detach() for name in self._names}
+        missing = 1 - self._config.ema**self._steps
+        return {name: mean / missing for name, mean in self._mean.items()}
+
+    def begin(self, timeline: Timeline) -> None:
+        """Fit schedules to the length of the run."""
+        self._timeline = timeline
+
+    def loss(self, iteration: int, index: int) -> Tensor:
+        """Colour and depth loss of one iteration's rays."""
+        config = self._config
+        batch = self._batch(iteration, index)
+        rendered = self.render(batch.scenes)
+        drawn = numpy_generator(self._seed, "backgrounds", iteration).random((len(batch.image), 3))
+        # Without a mask the recorded background is part of the picture and has to be rendered as it is.
+        random = torch.from_numpy(drawn.astype(np.float32))
+        background = random if self._masked else self._ground.expand_as(random)
+        truth = true_colors(batch.image, batch.coverage, self._ground, background, config)
+        device = rendered.color.device
+        color = rendered.color + rendered.transmittance[:, None] * background.to(device)
+        weighted = iteration >= self._timeline.at(config.mouth_from)
+        weights = torch.where(batch.mouth & weighted, config.mouth_weight, 1.0)
+        loss = color_loss(color, truth.to(device), weights.to(device), config.huber)
+        if config.depth_weight:
+            loss = loss + config.depth_weight * depth_loss(rendered.distance, batch.depth.to(device))
+        self._seen = rendered.samples
+        return loss
+
+    def render(self, scenes: Sequence[Scene]) -> Rendered:
+        """March rays through the field as it is."""
+        parameters = {name: self._optimiser[name] for name in self._names}
+        return render_rays(self.field, parameters, scenes, self._space, self.mouth, self._marching)
+
+    def after_backward(self, iteration: int) -> None:
+        """Weight decay, running mean, learning rate, number of rays, and the occupancy grid when it is due."""
+        config = self._config
+        with torch.no_grad():
+            for name in self._names:
+                value = self._optimiser[name]
+                if name != "table" and value.grad is not None:
+                    value.grad.add_(value, alpha=config.weight_decay)
+                self._mean[name].lerp_(value, 1 - config.ema)
+        self._steps += 1
+        decay = log_linear(1.0, config.final_rate, max(0.0, 2 * self._timeline.fraction(iteration) - 1))
+        for name in self._names:
+            self._optimiser.set_learning_rate(name, decay * config.learning_rate)
+        wanted = self._rays * config.samples_per_iteration / max(self._seen, 1)
+        # By no more than half at once: an iteration may have met little by chance.
+        self._rays = int(np.clip(wanted, max(self._rays / 2, RAYS_MIN), min(self._rays * 1.5, RAYS_MAX)))
+        if iteration % config.occupancy_every == 0:
+            self._refresh(iteration)
+
+    def state(self) -> dict[str, Any]:
+        """Parameters, moments, running means, occupancy and number of rays."""
+        return {
+            "optimiser": self._optimiser.state(),
+            "mean": self._mean,
+            "steps": self._steps,
+            "rays": self._rays,
+            "occupancy": self.occupancy.state(),
+        }
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Take over what `state` gave."""
+        self._optimiser.load_state(state["optimiser"])
+        self._mean = {name: state["mean"][name].to(self._device) for name in self._names}
+        self._steps, self._rays = state["steps"], state["rays"]
+        self.occupancy.load_state(state["occupancy"])
+        self._space = self.occupancy.space()
+
+    def note(self) -> str:
+        """Rays, and how much of the grid is occupied."""
+        return f"{self._rays} rays; {self.occupancy.occupied.mean():.0%} of the shell"
+
+    def _refresh(self, iteration: int) -> None:
+        key = self.keys[int(numpy_generator(self._seed, "expression", iteration).integers(len(self.keys)))]
+        condition = torch.as_tensor(
+            np.asarray(self._clip.poses[key.timestep].expression), dtype=torch.float32
+        )
+        parameters = {name: self._optimiser[name].detach() for name in self._names}
+        whole = iteration <= self._timeline.at(WHOLE_REFRESHES_UNTIL)
+        self.occupancy.refresh(
+            self.field, parameters, condition, self.mouth, self._seed, iteration, whole=whole
+        )
+        self._space = self.occupancy.space()
+
+    def _batch(self, iteration: int, index: int) -> Batch:
+        generator = numpy_generator(self._seed, "rays", iteration)
+        count = min(self._config.images_per_iteration, len(self.keys), self._rays)
+        others = generator.choice(len(self.keys), size=count - 1, replace=False) if count > 1 else []
+        parts = [self._rays_of(int(chosen), self._rays // count, generator) for chosen in (index, *others)]
+        scenes, *columns = zip(*parts)
+        return Batch(list(scenes), *(torch.cat(column) for column in columns))
+
+    def _rays_of(
+        self, index: int, count: int, generator: np.random.Generator
+    ) -> tuple[Scene, Tensor, Tensor, Tensor, Tensor]:
+        key = self.keys[index]
+        camera, surface = self._clip.cameras[key.camera], self._surface_at(key.timestep)
+        # Beyond these pixels nothing can be rendered, and no gradient comes of them.
+        corners = box_corners(surface.vertices.numpy(), max(float(self._space.reach.max()), 0.0))
+        left, top, right, bottom = pixels_of_hull(camera, corners)
+        columns = generator.integers(left, max(right, left + 1), count).clip(0, camera.width - 1)
+        rows = generator.integers(top, max(bottom, top + 1), count).clip(0, camera.height - 1)
+        rays = camera_rays(camera, columns, rows, generator.random(count))
+        image, mask = self._images(index)
+        colors = torch.from_numpy(image[rows, columns].astype(np.float32) / 255)
+        covered = np.full(count, 255) if mask is None else mask[rows, columns]
+        coverage = torch.from_numpy(covered.astype(np.float32)[:, None] / 255)
+        mouth, depth = self._guides(surface, rays, coverage[:, 0])
+        expression = np.asarray(self._clip.poses[key.timestep].expression)
+        scene = Scene(surface, torch.as_tensor(expression, dtype=torch.float32), rays)
+        return scene, colors, coverage, mouth, depth
+
+    def _guides(self, surface: PosedSurface, rays: Rays, coverage: Tensor) -> tuple[Tensor, Tensor]:
+        """Which rays meet the mouth, and where rays meet the bare mesh."""
+        found = surface.first_hit(rays)
+        hit, triangles = found.triangles >= 0, found.triangles.clamp_min(0)
+        bare = hit & self._bare[triangles] & (coverage > 0.001)
+        return hit & self.mouth[triangles], torch.where(bare, found.values, torch.inf)
+
+    def _surface_at(self, timestep: int) -> PosedSurface:
+        representative = self._alike.setdefault(pose_key(self._clip.poses[timestep]), timestep)
+        return self._poses(representative)
+
+    @torch.no_grad()
+    def _posed(self, timestep: int) -> PosedSurface:
+        return self._surface.pose(self._mesh.posed(self._mesh.arguments([self._clip.poses[timestep]])))
+
+    @property
+    def _masked(self) -> bool:
+        return self._images(0)[1] is not None
+
+    def _image(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
+        key = self.keys[index]
+        camera, image, mask = self._clip.cameras[key.camera], self._clip.image(key), self._clip.mask(key)
+        size = (camera.height, camera.width)
+        if image.shape != (*size, 3) or image.dtype != np.uint8:
+            found = f"{image.dtype} of shape {image.shape}"
+            raise InputError(str(key), "image", f"uint8 of shape {(*size, 3)}", found)
+        if mask is not None and (mask.shape != size or mask.dtype != np.uint8):
+            found = f"{mask.dtype} of shape {mask.shape}"
+            raise InputError(str(key), "mask", f"uint8 of shape {size}", found)
+        return image, mask
+
+    def _image_bytes(self) -> int:
+        cameras = [self._clip.cameras[key.camera] for key in self.keys]
+        return 4 * max(camera.width * camera.height for camera in cameras)
+
+    @staticmethod
+    def _entries(megabytes: int, size: int) -> int:
+        return max(1, megabytes * 2**20 // size)

@@ -1,0 +1,261 @@
+"""The method: learning, resuming, storing, and staying finite whatever is asked for."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from headbench.bench.configuration import build
+from headbench.bench.contracts import Budget, no_progress
+from headbench.bench.errors import InputError
+from headbench.methods.insta.avatar import InstaAvatar
+from headbench.methods.insta.config import InstaConfig
+from headbench.methods.insta.method import Insta
+from headbench.methods.insta.storage import FIELD_FILE, SETTINGS_FILE
+from headbench.methods.specs import INSTA
+from headbench.methods.training.loop import CHECKPOINT
+
+from .small import SMALL
+
+BUDGET = Budget(iterations=24)
+
+
+class Killed(Exception):
+    pass
+
+
+def fit(clip, folder, progress=no_progress, seed=3, **more):
+    config = InstaConfig(**{**SMALL, "checkpoint_every_s": 0.0, **more})
+    return Insta(config).fit(clip, folder, BUDGET, device="cpu", seed=seed, progress=progress)
+
+
+def content(avatar):
+    return {path.name: path.read_bytes() for path in avatar.files()}
+
+
+@pytest.fixture(scope="module")
+def trained(clip, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("insta")
+    return folder, fit(clip, folder)
+
+
+def test_an_unbroken_run_repeats_itself_and_another_seed_does_not(trained, clip, tmp_path):
+    assert content(fit(clip, tmp_path / "same")) == content(trained[1])
+    assert content(fit(clip, tmp_path / "other", seed=4)) != content(trained[1])
+
+
+# Between refreshes of the grid, right after one, and twice in one run.
+@pytest.mark.parametrize("kills", [(6,), (8,), (3, 17)])
+def test_interrupted_and_continued_is_the_same_bit_for_bit(trained, clip, tmp_path, kills):
+    for kill in kills:
+
+        def killer(done, total, note="", kill=kill):
+            if done == kill:
+                raise Killed
+
+        with pytest.raises(Killed):
+            fit(clip, tmp_path, killer)
+        assert (tmp_path / CHECKPOINT).exists()
+    seen = []
+    avatar = fit(clip, tmp_path, lambda done, total, note="": seen.append(done))
+    assert seen[0] == kills[-1] + 1
+    assert content(avatar) == content(trained[1])
+    assert not (tmp_path / CHECKPOINT).exists()
+
+
+def test_the_comparison_would_notice_a_lost_grid(trained, clip, tmp_path, monkeypatch):
+    from headbench.methods.insta.occupancy import Occupancy
+
+    def killer(done, total, note=""):
+        if done == 13:
+            raise Killed
+
+    whole = Occupancy.state
+    monkeypatch.setattr(Occupancy, "state", lambda self: {"values": whole(self)["values"] * 0 + 9})
+    with pytest.raises(Killed):
+        fit(clip, tmp_path, killer)
+    assert content(fit(clip, tmp_path)) != content(trained[1])
+
+
+def test_training_lowers_the_error_on_a_held_out_view(clip, tmp_path):
+    config = InstaConfig(**{**SMALL, "learning_rate": 1e-2})
+    avatars = [
+        Insta(config).fit(
+            clip, tmp_path / str(n), Budget(iterations=n), device="cpu", seed=0, progress=no_progress
+        )
+        for n in (1, 120)
+    ]
+    key = clip.splits["novel_view"][0]
+    errors = [
+        np.square(
+            a.render(clip.cameras[key.camera], clip.poses[key.timestep], clip.background).rgb
+            - clip.image(key) / 255.0
+        ).mean()
+        for a in avatars
+    ]
+    assert errors[1] < 0.5 * errors[0]
+
+
+def extreme_poses(pose, head):
+    rng = np.random.default_rng(0)
+    three = np.sign(rng.standard_normal(pose.expression.shape)).astype(np.float32) * 3
+    yield replace(pose, expression=three, timestep=None)
+    yield replace(pose, expression=-three, timestep=None)
+    for jaw in (0.0, 1.5, -1.5, np.pi):
+        yield replace(pose, jaw=np.array([jaw, 0, 0], np.float32), timestep=None)
+    yield replace(pose, rotation=np.array([0, np.pi, 0], np.float32), timestep=None)
+    yield replace(pose, translation=np.array([50, 0, 0], np.float32), timestep=None)
+
+
+def check_frame(frame, camera):
+    assert frame.rgb.shape == (camera.height, camera.width, 3)
+    for values in (frame.rgb, frame.alpha):
+        assert values.dtype == np.float32
+        assert np.isfinite(values).all()
+        assert values.min() >= 0
+        assert values.max() <= 1
+
+
+def test_extreme_poses_and_views_stay_finite_and_bounded(trained, clip, head):
+    key = clip.splits["train"][0]
+    camera, pose = clip.cameras[key.camera], clip.poses[key.timestep]
+    for extreme in extreme_poses(pose, head):
+        check_frame(trained[1].render(camera, extreme), camera)
+    within = np.eye(4)
+    close = np.eye(4)
+    close[2, 3] = 0.1
+    for transform in (within, close, np.diag([1.0, -1, -1, 1])):
+        check_frame(trained[1].render(replace(camera, world_to_camera=transform), pose), camera)
+
+
+def test_a_single_pixel_and_a_background(trained, clip):
+    key = clip.splits["train"][0]
+    camera, pose = clip.cameras[key.camera].resized(1, 1), clip.poses[key.timestep]
+    check_frame(trained[1].render(camera, pose), camera)
+    black, white = (trained[1].render(clip.cameras[key.camera], pose, (c, c, c)) for c in (0.0, 1.0))
+    np.testing.assert_allclose(white.rgb - black.rgb, 1 - white.alpha[..., None].repeat(3, 2), atol=1e-5)
+
+
+def test_large_images_are_rendered_in_parts(trained, clip, monkeypatch):
+    from headbench.methods.insta import avatar
+
+    key = clip.splits["train"][0]
+    camera, pose = clip.cameras[key.camera], clip.poses[key.timestep]
+    whole = trained[1].render(camera, pose)
+    monkeypatch.setattr(avatar, "RAYS_AT_ONCE", 37)
+    parts = trained[1].render(camera, pose)
+    np.testing.assert_allclose(parts.rgb, whole.rgb, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", [FIELD_FILE, SETTINGS_FILE])
+def test_damaged_files_are_refused(trained, tmp_path, name):
+    import shutil
+
+    folder = tmp_path / "copy"
+    shutil.copytree(trained[0], folder)
+    (folder / name).write_bytes(b"nonsense")
+    with pytest.raises(InputError, match=name):
+        InstaAvatar.read(folder, "cpu")
+
+
+def test_a_field_of_another_size_or_with_holes_is_refused(trained, tmp_path):
+    import shutil
+
+    folder = tmp_path / "copy"
+    shutil.copytree(trained[0], folder)
+    content = dict(np.load(folder / FIELD_FILE))
+    for name, wrong in (
+        ("table", content["table"][:-1]),
+        ("density_0", np.full_like(content["density_0"], np.nan)),
+        ("occupied", content["occupied"][:-1]),
+    ):
+        np.savez(folder / FIELD_FILE, **{**content, name: wrong})
+        with pytest.raises(InputError, match=name):
+            InstaAvatar.read(folder, "cpu")
+
+
+def test_unknown_settings_of_an_avatar_are_refused(trained, tmp_path):
+    import shutil
+
+    folder = tmp_path / "copy"
+    shutil.copytree(trained[0], folder)
+    (folder / SETTINGS_FILE).write_text('{"levles": 3}')
+    with pytest.raises(InputError, match="levles"):
+        InstaAvatar.read(folder, "cpu")
+
+
+def test_a_head_without_regions_and_images_without_masks_are_trained(clip, tmp_path):
+    bare = replace(clip.head, regions={})
+    plain = replace(clip, head=bare, masks=dict.fromkeys(clip.masks))
+    avatar = fit(plain, tmp_path)
+    key = clip.splits["train"][0]
+    check_frame(avatar.render(clip.cameras[key.camera], clip.poses[key.timestep]), clip.cameras[key.camera])
+
+
+def test_the_compatibility_options_train_as_well(clip, tmp_path):
+    one = fit(clip, tmp_path / "a", warp_compatibility="code")
+    other = fit(clip, tmp_path / "b", target_compatibility="code")
+    assert content(one) != content(other)
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong"),
+    [
+        ("level_features", 3),
+        ("ema", 1.0),
+        ("step", 0.0),
+        ("levels", 0),
+        ("final_rate", 0.0),
+        ("log2_table", 0),
+    ],
+)
+def test_settings_out_of_range_are_refused(name, wrong):
+    with pytest.raises(ValueError, match=name):
+        InstaConfig(**{name: wrong})
+
+
+def test_the_paper_preset_is_the_published_program():
+    settings = dict(INSTA.presets["paper"])
+    assert settings.pop("budget") == {"iterations": 20_000}
+    config = build(InstaConfig, settings, "preset")
+    assert (config.levels, config.level_features, config.log2_table) == (16, 8, 18)
+    assert (config.learning_rate, config.betas, config.weight_decay, config.ema) == (
+        1.75e-3,
+        (0.9, 0.99),
+        1e-6,
+        0.95,
+    )
+    assert (config.huber, config.mouth_weight, config.depth_weight) == (0.1, 40.0, 1.25)
+    assert config.step == pytest.approx(3**0.5 / 1024)
+
+
+@pytest.mark.slow
+def test_one_frame_is_learnt_by_heart(clip, tmp_path):
+    settings = {name: value for name, value in INSTA.presets["demo"].items() if name != "budget"}
+    key = clip.splits["train"][0]
+    single = replace(clip, splits={**clip.splits, "train": (key,)})
+    avatar = Insta(InstaConfig(**settings)).fit(
+        single, tmp_path, Budget(iterations=400), device="cpu", seed=0, progress=no_progress
+    )
+    frame = avatar.render(clip.cameras[key.camera], clip.poses[key.timestep], clip.background)
+    error = frame.rgb - clip.image(key).astype(np.float32) / 255
+    assert -10 * np.log10(np.mean(error**2)) >= 35.0
+
+
+@pytest.mark.slow
+def test_a_4k_image_stays_within_bounded_memory(trained, clip):
+    import resource
+
+    key = clip.splits["train"][0]
+    camera = clip.cameras[key.camera].resized(3840, 2160)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    check_frame(trained[1].render(camera, clip.poses[key.timestep]), camera)
+    grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
+    assert grown < 1_500_000  # kilobytes
+
+
+def test_a_pose_of_another_head_is_refused(trained, clip):
+    key = clip.splits["train"][0]
+    other = replace(clip.poses[key.timestep], head_model="another")
+    with pytest.raises(InputError, match="head_model"):
+        trained[1].render(clip.cameras[key.camera], other)

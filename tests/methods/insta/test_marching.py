@@ -1,0 +1,125 @@
+"""Samples of rays: the kernel against trying every sample and every triangle; rounds against all at once."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from headbench.methods.insta.marching import Rays, Space, Surface, occupied_at
+from headbench.methods.insta.rays import camera_rays
+
+from ...datasets.head.toy import toy_head
+from ..toy_clip import look_at
+
+STEP = 0.004
+
+
+def make(backend):
+    head = toy_head(16)
+    canonical = torch.from_numpy(head.template).float()
+    surface = Surface(head, canonical, backend=backend)
+    rng = np.random.default_rng(0)
+    moved = (head.template * 1.05 + 0.003 * rng.standard_normal(head.template.shape)).astype(np.float32)
+    return surface.pose(torch.from_numpy(moved))
+
+
+@pytest.fixture(scope="module")
+def pair():
+    return make("kernel"), make("reference")
+
+
+@pytest.fixture(scope="module")
+def space(pair):
+    rng = np.random.default_rng(1)
+    vertices = pair[0].surface.canonical.numpy()
+    low, cell = vertices.min(0) - 0.03, 0.02
+    size = np.ceil((vertices.max(0) + 0.03 - low) / cell).astype(int)
+    occupied = (rng.random(size) < 0.7).astype(np.uint8)
+    reach = rng.uniform(-0.005, 0.03, len(pair[0].surface.faces)).astype(np.float32)
+    return Space(reach, low.astype(np.float32), cell, occupied)
+
+
+def fan(count=12):
+    camera = look_at(np.array([0.1, 0.05, 0.5]), np.zeros(3), "c", count, count)
+    rows, columns = np.divmod(np.arange(count * count), count)
+    return camera_rays(camera, columns, rows, np.random.default_rng(2).random(count * count))
+
+
+def all_samples(mesh, rays, space, most):
+    """March in rounds until every ray is done; rows (ray, index), sorted."""
+    first, found = np.zeros(len(rays.origins), np.int32), []
+    while (first >= 0).any():
+        samples = mesh.march(rays, first, STEP, most, space)
+        found.append(samples)
+        assert np.bincount(samples.rays, minlength=1).max(initial=0) <= most
+        first = samples.next
+    columns = [np.concatenate(column) for column in zip(*(part[:-1] for part in found))]
+    order = np.lexsort((columns[4], columns[3]))
+    return [column[order] for column in columns]
+
+
+def test_the_kernel_gives_the_samples_of_the_reference(pair, space):
+    rays = fan()
+    ours, theirs = (all_samples(mesh, rays, space, 10_000) for mesh in pair)
+    keys = [set(zip(part[3].tolist(), part[4].tolist())) for part in (ours, theirs)]
+    assert len(keys[1]) > 500
+    # A sample at its limit of reach, at a cell's wall or between two triangles may go either way by rounding.
+    assert len(keys[0] ^ keys[1]) <= 0.01 * len(keys[1])
+    common = sorted(keys[0] & keys[1])
+    rows = [{key: row for row, key in enumerate(zip(p[3].tolist(), p[4].tolist()))} for p in (ours, theirs)]
+    a, b = ([rows[i][key] for key in common] for i in range(2))
+    same = ours[5][a] == theirs[5][b]
+    assert same.mean() > 0.99
+    for column in range(3):
+        difference = np.abs(ours[column][a] - theirs[column][b])[same]
+        assert difference.max() < 2e-5
+
+
+@pytest.mark.parametrize("most", [1, 3, 7])
+def test_rounds_together_are_all_samples(pair, space, most):
+    rays = fan(8)
+    whole, rounds = all_samples(pair[0], rays, space, 10_000), all_samples(pair[0], rays, space, most)
+    for one, other in zip(whole, rounds):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_samples_are_where_they_are_said_to_be(pair, space):
+    rays, mesh = fan(), pair[0]
+    positions, directions, away, owner, indices, triangles = all_samples(mesh, rays, space, 64)
+    points = rays.origins[owner] + ((indices + rays.jitter[owner]) * STEP)[:, None] * rays.directions[owner]
+    found = mesh.nearest(points.astype(np.float32))
+    np.testing.assert_allclose(away, found.values.sqrt(), atol=2e-6)
+    assert (away <= space.reach[triangles] + 1e-6).all()
+    assert occupied_at(space, positions).mean() > 0.999
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-5)
+
+
+def test_nothing_occupied_or_nothing_in_reach_gives_no_samples(pair, space):
+    empty = replace(space, occupied=np.zeros_like(space.occupied))
+    nowhere = replace(space, reach=np.full_like(space.reach, -1))
+    for mesh in pair:
+        for spaces in (empty, nowhere):
+            assert len(all_samples(mesh, fan(3), spaces, 8)[0]) == 0
+
+
+def test_rays_along_axes_and_rays_from_within_are_marched(pair, space):
+    origins = np.array([[0, 0, 0.5], [0.5, 0, 0], [0, 0.5, 0], [0, 0, 0], [9, 9, 9]], np.float32)
+    directions = np.array([[0, 0, -1], [-1, 0, 0], [0, -1, 0], [0, 0, 1], [1, 0, 0]], np.float32)
+    rays = Rays(origins, directions, np.full(5, 0.5, np.float32))
+    wide = replace(space, reach=np.full_like(space.reach, 0.02), occupied=np.ones_like(space.occupied))
+    ours, theirs = (all_samples(mesh, rays, wide, 10_000) for mesh in pair)
+    assert set(ours[3].tolist()) == {0, 1, 2, 3}
+    assert abs(len(ours[0]) - len(theirs[0])) <= 2
+
+
+def test_marching_does_not_depend_on_the_number_of_threads(pair, space):
+    before, results = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            results.append(all_samples(pair[0], fan(20), space, 16))
+    finally:
+        torch.set_num_threads(before)
+    for one, other in zip(*results):
+        np.testing.assert_array_equal(one, other)
