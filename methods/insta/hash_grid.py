@@ -24,14 +24,15 @@ class Level(NamedTuple):
     scale: float
     resolution: int
     first: int
-    count: int
+    rows: int
 
 
 def make_levels(count: int, base: int, finest: int, log2_table: int) -> tuple[Level, ...]:
     """Levels whose resolutions grow geometrically from ``base`` to ``finest``.
 
     A level has one row per sample, rounded up to 8, as long as that is no more than ``2**log2_table``; beyond that
-    rows are shared by a hash. Sizes are those of the published program.
+    rows are shared by a hash. Sizes are those of the published program, which shifts positions by half a cell and so
+    reads the samples of the last half cell from the other side; here the first sample lies at 0.
     """
     growth = (math.log2(finest) - math.log2(base)) / (count - 1) if count > 1 else 0.0
     levels, first = [], 0
@@ -47,7 +48,7 @@ def make_levels(count: int, base: int, finest: int, log2_table: int) -> tuple[Le
 
 def table_rows(levels: Sequence[Level]) -> int:
     """Rows of the table of all levels."""
-    return levels[-1].first + levels[-1].count
+    return levels[-1].first + levels[-1].rows
 
 
 def encode(positions: Tensor, table: Tensor, levels: Sequence[Level], backend: str = "auto") -> Tensor:
@@ -67,7 +68,7 @@ def encode_reference(positions: Tensor, table: Tensor, levels: Sequence[Level]) 
     corners = torch.tensor([[c >> axis & 1 for axis in range(3)] for c in range(8)], device=positions.device)
     parts = []
     for level in levels:
-        scaled = positions * level.scale + 0.5
+        scaled = positions * level.scale
         below = scaled.floor()
         part = (scaled - below)[:, None]
         at = below.long()[:, None] + corners
@@ -78,11 +79,11 @@ def encode_reference(positions: Tensor, table: Tensor, levels: Sequence[Level]) 
 
 
 def _rows(at: Tensor, level: Level) -> Tensor:
-    if level.resolution**3 <= level.count:
+    if level.resolution**3 <= level.rows:
         flat = at[..., 0] + level.resolution * (at[..., 1] + level.resolution * at[..., 2])
-        return flat % level.count
+        return flat % level.rows
     mixed = at[..., 0] * PRIMES[0] ^ at[..., 1] * PRIMES[1] ^ at[..., 2] * PRIMES[2]
-    return mixed & (level.count - 1)
+    return mixed & (level.rows - 1)
 
 
 class _Encode(torch.autograd.Function):

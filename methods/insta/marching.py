@@ -157,10 +157,10 @@ class PosedSurface:
         padding = max(float(space.reach.max()), 0.0)
         farthest = np.linalg.norm(0.5 * (low + high) - rays.origins, axis=1).max(initial=0.0)
         farthest += 0.5 * np.linalg.norm(high - low) + padding
-        numbers = np.arange(int(farthest / step) + 2)
+        lattice = np.arange(int(farthest / step) + 2)
         parts, following = [], np.full(len(first), -1, np.int32)
         for ray in np.flatnonzero(first >= 0):
-            indices = numbers[first[ray] :]
+            indices = lattice[first[ray] :]
             distances = ((indices + rays.jitter[ray]) * np.float32(step)).astype(np.float32)
             points = rays.origins[ray] + distances[:, None] * rays.directions[ray]
             close = ((points >= low - padding) & (points <= high + padding)).all(1)
@@ -182,8 +182,9 @@ class PosedSurface:
         if not parts:
             parts = [(np.empty((0, 3)), np.empty((0, 3)), *[np.empty(0)] * 4)]
         joined = [np.concatenate(column) for column in zip(*parts)]
-        types = (np.float32, np.float32, np.float32, np.int32, np.int32, np.int32)
-        return Samples(*(c.astype(t) for c, t in zip(joined, types)), next=following)
+        reals = [column.astype(np.float32) for column in joined[:3]]
+        numbers = [column.astype(np.int32) for column in joined[3:]]
+        return Samples(reals[0], reals[1], reals[2], numbers[0], numbers[1], numbers[2], following)
 
     def to_canonical(
         self, points: np.ndarray, triangles: np.ndarray, direction: np.ndarray

@@ -35,6 +35,7 @@ class Occupancy:
         self.low = low.astype(np.float32)
         near = _cells_near(surface, self.low, self.cell, self.size, config)
         self.candidates, self.triangles, self._distances = near
+        self._probes = _probes(surface, self.low, self.cell, self.size, self.candidates)
         self.values = np.full(len(self.candidates), np.inf, np.float32)
         self._rounds = _dilation_rounds(surface, self.cell)
         self._neighbours = surface.blend.neighbours
@@ -113,12 +114,13 @@ class Occupancy:
     def reach(self, chosen: np.ndarray) -> np.ndarray:
         """(F,) metres from each triangle within which there are cells of the (n,) ``chosen`` candidates.
 
-        A cell counts for its nearest triangle and for those around it, as far as the cell's diagonal goes. Negative
-        where there are none.
+        A cell counts for the triangles nearest to its centre and to its corners, and for those around them as far as
+        the cell's diagonal goes. Negative where there are none.
         """
-        half = 0.5 * math.sqrt(3) * self.cell
         reach = np.full(len(self._neighbours), -1.0, np.float32)
-        np.maximum.at(reach, self.triangles[chosen], self._distances[chosen] + 2 * half)
+        farthest = self._distances[chosen] + math.sqrt(3) * self.cell
+        for triangles in (self.triangles, *self._probes):
+            np.maximum.at(reach, triangles[chosen], farthest)
         across = np.where(self._neighbours >= 0, self._neighbours, np.arange(len(reach))[:, None])
         for _ in range(self._rounds):
             reach = np.maximum(reach, reach[across].max(1))
@@ -163,6 +165,25 @@ def _cells_near(
         kept.append((part[near], triangles[near], distances[near]))
     flat, triangles, distances = (np.concatenate(column) for column in zip(*kept))
     return flat, triangles, distances.astype(np.float32)
+
+
+def _probes(
+    surface: Surface, low: np.ndarray, cell: float, size: np.ndarray, candidates: np.ndarray
+) -> list[np.ndarray]:
+    """(8,) arrays: the nearest triangles of the eight corners of each candidate."""
+    cells = np.stack(np.unravel_index(candidates, size), axis=1)
+    lattice = size + 1
+    flat = [
+        np.ravel_multi_index((cells + np.array(np.unravel_index(corner, (2, 2, 2)))).T, lattice)
+        for corner in range(8)
+    ]
+    used, inverse = np.unique(np.concatenate(flat), return_inverse=True)
+    points = low + np.float32(cell) * np.stack(np.unravel_index(used, lattice), axis=1)
+    parts = [
+        surface.rest.nearest(points[start : start + CELLS_AT_ONCE]).triangles.numpy()
+        for start in range(0, len(points), CELLS_AT_ONCE)
+    ]
+    return list(np.concatenate(parts)[inverse].reshape(8, -1).astype(np.int32))
 
 
 def _dilation_rounds(surface: Surface, cell: float) -> int:

@@ -174,7 +174,7 @@ class InstaTraining:
     def _batch(self, iteration: int, index: int) -> Batch:
         generator = numpy_generator(self._seed, "rays", iteration)
         count = min(self._config.images_per_iteration, len(self.keys), self._rays)
-        others = generator.choice(len(self.keys), size=count - 1, replace=False) if count > 1 else []
+        others = generator.choice(len(self.keys), size=count - 1, replace=False)
         parts = [self._rays_of(int(chosen), self._rays // count, generator) for chosen in (index, *others)]
         scenes, *columns = zip(*parts)
         return Batch(list(scenes), *(torch.cat(column) for column in columns))

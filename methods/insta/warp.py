@@ -58,7 +58,7 @@ def touching(head: HeadAsset, region: str) -> np.ndarray:
     """(F,) bool: triangles with a vertex in a region; none where the head does not know the region."""
     inside = np.zeros(len(head.template), bool)
     inside[np.asarray(head.regions.get(region, ()), dtype=np.int64)] = True
-    return inside[np.asarray(head.faces)].any(1)
+    return np.asarray(inside[np.asarray(head.faces)].any(1))
 
 
 def edge_neighbours(faces: IntArray) -> IntArray:

@@ -21,7 +21,7 @@ inline Corners corners(const float* position, const Level& level) {
   std::uint32_t cell[3];
   float part[3];
   for (int i = 0; i < 3; ++i) {
-    const float scaled = position[i] * level.scale + 0.5f;
+    const float scaled = position[i] * level.scale;
     const float below = std::floor(scaled);
     cell[i] = static_cast<std::uint32_t>(static_cast<std::int32_t>(below));
     part[i] = scaled - below;

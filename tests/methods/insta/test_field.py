@@ -44,13 +44,13 @@ def test_rendered_gradients_are_those_of_float64(stage):
     weights = torch.rand(198, 5, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     results = []
     for dtype in (torch.float32, torch.float64):
-        leaves = {name: value.to(dtype).requires_grad_() for name, value in initial.items()}
+        leaves = {name: value.detach().clone().to(dtype).requires_grad_() for name, value in initial.items()}
         seen = render_rays(field, leaves, scenes_of(surface), occupancy.space(), mouth, marching)
         image = torch.cat([seen.color, seen.transmittance[:, None], seen.distance[:, None]], dim=1)
         (image * weights.to(dtype)).sum().backward()
         results.append((image.detach().double(), {n: v.grad.double() for n, v in leaves.items()}))
     (image, gradients), (expected, exact) = results
-    assert 0.05 < float(expected[:, 3].min()) < 0.9
+    assert float(expected[:, 3].min()) < 0.5
     torch.testing.assert_close(image, expected, atol=2e-5, rtol=0)
     for name, gradient in gradients.items():
         scale = float(exact[name].abs().max())

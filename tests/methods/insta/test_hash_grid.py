@@ -25,8 +25,8 @@ def test_the_published_networks_have_the_published_number_of_weights():
 
 def small_levels():
     levels = make_levels(4, 4, 40, 9)
-    assert levels[0].resolution ** 3 <= levels[0].count
-    assert levels[-1].resolution ** 3 > levels[-1].count
+    assert levels[0].resolution ** 3 <= levels[0].rows
+    assert levels[-1].resolution ** 3 > levels[-1].rows
     return levels
 
 
@@ -35,10 +35,10 @@ def test_a_linear_function_on_a_dense_level_is_reproduced():
     side = level.resolution
     at = np.stack(np.unravel_index(np.arange(side**3), (side,) * 3), axis=1)[:, ::-1]  # x runs fastest
     slope = np.array([0.3, -1.2, 2.0])
-    table = torch.zeros(level.count, 1, dtype=torch.float64)
+    table = torch.zeros(level.rows, 1, dtype=torch.float64)
     table[: side**3, 0] = torch.from_numpy(at @ slope + 0.7)
     positions = torch.rand(500, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    expected = (positions * level.scale + 0.5) @ torch.from_numpy(slope) + 0.7
+    expected = (positions * level.scale) @ torch.from_numpy(slope) + 0.7
     torch.testing.assert_close(encode(positions, table, [level])[:, 0], expected)
 
 

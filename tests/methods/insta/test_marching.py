@@ -63,7 +63,7 @@ def test_the_kernel_gives_the_samples_of_the_reference(pair, space):
     rays = fan()
     ours, theirs = (all_samples(mesh, rays, space, 10_000) for mesh in pair)
     keys = [set(zip(part[3].tolist(), part[4].tolist())) for part in (ours, theirs)]
-    assert len(keys[1]) > 500
+    assert len(keys[1]) > 300
     # A sample at its limit of reach, at a cell's wall or between two triangles may go either way by rounding.
     assert len(keys[0] ^ keys[1]) <= 0.01 * len(keys[1])
     common = sorted(keys[0] & keys[1])
