@@ -1,0 +1,1 @@
+"""How fast the image metrics are, next to the usual libraries."""
