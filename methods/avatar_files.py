@@ -38,9 +38,11 @@ class Subject:
         return cls(clip.subject, clip.head.version, shape, offset)
 
 
-def save_shared_head(folder: Path, head: HeadAsset) -> None:
-    """Put the head model beside the avatar, so that the folder alone can be rendered. A shared asset."""
-    arrays = HeadArrays(
+def head_arrays(head: HeadAsset) -> HeadArrays:
+    """A head model as arrays that can be stored and changed."""
+    if isinstance(head, HeadArrays):
+        return head
+    return HeadArrays(
         version=head.version,
         template=head.template,
         faces=head.faces,
@@ -53,7 +55,11 @@ def save_shared_head(folder: Path, head: HeadAsset) -> None:
         eyelid_basis=head.eyelid_basis,
         regions=head.regions,
     )
-    save_head(folder / HEAD_FILE, arrays)
+
+
+def save_shared_head(folder: Path, head: HeadAsset) -> None:
+    """Put the head model beside the avatar, so that the folder alone can be rendered. A shared asset."""
+    save_head(folder / HEAD_FILE, head_arrays(head))
 
 
 def read_shared_head(folder: Path) -> HeadArrays:

@@ -12,9 +12,9 @@ from torch import Tensor
 
 from ..bench.contracts import FloatArray, Frame, no_stage
 from .binding import WorldSplats
-from .bound_training import View
 from .splats import rasterize
 from .splats.constants import ALPHA_MIN, TRANSMITTANCE_MIN
+from .views import View
 
 
 @dataclass(frozen=True, eq=False)

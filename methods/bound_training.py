@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
-import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from ..bench.contracts import Budget, Camera, Clip, FrameKey, Progress
+from ..bench.contracts import Budget, Clip, Progress
 from .binding import Frames, WorldSplats
 from .configs import SplatTraining
-from .splats import rasterize
-from .training.densify import Densifier
-from .training.images import TrainingImages
-from .training.loop import Outcome, train
+from .splat_trainer import SplatTrainer, run_trainer
+from .training.loop import Outcome
 from .training.losses import photometric_loss, position_penalty, scale_penalty
 from .training.optimiser import Optimiser
 from .training.sampling import Sampler
-from .training.schedule import DensifySchedule, Timeline, log_linear
+from .training.schedule import Timeline
+from .views import View, scene_extent
 
 GEOMETRY = ("means", "log_scales", "quats", "opacities")
 
@@ -33,16 +29,6 @@ class Placed(NamedTuple):
     colors: Tensor  # (N, 3) >= 0
     opacities: Tensor  # (N,) in (0, 1)
     penalty: Tensor | None  # scalar added to the loss
-
-
-@dataclass(frozen=True)
-class View:
-    """A camera as tensors."""
-
-    camera: Camera
-    world_to_camera: Tensor
-    K: Tensor
-    center: Tensor
 
 
 class Appearance(Protocol):
@@ -97,11 +83,13 @@ def one_per_triangle(face_count: int, opacity: float, device: str) -> Start:
     return Start(torch.arange(face_count, device=device), means, opacities)
 
 
-class BoundTraining:
+class BoundTraining(SplatTrainer):
     """A `Trainable`: splats on the triangles of a mesh, seen in the training images of a clip.
 
     ``start`` holds each of the ``face_count`` triangles at least once; None: `one_per_triangle`.
     """
+
+    _settings: SplatTraining
 
     def __init__(
         self,
@@ -115,43 +103,19 @@ class BoundTraining:
         *,
         start: Start | None = None,
     ):
-        self._settings, self._appearance, self._seed = settings, appearance, seed
-        self.keys: Sequence[FrameKey] = clip.splits["train"]
-        self._images = TrainingImages(clip, self.keys, sampler, device)
-        cameras = {key.camera: clip.cameras[key.camera] for key in self.keys}
-        self._views = {name: view_of(camera, device) for name, camera in cameras.items()}
-        self._background = torch.as_tensor(np.asarray(clip.background), dtype=torch.float32, device=device)
-        self.extent = scene_extent(cameras)
-
+        super().__init__(clip, settings, sampler, device)
+        self._appearance = appearance
+        extent = scene_extent(self.cameras)
         start = start or one_per_triangle(face_count, settings.initial_opacity, device)
-        geometry = _initial_geometry(start, settings, self.extent)
-        own = appearance.splat_parameters(len(start.binding))
-        shared = appearance.parameters()
-        self.splat_names = (*geometry, *own)
-        initial = {**geometry, **own, **shared}
-        self._optimiser = Optimiser(
-            {name: nn.Parameter(value) for name, (value, _) in initial.items()},
-            {name: rate for name, (_, rate) in initial.items()},
-        )
-        self._rates = {name: rate for name, (_, rate) in initial.items() if name != "means"}
-        self._densifier = Densifier(
-            settings, self._optimiser, self.splat_names, start.binding, face_count, self.extent, seed
-        )
-
-    @property
-    def optimiser(self) -> Optimiser:
-        """Adam over everything trained."""
-        return self._optimiser
-
-    @property
-    def binding(self) -> Tensor:
-        """(N,) int64, triangle of each splat."""
-        return self._densifier.binding
+        splats = {
+            **_initial_geometry(start, settings, extent),
+            **appearance.splat_parameters(len(start.binding)),
+        }
+        self._start(splats, appearance.parameters(), start.binding, face_count, extent, seed)
 
     def begin(self, timeline: Timeline) -> None:
         """Fit schedules to the length of the run."""
-        self._timeline = timeline
-        self._schedule = DensifySchedule.of(self._settings, timeline)
+        super().begin(timeline)
         self._appearance.begin(timeline)
 
     def loss(self, iteration: int, index: int) -> Tensor:
@@ -160,61 +124,15 @@ class BoundTraining:
         view = self._views[key.camera]
         truth = self._images.get(iteration, index)
         frames = self._appearance.frames(key.timestep, optimiser)
-        means, log_scales = optimiser["means"], optimiser["log_scales"]
         placed = self._appearance.place(frames, self.binding, view, key.timestep, optimiser, iteration)
-        world = placed.world
-        offset = means.new_zeros(len(means), 2).requires_grad_()
-        rendering = rasterize(
-            *(world.means, world.quats, world.scales, placed.opacities, placed.colors),
-            *(view.world_to_camera, view.K, view.camera.width, view.camera.height),
-            background=self._background,
-            means2d_offset=offset,
-            check_finite=False,
+        rendering, visible = self._render(
+            placed.world, placed.opacities, placed.colors, view, frames.size.detach()
         )
-        visible = rendering.radii > 0
+        means, log_scales = optimiser["means"], optimiser["log_scales"]
         loss = photometric_loss(rendering.image, truth, settings.ssim_weight)
         loss = loss + settings.position_weight * position_penalty(means, visible, settings.position_threshold)
         loss = loss + settings.scale_weight * scale_penalty(log_scales, visible, settings.scale_threshold)
-        if placed.penalty is not None:
-            loss = loss + placed.penalty
-        self._seen = (offset, visible, view.camera, frames.size.detach())
-        return loss
-
-    def after_backward(self, iteration: int) -> None:
-        """Densification and resets of this iteration, and the position learning rate."""
-        settings, schedule = self._settings, self._schedule
-        offset, visible, camera, face_sizes = self._seen
-        if schedule.gathers(iteration) and offset.grad is not None:
-            self._densifier.observe(offset.grad, visible, camera.width, camera.height)
-            if schedule.is_round(iteration):
-                self._densifier.run(iteration, schedule, face_sizes)
-        if schedule.is_reset(iteration):
-            self._densifier.reset_opacity()
-        rate = log_linear(
-            settings.position_lr, settings.position_lr_final, self._timeline.fraction(iteration)
-        )
-        self._optimiser.set_learning_rate("means", rate * self.extent)
-        if settings.final_rate < 1:
-            decay = log_linear(1.0, settings.final_rate, max(0.0, 2 * self._timeline.fraction(iteration) - 1))
-            for name, initial in self._rates.items():
-                self._optimiser.set_learning_rate(name, decay * initial)
-
-    def state(self) -> dict[str, Any]:
-        """Parameters, moments, binding and densification statistics."""
-        return {"optimiser": self._optimiser.state(), "densifier": self._densifier.state()}
-
-    def load_state(self, state: dict[str, Any]) -> None:
-        """Take over what `state` gave."""
-        self._optimiser.load_state(state["optimiser"])
-        self._densifier.load_state(state["densifier"])
-
-    def note(self) -> str:
-        """Number of splats."""
-        return f"{len(self.binding)} splats"
-
-    def close(self) -> None:
-        """Stop background work."""
-        self._images.close()
+        return loss if placed.penalty is None else loss + placed.penalty
 
 
 def run_bound_training(
@@ -234,43 +152,17 @@ def run_bound_training(
 ) -> tuple[BoundTraining, Outcome]:
     """Train splats bound to a mesh of ``face_count`` triangles; arguments as those of `training.loop.train`."""
     training = BoundTraining(clip, settings, appearance, sampler, face_count, device, seed, start=start)
-    try:
-        outcome = train(
-            training,
-            sampler,
-            published_length=settings.schedule_length,
-            budget=budget,
-            folder=folder,
-            run=run,
-            device=device,
-            progress=progress,
-            checkpoint_every_s=settings.checkpoint_every_s,
-        )
-    finally:
-        training.close()
+    outcome = run_trainer(
+        training,
+        settings,
+        sampler,
+        budget=budget,
+        folder=folder,
+        run=run,
+        device=device,
+        progress=progress,
+    )
     return training, outcome
-
-
-def scene_extent(cameras: Mapping[str, Camera]) -> float:
-    """1.1 times the largest distance of a training camera from their mean centre, metres.
-
-    A single camera has no such radius; half its distance to the origin stands in, so that learning rates and
-    size thresholds keep their scale.
-    """
-    centers = np.stack([camera.center for camera in cameras.values()])
-    radius = float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
-    if radius < 1e-6:
-        radius = 0.5 * float(np.linalg.norm(centers[0]))
-    return 1.1 * max(radius, 1e-3)
-
-
-def view_of(camera: Camera, device: str) -> View:
-    """Put a camera on a device."""
-
-    def tensor(values: Any) -> Tensor:
-        return torch.as_tensor(np.asarray(values), dtype=torch.float32, device=device)
-
-    return View(camera, tensor(camera.world_to_camera), tensor(camera.K), tensor(camera.center))
 
 
 def _initial_geometry(

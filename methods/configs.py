@@ -15,8 +15,8 @@ from typing import Literal
 
 
 @dataclass(frozen=True)
-class SplatTraining:
-    """How splats bound to a mesh are trained: GaussianAvatars (CVPR 2024), section 3 and its code.
+class DensifiedTraining:
+    """How splats are trained and their number is adapted: 3DGS, section 5, with GaussianAvatars' values.
 
     Attributes
     ----------
@@ -25,8 +25,6 @@ class SplatTraining:
     final_rate : part of their learning rate that all other tensors end with, log-linearly over the last half of
         the run; 1 keeps them constant, as published. A short run has not the steps to average Adam's noise away.
     ssim_weight : the loss is ``(1 - w) L1 + w (1 - SSIM)``.
-    position_weight, position_threshold : penalty on local positions longer than the threshold (triangle sizes).
-    scale_weight, scale_threshold : penalty on local scales above the threshold (triangle sizes).
     densify_from, densify_every, densify_until : rounds of cloning, splitting and pruning.
     densify_gradient : mean gradient of the projected mean, in normalised device units, that asks for a round.
     densify_extent : splats larger than this part of the scene extent are split, smaller ones cloned.
@@ -35,8 +33,8 @@ class SplatTraining:
         children almost onto the parent.
     prune_opacity : splats below it are removed.
     prune_extent, prune_extent_from : so are splats larger than this part of the extent, from then on.
-    reset_every, reset_at_start, reset_opacity : opacities are cut to ``reset_opacity`` regularly, and once when
-        densification starts (published for white backgrounds).
+    reset_every, reset_at_start, reset_opacity : opacities are cut to ``reset_opacity`` regularly (None: never), and
+        once when densification starts (published for white backgrounds).
     max_splats : densification stops adding above this number; None for no bound.
     min_densify_every, min_reset_every : in iterations of the actual run. A gradient mean needs some views, and
         opacities some steps to recover.
@@ -53,10 +51,6 @@ class SplatTraining:
     rotation_lr: float = 1e-3
     final_rate: float = 1.0
     ssim_weight: float = 0.2
-    position_weight: float = 0.01
-    position_threshold: float = 1.0
-    scale_weight: float = 1.0
-    scale_threshold: float = 0.6
     initial_opacity: float = 0.1
     densify_from: int = 10_000
     densify_every: int = 2_000
@@ -67,7 +61,7 @@ class SplatTraining:
     prune_opacity: float = 0.005
     prune_extent: float = 0.1
     prune_extent_from: int = 60_000
-    reset_every: int = 60_000
+    reset_every: int | None = 60_000
     reset_at_start: bool = True
     reset_opacity: float = 0.01
     max_splats: int | None = None
@@ -85,8 +79,9 @@ class SplatTraining:
             "min_densify_every",
             "min_reset_every",
         ):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, found {getattr(self, name)}")
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"{name} must be at least 1, found {value}")
         if not 0 < self.initial_opacity < 1 or not 0 < self.reset_opacity < 1:
             raise ValueError("initial_opacity and reset_opacity must lie between 0 and 1")
         if not 0 < self.final_rate <= 1:
@@ -95,6 +90,22 @@ class SplatTraining:
             raise ValueError(f"ssim_weight must lie in [0, 1], found {self.ssim_weight}")
         if self.max_splats is not None and self.max_splats < 1:
             raise ValueError(f"max_splats must be at least 1 or null, found {self.max_splats}")
+
+
+@dataclass(frozen=True)
+class SplatTraining(DensifiedTraining):
+    """How splats bound to a mesh are trained: GaussianAvatars (CVPR 2024), section 3 and its code.
+
+    Attributes
+    ----------
+    position_weight, position_threshold : penalty on local positions longer than the threshold (triangle sizes).
+    scale_weight, scale_threshold : penalty on local scales above the threshold (triangle sizes).
+    """
+
+    position_weight: float = 0.01
+    position_threshold: float = 1.0
+    scale_weight: float = 1.0
+    scale_threshold: float = 0.6
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ from .avatar_files import (
 )
 from .binding import Frames, WorldSplats, to_world
 from .bound_avatar import USUAL, Cutoffs, Drawn, PosedSplats, draw_splats, posed_splats, read_back
-from .bound_training import Placed, View, run_bound_training, view_of
+from .bound_training import Placed, run_bound_training
 from .clip_checks import check_training_split
 from .configs import GAConfig
 from .ga_files import PLY_FILE, read_ga_splats, write_ga_splats
@@ -41,6 +41,7 @@ from .training.loop import CHECKPOINT, check_budget
 from .training.optimiser import Optimiser
 from .training.sampling import ShuffledEpochs
 from .training.schedule import Timeline
+from .views import View, view_of
 
 DRIVING_FILE = "driving.npz"
 STORED_DEGREE = 3  # the PLY layout has room for degree 3, whatever degree was trained

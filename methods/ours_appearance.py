@@ -13,7 +13,7 @@ from ..datasets.head.regions import faces_in_region
 from ..datasets.head.rotations import axis_angle_to_matrix
 from ..datasets.steps.jaw_bases import jaw_bases, jaw_quaternions, jaw_weights
 from .binding import Frames, to_world
-from .bound_training import Placed, View
+from .bound_training import Placed
 from .configs import OursConfig
 from .dynamics import LocalSplats, apply_offsets, changed_colors
 from .feature_lines import blend_lines, line_offsets, line_position
@@ -32,6 +32,7 @@ from .sh import initial_coefficients, sh_to_rgb
 from .subject_mesh import BoundedCache, SubjectMesh, centroid_displacements
 from .training.optimiser import Optimiser
 from .training.schedule import Timeline
+from .views import View
 
 FLOATS_PER_FACE = 17 + 9 + 1  # triangle frame, turn to canonical, penalty weight
 

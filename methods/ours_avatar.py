@@ -14,7 +14,6 @@ from ..bench.contracts import Camera, Frame, HeadPose, no_stage
 from .avatar_files import HEAD_FILE, SUBJECT_FILE, Subject, read_shared_head, read_subject
 from .binding import NORMAL, WorldSplats
 from .bound_avatar import USUAL, Cutoffs, Drawn, PosedSplats, draw_splats, posed_splats, read_back
-from .bound_training import view_of
 from .compact.file import COMPACT_FILE, read_compact
 from .dynamics import LocalSplats, apply_offsets, changed_colors
 from .known_poses import KnownPoses, pose_key
@@ -24,6 +23,7 @@ from .ours_inference import LineOffsets, Placed, PlaneColors, Posed
 from .ours_storage import FIELD_FILE, SPLAT_WIDTHS, Field, read_field
 from .stored_splats import Carrier, HarmonicColors
 from .subject_mesh import SubjectMesh
+from .views import view_of
 
 
 class SeenFrom(NamedTuple):

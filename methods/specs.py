@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from ..bench.specs import MethodSpec, ResolutionRule
+from .gbs.presets import GBS_PRESETS
 from .gha.presets import GHA_SHORT
 
 PAPER_ITERATIONS = 600_000
@@ -116,6 +117,17 @@ INSTA = MethodSpec(
     },
     monocular=True,
     source="Instant Volumetric Head Avatars, CVPR 2023, arXiv 2211.12499",
+)
+
+GBS = MethodSpec(
+    name="gbs",
+    summary="GaussianBlendshapes: splats of a neutral head plus linear differences for each expression, skinned.",
+    implementation="headbench.methods.gbs.method:GBS",
+    config="headbench.methods.gbs.config:GBSConfig",
+    presets=GBS_PRESETS,
+    head_models=("flame2020", "procedural2020", "ict-facekit"),
+    monocular=True,
+    source="3D Gaussian Blendshapes for Head Avatar Animation, SIGGRAPH 2024, arXiv 2404.19398",
 )
 
 MEAN_IMAGE = MethodSpec(

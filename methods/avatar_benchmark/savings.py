@@ -15,7 +15,6 @@ from torch import Tensor
 from ...bench.contracts import Camera, HeadAsset, HeadPose
 from ..binding import to_world
 from ..bound_avatar import render_splats
-from ..bound_training import view_of
 from ..dynamics import apply_offsets
 from ..feature_lines import LinePosition, blend_lines, line_offsets, line_position, normalised_weight
 from ..networks import offset_network
@@ -33,6 +32,7 @@ from ..ours_field import (
 from ..row_sums import sum_rows
 from ..splats.benchmark.timing import take_turns
 from ..stored_splats import Carrier
+from ..views import view_of
 from .untrained import cameras_around, random_poses, untrained_avatar
 
 Run = Callable[[], Any]

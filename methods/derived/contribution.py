@@ -11,8 +11,8 @@ from torch import Tensor
 
 from ...bench.contracts import Camera, Clip, HeadPose
 from ..bound_avatar import PosedSplats
-from ..bound_training import view_of
 from ..splats import rasterize
+from ..views import view_of
 
 VIEWS = 64
 

@@ -10,11 +10,11 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ...bench.contracts import FrameKey
-from ..bound_training import View, view_of
 from ..seeds import torch_generator
 from ..splats import rasterize
 from ..training.optimiser import Optimiser
 from ..training.schedule import Timeline
+from ..views import View, view_of
 from .config import GHAConfig
 from .mesh_head import DISC_OPACITY, MeshHead, vertex_discs
 from .scene import Scene

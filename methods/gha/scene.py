@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ...bench.contracts import Clip, FrameKey, IntArray
 from ..avatar_files import Subject
-from ..bound_training import View, view_of
+from ..views import View, view_of
 from .config import GHAConfig
 from .driving import Driver, Signal, expression_codes
 from .landmarks import landmark_vertices

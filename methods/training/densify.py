@@ -1,7 +1,8 @@
 """Adaptive density for splats bound to triangles: clone, split, prune, opacity reset.
 
 Kerbl et al., "3D Gaussian Splatting", section 5, with the inheritance of GaussianAvatars (section 3.3 there): a
-new splat belongs to its parent's triangle, and no triangle ever loses its last splat.
+new splat belongs to its parent's triangle, and no triangle loses its last splat unless that is allowed. What splats
+are bound to may be anything else that children inherit, such as the points of a surface that they were put on.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ...datasets.head.rotations import quaternion_to_matrix
-from ..configs import SplatTraining
+from ..configs import DensifiedTraining
 from ..seeds import torch_generator
 from .optimiser import Optimiser
 from .schedule import DensifySchedule
@@ -35,19 +36,31 @@ class Densifier:
     face_count : number of triangles.
     extent : size of the scene, metres (`scene_extent`).
     seed : of the run.
+    thresholds : (F,) gradient that asks for a round, by triangle; None takes ``settings.densify_gradient`` for all.
+    keep_last : whether a triangle keeps its last splat.
+    tables : groups with any number of rows for each splat, all rows of the first splat first; splats on one triangle
+        have equally many. Children inherit them.
+    table_rows : (F,) int64, how many rows a splat on each triangle has in the tables.
     """
 
     def __init__(
         self,
-        settings: SplatTraining,
+        settings: DensifiedTraining,
         optimiser: Optimiser,
         names: tuple[str, ...],
         binding: Tensor,
         face_count: int,
         extent: float,
         seed: int,
+        *,
+        thresholds: Tensor | None = None,
+        keep_last: bool = True,
+        tables: tuple[str, ...] = (),
+        table_rows: Tensor | None = None,
     ):
         self.binding = binding
+        self._thresholds, self._keep_last = thresholds, keep_last
+        self._tables, self._table_rows = tables, table_rows
         self._settings, self._optimiser, self._names = settings, optimiser, names
         self._face_count, self._extent, self._seed = face_count, extent, seed
         self._restart()
@@ -70,7 +83,10 @@ class Densifier:
         face_sizes : (F,) of the current frame, metres: what turns local scales into world scales.
         """
         gradient = self._gradient_sum / self._views.clamp_min(1)
-        asks = gradient >= self._settings.densify_gradient
+        if self._thresholds is None:
+            asks = gradient >= self._settings.densify_gradient
+        else:
+            asks = gradient >= self._thresholds.index_select(0, self.binding)
         asks = self._within_bound(asks, gradient)
         large = self._world_scale(face_sizes) > self._settings.densify_extent * self._extent
         parents = asks & large
@@ -119,7 +135,11 @@ class Densifier:
         return chosen
 
     def _rows(self, rows: Tensor) -> dict[str, Tensor]:
-        return {name: self._optimiser[name].detach().index_select(0, rows) for name in self._names}
+        taken = {name: self._optimiser[name].detach().index_select(0, rows) for name in self._names}
+        if self._table_rows is not None:
+            entries = rows_of_tables(self._table_rows.index_select(0, self.binding), rows)
+            taken |= {name: self._optimiser[name].detach().index_select(0, entries) for name in self._tables}
+        return taken
 
     def _append(self, rows: dict[str, Tensor], binding: Tensor) -> None:
         self._optimiser.append(rows)
@@ -151,11 +171,25 @@ class Densifier:
         unfit = torch.sigmoid(self._optimiser["opacities"].detach()) < self._settings.prune_opacity
         if large_too:
             unfit |= self._world_scale(face_sizes) > self._settings.prune_extent * self._extent
-        # A parent goes in any case: its children hold the face, fit or not.
-        kept = torch.bincount(self.binding[~(replaced | unfit)], minlength=self._face_count)
-        keep = ~(replaced | unfit & (kept.index_select(0, self.binding) > 0))
+        if self._keep_last:
+            # A parent goes in any case: its children hold the face, fit or not.
+            kept = torch.bincount(self.binding[~(replaced | unfit)], minlength=self._face_count)
+            unfit &= kept.index_select(0, self.binding) > 0
+        keep = ~(replaced | unfit)
         self._optimiser.select(self._names, keep)
+        if self._table_rows is not None:
+            entries = self._table_rows.index_select(0, self.binding)
+            self._optimiser.select(self._tables, keep.repeat_interleave(entries))
         self.binding = self.binding[keep]
+
+
+def rows_of_tables(counts: Tensor, splats: Tensor) -> Tensor:
+    """Where the rows of some splats lie in a table that has ``counts`` (N,) rows for each splat, in their order."""
+    starts = counts.cumsum(0) - counts
+    chosen = counts.index_select(0, splats)
+    within = torch.arange(int(chosen.sum()), device=counts.device)
+    before = chosen.cumsum(0) - chosen
+    return within + (starts.index_select(0, splats) - before).repeat_interleave(chosen)
 
 
 def logit(probability: float) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from ..configs import SplatTraining
+from ..configs import DensifiedTraining
 
 
 @dataclass(frozen=True)
@@ -52,12 +52,12 @@ class DensifySchedule:
     start: int
     every: int
     stop: int  # first iteration without rounds or resets
-    reset_every: int
+    reset_every: int | None
     first_reset: int | None
     prune_extent_from: int
 
     @classmethod
-    def of(cls, settings: SplatTraining, timeline: Timeline) -> DensifySchedule:
+    def of(cls, settings: DensifiedTraining, timeline: Timeline) -> DensifySchedule:
         """Fit the published schedule to a run."""
         long_enough = timeline.total > settings.min_reset_every
         full = timeline.total >= settings.schedule_length
@@ -66,7 +66,9 @@ class DensifySchedule:
             start=timeline.at(settings.densify_from),
             every=timeline.every(settings.densify_every, settings.min_densify_every),
             stop=min(timeline.at(settings.densify_until), timeline.total - settle + 1),
-            reset_every=timeline.every(settings.reset_every, settings.min_reset_every),
+            reset_every=None
+            if settings.reset_every is None
+            else timeline.every(settings.reset_every, settings.min_reset_every),
             first_reset=timeline.at(settings.densify_from)
             if settings.reset_at_start and long_enough
             else None,
@@ -85,7 +87,8 @@ class DensifySchedule:
         """Whether this iteration cuts the opacities."""
         if iteration >= self.stop:
             return False
-        return iteration % self.reset_every == 0 or iteration == self.first_reset
+        regular = self.reset_every is not None and iteration % self.reset_every == 0
+        return regular or iteration == self.first_reset
 
     def prunes_large(self, iteration: int) -> bool:
         """Whether a round at this iteration also removes splats that are large in the world."""

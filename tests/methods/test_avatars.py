@@ -1,4 +1,4 @@
-"""Both splat avatars: what is on disk, what comes back, what is refused; and that they learn."""
+"""The splat avatars: what is on disk, what comes back, what is refused; and that they learn."""
 
 import struct
 from dataclasses import replace
@@ -21,6 +21,8 @@ from headbench.bench.errors import InputError
 from headbench.methods.configs import GAConfig, OursConfig, SplatTraining
 from headbench.methods.ga import GA
 from headbench.methods.ga_files import COLUMNS
+from headbench.methods.gbs.config import BlendshapeTraining, GBSConfig
+from headbench.methods.gbs.method import GBS
 from headbench.methods.ours import Ours
 
 FAST = SplatTraining(max_splats=1200, min_densify_every=40, min_settle=20)
@@ -29,11 +31,21 @@ CONFIGS = {
     "ours": lambda: Ours(
         OursConfig(splats=FAST, plane_resolution=16, line_resolution=8, line_channels=4, hidden=16)
     ),
+    "gbs": lambda: GBS(
+        GBSConfig(
+            splats=BlendshapeTraining(
+                max_splats=1200, densify_from=0, densify_gradient=1e-4, min_densify_every=40, min_settle=20
+            ),
+            samples=600,
+            teeth_samples=40,
+            min_sh_every=30,
+        )
+    ),
 }
-STORED = {"ga": "point_cloud.ply", "ours": "avatar.safetensors"}
+STORED = {"ga": "point_cloud.ply", "ours": "avatar.safetensors", "gbs": "avatar.safetensors"}
 
 
-@pytest.fixture(scope="module", params=["ga", "ours"])
+@pytest.fixture(scope="module", params=[*CONFIGS])
 def fitted(request, clip, tmp_path_factory):
     """Method name, folder and avatar after a few iterations with a densification."""
     folder = tmp_path_factory.mktemp(request.param)
@@ -200,7 +212,7 @@ def test_a_subject_that_does_not_fit_the_head_is_refused(fitted, tmp_path, key, 
         method.load(tmp_path, device="cpu")
 
 
-@pytest.mark.parametrize("name", ["ga", "ours"])
+@pytest.mark.parametrize("name", CONFIGS)
 def test_a_clip_without_training_frames_is_refused_before_work(name, clip, tmp_path):
     empty = replace(clip, splits={**clip.splits, "train": ()})
     with pytest.raises(InputError, match="at least one frame"):
@@ -273,7 +285,7 @@ def test_ours_costs_48_bytes_per_splat_beside_what_is_fixed(clip, tmp_path):
     assert abs((large - small) - 48 * (many - few)) <= 32
 
 
-@pytest.mark.parametrize("name", ["ga", "ours"])
+@pytest.mark.parametrize("name", CONFIGS)
 def test_a_single_frame_is_overfitted(name, clip, tmp_path):
     key = clip.splits["train"][1]
     single = replace(clip, splits={**clip.splits, "train": (key,)})

@@ -10,12 +10,13 @@ from skimage.metrics import structural_similarity
 from headbench.bench.contracts import Camera
 from headbench.bench.errors import InputError
 from headbench.methods.binding import to_world
-from headbench.methods.bound_training import BoundTraining, Placed, scene_extent
+from headbench.methods.bound_training import BoundTraining, Placed
 from headbench.methods.clip_checks import check_training_split
 from headbench.methods.configs import SplatTraining
 from headbench.methods.splats import rasterize
 from headbench.methods.subject_mesh import SubjectMesh
 from headbench.methods.training.schedule import Timeline
+from headbench.methods.views import scene_extent
 
 PENALTY = 7.0
 

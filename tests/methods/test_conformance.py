@@ -26,7 +26,10 @@ OWN_TRAINING = {
     "insta": {"budget": {"iterations": 24}, "checkpoint_every_s": 0.0, **SMALL_INSTA},
 }
 """Methods that do not train splats bound to the mesh, with their own short settings."""
-SMALL = {"ours": {"plane_resolution": 16, "line_resolution": 8, "line_channels": 4, "hidden": 16}}
+SMALL = {
+    "ours": {"plane_resolution": 16, "line_resolution": 8, "line_channels": 4, "hidden": 16},
+    "gbs": {"samples": 300, "teeth_samples": 30},
+}
 SPECS = {
     name: plugin.spec
     for name, plugin in discover("methods").items()
@@ -61,7 +64,7 @@ def altered(clip, head):
 
 
 def test_our_methods_are_registered():
-    assert {"ours", "ga", "insta", "mean-image", "nearest-camera"} <= set(SPECS)
+    assert {"ours", "ga", "gbs", "gha", "insta", "mean-image", "nearest-camera"} <= set(SPECS)
 
 
 @pytest.mark.parametrize("name", SPECS)

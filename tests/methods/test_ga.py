@@ -6,13 +6,13 @@ import torch
 from torch import nn
 
 from headbench.methods.avatar_files import TRACKED
-from headbench.methods.bound_training import view_of
 from headbench.methods.configs import GAConfig
 from headbench.methods.ga import GAAppearance
 from headbench.methods.sh import C0, C1
 from headbench.methods.subject_mesh import SubjectMesh
 from headbench.methods.training.optimiser import Optimiser
 from headbench.methods.training.schedule import Timeline
+from headbench.methods.views import view_of
 
 
 def make(clip, config=None):

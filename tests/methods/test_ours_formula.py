@@ -11,13 +11,13 @@ from scipy.spatial.transform import Rotation
 
 from headbench.bench.contracts import Budget, no_progress
 from headbench.datasets.head.model import HeadModel
-from headbench.methods.bound_training import view_of
 from headbench.methods.configs import OursConfig, SplatTraining
 from headbench.methods.ours import Ours
 from headbench.methods.ours_appearance import OursAppearance
 from headbench.methods.subject_mesh import SubjectMesh
 from headbench.methods.training.optimiser import Optimiser
 from headbench.methods.training.schedule import Timeline
+from headbench.methods.views import view_of
 
 CONFIG = OursConfig(
     splats=SplatTraining(min_densify_every=10, min_settle=4),

@@ -13,6 +13,8 @@ import pytest
 from headbench.bench.contracts import Budget, no_progress
 from headbench.methods.configs import GAConfig, OursConfig, SplatTraining
 from headbench.methods.ga import GA
+from headbench.methods.gbs.config import BlendshapeTraining, GBSConfig
+from headbench.methods.gbs.method import GBS
 from headbench.methods.ours import Ours
 from headbench.methods.training.loop import CHECKPOINT
 
@@ -32,6 +34,21 @@ METHODS = {
     "ours": lambda: Ours(
         OursConfig(splats=SPLATS, plane_resolution=16, line_resolution=8, line_channels=4, hidden=16)
     ),
+    # A round each eighth iteration from the first on; nothing is reset.
+    "gbs": lambda: GBS(
+        GBSConfig(
+            splats=BlendshapeTraining(
+                densify_from=0,
+                min_densify_every=8,
+                min_settle=4,
+                densify_gradient=2e-4,
+                checkpoint_every_s=0.0,
+            ),
+            samples=400,
+            teeth_samples=40,
+            mask_floor_mm=0.5,
+        )
+    ),
 }
 BUDGET = Budget(iterations=40)
 
@@ -48,7 +65,7 @@ def content(avatar):
     return {path.name: path.read_bytes() for path in avatar.files()}
 
 
-@pytest.fixture(scope="module", params=["ga", "ours"])
+@pytest.fixture(scope="module", params=[*METHODS])
 def unbroken(request, clip, tmp_path_factory):
     folder = tmp_path_factory.mktemp("unbroken")
     return request.param, content(fit(request.param, clip, folder))

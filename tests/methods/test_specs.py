@@ -7,10 +7,12 @@ from headbench.bench.contracts import Budget
 from headbench.bench.registry import resolve
 from headbench.bench.run_config import resolve_method
 from headbench.methods.configs import GAConfig, OursConfig, SplatTraining
+from headbench.methods.gbs.config import GBSConfig
 from headbench.methods.gha.config import GHAConfig
-from headbench.methods.specs import GA, GHA, INSTA, MEAN_IMAGE, NEAREST_CAMERA, OURS
+from headbench.methods.specs import GA, GBS, GHA, INSTA, MEAN_IMAGE, NEAREST_CAMERA, OURS
+from headbench.methods.training.schedule import DensifySchedule, Timeline
 
-SPECS = {spec.name: spec for spec in (OURS, GA, GHA, INSTA, INSTA, MEAN_IMAGE, NEAREST_CAMERA)}
+SPECS = {spec.name: spec for spec in (OURS, GA, GBS, GHA, INSTA, MEAN_IMAGE, NEAREST_CAMERA)}
 PRESETS = ("smoke", "demo", "fast", "paper")
 
 
@@ -66,6 +68,45 @@ def test_the_paper_preset_of_gha_is_the_published_design():
         assert resolve_method(GHA, preset, {}).spec.resolution.native
 
 
+def test_the_paper_preset_of_gbs_is_the_published_code():
+    settings = dict(GBS.presets["paper"])
+    assert settings.pop("budget") == {"iterations": 40_000}
+    config = build(GBSConfig, settings, "preset")
+    assert config == GBSConfig(departures=("triple_correctives", "blended_lower_teeth"))
+    assert (config.samples, config.teeth_samples, config.expressions, config.sh_degree) == (
+        50_000,
+        5_000,
+        50,
+        3,
+    )
+    splats = config.splats
+    rates = (
+        splats.position_lr,
+        splats.position_lr_final,
+        splats.opacity_lr,
+        splats.scale_lr,
+        splats.rotation_lr,
+    )
+    assert rates == (1.6e-4, 1.6e-6, 0.05, 0.005, 0.001)
+    differences = (
+        config.difference_position_lr,
+        config.difference_sh_lr,
+        config.difference_opacity_lr,
+        config.difference_scale_lr,
+        config.difference_rotation_lr,
+    )
+    assert differences == (3.2e-7, 1.25e-3, 5e-5, 5e-4, 1e-4)
+    assert (splats.densify_gradient, config.teeth_densify_gradient, splats.prune_opacity) == (
+        1e-3,
+        2e-4,
+        0.005,
+    )
+    schedule = DensifySchedule.of(splats, Timeline(40_000, 40_000))
+    rounds = [iteration for iteration in range(1, 40_001) if schedule.is_round(iteration)]
+    assert rounds == list(range(600, 15_000, 100))
+    assert not any(schedule.is_reset(iteration) for iteration in range(1, 40_001))
+
+
 @pytest.mark.parametrize(
     ("config", "wrong"),
     [
@@ -80,6 +121,11 @@ def test_the_paper_preset_of_gha_is_the_published_design():
         (GHAConfig, {"sr_widths": ()}),
         (GHAConfig, {"max_points": 0}),
         (GHAConfig, {"unit": 0.0}),
+        (GBSConfig, {"samples": 0}),
+        (GBSConfig, {"expressions": -1}),
+        (GBSConfig, {"difference_sh_degree": 4}),
+        (GBSConfig, {"mask_floor_mm": 6.0}),
+        (GBSConfig, {"departures": ("triple_correctives",) * 2}),
         (OursConfig, {"plane_resolution": 1}),
         (OursConfig, {"expressions": -1}),
         (OursConfig, {"capacity_tolerance": 0.0}),

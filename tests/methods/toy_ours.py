@@ -4,12 +4,12 @@ import torch
 from torch import nn
 
 from headbench.methods.avatar_files import Subject
-from headbench.methods.bound_training import view_of
 from headbench.methods.configs import OursConfig
 from headbench.methods.ours_appearance import OursAppearance
 from headbench.methods.subject_mesh import SubjectMesh
 from headbench.methods.training.optimiser import Optimiser
 from headbench.methods.training.schedule import Timeline
+from headbench.methods.views import view_of
 
 SMALL = OursConfig(plane_resolution=8, plane_channels=(4, 2, 2), hidden=8, line_resolution=6, line_channels=3)
 

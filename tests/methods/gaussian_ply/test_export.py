@@ -9,13 +9,13 @@ import torch
 from scipy.special import sph_harm_y
 
 from headbench.bench.errors import InputError
-from headbench.methods.bound_training import view_of
 from headbench.methods.gaussian_ply.command import neutral_pose, run
 from headbench.methods.gaussian_ply.harmonics_fit import BEHIND, fit_harmonics, sphere
 from headbench.methods.gaussian_ply.settings import ExportPlySettings
 from headbench.methods.ours_avatar import OursAvatar
 from headbench.methods.sh import sh_basis
 from headbench.methods.splats import rasterize
+from headbench.methods.views import view_of
 
 from ...datasets.tiny_capture import write_tiny_capture
 from ..stored_toy import store

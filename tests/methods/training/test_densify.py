@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from torch import nn
 
 from headbench.methods.configs import SplatTraining
-from headbench.methods.training.densify import SHRINK, Densifier, logit
+from headbench.methods.training.densify import SHRINK, Densifier, logit, rows_of_tables
 from headbench.methods.training.optimiser import Optimiser
 from headbench.methods.training.schedule import DensifySchedule
 
@@ -164,3 +164,68 @@ def test_reset_cuts_opacities_and_forgets_their_moments():
     np.testing.assert_allclose(torch.sigmoid(optimiser["opacities"].detach()), [0.01, 0.007])
     assert (optimiser.moments("opacities")["exp_avg"] == 0).all()
     assert (optimiser.moments("means")["exp_avg"] != 0).all()
+
+
+def with_table(binding, opacities, rows, **more):
+    """Splats with a table whose rows tell their owner: the first splat's are 0.0, 0.1, ..., the next one's 1.0, ..."""
+    count = len(binding)
+    parameters = {
+        "means": torch.zeros(count, 3),
+        "log_scales": torch.full((count, 3), float(np.log(0.005))),
+        "quats": torch.ones(count, 4),
+        "opacities": torch.tensor([logit(o) for o in opacities]),
+        "table": torch.tensor([[n + 0.1 * k] for n, b in enumerate(binding) for k in range(rows[b])]),
+    }
+    optimiser = Optimiser(
+        {name: nn.Parameter(value) for name, value in parameters.items()}, dict.fromkeys(parameters, 0.1)
+    )
+    densifier = Densifier(
+        PUBLISHED,
+        optimiser,
+        tuple(parameters)[:-1],
+        torch.tensor(binding),
+        len(rows),
+        EXTENT,
+        0,
+        tables=("table",),
+        table_rows=torch.tensor(rows),
+        **more,
+    )
+    return densifier, optimiser
+
+
+def test_tables_follow_their_splats():
+    """Splats on triangles with 2, 0 and 3 rows: the third is cloned, the second goes, so does the first's first row."""
+    densifier, optimiser = with_table([0, 1, 2, 0], [0.5, 0.001, 0.5, 0.001], [2, 0, 3], keep_last=False)
+    gradient = torch.zeros(4, 2)
+    gradient[2] = 1.0
+    densifier.observe(gradient, torch.ones(4, dtype=torch.bool), 10, 10)
+    densifier.run(1, ALWAYS, torch.ones(3))
+    assert densifier.binding.tolist() == [0, 2, 2]
+    expected = [0.0, 0.1, 2.0, 2.1, 2.2, 2.0, 2.1, 2.2]
+    np.testing.assert_allclose(optimiser["table"].detach()[:, 0], expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("keep_last", [True, False])
+def test_a_last_splat_goes_only_where_that_is_allowed(keep_last):
+    densifier, _ = with_table([0, 1], [0.001, 0.5], [1, 1], keep_last=keep_last)
+    densifier.run(1, ALWAYS, torch.ones(2))
+    assert densifier.binding.tolist() == ([0, 1] if keep_last else [1])
+
+
+def test_triangles_may_ask_at_thresholds_of_their_own():
+    densifier, _ = with_table([0, 1], [0.5, 0.5], [1, 1], thresholds=torch.tensor([1e-3, 2e-4]))
+    gradient = torch.full((2, 2), 5e-4 / 5 / 2**0.5)  # 5e-4 in normalised device units of a 10 x 10 image
+    densifier.observe(gradient, torch.ones(2, dtype=torch.bool), 10, 10)
+    densifier.run(1, ALWAYS, torch.ones(2))
+    assert densifier.binding.tolist() == [0, 1, 1]
+
+
+@settings(max_examples=30, deadline=None)
+@given(counts=st.lists(st.integers(0, 4), min_size=1, max_size=8), data=st.data())
+def test_rows_of_tables_are_found(counts, data):
+    splats = data.draw(st.lists(st.integers(0, len(counts) - 1), max_size=8))
+    owners = [n for n, count in enumerate(counts) for _ in range(count)]
+    expected = [row for splat in splats for row, owner in enumerate(owners) if owner == splat]
+    found = rows_of_tables(torch.tensor(counts), torch.tensor(splats, dtype=torch.int64))
+    assert found.tolist() == expected

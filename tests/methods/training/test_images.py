@@ -53,3 +53,22 @@ def test_an_image_of_another_size_than_its_camera_is_an_input_error(clip):
     with pytest.raises(InputError, match="image"):
         images.get(1, 0)
     images.close()
+
+
+def test_mattes_come_as_a_fourth_channel(clip):
+    keys = clip.splits["train"]
+    images = TrainingImages(clip, keys, ShuffledEpochs(len(keys), 0), "cpu", mattes=True)
+    image = images.get(1, 2)
+    images.close()
+    np.testing.assert_allclose(image[:, :, :3], clip.image(keys[2]) / np.float32(255), atol=1e-7)
+    np.testing.assert_allclose(image[:, :, 3], clip.mask(keys[2]) / np.float32(255), atol=1e-7)
+
+
+@pytest.mark.parametrize("matte", [None, np.zeros((3, 3), np.uint8)])
+def test_a_matte_that_is_missing_or_does_not_fit_is_an_input_error(clip, matte):
+    keys = clip.splits["train"]
+    faulty = replace(clip, masks=dict.fromkeys(clip.masks, matte))
+    images = TrainingImages(faulty, keys, ShuffledEpochs(len(keys), 0), "cpu", mattes=True)
+    with pytest.raises(InputError, match="mask"):
+        images.get(1, 0)
+    images.close()

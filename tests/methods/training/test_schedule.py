@@ -1,5 +1,6 @@
 """Schedules against the published moments and what short runs need."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -58,3 +59,11 @@ def test_log_linear_ends_and_middle():
 def test_intervals_never_vanish():
     assert Timeline(10, 600_000).every(1_000) == 1
     assert Timeline(10, 600_000).every(1_000, 100) == 100
+
+
+def test_opacities_that_are_never_reset():
+    never = replace(PUBLISHED, reset_every=None, reset_at_start=False)
+    schedule = DensifySchedule.of(never, Timeline(600_000, 600_000))
+    assert not any(schedule.is_reset(iteration) for iteration in range(1, 600_001, 500))
+    once = DensifySchedule.of(replace(never, reset_at_start=True), Timeline(600_000, 600_000))
+    assert once.is_reset(10_000)

@@ -1,0 +1,1 @@
+"""GaussianBlendshapes: splats of a neutral head and linear differences for expressions."""

@@ -1,0 +1,99 @@
+"""Settings of GaussianBlendshapes. Light: neither torch nor numpy is imported here.
+
+The defaults are the published values; times are on the scale of the published run of 40,000 iterations.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from ..configs import DensifiedTraining
+
+Departure = Literal["triple_correctives", "blended_lower_teeth"]
+"""What the published code does otherwise than the paper says."""
+
+
+@dataclass(frozen=True)
+class BlendshapeTraining(DensifiedTraining):
+    """How the neutral splats are trained; lengths are metres, the extent of the scene is 1.
+
+    Opacities are never reset. The published code also means to remove splats of a radius above 20 pixels, but clears
+    the radii before it looks at them, as 3DGS does, so that there is no such rule here.
+    """
+
+    schedule_length: int = 40_000
+    position_lr: float = 1.6e-4
+    position_lr_final: float = 1.6e-6
+    scale_lr: float = 0.005
+    densify_from: int = 500
+    densify_every: int = 100
+    densify_until: int = 15_000
+    densify_gradient: float = 1e-3
+    prune_extent_from: int = 3_000
+    reset_every: int | None = None
+    reset_at_start: bool = False
+
+
+@dataclass(frozen=True)
+class GBSConfig:
+    """GaussianBlendshapes (SIGGRAPH 2024, arXiv 2404.19398): neutral splats plus differences for expressions.
+
+    Attributes
+    ----------
+    samples, teeth_samples : splats at the start, on the head and on each row of teeth; upper limits where
+        ``sample_spacing`` is set.
+    sample_spacing : pixels between neighbouring splats at the start, as the training cameras see the head on average:
+        more splats than images can tell apart are not required. 0 takes ``samples`` as they are, as published.
+    expressions : leading expression coefficients that have differences; as many as there are, if fewer.
+    sh_degree, sh_every, min_sh_every : degree of the neutral spherical harmonics at the end; one degree more each
+        ``sh_every`` iterations (published scale), but at least ``min_sh_every`` of the actual run.
+    difference_sh_degree : degree up to which the differences change the harmonics.
+    difference_..._lr : learning rates of the differences, for harmonics of all degrees the same.
+    position_settles : iteration (published scale) at which the learning rate of positions has fallen to its final value.
+    teeth_densify_gradient : ``densify_gradient`` of the teeth.
+    mask_floor_mm, mask_full_mm : displacement of the surface by one expression, at coefficient 1, up to which its
+        differences are zero and not stored, and at which they count in full. The published values: a tenth of the
+        largest displacement by FLAME's 50th expression, and the largest by its first.
+    alpha_weight : of the mean squared difference of alpha and matte; needs mattes, else it is left out.
+    teeth_weight : of the penalty on teeth that leave the mouth (`mouth.Cylinder`).
+    departures : what to do as the published code does. "triple_correctives" adds the pose correctives of a
+        triangle's corners instead of interpolating them, which makes them three times too strong;
+        "blended_lower_teeth" lets the lower teeth follow root and neck by 5.6 % instead of the jaw alone.
+    """
+
+    splats: BlendshapeTraining = field(default_factory=BlendshapeTraining)
+    samples: int = 50_000
+    teeth_samples: int = 5_000
+    sample_spacing: float = 0.0
+    expressions: int = 50
+    sh_degree: int = 3
+    sh_every: int = 1_000
+    min_sh_every: int = 100
+    sh_dc_lr: float = 0.0025
+    sh_rest_lr: float = 0.000125
+    difference_sh_degree: int = 3
+    difference_position_lr: float = 3.2e-7
+    difference_sh_lr: float = 1.25e-3
+    difference_scale_lr: float = 5e-4
+    difference_rotation_lr: float = 1e-4
+    difference_opacity_lr: float = 5e-5
+    position_settles: int = 30_000
+    teeth_densify_gradient: float = 2e-4
+    mask_floor_mm: float = 0.0237277
+    mask_full_mm: float = 5.7035
+    alpha_weight: float = 10.0
+    teeth_weight: float = 100.0
+    departures: tuple[Departure, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.samples < 1 or self.teeth_samples < 0:
+            raise ValueError("samples must be at least 1, and teeth_samples not negative")
+        if self.expressions < 0 or self.sample_spacing < 0:
+            raise ValueError("expressions and sample_spacing must not be negative")
+        if not 0 <= self.difference_sh_degree <= self.sh_degree <= 3:
+            raise ValueError("sh_degree must be 0 to 3, and difference_sh_degree not above it")
+        if not 0 <= self.mask_floor_mm < self.mask_full_mm:
+            raise ValueError("mask_floor_mm must be at least 0 and below mask_full_mm")
+        if len(set(self.departures)) != len(self.departures):
+            raise ValueError(f"departures must name each thing once, found {self.departures}")

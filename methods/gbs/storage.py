@@ -1,0 +1,141 @@
+"""The file of a GaussianBlendshapes avatar: neutral splats, and differences where an expression moves something."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from ...bench.contracts import IntArray
+from ...bench.errors import InputError
+from ...bench.files import atomic_path
+from ..sh import coefficient_count
+from .blend import Entries, difference_widths
+from .surface import SurfacePoints, full_barycentric
+
+AVATAR_FILE = "avatar.safetensors"
+EXPRESSIONS = "expressions"
+"""Key of the file's metadata: how many leading expressions there may be differences for."""
+
+GEOMETRY = {"means": 3, "log_scales": 3, "quats": 4, "opacities": 1, "sh_dc": 3}
+"""First columns of the (N, 14 + 3 R) float32 table of neutral splats; R harmonics above degree 0 by channel follow."""
+TENSORS = ("splats", "triangles", "barycentric", "moved_by", "differences")
+
+
+class Stored(NamedTuple):
+    """What an avatar's file holds.
+
+    Attributes
+    ----------
+    neutral : per-splat tensors by name, see `blend.place`.
+    points : surface point that each splat was put on at the start.
+    expressions : K.
+    entries : rows of the differences; their weights are 1.
+    differences : (M, C) what is added at coefficient 1, in the columns of `blend.difference_widths`.
+    """
+
+    neutral: dict[str, Tensor]
+    points: SurfacePoints
+    expressions: int
+    entries: Entries
+    differences: Tensor
+
+
+def write_avatar(
+    path: Path,
+    neutral: Mapping[str, Tensor],
+    points: SurfacePoints,
+    expressions: int,
+    entries: Entries,
+    differences: Tensor,
+) -> None:
+    """Write an avatar as safetensors, exact.
+
+    Of each splat: 4 (14 + 3 R) bytes of neutral attributes, 12 of its surface point, a bit for each expression, and
+    4 C bytes for each expression that moves it: 12,055 bytes with all harmonics and all of 50 expressions.
+    """
+    count = len(neutral["means"])
+    columns = [neutral[name].reshape(count, -1) for name in (*GEOMETRY, "sh_rest")]
+    moved_by = torch.zeros(count, expressions, dtype=torch.bool)
+    moved_by[entries.owners.cpu(), entries.expressions.cpu()] = True
+    tensors = {
+        "splats": torch.cat([column.detach().to("cpu", torch.float32) for column in columns], dim=1),
+        "triangles": torch.from_numpy(points.triangles.astype(np.int32)),
+        "barycentric": torch.from_numpy(points.barycentric[:, 1:].astype(np.float32)),
+        "moved_by": torch.from_numpy(np.packbits(moved_by.numpy(), axis=1)),
+        "differences": differences.detach().to("cpu", torch.float32).contiguous(),
+    }
+    with atomic_path(path) as temporary:
+        save_file(tensors, temporary, {EXPRESSIONS: str(expressions)})
+
+
+def read_avatar(path: Path, face_count: int, expression_size: int, device: str) -> Stored:
+    """Read and check what `write_avatar` wrote. Raises `InputError` where a tensor is missing or does not fit."""
+    try:
+        with safe_open(path, framework="pt", device="cpu") as file:
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
+            said = (file.metadata() or {}).get(EXPRESSIONS, "")
+    except (SafetensorError, OSError) as error:
+        raise InputError(path, "", "a safetensors file", str(error)) from error
+    for name in TENSORS:
+        if name not in tensors:
+            raise InputError(path, name, "a tensor of that name", "none")
+    if not said.isdecimal() or int(said) > expression_size:
+        raise InputError(path, EXPRESSIONS, f"a number up to {expression_size}", repr(said[:20]))
+    expressions = int(said)
+    moved_by = _check(path, tensors, face_count, expressions)
+    owners, moving = np.nonzero(moved_by)
+    counts = torch.from_numpy(moved_by.sum(1)).to(device)
+    columns = tensors["splats"].to(device).split([*GEOMETRY.values(), _rest(tensors["splats"])], dim=1)
+    neutral = {name: column.contiguous() for name, column in zip((*GEOMETRY, "sh_rest"), columns)}
+    neutral["opacities"] = neutral["opacities"][:, 0]
+    neutral["sh_rest"] = neutral["sh_rest"].reshape(len(counts), 3, -1)
+    points = SurfacePoints(
+        tensors["triangles"].numpy().astype(np.int64), full_barycentric(tensors["barycentric"].numpy())
+    )
+    entries = Entries.of(counts, torch.from_numpy(moving).to(device), torch.ones(len(owners), device=device))
+    return Stored(neutral, points, expressions, entries, tensors["differences"].to(device))
+
+
+def _rest(splats: Tensor) -> int:
+    return splats.shape[1] - sum(GEOMETRY.values())
+
+
+def _check(path: Path, tensors: Mapping[str, Tensor], face_count: int, expressions: int) -> IntArray:
+    """(N, K) which expressions move which splat. Raises `InputError` at the first tensor that does not fit."""
+
+    def require(name: str, fits: bool, expected: str) -> None:
+        if not fits:
+            found = f"{tensors[name].dtype} of shape {tuple(tensors[name].shape)}, or other numbers"
+            raise InputError(path, name, expected, found)
+
+    for name in ("splats", "barycentric", "differences"):
+        fits = tensors[name].dtype == torch.float32 and bool(torch.isfinite(tensors[name]).all())
+        require(name, fits, "finite float32 numbers")
+    splats, triangles, barycentric = (tensors[name] for name in TENSORS[:3])
+    rests = [3 * (coefficient_count(degree) - 1) for degree in range(4)]
+    require("splats", splats.ndim == 2 and len(splats) > 0 and _rest(splats) in rests, "(N, 14 + 3 R)")
+    count = len(splats)
+    fits = triangles.shape == (count,) and triangles.dtype == torch.int32
+    fits = fits and 0 <= int(triangles.min()) and int(triangles.max()) < face_count
+    require("triangles", fits, f"({count},) int32 triangles 0 to {face_count - 1}")
+    require("barycentric", barycentric.shape == (count, 2), f"({count}, 2)")
+    packed = tensors["moved_by"]
+    fits = packed.shape == (count, -(-expressions // 8)) and packed.dtype == torch.uint8
+    require("moved_by", fits, f"({count}, {-(-expressions // 8)}) uint8")
+    moved_by = np.unpackbits(packed.numpy(), axis=1, count=expressions)
+    widths = [
+        sum(difference_widths(degree).values())
+        for degree in range(4)
+        if 3 * (coefficient_count(degree) - 1) <= _rest(splats)
+    ]
+    table = tensors["differences"]
+    fits = table.ndim == 2 and len(table) == int(moved_by.sum()) and table.shape[1] in widths
+    require("differences", fits, f"({int(moved_by.sum())}, C), C one of {widths}")
+    return moved_by.astype(np.int64)

@@ -1,0 +1,218 @@
+"""Training of GaussianBlendshapes: the neutral splats and their differences, together."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...bench.contracts import Clip
+from ...datasets.head.arrays import HeadArrays
+from ..avatar_files import Subject
+from ..known_poses import pose_key
+from ..seeds import torch_generator
+from ..sh import initial_coefficients
+from ..splat_trainer import Initial, SplatTrainer
+from ..subject_mesh import BoundedCache, SubjectMesh
+from ..training.densify import logit, rows_of_tables
+from ..training.losses import photometric_loss
+from ..training.sampling import Sampler
+from ..training.schedule import Timeline
+from .blend import Entries, difference_widths, place
+from .config import GBSConfig
+from .differences import consistency_mask, entries_of
+from .mouth import mouth_room, rows_of_teeth
+from .rig import PARTS, Carried, Rig
+from .surface import SurfacePoints, poisson_disk, spacing, surface_area
+
+DIFFERENCES = "differences"
+RATE = 1e-6
+"""Learning rate of the table of differences; each column is scaled by its own rate over this one. Small, so that
+gradients by the table are not scaled down to where Adam's epsilon counts."""
+
+
+class Start(NamedTuple):
+    """Where splats are put at the start: first those of the head, then those of the teeth."""
+
+    points: SurfacePoints
+    spacing: np.ndarray
+    on_head: int
+
+
+class GBSTraining(SplatTrainer):
+    """A `Trainable`: neutral splats in metres and the learnt differences of those that expressions move.
+
+    Differences lie in one table, a row for each splat and expression whose consistency mask is not zero.
+
+    Attributes
+    ----------
+    points, entries : the surface point of each splat at the start, and the differences of the splats.
+    """
+
+    def __init__(
+        self,
+        clip: Clip,
+        config: GBSConfig,
+        subject: Subject,
+        head: HeadArrays,
+        sampler: Sampler,
+        device: str,
+        seed: int,
+    ):
+        mattes = clip.mask(clip.splits["train"][0]) is not None
+        super().__init__(clip, config.splats, sampler, device, mattes=mattes)
+        self._config, self._mattes = config, mattes
+        start = start_of(clip, config, subject, head, seed)
+        self.points = start.points
+        self.rig = Rig(head, subject.shape, subject.static_offset, start.points, config.expressions, device)
+        vertices = self.rig.mesh.canonical.cpu().numpy()
+        mask = consistency_mask(
+            head,
+            vertices,
+            self.rig.expressions,
+            1e-3 * config.mask_floor_mm,
+            1e-3 * config.mask_full_mm,
+        )
+        counts, expressions, weights = entries_of(mask, start.points.triangles)
+        self._counts = torch.from_numpy(counts).to(device)
+        self._expressions = torch.from_numpy(expressions).to(device)
+        self._weights = torch.from_numpy(weights).to(device, torch.float32)
+        self._on_head = start.on_head
+        self._room = None
+        if start.on_head < len(counts):
+            room = mouth_room(vertices[head.regions["teeth"]])
+            self._room = room._replace(center=room.center.to(device))
+        poses = {pose_key(clip.poses[key.timestep]): clip.poses[key.timestep] for key in self.keys}
+        row = {name: index for index, name in enumerate(poses)}
+        self._pose = {key.timestep: row[pose_key(clip.poses[key.timestep])] for key in self.keys}
+        self._arguments = self.rig.arguments(list(poses.values()))
+        entries = config.splats.mesh_cache_mb * 2**20 // (4 * sum(PARTS.values()) * len(counts))
+        self._carried = BoundedCache(self._carry, entries)
+        splats, shared = self._initial(start, int(counts.sum()), device, seed)
+        thresholds = torch.full((len(counts),), config.splats.densify_gradient, device=device)
+        thresholds[start.on_head :] = config.teeth_densify_gradient
+        self._start(
+            splats,
+            shared,
+            torch.arange(len(counts), device=device),
+            len(counts),
+            1.0,
+            seed,
+            thresholds=thresholds,
+            keep_last=False,
+            tables=(DIFFERENCES,),
+            table_rows=self._counts,
+        )
+        self._sizes = torch.ones(len(counts), device=device)
+        self._entries: tuple[Tensor, Entries] | None = None
+
+    def begin(self, timeline: Timeline) -> None:
+        """Fit schedules to the length of the run."""
+        super().begin(timeline)
+        self._degree_every = timeline.every(self._config.sh_every, self._config.min_sh_every)
+
+    def loss(self, iteration: int, index: int) -> Tensor:
+        """Photometric loss of one image, alpha against the matte, and teeth that leave the mouth."""
+        key, config, optimiser = self.keys[index], self._config, self._optimiser
+        view = self._views[key.camera]
+        image = self._images.get(iteration, index)
+        pose = self._pose[key.timestep]
+        carried = Carried.of(self._carried(pose).index_select(0, self.binding))
+        coefficients = self._arguments["expression"][pose, : self.rig.expressions]
+        differences = self.entries.sum(optimiser[DIFFERENCES], coefficients) * self._column_scales
+        placed = place({name: optimiser[name] for name in self.splat_names}, differences, carried)
+        degree = min(config.sh_degree, iteration // self._degree_every)
+        colors = placed.colors(view.center, degree)
+        rendering, _ = self._render(placed.world, placed.opacities, colors, view, self._sizes)
+        loss = photometric_loss(rendering.image, image[:, :, :3], config.splats.ssim_weight)
+        if self._mattes and config.alpha_weight:
+            loss = loss + config.alpha_weight * (rendering.alpha - image[:, :, 3]).square().mean()
+        if self._room is not None and config.teeth_weight:
+            teeth = (self.binding >= self._on_head).nonzero().squeeze(1)
+            if len(teeth):
+                violation = self._room.violation(optimiser["means"].index_select(0, teeth))
+                loss = loss + config.teeth_weight * violation
+        return loss
+
+    @property
+    def entries(self) -> Entries:
+        """The differences of the splats as they are now bound."""
+        binding = self.binding
+        if self._entries is None or self._entries[0] is not binding:
+            rows = rows_of_tables(self._counts, binding)
+            expressions, weights = (values[rows] for values in (self._expressions, self._weights))
+            self._entries = binding, Entries.of(self._counts[binding], expressions, weights)
+        return self._entries[1]
+
+    def merged_differences(self) -> Tensor:
+        """(M, C) what is added at coefficient 1: as trained, times the mask."""
+        table = self._optimiser[DIFFERENCES].detach() * self._column_scales
+        return table * self.entries.weights[:, None]
+
+    def _position_progress(self, iteration: int) -> float:
+        return iteration / max(self._timeline.at(self._config.position_settles), 1)
+
+    def _carry(self, row: int) -> Tensor:
+        return self.rig.carry({name: values[row : row + 1] for name, values in self._arguments.items()})
+
+    def _initial(self, start: Start, entries: int, device: str, seed: int) -> tuple[Initial, Initial]:
+        config, settings = self._config, self._config.splats
+        count = len(start.spacing)
+        widths = difference_widths(config.difference_sh_degree)
+        rates = {
+            "means": config.difference_position_lr,
+            "log_scales": config.difference_scale_lr,
+            "quats": config.difference_rotation_lr,
+            "opacities": config.difference_opacity_lr,
+            "sh_dc": config.difference_sh_lr,
+            "sh_rest": config.difference_sh_lr,
+        }
+        columns = [torch.full((width,), rates[name] / RATE) for name, width in widths.items()]
+        self._column_scales = torch.cat(columns).to(device)
+        harmonics = initial_coefficients(count, config.sh_degree, torch_generator(seed, "sh"))
+        quats = torch.zeros(count, 4)
+        quats[:, 0] = 1
+        log_scales = torch.from_numpy(np.log(start.spacing)).float()[:, None].repeat(1, 3)
+        opacities = torch.full((count,), logit(settings.initial_opacity))
+        splats = {
+            "means": (self.rig.rest.clone(), settings.position_lr),
+            "log_scales": (log_scales.to(device), settings.scale_lr),
+            "quats": (quats.to(device), settings.rotation_lr),
+            "opacities": (opacities.to(device), settings.opacity_lr),
+            "sh_dc": (harmonics["sh_dc"].to(device), config.sh_dc_lr),
+            "sh_rest": (harmonics["sh_rest"].to(device), config.sh_rest_lr),
+        }
+        table = torch.zeros(entries, sum(widths.values()), device=device)
+        return splats, {DIFFERENCES: (table, RATE)}
+
+
+def start_of(clip: Clip, config: GBSConfig, subject: Subject, head: HeadArrays, seed: int) -> Start:
+    """Poisson-disk samples of the neutral head and of each row of teeth."""
+    mesh = SubjectMesh(head, subject.shape, subject.static_offset, "cpu")
+    vertices, faces = mesh.canonical.numpy().astype(np.float64), np.asarray(head.faces)
+    rows = rows_of_teeth(head)
+    on_teeth = np.concatenate([*rows, np.empty(0, np.int64)])
+    on_head = np.setdiff1d(np.arange(len(faces)), on_teeth)
+    share = config.teeth_samples / config.samples
+    count = sample_count(clip, config, surface_area(vertices, faces[on_head]), vertices.mean(0))
+    parts = [(on_head, count), *((row, round(share * count)) for row in rows)]
+    found = [poisson_disk(vertices, faces, *part, seed) for part in parts if part[1] > 0]
+    points = SurfacePoints(*(np.concatenate(columns) for columns in zip(*found)))
+    distances = [spacing(part.positions(vertices, faces)) for part in found]
+    return Start(points, np.concatenate(distances), len(found[0].triangles))
+
+
+def sample_count(clip: Clip, config: GBSConfig, area: float, middle: np.ndarray) -> int:
+    """Splats on the head at the start: those configured, or as many as the training images tell apart."""
+    if not config.sample_spacing:
+        return config.samples
+    sizes = []
+    for key in clip.splits["train"]:
+        camera = clip.cameras[key.camera]
+        place = middle + np.asarray(clip.poses[key.timestep].translation, np.float64)
+        focal = 0.5 * (camera.K[0, 0] + camera.K[1, 1])
+        sizes.append(np.linalg.norm(camera.center - place) / focal)
+    required = area / (config.sample_spacing * float(np.mean(sizes))) ** 2
+    return max(1, min(config.samples, round(required)))

@@ -1,0 +1,146 @@
+"""The avatar's file: what goes in comes out, what it costs, what is refused."""
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from headbench.bench.errors import InputError
+from headbench.methods.gbs.blend import Entries, difference_widths
+from headbench.methods.gbs.storage import AVATAR_FILE, EXPRESSIONS, TENSORS, read_avatar, write_avatar
+from headbench.methods.gbs.surface import SurfacePoints, full_barycentric
+
+FACES, EXPRESSION_SIZE = 40, 60
+PUBLISHED_BYTES = 4 * 3128  # what the authors' viewer reads for each splat
+
+
+def write(path, count=30, expressions=50, degree=3, difference_degree=3, share=0.4):
+    """A random avatar; returns what was written."""
+    generator = torch.Generator().manual_seed(0)
+
+    def normal(*shape):
+        return torch.randn(*shape, generator=generator)
+
+    rest = (degree + 1) ** 2 - 1
+    neutral = {
+        "means": normal(count, 3),
+        "log_scales": normal(count, 3),
+        "quats": normal(count, 4),
+        "opacities": normal(count),
+        "sh_dc": normal(count, 3),
+        "sh_rest": normal(count, 3, rest),
+    }
+    moved_by = torch.rand(count, expressions, generator=generator) < share
+    owners, moving = moved_by.nonzero().unbind(1)
+    entries = Entries.of(moved_by.sum(1), moving, torch.ones(len(owners)))
+    differences = normal(len(owners), sum(difference_widths(difference_degree).values()))
+    rng = np.random.default_rng(0)
+    inside = rng.dirichlet(np.ones(3), count)[:, 1:].astype(np.float32)
+    points = SurfacePoints(rng.integers(0, FACES, count), full_barycentric(inside))
+    write_avatar(path, neutral, points, expressions, entries, differences)
+    return neutral, points, entries, differences
+
+
+def read(path):
+    return read_avatar(path, FACES, EXPRESSION_SIZE, "cpu")
+
+
+@pytest.mark.parametrize(("degree", "difference_degree"), [(3, 3), (3, 0), (2, 1), (0, 0)])
+def test_everything_comes_back_to_the_bit(tmp_path, degree, difference_degree):
+    path = tmp_path / AVATAR_FILE
+    neutral, points, entries, differences = write(
+        path, degree=degree, difference_degree=difference_degree, expressions=37
+    )
+    found = read(path)
+    assert found.expressions == 37
+    assert set(found.neutral) == set(neutral)
+    for name, value in neutral.items():
+        assert torch.equal(found.neutral[name], value), name
+    assert torch.equal(found.differences, differences)
+    for one, other in zip(found.entries, entries):
+        assert torch.equal(one, other)
+    np.testing.assert_array_equal(found.points.triangles, points.triangles)
+    np.testing.assert_array_equal(found.points.barycentric, points.barycentric)
+
+
+def test_a_splat_that_every_expression_moves_costs_less_than_published(tmp_path):
+    sizes = {}
+    for count in (100, 300):
+        write(tmp_path / "x", count, share=1.1)
+        sizes[count] = (tmp_path / "x").stat().st_size
+    per_splat = (sizes[300] - sizes[100]) / 200
+    assert per_splat == pytest.approx(4 * 59 + 12 + 7 + 50 * 4 * 59, abs=0.2)  # 12,055
+    assert per_splat < PUBLISHED_BYTES
+
+
+def test_what_no_expression_moves_costs_the_neutral_splat_alone(tmp_path):
+    sizes = {}
+    for count in (100, 300):
+        write(tmp_path / "x", count, share=-1.0)
+        sizes[count] = (tmp_path / "x").stat().st_size
+    assert (sizes[300] - sizes[100]) / 200 == pytest.approx(4 * 59 + 12 + 7, abs=0.2)
+
+
+def test_expressions_without_any_splat_and_splats_without_expressions(tmp_path):
+    write(tmp_path / "x", expressions=0)
+    found = read(tmp_path / "x")
+    assert found.expressions == 0
+    assert len(found.differences) == 0
+    assert found.entries.sum(found.differences, torch.zeros(0)).shape == (30, 59)
+
+
+def altered(path, change, said="50"):
+    tensors = load_file(path)
+    change(tensors)
+    save_file(tensors, path, {EXPRESSIONS: said})
+
+
+@pytest.mark.parametrize("name", TENSORS)
+def test_no_tensor_can_be_missing_or_of_another_size(tmp_path, name):
+    path = tmp_path / "x"
+    write(path)
+    altered(path, lambda tensors: tensors.update({name: tensors[name][:-1].contiguous()}))
+    with pytest.raises(InputError, match="x"):
+        read(path)
+    altered(path, lambda tensors: tensors.pop(name))
+    with pytest.raises(InputError, match=name):
+        read(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda t: t["splats"].__setitem__((0, 0), float("nan")), "splats"),
+        (lambda t: t["differences"].__setitem__((0, 0), float("inf")), "differences"),
+        (lambda t: t["triangles"].__setitem__(0, FACES), "triangles"),
+        (lambda t: t["triangles"].__setitem__(0, -1), "triangles"),
+        (lambda t: t.update(triangles=t["triangles"].float()), "triangles"),
+        (lambda t: t.update(splats=t["splats"].double()), "splats"),
+        (lambda t: t.update(splats=t["splats"][:, :-1].contiguous()), "splats"),
+        (lambda t: t.update(differences=t["differences"][:, :-1].contiguous()), "differences"),
+        (lambda t: t["moved_by"].__setitem__((0, 0), 255 - t["moved_by"][0, 0]), "differences"),
+    ],
+)
+def test_numbers_that_cannot_be_are_refused(tmp_path, change, says):
+    path = tmp_path / "x"
+    write(path)
+    altered(path, change)
+    with pytest.raises(InputError, match=says):
+        read(path)
+
+
+@pytest.mark.parametrize("said", ["", "-3", "fifty", "61", "20"])
+def test_a_wrong_number_of_expressions_is_refused(tmp_path, said):
+    path = tmp_path / "x"
+    write(path)
+    altered(path, lambda tensors: None, said)
+    with pytest.raises(InputError, match="expressions|moved_by"):
+        read(path)
+
+
+def test_a_file_cut_short_is_an_input_error(tmp_path):
+    path = tmp_path / "x"
+    write(path)
+    path.write_bytes(path.read_bytes()[:500])
+    with pytest.raises(InputError, match="safetensors"):
+        read(path)
