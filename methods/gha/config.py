@@ -31,12 +31,19 @@ class GHAConfig:
     geometry_hidden, expression_color_hidden, ... : widths of the networks' hidden layers.
     sr_widths : widths of the super-resolution network's blocks. The first works at the splatted size, each further
         one at twice the size before: their number decides by how much splats are drawn smaller than the image.
-    scale_expression : divide each driving value by its root mean square over the training timesteps. The published
-        networks take the raw values, and in a short run hardly notice the jaw's tenths of a radian.
+    residual : let super-resolution add to the splatted colours instead of making colours, as published, of nothing;
+        a short run then starts where splatting alone arrives, and splatting with the colours of the mesh stage.
+    at_rest : start deformation and attribute networks with outputs of zero instead of small random ones.
+    angle_unit : radians of jaw and eye angles that count as 1 in the expression code. Expression coefficients are of
+        the order of 1, and beside them a short run hardly notices a jaw's tenths of a radian.
+    expression_noise : standard deviation of what is added to each driving value in training, drawn anew in every
+        iteration. A few timesteps leave most directions of the code unseen, in which networks then do as they like;
+        noise keeps them from it. 0 as published.
     displacement_scale, attribute_scale : factors of the networks' outputs.
     initial_opacity : of all Gaussians.
     mesh_views, mesh_size : views of a timestep in one iteration of the mesh stage, and the longer side of their images
         in pixels; smaller images stay as they are.
+    landmark_weight : of the mean squared distance, in square units, between moved and tracked landmarks.
     mesh_lr, landmark_lr : learning rates of the mesh stage.
     network_lr, position_lr, feature_lr, rotation_lr, scale_lr, opacity_lr, correction_lr : of the Gaussian stage, the
         last one for the corrections of the tracked head pose, one for each training timestep.
@@ -72,12 +79,16 @@ class GHAConfig:
     expression_attribute_hidden: tuple[int, ...] = (256, 256, 256)
     pose_attribute_hidden: tuple[int, ...] = (128, 128)
     sr_widths: tuple[int, ...] = (128, 64, 32)
-    scale_expression: bool = False
+    residual: bool = False
+    at_rest: bool = False
+    angle_unit: float = 1.0
+    expression_noise: float = 0.0
     displacement_scale: float = 0.3
     attribute_scale: float = 0.2
     initial_opacity: float = 0.3
     mesh_views: int = 4
     mesh_size: int = 256
+    landmark_weight: float = 1.0
     mesh_lr: float = 1e-3
     landmark_lr: float = 1e-4
     network_lr: float = 1e-4
@@ -111,10 +122,10 @@ class GHAConfig:
             raise ValueError(f"sr_widths must name one width at least, all above 0, found {self.sr_widths}")
         if self.max_points is not None and self.max_points < 1:
             raise ValueError(f"max_points must be at least 1 or null, found {self.max_points}")
-        if not self.unit > 0:
-            raise ValueError(f"unit must be above 0 metres, found {self.unit}")
-        if min(self.mouth_points, self.start_steps) < 0:
-            raise ValueError("mouth_points and start_steps must not be negative")
+        if not self.unit > 0 or not self.angle_unit > 0:
+            raise ValueError(f"unit and angle_unit must be above 0, found {self.unit} and {self.angle_unit}")
+        if min(self.mouth_points, self.start_steps, self.expression_noise) < 0:
+            raise ValueError("mouth_points, start_steps and expression_noise must not be negative")
 
     @property
     def upscale(self) -> int:

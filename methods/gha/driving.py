@@ -25,6 +25,9 @@ from ...datasets.head.rotations import (
 POSE_SIZE = 6
 """Axis-angle and translation."""
 
+ANGLES = 9
+"""Of jaw and eyes in the expression code, after the expression."""
+
 
 class Signal(NamedTuple):
     """One timestep.
@@ -141,7 +144,7 @@ def expression_codes(arguments: Mapping[str, Tensor]) -> Tensor:
 
 def code_size(head: HeadAsset) -> int:
     """E of `expression_codes` for a head model."""
-    return head.expression_basis.shape[2] + 9 + (0 if head.eyelid_basis is None else 2)
+    return head.expression_basis.shape[2] + ANGLES + (0 if head.eyelid_basis is None else 2)
 
 
 def _principal(axis_angle: Tensor) -> Tensor:

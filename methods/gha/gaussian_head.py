@@ -59,7 +59,7 @@ class GaussianHead:
     @classmethod
     def of(cls, config: GHAConfig, expression_size: int) -> GaussianHead:
         """Networks of the configured widths."""
-        sharpener = SuperResolution(config.channels, config.sr_widths)
+        sharpener = SuperResolution(config.channels, config.sr_widths, config.residual)
         return cls(config, Controllers.of(config, expression_size), sharpener)
 
     def shapes(self) -> dict[str, tuple[int, ...]]:

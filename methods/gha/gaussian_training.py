@@ -19,7 +19,7 @@ from ..training.optimiser import Optimiser
 from ..training.sampling import Sampler
 from ..training.schedule import Timeline, log_linear
 from .config import GHAConfig
-from .driving import POSE_SIZE
+from .driving import POSE_SIZE, Signal
 from .gaussian_head import Drawn, GaussianHead
 from .landmarks import mouth_box
 from .mesh_head import MeshHead, Surface
@@ -95,7 +95,7 @@ class GaussianTraining:
         view = scene.views[key.camera]
         truth = self._images.get(iteration, index)
         tensors = _With(self._optimiser, self._landmarks)
-        signal = scene.signals[row]
+        signal = self._wavering(scene.signals[row], iteration)
         motion = scene.driver.motion(signal, self._optimiser["corrections"][row])
         drawn = head.draw(head.splats(tensors, signal, motion), view.camera, scene.background)
         padded = _padded(truth, view.camera, config.upscale, scene.background)
@@ -109,6 +109,14 @@ class GaussianTraining:
             planes = (values.permute(2, 0, 1).contiguous() for values in (image, padded))
             loss = loss + config.structure_weight * (1 - mean_ssim(*planes))
         return loss
+
+    def _wavering(self, signal: Signal, iteration: int) -> Signal:
+        """The signal with noise on its expression code, where that is asked for."""
+        if not self._config.expression_noise:
+            return signal
+        generator = torch_generator(self._scene.seed, "gha-expression", iteration)
+        noise = torch.randn(len(signal.expression), generator=generator).to(signal.expression)
+        return signal._replace(expression=signal.expression + self._config.expression_noise * noise)
 
     def after_backward(self, iteration: int) -> None:
         """Learning rates over the last half of a short run."""

@@ -92,7 +92,8 @@ class MeshHead:
     ) -> tuple[Tensor, Tensor, Tensor]:
         """(V, 3) vertices in the world, (V, 3) colours, and the mean squared displacement.
 
-        As published, the pose network sees the vertices that the expression network moved.
+        As published, the pose network sees the vertices that the expression network moved, and a sigmoid makes the
+        colours. Without it (``residual``) the Gaussians, which have none, start with the mesh's colours.
         """
         c, nets = self.config, self.controllers
         near, far = influences(surface.vertices, landmarks, c.near_squared, c.far_squared)
@@ -108,7 +109,7 @@ class MeshHead:
         displaced = displaced + (by_pose.square().sum(1).mean() if len(moved) else by_pose.sum())
         colors = nets.colors(weights, surface.features, (near, far), signal.expression, pose, channels=3)
         world = c.unit * vertices @ motion.rotation.t() + motion.translation
-        return world, torch.sigmoid(colors), displaced
+        return world, colors if c.residual else torch.sigmoid(colors), displaced
 
 
 def vertex_discs(vertices: Tensor, faces: Tensor) -> WorldSplats:
@@ -137,9 +138,8 @@ def vertex_discs(vertices: Tensor, faces: Tensor) -> WorldSplats:
 
 
 def _turn_z_to(directions: Tensor) -> Tensor:
-    """(N, 4) quaternions wxyz, of any length, that turn the z axis to (N, 3) directions of any length."""
+    """(N, 4) quaternions wxyz, of any length, that turn the z axis to (N, 3) directions, or to the opposite of those
+    that point down: a disc has no sides, and half a turn would be undetermined."""
     unit = torch.nn.functional.normalize(directions, dim=1)
-    x, y, z = unit.unbind(1)
-    # Straight down the half-way vector vanishes; any turn about a horizontal axis then does.
-    w = (1 + z).clamp_min(1e-6)
-    return torch.stack([w, -y, x, torch.zeros_like(x)], dim=1)
+    x, y, z = torch.where(unit[:, 2:] < 0, -unit, unit).unbind(1)
+    return torch.stack([1 + z, -y, x, torch.zeros_like(x)], dim=1)

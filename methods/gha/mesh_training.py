@@ -21,8 +21,8 @@ from .scene import Scene
 from .signed_distance import INNER_PARTS, TangentDistance
 from .tetrahedra import TetGrid, spacing_for, tet_grid
 
-COLOR, SILHOUETTE, LANDMARKS, DISPLACEMENT, DISTANCE, SMOOTHNESS = 0.1, 0.1, 1.0, 0.01, 0.1, 100.0
-"""Published weights of the losses."""
+COLOR, SILHOUETTE, DISPLACEMENT, DISTANCE, SMOOTHNESS = 0.1, 0.1, 0.01, 0.1, 100.0
+"""Published weights of the losses, but for that of the landmarks, which is a setting."""
 
 MARGIN = 0.3
 """Canonical units around the neutral mesh that the grid covers."""
@@ -77,7 +77,7 @@ class MeshTraining:
         surface = head.surface(weights, self.grid)
         distance, offset = head.landmark_offsets(weights, landmarks, self.grid.spacing)
         expressed = head.expressed(weights, landmarks, signal.expression) + offset
-        loss = LANDMARKS * F.mse_loss(expressed, self._tracked_landmarks[row])
+        loss = self._config.landmark_weight * F.mse_loss(expressed, self._tracked_landmarks[row])
         loss = loss + DISTANCE * distance.abs().mean()
         if not len(surface.faces):
             return loss

@@ -8,8 +8,7 @@ between them as published.
 
 What is our own: the tracked head model stands for the published face model (`driving`), the mesh is drawn with discs
 (`mesh_head.vertex_discs`), 1 - SSIM stands for LPIPS (`GHAConfig.structure_weight`), pixels that nothing is drawn near
-are background, and short presets scale with the capture: the published design splats at 512 for images of 2048 pixels;
-they splat at half the capture's size or more, with fewer points, features and channels, without resizing the capture.
+are background. Short presets scale with the capture (`presets`), without resizing it.
 """
 
 from __future__ import annotations

@@ -34,6 +34,7 @@ class Mlp:
     name : prefix of its tensors, ``NAME.weight_K`` (out, in) and ``NAME.bias_K`` (out,).
     point_inputs, condition_inputs : sizes of the two parts of the input, in this order.
     hidden, outputs : widths of the layers.
+    at_rest : start with outputs of zero, by a last layer of zero.
     """
 
     name: str
@@ -41,6 +42,7 @@ class Mlp:
     condition_inputs: int
     hidden: tuple[int, ...]
     outputs: int
+    at_rest: bool = False
 
     @property
     def widths(self) -> tuple[int, ...]:
@@ -59,7 +61,14 @@ class Mlp:
 
     def initial(self, generator: torch.Generator, device: str = "cpu") -> dict[str, Tensor]:
         """Weights and biases uniform within 1 / sqrt(inputs) of a layer."""
-        return uniform(self.shapes(), generator, device)
+        tensors = uniform(self.shapes(), generator, device)
+        if self.at_rest:
+            last = len(self.hidden)
+            tensors |= {
+                name: torch.zeros_like(tensors[name])
+                for name in (f"{self.name}.weight_{last}", f"{self.name}.bias_{last}")
+            }
+        return tensors
 
     def __call__(
         self, weights: Weights, points: Tensor, condition: Tensor | None = None, outputs: int | None = None

@@ -1,8 +1,9 @@
 """Presets of GHA that scale with the capture, for CPUs. Light: nothing is imported.
 
 The published design (`config`) splats 32 channels at 512 pixels for images of 2048, with networks of 836,000 numbers
-over some 100,000 Gaussians: hours on a GPU. These presets keep the capture's own size and splat at half of it, with
-fewer Gaussians than the capture has pixels and networks to match; the proportions of the design stay.
+over some 100,000 Gaussians: hours on a GPU. These presets take the capture at its own size, with fewer Gaussians than
+it has pixels and networks to match. "demo" and "smoke" are for captures smaller than what the published design splats,
+so they splat at the full size, and one block sharpens; "fast" splats at half of it.
 """
 
 from __future__ import annotations
@@ -25,10 +26,16 @@ _SHORT: dict[str, Any] = {
     "pose_deform_hidden": (64, 64),
     "expression_attribute_hidden": (64, 64),
     "pose_attribute_hidden": (32,),
-    "sr_widths": (32, 16),
-    "scale_expression": True,
+    "sr_widths": (16,),
+    "residual": True,
+    "initial_opacity": 0.7,
+    "at_rest": True,
+    "angle_unit": 0.2,
+    "expression_noise": 0.2,
     "mesh_views": 2,
     "mesh_size": 96,
+    "landmark_weight": 30.0,
+    "mesh_lr": 2e-3,
     "network_lr": 2e-3,
     "position_lr": 5e-4,
     "feature_lr": 5e-3,
@@ -42,5 +49,5 @@ _SHORT: dict[str, Any] = {
 GHA_SHORT: dict[str, dict[str, Any]] = {
     "smoke": {"budget": {"iterations": 60}, **_SHORT, "max_points": 2_000},
     "demo": {"budget": {"iterations": 1_200}, **_SHORT},
-    "fast": {"budget": {"iterations": 8_000}, **_SHORT},
+    "fast": {"budget": {"iterations": 8_000}, **_SHORT, "max_points": 20_000, "sr_widths": (32, 16)},
 }

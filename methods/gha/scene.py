@@ -13,11 +13,8 @@ from ...bench.contracts import Clip, FrameKey, IntArray
 from ..avatar_files import Subject
 from ..views import View, view_of
 from .config import GHAConfig
-from .driving import Driver, Signal, expression_codes
+from .driving import ANGLES, Driver, Signal, code_size
 from .landmarks import landmark_vertices
-
-SMALLEST_SCALE = 0.05
-"""Least divisor of a driving value, so that one which hardly moves in training is not magnified more than 20 times."""
 
 
 class Scene(NamedTuple):
@@ -67,10 +64,9 @@ def scene_of(clip: Clip, config: GHAConfig, device: str, seed: int) -> Scene:
     rows = landmark_vertices(clip.head, neutral, config.landmarks)
     timesteps = sorted({key.timestep for key in clip.splits["train"]})
     tracked = plain.arguments([clip.poses[timestep] for timestep in timesteps])
-    codes = expression_codes(tracked)
-    scale = torch.ones_like(codes[0])
-    if config.scale_expression:
-        scale = codes.square().mean(0).sqrt().clamp_min(SMALLEST_SCALE)
+    scale = torch.ones(code_size(clip.head), device=device)
+    expressions = clip.head.expression_basis.shape[2]
+    scale[expressions : expressions + ANGLES] = config.angle_unit
     driver = Driver(*identity, neutral[rows].mean(0), config.unit, scale, device)
     return Scene(
         clip=clip,

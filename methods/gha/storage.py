@@ -36,6 +36,7 @@ RENDERING = (
     "expression_attribute_hidden",
     "pose_attribute_hidden",
     "sr_widths",
+    "residual",
     "displacement_scale",
     "attribute_scale",
 )

@@ -23,10 +23,13 @@ class SuperResolution:
     ----------
     channels : of the feature image.
     widths : channels of the blocks.
+    residual : give what is to be added to the splatted colours, enlarged bilinearly, instead of the colours; there is
+        no sigmoid then, and the start is nothing to be added.
     """
 
     channels: int
     widths: tuple[int, ...]
+    residual: bool = False
 
     @property
     def upscale(self) -> int:
@@ -44,11 +47,14 @@ class SuperResolution:
         return {**shapes, "sr.color": (3, before, 1, 1), "sr.color_bias": (3,)}
 
     def initial(self, generator: torch.Generator, device: str) -> dict[str, Tensor]:
-        """Weights uniform within 1 / sqrt(fan-in)."""
-        return uniform(self.shapes(), generator, device)
+        """Weights uniform within 1 / sqrt(fan-in), the last layer's zero for a residual."""
+        tensors = uniform(self.shapes(), generator, device)
+        if self.residual:
+            tensors |= {name: torch.zeros_like(tensors[name]) for name in ("sr.color", "sr.color_bias")}
+        return tensors
 
     def __call__(self, weights: Weights, features: Tensor) -> Tensor:
-        """(u H, u W, 3) colours in (0, 1) of an (H, W, C) feature image."""
+        """(u H, u W, 3) colours of an (H, W, C) feature image, in (0, 1) unless they are a residual."""
         values = features.permute(2, 0, 1)[None]
         for block in range(len(self.widths)):
             if block:
@@ -58,10 +64,18 @@ class SuperResolution:
                 values = F.conv2d(values, weights[f"sr.conv_{block}_{layer}"], padding=1)
                 values = F.relu(_normalised(values))
         colors = F.conv2d(values, weights["sr.color"], weights["sr.color_bias"])
-        return torch.sigmoid(colors)[0].permute(1, 2, 0)
+        if not self.residual:
+            return torch.sigmoid(colors)[0].permute(1, 2, 0)
+        plain = features[..., :3].permute(2, 0, 1)[None]
+        if self.upscale > 1:
+            plain = F.interpolate(plain, colors.shape[2:], mode="bilinear", align_corners=False)
+        return (plain + colors)[0].permute(1, 2, 0)
 
 
 def _normalised(values: Tensor) -> Tensor:
-    """Each channel with mean 0 and variance 1 over the image, of one pixel too (then 0)."""
-    variance, mean = torch.var_mean(values, dim=(2, 3), correction=0, keepdim=True)
-    return (values - mean) * torch.rsqrt(variance + VARIANCE_FLOOR)
+    """Each channel with mean 0 and variance 1 over the image: instance normalisation.
+
+    Of one image that is what batch normalisation does, and torch's kernel for it takes an image of one pixel too
+    (which becomes 0).
+    """
+    return torch.native_batch_norm(values, None, None, None, None, True, 0.0, VARIANCE_FLOOR)[0]

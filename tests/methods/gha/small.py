@@ -6,7 +6,7 @@ SMALL = {
     "start": "mesh",
     "start_steps": 20,
     "mesh_fraction": 0.4,
-    "grid_vertices": 1_500,
+    "grid_vertices": 700,
     "subdivide": False,
     "max_points": 500,
     "mouth_points": 20,

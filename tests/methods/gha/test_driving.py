@@ -1,0 +1,107 @@
+"""The canonical frame and its motion are those of the head model."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from headbench.bench.errors import InputError
+from headbench.datasets.head.head_frame import rigid_motions
+from headbench.methods.gha.driving import Driver, code_size, expression_codes
+
+from ...datasets.head.toy import toy_head
+from ..toy_clip import toy_pose
+
+UNIT = 0.1
+ORIGIN = np.array([0.01, -0.02, 0.05])
+
+
+@pytest.fixture(scope="module")
+def rigged():
+    head = toy_head(16, eyelids=True)
+    rng = np.random.default_rng(5)
+    shape, offset = rng.normal(size=head.shape_basis.shape[2]), 1e-3 * rng.normal(size=head.template.shape)
+    driver = Driver(head, shape, offset, ORIGIN, UNIT, None, "cpu")
+    poses = [replace(toy_pose(head, rng, t, "toy"), rotation=rng.normal(size=3)) for t in range(4)]
+    return head, shape, offset, driver, poses
+
+
+def test_motion_is_the_head_models_rigid_motion(rigged):
+    head, shape, offset, driver, poses = rigged
+    expected = rigid_motions(head, shape, offset, poses)
+    for signal, whole in zip(driver.signals(driver.arguments(poses)), expected):
+        motion = driver.motion(signal)
+        np.testing.assert_allclose(motion.rotation, whole[:3, :3], atol=1e-6)
+        np.testing.assert_allclose(motion.translation, whole[:3, :3] @ ORIGIN + whole[:3, 3], atol=1e-6)
+        turn = Rotation.from_rotvec(motion.code[:3].numpy()).as_matrix()
+        np.testing.assert_allclose(turn, whole[:3, :3], atol=1e-6)
+        np.testing.assert_allclose(motion.code[3:], motion.translation)
+
+
+def test_a_correction_is_added_to_the_tracked_rotation_and_translation(rigged):
+    _, _, _, driver, poses = rigged
+    change = np.array([0.1, -0.2, 0.05, 0.01, 0.02, -0.03], np.float32)
+    changed = replace(
+        poses[0],
+        rotation=np.asarray(poses[0].rotation, np.float32) + change[:3],
+        translation=np.asarray(poses[0].translation) + change[3:],
+    )
+    before, after = driver.signals(driver.arguments([poses[0], changed]))
+    corrected, expected = driver.motion(before, torch.from_numpy(change)), driver.motion(after)
+    for one, other in zip(corrected, expected):
+        np.testing.assert_allclose(one, other, atol=1e-6)
+
+
+def test_motion_is_differentiable_in_the_correction(rigged):
+    _, _, _, driver, poses = rigged
+    signal = driver.signals(driver.arguments(poses[:1]))[0]
+    exact = signal._replace(**{name: getattr(signal, name).double() for name in signal._fields})
+    driver = Driver(*rigged[:3], ORIGIN, UNIT, None, "cpu")
+    driver.origin = driver.origin.double()
+    correction = torch.full((6,), 0.01, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda c: driver.motion(exact, c), (correction,))
+
+
+def test_the_unposed_head_moves_to_the_world_by_the_motion(rigged):
+    """Vertices that hang on the neck joint alone go rigidly, up to the neck's pose correctives."""
+    head, _, _, driver, poses = rigged
+    poses = [replace(pose, jaw=np.zeros(3), eyes=np.zeros(6), neck=np.zeros(3)) for pose in poses]
+    arguments = driver.arguments(poses)
+    canonical = driver.unposed(arguments)
+    world = driver.model(canonical=driver.neutral[None], **arguments)
+    rigid = np.flatnonzero(head.skinning_weights[:, 1] > 0.999)
+    assert len(rigid) > 20
+    for row, signal in enumerate(driver.signals(arguments)):
+        motion = driver.motion(signal)
+        placed = UNIT * canonical[row] @ motion.rotation.t() + motion.translation
+        np.testing.assert_allclose(placed[rigid], world[row][rigid], atol=2e-5)
+
+
+def test_the_code_holds_expression_jaw_eyes_and_eyelids(rigged):
+    head, _, _, driver, poses = rigged
+    pose = replace(poses[0], jaw=np.array([0.2, 0.1, 0.0]), eyelids=np.array([0.3, 0.6]))
+    turned = replace(pose, jaw=pose.jaw * (1 + 2 * np.pi / np.linalg.norm(pose.jaw)))
+    codes = expression_codes(driver.arguments([pose, turned])).numpy()
+    expected = np.concatenate([pose.expression, pose.jaw, pose.eyes, pose.eyelids])
+    assert codes.shape == (2, code_size(head)) == (2, head.expression_basis.shape[2] + 11)
+    np.testing.assert_allclose(codes[0], expected, atol=1e-6)
+    np.testing.assert_allclose(codes[1], expected, atol=1e-5)
+    scaled = Driver(*rigged[:3], ORIGIN, UNIT, torch.full((codes.shape[1],), 0.5), "cpu")
+    np.testing.assert_allclose(
+        scaled.signals(driver.arguments([pose]))[0].expression, 2 * codes[0], rtol=1e-6
+    )
+
+
+def test_a_pose_gives_the_same_signal_in_any_company(rigged):
+    _, _, _, driver, poses = rigged
+    alone = driver.signals(driver.arguments([poses[2]]))[0]
+    among = driver.signals(driver.arguments(poses))[2]
+    assert all(torch.equal(one, other) for one, other in zip(alone, among))
+
+
+def test_another_head_models_pose_is_refused(rigged):
+    _, _, _, driver, poses = rigged
+    with pytest.raises(InputError, match="head_model"):
+        driver.arguments([replace(poses[0], head_model="other")])

@@ -1,0 +1,138 @@
+"""The Gaussian stage: gradients of the whole model, its images, and what it prepares of them."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from headbench.methods.gha.driving import Motion, Signal
+from headbench.methods.gha.gaussian_head import Drawn, GaussianHead, enlarged, near_drawn
+from headbench.methods.gha.gaussian_training import reduced, zoomed
+
+from ..toy_clip import look_at
+from .small import small_config
+
+COUNT, CODE = 12, 4
+
+
+def model(**more):
+    """A tiny head in float64, with random tensors, and how it is driven."""
+    config = small_config(features=3, channels=4, sr_widths=(3, 3), unit=0.05, **more)
+    head = GaussianHead.of(config, CODE)
+    generator = torch.Generator().manual_seed(1)
+
+    def random(*shape, scale=1.0):
+        return scale * torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    tensors = {name: random(*shape, scale=0.5) for name, shape in head.shapes().items()}
+    tensors |= {
+        "points": random(COUNT, 3, scale=0.6),
+        "features": random(COUNT, 3),
+        "log_scales": random(COUNT, 3, scale=0.2) - 1.0,
+        "quats": random(COUNT, 4),
+        "opacities": random(COUNT),
+        "landmarks": random(3, 3, scale=0.6),
+    }
+    turn = torch.tensor(Rotation.from_rotvec([0.2, -0.1, 0.3]).as_matrix())
+    motion = Motion(turn, random(3, scale=0.01), random(6))
+    empty = torch.zeros(3, dtype=torch.float64)
+    signal = Signal(random(CODE), empty, empty, empty, torch.zeros(2, 3, dtype=torch.float64))
+    camera = look_at(np.array([0.0, 0.05, 0.4]), np.zeros(3), "c", 10, 12)
+    return head, tensors, signal, motion, camera
+
+
+@pytest.mark.parametrize("residual", [False, True])
+def test_gradients_of_the_whole_model_agree_with_finite_differences(residual):
+    """Every tensor and the motion, through networks, splatting and super-resolution, along random directions."""
+    head, tensors, signal, motion, camera = model(residual=residual)
+    ground = torch.tensor([1.0, 0.5, 0.25], dtype=torch.float64)
+    generator = torch.Generator().manual_seed(2)
+    target = torch.rand(12, 10, 3, generator=generator, dtype=torch.float64)
+
+    def loss(values, motion):
+        drawn = head.draw(head.splats(values, signal, motion), camera, ground)
+        image = head.sharpen(values, drawn, ground)
+        return (image - target).square().sum() + drawn.features[..., :3].square().sum()
+
+    variables = {
+        name: value.clone().requires_grad_() for name, value in tensors.items() if name != "landmarks"
+    }
+    parts = [value.clone().requires_grad_() for value in motion]
+    loss({**tensors, **variables}, Motion(*parts)).backward()
+    step = 1e-6
+    for name in [*variables, *Motion._fields]:
+        variable = variables[name] if name in variables else parts[Motion._fields.index(name)]
+        direction = torch.randn(variable.shape, generator=generator, dtype=torch.float64)
+
+        def moved(amount, name=name, direction=direction):
+            if name in tensors:
+                return loss({**tensors, name: tensors[name] + amount * direction}, motion).item()
+            return loss(tensors, motion._replace(**{name: getattr(motion, name) + amount * direction})).item()
+
+        numeric = (moved(step) - moved(-step)) / (2 * step)
+        exact = (variable.grad * direction).sum().item()
+        assert exact == pytest.approx(numeric, rel=2e-4, abs=2e-6), name
+
+
+def test_a_rigid_motion_turns_splats_and_their_covariances():
+    head, tensors, signal, motion, _ = model()
+    still = motion._replace(rotation=torch.eye(3, dtype=torch.float64), translation=torch.zeros(3).double())
+    before, after = (head.splats(tensors, signal, m).world for m in (still, motion))
+    np.testing.assert_allclose(
+        after.means, before.means @ motion.rotation.t() + motion.translation, atol=1e-12
+    )
+    np.testing.assert_allclose(after.scales, before.scales)
+    turns = [Rotation.from_quat(w.quats.numpy()[:, [1, 2, 3, 0]]).as_matrix() for w in (before, after)]
+    np.testing.assert_allclose(turns[1], motion.rotation.numpy() @ turns[0], atol=1e-12)
+
+
+def test_splats_stay_bounded_however_wild_the_expression():
+    head, tensors, signal, motion, _ = model()
+    wild = signal._replace(expression=torch.full((CODE,), 1e5, dtype=torch.float64))
+    splats = head.splats(tensors, wild, motion)
+    for values in (*splats.world, splats.opacities, splats.features):
+        assert torch.isfinite(values).all()
+    assert splats.world.scales.max() <= 0.05 * np.exp(2.0) * (1 + 1e-12)
+    moved = (splats.world.means - motion.translation) @ motion.rotation / 0.05
+    assert (moved - tensors["points"]).abs().max() <= 0.3 + 1e-9
+
+
+def test_only_drawn_surroundings_are_coloured():
+    alpha = torch.zeros(9, 9)
+    alpha[2, 3] = 0.5
+    near = near_drawn(alpha)
+    expected = torch.zeros(9, 9)
+    expected[0:5, 1:6] = 1
+    assert torch.equal(near, expected)
+    large = enlarged(near, 2)
+    assert large.shape == (18, 18)
+    assert torch.equal(large[1::2, ::2], near)
+
+
+@given(st.integers(1, 5), st.integers(1, 4), st.integers(1, 4))
+@settings(max_examples=20, deadline=None)
+def test_reduction_takes_means_or_as_published_every_nth_pixel(height, width, factor):
+    image = torch.rand(height * factor, width * factor, 3, dtype=torch.float64)
+    blocks = image.reshape(height, factor, width, factor, 3)
+    np.testing.assert_allclose(reduced(image, factor, "mean"), blocks.mean((1, 3)))
+    np.testing.assert_array_equal(reduced(image, factor, "gha"), blocks[:, 0, :, 0])
+
+
+def test_zoom_keeps_features_and_truth_together():
+    rows, columns = np.mgrid[:12, :16]
+    features = torch.tensor(np.stack([rows, columns, rows * 0 + 1], -1), dtype=torch.float64)
+    drawn, truth = Drawn(features, torch.ones(12, 16)), enlarged(features, 2)
+    same = zoomed(drawn, truth, 2, 1.0)
+    assert torch.equal(same[0].features, features)
+    assert torch.equal(same[1], truth)
+    smaller, small_truth = zoomed(drawn, truth, 2, 0.5)
+    assert torch.equal(smaller.alpha.bool(), (smaller.features[..., :2] != 1).any(-1) | (smaller.alpha > 0))
+    assert smaller.alpha[3:9, 4:12].all()
+    assert smaller.alpha.sum() == 6 * 8  # the rest is padding, drawn by nobody and one throughout
+    assert torch.equal(smaller.features[0], torch.ones(16, 3, dtype=torch.float64))
+    larger, _ = zoomed(drawn, truth, 2, 1.25)
+    assert larger.alpha.all()
+    assert larger.features[6, 8, 0].item() == 6
+    assert small_truth.shape == truth.shape
