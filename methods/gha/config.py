@@ -33,7 +33,8 @@ class GHAConfig:
         one at twice the size before: their number decides by how much splats are drawn smaller than the image.
     residual : let super-resolution add to the splatted colours instead of making colours, as published, of nothing;
         a short run then starts where splatting alone arrives, and splatting with the colours of the mesh stage.
-    at_rest : start deformation and attribute networks with outputs of zero instead of small random ones.
+    at_rest : start all controllers without an effect of expression and pose, deformation and attributes with outputs
+        of zero, instead of small random ones: what a short capture never shows then stays without effect.
     angle_unit : radians of jaw and eye angles that count as 1 in the expression code. Expression coefficients are of
         the order of 1, and beside them a short run hardly notices a jaw's tenths of a radian.
     expression_noise : standard deviation of what is added to each driving value in training, drawn anew in every

@@ -45,11 +45,10 @@ class Controllers:
         def pair(
             kind: str, inputs: int, hidden: tuple[tuple[int, ...], ...], outputs: int
         ) -> tuple[Mlp, Mlp]:
-            # What moves and changes points starts by leaving them alone, where that is asked for.
-            rest = config.at_rest and kind != "color"
+            starts = (config.at_rest, config.at_rest and kind != "color")
             return (
-                Mlp(f"expression_{kind}", inputs, expression_size, hidden[0], outputs, rest),
-                Mlp(f"pose_{kind}", inputs, pose, hidden[1], outputs, rest),
+                Mlp(f"expression_{kind}", inputs, expression_size, hidden[0], outputs, *starts),
+                Mlp(f"pose_{kind}", inputs, pose, hidden[1], outputs, *starts),
             )
 
         c = config

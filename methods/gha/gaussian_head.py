@@ -105,7 +105,7 @@ class GaussianHead:
 
     def sharpen(self, tensors: Weights, drawn: Drawn, background: Tensor) -> Tensor:
         """(u h, u w, 3) image of a feature image; ``background`` where nothing is drawn near."""
-        colors = self.super_resolution(tensors, drawn.features)
+        colors = self.super_resolution(tensors, drawn.features, drawn.alpha)
         near = enlarged(near_drawn(drawn.alpha), self.config.upscale)
         return torch.where(near[..., None] > 0, colors, background)
 

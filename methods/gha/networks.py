@@ -34,6 +34,8 @@ class Mlp:
     name : prefix of its tensors, ``NAME.weight_K`` (out, in) and ``NAME.bias_K`` (out,).
     point_inputs, condition_inputs : sizes of the two parts of the input, in this order.
     hidden, outputs : widths of the layers.
+    deaf : start without an effect of the condition, by weights of zero for it. What training never shows then has
+        none in the end, instead of a random one.
     at_rest : start with outputs of zero, by a last layer of zero.
     """
 
@@ -42,6 +44,7 @@ class Mlp:
     condition_inputs: int
     hidden: tuple[int, ...]
     outputs: int
+    deaf: bool = False
     at_rest: bool = False
 
     @property
@@ -49,19 +52,27 @@ class Mlp:
         """Width of the input and of each layer's output, as published."""
         return (self.point_inputs + self.condition_inputs, *self.hidden, self.outputs)
 
+    @property
+    def _again(self) -> int:
+        """The layer that the inputs come into once more; 0 where there is one layer alone."""
+        return len(self.widths) // 2 if self.hidden else 0
+
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Shape of every tensor, by name."""
         widths = self.widths
         shapes: dict[str, tuple[int, ...]] = {}
         for layer in range(len(widths) - 1):
-            again = widths[0] if layer == len(widths) // 2 else 0
-            shapes[f"{self.name}.weight_{layer}"] = (widths[layer + 1], widths[layer] + again)
+            extra = widths[0] if layer and layer == self._again else 0
+            shapes[f"{self.name}.weight_{layer}"] = (widths[layer + 1], widths[layer] + extra)
             shapes[f"{self.name}.bias_{layer}"] = (widths[layer + 1],)
         return shapes
 
     def initial(self, generator: torch.Generator, device: str = "cpu") -> dict[str, Tensor]:
         """Weights and biases uniform within 1 / sqrt(inputs) of a layer."""
         tensors = uniform(self.shapes(), generator, device)
+        if self.deaf and self.condition_inputs:
+            for layer in {0, self._again}:
+                tensors[f"{self.name}.weight_{layer}"][:, -self.condition_inputs :] = 0
         if self.at_rest:
             last = len(self.hidden)
             tensors |= {
@@ -83,7 +94,7 @@ class Mlp:
             weight, bias = weights[f"{self.name}.weight_{layer}"], weights[f"{self.name}.bias_{layer}"]
             if layer == count - 1 and outputs is not None:
                 weight, bias = weight[:outputs], bias[:outputs]
-            again = layer > 0 and layer == len(self.widths) // 2
+            again = layer > 0 and layer == self._again
             if layer == 0 or again:
                 start = self.widths[layer] if again else 0
                 if condition is not None:

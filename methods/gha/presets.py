@@ -31,7 +31,7 @@ _SHORT: dict[str, Any] = {
     "initial_opacity": 0.7,
     "at_rest": True,
     "angle_unit": 0.2,
-    "expression_noise": 0.2,
+    "expression_noise": 0.3,
     "mesh_views": 2,
     "mesh_size": 96,
     "landmark_weight": 30.0,

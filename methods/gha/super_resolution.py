@@ -23,8 +23,8 @@ class SuperResolution:
     ----------
     channels : of the feature image.
     widths : channels of the blocks.
-    residual : give what is to be added to the splatted colours, enlarged bilinearly, instead of the colours; there is
-        no sigmoid then, and the start is nothing to be added.
+    residual : add to the splatted colours, enlarged bilinearly, as far as something is drawn, instead of making
+        colours; there is no sigmoid then, and the start is nothing to be added.
     """
 
     channels: int
@@ -53,8 +53,8 @@ class SuperResolution:
             tensors |= {name: torch.zeros_like(tensors[name]) for name in ("sr.color", "sr.color_bias")}
         return tensors
 
-    def __call__(self, weights: Weights, features: Tensor) -> Tensor:
-        """(u H, u W, 3) colours of an (H, W, C) feature image, in (0, 1) unless they are a residual."""
+    def __call__(self, weights: Weights, features: Tensor, alpha: Tensor) -> Tensor:
+        """(u H, u W, 3) colours of an (H, W, C) feature image with its (H, W) alpha; in (0, 1) without ``residual``."""
         values = features.permute(2, 0, 1)[None]
         for block in range(len(self.widths)):
             if block:
@@ -66,10 +66,10 @@ class SuperResolution:
         colors = F.conv2d(values, weights["sr.color"], weights["sr.color_bias"])
         if not self.residual:
             return torch.sigmoid(colors)[0].permute(1, 2, 0)
-        plain = features[..., :3].permute(2, 0, 1)[None]
+        plain = torch.cat([features[..., :3], alpha[..., None]], dim=2).permute(2, 0, 1)[None]
         if self.upscale > 1:
             plain = F.interpolate(plain, colors.shape[2:], mode="bilinear", align_corners=False)
-        return (plain + colors)[0].permute(1, 2, 0)
+        return (plain[:, :3] + plain[:, 3:] * colors)[0].permute(1, 2, 0)
 
 
 def _normalised(values: Tensor) -> Tensor:

@@ -121,14 +121,48 @@ def test_super_resolution_is_torchs_layers(widths):
             values = F.conv2d(values, weights[f"sr.conv_{block}_{layer}"], padding="same")
             values = torch.relu(torch.nn.InstanceNorm2d(values.shape[1])(values))
     expected = torch.sigmoid(F.conv2d(values, weights["sr.color"], weights["sr.color_bias"]))[0]
-    image = network(weights, features)
+    alpha = torch.rand(5, 7, generator=generator, dtype=torch.float64)
+    image = network(weights, features, alpha)
     assert image.shape == (5 * network.upscale, 7 * network.upscale, 3)
     assert torch.allclose(image, expected.permute(1, 2, 0), atol=1e-10)
+
+
+@pytest.mark.parametrize("widths", [(4,), (5, 3)])
+def test_a_residual_starts_as_the_splatted_colours_and_leaves_the_undrawn_alone(widths):
+    network = SuperResolution(6, widths, residual=True)
+    generator = torch.Generator().manual_seed(4)
+    weights = network.initial(generator, "cpu")
+    features = torch.rand(4, 5, 6, generator=generator)
+    alpha = torch.zeros(4, 5)
+    planes = features[None, ..., :3].permute(0, 3, 1, 2)
+    plain = torch.nn.Upsample(scale_factor=network.upscale, mode="bilinear")(planes)[0].permute(1, 2, 0)
+    assert torch.equal(network(weights, features, torch.ones(4, 5)), plain)
+    weights["sr.color_bias"] += 0.3
+    alpha[:, 4] = 1
+    image = network(weights, features, alpha)
+    clear = slice(0, 3 * network.upscale)
+    assert torch.equal(image[:, clear], plain[:, clear])
+    assert (image[:, -1] != plain[:, -1]).all()
+
+
+def test_a_deaf_network_at_rest_says_nothing_until_it_learns():
+    generator = torch.Generator().manual_seed(5)
+    points = torch.randn(6, 3, generator=generator)
+    one, other = torch.randn(2, 4, generator=generator)
+    for hidden in ((), (5,), (5, 6, 7)):
+        hearing, deaf = (Mlp("m", 3, 4, hidden, 2, deaf=silent) for silent in (False, True))
+        weights = deaf.initial(torch.Generator().manual_seed(6))
+        assert torch.equal(deaf(weights, points, one), deaf(weights, points, other))
+        weights = hearing.initial(torch.Generator().manual_seed(6))
+        assert not torch.equal(hearing(weights, points, one), hearing(weights, points, other))
+        resting = Mlp("m", 3, 4, hidden, 2, at_rest=True)
+        weights = resting.initial(torch.Generator().manual_seed(6))
+        assert torch.equal(resting(weights, points, one), torch.zeros(6, 2))
 
 
 def test_super_resolution_of_one_pixel_is_finite():
     network = SuperResolution(3, (4, 4, 4))
     weights = network.initial(torch.Generator().manual_seed(3), "cpu")
-    image = network(weights, torch.full((1, 1, 3), 1e6))
+    image = network(weights, torch.full((1, 1, 3), 1e6), torch.ones(1, 1))
     assert image.shape == (4, 4, 3)
     assert np.isfinite(image.numpy()).all()
