@@ -6,8 +6,9 @@ never compared.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from typing import Literal
 
 from .contracts import Clip, FrameKey, TaskName
 from .errors import InputError
@@ -16,7 +17,12 @@ from .files import digest
 TASK_TITLES: Mapping[str, str] = {
     "novel_view": "Novel view",
     "self_reenactment": "Self-reenactment",
+    "cross_reenactment": "Cross-reenactment",
+    "extremes": "Extremes",
 }
+
+TrialName = Literal["cross_reenactment", "extremes"]
+"""Tasks without ground truth: what is measured is how steady an avatar stays, and whose look it keeps."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +31,7 @@ class Protocol:
 
     Attributes
     ----------
-    task : names the split whose frames are scored.
+    task : names the split whose frames are scored, or a task without ground truth.
     keys : the frames, sorted; every method renders exactly these.
     excluded : frames left out, with the reason.
     clips : fingerprint of each subject's clip (images, cameras and driving signal).
@@ -33,9 +39,11 @@ class Protocol:
     background : colour that renders and truth are composited on.
     quantisation : how float renders become 8-bit frames.
     metric_profile : the named set of metric definitions.
+    conditions : what else decides the numbers, by name, where keys do not say it: what is shown and the limits it is
+        held to, for tasks without ground truth.
     """
 
-    task: TaskName
+    task: TaskName | TrialName
     keys: tuple[FrameKey, ...]
     excluded: tuple[tuple[FrameKey, str], ...]
     clips: tuple[tuple[str, str], ...]
@@ -43,6 +51,7 @@ class Protocol:
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
     quantisation: str = "round-to-8-bit"
     metric_profile: str = "canonical"
+    conditions: tuple[tuple[str, str], ...] = ()
 
     @property
     def id(self) -> str:
@@ -52,7 +61,10 @@ class Protocol:
     @property
     def hash(self) -> str:
         """First 12 hex digits of the digest of all fields."""
-        return digest(self.id, asdict(self))[:12]
+        fields = asdict(self)
+        if not self.conditions:
+            del fields["conditions"]  # so that protocols made before there were any keep their hashes
+        return digest(self.id, fields)[:12]
 
 
 def make_protocol(task: TaskName, clips: Sequence[Clip], max_frames: int | None = None) -> Protocol:
@@ -85,18 +97,48 @@ def make_protocol(task: TaskName, clips: Sequence[Clip], max_frames: int | None 
         keys += chosen
         sizes |= {(camera.width, camera.height) for camera in {clip.cameras[key.camera] for key in chosen}}
         excluded += sorted(clip.excluded.items())
-    backgrounds = {tuple(float(v) for v in clip.background) for clip in clips}
-    if len(backgrounds) != 1:
-        raise InputError("clips", "background", "one colour for all clips", f"{sorted(backgrounds)}")
-    red, green, blue = backgrounds.pop()
     return Protocol(
         task=task,
         keys=tuple(keys),
         excluded=tuple(excluded),
         clips=tuple(sorted((clip.subject, clip.fingerprint) for clip in clips)),
-        resolution=", ".join(f"{width}x{height}" for width, height in sorted(sizes)),
-        background=(red, green, blue),
+        resolution=_resolution(sizes),
+        background=_background(clips),
     )
+
+
+def make_trial_protocol(
+    task: TrialName,
+    clips: Sequence[Clip],
+    keys: Iterable[FrameKey],
+    sizes: Iterable[tuple[int, int]],
+    conditions: Mapping[str, str],
+) -> Protocol:
+    """Make the protocol of a task without ground truth: frames of ``sizes`` (width, height), shown as conditions say.
+
+    Raises `InputError` for clips on different backgrounds.
+    """
+    return Protocol(
+        task=task,
+        keys=tuple(sorted(set(keys))),
+        excluded=(),
+        clips=tuple(sorted({(clip.subject, clip.fingerprint) for clip in clips})),
+        resolution=_resolution(set(sizes)),
+        background=_background(clips),
+        conditions=tuple(sorted(conditions.items())),
+    )
+
+
+def _resolution(sizes: Iterable[tuple[int, int]]) -> str:
+    return ", ".join(f"{width}x{height}" for width, height in sorted(sizes))
+
+
+def _background(clips: Sequence[Clip]) -> tuple[float, float, float]:
+    backgrounds = {tuple(float(v) for v in clip.background) for clip in clips}
+    if len(backgrounds) != 1:
+        raise InputError("clips", "background", "one colour for all clips", f"{sorted(backgrounds)}")
+    red, green, blue = backgrounds.pop()
+    return red, green, blue
 
 
 def _evenly(frames: list[FrameKey], count: int | None) -> list[FrameKey]:

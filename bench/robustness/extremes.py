@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
 
+from ..adaptation import MethodNeeds
 from ..contracts import Camera, Clip, FloatArray, FrameKey, Progress
 from ..files import digest, write_json
+from ..protocol import Protocol, make_trial_protocol
 from ..stages import Job
 from ..store import to_frame, write_rows
 from .avatars import load
@@ -23,6 +25,8 @@ from .trial import (
     ROWS_FILE,
     Trial,
     cell_folder,
+    described,
+    needs_of,
     shoot,
     splats_of,
     summary,
@@ -31,7 +35,7 @@ from .trial import (
 )
 from .viewpoints import Viewpoint, turntable
 
-TASK = "extremes"
+TASK: Literal["extremes"] = "extremes"
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,25 +83,56 @@ def try_extremes(
     sheet shows.
     """
     plans = [plan_extremes(job.form.clip, settings) for job in jobs]
+    protocols = _protocols(jobs, plans)
     total = sum(len(plan.views) * len(plan.extremes) for plan in plans)
     done, rows, summaries, views = 0, [], [], []
     for job, plan in zip(jobs, plans):
         trials = _try(job, plan, cell_folder(out, job), _Offset(progress, done, total, job.name))
         done += len(trials)
-        rows += to_rows(job, TASK, trials, plan.fingerprint)
+        rows += to_rows(job, TASK, trials, protocols[needs_of(job)].hash)
         summaries.append(summary(job, trials))
         views.append([_described(view) for view in plan.views])
     write_rows(out / ROWS_FILE, to_frame(rows))
     record = {
         "settings": asdict(settings),
         "limits": {"views": asdict(VIEW_LIMITS), "expressions": asdict(EXPRESSION_LIMITS)},
+        "protocols": described(protocols.values()),
         "avatars": [
-            {**s, "views": v, "expressions": [e.name for e in p.extremes], "protocol": p.fingerprint}
-            for s, v, p in zip(summaries, views, plans)
+            {
+                **s,
+                "views": v,
+                "expressions": [e.name for e in p.extremes],
+                "protocol": protocols[needs_of(job)].hash,
+            }
+            for job, s, v, p in zip(jobs, summaries, views, plans)
         ],
     }
     write_json(out / RECORD_FILE, record)
     return summaries
+
+
+def _protocols(jobs: Sequence[Job], plans: Sequence[Plan]) -> dict[MethodNeeds, Protocol]:
+    """The protocol of each form of the clips: all subjects, every pair of view and expression."""
+    protocols = {}
+    for needs in {needs_of(job): None for job in jobs}:
+        own = [(job, plan) for job, plan in zip(jobs, plans) if needs_of(job) == needs]
+        protocols[needs] = make_trial_protocol(
+            TASK,
+            [job.clip for job, _ in own],
+            (
+                _key(job, e, n, v)
+                for job, plan in own
+                for n, e in enumerate(plan.extremes)
+                for v in plan.views
+            ),
+            ((v.camera.width, v.camera.height) for _, plan in own for v in plan.views),
+            {f"views and expressions of {job.clip.subject}": plan.fingerprint for job, plan in own},
+        )
+    return protocols
+
+
+def _key(job: Job, extreme: Extreme, number: int, view: Viewpoint) -> FrameKey:
+    return FrameKey(job.clip.subject, extreme.name, number, view.camera.id)
 
 
 @dataclass(frozen=True)
@@ -136,8 +171,7 @@ def _try(job: Job, plan: Plan, folder: Path, report: _Offset) -> list[Trial]:
         else:
             verdicts = [judge(m, r, EXPRESSION_LIMITS) for m, r in zip(measured, references)]
         trials += [
-            Trial(FrameKey(job.clip.subject, extreme.name, number, view.camera.id), verdict)
-            for view, verdict in zip(plan.views, verdicts)
+            Trial(_key(job, extreme, number, view), verdict) for view, verdict in zip(plan.views, verdicts)
         ]
     return trials
 

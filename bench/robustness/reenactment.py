@@ -5,18 +5,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+from ..adaptation import MethodNeeds
 from ..captures import open_clips
 from ..contracts import Avatar, Camera, Clip, FrameKey, Progress
 from ..errors import InputError
 from ..files import digest, write_json
 from ..frames import write_png
+from ..protocol import Protocol, make_trial_protocol
 from ..runner import adapt, make_jobs
 from ..stages import Job
 from ..store import RunFolder, to_frame, write_rows
 from .avatars import load, run_configuration
 from .expressions import training_poses
+from .identity import Look, identity, mean_known, of_recording
 from .retarget import RigidMean, check_heads, retarget
 from .settings import ReenactSettings
 from .stability import Limits, Measures, judge, typical
@@ -25,6 +28,8 @@ from .trial import (
     ROWS_FILE,
     Trial,
     cell_folder,
+    described,
+    needs_of,
     shoot,
     splats_of,
     summary,
@@ -32,7 +37,7 @@ from .trial import (
     write_frame,
 )
 
-TASK = "cross_reenactment"
+TASK: Literal["cross_reenactment"] = "cross_reenactment"
 REFERENCE_FRAMES = 12
 LIMITS = Limits(coverage=(0.67, 1.5), translucent_rise=0.15)
 """Against the median over the avatar's own training poses in the same view; the head turns and moves."""
@@ -86,23 +91,67 @@ def reenact(
     Under ``out`` it leaves the frames, those of the source beside them, the rows, and a record.
     """
     drives = plan_reenactment(jobs, settings)
+    protocols = _protocols(drives)
     total = sum(len(drive.keys) for drive in drives)
     rows, summaries, done = [], [], 0
     for drive in drives:
-        trials, frames = _drive(drive, out, progress, done, total)
+        look = Look.recorded(drive.job.form.clip, drive.camera.id, REFERENCE_FRAMES)
+        trials, frames = _drive(drive, look, out, progress, done, total)
         done += len(trials)
-        rows += to_rows(drive.job, TASK, trials, drive.fingerprint)
+        protocol = protocols[needs_of(drive.job)].hash
+        rows += to_rows(drive.job, TASK, trials, protocol)
         found = summary(drive.job, trials)
-        summaries.append({**found, "source": drive.source.clip.subject, "protocol": drive.fingerprint})
+        summaries.append({**found, "source": drive.source.clip.subject, "protocol": protocol})
+        summaries[-1]["identity"] = _identity(drive, look, trials)
         summaries[-1]["shown"] = frames
     write_rows(out / ROWS_FILE, to_frame(rows))
-    record = {"settings": asdict(settings), "limits": asdict(LIMITS), "avatars": summaries}
+    record = {
+        "settings": asdict(settings),
+        "limits": asdict(LIMITS),
+        "protocols": described(protocols.values()),
+        "avatars": summaries,
+    }
     write_json(out / RECORD_FILE, record)
     return summaries
 
 
+def _protocols(drives: Sequence[Drive]) -> dict[MethodNeeds, Protocol]:
+    """The protocol of each form of the clips: every target with every source."""
+    protocols = {}
+    for needs in {needs_of(drive.job): None for drive in drives}:
+        own = [drive for drive in drives if needs_of(drive.job) == needs]
+        protocols[needs] = make_trial_protocol(
+            TASK,
+            [clip for drive in own for clip in (drive.job.clip, drive.source.clip)],
+            (_target(drive, key) for drive in own for key in drive.keys),
+            ((drive.camera.width, drive.camera.height) for drive in own),
+            {f"{d.source.clip.subject} drives {d.job.clip.subject}": d.fingerprint for d in own},
+        )
+    return protocols
+
+
+def _target(drive: Drive, key: FrameKey) -> FrameKey:
+    return FrameKey(drive.job.clip.subject, f"{key.subject}/{key.sequence}", key.timestep, drive.camera.id)
+
+
+def _identity(drive: Drive, look: Look | None, trials: Sequence[Trial]) -> dict[str, float | None] | None:
+    """Mean identity of the driven frames, between that of the subject's and that of the source's own recordings."""
+    if look is None:
+        return None
+    target, source = drive.job.form.clip, drive.source.form.clip
+    own = [key for key in target.splits.get("self_reenactment", ()) if key.camera == drive.camera.id]
+    theirs = [drive.source.form.key(key) for key in drive.keys]
+    return {
+        "driven": mean_known(
+            [v.value for trial in trials for v in trial.verdicts if v.measure == "identity"]
+        ),
+        "own": of_recording(look, target, own, REFERENCE_FRAMES),
+        "source": of_recording(look, source, theirs, REFERENCE_FRAMES),
+    }
+
+
 def _drive(
-    drive: Drive, out: Path, progress: Progress, done: int, total: int
+    drive: Drive, look: Look | None, out: Path, progress: Progress, done: int, total: int
 ) -> tuple[list[Trial], list[dict[str, Any]]]:
     job, source, camera = drive.job, drive.source, drive.camera
     avatar, clip = load(job), job.form.clip
@@ -114,14 +163,14 @@ def _drive(
         driver = source.form.clip.poses[source.form.key(key).timestep]
         pose = retarget(driver, *means, job.clip.subject)
         frame, found = shoot(avatar, camera, pose, splats_of(avatar, pose), background)
-        target = FrameKey(job.clip.subject, f"{key.subject}/{key.sequence}", key.timestep, camera.id)
+        target = _target(drive, key)
         name = f"{key.subject}_{key.sequence}_{key.timestep:05d}"
         driven = cell_folder(out, job) / f"{name}_{camera.id}.png"
         original = out / "sources" / f"{name}_{key.camera}.png"
         write_frame(driven, frame)
         if not original.exists():
             write_png(original, source.clip.image(key))
-        trials.append(Trial(target, judge(found, reference, LIMITS)))
+        trials.append(Trial(target, [*judge(found, reference, LIMITS), identity(look, frame, camera, pose)]))
         frames.append(
             {
                 "key": str(target),

@@ -72,12 +72,13 @@ VIEW_LIMITS = Limits(coverage=(0.5, 2.0), translucent_rise=0.2)
 
 @dataclass(frozen=True)
 class Verdict:
-    """One measure of one frame and its limits. ``value`` is None where the avatar does not allow it to be measured."""
+    """One measure of one frame and its limits. ``value`` is None where it cannot be measured, ``absent`` says why."""
 
     measure: str
     value: float | None
     lower: float
     upper: float
+    absent: str = "the avatar gives no splats"
 
     @property
     def passed(self) -> bool:

@@ -3,26 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ..adaptation import MethodNeeds
 from ..contracts import Avatar, Camera, Frame, FrameKey, HeadPose
 from ..frames import quantise, write_png
+from ..protocol import Protocol
 from ..stages import Job
 from ..store import Row
 from .stability import Measures, Verdict, measure
 
 ROWS_FILE, RECORD_FILE, SHEET_FILE = "rows.parquet", "record.json", "contact_sheet.png"
-NO_SPLATS = "the avatar gives no splats"
 
 
 @dataclass(frozen=True)
 class Trial:
-    """A judged frame. ``key`` names pose and view; verdicts stand in the order of `stability.MEASURES`."""
+    """A judged frame. ``key`` names pose and view; verdicts stand in the order of `stability.MEASURES`, further ones after."""
 
     key: FrameKey
     verdicts: Sequence[Verdict]
@@ -67,7 +68,7 @@ def to_rows(job: Job, task: str, trials: Sequence[Trial], protocol: str) -> list
         for verdict in trial.verdicts:
             status, reason = "ok", ""
             if verdict.value is None:
-                status, reason = "missing", NO_SPLATS
+                status, reason = "missing", verdict.absent
             elif not verdict.passed:
                 status, reason = "failed", str(verdict)
             rows.append(
@@ -109,6 +110,17 @@ def summary(job: Job, trials: Sequence[Trial]) -> dict[str, Any]:
     }
 
 
+def described(protocols: Iterable[Protocol]) -> list[dict[str, Any]]:
+    """What a record says of the protocols that its rows name, each once."""
+    by_hash = {protocol.hash: protocol for protocol in protocols}
+    return [{"id": p.id, "hash": name, **asdict(p)} for name, p in sorted(by_hash.items())]
+
+
+def needs_of(job: Job) -> MethodNeeds:
+    """Cells of equal needs are shown the same frames, and so share a protocol."""
+    return MethodNeeds.of(job.method.spec)
+
+
 def _range(values: Sequence[float | None]) -> tuple[float | None, float | None]:
     """Least and largest finite value; None without any."""
     finite = [v for v in values if v is not None and math.isfinite(v)]
@@ -132,6 +144,11 @@ def table(summaries: Sequence[Mapping[str, Any]]) -> str:
             f"{s['subject']:<10} {s['method']:<16} {s['seed']:>4} {s['frames']:>6} {s['frames_broken']:>6}  "
             + " ".join(f"{text:>13}" for text in shown)
         )
+        if s.get("identity") is not None:
+            told = ", ".join(
+                f"{name} {value:.1f}" for name, value in s["identity"].items() if value is not None
+            )
+            lines.append(f"  colour difference from the subject's own look (CIEDE2000): {told}")
         lines += [f"  {b['key']}: {'; '.join(b['limits'])}" for b in s["broken"][:5]]
         if len(s["broken"]) > 5:
             lines.append(f"  and {len(s['broken']) - 5} more; all are in {RECORD_FILE}")

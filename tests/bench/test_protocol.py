@@ -1,10 +1,14 @@
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 
+from headbench.bench.contracts import FrameKey
 from headbench.bench.errors import InputError
-from headbench.bench.protocol import make_protocol
+from headbench.bench.files import digest
+from headbench.bench.protocol import make_protocol, make_trial_protocol
+
+SIZE = (8, 6)
 
 
 @pytest.fixture
@@ -23,10 +27,28 @@ def test_every_field_changes_the_hash(clip):
         "background": (0.0, 0.0, 0.0),
         "quantisation": "floor",
         "metric_profile": "3dgs",
+        "conditions": (("who drives", "another"),),
     }
     hashes = {replace(protocol, **{name: value}).hash for name, value in changes.items()}
     assert len(hashes | {protocol.hash}) == len(changes) + 1
     assert make_protocol("novel_view", [clip]).hash == protocol.hash
+
+
+def test_a_protocol_without_conditions_keeps_the_hash_it_had_before_there_were_any(clip):
+    protocol = make_protocol("novel_view", [clip])
+    fields = {name: value for name, value in asdict(protocol).items() if name != "conditions"}
+    assert protocol.hash == digest(protocol.id, fields)[:12]
+
+
+def test_trials_are_keyed_whatever_the_order_they_are_made_in(clip):
+    keys = [FrameKey("subject1", "pc1+2", t, "view") for t in range(3)]
+    made = make_trial_protocol(
+        "extremes", [clip, clip], [*keys[::-1], keys[0]], [SIZE, SIZE], {"b": "2", "a": "1"}
+    )
+    again = make_trial_protocol("extremes", [clip], keys, [SIZE], {"a": "1", "b": "2"})
+    assert made == again
+    assert made.resolution == "8x6"
+    assert made.id == "extremes/canonical/1"
 
 
 def test_keys_do_not_depend_on_the_order_of_the_split(clip):

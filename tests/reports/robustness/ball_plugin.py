@@ -30,7 +30,10 @@ class BallClip:
             template=corners,
             shape_basis=np.zeros((8, 3, 1)),
             expression_basis=np.zeros((8, 3, 3)),
-            joint_regressor=np.full((1, 8), 1 / 8),
+            joint_regressor=np.full((2, 8), 1 / 8),
+            skinning_weights=np.tile([1.0, 0.0], (8, 1)),
+            faces=np.array([[0, 1, 2]]),
+            regions={},
         )
         K = np.array([[100.0, 0, SIZE[0] / 2], [0, 100.0, SIZE[1] / 2], [0, 0, 1]])
         place = len(path.name) + np.zeros(3)  # every subject stands somewhere else

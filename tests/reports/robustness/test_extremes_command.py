@@ -39,7 +39,12 @@ def test_an_avatar_that_nothing_moves_passes_and_every_pair_has_its_rows(ball_ru
     without = rows[rows["metric"].isin(["largest_splat", "mean_opacity"])]
     assert without["status"].eq("missing").all()
     assert without["reason"].str.contains("no splats").all()
-    assert rows.groupby("subject")["protocol"].nunique().eq(1).all()
+    record = json.loads((folder / "extremes" / RECORD_FILE).read_text())
+    (protocol,) = record["protocols"]  # all subjects, methods of equal needs: one comparison
+    assert set(rows["protocol"]) == {protocol["hash"]} == {a["protocol"] for a in record["avatars"]}
+    assert protocol["id"] == "extremes/canonical/1"
+    keys = rows[["subject", "sequence", "timestep", "camera"]].drop_duplicates()
+    assert {tuple(key) for key in protocol["keys"]} == set(keys.itertuples(index=False, name=None))
     shown = colours(folder / "extremes" / SHEET_FILE)
     assert EXTRAPOLATED in shown
 

@@ -34,6 +34,33 @@ def test_every_subject_is_driven_by_the_other_and_keyed_by_both(ball_run):
     assert (out / SHEET_FILE).exists()
 
 
+def test_the_protocol_is_an_object_and_identity_says_why_there_is_none(ball_run):
+    folder = ball_run("BALL")
+    run(settings(folder))
+    out = folder / "cross_reenactment"
+    rows = read_rows(out / ROWS_FILE)
+    (protocol,) = json.loads((out / RECORD_FILE).read_text())["protocols"]
+    assert set(rows["protocol"]) == {protocol["hash"]}
+    assert dict(protocol["clips"]) == {"ball-a": "ball-ball-a", "ball-bee": "ball-ball-bee"}
+    assert [name for name, _ in protocol["conditions"]] == [
+        "ball-a drives ball-bee",
+        "ball-bee drives ball-a",
+    ]
+    identity = rows[rows["metric"] == "identity"]  # a cube has no vertex that follows the head alone
+    assert len(identity) == 4
+    assert set(identity["status"]) == {"missing"}
+    assert identity["reason"].str.contains("no recorded frames").all()
+
+
+def test_another_performance_is_another_protocol(ball_run):
+    folder = ball_run("BALL")
+    hashes = set()
+    for frames in (1, 2):
+        run(settings(folder, frames=frames))
+        hashes |= set(read_rows(folder / "cross_reenactment" / ROWS_FILE)["protocol"])
+    assert len(hashes) == 2
+
+
 def test_the_target_stays_where_its_own_training_was(ball_run):
     """The subjects stand metres apart; a translation taken over as it is would leave the frame empty."""
     folder = ball_run("BALL")
