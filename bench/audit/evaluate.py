@@ -48,6 +48,8 @@ def images_method(label: str, version: str) -> ResolvedMethod:
 def run(settings: EvaluateSettings, progress: Progress = no_progress) -> Findings:
     """Check everything, copy the images into the layout of a run, score them, write rows, manifest and reports.
 
+    The text is the table, together with the run named by ``like``.
+
     Raises `InputError` for whatever is wrong with settings, capture or images, before anything is written.
     """
     config = _configuration(settings)
@@ -80,7 +82,8 @@ def run(settings: EvaluateSettings, progress: Progress = no_progress) -> Finding
         write_rows(folder.rows, rows)
         folder.write_manifest({**manifest, "status": "done"})
         write_reports(folder.root)
-    text = resolve(get("reports", "table-text").implementation)(folder.root, "md")
+    together = [*([Path(settings.like)] if settings.like else []), folder.root]
+    text = resolve(get("reports", "table-text").implementation)(together, "md")
     data = {"out": folder.root, "method": method.spec.name, "version": method.spec.version, "rows": len(rows)}
     return Findings(f"{text}\n{folder.root}", data)
 

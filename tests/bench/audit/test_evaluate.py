@@ -59,6 +59,16 @@ def test_a_cell_of_a_run_is_a_folder_of_images(run, renders, images, tmp_path):
     assert scored(renders.parent, run, tmp_path / "a").equals(scored(images, run, tmp_path / "b"))
 
 
+def test_the_table_shown_holds_the_run_and_the_images(run, images, tmp_path):
+    findings = evaluate(
+        EvaluateSettings(str(images), out=str(tmp_path / "out"), like=str(run), label="theirs")
+    )
+    lines = [line for line in findings.text.splitlines() if line.startswith(("| toy", "| theirs"))]
+    assert len(lines) == 2
+    shown = [[cell.strip(" *") for cell in line.split("|")[2:4]] for line in lines]
+    assert shown[0] == shown[1]  # the same images have the same numbers
+
+
 def test_the_rows_stand_in_one_table_with_the_runs_and_verify(run, images, tmp_path):
     from headbench.reports.run_set import RunSet
 
