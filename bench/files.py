@@ -33,13 +33,13 @@ def atomic_path(path: Path) -> Iterator[Path]:
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=path.suffix)
     os.close(handle)
-    # mkstemp makes private files; results are to be read by whoever may read the folder.
-    mask = os.umask(0)
-    os.umask(mask)
-    os.chmod(name, 0o666 & ~mask)
     temporary = Path(name)
     try:
         yield temporary
+        # mkstemp makes private files, and so do some writers; results are to be read by whoever may read the folder.
+        mask = os.umask(0)
+        os.umask(mask)
+        os.chmod(name, 0o666 & ~mask)
         os.replace(temporary, path)
     except OSError as error:
         # A full disk says so in the middle of writing, where the system no longer tells of which file.

@@ -33,6 +33,19 @@ def test_a_failed_write_leaves_the_old_file_and_no_rubbish(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_results_are_readable_whatever_their_writer_makes_of_the_file(tmp_path):
+    """safetensors writes beside the file it is given and renames, which leaves the mode of a private file."""
+    path = tmp_path / "a.txt"
+    with atomic_path(path) as temporary:
+        private = temporary.with_name("private")
+        private.write_text("new")
+        private.chmod(0o600)
+        private.replace(temporary)
+    usual = tmp_path / "b.txt"
+    usual.write_text("usual")
+    assert path.stat().st_mode == usual.stat().st_mode
+
+
 def test_the_temporary_name_keeps_the_suffix(tmp_path):
     with atomic_path(tmp_path / "new" / "a.png") as temporary:
         assert temporary.suffix == ".png"
