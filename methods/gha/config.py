@@ -45,6 +45,8 @@ class GHAConfig:
     mesh_views, mesh_size : views of a timestep in one iteration of the mesh stage, and the longer side of their images
         in pixels; smaller images stay as they are.
     landmark_weight : of the mean squared distance, in square units, between moved and tracked landmarks.
+    landmark_timesteps : timesteps whose landmarks one iteration of the mesh stage looks at; published is the one that
+        its images show, but landmarks cost little, and a short run does not come to each timestep often.
     mesh_lr, landmark_lr : learning rates of the mesh stage.
     network_lr, position_lr, feature_lr, rotation_lr, scale_lr, opacity_lr, correction_lr : of the Gaussian stage, the
         last one for the corrections of the tracked head pose, one for each training timestep.
@@ -90,6 +92,7 @@ class GHAConfig:
     mesh_views: int = 4
     mesh_size: int = 256
     landmark_weight: float = 1.0
+    landmark_timesteps: int = 1
     mesh_lr: float = 1e-3
     landmark_lr: float = 1e-4
     network_lr: float = 1e-4
@@ -107,7 +110,10 @@ class GHAConfig:
     checkpoint_every_s: float = 120.0
 
     def __post_init__(self) -> None:
-        counts = ("schedule_length", "landmarks", "grid_vertices", "features", "mesh_views", "mesh_size")
+        counts = (
+            *("schedule_length", "landmarks", "grid_vertices", "features"),
+            *("mesh_views", "mesh_size", "landmark_timesteps"),
+        )
         for name in counts:
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, found {getattr(self, name)}")

@@ -76,8 +76,9 @@ class MeshTraining:
         landmarks = weights["landmarks"]
         surface = head.surface(weights, self.grid)
         distance, offset = head.landmark_offsets(weights, landmarks, self.grid.spacing)
-        expressed = head.expressed(weights, landmarks, signal.expression) + offset
-        loss = self._config.landmark_weight * F.mse_loss(expressed, self._tracked_landmarks[row])
+        rows = self._timesteps(iteration, row)
+        off = sum(self._landmark_error(landmarks, offset, other) for other in rows)
+        loss = self._config.landmark_weight * off / len(rows)
         loss = loss + DISTANCE * distance.abs().mean()
         if not len(surface.faces):
             return loss
@@ -115,6 +116,19 @@ class MeshTraining:
     def note(self) -> str:
         """Number of vertices."""
         return self._note
+
+    def _landmark_error(self, landmarks: Tensor, offset: Tensor, row: int) -> Tensor:
+        """Mean squared component of what moved landmarks lack to the tracked ones of a timestep."""
+        signal = self._scene.signals[row]
+        expressed = self._head.expressed(self._optimiser, landmarks, signal.expression) + offset
+        return F.mse_loss(expressed, self._tracked_landmarks[row])
+
+    def _timesteps(self, iteration: int, row: int) -> list[int]:
+        """The timestep of the images, and others, drawn without replacement."""
+        generator = torch_generator(self._scene.seed, "gha-landmarks", iteration)
+        order = torch.randperm(len(self._scene.timesteps), generator=generator).tolist()
+        others = [other for other in order if other != row]
+        return [row, *others[: self._config.landmark_timesteps - 1]]
 
     def _views(self, iteration: int, key: FrameKey) -> list[FrameKey]:
         """The frame asked for, and others of its timestep, drawn without replacement."""

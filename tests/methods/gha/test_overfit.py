@@ -1,0 +1,38 @@
+"""GHA learns a path-traced frame by heart at its demo preset: a wrong or missing gradient anywhere keeps it from that."""
+
+import numpy as np
+import pytest
+
+from headbench.bench.contracts import Budget, no_progress
+from headbench.bench.run_config import resolve_method
+from headbench.datasets.ga_reader import read_capture
+from headbench.datasets.synthetic.capture import synthesize
+from headbench.methods.specs import GHA
+
+from ..toy_clip import ToyClip
+
+ENOUGH_DB = 35.0
+
+
+@pytest.mark.slow
+def test_one_path_traced_frame_is_learnt_by_heart(tmp_path):
+    (union,) = synthesize(
+        tmp_path / "capture", cameras=2, timesteps=8, size=(96, 138), samples_per_pixel=16, workers=2
+    )
+    whole = read_capture(union)
+    key = whole.splits["train"][0]
+    clip = ToyClip(
+        *(whole.head, whole.shape, whole.static_offset, whole.cameras, whole.poses),
+        splits={"train": (key,), "novel_view": (), "self_reenactment": ()},
+        images={key: whole.image(key)},
+        masks={key: whole.mask(key)},
+        background=whole.background,
+        subject=whole.subject,
+    )
+    method = resolve_method(GHA, "demo", {"expression_noise": 0.0})
+    avatar = method.create().fit(
+        clip, tmp_path / "avatar", Budget(iterations=600), device="cpu", seed=0, progress=no_progress
+    )
+    frame = avatar.render(clip.cameras[key.camera], clip.poses[key.timestep], clip.background)
+    error = frame.rgb - clip.image(key).astype(np.float32) / 255
+    assert -10 * np.log10(np.mean(error**2)) >= ENOUGH_DB
