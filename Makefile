@@ -37,8 +37,8 @@ check: setup
 	$(BIN)/mypy bench datasets methods metrics reports
 	$(BIN)/python -m pytest -q tests/test_architecture.py
 
-# Seconds of seeded training on a capture made on the spot. PSNR moved by up to 0.005 dB and SSIM by up to 0.0001 between
-# one and two threads, and with numpy, torch and libm held to SSE4; the baseline allows ten times that.
+# Seconds of seeded training on a capture made on the spot. PSNR moved by up to 0.005 dB and SSIM by up to 0.00013 between
+# one and two threads, and with numpy, torch and libm held to SSE4; the baseline allows about ten times that.
 GATED  := build/gated-demo
 define gated_demo
 rm -rf $(GATED)
