@@ -47,11 +47,16 @@ class DemoConfig:
         return Path(self.out) / "capture"
 
 
+DEMO_METHODS = ("mean-image", "nearest-camera", "ga", "gbs", "gha", "insta", "ours")
+"""Both floors and every native method: the demonstration's head model suits them all."""
+
+
 def demo_run_config(config: DemoConfig) -> dict[str, Any]:
     """Settings of the comparison, as `RunConfig` fields."""
     return {
         "data": str(config.capture_folder),
         "out": config.out,
+        "methods": DEMO_METHODS,
         "preset": config.preset,
         "seeds": (config.seed,),
     }
