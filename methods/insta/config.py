@@ -38,6 +38,7 @@ class InstaConfig:
     occupancy_resolution, occupancy_every, occupancy_decay, occupancy_threshold : cells along the longest side of the
         canonical box; iterations between refreshes; how much of an old value stays; optical thickness per ``step``
         above which a cell is marched through.
+    occupancy_whole : iterations of the actual run in which a refresh visits all cells; then it visits a quarter.
     samples_per_iteration, first_rays : samples the number of rays is adapted to, and how many rays to begin with.
     images_per_iteration : training images that share an iteration's rays.
     round_samples, stop_transmittance : samples per ray that are evaluated before rays with less transmittance than
@@ -45,6 +46,8 @@ class InstaConfig:
     huber : where the colour loss turns from square to linear.
     mouth_weight, mouth_from : weight of pixels that show lips or teeth, from then on.
     depth_weight : of the distance between the expected depth and the mesh, metres, outside hair and neck. 0 for none.
+    fog_weight : of the mean opacity of a ray's samples, summed. Not published (0 there): with it short runs clear
+        the air in front of the surface, which nothing else asks for, and have less to march through.
     target_compatibility : "" composites the truth over the random background as the prediction is, in sRGB. "code"
         does it in linear light, which differs where masks are soft.
     learning_rate, final_rate, betas, weight_decay, ema : Adam; part of the rate that is left at the end, log-linearly
@@ -77,6 +80,7 @@ class InstaConfig:
     occupancy_every: int = 16
     occupancy_decay: float = 0.95
     occupancy_threshold: float = 0.01
+    occupancy_whole: int = 256
     samples_per_iteration: int = 2**18
     first_rays: int = 4096
     images_per_iteration: int = 16
@@ -86,6 +90,7 @@ class InstaConfig:
     mouth_weight: float = 40.0
     mouth_from: int = 500
     depth_weight: float = 1.25
+    fog_weight: float = 0.0
     target_compatibility: Literal["", "code"] = ""
     learning_rate: float = 1.75e-3
     final_rate: float = 1.0
@@ -113,7 +118,14 @@ class InstaConfig:
         for name in ("step", "shell_outside", "shell_inside", "prior_scale", "huber", "learning_rate"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be above 0, found {getattr(self, name)}")
-        for name in ("conditions", "mouth_weight", "depth_weight", "weight_decay", "prior_depth"):
+        for name in (
+            "conditions",
+            "mouth_weight",
+            "depth_weight",
+            "weight_decay",
+            "prior_depth",
+            "fog_weight",
+        ):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must not be negative, found {getattr(self, name)}")
         for name in ("occupancy_decay", "occupancy_threshold", "ema", "stop_transmittance"):

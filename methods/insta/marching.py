@@ -7,6 +7,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
+from scipy.ndimage import distance_transform_cdt
 from torch import Tensor
 
 from ...bench.contracts import HeadAsset
@@ -15,6 +16,7 @@ from .triangles import Found, first_hits, nearest_triangles
 from .warp import Blend, Compatibility, blended, canonical_from_posed
 
 Backend = Literal["auto", "kernel", "reference"]
+FREE_MAX = 255
 
 
 class Rays(NamedTuple):
@@ -46,13 +48,26 @@ class Space:
     reach : (F,) float32 metres from each triangle; negative for nowhere.
     low : (3,) float32 corner of the occupancy grid, canonical metres.
     cell : size of its cubic cells, metres.
-    occupied : (X, Y, Z) uint8.
+    free : (X, Y, Z) uint8, cells to the nearest occupied one along the axis where that is most; 0 where occupied.
     """
 
     reach: np.ndarray
     low: np.ndarray
     cell: float
-    occupied: np.ndarray
+    free: np.ndarray
+
+    @classmethod
+    def of(cls, reach: np.ndarray, low: np.ndarray, cell: float, occupied: np.ndarray) -> Space:
+        """The space of (X, Y, Z) bool of occupied cells."""
+        away = distance_transform_cdt(np.logical_not(occupied), metric="chessboard")
+        # Where nothing is occupied at all there is no distance.
+        free = np.where(away < 0, FREE_MAX, away.clip(0, FREE_MAX)).astype(np.uint8)
+        return cls(reach, low, cell, free)
+
+    @property
+    def occupied(self) -> np.ndarray:
+        """(X, Y, Z) bool."""
+        return self.free == 0
 
 
 class Surface:
@@ -144,7 +159,7 @@ class PosedSurface:
                 *(np.ascontiguousarray(rays.origins), np.ascontiguousarray(rays.directions)),
                 *(first, np.ascontiguousarray(rays.jitter), step, samples_max, space.reach),
                 *(_array(self.matrices.float()), _array(self.centroids.float()), blend.neighbours),
-                *(blend.own_falloff, blend.neighbour_falloff, space.low, 1 / space.cell, space.occupied),
+                *(blend.own_falloff, blend.neighbour_falloff, space.low, 1 / space.cell, space.free),
                 self.surface.threads(),
             )
         )
@@ -201,11 +216,11 @@ class PosedSurface:
 
 def occupied_at(space: Space, positions: np.ndarray) -> np.ndarray:
     """(N,) bool: whether canonical positions lie in an occupied cell."""
-    size = np.array(space.occupied.shape)
+    size = np.array(space.free.shape)
     cells = np.floor((positions - space.low) * np.float32(1 / space.cell)).astype(np.int64)
     inside = ((cells >= 0) & (cells < size)).all(1)
     x, y, z = np.clip(cells, 0, size - 1).T
-    return inside & (space.occupied[x, y, z] > 0)
+    return inside & (space.free[x, y, z] == 0)
 
 
 def _array(values: Tensor) -> np.ndarray:

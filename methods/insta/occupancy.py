@@ -118,7 +118,7 @@ class Occupancy:
         the cell's diagonal goes. Negative where there are none.
         """
         reach = np.full(len(self._neighbours), -1.0, np.float32)
-        farthest = self._distances[chosen] + math.sqrt(3) * self.cell
+        farthest = self._distances[chosen] + 0.5 * math.sqrt(3) * self.cell
         for triangles in (self.triangles, *self._probes):
             np.maximum.at(reach, triangles[chosen], farthest)
         across = np.where(self._neighbours >= 0, self._neighbours, np.arange(len(reach))[:, None])
@@ -138,9 +138,9 @@ class Occupancy:
 def occupied_space(occupancy: Occupancy, cells: np.ndarray) -> Space:
     """The space of (n,) flat numbers of occupied cells, of which candidates alone count."""
     chosen = np.flatnonzero(np.isin(occupancy.candidates, cells))
-    grid = np.zeros(int(np.prod(occupancy.size)), np.uint8)
-    grid[occupancy.candidates[chosen]] = 1
-    return Space(occupancy.reach(chosen), occupancy.low, occupancy.cell, grid.reshape(tuple(occupancy.size)))
+    grid = np.zeros(int(np.prod(occupancy.size)), bool)
+    grid[occupancy.candidates[chosen]] = True
+    return Space.of(occupancy.reach(chosen), occupancy.low, occupancy.cell, grid.reshape(occupancy.size))
 
 
 def _cells_near(

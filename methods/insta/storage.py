@@ -42,7 +42,7 @@ def read_settings(path: Path) -> InstaConfig:
 def write_field(path: Path, parameters: Mapping[str, Tensor], occupied: np.ndarray) -> None:
     """Write parameters, and (X, Y, Z) occupancy."""
     arrays = {name: value.detach().cpu().half().numpy() for name, value in parameters.items()}
-    bits = np.packbits(occupied.reshape(-1) > 0)
+    bits = np.packbits(occupied.reshape(-1))
     write_arrays(path, {**arrays, OCCUPIED: bits})
 
 

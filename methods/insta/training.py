@@ -25,7 +25,6 @@ from .parts import bare_triangles, mouth_triangles
 from .rays import box_corners, camera_rays, pixels_of_hull
 from .rendering import Marching, Rendered, Scene, render_rays
 
-WHOLE_REFRESHES_UNTIL = 256  # published iterations in which every refresh visits all cells
 RAYS_MIN, RAYS_MAX = 64, 1 << 18
 
 
@@ -108,6 +107,10 @@ class InstaTraining:
         weighted = iteration >= self._timeline.at(config.mouth_from)
         weights = torch.where(batch.mouth & weighted, config.mouth_weight, 1.0)
         loss = color_loss(color, truth.to(device), weights.to(device), config.huber)
+        if not rendered.samples:  # all rays passed the head by: nothing to learn, but no error either
+            loss = loss + 0.0 * self._optimiser[self._names[-1]].sum()
+        if config.fog_weight:
+            loss = loss + config.fog_weight * rendered.fog / len(batch.image)
         if config.depth_weight:
             loss = loss + config.depth_weight * depth_loss(rendered.distance, batch.depth.to(device))
         self._seen = rendered.samples
@@ -165,7 +168,7 @@ class InstaTraining:
             np.asarray(self._clip.poses[key.timestep].expression), dtype=torch.float32
         )
         parameters = {name: self._optimiser[name].detach() for name in self._names}
-        whole = iteration <= self._timeline.at(WHOLE_REFRESHES_UNTIL)
+        whole = iteration <= self._config.occupancy_whole
         self.occupancy.refresh(
             self.field, parameters, condition, self.mouth, self._seed, iteration, whole=whole
         )

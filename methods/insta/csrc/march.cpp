@@ -2,7 +2,6 @@
 
 #include <algorithm>
 #include <cmath>
-#include <utility>
 
 #include "../../splats/csrc/thread_pool.h"
 
@@ -11,7 +10,7 @@ namespace headbench::insta {
 namespace {
 
 constexpr std::int64_t kRaysPerTask = 128;
-constexpr std::int32_t kClusterSize = 8;  // triangles of the subtrees whose boxes part a ray
+constexpr float kCaution = 0.75f;
 
 // Largest reach below every node: by so much its box grows.
 std::vector<float> paddings(const Tree& tree, const float* reach) {
@@ -30,15 +29,16 @@ std::vector<float> paddings(const Tree& tree, const float* reach) {
   return padding;
 }
 
-std::vector<std::int32_t> sizes(const Tree& tree) {
-  const auto& nodes = tree.nodes();
-  std::vector<std::int32_t> size(nodes.size());
-  for (std::size_t i = nodes.size(); i-- > 0;)
-    size[i] = nodes[i].count ? nodes[i].count : size[i + 1] + size[nodes[i].right];
-  return size;
+// Whether what a box grows by outweighs its own size, so that taking it apart would tell a ray little.
+bool is_cluster(const Node& node, const Box& box, float padding) {
+  const Vec3 size = box.high - box.low;
+  return node.count > 0 || std::max({size.x, size.y, size.z}) <= 2 * padding;
 }
 
-using Interval = std::pair<float, float>;
+// A part of a ray near some triangles, and the largest reach among them.
+struct Interval {
+  float from, to, reach;
+};
 
 bool crossing(const Box& box, float padding, Vec3 origin, Vec3 inverse, float limit, Interval& interval) {
   const float lows[3] = {(box.low.x - padding - origin.x) * inverse.x, (box.low.y - padding - origin.y) * inverse.y,
@@ -53,15 +53,14 @@ bool crossing(const Box& box, float padding, Vec3 origin, Vec3 inverse, float li
     if (near > from) from = near;
     if (far < to) to = far;
   }
-  interval = {from, to};
+  interval = {from, to, padding};
   return from <= to;
 }
 
 class Marcher {
  public:
   Marcher(const Posed& mesh, const Rays& rays, const float* reach, const Warp& warp, const Grid& grid)
-      : mesh_(mesh), rays_(rays), reach_(reach), warp_(warp), grid_(grid), padding_(paddings(mesh.tree(), reach)),
-        size_(sizes(mesh.tree())), limit_(padding_[0] * padding_[0]) {}
+      : mesh_(mesh), rays_(rays), reach_(reach), warp_(warp), grid_(grid), padding_(paddings(mesh.tree(), reach)) {}
 
   void ray(std::int64_t number, std::vector<Interval>& intervals, Samples& out) const {
     const float* o = rays_.origins + 3 * number;
@@ -75,26 +74,30 @@ class Marcher {
     std::int32_t emitted = 0, hint = -1;
     for (const Interval& interval : intervals) {
       // One lattice point more at both ends: nothing depends on how an interval's end was rounded.
-      index = std::max(index, static_cast<std::int32_t>(std::floor(interval.first / rays_.step - jitter)) - 1);
-      const float last = interval.second / rays_.step - jitter + 1;
-      for (; static_cast<float>(index) <= last; ++index) {
+      index = std::max(index, static_cast<std::int32_t>(std::floor(interval.from / rays_.step - jitter)) - 1);
+      const float last = interval.to / rays_.step - jitter + 1;
+      for (std::int32_t stride = 1; static_cast<float>(index) <= last; index += stride) {
+        stride = 1;
         const Vec3 point = origin + ((static_cast<float>(index) + jitter) * rays_.step) * direction;
-        const Hit hit = mesh_.nearest(point, limit_, hint);
+        // A triangle farther than every reach here is not wanted, so it need not be found.
+        const Hit hit = mesh_.nearest(point, interval.reach * interval.reach, hint);
         if (hit.triangle < 0) continue;
         hint = hit.triangle;
+        const Placed placed = place(point, direction, hit.triangle);
+        stride = std::max(1, static_cast<std::int32_t>(kCaution * placed.room / rays_.step));
         const float reach = reach_[hit.triangle];
-        if (reach < 0 || hit.value > reach * reach) continue;
+        if (!placed.occupied || reach < 0 || hit.value > reach * reach) continue;
         if (emitted == rays_.samples_max) {
           out.next.back() = index;
           return;
         }
-        if (emit(point, direction, hit.triangle, out)) {
-          out.rays.push_back(static_cast<std::int32_t>(number));
-          out.indices.push_back(index);
-          out.triangles.push_back(hit.triangle);
-          out.distances.push_back(std::sqrt(hit.value));
-          ++emitted;
-        }
+        out.positions.insert(out.positions.end(), {placed.position.x, placed.position.y, placed.position.z});
+        out.directions.insert(out.directions.end(), {placed.direction.x, placed.direction.y, placed.direction.z});
+        out.rays.push_back(static_cast<std::int32_t>(number));
+        out.indices.push_back(index);
+        out.triangles.push_back(hit.triangle);
+        out.distances.push_back(std::sqrt(hit.value));
+        ++emitted;
       }
     }
   }
@@ -116,45 +119,56 @@ class Marcher {
       Interval interval;
       if (padding_[at] < 0 || !crossing(mesh_.boxes()[at], padding_[at], origin, inverse, farthest, interval))
         continue;
-      if (size_[at] <= kClusterSize) {
+      if (is_cluster(nodes[at], mesh_.boxes()[at], padding_[at])) {
         intervals.push_back(interval);
         continue;
       }
       stack[top++] = nodes[at].right;
       stack[top++] = at + 1;
     }
-    std::sort(intervals.begin(), intervals.end());
+    std::sort(intervals.begin(), intervals.end(),
+              [](const Interval& a, const Interval& b) { return a.from < b.from; });
     std::size_t kept = 0;
     for (const Interval& interval : intervals) {
-      if (kept > 0 && interval.first <= intervals[kept - 1].second)
-        intervals[kept - 1].second = std::max(intervals[kept - 1].second, interval.second);
-      else
+      if (kept == 0 || interval.from > intervals[kept - 1].to) {
         intervals[kept++] = interval;
+        continue;
+      }
+      intervals[kept - 1].to = std::max(intervals[kept - 1].to, interval.to);
+      intervals[kept - 1].reach = std::max(intervals[kept - 1].reach, interval.reach);
     }
     intervals.resize(kept);
   }
 
-  bool emit(Vec3 point, Vec3 direction, std::int32_t triangle, Samples& out) const {
+  // A point in canonical space.
+  struct Placed {
+    Vec3 position, direction;
+    bool occupied = false;
+    float room = 0;  // metres along the posed ray that are free
+  };
+
+  Placed place(Vec3 point, Vec3 direction, std::int32_t triangle) const {
     float m[12];
     matrix(point, triangle, m);
-    const Vec3 p{m[0] * point.x + m[1] * point.y + m[2] * point.z + m[3],
-                 m[4] * point.x + m[5] * point.y + m[6] * point.z + m[7],
-                 m[8] * point.x + m[9] * point.y + m[10] * point.z + m[11]};
+    Placed placed;
+    const Vec3 p = placed.position = {m[0] * point.x + m[1] * point.y + m[2] * point.z + m[3],
+                                      m[4] * point.x + m[5] * point.y + m[6] * point.z + m[7],
+                                      m[8] * point.x + m[9] * point.y + m[10] * point.z + m[11]};
     const float scale = grid_.cells_per_metre;
     const float cells[3] = {(p.x - grid_.low.x) * scale, (p.y - grid_.low.y) * scale, (p.z - grid_.low.z) * scale};
     std::int64_t cell = 0;
     for (int i = 0; i < 3; ++i) {
-      if (!(cells[i] >= 0 && cells[i] < static_cast<float>(grid_.size[i]))) return false;
+      if (!(cells[i] >= 0 && cells[i] < static_cast<float>(grid_.size[i]))) return placed;
       cell = cell * grid_.size[i] + static_cast<std::int32_t>(cells[i]);
     }
-    if (!grid_.occupied[cell]) return false;
-    Vec3 way{m[0] * direction.x + m[1] * direction.y + m[2] * direction.z,
-             m[4] * direction.x + m[5] * direction.y + m[6] * direction.z,
-             m[8] * direction.x + m[9] * direction.y + m[10] * direction.z};
-    way = (1 / std::max(std::sqrt(dot(way, way)), 1e-12f)) * way;
-    out.positions.insert(out.positions.end(), {p.x, p.y, p.z});
-    out.directions.insert(out.directions.end(), {way.x, way.y, way.z});
-    return true;
+    const Vec3 way{m[0] * direction.x + m[1] * direction.y + m[2] * direction.z,
+                   m[4] * direction.x + m[5] * direction.y + m[6] * direction.z,
+                   m[8] * direction.x + m[9] * direction.y + m[10] * direction.z};
+    const float length = std::max(std::sqrt(dot(way, way)), 1e-12f);
+    placed.direction = (1 / length) * way;
+    placed.occupied = grid_.free[cell] == 0;
+    if (grid_.free[cell] > 1) placed.room = static_cast<float>(grid_.free[cell] - 1) / (scale * std::max(length, 0.1f));
+    return placed;
   }
 
   void matrix(Vec3 point, std::int32_t triangle, float* m) const {
@@ -187,8 +201,6 @@ class Marcher {
   const Warp& warp_;
   const Grid& grid_;
   const std::vector<float> padding_;
-  const std::vector<std::int32_t> size_;
-  const float limit_;
 };
 
 template <class T>

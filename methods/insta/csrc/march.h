@@ -20,7 +20,7 @@ struct Grid {
   Vec3 low;
   float cells_per_metre;
   std::int32_t size[3];
-  const std::uint8_t* occupied;
+  const std::uint8_t* free;  // cells, along the axis where it is most, to the nearest occupied one; 0: occupied
 };
 
 struct Rays {
@@ -40,7 +40,9 @@ struct Samples {
 };
 
 // Emit, in order along each ray, the lattice points t = (index + jitter) step whose nearest triangle is at most
-// its `reach` away and whose canonical position lies in an occupied cell.
+// its `reach` away and whose canonical position lies in an occupied cell. Where the cells around are free, lattice
+// points are passed over: as many as kCaution of the way to the nearest occupied cell holds. Only a fold of the warp
+// could bring one of them to an occupied cell after all.
 Samples march(const Posed& mesh, const Rays& rays, const float* reach, const Warp& warp, const Grid& grid,
               int threads);
 

@@ -94,7 +94,7 @@ nb::tuple march_rays(const Posed& mesh, const Array<const float, -1, 3>& origins
                      const Array<const float, -1, 3>& centroids, const Array<const std::int32_t, -1, 3>& neighbours,
                      const Array<const float, -1>& own_falloff, const Array<const float, -1>& neighbour_falloff,
                      const Array<const float, 3>& low, float cells_per_metre,
-                     const Array<const std::uint8_t, -1, -1, -1>& occupied, int threads) {
+                     const Array<const std::uint8_t, -1, -1, -1>& free, int threads) {
   const auto faces = static_cast<std::size_t>(mesh.tree().face_count());
   require(directions.shape(0) == origins.shape(0) && first.shape(0) == origins.shape(0) &&
           jitter.shape(0) == origins.shape(0) && step > 0 && samples_max >= 1 && reach.shape(0) == faces &&
@@ -104,9 +104,9 @@ nb::tuple march_rays(const Posed& mesh, const Array<const float, -1, 3>& origins
     require(neighbours.data()[i] < static_cast<std::int64_t>(faces));
   const Warp warp{matrices.data(), centroids.data(), neighbours.data(), own_falloff.data(), neighbour_falloff.data()};
   const Grid grid{row(low.data(), 0), cells_per_metre,
-                  {static_cast<std::int32_t>(occupied.shape(0)), static_cast<std::int32_t>(occupied.shape(1)),
-                   static_cast<std::int32_t>(occupied.shape(2))},
-                  occupied.data()};
+                  {static_cast<std::int32_t>(free.shape(0)), static_cast<std::int32_t>(free.shape(1)),
+                   static_cast<std::int32_t>(free.shape(2))},
+                  free.data()};
   const Rays rays{static_cast<std::int64_t>(origins.shape(0)), origins.data(), directions.data(), first.data(),
                   jitter.data(), step, samples_max};
   Samples samples;
@@ -171,7 +171,7 @@ NB_MODULE(_kernel, m) {
         "Write the first triangle each ray hits, or -1, and its distance.");
   m.def("march", &march_rays, "mesh"_a, "origins"_a, "directions"_a, "first"_a, "jitter"_a, "step"_a, "samples_max"_a,
         "reach"_a, "matrices"_a, "centroids"_a, "neighbours"_a, "own_falloff"_a, "neighbour_falloff"_a, "low"_a,
-        "cells_per_metre"_a, "occupied"_a, "threads"_a,
+        "cells_per_metre"_a, "free"_a, "threads"_a,
         "Canonical positions and directions, distances from the surface, rays, lattice indices and triangles of samples; where each ray goes on.");
   m.def("encode", &encode_points, "positions"_a, "table"_a, "levels"_a, "out"_a, "threads"_a);
   m.def("encode_backward", &encode_points_backward, "positions"_a, "gradient"_a, "levels"_a, "table_gradient"_a,

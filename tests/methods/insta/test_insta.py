@@ -8,6 +8,7 @@ import pytest
 from headbench.bench.configuration import build
 from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.errors import InputError
+from headbench.methods.insta import kernel
 from headbench.methods.insta.avatar import InstaAvatar
 from headbench.methods.insta.config import InstaConfig
 from headbench.methods.insta.method import Insta
@@ -71,7 +72,7 @@ def test_the_comparison_would_notice_a_lost_grid(trained, clip, tmp_path, monkey
             raise Killed
 
     whole = Occupancy.state
-    monkeypatch.setattr(Occupancy, "state", lambda self: {"values": whole(self)["values"] * 0 + 9})
+    monkeypatch.setattr(Occupancy, "state", lambda self: {"values": whole(self)["values"] * 0})
     with pytest.raises(Killed):
         fit(clip, tmp_path, killer)
     assert content(fit(clip, tmp_path)) != content(trained[1])
@@ -134,6 +135,18 @@ def test_a_single_pixel_and_a_background(trained, clip):
     check_frame(trained[1].render(camera, pose), camera)
     black, white = (trained[1].render(clip.cameras[key.camera], pose, (c, c, c)) for c in (0.0, 1.0))
     np.testing.assert_allclose(white.rgb - black.rgb, 1 - white.alpha[..., None].repeat(3, 2), atol=1e-5)
+
+
+def test_without_the_kernel_an_avatar_looks_the_same(trained, clip, monkeypatch):
+    key = clip.splits["train"][0]
+    camera, pose = clip.cameras[key.camera].resized(7, 9), clip.poses[key.timestep]
+    expected = trained[1].render(camera, pose)
+    monkeypatch.setattr(kernel, "load", lambda: None)
+    frame = InstaAvatar.read(trained[0], "cpu").render(camera, pose)
+    assert expected.alpha.max() > 0.1
+    # A sample between two triangles or at a cell's wall may go either way by rounding.
+    assert np.abs(frame.rgb - expected.rgb).mean() < 1e-4
+    assert np.abs(frame.alpha - expected.alpha).max() < 0.02
 
 
 def test_large_images_are_rendered_in_parts(trained, clip, monkeypatch):

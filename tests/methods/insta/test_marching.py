@@ -6,11 +6,16 @@ import numpy as np
 import pytest
 import torch
 
+from headbench.methods.insta import kernel
 from headbench.methods.insta.marching import Rays, Space, Surface, occupied_at
 from headbench.methods.insta.rays import camera_rays
 
 from ...datasets.head.toy import toy_head
 from ..toy_clip import look_at
+
+pytestmark = pytest.mark.skipif(
+    kernel.load() is None, reason="INSTA's kernel is not installed: no C++ compiler was found"
+)
 
 STEP = 0.004
 
@@ -35,9 +40,9 @@ def space(pair):
     vertices = pair[0].surface.canonical.numpy()
     low, cell = vertices.min(0) - 0.03, 0.02
     size = np.ceil((vertices.max(0) + 0.03 - low) / cell).astype(int)
-    occupied = (rng.random(size) < 0.7).astype(np.uint8)
+    occupied = rng.random(size) < 0.7
     reach = rng.uniform(-0.005, 0.03, len(pair[0].surface.faces)).astype(np.float32)
-    return Space(reach, low.astype(np.float32), cell, occupied)
+    return Space.of(reach, low.astype(np.float32), cell, occupied)
 
 
 def fan(count=12):
@@ -96,7 +101,7 @@ def test_samples_are_where_they_are_said_to_be(pair, space):
 
 
 def test_nothing_occupied_or_nothing_in_reach_gives_no_samples(pair, space):
-    empty = replace(space, occupied=np.zeros_like(space.occupied))
+    empty = replace(space, free=np.full_like(space.free, 255))
     nowhere = replace(space, reach=np.full_like(space.reach, -1))
     for mesh in pair:
         for spaces in (empty, nowhere):
@@ -107,7 +112,7 @@ def test_rays_along_axes_and_rays_from_within_are_marched(pair, space):
     origins = np.array([[0, 0, 0.5], [0.5, 0, 0], [0, 0.5, 0], [0, 0, 0], [9, 9, 9]], np.float32)
     directions = np.array([[0, 0, -1], [-1, 0, 0], [0, -1, 0], [0, 0, 1], [1, 0, 0]], np.float32)
     rays = Rays(origins, directions, np.full(5, 0.5, np.float32))
-    wide = replace(space, reach=np.full_like(space.reach, 0.02), occupied=np.ones_like(space.occupied))
+    wide = replace(space, reach=np.full_like(space.reach, 0.02), free=np.zeros_like(space.free))
     ours, theirs = (all_samples(mesh, rays, wide, 10_000) for mesh in pair)
     assert set(ours[3].tolist()) == {0, 1, 2, 3}
     assert abs(len(ours[0]) - len(theirs[0])) <= 2
@@ -123,3 +128,24 @@ def test_marching_does_not_depend_on_the_number_of_threads(pair, space):
         torch.set_num_threads(before)
     for one, other in zip(*results):
         np.testing.assert_array_equal(one, other)
+
+
+def test_free_space_is_passed_over_without_losing_a_sample(pair):
+    # A thin occupied sheet in a wide free shell, under a gentle pose.
+    mesh, reference = pair
+    canonical = mesh.surface.canonical
+    gentle = canonical * 1.02 + 0.002 * torch.sin(20 * canonical)
+    low, cell = canonical.numpy().min(0) - 0.06, 0.006
+    size = np.ceil((canonical.numpy().max(0) + 0.06 - low) / cell).astype(int)
+    centers = low + cell * (np.stack(np.indices(size), axis=-1).reshape(-1, 3) + 0.5)
+    away = mesh.surface.rest.nearest(centers).values.sqrt().numpy().reshape(size)
+    sheet = Space.of(
+        np.full(len(mesh.surface.faces), 0.06, np.float32), low.astype(np.float32), cell, away < 0.008
+    )
+    assert sheet.free.max() > 5
+    ours, theirs = (
+        all_samples(side.surface.pose(gentle), fan(), sheet, 10_000) for side in (mesh, reference)
+    )
+    keys = [set(zip(part[3].tolist(), part[4].tolist())) for part in (ours, theirs)]
+    assert len(keys[1]) > 200
+    assert len(keys[0] ^ keys[1]) <= 0.01 * len(keys[1])

@@ -6,11 +6,15 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from headbench.methods.insta import kernel
 from headbench.methods.insta.marching import Rays, Surface
 from headbench.methods.insta.triangles import first_hits, nearest_triangles, squared_distances
 
 from ...datasets.head.toy import toy_head
 
+needs_kernel = pytest.mark.skipif(
+    kernel.load() is None, reason="INSTA's kernel is not installed: no C++ compiler was found"
+)
 SIDE = 60
 
 
@@ -65,6 +69,7 @@ def posed(surface):
     return surface.pose(torch.from_numpy(moved).float())
 
 
+@needs_kernel
 @pytest.mark.parametrize("spread", [0.002, 0.02, 0.3])
 def test_the_kernel_finds_the_nearest_triangle_of_all(posed, spread):
     rng = np.random.default_rng(1)
@@ -80,6 +85,7 @@ def test_the_kernel_finds_the_nearest_triangle_of_all(posed, spread):
     assert float((reference.triangles == found.triangles).double().mean()) > 0.995  # but for rounding
 
 
+@needs_kernel
 def test_far_away_and_degenerate_meshes_are_searched_as_well():
     head = toy_head(16)
     flat = torch.from_numpy(head.template).float()
@@ -91,6 +97,7 @@ def test_far_away_and_degenerate_meshes_are_searched_as_well():
     np.testing.assert_allclose(surface.rest.nearest(points).values, least, rtol=1e-5, atol=1e-12)
 
 
+@needs_kernel
 def test_first_hits_are_those_of_the_reference_and_of_a_plane(posed):
     rng = np.random.default_rng(2)
     origins = np.tile(np.array([[0.05, 0.02, 0.6]], np.float32), (800, 1))
@@ -115,6 +122,7 @@ def test_first_hits_are_those_of_the_reference_and_of_a_plane(posed):
     assert float(((at - corners[:, 0]) * normal).sum(1)[both].abs().max()) < 1e-5
 
 
+@needs_kernel
 def test_a_ray_that_starts_on_the_other_side_sees_nothing(posed):
     away = Rays(np.array([[0, 0, 1]], np.float32), np.array([[0, 0, 1]], np.float32), np.zeros(1, np.float32))
     found = posed.first_hit(away)
