@@ -14,8 +14,7 @@ import cv2
 from ..bench.errors import InputError
 from ..bench.files import atomic_path, write_text
 from ..bench.frames import read_png
-from ..bench.progress import duration
-from ..bench.store import RunFolder
+from ..bench.store import RunFolder, read_rows
 from .table_report import table_text
 
 BEGIN, END = "<!-- demo:begin -->", "<!-- demo:end -->"
@@ -44,10 +43,13 @@ def publish(run_folder: Path, readme: Path) -> None:
 def block(gallery: Path) -> str:
     """Return the README's block for the stored result in ``gallery``: Markdown."""
     record = RunFolder(gallery).read_manifest()
-    machine, capture_s = record["machine"], record["capture_seconds"]
+    machine = record["machine"]
+    rows = read_rows(RunFolder(gallery).rows)
+    trained = rows[(rows["metric"] == "training_time") & (rows["status"] == "ok")]
+    # Not the run's own length: a demo that was continued would tell that of its last part.
+    minutes = ", ".join(f"{row.method} {row.value:.1f}" for row in trained.itertuples() if row.value >= 0.05)
     cost = (
-        f"`make demo` took {duration(capture_s + record['seconds'])}, {duration(capture_s)} of them for the capture, on "
-        f"{machine['cores']} cores ({machine['processor']}); the largest process took "
+        f"Minutes of training: {minutes}, on {machine['cores']} cores ({machine['processor']}); the largest process took "
         f"{record['peak_memory_bytes'] / 1e9:.1f} GB."
     )
     picture = f"![Ground truth, renders and error maps of every method]({GALLERY}/{PICTURE})"
