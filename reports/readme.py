@@ -47,7 +47,8 @@ def block(gallery: Path) -> str:
     rows = read_rows(RunFolder(gallery).rows)
     trained = rows[(rows["metric"] == "training_time") & (rows["status"] == "ok")]
     # Not the run's own length: a demo that was continued would tell that of its last part.
-    minutes = ", ".join(f"{row.method} {row.value:.1f}" for row in trained.itertuples() if row.value >= 0.05)
+    spent = zip(trained["method"].astype(str), trained["value"].astype(float))
+    minutes = ", ".join(f"{method} {value:.1f}" for method, value in spent if value >= 0.05)
     cost = (
         f"Minutes of training: {minutes}, on {machine['cores']} cores ({machine['processor']}); the largest process took "
         f"{record['peak_memory_bytes'] / 1e9:.1f} GB."
