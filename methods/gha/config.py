@@ -33,13 +33,21 @@ class GHAConfig:
         one at twice the size before: their number decides by how much splats are drawn smaller than the image.
     residual : let super-resolution add to the splatted colours instead of making colours, as published, of nothing;
         a short run then starts where splatting alone arrives, and splatting with the colours of the mesh stage.
+    neutral_jaw : radians that the jaw is open in the neutral head (about the first axis). Displacements belong to
+        places, so between lips that touch they cannot part; published landmarks start at any first timestep.
+    motion_steps : steps that fit the deformation by expression to the head model's own (`TrackedMotion`) before the
+        mesh stage; 0 as published.
+    motion_weight : of the same error in both stages, relative to the vertices' motion; 0 as published.
+    appearance_margin : how far beyond its training range, in parts of that range, each driving value is followed by
+        the networks of colour and attributes; None, as published, sets no end. What lies far outside of training
+        otherwise tints a face.
     at_rest : start all controllers without an effect of expression and pose, deformation and attributes with outputs
         of zero, instead of small random ones: what a short capture never shows then stays without effect.
     angle_unit : radians of jaw and eye angles that count as 1 in the expression code. Expression coefficients are of
         the order of 1, and beside them a short run hardly notices a jaw's tenths of a radian.
-    expression_noise : standard deviation of what is added to each driving value in training, drawn anew in every
-        iteration. A few timesteps leave most directions of the code unseen, in which networks then do as they like;
-        noise keeps them from it. 0 as published.
+    expression_noise : standard deviation of what is added to each driving value that the networks of colour and
+        attributes see in training, drawn anew in every iteration. A few timesteps leave most directions of the code
+        unseen, in which networks then do as they like; noise keeps them from it. 0 as published.
     displacement_scale, attribute_scale : factors of the networks' outputs.
     initial_opacity : of all Gaussians.
     mesh_views, mesh_size : views of a timestep in one iteration of the mesh stage, and the longer side of their images
@@ -83,6 +91,10 @@ class GHAConfig:
     pose_attribute_hidden: tuple[int, ...] = (128, 128)
     sr_widths: tuple[int, ...] = (128, 64, 32)
     residual: bool = False
+    neutral_jaw: float = 0.0
+    motion_steps: int = 0
+    motion_weight: float = 0.0
+    appearance_margin: float | None = None
     at_rest: bool = False
     angle_unit: float = 1.0
     expression_noise: float = 0.0
@@ -131,8 +143,13 @@ class GHAConfig:
             raise ValueError(f"max_points must be at least 1 or null, found {self.max_points}")
         if not self.unit > 0 or not self.angle_unit > 0:
             raise ValueError(f"unit and angle_unit must be above 0, found {self.unit} and {self.angle_unit}")
-        if min(self.mouth_points, self.start_steps, self.expression_noise) < 0:
-            raise ValueError("mouth_points, start_steps and expression_noise must not be negative")
+        not_negative = (
+            *("mouth_points", "start_steps", "expression_noise", "motion_steps", "motion_weight"),
+            "appearance_margin",
+        )
+        for name in not_negative:
+            if (getattr(self, name) or 0) < 0:
+                raise ValueError(f"{name} must not be negative, found {getattr(self, name)}")
 
     @property
     def upscale(self) -> int:

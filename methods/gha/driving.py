@@ -123,6 +123,14 @@ class Driver:
         translation = base + shift + root @ (joint - base) + rotation @ (self.origin - joint)
         return Motion(rotation, translation, torch.cat([matrix_to_axis_angle(rotation), translation]))
 
+    def still(self, codes: Tensor) -> dict[str, Tensor]:
+        """Arguments of (B, E) expression codes with the head at rest: the inverse of what `signals` makes of them."""
+        if self.expression_scale is not None:
+            codes = codes * self.expression_scale
+        rest = codes.new_zeros(len(codes), 3)
+        still = {"rotation": rest, "neck": rest, "translation": rest}
+        return {**still, **code_arguments(codes, self.model.expression_size)}
+
     def canonical(self, vertices: Tensor) -> Tensor:
         """Canonical coordinates of (..., 3) points of the unposed head, metres."""
         return (vertices - self.origin) / self.unit
@@ -140,6 +148,13 @@ def expression_codes(arguments: Mapping[str, Tensor]) -> Tensor:
     if "eyelids" in arguments:
         parts.append(arguments["eyelids"])
     return torch.cat(parts, dim=1)
+
+
+def code_arguments(codes: Tensor, expressions: int) -> dict[str, Tensor]:
+    """The parts of (T, E) `expression_codes` by name; eyelids where there are columns for them."""
+    parts = codes.split([expressions, 3, 6, codes.shape[1] - expressions - ANGLES], dim=1)
+    named = dict(zip(("expression", "jaw", "eyes", "eyelids"), parts))
+    return {name: values for name, values in named.items() if values.shape[1]}
 
 
 def code_size(head: HeadAsset) -> int:

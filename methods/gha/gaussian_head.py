@@ -69,15 +69,22 @@ class GaussianHead:
         }
         return {**controllers, **self.super_resolution.shapes()}
 
-    def splats(self, tensors: Weights, signal: Signal, motion: Motion) -> Splats:
-        """Pose all Gaussians; differentiable in every tensor but the landmarks, and in the motion."""
+    def splats(self, tensors: Weights, signal: Signal, motion: Motion, noise: Tensor | None = None) -> Splats:
+        """Pose all Gaussians; differentiable in every tensor but the landmarks and bounds, and in the motion.
+
+        Colour and attributes see the expression code within the bounds "code_low" and "code_high", and (E,) ``noise``
+        on it.
+        """
         c, nets = self.config, self.controllers
         points, features = tensors["points"], torch.tanh(tensors["features"])
         landmarks = tensors["landmarks"].detach()
         parts = influences(points, landmarks, c.near_squared, c.far_squared)
         pose, code = encode_pose(motion.code), signal.expression
         moves = nets.displacements(tensors, points, parts, code, pose)
-        scale, turn, faint = nets.attributes(tensors, features, parts, code, pose)
+        seen = torch.minimum(torch.maximum(code, tensors["code_low"]), tensors["code_high"])
+        if noise is not None:
+            seen = seen + noise
+        scale, turn, faint = nets.attributes(tensors, features, parts, seen, pose)
         log_scales = tensors["log_scales"] + c.attribute_scale * scale
         quats = tensors["quats"] + c.attribute_scale * turn
         opacities = torch.sigmoid(tensors["opacities"] + c.attribute_scale * faint[:, 0])
@@ -87,7 +94,7 @@ class GaussianHead:
             quats @ _turning(motion.rotation).t(),
             c.unit * log_scales.clamp_max(LARGEST_LOG_SCALE).exp(),
         )
-        return Splats(world, opacities, nets.colors(tensors, features, parts, code, pose))
+        return Splats(world, opacities, nets.colors(tensors, features, parts, seen, pose))
 
     def draw(self, splats: Splats, camera: Camera, background: Tensor) -> Drawn:
         """Splat the features for a camera of the full size; their background is (3,) colour, then ones."""

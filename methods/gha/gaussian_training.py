@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,7 @@ from .mesh_head import MeshHead, Surface
 from .mesh_training import grid_about
 from .networks import Weights
 from .scene import Scene
+from .tracked_motion import TrackedMotion
 
 NEIGHBOURS = 3
 SMALLEST_SQUARED = 1e-7
@@ -71,6 +73,8 @@ class GaussianTraining:
         for name in initial:
             self._rates.setdefault(name, config.network_lr)
         self._landmarks = mesh["landmarks"].detach().clone()
+        self._bounds = {"code_low": scene.code_low, "code_high": scene.code_high}
+        self._motion = TrackedMotion.of(scene, config) if config.motion_weight else None
         self._optimiser = Optimiser({name: nn.Parameter(v) for name, v in initial.items()}, self._rates)
 
     @property
@@ -94,10 +98,14 @@ class GaussianTraining:
         row = scene.row[key.timestep]
         view = scene.views[key.camera]
         truth = self._images.get(iteration, index)
-        tensors = _With(self._optimiser, self._landmarks)
-        signal = self._wavering(scene.signals[row], iteration)
+        tensors = _With(self._optimiser, {"landmarks": self._landmarks, **self._bounds})
+        signal = scene.signals[row]
         motion = scene.driver.motion(signal, self._optimiser["corrections"][row])
-        drawn = head.draw(head.splats(tensors, signal, motion), view.camera, scene.background)
+        drawn = head.draw(
+            head.splats(tensors, signal, motion, self._noise(signal, iteration)),
+            view.camera,
+            scene.background,
+        )
         padded = _padded(truth, view.camera, config.upscale, scene.background)
         small = reduced(padded, config.upscale, config.low_truth)
         loss = config.low_weight * (drawn.features[..., :3] - small).abs().mean()
@@ -108,15 +116,20 @@ class GaussianTraining:
         if config.structure_weight:
             planes = (values.permute(2, 0, 1).contiguous() for values in (image, padded))
             loss = loss + config.structure_weight * (1 - mean_ssim(*planes))
+        if self._motion is not None:
+            network = head.controllers.expression_deform
+            loss = loss + config.motion_weight * self._motion.error(
+                network, tensors, torch_generator(scene.seed, "gha-motion", iteration)
+            )
         return loss
 
-    def _wavering(self, signal: Signal, iteration: int) -> Signal:
-        """The signal with noise on its expression code, where that is asked for."""
+    def _noise(self, signal: Signal, iteration: int) -> Tensor | None:
+        """(E,) noise for the code that colour and attributes see, where it is asked for."""
         if not self._config.expression_noise:
-            return signal
+            return None
         generator = torch_generator(self._scene.seed, "gha-expression", iteration)
         noise = torch.randn(len(signal.expression), generator=generator).to(signal.expression)
-        return signal._replace(expression=signal.expression + self._config.expression_noise * noise)
+        return self._config.expression_noise * noise
 
     def after_backward(self, iteration: int) -> None:
         """Learning rates over the last half of a short run."""
@@ -144,13 +157,13 @@ class GaussianTraining:
 
 
 class _With:
-    """The optimiser's tensors and the frozen landmarks under one roof."""
+    """The optimiser's tensors and frozen ones under one roof."""
 
-    def __init__(self, tensors: Weights, landmarks: Tensor):
-        self._tensors, self._landmarks = tensors, landmarks
+    def __init__(self, tensors: Weights, frozen: Mapping[str, Tensor]):
+        self._tensors, self._frozen = tensors, frozen
 
     def __getitem__(self, name: str, /) -> Tensor:
-        return self._landmarks if name == "landmarks" else self._tensors[name]
+        return self._frozen[name] if name in self._frozen else self._tensors[name]
 
 
 @torch.no_grad()
@@ -163,8 +176,7 @@ def first_points(scene: Scene, config: GHAConfig, mesh_head: MeshHead, mesh: Wei
         Where the mesh stage ended without a surface.
     """
     device = scene.device
-    neutral = scene.driver.canonical(scene.driver.neutral)
-    grid = grid_about(neutral, config, device, finer=2 if config.subdivide else 1)
+    grid = grid_about(scene.rest, config, device, finer=2 if config.subdivide else 1)
     surface: Surface = mesh_head.surface(mesh, grid)
     if not len(surface.vertices):
         raise InputError(
@@ -181,7 +193,7 @@ def first_points(scene: Scene, config: GHAConfig, mesh_head: MeshHead, mesh: Wei
         points, features = points[rows], features[rows]
     lips = scene.clip.head.regions.get("lips")
     if lips is not None and config.mouth_points:
-        center, half = mouth_box(neutral[torch.as_tensor(np.asarray(lips))].cpu().double().numpy())
+        center, half = mouth_box(scene.rest[torch.as_tensor(np.asarray(lips))].cpu().double().numpy())
         draws = torch.rand(config.mouth_points, 3, generator=torch_generator(scene.seed, "gha-mouth"))
         inside = torch.as_tensor(center + half * (2 * draws.double().numpy() - 1)).to(points)
         points = torch.cat([points, inside])

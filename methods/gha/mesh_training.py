@@ -18,8 +18,10 @@ from ..views import View, view_of
 from .config import GHAConfig
 from .mesh_head import DISC_OPACITY, MeshHead, vertex_discs
 from .scene import Scene
-from .signed_distance import INNER_PARTS, TangentDistance
+from .signed_distance import TangentDistance, outer_vertices
+from .starts import fitted
 from .tetrahedra import TetGrid, spacing_for, tet_grid
+from .tracked_motion import TrackedMotion
 
 COLOR, SILHOUETTE, DISPLACEMENT, DISTANCE, SMOOTHNESS = 0.1, 0.1, 0.01, 0.1, 100.0
 """Published weights of the losses, but for that of the landmarks, which is a setting."""
@@ -27,7 +29,14 @@ COLOR, SILHOUETTE, DISPLACEMENT, DISTANCE, SMOOTHNESS = 0.1, 0.1, 0.01, 0.1, 100
 MARGIN = 0.3
 """Canonical units around the neutral mesh that the grid covers."""
 
-START_BATCH, START_RATE = 8_192, 1e-3
+SPHERE_BATCH, SPHERE_RATES = 8_192, (1e-3, 1e-3)
+"""Places in a step of the fit to a sphere, and its first and last learning rate, as published."""
+
+MESH_PLACES, MESH_BATCH, MESH_RATES = 100_000, 2_048, (5e-3, 5e-4)
+"""Places whose distance to the tracked mesh is known, how many of them a step of the fit to it takes, and its rates."""
+
+NEAR, FAR = 0.1, 0.3
+"""Canonical units: how far most of those places are from the mesh, and the distance that none exceeds."""
 
 
 class MeshTraining:
@@ -44,13 +53,17 @@ class MeshTraining:
         initial: dict[str, Tensor] = {}
         for network in head.networks:
             initial |= network.initial(generator, scene.device)
-        neutral = scene.driver.canonical(scene.driver.neutral)
-        self.grid = grid_about(neutral, self._config, scene.device)
+        self.grid = grid_about(scene.rest, self._config, scene.device)
+        taught = self._config.motion_steps or self._config.motion_weight
+        self._motion = TrackedMotion.of(scene, self._config) if taught else None
         if fitted:
-            initial |= self._fitted(initial, neutral)
+            initial |= self._fitted(initial)
+            if self._motion is not None:
+                network = head.controllers.expression_deform
+                initial |= self._motion.fitted(network, initial, self._config.motion_steps, scene.seed)
         rates = dict.fromkeys(initial, self._config.mesh_lr) | {"landmarks": self._config.landmark_lr}
         rows = torch.as_tensor(scene.landmark_rows, device=scene.device)
-        initial["landmarks"] = neutral.index_select(0, rows)
+        initial["landmarks"] = scene.rest.index_select(0, rows)
         self._optimiser = Optimiser({name: nn.Parameter(value) for name, value in initial.items()}, rates)
         self._tracked_landmarks = scene.driver.unposed(scene.tracked).index_select(1, rows)
         self._cameras_of: dict[int, list[FrameKey]] = {}
@@ -80,6 +93,11 @@ class MeshTraining:
         off = sum(self._landmark_error(landmarks, offset, other) for other in rows)
         loss = self._config.landmark_weight * off / len(rows)
         loss = loss + DISTANCE * distance.abs().mean()
+        if self._motion is not None and self._config.motion_weight:
+            network = head.controllers.expression_deform
+            loss = loss + self._config.motion_weight * self._motion.error(
+                network, weights, torch_generator(scene.seed, "gha-motion", iteration)
+            )
         if not len(surface.faces):
             return loss
         vertices, colors, displaced = head.posed(weights, surface, landmarks, signal, motion)
@@ -151,30 +169,28 @@ class MeshTraining:
             None if mask is None else _reduced(mask[..., None], height, width, scene.device)[..., 0],
         )
 
-    def _fitted(self, initial: dict[str, Tensor], neutral: Tensor) -> dict[str, Tensor]:
+    def _fitted(self, initial: dict[str, Tensor]) -> dict[str, Tensor]:
         """The geometry network after it learnt the distances of the start."""
-        head, config, device = self._head, self._config, self._scene.device
-        names = list(head.geometry.shapes())
-        weights = Optimiser(
-            {name: nn.Parameter(initial[name].clone()) for name in names}, dict.fromkeys(names, START_RATE)
-        )
+        head, config, seed = self._head, self._config, self._scene.seed
         low, high = self.grid.vertices.amin(0), self.grid.vertices.amax(0)
-        known = _tracked_distance(self._scene, neutral) if config.start == "mesh" else None
-        for step in range(1, config.start_steps + 1):
-            generator = torch_generator(self._scene.seed, "gha-start", step)
-            places = low + (high - low) * torch.rand(START_BATCH, 3, generator=generator).to(device)
-            if known is None:
-                target = torch.linalg.vector_norm(places, dim=1) - 1
-            else:
-                # Half of the places close to the surface, where the distance must be right.
-                rows = torch.randint(len(neutral), (START_BATCH // 2,), generator=generator).to(device)
-                noise = 0.1 * torch.randn(START_BATCH // 2, 3, generator=generator).to(device)
-                places = torch.cat([neutral[rows] + noise, places[: START_BATCH // 2]])
-                target = torch.as_tensor(known(places.cpu().double().numpy())).to(places).clamp(-0.9, 0.9)
-            F.mse_loss(head.distance(weights, places), target).backward()
-            weights.step()
-            weights.zero_grad()
-        return {name: weights[name].detach() for name in names}
+
+        def to_sphere(weights: Optimiser, step: int) -> Tensor:
+            generator = torch_generator(seed, "gha-start", step)
+            places = low + (high - low) * torch.rand(SPHERE_BATCH, 3, generator=generator).to(low)
+            target = torch.linalg.vector_norm(places, dim=1) - 1
+            return F.mse_loss(head.distance(weights, places), target)
+
+        def to_mesh(weights: Optimiser, step: int) -> Tensor:
+            rows = torch.randint(
+                MESH_PLACES, (MESH_BATCH,), generator=torch_generator(seed, "gha-start", step)
+            )
+            rows = rows.to(low.device)
+            return F.l1_loss(head.distance(weights, places[rows]), distances[rows])
+
+        if config.start == "sphere":
+            return fitted(head.geometry, initial, to_sphere, config.start_steps, SPHERE_RATES)
+        places, distances = _distances(self._scene, low, high)
+        return fitted(head.geometry, initial, to_mesh, config.start_steps, MESH_RATES)
 
 
 def grid_about(neutral: Tensor, config: GHAConfig, device: str, *, finer: int = 1) -> TetGrid:
@@ -210,8 +226,17 @@ def _reduced(image: np.ndarray, height: int, width: int, device: str) -> Tensor:
     return planes[0].permute(1, 2, 0).contiguous()
 
 
-def _tracked_distance(scene: Scene, neutral: Tensor) -> TangentDistance:
-    head = scene.clip.head
-    inner = [head.regions[name] for name in INNER_PARTS if name in head.regions]
-    keep = np.setdiff1d(np.arange(len(neutral)), np.concatenate([*inner, np.empty(0, np.int64)]))
-    return TangentDistance(neutral.cpu().double().numpy(), np.asarray(head.faces), keep)
+def _distances(scene: Scene, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
+    """(P, 3) places, most of them near the tracked mesh at rest, and their (P,) distances to it, up to `FAR`."""
+    head, vertices = scene.clip.head, scene.rest.cpu().double().numpy()
+    bounding = outer_vertices(vertices, np.asarray(head.faces), head.regions)
+    known = TangentDistance(vertices, np.asarray(head.faces), bounding)
+    generator = torch_generator(scene.seed, "gha-start")
+    anywhere = low + (high - low) * torch.rand(MESH_PLACES // 4, 3, generator=generator).to(low)
+    count = MESH_PLACES - len(anywhere)
+    # Close to the surface the distance must be right, and the closer the more of the places.
+    rows = torch.as_tensor(bounding)[torch.randint(len(bounding), (count,), generator=generator)]
+    away = torch.randn(count, 3, generator=generator) * torch.rand(count, 1, generator=generator)
+    places = torch.cat([scene.rest[rows.to(low.device)] + NEAR * away.to(low), anywhere])
+    distances = known(places.cpu().double().numpy())
+    return places, torch.as_tensor(distances).to(places).clamp(-FAR, FAR)

@@ -8,7 +8,8 @@ between them as published.
 
 What is our own: the tracked head model stands for the published face model (`driving`), the mesh is drawn with discs
 (`mesh_head.vertex_discs`), 1 - SSIM stands for LPIPS (`GHAConfig.structure_weight`), pixels that nothing is drawn near
-are background. Short presets scale with the capture (`presets`), without resizing it.
+are background. Short presets scale with the capture (`presets`), without resizing it, and let the head model teach the
+deformation (`tracked_motion`).
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ from .storage import AVATAR_FILE, write_avatar
 class GHA:
     """The method: see the module."""
 
-    name, version = "gha", "1"
+    name, version = "gha", "2"
 
     def __init__(self, config: GHAConfig | None = None):
         self.config = config or GHAConfig()

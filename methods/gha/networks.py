@@ -84,7 +84,7 @@ class Mlp:
     def __call__(
         self, weights: Weights, points: Tensor, condition: Tensor | None = None, outputs: int | None = None
     ) -> Tensor:
-        """(N, outputs) of (N, point_inputs) and (condition_inputs,).
+        """(N, outputs) of (N, point_inputs) and (condition_inputs,); (B, N, outputs) for (B, condition_inputs).
 
         ``outputs`` asks for so many of the first outputs only.
         """
@@ -98,11 +98,11 @@ class Mlp:
             if layer == 0 or again:
                 start = self.widths[layer] if again else 0
                 if condition is not None:
-                    bias = torch.addmv(bias, weight[:, start + size :], condition)
+                    bias = F.linear(condition, weight[:, start + size :], bias).unsqueeze(-2)
                 if again:
-                    bias = F.linear(values, weight[:, :start], bias)
+                    bias = F.linear(values, weight[:, :start]) + bias
                 by_points = weight[:, start : start + size].t()
-                values = torch.addmm(bias, points, by_points)
+                values = torch.addmm(bias, points, by_points) if bias.ndim < 3 else points @ by_points + bias
             else:
                 values = F.linear(values, weight, bias)
             if layer < count - 1:

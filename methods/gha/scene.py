@@ -28,8 +28,11 @@ class Scene(NamedTuple):
     tracked : driving arguments by name, (T, n) each.
     views : training cameras.
     background : (3,).
+    rest : (V, 3) the subject's neutral head with the jaw open by the configured angle, canonical units: what the
+        neutral surface is to be.
     landmark_rows : (L,) vertices of the head model.
     expression_scale : (E,) that expression codes are divided by.
+    code_low, code_high : (E,) bounds of the expression code that colour and attributes follow.
     """
 
     clip: Clip
@@ -41,8 +44,11 @@ class Scene(NamedTuple):
     tracked: Mapping[str, Tensor]
     views: Mapping[str, View]
     background: Tensor
+    rest: Tensor
     landmark_rows: IntArray
     expression_scale: Tensor
+    code_low: Tensor
+    code_high: Tensor
     device: str
     seed: int
 
@@ -52,6 +58,8 @@ class Scene(NamedTuple):
             "origin": self.driver.origin,
             "background": self.background,
             "expression_scale": self.expression_scale,
+            "code_low": self.code_low,
+            "code_high": self.code_high,
         }
 
 
@@ -68,20 +76,37 @@ def scene_of(clip: Clip, config: GHAConfig, device: str, seed: int) -> Scene:
     expressions = clip.head.expression_basis.shape[2]
     scale[expressions : expressions + ANGLES] = config.angle_unit
     driver = Driver(*identity, neutral[rows].mean(0), config.unit, scale, device)
+    opened = torch.zeros(1, len(scale), device=device)
+    opened[0, expressions] = config.neutral_jaw / config.angle_unit
+    signals = driver.signals(tracked)
+    low, high = bounds(torch.stack([signal.expression for signal in signals]), config.appearance_margin)
     return Scene(
         clip=clip,
         driver=driver,
         keys=tuple(clip.splits["train"]),
         timesteps=timesteps,
         row={timestep: row for row, timestep in enumerate(timesteps)},
-        signals=driver.signals(tracked),
+        signals=signals,
         tracked=tracked,
         views={
             name: view_of(clip.cameras[name], device) for name in {k.camera for k in clip.splits["train"]}
         },
         background=torch.as_tensor(np.asarray(clip.background), dtype=torch.float32, device=device),
+        rest=driver.unposed(driver.still(opened))[0],
         landmark_rows=rows,
         expression_scale=scale,
+        code_low=low,
+        code_high=high,
         device=device,
         seed=seed,
     )
+
+
+def bounds(codes: Tensor, margin: float | None) -> tuple[Tensor, Tensor]:
+    """(E,) lowest and highest values of (T, E) codes, each pushed out by ``margin`` of the range between them; without
+    a margin, the largest numbers there are."""
+    if margin is None:
+        largest = torch.full_like(codes[0], torch.finfo(codes.dtype).max)
+        return -largest, largest
+    low, high = codes.amin(0), codes.amax(0)
+    return low - margin * (high - low), high + margin * (high - low)

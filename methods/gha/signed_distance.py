@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from scipy.spatial import cKDTree
 
 from ...bench.contracts import FloatArray, IntArray
 
-INNER_PARTS = ("left_eyeball", "right_eyeball", "teeth", "mouth_socket")
+INNER_PARTS = ("teeth", "mouth_socket")
 """Regions behind the skin: what lies about them says nothing of inside and outside."""
+
+FACING, FORWARD = ("left_eyeball", "right_eyeball", "eye_region"), 0.3
+"""Regions that bound the head by what faces forward of them (least component of the normals along z): eyeballs fill the
+lids' opening, but their backs, and the inner sides of lids, lie behind the skin."""
 
 
 class TangentDistance:
@@ -45,3 +51,16 @@ def vertex_normals(vertices: FloatArray, faces: IntArray) -> FloatArray:
         np.add.at(normals, faces[:, corner], across)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     return normals / np.maximum(length, 1e-30)
+
+
+def outer_vertices(vertices: FloatArray, faces: IntArray, regions: Mapping[str, IntArray]) -> IntArray:
+    """(K,) vertices of an unposed head that bound it: all but `INNER_PARTS` and what does not face forward of
+    `FACING`."""
+    bounding = np.ones(len(vertices), bool)
+    for name in INNER_PARTS:
+        bounding[regions.get(name, [])] = False
+    forward = vertex_normals(vertices, faces)[:, 2] > FORWARD
+    for name in FACING:
+        rows = np.asarray(regions.get(name, []), np.int64)
+        bounding[rows] = forward[rows]
+    return np.flatnonzero(bounding)

@@ -42,8 +42,9 @@ RENDERING = (
 )
 """Settings that rendering depends on."""
 
-FRAME = ("origin", "background", "expression_scale")
-"""Small tensors: (3,) metres, (3,) colour that was trained on, (E,) divisors of the expression code."""
+FRAME = ("origin", "background", "expression_scale", "code_low", "code_high")
+"""Small tensors: (3,) metres, (3,) colour that was trained on, (E,) divisors of the expression code, (E,) bounds of it
+that colour and attributes follow."""
 
 
 def write_avatar(path: Path, config: GHAConfig, tensors: Mapping[str, Tensor]) -> None:
@@ -79,7 +80,8 @@ def read_avatar(path: Path, expression_size: int, device: str) -> tuple[Gaussian
     head = GaussianHead.of(_settings(path, text), expression_size)
     expected: dict[str, tuple[int | None, ...]] = {**head.shapes(), "landmarks": (None, 3)}
     expected["table"] = (None, sum(POINTS.values()) + head.config.features)
-    expected |= {"origin": (3,), "background": (3,), "expression_scale": (expression_size,)}
+    of_code = ("expression_scale", "code_low", "code_high")
+    expected |= {"origin": (3,), "background": (3,), **dict.fromkeys(of_code, (expression_size,))}
     for name, shape in expected.items():
         value = tensors.get(name)
         if value is None:

@@ -22,7 +22,7 @@ TRAINED = {
     "splats": {"min_densify_every": 8, "min_reset_every": 10, "min_settle": 2, "checkpoint_every_s": 0.0},
 }
 OWN_TRAINING = {
-    "gha": {"budget": {"iterations": 24}, "grid_vertices": 3_000, "start_steps": 20},
+    "gha": {"budget": {"iterations": 24}, "grid_vertices": 3_000, "start_steps": 20, "motion_steps": 20},
     "insta": {"budget": {"iterations": 24}, "checkpoint_every_s": 0.0, **SMALL_INSTA},
 }
 """Methods that do not train splats bound to the mesh, with their own short settings."""

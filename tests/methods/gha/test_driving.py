@@ -105,3 +105,24 @@ def test_another_head_models_pose_is_refused(rigged):
     _, _, _, driver, poses = rigged
     with pytest.raises(InputError, match="head_model"):
         driver.arguments([replace(poses[0], head_model="other")])
+
+
+@pytest.mark.parametrize("eyelids", [False, True])
+def test_a_code_gives_back_what_it_was_made_of(eyelids):
+    head = toy_head(16, eyelids=eyelids)
+    size = code_size(head)
+    scale = torch.linspace(0.2, 2.0, size)
+    driver = Driver(
+        head, np.zeros(head.shape_basis.shape[2]), np.zeros_like(head.template), ORIGIN, UNIT, scale, "cpu"
+    )
+    rng = np.random.default_rng(2)
+    pose = toy_pose(head, rng, 0, "toy")
+    if eyelids:
+        pose = replace(pose, eyelids=np.array([0.3, 0.7], np.float32))
+    arguments = driver.arguments([pose])
+    (signal,) = driver.signals(arguments)
+    back = driver.still(signal.expression[None])
+    for name in ("expression", "jaw", "eyes", *(["eyelids"] if eyelids else [])):
+        torch.testing.assert_close(back[name], arguments[name], atol=1e-6, rtol=1e-5)
+    assert all(not back[name].any() for name in ("rotation", "neck", "translation"))
+    torch.testing.assert_close(driver.unposed(back), driver.unposed(arguments), atol=1e-5, rtol=1e-5)

@@ -34,6 +34,8 @@ def model(**more):
         "quats": random(COUNT, 4),
         "opacities": random(COUNT),
         "landmarks": random(3, 3, scale=0.6),
+        "code_low": torch.full((CODE,), -9.0, dtype=torch.float64),
+        "code_high": torch.full((CODE,), 9.0, dtype=torch.float64),
     }
     turn = torch.tensor(Rotation.from_rotvec([0.2, -0.1, 0.3]).as_matrix())
     motion = Motion(turn, random(3, scale=0.01), random(6))
@@ -57,7 +59,9 @@ def test_gradients_of_the_whole_model_agree_with_finite_differences(residual):
         return (image - target).square().sum() + drawn.features[..., :3].square().sum()
 
     variables = {
-        name: value.clone().requires_grad_() for name, value in tensors.items() if name != "landmarks"
+        name: value.clone().requires_grad_()
+        for name, value in tensors.items()
+        if name not in ("landmarks", "code_low", "code_high")
     }
     parts = [value.clone().requires_grad_() for value in motion]
     loss({**tensors, **variables}, Motion(*parts)).backward()
@@ -136,3 +140,30 @@ def test_zoom_keeps_features_and_truth_together():
     assert larger.alpha.all()
     assert larger.features[6, 8, 0].item() == 6
     assert small_truth.shape == truth.shape
+
+
+def test_beyond_its_bounds_the_code_moves_points_but_changes_nothing_else():
+    head, tensors, signal, motion, _ = model()
+    high = torch.full((CODE,), 0.5, dtype=torch.float64)
+    tensors["code_high"] = high
+
+    def posed(code):
+        return head.splats(tensors, signal._replace(expression=code), motion)
+
+    at, beyond, below = posed(high), posed(high + 3), posed(high - 0.5)
+    torch.testing.assert_close(beyond.features, at.features)
+    torch.testing.assert_close(beyond.opacities, at.opacities)
+    torch.testing.assert_close(beyond.world.scales, at.world.scales)
+    assert not torch.allclose(beyond.world.means, at.world.means, atol=1e-4)
+    assert not torch.allclose(below.features, at.features, atol=1e-4)
+
+
+def test_noise_is_for_colours_and_attributes_alone():
+    head, tensors, signal, motion, _ = model()
+    noise = torch.full((CODE,), 0.7, dtype=torch.float64)
+    plain, noisy = head.splats(tensors, signal, motion), head.splats(tensors, signal, motion, noise)
+    moved = head.splats(tensors, signal._replace(expression=signal.expression + noise), motion)
+    torch.testing.assert_close(noisy.world.means, plain.world.means)
+    torch.testing.assert_close(noisy.features, moved.features)
+    torch.testing.assert_close(noisy.opacities, moved.opacities)
+    assert not torch.allclose(noisy.features, plain.features, atol=1e-4)

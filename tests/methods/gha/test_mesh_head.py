@@ -11,7 +11,7 @@ from headbench.methods.gha.mesh_head import DISC_RADIUS, DISC_THICKNESS, MeshHea
 from headbench.methods.gha.mesh_stage import mesh_stage
 from headbench.methods.gha.mesh_training import MeshTraining, roughness, soft_overlap
 from headbench.methods.gha.scene import scene_of
-from headbench.methods.gha.signed_distance import TangentDistance, vertex_normals
+from headbench.methods.gha.signed_distance import TangentDistance, outer_vertices, vertex_normals
 from headbench.methods.gha.tetrahedra import marching_tetrahedra, tet_grid
 from headbench.methods.triplane import encode
 
@@ -128,3 +128,17 @@ def test_the_mesh_stage_learns_shape_motion_and_colour(clip, tmp_path):
         moved = moved + head.landmark_offsets(result.tensors, landmarks, spacing)[1]
     still = scene.driver.canonical(scene.driver.neutral)[rows]
     assert (moved - tracked).square().mean() < 0.5 * (still - tracked).square().mean()
+
+
+def test_what_lies_behind_the_skin_does_not_bound_the_head(head):
+    vertices, faces = np.asarray(head.template, np.float64), np.asarray(head.faces)
+    kept = set(outer_vertices(vertices, faces, head.regions).tolist())
+    facing = vertex_normals(vertices, faces)[:, 2]
+    for name in ("left_eyeball", "right_eyeball"):
+        rows = np.asarray(head.regions[name])
+        front = {int(row) for row in rows if facing[row] > 0.3}
+        assert kept & set(rows.tolist()) == front
+        assert 0 < len(front) < len(rows)
+    for name in ("mouth_socket", "teeth"):
+        assert not kept & set(np.asarray(head.regions.get(name, [])).tolist())
+    assert kept >= set(np.asarray(head.regions["nose"]).tolist())

@@ -75,6 +75,18 @@ def test_a_condition_once_is_a_condition_at_every_point(sizes, hidden, seed):
     assert torch.allclose(mlp(weights, points, condition, 1), expected[:, :1], atol=1e-12)
 
 
+@given(hidden=st.lists(st.integers(1, 7), max_size=4).map(tuple), seed=st.integers(0, 99))
+@settings(max_examples=20, deadline=None)
+def test_several_conditions_at_once_are_each_on_its_own(hidden, seed):
+    mlp = Mlp("m", 3, 2, hidden, 4)
+    generator = torch.Generator().manual_seed(seed)
+    weights = {name: value.double() for name, value in mlp.initial(generator).items()}
+    points = torch.randn(5, 3, generator=generator, dtype=torch.float64)
+    conditions = torch.randn(6, 2, generator=generator, dtype=torch.float64)
+    expected = torch.stack([plain(mlp, weights, points, condition) for condition in conditions])
+    assert torch.allclose(mlp(weights, points, conditions), expected, atol=1e-12)
+
+
 def test_network_gradients_agree_with_finite_differences():
     mlp = Mlp("m", 3, 2, (5, 4), 2)
     generator = torch.Generator().manual_seed(0)

@@ -1,0 +1,110 @@
+"""What the head model knows of the face's motion, as a teacher of the deformation network.
+
+The published network learns motion from landmarks and images of thousands of timesteps. A short clip shows few of the
+directions of the expression code; the head model that tracked it moves its face in all of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..seeds import torch_generator
+from ..triplane import encode
+from .config import GHAConfig
+from .driving import Driver
+from .landmarks import influences
+from .networks import Mlp, Weights
+from .scene import Scene
+from .starts import fitted
+
+TURNING = ("left_eyeball", "right_eyeball")
+"""Regions left out: gaze turns them under the lids, where one field of displacements has no room for both."""
+
+CODES, CODES_AT_ONCE = 512, 32
+"""Expression codes kept, and how many of them one draw takes."""
+
+POINTS_AT_ONCE = 64
+
+RATES = (5e-3, 5e-4)
+"""First and last learning rate of the fit before the mesh stage."""
+
+SHARE_TRACKED, AROUND_TRACKED = 0.5, 0.3
+"""Share of the codes that lie about those of training timesteps, and their standard deviation there; the others are
+standard normal."""
+
+STILL = 0.02
+"""Canonical units (2 mm of the published 0.1 m) of motion below which an error counts no more for being relative."""
+
+
+class TrackedMotion(NamedTuple):
+    """Displacements of the head model's vertices by expression codes.
+
+    Attributes
+    ----------
+    encoded : (n, 27) positional encoding of vertices at rest (`Scene.rest`), those where expression alone rules.
+    codes : (K, E) expression codes.
+    moves : (K, n, 3) displacements from rest, canonical units.
+    weights : (n,) one over each vertex's mean squared motion, so that lids count beside a jaw.
+    scale : factor of the network's outputs.
+    """
+
+    encoded: Tensor
+    codes: Tensor
+    moves: Tensor
+    weights: Tensor
+    scale: float
+
+    @classmethod
+    @torch.no_grad()
+    def of(cls, scene: Scene, config: GHAConfig) -> TrackedMotion:
+        """Codes about those of the training timesteps and random ones, with what they do to the head model."""
+        rows = _rows(scene, config)
+        tracked = torch.stack([signal.expression for signal in scene.signals])
+        generator = torch_generator(scene.seed, "gha-motion-codes")
+        codes = torch.randn(CODES, tracked.shape[1], generator=generator).to(tracked)
+        known = round(SHARE_TRACKED * CODES)
+        chosen = torch.randint(len(tracked), (known,), generator=generator).to(tracked.device)
+        codes[:known] = tracked[chosen] + AROUND_TRACKED * codes[:known]
+        rest = scene.rest[rows]
+        moves = [_moved(scene.driver, part)[:, rows] - rest for part in codes.split(CODES_AT_ONCE)]
+        every = torch.cat(moves)
+        weights = 1 / (every.square().sum(2).mean(0) + STILL**2)
+        return cls(encode(rest), codes, every, weights, config.displacement_scale)
+
+    def error(self, network: Mlp, weights: Weights, generator: torch.Generator) -> Tensor:
+        """Mean squared error of the network's displacements, relative to the vertices' motion, over a draw of codes
+        and vertices."""
+        device = self.codes.device
+        rows = torch.randint(self.encoded.shape[0], (POINTS_AT_ONCE,), generator=generator).to(device)
+        drawn = torch.randint(len(self.codes), (CODES_AT_ONCE,), generator=generator).to(device)
+        found = self.scale * torch.tanh(network(weights, self.encoded[rows], self.codes[drawn]))
+        squared = (found - self.moves[drawn[:, None], rows]).square().sum(2)
+        return (self.weights[rows] * squared).mean()
+
+    def fitted(self, network: Mlp, initial: Mapping[str, Tensor], steps: int, seed: int) -> dict[str, Tensor]:
+        """The network's tensors after so many steps on `error`."""
+
+        def loss(weights: Weights, step: int) -> Tensor:
+            return self.error(network, weights, torch_generator(seed, "gha-motion-start", step))
+
+        return fitted(network, initial, loss, steps, RATES)
+
+
+def _moved(driver: Driver, codes: Tensor) -> Tensor:
+    """(B, V, 3) canonical vertices for (B, E) expression codes."""
+    return driver.unposed(driver.still(codes))
+
+
+def _rows(scene: Scene, config: GHAConfig) -> Tensor:
+    """Vertices within the landmarks' undivided rule."""
+    near, _ = influences(scene.rest, scene.rest[scene.landmark_rows], config.near_squared, config.far_squared)
+    ruled = torch.zeros(len(scene.rest), dtype=torch.bool, device=scene.rest.device)
+    ruled[near.rows[near.weights == 1]] = True
+    for name in TURNING:
+        if name in scene.clip.head.regions:
+            ruled[torch.as_tensor(scene.clip.head.regions[name], device=ruled.device)] = False
+    return ruled.nonzero().squeeze(1)
