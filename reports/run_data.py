@@ -18,6 +18,7 @@ from ..bench.contracts import ByteArray, Clip, FrameKey
 from ..bench.errors import InputError
 from ..bench.frames import read_png
 from ..bench.run_config import RunConfig
+from ..bench.scoring import FULL
 from ..bench.specs import MetricSpec
 from ..bench.store import RunFolder, keys_of, read_rows
 
@@ -112,7 +113,7 @@ class RunData:
         return "not rendered" if failed.empty else str(failed.iloc[0]["reason"])
 
     def value(self, metric: str, method: str, task: str, key: FrameKey) -> float | None:
-        """Return a metric of the image shown, or None where it was not measured."""
+        """Return a metric of the whole image shown, or None where it was not measured."""
         return self._by_frame.get((metric, method, task, *key))
 
     @property
@@ -136,6 +137,7 @@ class RunData:
     def _by_frame(self) -> dict[tuple[Any, ...], float]:
         rows = self.rows
         shown = rows[(rows["status"] == "ok") & (rows["timestep"] >= 0) & (rows["seed"] == self.seed)]
+        shown = shown[shown["region"] == FULL]
         places = shown[["metric", "method", "task", *FrameKey._fields]].itertuples(index=False, name=None)
         return dict(zip(places, shown["value"].astype(float)))
 

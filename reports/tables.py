@@ -8,6 +8,7 @@ import pandas as pd
 
 from ..bench.errors import InputError
 from ..bench.protocol import TASK_TITLES
+from ..bench.scoring import FULL
 from ..bench.specs import MetricSpec
 from .aggregate import Aggregate, check_rows, summarise, task_frames
 from .ranking import best_of_column, marking, ranked
@@ -26,7 +27,7 @@ def build_table(
     trivial: Sequence[str] = (),
     tasks: Sequence[str] | None = None,
     protocol_ids: Mapping[str, str] | None = None,
-    region: str = "full",
+    region: str = FULL,
     image_size: str = "",
     machine: str = "",
     avatar_title: str = AVATAR_TITLE,

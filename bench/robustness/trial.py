@@ -14,6 +14,7 @@ from ..adaptation import MethodNeeds
 from ..contracts import Avatar, Camera, Frame, FrameKey, HeadPose
 from ..frames import quantise, write_png
 from ..protocol import Protocol
+from ..scoring import FULL
 from ..stages import Job
 from ..store import Row
 from .stability import Measures, Verdict, measure
@@ -81,7 +82,7 @@ def to_rows(job: Job, task: str, trials: Sequence[Trial], protocol: str) -> list
                     sequence=trial.key.sequence,
                     timestep=trial.key.timestep,
                     camera=trial.key.camera,
-                    region="full",
+                    region=FULL,
                     metric=verdict.measure,
                     value=math.nan if verdict.value is None else verdict.value,
                     protocol=protocol,

@@ -12,6 +12,7 @@ from pathlib import Path
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.protocol import TASK_TITLES
+from ...bench.scoring import FULL
 from ...bench.specs import Findings, MetricSpec
 from ..run_set import RunSet
 from ..statistics.comparisons import Comparison, compare
@@ -19,7 +20,6 @@ from ..table_report import COMPARISON
 from ..tables import AVATAR_TITLE
 from .settings import CompareSettings
 
-REGION = "full"
 FIELDS = (
     *("task", "metric", "first", "second", "difference", "low", "high", "effect", "p", "p_holm"),
     *("family", "subjects", "wins", "seeds_first", "seeds_second", "verdict", "reason"),
@@ -39,7 +39,7 @@ def run(settings: CompareSettings, progress: Progress = no_progress) -> Findings
     if strange:
         names = ", ".join(spec.name for spec in runs.metrics)
         raise InputError("command line", "--metrics", f"metrics of the runs: {names}", ", ".join(strange))
-    rows = runs.rows[runs.rows["region"] == REGION]
+    rows = runs.rows[runs.rows["region"] == FULL]
     columns = [(task, spec) for task in runs.tasks for spec in metrics if spec.per_frame]
     columns += [("", spec) for spec in metrics if not spec.per_frame]
     found: list[tuple[MetricSpec, list[Comparison]]] = []

@@ -3,13 +3,14 @@ import subprocess
 import sys
 
 import numpy as np
+import pandas as pd
 import pytest
 from PIL import Image
 
 from headbench.bench.errors import InputError
 from headbench.bench.registry import resolve
 from headbench.bench.specs import ReportSpec
-from headbench.bench.store import RunFolder, read_rows
+from headbench.bench.store import RunFolder, read_rows, write_rows
 from headbench.reports import specs
 from headbench.reports.run_data import RunData
 from headbench.reports.run_set import RunSet
@@ -114,7 +115,9 @@ def test_reports_need_no_torch():
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-def test_the_number_under_an_image_is_that_of_the_image(toy_run):
+def test_the_number_under_an_image_is_that_of_the_whole_image(toy_run):
+    rows = read_rows(RunFolder(toy_run).rows)
+    write_rows(RunFolder(toy_run).rows, pd.concat([rows, rows.assign(region="face", value=99.0)]))
     data = RunData.read(toy_run)
     for key in data.keys("novel_view"):
         error = np.abs(data.render("toy", "novel_view", key).astype(float) - data.truth(key)).mean()
