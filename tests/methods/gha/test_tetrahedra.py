@@ -65,7 +65,7 @@ def test_a_sphere_has_its_area_and_volume_within_a_hundredth():
     assert volume == pytest.approx(4 / 3 * np.pi, rel=0.01)
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=4, deadline=None)
 @given(st.tuples(*[st.floats(0.5, 1.2)] * 3), st.tuples(*[st.floats(-0.05, 0.05)] * 3))
 def test_ellipsoids_have_their_area_and_volume(axes, center):
     grid = box(spacing=0.08)
