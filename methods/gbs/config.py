@@ -56,7 +56,7 @@ class GBSConfig:
         differences are zero and not stored, and at which they count in full. The published values: a tenth of the
         largest displacement by FLAME's 50th expression, and the largest by its first.
     alpha_weight : of the mean squared difference of alpha and matte; needs mattes, else it is left out.
-    teeth_weight : of the penalty on teeth that leave the mouth (`mouth.Cylinder`).
+    teeth_weight : of the penalty on teeth that leave the mouth (`mouth.Cylinder`), the mean over each row, added up.
     departures : what to do as the published code does. "triple_correctives" adds the pose correctives of a
         triangle's corners instead of interpolating them, which makes them three times too strong;
         "blended_lower_teeth" lets the lower teeth follow root and neck by 5.6 % instead of the jaw alone.

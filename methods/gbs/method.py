@@ -34,7 +34,7 @@ from .training import GBSTraining
 class GBS:
     """The method: see the module."""
 
-    name, version = "gbs", "1"
+    name, version = "gbs", "2"
 
     def __init__(self, config: GBSConfig | None = None):
         self.config = config or GBSConfig()

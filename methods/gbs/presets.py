@@ -57,8 +57,5 @@ GBS_PRESETS: dict[str, dict[str, Any]] = {
         "teeth_samples": 1_500,
         "splats": {**_SPLATS, "max_splats": 40_000},
     },
-    "paper": {
-        "budget": {"iterations": 40_000},
-        "departures": ("triple_correctives", "blended_lower_teeth"),
-    },
+    "paper": {"budget": {"iterations": 40_000}},
 }

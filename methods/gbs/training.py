@@ -34,11 +34,17 @@ gradients by the table are not scaled down to where Adam's epsilon counts."""
 
 
 class Start(NamedTuple):
-    """Where splats are put at the start: first those of the head, then those of the teeth."""
+    """Where splats are put at the start.
+
+    Attributes
+    ----------
+    points, spacing : N points, and the distances between them and their neighbours, metres.
+    part : (N,) what each is put on, in ascending order: 0 for the head, then a number for each row of teeth.
+    """
 
     points: SurfacePoints
     spacing: np.ndarray
-    on_head: int
+    part: np.ndarray
 
 
 class GBSTraining(SplatTrainer):
@@ -79,9 +85,10 @@ class GBSTraining(SplatTrainer):
         self._counts = torch.from_numpy(counts).to(device)
         self._expressions = torch.from_numpy(expressions).to(device)
         self._weights = torch.from_numpy(weights).to(device, torch.float32)
-        self._on_head = start.on_head
+        self._part = torch.from_numpy(start.part).to(device)
+        self._rows = int(start.part[-1])
         self._room = None
-        if start.on_head < len(counts):
+        if self._rows:
             room = mouth_room(vertices[head.regions["teeth"]])
             self._room = room._replace(center=room.center.to(device))
         poses = {pose_key(clip.poses[key.timestep]): clip.poses[key.timestep] for key in self.keys}
@@ -92,7 +99,7 @@ class GBSTraining(SplatTrainer):
         self._carried = BoundedCache(self._carry, entries)
         splats, shared = self._initial(start, int(counts.sum()), device, seed)
         thresholds = torch.full((len(counts),), config.splats.densify_gradient, device=device)
-        thresholds[start.on_head :] = config.teeth_densify_gradient
+        thresholds[self._part > 0] = config.teeth_densify_gradient
         self._start(
             splats,
             shared,
@@ -130,10 +137,12 @@ class GBSTraining(SplatTrainer):
         if self._mattes and config.alpha_weight:
             loss = loss + config.alpha_weight * (rendering.alpha - image[:, :, 3]).square().mean()
         if self._room is not None and config.teeth_weight:
-            teeth = (self.binding >= self._on_head).nonzero().squeeze(1)
-            if len(teeth):
-                violation = self._room.violation(optimiser["means"].index_select(0, teeth))
-                loss = loss + config.teeth_weight * violation
+            part = self._part.index_select(0, self.binding)
+            for row in range(1, self._rows + 1):
+                teeth = (part == row).nonzero().squeeze(1)
+                if len(teeth):
+                    violation = self._room.violation(optimiser["means"].index_select(0, teeth))
+                    loss = loss + config.teeth_weight * violation
         return loss
 
     @property
@@ -201,7 +210,8 @@ def start_of(clip: Clip, config: GBSConfig, subject: Subject, head: HeadArrays, 
     found = [poisson_disk(vertices, faces, *part, seed) for part in parts if part[1] > 0]
     points = SurfacePoints(*(np.concatenate(columns) for columns in zip(*found)))
     distances = [spacing(part.positions(vertices, faces)) for part in found]
-    return Start(points, np.concatenate(distances), len(found[0].triangles))
+    part = np.repeat(np.arange(len(found)), [len(points.triangles) for points in found])
+    return Start(points, np.concatenate(distances), part)
 
 
 def sample_count(clip: Clip, config: GBSConfig, area: float, middle: np.ndarray) -> int:

@@ -91,15 +91,16 @@ def test_the_loss_is_the_papers_sum(training, clip):
     expected += 10 * np.mean((rendering.alpha.double().numpy() - clip.mask(key) / 255.0) ** 2)
     vertices = training.rig.mesh.canonical.numpy()
     room = mouth_room(vertices[head.regions["teeth"]])
-    on_teeth = np.isin(
-        training.points.triangles, np.flatnonzero(np.isin(head.faces, head.regions["teeth"]).any(1))
-    )
-    x, y, z = (neutral["means"].double().numpy()[on_teeth] - room.center.double().numpy()).T
-    outward = np.maximum(np.hypot(x, z) - room.radius, 0)
-    upward = np.maximum(np.abs(y) - room.half_height, 0)
-    violation = np.mean(outward**2 + upward**2)
-    assert violation > 0
-    assert found == pytest.approx(expected + 100 * violation, rel=1e-4)
+    for row in ("teeth_upper", "teeth_lower"):
+        of_row = np.flatnonzero(np.isin(head.faces, head.regions[row]).any(1))
+        on_row = np.isin(training.points.triangles, of_row)
+        x, y, z = (neutral["means"].double().numpy()[on_row] - room.center.double().numpy()).T
+        outward = np.maximum(np.hypot(x, z) - room.radius, 0)
+        upward = np.maximum(np.abs(y) - room.half_height, 0)
+        violation = np.mean(outward**2 + upward**2)
+        assert violation > 0
+        expected += 100 * violation
+    assert found == pytest.approx(expected, rel=1e-4)
 
 
 def test_without_mattes_alpha_is_left_alone(clip):
