@@ -61,7 +61,8 @@ def test_unposed_meshes_know_no_rigid_motion_and_pictures_show_the_jaw():
         replace(clip.poses[0], rotation=np.ones(3), neck=np.ones(3), translation=np.ones(3)),
     ]
     meshes = unposed_meshes(clip, [*poses, replace(poses[0], jaw=poses[0].jaw + [0.3, 0, 0])])
-    np.testing.assert_array_equal(meshes[0], meshes[1])
+    # Rows of a batch round alike on some processors only.
+    np.testing.assert_allclose(meshes[0], meshes[1], rtol=0, atol=1e-8)
     first, second, third = draw_meshes(clip, meshes, 40, 50)
     np.testing.assert_array_equal(first, second)
     assert (first != third).any()
