@@ -15,11 +15,12 @@ from ..subject_mesh import SubjectMesh
 from .canonical import canonical_surface
 from .config import InstaConfig
 from .field import Architecture, Field, Parameters, Prior
+from .inference import Inference
 from .marching import PosedSurface, Space
 from .occupancy import Occupancy, occupied_space
 from .parts import mouth_triangles
 from .rays import box_corners, camera_rays, pixels_of_hull
-from .rendering import Marching, Scene, render_rays
+from .rendering import Marching, Scene
 from .storage import FIELD_FILE, SETTINGS_FILE, read_field, read_settings
 
 RAYS_AT_ONCE = 1 << 15
@@ -49,8 +50,8 @@ class InstaAvatar:
     ):
         self.subject, self.config, self.space = subject, config, space
         self._folder, self._mesh, self._surface = folder, mesh, surface.surface
-        self._field, self._parameters, self._mouth = field, parameters, mouth
-        self._marching = Marching(config.step, config.round_samples, config.stop_transmittance)
+        marching = Marching(config.step, config.round_samples, config.stop_transmittance)
+        self._inference = Inference(field, parameters, space, mouth, marching)
         self._last: tuple[bytes, PosedSurface] | None = None
 
     @classmethod
@@ -89,11 +90,9 @@ class InstaAvatar:
             numbers = np.arange(start, min(start + RAYS_AT_ONCE, width * (bottom - top)))
             rows, columns = top + numbers // width, left + numbers % width
             scene = Scene(surface, condition, camera_rays(camera, columns, rows, MIDDLE))
-            rendered = render_rays(
-                self._field, self._parameters, [scene], self.space, self._mouth, self._marching
-            )
-            left_over = rendered.transmittance.cpu().numpy()[:, None]
-            rgb[rows, columns] = rendered.color.cpu().numpy() + left_over * rgb[rows, columns]
+            seen = self._inference.render(scene)
+            left_over = seen.transmittance[:, None]
+            rgb[rows, columns] = seen.color + left_over * rgb[rows, columns]
             alpha[rows, columns] = 1 - left_over[:, 0]
         return Frame(rgb.clip(0, 1), alpha.clip(0, 1))
 

@@ -112,6 +112,7 @@ class PosedSurface:
         self.corners = vertices[surface.faces]
         self.centroids = self.corners.mean(1)
         self._mesh: Any = None
+        self._guide: tuple[Space, Any] | None = None
         if surface.module is not None:
             self._mesh = surface.module.posed(surface.tree, _array(vertices.float()))
 
@@ -151,18 +152,28 @@ class PosedSurface:
         """
         if self._mesh is None:
             return self._march_reference(rays, first, step, samples_max, space)
-        blend, module = self.surface.blend, self.surface.module
+        module = self.surface.module
         assert module is not None
         return Samples(
             *module.march(
-                self._mesh,
+                self.guide(space),
                 *(np.ascontiguousarray(rays.origins), np.ascontiguousarray(rays.directions)),
-                *(first, np.ascontiguousarray(rays.jitter), step, samples_max, space.reach),
-                *(_array(self.matrices.float()), _array(self.centroids.float()), blend.neighbours),
-                *(blend.own_falloff, blend.neighbour_falloff, space.low, 1 / space.cell, space.free),
-                self.surface.threads(),
+                *(first, np.ascontiguousarray(rays.jitter), step, samples_max, self.surface.threads()),
             )
         )
+
+    def guide(self, space: Space) -> Any:
+        """The kernel's view of this pose and a space; the last one is kept. Needs the kernel."""
+        if self._guide is None or self._guide[0] is not space:
+            blend, module = self.surface.blend, self.surface.module
+            assert module is not None
+            made = module.Guide(
+                *(self._mesh, space.reach, _array(self.matrices.float()), _array(self.centroids.float())),
+                *(blend.neighbours, blend.own_falloff, blend.neighbour_falloff),
+                *(space.low, 1 / space.cell, space.free),
+            )
+            self._guide = space, made
+        return self._guide[1]
 
     def _march_reference(
         self, rays: Rays, first: np.ndarray, step: float, samples_max: int, space: Space

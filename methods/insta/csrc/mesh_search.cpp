@@ -10,70 +10,7 @@ namespace headbench::insta {
 namespace {
 
 constexpr std::int32_t kLeafSize = kLanes;
-constexpr int kDepthMax = 40;  // halving 2^28 triangles takes 28
-// Distances that differ by no more than rounding count as equal.
-constexpr float kTie = 2e-6f;
-constexpr float kTieFloor = 1e-16f;
-
-// Squared distances of a point to four boxes.
-void squared_distances(const WideBox& boxes, Vec3 p, float* out) {
-  const float at[3] = {p.x, p.y, p.z};
-  for (int lane = 0; lane < kLanes; ++lane) out[lane] = 0;
-  for (int i = 0; i < 3; ++i)
-    for (int lane = 0; lane < kLanes; ++lane) {
-      const float below = boxes.low[i][lane] - at[i], above = at[i] - boxes.high[i][lane];
-      float out_of = below > above ? below : above;
-      out_of = out_of > 0 ? out_of : 0;
-      out[lane] += out_of * out_of;
-    }
-}
-
-// Squared distances of a point to four triangles: the nearest of three edges, or the plane where the foot lies
-// inside all of them. Without branches, so that the lanes run side by side.
-void squared_distances(const WideTriangles& t, Vec3 p, float* out) {
-  const float at[3] = {p.x, p.y, p.z};
-  float ap[3][kLanes];
-  float d1[kLanes] = {}, d2[kLanes] = {}, ab2[kLanes] = {}, ac2[kLanes] = {}, abac[kLanes] = {}, height[kLanes] = {};
-  for (int i = 0; i < 3; ++i)
-    for (int lane = 0; lane < kLanes; ++lane) {
-      ap[i][lane] = at[i] - t.a[i][lane];
-      d1[lane] += t.ab[i][lane] * ap[i][lane];
-      d2[lane] += t.ac[i][lane] * ap[i][lane];
-      ab2[lane] += t.ab[i][lane] * t.ab[i][lane];
-      ac2[lane] += t.ac[i][lane] * t.ac[i][lane];
-      abac[lane] += t.ab[i][lane] * t.ac[i][lane];
-      height[lane] += t.normal[i][lane] * ap[i][lane];
-    }
-  float on_ab[kLanes], on_ac[kLanes], on_bc[kLanes];
-  for (int lane = 0; lane < kLanes; ++lane) {
-    const auto clamped = [](float value) { return value < 0 ? 0.0f : value > 1 ? 1.0f : value; };
-    on_ab[lane] = clamped(d1[lane] * t.by_ab[lane]);
-    on_ac[lane] = clamped(d2[lane] * t.by_ac[lane]);
-    // (p - b) . (c - b) = (ap - ab) . (ac - ab)
-    on_bc[lane] = clamped((d2[lane] - d1[lane] - abac[lane] + ab2[lane]) * t.by_bc[lane]);
-  }
-  float to_ab[kLanes] = {}, to_ac[kLanes] = {}, to_bc[kLanes] = {};
-  for (int i = 0; i < 3; ++i)
-    for (int lane = 0; lane < kLanes; ++lane) {
-      const float x = ap[i][lane], ab = t.ab[i][lane], ac = t.ac[i][lane];
-      const float way_ab = x - on_ab[lane] * ab, way_ac = x - on_ac[lane] * ac;
-      const float way_bc = x - ab - on_bc[lane] * (ac - ab);
-      to_ab[lane] += way_ab * way_ab;
-      to_ac[lane] += way_ac * way_ac;
-      to_bc[lane] += way_bc * way_bc;
-    }
-  for (int lane = 0; lane < kLanes; ++lane) {
-    // Barycentric coordinates of the foot times the determinant (Ericson, "Real-Time Collision Detection", 3.4).
-    const float v = ac2[lane] * d1[lane] - abac[lane] * d2[lane];
-    const float w = ab2[lane] * d2[lane] - abac[lane] * d1[lane];
-    const float whole = ab2[lane] * ac2[lane] - abac[lane] * abac[lane];
-    const float edge = to_ab[lane] < to_ac[lane] ? to_ab[lane] : to_ac[lane];
-    const float edges = edge < to_bc[lane] ? edge : to_bc[lane];
-    const float plane = height[lane] * height[lane] * t.by_area[lane];
-    const bool inside = (v >= 0) & (w >= 0) & (v + w <= whole) & (t.by_area[lane] > 0) & (plane < edges);
-    out[lane] = inside ? plane : edges;
-  }
-}
+constexpr float kFar = 1e30f;  // its square is infinite
 
 float inverse(float value) { return value > 0 && std::isfinite(1 / value) ? 1 / value : 0.0f; }
 
@@ -85,41 +22,15 @@ void set_lane(WideTriangles& t, int lane, const Triangle& triangle, std::int32_t
   put(t.ab, ab);
   put(t.ac, ac);
   put(t.normal, normal);
+  t.ab2[lane] = dot(ab, ab);
+  t.ac2[lane] = dot(ac, ac);
+  t.abac[lane] = dot(ab, ac);
   t.by_ab[lane] = inverse(dot(ab, ab));
   t.by_ac[lane] = inverse(dot(ac, ac));
   t.by_bc[lane] = inverse(dot(bc, bc));
   t.by_area[lane] = inverse(dot(normal, normal));
   t.index[lane] = index;
 }
-
-float plane_distance(const Triangle& t, Vec3 p) {
-  const Vec3 normal = cross(t.b - t.a, t.c - t.a);
-  const float length = std::sqrt(dot(normal, normal));
-  return length > 0 ? std::fabs(dot(normal, p - t.a)) / length : 0.0f;
-}
-
-struct Best {
-  Hit hit;
-  float reach;  // what is farther cannot be chosen
-  const Triangle* triangle = nullptr;
-
-  void offer(const Triangle& candidate, std::int32_t index, float squared, Vec3 p) {
-    if (!(squared <= reach)) return;
-    const float slack = kTie * hit.value + kTieFloor;
-    const bool nearer = triangle == nullptr || squared < hit.value - slack;
-    if (!nearer) {
-      const float own = plane_distance(candidate, p), other = plane_distance(*triangle, p);
-      if (own < other || (own == other && index > hit.triangle)) {
-        hit.value = std::min(hit.value, squared);
-        return;
-      }
-    }
-    hit.value = nearer ? squared : std::min(hit.value, squared);
-    hit.triangle = index;
-    triangle = &candidate;
-    reach = hit.value * (1 + kTie) + kTieFloor;
-  }
-};
 
 // Distance along a ray at which it enters a box, or infinity.
 float entry(const Box& box, Vec3 origin, Vec3 inverse, float limit) {
@@ -149,7 +60,7 @@ void Box::add(const Box& other) {
 }
 
 Tree::Tree(const std::int32_t* faces, std::int64_t face_count, const float* vertices, std::int64_t vertex_count)
-    : faces_(faces, faces + 3 * face_count), order_(face_count), vertex_count_(vertex_count) {
+    : faces_(faces, faces + 3 * face_count), order_(face_count), leaf_of_(face_count), vertex_count_(vertex_count) {
   if (face_count < 1 || face_count > (std::int64_t{1} << 28))
     throw std::invalid_argument("a mesh has from 1 to 2^28 triangles");
   for (const std::int32_t index : faces_)
@@ -170,11 +81,12 @@ Tree::Tree(const std::int32_t* faces, std::int64_t face_count, const float* vert
   widen(0);
 }
 
-// Takes a node apart into up to four below it, the largest first, and puts them side by side.
+// Takes a node apart into up to kLanes below it, the one put in first at first, and puts them side by side.
 std::int32_t Tree::widen(std::int32_t node) {
   const auto self = static_cast<std::int32_t>(wide_.size());
-  wide_.push_back({{0, 0, 0, 0}, {-1, -1, -1, -1}});
-  std::int32_t below[kLanes] = {node, -1, -1, -1};
+  wide_.emplace_back();
+  for (int lane = 0; lane < kLanes; ++lane) wide_[self].child[lane] = wide_[self].node[lane] = -1;
+  std::int32_t below[kLanes] = {node};
   int used = 1;
   while (used < kLanes) {
     int inner = -1;  // of the inner nodes, the one that was put in first
@@ -190,6 +102,9 @@ std::int32_t Tree::widen(std::int32_t node) {
     std::int32_t child;
     if (nodes_[below[lane]].count > 0) {
       child = ~static_cast<std::int32_t>(leaves_.size());
+      const Node& leaf = nodes_[below[lane]];
+      for (std::int32_t k = leaf.first; k < leaf.first + leaf.count; ++k)
+        leaf_of_[order_[k]] = static_cast<std::int32_t>(leaves_.size());
       leaves_.push_back(below[lane]);
     } else {
       child = widen(below[lane]);
@@ -221,7 +136,8 @@ void Tree::build(std::vector<Vec3>& centroids, std::int32_t first, std::int32_t 
   build(centroids, first + half, count - half);
 }
 
-Posed::Posed(std::shared_ptr<const Tree> tree, const float* vertices) : tree_(std::move(tree)) {
+Posed::Posed(std::shared_ptr<const Tree> tree, const float* vertices, Nearest nearest)
+    : tree_(std::move(tree)), nearest_(nearest) {
   const std::int64_t count = tree_->face_count();
   by_face_.resize(count);
   by_order_.resize(count);
@@ -254,61 +170,28 @@ Posed::Posed(std::shared_ptr<const Tree> tree, const float* vertices) : tree_(st
   wide_.resize(wide.size());
   for (std::size_t i = 0; i < wide.size(); ++i)
     for (int lane = 0; lane < kLanes; ++lane) {
-      const Box box = wide[i].node[lane] < 0 ? Box() : boxes_[wide[i].node[lane]];
+      const bool used = wide[i].node[lane] >= 0;
+      const Box box = used ? boxes_[wide[i].node[lane]] : Box();
       const float low[3] = {box.low.x, box.low.y, box.low.z}, high[3] = {box.high.x, box.high.y, box.high.z};
-      for (int axis = 0; axis < 3; ++axis) wide_[i].low[axis][lane] = low[axis], wide_[i].high[axis][lane] = high[axis];
+      for (int axis = 0; axis < 3; ++axis) {
+        wide_[i].low[axis][lane] = used ? low[axis] : kFar;
+        wide_[i].high[axis][lane] = used ? high[axis] : kFar;
+      }
     }
   leaves_.resize(tree_->leaves().size());
   for (std::size_t i = 0; i < leaves_.size(); ++i) {
     const Node& node = nodes[tree_->leaves()[i]];
-    leaves_[i] = WideTriangles{};
+    const Triangle none{{kFar, kFar, kFar}, {kFar, kFar, kFar}, {kFar, kFar, kFar}};
     for (int lane = 0; lane < kLanes; ++lane) {
-      leaves_[i].index[lane] = -1;
-      if (lane < node.count) set_lane(leaves_[i], lane, by_order_[node.first + lane], tree_->order()[node.first + lane]);
+      const bool used = lane < node.count;
+      set_lane(leaves_[i], lane, used ? by_order_[node.first + lane] : none, used ? tree_->order()[node.first + lane] : -1);
     }
   }
 }
 
 Hit Posed::nearest(Vec3 point, float limit, std::int32_t hint) const {
-  Best best;
-  best.reach = limit;
-  if (hint >= 0) {
-    WideTriangles alone{};
-    float squared[kLanes];
-    set_lane(alone, 0, by_face_[hint], hint);
-    squared_distances(alone, point, squared);
-    best.offer(by_face_[hint], hint, squared[0], point);
-  }
-  struct Waiting {
-    std::int32_t child;
-    float distance;
-  } stack[kLanes * kDepthMax];
-  int top = 0;
-  stack[top++] = {0, 0};
-  const auto& wide = tree_->wide();
-  while (top > 0) {
-    const Waiting next = stack[--top];
-    if (!(next.distance <= best.reach)) continue;
-    float squared[kLanes];
-    if (next.child < 0) {
-      const WideTriangles& leaf = leaves_[~next.child];
-      squared_distances(leaf, point, squared);
-      for (int lane = 0; lane < kLanes; ++lane)
-        if (squared[lane] <= best.reach && leaf.index[lane] >= 0 && leaf.index[lane] != hint)
-          best.offer(by_face_[leaf.index[lane]], leaf.index[lane], squared[lane], point);
-      continue;
-    }
-    squared_distances(wide_[next.child], point, squared);
-    // The nearest on top.
-    const int floor = top;
-    for (int lane = 0; lane < kLanes; ++lane) {
-      if (!(squared[lane] <= best.reach) || wide[next.child].node[lane] < 0) continue;
-      int place = top++;
-      for (; place > floor && stack[place - 1].distance < squared[lane]; --place) stack[place] = stack[place - 1];
-      stack[place] = {wide[next.child].child[lane], squared[lane]};
-    }
-  }
-  return best.hit;
+  const Search search{tree_->wide().data(), wide_.data(), leaves_.data(), tree_->leaf_of().data(), by_face_.data()};
+  return nearest_(search, point, limit, hint);
 }
 
 Hit Posed::first_hit(Vec3 origin, Vec3 direction) const {

@@ -6,17 +6,9 @@
 #include <memory>
 #include <vector>
 
+#include "search.h"
+
 namespace headbench::insta {
-
-struct Vec3 {
-  float x, y, z;
-};
-
-inline Vec3 operator+(Vec3 a, Vec3 b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
-inline Vec3 operator-(Vec3 a, Vec3 b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
-inline Vec3 operator*(float s, Vec3 a) { return {s * a.x, s * a.y, s * a.z}; }
-inline float dot(Vec3 a, Vec3 b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
-inline Vec3 cross(Vec3 a, Vec3 b) { return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x}; }
 
 struct Box {
   Vec3 low{std::numeric_limits<float>::infinity(), std::numeric_limits<float>::infinity(),
@@ -34,15 +26,6 @@ struct Node {
   std::int32_t count;  // 0 for an inner node
 };
 
-constexpr int kLanes = 4;
-
-// Up to four nodes of the tree side by side. A child is a wide node, or the leaf ~child; unused lanes have the node
-// -1 and a box that nothing is near to.
-struct WideNode {
-  std::int32_t child[kLanes];
-  std::int32_t node[kLanes];
-};
-
 // Which triangles lie together. Made from one pose of the mesh; poses that differ moderately keep it tight.
 class Tree {
  public:
@@ -54,43 +37,23 @@ class Tree {
   const std::vector<std::int32_t>& order() const { return order_; }
   const std::vector<std::int32_t>& faces() const { return faces_; }
   const std::vector<WideNode>& wide() const { return wide_; }
-  const std::vector<std::int32_t>& leaves() const { return leaves_; }  // nodes
+  const std::vector<std::int32_t>& leaves() const { return leaves_; }    // nodes
+  const std::vector<std::int32_t>& leaf_of() const { return leaf_of_; }  // by triangle
 
  private:
   void build(std::vector<Vec3>& centroids, std::int32_t first, std::int32_t count);
   std::int32_t widen(std::int32_t node);
 
-  std::vector<std::int32_t> faces_, order_, leaves_;
+  std::vector<std::int32_t> faces_, order_, leaves_, leaf_of_;
   std::vector<Node> nodes_;
   std::vector<WideNode> wide_;
   std::int64_t vertex_count_;
 };
 
-struct Triangle {
-  Vec3 a, b, c;
-};
-
-// Boxes and triangles of four lanes, coordinate by coordinate.
-struct WideBox {
-  float low[3][kLanes], high[3][kLanes];
-};
-
-struct WideTriangles {
-  float a[3][kLanes], ab[3][kLanes], ac[3][kLanes], normal[3][kLanes];
-  float by_ab[kLanes], by_ac[kLanes], by_bc[kLanes];  // one over squared lengths of the edges, 0 for none
-  float by_area[kLanes];                              // one over the normal's square, 0 for none
-  std::int32_t index[kLanes];                         // -1 for an unused lane
-};
-
-struct Hit {
-  std::int32_t triangle = -1;
-  float value = std::numeric_limits<float>::infinity();  // squared distance, or distance along the ray
-};
-
 // The tree fitted to one pose.
 class Posed {
  public:
-  Posed(std::shared_ptr<const Tree> tree, const float* vertices);
+  Posed(std::shared_ptr<const Tree> tree, const float* vertices, Nearest nearest);
 
   const Tree& tree() const { return *tree_; }
   const std::vector<Box>& boxes() const { return boxes_; }
@@ -110,6 +73,7 @@ class Posed {
   std::vector<Box> boxes_;
   std::vector<WideBox> wide_;
   std::vector<WideTriangles> leaves_;
+  Nearest nearest_;
 };
 
 }  // namespace headbench::insta

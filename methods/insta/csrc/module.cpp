@@ -2,19 +2,23 @@
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/shared_ptr.h>
+#include <nanobind/stl/string.h>
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
 #include <memory>
 #include <stdexcept>
+#include <string>
 #include <tuple>
 #include <utility>
 #include <vector>
 
 #include "../../splats/csrc/thread_pool.h"
 #include "hash_grid.h"
+#include "instruction_sets.h"
 #include "march.h"
 #include "mesh_search.h"
+#include "render.h"
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -45,13 +49,17 @@ std::shared_ptr<Tree> make_tree(const Array<const std::int32_t, -1, 3>& faces, c
   return std::make_shared<Tree>(faces.data(), faces.shape(0), vertices.data(), vertices.shape(0));
 }
 
-std::shared_ptr<Posed> make_posed(std::shared_ptr<Tree> tree, const Array<const float, -1, 3>& vertices) {
-  require(static_cast<std::int64_t>(vertices.shape(0)) == tree->vertex_count());
-  return std::make_shared<Posed>(std::move(tree), vertices.data());
+// The instruction set of a name; of none, the fastest.
+const InstructionSet& instruction_set(const std::string& name) {
+  for (const InstructionSet* set : instruction_sets())
+    if (name.empty() || name == set->name) return *set;
+  throw std::invalid_argument("no such instruction set here: " + name);
 }
 
-Vec3 row(const float* values, std::int64_t number) {
-  return {values[3 * number], values[3 * number + 1], values[3 * number + 2]};
+std::shared_ptr<Posed> make_posed(std::shared_ptr<Tree> tree, const Array<const float, -1, 3>& vertices,
+                                  const std::string& isa) {
+  require(static_cast<std::int64_t>(vertices.shape(0)) == tree->vertex_count());
+  return std::make_shared<Posed>(std::move(tree), vertices.data(), instruction_set(isa).nearest);
 }
 
 template <class Query>
@@ -87,32 +95,61 @@ void first_hit(const Posed& mesh, const Array<const float, -1, 3>& origins, cons
   });
 }
 
-nb::tuple march_rays(const Posed& mesh, const Array<const float, -1, 3>& origins,
+// Where rays through one pose may meet density. Keeps the arrays it was made of.
+class Guide {
+ public:
+  Guide(std::shared_ptr<Posed> mesh, Array<const float, -1> reach, Array<const float, -1, 3, 4> matrices,
+        Array<const float, -1, 3> centroids, Array<const std::int32_t, -1, 3> neighbours,
+        Array<const float, -1> own_falloff, Array<const float, -1> neighbour_falloff, const Array<const float, 3>& low,
+        float cells_per_metre, Array<const std::uint8_t, -1, -1, -1> free)
+      : mesh_(std::move(mesh)), reach_(std::move(reach)), matrices_(std::move(matrices)),
+        centroids_(std::move(centroids)), neighbours_(std::move(neighbours)), own_falloff_(std::move(own_falloff)),
+        neighbour_falloff_(std::move(neighbour_falloff)), free_(std::move(free)), low_(row(low.data(), 0)),
+        cells_per_metre_(cells_per_metre) {
+    const std::size_t faces = face_count();
+    require(reach_.shape(0) == faces && matrices_.shape(0) == faces && centroids_.shape(0) == faces &&
+            neighbours_.shape(0) == faces && own_falloff_.shape(0) == faces && neighbour_falloff_.shape(0) == faces);
+    for (std::size_t i = 0; i < 3 * faces; ++i)
+      require(neighbours_.data()[i] < static_cast<std::int64_t>(faces));
+  }
+
+  std::size_t face_count() const { return static_cast<std::size_t>(mesh_->tree().face_count()); }
+
+  Marcher marcher(float step) const {
+    require(step > 0);
+    const Warp warp{matrices_.data(), centroids_.data(), neighbours_.data(), own_falloff_.data(),
+                    neighbour_falloff_.data()};
+    const Grid grid{low_, cells_per_metre_,
+                    {static_cast<std::int32_t>(free_.shape(0)), static_cast<std::int32_t>(free_.shape(1)),
+                     static_cast<std::int32_t>(free_.shape(2))},
+                    free_.data()};
+    return Marcher(*mesh_, warp, reach_.data(), grid, step);
+  }
+
+ private:
+  std::shared_ptr<Posed> mesh_;
+  Array<const float, -1> reach_;
+  Array<const float, -1, 3, 4> matrices_;
+  Array<const float, -1, 3> centroids_;
+  Array<const std::int32_t, -1, 3> neighbours_;
+  Array<const float, -1> own_falloff_, neighbour_falloff_;
+  Array<const std::uint8_t, -1, -1, -1> free_;
+  Vec3 low_;
+  float cells_per_metre_;
+};
+
+nb::tuple march_rays(const Guide& guide, const Array<const float, -1, 3>& origins,
                      const Array<const float, -1, 3>& directions, const Array<const std::int32_t, -1>& first,
-                     const Array<const float, -1>& jitter, float step, int samples_max,
-                     const Array<const float, -1>& reach, const Array<const float, -1, 3, 4>& matrices,
-                     const Array<const float, -1, 3>& centroids, const Array<const std::int32_t, -1, 3>& neighbours,
-                     const Array<const float, -1>& own_falloff, const Array<const float, -1>& neighbour_falloff,
-                     const Array<const float, 3>& low, float cells_per_metre,
-                     const Array<const std::uint8_t, -1, -1, -1>& free, int threads) {
-  const auto faces = static_cast<std::size_t>(mesh.tree().face_count());
+                     const Array<const float, -1>& jitter, float step, int samples_max, int threads) {
   require(directions.shape(0) == origins.shape(0) && first.shape(0) == origins.shape(0) &&
-          jitter.shape(0) == origins.shape(0) && step > 0 && samples_max >= 1 && reach.shape(0) == faces &&
-          matrices.shape(0) == faces && centroids.shape(0) == faces && neighbours.shape(0) == faces &&
-          own_falloff.shape(0) == faces && neighbour_falloff.shape(0) == faces && threads >= 1);
-  for (std::size_t i = 0; i < 3 * faces; ++i)
-    require(neighbours.data()[i] < static_cast<std::int64_t>(faces));
-  const Warp warp{matrices.data(), centroids.data(), neighbours.data(), own_falloff.data(), neighbour_falloff.data()};
-  const Grid grid{row(low.data(), 0), cells_per_metre,
-                  {static_cast<std::int32_t>(free.shape(0)), static_cast<std::int32_t>(free.shape(1)),
-                   static_cast<std::int32_t>(free.shape(2))},
-                  free.data()};
+          jitter.shape(0) == origins.shape(0) && samples_max >= 1 && threads >= 1);
+  const Marcher marcher = guide.marcher(step);
   const Rays rays{static_cast<std::int64_t>(origins.shape(0)), origins.data(), directions.data(), first.data(),
-                  jitter.data(), step, samples_max};
+                  jitter.data(), samples_max};
   Samples samples;
   {
     nb::gil_scoped_release unlocked;
-    samples = march(mesh, rays, reach.data(), warp, grid, threads);
+    samples = march(marcher, rays, threads);
   }
   return nb::make_tuple(given(std::move(samples.positions), 3), given(std::move(samples.directions), 3),
                         given(std::move(samples.distances), 1),
@@ -153,6 +190,70 @@ void encode_points_backward(const Array<const float, -1, 3>& positions, const Ar
                   static_cast<int>(table_gradient.shape(1)), table_gradient.data(), threads);
 }
 
+using Weights = std::vector<Array<const float, -1, -1>>;
+
+// The field's parameters. Keeps the arrays it was made of.
+class Trained {
+ public:
+  Trained(const std::vector<LevelTuple>& levels, Array<const float, -1, -1> table, const Array<const float, 3>& low,
+          float side, float bias, float depth, float scale, Weights density, Weights color)
+      : levels_(levels_of(levels, table.shape(0))), table_(std::move(table)), density_(std::move(density)),
+        color_(std::move(color)), density_layers_(layers(density_)), color_layers_(layers(color_)) {
+    const int features = static_cast<int>(table_.shape(1)), encoded = features * static_cast<int>(levels_.size());
+    require((features == 1 || features == 2 || features == 4 || features == 8) && side > 0 && scale > 0);
+    require(density_layers_[0].inputs >= encoded && color_layers_.back().outputs == 3 &&
+            color_layers_[0].inputs == density_layers_.back().outputs + kDirections);
+    field_ = {static_cast<int>(levels_.size()), levels_.data(), features, table_.data(),
+              {low.data()[0], low.data()[1], low.data()[2]}, side, bias, depth, scale,
+              {static_cast<int>(density_layers_.size()), density_layers_.data()},
+              {static_cast<int>(color_layers_.size()), color_layers_.data()}};
+  }
+  Trained(const Trained&) = delete;
+
+  const Field& field() const { return field_; }
+
+ private:
+  static std::vector<Layer> layers(const Weights& weights) {
+    std::vector<Layer> found;
+    for (const auto& each : weights) {
+      found.push_back({static_cast<int>(each.shape(1)), static_cast<int>(each.shape(0)), each.data()});
+      require(found.back().outputs >= 1 && (found.size() == 1 || found[found.size() - 2].outputs == found.back().inputs));
+    }
+    require(!found.empty());
+    return found;
+  }
+
+  std::vector<Level> levels_;
+  Array<const float, -1, -1> table_;
+  Weights density_, color_;
+  std::vector<Layer> density_layers_, color_layers_;
+  Field field_;
+};
+
+std::vector<std::string> instruction_set_names() {
+  std::vector<std::string> names;
+  for (const InstructionSet* set : instruction_sets()) names.push_back(set->name);
+  return names;
+}
+
+std::int64_t render_rays(const Guide& guide, const Trained& trained, const Array<const float, 2, -1>& starts,
+                         const Array<const std::uint8_t, -1>& mouth, const Array<const float, -1, 3>& origins,
+                         const Array<const float, -1, 3>& directions, const Array<const float, -1>& jitter, float step,
+                         int round_samples, float stop_transmittance, const Array<float, -1, 3>& color,
+                         const Array<float, -1>& transmittance, const std::string& isa, int threads) {
+  const std::size_t count = origins.shape(0);
+  require(directions.shape(0) == count && jitter.shape(0) == count && color.shape(0) == count &&
+          transmittance.shape(0) == count && mouth.shape(0) == guide.face_count() && round_samples >= 1 && threads >= 1 &&
+          static_cast<int>(starts.shape(1)) == trained.field().density.layers[0].outputs);
+  const InstructionSet& set = instruction_set(isa);
+  const Marcher marcher = guide.marcher(step);
+  const View view{static_cast<std::int64_t>(count), origins.data(), directions.data(), jitter.data(), round_samples,
+                  stop_transmittance};
+  nb::gil_scoped_release unlocked;
+  return render(marcher, set, trained.field(), starts.data(), mouth.data(), step, view,
+                {color.data(), transmittance.data()}, threads);
+}
+
 }  // namespace
 }  // namespace headbench::insta
 
@@ -164,15 +265,29 @@ NB_MODULE(_kernel, m) {
   nb::class_<Tree>(m, "Tree", "Boxes around the triangles of a mesh.");
   nb::class_<Posed>(m, "Posed", "A tree fitted to one pose.");
   m.def("tree", &make_tree, "faces"_a, "vertices"_a);
-  m.def("posed", &make_posed, "tree"_a, "vertices"_a);
+  m.def("posed", &make_posed, "tree"_a, "vertices"_a, "isa"_a = "");
   m.def("nearest", &nearest, "mesh"_a, "points"_a, "triangles"_a, "squared"_a, "threads"_a,
         "Write the nearest triangle of each point and its squared distance.");
   m.def("first_hit", &first_hit, "mesh"_a, "origins"_a, "directions"_a, "triangles"_a, "distances"_a, "threads"_a,
         "Write the first triangle each ray hits, or -1, and its distance.");
-  m.def("march", &march_rays, "mesh"_a, "origins"_a, "directions"_a, "first"_a, "jitter"_a, "step"_a, "samples_max"_a,
-        "reach"_a, "matrices"_a, "centroids"_a, "neighbours"_a, "own_falloff"_a, "neighbour_falloff"_a, "low"_a,
-        "cells_per_metre"_a, "free"_a, "threads"_a,
+  nb::class_<Guide>(m, "Guide", "Where rays through one pose may meet density.")
+      .def(nb::init<std::shared_ptr<Posed>, Array<const float, -1>, Array<const float, -1, 3, 4>,
+                    Array<const float, -1, 3>, Array<const std::int32_t, -1, 3>, Array<const float, -1>,
+                    Array<const float, -1>, const Array<const float, 3>&, float,
+                    Array<const std::uint8_t, -1, -1, -1>>(),
+           "mesh"_a, "reach"_a, "matrices"_a, "centroids"_a, "neighbours"_a, "own_falloff"_a, "neighbour_falloff"_a,
+           "low"_a, "cells_per_metre"_a, "free"_a);
+  m.def("march", &march_rays, "guide"_a, "origins"_a, "directions"_a, "first"_a, "jitter"_a, "step"_a, "samples_max"_a,
+        "threads"_a,
         "Canonical positions and directions, distances from the surface, rays, lattice indices and triangles of samples; where each ray goes on.");
+  nb::class_<Trained>(m, "Trained", "The field's parameters.")
+      .def(nb::init<const std::vector<LevelTuple>&, Array<const float, -1, -1>, const Array<const float, 3>&, float,
+                    float, float, float, Weights, Weights>(),
+           "levels"_a, "table"_a, "low"_a, "side"_a, "bias"_a, "depth"_a, "scale"_a, "density"_a, "color"_a);
+  m.def("instruction_sets", &instruction_set_names, "Instruction sets that this machine can run, the fastest first.");
+  m.def("render", &render_rays, "guide"_a, "trained"_a, "starts"_a, "mouth"_a, "origins"_a, "directions"_a, "jitter"_a,
+        "step"_a, "round_samples"_a, "stop_transmittance"_a, "color"_a, "transmittance"_a, "isa"_a, "threads"_a,
+        "Write what rays see and what they leave; return the number of samples.");
   m.def("encode", &encode_points, "positions"_a, "table"_a, "levels"_a, "out"_a, "threads"_a);
   m.def("encode_backward", &encode_points_backward, "positions"_a, "gradient"_a, "levels"_a, "table_gradient"_a,
         "threads"_a);

@@ -3,6 +3,7 @@
 
 #include <vector>
 
+#include "processor.h"
 #include "scene.h"
 
 namespace headbench {
@@ -30,11 +31,8 @@ extern const Stages stages;
 inline std::vector<const Stages*> runnable_stages() {
   std::vector<const Stages*> found;
 #ifdef HEADBENCH_X86
-  __builtin_cpu_init();
-  if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") &&
-      __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512vl"))
-    found.push_back(&avx512::stages);
-  if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma")) found.push_back(&avx2::stages);
+  if (runs_avx512()) found.push_back(&avx512::stages);
+  if (runs_avx2()) found.push_back(&avx2::stages);
 #endif
 #ifdef HEADBENCH_NEON
   found.push_back(&neon::stages);  // part of every 64-bit ARM processor

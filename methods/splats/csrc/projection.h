@@ -7,12 +7,10 @@
 #include <math.h>
 
 #include "scene.h"
+#include "vector_math.h"
 
 namespace headbench::HEADBENCH_ISA {
 
-constexpr int W = Real::lanes;
-constexpr float kLog2e = 1.4426950408889634f;
-constexpr float kLn2 = 0.6931471805599453f;
 constexpr float kSqrtHalfLog2e = 0.8493218002880191f;
 
 // Floats per record.

@@ -40,6 +40,7 @@ HEADBENCH_INLINE Mask operator&(Mask a, Mask b) { return {_mm256_and_ps(a.v, b.v
 HEADBENCH_INLINE Real select(Mask m, Real a, Real b) { return _mm256_blendv_ps(b.v, a.v, m.v); }
 HEADBENCH_INLINE Real zero_unless(Mask m, Real a) { return _mm256_and_ps(m.v, a.v); }
 HEADBENCH_INLINE bool any(Mask m) { return _mm256_movemask_ps(m.v) != 0; }
+HEADBENCH_INLINE std::uint32_t bits(Mask m) { return static_cast<std::uint32_t>(_mm256_movemask_ps(m.v)); }
 
 // One Newton step on the 12-bit estimate: 1 to 2 units in the last place.
 HEADBENCH_INLINE Real reciprocal(Real a) {

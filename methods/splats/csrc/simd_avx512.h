@@ -40,6 +40,7 @@ HEADBENCH_INLINE Mask operator&(Mask a, Mask b) { return {static_cast<__mmask16>
 HEADBENCH_INLINE Real select(Mask m, Real a, Real b) { return _mm512_mask_mov_ps(b.v, m.v, a.v); }
 HEADBENCH_INLINE Real zero_unless(Mask m, Real a) { return _mm512_maskz_mov_ps(m.v, a.v); }
 HEADBENCH_INLINE bool any(Mask m) { return m.v != 0; }
+HEADBENCH_INLINE std::uint32_t bits(Mask m) { return m.v; }
 
 // One Newton step on the 14-bit estimate: 1 to 2 units in the last place.
 HEADBENCH_INLINE Real reciprocal(Real a) {

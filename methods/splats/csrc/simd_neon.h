@@ -43,6 +43,10 @@ HEADBENCH_INLINE Real zero_unless(Mask m, Real a) {
   return vreinterpretq_f32_u32(vandq_u32(m.v, vreinterpretq_u32_f32(a.v)));
 }
 HEADBENCH_INLINE bool any(Mask m) { return vmaxvq_u32(m.v) != 0; }
+HEADBENCH_INLINE std::uint32_t bits(Mask m) {
+  constexpr std::uint32_t places[4] = {1, 2, 4, 8};
+  return vaddvq_u32(vandq_u32(m.v, vld1q_u32(places)));
+}
 HEADBENCH_INLINE Real reciprocal(Real a) { return Real(1.0f) / a; }
 
 // Split x into the nearest whole number and the rest in [-1/2, 1/2].

@@ -49,6 +49,9 @@ HEADBENCH_INLINE Mask operator&(Mask a, Mask b) { HEADBENCH_LANES(Mask, a.v[i] &
 HEADBENCH_INLINE Real select(Mask m, Real a, Real b) { HEADBENCH_LANES(Real, m.v[i] ? a.v[i] : b.v[i]); }
 HEADBENCH_INLINE Real zero_unless(Mask m, Real a) { HEADBENCH_LANES(Real, m.v[i] ? a.v[i] : 0.0f); }
 HEADBENCH_INLINE bool any(Mask m) { return (m.v[0] | m.v[1] | m.v[2] | m.v[3]) != 0; }
+HEADBENCH_INLINE std::uint32_t bits(Mask m) {
+  return (m.v[0] & 1u) | (m.v[1] & 2u) | (m.v[2] & 4u) | (m.v[3] & 8u);
+}
 
 #undef HEADBENCH_LANES
 

@@ -44,6 +44,9 @@ HEADBENCH_INLINE Real zero_unless(Mask m, Real a) { return (Float4)((Int4)a.v & 
 HEADBENCH_INLINE Real min(Real a, Real b) { return select({a.v < b.v}, a, b); }
 HEADBENCH_INLINE Real max(Real a, Real b) { return select({a.v > b.v}, a, b); }
 HEADBENCH_INLINE bool any(Mask m) { return (m.v[0] | m.v[1] | m.v[2] | m.v[3]) != 0; }
+HEADBENCH_INLINE std::uint32_t bits(Mask m) {
+  return (m.v[0] & 1u) | (m.v[1] & 2u) | (m.v[2] & 4u) | (m.v[3] & 8u);
+}
 HEADBENCH_INLINE Real reciprocal(Real a) { return Real(1.0f) / a; }
 
 HEADBENCH_INLINE Real sqrt(Real a) { return Float4{sqrtf(a.v[0]), sqrtf(a.v[1]), sqrtf(a.v[2]), sqrtf(a.v[3])}; }

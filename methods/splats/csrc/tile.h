@@ -41,17 +41,6 @@ HEADBENCH_INLINE Block block_of(const View& view, int tile, int index) {
   return b;
 }
 
-// Lowest bit of a non-zero word, as an index.
-HEADBENCH_INLINE int lowest_bit(std::uint64_t bits) {
-#if defined(__GNUC__) || defined(__clang__)
-  return __builtin_ctzll(bits);
-#else
-  int index = 0;
-  while (!(bits & 1)) bits >>= 1, ++index;
-  return index;
-#endif
-}
-
 // Highest bit of a non-zero word, as an index.
 HEADBENCH_INLINE int highest_bit(std::uint64_t bits) {
 #if defined(__GNUC__) || defined(__clang__)
@@ -147,21 +136,6 @@ HEADBENCH_INLINE void prefetch_tile(const View& view, const float* image, int ch
     const float* row = image + (static_cast<std::size_t>(y) * view.width + left) * channels;
     for (int k = 0; k < kTile * channels; k += 16) HEADBENCH_PREFETCH(row + k);
   }
-}
-
-// 2^x for x up to 127, not below about 2^-126; relative error below 2e-7.
-HEADBENCH_INLINE Real exp2(Real x) {
-  Real f;
-  if constexpr (!kAnyPower) x = max(x, -126.0f);
-  const Real n = round(x, f);
-  // Minimax in relative error on [-1/2, 1/2] with the constant held at 1, so that whole powers are exact.
-  Real p = 1.32647273e-3f;
-  p = fma(p, f, 9.67151299e-3f);
-  p = fma(p, f, 5.55073358e-2f);
-  p = fma(p, f, 0.240222424f);
-  p = fma(p, f, 0.693147004f);
-  p = fma(p, f, 1.0f);
-  return scale_by_power(p, n);
 }
 
 struct Alpha {

@@ -1,0 +1,51 @@
+// The field as plain arrays, and samples of it.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <vector>
+
+#include "hash_grid.h"
+
+namespace headbench::insta {
+
+constexpr int kDirections = 16;  // spherical harmonics up to degree 3
+
+// One layer's weights, (outputs, inputs).
+struct Layer {
+  int inputs, outputs;
+  const float* weights;
+};
+
+struct Network {
+  int count;
+  const Layer* layers;
+};
+
+// Plain arrays: code compiled for one instruction set must not share the standard library's templates with the rest.
+struct Field {
+  int level_count;
+  const Level* levels;
+  int features;        // of a level
+  const float* table;  // (rows, features)
+  float low[3], side;  // cube that the encoding covers, metres
+  float bias, depth, scale;  // the prior of field.py
+  Network density, color;
+};
+
+// Lanes are worked on in groups of up to this many; arrays of samples are padded to multiples of it.
+constexpr std::int64_t kGroupMax = 32;
+
+// Samples coordinate by coordinate. What lies between their number and the next multiple of kGroupMax is finite.
+struct Points {
+  const float *position[3], *direction[3];  // canonical
+  const float* away;                        // metres from the mesh
+  const float* mouth;                       // 1 at the mouth, else 0
+};
+
+struct Values {
+  float* left;      // what a step leaves of the light
+  float* color[3];  // in (0, 1)
+};
+
+}  // namespace headbench::insta

@@ -1,0 +1,70 @@
+// A posed mesh as plain arrays to be searched, many boxes or triangles side by side.
+#pragma once
+
+#include <cstdint>
+#include <limits>
+
+#include "../../splats/csrc/inlining.h"
+
+namespace headbench::insta {
+
+struct Vec3 {
+  float x, y, z;
+};
+
+HEADBENCH_INLINE Vec3 operator+(Vec3 a, Vec3 b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
+HEADBENCH_INLINE Vec3 operator-(Vec3 a, Vec3 b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
+HEADBENCH_INLINE Vec3 operator*(float s, Vec3 a) { return {s * a.x, s * a.y, s * a.z}; }
+HEADBENCH_INLINE float dot(Vec3 a, Vec3 b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+HEADBENCH_INLINE Vec3 cross(Vec3 a, Vec3 b) { return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x}; }
+
+HEADBENCH_INLINE Vec3 row(const float* values, std::int64_t number) {
+  return {values[3 * number], values[3 * number + 1], values[3 * number + 2]};
+}
+
+struct Triangle {
+  Vec3 a, b, c;
+};
+
+struct Hit {
+  std::int32_t triangle = -1;
+  float value = std::numeric_limits<float>::infinity();  // squared distance, or distance along the ray
+};
+
+constexpr int kLanes = 16;
+constexpr int kDepthMax = 40;  // halving 2^28 triangles takes 28
+
+// Up to kLanes nodes of the tree side by side. A child is a wide node, or the leaf ~child. Unused lanes have the node -1.
+struct WideNode {
+  std::int32_t child[kLanes];
+  std::int32_t node[kLanes];
+};
+
+// Boxes and triangles of as many lanes, coordinate by coordinate. Unused lanes are infinitely far away.
+struct alignas(64) WideBox {
+  float low[3][kLanes], high[3][kLanes];
+};
+
+struct alignas(64) WideTriangles {
+  float a[3][kLanes], ab[3][kLanes], ac[3][kLanes], normal[3][kLanes];
+  float ab2[kLanes], ac2[kLanes], abac[kLanes];       // dot products of the edges
+  float by_ab[kLanes], by_ac[kLanes], by_bc[kLanes];  // one over squared lengths of the edges, 0 for none
+  float by_area[kLanes];                              // one over the normal's square, 0 for none
+  std::int32_t index[kLanes];
+};
+
+// A tree fitted to one pose.
+struct Search {
+  const WideNode* nodes;
+  const WideBox* boxes;
+  const WideTriangles* leaves;
+  const std::int32_t* leaf_of;  // by triangle
+  const Triangle* triangles;
+};
+
+// Nearest triangle of those at most sqrt(limit) away; of equally near ones (a shared edge or corner) that whose plane is
+// farthest, so that the space around a convex edge is parted along the bisector and not by rounding. `hint` is a
+// triangle to try first, or -1.
+using Nearest = Hit (*)(const Search& search, Vec3 point, float limit, std::int32_t hint);
+
+}  // namespace headbench::insta
