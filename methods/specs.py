@@ -106,7 +106,8 @@ _SHORT_INSTA: dict[str, Any] = {
     "color_layers": 2,
     "density_bias": 4.5,
     "prior_depth": 4.0,
-    "fog_weight": 3e-4,
+    "fog_weight": 9e-4,
+    "depth_weight": 3.75,
     "step": 0.004,
     "shell_outside": 0.04,
     "shell_inside": 0.006,
@@ -131,7 +132,12 @@ INSTA = MethodSpec(
     presets={
         "smoke": {"budget": {"iterations": 40}, **_SHORT_INSTA},
         "demo": {"budget": {"iterations": 400}, **_SHORT_INSTA},
-        "fast": {"budget": {"iterations": 3_000}, **_SHORT_INSTA},
+        "fast": {
+            "budget": {"iterations": 3_000},
+            **_SHORT_INSTA,
+            "log2_table": 17,
+            "finest_resolution": 768,
+        },
         "paper": {"budget": {"iterations": 20_000}},
     },
     monocular=True,

@@ -79,7 +79,7 @@ class InstaAvatar:
         rgb = np.empty((camera.height, camera.width, 3), np.float32)
         rgb[:] = np.asarray([float(channel) for channel in background], np.float32).clip(0, 1)
         alpha = np.zeros((camera.height, camera.width), np.float32)
-        reach = float(self.space.reach.max())
+        reach = float(surface.reach(self.space).max())
         if reach < 0:
             return Frame(rgb, alpha)
         corners = box_corners(surface.vertices.numpy(), reach)

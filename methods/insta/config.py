@@ -7,11 +7,31 @@ from dataclasses import dataclass
 from typing import Literal
 
 INSTANT_NGP_STEP = math.sqrt(3) / 1024
+STEP_MIN = 1e-5
+MOST = {
+    "levels": 32,
+    "finest_resolution": 2**20,
+    "hidden": 1024,
+    "density_layers": 16,
+    "color_layers": 16,
+    "latent": 256,
+    "occupancy_resolution": 512,
+    "samples_per_iteration": 2**24,
+    "first_rays": 2**22,
+    "images_per_iteration": 4096,
+    "round_samples": 4096,
+}
+"""Upper limits of settings; the published values are far below."""
 
 
 @dataclass(frozen=True)
 class InstaConfig:
-    """INSTA (Zielonka, Bolkart, Thies, CVPR 2023). The defaults are the published values.
+    """INSTA (Zielonka, Bolkart, Thies, CVPR 2023). The defaults are the published values, with these exceptions.
+
+    Density is confined to a shell about the mesh (the program marches a whole cube), so hair may stand off the tracked
+    surface by ``shell_outside`` and no more. The occupancy at the mouth is probed with the coefficients of training
+    frames (there with ones), rows of the hash table that an iteration does not touch decay with the others' moments
+    (there they are left out), and rays stop at a transmittance of 1e-3 (there 1e-2 when rendering).
 
     Moments in training (``..._from``) are on the scale of ``schedule_length`` and mapped to the budget at hand.
 
@@ -106,6 +126,12 @@ class InstaConfig:
             raise ValueError(f"level_features must be 1, 2, 4 or 8, found {self.level_features}")
         if not 1 <= self.log2_table <= 24:
             raise ValueError(f"log2_table must lie between 1 and 24, found {self.log2_table}")
+        # An avatar's settings come from a file: none may ask for more memory than any use of it needs.
+        for name, most in MOST.items():
+            if getattr(self, name) > most:
+                raise ValueError(f"{name} must be at most {most}, found {getattr(self, name)}")
+        if not self.step >= STEP_MIN:
+            raise ValueError(f"step must be at least {STEP_MIN} metres, found {self.step}")
         if not 2 <= self.base_resolution <= self.finest_resolution:
             raise ValueError("base_resolution must be at least 2 and at most finest_resolution")
         for name in (

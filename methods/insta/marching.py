@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -17,6 +18,8 @@ from .warp import Blend, Compatibility, blended, canonical_from_posed
 
 Backend = Literal["auto", "kernel", "reference"]
 FREE_MAX = 255
+STRETCH_MAX = 2.0
+"""How much farther than in the canonical pose density is looked for where a pose stretches the mesh."""
 
 
 class Rays(NamedTuple):
@@ -45,7 +48,7 @@ class Space:
 
     Attributes
     ----------
-    reach : (F,) float32 metres from each triangle; negative for nowhere.
+    reach : (F,) float32 canonical metres from each triangle; negative for nowhere.
     low : (3,) float32 corner of the occupancy grid, canonical metres.
     cell : size of its cubic cells, metres.
     free : (X, Y, Z) uint8, cells to the nearest occupied one along the axis where that is most; 0 where occupied.
@@ -162,13 +165,29 @@ class PosedSurface:
             )
         )
 
+    def reach(self, space: Space) -> np.ndarray:
+        """(F,) float32 metres from each triangle of this pose within which the space has density; negative for none.
+
+        Where the mesh is stretched its surroundings are too, by the smallest scale that is blended at a triangle.
+        """
+        scale = (torch.linalg.vector_norm(self.matrices[:, :, :3], dim=(1, 2)) / math.sqrt(3)).numpy()
+        neighbours = self.surface.blend.neighbours
+        across = np.where(neighbours >= 0, neighbours, np.arange(len(scale))[:, None])
+        smallest = np.minimum(scale, scale[across].min(1)).clip(1 / STRETCH_MAX, 1)
+        return np.asarray(space.reach / smallest, dtype=np.float32)
+
     def guide(self, space: Space) -> Any:
         """The kernel's view of this pose and a space; the last one is kept. Needs the kernel."""
         if self._guide is None or self._guide[0] is not space:
             blend, module = self.surface.blend, self.surface.module
             assert module is not None
             made = module.Guide(
-                *(self._mesh, space.reach, _array(self.matrices.float()), _array(self.centroids.float())),
+                *(
+                    self._mesh,
+                    self.reach(space),
+                    _array(self.matrices.float()),
+                    _array(self.centroids.float()),
+                ),
                 *(blend.neighbours, blend.own_falloff, blend.neighbour_falloff),
                 *(space.low, 1 / space.cell, space.free),
             )
@@ -180,7 +199,8 @@ class PosedSurface:
     ) -> Samples:
         """Twin of the kernel: every sample that is not behind the mesh, its nearest triangle of all."""
         low, high = self.vertices.min(0).values.numpy(), self.vertices.max(0).values.numpy()
-        padding = max(float(space.reach.max()), 0.0)
+        reach = self.reach(space)
+        padding = max(float(reach.max()), 0.0)
         farthest = np.linalg.norm(0.5 * (low + high) - rays.origins, axis=1).max(initial=0.0)
         farthest += 0.5 * np.linalg.norm(high - low) + padding
         lattice = np.arange(int(farthest / step) + 2)
@@ -193,8 +213,8 @@ class PosedSurface:
             indices, points = indices[close], points[close]
             found = self.nearest(points)
             triangles = found.triangles.numpy()
-            near = found.values.numpy() <= np.maximum(space.reach[triangles], 0) ** 2
-            near &= space.reach[triangles] >= 0
+            near = found.values.numpy() <= np.maximum(reach[triangles], 0) ** 2
+            near &= reach[triangles] >= 0
             away = np.sqrt(found.values.numpy()[near])
             indices, points, triangles = indices[near], points[near], triangles[near]
             positions, directions = self.to_canonical(points, triangles, rays.directions[ray])

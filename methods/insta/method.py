@@ -28,7 +28,7 @@ from .training import InstaTraining
 class Insta:
     """The method: see the module."""
 
-    name, version = "insta", "1"
+    name, version = "insta", "2"
 
     def __init__(self, config: InstaConfig | None = None):
         self.config = config or InstaConfig()

@@ -64,6 +64,7 @@ class InstaTraining:
         self._bare = bare_triangles(clip.head)
         self._ground = torch.as_tensor(np.asarray(clip.background), dtype=torch.float32)
         self._marching = Marching(config.step, config.round_samples, config.stop_transmittance)
+        self._masked = clip.mask(self.keys[0]) is not None
         self._images = BoundedCache(self._image, self._entries(config.image_cache_mb, self._image_bytes()))
         # Frames of one timestep often share their pose; so do frames of a video made of several views.
         self._alike: dict[bytes, int] = {}
@@ -188,7 +189,7 @@ class InstaTraining:
         key = self.keys[index]
         camera, surface = self._clip.cameras[key.camera], self._surface_at(key.timestep)
         # Beyond these pixels nothing can be rendered, and no gradient comes of them.
-        corners = box_corners(surface.vertices.numpy(), max(float(self._space.reach.max()), 0.0))
+        corners = box_corners(surface.vertices.numpy(), max(float(surface.reach(self._space).max()), 0.0))
         left, top, right, bottom = pixels_of_hull(camera, corners)
         columns = generator.integers(left, max(right, left + 1), count).clip(0, camera.width - 1)
         rows = generator.integers(top, max(bottom, top + 1), count).clip(0, camera.height - 1)
@@ -217,10 +218,6 @@ class InstaTraining:
     def _posed(self, timestep: int) -> PosedSurface:
         return self._surface.pose(self._mesh.posed(self._mesh.arguments([self._clip.poses[timestep]])))
 
-    @property
-    def _masked(self) -> bool:
-        return self._images(0)[1] is not None
-
     def _image(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
         key = self.keys[index]
         camera, image, mask = self._clip.cameras[key.camera], self._clip.image(key), self._clip.mask(key)
@@ -228,6 +225,10 @@ class InstaTraining:
         if image.shape != (*size, 3) or image.dtype != np.uint8:
             found = f"{image.dtype} of shape {image.shape}"
             raise InputError(str(key), "image", f"uint8 of shape {(*size, 3)}", found)
+        if (mask is not None) != self._masked:
+            names = ("none", "a matte")
+            expected, found = names[self._masked], names[not self._masked]
+            raise InputError(str(key), "mask", f"{expected}, as the first training frame has", found)
         if mask is not None and (mask.shape != size or mask.dtype != np.uint8):
             found = f"{mask.dtype} of shape {mask.shape}"
             raise InputError(str(key), "mask", f"uint8 of shape {size}", found)

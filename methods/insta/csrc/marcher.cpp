@@ -157,6 +157,7 @@ Marcher::Placed Marcher::place(Vec3 point, Vec3 direction, std::int32_t triangle
 std::int32_t Marcher::passed(const Placed& placed, float most) const {
   const Vec3 step = (step_ * grid_.cells_per_metre) * placed.way;
   const float length = std::sqrt(dot(step, step)), bend = kBend * length;
+  if (!(length > 0)) return 0;  // a triangle without area leads nowhere
   std::int32_t clear = 0;
   while (static_cast<float>(clear) < most) {
     const float steps = static_cast<float>(clear + 1), slack = steps * bend;

@@ -163,7 +163,7 @@ std::vector<Level> levels_of(const std::vector<LevelTuple>& given, std::size_t r
   std::vector<Level> levels;
   for (const auto& [scale, resolution, first, count] : given) {
     const bool hashed = static_cast<double>(resolution) * resolution * resolution > static_cast<double>(count);
-    require(resolution >= 1 && first >= 0 && count >= 1 && first + count <= static_cast<std::int64_t>(rows) &&
+    require(resolution >= 2 && scale > 0 && scale <= static_cast<float>(resolution) - 0.999f && first >= 0 && count >= 1 && first + count <= static_cast<std::int64_t>(rows) &&
             (!hashed || (count & (count - 1)) == 0));
     levels.push_back({scale, resolution, first, count});
   }

@@ -13,12 +13,12 @@ def test_the_color_loss_is_hubers():
     color = torch.tensor([[0.5, 0.5, 0.5], [0.2, 0.0, 0.0]], requires_grad=True)
     truth = torch.tensor([[0.45, 0.5, 0.5], [0.9, 0.0, 0.0]])
     weights = torch.tensor([1.0, 40.0])
-    # Square below 0.1: d^2 / (2 delta). Linear above: |d| - delta / 2. Mean over three channels, two rays; a fifth.
-    expected = 0.2 * 0.5 * (0.05**2 / 0.2 / 3 + 40 * (0.7 - 0.05) / 3)
+    # Square below 0.1: d^2 / (2 delta). Linear above: |d| - delta / 2. Sum of three channels, mean of two rays; a fifth.
+    expected = 0.2 * 0.5 * (0.05**2 / 0.2 + 40 * (0.7 - 0.05))
     loss = color_loss(color, truth, weights, 0.1)
     assert loss.item() == pytest.approx(expected, rel=1e-5)
     loss.backward()
-    assert color.grad[1, 0].item() == pytest.approx(-0.2 * 0.5 * 40 / 3)
+    assert color.grad[1, 0].item() == pytest.approx(-0.2 * 0.5 * 40)
 
 
 def test_rays_without_depth_count_for_nothing():

@@ -97,7 +97,7 @@ def test_samples_are_where_they_are_said_to_be(pair, space):
     points = rays.origins[owner] + ((indices + rays.jitter[owner]) * STEP)[:, None] * rays.directions[owner]
     found = mesh.nearest(points.astype(np.float32))
     np.testing.assert_allclose(away, found.values.sqrt(), atol=2e-6)
-    assert (away <= space.reach[triangles] + 1e-6).all()
+    assert (away <= mesh.reach(space)[triangles] + 1e-6).all()
     assert occupied_at(space, positions).mean() > 0.999
     np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-5)
 
