@@ -99,13 +99,11 @@ class GaussianHead:
     def draw(self, splats: Splats, camera: Camera, background: Tensor) -> Drawn:
         """Splat the features for a camera of the full size; their background is (3,) colour, then ones."""
         small = feature_camera(camera, self.config.upscale)
-        ground = background.new_ones(self.config.channels)
-        ground[:3] = background
         world = splats.world
         rendering = rasterize(
             *(world.means, world.quats, world.scales, splats.opacities, splats.features),
             *(small.world_to_camera, small.K, small.width, small.height),
-            background=ground,
+            background=feature_background(background, self.config.channels),
             check_finite=False,
         )
         return Drawn(rendering.image, rendering.alpha)
@@ -115,6 +113,13 @@ class GaussianHead:
         colors = self.super_resolution(tensors, drawn.features, drawn.alpha)
         near = enlarged(near_drawn(drawn.alpha), self.config.upscale)
         return torch.where(near[..., None] > 0, colors, background)
+
+
+def feature_background(background: Tensor, channels: int) -> Tensor:
+    """(C,) features where nothing is drawn: the (3,) colour, then ones."""
+    features = background.new_ones(channels)
+    features[:3] = background
+    return features
 
 
 def feature_camera(camera: Camera, upscale: int) -> Camera:

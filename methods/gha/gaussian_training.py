@@ -21,7 +21,7 @@ from ..training.sampling import Sampler
 from ..training.schedule import Timeline, log_linear
 from .config import GHAConfig
 from .driving import POSE_SIZE, Signal
-from .gaussian_head import Drawn, GaussianHead
+from .gaussian_head import Drawn, GaussianHead, feature_background
 from .landmarks import mouth_box
 from .mesh_head import MeshHead, Surface
 from .mesh_training import grid_about
@@ -110,7 +110,7 @@ class GaussianTraining:
         small = reduced(padded, config.upscale, config.low_truth)
         loss = config.low_weight * (drawn.features[..., :3] - small).abs().mean()
         if config.augment:
-            drawn, padded = zoomed(drawn, padded, config.upscale, _zoom(scene.seed, iteration))
+            drawn, padded = zoomed(drawn, padded, _zoom(scene.seed, iteration), scene.background)
         image = head.sharpen(tensors, drawn, scene.background)
         loss = loss + (image - padded).abs().mean()
         if config.structure_weight:
@@ -220,26 +220,28 @@ def reduced(image: Tensor, factor: int, how: str) -> Tensor:
     return image.view(height, factor, width, factor, 3).mean((1, 3))
 
 
-def zoomed(drawn: Drawn, truth: Tensor, upscale: int, factor: float) -> tuple[Drawn, Tensor]:
+def zoomed(drawn: Drawn, truth: Tensor, factor: float, background: Tensor) -> tuple[Drawn, Tensor]:
     """Feature image and truth rescaled about their middle and cut or padded to their size before.
 
-    By the nearest pixel, as published; what is padded is one throughout, and drawn by nobody.
+    By the nearest pixel, as published; what is padded is the (3,) ``background``, as where nothing is drawn.
     """
-    height, width = drawn.alpha.shape
-    features = _zoomed(drawn.features, height, width, factor)
-    alpha = _zoomed(drawn.alpha[..., None], height, width, factor, 0.0)[..., 0]
-    return Drawn(features, alpha), _zoomed(truth, height * upscale, width * upscale, factor)
+    outside = feature_background(background, drawn.features.shape[2])
+    features = _zoomed(drawn.features, factor, outside)
+    alpha = _zoomed(drawn.alpha[..., None], factor, drawn.alpha.new_zeros(1))[..., 0]
+    return Drawn(features, alpha), _zoomed(truth, factor, background)
 
 
-def _zoomed(values: Tensor, height: int, width: int, factor: float, outside: float = 1.0) -> Tensor:
+def _zoomed(values: Tensor, factor: float, outside: Tensor) -> Tensor:
+    """The (H, W, C) image, with (C,) ``outside`` where it has nothing."""
+
     def places(size: int) -> tuple[Tensor, Tensor]:
         middle = 0.5 * size
         place = ((torch.arange(size, device=values.device) + 0.5 - middle) / factor + middle).floor().long()
         return place.clamp(0, size - 1), (place >= 0) & (place < size)
 
-    (rows, rows_in), (columns, columns_in) = places(height), places(width)
+    (rows, rows_in), (columns, columns_in) = (places(size) for size in values.shape[:2])
     moved = values.index_select(0, rows).index_select(1, columns)
-    return torch.where((rows_in[:, None] & columns_in)[..., None], moved, moved.new_tensor(outside))
+    return torch.where((rows_in[:, None] & columns_in)[..., None], moved, outside)
 
 
 def _zoom(seed: int, iteration: int) -> float:

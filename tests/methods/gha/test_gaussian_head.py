@@ -126,17 +126,21 @@ def test_reduction_takes_means_or_as_published_every_nth_pixel(height, width, fa
 
 def test_zoom_keeps_features_and_truth_together():
     rows, columns = np.mgrid[:12, :16]
-    features = torch.tensor(np.stack([rows, columns, rows * 0 + 1], -1), dtype=torch.float64)
-    drawn, truth = Drawn(features, torch.ones(12, 16)), enlarged(features, 2)
-    same = zoomed(drawn, truth, 2, 1.0)
+    planes = [rows, columns, rows * 0 + 1, rows + columns]
+    features = torch.tensor(np.stack(planes, -1), dtype=torch.float64)
+    ground = torch.tensor([0.25, 0.5, 0.75], dtype=torch.float64)
+    drawn, truth = Drawn(features, torch.ones(12, 16)), enlarged(features[..., :3], 2)
+    same = zoomed(drawn, truth, 1.0, ground)
     assert torch.equal(same[0].features, features)
     assert torch.equal(same[1], truth)
-    smaller, small_truth = zoomed(drawn, truth, 2, 0.5)
-    assert torch.equal(smaller.alpha.bool(), (smaller.features[..., :2] != 1).any(-1) | (smaller.alpha > 0))
+    smaller, small_truth = zoomed(drawn, truth, 0.5, ground)
     assert smaller.alpha[3:9, 4:12].all()
-    assert smaller.alpha.sum() == 6 * 8  # the rest is padding, drawn by nobody and one throughout
-    assert torch.equal(smaller.features[0], torch.ones(16, 3, dtype=torch.float64))
-    larger, _ = zoomed(drawn, truth, 2, 1.25)
+    assert smaller.alpha.sum() == 6 * 8  # the rest is padding, drawn by nobody: background
+    undrawn = smaller.alpha == 0
+    for channel, value in enumerate((0.25, 0.5, 0.75, 1.0)):
+        assert (smaller.features[undrawn][:, channel] == value).all()
+    assert torch.equal(small_truth[enlarged(undrawn, 2)], ground.expand(4 * int(undrawn.sum()), 3))
+    larger, _ = zoomed(drawn, truth, 1.25, ground)
     assert larger.alpha.all()
     assert larger.features[6, 8, 0].item() == 6
     assert small_truth.shape == truth.shape
