@@ -76,7 +76,8 @@ class GHAAvatar:
         """Splats of a pose in the world, coloured as they are before super-resolution; the view does not matter."""
         splats = self._posed(pose)
         colors = None if camera is None else splats.features[:, :3].clamp(0, 1)
-        return posed_splats(splats.world, splats.opacities, colors)
+        world = splats.world._replace(quats=F.normalize(splats.world.quats, dim=1))
+        return posed_splats(world, splats.opacities, colors)
 
     def files(self) -> Sequence[Path]:
         """The tensors and the subject."""

@@ -34,7 +34,8 @@ COVERED = 1e-3
 
 
 class Splats(NamedTuple):
-    """Splats of one pose: geometry in the world, (N,) opacities, (N, C) features, of which 3 are a colour."""
+    """Splats of one pose: geometry in the world, its quaternions of any length, (N,) opacities, and (N, C) features, of
+    which 3 are a colour."""
 
     world: WorldSplats
     opacities: Tensor

@@ -128,6 +128,16 @@ def test_a_turned_and_shifted_head_takes_its_splats_along(trained, clip):
     np.testing.assert_allclose(shift, np.broadcast_to([0, 0, 0.5], shift.shape), atol=2e-5)
 
 
+def test_splats_have_unit_quaternions_of_the_rotations_drawn(trained, clip):
+    avatar, _ = trained
+    _, pose = views(clip)
+    raw, given = avatar._posed(pose).world.quats.detach().numpy(), avatar.splats(pose).quats
+    lengths = np.linalg.norm(raw, axis=1, keepdims=True)
+    assert np.abs(lengths - 1).max() > 1e-3
+    np.testing.assert_allclose(np.linalg.norm(given, axis=1), 1, atol=1e-6)
+    np.testing.assert_allclose(given * lengths, raw, atol=1e-6)
+
+
 @pytest.mark.parametrize("size", [(1, 1), (3, 2), (640, 360)])
 @pytest.mark.parametrize(
     "change",
