@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,13 +28,19 @@ class MeshResult(NamedTuple):
 
 
 def mesh_stage(
-    scene: Scene, head: MeshHead, budget: Budget, out: Path, run: str, progress: Progress
+    scene: Scene,
+    head: MeshHead,
+    budget: Budget,
+    out: Path,
+    run: str,
+    progress: Progress,
+    clock: Callable[[], float] = time.monotonic,
 ) -> MeshResult:
     """Train the mesh head, continue its training, or read what a finished one left under ``out``."""
     folder = out / FOLDER
     stored = load_checkpoint(folder / RESULT_FILE, run, scene.device)
     if stored is None:
-        stored = _trained(scene, head, budget, folder, run, progress)
+        stored = _trained(scene, head, budget, folder, run, progress, clock)
         save_checkpoint(folder / RESULT_FILE, run, stored)
         (folder / CHECKPOINT).unlink(missing_ok=True)
     return MeshResult(stored["tensors"], stored["iterations"], stored["seconds"])
@@ -49,7 +56,13 @@ def remove_mesh_stage(out: Path) -> None:
 
 
 def _trained(
-    scene: Scene, head: MeshHead, budget: Budget, folder: Path, run: str, progress: Progress
+    scene: Scene,
+    head: MeshHead,
+    budget: Budget,
+    folder: Path,
+    run: str,
+    progress: Progress,
+    clock: Callable[[], float],
 ) -> dict[str, Any]:
     training = MeshTraining(scene, head, fitted=not (folder / CHECKPOINT).exists())
     config = head.config
@@ -63,6 +76,7 @@ def _trained(
         device=scene.device,
         progress=progress,
         checkpoint_every_s=config.checkpoint_every_s,
+        clock=clock,
     )
     names = [*(name for network in head.networks for name in network.shapes()), "landmarks"]
     tensors = {name: training.optimiser[name].detach() for name in names}

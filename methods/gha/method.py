@@ -14,6 +14,8 @@ deformation (`tracked_motion`).
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -45,12 +47,17 @@ from .storage import AVATAR_FILE, write_avatar
 
 
 class GHA:
-    """The method: see the module."""
+    """The method: see the module.
+
+    Parameters
+    ----------
+    clock : seconds, from any start; what budgets in seconds are measured by.
+    """
 
     name, version = "gha", "2"
 
-    def __init__(self, config: GHAConfig | None = None):
-        self.config = config or GHAConfig()
+    def __init__(self, config: GHAConfig | None = None, clock: Callable[[], float] = time.monotonic):
+        self.config, self._clock = config or GHAConfig(), clock
 
     def fit(
         self, clip: Clip, out: Path, budget: Budget, *, device: str, seed: int, progress: Progress
@@ -66,7 +73,8 @@ class GHA:
         size = len(scene.signals[0].expression)
         mesh_head, head = MeshHead.of(config, size), GaussianHead.of(config, size)
         first, second = parted(budget, config.mesh_fraction)
-        mesh = mesh_stage(scene, mesh_head, first, out, run, _Part(progress, 0, second.iterations or 0))
+        before = _Part(progress, 0, second.iterations or 0)
+        mesh = mesh_stage(scene, mesh_head, first, out, run, before, self._clock)
         sampler = ShuffledEpochs(len(scene.keys), seed)
         training = GaussianTraining(scene, head, mesh_head, mesh.tensors, sampler)
         try:
@@ -80,6 +88,7 @@ class GHA:
                 device=device,
                 progress=_Part(progress, mesh.iterations, 0),
                 checkpoint_every_s=config.checkpoint_every_s,
+                clock=self._clock,
             )
         finally:
             training.close()

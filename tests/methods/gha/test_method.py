@@ -200,18 +200,34 @@ def test_budgets_are_parted_without_loss():
     assert parted(Budget(seconds=10.0), 0.25) == (Budget(seconds=2.5), Budget(seconds=7.5))
 
 
+class Ticking:
+    """A clock on which every look takes a second."""
+
+    def __init__(self):
+        self.now = 0.0
+
+    def __call__(self):
+        self.now += 1
+        return self.now
+
+
+def fit_in_seconds(clip, folder, clock, seconds, progress=no_progress):
+    method = GHA(small_config(), clock)
+    return method.fit(clip, folder, Budget(seconds=seconds), device="cpu", seed=0, progress=progress)
+
+
 def test_seconds_bound_a_run_and_the_avatar_is_whole(clip, tmp_path):
-    seen = []
-    avatar = GHA(small_config()).fit(
-        clip,
-        tmp_path,
-        Budget(seconds=0.6),
-        device="cpu",
-        seed=0,
-        progress=lambda d, t, n="": seen.append((d, t)),
-    )
+    """Both stages end by the clock, before the iterations that their trial steps promised."""
+    clock, seen = Ticking(), []
+    avatar = fit_in_seconds(clip, tmp_path, clock, 100.0, lambda d, t, n="": seen.append((d, t)))
     assert seen == sorted(seen)
-    assert all(done <= total for done, total in seen)
+    record = read_json(tmp_path / RECORD_FILE)
+    done, planned, mesh = (record[name] for name in ("iterations", "planned_iterations", "mesh_iterations"))
+    mesh_planned = seen[0][1]
+    assert 0 < mesh < mesh_planned
+    assert mesh < done < planned
+    assert 90 < record["seconds"] < 110
+    assert clock.now < 110
     assert avatar.render(*views(clip)).rgb.shape[2] == 3
 
 
