@@ -20,7 +20,7 @@ FOLDER, RESULT_FILE = "mesh", "mesh.pt"
 
 
 class MeshResult(NamedTuple):
-    """What the mesh stage leaves: its tensors by name, iterations done, and seconds spent."""
+    """What the mesh stage leaves: its tensors by name, iterations done, and seconds spent, those of its start included."""
 
     tensors: Mapping[str, Tensor]
     iterations: int
@@ -64,6 +64,7 @@ def _trained(
     progress: Progress,
     clock: Callable[[], float],
 ) -> dict[str, Any]:
+    began = clock()
     training = MeshTraining(scene, head, fitted=not (folder / CHECKPOINT).exists())
     config = head.config
     outcome = train(
@@ -77,6 +78,7 @@ def _trained(
         progress=progress,
         checkpoint_every_s=config.checkpoint_every_s,
         clock=clock,
+        began=began,
     )
     names = [*(name for network in head.networks for name in network.shapes()), "landmarks"]
     tensors = {name: training.optimiser[name].detach() for name in names}

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -76,19 +77,21 @@ class GHA:
         before = _Part(progress, 0, second.iterations or 0)
         mesh = mesh_stage(scene, mesh_head, first, out, run, before, self._clock)
         sampler = ShuffledEpochs(len(scene.keys), seed)
+        began = self._clock()
         training = GaussianTraining(scene, head, mesh_head, mesh.tensors, sampler)
         try:
             outcome = train(
                 training,
                 sampler,
                 published_length=round(config.schedule_length * (1 - config.mesh_fraction)),
-                budget=second,
+                budget=within(second, budget, mesh.seconds),
                 folder=out,
                 run=run,
                 device=device,
                 progress=_Part(progress, mesh.iterations, 0),
                 checkpoint_every_s=config.checkpoint_every_s,
                 clock=self._clock,
+                began=began,
             )
         finally:
             training.close()
@@ -132,6 +135,13 @@ def parted(budget: Budget, fraction: float) -> tuple[Budget, Budget]:
     if seconds is None:
         return Budget(**first), Budget(**second)
     return Budget(**first, seconds=fraction * seconds), Budget(**second, seconds=(1 - fraction) * seconds)
+
+
+def within(part: Budget, whole: Budget, spent: float) -> Budget:
+    """The budget of a part, cut to what the ``spent`` seconds leave of the whole; a millisecond if they leave none."""
+    if part.seconds is None or whole.seconds is None:
+        return part
+    return replace(part, seconds=min(part.seconds, max(whole.seconds - spent, 1e-3)))
 
 
 def corrected(scene: Scene, corrections: Tensor) -> RefinedTracking:

@@ -69,6 +69,7 @@ def train(
     progress: Progress,
     checkpoint_every_s: float,
     clock: Callable[[], float] = time.monotonic,
+    began: float | None = None,
 ) -> Outcome:
     """Train until the budget is spent; continue from ``folder``'s checkpoint if it is of the same run.
 
@@ -80,6 +81,8 @@ def train(
     ----------
     published_length : iterations of the published run (`Timeline`).
     run : digest of what the run was started with; another run's checkpoint is refused.
+    began : what the clock said before the preparation of ``trainable``, whose seconds then count like those of
+        iterations; by default counting begins here.
 
     Raises
     ------
@@ -89,16 +92,19 @@ def train(
     check_budget(budget)
     path = folder / CHECKPOINT
     saved = load_checkpoint(path, run, device)
+    started = clock() if began is None else began
     if saved is None:
         iteration, spent = 0, 0.0
-        started = clock()
-        total = budget.iterations or _estimate(trainable, sampler, budget, published_length, clock)
+        total = budget.iterations
+        if total is None:
+            assert budget.seconds is not None
+            left = budget.seconds if began is None else budget.seconds - (clock() - began)
+            total = _estimate(trainable, sampler, left, published_length, clock)
         trainable.begin(Timeline(total, published_length))
     else:
         iteration, total, spent = saved["iteration"], saved["total"], saved["seconds"]
         trainable.begin(Timeline(total, published_length))
         trainable.load_state(saved["trainable"])
-        started = clock()
     estimated = "" if budget.iterations else f"{total} iterations estimated; "
 
     def seconds() -> float:
@@ -144,12 +150,11 @@ def check_budget(budget: Budget) -> None:
 def _estimate(
     trainable: Trainable,
     sampler: Sampler,
-    budget: Budget,
+    seconds: float,
     published_length: int,
     clock: Callable[[], float],
 ) -> int:
-    """How many iterations fit into the seconds, from a few trial steps that change nothing."""
-    assert budget.seconds is not None
+    """How many iterations fit into so many seconds, one at least, from a few trial steps that change nothing."""
     trainable.begin(Timeline(published_length, published_length))
     durations = []
     for trial in range(1, TRIAL_STEPS + 2):
@@ -159,7 +164,7 @@ def _estimate(
         durations.append(clock() - before)
     # The first step pays for lazy initialisation; the median of the rest shrugs off a hiccup.
     typical = sorted(durations[1:])[TRIAL_STEPS // 2]
-    return max(1, int(budget.seconds / max(typical * COST_GROWTH, 1e-6)))
+    return max(1, int(seconds / max(typical * COST_GROWTH, 1e-6)))
 
 
 def _check_finite(loss: Tensor, iteration: int, folder: Path) -> None:

@@ -12,10 +12,13 @@ from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.errors import InputError
 from headbench.bench.files import read_json
 from headbench.methods.avatar_files import RECORD_FILE
+from headbench.methods.gha import mesh_stage, method
 from headbench.methods.gha.avatar import DRIVING_FILE, GHAAvatar
 from headbench.methods.gha.gaussian_head import feature_camera
+from headbench.methods.gha.gaussian_training import GaussianTraining
 from headbench.methods.gha.mesh_stage import FOLDER, RESULT_FILE
-from headbench.methods.gha.method import GHA, parted
+from headbench.methods.gha.mesh_training import MeshTraining
+from headbench.methods.gha.method import GHA, parted, within
 from headbench.methods.gha.storage import AVATAR_FILE
 from headbench.methods.training.loop import CHECKPOINT
 
@@ -29,8 +32,8 @@ class Killed(Exception):
 
 
 def fit(clip, folder, progress=no_progress, seed=3, **more):
-    method = GHA(small_config(**more))
-    return method.fit(clip, folder, BUDGET, device="cpu", seed=seed, progress=progress)
+    small = GHA(small_config(**more))
+    return small.fit(clip, folder, BUDGET, device="cpu", seed=seed, progress=progress)
 
 
 def content(avatar):
@@ -212,8 +215,8 @@ class Ticking:
 
 
 def fit_in_seconds(clip, folder, clock, seconds, progress=no_progress):
-    method = GHA(small_config(), clock)
-    return method.fit(clip, folder, Budget(seconds=seconds), device="cpu", seed=0, progress=progress)
+    small = GHA(small_config(), clock)
+    return small.fit(clip, folder, Budget(seconds=seconds), device="cpu", seed=0, progress=progress)
 
 
 def test_seconds_bound_a_run_and_the_avatar_is_whole(clip, tmp_path):
@@ -229,6 +232,34 @@ def test_seconds_bound_a_run_and_the_avatar_is_whole(clip, tmp_path):
     assert 90 < record["seconds"] < 110
     assert clock.now < 110
     assert avatar.render(*views(clip)).rgb.shape[2] == 3
+
+
+@pytest.mark.parametrize(("mesh", "gaussians"), [(25, 20), (70, 0), (500, 0)])
+def test_seconds_of_preparation_are_taken_off_the_budget(clip, tmp_path, monkeypatch, mesh, gaussians):
+    clock = Ticking()
+
+    def slower(training, seconds):
+        def prepared(*arguments, **named):
+            clock.now += seconds
+            return training(*arguments, **named)
+
+        return prepared
+
+    monkeypatch.setattr(mesh_stage, "MeshTraining", slower(MeshTraining, mesh))
+    monkeypatch.setattr(method, "GaussianTraining", slower(GaussianTraining, gaussians))
+    avatar = fit_in_seconds(clip, tmp_path, clock, 100.0)
+    # Beyond what was asked for go at most the trial steps of two stages, two looks each, and the last iteration.
+    assert clock.now < max(100, mesh) + 2 * 20
+    assert read_json(tmp_path / RECORD_FILE)["seconds"] > clock.now - 10
+    assert avatar.render(*views(clip)).rgb.shape[2] == 3
+
+
+def test_what_a_stage_spent_beyond_its_part_is_taken_off_the_next():
+    whole, part = Budget(iterations=9, seconds=10.0), Budget(iterations=5, seconds=7.5)
+    assert within(part, whole, 2.0) == part
+    assert within(part, whole, 4.0) == Budget(iterations=5, seconds=6.0)
+    assert 0 < within(part, whole, 40.0).seconds < 0.01
+    assert within(Budget(iterations=5), Budget(iterations=9), 40.0) == Budget(iterations=5)
 
 
 @pytest.mark.parametrize(

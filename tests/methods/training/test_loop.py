@@ -47,7 +47,7 @@ class Clock:
         return self.now
 
 
-def run(model, folder, budget, progress=no_progress, clock=None, every=1e9, name="run"):
+def run(model, folder, budget, progress=no_progress, clock=None, every=1e9, name="run", began=None):
     return train(
         model,
         lambda iteration: iteration % 3,
@@ -59,6 +59,7 @@ def run(model, folder, budget, progress=no_progress, clock=None, every=1e9, name
         progress=progress,
         checkpoint_every_s=every,
         clock=clock or Clock(),
+        began=began,
     )
 
 
@@ -127,6 +128,24 @@ def test_seconds_add_up_over_the_parts_of_a_run(tmp_path):
     clock.now += 1000  # time between the parts does not count
     outcome = run(Drift(clock, 1.0), tmp_path, Budget(iterations=9), clock=clock)
     assert outcome.seconds == pytest.approx(9.0)
+
+
+def test_seconds_of_preparation_count(tmp_path):
+    clock = Clock()
+    clock.now = 30.0
+    outcome = run(Drift(clock, 1.0), tmp_path / "seconds", Budget(seconds=40.0), clock=clock, began=6.0)
+    assert outcome.planned == 10  # (40 s - 24 s) / (1 s * 1.6)
+    assert outcome.seconds == pytest.approx(40.0)
+
+    def killer(done, total, note=""):
+        if done == 4:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(Drift(clock, 1.0), tmp_path, Budget(iterations=9), killer, clock, every=0.0, began=clock.now - 5)
+    clock.now += 1000
+    outcome = run(Drift(clock, 1.0), tmp_path, Budget(iterations=9), clock=clock, began=clock.now - 2)
+    assert outcome.seconds == pytest.approx(5 + 2 + 9)
 
 
 def test_another_runs_checkpoint_is_refused(tmp_path):
