@@ -63,7 +63,8 @@ class GHAAvatar:
         """
         trained = self._tensors["background"]
         drawn = self._head.draw(self._posed(pose), camera, trained)
-        image = self._head.sharpen(self._tensors, drawn, trained)[: camera.height, : camera.width]
+        image = self._head.sharpen(self._tensors, drawn, trained, bounded=True)
+        image = image[: camera.height, : camera.width]
         size = [side * self._head.config.upscale for side in drawn.alpha.shape]
         alpha = F.interpolate(drawn.alpha[None, None], size, mode="bilinear", align_corners=False)
         alpha = alpha[0, 0, : camera.height, : camera.width].clamp(0, 1)

@@ -109,9 +109,13 @@ class GaussianHead:
         )
         return Drawn(rendering.image, rendering.alpha)
 
-    def sharpen(self, tensors: Weights, drawn: Drawn, background: Tensor) -> Tensor:
-        """(u h, u w, 3) image of a feature image; ``background`` where nothing is drawn near."""
-        colors = self.super_resolution(tensors, drawn.features, drawn.alpha)
+    def sharpen(self, tensors: Weights, drawn: Drawn, background: Tensor, *, bounded: bool = False) -> Tensor:
+        """(u h, u w, 3) image of a feature image; ``background`` where nothing is drawn near.
+
+        ``bounded`` keeps the memory for large images small, without gradients.
+        """
+        network = self.super_resolution.bounded if bounded else self.super_resolution
+        colors = network(tensors, drawn.features, drawn.alpha)
         near = enlarged(near_drawn(drawn.alpha), self.config.upscale)
         return torch.where(near[..., None] > 0, colors, background)
 

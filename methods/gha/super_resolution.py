@@ -9,8 +9,12 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from .networks import Weights, uniform
+from .strips import Reader, activated, convolve_in_place, convolved, doubled, rows_at_once
 
 VARIANCE_FLOOR = 1e-5
+
+AT_ONCE = 2**24
+"""Numbers of the largest tensor up to which images are computed whole, and of a strip above (64 MiB of float32)."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +68,43 @@ class SuperResolution:
                 values = F.conv2d(values, weights[f"sr.conv_{block}_{layer}"], padding=1)
                 values = F.relu(_normalised(values))
         colors = F.conv2d(values, weights["sr.color"], weights["sr.color_bias"])
+        return self._finished(colors, features, alpha)
+
+    @torch.no_grad()
+    def bounded(self, weights: Weights, features: Tensor, alpha: Tensor, at_once: int = AT_ONCE) -> Tensor:
+        """What calling gives, without gradients, in bounded memory: see `strips`.
+
+        By calling, where no tensor there has more than ``at_once`` numbers. Otherwise no more than a block's output and
+        that of the block before exist at a time, beside strips of so many numbers.
+        """
+        height, width = features.shape[:2]
+        before = (self.channels, *self.widths[:-1])
+        largest = [4**b * max(pair) * height * width for b, pair in enumerate(zip(before, self.widths))]
+        if max(largest) <= at_once:
+            return self(weights, features, alpha)
+        planes = features.permute(2, 0, 1)[None]
+
+        def given(first: int, last: int) -> Tensor:
+            return planes[:, :, first:last]
+
+        read: Reader = given
+        for block, channels in enumerate(zip(before, self.widths)):
+            if block:
+                read, height, width = doubled(read, height), 2 * height, 2 * width
+            rows = rows_at_once(width, max(channels), at_once)
+            raw = convolved(read, height, weights[f"sr.conv_{block}_0"], rows)
+            convolve_in_place(raw, weights[f"sr.conv_{block}_1"], rows, VARIANCE_FLOOR)
+            read = activated(raw, VARIANCE_FLOOR)
+        colors = features.new_empty(1, 3, height, width)
+        for first in range(0, height, rows):
+            strip = read(first, min(first + rows, height))
+            colors[:, :, first : first + rows] = F.conv2d(
+                strip, weights["sr.color"], weights["sr.color_bias"]
+            )
+        return self._finished(colors, features, alpha)
+
+    def _finished(self, colors: Tensor, features: Tensor, alpha: Tensor) -> Tensor:
+        """(u H, u W, 3) image of the last layer's (1, 3, u H, u W) output."""
         if not self.residual:
             return torch.sigmoid(colors)[0].permute(1, 2, 0)
         plain = torch.cat([features[..., :3], alpha[..., None]], dim=2).permute(2, 0, 1)[None]

@@ -7,6 +7,7 @@ import pytest
 import torch
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.errors import InputError
@@ -20,6 +21,7 @@ from headbench.methods.gha.mesh_stage import FOLDER, RESULT_FILE
 from headbench.methods.gha.mesh_training import MeshTraining
 from headbench.methods.gha.method import GHA, parted, within
 from headbench.methods.gha.storage import AVATAR_FILE
+from headbench.methods.gha.super_resolution import AT_ONCE
 from headbench.methods.training.loop import CHECKPOINT
 
 from .small import SMALL, small_config
@@ -165,6 +167,33 @@ def test_frames_stay_bounded_at_extremes(trained, clip, size, change):
         assert np.isfinite(values).all()
         assert values.min() >= 0
         assert values.max() <= 1
+
+
+class Convolutions(TorchDispatchMode):
+    """Collects how many numbers convolutions give."""
+
+    def __init__(self):
+        super().__init__()
+        self.sizes = []
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        result = function(*args, **(kwargs or {}))
+        if function is torch.ops.aten.convolution.default:
+            self.sizes.append(result.numel())
+        return result
+
+
+@pytest.mark.slow
+def test_a_4k_frame_stays_bounded_and_is_made_in_strips(trained, clip):
+    avatar, _ = trained
+    camera, pose = views(clip)
+    with Convolutions() as convolutions:
+        frame = avatar.render(camera.resized(3840, 2160), pose, (0.2, 0.4, 0.6))
+    assert 0 < max(convolutions.sizes) <= AT_ONCE < SMALL["sr_widths"][-1] * 3840 * 2160
+    assert frame.rgb.shape == (2160, 3840, 3)
+    for values in frame:
+        assert np.isfinite(values).all()
+        assert 0 <= values.min() < values.max() <= 1
 
 
 def test_jaw_angles_are_known_up_to_whole_turns(trained, clip):
