@@ -126,6 +126,7 @@ _SHORT_INSTA: dict[str, Any] = {
 
 INSTA = MethodSpec(
     name="insta",
+    version="2",
     summary="INSTA: a canonical hash-grid radiance field, warped by the nearest triangle of the tracked mesh.",
     implementation="headbench.methods.insta.method:Insta",
     config="headbench.methods.insta.config:InstaConfig",
@@ -146,6 +147,7 @@ INSTA = MethodSpec(
 
 GBS = MethodSpec(
     name="gbs",
+    version="2",
     summary="GaussianBlendshapes: splats of a neutral head plus linear differences for each expression, skinned.",
     implementation="headbench.methods.gbs.method:GBS",
     config="headbench.methods.gbs.config:GBSConfig",
@@ -174,6 +176,7 @@ NEAREST_CAMERA = MethodSpec(
 
 GHA = MethodSpec(
     name="gha",
+    version="2",
     summary="Gaussian Head Avatar: splats driven by networks, drawn as features, sharpened by another network.",
     implementation="headbench.methods.gha.method:GHA",
     config="headbench.methods.gha.config:GHAConfig",

@@ -32,6 +32,12 @@ def test_presets_resolve(name, preset):
         implementation()
 
 
+@pytest.mark.parametrize("name", SPECS)
+def test_a_run_records_the_version_of_the_method_that_it_runs(name):
+    spec = SPECS[name]
+    assert resolve_method(spec, "demo", {}).record()["version"] == resolve(spec.implementation).version
+
+
 def test_paper_presets_are_the_published_values():
     for spec in (OURS, GA):
         settings = dict(spec.presets["paper"])
