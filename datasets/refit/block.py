@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from ...bench.contracts import FloatArray, HeadPose
 from ...bench.files import atomic_path, digest
@@ -64,11 +63,9 @@ class BlockFitter:
         frames = self._problem.frames(local, matrices(necks))
         given = np.array([[*pose.jaw, *pose.eyes] for pose in poses], dtype=np.float64)
         solutions, start = [], given[0]
-        # The matrices of a timestep are small: threads would only wait for each other.
-        with threadpool_limits(1, user_api="blas"):
-            for frame, own in zip(frames, given):
-                solutions.append(solve_frame(self._problem, frame, start, own, self.settings))
-                start = solutions[-1].angles
+        for frame, own in zip(frames, given):
+            solutions.append(solve_frame(self._problem, frame, start, own, self.settings))
+            start = solutions[-1].angles
         columns: dict[str, FloatArray] = {
             "coefficients": np.stack([solution.coefficients for solution in solutions]),
             "angles": np.stack([solution.angles for solution in solutions]),

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from ...bench.contracts import FloatArray, Progress, no_progress
 from ...bench.errors import InputError
@@ -41,6 +42,9 @@ def refit_clip(
     return refit(clip, target, settings, folder=folder, progress=progress).clip
 
 
+# The number of threads decides how sums are rounded, and by that whether blocks kept earlier fit and what the
+# refitted clip's fingerprint is: a run that continues with another number would find another clip.
+@threadpool_limits.wrap(limits=1)
 def refit(
     clip: CaptureClip,
     target: HeadArrays,

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from threadpoolctl import threadpool_limits
 
 from headbench.bench.contracts import Camera
 from headbench.bench.errors import InputError
@@ -155,6 +156,15 @@ def test_a_target_out_of_reach_ends_at_bounds_that_are_reported():
 def test_no_timestep_is_refused():
     with pytest.raises(InputError, match="timestep"):
         refit_clip(replace(performance(SOURCE, 1), poses={}), TARGET)
+
+
+def test_the_number_of_threads_does_not_change_the_clip():
+    clip, target = performance(procedural_head("2023"), 3), procedural_head("2020")
+    found = set()
+    for threads in (1, 2):
+        with threadpool_limits(threads):
+            found.add(refit_clip(clip, target).fingerprint)
+    assert len(found) == 1
 
 
 def test_identical_timesteps_give_identical_poses():
