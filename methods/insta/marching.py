@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -166,15 +167,16 @@ class PosedSurface:
         )
 
     def reach(self, space: Space) -> np.ndarray:
-        """(F,) float32 metres from each triangle of this pose within which the space has density; negative for none.
+        """(F,) float32 metres from each triangle of this pose within which the space has density; negative for none."""
+        return np.asarray(space.reach / self._shrinking, dtype=np.float32)
 
-        Where the mesh is stretched its surroundings are too, by the smallest scale that is blended at a triangle.
-        """
+    @cached_property
+    def _shrinking(self) -> np.ndarray:
+        """(F,) canonical metres for each of this pose around a triangle: the smallest scale blended there, up to 1."""
         scale = (torch.linalg.vector_norm(self.matrices[:, :, :3], dim=(1, 2)) / math.sqrt(3)).numpy()
         neighbours = self.surface.blend.neighbours
         across = np.where(neighbours >= 0, neighbours, np.arange(len(scale))[:, None])
-        smallest = np.minimum(scale, scale[across].min(1)).clip(1 / STRETCH_MAX, 1)
-        return np.asarray(space.reach / smallest, dtype=np.float32)
+        return np.asarray(np.minimum(scale, scale[across].min(1)).clip(1 / STRETCH_MAX, 1))
 
     def guide(self, space: Space) -> Any:
         """The kernel's view of this pose and a space; the last one is kept. Needs the kernel."""
