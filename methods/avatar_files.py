@@ -14,7 +14,7 @@ from ..bench.contracts import Budget, Clip, FloatArray, HeadAsset, HeadPose
 from ..bench.errors import InputError
 from ..bench.files import atomic_path, digest, write_json
 from ..datasets.head.arrays import HeadArrays, read_head, read_npz, save_head
-from .training.loop import Outcome
+from .training.loop import CHECKPOINT, Outcome
 
 HEAD_FILE = "head_model.npz"
 SUBJECT_FILE = "subject.npz"
@@ -219,3 +219,13 @@ def write_record(folder: Path, run: str, outcome: Outcome, **more: Any) -> None:
         **more,
     }
     write_json(folder / RECORD_FILE, record)
+
+
+def finish_fit(
+    folder: Path, run: str, outcome: Outcome, subject: Subject, head: HeadAsset, **more: Any
+) -> None:
+    """Write what every trained avatar has beside its own files, the record last; the checkpoint is done with."""
+    write_subject(folder / SUBJECT_FILE, subject)
+    save_shared_head(folder, head)
+    write_record(folder, run, outcome, **more)
+    (folder / CHECKPOINT).unlink(missing_ok=True)

@@ -19,13 +19,11 @@ from .avatar_files import (
     TRACKED,
     RefinedTracking,
     Subject,
+    finish_fit,
     is_finished,
     read_shared_head,
     read_subject,
     run_digest,
-    save_shared_head,
-    write_record,
-    write_subject,
 )
 from .binding import Frames, WorldSplats, to_world
 from .bound_avatar import USUAL, Cutoffs, Drawn, PosedSplats, draw_splats, posed_splats, read_back
@@ -37,7 +35,7 @@ from .seeds import torch_generator
 from .sh import coefficient_count, initial_coefficients, occupied_degree, sh_to_rgb
 from .stored_splats import Carrier, HarmonicColors
 from .subject_mesh import BoundedCache, SubjectMesh
-from .training.loop import CHECKPOINT, check_budget
+from .training.loop import check_budget
 from .training.optimiser import Optimiser
 from .training.sampling import ShuffledEpochs
 from .training.schedule import Timeline
@@ -261,13 +259,10 @@ class GA:
         write_ga_splats(
             out / PLY_FILE, {name: optimiser[name] for name in training.splat_names}, training.binding
         )
-        write_subject(out / SUBJECT_FILE, subject)
         refined = appearance.refined(clip.subject, optimiser)
         if refined is not None:
             refined.save(out / DRIVING_FILE)
-        save_shared_head(out, clip.head)
-        write_record(out, run, outcome, splats=len(training.binding))
-        (out / CHECKPOINT).unlink(missing_ok=True)
+        finish_fit(out, run, outcome, subject, clip.head, splats=len(training.binding))
         return self.load(out, device=device)
 
     def load(self, path: Path, *, device: str) -> GAAvatar:

@@ -10,18 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from ...bench.contracts import Budget, Clip, Progress
-from ..avatar_files import (
-    SUBJECT_FILE,
-    Subject,
-    is_finished,
-    run_digest,
-    save_shared_head,
-    write_record,
-    write_subject,
-)
+from ..avatar_files import Subject, finish_fit, is_finished, run_digest
 from ..clip_checks import check_training_split
 from ..splat_trainer import run_trainer
-from ..training.loop import CHECKPOINT, check_budget
+from ..training.loop import check_budget
 from ..training.sampling import ShuffledEpochs
 from .avatar import GBSAvatar
 from .config import GBSConfig
@@ -64,12 +56,8 @@ class GBS:
             progress=progress,
         )
         self._write(out / AVATAR_FILE, training)
-        write_subject(out / SUBJECT_FILE, subject)
-        save_shared_head(out, head)
-        entries = len(training.entries.owners)
-        teeth = "teeth" in head.regions
-        write_record(out, run, outcome, splats=len(training.binding), differences=entries, teeth=teeth)
-        (out / CHECKPOINT).unlink(missing_ok=True)
+        counts = {"splats": len(training.binding), "differences": len(training.entries.owners)}
+        finish_fit(out, run, outcome, subject, head, **counts, teeth="teeth" in head.regions)
         return self.load(out, device=device)
 
     def load(self, path: Path, *, device: str) -> GBSAvatar:

@@ -24,18 +24,15 @@ from torch import Tensor
 
 from ...bench.contracts import Budget, Clip, Progress
 from ..avatar_files import (
-    SUBJECT_FILE,
     TRACKED,
     RefinedTracking,
     Subject,
+    finish_fit,
     is_finished,
     run_digest,
-    save_shared_head,
-    write_record,
-    write_subject,
 )
 from ..clip_checks import check_training_split
-from ..training.loop import CHECKPOINT, Outcome, check_budget, train
+from ..training.loop import Outcome, check_budget, train
 from ..training.sampling import ShuffledEpochs
 from .avatar import DRIVING_FILE, GHAAvatar
 from .config import GHAConfig
@@ -97,17 +94,15 @@ class GHA:
             training.close()
         tensors = training.tensors()
         write_avatar(out / AVATAR_FILE, config, {**tensors, **scene.frame()})
-        write_subject(out / SUBJECT_FILE, Subject.of(clip))
         corrected(scene, training.optimiser["corrections"].detach()).save(out / DRIVING_FILE)
-        save_shared_head(out, clip.head)
         whole = Outcome(
             mesh.iterations + outcome.iterations,
             mesh.iterations + outcome.planned,
             mesh.seconds + outcome.seconds,
         )
-        write_record(*(out, run, whole), splats=len(tensors["points"]), mesh_iterations=mesh.iterations)
+        counts = {"splats": len(tensors["points"]), "mesh_iterations": mesh.iterations}
+        finish_fit(out, run, whole, Subject.of(clip), clip.head, **counts)
         remove_mesh_stage(out)
-        (out / CHECKPOINT).unlink(missing_ok=True)
         return self.load(out, device=device)
 
     def load(self, path: Path, *, device: str) -> GHAAvatar:

@@ -5,18 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from ...bench.contracts import Budget, Clip, Progress
-from ..avatar_files import (
-    SUBJECT_FILE,
-    Subject,
-    is_finished,
-    run_digest,
-    save_shared_head,
-    write_record,
-    write_subject,
-)
+from ..avatar_files import Subject, finish_fit, is_finished, run_digest
 from ..clip_checks import check_training_split
 from ..subject_mesh import SubjectMesh
-from ..training.loop import CHECKPOINT, check_budget, train
+from ..training.loop import check_budget, train
 from ..training.sampling import ShuffledEpochs
 from .avatar import InstaAvatar
 from .canonical import canonical_surface
@@ -59,10 +51,8 @@ class Insta:
         )
         write_field(out / FIELD_FILE, training.parameters(), training.space.occupied)
         write_settings(out / SETTINGS_FILE, self.config)
-        write_subject(out / SUBJECT_FILE, subject)
-        save_shared_head(out, clip.head)
-        write_record(out, run, outcome, occupied_cells=int(training.space.occupied.sum()))
-        (out / CHECKPOINT).unlink(missing_ok=True)
+        occupied = int(training.space.occupied.sum())
+        finish_fit(out, run, outcome, subject, clip.head, occupied_cells=occupied)
         return self.load(out, device=device)
 
     def load(self, path: Path, *, device: str) -> InstaAvatar:
