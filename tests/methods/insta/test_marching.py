@@ -83,6 +83,18 @@ def test_the_kernel_gives_the_samples_of_the_reference(space, roughness, lost):
         assert difference.max() < 2e-5
 
 
+def test_a_head_that_a_pose_enlarges_has_the_same_samples(pair, space):
+    """Everything posed is 1.6 times as large, the step too: what is met in canonical space must not change."""
+    surface, rays = pair[0].surface, fan()
+    large = Rays((np.float32(1.6) * rays.origins).astype(np.float32), rays.directions, rays.jitter)
+    first = np.zeros(len(rays.origins), np.int32)
+    whole = surface.rest.march(rays, first, STEP, 10_000, space)
+    found = surface.pose(1.6 * surface.canonical).march(large, first, 1.6 * STEP, 10_000, space)
+    keys = [set(zip(part.rays.tolist(), part.indices.tolist())) for part in (whole, found)]
+    assert len(keys[0]) > 300
+    assert len(keys[0] ^ keys[1]) <= 0.01 * len(keys[0])
+
+
 @pytest.mark.parametrize("most", [1, 3, 7])
 def test_rounds_together_are_all_samples(pair, space, most):
     rays = fan(8)
