@@ -1,24 +1,119 @@
-"""headbench: a benchmark suite for animatable 3D head avatars."""
+"""headbench: a benchmark suite for animatable 3D head avatars.
 
-from .bench.contracts import Avatar, Budget, Camera, Clip, Frame, FrameKey, HeadPose, Method, Metric
-from .bench.errors import HeadbenchError, InputError, UnavailableError
-from .bench.specs import DatasetSpec, MethodSpec, MetricSpec, ReportSpec
+Everything a plug-in needs is here: specifications to register, the values and protocols of the contracts, errors,
+and the checks of the conformance kit. Names are imported when first used, so that ``import headbench`` is light.
+"""
+
+from importlib import import_module as _import_module
+from typing import TYPE_CHECKING as _TYPE_CHECKING
+from typing import Any as _Any
+
+if _TYPE_CHECKING:
+    from .bench.adaptation import AdaptedClip, MethodNeeds
+    from .bench.conformance.methods import check_method
+    from .bench.conformance.metrics import check_metric
+    from .bench.conformance.readers import check_clip, check_reader
+    from .bench.contracts import (
+        STAGES,
+        Avatar,
+        AvatarMetric,
+        Budget,
+        Camera,
+        Clip,
+        Frame,
+        FrameKey,
+        HeadAsset,
+        HeadPose,
+        Measurement,
+        Method,
+        Metric,
+        Progress,
+        RegionalClip,
+        RegionalMetric,
+        SharingAvatar,
+        StagedAvatar,
+        StepRecord,
+        TemporalMetric,
+        TrainingMetric,
+        Variant,
+    )
+    from .bench.errors import HeadbenchError, InputError, UnavailableError
+    from .bench.run_config import resolve_method
+    from .bench.specs import (
+        BenchmarkSpec,
+        CommandSpec,
+        DatasetSpec,
+        Findings,
+        MethodSpec,
+        MetricSpec,
+        ProfileSpec,
+        ReportSpec,
+        ResolutionRule,
+    )
 
 __all__ = [
+    "STAGES",
+    "AdaptedClip",
     "Avatar",
+    "AvatarMetric",
+    "BenchmarkSpec",
     "Budget",
     "Camera",
     "Clip",
+    "CommandSpec",
     "DatasetSpec",
+    "Findings",
     "Frame",
     "FrameKey",
+    "HeadAsset",
     "HeadPose",
     "HeadbenchError",
     "InputError",
+    "Measurement",
     "Method",
+    "MethodNeeds",
     "MethodSpec",
     "Metric",
     "MetricSpec",
+    "ProfileSpec",
+    "Progress",
+    "RegionalClip",
+    "RegionalMetric",
     "ReportSpec",
+    "ResolutionRule",
+    "SharingAvatar",
+    "StagedAvatar",
+    "StepRecord",
+    "TemporalMetric",
+    "TrainingMetric",
     "UnavailableError",
+    "Variant",
+    "check_clip",
+    "check_method",
+    "check_metric",
+    "check_reader",
+    "resolve_method",
 ]
+
+_HOMES = {
+    "adaptation": ("AdaptedClip", "MethodNeeds"),
+    "conformance.methods": ("check_method",),
+    "conformance.metrics": ("check_metric",),
+    "conformance.readers": ("check_clip", "check_reader"),
+    "errors": ("HeadbenchError", "InputError", "UnavailableError"),
+    "run_config": ("resolve_method",),
+    "specs": tuple(name for name in __all__ if name.endswith("Spec")) + ("Findings", "ResolutionRule"),
+}
+_HOME = {name: module for module, names in _HOMES.items() for name in names}
+
+
+def __getattr__(name: str) -> _Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(_import_module(f".bench.{_HOME.get(name, 'contracts')}", __name__), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

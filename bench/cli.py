@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
-import csv
-import io
+import errno
 import json
 import os
+import select
+import signal
 import sys
 import time
+import traceback
 from collections.abc import Callable
 from dataclasses import asdict
+from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
-from .commands import offered_commands, with_groups
-from .configuration import build, merge, parse_assignments, read_yaml
+from .commands import check_known, exit_code, offered_commands, prepare_streams, show, with_groups
+from .configuration import build, merge, parse_assignments
 from .demo import DemoConfig, demo_run_config, parse_size
 from .device import check_device
-from .errors import HeadbenchError, InputError
-from .files import WRITE_FAULTS, plain, write_json
+from .documents import read_yaml
+from .errors import EXIT_CODES, ExitCode, HeadbenchError, InputError, Interruption
+from .files import check_writable, plain, write_json
 from .lock import locked
 from .progress import log_to, progress
 from .registry import Group, discover, get, resolve
@@ -28,9 +32,6 @@ from .run_config import RunConfig, resolve_methods, resolve_metrics
 from .runner import run as run_comparison
 from .specs import Findings
 from .store import RunFolder
-
-EXIT_FAILED_CELL = 1
-EXIT_BAD_INPUT = 2
 
 Preset = Literal["smoke", "demo", "fast", "paper"]
 Text = Annotated[str | None, tyro.conf.arg(metavar="TEXT")]
@@ -107,8 +108,7 @@ def synth(
         dynamics: Scales what expressions do to skin beyond moving it (wrinkles, blush), 0 to 3.
     """
     RunFolder(Path(out)).prepare()
-    folder = Path(out).resolve()  # its lock lies beside it: a capture is made in an empty folder
-    with log_to(None), locked(folder.parent, f".{folder.name}.lock"):
+    with log_to(None), locked(Path(out), beside=True):  # a capture is made in an empty folder
         _synthesise(
             {
                 "out": Path(out),
@@ -123,7 +123,7 @@ def synth(
                 "dynamics": dynamics,
             }
         )
-    print(out)
+    show(out)
     return 0
 
 
@@ -189,7 +189,7 @@ def table(
         published: Add columns with the figures that papers printed, where a layout has some.
     """
     render: Callable[..., str] = resolve(get("reports", "table-text").implementation)
-    print(render([Path(run) for run in runs], format, layout, published))
+    show(render([Path(run) for run in runs], format, layout, published))
     return 0
 
 
@@ -228,9 +228,11 @@ def list_(
         _print_json(entries)
         return 0
     width = max((len(entry["name"]) for entry in entries), default=0)
+    lines = []
     for entry in entries:
         text = f"broken: {entry['error']}" if entry["error"] else entry["summary"]
-        print(f"{entry['name']:<{width}}  {text}")
+        lines.append(f"{entry['name']:<{width}}  {text}")
+    show("\n".join(lines))
     return 0
 
 
@@ -274,9 +276,9 @@ def stress(
 
 COMMANDS: dict[str, Callable[..., int]] = {
     "demo": demo,
-    "synth": synth,
     "run": run,
     "table": table,
+    "synth": synth,
     "list": list_,
     "bench": bench,
     "stress": stress,
@@ -284,44 +286,67 @@ COMMANDS: dict[str, Callable[..., int]] = {
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Entry point of the console script; returns the exit code."""
+    """Run a command line, by default the process's own; returns the exit code, one of `ExitCode`."""
     # OpenMP's workers spin by default while they wait. On a machine with any other work that makes several
     # threads many times slower than one, so let them sleep; read once, when torch is first imported.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    prepare_streams()
     words = sys.argv[1:] if arguments is None else arguments
     try:
-        offered = offered_commands()
-        group = offered.get(words[0]) if words else None
-        if isinstance(group, dict):
-            return _call(group, f"headbench {words[0]}", f"What to {words[0]}.", words[1:])
-        description = "Benchmark of animatable 3D head avatars. Start with `headbench demo`."
-        return _call({**with_groups(offered), **COMMANDS}, "headbench", description, words)
+        try:
+            return _call(words)
+        except BrokenPipeError:
+            if not _reader_has_gone():
+                raise
+            return ExitCode.OK  # `headbench --help | head -1`: not an error of ours
+        finally:
+            show(end="")  # what is still buffered, here, where an error can be reported
     except HeadbenchError as error:
-        print(f"headbench: {error}", file=sys.stderr)
-        return EXIT_BAD_INPUT
-    except KeyboardInterrupt:
-        print("headbench: interrupted; start it again to continue", file=sys.stderr)
-        return 130
-    except BrokenPipeError:
-        # The reader of our output has gone (`headbench list methods | head`): not an error of ours.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
+        return _fail(str(error), ExitCode.BAD_INPUT)
+    except KeyboardInterrupt as error:
+        ended = error if isinstance(error, Interruption) else Interruption(signal.SIGINT)
+        return _fail(str(ended), ended.code)
     except OSError as error:
-        if error.errno not in WRITE_FAULTS:
-            raise
-        where = f"{error.filename}: " if error.filename else ""
-        reason = error.strerror or str(error)
-        remedy = "Make room (or let it be written) and start again."
-        print(
-            f"headbench: {where}expected a file that can be written, found: {reason}. {remedy}",
-            file=sys.stderr,
-        )
-        return EXIT_BAD_INPUT
+        return _fail(_described(error), ExitCode.BAD_INPUT)
+    except Exception:  # noqa: BLE001
+        traceback.print_exc()
+        return _fail("unexpected error; please report it with the lines above", ExitCode.UNEXPECTED)
 
 
-def _call(commands: dict[str, Callable[..., int]], prog: str, description: str, words: list[str]) -> int:
+def _fail(message: str, code: ExitCode) -> ExitCode:
+    print(f"headbench: {message}", file=sys.stderr)
+    return code
+
+
+def _described(error: OSError) -> str:
+    """An error of the system in one line: the file, the reason, and what to do where that is not obvious."""
+    reason = error.strerror or " ".join(str(error).split()) or type(error).__name__
+    full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
+    remedy = ". Make room (or let it be written) and start again." if full else ""
+    return f"{'' if error.filename is None else f'{error.filename}: '}{reason}{remedy}"
+
+
+def _reader_has_gone() -> bool:
+    """Whether standard output is a pipe that nobody reads any longer."""
+    poll = select.poll()
+    poll.register(sys.stdout.fileno(), 0)
+    return any(event & select.POLLERR for _, event in poll.poll(0))
+
+
+def _call(words: list[str]) -> int:
+    """Call the command that the words of the command line name."""
+    if words[:1] == ["--version"]:
+        show(f"headbench {version('headbench')}")
+        return ExitCode.OK
+    offered = {**offered_commands(), **COMMANDS}
+    check_known(words, offered)
+    first = ("demo", "run", "table")  # what a newcomer needs
+    commands = with_groups({name: offered[name] for name in (*first, *sorted(offered.keys() - set(first)))})
+    description = "Benchmark of animatable 3D head avatars. Start with `headbench demo`."
+    description += f" `headbench --version` prints the version.\n\n{EXIT_CODES}"
+    config = (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
     return tyro.extras.subcommand_cli_from_dict(
-        commands, prog=prog, description=description, args=words, config=(tyro.conf.FlagCreatePairsOff,)
+        commands, prog="headbench", description=description, args=words, config=config
     )
 
 
@@ -333,33 +358,28 @@ def _synthesise(arguments: dict[str, Any]) -> None:
 
 def _run(config: RunConfig, as_json: bool, **record: Any) -> int:
     rows = run_comparison(config, **record)
-    failed = rows[rows["status"] == "failed"]
     if as_json:
-        failures = sorted(set(failed["method"]))
-        _print_json({"out": config.out, "failed": failures, "means": _means(Path(config.out))})
+        _print_json({"out": config.out, "failed": rows.failed, "means": _means(Path(config.out))})
     else:
         table((config.out,))
-        print(f"\nPictures, tables and everything else: {config.out}")
-    return EXIT_FAILED_CELL if len(failed) else 0
+        show(f"\nPictures, tables and everything else: {config.out}")
+    return ExitCode.NEGATIVE if rows.failed else ExitCode.OK
 
 
 def _means(run_folder: Path) -> list[dict[str, Any]]:
     """Numbers of the comparison table, so that a machine reads what a person does; None where there is none."""
     render: Callable[..., str] = resolve(get("reports", "table-text").implementation)
-    means = []
-    for line in csv.DictReader(io.StringIO(render([run_folder], "csv"))):
-        for column in (name.removesuffix("/status") for name in line if name.endswith("/status")):
-            task, _, metric = column.rpartition("/")
-            means.append(
-                {
-                    "task": task,
-                    "method": line["method"],
-                    "metric": metric,
-                    "value": float(line[column]) if line[column] else None,
-                    "status": line[f"{column}/status"],
-                }
-            )
-    return means
+    table = json.loads(render([run_folder], "json"))
+    return [
+        {
+            **{name: column[name] for name in ("task", "metric")},
+            "method": row["method"],
+            **{name: cell[name] for name in ("value", "status")},
+        }
+        for _, rows in table["groups"]
+        for row in rows
+        for column, cell in zip(table["columns"], row["cells"])
+    ]
 
 
 def _measure(part: str, kind: str, quick: bool, out: str | None, as_json: bool) -> int:
@@ -367,6 +387,8 @@ def _measure(part: str, kind: str, quick: bool, out: str | None, as_json: bool) 
     function = getattr(spec, kind)
     if not function:
         raise InputError("command line", "part", f"a benchmark with {kind}", f"{part}, which has none")
+    if out is not None:
+        check_writable(Path(out), "--out")
     with log_to(None), progress(kind) as report:
         findings: Findings = resolve(function)(quick, report)
     if out is not None:
@@ -374,8 +396,8 @@ def _measure(part: str, kind: str, quick: bool, out: str | None, as_json: bool) 
     if as_json:
         _print_json(findings.data)
     else:
-        print(findings.text)
-    return 0 if findings.passed else EXIT_FAILED_CELL
+        show(findings.text)
+    return exit_code(findings)
 
 
 def _log_file(out: Path) -> Path | None:
@@ -392,8 +414,10 @@ def _settings_line(values: dict[str, Any]) -> str:
 
 
 def _print_json(value: Any) -> None:
-    print(json.dumps(value, indent=1, default=plain))
+    show(json.dumps(value, indent=1, default=plain))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    from .start import main as start
+
+    sys.exit(start())

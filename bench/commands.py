@@ -2,21 +2,54 @@
 
 from __future__ import annotations
 
+import codecs
+import difflib
+import io
 import json as json_module
-from collections.abc import Callable, Mapping
-from typing import Annotated, Any
+import os
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Annotated, Any, Union
 
 import tyro
 
-from .errors import HeadbenchError
+from .errors import ExitCode, HeadbenchError, InputError
 from .files import plain
+from .lock import locked
 from .progress import log_to, progress
 from .registry import discover, resolve
 from .specs import CommandSpec, Findings
 
-EXIT_NOT_PASSED = 1
-
 Command = Callable[..., int]
+
+WORDS_OF_OTHERS = {
+    "analyze": "compare",
+    "benchmark": "run",
+    "check": "lint",
+    "eval": "evaluate",
+    "evaluation": "evaluate",
+    "fit": "run",
+    "generate": "synth",
+    "metrics": "evaluate",
+    "preprocess": "prepare nersemble",
+    "process-data": "prepare nersemble",
+    "process": "prepare nersemble",
+    "prune": "sweep",
+    "render": "run",
+    "report": "table",
+    "results": "table",
+    "show": "table",
+    "synthesize": "synth",
+    "test": "evaluate",
+    "train": "run",
+    "validate": "lint",
+    "view": "export ply",
+    "viewer": "export ply",
+    "visualize": "inspect",
+}
+"""What other toolkits call their commands, and which of ours does it."""
 
 
 def offered_commands() -> dict[str, Command | dict[str, Command]]:
@@ -40,11 +73,75 @@ def offered_commands() -> dict[str, Command | dict[str, Command]]:
 
 
 def with_groups(commands: Mapping[str, Command | dict[str, Command]]) -> dict[str, Command]:
-    """Stand-ins for the tables of `offered_commands`, so that the list of commands shows them."""
+    """Each table of `offered_commands` as one command whose first argument names a command of the table."""
     return {
-        name: _listed(name, command) if isinstance(command, dict) else command
-        for name, command in commands.items()
+        name: _nested(command) if isinstance(command, dict) else command for name, command in commands.items()
     }
+
+
+def check_known(words: Sequence[str], commands: Mapping[str, Command | dict[str, Command]]) -> None:
+    """Raise `InputError` where the words of a command line name none of ``commands``, with the nearest one."""
+    word = next(iter(words), "-")
+    table = commands.get(word)
+    if isinstance(table, dict) and words[1:]:
+        if words[1].startswith("-") or words[1] in table:
+            return
+        word = f"{word} {words[1]}"
+    elif word.startswith("-") or word in commands:
+        return
+    described: dict[str, Command] = {}
+    for name, command in commands.items():
+        parts = command if isinstance(command, dict) else {"": command}
+        described |= {f"{name} {second}".strip(): part for second, part in parts.items()}
+    name = WORDS_OF_OTHERS.get(word.lower().replace("_", "-"), "")
+    if name not in described:
+        name = next(iter(difflib.get_close_matches(word, described, n=1, cutoff=0.5)), "")
+    remedy = "`headbench --help` lists them."
+    if name:
+        summary = (described[name].__doc__ or "").strip().splitlines()[0].rstrip(".")
+        remedy = f"Did you mean `headbench {name}` ({summary})? {remedy}"
+    raise InputError("command line", "", "a command of headbench", repr(word[:60]), remedy)
+
+
+IN_ASCII = dict(
+    zip("↑↓±×·–—…²µ•→°", ("^", "v", "+/-", "x", "-", "-", "--", "...", "^2", "u", "*", "->", " deg"))
+)
+"""What our output has beyond ASCII, for terminals that have no more."""
+
+
+def prepare_streams() -> None:
+    """Let standard output and error write in ASCII what their encoding lacks, where they would raise otherwise."""
+    codecs.register_error("headbench", _in_ascii)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="headbench")
+
+
+def _in_ascii(error: UnicodeError) -> tuple[str, int]:
+    """Handle characters that an encoding lacks: ours by `IN_ASCII`, others as JSON escapes them."""
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    lacking = error.object[error.start : error.end]
+    return "".join(IN_ASCII.get(c) or json_module.dumps(c)[1:-1] for c in lacking), error.end
+
+
+def show(text: str = "", end: str = "\n") -> None:
+    """Print the result of a command. A reader that has gone (``headbench gate … | head -1``) changes no exit code."""
+    try:
+        print(text, end=end, flush=True)
+    except OSError as error:
+        # What is still buffered must not fail again when the interpreter ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if not isinstance(error, BrokenPipeError):
+            error.filename = "standard output"
+            raise
+
+
+def exit_code(findings: Findings) -> int:
+    """Exit code of the command that found this."""
+    if findings.code is not None:
+        return findings.code
+    return ExitCode.OK if findings.passed else ExitCode.NEGATIVE
 
 
 def _command(spec: CommandSpec) -> Command:
@@ -55,12 +152,12 @@ def _command(spec: CommandSpec) -> Command:
 
     def command(settings: Any, json: bool = False) -> int:
         implementation = resolve(spec.implementation)
-        with log_to(None), progress(spec.name) as report:
+        folder = getattr(settings, spec.writes) if spec.writes else None
+        lock = locked(Path(folder)) if folder else nullcontext()
+        with log_to(None), lock, progress(spec.name) as report:
             findings: Findings = implementation(settings, report)
-        print(json_module.dumps(findings.data, indent=1, default=plain) if json else findings.text)
-        if findings.code is not None:
-            return findings.code
-        return 0 if findings.passed else EXIT_NOT_PASSED
+        show(json_module.dumps(findings.data, indent=1, default=plain) if json else findings.text)
+        return exit_code(findings)
 
     # The options are those of this command's own settings, which only its specification knows.
     command.__annotations__ = {
@@ -80,9 +177,13 @@ def _broken(name: str, why: str) -> Command:
     return command
 
 
-def _listed(name: str, group: Mapping[str, Command]) -> Command:
-    def command() -> int:
-        raise HeadbenchError(f"{name}: say what: {', '.join(sorted(group))}")
+def _nested(group: Mapping[str, Command]) -> Command:
+    def command(what: int) -> int:
+        return what
 
+    # The parser calls the command that the second word names, and gives what it returned.
+    choices = [Annotated[Any, tyro.conf.subcommand(name=n, constructor=c)] for n, c in sorted(group.items())]
+    union: Any = Union[(*choices, Annotated[None, tyro.conf.Suppress])]
+    command.__annotations__ = {"what": union, "return": int}
     command.__doc__ = f"Followed by one of: {', '.join(sorted(group))}."
     return command

@@ -1,4 +1,4 @@
-"""Settings: YAML and ``--set a.b=c`` into frozen dataclasses. Unknown keys and wrong types are refused."""
+"""Settings: mappings and ``--set a.b=c`` into frozen dataclasses. Unknown keys and wrong types are refused."""
 
 from __future__ import annotations
 
@@ -11,28 +11,11 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
-import yaml
-
+from .documents import parse_setting, shown
 from .errors import InputError
 from .registry import unknown
 
 T = TypeVar("T")
-
-
-def read_yaml(path: Path) -> dict[str, Any]:
-    """Read a YAML mapping (safe loader: data, never code)."""
-    try:
-        value = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(path, "", "a readable YAML file", error.strerror or str(error)) from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(path, "", "valid YAML", reason) from error
-    if value is None:
-        return {}
-    if not isinstance(value, dict):
-        raise InputError(path, "", "a mapping of settings", type(value).__name__)
-    return value
 
 
 def parse_assignments(assignments: Iterable[str]) -> dict[str, Any]:
@@ -43,10 +26,7 @@ def parse_assignments(assignments: Iterable[str]) -> dict[str, Any]:
         keys = path.strip().split(".")
         if not equals or not all(keys):
             raise InputError("--set", assignment, "KEY=VALUE with dots in KEY for nesting", "no such form")
-        try:
-            value = _scalar(yaml.safe_load(text))
-        except yaml.YAMLError as error:
-            raise InputError("--set", path, "a YAML value", " ".join(str(error).split())) from error
+        value = _scalar(parse_setting(text, "--set", path))
         level = nested
         for key in keys[:-1]:
             level = level.setdefault(key, {})
@@ -80,7 +60,7 @@ def build(cls: type[T], values: Mapping[str, Any], source: str, prefix: str = ""
     InputError : an unknown key (with the nearest known one), a missing one, or a value of the wrong type.
     """
     if not isinstance(values, Mapping):
-        raise InputError(source, prefix.rstrip("."), "a group of settings", _shown(values))
+        raise InputError(source, prefix.rstrip("."), "a group of settings", shown(values))
     hints = get_type_hints(cls)
     fields = {f.name: f for f in dataclasses.fields(cls) if f.init}  # type: ignore[arg-type]
     arguments: dict[str, Any] = {}
@@ -148,14 +128,14 @@ def _convert(hint: Any, value: Any, source: str, key: str) -> Any:
                 refusals.append(error)
         if len(refusals) == 1:
             raise refusals[0]
-        raise InputError(source, key, " or ".join(error.expected for error in refusals), _shown(value))
+        raise InputError(source, key, " or ".join(error.expected for error in refusals), shown(value))
     if origin is Sequence:
         origin, arguments = tuple, (*arguments, Ellipsis)
     if origin is tuple:
         if isinstance(value, str):
             value = [_scalar(part.strip()) for part in value.split(",") if part.strip()]
         if not isinstance(value, (list, tuple)):
-            raise InputError(source, key, "a list", _shown(value))
+            raise InputError(source, key, "a list", shown(value))
         repeated = len(arguments) == 2 and arguments[1] is Ellipsis
         if not repeated and len(arguments) != len(value):
             raise InputError(source, key, f"{len(arguments)} values", f"{len(value)}")
@@ -163,7 +143,7 @@ def _convert(hint: Any, value: Any, source: str, key: str) -> Any:
         return tuple(_convert(k, v, source, f"{key}[{i}]") for i, (k, v) in enumerate(zip(kinds, value)))
     if origin in (dict, Mapping) or hint is dict:
         if not isinstance(value, Mapping):
-            raise InputError(source, key, "a group of settings", _shown(value))
+            raise InputError(source, key, "a group of settings", shown(value))
         return dict(value)
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
         return build(hint, value, source, f"{key}.")
@@ -189,8 +169,4 @@ def _convert_scalar(hint: Any, value: Any, source: str, key: str) -> Any:
     if hint is str and isinstance(value, (int, float)) and not isinstance(value, bool):
         return str(value)
     names = {int: "a whole number", float: "a number", bool: "true or false", str: "text", Path: "a path"}
-    raise InputError(source, key, names.get(hint, getattr(hint, "__name__", str(hint))), _shown(value))
-
-
-def _shown(value: Any) -> str:
-    return f"{value!r} ({type(value).__name__})"
+    raise InputError(source, key, names.get(hint, getattr(hint, "__name__", str(hint))), shown(value))

@@ -1,16 +1,57 @@
-"""Errors that a user can act on."""
+"""Errors that a user can act on, and the exit codes of all commands. Light to import."""
 
 from __future__ import annotations
 
+import signal
+from enum import IntEnum
 from os import PathLike
+
+
+class ExitCode(IntEnum):
+    """What the exit code of a command means; the same in every command."""
+
+    OK = 0
+    NEGATIVE = 1
+    """The work was done and its answer is negative: a method failed, a number got worse, a check did not pass."""
+    BAD_INPUT = 2
+    """Wrong usage, bad input, or a file or folder that cannot be read or written."""
+    NO_VERDICT = 3
+    """What a verdict needs is missing or invalid."""
+    UNEXPECTED = 70
+    """An unexpected exception, to be reported; its traceback is printed (EX_SOFTWARE of sysexits.h)."""
+    HANGUP = 129
+    INTERRUPTED = 130
+    TERMINATED = 143
+
+
+EXIT_CODES = (
+    "Exit codes: 0 done; 1 done, and the answer is negative (a method failed, a number got worse, a check did not pass); "
+    "2 wrong usage, bad input, or a file that cannot be read or written; 3 what a verdict needs is missing or invalid; "
+    "70 unexpected error, please report; 129, 130, 143 ended by SIGHUP, Ctrl-C, SIGTERM."
+)
+
+
+class Interruption(KeyboardInterrupt):
+    """A signal asks the program to end: Ctrl-C, SIGTERM or SIGHUP."""
+
+    def __init__(self, number: int):
+        self.code = ExitCode(128 + number)
+        reason = "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
+        super().__init__(f"{reason}; start it again to continue")
 
 
 class HeadbenchError(Exception):
     """Base of all errors the command line reports as one paragraph, without a traceback (exit code 2)."""
 
 
+LONGEST_PLACE, LONGEST_WORDS, LONGEST_FOUND = 400, 1200, 300
+"""Characters of an error's parts; what is longer is cut in its middle."""
+
+
 class InputError(HeadbenchError):
     """Bad input, found before any long work started.
+
+    Its message is short whatever the input holds, and without control characters.
 
     Parameters
     ----------
@@ -22,11 +63,12 @@ class InputError(HeadbenchError):
     """
 
     def __init__(self, file: str | PathLike[str], key: str, expected: str, found: str, remedy: str = ""):
-        self.file, self.key = str(file), key
-        self.expected, self.found, self.remedy = expected, found, remedy
-        where = f"{self.file}, {key}" if key else self.file
-        message = f"{where}: expected {expected}, found {found}."
-        super().__init__(f"{message} {remedy}" if remedy else message)
+        self.file, self.key = shortened(str(file), LONGEST_PLACE), shortened(key, LONGEST_PLACE)
+        self.expected, self.found = shortened(expected, LONGEST_WORDS), shortened(found, LONGEST_FOUND)
+        self.remedy = shortened(remedy, LONGEST_WORDS)
+        where = f"{self.file}, {self.key}" if key else self.file
+        message = f"{where}: expected {self.expected}, found {self.found}."
+        super().__init__(f"{message} {self.remedy}" if remedy else message)
 
 
 class UnavailableError(HeadbenchError):
@@ -38,3 +80,12 @@ class UnavailableError(HeadbenchError):
     def __init__(self, what: str, remedy: str):
         self.what, self.remedy = what, remedy
         super().__init__(f"{what} {remedy}")
+
+
+def shortened(text: str, longest: int) -> str:
+    """Text of bounded length, its middle left out, and without control characters other than line ends."""
+    if len(text) > longest:
+        text = f"{text[: longest // 2]} [...] {text[-longest // 4 :]}"
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text)

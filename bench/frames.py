@@ -9,7 +9,8 @@ import numpy as np
 
 from .contracts import ByteArray, FloatArray
 from .errors import InputError
-from .files import atomic_path
+from .files import write_bytes
+from .image_files import read_pixels
 
 
 def quantise(rgb: FloatArray) -> ByteArray:
@@ -28,23 +29,19 @@ def quantise(rgb: FloatArray) -> ByteArray:
     return np.rint(np.clip(rgb, 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
-def write_png(path: Path, image: ByteArray) -> None:
-    """Write an (H, W, 3) 8-bit sRGB image, atomically."""
+def write_png(path: Path, image: ByteArray) -> bytes:
+    """Write an (H, W, 3) 8-bit sRGB image, atomically; return what was written."""
     ok, encoded = cv2.imencode(
         ".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_PNG_COMPRESSION, 3]
     )
     if not ok:
         raise InputError(path, "", "an image that PNG can hold", f"shape {image.shape}, {image.dtype}")
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(encoded.tobytes())
+    content = encoded.tobytes()
+    write_bytes(path, content)
+    return content
 
 
 def read_png(path: Path) -> ByteArray:
     """Read an (H, W, 3) 8-bit sRGB image. Raises `InputError` for a missing or damaged file."""
-    if not path.exists():
-        raise InputError(path, "", "a PNG image", "no such file")
-    data = np.frombuffer(path.read_bytes(), dtype=np.uint8)
-    image = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
-    if image is None:
-        raise InputError(path, "", "a PNG image", "a file that cannot be decoded")
+    image = read_pixels(path, cv2.IMREAD_COLOR)
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)

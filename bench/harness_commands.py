@@ -11,7 +11,7 @@ GATE = CommandSpec(
 
 VERIFY = CommandSpec(
     name="verify",
-    summary="Recompute a run's hashes and metrics from the frames it left; exit code 1 where anything differs.",
+    summary="Recompute a run's hashes and metrics from the frames it left: exit code 1 where anything differs, 3 where it is no finished run.",
     implementation="headbench.bench.audit.verify:run",
     settings="headbench.bench.audit.settings:VerifySettings",
 )
@@ -21,4 +21,11 @@ EVALUATE = CommandSpec(
     summary="Score a folder of images named by key: a method is compared without a plug-in.",
     implementation="headbench.bench.audit.evaluate:run",
     settings="headbench.bench.audit.settings:EvaluateSettings",
+)
+
+CHECK_PLUGIN = CommandSpec(
+    name="check-plugin",
+    summary="Try a method, a reader or a metric and list every breach of its contract; exit code 1 where there is one.",
+    implementation="headbench.bench.conformance.command:run",
+    settings="headbench.bench.conformance.settings:CheckPluginSettings",
 )

@@ -8,28 +8,34 @@ import json
 import os
 import platform
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO
 
 from .errors import InputError
+from .files import check_inside, flush_renames, no_link, output_inside, remove_dead_temporaries
 
 LOCK_FILE = "run.lock"
+_MOST = 1000  # characters of a lock file that are read
 
 
 @contextmanager
-def locked(folder: Path, name: str = LOCK_FILE) -> Iterator[None]:
-    """Keep other processes out of ``folder`` while the block runs; the file ``name`` in it tells the owner.
+def locked(folder: Path, *, beside: bool = False) -> Iterator[None]:
+    """Keep other processes out of ``folder`` while the block writes in it; the lock file names the owner.
 
     The lock is the system's (``flock``), so that it ends with its process however that ends: a file left by a killed
-    one keeps nobody out.
+    one keeps nobody out. Under it, temporary files of dead processes are removed, and nothing is written through
+    links that lead out of the folder. ``beside``: the lock file lies beside the folder, which may have to be empty.
 
     Raises
     ------
-    InputError : another process works in the folder; says which, where and since when.
+    InputError : another process works in the folder; says which, where and since when. The folder cannot be made,
+        or its lock file is a link.
     """
-    path = folder / name
+    path = folder.resolve().parent / f".{folder.resolve().name}.lock" if beside else folder / LOCK_FILE
+    check_inside(folder)
+    is_new = not folder.exists()
     stream = _acquire(path)
     try:
         owner = {"process": os.getpid(), "host": platform.node(), "since": _now()}
@@ -37,20 +43,29 @@ def locked(folder: Path, name: str = LOCK_FILE) -> Iterator[None]:
         stream.truncate()
         stream.write(json.dumps(owner) + "\n")
         stream.flush()
-        yield
+        remove_dead_temporaries(folder)
+        with output_inside(folder):
+            yield
     finally:
-        path.unlink(missing_ok=True)  # while still locked: whoever waits sees that the file has gone
-        stream.close()
+        try:
+            flush_renames()
+        finally:
+            path.unlink(missing_ok=True)  # while still locked: whoever waits sees that the file has gone
+            stream.close()
+            if is_new:
+                with suppress(OSError):  # unless it is empty: nothing came of it
+                    folder.rmdir()
 
 
 def _acquire(path: Path) -> IO[str]:
+    path.parent.mkdir(parents=True, exist_ok=True)
     while True:
-        stream = path.open("a+", encoding="utf-8")
+        stream = open(path, "a+", encoding="utf-8", opener=no_link)  # noqa: SIM115
         try:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             stream.seek(0)
-            owner = _described(stream.read())
+            owner = _described(stream.read(_MOST))
             stream.close()
             if error.errno not in (errno.EACCES, errno.EAGAIN):
                 raise

@@ -5,16 +5,24 @@ from __future__ import annotations
 import logging
 import sys
 import time
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from .contracts import Progress
+from .files import no_link
 
-LOG_EVERY_S = 15.0
+LOG_EVERY_S, SHOW_EVERY_S = 15.0, 0.2
+"""Seconds between lines of a log, and between changes of the line on a terminal."""
+BASIS_S, SAMPLES, SAMPLE_EVERY_S = 5.0, 60, 1.0
+"""Seconds of steps from which on their speed is told, how many samples of it are kept, how far apart."""
+Show = Callable[[Callable[[], str]], None]
+"""Shows a line that a function makes, if it is time to."""
 log = logging.getLogger("headbench")
 
 
@@ -30,7 +38,7 @@ def log_to(path: Path | None, *, quiet: bool = False) -> Iterator[None]:
     handlers.append(console)
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
-        file = logging.FileHandler(path, encoding="utf-8")
+        file = _LogFile(path)
         file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
         handlers.append(file)
     root.setLevel(logging.INFO)
@@ -47,42 +55,159 @@ def log_to(path: Path | None, *, quiet: bool = False) -> Iterator[None]:
         root.propagate = propagate
 
 
+class _LogFile(logging.StreamHandler):
+    """A file of log lines, never written through a link. What keeps it from being written is an error of the run."""
+
+    def __init__(self, path: Path):
+        self.path = path
+        super().__init__(open(path, "a", encoding="utf-8", errors="backslashreplace", opener=no_link))  # noqa: SIM115
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        error = sys.exception()
+        if not isinstance(error, OSError):
+            super().handleError(record)  # a faulty message of a plug-in is printed and ends nothing
+            return
+        error.filename = str(self.path)
+        raise error
+
+    def close(self) -> None:
+        self.stream.close()
+        super().close()
+
+
 @contextmanager
 def progress(label: str) -> Iterator[Progress]:
     """Give a `Progress` callback that shows ``label``, the share done and the time left."""
-    if sys.stderr.isatty():
-        with logging_redirect_tqdm([log]), tqdm(desc=label, leave=False, dynamic_ncols=True) as bar:
+    with _line() as show:
+        left = TimeLeft()
 
-            def show(done: int, total: int, note: str = "") -> None:
-                bar.total = total
-                bar.set_postfix_str(note, refresh=False)
-                bar.update(done - bar.n)
+        def report(done: int, total: int, note: str = "") -> None:
+            left.step(done, total)
+            show(lambda: _text(f"{label}: {done} of {total}", left.seconds, note))
 
-            yield show
-    else:
-        yield _LogProgress(label)
+        yield report
 
 
-class _LogProgress:
-    """Writes a line at most every `LOG_EVERY_S` seconds."""
+class TimeLeft:
+    """How long a number of steps still takes, by those of the last while: steps may grow faster or slower."""
 
-    def __init__(self, label: str):
-        self.label = label
-        self.first: tuple[float, int] | None = None
-        self.last = time.monotonic()
+    def __init__(self) -> None:
+        self._left = 0
+        self._samples: deque[tuple[float, int]] = deque(maxlen=SAMPLES)
 
-    def __call__(self, done: int, total: int, note: str = "") -> None:
+    def step(self, done: int, total: int) -> None:
+        """Take note of where the work is."""
         now = time.monotonic()
-        if self.first is None:
-            self.first = (now, done)
-        if now - self.last < LOG_EVERY_S:
-            return
-        self.last = now
-        start, base = self.first
-        left = (total - done) * (now - start) / max(done - base, 1)
-        log.info(
-            "%s: %d of %d, %s left%s", self.label, done, total, duration(left), f" ({note})" if note else ""
-        )
+        self._left = total - done
+        if self._samples and done < self._samples[-1][1]:
+            self._samples.clear()
+        if not self._samples or now - self._samples[-1][0] >= SAMPLE_EVERY_S:
+            self._samples.append((now, done))
+
+    @property
+    def seconds(self) -> float | None:
+        """Seconds left; None as long as nothing can be said of the speed."""
+        if not self._samples:
+            return None
+        (start, base), (end, done) = self._samples[0], self._samples[-1]
+        if end - start < BASIS_S or done == base:
+            return None
+        return self._left * (end - start) / (done - base)
+
+
+@contextmanager
+def run_progress(cells: Mapping[str, Mapping[str, str]]) -> Iterator[RunProgress]:
+    """Show one line for the work on all cells of a run, see `RunProgress`."""
+    with _line() as show:
+        yield RunProgress(cells, show)
+
+
+class RunProgress:
+    """One line for the work on all cells of a run: which cell it is at, what it does there, the time that all takes.
+
+    How long a stage of a cell takes is told by its own steps, before it by such stages that were worked on already. As
+    long as some of the work has no such basis, only a lower bound is shown.
+
+    Parameters
+    ----------
+    cells : by name, in order: the stages that a cell needs, each with what tells alike ones; those of one stage and one
+        kind (the method's name, say) take about as long as each other.
+    show : shows a line, if it is time to.
+    """
+
+    def __init__(self, cells: Mapping[str, Mapping[str, str]], show: Show):
+        self._cells, self._show = cells, show
+        self._names = list(cells)
+        self._took: dict[tuple[str, str], list[float]] = {}
+
+    @contextmanager
+    def stage(self, cell: str, stage: str) -> Iterator[Progress]:
+        """Work on a stage of a cell; give its `Progress`. A stage that fails tells nothing of others."""
+        left, started = TimeLeft(), time.monotonic()
+        first: list[tuple[float, int]] = []
+        steps = 0
+
+        def report(done: int, total: int, note: str = "") -> None:
+            nonlocal steps
+            steps = total
+            if not first:
+                first.append((time.monotonic(), done - 1))
+            left.step(done, total)
+            self._show(lambda: self._shown(cell, stage, f" {done} of {total}", left.seconds, started, note))
+
+        self._show(lambda: self._shown(cell, stage, "", None, started, ""))
+        yield report
+        seconds = time.monotonic() - started
+        if first and steps > first[0][1]:  # steps that an earlier start did would have taken their time, too
+            since, before = first[0]
+            seconds += (time.monotonic() - since) * before / (steps - before)
+        if stage in self._cells[cell]:
+            self._took.setdefault((stage, self._cells[cell][stage]), []).append(seconds)
+
+    def _shown(self, cell: str, stage: str, steps: str, left: float | None, started: float, note: str) -> str:
+        index = self._names.index(cell)
+        stages = list(self._cells[cell])
+        if left is None and stage in stages:
+            took, spent = self._mean(stage, self._cells[cell][stage]), time.monotonic() - started
+            left = took - spent if took is not None and took > spent else None
+        later = stages[stages.index(stage) + 1 :] if stage in stages else []
+        ahead = [(name, self._cells[cell][name]) for name in later]
+        ahead += [part for name in self._names[index + 1 :] for part in self._cells[name].items()]
+        parts = [left, *(self._mean(*part) for part in ahead)]
+        known = [part for part in parts if part is not None]
+        bound = "" if len(known) == len(parts) else "more than "
+        text = f"cell {index + 1} of {len(self._names)}, {cell}: {stage}{steps}"
+        return _text(text, sum(known) if known else None, note, bound)
+
+    def _mean(self, stage: str, kind: str) -> float | None:
+        took = self._took.get((stage, kind))
+        return sum(took) / len(took) if took else None
+
+
+def _text(text: str, left: float | None, note: str, bound: str = "") -> str:
+    time_left = "" if left is None or left < 1 else f", {bound}{duration(left)} left"
+    return f"{text}{time_left}{f' ({note})' if note else ''}"
+
+
+@contextmanager
+def _line() -> Iterator[Show]:
+    """Give what shows a line: over the last one on a terminal, as a line of the log elsewhere, if it is time to."""
+    on_terminal = sys.stderr.isatty()
+    every = SHOW_EVERY_S if on_terminal else LOG_EVERY_S
+    last = time.monotonic() - (every if on_terminal else 0.0)
+
+    def show(write: Callable[[str], object], text: Callable[[], str]) -> None:
+        nonlocal last
+        now = time.monotonic()
+        if now - last >= every:
+            last = now
+            write(text())
+
+    if not on_terminal:
+        yield partial(show, partial(log.info, "%s"))
+        return
+    with logging_redirect_tqdm([log]), tqdm(bar_format="{desc}", leave=False, dynamic_ncols=True) as bar:
+        yield partial(show, bar.set_description_str)
 
 
 def duration(seconds: float) -> str:

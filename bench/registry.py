@@ -86,7 +86,8 @@ def resolve(reference: str) -> Any:
         for part in attribute.split("."):
             value = getattr(value, part)
     except (ImportError, AttributeError, ValueError, TypeError) as error:
-        raise HeadbenchError(f"{reference}: cannot be imported: {error}") from error
+        where = " It is looked for on PYTHONPATH." if isinstance(error, ModuleNotFoundError) else ""
+        raise HeadbenchError(f"{reference}: cannot be imported: {error}.{where}") from error
     return value
 
 

@@ -5,35 +5,36 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from . import adaptation
 from .adaptation import AdaptedClip, MethodNeeds
-from .audit.digests import record_digests
-from .captures import open_clips
+from .captures import open_clips, relative_paths
 from .contracts import Clip
 from .device import check_device
 from .errors import HeadbenchError, InputError, UnavailableError
+from .files import output_inside
 from .lock import locked
 from .machine import machine_record, peak_memory_bytes
-from .progress import duration
+from .manifest import AdaptedRecord, ClipRecord, Manifest, MethodRecord, ProtocolRecord
+from .progress import duration, run_progress
 from .protocol import Protocol, make_protocol
 from .registry import discover, get, resolve
+from .rows import Rows
 from .run_config import ResolvedMethod, RunConfig, resolve_methods, resolve_metrics
 from .scoring import check_regions, make_metric
 from .specs import DatasetSpec, MetricSpec
-from .stages import Job, failed_rows, fit, measure, render
-from .store import RunFolder, write_rows
+from .stages import Job, failed_rows, fit, measure, render, stages_ahead
+from .store import RunFolder
 
 log = logging.getLogger(__name__)
 
 
-def run(config: RunConfig, **record: Any) -> pd.DataFrame:
+def run(config: RunConfig, **record: Any) -> Rows:
     """Run a comparison into ``config.out`` and return its rows; ``record`` is added to the manifest.
 
     Everything that can be checked is checked before the first long step: settings, device, methods, captures, the
@@ -54,7 +55,7 @@ def _run(
     metrics: Sequence[MetricSpec],
     folder: RunFolder,
     record: Mapping[str, Any],
-) -> pd.DataFrame:
+) -> Rows:
     start = time.perf_counter()
     for method in methods:
         method.create()  # an implementation that cannot be imported or made is not to be found out hours later
@@ -69,26 +70,22 @@ def _run(
         job.check()
     _warn_of_missing_metrics(metrics, clips[0])
 
-    manifest = {**describe(config, methods, metrics, clips, protocols), **record}
-    manifest["adapted"] = [
-        adaptation.record(job.clip, job.adapted, job.method.spec.name)
+    forms = tuple(
+        AdaptedRecord(**adaptation.record(job.clip, job.adapted, job.method.spec.name))
         for job in jobs
         if job.adapted is not None and job.seed == config.seeds[0]
-    ]
-    folder.write_manifest({**manifest, "status": "started"})
+    )
+    manifest = replace(describe(config, methods, metrics, clips, protocols), adapted=forms, **record)
+    manifest.write(folder.manifest)
     for protocol in protocols.values():
         log.info("%s, protocol %s: %d frames", protocol.task, protocol.hash, len(protocol.keys))
-    frames = [_run_cell(job, metrics) for job in jobs]
-    rows = pd.concat(frames, ignore_index=True)
-    write_rows(folder.rows, rows)
-    folder.write_manifest(
-        {
-            **manifest,
-            "status": "done",
-            "seconds": round(time.perf_counter() - start, 3),
-            "peak_memory_bytes": peak_memory_bytes(),
-        }
-    )
+    with run_progress({job.name: stages_ahead(job, metrics) for job in jobs}) as line:
+        frames = [_run_cell(replace(job, line=line), metrics) for job in jobs]
+    rows = Rows.joined(frames)
+    rows.write(folder.rows)
+    seconds = round(time.perf_counter() - start, 3)
+    done = replace(manifest, status="done", seconds=seconds, peak_memory_bytes=peak_memory_bytes())
+    done.write(folder.manifest)
     write_reports(folder.root)
     log.info("finished in %s: %s", duration(time.perf_counter() - start), folder.root)
     return rows
@@ -103,6 +100,8 @@ def write_reports(run_folder: Path) -> list[Path]:
         elif plugin.spec.writes:
             try:
                 written += resolve(plugin.spec.implementation)(run_folder)
+            except (HeadbenchError, OSError) as error:
+                log.error("report %r of %s failed: %s; the rows are complete", name, plugin.origin, error)
             except Exception:
                 log.exception("report %r of %s failed; the rows are complete", name, plugin.origin)
     return written
@@ -125,10 +124,13 @@ def adapt(
             step = adaptation.plan(clip, needs, reader, config.heads)
             if step is not None:
                 planned[clip.subject, needs] = step
-    return {
-        (subject, needs): adaptation.carry_out(step, needs, folder.adapted / subject, f"adapting {subject}")
-        for (subject, needs), step in planned.items()
-    }
+    with output_inside(folder.root):
+        return {
+            (subject, needs): adaptation.carry_out(
+                step, needs, folder.adapted / subject, f"adapting {subject}"
+            )
+            for (subject, needs), step in planned.items()
+        }
 
 
 def make_jobs(
@@ -157,14 +159,12 @@ def make_jobs(
     ]
 
 
-def _run_cell(job: Job, metrics: Sequence[MetricSpec]) -> pd.DataFrame:
+def _run_cell(job: Job, metrics: Sequence[MetricSpec]) -> Rows:
     log.info("%s", job.name)
     try:
         avatar = fit(job)
         render(job, avatar)
-        rows = measure(job, avatar, metrics)
-        record_digests(job, avatar)
-        return rows
+        return measure(job, avatar, metrics)
     except InputError as error:
         log.error("%s failed: %s", job.name, error)
         return failed_rows(job, metrics, error)
@@ -195,25 +195,23 @@ def describe(
     metrics: Sequence[MetricSpec],
     clips: Sequence[Clip],
     protocols: Mapping[str, Protocol],
-) -> dict[str, Any]:
-    """What the manifest of a run tells: everything that made its numbers."""
-    return {
-        "configuration": asdict(config),
-        "methods": [method.record() for method in methods],
-        "metrics": [asdict(metric) for metric in metrics],
-        "clips": [
-            {
-                "subject": clip.subject,
-                "fingerprint": clip.fingerprint,
-                "steps": [asdict(step) for step in clip.steps],
-                "splits": {name: len(keys) for name, keys in clip.splits.items()},
-                "excluded": {str(key): reason for key, reason in sorted(clip.excluded.items())},
-            }
+) -> Manifest:
+    """The manifest of a run that starts."""
+    return Manifest(
+        configuration=config,
+        paths=relative_paths(config),
+        methods=tuple(MethodRecord(**method.record()) for method in methods),
+        metrics=tuple(metrics),
+        clips=tuple(
+            ClipRecord(
+                subject=clip.subject,
+                fingerprint=clip.fingerprint,
+                steps=[asdict(step) for step in clip.steps],
+                splits={name: len(keys) for name, keys in clip.splits.items()},
+                excluded={str(key): reason for key, reason in sorted(clip.excluded.items())},
+            )
             for clip in clips
-        ],
-        "protocols": {
-            task: {"id": protocol.id, "hash": protocol.hash, **asdict(protocol)}
-            for task, protocol in protocols.items()
-        },
-        "machine": machine_record(),
-    }
+        ),
+        protocols={task: ProtocolRecord.of(protocol) for task, protocol in protocols.items()},
+        machine=machine_record(),
+    )

@@ -94,6 +94,10 @@ class MethodSpec:
         return self if rule == self.resolution else replace(self, resolution=rule)
 
 
+MAX_DIGITS = 12
+"""Digits behind the point that a table shows."""
+
+
 @dataclass(frozen=True)
 class MetricSpec:
     """What a table needs to know of a metric.
@@ -130,6 +134,11 @@ class MetricSpec:
     regions: bool = False
     temporal: bool = False
 
+    def __post_init__(self) -> None:
+        """Refuse what no table could show."""
+        if not 0 <= self.digits <= MAX_DIGITS:
+            raise ValueError(f"digits is {self.digits}; from 0 to {MAX_DIGITS}")
+
 
 @dataclass(frozen=True)
 class ProfileSpec:
@@ -154,8 +163,10 @@ class DatasetSpec:
     """A reader: ``implementation`` names a function ``(path, **settings) -> Clip``.
 
     ``find`` names a function ``(root) -> list of paths`` that lists the captures under a folder. A reader with
-    a keyword ``progress`` is given a `Progress`. ``reads`` is False for one that makes captures instead: its
-    function takes ``out`` and settings and writes what another reader reads.
+    a keyword ``progress`` is given a `Progress`; one with a keyword ``remembered`` is given False where the bytes
+    of every file have to be read, whatever it remembers of an earlier time. ``reads`` is False for one that
+    makes captures instead: its function takes ``out`` and settings and writes what another reader reads.
+    Settings whose annotation admits a `Path` name files; a run finds them again after it was moved together with them.
 
     ``adapt`` names a function that brings clips into the form a method needs, see `adaptation`; "" for none.
     """
@@ -217,10 +228,12 @@ class CommandSpec:
     ``name`` may have two words ("prepare nersemble"). ``settings`` names a frozen dataclass in a module that is
     light to import; its attributes, described in its docstring, become the options. ``implementation`` names a
     function ``(settings, progress) -> Findings``; the exit code is 0, or 1 where it did not pass, unless the findings
-    give one.
+    give one. ``writes`` names the setting with the folder that the command writes, if it has one: no other process
+    works in it meanwhile.
     """
 
     name: str
     summary: str
     implementation: str
     settings: str
+    writes: str = ""

@@ -6,96 +6,65 @@
     run.log
     rows.parquet                  one row per method, seed, frame and metric
     <subject>/<method>/seed-<n>/
-        fit.json                  what the avatar was made of, how long it took
+        fit.json                  what the avatar was made of, how long it took, digests of its files
         avatar/                   what the method wrote
         renders/<task>/*.png      8-bit frames, named by key
-        speed.json, rows.parquet
+        digests.json              digests of the frames as they were rendered
+        rows.parquet              what was measured
+        measure.json              what it was measured of, digest of the rows
     adapted/<subject>/            tracking refitted for methods that want another head model
     tables/, contact_sheet.png    views of the rows
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
-from pathlib import Path
-from typing import Any
+import logging
+import tempfile
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any, Literal, Required
 
-import pandas as pd
+from typing_extensions import TypedDict
 
 from .contracts import FrameKey
+from .documents import checked, read_json
 from .errors import InputError
-from .files import atomic_path, read_json, write_json
+from .files import TEMPORARY, digest_file, write_json
+from .manifest import Manifest
+from .rows import Rows
 
-FORMAT = 1
-
-
-@dataclass(frozen=True)
-class Row:
-    """One measured value, or why there is none. Per-avatar values have no task, timestep -1 and no camera."""
-
-    method: str
-    version: str
-    seed: int
-    task: str
-    subject: str
-    sequence: str
-    timestep: int
-    camera: str
-    region: str
-    metric: str
-    value: float
-    protocol: str
-    status: str = "ok"  # ok | missing | failed
-    reason: str = ""
+log = logging.getLogger(__name__)
 
 
-COLUMNS = tuple(f.name for f in fields(Row))
+class Stage(TypedDict, total=False):
+    """What a stage of a cell records.
 
-
-def to_frame(rows: Iterable[Row]) -> pd.DataFrame:
-    """Rows as a table with the columns of `Row`, typed even when empty."""
-    frame = pd.DataFrame([asdict(row) for row in rows], columns=list(COLUMNS))
-    return frame.astype({"seed": "int64", "timestep": "int64", "value": "float64"})
-
-
-def write_rows(path: Path, frame: pd.DataFrame) -> None:
-    """Write rows as Parquet, atomically."""
-    with atomic_path(path) as temporary:
-        frame.to_parquet(temporary, index=False)
-
-
-def read_rows(path: Path) -> pd.DataFrame:
-    """Read rows. Raises `InputError` for a file that is not there, not Parquet, or lacks a column."""
-    try:
-        frame = pd.read_parquet(path)
-    except FileNotFoundError as error:
-        raise InputError(
-            path, "", "the rows of a finished run", "no such file", "Start the run again."
-        ) from error
-    except (OSError, ValueError) as error:
-        raise InputError(path, "", "a Parquet file of rows", " ".join(str(error).split())) from error
-    missing = [c for c in COLUMNS if c not in frame.columns]
-    if missing:
-        raise InputError(path, "columns", ", ".join(COLUMNS), f"no {', '.join(missing)}")
-    return frame
-
-
-def check_protocols(
-    rows: pd.DataFrame, source: Path | str, expected: Mapping[str, str] | None = None
-) -> None:
-    """Raise `InputError` where rows of one task come from several protocols, or from another than ``expected``.
-
-    Numbers of different protocols do not compare. ``expected`` holds the hash of each task's protocol.
+    Attributes
+    ----------
+    fingerprint : digest of everything that its result depends on.
+    files : SHA-256 of the files that it left, by their place in the cell's folder.
+    rows : SHA-256 of ``rows.parquet``.
+    fingerprints, details : of the measurements, by metric.
+    seconds, interruptions, peak_memory_bytes, memory_before_bytes, method : of the training.
+    derived_from : digest of the trained avatar that this one was derived from without training.
     """
-    for task, hashes in rows[rows["task"] != ""].groupby("task")["protocol"].unique().items():
-        found = sorted(map(str, hashes))
-        if len(found) > 1:
-            wanted = "one protocol: numbers of different protocols do not compare"
-            remedy = "Take the rows of each protocol for themselves."
-            raise InputError(source, f"protocol of {task}", wanted, ", ".join(found), remedy)
-        if expected is not None and found != [expected.get(str(task))]:
-            raise InputError(source, f"protocol of {task}", str(expected.get(str(task))), found[0])
+
+    fingerprint: Required[str]
+    status: Required[Literal["started", "done"]]
+    files: dict[str, str]
+    rows: str
+    fingerprints: dict[str, str]
+    details: dict[str, dict[str, Any]]
+    seconds: float
+    interruptions: int
+    peak_memory_bytes: int
+    memory_before_bytes: int
+    method: dict[str, Any]
+    derived_from: str
+
+
+STAGES = ("fit", "digests", "measure")
 
 
 @dataclass(frozen=True)
@@ -116,10 +85,48 @@ class Cell:
         """Where the render of ``key`` lies."""
         return self.folder / "renders" / task / f"{key.sequence}_{key.timestep:05d}_{key.camera}.png"
 
-    def stage(self, name: str) -> Mapping[str, Any] | None:
-        """Return what `begin` or `finish` wrote for a stage, or None."""
+    def stage(self, name: str) -> Stage | None:
+        """Return what `begin` or `finish` wrote for a stage, or None. Raises `InputError` for a damaged record."""
         path = self.folder / f"{name}.json"
-        return read_json(path) if path.exists() else None
+        if not path.exists():
+            return None
+        stage: Stage = checked(read_json(path), Stage, path)
+        for file in map(PurePosixPath, stage.get("files", {})):
+            if file.is_absolute() or ".." in file.parts:
+                raise InputError(path, "files", f"files inside {self.folder}", str(file))
+        return stage
+
+    def drop_damaged_records(self) -> None:
+        """Remove records of stages that cannot be read, with a warning: what they record is made again."""
+        for name in STAGES:
+            try:
+                self.stage(name)
+            except InputError as error:
+                if isinstance(error.__cause__, OSError):
+                    raise  # not damaged: the disk or its permissions are at fault
+                log.warning("%s What it records is made again.", error)
+                (self.folder / f"{name}.json").unlink()
+
+    def set_aside(self, folder: Path) -> None:
+        """Move a folder of the cell whose files cannot be trusted to a name of its own beside it; nothing is deleted."""
+        number = 1
+        while (aside := folder.with_name(f"{folder.name}-damaged-{number}")).exists():
+            number += 1
+        folder.rename(aside)
+        log.info("%s was moved to %s.", folder, aside.name)
+
+    def digests(self, files: Iterable[Path]) -> dict[str, str]:
+        """SHA-256 of files in the cell's folder, by their place in it."""
+        return {self.name(path): digest_file(path) for path in sorted(files)}
+
+    def name(self, path: Path) -> str:
+        """The place of a file in the cell's folder."""
+        return path.relative_to(self.folder).as_posix()
+
+    def damage(self, files: Mapping[str, str]) -> dict[str, str]:
+        """Which of the files are not as their digests say, and what is wrong with each."""
+        found = {name: _damage(self.folder / name, known) for name, known in files.items()}
+        return {name: why for name, why in found.items() if why}
 
     def is_done(self, name: str, fingerprint: str) -> bool:
         """Say whether the stage ended with exactly these inputs."""
@@ -133,6 +140,14 @@ class Cell:
     def finish(self, name: str, fingerprint: str, **record: Any) -> None:
         """Record that the stage ended, with what it measured."""
         write_json(self.folder / f"{name}.json", {"fingerprint": fingerprint, "status": "done", **record})
+
+
+def _damage(path: Path, known: str) -> str:
+    if not path.is_file():
+        return "is missing"
+    if not path.stat().st_size:
+        return "is empty"
+    return "" if digest_file(path) == known else "is not as it was written (SHA-256)"
 
 
 @dataclass(frozen=True)
@@ -170,27 +185,29 @@ class RunFolder:
         """Make the folder and prove that it can be written, before any work."""
         try:
             self.root.mkdir(parents=True, exist_ok=True)
-            with atomic_path(self.root / ".writable") as probe:
-                probe.write_bytes(b"")
-            (self.root / ".writable").unlink()
+            with tempfile.TemporaryFile(
+                dir=self.root, prefix=TEMPORARY
+            ):  # has no name where the system can do without
+                pass
         except (OSError, ValueError) as error:  # ValueError: a name that no file can have
             found = getattr(error, "strerror", None) or str(error)
             raise InputError(self.root, "--out", "a folder that can be written", found) from error
 
-    def write_manifest(self, record: Mapping[str, Any]) -> None:
-        """Write ``run.json``."""
-        write_json(self.manifest, {"format": FORMAT, **record})
-
-    def read_manifest(self) -> dict[str, Any]:
+    def read_manifest(self) -> Manifest:
         """Read ``run.json``. Raises `InputError` where there is none, or one of another format."""
         if not self.manifest.exists():
             raise InputError(self.root, "run.json", "the folder of a run", "no run.json")
-        record = read_json(self.manifest)
-        if record.get("format") != FORMAT:
-            raise InputError(self.manifest, "format", str(FORMAT), repr(record.get("format")))
-        return record
+        return Manifest.read(self.manifest)
 
-
-def keys_of(record: Mapping[str, Any], task: str) -> Sequence[FrameKey]:
-    """Return the frames of a task from a manifest."""
-    return [FrameKey(*key) for key in record["protocols"][task]["keys"]]
+    def read_rows(self, manifest: Manifest) -> Rows:
+        """Read ``rows.parquet``. Raises `InputError` for rows of methods, metrics and tasks that the run does not have."""
+        rows = Rows.read(self.rows)
+        for what, found, known in (
+            ("method", rows.methods, {method.name for method in manifest.methods}),
+            ("metric", rows.metrics, {metric.name for metric in manifest.metrics}),
+            ("task", rows.tasks, manifest.protocols.keys()),
+        ):
+            if found - known:
+                names = ", ".join(sorted(known)), ", ".join(sorted(found - known))
+                raise InputError(self.rows, what, f"those of {self.manifest.name}: {names[0]}", names[1])
+        return rows

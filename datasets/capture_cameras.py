@@ -17,8 +17,8 @@ import numpy as np
 
 from ..bench.contracts import Camera, FloatArray
 from ..bench.errors import InputError
+from ..bench.image_files import ImageInfo
 from .ga_layout import CyConvention, extrinsics_from_json, intrinsics_from_json
-from .image_files import ImageInfo
 from .transforms import FrameEntry
 
 ROTATION_TOLERANCE = 1e-5

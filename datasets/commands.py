@@ -7,6 +7,7 @@ EXPORT_COLMAP = CommandSpec(
     summary="Write frames of a capture as a COLMAP dataset: images, masks and a sparse model.",
     implementation="headbench.datasets.colmap.command:run",
     settings="headbench.datasets.colmap.settings:ExportColmapSettings",
+    writes="out",
 )
 
 STEPS = CommandSpec(
@@ -14,6 +15,7 @@ STEPS = CommandSpec(
     summary="Draw the jaw bases and expression classes that a capture's training frames give, and their numbers.",
     implementation="headbench.datasets.step_pictures.command:run",
     settings="headbench.datasets.step_pictures.settings:StepsSettings",
+    writes="out",
 )
 
 LINT = CommandSpec(
@@ -28,6 +30,7 @@ INSPECT = CommandSpec(
     summary="Draw what a capture holds: camera rig, splits, tracked mesh on images, motion by sequence.",
     implementation="headbench.datasets.inspection.command:run",
     settings="headbench.datasets.inspection.settings:InspectSettings",
+    writes="out",
 )
 
 PREPARE_NERSEMBLE = CommandSpec(
@@ -42,6 +45,7 @@ RECORD_NERSEMBLE = CommandSpec(
     summary="Write a synthetic capture as a raw NeRSemble recording with VHAP's tracking, to try prepare on.",
     implementation="headbench.datasets.nersemble.re_record:run",
     settings="headbench.datasets.nersemble.settings:RecordSettings",
+    writes="out",
 )
 
 REFIT = CommandSpec(
@@ -49,6 +53,7 @@ REFIT = CommandSpec(
     summary="Carry a capture's tracking over to another head model; residuals in millimetres, a heat map.",
     implementation="headbench.datasets.refit.command:run",
     settings="headbench.datasets.refit.settings:RefitCommandSettings",
+    writes="out",
 )
 
 TONGUE = CommandSpec(
@@ -56,4 +61,5 @@ TONGUE = CommandSpec(
     summary="Find the frames that show the tongue; scores, reasons, your overrides, and a contact sheet to review.",
     implementation="headbench.datasets.tongue.command:run",
     settings="headbench.datasets.tongue.settings:TongueSettings",
+    writes="out",
 )

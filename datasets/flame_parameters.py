@@ -9,12 +9,15 @@ from typing import Any, Literal
 
 import numpy as np
 
+from ..bench.arrays import MAX_MAGNITUDE, check_numbers, read_npz
 from ..bench.contracts import FloatArray, HeadPose
 from ..bench.errors import InputError
-from .head.arrays import HeadArrays, read_npz
-from .head.teeth import with_teeth
+from .head.arrays import HeadArrays, check_size
+from .head.teeth import with_teeth, with_teeth_where_possible
 
 TeethPolicy = Literal["auto", "add", "keep"]
+
+MAX_MOTION = 100.0  # metres; a wide open mouth takes 0.05
 
 _POSE_SIZES = {"translation": 3, "rotation": 3, "neck_pose": 3, "jaw_pose": 3, "eyes_pose": 6}
 
@@ -44,13 +47,15 @@ def read_tracking(
 
     Parameters
     ----------
-    teeth : "auto" appends teeth (see `with_teeth`) where the static offset has rows for them, and to every
-        FLAME head as GaussianAvatars does; "add" always; "keep" takes the head as it is.
+    teeth : "auto" appends teeth (see `with_teeth`) to every head that has none, as GaussianAvatars does to FLAME, so
+        that all methods have the same; a head without lips to hang them on stays without, unless it is FLAME's or the
+        static offset has rows for them. "add" always appends them; "keep" takes the head as it is.
 
     Raises
     ------
     InputError
-        For a missing or damaged file, a missing array, a wrong shape or numbers that are not finite.
+        For a missing or damaged file, a missing array, a wrong shape, numbers that are not finite or beyond
+        `MAX_MAGNITUDE`, and coefficients that make no head by its size.
     """
     poses: dict[int, HeadPose] = {}
     shape = static = None
@@ -71,6 +76,7 @@ def read_tracking(
     static_offset = np.zeros((len(head.template), 3), dtype=np.float32)
     if static is not None:
         static_offset[:rows] = static[:rows]
+    _check_motion(files, head, shape, static_offset, poses)
     notes = {
         "static_offset": "zeros, as the files have none" if static is None else f"{len(static)} rows",
         "teeth": len(head.regions.get("teeth", ())),
@@ -89,13 +95,10 @@ def resolve_teeth(
     ``rows`` is the row count of the files' static offset, None where they have none.
     """
     vertices = len(head.template)
+    if teeth != "keep" and not len(head.regions.get("teeth", ())):
+        required = teeth == "add" or head.version.startswith("flame") or (rows or 0) > vertices
+        head = with_teeth(head) if required else with_teeth_where_possible(head)
     has_teeth = len(head.regions.get("teeth", ())) > 0
-    wanted = teeth == "add" or (
-        teeth == "auto" and (head.version.startswith("flame") or (rows or 0) > vertices)
-    )
-    if wanted and not has_teeth:
-        head = with_teeth(head)
-        has_teeth = True
     total = len(head.template)
     if rows is None or rows == total:
         return head, total
@@ -109,6 +112,24 @@ def resolve_teeth(
     raise InputError(
         file, "static_offset", expected, found, "Give the head model the capture was tracked with."
     )
+
+
+def _check_motion(
+    files: Mapping[int, Path],
+    head: HeadArrays,
+    shape: FloatArray,
+    static_offset: FloatArray,
+    poses: Mapping[int, HeadPose],
+) -> None:
+    """Raise `InputError` where identity, or an expression, makes a mesh that is no head's by its size."""
+    neutral = head.template + head.shape_basis @ shape + static_offset
+    check_size(files[min(files)], "shape, static_offset", neutral, head.faces)
+    reach = np.abs(head.expression_basis).max(axis=(0, 1))  # (E,) metres per unit
+    for timestep, pose in poses.items():
+        moved = float(reach @ np.abs(pose.expression))
+        if not moved <= MAX_MOTION:
+            expected = f"coefficients that move no vertex further than {MAX_MOTION:g} m together"
+            raise InputError(files[timestep], "expr", expected, f"up to {moved:g} m")
 
 
 def _pose(
@@ -138,11 +159,8 @@ def _array(path: Path, arrays: Mapping[str, np.ndarray], key: str) -> FloatArray
     array = arrays[key]
     if array.dtype.kind not in "fiu":
         raise InputError(path, key, "numbers", f"dtype {array.dtype}")
-    with np.errstate(over="ignore"):  # what overflows becomes infinite and is counted
-        broken = int(array.size - np.count_nonzero(np.isfinite(array.astype(np.float32))))
-    if broken:
-        raise InputError(path, key, "finite float32 numbers", f"{broken} that are NaN or infinite")
-    return array
+    check_numbers(path, key, array, MAX_MAGNITUDE)
+    return array if array.dtype.kind == "f" else array.astype(np.float64)
 
 
 def _row(path: Path, arrays: Mapping[str, np.ndarray], key: str, size: int) -> FloatArray:

@@ -28,8 +28,10 @@ from typing import Any, Literal
 import numpy as np
 
 from ..bench.contracts import Camera, FloatArray
+from ..bench.documents import checked, read_json, shown
 from ..bench.errors import InputError
-from ..bench.files import check_name, read_json, write_json
+from ..bench.files import check_name, write_json
+from .rounding import ANGLE_BITS, on_grid
 
 CyConvention = Literal["top", "bottom", "centre"]
 """Where the principal point stands: ``cy`` from the top edge, from the bottom edge, or (as GaussianAvatars
@@ -89,8 +91,8 @@ def intrinsics_to_json(camera: Camera, cy: CyConvention) -> dict[str, float | in
         "fl_y": fl_y,
         "h": height,
         "w": width,
-        "camera_angle_x": 2 * math.atan(width / (2 * fl_x)),
-        "camera_angle_y": 2 * math.atan(height / (2 * fl_y)),
+        "camera_angle_x": float(on_grid(2 * math.atan(width / (2 * fl_x)), ANGLE_BITS)),
+        "camera_angle_y": float(on_grid(2 * math.atan(height / (2 * fl_y)), ANGLE_BITS)),
     }
 
 
@@ -114,8 +116,15 @@ def intrinsics_from_json(
 
 def extrinsics_to_json(world_to_camera: FloatArray) -> list[list[float]]:
     """4x4 camera-to-world with OpenGL axes, from world-to-camera with OpenCV axes."""
-    matrix: list[list[float]] = (np.linalg.inv(world_to_camera) @ OPENGL_FROM_OPENCV).tolist()
-    return matrix
+    # The inverse by cofactors, in elementary operations: LAPACK's last digits differ between machines.
+    a, b, c = world_to_camera[:3, :3]
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
+    matrix[:3, :3] /= (a * matrix[:3, 0]).sum()
+    matrix[:3, 3] = -(matrix[:3, :3] * world_to_camera[:3, 3]).sum(axis=1)
+    matrix[:3, 1:3] *= -1.0
+    entries: list[list[float]] = (matrix + 0.0).tolist()
+    return entries
 
 
 def extrinsics_from_json(transform_matrix: FloatArray) -> FloatArray:
@@ -172,57 +181,38 @@ class Declaration:
         value = read_json(path)
         found = value.get("format_version")
         if found != FORMAT_VERSION:
-            raise InputError(
-                path,
-                "format_version",
-                f"{FORMAT_VERSION}",
-                repr(found),
-                "Read it with the release of headbench that wrote it.",
-            )
-        _check_declaration(path, value)
-        return cls(
-            subject=value["subject"],
-            head_model=value["head_model"],
-            head_file=value["head_file"],
-            background=tuple(float(c) for c in value["background"]),  # type: ignore[arg-type]
-            cy=value["cy"],
-            sequences=value["sequences"],
-            excluded={entry["timestep"]: entry["reason"] for entry in value["excluded"]},
-            synthetic=value["synthetic"],
-        )
+            remedy = "Read it with the release of headbench that wrote it."
+            raise InputError(path, "format_version", f"{FORMAT_VERSION}", shown(found), remedy)
+        file = checked(value, _DeclarationFile, path)
+        check_name(file.subject, path, "subject")
+        for part, name in file.sequences.items():
+            check_name(name, path, f"sequences.{part}")
+        if not all(0 <= channel <= 1 for channel in file.background):
+            raise InputError(path, "background", "three numbers in [0, 1]", str(file.background))
+        excluded = {entry.timestep: entry.reason for entry in file.excluded}
+        members = {name: getattr(file, name) for name in _PLAIN_MEMBERS}
+        return cls(**members, excluded=excluded)
 
 
-def _check_declaration(path: Path, value: Mapping[str, Any]) -> None:
-    """Raise `InputError` for the first entry of a declaration that is missing or of the wrong kind."""
+@dataclass(frozen=True)
+class _Exclusion:
+    timestep: int
+    reason: str
 
-    def colour(entry: Any) -> bool:
-        numbers = isinstance(entry, list) and all(isinstance(c, (int, float)) for c in entry)
-        return numbers and len(entry) == 3 and all(0 <= c <= 1 for c in entry)
 
-    def exclusions(entry: Any) -> bool:
-        return isinstance(entry, list) and all(
-            isinstance(e, dict) and isinstance(e.get("timestep"), int) and isinstance(e.get("reason"), str)
-            for e in entry
-        )
+@dataclass(frozen=True)
+class _DeclarationFile:
+    """A declaration as its file has it."""
 
-    def texts(entry: Any) -> bool:
-        return isinstance(entry, dict) and all(isinstance(text, str) for text in entry.values())
+    format_version: int
+    subject: str
+    head_model: str
+    head_file: str
+    background: tuple[float, float, float]
+    cy: CyConvention
+    sequences: dict[str, str]
+    excluded: tuple[_Exclusion, ...]
+    synthetic: dict[str, Any]
 
-    rules = {
-        "subject": ("text", lambda entry: isinstance(entry, str)),
-        "head_model": ("text", lambda entry: isinstance(entry, str)),
-        "head_file": ("text", lambda entry: isinstance(entry, str)),
-        "background": ("three numbers in [0, 1]", colour),
-        "cy": ('"top", "bottom" or "centre"', lambda entry: entry in ("top", "bottom", "centre")),
-        "sequences": ("an object of texts", texts),
-        "excluded": ('a list of {"timestep": integer, "reason": text}', exclusions),
-        "synthetic": ("an object", lambda entry: isinstance(entry, dict)),
-    }
-    for key, (expected, holds) in rules.items():
-        if key not in value:
-            raise InputError(path, key, expected, "no such entry")
-        if not holds(value[key]):
-            raise InputError(path, key, expected, repr(value[key])[:80])
-    check_name(value["subject"], path, "subject")
-    for folder, name in value["sequences"].items():
-        check_name(name, path, f"sequences.{folder[:60]}")
+
+_PLAIN_MEMBERS = ("subject", "head_model", "head_file", "background", "cy", "sequences", "synthetic")

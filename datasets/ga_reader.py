@@ -18,14 +18,15 @@ import numpy as np
 from ..bench.contracts import FrameKey, HeadPose, Progress, StepRecord, no_progress
 from ..bench.errors import InputError
 from ..bench.files import check_name, digest
+from ..bench.image_files import ImageInfo
 from . import ga_layout as layout
 from .capture_cameras import CaptureCameras, collect_cameras
 from .capture_head import find_head
 from .clip import CaptureClip, FrameFiles
 from .content_digests import content_digests
 from .flame_parameters import TeethPolicy, Tracking, read_tracking
+from .foreign import describe
 from .head.arrays import HeadArrays
-from .image_files import ImageInfo
 from .images import ImageStore
 from .principal_point import settle_cy
 from .splits import check_disjoint, sequence_names, split_by_holding_out
@@ -54,12 +55,13 @@ def read_capture(
     leaks: LeakPolicy = "error",
     decode: bool = False,
     cache_mb: float = 512.0,
+    remembered: bool = True,
     progress: Progress = no_progress,
 ) -> CaptureClip:
     """Read a capture folder (or the folder that holds its one union).
 
-    The first call reads every file once for the fingerprint and keeps the digests in the capture's folder,
-    see `content_digests`.
+    The first call reads every file once for the fingerprint and keeps the digests in the user's cache, see
+    `content_digests`. Images are compared between splits by their bytes at every call.
 
     Parameters
     ----------
@@ -80,13 +82,15 @@ def read_capture(
     leaks : "error" refuses splits that share data; "record" notes it in the step record.
     decode : decode every image when checking; finds damage in the middle of files.
     cache_mb : bound of the decoded images held in memory, in 10^6 bytes.
+    remembered : take the digests of files that the system has not touched since from the user's cache. ``headbench
+        verify`` has it False.
 
     Raises
     ------
     InputError
         For the first fault found.
     """
-    folder = _one_capture(Path(os.path.abspath(path)))  # "." has no name to take a subject from
+    folder = find_capture(path)
     declaration = layout.Declaration.read(folder)
     entries = _read_splits(folder, bool(held_out_sequences or held_out_cameras))
     everything = [entry for part in entries.values() for entry in part]
@@ -106,8 +110,9 @@ def read_capture(
     splits, frames = _index_frames(folder, subject, names, entries, infos)
     if held_out_sequences or held_out_cameras:
         splits = split_by_holding_out(folder, frames, held_out_sequences, held_out_cameras)
-    digests = content_digests(folder, _used_files(folder, everything), progress=progress)
-    found = find_leaks(splits, {key: frame.image for key, frame in frames.items()}, digests)
+    used = _used_files(folder, everything)
+    digests = content_digests(used, remembered_for=folder if remembered else None, progress=progress)
+    found = find_leaks(splits, {key: frame.image for key, frame in frames.items()}, progress=progress)
     record = {
         "cy": convention,
         "cy_from": basis,
@@ -146,28 +151,44 @@ def read_capture(
 
 
 def find_captures(root: Path) -> list[Path]:
-    """Captures under ``root``: the folder itself if it holds transforms JSONs, else its union folders."""
+    """Captures under ``root``: the folder itself if it holds transforms JSONs, else its union folders.
+
+    Raises `InputError` where there is none, with what lies there instead and the way from it to a capture.
+    """
+    expected = "a folder with a capture in the GaussianAvatars/VHAP layout"
+    if not root.exists():
+        raise InputError(root, "", expected, "no such folder")
     if any((root / file).exists() for file in (*layout.SPLIT_FILES.values(), layout.ALL_FRAMES_FILE)):
         return [root]
-    return sorted(path.parent for path in root.glob(f"UNION*/{layout.SPLIT_FILES['train']}"))
+    captures = sorted(path.parent for path in root.glob(f"UNION*/{layout.SPLIT_FILES['train']}"))
+    if not captures:
+        raise InputError(root, "", expected, *describe(root))
+    return captures
 
 
-def _one_capture(path: Path) -> Path:
-    if not path.is_dir():
-        raise InputError(path, "", "a capture folder", "a file" if path.exists() else "nothing")
-    captures = find_captures(path)
+def find_capture(path: str | Path) -> Path:
+    """The one capture at ``path``. Raises `InputError` where there is none or several."""
+    folder = Path(os.path.abspath(path))  # "." has no name to take a subject from
+    captures = find_captures(folder)
     if len(captures) != 1:
-        found = ", ".join(capture.name for capture in captures) or "neither"
-        expected = f"{layout.SPLIT_FILES['train']}, or one UNION folder that has it"
-        raise InputError(path, "", expected, found, "Name one capture.")
+        found = ", ".join(capture.name for capture in captures)
+        raise InputError(
+            path, "", "one capture in the GaussianAvatars/VHAP layout", found, "Name one capture."
+        )
     return captures[0]
 
 
 def _read_splits(folder: Path, resplit: bool) -> dict[str, list[FrameEntry]]:
     """Entries by split name; with ``resplit``, ``transforms.json`` will do in place of the three."""
     paths = {name: folder / file for name, file in layout.SPLIT_FILES.items()}
-    if resplit and not any(path.exists() for path in paths.values()):
-        return {"train": read_transforms(folder / layout.ALL_FRAMES_FILE)}
+    if not any(path.exists() for path in paths.values()):
+        entries = {"train": read_transforms(folder / layout.ALL_FRAMES_FILE)}
+        if resplit:
+            return entries
+        remedy = "Splits are made by reader_settings.held_out_sequences and .held_out_cameras."
+        raise InputError(
+            paths["train"], "", "a file for each split", f"{layout.ALL_FRAMES_FILE} alone", remedy
+        )
     entries = {name: read_transforms(path) for name, path in paths.items()}
     if not entries["train"]:
         raise InputError(paths["train"], "frames", "at least one training frame", "an empty list")

@@ -17,11 +17,11 @@ import numpy as np
 
 from ..bench.contracts import ByteArray, Camera, FloatArray, HeadPose
 from ..bench.errors import InputError
-from ..bench.files import atomic_path, write_json, write_text
+from ..bench.files import atomic_path, grouped_writes, write_json, write_text
+from ..bench.image_files import probe_image
 from . import ga_layout as layout
 from .ga_documents import camera_record, file_record, save_npz, split_of, transforms_document
 from .head.arrays import HeadArrays, save_head
-from .image_files import probe_image
 
 CANONICAL_JAW = (0.3, 0.0, 0.0)
 """Axis-angle of the open mouth that VHAP stores in the canonical parameters, radians."""
@@ -177,8 +177,9 @@ class CaptureWriter:
     def _write_sequence(self, sequence: SequencePlan) -> None:
         folder = self.sequence_folder(sequence.name)
         constant = self._constant_parameters()
-        for timestep, pose in enumerate(sequence.poses):
-            save_npz(folder / "flame_param" / f"{timestep:05d}.npz", pose_to_parameters(pose) | constant)
+        with grouped_writes():
+            for timestep, pose in enumerate(sequence.poses):
+                save_npz(folder / "flame_param" / f"{timestep:05d}.npz", pose_to_parameters(pose) | constant)
         self._write_canonical(folder)
         boundary = math.ceil(TRAIN_FRACTION * len(sequence.poses))
         frames = list(self._frames(sequence, 0, ""))

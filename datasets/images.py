@@ -12,6 +12,9 @@ import numpy as np
 
 from ..bench.contracts import ByteArray
 from ..bench.errors import InputError
+from ..bench.image_files import read_pixels
+
+_ROWS = 64
 
 
 class ImageStore:
@@ -73,34 +76,29 @@ class ImageStore:
 def read_image(path: Path, background: Iterable[float]) -> ByteArray:
     """Decode a PNG or JPEG to (H, W, 3) RGB, straight alpha composited on ``background`` and rounded.
 
-    Raises `InputError` where the file does not decode or has more than 8 bits per channel.
+    Raises `InputError` where `read_pixels` does.
     """
-    pixels = _decode(path)
+    pixels = read_pixels(path)
     if pixels.ndim == 2:
         return cv2.cvtColor(pixels, cv2.COLOR_GRAY2RGB).astype(np.uint8, copy=False)
     if pixels.shape[2] == 3:
         return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
-    rgba = cv2.cvtColor(pixels, cv2.COLOR_BGRA2RGBA)
-    alpha = rgba[..., 3:].astype(np.float32) / 255
     ground = np.array([*background], dtype=np.float32) * 255
-    blended = rgba[..., :3] * alpha + ground * (1 - alpha)
-    return np.round(blended).astype(np.uint8)
+    result = np.empty((*pixels.shape[:2], 3), np.uint8)
+    for start in range(
+        0, len(pixels), _ROWS
+    ):  # floating-point images of all rows would take ten times the file's
+        rgba = cv2.cvtColor(pixels[start : start + _ROWS], cv2.COLOR_BGRA2RGBA)
+        alpha = rgba[..., 3:].astype(np.float32) / 255
+        blended = rgba[..., :3] * alpha + ground * (1 - alpha)
+        result[start : start + _ROWS] = np.round(blended)
+    return result
 
 
 def read_mask(path: Path) -> ByteArray:
     """Decode a mask to (H, W): the alpha channel where there is one, else the first channel."""
-    pixels = _decode(path)
+    pixels = read_pixels(path)
     if pixels.ndim == 2:
         return pixels
     channel = 3 if pixels.shape[2] == 4 else 0
     return np.ascontiguousarray(pixels[..., channel])
-
-
-def _decode(path: Path) -> ByteArray:
-    pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if pixels is None:
-        found = "damaged data" if path.exists() else "no such file"
-        raise InputError(path, "", "an image that decodes", found)
-    if pixels.dtype != np.uint8:
-        raise InputError(path, "", "8 bits per channel", f"{pixels.dtype}")
-    return pixels.astype(np.uint8, copy=False)

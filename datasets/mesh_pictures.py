@@ -6,13 +6,14 @@ twice, takes about a tenth of a second.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
 from ..bench.contracts import ByteArray, Camera, FloatArray, IntArray
+from ..bench.errors import InputError
 
 PAPER = (1.0, 1.0, 1.0)
 CLAY = (0.78, 0.76, 0.74)
@@ -20,6 +21,10 @@ CLAY = (0.78, 0.76, 0.74)
 
 NEAR = 1e-3
 """Metres before the camera within which nothing is drawn: a triangle that reaches into it is left out whole."""
+
+MAX_LAYERS = 32
+"""Times that triangles, by their bounding boxes, may cover a picture; those of a head do it about four times."""
+_AT_ONCE = 2**21  # pixels
 
 _LIGHT = (-0.30, -0.45, -0.84)  # camera axes: from the upper left, mostly from the viewer
 _AMBIENT = 0.25
@@ -87,24 +92,23 @@ def rasterize_mesh(vertices: FloatArray, faces: IntArray, camera: Camera) -> Fra
 
     A centre on an edge belongs to one of its two triangles. Among triangles at one depth (to float32) the one of
     lowest index is in front. See `draw_mesh` for ``vertices`` and ``faces``; `NEAR` bounds the depth.
+
+    Raises
+    ------
+    InputError
+        Where the triangles together cover the picture more than `MAX_LAYERS` times: no head's do.
     """
     width, height = camera.width, camera.height
     points, usable = _project(vertices, camera)
     kept = np.flatnonzero(usable[faces].all(axis=1))
     corners = points[faces[kept]]  # (n, 3, 3): x, y in pixels, 1/z
-    which, row, left, right = _spans(corners, width, height)
-    counts = right - left
-    # Fragments lie one span after another; what a span has in common is repeated over its fragments.
-    first = np.repeat(np.cumsum(counts) - counts, counts)
-    along = np.arange(len(first)) - first
-    # 1/z is linear over the image of a triangle, so along a span it takes a start and a slope.
-    slope, start = _inverse_depth(corners[which], row, left)
-    inverse = (np.repeat(start, counts) + np.repeat(slope, counts) * along).astype(np.float32)
-    # Positive floats order as their bits do: depth above, triangle below, and the largest key is in front.
-    order = np.repeat(np.uint64(len(kept)) - which.astype(np.uint64), counts)
-    keys = (np.maximum(inverse, 0).view(np.uint32).astype(np.uint64) << np.uint64(32)) | order
     front = np.zeros(height * width, dtype=np.uint64)
-    np.maximum.at(front, np.repeat(row * width + left, counts) + along, keys)
+    for start, end in _parts(corners, width, height):
+        place, inverse, which = _fragments(corners[start:end], width, height)
+        # Positive floats order as their bits do: depth above, triangle below, and the largest key is in front.
+        order = np.uint64(len(kept) - start) - which.astype(np.uint64)
+        keys = (np.maximum(inverse, 0).view(np.uint32).astype(np.uint64) << np.uint64(32)) | order
+        np.maximum.at(front, place, keys)
     pixels = np.flatnonzero(front)
     local = len(kept) - (front[pixels] & np.uint64(0xFFFFFFFF)).astype(np.int64)
     weights = _weights(corners, local, pixels % width + 0.5, pixels // width + 0.5)
@@ -179,6 +183,37 @@ def _project(vertices: FloatArray, camera: Camera) -> tuple[FloatArray, np.ndarr
     inverse = 1 / np.where(usable, points[:, 2], 1.0)
     pixels = (points * inverse[:, None]) @ camera.K[:2].T
     return np.column_stack([pixels, inverse]), usable
+
+
+def _parts(corners: FloatArray, width: int, height: int) -> Iterator[tuple[int, int]]:
+    """First and end of runs of triangles whose bounding boxes have together about `_AT_ONCE` pixels of the picture."""
+    low = np.clip(corners[:, :, :2].min(axis=1), 0, (width, height))
+    high = np.clip(corners[:, :, :2].max(axis=1), 0, (width, height))
+    size = high - low
+    covered = np.cumsum((size[:, 0] + 1) * size[:, 1])  # a row costs something, however narrow
+    layers = covered[-1] / (width * height) if len(covered) else 0.0
+    if layers > MAX_LAYERS:
+        expected = f"triangles that cover the picture {MAX_LAYERS} times at most"
+        raise InputError("mesh", "vertices", expected, f"{layers:.0f} times", "Is the tracking right?")
+    start = 0
+    while start < len(corners):
+        before = covered[start - 1] if start else 0.0
+        end = max(start + 1, int(np.searchsorted(covered, before + _AT_ONCE)))
+        yield start, end
+        start = end
+
+
+def _fragments(corners: FloatArray, width: int, height: int) -> tuple[IntArray, FloatArray, IntArray]:
+    """Number of the pixel, 1/z and triangle of each pixel centre inside a triangle."""
+    which, row, left, right = _spans(corners, width, height)
+    counts = right - left
+    # Fragments lie one span after another; what a span has in common is repeated over its fragments.
+    first = np.repeat(np.cumsum(counts) - counts, counts)
+    along = np.arange(len(first)) - first
+    # 1/z is linear over the image of a triangle, so along a span it takes a start and a slope.
+    slope, start = _inverse_depth(corners[which], row, left)
+    inverse = (np.repeat(start, counts) + np.repeat(slope, counts) * along).astype(np.float32)
+    return np.repeat(row * width + left, counts) + along, inverse, np.repeat(which, counts)
 
 
 def _spans(corners: FloatArray, width: int, height: int) -> tuple[IntArray, IntArray, IntArray, IntArray]:

@@ -12,11 +12,14 @@ from typing import Any
 import numpy as np
 
 from ..bench.contracts import FloatArray
+from ..bench.documents import read_json
 from ..bench.errors import InputError
-from ..bench.files import check_name, read_json
+from ..bench.files import check_name
+from .foreign import frame_route
 
 INTRINSIC_KEYS = ("cx", "cy", "fl_x", "fl_y", "camera_angle_x")
 RIGID_TOLERANCE = 1e-4
+MAX_INTEGER = 2**31
 _IDENTITY, _LAST_ROW = np.eye(3), np.array([0.0, 0.0, 0.0, 1.0])
 
 
@@ -68,6 +71,9 @@ def parse_frame(path: Path, where: str, frame: Any, document: Mapping[str, Any])
     if not isinstance(frame, dict):
         raise InputError(path, where, "an object", type(frame).__name__)
     reader = _Reader(path, where, frame, document)
+    way = frame_route(frame)
+    if way:
+        raise InputError(path, f"{where}.flame_param_path", "text", "no such key", way)
     image = reader.text("file_path")
     if ".png" not in image and ".jpg" not in image.lower():
         image += ".png"  # the rule of GaussianAvatars, to which we add JPEG
@@ -143,8 +149,8 @@ class _Reader:
     def integer(self, key: str) -> int:
         value = self._get(key)
         whole = isinstance(value, int) or (isinstance(value, float) and value.is_integer())
-        if isinstance(value, bool) or not whole or value < 0:
-            raise self._fail(key, "an integer from 0")
+        if isinstance(value, bool) or not whole or not 0 <= value < MAX_INTEGER:
+            raise self._fail(key, f"an integer from 0 to {MAX_INTEGER - 1}")
         return int(value)
 
     def number(self, key: str) -> float:

@@ -13,7 +13,8 @@ from typing import Literal
 
 from ..bench.contracts import FrameKey, Progress, no_progress
 from ..bench.errors import InputError
-from .image_files import ImageInfo, probe_image
+from ..bench.image_files import ImageInfo, probe_image
+from .content_digests import content_digests
 from .transforms import FrameEntry, timesteps_of
 
 LeakPolicy = Literal["error", "record"]
@@ -85,13 +86,16 @@ def check_timesteps(folder: Path, entries: Sequence[FrameEntry]) -> None:
 def find_leaks(
     splits: Mapping[str, Sequence[FrameKey]],
     images: Mapping[FrameKey, Path],
-    digests: Mapping[Path, str],
+    *,
+    progress: Progress = no_progress,
 ) -> list[str]:
     """Ways in which held-out data is seen in training, one sentence each; empty where there is none.
 
     Looks for one image file or one image content in two splits, for self-reenactment timesteps among the
-    training timesteps, and for novel-view cameras among the training cameras.
+    training timesteps, and for novel-view cameras among the training cameras. Contents are read from the files
+    at each call, but only of images that have their size in common with one of another split.
     """
+    contents = _contents(splits, images, progress)
     found = []
     for one, other in combinations(splits, 2):
         names = f"{one} and {other}"
@@ -99,12 +103,12 @@ def find_leaks(
         if shared:
             found.append(f"{len(shared)} image files are in both {names}, such as {shared[0]}")
             continue
-        by_content = {digests[images[key]]: key for key in splits[one]}
-        equal = [key for key in splits[other] if digests[images[key]] in by_content]
+        by_content = {contents[images[key]]: key for key in splits[one] if images[key] in contents}
+        equal = [key for key in splits[other] if contents.get(images[key]) in by_content]
         if equal:
-            twin = by_content[digests[images[equal[0]]]]
+            first = by_content[contents[images[equal[0]]]]
             found.append(
-                f"{len(equal)} images have the same content in {names}, such as {twin} and {equal[0]}"
+                f"{len(equal)} images have the same content in {names}, such as {first} and {equal[0]}"
             )
     train = splits.get("train", ())
     timesteps = _common({k.timestep for k in train}, {k.timestep for k in splits.get("self_reenactment", ())})
@@ -114,6 +118,20 @@ def find_leaks(
     if cameras:
         found.append(f"novel-view cameras are trained on: {', '.join(map(str, cameras))}")
     return found
+
+
+def _contents(
+    splits: Mapping[str, Sequence[FrameKey]], images: Mapping[FrameKey, Path], progress: Progress
+) -> dict[Path, str]:
+    """Digest of each image that may have the content of one in another split, having its size."""
+    split_of_size: dict[int, set[str]] = {}
+    sizes: dict[Path, int] = {}
+    for split, keys in splits.items():
+        for path in {images[key] for key in keys}:
+            sizes[path] = path.stat().st_size
+            split_of_size.setdefault(sizes[path], set()).add(split)
+    candidates = [path for path, size in sizes.items() if len(split_of_size[size]) > 1]
+    return content_digests(candidates, progress=progress)
 
 
 def _common(one: set, other: set) -> list:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,15 +9,18 @@ from typing import Any
 
 import numpy as np
 
+from ..bench.arrays import MAX_MAGNITUDE, TEXT, Member, read_arrays
 from ..bench.contracts import Budget, Clip, FloatArray, HeadAsset, HeadPose
+from ..bench.documents import read_json
 from ..bench.errors import InputError
 from ..bench.files import atomic_path, digest, write_json
-from ..datasets.head.arrays import HeadArrays, read_head, read_npz, save_head
+from ..datasets.head.arrays import HeadArrays, read_head, save_head
 from .training.loop import CHECKPOINT, Outcome
 
 HEAD_FILE = "head_model.npz"
 SUBJECT_FILE = "subject.npz"
 RECORD_FILE = "training.json"
+_SIZES = {"rotation": 3, "neck": 3, "jaw": 3, "eyes": 6, "translation": 3}
 TRACKED = ("expression", "rotation", "neck", "jaw", "eyes", "translation")
 
 
@@ -73,15 +75,6 @@ def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
         np.savez(stream, allow_pickle=False, **{name: np.asarray(value) for name, value in arrays.items()})
 
 
-def read_arrays(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """Read an npz that must have these members. Raises `InputError` otherwise."""
-    content = read_npz(path)
-    for name in names:
-        if name not in content:
-            raise InputError(path, name, "an array of that name", f"only {', '.join(sorted(content))}")
-    return content
-
-
 def write_subject(path: Path, subject: Subject) -> None:
     """Write identity coefficients and static offset as float32 npz."""
     arrays: dict[str, Any] = {
@@ -95,19 +88,17 @@ def write_subject(path: Path, subject: Subject) -> None:
 
 def read_subject(path: Path, head: HeadAsset) -> Subject:
     """Read what `write_subject` wrote. Raises `InputError` where it does not fit the head model."""
-    arrays = read_arrays(path, ("name", "head_model", "shape", "static_offset"))
-    subject = Subject(
-        str(arrays["name"]), str(arrays["head_model"]), arrays["shape"], arrays["static_offset"]
-    )
-    if subject.head_model != head.version:
-        raise InputError(path, "head_model", repr(head.version), repr(subject.head_model))
-    expected = {"shape": head.shape_basis.shape[2:], "static_offset": head.template.shape}
-    for name, shape in expected.items():
-        values = arrays[name]
-        if values.shape != shape or values.dtype != np.float32 or not np.isfinite(values).all():
-            found = f"{values.dtype} of shape {values.shape}, or non-finite numbers"
-            raise InputError(path, name, f"finite float32 of shape {shape}", found)
-    return subject
+    members = {
+        "name": TEXT,
+        "head_model": TEXT,
+        "shape": Member("f", ("S",), MAX_MAGNITUDE, "f4"),
+        "static_offset": Member("f", ("V", 3), MAX_MAGNITUDE, "f4"),
+    }
+    arrays = read_arrays(path, members, {"S": head.shape_basis.shape[2], "V": len(head.template)})
+    name, version = str(arrays["name"]), str(arrays["head_model"])
+    if version != head.version:
+        raise InputError(path, "head_model", repr(head.version), repr(version)[:80])
+    return Subject(name, version, arrays["shape"], arrays["static_offset"])
 
 
 class RefinedTracking:
@@ -159,23 +150,13 @@ class RefinedTracking:
     @classmethod
     def read(cls, path: Path) -> RefinedTracking:
         """Read what `save` wrote."""
-        names = (
-            *("subject", "timesteps"),
-            *(f"{kind}_{name}" for kind in ("tracked", "refined") for name in TRACKED),
-        )
-        arrays = read_arrays(path, names)
+        members = {"subject": TEXT, "timesteps": Member("iu", ("T",))} | {
+            f"{kind}_{name}": Member("f", ("T", _SIZES.get(name, f"size of {name}")), MAX_MAGNITUDE, "f4")
+            for kind in ("tracked", "refined")
+            for name in TRACKED
+        }
+        arrays = read_arrays(path, members)
         timesteps = arrays["timesteps"]
-        if timesteps.ndim != 1 or not np.issubdtype(timesteps.dtype, np.integer):
-            raise InputError(
-                path, "timesteps", "(T,) integers", f"{timesteps.dtype} of shape {timesteps.shape}"
-            )
-        for name in TRACKED:
-            shape = (len(timesteps), arrays[f"tracked_{name}"].size // max(len(timesteps), 1))
-            for key in (f"tracked_{name}", f"refined_{name}"):
-                values = arrays[key]
-                if values.shape != shape or values.dtype != np.float32 or not np.isfinite(values).all():
-                    found = f"{values.dtype} of shape {values.shape}, or non-finite numbers"
-                    raise InputError(path, key, f"finite float32 of shape {shape}", found)
         tracked = {name: arrays[f"tracked_{name}"] for name in TRACKED}
         refined = {name: arrays[f"refined_{name}"] for name in TRACKED}
         return cls(str(arrays["subject"]), timesteps, tracked, refined)
@@ -194,10 +175,7 @@ def is_finished(folder: Path, run: str) -> bool:
     path = folder / RECORD_FILE
     if not path.exists():
         return False
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))["run"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(path, "run", "the record of a run", "something else", "Delete it.") from error
+    found = read_json(path).get("run")
     if found != run:
         raise InputError(
             path,

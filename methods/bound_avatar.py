@@ -71,7 +71,7 @@ def draw_splats(
         background=world.means.new_tensor([float(channel) for channel in background]),
         alpha_min=cutoffs.alpha_min,
         transmittance_min=cutoffs.transmittance_min,
-        check_finite=False,
+        check_values=False,
     )
     done("raster")
     drawn = Drawn(rendering.image.clamp(0, 1), rendering.alpha.clamp(0, 1))

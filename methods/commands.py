@@ -7,6 +7,7 @@ COMPACT = CommandSpec(
     summary="Store an avatar of ours in about a fifteenth of its bytes; with a capture, measure what each part costs in quality.",
     implementation="headbench.methods.compact.command:run",
     settings="headbench.methods.compact.settings:CompactSettings",
+    writes="out",
 )
 
 EXPORT_PLY = CommandSpec(
@@ -21,4 +22,5 @@ IMPORT_GA = CommandSpec(
     summary="Make an avatar of a GaussianAvatars PLY and the capture it was trained on.",
     implementation="headbench.methods.gaussian_ply.import_command:run",
     settings="headbench.methods.gaussian_ply.settings:ImportGASettings",
+    writes="out",
 )

@@ -34,7 +34,7 @@ class DensifiedTraining:
     prune_opacity : splats below it are removed.
     prune_extent, prune_extent_from : so are splats larger than this part of the extent, from then on.
     reset_every, reset_at_start, reset_opacity : opacities are cut to ``reset_opacity`` regularly (None: never), and
-        once when densification starts (published for white backgrounds).
+        once when densification starts, if the background is white, as published.
     max_splats : densification stops adding above this number; None for no bound.
     min_densify_every, min_reset_every : in iterations of the actual run. A gradient mean needs some views, and
         opacities some steps to recover.

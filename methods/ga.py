@@ -224,7 +224,7 @@ class GAAvatar:
 class GA:
     """The method: see the module."""
 
-    name, version = "ga", "1"
+    name, version = "ga", "2"
 
     def __init__(self, config: GAConfig | None = None):
         self.config = config or GAConfig()

@@ -7,9 +7,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from ..bench.arrays import check_numbers
 from ..bench.errors import InputError
 from .ply import read_names, read_ply, write_ply
 from .sh import coefficient_count
+from .tensor_files import MAX_MAGNITUDE, check_sizes
 
 PLY_FILE = "point_cloud.ply"
 
@@ -60,6 +62,10 @@ def read_ga_splats(path: Path, face_count: int, device: str) -> tuple[dict[str, 
     degree_rest = _rest_count(path)
     table = torch.from_numpy(read_ply(path, (*needed, *rest_names[: 3 * degree_rest])))
     binding = table[:, needed.index("binding_0")].to(torch.int64)
+    for column, name in enumerate((*needed, *rest_names[: 3 * degree_rest])):
+        if name != "binding_0":
+            check_numbers(path, name, table[:, column].numpy(), MAX_MAGNITUDE)
+    check_sizes(path, table[:, [needed.index(f"scale_{i}") for i in range(3)]])
     if len(binding) and not (0 <= int(binding.min()) and int(binding.max()) < face_count):
         found = f"{int(binding.min())} to {int(binding.max())}"
         raise InputError(path, "binding_0", f"triangles 0 to {face_count - 1}", found)

@@ -45,7 +45,7 @@ log = logging.getLogger(__name__)
 class Ours:
     """The method: see the module."""
 
-    name, version = "ours", "1"
+    name, version = "ours", "2"
 
     def __init__(self, config: OursConfig | None = None):
         self.config = config or OursConfig()

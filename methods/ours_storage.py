@@ -9,16 +9,17 @@ from typing import NamedTuple, cast
 
 import numpy as np
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor
 
+from ..bench.arrays import Member
 from ..bench.errors import InputError
-from ..bench.files import atomic_path
+from ..bench.files import write_bytes
 from .configs import Dynamic
 from .dynamics import WIDTHS, offset_width
 from .ours_field import Box
 from .sh import coefficient_count
+from .tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors
 from .triplane import ENCODING_SIZE, PAIRS
 
 FIELD_FILE = "avatar.safetensors"
@@ -65,19 +66,14 @@ class Field(NamedTuple):
 def save_field(path: Path, field: Field) -> None:
     """Write the exact file of a field, whole or not at all."""
     tensors = {name: value.cpu().contiguous() for name, value in field.tensors.items()}
-    with atomic_path(path) as temporary:
-        save_file(tensors, temporary, {DYNAMIC: ",".join(field.dynamic)})
+    write_bytes(path, save(tensors, {DYNAMIC: ",".join(field.dynamic)}))
 
 
 def read_field(path: Path, face_count: int, expression_size: int, device: str) -> Field:
     """Read and check what `write_field` wrote. Raises `InputError` where a tensor is missing or does not fit."""
-    try:
-        with safe_open(path, framework="pt", device=device) as file:
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
-            names = (file.metadata() or {}).get(DYNAMIC, "opacity")
-    except (SafetensorError, OSError) as error:
-        raise InputError(path, "", "a safetensors file", str(error)) from error
-    return checked_field(path, tensors, names, face_count, expression_size)
+    tensors, metadata = read_safetensors(path)
+    field = checked_field(path, tensors, metadata.get(DYNAMIC, "opacity"), face_count, expression_size)
+    return field._replace(tensors={name: value.to(device) for name, value in field.tensors.items()})
 
 
 def checked_field(
@@ -98,12 +94,8 @@ def checked_field(
         needed += ["color_weight_0", "color_weight_1", *(f"plane_{name}" for name, _, _ in PAIRS)]
     if "lines" in tensors:
         needed += [f"line_{part}_{layer}" for layer in range(3) for part in ("direction", "gain", "bias")]
-    for name in needed:
-        if name not in tensors:
-            raise InputError(path, name, "a tensor of that name", "none")
-    for name, value in tensors.items():
-        if value.dtype != torch.float32 or not torch.isfinite(value).all():
-            raise InputError(path, name, "finite float32 numbers", f"{value.dtype} or non-finite numbers")
+    number = Member("f", None, MAX_MAGNITUDE, "f4")
+    check_tensors(path, tensors, dict.fromkeys([*needed, *tensors], number))
     _check_shapes(path, tensors, face_count, expression_size, offset_width(dynamic))
     return Field(tensors, dynamic)
 
@@ -127,6 +119,9 @@ def _check_shapes(
     if len(binding) and not (0 <= float(binding.min()) and float(binding.max()) < face_count):
         found = f"{float(binding.min()):g} to {float(binding.max()):g}"
         raise InputError(path, "splats, triangle", f"0 to {face_count - 1}", found)
+    check_sizes(
+        path, splats.split(list(SPLAT_WIDTHS.values()), dim=1)[list(SPLAT_WIDTHS).index("log_scales")]
+    )
     for name in ("plane_box", "line_box"):
         exactly(name, 2, 3)
         if not (tensors[name][0] < tensors[name][1]).all():

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..bench.contracts import FloatArray
 from ..bench.errors import InputError
-from ..bench.files import atomic_path
+from ..bench.files import atomic_path, open_regular, read_bytes
 
 SCALARS = {
     **dict.fromkeys(("char", "int8"), "<i1"),
@@ -23,6 +23,8 @@ SCALARS = {
 }
 """Types of a property, by both of their names."""
 BEGIN, END = re.compile(rb"ply\r?\n"), re.compile(rb"\nend_header\r?\n")
+_COUNT = re.compile(r"[0-9]{1,18}")
+EXPECTED, MAX_BYTES = "a PLY file", 2**30
 HEADER_LIMIT = 65536  # bytes; a longer header is no file of ours
 
 
@@ -44,7 +46,7 @@ def read_ply(path: Path, names: tuple[str, ...]) -> FloatArray:
     Other columns may be there, of any scalar type. Raises `InputError` where the file is no such PLY, lacks a column,
     is cut short, or holds numbers that are not finite in float32.
     """
-    content = _content(path, -1)
+    content = read_bytes(path, EXPECTED, MAX_BYTES)
     count, columns, start = _header(path, content)
     missing = [name for name in names if name not in columns]
     if missing:
@@ -65,15 +67,8 @@ def read_ply(path: Path, names: tuple[str, ...]) -> FloatArray:
 
 def read_names(path: Path) -> tuple[str, ...]:
     """The columns a PLY file has, by its header alone. Raises `InputError` as `read_ply` does."""
-    return tuple(_header(path, _content(path, HEADER_LIMIT))[1])
-
-
-def _content(path: Path, limit: int) -> bytes:
-    try:
-        with path.open("rb") as stream:
-            return stream.read(limit)
-    except OSError as error:
-        raise InputError(path, "", "a PLY file", error.strerror or str(error)) from error
+    with open_regular(path, EXPECTED) as stream:
+        return tuple(_header(path, stream.read(HEADER_LIMIT))[1])
 
 
 def _header(path: Path, content: bytes) -> tuple[int, dict[str, str], int]:
@@ -97,7 +92,7 @@ def _parse_header(path: Path, lines: list[str]) -> tuple[int, dict[str, str]]:
             if words[1:] != ["binary_little_endian", "1.0"]:
                 raise InputError(path, "format", "binary_little_endian 1.0", " ".join(words[1:]))
         elif words[0] == "element":
-            if len(words) != 3 or words[1] != "vertex" or count >= 0 or not words[2].isdecimal():
+            if len(words) != 3 or words[1] != "vertex" or count >= 0 or not _COUNT.fullmatch(words[2]):
                 raise InputError(path, "element", "one vertex element", line)
             count = int(words[2])
         elif words[0] == "property":

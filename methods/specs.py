@@ -73,6 +73,7 @@ def _presets(short: Mapping[str, Any], paper: Mapping[str, Any]) -> dict[str, di
 
 OURS = MethodSpec(
     name="ours",
+    version="2",
     summary="Mesh-bound splats with tri-plane colour and expression-driven opacity along feature lines.",
     implementation="headbench.methods.ours:Ours",
     config="headbench.methods.configs:OursConfig",
@@ -84,6 +85,7 @@ OURS = MethodSpec(
 
 GA = MethodSpec(
     name="ga",
+    version="2",
     summary="GaussianAvatars: splats with spherical harmonics rigged to the triangles of the tracked mesh.",
     implementation="headbench.methods.ga:GA",
     config="headbench.methods.configs:GAConfig",
@@ -147,7 +149,7 @@ INSTA = MethodSpec(
 
 GBS = MethodSpec(
     name="gbs",
-    version="2",
+    version="3",
     summary="GaussianBlendshapes: splats of a neutral head plus linear differences for each expression, skinned.",
     implementation="headbench.methods.gbs.method:GBS",
     config="headbench.methods.gbs.config:GBSConfig",
@@ -176,7 +178,7 @@ NEAREST_CAMERA = MethodSpec(
 
 GHA = MethodSpec(
     name="gha",
-    version="2",
+    version="3",
     summary="Gaussian Head Avatar: splats driven by networks, drawn as features, sharpened by another network.",
     implementation="headbench.methods.gha.method:GHA",
     config="headbench.methods.gha.config:GHAConfig",

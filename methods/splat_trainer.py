@@ -84,7 +84,8 @@ class SplatTrainer:
     def begin(self, timeline: Timeline) -> None:
         """Fit schedules to the length of the run."""
         self._timeline = timeline
-        self._schedule = DensifySchedule.of(self._settings, timeline)
+        white = bool((self._background == 1).all())
+        self._schedule = DensifySchedule.of(self._settings, timeline, white=white)
 
     def loss(self, iteration: int, index: int) -> Tensor:
         """Loss of one image."""
@@ -145,9 +146,9 @@ class SplatTrainer:
             *(view.world_to_camera, view.K, view.camera.width, view.camera.height),
             background=self._background,
             means2d_offset=offset,
-            check_finite=False,
+            check_values=False,
         )
-        visible = rendering.radii > 0
+        visible = rendering.radii > 0  # whatever their opacity, as published
         self._seen: tuple[Tensor, Tensor, Camera, Tensor] = (offset, visible, view.camera, face_sizes)
         return rendering, visible
 

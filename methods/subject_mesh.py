@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ..bench.contracts import FloatArray, HeadAsset, HeadPose
+from ..datasets.head.arrays import check_size
 from ..datasets.head.model import HeadModel
 from . import avatar_kernel
 from .binding import Frames, triangle_frames
@@ -25,6 +26,11 @@ class SubjectMesh:
     ----------
     shape : (S,) identity coefficients.
     static_offset : (V, 3) metres, added to the shaped template.
+
+    Raises
+    ------
+    InputError
+        Where they make a mesh that is no head's by its size, see `check_size`.
     """
 
     def __init__(self, head: HeadAsset, shape: FloatArray, static_offset: FloatArray, device: str):
@@ -33,6 +39,9 @@ class SubjectMesh:
         like = self.model.template
         self._canonical = self.model.canonical(
             torch.as_tensor(np.asarray(shape)).to(like), torch.as_tensor(np.asarray(static_offset)).to(like)
+        )
+        check_size(
+            "subject", "shape, static_offset", self._canonical[0].cpu().numpy(), np.asarray(head.faces)
         )
 
     @property

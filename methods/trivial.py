@@ -12,10 +12,12 @@ from typing import Any
 import cv2
 import numpy as np
 
+from ..bench.arrays import MAX_MAGNITUDE, TEXT, Member, read_arrays
 from ..bench.contracts import Budget, Camera, Clip, FloatArray, Frame, HeadPose, Progress
 from ..bench.errors import InputError
 from ..bench.files import atomic_path
-from .avatar_files import TRACKED, is_finished, read_arrays, run_digest, write_arrays, write_record
+from ..bench.image_files import read_pixels
+from .avatar_files import TRACKED, is_finished, run_digest, write_arrays, write_record
 from .clip_checks import check_training_split
 from .configs import NearestCameraConfig
 from .training.loop import Outcome
@@ -23,6 +25,18 @@ from .training.loop import Outcome
 MEAN_FILE = "mean.npz"
 INDEX_FILE = "index.npz"
 IMAGE_FOLDER = "images"
+
+_COLOR = Member("f", (3,), 1)
+_MEAN = {"rgba": Member("f", ("H", "W", 4), 1, "f4"), "background": _COLOR, "head_model": TEXT}
+_INDEX = {
+    "head_model": TEXT,
+    "background": _COLOR,
+    "timesteps": Member("iu", ("T",)),
+    "signals": Member("f", ("T", "D"), MAX_MAGNITUDE),
+    "scales": Member("f", ("D",), MAX_MAGNITUDE),
+    "centers": Member("f", ("C", 3)),
+    "images": Member("i", ("T", "C")),
+}
 
 
 def resize(image: FloatArray, width: int, height: int) -> FloatArray:
@@ -55,13 +69,12 @@ class MeanImageAvatar:
     """One image for every camera and pose."""
 
     def __init__(self, folder: Path):
-        arrays = read_arrays(folder / MEAN_FILE, ("rgba", "background", "head_model"))
         self._path = folder / MEAN_FILE
+        arrays = read_arrays(self._path, _MEAN)
         self._rgba, self._background = arrays["rgba"], arrays["background"]
         self._head_model = str(arrays["head_model"])
-        if self._rgba.ndim != 3 or self._rgba.shape[2] != 4 or self._rgba.dtype != np.float32:
-            found = f"{self._rgba.dtype} of shape {self._rgba.shape}"
-            raise InputError(self._path, "rgba", "float32 of shape (H, W, 4)", found)
+        if not self._rgba.size:
+            raise InputError(self._path, "rgba", "at least one pixel", f"shape {self._rgba.shape}")
 
     def render(self, camera: Camera, pose: HeadPose, background: Sequence[float] = (1.0, 1.0, 1.0)) -> Frame:
         """The mean image at the camera's size. Raises `InputError` for a pose of another head model."""
@@ -116,13 +129,10 @@ class NearestCameraAvatar:
     """
 
     def __init__(self, folder: Path):
-        names = ("head_model", "background", "timesteps", "signals", "scales", "centers", "images")
         self._folder = folder
-        self._index = read_arrays(folder / INDEX_FILE, names)
+        self._index = read_arrays(folder / INDEX_FILE, _INDEX)
         self._head_model = str(self._index["head_model"])
-        rows, cameras = len(self._index["timesteps"]), len(self._index["centers"])
-        if self._index["images"].shape != (rows, cameras) or len(self._index["signals"]) != rows:
-            raise InputError(folder / INDEX_FILE, "images", f"({rows}, {cameras})", "another shape")
+        self._check_index(folder / INDEX_FILE)
 
     def render(self, camera: Camera, pose: HeadPose, background: Sequence[float] = (1.0, 1.0, 1.0)) -> Frame:
         """The nearest training image at the camera's size. Raises `InputError` for another head model's pose."""
@@ -151,10 +161,23 @@ class NearestCameraAvatar:
         numbers = sorted(int(number) for number in self._index["images"].ravel() if number >= 0)
         return [self._folder / INDEX_FILE, *(image_path(self._folder, number) for number in numbers)]
 
+    def _check_index(self, path: Path) -> None:
+        images = self._index["images"]
+        if not len(images) or not (images >= 0).any(axis=1).all():
+            raise InputError(path, "images", "an image of each timestep, and a timestep", "none of one")
+        if images.min() < -1 or images.max() >= images.size:
+            found = f"numbers from {images.min()} to {images.max()}"
+            raise InputError(path, "images", f"numbers from -1 to {images.size - 1}", found)
+        if not (self._index["scales"] > 0).all():
+            raise InputError(path, "scales", "numbers above 0", "others")
+        for file in self.files():
+            if not file.is_file():
+                raise InputError(file, "", f"an image that {INDEX_FILE} names", "no such file")
+
     def _read(self, number: int) -> FloatArray:
         path = image_path(self._folder, number)
-        pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        if pixels is None or pixels.ndim != 3 or pixels.shape[2] != 4 or pixels.dtype != np.uint8:
+        pixels = read_pixels(path)
+        if pixels.ndim != 3 or pixels.shape[2] != 4:
             raise InputError(path, "", "an 8-bit RGBA image", "something else")
         return pixels[..., [2, 1, 0, 3]].astype(np.float32) / 255
 

@@ -17,7 +17,6 @@ import functools
 import hashlib
 import importlib.util
 import os
-import pickle
 import shutil
 import urllib.request
 from collections.abc import Mapping
@@ -28,16 +27,12 @@ import torch
 from torch import Tensor
 
 from ..bench.errors import InputError, UnavailableError
-from ..bench.files import atomic_path
+from ..bench.files import atomic_path, cache_folder
 from .networks import NETWORKS, NetworkSpec
+from .torch_file import read_weights
 
 VARIABLE = "HEADBENCH_LPIPS_WEIGHTS"
 TIMEOUT_S = 5.0
-
-
-def cache_folder() -> Path:
-    """Where fetched weights are kept: ``$XDG_CACHE_HOME/headbench``, by default ``~/.cache/headbench``."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "headbench"
 
 
 def find_backbone(spec: NetworkSpec, path: Path | None = None) -> Path:
@@ -70,7 +65,7 @@ def load_backbone(spec: NetworkSpec, path: Path) -> dict[str, Tensor]:
 
     Raises `InputError` for a file that is none, lacks a parameter, or has one of another shape or not finite.
     """
-    return _select(_load(path), spec.build().state_dict(), path)
+    return _read(path, {name: tuple(value.shape) for name, value in spec.build().state_dict().items()})
 
 
 def load_linear(spec: NetworkSpec, path: Path | None = None) -> list[Tensor]:
@@ -79,8 +74,8 @@ def load_linear(spec: NetworkSpec, path: Path | None = None) -> list[Tensor]:
     ``path`` defaults to the file in the installed torchmetrics package.
     """
     path = _torchmetrics_folder() / f"{spec.name}.pth" if path is None else path
-    shapes = {f"lin{i}.model.1.weight": torch.empty(1, c, 1, 1) for i, c in enumerate(spec.channels)}
-    return list(_select(_load(path), shapes, path).values())
+    shapes = {f"lin{i}.model.1.weight": (1, c, 1, 1) for i, c in enumerate(spec.channels)}
+    return list(_read(path, shapes).values())
 
 
 def network_spec(name: str) -> NetworkSpec:
@@ -130,34 +125,6 @@ def _torchmetrics_folder() -> Path:
     return Path(package.submodule_search_locations[0]) / "functional" / "image" / "lpips_models"
 
 
-def _load(path: Path) -> Mapping[str, Tensor]:
-    try:
-        values = torch.load(path, map_location="cpu", weights_only=True)
-    except FileNotFoundError as error:
-        raise InputError(path, "", "a PyTorch file of weights", "no such file") from error
-    except (OSError, RuntimeError, EOFError, ValueError, KeyError, pickle.UnpicklingError) as error:
-        found = " ".join(str(error).split())[:200] or type(error).__name__
-        raise InputError(
-            path, "", "a PyTorch file of weights", f"one that cannot be read ({found})"
-        ) from error
-    if not isinstance(values, Mapping):
-        raise InputError(path, "", "a dictionary of tensors", type(values).__name__)
-    return values
-
-
-def _select(values: Mapping[str, Tensor], wanted: Mapping[str, Tensor], path: Path) -> dict[str, Tensor]:
-    """Return the entries of ``wanted``, float32, each checked against the shape there; others are ignored."""
-    selected: dict[str, Tensor] = {}
-    for key, like in wanted.items():
-        value = values.get(key)
-        shape = f"a float tensor of shape {tuple(like.shape)}"
-        if value is None:
-            raise InputError(path, key, shape, "no such entry", "Is it the file of another network?")
-        if not isinstance(value, Tensor) or not value.is_floating_point():
-            raise InputError(path, key, shape, str(getattr(value, "dtype", type(value).__name__)))
-        if value.shape != like.shape:
-            raise InputError(path, key, shape, f"shape {tuple(value.shape)}")
-        if not torch.isfinite(value).all():
-            raise InputError(path, key, "finite weights", "infinite or undefined ones")
-        selected[key] = value.to(torch.float32)
-    return selected
+def _read(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Tensor]:
+    found = read_weights(path, shapes)
+    return {name: torch.from_numpy(values).to(torch.float32) for name, values in found.items()}

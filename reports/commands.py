@@ -28,6 +28,7 @@ PARETO = CommandSpec(
     summary="Quality against size and frame time over finished runs: CSV, and a plot with the Pareto front marked.",
     implementation="headbench.reports.pareto.command:run",
     settings="headbench.reports.pareto.settings:ParetoSettings",
+    writes="out",
 )
 
 COMPARE = CommandSpec(

@@ -55,20 +55,18 @@ class PaperLayout:
         """Rows: labels of methods and how the paper writes them, in its order; floors have no place in it."""
         order = list(NAMES)
         chosen = [
-            label
-            for label in runs.ranked
-            if not self.methods or str(runs.records[label]["name"]) in self.methods
+            label for label in runs.ranked if not self.methods or runs.records[label].name in self.methods
         ]
         if not chosen:
             found = ", ".join(runs.methods)
             raise InputError(runs.runs[0].folder.root, f"layout {name}", ", ".join(self.methods), found)
 
         def place(label: str) -> tuple[bool, int]:
-            known = str(runs.records[label]["name"])
+            known = runs.records[label].name
             # Methods that no table of the paper has come before "ours", which is last.
             return known == "ours", order.index(known) if known in order else len(order)
 
-        own = {label: str(runs.records[label]["name"]) for label in chosen}
+        own = {label: runs.records[label].name for label in chosen}
         return {
             label: NAMES.get(own[label], own[label]) + label.removeprefix(own[label])
             for label in sorted(chosen, key=place)

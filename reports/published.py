@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from ..bench.configuration import build
+from ..bench.documents import read_json
 from ..bench.errors import InputError
-from ..bench.files import read_json
+from ..bench.manifest import MethodRecord
 from .csv_table import column_name
 from .table_model import Table, TableCell
 
@@ -41,11 +42,11 @@ class PublishedRow:
     settings: dict[str, Any]
     values: dict[str, str]
 
-    def is_of(self, record: Mapping[str, Any]) -> bool:
+    def is_of(self, record: MethodRecord) -> bool:
         """Whether a measured method, as in a run's manifest, is the one of this row."""
-        config = record.get("config") or {}
+        config = record.config or {}
         settled = all(name in config and config[name] == value for name, value in self.settings.items())
-        return record["name"] == self.method and settled
+        return record.name == self.method and settled
 
 
 @cache
@@ -61,7 +62,7 @@ def published_rows() -> tuple[tuple[PublishedRow, str], ...]:
     return tuple((row, str(content["sources"][row.source])) for row in rows)
 
 
-def with_published(table: Table, layout: str, records: Mapping[str, Mapping[str, Any]]) -> Table:
+def with_published(table: Table, layout: str, records: Mapping[str, MethodRecord]) -> Table:
     """Put a column "published" behind each measured one that a paper's table of this layout has a figure for.
 
     Parameters

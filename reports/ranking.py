@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-import pandas as pd
-
+from ..bench.rows import ALL, Rows
 from .aggregate import subject_means
 from .statistics.comparisons import LEVEL, BestSet, best_set
 from .table_model import Column, TableRow
 
 
 def best_of_column(
-    rows: pd.DataFrame, lines: Sequence[TableRow], index: int, column: Column
+    rows: Rows, lines: Sequence[TableRow], index: int, column: Column, region: str
 ) -> BestSet | None:
     """Find the methods that may be the best of a column; None where fewer than two have values.
 
@@ -22,8 +21,12 @@ def best_of_column(
     competing = _competing(lines, index)
     if len(competing) < 2:
         return None
-    own = rows[(rows["task"] == column.task) & (rows["metric"] == column.metric)]
-    means = {method: subject_means(own[own["method"] == method]) for method in competing}
+    means = {
+        method: subject_means(
+            rows.select(method=method, metric=column.metric, task=column.task, region=region, seeds=ALL)
+        )
+        for method in competing
+    }
     return best_set(means, higher_is_better=column.higher_is_better)
 
 

@@ -14,7 +14,9 @@ import cv2
 from ..bench.errors import InputError
 from ..bench.files import atomic_path, write_text
 from ..bench.frames import read_png
-from ..bench.store import RunFolder, read_rows
+from ..bench.rows import ALL, Rows
+from ..bench.scoring import FULL
+from ..bench.store import RunFolder
 from .table_report import table_text
 
 BEGIN, END = "<!-- demo:begin -->", "<!-- demo:end -->"
@@ -43,15 +45,16 @@ def publish(run_folder: Path, readme: Path) -> None:
 def block(gallery: Path) -> str:
     """Return the README's block for the stored result in ``gallery``: Markdown."""
     record = RunFolder(gallery).read_manifest()
-    machine = record["machine"]
-    rows = read_rows(RunFolder(gallery).rows)
-    trained = rows[(rows["metric"] == "training_time") & (rows["status"] == "ok")]
+    machine = record.machine
+    rows = Rows.read(RunFolder(gallery).rows)
+    trained = rows.select(method=ALL, metric="training_time", task="", region=FULL, seeds=ALL)
+    trained = trained[trained["status"] == "ok"]
     # Not the run's own length: a demo that was continued would tell that of its last part.
     spent = zip(trained["method"].astype(str), trained["value"].astype(float))
     minutes = ", ".join(f"{method} {value:.1f}" for method, value in spent if value >= 0.05)
     cost = (
         f"Minutes of training: {minutes}, on {machine['cores']} cores ({machine['processor']}); the largest process took "
-        f"{record['peak_memory_bytes'] / 1e9:.1f} GB."
+        f"{(record.peak_memory_bytes or 0) / 1e9:.1f} GB."
     )
     picture = f"![Ground truth, renders and error maps of every method]({GALLERY}/{PICTURE})"
     return f"{picture}\n\n{table_text([gallery], 'md').strip()}\n\n{cost}"

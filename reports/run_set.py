@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
-
 from ..bench.errors import InputError
+from ..bench.manifest import MethodRecord
+from ..bench.rows import Rows
 from ..bench.specs import MetricSpec
-from .aggregate import check_rows
 from .run_data import RunData
 
 LONGEST_DIFFERENCE = 48
@@ -25,17 +24,17 @@ class RunSet:
     Attributes
     ----------
     runs : in the order given.
-    rows : of all, the column "method" holding labels.
+    rows : of all, their methods named by labels.
     metrics, tasks : those of all runs, in their order.
     records : by label, in order: what the method was, as in the manifest (name, version, config, budget).
     trivial : labels of floors.
     """
 
     runs: tuple[RunData, ...]
-    rows: pd.DataFrame
+    rows: Rows
     metrics: tuple[MetricSpec, ...]
     tasks: tuple[str, ...]
-    records: Mapping[str, Mapping[str, Any]]
+    records: Mapping[str, MethodRecord]
     trivial: tuple[str, ...]
 
     @classmethod
@@ -55,14 +54,15 @@ class RunSet:
         runs = tuple(RunData.read(folder) for folder in folders)
         _check_protocols(runs)
         labels = _labels(runs)
-        parts = [
-            run.rows.assign(method=[labels[index, name] for name in run.rows["method"]])
-            for index, run in enumerate(runs)
-        ]
-        rows = pd.concat(parts, ignore_index=True)
-        check_rows(rows)
+        rows = Rows.joined(
+            [
+                run.rows.renamed({name: label for (i, name), label in labels.items() if i == index})
+                for index, run in enumerate(runs)
+            ]
+        )
+        rows.check()
         records = {
-            labels[i, entry["name"]]: entry for i, run in enumerate(runs) for entry in run.manifest["methods"]
+            labels[i, method.name]: method for i, run in enumerate(runs) for method in run.manifest.methods
         }
         return cls(
             runs,
@@ -70,7 +70,7 @@ class RunSet:
             _metrics(runs),
             tuple(dict.fromkeys(task for run in runs for task in run.tasks)),
             records,
-            tuple(label for label, record in records.items() if record["trivial"]),
+            tuple(label for label, record in records.items() if record.trivial),
         )
 
     @property
@@ -104,7 +104,7 @@ def _check_protocols(runs: Sequence[RunData]) -> None:
     for run in runs:
         for task in run.tasks:
             other = first.setdefault(task, run)
-            expected, found = (str(r.manifest["protocols"][task]["hash"]) for r in (other, run))
+            expected, found = (r.manifest.protocols[task].hash for r in (other, run))
             if expected != found:
                 known = f"protocol {expected}, that of {other.folder.root}"
                 raise InputError(
@@ -129,11 +129,11 @@ def _meaning(spec: MetricSpec) -> tuple[str, bool, str, str]:
 
 def _labels(runs: Sequence[RunData]) -> dict[tuple[int, str], str]:
     """Label of each run's methods, by index of the run and name."""
-    variants: dict[str, list[tuple[Mapping[str, Any], list[int], set[int]]]] = {}
+    variants: dict[str, list[tuple[MethodRecord, list[int], set[int]]]] = {}
     for index, run in enumerate(runs):
-        for record in run.manifest["methods"]:
-            name = str(record["name"])
-            seeds = set(run.rows.loc[run.rows["method"] == name, "seed"])
+        for record in run.manifest.methods:
+            name = record.name
+            seeds = run.rows.seeds(name)
             known = variants.setdefault(name, [])
             same = next((v for v in known if v[0] == record and not v[2] & seeds), None)
             if same is None:
@@ -149,11 +149,11 @@ def _labels(runs: Sequence[RunData]) -> dict[tuple[int, str], str]:
     return labels
 
 
-def _names(name: str, records: Sequence[Mapping[str, Any]], folders: Sequence[Sequence[Path]]) -> list[str]:
+def _names(name: str, records: Sequence[MethodRecord], folders: Sequence[Sequence[Path]]) -> list[str]:
     """Tell variants of a method apart: by what differs in their settings, else by their folders."""
     if len(records) == 1:
         return [name]
-    flat = [_flat(record) for record in records]
+    flat = [_flat(asdict(record)) for record in records]
     keys = [k for k in dict.fromkeys(k for f in flat for k in f) if len({f.get(k, "") for f in flat}) > 1]
     told = [", ".join(f"{key.rpartition('.')[2]}={f.get(key, 'none')}" for key in keys) for f in flat]
     if len(set(told)) == len(told) and max(map(len, told)) <= LONGEST_DIFFERENCE:

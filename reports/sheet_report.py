@@ -27,7 +27,7 @@ def write_contact_sheet(run_folder: Path, frames_per_task: int = FRAMES_PER_TASK
         for key in evenly_spaced(data.keys(task), frames_per_task)
     ]
     protocols = ", ".join(
-        f"{identifier} ({data.manifest['protocols'][task]['hash']})"
+        f"{identifier} ({data.manifest.protocols[task].hash})"
         for task, identifier in data.protocol_ids.items()
     )
     path = data.folder.contact_sheet

@@ -8,7 +8,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from ..bench.errors import InputError
-from ..bench.files import write_text
+from ..bench.files import grouped_writes, write_text
 from .csv_table import to_csv
 from .html_table import to_html
 from .latex import to_latex
@@ -42,10 +42,11 @@ def write_tables(run_folder: Path) -> list[Path]:
     files = []
     for layout in layouts(runs):
         table = table_of(runs, layout)
-        for suffix, write in WRITERS.values():
-            path = runs.runs[0].folder.tables / f"{layout}.{suffix}"
-            write_text(path, write(table))
-            files.append(path)
+        with grouped_writes():
+            for suffix, write in WRITERS.values():
+                path = runs.runs[0].folder.tables / f"{layout}.{suffix}"
+                write_text(path, write(table))
+                files.append(path)
     return files
 
 

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import pandas as pd
-
-from ..bench.errors import InputError
 from ..bench.protocol import TASK_TITLES
+from ..bench.rows import ALL, Rows
 from ..bench.scoring import FULL
 from ..bench.specs import MetricSpec
-from .aggregate import Aggregate, check_rows, summarise, task_frames
+from .aggregate import Aggregate, summarise
 from .ranking import best_of_column, marking, ranked
 from .table_model import Column, Table, TableCell, TableRow, TaskSummary
 
@@ -20,7 +18,7 @@ FLOOR_TITLE = "Floor (not ranked)"
 
 
 def build_table(
-    rows: pd.DataFrame,
+    rows: Rows,
     metrics: Sequence[MetricSpec],
     methods: Sequence[str],
     *,
@@ -39,7 +37,6 @@ def build_table(
 
     Parameters
     ----------
-    rows : columns as in `headbench.bench.store.Row`.
     metrics : columns of the table, in order; those per frame appear once in each task, the others last.
     methods : in order; one without rows is shown as not measured.
     trivial : those of ``methods`` that are floors: listed apart, not ranked.
@@ -53,22 +50,21 @@ def build_table(
     ------
     InputError : rows that lack a column, repeat a frame, have an undefined value, or mix protocols in a task.
     """
-    rows = rows[rows["region"] == region] if "region" in rows.columns else rows
-    check_rows(rows)
-    present = set(rows["task"]) - {""}
+    rows.check()
+    rows.check_protocols("rows")
+    present = rows.tasks
     known = [task for task in TASK_TITLES if task in present]
     tasks = [*known, *sorted(present - set(known))] if tasks is None else tasks
     columns = _columns(metrics, tasks, avatar_title)
-    summaries = [_task_summary(rows, task, (protocol_ids or {}).get(task, "")) for task in tasks]
+    summaries = [_task_summary(rows, task, region, (protocol_ids or {}).get(task, "")) for task in tasks]
 
     notes: list[str] = []
     lines: list[TableRow] = []
     for method in methods:
-        own = rows[rows["method"] == method]
-        cells = tuple(_cell(summarise(rows, own, c.task, c.metric), c.digits, notes) for c in columns)
-        versions = sorted(set(own["version"].astype(str)))
-        lines.append(TableRow(method, ", ".join(versions), method in trivial, cells))
-    markings = [best_of_column(rows, lines, index, column) for index, column in enumerate(columns)]
+        found = (summarise(rows, method=method, metric=c.metric, task=c.task, region=region) for c in columns)
+        cells = tuple(_cell(aggregate, c.digits, notes) for aggregate, c in zip(found, columns))
+        lines.append(TableRow(method, ", ".join(rows.versions(method)), method in trivial, cells))
+    markings = [best_of_column(rows, lines, index, column, region) for index, column in enumerate(columns)]
     lines = ranked(lines, columns, markings)
     groups = (
         (METHODS_TITLE, tuple(line for line in lines if not line.trivial)),
@@ -79,7 +75,7 @@ def build_table(
         groups=tuple((title, members) for title, members in groups if members),
         notes=tuple(notes),
         tasks=tuple(summaries),
-        seeds=max(1, rows["seed"].nunique()),
+        seeds=max(1, len(rows.seeds(ALL))),
         marking=marking(columns, lines, markings),
         image_size=image_size,
         machine=machine,
@@ -96,20 +92,11 @@ def _columns(metrics: Sequence[MetricSpec], tasks: Sequence[str], avatar_title: 
     return (*per_frame, *(column(m, "", avatar_title) for m in metrics if not m.per_frame))
 
 
-def _task_summary(rows: pd.DataFrame, task: str, protocol_id: str) -> TaskSummary:
-    hashes = sorted(set(rows.loc[rows["task"] == task, "protocol"]))
-    if len(hashes) > 1:
-        raise InputError(
-            "rows",
-            f"protocol of {task}",
-            "one protocol: numbers of different protocols do not compare",
-            ", ".join(hashes),
-            "Make one table for each protocol.",
-        )
-    frames = task_frames(rows, task)
+def _task_summary(rows: Rows, task: str, region: str, protocol_id: str) -> TaskSummary:
+    frames = rows.frames(task, region)
     subjects = {key[0] for key in frames}
     title = TASK_TITLES.get(task, task)
-    return TaskSummary(task, title, protocol_id, "".join(hashes), len(frames), len(subjects))
+    return TaskSummary(task, title, protocol_id, "".join(rows.protocols(task)), len(frames), len(subjects))
 
 
 def _cell(aggregate: Aggregate, digits: int, notes: list[str]) -> TableCell:

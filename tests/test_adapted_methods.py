@@ -4,13 +4,14 @@ import dataclasses
 import sys
 from types import ModuleType
 
+import pandas as pd
 import pytest
 
 from headbench.bench import runner
 from headbench.bench.frames import read_png
 from headbench.bench.run_config import RunConfig
 from headbench.bench.specs import ResolutionRule
-from headbench.bench.store import RunFolder, keys_of
+from headbench.bench.store import RunFolder
 from headbench.methods.specs import MEAN_IMAGE
 
 from .datasets.tiny_capture import write_tiny_capture
@@ -34,7 +35,7 @@ def run(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(sys.modules, module.__name__, module)
         patch.setattr(runner, "write_reports", lambda out: [])
-        rows = runner.run(
+        runner.run(
             RunConfig(
                 data=str(capture.union),
                 out=str(folder / "out"),
@@ -43,7 +44,8 @@ def run(tmp_path_factory):
                 metrics=("psnr",),
             )
         )
-    return RunFolder(folder / "out"), rows
+    run = RunFolder(folder / "out")
+    return run, pd.read_parquet(run.rows)
 
 
 def values(rows, method):
@@ -72,19 +74,17 @@ def test_a_detour_over_another_size_costs_little(run, name):
 @pytest.mark.parametrize("name", ["mean-image", "video", "square", "both"])
 def test_every_render_has_the_size_of_the_protocol(run, name):
     folder, _ = run
-    record = folder.read_manifest()
-    assert record["protocols"]["novel_view"]["resolution"] == "48x64"
+    protocols = folder.read_manifest().protocols
+    assert protocols["novel_view"].resolution == "48x64"
     cell = folder.cell("901", name, 0)
-    for task in record["protocols"]:
-        for key in keys_of(record, task):
+    for task, protocol in protocols.items():
+        for key in protocol.keys:
             assert read_png(cell.render(task, key)).shape == (64, 48, 3)
 
 
 def test_the_manifest_tells_how_each_form_came_about(run):
     folder, _ = run
-    steps = {
-        form["method"]: [step["name"] for step in form["steps"]] for form in folder.read_manifest()["adapted"]
-    }
+    steps = {form.method: [step["name"] for step in form.steps] for form in folder.read_manifest().adapted}
     assert steps == {
         "video": ["as_single_video"],
         "square": ["align_resolution"],

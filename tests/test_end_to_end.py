@@ -1,19 +1,27 @@
-"""The main job on real input, small: a path-traced capture, all methods, every metric, tables and pictures."""
+"""The main job on real input, small: a path-traced capture, all methods, every metric, tables and pictures.
+
+Then every command that the command line lists, over the folder of that run and from another directory.
+"""
 
 import json
 import random
+import re
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
+import pandas as pd
 import pytest
 
 from headbench.bench import cli
+from headbench.bench.documents import read_json
+from headbench.bench.registry import SPEC_TYPES, discover
 from headbench.bench.run_config import RunConfig, resolve_metrics
-from headbench.bench.store import RunFolder, read_rows
+from headbench.bench.store import RunFolder
 
 TINY = ("--preset", "smoke", "--set", "frames_per_task=3")
 METHODS = {"mean-image", "nearest-camera", "ga", "gbs", "gha", "insta", "ours"}
@@ -21,22 +29,24 @@ METHODS = {"mean-image", "nearest-camera", "ga", "gbs", "gha", "insta", "ours"}
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """The folder of one small comparison from nothing."""
-    out = tmp_path_factory.mktemp("demo")
-    assert cli.main(["demo", "--out", str(out), *TINY]) == 0
-    return RunFolder(out)
+    """The folder of one small comparison from nothing, its paths given from a directory that is left afterwards."""
+    home = tmp_path_factory.mktemp("home")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(home)
+        assert cli.main(["demo", "--out", "demo", *TINY]) == 0
+    return RunFolder(home / "demo")
 
 
 def quality(folder: RunFolder):
     """Rows that must not depend on the machine's load, in one order."""
-    rows = read_rows(folder.rows)
+    rows = pd.read_parquet(folder.rows)
     columns = ["method", "task", "subject", "sequence", "timestep", "camera", "metric"]
     machine_bound = {s.name for s in resolve_metrics(RunConfig("", "")) if "speed" in s.tables or s.training}
     return rows[~rows["metric"].isin(machine_bound)].sort_values(columns).reset_index(drop=True)
 
 
 def test_every_cell_of_the_comparison_is_there(run):
-    rows = read_rows(run.rows)
+    rows = pd.read_parquet(run.rows)
     assert set(rows["method"]) == METHODS
     assert set(rows["metric"]) == {s.name for s in resolve_metrics(RunConfig("", ""))}
     measured = rows[rows["metric"] != "lpips"]  # whose weights may not be at hand
@@ -53,7 +63,7 @@ def test_every_cell_of_the_comparison_is_there(run):
 
 
 def test_trained_methods_beat_the_mean_image_even_after_seconds(run):
-    rows = read_rows(run.rows)
+    rows = pd.read_parquet(run.rows)
     psnr = rows[(rows["metric"] == "psnr") & (rows["task"] == "novel_view") & (rows["region"] == "full")]
     means = psnr.groupby("method")["value"].mean()
     assert means["ga"] > means["mean-image"] + 1
@@ -76,7 +86,7 @@ def test_tables_and_pictures_are_left_to_look_at(run, capsys):
 
 
 def test_the_manifest_lets_one_repeat_it(run):
-    record = run.read_manifest()
+    record = read_json(run.manifest)
     assert record["status"] == "done"
     assert record["peak_memory_bytes"] > 0
     for protocol in record["protocols"].values():
@@ -84,8 +94,9 @@ def test_the_manifest_lets_one_repeat_it(run):
         assert not {tuple(k) for k in protocol["keys"]} & {tuple(k) for k, _ in protocol["excluded"]}
 
 
-def test_the_result_is_there_for_machines(run, capsys):
-    assert cli.main(["demo", "--out", str(run.root), *TINY, "--json"]) == 0
+def test_the_result_is_there_for_machines(run, capsys, monkeypatch):
+    monkeypatch.chdir(run.root.parent)
+    assert cli.main(["demo", "--out", run.root.name, *TINY, "--json"]) == 0
     means = json.loads(capsys.readouterr().out)["means"]
     assert {entry["method"] for entry in means} == METHODS
 
@@ -107,3 +118,171 @@ def test_killed_at_random_moments_it_ends_with_the_same_numbers(run, tmp_path):
     resumed, whole = quality(RunFolder(tmp_path / "demo")), quality(run)
     assert resumed.equals(whole)
     assert Path(tmp_path / "demo" / "contact_sheet.png").read_bytes() == run.contact_sheet.read_bytes()
+
+
+LAYOUTS = ("speed", "cost", "paper-1", "paper-3", "paper-4")
+FORMATS = {
+    "md": r"(?i)\| ours +\|",
+    "csv": "(?im)^ours",
+    "latex": r"\\toprule",
+    "html": "<table",
+    "json": '(?i)"ours"',
+}
+
+
+class Case(NamedTuple):
+    """A command line, what it prints (a pattern), the files it leaves in the directory, and its exit code."""
+
+    words: str
+    prints: str
+    leaves: tuple[str, ...] = ()
+    code: int = 0
+
+
+OTHERS = "synth --out others --subjects 2 --cameras 2 --timesteps 4 --size 24x32"
+PLAIN = "run --data {capture} --out plain --methods mean-image,nearest-camera --preset smoke --set metrics=psnr,ssim --set frames_per_task=3"
+GATE = "gate plain --baseline baseline.json"
+RECORD = "record nersemble {capture} --out recording"
+PREPARE = "prepare nersemble --root recording/recording --tracking recording/tracking --head recording/head_model.npz"
+
+# In the order in which they run: some need what an earlier one left.
+CASES = {
+    "demo": [
+        Case(
+            "demo --out mini --preset smoke --set methods=mean-image --set metrics=psnr "
+            "--set capture.cameras=2 --set capture.timesteps=4",
+            r"\| mean-image",
+            ("mini/run.json", "mini/contact_sheet.png"),
+        )
+    ],
+    "synth": [Case(OTHERS, "others", ("others/synthesis.json",))],
+    "run": [Case(PLAIN, r"\| nearest-camera", ("plain/rows.parquet", "plain/tables/comparison.md"))],
+    "list": [Case(f"list {what}", r"\w") for what in (*SPEC_TYPES, "presets")],
+    "table": [
+        *(Case(f"table {{demo}} --format {name}", mark) for name, mark in FORMATS.items()),
+        *(Case(f"table {{demo}} --layout {layout}", FORMATS["md"]) for layout in LAYOUTS),
+        *(Case(f"table {{demo}} --layout {layout} --format csv", FORMATS["csv"]) for layout in LAYOUTS),
+        Case("table {demo} --layout paper-4 --published", "Published"),
+        Case("table {demo} plain", "one seed"),
+    ],
+    "verify": [Case("verify {demo}", "as recorded")],
+    "compare": [
+        Case("compare {demo} --metrics psnr", "ga +ours"),
+        Case("compare {demo} --metrics psnr ssim --against ours --floors --format csv", "ours"),
+    ],
+    "evaluate": [
+        Case(
+            "evaluate {demo}/{subject}/ours/seed-0 --like {demo} --out theirs --label theirs",
+            r"\| theirs",
+            ("theirs/run.json",),
+        )
+    ],
+    "gate": [
+        Case("gate {demo} --baseline demo.json --update", "numbers written", ("demo.json",)),
+        Case("gate {demo} --baseline demo.json", "nothing got worse"),
+        Case(f"{GATE} --update", "numbers written", ("baseline.json",)),
+        Case(f"{GATE} --junit gate.xml --markdown gate.md", "(?i)pass|nothing", ("gate.xml", "gate.md")),
+    ],
+    "pareto": [
+        Case("pareto {demo} --out front", r"(?m)^ours", ("front/points.csv", "front/pareto.png")),
+        Case("pareto {demo} --out front --task self_reenactment --metric ssim --time processor_time", "ours"),
+    ],
+    "sweep": [
+        Case(
+            "sweep {demo} --out swept --methods ga --variants half --frames 1",
+            r"ga\+half",
+            ("swept/points.csv",),
+        ),
+        Case("table swept --layout speed", r"ga\+half"),
+    ],
+    "extremes": [
+        Case(
+            "extremes {demo} --out extremes --views 2 --dimensions 1 --sigmas 1",
+            "(?s)ga .*gbs .*gha .*insta .*ours ",
+            ("extremes/contact_sheet.png",),
+        )
+    ],
+    "reenact": [
+        Case(
+            "reenact {demo} --source others --out reenacted --frames 1",
+            "(?s)ga .*gbs .*gha .*insta .*ours ",
+            ("reenacted/contact_sheet.png",),
+        )
+    ],
+    "compact": [
+        Case(
+            "compact {demo}/{subject}/ours/seed-0/avatar --out compact",
+            "all",
+            ("compact/compact.safetensors",),
+        )
+    ],
+    "export ply": [
+        Case(
+            f"export ply {{demo}}/{{subject}}/{name}/seed-0/avatar --out {name}.ply",
+            "splats",
+            (f"{name}.ply",),
+        )
+        for name in ("ours", "ga")
+    ],
+    "import ga": [
+        Case(
+            "import ga {demo}/{subject}/ga/seed-0/avatar/point_cloud.ply --capture {capture} --out imported",
+            "splats on",
+            ("imported/point_cloud.ply",),
+        )
+    ],
+    "export colmap": [
+        Case("export colmap {capture} --out colmap", "points", ("colmap/sparse/0/points3D.bin",))
+    ],
+    "check-plugin": [
+        Case("check-plugin mean-image --data {capture}", "keeps its contract"),
+        Case("check-plugin psnr", "keeps its contract"),
+    ],
+    "lint": [Case("lint {capture}", "HB110"), Case("lint --list", "HB101")],
+    "inspect": [Case("inspect {capture} --out inspected", "head model", ("inspected/inspection.png",))],
+    "steps": [Case("steps {capture} --out steps", "jaw bases", ("steps/jaw_bases.png", "steps/steps.json"))],
+    "tongue": [Case("tongue {capture} --out tongue", "left out", ("tongue/tongue.yaml",))],
+    "refit": [
+        Case("refit {capture} --target 2020 --out refitted", "neutral head", ("refitted/heat_map.png",))
+    ],
+    "record nersemble": [Case(RECORD, "Prepare it", ("recording/head_model.npz",))],
+    "prepare nersemble": [
+        Case(
+            f"{PREPARE} --subjects {{subject}} --sequences all --downscale 1 --out prepared",
+            "FREE",
+            ("prepared",),
+        )
+    ],
+    "bench": [Case("bench splats --quick --tradeoffs --out bench.json", "knob", ("bench.json",))],
+    "stress": [Case("stress statistics --quick --json", "trials")],
+}
+
+
+@pytest.fixture(scope="module")
+def elsewhere(tmp_path_factory):
+    """The directory that commands run in: neither that of the run nor one above it."""
+    return tmp_path_factory.mktemp("elsewhere")
+
+
+def test_every_listed_command_has_a_case(capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["--help"])
+    listed = set(re.findall(r"•\s+([\w-]+)", capsys.readouterr().out))
+    offered = {plugin.spec.name for plugin in discover("commands").values() if plugin.spec is not None}
+    assert set(CASES) == offered | set(cli.COMMANDS)
+    assert {name.split()[0] for name in CASES} == listed
+
+
+@pytest.mark.parametrize("command", CASES)
+def test_the_command_works_from_another_directory(command, run, elsewhere, monkeypatch, capsys):
+    monkeypatch.chdir(elsewhere)
+    (union,) = (run.root / "capture").glob("UNION*")
+    places = {"demo": run.root, "capture": union, "subject": union.name.rpartition("_")[2]}
+    for case in CASES[command]:
+        words = case.words.format(**places).split()
+        code = cli.main(words)
+        printed = capsys.readouterr()
+        assert code == case.code, printed.err
+        assert re.search(case.prints, printed.out), printed.out
+        for name in case.leaves:
+            assert (elsewhere / name).stat().st_size > 0

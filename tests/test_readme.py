@@ -1,14 +1,15 @@
 """The README keeps its word: its links lead somewhere, its example is a method, its commands exist."""
 
 import re
+import subprocess
+import tomllib
 from pathlib import Path
 
 import pytest
+import yaml
 
 from headbench.bench.cli import COMMANDS
-from headbench.bench.conformance import check_method
-from headbench.bench.registry import discover, get
-from headbench.bench.run_config import resolve_method
+from headbench.bench.registry import discover
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -20,24 +21,67 @@ def test_links_lead_somewhere(link):
     assert (ROOT / link).exists()
 
 
-def test_the_example_method_keeps_the_contract(monkeypatch, tmp_path):
-    code = re.search(r"```python\n(# grey\.py\n.*?)```", README, re.DOTALL)
-    assert code is not None
-    (tmp_path / "grey.py").write_text(code[1])
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.syspath_prepend(ROOT / "tests" / "bench")
-    from toy_plugin import ToyClip
-
-    method = resolve_method(get("methods", "grey:SPEC"), "demo", {})
-    assert check_method(method, ToyClip(tmp_path / "subject1"), tmp_path / "out") == []
-
-
 def test_the_commands_are_those_of_the_command_line():
-    named = set(re.findall(r"^\| `headbench ([a-z]+(?: [a-z]+)?)(?: [A-Z]+)?`", README, re.MULTILINE))
+    named = set(re.findall(r"^\| `headbench ([a-z-]+(?: [a-z]+)?)(?: [A-Z]+)?`", README, re.MULTILINE))
     offered = {
         plugin.spec.name for plugin in discover("commands").values() if plugin.origin.startswith("headbench ")
     }
     assert named == set(COMMANDS) | offered
+
+
+def test_the_ci_example_installs_from_checkouts():
+    block = re.search(r"```yaml\n(# \.github/workflows.*?)```", README, re.DOTALL)
+    steps = yaml.safe_load(block[1])["jobs"]["quality"]["steps"]
+    checked_out = {
+        step.get("with", {}).get("path", ".") for step in steps if "checkout" in step.get("uses", "")
+    }
+    installs = [step["run"].split() for step in steps if step.get("run", "").startswith("pip install")]
+    for words in installs:
+        sources = words[2 : words.index("-c")]
+        assert {source.removeprefix("./") for source in sources} <= checked_out
+        assert (ROOT / words[-1].removeprefix("headbench/")).is_file()
+    used = {step["run"].split()[1] for step in steps if step.get("run", "").startswith("headbench ")}
+    assert used <= set(COMMANDS) | {plugin.name for plugin in discover("commands").values()}
+
+
+def test_a_release_names_its_address_and_has_absolute_links(tmp_path):
+    subprocess.run(
+        ["make", "-s", "release-source", f"RELEASE={tmp_path}/r", "URL=https://example.org/me/headbench"],
+        cwd=ROOT,
+        check=True,
+    )
+    readme, project = ((tmp_path / "r" / name).read_text("utf-8") for name in ("README.md", "pyproject.toml"))
+    links = re.findall(r"\]\(([^)#]+)\)", readme)
+    assert links
+    assert [link for link in links if "://" not in link] == []
+    assert "/raw/HEAD/reports/gallery/contact_sheet.jpg" in readme
+    assert tomllib.loads(project)["project"]["urls"]["Repository"] == "https://example.org/me/headbench"
+
+
+def test_the_citation_has_the_version_of_the_package():
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert {"cff-version", "message", "title", "authors"} <= set(citation)
+    assert (citation["version"], citation["license"]) == (project["version"], project["license"])
+
+
+def test_the_container_copies_every_package_and_no_more():
+    lines = (ROOT / "Containerfile").read_text(encoding="utf-8").splitlines()
+    copied = {word for line in lines if line.startswith("COPY") for word in line.split()[1:-1]}
+    packages = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["scikit-build"]["wheel"][
+        "packages"
+    ]
+    files = {
+        "CMakeLists.txt",
+        "LICENSE",
+        "README.md",
+        "__init__.py",
+        "py.typed",
+        "pyproject.toml",
+        "constraints.txt",
+    }
+    assert copied == set(packages.values()) | files
+    assert all((ROOT / name).exists() for name in copied)
 
 
 def test_make_targets_exist():

@@ -7,23 +7,21 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import pandas as pd
-
-from ..captures import open_clips
-from ..contracts import Avatar, Budget, Camera, Frame, FrameKey, HeadPose, Progress, no_progress
+from ..captures import open_clips, open_run_clips
+from ..contracts import Avatar, Budget, Camera, Clip, Frame, FrameKey, HeadPose, Progress, no_progress
 from ..errors import HeadbenchError, InputError
-from ..files import atomic_path, check_name, digest, digest_file
+from ..files import atomic_path, check_name, digest, digest_file, grouped_writes
 from ..lock import locked
 from ..protocol import Protocol, make_protocol
 from ..registry import discover, get, resolve
-from ..robustness.avatars import run_configuration
+from ..rows import Rows
 from ..run_config import ResolvedMethod, RunConfig, resolve_metrics
+from ..run_options import RunOptions
 from ..runner import describe, make_jobs, write_reports
 from ..scoring import check_regions
 from ..specs import Findings, MethodSpec
-from ..stages import Job, measure
-from ..store import RunFolder, write_rows
-from .digests import record_digests
+from ..stages import DIGESTS, Job, measure
+from ..store import RunFolder
 from .folder_images import find_images
 from .settings import EvaluateSettings
 
@@ -52,11 +50,10 @@ def run(settings: EvaluateSettings, progress: Progress = no_progress) -> Finding
 
     Raises `InputError` for whatever is wrong with settings, capture or images, before anything is written.
     """
-    config = _configuration(settings)
+    config, clips = _opened(settings)
     metrics = [metric for metric in resolve_metrics(config) if metric.per_frame]
     if not metrics:
         raise InputError("metrics", "", "at least one metric of frames", ", ".join(config.metrics))
-    clips = open_clips(config)
     protocols: dict[str, Protocol] = {
         task: make_protocol(task, clips, config.frames_per_task) for task in config.tasks
     }
@@ -69,18 +66,19 @@ def run(settings: EvaluateSettings, progress: Progress = no_progress) -> Finding
         regions = {clip.subject: check_regions(clip, config.regions) for clip in clips}
         jobs = make_jobs(config, [method], clips, protocols, folder, {}, regions)
         manifest = describe(config, [method], metrics, clips, protocols)
-        manifest["evaluated"] = str(Path(settings.folder))
-        folder.write_manifest({**manifest, "status": "started"})
+        manifest = replace(manifest, evaluated=str(Path(settings.folder)))
+        manifest.write(folder.manifest)
         parts = []
         avatar: Avatar = NoAvatar()
         for index, job in enumerate(jobs):
+            job.check()
             _copy(images, job)
+            job.cell.finish(DIGESTS, job.fit_fingerprint, files=job.cell.digests(job.frame_paths))
             parts.append(measure(job, avatar, metrics))
-            record_digests(job, avatar)
             progress(index + 1, len(jobs), job.name)
-        rows = pd.concat(parts, ignore_index=True)
-        write_rows(folder.rows, rows)
-        folder.write_manifest({**manifest, "status": "done"})
+        rows = Rows.joined(parts)
+        rows.write(folder.rows)
+        replace(manifest, status="done").write(folder.manifest)
         write_reports(folder.root)
     together = [*([Path(settings.like)] if settings.like else []), folder.root]
     text = resolve(get("reports", "table-text").implementation)(together, "md")
@@ -88,14 +86,17 @@ def run(settings: EvaluateSettings, progress: Progress = no_progress) -> Finding
     return Findings(f"{text}\n{folder.root}", data)
 
 
-def _configuration(settings: EvaluateSettings) -> RunConfig:
+def _opened(settings: EvaluateSettings) -> tuple[RunConfig, list[Clip]]:
+    """The settings to score by, and the captures to score against."""
     label = check_name(settings.label, "command line", "--label")
     if label in discover("methods"):
         expected = "a name that no registered method has"
         raise InputError("command line", "--label", expected, repr(label), f"For example {label}-official.")
+    if Path(settings.out).resolve() == Path(settings.like or "").resolve():
+        raise InputError("command line", "--out", "a folder of its own", "that of the run")
     if settings.like is not None:
-        config = run_configuration(Path(settings.like))
-        config = replace(config, data=settings.clip or config.data)
+        options = RunOptions(data=settings.clip, head=settings.head, trust=settings.trust)
+        config, clips = open_run_clips(Path(settings.like), options, altered=settings.clip is not None)
     else:
         config = RunConfig(
             data=str(settings.clip),
@@ -106,18 +107,19 @@ def _configuration(settings: EvaluateSettings) -> RunConfig:
             reader_settings={} if settings.head is None else {"head": settings.head},
             frames_per_task=settings.frames_per_task,
         )
-    if Path(settings.out).resolve() == Path(settings.like or "").resolve():
-        raise InputError("command line", "--out", "a folder of its own", "that of the run")
-    return replace(
+        clips = open_clips(config)
+    config = replace(
         config, out=settings.out, methods=(label,), seeds=(0,), settings={}, heads={}, device="cpu"
     )
+    return config, clips
 
 
 def _copy(images: Mapping[tuple[str, FrameKey], Path], job: Job) -> None:
     """Bring the images of a subject to where a run has its renders."""
-    for (task, key), source in images.items():
-        target = job.cell.render(task, key)
-        if key.subject != job.clip.subject or (target.exists() and target.samefile(source)):
-            continue
-        with atomic_path(target) as temporary:
-            shutil.copyfile(source, temporary)
+    with grouped_writes():
+        for (task, key), source in images.items():
+            target = job.cell.render(task, key)
+            if key.subject != job.clip.subject or (target.exists() and target.samefile(source)):
+                continue
+            with atomic_path(target) as temporary:
+                shutil.copyfile(source, temporary)

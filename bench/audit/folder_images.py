@@ -9,6 +9,7 @@ from PIL import Image, UnidentifiedImageError
 
 from ..contracts import Clip, FrameKey
 from ..errors import InputError
+from ..image_files import probe_image
 from ..protocol import Protocol
 from ..store import Cell
 
@@ -58,6 +59,10 @@ def _places(folder: Path, task: str, key: FrameKey, subjects: int) -> list[Path]
 
 
 def _check(path: Path, size: tuple[int, int]) -> None:
+    info = probe_image(path)  # before Pillow decodes what may be a bomb
+    if (info.width, info.height) != size:
+        expected, found = ("{} x {} pixels".format(*pair) for pair in (size, (info.width, info.height)))
+        raise InputError(path, "size", f"{expected}, as the ground truth", found)
     try:
         with Image.open(path) as image:
             if image.format != "PNG":
@@ -67,8 +72,5 @@ def _check(path: Path, size: tuple[int, int]) -> None:
                 raise InputError(path, "alpha", "an opaque image", "transparent pixels", remedy)
             if image.mode not in ("RGB", "RGBA"):
                 raise InputError(path, "mode", "8-bit RGB", str(image.mode))
-            if image.size != size:
-                expected, found = ("{} x {} pixels".format(*pair) for pair in (size, image.size))
-                raise InputError(path, "size", f"{expected}, as the truth", found)
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
         raise InputError(path, "", "a PNG image", f"a file that cannot be read ({error})") from error

@@ -7,17 +7,18 @@ from dataclasses import dataclass
 import tyro
 
 from ..contracts import TaskName
+from ..run_options import RunOptions
 
 
 @dataclass(frozen=True)
-class VerifySettings:
-    """Recompute a run's hashes and metrics from the files it left; exit code 1 where anything differs."""
+class VerifySettings(RunOptions):
+    """Recompute a run's hashes and metrics from the files it left.
+
+    Exit code 0: as recorded; 1: something differs; 2: wrong usage; 3: the run or its capture is missing or invalid.
+    """
 
     run: tyro.conf.Positional[str]
     """Folder of a finished run, or of `headbench evaluate`."""
-
-    data: str | None = None
-    """The capture, where it was moved since the run."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,10 @@ class EvaluateSettings:
 
     head: str | None = None
     """Head model for captures that bring none: FLAME pickle or npz."""
+
+    trust: bool = False
+    """With --like, import the modules that the run folder names for metrics and readers which are not registered; they
+    can run any code."""
 
     frames_per_task: int | None = None
     """Score at most so many frames per subject and task, evenly spaced, as the run compared with did."""

@@ -2,32 +2,33 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
-from ..captures import open_clips
-from ..contracts import Avatar, Clip, Progress, no_progress
-from ..errors import HeadbenchError, InputError
-from ..files import digest_file, plain
+from ..captures import open_run_clips
+from ..contracts import Avatar, Clip, FrameKey, Progress, no_progress
+from ..errors import ExitCode, HeadbenchError, InputError
+from ..files import digest_file
+from ..frames import read_png
+from ..manifest import Manifest, ProtocolRecord
 from ..protocol import Protocol, make_protocol
-from ..robustness.avatars import load, run_configuration
+from ..robustness.avatars import load
+from ..rows import ALL, FRAME, Rows
 from ..run_config import ResolvedMethod, RunConfig, resolve_methods, resolve_metrics
 from ..runner import adapt, make_jobs
 from ..scoring import check_regions
 from ..specs import Findings, MetricSpec
-from ..stages import Job, measure
-from ..store import Cell, RunFolder, check_protocols, read_rows
-from .digests import STAGE, frame_paths
+from ..stages import DIGESTS, Job, measure, recorded_frames
+from ..store import Cell, RunFolder
 from .evaluate import NoAvatar, images_method
 from .settings import VerifySettings
 
-KEY = ["method", "seed", "task", "subject", "sequence", "timestep", "camera", "region", "metric"]
+KEY = ["method", "seed", "task", *FRAME, "region", "metric"]
 SHOWN = 20
 
 
@@ -62,27 +63,29 @@ def run(settings: VerifySettings, progress: Progress = no_progress) -> Findings:
     digests of frames and avatar files, every metric of frames and those of avatars that are not bound to a machine.
     A value may differ by a tenth of the last digit that tables show, for networks that round otherwise elsewhere.
 
-    Raises `InputError` for a folder that is no finished run, and a capture that cannot be opened.
+    A folder that is no finished run, and a capture that cannot be opened, are a finding too, with exit code 3.
     """
+    try:
+        return _verify(settings, progress)
+    except InputError as error:
+        text = f"Verify: missing or invalid: {error}"
+        return Findings(text, {"error": str(error)}, False, ExitCode.NO_VERDICT)
+
+
+def _verify(settings: VerifySettings, progress: Progress) -> Findings:
     folder = RunFolder(Path(settings.run))
     manifest = folder.read_manifest()
-    if manifest.get("status") != "done":
-        raise InputError(
-            folder.manifest, "status", "'done'", repr(manifest.get("status")), "Start the run again."
-        )
-    config = run_configuration(folder.root)
-    if settings.data is not None:
-        config = replace(config, data=settings.data)
-    rows = read_rows(folder.rows)
+    manifest.check_done(folder.manifest)
+    config, clips = open_run_clips(folder.root, settings, altered=True, remembered=False)
+    rows = folder.read_rows(manifest)
     methods = _methods(config, manifest)
     metrics = resolve_metrics(config) if _has_avatars(methods) else _of_frames(resolve_metrics(config))
-    clips = open_clips(config)
     protocols: dict[str, Protocol] = {
         task: make_protocol(task, clips, config.frames_per_task) for task in config.tasks
     }
     report = _Report([*_clips(folder, manifest, clips), *_protocols(folder, manifest, protocols)])
     if not report.mismatches:
-        check_protocols(rows, folder.rows, {task: protocol.hash for task, protocol in protocols.items()})
+        rows.check_protocols(folder.rows, {task: protocol.hash for task, protocol in protocols.items()})
         regions = {clip.subject: check_regions(clip, config.regions) for clip in clips}
         adapted = adapt(clips, methods, config, folder) if _has_avatars(methods) else {}
         jobs = make_jobs(config, methods, clips, protocols, folder, adapted, regions)
@@ -107,11 +110,10 @@ def run(settings: VerifySettings, progress: Progress = no_progress) -> Findings:
     return Findings(text, data, not report.mismatches)
 
 
-def _methods(config: RunConfig, manifest: Mapping[str, Any]) -> list[ResolvedMethod]:
-    entries = manifest["methods"]
-    if any(entry["implementation"] for entry in entries):
+def _methods(config: RunConfig, manifest: Manifest) -> list[ResolvedMethod]:
+    if any(method.implementation for method in manifest.methods):
         return resolve_methods(config)
-    return [images_method(str(entry["name"]), str(entry["version"])) for entry in entries]
+    return [images_method(method.name, method.version) for method in manifest.methods]
 
 
 def _has_avatars(methods: Sequence[ResolvedMethod]) -> bool:
@@ -122,73 +124,83 @@ def _of_frames(metrics: Sequence[MetricSpec]) -> list[MetricSpec]:
     return [metric for metric in metrics if metric.per_frame]
 
 
-def _clips(folder: RunFolder, manifest: Mapping[str, Any], clips: Sequence[Clip]) -> Iterator[Mismatch]:
+def _clips(folder: RunFolder, manifest: Manifest, clips: Sequence[Clip]) -> Iterator[Mismatch]:
     found = {clip.subject: clip.fingerprint for clip in clips}
-    for entry in manifest["clips"]:
-        subject, expected = str(entry["subject"]), str(entry["fingerprint"])
+    for entry in manifest.clips:
+        subject, expected = entry.subject, entry.fingerprint
         if found.get(subject) != expected:
             there = found.get(subject, "no such capture")
             yield Mismatch(folder.manifest, f"clips, fingerprint of {subject}", expected[:12], there[:12])
 
 
 def _protocols(
-    folder: RunFolder, manifest: Mapping[str, Any], protocols: Mapping[str, Protocol]
+    folder: RunFolder, manifest: Manifest, protocols: Mapping[str, Protocol]
 ) -> Iterator[Mismatch]:
     """The recorded protocols, field by field, against those that captures and settings give."""
     for task, protocol in protocols.items():
-        wanted = {"id": protocol.id, "hash": protocol.hash, **asdict(protocol)}
-        expected = json.loads(json.dumps(wanted, default=plain))
-        recorded = manifest["protocols"].get(task, {})
-        for name, value in expected.items():
-            if recorded.get(name) != value:
-                key = f"protocols.{task}.{name}"
-                yield Mismatch(folder.manifest, key, _short(value), _short(recorded.get(name)))
+        wanted, recorded = ProtocolRecord.of(protocol), manifest.protocols.get(task)
+        for name in (field.name for field in fields(wanted)):
+            value, found = getattr(wanted, name), getattr(recorded, name, None)
+            if found != value:
+                yield Mismatch(folder.manifest, f"protocols.{task}.{name}", _short(value), _short(found))
 
 
-def _verify_cell(
-    job: Job, metrics: Sequence[MetricSpec], rows: pd.DataFrame, file: Path, report: _Report
-) -> None:
+def _verify_cell(job: Job, metrics: Sequence[MetricSpec], rows: Rows, file: Path, report: _Report) -> None:
     method = job.method.spec
-    own = rows[
-        (rows["method"] == method.name) & (rows["subject"] == job.clip.subject) & (rows["seed"] == job.seed)
-    ]
+    own = rows.select(
+        method=method.name, metric=ALL, task=ALL, region=ALL, seeds=(job.seed,), subject=job.clip.subject
+    )
     if len(own) and (own["status"] == "failed").all():
         report.unverified += len(own)
         return  # recorded as failed: there is nothing it claims
-    report.mismatches += _files(job, report)
-    missing = [path for path in frame_paths(job) if not path.is_file()]
-    if missing:
-        return  # each is told above
+    state = job.cell.stage("fit")
+    digests = {**({} if state is None else state.get("files", {})), **recorded_frames(job)}
+    found = list(_files(job, digests, report))
+    report.mismatches += found
     if not method.implementation:
         avatar: Avatar = NoAvatar()
     else:
-        state = job.cell.stage("fit") or {}
-        if state.get("fingerprint") != job.fit_fingerprint:
-            found = _short(state.get("fingerprint"))
-            report.mismatches.append(
-                Mismatch(job.cell.folder / "fit.json", "fingerprint", job.fit_fingerprint[:12], found)
-            )
+        made_of = "none" if state is None else state["fingerprint"]
+        if made_of != job.fit_fingerprint:
+            record = job.cell.folder / "fit.json"
+            report.mismatches.append(Mismatch(record, "fingerprint", job.fit_fingerprint[:12], made_of[:12]))
         avatar = load(job)
+        names = [job.cell.name(path) for path in avatar.files() if path.is_relative_to(job.cell.folder)]
+        unknown = [name for name in names if name not in digests]
+        report.mismatches += [
+            Mismatch(job.cell.folder / "fit.json", f"files, {name}", "a digest", "none") for name in unknown
+        ]
+    changed = {mismatch.file for mismatch in found}
+    for path, (_, key) in job.frame_paths.items():
+        suspect = path in changed or job.cell.name(path) not in digests
+        if suspect and not _can_be_scored(job, path, key):
+            return  # told above
     report.mismatches += _values(_measured_anew(job, avatar, metrics), own, metrics, file, report)
 
 
-def _files(job: Job, report: _Report) -> Iterator[Mismatch]:
+def _files(job: Job, digests: Mapping[str, str], report: _Report) -> Iterator[Mismatch]:
     """Digests of frames and avatar files; every scored frame has to have one."""
-    record = job.cell.folder / f"{STAGE}.json"
-    digests = dict((job.cell.stage(STAGE) or {}).get("files", {}))
-    for path in frame_paths(job):
-        name = path.relative_to(job.cell.folder).as_posix()
-        if name not in digests:
-            yield Mismatch(record, f"files, {name}", "a digest", "none")
+    record = job.cell.folder / f"{DIGESTS}.json"
+    for path in job.frame_paths:
+        if job.cell.name(path) not in digests:
+            yield Mismatch(record, f"files, {job.cell.name(path)}", "a digest", "none")
     for name, expected in digests.items():
         path = job.cell.folder / name
         if not path.is_file():
-            yield Mismatch(path, "", f"a file of digest {str(expected)[:12]}", "no such file")
+            yield Mismatch(path, "", f"a file of digest {expected[:12]}", "no such file")
             continue
         report.files += 1
         found = digest_file(path)
         if found != expected:
-            yield Mismatch(path, "digest", str(expected)[:12], found[:12])
+            yield Mismatch(path, "digest", expected[:12], found[:12])
+
+
+def _can_be_scored(job: Job, path: Path, key: FrameKey) -> bool:
+    camera = job.clip.cameras[key.camera]
+    try:
+        return read_png(path).shape == (camera.height, camera.width, 3)
+    except InputError:
+        return False
 
 
 def _measured_anew(job: Job, avatar: Avatar, metrics: Sequence[MetricSpec]) -> pd.DataFrame:
@@ -197,7 +209,8 @@ def _measured_anew(job: Job, avatar: Avatar, metrics: Sequence[MetricSpec]) -> p
     with tempfile.TemporaryDirectory() as name:
         scratch = Cell(Path(name))
         (scratch.folder / "renders").symlink_to((job.cell.folder / "renders").resolve())
-        return measure(replace(job, cell=scratch), avatar, stable)
+        rows = measure(replace(job, cell=scratch), avatar, stable)
+    return rows.select(method=ALL, metric=ALL, task=ALL, region=ALL, seeds=ALL)
 
 
 def _values(

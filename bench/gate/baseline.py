@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, Literal
 
-from ..configuration import build
+from ..documents import checked, read_json, shown
 from ..errors import InputError
-from ..files import read_json, write_json
-from ..specs import MetricSpec
-from .results import Place, ProtocolIdentity, Results
+from ..files import check_name, write_json
+from ..specs import MAX_DIGITS, MetricSpec
+from .results import AVATAR, Place, ProtocolIdentity, Results
 from .settings import Captures
 
-FORMAT = 1
+FORMAT = 2
 LAST_DIGITS = 10
 MACHINE_SHARE = 0.3
 KEPT_DIGITS = 3
@@ -43,6 +43,8 @@ class Tolerance:
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0.0):
                 raise ValueError(f"{name} is {value}; a finite number from 0")
+        if not 0 <= self.digits <= MAX_DIGITS:
+            raise ValueError(f"digits is {self.digits}; from 0 to {MAX_DIGITS}")
 
     @classmethod
     def default(cls, spec: MetricSpec) -> Tolerance:
@@ -58,14 +60,32 @@ class Tolerance:
 
 
 @dataclass(frozen=True)
+class _File:
+    """The file as it stands."""
+
+    format: Literal[2]
+    captures: Captures
+    environment: dict[str, Any]
+    protocols: dict[str, ProtocolIdentity]
+    tolerances: dict[str, Tolerance]
+    count: int
+    values: dict[str, float]
+    unavailable: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class Baseline:
-    """A baseline, read or made from results."""
+    """A baseline, read or made from results.
+
+    ``unavailable`` holds what could not be measured when it was made, with the reason: to lack it is no loss.
+    """
 
     captures: Captures
     environment: Mapping[str, Any]
     protocols: Mapping[str, ProtocolIdentity]
     tolerances: Mapping[str, Tolerance]
     values: Mapping[Place, float]
+    unavailable: Mapping[Place, str] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -73,11 +93,17 @@ class Baseline:
     ) -> Baseline:
         """Make the baseline of some results, with the tolerances of an ``earlier`` one where it has them.
 
-        Raises `InputError` where a number is missing: a baseline with holes would hide what is missing later.
+        Raises `InputError` where a number is missing that could be had: a baseline with holes would hide what is missing
+        later.
         """
         if results.problems or not results.values:
             problem = next(iter(results.problems.items()), ("rows", "no numbers"))
             raise InputError(results.source, str(problem[0]), "a number for everything measured", problem[1])
+        lost = sorted(results.unavailable.keys() & earlier.values.keys()) if earlier else []
+        if lost:
+            remedy = "Install what is missing, or delete the number from the baseline."
+            reason = results.unavailable[lost[0]]
+            raise InputError(results.source, str(lost[0]), "a number, as in the baseline", reason, remedy)
         known = earlier.tolerances if earlier else {}
         metrics = sorted({place.metric for place in results.values})
         return cls(
@@ -86,44 +112,33 @@ class Baseline:
             dict(results.protocols),
             {name: known.get(name) or Tolerance.default(results.metrics[name]) for name in metrics},
             dict(sorted(results.values.items())),
+            dict(sorted(results.unavailable.items())),
         )
 
     @classmethod
     def read(cls, path: Path) -> Baseline:
-        """Read a baseline file. Raises `InputError` naming what is missing or malformed."""
+        """Read a baseline file. Raises `InputError` naming what is missing or malformed.
+
+        A file that holds nothing to judge by, or fewer numbers than it says, would let everything pass.
+        """
         record = read_json(path)
         if record.get("format") != FORMAT:
-            raise InputError(path, "format", str(FORMAT), repr(record.get("format")))
-        parts = {
-            name: _mapping(path, name, record.get(name))
-            for name in ("environment", "protocols", "tolerances", "values")
-        }
-        if record.get("captures") not in get_args(Captures):
-            expected = " or ".join(get_args(Captures))
-            raise InputError(path, "captures", expected, repr(record.get("captures")))
-        protocols = {
-            task: build(
-                ProtocolIdentity, _mapping(path, f"protocols.{task}", value), str(path), f"protocols.{task}."
-            )
-            for task, value in parts["protocols"].items()
-        }
-        tolerances = {
-            name: build(
-                Tolerance, _mapping(path, f"tolerances.{name}", value), str(path), f"tolerances.{name}."
-            )
-            for name, value in parts["tolerances"].items()
-        }
+            remedy = 'Format 1 lacked "count", the number of values.' if record.get("format") == 1 else ""
+            raise InputError(path, "format", str(FORMAT), shown(record.get("format")), remedy)
+        file = checked(record, _File, path)
+        if file.count != len(file.values) or not file.values:
+            expected = f"as many as count says, {file.count}" if file.count > 0 else "at least one number"
+            raise InputError(path, "values", expected, str(len(file.values)))
         values = {}
-        for key, value in parts["values"].items():
-            place = Place.parse(key)
-            if place is None:
-                raise InputError(path, f"values, {key}", "task/method/subject/region/metric", repr(key))
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-                raise InputError(path, f"values, {key}", "a finite number", repr(value))
-            if place.metric not in tolerances:
+        for key, value in file.values.items():
+            place = _place(key, path, "values")
+            if place.metric not in file.tolerances:
                 raise InputError(path, "tolerances", f"an entry {place.metric!r}", "none")
-            values[place] = float(value)
-        return cls(record["captures"], parts["environment"], protocols, tolerances, values)
+            if place.task != AVATAR and place.task not in file.protocols:
+                raise InputError(path, "protocols", f"an entry {place.task!r}", "none")
+            values[place] = value
+        unavailable = {_place(key, path, "unavailable"): why for key, why in file.unavailable.items()}
+        return cls(file.captures, file.environment, file.protocols, file.tolerances, values, unavailable)
 
     def write(self, path: Path) -> None:
         """Write the file. Numbers keep three digits more than tables show, so that a diff shows what has changed."""
@@ -137,6 +152,8 @@ class Baseline:
             "environment": self.environment,
             "protocols": {task: asdict(identity) for task, identity in self.protocols.items()},
             "tolerances": {name: asdict(tolerance) for name, tolerance in self.tolerances.items()},
+            "unavailable": {str(place): reason for place, reason in self.unavailable.items()},
+            "count": len(values),
             "values": values,
         }
         write_json(path, record)
@@ -146,7 +163,10 @@ class Baseline:
         return all(self.environment.get(name) == environment.get(name) for name in MACHINE)
 
 
-def _mapping(path: Path, key: str, value: Any) -> Mapping[str, Any]:
-    if not isinstance(value, dict):
-        raise InputError(path, key, "a JSON object", repr(value)[:60])
-    return value
+def _place(key: str, path: Path, group: str) -> Place:
+    place = Place.parse(key)
+    if place is None:
+        raise InputError(path, f"{group}, {key}", "task/method/subject/region/metric", repr(key))
+    for name in place:
+        check_name(name, path, f"{group}, {key}")
+    return place

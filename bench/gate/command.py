@@ -6,13 +6,13 @@ from dataclasses import asdict
 from pathlib import Path
 
 from ..contracts import Progress, no_progress
-from ..errors import InputError
-from ..files import write_text
+from ..errors import ExitCode, InputError
+from ..files import check_writable, write_text
 from ..specs import Findings
 from .baseline import Baseline
 from .results import read_results
 from .settings import GateSettings
-from .verdicts import INVALID, environment_changes, exit_code, judge
+from .verdicts import environment_changes, exit_code, judge
 from .writers import to_junit, to_markdown, to_text
 
 
@@ -22,13 +22,18 @@ def run(settings: GateSettings, progress: Progress = no_progress) -> Findings:
     Results or a baseline that are missing or invalid are a finding too, with exit code 3, so that CI can tell them
     from a usage error. Nothing is written then but the reports asked for.
     """
+    for option, path in (("--junit", settings.junit), ("--markdown", settings.markdown)):
+        if path is not None:
+            check_writable(Path(path), option)
+            Path(path).unlink(missing_ok=True)  # a report of an earlier run would pass for this one's
+    if settings.update:
+        check_writable(Path(settings.baseline), "--baseline")
     try:
         return _update(settings) if settings.update else _judge(settings)
     except InputError as error:
-        for path in (settings.junit, settings.markdown):
-            if path is not None:
-                Path(path).unlink(missing_ok=True)  # a report of an earlier run would pass for this one's
-        return Findings(f"Gate: missing or invalid: {error}", {"error": str(error)}, False, INVALID)
+        return Findings(
+            f"Gate: missing or invalid: {error}", {"error": str(error)}, False, ExitCode.NO_VERDICT
+        )
 
 
 def _judge(settings: GateSettings) -> Findings:
@@ -38,7 +43,10 @@ def _judge(settings: GateSettings) -> Findings:
     changes = environment_changes(baseline.environment, results.environment)
     notes = [f"Environment changed: {change}." for change in changes]
     if baseline.captures == "remade":
-        notes.append("Captures were made anew for these results, as the baseline declares.")
+        notes.append("Captures were made again for these results, as the baseline declares.")
+    unavailable = results.unavailable.keys() & baseline.unavailable.keys()
+    if unavailable:
+        notes.append(f"Unavailable here as in the baseline: {len(unavailable)} numbers.")
     if any(verdict.outcome in ("improved", "new") for verdict in verdicts) and code == 0:
         notes.append("The baseline can be brought up to date with --update.")
     if settings.junit is not None:
@@ -64,5 +72,6 @@ def _update(settings: GateSettings) -> Findings:
     lines = [f"{path}: {len(baseline.values)} numbers written."]
     lines += [f"  was: {verdict}" for verdict in verdicts if verdict.outcome not in ("pass", "missing")]
     lines += [f"  gone: {place}" for place in gone]
+    lines += [f"  unavailable: {place}: {reason}" for place, reason in baseline.unavailable.items()]
     data = {"baseline": path, "values": len(baseline.values), "gone": [str(place) for place in gone]}
     return Findings("\n".join(lines), data, True, 0)

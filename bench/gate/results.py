@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import pandas as pd
 
-from ..errors import InputError
-from ..files import digest
+from ..rows import ALL, FRAME
 from ..scoring import FULL
 from ..specs import MetricSpec
-from ..store import RunFolder, check_protocols, read_rows
+from ..store import RunFolder
 
 AVATAR = "avatar"
 
@@ -51,7 +51,11 @@ class ProtocolIdentity:
 
 @dataclass(frozen=True)
 class Results:
-    """What was measured, and of what it lacks a number, with the reason."""
+    """What was measured, and of what it lacks a number, with the reason.
+
+    ``unavailable`` numbers are those that no seed could have: an avatar that offers no stage times, a metric whose
+    weights are not installed. ``problems`` are all others.
+    """
 
     source: Path
     values: Mapping[Place, float]
@@ -59,6 +63,7 @@ class Results:
     metrics: Mapping[str, MetricSpec]
     protocols: Mapping[str, ProtocolIdentity]
     environment: Mapping[str, Any] = field(default_factory=dict)
+    unavailable: Mapping[Place, str] = field(default_factory=dict)
 
 
 def read_results(root: Path) -> Results:
@@ -73,50 +78,31 @@ def read_results(root: Path) -> Results:
     """
     folder = RunFolder(root)
     manifest = folder.read_manifest()
-    if manifest.get("status") != "done":
-        remedy = "Start the run again; it continues."
-        raise InputError(folder.manifest, "status", "'done'", repr(manifest.get("status")), remedy)
-    rows = read_rows(folder.rows)
-    try:
-        metrics = {spec.name: spec for spec in map(_metric, manifest["metrics"])}
-        expected = {task: _frames(record) for task, record in manifest["protocols"].items()}
-        protocols = {task: identity(record) for task, record in manifest["protocols"].items()}
-        seeds = {int(seed) for seed in manifest["configuration"]["seeds"]}
-        device = str(manifest["configuration"]["device"])
-        machine = dict(manifest["machine"])
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(folder.manifest, "", "the manifest of a run", f"{error!r}") from error
-    check_protocols(rows, folder.rows, {task: identity.hash for task, identity in protocols.items()})
+    manifest.check_done(folder.manifest)
+    rows = folder.read_rows(manifest)
+    metrics = {spec.name: spec for spec in manifest.metrics}
+    expected = {task: Counter(key.subject for key in p.keys) for task, p in manifest.protocols.items()}
+    protocols = {task: ProtocolIdentity(p.id, p.hash, p.design) for task, p in manifest.protocols.items()}
+    seeds = set(manifest.configuration.seeds)
+    rows.check_protocols(folder.rows, {task: identity.hash for task, identity in protocols.items()})
     values: dict[Place, float] = {}
     problems: dict[Place, str] = {}
+    unavailable: dict[Place, str] = {}
     columns = ["task", "method", "subject", "region", "metric"]
-    for parts, own in rows.groupby(columns, sort=True):
+    every = rows.select(method=ALL, metric=ALL, task=ALL, region=ALL, seeds=ALL)
+    for parts, own in every.groupby(columns, sort=True):
         task, *rest = map(str, parts)
         place = Place(task or AVATAR, *rest)
-        wanted = expected.get(task, {}).get(place.subject, 0) if task else 1
+        wanted = expected[task][place.subject] if task else 1
         reason = _lacking(own, wanted, seeds)
-        if reason:
+        if (own["status"] == "missing").all():
+            unavailable[place] = reason
+        elif reason:
             problems[place] = reason
         else:
             values[place] = _mean(own)
-    return Results(root, values, problems, metrics, protocols, {"device": device, **machine})
-
-
-def identity(record: Mapping[str, Any]) -> ProtocolIdentity:
-    """Identity of a protocol as a manifest records it."""
-    design = {name: value for name, value in record.items() if name not in ("hash", "clips")}
-    return ProtocolIdentity(str(record["id"]), str(record["hash"]), digest(design)[:12])
-
-
-def _metric(record: Mapping[str, Any]) -> MetricSpec:
-    known = {field.name for field in fields(MetricSpec)}
-    return MetricSpec(**{name: value for name, value in record.items() if name in known})
-
-
-def _frames(record: Mapping[str, Any]) -> dict[str, int]:
-    """How many frames of each subject a protocol asks for."""
-    subjects = [str(key[0]) for key in record["keys"]]
-    return {subject: subjects.count(subject) for subject in set(subjects)}
+    environment = {"device": manifest.configuration.device, **manifest.machine}
+    return Results(root, values, problems, metrics, protocols, environment, unavailable)
 
 
 def _lacking(own: pd.DataFrame, frames: int, seeds: set[int]) -> str:
@@ -129,8 +115,8 @@ def _lacking(own: pd.DataFrame, frames: int, seeds: set[int]) -> str:
         return "a value that is not finite"
     regional = (own["region"] != FULL).all()  # seen in some frames only, which ones is the truth's matter
     if regional:
-        frames = own.groupby(["sequence", "timestep", "camera"]).ngroups
-    measured = own.drop_duplicates(["seed", "sequence", "timestep", "camera"])
+        frames = own.groupby(FRAME).ngroups
+    measured = own.drop_duplicates(["seed", *FRAME])
     if len(measured) != len(own):
         return "frames measured twice"
     if set(own["seed"]) != seeds or len(own) != frames * len(seeds):

@@ -28,7 +28,7 @@ class GateSettings:
 
     captures: Captures | None = None
     """With --update: `same` (default) demands the very same captures, by fingerprint, ever after; `remade` is for ones
-    synthesised anew for every run, which differ in last bits between processors: all else must be the same."""
+    synthesised again for every run, whose pictures differ in last bits between processors: all else must be the same."""
 
     junit: str | None = None
     """Also write a JUnit XML file: one test case for every task, method, subject and metric."""

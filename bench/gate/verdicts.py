@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from ..errors import ExitCode
 from ..scoring import FULL
 from .baseline import Baseline, Tolerance
 from .results import Place, Results
@@ -14,8 +15,6 @@ Outcome = Literal["pass", "regressed", "improved", "missing", "new", "unjudged"]
 ORDER: tuple[Outcome, ...] = ("missing", "regressed", "improved", "new", "unjudged", "pass")
 ROUNDING = 1e-9
 """Share of a tolerance that is rounding: a number moved by exactly the tolerance passes."""
-
-OK, REGRESSED, INVALID = 0, 1, 3
 
 
 @dataclass(frozen=True)
@@ -66,29 +65,35 @@ def judge(results: Results, baseline: Baseline) -> list[Verdict]:
         if place.task in other:
             verdicts.append(Verdict(place, "missing", None, expected, tolerance, other[place.task]))
         elif found is None:
-            reason = results.problems.get(place) or "no rows; was it measured?"
+            reason = (
+                results.problems.get(place) or results.unavailable.get(place) or "no rows; was it measured?"
+            )
             verdicts.append(Verdict(place, "missing", None, expected, tolerance, reason))
         elif tolerance.machine_bound and not same_machine:
             reason = "measured on another machine"
             verdicts.append(Verdict(place, "unjudged", found, expected, tolerance, reason))
         else:
             verdicts.append(Verdict(place, _outcome(found, expected, tolerance), found, expected, tolerance))
-    for place in {**results.values, **results.problems}.keys() - baseline.values.keys():
+    lacking = {
+        **results.problems,
+        **{p: r for p, r in results.unavailable.items() if p not in baseline.unavailable},
+    }
+    for place in {**results.values, **lacking}.keys() - baseline.values.keys():
         tolerance = Tolerance.default(results.metrics[place.metric])
-        if place in results.problems:
-            reason = f"{results.problems[place]} (not in the baseline either)"
+        if place in lacking:
+            reason = f"{lacking[place]} (not in the baseline either)"
             verdicts.append(Verdict(place, "missing", None, None, tolerance, reason))
         else:
             verdicts.append(Verdict(place, "new", results.values[place], None, tolerance))
     return sorted(verdicts, key=lambda verdict: (ORDER.index(verdict.outcome), verdict.place))
 
 
-def exit_code(verdicts: Sequence[Verdict]) -> int:
+def exit_code(verdicts: Sequence[Verdict]) -> ExitCode:
     """3 where a number is missing, since what cannot be compared is not judged; else 1 where one regressed."""
     outcomes = {verdict.outcome for verdict in verdicts}
     if "missing" in outcomes or not verdicts:
-        return INVALID
-    return REGRESSED if "regressed" in outcomes else OK
+        return ExitCode.NO_VERDICT
+    return ExitCode.NEGATIVE if "regressed" in outcomes else ExitCode.OK
 
 
 def environment_changes(baseline: Mapping[str, Any], found: Mapping[str, Any]) -> list[str]:

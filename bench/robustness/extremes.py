@@ -14,8 +14,8 @@ from ..adaptation import MethodNeeds
 from ..contracts import Camera, Clip, FloatArray, FrameKey, Progress
 from ..files import digest, write_json
 from ..protocol import Protocol, make_trial_protocol
+from ..rows import Rows
 from ..stages import Job
-from ..store import to_frame, write_rows
 from .avatars import load
 from .expressions import Extreme, extremes, training_poses, typical_pose
 from .settings import ExtremesSettings
@@ -92,7 +92,7 @@ def try_extremes(
         rows += to_rows(job, TASK, trials, protocols[needs_of(job)].hash)
         summaries.append(summary(job, trials))
         views.append([_described(view) for view in plan.views])
-    write_rows(out / ROWS_FILE, to_frame(rows))
+    Rows.of(rows).write(out / ROWS_FILE)
     record = {
         "settings": asdict(settings),
         "limits": {"views": asdict(VIEW_LIMITS), "expressions": asdict(EXPRESSION_LIMITS)},

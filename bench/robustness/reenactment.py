@@ -8,16 +8,17 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ..adaptation import MethodNeeds
-from ..captures import open_clips
+from ..captures import open_clips, run_configuration
 from ..contracts import Avatar, Camera, Clip, FrameKey, Progress
 from ..errors import InputError
 from ..files import digest, write_json
 from ..frames import write_png
 from ..protocol import Protocol, make_trial_protocol
+from ..rows import Rows
 from ..runner import adapt, make_jobs
 from ..stages import Job
-from ..store import RunFolder, to_frame, write_rows
-from .avatars import load, run_configuration
+from ..store import RunFolder
+from .avatars import load
 from .expressions import training_poses
 from .identity import Look, identity, mean_known, of_recording
 from .retarget import RigidMean, check_heads, retarget
@@ -104,7 +105,7 @@ def reenact(
         summaries.append({**found, "source": drive.source.clip.subject, "protocol": protocol})
         summaries[-1]["identity"] = _identity(drive, look, trials)
         summaries[-1]["shown"] = frames
-    write_rows(out / ROWS_FILE, to_frame(rows))
+    Rows.of(rows).write(out / ROWS_FILE)
     record = {
         "settings": asdict(settings),
         "limits": asdict(LIMITS),
@@ -168,8 +169,7 @@ def _drive(
         driven = cell_folder(out, job) / f"{name}_{camera.id}.png"
         original = out / "sources" / f"{name}_{key.camera}.png"
         write_frame(driven, frame)
-        if not original.exists():
-            write_png(original, source.clip.image(key))
+        write_png(original, source.clip.image(key))
         trials.append(Trial(target, [*judge(found, reference, LIMITS), identity(look, frame, camera, pose)]))
         frames.append(
             {
@@ -195,7 +195,7 @@ def _sources(jobs: Sequence[Job], settings: ReenactSettings) -> list[Job]:
     if settings.source is None:
         first = {(job.clip.subject, job.method.spec.name): job for job in reversed(jobs)}
         return sorted(first.values(), key=lambda job: job.clip.subject)
-    config = replace(run_configuration(Path(settings.run)), data=settings.source)
+    config = run_configuration(Path(settings.run), replace(settings, data=settings.source))
     folder = RunFolder(Path(settings.out) if settings.out else Path(settings.run) / TASK)
     methods = list({job.method.spec.name: job.method for job in jobs}.values())
     clips = open_clips(config)

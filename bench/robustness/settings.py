@@ -6,9 +6,11 @@ from dataclasses import dataclass
 
 import tyro
 
+from ..run_options import RunOptions
+
 
 @dataclass(frozen=True)
-class ExtremesSettings:
+class ExtremesSettings(RunOptions):
     """Try a run's avatars on views and expressions beyond those of training; 1 where a limit is broken."""
 
     run: tyro.conf.Positional[str]
@@ -19,9 +21,6 @@ class ExtremesSettings:
 
     methods: tuple[str, ...] = ()
     """Methods to try; default: all but the floors."""
-
-    data: str | None = None
-    """The capture, where it was moved since the run."""
 
     views: int = 16
     """Views of the turntable, in even steps."""
@@ -45,7 +44,7 @@ class ExtremesSettings:
 
 
 @dataclass(frozen=True)
-class ReenactSettings:
+class ReenactSettings(RunOptions):
     """Drive a run's avatars with another subject's expressions (cross-reenactment); 1 where a limit is broken."""
 
     run: tyro.conf.Positional[str]
@@ -59,9 +58,6 @@ class ReenactSettings:
 
     methods: tuple[str, ...] = ()
     """Methods to drive; default: all but the floors."""
-
-    data: str | None = None
-    """The run's capture, where it was moved since."""
 
     camera: str | None = None
     """Camera of the target to render; default: the first held out, or else the first of training."""

@@ -14,9 +14,9 @@ from ..adaptation import MethodNeeds
 from ..contracts import Avatar, Camera, Frame, FrameKey, HeadPose
 from ..frames import quantise, write_png
 from ..protocol import Protocol
+from ..rows import Row
 from ..scoring import FULL
 from ..stages import Job
-from ..store import Row
 from .stability import Measures, Verdict, measure
 
 ROWS_FILE, RECORD_FILE, SHEET_FILE = "rows.parquet", "record.json", "contact_sheet.png"

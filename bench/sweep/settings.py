@@ -6,9 +6,11 @@ from dataclasses import dataclass
 
 import tyro
 
+from ..run_options import RunOptions
+
 
 @dataclass(frozen=True)
-class SweepSettings:
+class SweepSettings(RunOptions):
     """Quality against size and frame time of what can be derived from a run's avatars without training."""
 
     run: tyro.conf.Positional[str]
@@ -22,9 +24,6 @@ class SweepSettings:
 
     variants: tuple[str, ...] = ()
     """Variants to derive, by name; default: all. The trained avatar itself is always measured."""
-
-    data: str | None = None
-    """The capture, where it was moved since the run."""
 
     frames: int | None = None
     """Score at most so many frames per subject and task, evenly spaced; default: those of the run."""

@@ -6,21 +6,20 @@ import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
-
-import pandas as pd
 
 from ..contracts import Progress, Variant
 from ..errors import InputError
 from ..files import check_name, digest
+from ..manifest import Derived, MethodRecord
 from ..protocol import Protocol, make_protocol
 from ..registry import resolve
-from ..robustness.avatars import load, run_configuration, trained
+from ..robustness.avatars import load, trained
+from ..rows import Rows
 from ..run_config import resolve_metrics
 from ..runner import describe
 from ..specs import MetricSpec
 from ..stages import Job, measure, render
-from ..store import RunFolder, write_rows
+from ..store import RunFolder
 from .settings import SweepSettings
 
 log = logging.getLogger(__name__)
@@ -30,7 +29,7 @@ MARK = "+"
 """Between the name of a method and that of a variant."""
 
 
-def sweep(settings: SweepSettings, out: Path, progress: Progress) -> pd.DataFrame:
+def sweep(settings: SweepSettings, out: Path, progress: Progress) -> Rows:
     """Derive, render and measure; return the rows of the run folder that it writes to ``out``.
 
     The trained avatars are measured anew beside their variants, so that frame times were taken in one go. Started
@@ -41,15 +40,12 @@ def sweep(settings: SweepSettings, out: Path, progress: Progress) -> pd.DataFram
     InputError
         For a folder that is no finished run, a method that derives nothing, a variant that none of them has.
     """
-    jobs = trained(Path(settings.run), settings.methods, settings.data)
+    config, jobs = trained(Path(settings.run), settings.methods, settings)
     able = [job for job in jobs if job.method.spec.variants]
     unable = sorted({job.method.spec.name for job in jobs} - {job.method.spec.name for job in able})
     if not able or (settings.methods and unable):
         found = ", ".join(unable) or "none"
         raise InputError(settings.run, "methods", "methods that derive variants", found)
-    config = run_configuration(Path(settings.run))
-    if settings.data is not None:
-        config = replace(config, data=settings.data)
     if settings.frames is not None:
         config = replace(config, frames_per_task=settings.frames)
     clips = list({job.clip.subject: job.clip for job in able}.values())
@@ -65,8 +61,8 @@ def sweep(settings: SweepSettings, out: Path, progress: Progress) -> pd.DataFram
         if name not in known:
             raise InputError("sweep", "variants", "a variant of these methods", repr(name))
 
-    frames: list[pd.DataFrame] = []
-    records: dict[str, dict[str, Any]] = {}
+    frames: list[Rows] = []
+    records: dict[str, MethodRecord] = {}
     total = sum(len(variants) + 1 for _, variants in derived)
     for base, variants in derived:
         for variant in (None, *variants):
@@ -74,11 +70,11 @@ def sweep(settings: SweepSettings, out: Path, progress: Progress) -> pd.DataFram
             progress(len(frames), total, job.name)
             frames.append(_measured(job, base, variant, metrics))
             records[job.method.spec.name] = _record(job, base, variant)
-    rows = pd.concat(frames, ignore_index=True)
-    write_rows(folder.rows, rows)
+    rows = Rows.joined(frames)
+    rows.write(folder.rows)
     manifest = describe(replace(config, out=str(out)), [], metrics, clips, protocols)
-    manifest |= {"methods": list(records.values()), "sweep_of": settings.run, "status": "done"}
-    folder.write_manifest(manifest)
+    done = replace(manifest, methods=tuple(records.values()), sweep_of=settings.run, status="done")
+    done.write(folder.manifest)
     return rows
 
 
@@ -103,21 +99,21 @@ def _derived(base: Job, variant: Variant | None, protocols: Mapping[str, Protoco
     )
 
 
-def _measured(job: Job, base: Job, variant: Variant | None, metrics: Sequence[MetricSpec]) -> pd.DataFrame:
+def _measured(job: Job, base: Job, variant: Variant | None, metrics: Sequence[MetricSpec]) -> Rows:
     job.check()
     avatar = load(base) if variant is None else variant.make(job.cell.avatar)
-    trained_from = base.cell.stage("fit") or {}
-    job.cell.finish("fit", job.fit_fingerprint, derived_from=digest(trained_from.get("fingerprint")))
+    source = base.cell.stage("fit")
+    assert source is not None  # `trained` saw to it
+    derived_from = digest(source["fingerprint"], source.get("files"))
+    files = job.cell.digests(path for path in job.cell.avatar.rglob("*") if path.is_file())
+    job.cell.finish("fit", job.fit_fingerprint, derived_from=derived_from, files=files)
     render(job, avatar)
     return measure(job, avatar, metrics)
 
 
-def _record(job: Job, base: Job, variant: Variant | None) -> dict[str, Any]:
+def _record(job: Job, base: Job, variant: Variant | None) -> MethodRecord:
     """As a run records a method, and what it was derived from."""
-    record = job.method.record()
-    if variant is None:
-        return record
-    return {
-        **record,
-        "derived": {"from": base.method.spec.name, "variant": variant.name, "change": variant.summary},
-    }
+    derived: Derived | None = None
+    if variant is not None:
+        derived = {"from": base.method.spec.name, "variant": variant.name, "change": variant.summary}
+    return MethodRecord(**job.method.record(), derived=derived)

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import math
+import signal
+import threading
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
 import numpy as np
-import pycolmap
+import pycolmap as pycolmap  # noqa: PLC0414 - the writer imports it from here
 
 from ...bench.errors import InputError
 from ...bench.files import check_name
+
+# Its import replaces the handler of SIGTERM by one that prints a stack, behind the interpreter's back.
+if threading.current_thread() is threading.main_thread():
+    signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)
 
 _MAX_PIXELS = 1 << 20  # along one side: far beyond any sensor
 _UNIT_TOLERANCE = 1e-3  # of a quaternion's length; COLMAP itself normalises what it reads

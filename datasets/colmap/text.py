@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 from ...bench.errors import InputError
 from .records import ColmapCamera, ColmapImage, camera_models, checked_camera, checked_image
 
+_LONGEST_LINE = 2**23  # 300,000 points of an image; words take ten times the memory of their line
 _IMAGE_WORDS = 10  # number, quaternion, translation, camera, name
 
 
@@ -62,7 +64,10 @@ def _lines(file: Path) -> Iterator[tuple[int, list[str]]]:
     """Number and words of each line that is no comment. An empty line may be an image without points."""
     try:
         with file.open(encoding="utf-8") as stream:
-            for number, line in enumerate(stream, start=1):
+            for number, line in enumerate(iter(partial(stream.readline, _LONGEST_LINE + 1), ""), start=1):
+                if len(line) > _LONGEST_LINE:
+                    expected = f"at most {_LONGEST_LINE} characters in a line"
+                    raise InputError(file, f"line {number}", expected, "more")
                 if not line.startswith("#"):
                     yield number, line.split()
     except UnicodeDecodeError as error:

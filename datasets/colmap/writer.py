@@ -5,7 +5,7 @@ Layout of ``colmap`` itself and of the radiance-field codes that read it: ``imag
 
 from __future__ import annotations
 
-import os
+import shutil
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,14 +13,14 @@ from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
-import pycolmap
 import torch
 
 from ...bench.contracts import ByteArray, Camera, Clip, FloatArray, FrameKey, Progress, no_progress
 from ...bench.errors import InputError
-from ...bench.files import atomic_path
+from ...bench.files import atomic_path, grouped_writes
 from ..head.model import HeadModel
 from ..mesh_pictures import rasterize_mesh
+from .records import pycolmap
 
 ModelFormat = Literal["bin", "txt"]
 _DEPTH_TOLERANCE = (
@@ -87,19 +87,20 @@ def export_model(
     for number, name in enumerate(ids, start=1):
         model.add_camera_with_trivial_rig(_pinhole(number, clip.cameras[name]))
     views: dict[int, _View] = {}
-    for number, key in enumerate(sorted(keys), start=1):
-        camera, picture = clip.cameras[key.camera], clip.image(key)
-        if key.timestep == first:
-            views[number] = _observe(vertices, np.asarray(clip.head.faces), camera, picture)
-        pixels = views[number].pixels if number in views else np.zeros((0, 2))
-        image = pycolmap.Image(image_name(key), pixels, ids.index(key.camera) + 1, number)
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(camera.world_to_camera[:3]))
-        _write_picture(out / "images" / image_name(key), picture[..., ::-1])
-        mask = clip.mask(key)
-        if mask is not None:
-            # COLMAP's own convention: the image's whole name and one more suffix, 0 for what to leave out.
-            _write_picture(out / "masks" / f"{image_name(key)}.png", mask)
-        progress(number, len(keys), str(key))
+    with grouped_writes():
+        for number, key in enumerate(sorted(keys), start=1):
+            camera, picture = clip.cameras[key.camera], clip.image(key)
+            if key.timestep == first:
+                views[number] = _observe(vertices, np.asarray(clip.head.faces), camera, picture)
+            pixels = views[number].pixels if number in views else np.zeros((0, 2))
+            image = pycolmap.Image(image_name(key), pixels, ids.index(key.camera) + 1, number)
+            model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(camera.world_to_camera[:3]))
+            _write_picture(out / "images" / image_name(key), picture[..., ::-1])
+            mask = clip.mask(key)
+            if mask is not None:
+                # COLMAP's own convention: the image's whole name and one more suffix, 0 for what to leave out.
+                _write_picture(out / "masks" / f"{image_name(key)}.png", mask)
+            progress(number, len(keys), str(key))
     _add_points(model, vertices, views)
     _write_model(model, out / "sparse" / "0", model_format)
     return Exported(
@@ -154,12 +155,12 @@ def _add_points(model: pycolmap.Reconstruction, vertices: FloatArray, views: dic
 
 
 def _write_model(model: pycolmap.Reconstruction, folder: Path, model_format: ModelFormat) -> None:
-    """Write a model beside its place, then move its files there: none of them is ever half-written.
+    """Write a model elsewhere, then copy its files to their place: none of them is ever half-written.
 
     Files of the other format go first: readers take the binary ones before the others, whichever is newer.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".model-") as temporary:
+    with tempfile.TemporaryDirectory() as temporary:
         if model_format == "bin":
             model.write_binary(temporary)
         else:
@@ -169,7 +170,8 @@ def _write_model(model: pycolmap.Reconstruction, folder: Path, model_format: Mod
         for file in files:
             (folder / file.with_suffix(other).name).unlink(missing_ok=True)
         for file in files:
-            os.replace(file, folder / file.name)
+            with atomic_path(folder / file.name) as copy:
+                shutil.copyfile(file, copy)
 
 
 def _write_picture(path: Path, picture: ByteArray) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ...bench.arrays import MAX_MAGNITUDE, TEXT, Member, check_arrays, read_arrays
 from ...bench.contracts import FloatArray, IntArray
 from ...bench.errors import InputError
 from ...bench.files import atomic_path, digest
@@ -22,11 +23,26 @@ RING_REGIONS = ("lip_outside_ring_upper", "lip_outside_ring_lower")
 FORMAT = "headbench-head-1"
 WEIGHT_TOLERANCE = 1e-4
 
-MAX_BYTES = 4 * 2**30
-"""Most an npz may hold unpacked: tracked parameters of ten thousand timesteps, and ten times any head model."""
+MAX_CORRECTION = 100.0
+"""Metres that all pose correctives together may move a vertex, whatever the pose; those of ICT-FaceKit do by 0.08."""
+
+MAX_EXTENT, MAX_AREA = 10.0, 100.0
+"""Metres and square metres that an unposed head may have; a head with shoulders has 1 and 2. A few vertices far away, or
+a tangle of triangles across the room, take the time and memory of thousands of heads wherever a mesh is drawn."""
 
 _ARRAYS = ("template", "faces", "shape_basis", "expression_basis", "pose_basis", "joint_regressor")
 _STORED = (*_ARRAYS, "skinning_weights", "parents")
+_MEMBERS = {
+    "template": Member("f", ("V", 3), MAX_MAGNITUDE),
+    "faces": Member("iu", ("F", 3)),
+    "shape_basis": Member("f", ("V", 3, "S"), MAX_MAGNITUDE),
+    "expression_basis": Member("f", ("V", 3, "E"), MAX_MAGNITUDE),
+    "pose_basis": Member("f", ("V", 3, "9 (J - 1)"), MAX_MAGNITUDE),
+    "joint_regressor": Member("f", ("J", "V"), MAX_MAGNITUDE),
+    "skinning_weights": Member("f", ("V", "J"), MAX_MAGNITUDE),
+    "parents": Member("iu", ("J",)),
+    "eyelid_basis": Member("f", ("V", 3, 2), MAX_MAGNITUDE, optional=True),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,13 +90,16 @@ class HeadArrays:
         Raises
         ------
         InputError
-            For wrong shapes, non-finite numbers, face or region indices out of range, a joint tree that is
-            none, or skinning weights that do not sum to 1.
+            For wrong types and shapes, numbers that are not finite or beyond `MAX_MAGNITUDE`, face or region
+            indices out of range, a joint tree that is none, skinning weights that do not sum to 1, or a mesh
+            that cannot be a head's by its size.
         """
-        self._validate_shapes(file)
-        self._validate_numbers(file)
+        self._validate_arrays(file)
+        self._validate_weights(file)
         self._validate_indices(file)
         self._validate_skeleton(file)
+        check_size(file, "template", self.template, self.faces)
+        self._validate_motion(file)
         return self
 
     def fingerprint(self) -> str:
@@ -91,41 +110,27 @@ class HeadArrays:
         regions = [part for name in sorted(self.regions) for part in (name, self.regions[name])]
         return digest(self.version, *arrays, *regions, dict(sorted(self.landmarks.items())))
 
-    def _validate_shapes(self, file: str | PathLike[str]) -> None:
-        joints = len(JOINT_NAMES)
-        vertices = self.template.shape[0] if self.template.ndim == 2 else -1
-        expected: dict[str, tuple[int | str, ...]] = {
-            "template": ("V", 3),
-            "faces": ("F", 3),
-            "shape_basis": (vertices, 3, "S"),
-            "expression_basis": (vertices, 3, "E"),
-            "pose_basis": (vertices, 3, 9 * (joints - 1)),
-            "joint_regressor": (joints, vertices),
-            "skinning_weights": (vertices, joints),
-            "parents": (joints,),
-        }
+    def _validate_arrays(self, file: str | PathLike[str]) -> None:
+        arrays = {name: np.asarray(getattr(self, name)) for name in _STORED}
         if self.eyelid_basis is not None:
-            expected["eyelid_basis"] = (vertices, 3, 2)
-        for name, shape in expected.items():
-            found = np.asarray(getattr(self, name)).shape
-            fits = len(found) == len(shape) and all(
-                isinstance(want, str) or want == have for want, have in zip(shape, found)
-            )
-            if not fits:
-                raise InputError(file, name, f"shape ({', '.join(map(str, shape))})", f"shape {found}")
-        if vertices == 0 or self.faces.shape[0] == 0:
+            arrays["eyelid_basis"] = self.eyelid_basis
+        sizes = {"J": len(JOINT_NAMES), "9 (J - 1)": 9 * (len(JOINT_NAMES) - 1)}
+        sizes = check_arrays(file, arrays, _MEMBERS, sizes)
+        if sizes["V"] == 0 or sizes["F"] == 0:
             raise InputError(file, "template", "at least one vertex and one triangle", "an empty mesh")
 
-    def _validate_numbers(self, file: str | PathLike[str]) -> None:
-        names = ["template", "shape_basis", "expression_basis", "pose_basis", "joint_regressor"]
-        names += ["skinning_weights"] + ["eyelid_basis"] * (self.eyelid_basis is not None)
-        for name in names:
-            array = getattr(self, name)
-            if array.dtype.kind != "f":
-                raise InputError(file, name, "floating-point numbers", f"dtype {array.dtype}")
-            broken = int(array.size - np.count_nonzero(np.isfinite(array)))
-            if broken:
-                raise InputError(file, name, "finite numbers", f"{broken} that are NaN or infinite")
+    def _validate_motion(self, file: str | PathLike[str]) -> None:
+        joints = float(np.abs(self.joint_regressor.astype(np.float64) @ self.template).max())
+        if joints > MAX_EXTENT:
+            expected = f"joints within {MAX_EXTENT:g} m of the origin"
+            raise InputError(file, "joint_regressor", expected, f"{joints:g} m")
+        # Entries of a rotation less the identity are 2 at most.
+        corrected = 2 * float(np.abs(self.pose_basis).max(axis=(0, 1)).sum(dtype=np.float64))
+        if corrected > MAX_CORRECTION:
+            expected = f"correctives that move no vertex further than {MAX_CORRECTION:g} m together"
+            raise InputError(file, "pose_basis", expected, f"up to {corrected:g} m")
+
+    def _validate_weights(self, file: str | PathLike[str]) -> None:
         sums = self.skinning_weights.sum(axis=1, dtype=np.float64)
         worst = int(np.argmax(np.abs(sums - 1)))
         if abs(sums[worst] - 1) > WEIGHT_TOLERANCE:
@@ -153,8 +158,6 @@ class HeadArrays:
                 raise InputError(file, f"landmarks[{name}]", f"a vertex below {vertices}", str(vertex))
 
     def _validate_skeleton(self, file: str | PathLike[str]) -> None:
-        if self.parents.dtype.kind not in "iu":
-            raise InputError(file, "parents", "integer joint indices", f"dtype {self.parents.dtype}")
         parents = [int(parent) for parent in self.parents]
         is_tree = parents[0] == -1 and all(
             0 <= parent < joint for joint, parent in enumerate(parents) if joint
@@ -168,6 +171,20 @@ class HeadArrays:
             )
 
 
+def check_size(file: str | PathLike[str], key: str, vertices: FloatArray, faces: IntArray) -> None:
+    """Raise `InputError` unless a mesh, (V, 3) metres, has an area, and extents and area within their bounds."""
+    vertices = np.asarray(vertices, np.float64)
+    extent = float(np.abs(vertices).max())
+    if not extent <= MAX_EXTENT:
+        raise InputError(file, key, f"a head within {MAX_EXTENT:g} m of its origin", f"{extent:g} m")
+    one, other = (vertices[faces[:, corner]] - vertices[faces[:, 0]] for corner in (1, 2))
+    area = 0.5 * float(np.linalg.norm(np.cross(one, other), axis=1).sum())
+    if not 0 < area <= MAX_AREA:
+        raise InputError(
+            file, key, f"a surface of at most {MAX_AREA:g} square metres, not of none", f"{area:g}"
+        )
+
+
 def _check_indices(file: str | PathLike[str], key: str, indices: IntArray, count: int) -> None:
     if indices.dtype.kind not in "iu":
         raise InputError(file, key, "integer vertex indices", f"dtype {indices.dtype}")
@@ -176,11 +193,20 @@ def _check_indices(file: str | PathLike[str], key: str, indices: IntArray, count
         raise InputError(file, key, f"vertex indices from 0 to {count - 1}", found)
 
 
+_FILE = {
+    **dict.fromkeys(_STORED, Member("biufU")),
+    "version": TEXT,
+    "landmark_names": Member("U", ("L",)),
+    "landmark_vertices": Member("iu", ("L",)),
+}
+
+
 def save_head(path: Path, arrays: HeadArrays) -> None:
     """Write a head as one npz file (no pickled objects), whole or not at all.
 
     Members: ``format``, ``version``, the array fields by name, ``eyelid_basis`` if there is one,
-    ``region/<name>`` for each region, ``landmark_names`` and ``landmark_vertices``.
+    ``region/<name>`` for each region, ``landmark_names`` and ``landmark_vertices``. Equal heads make equal bytes:
+    uncompressed, since what a compressor makes of them depends on its version.
     """
     content: dict[str, np.ndarray] = {"format": np.array(FORMAT), "version": np.array(arrays.version)}
     content |= {name: np.asarray(getattr(arrays, name)) for name in _STORED}
@@ -190,7 +216,7 @@ def save_head(path: Path, arrays: HeadArrays) -> None:
     content["landmark_names"] = np.array(list(arrays.landmarks), dtype=np.str_)
     content["landmark_vertices"] = np.array(list(arrays.landmarks.values()), dtype=np.int64)
     with atomic_path(Path(path)) as temporary, temporary.open("wb") as stream:
-        np.savez_compressed(stream, allow_pickle=False, **content)
+        np.savez(stream, allow_pickle=False, **content)
 
 
 def read_head(path: Path) -> HeadArrays:
@@ -201,22 +227,14 @@ def read_head(path: Path) -> HeadArrays:
     InputError
         Where the file is not such an npz, lacks a member or holds arrays that make no head.
     """
-    content = read_npz(path)
-    if str(content.get("format", "")) != FORMAT:
-        raise InputError(path, "format", repr(FORMAT), repr(str(content.get("format", "nothing"))))
-    missing = [
-        name for name in (*_STORED, "version", "landmark_names", "landmark_vertices") if name not in content
-    ]
-    if missing:
-        raise InputError(path, missing[0], "an array of that name", f"only {', '.join(sorted(content))}")
+    content = read_arrays(path, {"format": TEXT})
+    if str(content["format"]) != FORMAT:
+        raise InputError(path, "format", repr(FORMAT), repr(str(content["format"]))[:80])
+    check_arrays(path, content, _FILE)
     regions = {
         key.removeprefix("region/"): value for key, value in content.items() if key.startswith("region/")
     }
     names, vertices = content["landmark_names"], content["landmark_vertices"]
-    if names.shape != vertices.shape or names.ndim != 1 or vertices.dtype.kind not in "iu":
-        raise InputError(
-            path, "landmark_vertices", f"one vertex for each of {names.size} names", f"{vertices.shape}"
-        )
     return HeadArrays(
         version=str(content["version"]),
         **{name: content[name] for name in _STORED},
@@ -224,26 +242,3 @@ def read_head(path: Path) -> HeadArrays:
         regions=regions,
         landmarks={str(name): int(vertex) for name, vertex in zip(names, vertices)},
     ).validate(path)
-
-
-def read_npz(path: Path) -> dict[str, np.ndarray]:
-    """Read every member of an npz without ever unpickling, `MAX_BYTES` in all once unpacked.
-
-    Raises
-    ------
-    InputError
-        Where the file is missing, damaged, too large, no npz, or holds pickled objects.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            # Before anything is unpacked: a few kB of zeros can declare terabytes.
-            unpacked = sum(member.file_size for member in archive.zip.infolist())
-            if unpacked > MAX_BYTES:
-                raise InputError(path, "", f"at most {MAX_BYTES} bytes of arrays", f"{unpacked} bytes")
-            return {name: archive[name] for name in archive.files}
-    except FileNotFoundError as error:
-        raise InputError(path, "", "a file", "none") from error
-    except InputError:
-        raise
-    except Exception as error:  # a damaged archive makes zipfile and numpy raise almost anything
-        raise InputError(path, "", "an npz file of plain arrays", f"unreadable content ({error})") from error

@@ -16,8 +16,10 @@ from os import PathLike
 
 import numpy as np
 
+from ...bench.arrays import MAX_MAGNITUDE, Member, check_arrays
 from ...bench.contracts import FloatArray, IntArray
 from ...bench.errors import InputError
+from ..rounding import LENGTH_BITS, REGRESSOR_BITS, SHARE_BITS, on_grid
 from .arrays import HeadArrays
 from .ict_regions import MeshParts, Profile, landmark_names, mesh_parts, regions_of
 from .rigging import (
@@ -37,15 +39,16 @@ DROPPED_SHAPES = (JAW_SHAPE, "mouthClose")
 
 _METRES = 0.01
 _SOFTNESS = 0.004  # metres; see hinge_weights
+_LARGEST = MAX_MAGNITUDE / _METRES  # centimetres
 _KEYS = {
-    "v_neutral": ("V", 3),
-    "tri_v": ("F", 3),
-    "tri_material": ("F",),
-    "material_names": ("M",),
-    "expr_names": ("E",),
-    "expr_deltas": ("E", "V", 3),
-    "id_deltas": ("S", "V", 3),
-    "idx_to_landmark_verts": (len(landmark_names()),),
+    "v_neutral": Member("f", ("V", 3), _LARGEST),
+    "tri_v": Member("iu", ("F", 3)),
+    "tri_material": Member("iu", ("F",)),
+    "material_names": Member("U", ("M",)),
+    "expr_names": Member("U", ("E",)),
+    "expr_deltas": Member("f", ("E", "V", 3), _LARGEST),
+    "id_deltas": Member("f", ("S", "V", 3), _LARGEST),
+    "idx_to_landmark_verts": Member("iu", (len(landmark_names()),)),
 }
 
 
@@ -76,9 +79,17 @@ def ict_head(file: str | PathLike[str], content: Mapping[str, np.ndarray]) -> He
     Raises
     ------
     InputError
-        Where a member is missing or does not fit the others.
+        Where a member is missing or does not fit the others, or the mesh has not the kit's parts.
     """
     _check(file, content)
+    try:
+        return _rigged(file, content).validate(file)
+    except (ValueError, IndexError, ArithmeticError, np.linalg.LinAlgError) as error:
+        expected = "the mesh of ICT-FaceKit, whose parts can be told apart"
+        raise InputError(file, "", expected, f"one whose rig cannot be fitted ({error})"[:400]) from error
+
+
+def _rigged(file: str | PathLike[str], content: Mapping[str, np.ndarray]) -> HeadArrays:
     faces = content["tri_v"].astype(np.int64)
     landmarks = content["idx_to_landmark_verts"].astype(np.int64)
     names = [str(name) for name in content["expr_names"]]
@@ -93,7 +104,7 @@ def ict_head(file: str | PathLike[str], content: Mapping[str, np.ndarray]) -> He
     profile = Profile.of(template, landmarks)
 
     hinge = fit_hinge(template[parts.teeth_lower], template[parts.teeth_lower] + jaw_open[parts.teeth_lower])
-    weights = _weights(template, jaw_open, hinge, parts, profile)
+    weights = on_grid(_weights(template, jaw_open, hinge, parts, profile), SHARE_BITS)
     correctives = np.zeros((len(template), 3, 36))
     # The second joint's block: the root has none, the neck has the first.
     correctives[:, :, 9:18] = hinge_correctives(hinge, template, jaw_open, weights[:, 2])
@@ -104,13 +115,13 @@ def ict_head(file: str | PathLike[str], content: Mapping[str, np.ndarray]) -> He
         faces=faces,
         shape_basis=_basis(content["id_deltas"]),
         expression_basis=_basis(content["expr_deltas"][kept]),
-        pose_basis=correctives.astype(np.float32),
-        joint_regressor=_regressor(template, hinge, parts, profile),
+        pose_basis=on_grid(correctives, LENGTH_BITS).astype(np.float32),
+        joint_regressor=on_grid(_regressor(template, hinge, parts, profile), REGRESSOR_BITS),
         skinning_weights=weights,
         parents=np.array([-1, 0, 1, 1, 1]),
         regions=regions_of(template, faces, parts, profile, landmarks),
         landmarks=dict(zip(landmark_names(), landmarks.tolist())),
-    ).validate(file)
+    )
 
 
 def fitted_jaw(head: HeadArrays, displacement: FloatArray) -> Hinge:
@@ -120,23 +131,7 @@ def fitted_jaw(head: HeadArrays, displacement: FloatArray) -> Hinge:
 
 
 def _check(file: str | PathLike[str], content: Mapping[str, np.ndarray]) -> None:
-    sizes: dict[str, int] = {}
-    for key, shape in _KEYS.items():
-        if key not in content:
-            raise InputError(file, key, "an array of that name", f"only {', '.join(sorted(content))}")
-        found = content[key].shape
-        fits = len(found) == len(shape) and all(
-            sizes.setdefault(want, have) == have if isinstance(want, str) else want == have
-            for want, have in zip(shape, found)
-        )
-        if not fits:
-            named = ", ".join(
-                f"{size}={sizes[size]}" if size in sizes else str(size) for size in map(str, shape)
-            )
-            raise InputError(file, key, f"shape ({named})", f"shape {found}")
-        kinds = "U" if key.endswith("names") else "iu" if key.startswith(("tri", "idx")) else "f"
-        if content[key].dtype.kind not in kinds:
-            raise InputError(file, key, f"an array of kind {kinds}", f"dtype {content[key].dtype}")
+    sizes = check_arrays(file, content, _KEYS)
     for key, bound in (
         ("tri_v", sizes["V"]),
         ("tri_material", sizes["M"]),
@@ -145,9 +140,8 @@ def _check(file: str | PathLike[str], content: Mapping[str, np.ndarray]) -> None
         if content[key].size == 0 or not 0 <= content[key].min() <= content[key].max() < bound:
             raise InputError(file, key, f"indices from 0 to {bound - 1}", "others, or none")
     if JAW_SHAPE not in content["expr_names"]:
-        raise InputError(
-            file, "expr_names", f"a shape {JAW_SHAPE}", ", ".join(map(str, content["expr_names"]))
-        )
+        found = ", ".join(map(str, content["expr_names"]))[:400]
+        raise InputError(file, "expr_names", f"a shape {JAW_SHAPE}", found)
 
 
 def _middle_of_head(vertices: FloatArray, landmarks: IntArray) -> FloatArray:

@@ -26,6 +26,8 @@ _REMEDY = (
 def lip_rings(asset: HeadAsset, length: int = RING_LENGTH) -> tuple[IntArray, IntArray]:
     """Upper and lower ring: (n,) vertices each, from one corner of the mouth to the other, pairs matching.
 
+    Rings that are found run from the subject's left to the right, as GaussianAvatars' do.
+
     Parameters
     ----------
     asset : its ring regions are returned as they are if it has both; otherwise the rings are found from
@@ -56,7 +58,7 @@ def lip_rings(asset: HeadAsset, length: int = RING_LENGTH) -> tuple[IntArray, In
     left = min(asset.template[part, 0].max() for part in (upper, lower))
     right = max(asset.template[part, 0].min() for part in (upper, lower))
     across = np.linspace(right, left, count)
-    return _pick(asset, upper, across), _pick(asset, lower, across)
+    return _pick(asset, upper, across)[::-1], _pick(asset, lower, across)[::-1]
 
 
 def _rim(asset: HeadAsset, where: str) -> IntArray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import reprlib
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -9,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from ...bench.arrays import MAX_MAGNITUDE, Member, check_arrays, read_npy, read_npz
 from ...bench.contracts import IntArray
+from ...bench.documents import read_json
 from ...bench.errors import InputError
-from ...bench.files import read_json
-from .arrays import RING_REGIONS, HeadArrays, read_head, read_npz
+from .arrays import RING_REGIONS, HeadArrays, read_head
 from .ict import ict_head, is_ict
 from .regions import with_derived_regions
 from .unpickle import read_pickle
@@ -99,9 +101,11 @@ def read_regions(path: str | PathLike[str]) -> dict[str, IntArray]:
     """Regions of a JSON file ``{name: [vertex, ...]}``. Lip rings keep their order, others are sorted."""
     result = {}
     for name, members in read_json(Path(path)).items():
-        is_list = isinstance(members, list) and all(type(member) is int for member in members)
+        is_list = isinstance(members, list) and all(
+            type(member) is int and 0 <= member < 2**31 for member in members
+        )
         if not is_list:
-            raise InputError(path, name, "a list of vertex indices", f"{str(members)[:40]}")
+            raise InputError(path, name, "a list of vertex indices", reprlib.repr(members))
         result[name] = _members(path, name, np.array(members, dtype=np.int64))
     return result
 
@@ -110,13 +114,8 @@ def with_eyelids(head: HeadArrays, left: str | PathLike[str], right: str | PathL
     """Add the eyelid bases of the metrical tracker: ``l_eyelid.npy`` and ``r_eyelid.npy``, (V, 3) metres."""
     columns = []
     for path in (left, right):
-        try:
-            column = np.load(path, allow_pickle=False)
-        except (OSError, ValueError, EOFError) as error:
-            raise InputError(path, "", "a numpy array file", str(error)) from error
-        if not isinstance(column, np.ndarray) or column.shape != head.template.shape:
-            found = getattr(column, "shape", "an archive")
-            raise InputError(path, "", f"an array of shape {head.template.shape}", f"{found}")
+        column = read_npy(Path(path))
+        check_arrays(path, {"": column}, {"": Member("f", head.template.shape, MAX_MAGNITUDE)})
         columns.append(column)
     return replace(head, eyelid_basis=np.stack(columns, axis=-1)).validate(left)
 
@@ -147,6 +146,8 @@ def _flame(path: Path, version: str) -> HeadArrays:
         expected = f"{FLAME_IDENTITY_SIZE} identity directions and then those of expression"
         raise InputError(path, "shapedirs", expected, f"{directions.shape[2]} directions in all")
     tree = array("kintree_table", "iu", 2)
+    if not len(tree):
+        raise InputError(path, "kintree_table", "a row of parents", "none")
     parents = tree[0].astype(np.int64)
     parents[:1] = -1  # the file has an unsigned -1 there
     return HeadArrays(

@@ -5,6 +5,7 @@ Qian et al., "GaussianAvatars", CVPR 2024, supplement; the construction is the o
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,8 @@ from ...bench.contracts import FloatArray, IntArray
 from ...bench.errors import InputError
 from .arrays import JOINT_NAMES, HeadArrays
 from .lips import lip_rings
+
+_log = logging.getLogger(__name__)
 
 ROWS = (
     *("upper_root", "lower_root", "upper_edge", "lower_edge"),
@@ -75,6 +78,17 @@ def with_teeth(arrays: HeadArrays) -> HeadArrays:
     )
 
 
+def with_teeth_where_possible(arrays: HeadArrays) -> HeadArrays:
+    """Append teeth to a head that has none; where it has no lips to hang them on, log why and leave it without."""
+    if "teeth" in arrays.regions:
+        return arrays
+    try:
+        return with_teeth(arrays)
+    except InputError as error:
+        _log.warning("no teeth: %s", error)
+        return arrays
+
+
 def _positions(upper: FloatArray, lower: FloatArray) -> FloatArray:
     """(8 n, 3) vertices, block by block as in `ROWS`, from the (n, 3) rings."""
     distance = np.linalg.norm(upper - lower, axis=1).mean()
@@ -93,30 +107,41 @@ def _positions(upper: FloatArray, lower: FloatArray) -> FloatArray:
 
 
 def _triangles(columns: int, towards_left: bool) -> IntArray:
-    """Triangles of the six strips, seen from outside counter-clockwise, as indices into the new vertices."""
+    """Triangles of the six strips, seen from outside counter-clockwise, as indices into the new vertices.
+
+    In the order of GaussianAvatars, whose splats are bound to triangles by number and turn with their first edge.
+    """
     block = {name: index * columns + np.arange(columns) for index, name in enumerate(ROWS)}
+    upper_back = _strip(block["upper_root_back"], block["upper_edge_back"], falling=True)
+    upper_edge = _strip(block["upper_edge_back"], block["upper_edge"], falling=False)
     strips = [
-        _strip(block["upper_edge"], block["upper_root"]),
-        _strip(block["upper_root_back"], block["upper_edge_back"]),
-        _strip(block["upper_edge_back"], block["upper_edge"]),
-        _strip(block["lower_root"], block["lower_edge"]),
-        _strip(block["lower_edge_back"], block["lower_root_back"]),
-        _strip(block["lower_edge"], block["lower_edge_back"]),
+        _strip(block["upper_root"], block["upper_edge"], falling=True),
+        _turned(upper_back),
+        _turned(upper_edge),
+        _strip(block["lower_edge"], block["lower_root"], falling=False),
+        _strip(block["lower_root_back"], block["lower_edge_back"], falling=True),
+        _strip(block["lower_edge_back"], block["lower_edge"], falling=False),
     ]
     triangles = np.concatenate(strips)
-    return triangles if towards_left else triangles[:, ::-1]
+    return _turned(triangles) if towards_left else triangles
 
 
-def _strip(low: IntArray, high: IntArray) -> IntArray:
+def _strip(first: IntArray, second: IntArray, *, falling: bool) -> IntArray:
     """Quads between two rows in two triangles each; the diagonal flips at the middle for symmetry.
 
-    The triangles face the viewer for whom the rows run to the right and ``high`` is above ``low``.
+    The triangles face the viewer for whom the rows run to the left and ``first`` is above ``second``. ``falling``:
+    the first half's diagonals run from ``first`` to the next of ``second``.
     """
-    a, b, c, d = low[:-1], low[1:], high[1:], high[:-1]
-    rising = np.stack([a, b, c, a, c, d], axis=1).reshape(-1, 2, 3)
-    falling = np.stack([a, b, d, b, c, d], axis=1).reshape(-1, 2, 3)
+    a, next_a, b, next_b = first[:-1], first[1:], second[:-1], second[1:]
+    down = np.stack([a, next_b, b, a, next_a, next_b], axis=1).reshape(-1, 2, 3)
+    up = np.stack([a, next_a, b, next_a, next_b, b], axis=1).reshape(-1, 2, 3)
     first_half = np.arange(len(a)) < len(a) / 2
-    return np.where(first_half[:, None, None], rising, falling).reshape(-1, 3)
+    return np.where((first_half == falling)[:, None, None], down, up).reshape(-1, 3)
+
+
+def _turned(triangles: IntArray) -> IntArray:
+    """The same triangles seen from behind."""
+    return triangles[:, [0, 2, 1]]
 
 
 def _append(array: FloatArray, rows: FloatArray) -> FloatArray:

@@ -11,8 +11,9 @@ from typing import Any
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.specs import Findings
+from ..ga_reader import find_capture
 from .catalogue import GROUPS, RULES
-from .evidence import Evidence, find_capture, gather
+from .evidence import Evidence, gather
 from .rules import SEVERITIES, Finding, apply, several
 from .settings import LintSettings
 

@@ -6,7 +6,6 @@ behind each fault, so that one broken frame does not hide what else is wrong.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,14 +13,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ...bench.contracts import Progress, no_progress
+from ...bench.documents import read_json
 from ...bench.errors import InputError
-from ...bench.files import read_json
+from ...bench.image_files import ImageInfo, probe_image
 from .. import ga_layout as layout
 from ..capture_head import find_head
 from ..content_digests import content_digests
-from ..ga_reader import find_captures, read_capture
+from ..ga_reader import read_capture
 from ..head.arrays import HeadArrays
-from ..image_files import ImageInfo, probe_image
 from ..splits import sequence_names
 from ..transforms import FrameEntry, parse_frame
 from .expression_fit import ExpressionFit, weigh_expression
@@ -104,16 +103,6 @@ class Evidence:
         return {folder: tuple(sorted(timesteps)) for folder, timesteps in found.items()}
 
 
-def find_capture(path: str | Path) -> Path:
-    """The one capture at ``path``. Raises `InputError` where there is none or several."""
-    folder = Path(os.path.abspath(path))
-    captures = find_captures(folder) if folder.is_dir() else []
-    if len(captures) == 1:
-        return captures[0]
-    found = ", ".join(capture.name for capture in captures) or "none"
-    raise InputError(path, "", "one capture in the GaussianAvatars/VHAP layout", found, "Name one capture.")
-
-
 def gather(folder: Path, settings: LintSettings, progress: Progress = no_progress) -> Evidence:
     """Read all that can be read of a capture."""
     declaration, declaration_faults = _read_declaration(folder)
@@ -121,7 +110,7 @@ def gather(folder: Path, settings: LintSettings, progress: Progress = no_progres
     entries = [entry for part in splits.values() for entry in part]
     headers, file_faults = _probe(entries, progress)
     images = {entry.image for entry in entries} & headers.keys()
-    digests = content_digests(folder, images, progress=progress)
+    digests = content_digests(images, progress=progress)
     head, head_faults = _find_head(folder, declaration, settings)
     parameters, subject = read_parameters(entries, head, progress=progress)
     background = declaration.background if declaration else (1.0, 1.0, 1.0)

@@ -20,8 +20,8 @@ import numpy as np
 
 from ...bench.contracts import ByteArray, Camera, FloatArray
 from ...bench.errors import InputError
+from ...bench.image_files import ImageInfo
 from ..ga_layout import CyConvention
-from ..image_files import ImageInfo
 from ..images import read_image
 from ..mesh_pictures import vertex_normals
 from ..transforms import FrameEntry

@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from ...bench.arrays import read_npz
 from ...bench.contracts import FloatArray, HeadPose, Progress, no_progress
 from ...bench.errors import InputError
 from ..flame_parameters import Tracking, read_tracking
-from ..head.arrays import HeadArrays, read_npz
+from ..head.arrays import HeadArrays
 from ..head.model import HeadModel
 from ..transforms import FrameEntry
 

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ...bench.arrays import check_numbers, read_npy
 from ...bench.contracts import ByteArray, FloatArray
 from ...bench.errors import InputError
 from ..srgb import srgb_to_linear
@@ -24,6 +25,7 @@ from ..srgb import srgb_to_linear
 Correction = Callable[[ByteArray], ByteArray]
 """From (H, W, 3) 8-bit RGB to the same."""
 
+_LARGEST = 1e6  # of a coefficient; genuine ones are below 100
 _CHANNELS = "rgb"
 _PAIRS, _SQUARES, _CUBES = ("rg", "rb", "gb"), ("rr", "gg", "bb"), ("rrr", "ggg", "bbb")
 _CYCLE, _COUNTERCYCLE = ("rrg", "ggb", "bbr"), ("rrb", "ggr", "bbg")
@@ -139,18 +141,11 @@ def _to_bytes(levels: NDArray[Any]) -> ByteArray:
 
 def affine_correction(path: Path) -> AffineCorrection:
     """Read version 1, ``SER.npy``. Raises `InputError` for a file that holds no such matrix."""
-    try:
-        matrix = np.load(path, allow_pickle=False)
-    except FileNotFoundError as error:
-        raise InputError(path, "", "a colour correction", "no such file") from error
-    except Exception as error:  # a damaged file makes numpy raise almost anything
-        raise InputError(path, "", "an npy file of numbers", f"unreadable content ({error})") from error
-    numbers = isinstance(matrix, np.ndarray) and matrix.dtype.kind in "fiu"
-    if not numbers or matrix.ndim != 2 or matrix.shape[0] < 3 or matrix.shape[1] != 4:
-        found = f"{matrix.dtype} {matrix.shape}" if isinstance(matrix, np.ndarray) else "an archive"
+    matrix = read_npy(path)
+    if matrix.dtype.kind not in "fiu" or matrix.shape not in ((3, 4), (4, 4)):
+        found = f"{matrix.dtype} {matrix.shape}"
         raise InputError(path, "", "an affine matrix of numbers, (4, 4) or (3, 4)", found)
-    if not np.isfinite(matrix).all():
-        raise InputError(path, "", "finite numbers", "NaN or infinity")
+    check_numbers(path, "", matrix, _LARGEST)
     return AffineCorrection(matrix[:3].astype(np.float64))
 
 
@@ -164,6 +159,5 @@ def polynomial_correction(path: Path, serial: str, value: Any) -> PolynomialCorr
         counts = ", ".join(map(str, POLYNOMIALS))
         found = f"shape {matrix.shape}" if matrix.size else repr(value)[:60]
         raise InputError(path, serial, f"a 3 x N matrix of numbers, N out of {counts}", found)
-    if not np.isfinite(matrix).all():
-        raise InputError(path, serial, "finite numbers", "NaN or infinity")
+    check_numbers(path, serial, matrix, _LARGEST)
     return PolynomialCorrection(matrix)

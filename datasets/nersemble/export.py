@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from ...bench.contracts import Camera, FloatArray
-from ...bench.files import atomic_path, read_json, write_json, write_text
+from ...bench.documents import read_json
+from ...bench.files import atomic_path, grouped_writes, write_json, write_text
 from .. import ga_layout as layout
 from ..ga_documents import camera_record, file_record, save_npz, split_of, transforms_document
 from ..ga_writer import TRAIN_FRACTION
@@ -58,9 +59,10 @@ class SequenceExport:
         The splits within the sequence are VHAP's: the first 70 % of the timesteps are training and novel
         views, the rest is test.
         """
-        for timestep in range(tracked.count):
-            path = self.folder / "flame_param" / f"{timestep:05d}.npz"
-            save_npz(path, tracked.parameters(timestep))
+        with grouped_writes():
+            for timestep in range(tracked.count):
+                path = self.folder / "flame_param" / f"{timestep:05d}.npz"
+                save_npz(path, tracked.parameters(timestep))
         save_npz(self.folder / layout.CANONICAL_FILE, tracked.canonical())
         declaration.write(self.folder)
         frames = self._frames(tracked.shift)

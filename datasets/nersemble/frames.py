@@ -10,6 +10,7 @@ import cv2
 
 from ...bench.contracts import ByteArray
 from ...bench.errors import InputError
+from ...bench.image_files import read_pixels
 from .sequence import View, open_video
 
 
@@ -30,10 +31,8 @@ def read_frames(view: View, numbers: Sequence[int]) -> Iterator[RawFrame]:
     """
     if view.video is None:
         for number in numbers:
-            matte = (
-                _decode_image(view.mattes[number], view.size, cv2.IMREAD_GRAYSCALE) if view.mattes else None
-            )
-            bgr = _decode_image(view.images[number], view.size, cv2.IMREAD_COLOR)
+            matte = read_pixels(view.mattes[number], cv2.IMREAD_GRAYSCALE, view.size) if view.mattes else None
+            bgr = read_pixels(view.images[number], cv2.IMREAD_COLOR, view.size)
             yield RawFrame(number, bgr, matte)
         return
     frames = _decode_video(view.video, view, numbers)
@@ -48,15 +47,6 @@ def read_frames(view: View, numbers: Sequence[int]) -> Iterator[RawFrame]:
 def _one_channel(matte: ByteArray) -> ByteArray:
     """First channel: mattes are grey, and videos have it thrice."""
     return cv2.extractChannel(matte, 0).astype("uint8", copy=False)
-
-
-def _decode_image(path: Path, size: tuple[int, int], flags: int) -> ByteArray:
-    pixels = cv2.imread(str(path), flags)
-    if pixels is None:
-        raise InputError(path, "", "an image that decodes", "damaged data")
-    if (pixels.shape[1], pixels.shape[0]) != size:
-        raise InputError(path, "", f"{size[0]}x{size[1]} pixels", f"{pixels.shape[1]}x{pixels.shape[0]}")
-    return pixels.astype("uint8", copy=False)
 
 
 def _decode_video(path: Path, view: View, numbers: Sequence[int]) -> Iterator[ByteArray]:

@@ -5,7 +5,6 @@ Decoding, shrinking and encoding all happen in OpenCV with the interpreter's loc
 
 from __future__ import annotations
 
-import errno
 import os
 import queue
 import threading
@@ -17,15 +16,13 @@ from pathlib import Path
 
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
-from ...bench.files import WRITE_FAULTS
+from ...bench.files import grouped_writes
+from ...bench.image_files import probe_image
 from ...bench.machine import processor_count
 from ..ga_writer import write_png
-from ..image_files import probe_image
 from .frames import read_frames
 from .pixels import prepare_pixels, read_still
 from .plan import SequenceJob
-
-_WRITE_FAULTS = (*WRITE_FAULTS, errno.EACCES, errno.EPERM)
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +49,7 @@ def write_images(
     reports: queue.SimpleQueue[Future[None] | str] = queue.SimpleQueue()
     stop = threading.Event()
     done = kept
-    with ThreadPoolExecutor(workers or processor_count()) as pool:
+    with grouped_writes(), ThreadPoolExecutor(workers or processor_count()) as pool:
         for stream in streams:
             pool.submit(_run, stream, reports, stop).add_done_callback(reports.put)
         try:
@@ -68,8 +65,6 @@ def write_images(
         finally:
             stop.set()
             pool.shutdown(wait=True, cancel_futures=True)
-    for job in jobs:
-        _remove_leftovers(job)
     return done - kept, kept
 
 
@@ -96,15 +91,13 @@ def _run(stream: _Stream, reports: queue.SimpleQueue, stop: threading.Event) -> 
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Turn a full disk or a folder that cannot be written into an `InputError`."""
+    """Turn an error of the system into an `InputError` that names the file, the reason and how to go on."""
     try:
         yield
     except OSError as error:
-        if error.errno not in _WRITE_FAULTS:
-            raise
         remedy = "Make room (or let it be written) and start again: it continues where it stopped."
         raise InputError(
-            path, "", "a file that can be written", error.strerror or str(error), remedy
+            error.filename or path, "", "a file that can be written", error.strerror or str(error), remedy
         ) from error
 
 
@@ -134,10 +127,3 @@ def _is_whole(path: Path, width: int, height: int) -> bool:
     except InputError:
         return False
     return (info.width, info.height) == (width, height)
-
-
-def _remove_leftovers(job: SequenceJob) -> None:
-    """Remove temporary files that a killed call left behind."""
-    for name in ("images", "fg_masks"):
-        for path in (job.folder / name).glob(".*.png"):
-            path.unlink(missing_ok=True)

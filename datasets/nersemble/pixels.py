@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from ...bench.contracts import ByteArray
-from ...bench.errors import InputError
+from ...bench.image_files import read_pixels
 from .colour import Correction
 
 
@@ -63,11 +63,7 @@ def read_still(path: Path, size: tuple[int, int]) -> ByteArray:
 
     Raises `InputError` where it does not decode.
     """
-    still = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if still is None:
-        raise InputError(
-            path, "", "a still that decodes", "damaged data" if path.exists() else "no such file"
-        )
+    still = read_pixels(path, cv2.IMREAD_COLOR)
     return cv2.resize(still, size, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
 
 

@@ -10,13 +10,16 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from ...bench.contracts import Progress, no_progress
+from ...bench.documents import checked, read_json
 from ...bench.errors import InputError
-from ...bench.files import digest, read_json, write_json
+from ...bench.files import digest, remove_dead_temporaries, write_json
+from ...bench.lock import locked
 from .. import ga_layout as layout
 from ..head.arrays import save_head
 from .export import write_union
@@ -65,6 +68,15 @@ def prepare(
 ) -> list[SubjectResult]:
     """Prepare subjects. Raises `InputError` before the first image where a folder holds something else, and in
     mid-run for videos that end early and for a full disk; another call then continues."""
+    with ExitStack() as stack:
+        for plan in plans:  # one by one: other subjects of the same folder may be prepared elsewhere
+            stack.enter_context(locked(plan.union, beside=True))
+            for job in plan.jobs:
+                remove_dead_temporaries(job.folder)
+        return _prepare(plans, workers, progress)
+
+
+def _prepare(plans: Sequence[SubjectPlan], workers: int, progress: Progress) -> list[SubjectResult]:
     states = {job.folder: _checked_state(job) for plan in plans for job in plan.jobs}
     jobs = [job for plan in plans for job in plan.jobs]
     open_jobs = [job for job in jobs if not _has_all_images(job, states[job.folder])]
@@ -196,8 +208,8 @@ def _write_union(plan: SubjectPlan) -> dict[str, int]:
     readable = all((plan.union / name).exists() for name in layout.SPLIT_FILES.values())
     if readable and record.exists():
         value = read_json(record)
-        if value.get("metadata") == fingerprint and isinstance(value.get("frames"), dict):
-            return value["frames"]
+        if value.get("metadata") == fingerprint and "frames" in value:
+            return checked(value["frames"], dict[str, int], record, "frames")
     if own_head and plan.head is not None:  # FLAME's licence forbids copies; readers are given its file
         save_head(plan.union / layout.HEAD_FILE, plan.head)
     folders = [job.folder for job in train], [job.folder for job in test]

@@ -12,7 +12,7 @@ from typing import Literal
 import cv2
 
 from ...bench.errors import InputError
-from ..image_files import probe_image
+from ...bench.image_files import MAX_PIXELS, probe_image
 from .calibration import Calibration
 from .mp4 import check_boxes
 from .names import numbered, serial_of
@@ -246,9 +246,10 @@ def probe_video(path: Path) -> tuple[int, tuple[int, int]]:
         size = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
     finally:
         capture.release()
-    if count < 1 or min(size) < 1:
+    # An index of a few bytes can declare any number and size; a frame takes some bytes at least.
+    if not 1 <= count <= path.stat().st_size or min(size) < 1 or size[0] * size[1] > MAX_PIXELS:
         found = f"{count} frames of {size[0]}x{size[1]} pixels"
-        raise InputError(path, "", "a video with frames", found)
+        raise InputError(path, "", f"a video with frames of at most {MAX_PIXELS} pixels", found)
     return count, size
 
 

@@ -9,12 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
+from ...bench.arrays import MAX_MAGNITUDE, check_numbers, read_npz
 from ...bench.contracts import FloatArray
 from ...bench.errors import InputError
 from ..flame_parameters import resolve_teeth
 from ..ga_layout import parse_sequence_folder
 from ..ga_writer import CANONICAL_JAW
-from ..head.arrays import HeadArrays, read_npz
+from ..head.arrays import HeadArrays
 
 PER_TIMESTEP = {"translation": 3, "rotation": 3, "neck_pose": 3, "jaw_pose": 3, "eyes_pose": 6}
 """Arrays of shape (T, n) that every tracking has, in the order of an export; ``expr`` is (T, E)."""
@@ -71,8 +72,8 @@ def read_tracked(
     ``kept`` says of each frame before a cut whether it is among the ``timesteps``; parameters of all those frames
     are cut with them.
 
-    Raises `InputError` for a file of another tracker, missing arrays, wrong shapes, numbers that are not finite,
-    a number of timesteps other than ``timesteps``, and coefficients that the head model has no basis for.
+    Raises `InputError` for a file of another tracker, missing arrays, wrong shapes, numbers that are not finite or beyond
+    `MAX_MAGNITUDE`, a number of timesteps other than ``timesteps``, and coefficients that the head model has no basis for.
     """
     arrays = read_npz(path)
     if "rotation_matrices" in arrays:
@@ -162,9 +163,9 @@ def _floats(
         if array.ndim and shape[0] is not None and array.shape[0] != shape[0]:
             remedy = "Track the very frames that are prepared (mind every, and the frames VHAP extracted)."
         raise InputError(path, key, f"numbers of shape {wanted}", f"{array.dtype} {array.shape}", remedy)
-    values = array.astype(np.float32)
-    if not np.isfinite(values).all():
-        raise InputError(path, key, "finite float32 numbers", "NaN or infinity")
+    with np.errstate(over="ignore"):  # what overflows becomes infinite and is refused
+        values = array.astype(np.float32)
+    check_numbers(path, key, values, MAX_MAGNITUDE)
     return values
 
 

@@ -13,10 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...bench.contracts import FloatArray
+from ..rounding import COEFFICIENT_BITS, LENGTH_BITS, on_grid
 from .anatomy import MOUTH_HALF_WIDTH, lip_arc
 from .eyelids import blink, keep_off_eyes, lid_turn
 from .rig import jaw_weight, smoothstep
 from .surface import Surface
+
+_MIXING_BITS = 25  # 2**-25 times 2**-27 m leaves two metres of room in a float64
+_SWEEPS = 12  # of Jacobi rotations; 40 x 40 matrices need 8
 
 CORNER = (MOUTH_HALF_WIDTH, -0.0520, 0.0665)
 Vector = tuple[float, float, float]
@@ -216,7 +220,7 @@ def semantic_shapes(surface: Surface) -> dict[str, FloatArray]:
 class ExpressionBasis:
     """A version's expression directions (V, 3, E) and the matrix (K, E) from its shapes' activations to them.
 
-    ``names`` are the K shapes the basis plays; a version with eyelid bases leaves the blinks to those.
+    ``names`` are the K shapes the basis plays, E at most K; a version with eyelid bases leaves the blinks to those.
     """
 
     directions: FloatArray
@@ -235,20 +239,59 @@ def principal_basis(shapes: dict[str, FloatArray], deviation: FloatArray, seed: 
 
     Notes
     -----
-    With activations a ~ N(0, L L'), displacements are a'D. The SVD L'D = U S W' gives directions S W',
+    With activations a ~ N(0, L L'), displacements are a'D. The SVD L'D = U S W' gives directions S W' = U'L'D,
     orthogonal and in order of variance, whose coefficients are N(0, 1); activations a have the coefficients
-    a inv(L') U.
+    a inv(L') U. U are the eigenvectors of L'DD'L. The shapes are rounded first, and nothing that follows but the last
+    line depends on the order of a sum, so that all machines find the same directions: DD' and U'L'D are exact.
     """
-    stack = np.stack([field.ravel() for field in shapes.values()])
+    stack = on_grid(np.stack([field.ravel() for field in shapes.values()]), LENGTH_BITS)
     random = np.random.default_rng(seed)
     mixing = np.eye(len(stack)) + 0.35 * random.standard_normal((len(stack),) * 2) / np.sqrt(len(stack))
     root = deviation[:, None] * mixing
-    u, s, w = np.linalg.svd(root.T @ stack, full_matrices=False)
-    sign = np.sign(w[np.arange(len(w)), np.abs(w).argmax(axis=1)])  # an SVD's signs are arbitrary: fix them
-    directions = (s * sign)[:, None] * w
+    u = _eigenvectors(_product(_product(root.T, stack @ stack.T), root))
+    directions = on_grid(_product(u.T, root.T), _MIXING_BITS) @ stack
+    # An eigenvector's sign is arbitrary: fix it.
+    sign = np.sign(directions[np.arange(len(u)), np.abs(directions).argmax(axis=1)])
+    directions *= sign[:, None]
+    # Where shapes depend on each other, one combination moves nothing.
+    moving = on_grid(directions, LENGTH_BITS).any(axis=1)
+    directions, u, sign = directions[moving], u[:, moving], sign[moving]
     vertices = len(next(iter(shapes.values())))
     return ExpressionBasis(
         directions=directions.reshape(-1, vertices, 3).transpose(1, 2, 0),
         names=tuple(shapes),
-        from_semantic=np.linalg.solve(root.T, u * sign),
+        from_semantic=on_grid(np.linalg.solve(root.T, u * sign), COEFFICIENT_BITS),
     )
+
+
+def _product(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Product of small matrices, summed in one order everywhere, as BLAS's is not."""
+    product: FloatArray = (a[:, :, None] * b[None]).sum(axis=1)
+    return product
+
+
+def _eigenvectors(matrix: FloatArray) -> FloatArray:
+    """Eigenvectors of a symmetric (K, K) matrix, in columns, the largest eigenvalue's first.
+
+    Jacobi rotations of disjoint pairs (Golub and Van Loan, "Matrix Computations", 4th edition, 8.5.3), in elementary
+    operations alone: the last digits of LAPACK's differ between machines, and small gaps between eigenvalues would
+    enlarge them.
+    """
+    size = len(matrix)
+    even = size + size % 2
+    rotated, vectors = np.zeros((even, even)), np.eye(even)
+    rotated[:size, :size] = matrix
+    order = np.arange(even)
+    for _ in range(_SWEEPS * (even - 1)):
+        p, q = order[: even // 2], order[even // 2 :][::-1]
+        difference, twice = rotated[q, q] - rotated[p, p], 2.0 * rotated[p, q]
+        length = np.abs(difference) + np.sqrt(difference**2 + twice**2)
+        tangent = np.where(difference < 0.0, -twice, twice) / np.where(length > 0.0, length, 1.0)
+        cosine = 1.0 / np.sqrt(1.0 + tangent**2)
+        sine = tangent * cosine
+        for array in (rotated, rotated.T, vectors):  # of .T the columns are the rows
+            at_p, at_q = array[:, p], array[:, q]
+            array[:, p], array[:, q] = cosine * at_p - sine * at_q, sine * at_p + cosine * at_q
+        order = np.concatenate([order[:1], np.roll(order[1:], 1)])  # every pair meets once a sweep
+    largest_first = np.argsort(-np.diag(rotated)[:size], kind="stable")
+    return vectors[:size, largest_first]

@@ -7,6 +7,7 @@ import numpy as np
 from ...bench.contracts import FloatArray
 from ...bench.errors import InputError
 from ..head.arrays import HeadArrays
+from ..rounding import LENGTH_BITS, REGRESSOR_BITS, SHARE_BITS, on_grid
 from .expressions import LIDS, SEMANTIC_NAMES, ExpressionBasis, principal_basis, semantic_shapes
 from .eyelids import keep_off_eyes
 from .identity import identity_basis
@@ -36,16 +37,16 @@ def procedural_head(version: str = "2023") -> HeadArrays:
     shapes = version_shapes(surface, name)
     lids = None
     if name == "procedural2020":
-        lids = np.stack([shapes[lid] for lid in LIDS], axis=-1).astype(np.float32)
+        lids = on_grid(np.stack([shapes[lid] for lid in LIDS], axis=-1), LENGTH_BITS).astype(np.float32)
     return HeadArrays(
         version=name,
-        template=surface.vertices.astype(np.float32),
+        template=on_grid(surface.vertices, LENGTH_BITS).astype(np.float32),
         faces=surface.faces,
-        shape_basis=identity_basis(surface, _SEEDS[name]).astype(np.float32),
-        expression_basis=_expression_basis(shapes, name).directions.astype(np.float32),
-        pose_basis=pose_basis(surface).astype(np.float32),
-        joint_regressor=joint_regressor(surface).astype(np.float32),
-        skinning_weights=skinning_weights(surface).astype(np.float32),
+        shape_basis=on_grid(identity_basis(surface, _SEEDS[name]), LENGTH_BITS).astype(np.float32),
+        expression_basis=on_grid(_expression_basis(shapes, name).directions, LENGTH_BITS).astype(np.float32),
+        pose_basis=on_grid(pose_basis(surface), LENGTH_BITS).astype(np.float32),
+        joint_regressor=on_grid(joint_regressor(surface), REGRESSOR_BITS).astype(np.float32),
+        skinning_weights=on_grid(skinning_weights(surface), SHARE_BITS).astype(np.float32),
         parents=PARENTS.copy(),
         eyelid_basis=lids,
         regions=regions(surface),

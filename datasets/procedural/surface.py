@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ...bench.arrays import Member, read_arrays
 from ...bench.contracts import FloatArray, IntArray
-from ...bench.errors import InputError
-from ..head.arrays import read_npz
 from .anatomy import EYE_CENTER, EYE_RADIUS, LID_CLEARANCE, MOUTH_CAVITY, slit_height
 
 MIRROR = np.array([-1.0, 1.0, 1.0])
@@ -142,11 +141,11 @@ def load_surface(path: Path | None = None) -> Surface:
     if path is None:
         with as_file(files(__package__) / "head.npz") as packaged:
             return load_surface(packaged)
-    stored = read_npz(path)
-    missing = [name for name in ("vertices", "faces", "mirror") if name not in stored]
-    if missing:
-        raise InputError(path, missing[0], "an array of that name", f"only {', '.join(sorted(stored))}")
-    vertices, faces, mirror = (stored[name] for name in ("vertices", "faces", "mirror"))
-    if vertices.ndim != 2 or vertices.shape[1] != 3 or mirror.shape != vertices.shape[:1]:
-        raise InputError(path, "vertices", "(V, 3), and (V,) of mirror", f"{vertices.shape}, {mirror.shape}")
+    members = {
+        "vertices": Member("f", ("V", 3)),
+        "faces": Member("iu", ("F", 3)),
+        "mirror": Member("iu", ("V",)),
+    }
+    stored = read_arrays(path, members)
+    vertices, faces, mirror = (stored[name] for name in members)
     return assemble(vertices.astype(np.float64), faces.astype(np.int64), mirror.astype(np.int64))

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from ...bench.arrays import MAX_MAGNITUDE, TEXT, Member, read_arrays
 from ...bench.contracts import FloatArray, HeadPose
+from ...bench.errors import InputError
 from ...bench.files import atomic_path, digest
 from ..clip import CaptureClip
-from ..head.arrays import HeadArrays, read_npz
+from ..head.arrays import HeadArrays
 from .identity import EYEBALLS, FACE, Matching
 from .problem import FitProblem
 from .report import FrameResidual, RefitReport
@@ -26,6 +29,18 @@ PER_TIMESTEP = (
     *("coefficients", "angles", "rotation", "neck", "translation"),
     *("mean_mm", "p95_mm", "max_mm", "eyeballs_mm", "evaluations"),
 )
+
+
+_BLOCK = {
+    "mark": TEXT,
+    "coefficients": Member("f", ("T", "C"), MAX_MAGNITUDE),
+    "angles": Member("f", ("T", 9), MAX_MAGNITUDE),
+    **dict.fromkeys(("rotation", "neck", "translation"), Member("f", ("T", 3), MAX_MAGNITUDE)),
+    **dict.fromkeys(("mean_mm", "p95_mm", "max_mm", "eyeballs_mm"), Member("f", ("T",))),
+    "evaluations": Member("iu", ("T",)),
+    "vertex_sums": Member("f", ("n",)),
+}
+_log = logging.getLogger(__name__)
 
 
 class BlockFitter:
@@ -87,9 +102,13 @@ class BlockFitter:
         mark = digest(self._input, inputs, places)
         path = folder / f"refit-{index:05d}.npz"
         if path.exists():
-            kept = read_npz(path)
-            if str(kept.pop("mark", "")) == mark:
-                return kept
+            try:
+                sizes = {"T": len(poses), "C": len(self._problem.bound), "n": len(self.matching.vertices)}
+                kept = read_arrays(path, _BLOCK, sizes)
+                if str(kept.pop("mark")) == mark:
+                    return kept
+            except InputError as error:
+                _log.warning("fitted again: %s", error)
         block = self.fit(poses)
         with atomic_path(path) as temporary, temporary.open("wb") as stream:
             np.savez(stream, allow_pickle=False, mark=np.array(mark), **block)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ...bench.contracts import FrameKey, Progress, no_progress
 from ...bench.errors import InputError
-from ...bench.files import atomic_path
+from ...bench.files import atomic_path, grouped_writes
 from ..clip import CaptureClip
 from ..full_grid import require_full_grid
 from ..ga_writer import CapturePlan, CaptureWriter, SequencePlan
@@ -30,12 +30,13 @@ def write_capture(clip: CaptureClip, out: Path, progress: Progress = no_progress
     """
     plan, first = capture_plan(clip)
     writer = CaptureWriter(out, plan)
-    for done, (key, files) in enumerate(sorted(clip.files.items())):
-        progress(done, len(clip.files), "linking images")
-        place = (key.sequence, key.timestep - first[key.sequence], key.camera)
-        if files.mask is not None:
-            link_or_copy(files.mask, writer.mask_path(*place))
-        link_or_copy(files.image, writer.image_path(*place))
+    with grouped_writes():
+        for done, (key, files) in enumerate(sorted(clip.files.items())):
+            progress(done, len(clip.files), "linking images")
+            place = (key.sequence, key.timestep - first[key.sequence], key.camera)
+            if files.mask is not None:
+                link_or_copy(files.mask, writer.mask_path(*place))
+            link_or_copy(files.image, writer.image_path(*place))
     return writer.write_metadata()
 
 

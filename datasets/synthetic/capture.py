@@ -2,6 +2,9 @@
 
 A folder belongs to one set of settings. Each image is written whole or not at all and depends on nothing but
 those settings, so a killed run continues where it stopped and ends with the same capture.
+
+Everything but the pictures has the same bytes on every x86-64 machine (see `rounding`). Pictures have them with any
+number of threads and whatever numpy, BLAS, torch and libm use, but not on every kind of processor: see `scene`.
 """
 
 from __future__ import annotations
@@ -10,15 +13,18 @@ import multiprocessing
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
 from ...bench.contracts import Progress, no_progress
+from ...bench.documents import read_json
 from ...bench.errors import InputError
-from ...bench.files import read_json, write_json, write_text
+from ...bench.files import TEMPORARY, grouped_writes, write_json, write_text
+from ...bench.image_files import probe_image
 from ...bench.machine import processor_count
-from ..image_files import probe_image
+from ...bench.start import end_with_parent, starting_workers
 from .geometry import load_geometry
 from .performance import KINDS, Kind, share_out
 from .photographer import Photographer
@@ -27,7 +33,7 @@ from .scene import default_samples, sample_count
 from .take import Settings, Take, plan_take
 
 MANIFEST = "synthesis.json"
-_VERSION = 2
+_VERSION = 3
 _SMALL = 400_000  # pixels in all that are rendered sooner than another process starts
 _README = """This folder holds synthetic recordings made by `headbench synth`.
 
@@ -111,16 +117,25 @@ def _photograph(out: Path, take: Take, work: list[Job], workers: int | None) -> 
         photographer = Photographer(take) if work else None
         for job in work:
             assert photographer is not None
-            photographer.shoot(*job)
+            with grouped_writes():
+                photographer.shoot(*job)
             yield job[0], len(job[2])
         return
     # Spawned, since neither torch nor the renderer's thread pool survives a fork.
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(count, context, _begin, (out, take.index, take.settings)) as pool:
-        futures = {pool.submit(_shoot, job): job for job in work}
+    pool = ProcessPoolExecutor(count, context, _begin, (out, take.index, take.settings))
+    try:
+        with starting_workers():
+            futures = {pool.submit(_shoot, job): job for job in work}
         for future in as_completed(futures):
             future.result()
             yield futures[future][0], len(futures[future][2])
+    except BaseException:
+        for process in multiprocessing.active_children():
+            process.kill()  # else the images that they are at would be waited for
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 _photographer: list[Photographer] = []
@@ -128,12 +143,14 @@ _photographer: list[Photographer] = []
 
 
 def _begin(out: Path, index: int, settings: Settings) -> None:
+    end_with_parent()
     torch.set_num_threads(1)  # the processes share the cores already
     _photographer.append(Photographer(plan_take(out, index, load_geometry(settings.head), settings)))
 
 
 def _shoot(job: Job) -> None:
-    _photographer[0].shoot(*job)
+    with grouped_writes():
+        _photographer[0].shoot(*job)
 
 
 def _missing(take: Take, sequence: str, timestep: int) -> tuple[str, ...]:
@@ -181,13 +198,18 @@ def _claim(out: Path, settings: Settings, head: str) -> None:
     }
     # The same file may lie elsewhere: its content counts, not its path.
     wanted["head"] = Path(settings.head).name
-    manifest = out / MANIFEST
-    if not manifest.exists():
-        if out.exists() and any(out.iterdir()):
+    manifest, readme = out / MANIFEST, out / "README.txt"
+    if manifest.exists():
+        _compare(manifest, wanted)
+    else:
+        if out.exists() and any(_is_foreign(path) for path in out.iterdir()):
             raise InputError(out, "", "an empty folder or an earlier synthetic capture", "other files")
-        write_text(out / "README.txt", _README)
         write_json(manifest, wanted)
-        return
+    if not readme.exists():
+        write_text(readme, _README)
+
+
+def _compare(manifest: Path, wanted: dict[str, Any]) -> None:
     found = read_json(manifest)
     for key in {**wanted, **found}:
         value = wanted.get(key)
@@ -199,3 +221,11 @@ def _claim(out: Path, settings: Settings, head: str) -> None:
                 f"{found.get(key)!r}",
                 "Take another folder, or the same settings.",
             )
+
+
+def _is_foreign(path: Path) -> bool:
+    """Whether a file is none that a killed start of this command may have left before the manifest."""
+    if path.name == "README.txt" and path.is_file():
+        ours = _README.encode()
+        return path.stat().st_size != len(ours) or path.read_bytes() != ours
+    return not (path.is_file() and path.name.startswith(TEMPORARY))

@@ -42,7 +42,10 @@ _GAZE_SIDE, _GAZE_UP = 0.45, 0.32
 
 @dataclass(frozen=True, eq=False)
 class Translation:
-    """From expression controls to one head model: ``expression`` (K, E) and, where it has them, eyelids (K, 2)."""
+    """From expression controls to one head model: ``expression`` (K, E) and, where it has them, eyelids (K, 2).
+
+    Both stand on the grid of coefficients, as activations do: their products and sums are exact.
+    """
 
     head_model: str
     expression: FloatArray

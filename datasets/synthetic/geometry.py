@@ -6,9 +6,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from ...bench.arrays import read_npz
 from ...bench.contracts import FloatArray
 from ...bench.errors import InputError
-from ..head.arrays import HeadArrays, read_npz
+from ..head.arrays import HeadArrays
 from ..head.ict import expression_names, ict_head, is_ict
 from ..procedural.model import procedural_head
 from .anatomy import Anatomy

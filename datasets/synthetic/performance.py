@@ -15,6 +15,7 @@ from scipy.interpolate import PchipInterpolator
 
 from ...bench.contracts import FloatArray
 from ...bench.errors import InputError
+from ..rounding import COEFFICIENT_BITS, on_grid
 from .anatomy import SIDES
 from .controls import CONTROLS, EXPRESSION_CONTROLS
 
@@ -244,6 +245,7 @@ def perform(
             values[f"blink_{side}"] + 0.35 * np.maximum(-values["gaze_up"], 0), 0, 1
         )
     values |= {control: np.zeros(timesteps) for control in _MUTED[kind]}
+    values = {control: on_grid(curve, COEFFICIENT_BITS) for control, curve in values.items()}
     activations = [{control: float(values[control][t]) for control in CONTROLS} for t in range(timesteps)]
     excluded = {t: TONGUE for t, a in enumerate(activations) if a["tongue_out"] >= tongue_shows}
     return Performed(name, activations, excluded)

@@ -13,6 +13,7 @@ import numpy as np
 
 from ...bench.contracts import Camera, FloatArray
 from ...bench.errors import InputError
+from ..rounding import ANGLE_BITS, on_grid
 
 FRONTAL = "222200037"
 SERIALS = (
@@ -82,10 +83,11 @@ def _look_at(azimuth: float, elevation: float, target: FloatArray) -> FloatArray
     forward = -outward
     right = np.cross(forward, np.array([0.0, 1.0, 0.0]))
     right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
+    rotation = on_grid(np.stack([right, np.cross(forward, right), forward]), ANGLE_BITS)
     matrix = np.eye(4)
     matrix[:3, :3] = rotation
-    matrix[:3, 3] = -rotation @ (target + _DISTANCE * outward)
+    # Along the rounded axis, and summed in one order: the JSONs state these numbers to the last digit.
+    matrix[:3, 3] = -(rotation * (target - _DISTANCE * rotation[2])).sum(axis=1) + 0.0
     return matrix
 
 

@@ -2,6 +2,10 @@
 
 Mitsuba's own kernel (Embree rays, direct illumination) has nothing in common with the splat renderer, so an
 error of projection or blending in one cannot hide in the other.
+
+Embree chooses its instructions by the processor, takes approximate reciprocals and has no switch for either. On one
+machine, 19 of 1.4 million 8-bit values differed, by up to 3, between its AVX-512 and its AVX2 code, and 310, by up to 4, between
+AVX-512 and SSE4.2: 12 pictures of 144 x 208 pixels, 25 samples.
 """
 
 from __future__ import annotations

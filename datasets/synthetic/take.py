@@ -14,6 +14,7 @@ from ...bench.contracts import Camera, FloatArray, HeadPose
 from ...bench.files import digest
 from ..ga_writer import CapturePlan, CaptureWriter, SequencePlan
 from ..head.model import HeadModel
+from ..rounding import COEFFICIENT_BITS, LENGTH_BITS, on_grid
 from . import rig
 from .anatomy import Anatomy, measure
 from .geometry import Geometry
@@ -85,8 +86,8 @@ def plan_take(out: Path, index: int, geometry: Geometry, settings: Settings) -> 
     who = person(name, index, settings.seed, settings.dynamics)
     rng = np.random.default_rng([settings.seed, index, 3])
     head = geometry.head
-    shape = rng.standard_normal(head.shape_basis.shape[2]) * _IDENTITY_SPREAD
-    shape = np.clip(shape, -1.6, 1.6).astype(np.float32).astype(np.float64)
+    drawn = rng.standard_normal(head.shape_basis.shape[2]) * _IDENTITY_SPREAD
+    shape = on_grid(np.clip(drawn, -1.6, 1.6), COEFFICIENT_BITS)
     width, height = settings.size
     neutral = HeadModel(head, dtype=torch.float64).canonical(torch.from_numpy(shape))[0].numpy()
     anatomy = measure(head, neutral)
@@ -131,4 +132,4 @@ def _middle(anatomy: Anatomy, neutral: FloatArray, style: Style) -> FloatArray:
     low, high = above.min(axis=0), above.max(axis=0)
     low[2] -= (style.cap + style.rise) * anatomy.scale
     middle = 0.5 * (low + high)
-    return middle - np.array([0.0, _LOOK_BELOW * anatomy.scale, 0.0])
+    return on_grid(middle - np.array([0.0, _LOOK_BELOW * anatomy.scale, 0.0]), LENGTH_BITS)

@@ -93,6 +93,8 @@ def mouth_atlas(clip: Clip) -> MouthAtlas:
     width = float(np.ptp(neutral[lips, 0]))
     upper, lower = lips[span < middle], lips[span >= middle]
     near = np.abs(neutral[:, 0] - neutral[lips, 0].mean()) < 0.2 * width
+    if not near[upper].any() or not near[lower].any():
+        raise InputError(where, "regions[lips]", "an upper and a lower lip about the middle", "none of one")
     line = 0.5 * (neutral[upper[near[upper]], 1].min() + neutral[lower[near[lower]], 1].max())
     centre = np.array([neutral[lips, 0].mean(), line, neutral[lips, 2].max()])
 

@@ -27,11 +27,7 @@ def run(settings: TongueSettings, progress: Progress) -> Findings:
     """
     _check(settings)
     root, out = Path(settings.capture), Path(settings.out)
-    if not root.is_dir():
-        raise InputError(root, "capture", "a capture folder", "a file" if root.exists() else "nothing")
     captures = find_captures(root)
-    if not captures:
-        raise InputError(root, "capture", "a capture in the GaussianAvatars/VHAP layout", "none")
     path = out / DECISIONS_FILE
     decided = read_exclusions(path) if path.exists() else {}
     clips = [

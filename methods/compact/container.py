@@ -10,21 +10,27 @@ Layout
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
+from safetensors.numpy import save
 
+from ...bench.arrays import Member
+from ...bench.documents import parse_json
 from ...bench.errors import InputError
-from ...bench.files import atomic_path
+from ...bench.files import write_bytes
+from ..tensor_files import check_tensors, read_safetensors
 from .packing import DTYPES, MAX_BYTES, pack, unpack
 
 KEY, VERSION = "compact", 1
 MAX_ARRAYS = 64
+MOST, MOST_PER_BYTE = 2**22, 16
+"""Numbers of all arrays of a file: 4 million, and 16 for each packed byte. Avatars have one or two for each byte; the
+coder packs zeros ten thousand times smaller."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,57 +57,42 @@ def write_content(path: Path, content: Content) -> None:
         "steps": dict(content.steps),
         "arrays": arrays,
     }
-    with atomic_path(path) as temporary:
-        save_file(packed, temporary, {KEY: json.dumps(layout, separators=(",", ":"))})
+    write_bytes(path, save(packed, {KEY: json.dumps(layout, separators=(",", ":"))}))
 
 
 def read_content(path: Path) -> Content:
     """Read what `write_content` wrote.
 
-    Sizes are checked before anything is unpacked, all arrays together may take `MAX_BYTES`. Raises `InputError` for
-    anything else.
+    Sizes are checked before anything is unpacked, see `MOST`. Raises `InputError` for anything else.
     """
-    try:
-        with safe_open(path, framework="np") as file:
-            layout = _layout(path, file.metadata() or {})
-            names = set(file.keys())
-            if names != set(layout["arrays"]):
-                found = ", ".join(sorted(names.symmetric_difference(layout["arrays"])))
-                raise InputError(
-                    path, KEY, "the file's tensors and no others", f"a difference in {found}"[:200]
-                )
-            packed = {name: file.get_tensor(name) for name in sorted(names)}
-    except (SafetensorError, OSError) as error:
-        raise InputError(path, "", "a safetensors file", str(error)) from error
+    tensors, metadata = read_safetensors(path)
+    layout = _layout(path, metadata, sum(value.nbytes for value in tensors.values()))
+    if set(tensors) != set(layout["arrays"]):
+        found = ", ".join(sorted(set(tensors).symmetric_difference(layout["arrays"])))
+        raise InputError(path, KEY, "the file's tensors and no others", f"a difference in {found}")
+    check_tensors(path, tensors, dict.fromkeys(tensors, Member("u", (None,), dtype="u1")))
     arrays = {}
-    for name, stream in packed.items():
+    for name, stream in sorted(tensors.items()):
         dtype, shape = layout["arrays"][name]
-        if stream.dtype != np.uint8 or stream.ndim != 1:
-            raise InputError(path, name, "a uint8 stream", f"{stream.dtype} of shape {stream.shape}")
         try:
-            arrays[name] = unpack(stream.tobytes(), dtype, tuple(shape))
+            arrays[name] = unpack(stream.numpy().tobytes(), dtype, tuple(shape))
         except ValueError as error:
             raise InputError(path, name, f"{dtype} of shape {tuple(shape)}", str(error)) from error
     return Content(arrays, layout["text"], layout["steps"])
 
 
-def _layout(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
-    """The checked JSON of the metadata."""
-    try:
-        layout = json.loads(metadata.get(KEY, "null"))
-    except (ValueError, RecursionError) as error:
-        raise InputError(path, KEY, "JSON", f"text that does not parse ({error})"[:200]) from error
-    if not isinstance(layout, dict) or layout.get("version") != VERSION:
+def _layout(path: Path, metadata: Mapping[str, str], packed: int) -> dict[str, Any]:
+    """The checked JSON of the metadata of a file with so many packed bytes."""
+    layout = parse_json(metadata.get(KEY, "{}"), path, KEY)
+    if layout.get("version") != VERSION:
         raise InputError(path, KEY, f"the layout of a compact avatar, version {VERSION}", "none or another")
     arrays, text, steps = (layout.get(name) for name in ("arrays", "text", "steps"))
     if not isinstance(arrays, dict) or len(arrays) > MAX_ARRAYS or not all(map(_is_entry, arrays.values())):
         expected = f"up to {MAX_ARRAYS} times [type, shape], types among {', '.join(DTYPES)}"
         raise InputError(path, f"{KEY}, arrays", expected, repr(arrays)[:200])
-    total = sum(
-        int(np.prod(shape, dtype=object)) * DTYPES[dtype].itemsize for dtype, shape in arrays.values()
-    )
-    if total > MAX_BYTES:
-        raise InputError(path, f"{KEY}, arrays", f"{MAX_BYTES} bytes at most", f"{total}")
+    numbers, limit = sum(math.prod(shape) for _, shape in arrays.values()), MOST + MOST_PER_BYTE * packed
+    if numbers > limit:
+        raise InputError(path, f"{KEY}, arrays", f"at most {limit} numbers in {packed} bytes", f"{numbers}")
     if not isinstance(text, dict) or not all(isinstance(value, str) for value in text.values()):
         raise InputError(path, f"{KEY}, text", "strings by name", repr(text)[:200])
     if not isinstance(steps, dict) or not all(map(_is_step, steps.values())):
@@ -113,8 +104,8 @@ def _is_entry(entry: Any) -> bool:
     if not isinstance(entry, list) or len(entry) != 2 or not isinstance(entry[1], list):
         return False
     dtype, shape = entry
-    whole = all(type(size) is int and 0 <= size <= MAX_BYTES for size in shape)
-    return isinstance(dtype, str) and dtype in DTYPES and len(shape) <= 4 and whole
+    whole = len(shape) <= 4 and all(type(size) is int and 0 <= size <= MAX_BYTES for size in shape)
+    return isinstance(dtype, str) and dtype in DTYPES and whole
 
 
 def _is_step(value: Any) -> bool:

@@ -19,6 +19,8 @@ from .precision import Precision
 
 PLANES = tuple(f"plane_{pair}" for pair, _, _ in PAIRS)
 MATRICES = ("color_weight_0", "color_weight_1", *(f"line_direction_{layer}" for layer in range(3)))
+MAX_TABLE = 2**25
+"""Numbers of a plane or of all lines, those left out included; 512 x 512 samples of 128 channels."""
 SENSITIVITY_FLOOR = 1e-6  # a channel that changes nothing may have any step, but a finite one
 
 
@@ -78,6 +80,7 @@ def _decode_plane(arrays: Arrays, name: str) -> FloatArray:
     used = arrays.integers(f"{name}_used", None) > 0
     steps = arrays.floats(f"{name}_steps", None)
     values = arrays.decoded(name, steps[:, None].astype(np.float64), len(steps), int(used.sum()))
+    _check_size(arrays, f"{name}_used", len(used) * len(steps))
     plane = np.zeros((len(used), len(steps)), np.float32)
     plane[used] = values.T
     return plane
@@ -101,11 +104,16 @@ def _decode_lines(arrays: Arrays) -> FloatArray:
     steps = arrays.floats("lines_steps", None)
     wide = steps[:, None, None, None].astype(np.float64)
     values = arrays.decoded("lines", wide, len(steps), int(kept.sum()), None, None)
-    if len(kept) * values.shape[2] * values.shape[3] * len(steps) > 2**26:
-        raise InputError(arrays.path, "lines_kept", "a number of lines that fits their size", str(len(kept)))
+    _check_size(arrays, "lines_kept", len(kept) * values.shape[2] * values.shape[3] * len(steps))
     lines = np.zeros((len(kept), *values.shape[2:], len(steps)), np.float32)
     lines[kept] = np.moveaxis(values, 0, -1)
     return lines
+
+
+def _check_size(arrays: Arrays, name: str, size: int) -> None:
+    """Raise `InputError` where what was left out, which takes no bytes, would make a table too large."""
+    if size > MAX_TABLE:
+        raise InputError(arrays.path, name, f"a table of at most {MAX_TABLE} numbers", str(size))
 
 
 def negligible_lines(tensors: Mapping[str, Tensor], step: float) -> np.ndarray:

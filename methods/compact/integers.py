@@ -20,7 +20,8 @@ def dequantise(folded: np.ndarray, step: FloatArray | float) -> FloatArray:
     """The multiples of ``step`` that `quantise` rounded to, float32."""
     wide = folded.astype(np.int64)
     whole = np.where(wide % 2 == 1, -(wide + 1) // 2, wide // 2)
-    return (whole * np.asarray(step, np.float64)).astype(np.float32)
+    with np.errstate(over="ignore"):  # what overflows becomes infinite and is refused with all such numbers
+        return (whole * np.asarray(step, np.float64)).astype(np.float32)
 
 
 def narrow(values: np.ndarray) -> np.ndarray:

@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Literal
 
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save
 from torch import Tensor
 
-from ...bench.files import atomic_path
+from ...bench.files import write_bytes
+from ..tensor_files import read_safetensors
 
 Kind = Literal["half", "8bit"]
 LEVELS = 255
@@ -28,13 +29,12 @@ def write_reduced(path: Path, tensors: Mapping[str, Tensor], kind: Kind, exact: 
             stored[name] = value.to(torch.float16).contiguous()
         else:
             stored |= _eight_bits(name, value)
-    with atomic_path(path) as temporary:
-        save_file(stored, temporary)
+    write_bytes(path, save(stored))
 
 
 def read_reduced(path: Path) -> dict[str, Tensor]:
     """What `write_reduced` wrote, as float32 up to rounding; exact tensors as they were."""
-    stored = load_file(path)
+    stored, _ = read_safetensors(path)
     result: dict[str, Tensor] = {}
     for name, value in stored.items():
         if name.endswith((LOW, STEP)):

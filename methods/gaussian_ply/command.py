@@ -10,25 +10,33 @@ import torch
 
 from ...bench.contracts import HeadAsset, HeadPose, Progress, no_progress
 from ...bench.errors import InputError
+from ...bench.files import check_writable
 from ...bench.specs import Findings
 from ...datasets.ga_reader import read_capture
 from ..avatar_files import read_shared_head
 from ..compact.file import COMPACT_FILE
 from ..ga import GAAvatar
 from ..ga_files import PLY_FILE
+from ..gbs.avatar import GBSAvatar
+from ..insta.storage import FIELD_FILE as RADIANCE_FILE
 from ..ours_avatar import OursAvatar
 from ..ours_storage import FIELD_FILE
-from .harmonics_fit import fit_harmonics, sphere
+from ..tensor_files import read_safetensors
+from .harmonics_fit import fit_harmonics, sphere, turn_harmonics
 from .settings import ExportPlySettings
 from .table import write_gaussians
 
+EXPORTED = "an avatar of ours, ga or gbs"
+DRAWN = "A PLY cannot hold it; `headbench extremes` and `headbench reenact` draw its frames."
+
 
 def run(settings: ExportPlySettings, progress: Progress = no_progress) -> Findings:
-    """Write one pose of an avatar; tells how well harmonics take up its colours.
+    """Write one pose of an avatar; its findings state how well harmonics take up its colours.
 
-    Raises `InputError` for a folder that holds no avatar of ours or ga, and for a timestep that the capture lacks.
+    Raises `InputError` for a folder that holds no avatar of ours, ga or gbs, and for a timestep that the capture lacks.
     """
     folder, out = Path(settings.avatar), Path(settings.out)
+    check_writable(out, "--out")
     avatar = _read(folder)
     pose = _pose(settings, read_shared_head(folder), progress)
     splats = avatar.splats(pose)
@@ -36,6 +44,9 @@ def run(settings: ExportPlySettings, progress: Progress = no_progress) -> Findin
     if isinstance(avatar, GAAvatar):
         write_gaussians(out, splats, *avatar.harmonics())
         colours = "its own spherical harmonics, exactly"
+    elif isinstance(avatar, GBSAvatar):
+        write_gaussians(out, splats, *turn_harmonics(*avatar.harmonics(pose)))
+        colours = "its spherical harmonics in this pose, turned with the surface"
     else:
         seen_from = avatar.seen_from(pose)
         fit = fit_harmonics(seen_from.radiance, seen_from.normals, sphere(settings.directions))
@@ -52,12 +63,33 @@ def run(settings: ExportPlySettings, progress: Progress = no_progress) -> Findin
     return Findings(text, data)
 
 
-def _read(folder: Path) -> GAAvatar | OursAvatar:
+def _read(folder: Path) -> GAAvatar | GBSAvatar | OursAvatar:
     if (folder / PLY_FILE).exists():
         return GAAvatar.read(folder, "cpu")
-    if (folder / FIELD_FILE).exists() or (folder / COMPACT_FILE).exists():
+    if (folder / COMPACT_FILE).exists():
         return OursAvatar.read(folder, "cpu")
-    raise InputError(folder, "", f"an avatar: {PLY_FILE}, {FIELD_FILE} or {COMPACT_FILE}", "none of them")
+    names = _tensor_names(folder / FIELD_FILE)
+    if "differences" in names:
+        return GBSAvatar.read(folder, "cpu")
+    if "table" in names:
+        found = "an avatar of gha, whose splats are features that a network turns into colours"
+        raise InputError(folder, "", EXPORTED, found, DRAWN)
+    if names:
+        return OursAvatar.read(folder, "cpu")
+    if (folder / RADIANCE_FILE).exists():
+        raise InputError(folder, "", EXPORTED, "an avatar of insta, a radiance field without splats", DRAWN)
+    remedy = (
+        "The avatars of a run lie in the folder avatars/ inside its own."
+        if (folder / "run.json").exists()
+        else ""
+    )
+    expected = f"{EXPORTED}: {PLY_FILE}, {FIELD_FILE} or {COMPACT_FILE}"
+    raise InputError(folder, "", expected, "none of them", remedy)
+
+
+def _tensor_names(path: Path) -> set[str]:
+    """Names of a file's tensors, which show whose avatar it is; empty where there is no such file."""
+    return set(read_safetensors(path)[0]) if path.exists() else set()
 
 
 def _pose(settings: ExportPlySettings, head: HeadAsset, progress: Progress) -> HeadPose:

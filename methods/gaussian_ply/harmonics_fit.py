@@ -38,6 +38,30 @@ def sphere(count: int) -> Tensor:
     )
 
 
+def turn_harmonics(dc: Tensor, rest: Tensor, rotation: Tensor) -> tuple[Tensor, Tensor]:
+    """Harmonics along world directions, (N, 3) and (N, 3, 15), of harmonics along the splats' own directions.
+
+    A turned harmonic is a sum of those of its degree: found from as many directions as decide it, exact to rounding.
+
+    Parameters
+    ----------
+    dc, rest : (N, 3) and (N, 3, K - 1) along own directions, K up to 16.
+    rotation : (N, 3, 3) from a splat's own axes to the world's.
+    """
+    count = coefficient_count(DEGREE)
+    directions = sphere(4 * count).to(dc.dtype)
+    solve = torch.linalg.pinv(sh_basis(directions, DEGREE).double())
+    own = torch.zeros(len(dc), 3, count, dtype=dc.dtype)
+    own[:, :, 0], own[:, :, 1 : 1 + rest.shape[2]] = dc, rest
+    turned = torch.empty_like(own)
+    for start in range(0, len(dc), BLOCK):
+        rows = slice(start, start + BLOCK)
+        along = directions @ rotation[rows]  # (n, M, 3) the directions in the splats' own axes
+        basis = sh_basis(along.reshape(-1, 3), DEGREE).view(len(along), -1, count)
+        turned[rows] = (own[rows] @ basis.transpose(1, 2) @ solve.to(dc.dtype).t()).to(dc.dtype)
+    return turned[:, :, 0].contiguous(), turned[:, :, 1:].contiguous()
+
+
 def fit_harmonics(radiance: Callable[[Tensor], Tensor], normals: Tensor, directions: Tensor) -> HarmonicsFit:
     """Weighted least squares for each splat over (M, 3) directions from the splat to the camera.
 

@@ -6,9 +6,10 @@ from pathlib import Path
 
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
+from ...bench.lock import LOCK_FILE
 from ...bench.specs import Findings
 from ...datasets.ga_reader import read_capture
-from ..avatar_files import SUBJECT_FILE, Subject, save_shared_head, write_subject
+from ..avatar_files import HEAD_FILE, SUBJECT_FILE, Subject, save_shared_head, write_subject
 from ..ga_files import PLY_FILE, read_ga_splats, write_ga_splats
 from .settings import ImportGASettings
 
@@ -21,13 +22,14 @@ def run(settings: ImportGASettings, progress: Progress = no_progress) -> Finding
     Raises `InputError` for a file that does not fit, and for a folder that holds something already.
     """
     ply, out = Path(settings.ply), Path(settings.out)
-    if out.exists() and any(out.iterdir()):
+    ours = {LOCK_FILE, SUBJECT_FILE, HEAD_FILE}  # an avatar's only with its splats, which are written last
+    if out.exists() and any(path.name not in ours for path in out.iterdir()):
         raise InputError(out, "", "a new or an empty folder", "one with files in it")
     clip = read_capture(settings.capture, head=settings.head, progress=progress)
     splats, binding = read_ga_splats(ply, len(clip.head.faces), "cpu")
-    write_ga_splats(out / PLY_FILE, splats, binding)
     write_subject(out / SUBJECT_FILE, Subject.of(clip))
     save_shared_head(out, clip.head)
+    write_ga_splats(out / PLY_FILE, splats, binding)
     used = len(binding.unique())
     text = (
         f"{out}: {len(binding)} splats on {used} of {len(clip.head.faces)} triangles, subject {clip.subject}"

@@ -12,7 +12,7 @@ class ExportPlySettings:
     """Write an avatar in one pose as a 3D Gaussian splatting PLY that common viewers open."""
 
     avatar: tyro.conf.Positional[str]
-    """Folder of an avatar of ours or ga."""
+    """Folder of an avatar of ours, ga or gbs (RUN/avatars/...)."""
 
     out: str
     """PLY file to write."""

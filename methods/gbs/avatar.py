@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from ...bench.contracts import Camera, Frame, HeadPose, no_stage
 from ..avatar_files import HEAD_FILE, SUBJECT_FILE, Subject, read_shared_head, read_subject
@@ -74,6 +75,12 @@ class GBSAvatar:
         if camera is not None:
             colors = placed.colors(view_of(camera, self._device).center, self._degree)
         return posed_splats(placed.world, placed.opacities, colors)
+
+    @torch.no_grad()
+    def harmonics(self, pose: HeadPose) -> tuple[Tensor, Tensor, Tensor]:
+        """(N, 3) and (N, 3, K - 1) harmonics in a pose, along the splats' axes, and the (N, 3, 3) turn of these."""
+        placed = self._placed(pose)
+        return placed.sh_dc.cpu(), placed.sh_rest.cpu(), placed.rotation.cpu()
 
     def files(self) -> Sequence[Path]:
         """The splats and the subject."""

@@ -26,14 +26,17 @@ def deformation_gradients(rest: Tensor, moved: Tensor) -> Tensor:
     """(..., 3, 3) linear maps that take each triangle, with its normal, to where it has moved.
 
     A fourth vertex off the triangle at n / sqrt(|n|), n being the cross product of its edges, makes the map unique
-    (Sumner and Popovic, eq. 1 to 3). It takes a point x of the rest triangle's plane to ``Q (x - v0) + v0'``.
+    (Sumner and Popovic, eq. 1 to 3). It takes a point x of the rest triangle's plane to ``Q (x - v0) + v0'``. A
+    triangle without area has no such map and gets the identity.
 
     Parameters
     ----------
     rest : (F, 3, 3) corners, metres.
     moved : (..., F, 3, 3) corners.
     """
-    return _edges(moved) @ torch.linalg.inv(_edges(rest))
+    inverse, singular = torch.linalg.inv_ex(_edges(rest))
+    maps = _edges(moved) @ inverse
+    return torch.where(singular[:, None, None] == 0, maps, torch.eye(3, dtype=maps.dtype, device=maps.device))
 
 
 def _edges(corners: Tensor) -> Tensor:

@@ -26,7 +26,7 @@ from .training import GBSTraining
 class GBS:
     """The method: see the module."""
 
-    name, version = "gbs", "2"
+    name, version = "gbs", "3"
 
     def __init__(self, config: GBSConfig | None = None):
         self.config = config or GBSConfig()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -12,14 +11,11 @@ import torch
 from torch import Tensor
 
 from ...bench.contracts import FloatArray, HeadAsset, IntArray
-from ...bench.errors import InputError
 from ...datasets.head.arrays import HeadArrays
 from ...datasets.head.regions import faces_in_region
-from ...datasets.head.teeth import with_teeth
+from ...datasets.head.teeth import with_teeth_where_possible
 from ..avatar_files import head_arrays
 from .config import Departure
-
-log = logging.getLogger(__name__)
 
 ROWS = ("teeth_upper", "teeth_lower")
 LOWER_TEETH_WEIGHTS = (0.0131, 0.0426, 0.9443)
@@ -47,15 +43,10 @@ class Cylinder(NamedTuple):
 def with_mouth(head: HeadAsset, departures: Sequence[Departure]) -> HeadArrays:
     """The head with teeth (regions `ROWS`), and with what the published code does otherwise than the paper.
 
-    A head that has teeth keeps them, one that has no lips to hang them on stays without. The paper's teeth are two
-    billboards of fixed size in FLAME's mouth; these plates follow the lips of any head.
+    Clips bring the same teeth for all methods; a head without gets them here. The paper's teeth are two billboards of
+    fixed size in FLAME's mouth; these plates follow the lips of any head.
     """
-    arrays = head_arrays(head)
-    if "teeth" not in arrays.regions:
-        try:
-            arrays = with_teeth(arrays)
-        except InputError as error:
-            log.warning("no teeth: %s", error)
+    arrays = with_teeth_where_possible(head_arrays(head))
     if "blended_lower_teeth" in departures and "teeth_lower" in arrays.regions:
         weights = arrays.skinning_weights.copy()
         weights[arrays.regions["teeth_lower"]] = (*LOWER_TEETH_WEIGHTS, 0, 0)

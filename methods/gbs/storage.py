@@ -8,14 +8,15 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor
 
+from ...bench.arrays import Member
 from ...bench.contracts import IntArray
 from ...bench.errors import InputError
-from ...bench.files import atomic_path
+from ...bench.files import write_bytes
 from ..sh import coefficient_count
+from ..tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors
 from .blend import Entries, difference_widths
 from .surface import SurfacePoints, full_barycentric
 
@@ -25,7 +26,13 @@ EXPRESSIONS = "expressions"
 
 GEOMETRY = {"means": 3, "log_scales": 3, "quats": 4, "opacities": 1, "sh_dc": 3}
 """First columns of the (N, 14 + 3 R) float32 table of neutral splats; R harmonics above degree 0 by channel follow."""
-TENSORS = ("splats", "triangles", "barycentric", "moved_by", "differences")
+MEMBERS = {
+    "splats": Member("f", ("N", None), MAX_MAGNITUDE, "f4"),
+    "triangles": Member("i", ("N",), dtype="i4"),
+    "barycentric": Member("f", ("N", 2), MAX_MAGNITUDE, "f4"),
+    "moved_by": Member("u", ("N", "bytes"), dtype="u1"),
+    "differences": Member("f", (None, None), MAX_MAGNITUDE, "f4"),
+}
 
 
 class Stored(NamedTuple):
@@ -71,22 +78,14 @@ def write_avatar(
         "moved_by": torch.from_numpy(np.packbits(moved_by.numpy(), axis=1)),
         "differences": differences.detach().to("cpu", torch.float32).contiguous(),
     }
-    with atomic_path(path) as temporary:
-        save_file(tensors, temporary, {EXPRESSIONS: str(expressions)})
+    write_bytes(path, save(tensors, {EXPRESSIONS: str(expressions)}))
 
 
 def read_avatar(path: Path, face_count: int, expression_size: int, device: str) -> Stored:
     """Read and check what `write_avatar` wrote. Raises `InputError` where a tensor is missing or does not fit."""
-    try:
-        with safe_open(path, framework="pt", device="cpu") as file:
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
-            said = (file.metadata() or {}).get(EXPRESSIONS, "")
-    except (SafetensorError, OSError) as error:
-        raise InputError(path, "", "a safetensors file", str(error)) from error
-    for name in TENSORS:
-        if name not in tensors:
-            raise InputError(path, name, "a tensor of that name", "none")
-    if not said.isdecimal() or int(said) > expression_size:
+    tensors, metadata = read_safetensors(path)
+    said = metadata.get(EXPRESSIONS, "")
+    if not said.isdecimal() or len(said) > 9 or int(said) > expression_size:
         raise InputError(path, EXPRESSIONS, f"a number up to {expression_size}", repr(said[:20]))
     expressions = int(said)
     moved_by = _check(path, tensors, face_count, expressions)
@@ -109,33 +108,26 @@ def _rest(splats: Tensor) -> int:
 
 def _check(path: Path, tensors: Mapping[str, Tensor], face_count: int, expressions: int) -> IntArray:
     """(N, K) which expressions move which splat. Raises `InputError` at the first tensor that does not fit."""
+    bytes_of = {"bytes": -(-expressions // 8)}
+    sizes = check_tensors(path, tensors, MEMBERS, bytes_of)
+    splats, triangles = tensors["splats"], tensors["triangles"]
 
     def require(name: str, fits: bool, expected: str) -> None:
         if not fits:
-            found = f"{tensors[name].dtype} of shape {tuple(tensors[name].shape)}, or other numbers"
-            raise InputError(path, name, expected, found)
+            raise InputError(path, name, expected, f"shape {tuple(tensors[name].shape)}, or other numbers")
 
-    for name in ("splats", "barycentric", "differences"):
-        fits = tensors[name].dtype == torch.float32 and bool(torch.isfinite(tensors[name]).all())
-        require(name, fits, "finite float32 numbers")
-    splats, triangles, barycentric = (tensors[name] for name in TENSORS[:3])
     rests = [3 * (coefficient_count(degree) - 1) for degree in range(4)]
-    require("splats", splats.ndim == 2 and len(splats) > 0 and _rest(splats) in rests, "(N, 14 + 3 R)")
-    count = len(splats)
-    fits = triangles.shape == (count,) and triangles.dtype == torch.int32
-    fits = fits and 0 <= int(triangles.min()) and int(triangles.max()) < face_count
-    require("triangles", fits, f"({count},) int32 triangles 0 to {face_count - 1}")
-    require("barycentric", barycentric.shape == (count, 2), f"({count}, 2)")
-    packed = tensors["moved_by"]
-    fits = packed.shape == (count, -(-expressions // 8)) and packed.dtype == torch.uint8
-    require("moved_by", fits, f"({count}, {-(-expressions // 8)}) uint8")
-    moved_by = np.unpackbits(packed.numpy(), axis=1, count=expressions)
+    require("splats", sizes["N"] > 0 and _rest(splats) in rests, f"(N, 14 + 3 R), 3 R one of {rests}")
+    fits = 0 <= int(triangles.min()) and int(triangles.max()) < face_count
+    require("triangles", fits, f"triangles 0 to {face_count - 1}")
+    check_sizes(path, splats[:, GEOMETRY["means"] : GEOMETRY["means"] + GEOMETRY["log_scales"]])
+    moved_by = np.unpackbits(tensors["moved_by"].numpy(), axis=1, count=expressions)
     widths = [
         sum(difference_widths(degree).values())
         for degree in range(4)
         if 3 * (coefficient_count(degree) - 1) <= _rest(splats)
     ]
     table = tensors["differences"]
-    fits = table.ndim == 2 and len(table) == int(moved_by.sum()) and table.shape[1] in widths
+    fits = len(table) == int(moved_by.sum()) and table.shape[1] in widths
     require("differences", fits, f"({int(moved_by.sum())}, C), C one of {widths}")
     return moved_by.astype(np.int64)

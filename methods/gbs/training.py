@@ -17,6 +17,7 @@ from ..sh import initial_coefficients
 from ..splat_trainer import Initial, SplatTrainer
 from ..subject_mesh import BoundedCache, SubjectMesh
 from ..training.densify import logit, rows_of_tables
+from ..training.images import recomposited
 from ..training.losses import photometric_loss
 from ..training.sampling import Sampler
 from ..training.schedule import Timeline
@@ -70,6 +71,9 @@ class GBSTraining(SplatTrainer):
         mattes = clip.mask(clip.splits["train"][0]) is not None
         super().__init__(clip, config.splats, sampler, device, mattes=mattes)
         self._config, self._mattes = config, mattes
+        self._recorded_on = self._background
+        if mattes:
+            self._background = torch.zeros_like(self._recorded_on)  # as published
         start = start_of(clip, config, subject, head, seed)
         self.points = start.points
         self.rig = Rig(head, subject.shape, subject.static_offset, start.points, config.expressions, device)
@@ -124,7 +128,7 @@ class GBSTraining(SplatTrainer):
         """Photometric loss of one image, alpha against the matte, and teeth that leave the mouth."""
         key, config, optimiser = self.keys[index], self._config, self._optimiser
         view = self._views[key.camera]
-        image = self._images.get(iteration, index)
+        image, coverage = self._on_background(self._images.get(iteration, index))
         pose = self._pose[key.timestep]
         carried = Carried.of(self._carried(pose).index_select(0, self.binding))
         coefficients = self._arguments["expression"][pose, : self.rig.expressions]
@@ -133,9 +137,9 @@ class GBSTraining(SplatTrainer):
         degree = min(config.sh_degree, iteration // self._degree_every)
         colors = placed.colors(view.center, degree)
         rendering, _ = self._render(placed.world, placed.opacities, colors, view, self._sizes)
-        loss = photometric_loss(rendering.image, image[:, :, :3], config.splats.ssim_weight)
-        if self._mattes and config.alpha_weight:
-            loss = loss + config.alpha_weight * (rendering.alpha - image[:, :, 3]).square().mean()
+        loss = photometric_loss(rendering.image, image, config.splats.ssim_weight)
+        if coverage is not None and config.alpha_weight:
+            loss = loss + config.alpha_weight * (rendering.alpha - coverage).square().mean()
         if self._room is not None and config.teeth_weight:
             part = self._part.index_select(0, self.binding)
             for row in range(1, self._rows + 1):
@@ -159,6 +163,16 @@ class GBSTraining(SplatTrainer):
         """(M, C) what is added at coefficient 1: as trained, times the mask."""
         table = self._optimiser[DIFFERENCES].detach() * self._column_scales
         return table * self.entries.weights[:, None]
+
+    def _on_background(self, image: Tensor) -> tuple[Tensor, Tensor | None]:
+        """(H, W, 3) colours on the background of training, and (H, W) coverage where there are mattes.
+
+        A matte takes the background that the image was recorded on out of it.
+        """
+        if not self._mattes:
+            return image, None
+        colors, coverage = image[:, :, :3], image[:, :, 3:]
+        return recomposited(colors, coverage, self._recorded_on, self._background), coverage[:, :, 0]
 
     def _position_progress(self, iteration: int) -> float:
         return iteration / max(self._timeline.at(self._config.position_settles), 1)

@@ -64,7 +64,8 @@ class GHAConfig:
         The latter stands for the published 0.1 LPIPS, whose backbone is not ours to ship.
     low_truth : "mean" compares the splatted colours with area means of the image; "gha" is the compatibility option
         for the published code, which takes every fourth pixel.
-    augment : rescale the feature image by 0.8 to 1.25 before super-resolution, as published.
+    augment : rescale the feature image by 0.8 to 1.25 before super-resolution, and cut out of it or put it at random,
+        as published.
     checkpoint_every_s : seconds between checkpoints.
     """
 

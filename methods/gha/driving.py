@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from ...bench.contracts import FloatArray, HeadAsset, HeadPose
+from ...datasets.head.arrays import check_size
 from ...datasets.head.model import HeadModel
 from ...datasets.head.rotations import (
     axis_angle_to_matrix,
@@ -90,6 +91,7 @@ class Driver:
             "static_offset": torch.as_tensor(np.asarray(static_offset)).to(self.model.template),
         }
         self.neutral = self.model.canonical(**self._identity)[0]
+        check_size("subject", "shape, static_offset", self.neutral.cpu().numpy(), np.asarray(head.faces))
         self.origin = torch.as_tensor(np.asarray(origin)).to(self.neutral)
         self.unit = unit
         self.expression_scale = expression_scale

@@ -105,7 +105,7 @@ class GaussianHead:
             *(world.means, world.quats, world.scales, splats.opacities, splats.features),
             *(small.world_to_camera, small.K, small.width, small.height),
             background=feature_background(background, self.config.channels),
-            check_finite=False,
+            check_values=False,
         )
         return Drawn(rendering.image, rendering.alpha)
 

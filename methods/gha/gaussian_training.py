@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -110,7 +110,8 @@ class GaussianTraining:
         small = reduced(padded, config.upscale, config.low_truth)
         loss = config.low_weight * (drawn.features[..., :3] - small).abs().mean()
         if config.augment:
-            drawn, padded = zoomed(drawn, padded, _zoom(scene.seed, iteration), scene.background)
+            zoom = Zoom.of(drawn.alpha.shape, _draws(scene.seed, iteration))
+            drawn, padded = zoomed(drawn, padded, zoom, scene.background)
         image = head.sharpen(tensors, drawn, scene.background)
         loss = loss + (image - padded).abs().mean()
         if config.structure_weight:
@@ -220,33 +221,62 @@ def reduced(image: Tensor, factor: int, how: str) -> Tensor:
     return image.view(height, factor, width, factor, 3).mean((1, 3))
 
 
-def zoomed(drawn: Drawn, truth: Tensor, factor: float, background: Tensor) -> tuple[Drawn, Tensor]:
-    """Feature image and truth rescaled about their middle and cut or padded to their size before.
+class Zoom(NamedTuple):
+    """A rescaling of the splatted image, and what is cut out of it or where it is put, in whole pixels.
+
+    Attributes
+    ----------
+    factor : of both sides; a whole number of pixels in height, as published.
+    size : (2,) rows and columns of the rescaled image.
+    start : (2,) first row and column cut out of it, or minus those that it is put at where it is the smaller.
+    """
+
+    factor: float
+    size: tuple[int, int]
+    start: tuple[int, int]
+
+    @classmethod
+    def of(cls, shape: Sequence[int], draws: Sequence[float]) -> Zoom:
+        """From three numbers in [0, 1): of the factor within `ZOOM`, of the row and of the column."""
+        height, width = shape
+        factor = int(height * (ZOOM[0] + (ZOOM[1] - ZOOM[0]) * draws[0])) / height
+        size = (round(height * factor), int(width * factor))
+        start = [
+            (1 if after >= before else -1) * int(draw * (abs(after - before) + 1))
+            for before, after, draw in zip((height, width), size, draws[1:], strict=True)
+        ]
+        return cls(factor, size, (start[0], start[1]))
+
+
+def zoomed(drawn: Drawn, truth: Tensor, zoom: Zoom, background: Tensor) -> tuple[Drawn, Tensor]:
+    """Feature image and ground truth rescaled alike, and cut or padded to their size before.
 
     By the nearest pixel, as published; what is padded is the (3,) ``background``, as where nothing is drawn.
     """
+    upscale = truth.shape[0] // drawn.alpha.shape[0]
     outside = feature_background(background, drawn.features.shape[2])
-    features = _zoomed(drawn.features, factor, outside)
-    alpha = _zoomed(drawn.alpha[..., None], factor, drawn.alpha.new_zeros(1))[..., 0]
-    return Drawn(features, alpha), _zoomed(truth, factor, background)
+    features = _zoomed(drawn.features, zoom, 1, outside)
+    alpha = _zoomed(drawn.alpha[..., None], zoom, 1, drawn.alpha.new_zeros(1))[..., 0]
+    return Drawn(features, alpha), _zoomed(truth, zoom, upscale, background)
 
 
-def _zoomed(values: Tensor, factor: float, outside: Tensor) -> Tensor:
+def _zoomed(values: Tensor, zoom: Zoom, upscale: int, outside: Tensor) -> Tensor:
     """The (H, W, C) image, with (C,) ``outside`` where it has nothing."""
 
-    def places(size: int) -> tuple[Tensor, Tensor]:
-        middle = 0.5 * size
-        place = ((torch.arange(size, device=values.device) + 0.5 - middle) / factor + middle).floor().long()
-        return place.clamp(0, size - 1), (place >= 0) & (place < size)
+    def places(size: int, rescaled: int, start: int) -> tuple[Tensor, Tensor]:
+        place = torch.arange(size, device=values.device) + upscale * start
+        known = (place >= 0) & (place < upscale * rescaled)
+        return (place / zoom.factor).floor().long().clamp(0, size - 1), known
 
-    (rows, rows_in), (columns, columns_in) = (places(size) for size in values.shape[:2])
+    (rows, rows_in), (columns, columns_in) = (
+        places(*axis) for axis in zip(values.shape[:2], zoom.size, zoom.start, strict=True)
+    )
     moved = values.index_select(0, rows).index_select(1, columns)
     return torch.where((rows_in[:, None] & columns_in)[..., None], moved, outside)
 
 
-def _zoom(seed: int, iteration: int) -> float:
-    draw = torch.rand((), generator=torch_generator(seed, "gha-zoom", iteration)).item()
-    return ZOOM[0] + (ZOOM[1] - ZOOM[0]) * draw
+def _draws(seed: int, iteration: int) -> list[float]:
+    return torch.rand(3, generator=torch_generator(seed, "gha-zoom", iteration)).tolist()
 
 
 def _padded(image: Tensor, camera: Camera, upscale: int, background: Tensor) -> Tensor:

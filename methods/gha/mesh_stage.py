@@ -16,7 +16,7 @@ from ..training.sampling import ShuffledEpochs
 from .mesh_head import MeshHead
 from .mesh_training import MeshTraining, Scene
 
-FOLDER, RESULT_FILE = "mesh", "mesh.pt"
+FOLDER, RESULT_FILE = "mesh", "mesh.safetensors"
 
 
 class MeshResult(NamedTuple):

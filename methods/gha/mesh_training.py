@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from ...bench.contracts import FrameKey
 from ..seeds import torch_generator
 from ..splats import rasterize
+from ..training.images import recomposited
 from ..training.optimiser import Optimiser
 from ..training.schedule import Timeline
 from ..views import View, view_of
@@ -106,12 +107,12 @@ class MeshTraining:
         opacities = vertices.new_full((len(vertices),), DISC_OPACITY)
         chosen = self._views(iteration, key)
         for seen in chosen:
-            view, truth, mask = self._target(seen)
+            view, truth, mask, background = self._target(seen)
             rendering = rasterize(
                 *(discs.means, discs.quats, discs.scales, opacities, colors),
                 *(view.world_to_camera, view.K, view.camera.width, view.camera.height),
-                background=scene.background,
-                check_finite=False,
+                background=background,
+                check_values=False,
             )
             part = COLOR * (rendering.image - truth).abs().mean()
             if mask is not None:
@@ -155,19 +156,23 @@ class MeshTraining:
         order = torch.randperm(len(others), generator=generator).tolist()
         return [key, *(others[place] for place in order[: self._config.mesh_views - 1])]
 
-    def _target(self, key: FrameKey) -> tuple[View, Tensor, Tensor | None]:
-        """View, (H, W, 3) image and (H, W) coverage at the stage's size."""
+    def _target(self, key: FrameKey) -> tuple[View, Tensor, Tensor | None, Tensor]:
+        """View, (H, W, 3) image and (H, W) coverage at the stage's size, and the (3,) background of the image.
+
+        Black, as published, where a matte takes the background out of the image.
+        """
         scene = self._scene
         camera = scene.clip.cameras[key.camera]
         factor = min(1.0, self._config.mesh_size / max(camera.width, camera.height))
         width, height = max(1, round(camera.width * factor)), max(1, round(camera.height * factor))
         view = view_of(camera.resized(width, height), scene.device)
+        image = _reduced(scene.clip.image(key), height, width, scene.device)
         mask = scene.clip.mask(key)
-        return (
-            view,
-            _reduced(scene.clip.image(key), height, width, scene.device),
-            None if mask is None else _reduced(mask[..., None], height, width, scene.device)[..., 0],
-        )
+        if mask is None:
+            return view, image, None, scene.background
+        coverage = _reduced(mask[..., None], height, width, scene.device)
+        black = torch.zeros_like(scene.background)
+        return view, recomposited(image, coverage, scene.background, black), coverage[..., 0], black
 
     def _fitted(self, initial: dict[str, Tensor]) -> dict[str, Tensor]:
         """The geometry network after it learnt the distances of the start."""

@@ -52,7 +52,7 @@ class GHA:
     clock : seconds, from any start; what budgets in seconds are measured by.
     """
 
-    name, version = "gha", "2"
+    name, version = "gha", "3"
 
     def __init__(self, config: GHAConfig | None = None, clock: Callable[[], float] = time.monotonic):
         self.config, self._clock = config or GHAConfig(), clock

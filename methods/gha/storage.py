@@ -6,16 +6,17 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, fields
 from pathlib import Path
-from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor
 
+from ...bench.arrays import Member
 from ...bench.configuration import build
+from ...bench.documents import parse_json
 from ...bench.errors import InputError
-from ...bench.files import atomic_path
+from ...bench.files import write_bytes
+from ..tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors
 from .config import GHAConfig
 from .gaussian_head import POINTS, GaussianHead
 
@@ -55,12 +56,8 @@ def write_avatar(path: Path, config: GHAConfig, tensors: Mapping[str, Tensor]) -
     kept = {name: value for name, value in tensors.items() if name not in (*POINTS, "features")}
     kept["table"] = table
     settings = {name: value for name, value in asdict(config).items() if name in RENDERING}
-    with atomic_path(path) as temporary:
-        save_file(
-            {name: value.detach().to("cpu", torch.float32).contiguous() for name, value in kept.items()},
-            temporary,
-            {CONFIG: json.dumps(settings)},
-        )
+    stored = {name: value.detach().to("cpu", torch.float32).contiguous() for name, value in kept.items()}
+    write_bytes(path, save(stored, {CONFIG: json.dumps(settings)}))
 
 
 def read_avatar(path: Path, expression_size: int, device: str) -> tuple[GaussianHead, dict[str, Tensor]]:
@@ -71,40 +68,33 @@ def read_avatar(path: Path, expression_size: int, device: str) -> tuple[Gaussian
     InputError
         Where the file is damaged, or a tensor is missing, does not fit the settings, or is not finite float32.
     """
-    try:
-        with safe_open(path, framework="pt", device=device) as file:
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
-            text = (file.metadata() or {}).get(CONFIG, "")
-    except (SafetensorError, OSError) as error:
-        raise InputError(path, "", "a safetensors file", str(error)) from error
-    head = GaussianHead.of(_settings(path, text), expression_size)
-    expected: dict[str, tuple[int | None, ...]] = {**head.shapes(), "landmarks": (None, 3)}
-    expected["table"] = (None, sum(POINTS.values()) + head.config.features)
+    tensors, metadata = read_safetensors(path)
+    head = GaussianHead.of(_settings(path, metadata.get(CONFIG, "")), expression_size)
+    columns = sum(POINTS.values()) + head.config.features
+    shapes: dict[str, tuple[int | None, ...]] = {
+        **head.shapes(),
+        "landmarks": (None, 3),
+        "table": (None, columns),
+    }
     of_code = ("expression_scale", "code_low", "code_high")
-    expected |= {"origin": (3,), "background": (3,), **dict.fromkeys(of_code, (expression_size,))}
-    for name, shape in expected.items():
-        value = tensors.get(name)
-        if value is None:
-            raise InputError(path, name, "a tensor of that name", "none")
-        fits = value.ndim == len(shape) and all(s in (None, n) for s, n in zip(shape, value.shape))
-        if not fits:
-            raise InputError(path, name, f"shape {shape}", f"shape {tuple(value.shape)}")
-        if value.dtype != torch.float32 or not torch.isfinite(value).all():
-            raise InputError(path, name, "finite float32 numbers", f"{value.dtype} or non-finite numbers")
+    shapes |= {"origin": (3,), "background": (3,), **dict.fromkeys(of_code, (expression_size,))}
+    members = {name: Member("f", shape, MAX_MAGNITUDE, "f4") for name, shape in shapes.items()}
+    # Where nothing bounds the code, these are float32's largest numbers.
+    members |= dict.fromkeys(("code_low", "code_high"), Member("f", (expression_size,), dtype="f4"))
+    check_tensors(path, tensors, members)
     if not len(tensors["landmarks"]) or not (tensors["expression_scale"] > 0).all():
         raise InputError(path, "landmarks, expression_scale", "at least one; above 0", "none, or not above 0")
-    columns = tensors.pop("table").split([*POINTS.values(), head.config.features], dim=1)
-    for name, column in zip((*POINTS, "features"), columns):
+    tensors = {name: tensors[name].to(device) for name in shapes}
+    table = tensors.pop("table").split([*POINTS.values(), head.config.features], dim=1)
+    for name, column in zip((*POINTS, "features"), table):
         tensors[name] = (column[:, 0] if name == "opacities" else column).contiguous()
+    check_sizes(path, tensors["log_scales"])
     return head, tensors
 
 
 def _settings(path: Path, text: str) -> GHAConfig:
-    try:
-        values: Any = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise InputError(path, CONFIG, "settings as JSON", repr(text)[:80]) from error
+    values = parse_json(text, path, CONFIG)
     known = {field.name for field in fields(GHAConfig)}
-    if not isinstance(values, dict) or set(values) != set(RENDERING) & known:
+    if set(values) != set(RENDERING) & known:
         raise InputError(path, CONFIG, f"the settings {', '.join(RENDERING)}", repr(text)[:80])
     return build(GHAConfig, values, str(path))

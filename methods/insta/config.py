@@ -31,7 +31,8 @@ class InstaConfig:
     Density is confined to a shell about the mesh (the program marches a whole cube), so hair may stand off the tracked
     surface by ``shell_outside`` and no more. The occupancy at the mouth is probed with the coefficients of training
     frames (there with ones), rows of the hash table that an iteration does not touch decay with the others' moments
-    (there they are left out), and rays stop at a transmittance of 1e-3 (there 1e-2 when rendering).
+    (there they are left out), rays stop at a transmittance of 1e-3 (there 1e-2 when rendering), and an iteration's rays
+    come from ``images_per_iteration`` images.
 
     Moments in training (``..._from``) are on the scale of ``schedule_length`` and mapped to the budget at hand.
 
@@ -60,7 +61,8 @@ class InstaConfig:
         above which a cell is marched through.
     occupancy_whole : iterations of the actual run in which a refresh visits all cells; then it visits a quarter.
     samples_per_iteration, first_rays : samples the number of rays is adapted to, and how many rays to begin with.
-    images_per_iteration : training images that share an iteration's rays.
+    images_per_iteration : training images that share an iteration's rays; the program takes all it has loaded, up to
+        1,700.
     round_samples, stop_transmittance : samples per ray that are evaluated before rays with less transmittance than
         this stop.
     huber : where the colour loss turns from square to linear.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ..training.images import recomposited
 from .config import InstaConfig
 
 COLOR_PART = 0.2  # the published program divides the Huber loss by 5
@@ -38,7 +39,7 @@ def true_colors(
         own = (image - (1 - coverage) * recorded_on).clamp(0, 1) / coverage.clamp_min(1 / 255)
         mixed = coverage * to_linear(own.clamp(0, 1)) + (1 - coverage) * to_linear(background)
         return to_srgb(mixed)
-    return image + (1 - coverage) * (background - recorded_on)
+    return recomposited(image, coverage, recorded_on, background)
 
 
 def to_linear(srgb: Tensor) -> Tensor:

@@ -11,10 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ...bench.arrays import Member, read_arrays
 from ...bench.configuration import build
+from ...bench.documents import read_json
 from ...bench.errors import HeadbenchError, InputError
-from ...bench.files import read_json, write_json
-from ..avatar_files import read_arrays, write_arrays
+from ...bench.files import write_json
+from ..avatar_files import write_arrays
 from .config import InstaConfig
 from .field import Architecture
 
@@ -54,15 +56,8 @@ def read_field(
     Raises `InputError` where an array is missing, not finite or of another shape or type.
     """
     shapes = architecture.shapes()
-    arrays = read_arrays(path, (*shapes, OCCUPIED))
-    for name, shape in shapes.items():
-        values = arrays[name]
-        if values.shape != shape or values.dtype != np.float16 or not np.isfinite(values).all():
-            found = f"{values.dtype} of shape {values.shape}, or non-finite numbers"
-            raise InputError(path, name, f"finite float16 of shape {shape}", found)
-    bits, cells = arrays[OCCUPIED], math.prod(size)
-    if bits.dtype != np.uint8 or bits.shape != (-(-cells // 8),):
-        expected = f"uint8 of shape {(-(-cells // 8),)}"
-        raise InputError(path, OCCUPIED, expected, f"{bits.dtype} of shape {bits.shape}")
+    cells = math.prod(size)
+    members = {name: Member("f", shape, dtype="f2") for name, shape in shapes.items()}
+    arrays = read_arrays(path, {**members, OCCUPIED: Member("u", (-(-cells // 8),), dtype="u1")})
     parameters = {name: torch.from_numpy(arrays[name].astype(np.float32)).to(device) for name in shapes}
-    return parameters, np.flatnonzero(np.unpackbits(bits, count=cells))
+    return parameters, np.flatnonzero(np.unpackbits(arrays[OCCUPIED], count=cells))

@@ -84,7 +84,7 @@ def rasterize_cpu(request: Request, backend: str, threads: int | None) -> Render
         available[backend],
         threads,
     )
-    return Rendering(image, alpha, radii, request.masked)
+    return request.rendering(image, alpha, lambda: radii)
 
 
 class _Rasterize(torch.autograd.Function):
@@ -133,16 +133,15 @@ class _Rasterize(torch.autograd.Function):
         ctx.threads, ctx.absolute_like = threads, absolute.shape
         ctx.save_for_backward(*inputs)
         # Taking the one image out of a stack here and not outside spares autograd a copy of its gradient.
-        outputs = (images, alphas, radii) if batched else (images[0], alphas[0], radii[0])
-        ctx.mark_non_differentiable(outputs[2])
-        return outputs
+        ctx.mark_non_differentiable(radii)
+        return (images, alphas, radii) if batched else (images[0], alphas[0], radii)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad_images: Tensor, grad_alphas: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
         inputs = ctx.saved_tensors
         views = len(ctx.frames)
-        # The kernel adds to those of visible splats; culled ones have zero.
+        # The kernel adds to those of drawn splats; the others have zero.
         gradients = [torch.zeros_like(value) for value in inputs]
         grad_viewmats, grad_Ks = inputs[0].new_zeros(views, 4, 4), inputs[0].new_zeros(views, 3, 3)
         absolute = ctx.absolute_like if ctx.needs_input_grad[_ABSOLUTE] else (views, 0, 2)

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from ...bench.errors import UnavailableError
 from .constants import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN
+from .reference import published_radii
 from .request import Rendering, Request
 
 log = logging.getLogger(__name__)
@@ -30,6 +31,25 @@ REMEDY = "pip install 'headbench[cuda]', on a machine with an NVIDIA GPU and the
 def usable() -> bool:
     """Tell whether there is a GPU and gsplat is installed, without importing it."""
     return torch.cuda.is_available() and importlib.util.find_spec("gsplat") is not None
+
+
+def usable_or_warn(request: Request) -> bool:
+    """Tell whether gsplat is there and draws this request; if not, log why and what helps, once per process and reason."""
+    if not usable():
+        _warn_once("gsplat is not installed", REMEDY)
+        return False
+    if not _exact(request):
+        _warn_once(
+            "gsplat has no other cut-offs than the defaults of alpha_min and transmittance_min",
+            "Leave them at the defaults, or draw on the CPU.",
+        )
+        return False
+    return True
+
+
+@functools.cache
+def _warn_once(reason: str, remedy: str) -> None:
+    log.warning("On this GPU splats are drawn by the slow reference backend: %s. %s", reason, remedy)
 
 
 @functools.cache
@@ -46,9 +66,8 @@ def load() -> ModuleType:
 
 
 def supports(request: Request) -> bool:
-    """Tell whether gsplat takes this request's dtype, device and cut-offs."""
-    on_gpu = request.means.dtype == torch.float32 and request.means.device.type == "cuda"
-    return on_gpu and _exact(request)
+    """Tell whether gsplat takes this request's dtype and device."""
+    return request.means.dtype == torch.float32 and request.means.device.type == "cuda"
 
 
 def _exact(request: Request) -> bool:
@@ -118,9 +137,10 @@ def draw(gsplat: Any, request: Request) -> Rendering:
         backgrounds=request.backgrounds,
         absgrad=collects,
     )
-    # One radius in old releases, one by axis in new ones.
-    reach = radii.amax(-1) if radii.ndim == 3 else radii
-    return request.rendering(images, alphas.squeeze(-1), reach.to(torch.int32))
+    # gsplat's own radii are 0 for splats too faint to be drawn, and are cut to their opacity.
+    return request.rendering(
+        request.unstacked(images), request.unstacked(alphas.squeeze(-1)), lambda: published_radii(request)
+    )
 
 
 class _TakeAbsolute(torch.autograd.Function):
@@ -171,6 +191,6 @@ def clamp_of(gsplat: Any, device: str) -> float:
         eps2d=0.3,
         antialiased=False,
         batched=False,
-        masked=0,
+        masked=None,
     )
     return float(draw(gsplat, request).alpha[0, 0])

@@ -42,20 +42,20 @@ def rasterize_reference(request: Request) -> Rendering:
     """Render ``request``; see `rasterize` for the meaning of every field."""
     drawn = [_draw(request, request.view(index)) for index in range(len(request.viewmats))]
     images, alphas, radii = (torch.stack(parts) for parts in zip(*drawn, strict=True))
-    return request.rendering(images, alphas, radii)
+    return request.rendering(request.unstacked(images), request.unstacked(alphas), lambda: radii)
 
 
 def _draw(request: Request, view: View) -> tuple[Tensor, Tensor, Tensor]:
     """Image, alpha and radii of one camera."""
     with torch.no_grad():
-        visible, radii, extents = _find_visible(request, view)
-    footprints = project(request, view, visible)
+        drawn, extents, radii = _find_drawn(request, view)
+    footprints = project(request, view, drawn)
     order = torch.argsort(footprints.depths.detach(), stable=True)
-    visible, extents = visible[order], extents[order]
+    drawn, extents = drawn[order], extents[order]
     footprints = Footprints(*(value[order] for value in footprints))
-    colors = view.colors[visible]
+    colors = view.colors[drawn]
     absolute = (
-        footprints.means.new_zeros(len(visible), 2) if view.means2d_abs is None else view.means2d_abs[visible]
+        footprints.means.new_zeros(len(drawn), 2) if view.means2d_abs is None else view.means2d_abs[drawn]
     )
 
     rows = []
@@ -139,16 +139,15 @@ def project(request: Request, view: View, subset: Tensor) -> Footprints:
     return Footprints(means, torch.stack([xx + eps, xy, yy + eps], dim=-1), determinants, z, opacities)
 
 
-def _find_visible(request: Request, view: View) -> tuple[Tensor, Tensor, Tensor]:
-    """Indices (M,) of the splats to draw, radii (N,) of all, and half sizes (M, 2) of the bounding boxes.
+def _find_drawn(request: Request, view: View) -> tuple[Tensor, Tensor, Tensor]:
+    """Indices (M,) of the splats to draw, half sizes (M, 2) of their bounding boxes, and radii (N,) of all splats.
 
     Conditions are stated positively, so that a NaN anywhere culls.
     """
-    radii = torch.zeros(len(request.means), dtype=torch.int32, device=request.means.device)
-    depths = request.means @ view.viewmat[2, :3] + view.viewmat[2, 3]
-    candidate = (depths > request.near) & (depths < request.far) & (request.opacities >= request.alpha_min)
-    subset = candidate.nonzero().squeeze(-1)
+    subset = _in_depth(request, view)
     footprints = project(request, view, subset)
+    radii = torch.zeros(len(request.means), dtype=torch.int32, device=request.means.device)
+    radii[subset] = _published_radii(request, footprints)
 
     # alpha falls to alpha_min on the ellipse at Mahalanobis distance sqrt(2 ln(opacity / alpha_min)).
     level = 2 * torch.log(footprints.opacities / request.alpha_min)
@@ -156,12 +155,48 @@ def _find_visible(request: Request, view: View) -> tuple[Tensor, Tensor, Tensor]
     reach = torch.ceil(extents)
     size = torch.tensor([request.width, request.height], device=reach.device)
     inside = (footprints.means + reach > 0).all(-1) & (footprints.means - reach < size).all(-1)
-    drawable = (footprints.determinants > 0) & torch.isfinite(footprints.determinants)
     opaque = footprints.opacities >= request.alpha_min
-    keep = inside & drawable & opaque & (reach.amax(-1) < RADIUS_MAX)
-    visible = subset[keep]
-    radii[visible] = reach[keep].amax(-1).to(torch.int32)
-    return visible, radii, extents[keep]
+    keep = inside & _resolved(footprints) & opaque & (reach.amax(-1) < RADIUS_MAX)
+    return subset[keep], extents[keep], radii
+
+
+@torch.no_grad()
+def published_radii(request: Request) -> Tensor:
+    """(V, N) radii, as `Rendering.radii` defines them, of all splats of a request."""
+    radii = torch.zeros(
+        *(len(request.viewmats), len(request.means)), dtype=torch.int32, device=request.means.device
+    )
+    for index, of_view in enumerate(radii):
+        view = request.view(index)
+        subset = _in_depth(request, view)
+        of_view[subset] = _published_radii(request, project(request, view, subset))
+    return radii
+
+
+def _in_depth(request: Request, view: View) -> Tensor:
+    """Indices (M,) of the splats between the near and the far plane."""
+    depths = request.means @ view.viewmat[2, :3] + view.viewmat[2, 3]
+    return ((depths > request.near) & (depths < request.far)).nonzero().squeeze(-1)
+
+
+def _published_radii(request: Request, footprints: Footprints) -> Tensor:
+    """(M,) int32: preprocessCUDA of diff-gaussian-rasterization (Kerbl et al. 2023), where opacity plays no part.
+
+    Three standard deviations along the longest axis, and 0 where the square of that half side about the mean meets no
+    tile. Pixel centres are whole numbers there, and so half a pixel from ours.
+    """
+    xx, xy, yy = footprints.covariances.unbind(-1)
+    spread = torch.sqrt((0.25 * (xx - yy) ** 2 + xy * xy).clamp(min=0.1))
+    radii = torch.ceil(3 * torch.sqrt(0.5 * (xx + yy) + spread))
+    size = radii.new_tensor([-(-side // TILE) * TILE for side in (request.width, request.height)])
+    low, high = footprints.means - radii[:, None], footprints.means + radii[:, None]
+    in_view = (high >= 1.5).all(-1) & (low < size + 0.5).all(-1)
+    keep = in_view & _resolved(footprints) & (radii < RADIUS_MAX)
+    return torch.where(keep, radii, 0).to(torch.int32)
+
+
+def _resolved(footprints: Footprints) -> Tensor:
+    return (footprints.determinants > 0) & torch.isfinite(footprints.determinants)
 
 
 def _touching(means: Tensor, extents: Tensor, left: int, top: int, right: int, bottom: int) -> Tensor:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -12,20 +14,32 @@ from torch import Tensor
 
 from .constants import ALPHA_MAX, ALPHA_MIN, CHANNELS_MAX, TRANSMITTANCE_MIN
 
+_SMALLEST = torch.finfo(torch.float32).tiny
+"""Least focal length, pixels."""
+
 ArrayLike = Tensor | np.ndarray | Sequence[Any]
 
 
-class Rendering(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Rendering:
     """A rendered image, or V of them along a leading dimension where V cameras were asked for."""
 
     image: Tensor
     """(H, W, C), composited over the background."""
     alpha: Tensor
     """(H, W) in [0, 1]: one minus the transmittance."""
-    radii: Tensor
-    """(N,) int32, pixels: how far the splat reaches from its mean along the wider image axis; 0 where culled."""
+    find_radii: Callable[[], Tensor]
+    """Gives `radii`."""
     masked: int = 0
     """Splats left out because some value of theirs is not finite; counted with ``mask_non_finite`` alone."""
+
+    @functools.cached_property
+    def radii(self) -> Tensor:
+        """(N,) int32, pixels: which splats are in view (above 0) and how large, whatever their opacity; see `rasterize`.
+
+        Found when first asked for, for gsplat computes something else.
+        """
+        return self.find_radii()
 
 
 class View(NamedTuple):
@@ -60,7 +74,7 @@ class Request:
     eps2d: float
     antialiased: bool
     batched: bool
-    masked: int
+    masked: Tensor | None  # (N,) bool, splats to leave out; None for none
     alpha_min: float = ALPHA_MIN
     transmittance_min: float = TRANSMITTANCE_MIN
 
@@ -75,11 +89,18 @@ class Request:
             None if self.means2d_abs is None else self.means2d_abs[index],
         )
 
-    def rendering(self, images: Tensor, alphas: Tensor, radii: Tensor) -> Rendering:
-        """Give what was drawn, all with a leading V, the shape the caller expects."""
-        if self.batched:
-            return Rendering(images, alphas, radii, self.masked)
-        return Rendering(images[0], alphas[0], radii[0], self.masked)
+    def unstacked(self, values: Tensor) -> Tensor:
+        """Values of all cameras without their leading V where the caller gave one camera without it."""
+        return values if self.batched else values[0]
+
+    def rendering(self, image: Tensor, alpha: Tensor, find_radii: Callable[[], Tensor]) -> Rendering:
+        """What `rasterize` gives, from an image and an alpha as the caller expects them and a function for (V, N) radii."""
+
+        def radii() -> Tensor:
+            found = self.unstacked(find_radii())
+            return found if self.masked is None else found.masked_fill(self.masked, 0)
+
+        return Rendering(image, alpha, radii, 0 if self.masked is None else int(self.masked.sum()))
 
 
 def make_request(
@@ -100,7 +121,7 @@ def make_request(
     antialiased: bool,
     means2d_offset: Tensor | None,
     means2d_abs: Tensor | None,
-    check_finite: bool,
+    check_values: bool,
     mask_non_finite: bool,
     alpha_min: float = ALPHA_MIN,
     transmittance_min: float = TRANSMITTANCE_MIN,
@@ -149,8 +170,8 @@ def make_request(
             raise _error(name, "a positive integer", repr(size))
     if not 0 < near < far:
         raise _error("near, far", "0 < near < far", f"{near}, {far}")
-    if not eps2d >= 0:
-        raise _error("eps2d", "a number >= 0", repr(eps2d))
+    if not 0 <= eps2d < math.inf:
+        raise _error("eps2d", "a finite number >= 0", repr(eps2d))
     if not ALPHA_MIN <= alpha_min < ALPHA_MAX:
         raise _error("alpha_min", f"a number from 1/255 to below {ALPHA_MAX}", repr(alpha_min))
     if not TRANSMITTANCE_MIN <= transmittance_min < 1:
@@ -158,12 +179,16 @@ def make_request(
             "transmittance_min", f"a number from {TRANSMITTANCE_MIN} to below 1", repr(transmittance_min)
         )
 
-    masked = 0
+    masked = None
     if mask_non_finite:
         tensors, masked = _mask(tensors)
-    if check_finite or mask_non_finite:
+    if check_values or mask_non_finite:
         for name, value in {**tensors, **cameras, "background": over}.items():
             _check_finite(name, value)
+        _check_range("scales", tensors["scales"], "values >= 0", 0.0, math.inf)
+        _check_range("opacities", tensors["opacities"], "values in [0, 1]", 0.0, 1.0)
+        focals = cameras["K"].diagonal(dim1=-2, dim2=-1)[..., :2]
+        _check_range("K", focals, "focal lengths > 0", _SMALLEST, math.inf)
     return Request(
         **{name: tensors[name] for name in splats},
         means2d_offset=_leading(tensors.get("means2d_offset"), batched),
@@ -199,7 +224,7 @@ def _leading(value: Tensor | None, batched: bool) -> Tensor | None:
     return value if value is None or batched else value[None]
 
 
-def _mask(tensors: dict[str, Tensor]) -> tuple[dict[str, Tensor], int]:
+def _mask(tensors: dict[str, Tensor]) -> tuple[dict[str, Tensor], Tensor | None]:
     """Make splats with any value that is not finite invisible: zeros, and so no opacity and no gradient."""
     count = len(tensors["means"])
     bad = torch.zeros(count, dtype=torch.bool, device=tensors["means"].device)
@@ -207,13 +232,12 @@ def _mask(tensors: dict[str, Tensor]) -> tuple[dict[str, Tensor], int]:
         finite = torch.isfinite(value.detach())
         finite = finite if value.ndim == 1 else finite.all(-1)
         bad |= ~(finite if finite.ndim == 1 else finite.all(0))
-    masked = int(bad.sum())
-    if not masked:
-        return tensors, 0
+    if not bad.any():
+        return tensors, None
     return {
         name: value.masked_fill(bad if value.ndim == 1 else bad[:, None], 0.0)  # also under a leading V
         for name, value in tensors.items()
-    }, masked
+    }, bad
 
 
 def _check_like(name: str, value: Tensor, shape: tuple[int, ...], means: Tensor) -> None:
@@ -247,6 +271,19 @@ def _check_finite(name: str, value: Tensor) -> None:
         return
     first = tuple(int(i) for i in bad.nonzero()[0])
     raise _error(name, "finite values", f"{int(bad.sum())} that are not, the first at index {first}")
+
+
+def _check_range(name: str, value: Tensor, expected: str, low: float, high: float) -> None:
+    """Refuse values below ``low`` or above ``high``; two extremes are searched in the usual case."""
+    if not value.numel():
+        return
+    least, most = value.detach().aminmax()
+    if least >= low and most <= high:
+        return
+    bad = (value.detach() < low) | (value.detach() > high)
+    first = tuple(bad.nonzero()[0].tolist())
+    found = f"{int(bad.sum())} outside, the first {value[first].item():g} at index {first}"
+    raise _error(name, expected, found)
 
 
 def _error(name: str, expected: str, found: str) -> ValueError:

@@ -65,3 +65,8 @@ class TrainingImages:
             found = "none" if matte is None else f"{matte.dtype} of shape {matte.shape}"
             raise InputError(str(key), "mask", f"uint8 of shape {expected}", found)
         return matte
+
+
+def recomposited(image: Tensor, coverage: Tensor, recorded_on: Tensor, background: Tensor) -> Tensor:
+    """Colours (..., 3) on another background than the one they were recorded on; ``coverage`` is (..., 1) in [0, 1]."""
+    return image + (1 - coverage) * (background - recorded_on)

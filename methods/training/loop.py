@@ -13,12 +13,12 @@ from torch import Tensor
 
 from ...bench.contracts import Budget, Progress
 from ...bench.errors import InputError
-from .checkpoint import load_checkpoint, save_checkpoint
+from .checkpoint import REMEDY, load_checkpoint, save_checkpoint
 from .optimiser import Optimiser
 from .sampling import Sampler
 from .schedule import Timeline
 
-CHECKPOINT = "checkpoint.pt"
+CHECKPOINT = "checkpoint.safetensors"
 TRIAL_STEPS = 5  # steps timed to turn seconds into iterations
 COST_GROWTH = 1.6  # a step late in training costs about so much more than one at its start: more splats
 REPORT_EVERY = 10  # iterations between looks at the loss, each of which waits for the device
@@ -87,7 +87,7 @@ def train(
     Raises
     ------
     InputError
-        For a budget without iterations and seconds, and for a checkpoint of another run.
+        For a budget without iterations and seconds, and for a checkpoint that is damaged or of another run.
     """
     check_budget(budget)
     path = folder / CHECKPOINT
@@ -102,9 +102,13 @@ def train(
             total = _estimate(trainable, sampler, left, published_length, clock)
         trainable.begin(Timeline(total, published_length))
     else:
-        iteration, total, spent = saved["iteration"], saved["total"], saved["seconds"]
-        trainable.begin(Timeline(total, published_length))
-        trainable.load_state(saved["trainable"])
+        try:
+            iteration, total, spent = int(saved["iteration"]), int(saved["total"]), float(saved["seconds"])
+            trainable.begin(Timeline(total, published_length))
+            trainable.load_state(saved["trainable"])
+        except (KeyError, IndexError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+            found = f"another ({type(error).__name__}: {error})"
+            raise InputError(path, "state", "the state of this method", found, REMEDY) from error
     estimated = "" if budget.iterations else f"{total} iterations estimated; "
 
     def seconds() -> float:

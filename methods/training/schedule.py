@@ -57,8 +57,8 @@ class DensifySchedule:
     prune_extent_from: int
 
     @classmethod
-    def of(cls, settings: DensifiedTraining, timeline: Timeline) -> DensifySchedule:
-        """Fit the published schedule to a run."""
+    def of(cls, settings: DensifiedTraining, timeline: Timeline, *, white: bool) -> DensifySchedule:
+        """Fit the published schedule to a run; ``white`` says whether splats are trained on a white background."""
         long_enough = timeline.total > settings.min_reset_every
         full = timeline.total >= settings.schedule_length
         settle = 1 if full else settings.min_settle
@@ -70,7 +70,7 @@ class DensifySchedule:
             if settings.reset_every is None
             else timeline.every(settings.reset_every, settings.min_reset_every),
             first_reset=timeline.at(settings.densify_from)
-            if settings.reset_at_start and long_enough
+            if settings.reset_at_start and white and long_enough
             else None,
             prune_extent_from=timeline.at(settings.prune_extent_from),
         )

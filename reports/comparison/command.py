@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
 from dataclasses import asdict
 from itertools import combinations
@@ -14,6 +12,7 @@ from ...bench.errors import InputError
 from ...bench.protocol import TASK_TITLES
 from ...bench.scoring import FULL
 from ...bench.specs import Findings, MetricSpec
+from ..csv_table import csv_text
 from ..run_set import RunSet
 from ..statistics.comparisons import Comparison, compare
 from ..table_report import COMPARISON
@@ -39,13 +38,19 @@ def run(settings: CompareSettings, progress: Progress = no_progress) -> Findings
     if strange:
         names = ", ".join(spec.name for spec in runs.metrics)
         raise InputError("command line", "--metrics", f"metrics of the runs: {names}", ", ".join(strange))
-    rows = runs.rows[runs.rows["region"] == FULL]
     columns = [(task, spec) for task in runs.tasks for spec in metrics if spec.per_frame]
     columns += [("", spec) for spec in metrics if not spec.per_frame]
     found: list[tuple[MetricSpec, list[Comparison]]] = []
     for index, (task, spec) in enumerate(columns):
-        higher = spec.higher_is_better
-        comparisons = compare(rows, pairs, task, spec.name, higher_is_better=higher, level=settings.level)
+        comparisons = compare(
+            runs.rows,
+            pairs,
+            task=task,
+            metric=spec.name,
+            region=FULL,
+            higher_is_better=spec.higher_is_better,
+            level=settings.level,
+        )
         found.append((spec, comparisons))
         progress(index + 1, len(columns), spec.label)
     every = [comparison for _, comparisons in found for comparison in comparisons]
@@ -79,14 +84,12 @@ def _plain(comparison: Comparison) -> dict[str, object]:
 
 
 def _csv(comparisons: Sequence[Comparison]) -> str:
-    stream = io.StringIO()
-    writer = csv.DictWriter(stream, FIELDS, extrasaction="ignore", lineterminator="\n")
-    writer.writeheader()
+    lines: list[list[object]] = [list(FIELDS)]
     for comparison in comparisons:
         values = _plain(comparison)
         values["seeds_first"], values["seeds_second"] = comparison.seeds
-        writer.writerow({key: "" if value is None else value for key, value in values.items()})
-    return stream.getvalue().rstrip()
+        lines.append([values[name] for name in FIELDS])
+    return csv_text(lines).rstrip()
 
 
 def _text(spec: MetricSpec, comparisons: Sequence[Comparison]) -> str:

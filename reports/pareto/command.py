@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 
 from ...bench.contracts import Progress, no_progress
-from ...bench.files import atomic_path
+from ...bench.files import write_text
 from ...bench.specs import Findings
 from ...bench.store import RunFolder
 from ...bench.sweep.sweep import MARK
+from ..csv_table import csv_text
 from .front import pareto_front
 from .plot import Panel, write_plot
 from .points import Point, read_points
@@ -29,16 +29,12 @@ def run(settings: ParetoSettings, progress: Progress = no_progress) -> Findings:
     RunFolder(out).prepare()
     sign = 1.0 if metric.higher_is_better else -1.0
     fronts = {cost: _front(points, cost, sign, range(len(points))) for cost in COSTS}
-    with (
-        atomic_path(out / "points.csv") as temporary,
-        temporary.open("w", newline="", encoding="utf-8") as stream,
-    ):
-        writer = csv.writer(stream)
-        names = [field.name for field in fields(Point)]
-        writer.writerow([*names, *(f"on_front_of_{cost}" for cost in COSTS)])
-        for index, point in enumerate(points):
-            marks = [int(index in fronts[cost]) for cost in COSTS]
-            writer.writerow([*(asdict(point)[name] for name in names), *marks])
+    names = [field.name for field in fields(Point)]
+    lines: list[list[object]] = [[*names, *(f"on_front_of_{cost}" for cost in COSTS)]]
+    for index, point in enumerate(points):
+        marks = [int(index in fronts[cost]) for cost in COSTS]
+        lines.append([*(getattr(point, name) for name in names), *marks])
+    write_text(out / "points.csv", csv_text(lines))
     unit = f", {metric.unit}" if metric.unit else ""
     labels = {
         **COSTS,

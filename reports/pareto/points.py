@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ...bench.errors import InputError
+from ...bench.scoring import FULL
 from ...bench.specs import MetricSpec
-from ..aggregate import check_rows, summarise
+from ..aggregate import summarise
 from ..run_data import RunData
 
 SIZE, SPEED, LATENCY = "storage", "fps", "latency_p50"
@@ -49,7 +50,7 @@ def read_points(
     spec = None
     for folder in folders:
         data = RunData.read(folder)
-        check_rows(data.rows)
+        data.rows.check()
         if task not in data.tasks:
             raise InputError(folder, "task", ", ".join(data.tasks), task)
         found = next((m for m in data.metrics if m.name == metric and m.per_frame), None)
@@ -61,7 +62,7 @@ def read_points(
             names = ", ".join(name for name, unit in units.items() if unit == "ms") or "none"
             raise InputError(folder, "time", f"a metric in ms: {names}", time)
         spec = spec or found
-        protocol = str(data.manifest["protocols"][task]["hash"])
+        protocol = data.manifest.protocols[task].hash
         protocols.setdefault(protocol, folder)
         if len(protocols) > 1:
             first = next(iter(protocols))
@@ -70,10 +71,9 @@ def read_points(
         for method in data.methods:
             if method in data.trivial:
                 continue
-            own = data.rows[data.rows["method"] == method]
             quality, size, speed, latency = (
-                summarise(data.rows, own, *wanted)
-                for wanted in ((task, metric), ("", SIZE), ("", SPEED), ("", time or LATENCY))
+                summarise(data.rows, method=method, metric=name, task=where, region=FULL)
+                for name, where in ((metric, task), (SIZE, ""), (SPEED, ""), (time or LATENCY, ""))
             )
             if quality.value is None:
                 left_out.append(f"{method} of {folder}: {quality.reason}")
@@ -81,8 +81,8 @@ def read_points(
             milliseconds = latency.value
             if milliseconds is None and not time and speed.value:
                 milliseconds = 1000.0 / speed.value
-            derived = data.derived.get(method, {})
-            source, variant = str(derived.get("from", "")), str(derived.get("variant", ""))
+            derived = data.derived.get(method)
+            source, variant = (derived["from"], derived["variant"]) if derived else ("", "")
             points.append(
                 Point(
                     str(folder),

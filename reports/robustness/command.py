@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, TypeVar
 
 from ...bench.contracts import Progress
+from ...bench.files import output_inside
+from ...bench.lock import locked
 from ...bench.robustness.avatars import trained
 from ...bench.robustness.settings import ExtremesSettings, ReenactSettings
 from ...bench.robustness.trial import SHEET_FILE, table
 from ...bench.specs import Findings
 from ...bench.stages import Job
-from ...bench.store import RunFolder
 
 Settings = TypeVar("Settings", ExtremesSettings, ReenactSettings)
 
@@ -27,10 +29,10 @@ def try_run(
     """Try the avatars of a run, write the contact sheet; did not pass where a limit is broken."""
     folder = Path(settings.run)
     out = Path(settings.out) if settings.out else folder / default_folder
-    jobs = trained(folder, settings.methods, settings.data)
-    RunFolder(out).prepare()
-    summaries = attempt(jobs, settings, out, progress)
-    write_sheet(out)
+    _, jobs = trained(folder, settings.methods, settings)
+    with nullcontext() if settings.out else output_inside(folder), locked(out):
+        summaries = attempt(jobs, settings, out, progress)
+        write_sheet(out)
     text = f"{table(summaries)}\n{out / SHEET_FILE}"
     passed = all(summary["frames_broken"] == 0 for summary in summaries)
     return Findings(text, {"out": out, "avatars": summaries}, passed)

@@ -10,8 +10,9 @@ import cv2
 from PIL import Image
 
 from ...bench.contracts import ByteArray
+from ...bench.documents import read_json
 from ...bench.errors import InputError
-from ...bench.files import atomic_path, read_json
+from ...bench.files import atomic_path
 from ...bench.frames import read_png
 from ...bench.robustness.trial import RECORD_FILE, SHEET_FILE
 from ..drawing import MUTED, Colour, Pen, wrap

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import pandas as pd
 
+from ...bench.rows import ALL, Rows
 from ..aggregate import summarise
 from .bootstrap import interval
 from .holm import holm
@@ -80,11 +80,12 @@ class Comparison:
 
 
 def compare(
-    rows: pd.DataFrame,
+    rows: Rows,
     pairs: Sequence[tuple[str, str]],
+    *,
     task: str,
     metric: str,
-    *,
+    region: str,
     higher_is_better: bool,
     level: float = LEVEL,
 ) -> list[Comparison]:
@@ -95,7 +96,7 @@ def compare(
 
     Parameters
     ----------
-    rows : of one region, checked by `aggregate.check_rows`.
+    rows : checked by `Rows.check`.
 
     Raises
     ------
@@ -104,14 +105,19 @@ def compare(
     found = []
     for first, second in pairs:
         comparison = Comparison(task, metric, higher_is_better, first, second, level)
-        own = [rows[rows["method"] == method] for method in (first, second)]
-        summaries = [summarise(rows, part, task, metric) for part in own]
+        summaries = [
+            summarise(rows, method=method, metric=metric, task=task, region=region)
+            for method in (first, second)
+        ]
         absent = [f"{m}: {s.reason}" for m, s in zip((first, second), summaries) if s.value is None]
         if absent:
             found.append(replace(comparison, reason=" ".join(absent)))
             continue
-        values = [part[(part["task"] == task) & (part["metric"] == metric)] for part in own]
-        seeds = (int(values[0]["seed"].nunique()), int(values[1]["seed"].nunique()))
+        values = [
+            rows.select(method=method, metric=metric, task=task, region=region, seeds=ALL)
+            for method in (first, second)
+        ]
+        seeds = (len(rows.seeds(first)), len(rows.seeds(second)))
         found.append(_compared(replace(comparison, seeds=seeds), pair(*values)))
     return corrected(found)
 

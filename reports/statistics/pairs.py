@@ -13,7 +13,7 @@ import pandas as pd
 
 from ...bench.contracts import FloatArray
 from ...bench.errors import InputError
-from ..aggregate import FRAME
+from ...bench.rows import FRAME
 
 
 @dataclass(frozen=True, eq=False)

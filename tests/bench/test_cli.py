@@ -1,11 +1,21 @@
 import errno
+import io
 import json
+import os
+import shlex
+import subprocess
+import sys
+from contextlib import suppress
+from pathlib import Path
 
+import pandas as pd
 import pytest
 
 from headbench.bench import cli
 from headbench.bench.demo import DemoConfig, parse_size
-from headbench.bench.errors import InputError
+from headbench.bench.errors import HeadbenchError, InputError
+
+GALLERY = Path(__file__).parents[2] / "reports" / "gallery"
 
 
 @pytest.mark.parametrize("command", ["demo", "synth", "run", "table", "list", "bench", "stress"])
@@ -14,6 +24,29 @@ def test_help_teaches_every_option(command, capsys):
         cli.main([command, "--help"])
     assert caught.value.code == 0
     assert "usage: headbench" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1", "cp1252", "utf-8"])
+@pytest.mark.parametrize("words", [["table"], ["table", "--format", "json"], ["compare"], ["--help"]])
+def test_output_is_readable_in_every_encoding(monkeypatch, encoding, words):
+    folder = [] if words == ["--help"] else [str(GALLERY)]
+    for name in ("stdout", "stderr"):
+        monkeypatch.setattr(sys, name, io.TextIOWrapper(io.BytesIO(), encoding=encoding))
+    with suppress(SystemExit):
+        assert cli.main([*words, *folder]) == 0
+    sys.stdout.flush()
+    text = sys.stdout.buffer.getvalue().decode(encoding)
+    assert "\\u" not in text
+    assert "PSNR" in text or words == ["--help"]
+    assert "?" not in text
+    assert encoding != "utf-8" or words != ["table"] or "\N{UPWARDS ARROW}" in text
+
+
+def test_what_no_encoding_holds_is_escaped(monkeypatch, tmp_path):
+    monkeypatch.setattr(sys, "stderr", io.TextIOWrapper(io.BytesIO(), encoding="ascii"))
+    assert cli.main(["table", str(tmp_path / "\N{CJK UNIFIED IDEOGRAPH-9762}\udcff")]) == 2
+    sys.stderr.flush()
+    assert rb"\u9762\udcff" in sys.stderr.buffer.getvalue()
 
 
 def test_bad_input_is_one_paragraph_and_exit_code_2(capsys, tmp_path):
@@ -113,14 +146,17 @@ def test_a_folder_that_cannot_be_written_is_refused_before_work(capsys, tmp_path
         assert "can be written" in capsys.readouterr().err
 
 
-def test_json_gives_the_numbers_of_the_table(monkeypatch, tmp_path):
-    text = "method,version,group,novel_view/psnr,novel_view/psnr/rank,novel_view/psnr/status,fps,fps/rank,fps/status\n"
-    text += "ga,1,,25.5,1,ok,,,missing\n"
-    monkeypatch.setattr(cli, "resolve", lambda reference: lambda folder, format: text)
-    assert cli._means(tmp_path) == [
-        {"task": "novel_view", "method": "ga", "metric": "psnr", "value": 25.5, "status": "ok"},
-        {"task": "", "method": "ga", "metric": "fps", "value": None, "status": "missing"},
-    ]
+def test_json_gives_the_numbers_of_the_table():
+    means = cli._means(GALLERY)
+    found = {
+        (mean["task"], mean["method"], mean["metric"]): (mean["value"], mean["status"]) for mean in means
+    }
+    rows = pd.read_parquet(GALLERY / "rows.parquet")
+    own = rows[(rows["task"] == "novel_view") & (rows["method"] == "ga") & (rows["metric"] == "psnr")]
+    own = own[own["region"] == "full"]
+    expected = own.groupby("sequence")["value"].mean().mean()
+    assert found["novel_view", "ga", "psnr"] == (pytest.approx(expected, abs=1e-9), "ok")
+    assert len(found) == len(means) == 7 * 8  # methods, columns of the comparison
 
 
 @pytest.fixture
@@ -158,25 +194,95 @@ def test_the_splat_benchmark_is_listed(capsys):
     assert "splats" in capsys.readouterr().out
 
 
-def test_a_full_disk_is_told_in_a_line_with_its_remedy(capsys, monkeypatch):
-    def full(*arguments, **settings):
-        raise OSError(errno.ENOSPC, "No space left on device", "somewhere/rows.parquet")
+@pytest.mark.parametrize(
+    ("raised", "code", "line"),
+    [
+        (InputError("a.json", "x", "1", "2"), 2, "headbench: a.json, x: expected 1, found 2.\n"),
+        (HeadbenchError("no"), 2, "headbench: no\n"),
+        (OSError(errno.EACCES, "Permission denied", "a"), 2, "headbench: a: Permission denied\n"),
+        (OSError(errno.EISDIR, "Is a directory", "a"), 2, "headbench: a: Is a directory\n"),
+        (OSError(errno.ENAMETOOLONG, "File name too long", "a"), 2, "headbench: a: File name too long\n"),
+        (OSError(errno.EIO, "Input/output error"), 2, "headbench: Input/output error\n"),
+        (OSError(errno.ENOSPC, "No space left on device", "a"), 2, "start again.\n"),
+        (OSError("of a library,\nin two lines"), 2, "headbench: of a library, in two lines\n"),
+        (
+            BrokenPipeError(errno.EPIPE, "Broken pipe"),
+            2,
+            "headbench: Broken pipe\n",
+        ),  # not of standard output
+        (KeyboardInterrupt(), 130, "headbench: interrupted; start it again to continue\n"),
+        (KeyError("x"), 70, "please report it with the lines above\n"),
+        (RecursionError(), 70, "please report it with the lines above\n"),
+    ],
+)
+def test_an_error_ends_in_a_line_and_its_exit_code(capfd, monkeypatch, raised, code, line):
+    def fail(*arguments, **settings):
+        raise raised
 
-    monkeypatch.setattr(cli, "_call", full)
-    assert cli.main(["table", "run"]) == 2
-    told = capsys.readouterr().err
-    assert "somewhere/rows.parquet" in told
-    assert "No space left" in told
-    assert "Make room" in told
+    monkeypatch.setattr(cli, "_call", fail)
+    with open(os.devnull, "w") as stdout:
+        monkeypatch.setattr("sys.stdout", stdout)
+        assert cli.main(["table", "run"]) == code
+    error = capfd.readouterr().err
+    assert error.endswith(line)
+    assert ("Traceback" in error) == (code == 70)
 
 
-def test_other_faults_of_the_system_are_not_hidden(monkeypatch):
-    def broken(*arguments, **settings):
-        raise OSError(errno.EIO, "Input/output error")
+MAKE_ROOM = "Make room (or let it be written) and start again.\n"
+LONG = "n" * 300
 
-    monkeypatch.setattr(cli, "_call", broken)
-    with pytest.raises(OSError, match="Input/output"):
-        cli.main(["table", "run"])
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["table", LONG],
+        ["table", "."],
+        ["run", "--data", LONG, "--out", "out"],
+        ["run", "--data", ".", "--out", LONG],
+        ["run", "--config", LONG],
+        ["run", "--config", "."],
+        ["synth", "--out", LONG],
+        ["synth", "--out", "/dev/null"],
+        ["stress", "statistics", "--out", "."],
+        ["bench", "statistics", "--out", LONG],
+        ["bench", "statistics", "--out", "/dev/null"],
+        ["gate", ".", "--baseline", "b", "--junit", "."],
+        ["gate", ".", "--baseline", "b", "--junit", LONG],
+        ["gate", ".", "--baseline", "b", "--markdown", "/dev/full"],
+        ["gate", ".", "--baseline", ".", "--update"],
+    ],
+    ids=lambda arguments: " ".join(arguments).replace(LONG, "LONG"),
+)
+def test_a_path_that_cannot_be_used_is_code_2(arguments, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(arguments) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("headbench: ")
+    assert error.count("\n") == 1
+    assert list(tmp_path.glob(".*")) == []
+
+
+@pytest.mark.parametrize(
+    ("command", "code"),
+    [
+        ("headbench list methods > /dev/full", 2),
+        ("headbench --help > /dev/full", 2),
+        ("headbench list methods >&-", 0),
+        ("headbench list methods | true; exit ${PIPESTATUS[0]}", 0),
+        ("headbench gate none --baseline none | true; exit ${PIPESTATUS[0]}", 3),
+    ],
+)
+def test_output_that_goes_nowhere(command, code):
+    """A full disk is an error of its own; a reader that has gone changes no verdict."""
+    executable = shlex.join([sys.executable, "-m", "headbench.bench.cli"])
+    done = subprocess.run(
+        ["bash", "-c", command.replace("headbench", executable, 1)],
+        stderr=subprocess.PIPE,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == code, done.stderr
+    assert done.stderr == ("headbench: standard output: No space left on device. " + MAKE_ROOM) * (code == 2)
 
 
 def test_seeds_are_given_as_a_list(monkeypatch, tmp_path):

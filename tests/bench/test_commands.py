@@ -1,10 +1,14 @@
 """Commands that rooms offer: their settings become options, their findings output and exit code."""
 
+import dataclasses
+import importlib.metadata
 import json
+import subprocess
 
 import pytest
 
-from headbench.bench import cli, commands
+from headbench.bench import cli, commands, registry
+from headbench.bench.lock import locked
 from headbench.bench.registry import Plugin
 from headbench.bench.specs import CommandSpec
 
@@ -34,8 +38,8 @@ def offer(monkeypatch, tmp_path):
     (tmp_path / "toy_command.py").write_text(TOY)
     monkeypatch.syspath_prepend(tmp_path)
 
-    def offer(*names, settings="toy_command:Settings"):
-        specs = [CommandSpec(name, "look at it", "toy_command:run", settings) for name in names]
+    def offer(*names, settings="toy_command:Settings", writes=""):
+        specs = [CommandSpec(name, "look at it", "toy_command:run", settings, writes) for name in names]
         found = {spec.name.replace(" ", "-"): Plugin(spec.name, "toys 1", spec) for spec in specs}
         monkeypatch.setattr(commands, "discover", lambda group: found)
 
@@ -76,6 +80,60 @@ def test_two_words_share_the_first(offer, capsys):
     assert "big, small" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(
+    ("words", "answer"),
+    [
+        ("train", "`headbench run`"),
+        ("fit", "`headbench run`"),
+        ("render", "`headbench run`"),
+        ("benchmark", "`headbench run`"),
+        ("eval", "`headbench evaluate`"),
+        ("EVAL", "`headbench evaluate`"),
+        ("view", "`headbench export ply`"),
+        ("tabel", "`headbench table`"),
+        ("export-ply", "`headbench export ply`"),
+        ("export pyl", "`headbench export ply`"),
+        ("xyzzy", "`headbench --help` lists them"),
+    ],
+)
+def test_an_unknown_command_is_answered_with_the_nearest(capsys, words, answer):
+    assert cli.main(words.split()) == 2
+    error = capsys.readouterr().err
+    assert answer in error
+    assert ("Did you mean" in error) == (words != "xyzzy")
+
+
+def test_words_of_other_toolkits_lead_to_commands_that_exist():
+    names = {plugin.spec.name for plugin in commands.discover("commands").values()} | set(cli.COMMANDS)
+    assert set(commands.WORDS_OF_OTHERS.values()) <= names
+    assert not set(commands.WORDS_OF_OTHERS) & names
+
+
+def test_help_starts_with_demo_and_run(capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["--help"])
+    text = capsys.readouterr().out
+    assert text.index("• demo") < text.index("• run ") < text.index("• table") < text.index("• bench")
+    assert "--version" in text
+
+
+def test_version_is_that_of_the_package(capsys):
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr().out == f"headbench {importlib.metadata.version('headbench')}\n"
+
+
+def test_bash_completes_commands_their_second_words_and_options(capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["--tyro-print-completion", "bash"])
+    script = capsys.readouterr().out
+    for typed, offered in (("ex", "export extremes"), ("export p", "ply"), ("run --da", "--data")):
+        ask = f"COMP_WORDS=(headbench {typed}); COMP_CWORD={len(typed.split())}; _tyro_headbench; echo ${{COMPREPLY[*]}}"
+        answer = subprocess.run(
+            ["bash"], check=True, input=f"{script}\n{ask}\n", capture_output=True, text=True
+        )
+        assert answer.stdout.strip() == offered, answer.stderr
+
+
 def test_help_shows_the_settings_text(offer, capsys):
     offer("look")
     with pytest.raises(SystemExit):
@@ -88,3 +146,21 @@ def test_a_broken_command_is_listed_and_raises_only_when_called(offer, capsys):
     assert cli.main(["list", "reports"]) == 0
     assert cli.main(["look"]) == 2
     assert "not_there" in capsys.readouterr().err
+
+
+def test_a_folder_that_is_written_is_locked(offer, capsys, tmp_path):
+    offer("make", writes="path")
+    with locked(tmp_path):
+        assert cli.main(["make", str(tmp_path)]) == 2
+    assert "no other process works in" in capsys.readouterr().err
+    assert cli.main(["make", str(tmp_path)]) == 0
+
+
+def test_every_command_with_a_folder_to_write_locks_it():
+    """All but those that lock for themselves: they check first, or lock what they find to be written."""
+    own = {"evaluate", "extremes", "prepare nersemble", "reenact", "sweep"}
+    files = {"export ply"}  # --out is one
+    for plugin in registry.discover("commands").values():
+        spec = plugin.spec
+        names = {field.name for field in dataclasses.fields(registry.resolve(spec.settings))}
+        assert ("out" in names) == (spec.writes == "out" or spec.name in own | files), spec.name

@@ -2,11 +2,10 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import pytest
-import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from headbench.bench.configuration import build, merge, parse_assignments, read_yaml
+from headbench.bench.configuration import build, merge, parse_assignments
 from headbench.bench.errors import InputError
 
 
@@ -88,17 +87,3 @@ def test_merge_lays_one_over_the_other_without_changing_either():
 )
 def test_merging_with_itself_or_nothing_changes_nothing(values):
     assert merge(values, values) == merge(values, {}) == merge({}, values) == values
-
-
-def test_yaml_is_data_never_code(tmp_path):
-    path = tmp_path / "evil.yaml"
-    path.write_text("a: !!python/object/apply:os.system ['true']")
-    with pytest.raises(InputError, match="valid YAML"):
-        read_yaml(path)
-    path.write_text(yaml.safe_dump({"a": {"b": 1}}))
-    assert read_yaml(path) == {"a": {"b": 1}}
-    path.write_text("- 1")
-    with pytest.raises(InputError, match="mapping"):
-        read_yaml(path)
-    with pytest.raises(InputError, match="readable"):
-        read_yaml(tmp_path / "none.yaml")

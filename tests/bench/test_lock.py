@@ -9,7 +9,9 @@ import sys
 import pytest
 
 from headbench.bench.errors import InputError
+from headbench.bench.files import TEMPORARY
 from headbench.bench.lock import LOCK_FILE, locked
+from headbench.bench.progress import log_to
 
 HOLDER = """
 import sys, time
@@ -70,3 +72,42 @@ def test_a_lock_file_of_nonsense_is_no_obstacle_and_tells_nothing(tmp_path):
         (tmp_path / LOCK_FILE).write_text("[1, 2")
         with pytest.raises(InputError, match="does not tell its number"), locked(tmp_path):
             pytest.fail("entered twice")
+
+
+@pytest.mark.parametrize("name", [LOCK_FILE, "run.log"])
+def test_lock_and_log_are_never_links(tmp_path, name):
+    victim, folder = tmp_path / "victim", tmp_path / "run"
+    victim.write_text("victim")
+    folder.mkdir()
+    (folder / name).symlink_to(victim)
+    with (
+        pytest.raises(InputError, match="expected a file, found a link"),
+        log_to(folder / "run.log"),
+        locked(folder),
+    ):
+        pytest.fail("went on")
+    assert victim.read_text() == "victim"
+
+
+def test_what_dead_processes_left_is_removed_under_the_lock(tmp_path):
+    (tmp_path / "below").mkdir()
+    left = tmp_path / "below" / f"{TEMPORARY}x.png"
+    left.touch()
+    with locked(tmp_path):
+        assert not left.exists()
+
+
+def test_a_lock_beside_leaves_the_folder_empty(tmp_path):
+    with locked(tmp_path / "new", beside=True):
+        assert [path.name for path in tmp_path.iterdir()] == [".new.lock"]
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("there", [False, True])
+def test_a_new_folder_in_which_nothing_came_of_it_is_removed(tmp_path, there):
+    folder = tmp_path / "out"
+    if there:
+        folder.mkdir()
+    with pytest.raises(RuntimeError), locked(folder):
+        raise RuntimeError
+    assert folder.exists() == there

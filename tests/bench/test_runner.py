@@ -5,15 +5,17 @@ import json
 import math
 import types
 
+import pandas as pd
 import pytest
 
-from headbench.bench import runner
+from headbench.bench import cli, runner
+from headbench.bench.documents import read_json
 from headbench.bench.errors import HeadbenchError, InputError
 from headbench.bench.lock import locked
 from headbench.bench.registry import Plugin
 from headbench.bench.run_config import RunConfig
 from headbench.bench.specs import ReportSpec
-from headbench.bench.store import RunFolder, read_rows
+from headbench.bench.store import RunFolder
 
 
 @pytest.fixture
@@ -36,12 +38,18 @@ def config(toy, capture, tmp_path, monkeypatch):
     )
 
 
+def rows_of(config):
+    """Table of the rows of a run."""
+    runner.run(config)
+    return pd.read_parquet(RunFolder(runner.Path(config.out)).rows)
+
+
 def changed(config, **changes):
     return dataclasses.replace(config, **changes)
 
 
 def test_rows_hold_every_frame_of_every_task_keyed(config):
-    rows = runner.run(config)
+    rows = rows_of(config)
     errors = rows[rows["metric"] == "error"]
     assert len(errors) == 2 * (3 + 2)  # subjects x (novel-view + self-reenactment frames)
     row = errors[
@@ -53,12 +61,11 @@ def test_rows_hold_every_frame_of_every_task_keyed(config):
     per_avatar = rows[rows["metric"] == "files"]
     assert per_avatar["value"].tolist() == [1.0, 1.0]
     assert (per_avatar["timestep"] == -1).all()
-    assert read_rows(RunFolder(runner.Path(config.out)).rows).equals(rows)
 
 
 def test_the_manifest_names_everything_that_made_the_numbers(config):
     runner.run(config)
-    record = RunFolder(runner.Path(config.out)).read_manifest()
+    record = read_json(RunFolder(runner.Path(config.out)).manifest)
     assert record["status"] == "done"
     assert record["methods"][0]["config"] == {"level": 0.5, "fail": False}
     assert record["methods"][0]["budget"] == {"iterations": 2, "seconds": None}
@@ -69,14 +76,14 @@ def test_the_manifest_names_everything_that_made_the_numbers(config):
 
 
 def test_a_second_run_trains_nothing_again_and_gives_the_same_rows(config, toy):
-    first = runner.run(config)
+    first = rows_of(config)
     toy.FITS.clear()
-    assert runner.run(config).equals(first)
+    assert rows_of(config).equals(first)
     assert toy.FITS == []
 
 
 def test_a_run_killed_in_training_continues(config, toy, monkeypatch):
-    whole = runner.run(changed(config, out=config.out + "-whole"))
+    whole = rows_of(changed(config, out=config.out + "-whole"))
 
     def killed(self, *args, **kwargs):
         raise KeyboardInterrupt
@@ -86,7 +93,7 @@ def test_a_run_killed_in_training_continues(config, toy, monkeypatch):
         with pytest.raises(KeyboardInterrupt):
             runner.run(config)
     toy.FITS.clear()
-    assert runner.run(config).equals(whole)
+    assert rows_of(config).equals(whole)
     assert toy.FITS == ["subject2"]  # the first had been trained
 
 
@@ -106,14 +113,14 @@ def test_the_record_of_training_says_how_often_it_was_interrupted(config, toy, m
 
 
 def test_a_method_that_looks_at_held_out_frames_fails(config):
-    rows = runner.run(changed(config, methods=("toy_plugin:PEEKING",)))
+    rows = rows_of(changed(config, methods=("toy_plugin:PEEKING",)))
     assert set(rows["status"]) == {"failed"}
     assert rows["reason"].str.contains("not a training frame").all()
 
 
 def test_an_adapter_is_given_the_whole_capture(config, toy, monkeypatch):
     monkeypatch.setattr(toy, "PEEKING", dataclasses.replace(toy.PEEKING, native=False))
-    rows = runner.run(changed(config, methods=("toy_plugin:PEEKING",)))
+    rows = rows_of(changed(config, methods=("toy_plugin:PEEKING",)))
     assert set(rows["status"]) == {"ok"}
 
 
@@ -131,7 +138,7 @@ def test_what_a_method_needs_is_looked_for_before_training(config, toy, monkeypa
     monkeypatch.setattr(toy, "SAME_NAME", dataclasses.replace(toy.METHOD, name="needy", **needs))
     both = changed(config, methods=("toy_plugin:METHOD", "toy_plugin:SAME_NAME"))
     if fits:
-        assert set(runner.run(both)["status"]) == {"ok"}
+        assert set(rows_of(both)["status"]) == {"ok"}
         return
     with pytest.raises(HeadbenchError):
         runner.run(both)
@@ -162,13 +169,13 @@ def test_another_setting_in_the_same_folder_is_refused_before_work(config, toy):
 def test_measuring_something_else_trains_nothing_again(config, toy):
     runner.run(config)
     toy.FITS.clear()
-    rows = runner.run(changed(config, metrics=("toy_plugin:ERROR",), tasks=("novel_view",)))
+    rows = rows_of(changed(config, metrics=("toy_plugin:ERROR",), tasks=("novel_view",)))
     assert set(rows["task"]) == {"novel_view"}
     assert toy.FITS == []
 
 
 def test_a_failing_method_is_recorded_and_the_others_go_on(config):
-    rows = runner.run(changed(config, methods=("toy_plugin:FAILING", "toy_plugin:METHOD")))
+    rows = rows_of(changed(config, methods=("toy_plugin:FAILING", "toy_plugin:METHOD")))
     failed = rows[rows["method"] == "failing"]
     assert set(failed["status"]) == {"failed"}
     assert failed["reason"].str.contains("the training diverged").all()
@@ -180,7 +187,7 @@ def test_a_metric_that_cannot_be_had_is_missing_with_reason_and_said_before_trai
     import logging
 
     logging.getLogger("headbench").propagate = True
-    rows = runner.run(changed(config, metrics=("toy_plugin:NOT_HERE", "toy_plugin:ERROR")))
+    rows = rows_of(changed(config, metrics=("toy_plugin:NOT_HERE", "toy_plugin:ERROR")))
     missing = rows[rows["metric"] == "not_here"]
     assert set(missing["status"]) == {"missing"}
     assert missing["reason"].str.contains("Put them there").all()
@@ -196,7 +203,7 @@ def test_what_was_missing_is_measured_once_it_is_there_and_nothing_else_again(co
     runner.run(both)
     counted.clear()
     monkeypatch.setattr(toy, "not_here", lambda image, truth: 1.0)
-    rows = runner.run(both)
+    rows = rows_of(both)
     assert (rows["status"] == "ok").all()
     assert len(counted) == 1  # the check before training, nothing else
 
@@ -206,12 +213,12 @@ def test_metrics_of_one_measurement_are_taken_together_and_once(config, toy, mon
     original = toy.files_in_avatar
     monkeypatch.setattr(toy, "files_in_avatar", lambda *arguments: counted.append(1) or original(*arguments))
     group = ("toy_plugin:FILES_NONE", "toy_plugin:FILES", "toy_plugin:FILES_LOAD")
-    rows = runner.run(changed(config, metrics=group)).set_index(["subject", "metric"])
+    rows = rows_of(changed(config, metrics=group)).set_index(["subject", "metric"])
     assert len(counted) == 2  # subjects
     assert rows.loc[("subject1", "files"), "value"] == 1.0
     assert rows.loc[("subject1", "files_load"), "value"] == 4.0  # frames of the workload
     assert rows.loc[("subject1", "files_none"), "status"] == "missing"
-    again = runner.run(changed(config, metrics=group)).set_index(["subject", "metric"])
+    again = rows_of(changed(config, metrics=group)).set_index(["subject", "metric"])
     assert again.equals(rows)
     assert len(counted) == 2
     runner.run(changed(config, out=config.out + "-less", metrics=group[1:2]))
@@ -221,7 +228,7 @@ def test_metrics_of_one_measurement_are_taken_together_and_once(config, toy, mon
 
 
 def test_a_metric_of_training_sees_the_record_of_the_fit(config):
-    rows = runner.run(changed(config, metrics=("toy_plugin:STEPS",)))
+    rows = rows_of(changed(config, metrics=("toy_plugin:STEPS",)))
     assert rows["value"].tolist() == [2.0, 2.0]
     folder = RunFolder(runner.Path(config.out))
     measured = folder.cell("subject1", "toy", 0).stage("measure")["details"]["steps"]
@@ -230,7 +237,7 @@ def test_a_metric_of_training_sees_the_record_of_the_fit(config):
 
 def test_a_preset_and_settings_reach_the_method(config):
     runner.run(changed(config, preset="fast", settings={"toy": {"budget": {"iterations": 3}}}))
-    record = RunFolder(runner.Path(config.out)).read_manifest()
+    record = read_json(RunFolder(runner.Path(config.out)).manifest)
     assert record["methods"][0]["config"]["level"] == 0.25
     assert record["methods"][0]["budget"]["iterations"] == 3
 
@@ -314,3 +321,33 @@ def test_every_registered_report_is_written_and_a_failing_one_stops_no_other(
     assert len(messages) == 2
     assert "'broken' of other 1 is broken: ImportError: no" in messages[0]
     assert "'failing' of other 1 failed" in messages[1]
+
+
+LINKED = (
+    *("run.json", "rows.parquet", "contact_sheet.png", "tables", "subject1"),
+    *(f"subject1/toy{below}" for below in ("", "/seed-0", "/seed-0/avatar", "/seed-0/avatar/level.txt")),
+    *(
+        f"subject1/toy/seed-0/{name}"
+        for name in ("fit.json", "renders", "renders/novel_view", "rows.parquet")
+    ),
+)
+
+
+@pytest.mark.parametrize("place", LINKED)
+def test_a_received_run_is_not_written_through_its_links(toy, capture, tmp_path, place, capsys):
+    run = RunFolder(tmp_path / "out")
+    words = ["run", "--data", str(capture), "--out", str(run.root), "--methods", "toy_plugin:METHOD"]
+    words += ["--set", "reader=toy_plugin:READER", "--set", "metrics=psnr"]
+    outside = tmp_path / "outside"
+    link = run.root / place
+    link.parent.mkdir(parents=True)
+    if link.suffix:
+        outside.write_text("victim")
+    else:
+        outside.mkdir()
+    link.symlink_to(outside)
+    code = cli.main(words)
+    error = capsys.readouterr().err
+    assert "Traceback" not in error
+    assert outside.read_text() == "victim" if link.suffix else not list(outside.iterdir())
+    assert code == (2 if place.startswith("subject1") else 0), error  # a file is replaced, a report left out

@@ -18,8 +18,10 @@ from .tiny_capture import FRONTAL
 
 def test_pixels_are_read_when_asked_for_and_held_within_the_bound(pristine_capture, monkeypatch):
     decoded = []
-    original = images._decode
-    monkeypatch.setattr(images, "_decode", lambda path: decoded.append(path) or original(path))
+    original = images.read_pixels
+    monkeypatch.setattr(
+        images, "read_pixels", lambda path, *a, **k: decoded.append(path) or original(path, *a, **k)
+    )
     bound = 5 * 64 * 48 * 3
     clip = read_capture(pristine_capture.union, cache_mb=bound / 1e6)
     assert decoded == []

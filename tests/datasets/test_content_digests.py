@@ -3,54 +3,118 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 
+import pytest
+
+from headbench.bench.files import digest
 from headbench.datasets import content_digests as module
-from headbench.datasets.content_digests import CACHE_FILE, content_digests
+from headbench.datasets.content_digests import content_digests
 
 
-def test_digests_are_sha256_and_reread_only_after_a_change(tmp_path, monkeypatch):
-    files = [tmp_path / name for name in ("a", "b", "c")]
-    for path in files:
-        path.write_text(path.name)
-    expected = {path: hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
-    reads = []
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    """The folder of remembered digests, where also files that were just written are remembered."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(module, "YOUNG_NS", -(10**9))
+    return tmp_path / "cache" / "headbench" / "digests"
+
+
+@pytest.fixture
+def capture(tmp_path):
+    folder = tmp_path / "capture"
+    folder.mkdir()
+    for name in ("a", "b", "c"):
+        (folder / name).write_text(name)
+    return folder
+
+
+@pytest.fixture
+def reads(monkeypatch):
+    """Names of the files whose bytes were read."""
+    names = []
     original = module.digest_file
-    monkeypatch.setattr(module, "digest_file", lambda path: reads.append(path) or original(path))
+    monkeypatch.setattr(module, "digest_file", lambda path: names.append(path.name) or original(path))
+    return names
 
-    assert content_digests(tmp_path, files) == expected
-    assert sorted(reads) == files
+
+def expected(folder):
+    return {path: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(folder.iterdir())}
+
+
+def test_only_what_changed_is_read_again(capture, cache, reads):
+    for change in (None, None, ("b", "other"), ("c", "C")):
+        if change:
+            name, text = change
+            before = (capture / name).stat()
+            (capture / name).write_text(text)
+            os.utime(capture / name, ns=(before.st_atime_ns, before.st_mtime_ns))
+        else:
+            name = "abc" if not cache.exists() else ""
+        reads.clear()
+        assert content_digests(capture.iterdir(), remembered_for=capture) == expected(capture)
+        assert "".join(sorted(reads)) == name
+    assert sorted(path.name for path in capture.iterdir()) == ["a", "b", "c"]
+
+
+def test_without_memory_every_byte_is_read(capture, cache, reads):
+    content_digests(capture.iterdir(), remembered_for=capture)
+    for path in cache.iterdir():  # what is remembered is wrong, as it cannot be but on purpose
+        entries = dict.fromkeys(json.loads(path.read_text())["entries"], "0" * 64)
+        path.write_text(json.dumps({"digest": digest(entries), "entries": entries}))
+    assert content_digests(capture.iterdir(), remembered_for=capture) != expected(capture)
     reads.clear()
-    assert content_digests(tmp_path, files) == expected
-    assert reads == []
-
-    files[1].write_text("other")  # another size
-    expected[files[1]] = hashlib.sha256(b"other").hexdigest()
-    assert content_digests(tmp_path, files) == expected
-    assert reads == [files[1]]
-    reads.clear()
-    stamp = files[2].stat()
-    files[2].write_text("C")  # the same size, another time
-    os.utime(files[2], ns=(stamp.st_atime_ns, stamp.st_mtime_ns + 1))
-    expected[files[2]] = hashlib.sha256(b"C").hexdigest()
-    assert content_digests(tmp_path, files) == expected
-    assert reads == [files[2]]
+    assert content_digests(capture.iterdir()) == expected(capture)
+    assert sorted(reads) == ["a", "b", "c"]
 
 
-def test_damaged_cache_is_made_anew(tmp_path):
-    path = tmp_path / "a"
-    path.write_text("a")
-    for rubbish in ("", "[]", '{"a": [1]}', '{"a": "xyz"}', "\0"):
-        (tmp_path / CACHE_FILE).write_text(rubbish)
-        assert content_digests(tmp_path, [path]) == {path: hashlib.sha256(b"a").hexdigest()}
+def test_a_file_of_digests_inside_a_capture_is_ignored(capture, cache):
+    digests = expected(capture)
+    stamps = {path.name: path.stat() for path in digests}
+    lies = {name: [stamp.st_size, stamp.st_mtime_ns, "0" * 64] for name, stamp in stamps.items()}
+    (capture / ".headbench-digests.json").write_text(json.dumps(lies))
+    assert content_digests(digests, remembered_for=capture) == digests
 
 
-def test_folder_that_cannot_be_written_is_no_obstacle(tmp_path, monkeypatch):
-    path = tmp_path / "a"
-    path.write_text("a")
+@pytest.mark.parametrize(
+    "rubbish", ["", "[]", '{"entries": 1}', '{"digest": "0", "entries": {"a": "b"}}', "\0", "[" * 100_000]
+)
+def test_a_damaged_cache_is_ignored(capture, cache, rubbish):
+    content_digests(capture.iterdir(), remembered_for=capture)
+    for path in cache.iterdir():
+        path.write_text(rubbish)
+    assert content_digests(capture.iterdir(), remembered_for=capture) == expected(capture)
 
-    def refuse(*_):
-        raise PermissionError("read-only file system")
 
-    monkeypatch.setattr(module, "write_json", refuse)
-    assert content_digests(tmp_path, [path]) == {path: hashlib.sha256(b"a").hexdigest()}
+def test_a_file_that_just_changed_is_not_remembered(capture, cache, monkeypatch):
+    monkeypatch.setattr(module, "YOUNG_NS", 60 * 10**9)
+    content_digests(capture.iterdir(), remembered_for=capture)
+    assert all(json.loads(path.read_text())["entries"] == {} for path in cache.iterdir())
+
+
+def test_the_captures_read_longest_ago_are_forgotten(capture, cache, monkeypatch):
+    for number in range(4):
+        content_digests(capture.iterdir(), remembered_for=capture / str(number))
+        for path in cache.iterdir():
+            os.utime(path, (path.stat().st_atime, path.stat().st_mtime - 60))
+    first, *_ = sorted(cache.iterdir(), key=lambda path: path.stat().st_mtime)
+    monkeypatch.setattr(module, "MAX_CACHE_BYTES", 4 * first.stat().st_size)
+    content_digests(capture.iterdir(), remembered_for=capture)
+    assert not first.exists()
+    assert len([*cache.iterdir()]) == 4
+
+
+@pytest.mark.parametrize("home", ["a file", "none"])
+def test_a_home_that_cannot_be_written_is_no_obstacle(capture, tmp_path, monkeypatch, home):
+    if home == "a file":
+        (tmp_path / "cache").write_text("no folder")
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    else:
+
+        def homeless():
+            raise RuntimeError("Could not determine home directory.")
+
+        monkeypatch.delenv("XDG_CACHE_HOME")
+        monkeypatch.setattr(module.Path, "home", homeless)
+    assert content_digests(capture.iterdir(), remembered_for=capture) == expected(capture)

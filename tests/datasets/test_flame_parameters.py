@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -51,7 +52,7 @@ def test_shorter_coefficients_are_padded_with_zeros(tmp_path):
 
 def test_missing_static_offset_is_zero_and_noted(tmp_path):
     tracking = read_tracking(write_files(tmp_path, static_offset=lambda t: None), HEAD, "s")
-    assert tracking.static_offset.shape == (VERTICES, 3)
+    assert tracking.static_offset.shape == tracking.head.template.shape
     assert not tracking.static_offset.any()
     assert tracking.notes["static_offset"] == "zeros, as the files have none"
 
@@ -99,7 +100,9 @@ def test_numbers_that_overflow_float32_are_refused(tmp_path):
     files = write_files(tmp_path)
     arrays = dict(np.load(files[1]))
     np.savez(files[1], **{**arrays, "expr": np.full((1, 5), 1e39)})
-    with pytest.raises(InputError, match=r"00001.npz, expr: expected finite float32 numbers, found 5"):
+    with pytest.raises(
+        InputError, match=r"00001.npz, expr: expected numbers from -10000 to 10000, found one of size 1e\+39"
+    ):
         read_tracking(files, HEAD, "s")
 
 
@@ -107,9 +110,12 @@ def test_teeth_policies():
     file, toothed = Path("x"), with_teeth(HEAD)
     more = len(toothed.template)
     flame = toy_head(16, version="flame2020")
+    lipless = replace(HEAD, regions={})
     cases = [
-        (HEAD, VERTICES, "auto", (VERTICES, VERTICES)),
-        (HEAD, None, "auto", (VERTICES, VERTICES)),
+        (HEAD, VERTICES, "auto", (more, VERTICES)),
+        (HEAD, None, "auto", (more, more)),
+        (lipless, VERTICES, "auto", (VERTICES, VERTICES)),
+        (lipless, None, "auto", (VERTICES, VERTICES)),
         (HEAD, more, "auto", (more, more)),
         (HEAD, more, "keep", (VERTICES, VERTICES)),  # the teeth's rows are dropped
         (HEAD, VERTICES, "add", (more, VERTICES)),  # the teeth's rows are zero
@@ -124,3 +130,25 @@ def test_teeth_policies():
     for head, rows, policy in [(HEAD, VERTICES - 1, "auto"), (HEAD, more + 1, "auto"), (toothed, 5, "keep")]:
         with pytest.raises(InputError, match="static_offset"):
             resolve_teeth(head, rows, policy, file)
+    # Where teeth are needed they are not left out: of FLAME, by rows of the offset, on demand.
+    for head, rows, policy in [
+        (replace(flame, regions={}), VERTICES, "auto"),
+        (lipless, more, "auto"),
+        (lipless, None, "add"),
+    ]:
+        with pytest.raises(InputError, match="regions"):
+            resolve_teeth(head, rows, policy, file)
+
+
+@pytest.mark.parametrize(
+    ("change", "key"),
+    [
+        ({"shape": lambda t: np.full((1, 6), 5000.0)}, "shape, static_offset"),
+        ({"static_offset": lambda t: np.full((1, VERTICES, 3), 20.0)}, "shape, static_offset"),
+        ({"expr": lambda t: np.full((1, 8), 9000.0 * t)}, "expr"),
+    ],
+)
+def test_coefficients_that_make_no_head_are_refused(tmp_path, change, key):
+    with pytest.raises(InputError) as caught:
+        read_tracking(write_files(tmp_path, **change), HEAD, "s")
+    assert caught.value.key == key

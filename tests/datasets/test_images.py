@@ -32,8 +32,8 @@ def paths(tmp_path_factory):
 def reads(monkeypatch):
     """Paths decoded, in order."""
     decoded = []
-    original = images._decode
-    monkeypatch.setattr(images, "_decode", lambda path: decoded.append(path) or original(path))
+    original = images.read_pixels
+    monkeypatch.setattr(images, "read_pixels", lambda path: decoded.append(path) or original(path))
     return decoded
 
 
@@ -102,7 +102,7 @@ def test_jpeg_channels_are_in_order(tmp_path):
 def test_file_that_does_not_decode_is_named(tmp_path):
     path = tmp_path / "bad.png"
     path.write_bytes(b"\x89PNG\r\n\x1a\nrubbish")
-    with pytest.raises(InputError, match="bad.png: expected an image that decodes, found damaged data"):
+    with pytest.raises(InputError, match="bad.png: expected a whole PNG header"):
         ImageStore().image(path, WHITE)
     with pytest.raises(InputError, match="found no such file"):
         ImageStore().mask(tmp_path / "none.png")

@@ -9,6 +9,8 @@ from scipy.spatial import Delaunay
 from skimage.measure import marching_cubes
 
 from headbench.bench.contracts import Camera
+from headbench.bench.errors import InputError
+from headbench.datasets import mesh_pictures
 from headbench.datasets.mesh_pictures import (
     draw_mesh,
     portrait_camera,
@@ -62,6 +64,22 @@ def test_fragments_equal_cast_rays(seed):
     np.testing.assert_array_equal(found.face, face)
     np.testing.assert_allclose(found.depth, depth, rtol=1e-6)
     np.testing.assert_allclose(found.weights, weights, atol=1e-5)
+
+
+def test_triangles_drawn_in_parts_give_the_same(monkeypatch):
+    head, view = procedural_head(), camera(200, 150, distance=0.5)
+    whole = rasterize_mesh(head.template, head.faces, view)
+    assert (whole.face >= 0).mean() > 0.2
+    monkeypatch.setattr(mesh_pictures, "_AT_ONCE", 1000)
+    for one, other in zip(whole, rasterize_mesh(head.template, head.faces, view)):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_a_tangle_of_triangles_over_the_whole_picture_is_refused():
+    vertices = np.random.default_rng(0).choice([-30.0, 30.0], size=(300, 3)) * [1, 1, 0.1]
+    faces = np.arange(300).reshape(100, 3)
+    with pytest.raises(InputError, match="times at most"):
+        rasterize_mesh(vertices, faces, camera(1000, 1000))
 
 
 def test_shared_edges_leave_no_hole_and_no_overlap():

@@ -107,5 +107,5 @@ def test_size_and_intrinsics_may_stand_at_the_top_level(tmp_path):
 def test_deeply_nested_json_is_refused(tmp_path):
     path = tmp_path / "transforms_train.json"
     path.write_text("[" * 100_000)
-    with pytest.raises(InputError, match="does not parse"):
+    with pytest.raises(InputError, match="deeper nesting"):
         read_transforms(path)

@@ -133,7 +133,7 @@ def test_bad_entry_of_a_frame(capture, key, value):
     capture.edit(TRAIN, change)
     error = fault(capture)
     assert error.file.endswith(TRAIN)
-    assert error.key == f"frames[5].{key}"
+    assert error.key.startswith(f"frames[5].{key}")
     if value is None:
         assert error.found == "no such key"
 
@@ -302,12 +302,13 @@ DECLARATION_FAULTS = {
 def test_bad_declaration(capture, key, value):
     capture.edit("headbench.json", lambda document: document.update({key: value}))
     error = fault(capture)
-    assert (error.file, error.key) == (str(capture.union / "headbench.json"), key)
+    assert error.file == str(capture.union / "headbench.json")
+    assert error.key.startswith(key)
 
 
 def test_declaration_without_an_entry(capture):
     capture.edit("headbench.json", lambda document: document.pop("cy"))
-    assert fault(capture).found == "no such entry"
+    assert fault(capture).found == "nothing"
 
 
 def test_declaration_that_is_no_object(capture):
@@ -390,7 +391,7 @@ def test_key_in_two_splits_is_refused_even_when_leaks_are_recorded(capture):
     assert fault(capture, leaks="record").key == "train and novel_view"
 
 
-def test_trained_test_timesteps_and_cameras_are_leaks():
+def test_trained_test_timesteps_and_cameras_are_leaks(tmp_path):
     def key(timestep, camera):
         return FrameKey("s", "q", timestep, camera)
 
@@ -399,12 +400,13 @@ def test_trained_test_timesteps_and_cameras_are_leaks():
         "novel_view": [key(0, "b")],
         "self_reenactment": [key(1, "c"), key(2, "c")],
     }
-    images = {k: str(k) for keys in splits.values() for k in keys}
-    digests = {name: name for name in images.values()}
-    leaks = find_leaks(splits, images, digests)
+    images = {k: tmp_path / str(i) for i, k in enumerate(k for keys in splits.values() for k in keys)}
+    for path in images.values():
+        path.write_text(path.name)
+    leaks = find_leaks(splits, images)
     assert len(leaks) == 2
     assert any("self-reenactment timesteps are trained on, such as 1" in leak for leak in leaks)
     assert any("novel-view cameras are trained on: b" in leak for leak in leaks)
     clean = {**splits, "novel_view": [key(0, "d")], "self_reenactment": [key(2, "c")]}
-    images = {k: str(k) for keys in clean.values() for k in keys}
-    assert find_leaks(clean, images, {name: name for name in images.values()}) == []
+    images = dict(zip([k for keys in clean.values() for k in keys], images.values()))
+    assert find_leaks(clean, images) == []

@@ -14,6 +14,7 @@ from headbench.bench.contracts import Camera, HeadPose
 from headbench.datasets.ga_writer import CapturePlan, CaptureWriter, SequencePlan
 from headbench.datasets.head.arrays import HeadArrays
 from headbench.datasets.head.model import HeadModel
+from headbench.datasets.head.teeth import with_teeth
 
 from .head.toy import toy_head
 
@@ -64,7 +65,7 @@ def make_plan(
     *, lengths: dict[str, int] | None = None, cameras: list[Camera] | None = None, seed: int = 0, **changes
 ) -> CapturePlan:
     """Plan of two training sequences and FREE, whose last frame shows the tongue."""
-    head = changes.pop("head", None) or toy_head(16)
+    head = changes.pop("head", None) or with_teeth(toy_head(16))
     rng = np.random.default_rng(seed)
     lengths = lengths or {"FREE": 3, "EMO-1-shout+laugh": 2, "SEN-01-cramp_small_danger": 2}
     vertices, _, identities = head.shape_basis.shape

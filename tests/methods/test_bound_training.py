@@ -64,6 +64,8 @@ def training(clip):
 def test_the_loss_is_the_papers_sum_over_what_is_seen(training, clip):
     index = 2
     training.optimiser["means"].data[::3] *= 1000  # far away: unseen, and so not asked to stay
+    # Too faint to be drawn: seen all the same, as published.
+    training.optimiser["opacities"].data[1::3] = -8.0
     found = float(training.loss(1, index).detach())
     key = clip.splits["train"][index]
     camera, truth = clip.cameras[key.camera], clip.image(key) / 255.0
@@ -83,6 +85,7 @@ def test_the_loss_is_the_papers_sum_over_what_is_seen(training, clip):
     )
     seen = rendering.radii.numpy() > 0
     assert 0 < seen.sum() < len(seen)
+    assert seen[1::3].any()
     image = rendering.image.double().numpy()
     expected = 0.8 * np.abs(image - truth).mean() + PENALTY
     # Zeros outside the image, as training has it: pad, compare, and keep the windows centred on its pixels.
@@ -122,8 +125,20 @@ def test_positions_move_with_the_scene_and_ever_slower(training, clip):
     assert rate(training) == pytest.approx(5e-5 * extent)
 
 
-@pytest.mark.parametrize(("iteration", "cut"), [(59_999, False), (60_000, True), (10_000, True)])
-def test_opacities_are_reset_when_the_schedule_says(training, iteration, cut):
+@pytest.mark.parametrize(
+    ("iteration", "white", "cut"),
+    [
+        (59_999, True, False),
+        (60_000, True, True),
+        (60_000, False, True),
+        (10_000, True, True),
+        (10_000, False, False),
+    ],
+)
+def test_opacities_are_reset_when_the_schedule_says(training, iteration, white, cut):
+    """The first reset is for white backgrounds alone, as published."""
+    training._background[0] = 1.0 if white else 0.5
+    training.begin(Timeline(600_000, 600_000))
     step(training, iteration)
     largest = float(torch.sigmoid(training.optimiser["opacities"].detach()).max())
     assert (largest <= 0.0100001) == cut
@@ -138,6 +153,16 @@ def test_rounds_prune_what_is_faint(training):
     assert len(training.binding) == before + 1
     step(training, 12_000)
     assert len(training.binding) == before
+
+
+def test_splats_too_faint_to_be_drawn_count_as_seen(training):
+    """As published: the rasteriser's radii know no opacity, and views are counted by them."""
+    training.optimiser["opacities"].data[::2] = -9.0
+    training.optimiser["means"].data[1] *= 1000
+    step(training, 11_999)
+    views = training.state()["densifier"]["views"]
+    assert views[::2].all()
+    assert not views[1]
 
 
 def camera_at(*center):

@@ -7,7 +7,8 @@ import pytest
 
 from headbench.bench.conformance import check_method
 from headbench.bench.contracts import no_progress
-from headbench.bench.files import digest_file, read_json
+from headbench.bench.documents import read_json
+from headbench.bench.files import digest_file
 from headbench.bench.registry import discover
 from headbench.bench.run_config import resolve_method
 from headbench.bench.specs import MethodSpec

@@ -107,7 +107,7 @@ def test_the_paper_preset_of_gbs_is_the_paper():
         2e-4,
         0.005,
     )
-    schedule = DensifySchedule.of(splats, Timeline(40_000, 40_000))
+    schedule = DensifySchedule.of(splats, Timeline(40_000, 40_000), white=True)
     rounds = [iteration for iteration in range(1, 40_001) if schedule.is_round(iteration)]
     assert rounds == list(range(600, 15_000, 100))
     assert not any(schedule.is_reset(iteration) for iteration in range(1, 40_001))

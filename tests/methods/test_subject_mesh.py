@@ -1,8 +1,10 @@
 """One subject's mesh against the head model it is built on; and the bounded cache."""
 
 import numpy as np
+import pytest
 import torch
 
+from headbench.bench.errors import InputError
 from headbench.datasets.head.model import HeadModel
 from headbench.methods.subject_mesh import BoundedCache, SubjectMesh
 
@@ -48,3 +50,8 @@ def test_the_cache_computes_once_and_stays_bounded():
     assert [cache(k) for k in (1, 2, 1, 3, 1, 2)] == [1, 4, 1, 9, 1, 4]
     assert computed == [1, 2, 3, 2]  # 2 was the least recently used when 3 came
     assert len(cache) == 2
+
+
+def test_an_identity_that_makes_no_head_is_refused(clip, head):
+    with pytest.raises(InputError, match="a head within 10 m"):
+        SubjectMesh(head, np.full_like(clip.shape, 9e3), clip.static_offset, "cpu")

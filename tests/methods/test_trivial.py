@@ -8,7 +8,7 @@ import pytest
 from headbench.bench.contracts import Avatar, Budget, Method, no_progress
 from headbench.bench.errors import InputError
 from headbench.methods.configs import NearestCameraConfig
-from headbench.methods.trivial import MeanImage, NearestCamera, resize
+from headbench.methods.trivial import INDEX_FILE, MEAN_FILE, MeanImage, NearestCamera, resize
 
 
 def fit(method, clip, folder):
@@ -117,3 +117,35 @@ def test_cameras_of_other_sizes_are_met_by_resizing(clip, tmp_path):
     avatar = fit(MeanImage(), clip, tmp_path)
     camera = replace(clip.cameras["00"], width=14, height=18)
     assert avatar.render(camera, clip.poses[0]).rgb.shape == (18, 14, 3)
+
+
+@pytest.mark.parametrize(
+    ("method", "file", "name", "change"),
+    [
+        (MeanImage, MEAN_FILE, "rgba", lambda v: np.full_like(v, np.nan)),
+        (MeanImage, MEAN_FILE, "rgba", lambda v: v[:0]),
+        (MeanImage, MEAN_FILE, "background", lambda v: v[:2]),
+        (NearestCamera, INDEX_FILE, "images", lambda v: v + 10**6),
+        (NearestCamera, INDEX_FILE, "images", lambda v: v - 10),
+        (NearestCamera, INDEX_FILE, "images", lambda v: np.full_like(v, -1)),
+        (NearestCamera, INDEX_FILE, "images", lambda v: v[:1]),
+        (NearestCamera, INDEX_FILE, "signals", lambda v: v * np.nan),
+        (NearestCamera, INDEX_FILE, "scales", lambda v: v * 0),
+        (NearestCamera, INDEX_FILE, "centers", lambda v: v[:, :2]),
+    ],
+)
+def test_a_damaged_avatar_is_refused_when_loaded(clip, tmp_path, method, file, name, change):
+    fit(method(), clip, tmp_path)
+    with np.load(tmp_path / file) as archive:
+        arrays = dict(archive)
+    np.savez(tmp_path / file, **{**arrays, name: change(arrays[name])})
+    with pytest.raises(InputError) as caught:
+        method().load(tmp_path, device="cpu")
+    assert caught.value.key == name
+
+
+def test_an_image_that_is_gone_is_named_when_loaded(clip, tmp_path):
+    avatar = fit(NearestCamera(), clip, tmp_path)
+    avatar.files()[-1].unlink()
+    with pytest.raises(InputError, match="000.*png"):
+        NearestCamera().load(tmp_path, device="cpu")

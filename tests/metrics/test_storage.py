@@ -61,9 +61,9 @@ def test_the_driving_signal_counts_as_float32_at_25_frames_a_second(tmp_path):
 
 
 def test_packed_bytes_are_those_of_the_xz_tool(tmp_path):
-    noise = np.random.default_rng(0).integers(0, 4, 3_000_000, dtype=np.uint8).tobytes()
+    noise = np.random.default_rng(0).integers(0, 4, 300_000, dtype=np.uint8).tobytes()
     paths = [tmp_path / "a.bin", tmp_path / "b.bin"]
-    for path, part in zip(paths, (noise[:100_000], noise[100_000:])):
+    for path, part in zip(paths, (noise[:10_000], noise[10_000:])):
         path.write_bytes(part)
     found = packed_bytes(paths)
     packed = len(noise) * 2 / 8  # two bits of each byte are random

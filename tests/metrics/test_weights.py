@@ -109,7 +109,7 @@ def test_a_file_that_is_no_weights_file_is_bad_input(tmp_path, content):
 
 def test_code_in_a_weights_file_is_not_run(tmp_path, capsys):
     torch.save({"features.0.weight": Payload()}, tmp_path / "w.pth")
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match="print: expected a PyTorch file of weights"):
         weights.load_backbone(SQUEEZE, tmp_path / "w.pth")
     assert "ran" not in capsys.readouterr().out
 

@@ -1,12 +1,15 @@
 import itertools
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 from headbench.bench import runner
+from headbench.bench.manifest import Manifest, MethodRecord, ProtocolRecord
+from headbench.bench.rows import Row, Rows
 from headbench.bench.run_config import RunConfig
 from headbench.bench.specs import MetricSpec
-from headbench.bench.store import Row, RunFolder, to_frame, write_rows
+from headbench.bench.store import RunFolder
 
 PSNR = MetricSpec("psnr", "PSNR", "dB", True, 2, "m:psnr")
 LPIPS = MetricSpec("lpips", "LPIPS", "", False, 3, "m:lpips")
@@ -20,7 +23,7 @@ def metrics():
 
 @pytest.fixture
 def make_rows():
-    """Rows of a small comparison; values by method, or by a function of the row's place.
+    """Table of the rows of a small comparison; values by method, or by a function of the row's place.
 
     Two subjects, of which the first has a sequence of three frames and one of a single frame.
     """
@@ -37,9 +40,33 @@ def make_rows():
             for subject in ("s1", "s2"):
                 number = (size or {}).get(method, 1.0)
                 rows.append(Row(method, "1", seed, "", subject, "", -1, "", "full", "size", number, ""))
-        return to_frame(rows)
+        return pd.DataFrame(rows)
 
     return make
+
+
+@pytest.fixture
+def write_manifest():
+    """Write ``run.json`` of a finished run; ``methods`` are their configurations by name, protocols hashes by task."""
+
+    def write(folder, metrics, methods, protocols, seeds=(0,), trivial=()):
+        Manifest(
+            configuration=RunConfig(data="data", out=str(folder.root), seeds=tuple(seeds)),
+            methods=tuple(
+                MethodRecord(name, "1", "m:M", name in trivial, config, {})
+                for name, config in methods.items()
+            ),
+            metrics=tuple(metrics),
+            clips=(),
+            protocols={
+                task: ProtocolRecord(f"{task}/1", name, task, (), (), (), "", (1.0, 1.0, 1.0), "", "")
+                for task, name in protocols.items()
+            },
+            machine={"processor": "abacus"},
+            status="done",
+        ).write(folder.manifest)
+
+    return write
 
 
 @pytest.fixture
@@ -92,7 +119,7 @@ def make_run(toy, tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def write_run(tmp_path):
+def write_run(tmp_path, write_manifest):
     """Write a finished run of four subjects by hand: each method at its PSNR; settings by method."""
     # Offset and slope of each metric over the PSNR.
     lines = {"psnr": (0, 1), "ssim": (0, 0.025), "lpips": (0.1, -0.001), "storage": (5, 0.1), "fps": (100, 1)}
@@ -100,34 +127,34 @@ def write_run(tmp_path):
     def write(name, methods, settings=None):
         folder = RunFolder(tmp_path / name)
         specs = [
-            {"label": metric.upper(), "unit": "", "digits": 4, "implementation": "m:m", "name": metric}
-            | {
-                "higher_is_better": metric not in ("lpips", "storage"),
-                "per_frame": metric not in ("storage", "fps"),
-            }
+            MetricSpec(
+                metric,
+                metric.upper(),
+                "",
+                metric not in ("lpips", "storage"),
+                4,
+                "m:m",
+                per_frame=metric not in ("storage", "fps"),
+            )
             for metric in lines
         ]
         tasks = ("novel_view", "self_reenactment")
-        folder.write_manifest(
-            {
-                "metrics": specs,
-                "methods": [
-                    {"name": m, "trivial": m == "mean-image", "config": (settings or {}).get(m)}
-                    for m in methods
-                ],
-                "protocols": {task: {"hash": f"hash-{task}", "keys": []} for task in tasks},
-                "configuration": {"seeds": [0]},
-            }
+        write_manifest(
+            folder,
+            specs,
+            {method: (settings or {}).get(method) for method in methods},
+            {task: f"hash-{task}" for task in tasks},
+            trivial=("mean-image",),
         )
         rows = []
         for (method, level), subject, spec in itertools.product(methods.items(), "abcd", specs):
-            offset, slope = lines[spec["name"]]
+            offset, slope = lines[spec.name]
             number = offset + slope * level
-            for task in tasks if spec["per_frame"] else ("",):
+            for task in tasks if spec.per_frame else ("",):
                 place = (subject, "EMO", 0, "c") if task else (subject, "", -1, "")
                 protocol = f"hash-{task}" if task else ""
-                rows.append(Row(method, "1", 0, task, *place, "full", spec["name"], number, protocol))
-        write_rows(folder.rows, to_frame(rows))
+                rows.append(Row(method, "1", 0, task, *place, "full", spec.name, number, protocol))
+        Rows.of(rows).write(folder.rows)
         return folder.root
 
     return write

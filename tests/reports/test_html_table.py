@@ -3,6 +3,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
+from headbench.bench.rows import Rows
 from headbench.reports.html_table import to_html
 from headbench.reports.tables import build_table
 
@@ -43,7 +44,7 @@ def page(make_rows, metrics):
     rows = make_rows(names)
     lpips = (rows["metric"] == "lpips") & (rows["method"] == "third")
     rows.loc[lpips, ["status", "value", "reason"]] = ["missing", np.nan, "No <weights>."]
-    return to_html(build_table(rows, metrics, list(names), trivial=["floor"]))
+    return to_html(build_table(Rows(rows), metrics, list(names), trivial=["floor"]))
 
 
 def test_cells_say_what_they_are(page):

@@ -9,8 +9,9 @@ from PIL import Image
 
 from headbench.bench.errors import InputError
 from headbench.bench.registry import resolve
+from headbench.bench.rows import Rows
 from headbench.bench.specs import ReportSpec
-from headbench.bench.store import RunFolder, read_rows, write_rows
+from headbench.bench.store import RunFolder
 from headbench.reports import specs
 from headbench.reports.run_data import RunData
 from headbench.reports.run_set import RunSet
@@ -32,7 +33,7 @@ def test_tables_of_a_run(toy_run):
     data = RunData.read(toy_run)
     table = table_of(RunSet.read([toy_run]))
     good, failing = table.rows
-    rows = read_rows(toy_run / "rows.parquet")
+    rows = pd.read_parquet(toy_run / "rows.parquet")
     error = rows[(rows["metric"] == "error") & (rows["task"] == "novel_view") & (rows["method"] == "toy")]
     assert good.cells[0].value == pytest.approx(error.groupby("subject")["value"].mean().mean())
     assert good.cells[1].status == "missing"
@@ -42,7 +43,7 @@ def test_tables_of_a_run(toy_run):
     assert "RuntimeError: the training diverged" in table.notes
     assert "Images of 8 x 6 pixels" in table.caption
     for task in ("novel_view", "self_reenactment"):
-        assert data.manifest["protocols"][task]["hash"] in table.caption
+        assert data.manifest.protocols[task].hash in table.caption
     for file, name in zip(files, ("md", "csv", "latex", "html", "json")):
         assert file.read_text() == table_text([toy_run], name)
 
@@ -78,8 +79,16 @@ def test_contact_sheet_of_a_run(toy_run):
 
 def test_a_capture_that_changed_since_is_not_shown(toy_run):
     change_manifest(toy_run, lambda m: m["clips"][0].update(fingerprint="0" * 64))
-    with pytest.raises(InputError, match="as when the run was made"):
+    with pytest.raises(InputError, match="the capture of the run"):
         write_contact_sheet(toy_run)
+
+
+@pytest.mark.parametrize("column", ["method", "metric", "task"])
+def test_rows_of_what_the_run_does_not_have_are_refused(toy_run, column):
+    rows = pd.read_parquet(RunFolder(toy_run).rows)
+    Rows(rows.assign(**{column: "unheard"})).write(RunFolder(toy_run).rows)
+    with pytest.raises(InputError, match=f"{column}: expected those of run.json: .*, found unheard"):
+        RunData.read(toy_run)
 
 
 @pytest.mark.parametrize("key", ["metrics", "methods", "protocols"])
@@ -116,8 +125,8 @@ def test_reports_need_no_torch():
 
 
 def test_the_number_under_an_image_is_that_of_the_whole_image(toy_run):
-    rows = read_rows(RunFolder(toy_run).rows)
-    write_rows(RunFolder(toy_run).rows, pd.concat([rows, rows.assign(region="face", value=99.0)]))
+    rows = pd.read_parquet(RunFolder(toy_run).rows)
+    Rows(pd.concat([rows, rows.assign(region="face", value=99.0)])).write(RunFolder(toy_run).rows)
     data = RunData.read(toy_run)
     for key in data.keys("novel_view"):
         error = np.abs(data.render("toy", "novel_view", key).astype(float) - data.truth(key)).mean()

@@ -3,6 +3,7 @@ import json
 import pytest
 
 from headbench.bench.errors import InputError
+from headbench.bench.rows import ALL
 from headbench.reports.run_set import RunSet
 
 
@@ -17,13 +18,13 @@ def test_one_run_is_as_it_is(make_run):
     assert runs.methods == ("toy", "mirror")
     assert runs.tasks == ("novel_view", "self_reenactment")
     assert [spec.name for spec in runs.metrics] == ["error", "files"]
-    assert set(runs.rows["seed"]) == {0, 4}
+    assert runs.rows.seeds(ALL) == {0, 4}
 
 
 def test_other_seeds_of_the_same_settings_join(make_run):
     runs = RunSet.read([make_run("a", seeds=(0,)), make_run("b", seeds=(1, 2))])
     assert runs.methods == ("toy",)
-    assert sorted(set(runs.rows["seed"])) == [0, 1, 2]
+    assert runs.rows.seeds(ALL) == {0, 1, 2}
 
 
 def test_other_settings_are_told_apart_by_what_differs(make_run):
@@ -31,10 +32,10 @@ def test_other_settings_are_told_apart_by_what_differs(make_run):
     second = make_run("b", settings={"toy": {"level": 0.5}})
     runs = RunSet.read([first, second])
     assert runs.methods == ("toy (level=0.25)", "toy (level=0.5)")
-    assert set(runs.rows["method"]) == set(runs.methods)
-    errors = runs.rows[runs.rows["metric"] == "error"].groupby("method")["value"].mean()
-    alone = RunSet.read([second]).rows
-    assert errors["toy (level=0.5)"] == alone.loc[alone["metric"] == "error", "value"].mean()
+    what = {"metric": "error", "task": ALL, "region": "full", "seeds": ALL}
+    labelled = runs.rows.select(method="toy (level=0.5)", **what)
+    alone = RunSet.read([second]).rows.select(method="toy", **what)
+    assert labelled["value"].tolist() == alone["value"].tolist() != []
 
 
 def test_settings_too_long_for_a_label_give_way_to_the_folder(make_run):

@@ -5,8 +5,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from headbench.bench.errors import InputError
+from headbench.bench.rows import Row, Rows
 from headbench.bench.specs import MetricSpec
-from headbench.bench.store import Row, to_frame
 from headbench.reports.tables import build_table
 
 
@@ -21,7 +21,7 @@ def cell(table, method, task, metric):
 
 
 def test_columns_are_tasks_then_the_avatar(make_rows, metrics):
-    table = build_table(make_rows({"a": 1.0}), metrics, ["a"])
+    table = build_table(Rows(make_rows({"a": 1.0})), metrics, ["a"])
     assert [(c.title, c.label, c.arrow) for c in table.columns] == [
         ("Novel view", "PSNR", "↑"),
         ("Novel view", "LPIPS", "↓"),
@@ -32,14 +32,14 @@ def test_columns_are_tasks_then_the_avatar(make_rows, metrics):
 
 
 def test_direction_decides_the_rank(make_rows, metrics):
-    table = build_table(make_rows({"a": 1.0, "b": 3.0, "c": 2.0}), metrics, ["a", "b", "c"])
+    table = build_table(Rows(make_rows({"a": 1.0, "b": 3.0, "c": 2.0})), metrics, ["a", "b", "c"])
     assert ranks(table, "novel_view", "psnr") == {"a": 3, "b": 1, "c": 2}
     assert ranks(table, "novel_view", "lpips") == {"a": 1, "b": 3, "c": 2}
 
 
 def test_values_that_look_equal_share_a_rank(make_rows, metrics):
     values = {"a": 30.004, "b": 29.996, "c": 29.99, "d": 12.0}
-    table = build_table(make_rows(values), metrics, list(values))
+    table = build_table(Rows(make_rows(values)), metrics, list(values))
     assert [cell(table, m, "novel_view", "psnr").text for m in "abc"] == ["30.00", "30.00", "29.99"]
     assert ranks(table, "novel_view", "psnr") == {"a": 1, "b": 1, "c": 2, "d": 3}
     assert cell(table, "a", "novel_view", "psnr").value == pytest.approx(30.004)
@@ -47,7 +47,7 @@ def test_values_that_look_equal_share_a_rank(make_rows, metrics):
 
 def test_a_floor_is_listed_apart_and_never_ranked(make_rows, metrics):
     values = {"floor": 99.0, "a": 1.0, "b": 2.0}
-    table = build_table(make_rows(values), metrics, list(values), trivial=["floor"])
+    table = build_table(Rows(make_rows(values)), metrics, list(values), trivial=["floor"])
     assert ranks(table, "novel_view", "psnr") == {"a": 2, "b": 1, "floor": None}
     assert [(title, [r.method for r in rows]) for title, rows in table.groups] == [
         ("Methods", ["a", "b"]),
@@ -56,7 +56,7 @@ def test_a_floor_is_listed_apart_and_never_ranked(make_rows, metrics):
 
 
 def test_a_single_method_has_nothing_to_be_best_of(make_rows, metrics):
-    table = build_table(make_rows({"a": 1.0, "floor": 2.0}), metrics, ["a", "floor"], trivial=["floor"])
+    table = build_table(Rows(make_rows({"a": 1.0, "floor": 2.0})), metrics, ["a", "floor"], trivial=["floor"])
     assert ranks(table, "novel_view", "psnr") == {"a": None, "floor": None}
     assert "bold" not in table.caption
 
@@ -92,8 +92,8 @@ def test_missing_and_failed_cells_say_why_and_are_not_ranked(make_rows, metrics)
             ("", "size", ""),
         ]
     ]
-    rows = pd.concat([rows, to_frame(failed)], ignore_index=True)
-    table = build_table(rows, metrics, ["a", "b", "c", "d"])
+    rows = pd.concat([rows, pd.DataFrame(failed)], ignore_index=True)
+    table = build_table(Rows(rows), metrics, ["a", "b", "c", "d"])
     absent = cell(table, "a", "novel_view", "lpips")
     assert (absent.text, absent.rank, table.notes[absent.note]) == ("–", None, "No weights. Put them there.")
     for column, shown in zip(table.columns, next(r for r in table.rows if r.method == "c").cells):
@@ -109,12 +109,12 @@ def test_rows_of_different_protocols_are_not_mixed(make_rows, metrics):
     rows = make_rows({"a": 1.0, "b": 2.0})
     rows.loc[(rows["method"] == "b") & (rows["task"] == "novel_view"), "protocol"] = "other"
     with pytest.raises(InputError, match="hash-novel_view, other"):
-        build_table(rows, metrics, ["a", "b"])
+        build_table(Rows(rows), metrics, ["a", "b"])
 
 
 def test_the_caption_tells_protocol_frames_and_size(make_rows, metrics):
     table = build_table(
-        make_rows({"a": 1.0, "b": 2.0}, seeds=(0, 1)),
+        Rows(make_rows({"a": 1.0, "b": 2.0}, seeds=(0, 1))),
         metrics,
         ["a", "b"],
         protocol_ids={"novel_view": "novel_view/canonical/1"},
@@ -139,10 +139,10 @@ def test_the_caption_tells_protocol_frames_and_size(make_rows, metrics):
 def test_ranks_agree_with_a_count_of_better_displayed_values(values, higher, digits):
     metric = MetricSpec("m", "M", "", higher, digits, "m:m")
     names = [f"method{i}" for i in range(len(values))]
-    rows = to_frame(
+    rows = pd.DataFrame(
         Row(n, "1", 0, "novel_view", "s", "q", 0, "a", "full", "m", v, "h") for n, v in zip(names, values)
     )
-    table = build_table(rows, [metric], names)
+    table = build_table(Rows(rows), [metric], names)
     shown = [float(f"{v:.{digits}f}") for v in values]
     for row, own in zip(table.rows, shown):
         better = {other for other in shown if (other > own if higher else other < own)}
@@ -152,7 +152,7 @@ def test_ranks_agree_with_a_count_of_better_displayed_values(values, higher, dig
 def many_subjects(methods, subjects=9, seeds=(0,), spread=0.0):
     """Rows of methods at levels, each subject and method a little off; ``spread`` moves whole seeds."""
     generator = np.random.default_rng(1)
-    return to_frame(
+    return pd.DataFrame(
         Row(m, "1", seed, "novel_view", f"s{s}", "q", t, "a", "full", "m", level + noise + spread * seed, "h")
         for m, level in methods.items()
         for s in range(subjects)
@@ -167,7 +167,7 @@ METRIC = MetricSpec("m", "M", "", True, 2, "m:m")
 
 def test_all_that_cannot_be_told_from_the_best_are_marked_best():
     levels = {"a": 30.0, "b": 30.02, "c": 28.0, "d": 25.0}
-    table = build_table(many_subjects(levels), [METRIC], list(levels))
+    table = build_table(Rows(many_subjects(levels)), [METRIC], list(levels))
     assert len({row.cells[0].text for row in table.rows}) == 4
     assert ranks(table, "novel_view", "m") == {"a": 1, "b": 1, "c": 2, "d": 3}
     assert "every method that cannot be told from the best" in table.caption
@@ -177,7 +177,7 @@ def test_all_that_cannot_be_told_from_the_best_are_marked_best():
 
 def test_with_few_subjects_the_digits_alone_decide_and_the_caption_says_so():
     levels = {"a": 30.0, "b": 30.5, "c": 28.0, "d": 25.0}
-    table = build_table(many_subjects(levels, 5), [METRIC], list(levels))
+    table = build_table(Rows(many_subjects(levels, 5)), [METRIC], list(levels))
     assert sorted(ranks(table, "novel_view", "m").values()) == [1, 2, 3, 4]
     assert (
         "by the digits shown alone: with 5 subjects no test can tell the best (it takes 7)" in table.caption
@@ -189,7 +189,7 @@ def test_a_column_with_too_few_subjects_for_its_test_is_named(metrics):
     rows = many_subjects({"a": 30.0, "b": 28.0, "c": 25.0}, 6)
     both = pd.concat([rows.assign(metric="psnr"), rows.assign(metric="lpips")], ignore_index=True)
     both = both[~((both["metric"] == "lpips") & (both["method"] == "c"))]
-    table = build_table(both, metrics[:2], ["a", "b", "c"])
+    table = build_table(Rows(both), metrics[:2], ["a", "b", "c"])
     assert ranks(table, "novel_view", "psnr") == {"a": 1, "b": 2, "c": 3}
     assert "Too few subjects for the test, so that the digits alone decide: Novel view PSNR." in table.caption
     assert "sign-flip test over 6 subjects" in table.caption
@@ -197,10 +197,10 @@ def test_a_column_with_too_few_subjects_for_its_test_is_named(metrics):
 
 def test_seeds_have_their_spread_and_subjects_theirs_not():
     levels = {"a": 30.0, "b": 28.0}
-    table = build_table(many_subjects(levels, seeds=(0, 1, 2), spread=0.5), [METRIC], list(levels))
+    table = build_table(Rows(many_subjects(levels, seeds=(0, 1, 2), spread=0.5)), [METRIC], list(levels))
     one = table.rows[0].cells[0]
     assert one.spread == "0.500"  # of 0, 0.5 and 1: no part of it from the subjects, which differ by 0.2
     assert one.shown == f"{one.text} ± 0.500"
     assert "mean of 3 seeds ± its standard deviation from seed to seed" in table.caption
-    single = build_table(many_subjects(levels), [METRIC], list(levels))
+    single = build_table(Rows(many_subjects(levels)), [METRIC], list(levels))
     assert {row.cells[0].spread for row in single.rows} == {""}

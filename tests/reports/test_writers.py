@@ -1,14 +1,16 @@
 import csv
 import io
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from headbench.bench.rows import Rows
 from headbench.reports import latex, markdown
-from headbench.reports.csv_table import to_csv
+from headbench.reports.csv_table import csv_text, to_csv
 from headbench.reports.latex import to_latex
 from headbench.reports.markdown import to_markdown
 from headbench.reports.tables import build_table
@@ -21,7 +23,7 @@ def table(make_rows, metrics):
     rows = make_rows({"good": 30.126, NASTY: 25.5, "floor": 10.0}, size={"good": 2.25, NASTY: 1.75})
     lpips = (rows["metric"] == "lpips") & (rows["method"] == NASTY)
     rows.loc[lpips, ["status", "value", "reason"]] = ["missing", np.nan, "No 100% weights_file."]
-    return build_table(rows, metrics, ["good", NASTY, "floor"], trivial=["floor"])
+    return build_table(Rows(rows), metrics, ["good", NASTY, "floor"], trivial=["floor"])
 
 
 def cells_of(line):
@@ -62,6 +64,31 @@ def test_csv_reads_back_with_full_precision(table):
     assert second["notes"] == "No 100% weights_file."
     assert (floor["group"], floor["novel_view/psnr/rank"]) == ("Floor (not ranked)", "")
     assert first["protocol"] == "novel_view=hash-novel_view self_reenactment=hash-self_reenactment"
+
+
+@pytest.mark.parametrize(
+    ("value", "cell"),
+    [
+        *(
+            ("=1+1", "'=1+1"),
+            ("+a", "'+a"),
+            ("-a", "'-a"),
+            ("@a", "'@a"),
+            ("\t=a", "'\t=a"),
+            ("a\r=b", "a =b"),
+        ),
+        *(("-1.5", "-1.5"), ("+2e-3", "+2e-3"), (-1.5, "-1.5"), ("a=b", "a=b"), ("-inf", "-inf"), (None, "")),
+    ],
+)
+def test_csv_holds_no_formula_of_a_spreadsheet(value, cell):
+    (line,) = csv.reader(io.StringIO(csv_text([[value, 1]]), newline=""))
+    assert line == [cell, "1"]
+
+
+def test_every_csv_is_written_in_one_place():
+    root = Path(__file__).parents[2]
+    writers = {path.name for path in (root / "reports").rglob("*.py") if "csv.writer(" in path.read_text()}
+    assert writers == {"csv_table.py"}
 
 
 def balance(text):
@@ -112,7 +139,7 @@ def test_latex_text_has_no_live_character(text):
 
 def test_a_spread_stands_beside_its_mean_in_every_format(make_rows, metrics):
     rows = make_rows({"a": lambda metric, seed, *frame: 20.0 + seed, "b": 18.0}, seeds=(0, 1))
-    table = build_table(rows, metrics, ["a", "b"])
+    table = build_table(Rows(rows), metrics, ["a", "b"])
     assert "**20.50 ± 0.707**" in to_markdown(table)
     assert r"\tabfirst{20.50}\tabspread{0.707}" in to_latex(table)
     first = next(csv.DictReader(io.StringIO(to_csv(table))))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
@@ -63,7 +64,7 @@ def render_with_gradients(
     if weights is not None:
         on_image, on_alpha = on_image * weights[..., None], on_alpha * weights
     gradients = torch.autograd.grad((result.image, result.alpha), list(leaves.values()), (on_image, on_alpha))
-    detached = Rendering(result.image.detach(), result.alpha.detach(), result.radii, result.masked)
+    detached = replace(result, image=result.image.detach(), alpha=result.alpha.detach())
     return Outcome(detached, dict(zip(leaves, gradients, strict=True)))
 
 

@@ -6,7 +6,7 @@ the mean absolute error of the image (colours of order 1), and the relative L2 e
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -67,18 +67,32 @@ def facing(count: int, size: int = 32, *, seed: int = 0, spread: float = 0.25, *
 
 
 def culled(*indices: int) -> Callable[[Outcome], str]:
-    """Ask that just these splats are culled and get no gradient, all others being visible."""
+    """Ask that just these splats are out of view and get no gradient."""
 
     def complaint(outcome: Outcome) -> str:
         found = (outcome.rendering.radii == 0).nonzero().flatten().tolist()
         if found != sorted(indices):
-            return f"culled {found}, expected {sorted(indices)}"
-        for name in ("means", "quats", "scales", "opacities", "colors", "means2d_offset"):
-            if outcome.gradients[name][list(indices)].any():
-                return f"culled splats have a gradient of {name}"
-        return ""
+            return f"out of view are {found}, expected {sorted(indices)}"
+        return _moved(outcome, indices)
 
     return complaint
+
+
+def too_faint(*indices: int) -> Callable[[Outcome], str]:
+    """Ask that these splats get no gradient, although they are in view as all others are."""
+
+    def complaint(outcome: Outcome) -> str:
+        hidden = (outcome.rendering.radii == 0).nonzero().flatten().tolist()
+        return f"out of view are {hidden}" if hidden else _moved(outcome, indices)
+
+    return complaint
+
+
+def _moved(outcome: Outcome, indices: Sequence[int]) -> str:
+    for name in ("means", "quats", "scales", "opacities", "colors", "means2d_offset"):
+        if outcome.gradients[name][list(indices)].any():
+            return f"splats that are not drawn have a gradient of {name}"
+    return ""
 
 
 def _background_alone(outcome: Outcome) -> str:
@@ -238,7 +252,7 @@ CASES = (
     ),
     Case(
         "the same, antialiased",
-        "fainter than 1/255: culled",
+        "fainter than 1/255: not drawn",
         lambda: facing(20, scales=uneven(20, 1e-6), opacities=[0.9] * 20),
         options={"antialiased": True},
         complaint=_background_alone,
@@ -317,11 +331,11 @@ CASES = (
     ),
     Case(
         "opacities of 0, below 1/255 and at it",
-        "culled below, without a gradient",
+        "in view, not drawn below, without a gradient",
         lambda: facing(
             9, spread=0.05, opacities=[0.0, 0.5 * ALPHA_MIN, 0.999 * ALPHA_MIN, 1.001 * ALPHA_MIN, 1.0]
         ),
-        complaint=culled(0, 1, 2),
+        complaint=too_faint(0, 1, 2),
     ),
     Case(
         "opacity 1",

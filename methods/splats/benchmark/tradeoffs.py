@@ -54,8 +54,8 @@ class Point:
     mean_error: float
     """Mean absolute error of the image against the exact setting's."""
     max_error: float
-    psnr: float
-    """Of the same, dB, for a peak of 1."""
+    psnr: float | None
+    """Of the same, dB, for a peak of 1; None where the images are equal."""
     forward: float
     both: float
 
@@ -75,7 +75,7 @@ def measure(quick: bool, progress: Progress) -> Findings:
     rows = [
         (
             *(p.knob, p.setting, str(p.splats), f"{p.mean_error:.1e}", f"{p.max_error:.1e}"),
-            "-" if p.psnr == float("inf") else f"{p.psnr:.1f}",
+            "-" if p.psnr is None else f"{p.psnr:.1f}",
             *(milliseconds(p.forward), milliseconds(p.both), f"{points[0].both / p.both:.2f}"),
         )
         for p in points
@@ -149,7 +149,7 @@ def _image(one: Setting, backend: str) -> Tensor:
 def _point(one: Setting, exact: Tensor, backend: str, forward: float, both: float) -> Point:
     error = (_image(one, backend) - exact).abs()
     squared = float(error.square().mean())
-    psnr = -10 * math.log10(squared) if squared else math.inf
+    psnr = -10 * math.log10(squared) if squared else None
     return Point(
         *(one.knob, one.name, len(one.scene.means), float(error.mean()), float(error.max()), psnr),
         *(forward, both),

@@ -94,7 +94,7 @@ inline void find_entries(const View& view, const Splats& splats, const FrameData
                          std::int64_t end) {
   const int stride = record_stride(splats.channels);
   for (std::int64_t i = begin; i < end; ++i) {
-    const std::uint32_t splat = frame.visible[i];
+    const std::uint32_t splat = frame.drawn[i];
     const float* record = frame.records + static_cast<std::size_t>(splat) * stride;
     const Rect rect = frame.rects[splat];
     // The slack keeps pixels that pass the drawing's own test by a rounding.

@@ -73,7 +73,7 @@ Frame::Frame(const View& view, const Splats& splats, const ImageOut& out, std::i
     stages.project(view_, splats, data_, begin, std::min(begin + kSplatsPerTask, splats.count));
   });
   clock.ends(kProject);
-  list_visible(splats.count);
+  list_drawn(splats.count);
   sort_by_depth();
   clock.ends(kSort);
   reserve_entries();
@@ -95,26 +95,26 @@ Frame::Frame(const View& view, const Splats& splats, const ImageOut& out, std::i
   data_.radii = nullptr;
 }
 
-void Frame::list_visible(std::int64_t count) {
-  std::uint32_t* visible = visible_.resize(static_cast<std::size_t>(count));
+void Frame::list_drawn(std::int64_t count) {
+  std::uint32_t* drawn = drawn_.resize(static_cast<std::size_t>(count));
   for (std::int64_t splat = 0; splat < count; ++splat) {
-    visible[visible_count_] = static_cast<std::uint32_t>(splat);
-    visible_count_ += data_.depths[splat] > 0.0;
+    drawn[drawn_count_] = static_cast<std::uint32_t>(splat);
+    drawn_count_ += data_.depths[splat] > 0.0;
   }
-  data_.visible = visible;
+  data_.drawn = drawn;
 }
 
 // Stable: splats at one depth keep the order of their indices. A radix sort by depth rounded to float32, positive, so
 // that its bits sort as whole numbers do; then what is equal in float32 is sorted by the depth itself.
 void Frame::sort_by_depth() {
   constexpr int kBits = 11, kPasses = 3, kBins = 1 << kBits;
-  const std::size_t count = static_cast<std::size_t>(visible_count_);
+  const std::size_t count = static_cast<std::size_t>(drawn_count_);
   Buffer<std::uint32_t> key_buffers[2], other;
   std::uint32_t *keys = key_buffers[0].resize(count), *next_keys = key_buffers[1].resize(count);
   std::uint32_t *values = order_.resize(count), *next_values = other.resize(count);
   std::vector<std::uint32_t> bins(kPasses * kBins, 0);
   for (std::size_t i = 0; i < count; ++i) {
-    values[i] = data_.visible[i];
+    values[i] = data_.drawn[i];
     const float rounded = static_cast<float>(data_.depths[values[i]]);
     std::memcpy(&keys[i], &rounded, sizeof rounded);
     for (int pass = 0; pass < kPasses; ++pass) ++bins[pass * kBins + (keys[i] >> (kBits * pass) & (kBins - 1))];
@@ -146,8 +146,8 @@ void Frame::sort_by_depth() {
 
 // Give every splat as many entries as its rectangle has tiles; what it does not use is never touched.
 void Frame::reserve_entries() {
-  for (std::int64_t i = 0; i < visible_count_; ++i) {
-    const std::uint32_t splat = data_.visible[i];
+  for (std::int64_t i = 0; i < drawn_count_; ++i) {
+    const std::uint32_t splat = data_.drawn[i];
     const Rect& rect = data_.rects[splat];
     data_.ranges[splat].begin = static_cast<std::uint32_t>(entry_count_);
     entry_count_ += std::size_t{1} * (rect.x1 - rect.x0 + 1) * (rect.y1 - rect.y0 + 1);
@@ -161,17 +161,17 @@ void Frame::reserve_entries() {
 // are threads; a piece's pairs go behind those of the pieces before it, so the lists do not depend on the cut.
 void Frame::fill_tiles(const Splats& splats, int threads) {
   ThreadPool& pool = ThreadPool::instance();
-  pool.run(task_count(visible_count_), threads, [&](std::int64_t task, int) {
+  pool.run(task_count(drawn_count_), threads, [&](std::int64_t task, int) {
     const std::int64_t begin = task * kSplatsPerTask;
-    stages_.find_entries(view_, splats, data_, begin, std::min(begin + kSplatsPerTask, visible_count_));
+    stages_.find_entries(view_, splats, data_, begin, std::min(begin + kSplatsPerTask, drawn_count_));
   });
 
   const std::size_t tiles = static_cast<std::size_t>(view_.tiles_x) * view_.tiles_y;
-  const std::int64_t pieces = std::max<std::int64_t>(1, std::min<std::int64_t>(threads, visible_count_ / kSplatsPerTask));
-  const auto piece_begin = [&](std::int64_t piece) { return visible_count_ * piece / pieces; };
+  const std::int64_t pieces = std::max<std::int64_t>(1, std::min<std::int64_t>(threads, drawn_count_ / kSplatsPerTask));
+  const auto piece_begin = [&](std::int64_t piece) { return drawn_count_ * piece / pieces; };
   std::vector<std::uint32_t> places(pieces * tiles, 0);
   // All splats at once may be counted in any order: the one in which they lie in memory is the fastest.
-  const std::uint32_t* counted = pieces == 1 ? data_.visible : data_.order;
+  const std::uint32_t* counted = pieces == 1 ? data_.drawn : data_.order;
   pool.run(pieces, threads, [&](std::int64_t piece, int) {
     std::uint32_t* counts = &places[piece * tiles];
     const std::int64_t end = piece_begin(piece + 1);
@@ -237,11 +237,11 @@ void Frame::backward(const Splats& splats, Gradients grads, float* background, f
   clock.ends(kDrawBackward);
 
   // Tasks of a fixed size, added in order: sums do not depend on the number of threads.
-  const std::int64_t tasks = task_count(visible_count_);
+  const std::int64_t tasks = task_count(drawn_count_);
   std::vector<double> task_view(static_cast<std::size_t>(tasks) * kViewGradient, 0.0);
   pool.run(tasks, threads, [&](std::int64_t task, int) {
     const std::int64_t begin = task * kSplatsPerTask;
-    stages_.project_backward(view_, splats, data_, grads, begin, std::min(begin + kSplatsPerTask, visible_count_),
+    stages_.project_backward(view_, splats, data_, grads, begin, std::min(begin + kSplatsPerTask, drawn_count_),
                              &task_view[task * kViewGradient]);
   });
   for (int c = 0; c < channels; ++c) {

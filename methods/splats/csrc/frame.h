@@ -75,7 +75,7 @@ class Frame {
   }
 
  private:
-  void list_visible(std::int64_t count);
+  void list_drawn(std::int64_t count);
   void sort_by_depth();
   void reserve_entries();
   void fill_tiles(const Splats& splats, int threads);
@@ -87,13 +87,13 @@ class Frame {
   const int channels_;
   const bool has_offset_;
   FrameData data_{};
-  std::int64_t visible_count_ = 0;
+  std::int64_t drawn_count_ = 0;
   Buffer<float> records_, transmittances_, last_;
   Buffer<double> depths_;
   Buffer<Rect> rects_;
   Buffer<EntryRange> ranges_;
   Buffer<Entry> entries_;
-  Buffer<std::uint32_t> visible_, order_, tile_begin_, places_;
+  Buffer<std::uint32_t> drawn_, order_, tile_begin_, places_;
   Buffer<Pair> pairs_;
   std::size_t entry_count_ = 0;
   std::array<double, kStageCount> seconds_{};

@@ -218,7 +218,7 @@ NB_MODULE(_kernel, m) {
         "background"_a, "grad_image"_a, "grad_alpha"_a, "grad_means"_a, "grad_quats"_a, "grad_scales"_a,
         "grad_opacities"_a, "grad_colors"_a, "grad_offset"_a, "grad_background"_a, "grad_viewmat"_a, "grad_K"_a,
         "grad_absolute"_a, "threads"_a,
-        "Add the gradients of visible splats; write those of background and camera. An empty grad_absolute asks for none.");
+        "Add the gradients of drawn splats; write those of background and camera. An empty grad_absolute asks for none.");
   bind_avatar(m);
   m.def("instruction_sets", &instruction_sets, "Variants this machine can run, the fastest first.");
 }

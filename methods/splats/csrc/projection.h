@@ -161,6 +161,21 @@ inline std::uint16_t tile_of(float pixel, int tiles) {
   return static_cast<std::uint16_t>(tile > 0.0f ? (tile < tiles - 1 ? tile : tiles - 1) : 0.0f);
 }
 
+// The radius that the published rasteriser gives a splat (`published_radii` in reference.py), whatever its opacity:
+// three standard deviations along the longest axis.
+HEADBENCH_INLINE Real published_radius(const Projection& p) {
+  const Real half = Real(0.5f) * (p.xx - p.yy);
+  const Real spread = sqrt(max(fma(half, half, p.xy * p.xy), Real(0.1f)));
+  return ceil(Real(3.0f) * sqrt(fma(Real(0.5f), p.xx + p.yy, spread)));
+}
+
+// Where that rasteriser finds at least one whole tile: its pixel centres lie at whole numbers, half a pixel from ours.
+HEADBENCH_INLINE Mask in_view_of_tiles(const View& view, Real x, Real y, Real radius) {
+  return (x + radius >= Real(1.5f)) & (y + radius >= Real(1.5f)) &
+         (Real(static_cast<float>(view.tiles_x * kTile) + 0.5f) > x - radius) &
+         (Real(static_cast<float>(view.tiles_y * kTile) + 0.5f) > y - radius);
+}
+
 inline void project(const View& view, const Splats& splats, const FrameData& frame, std::int64_t begin,
                     std::int64_t end) {
   for (std::int64_t first = begin; first < end; first += W) {
@@ -192,11 +207,14 @@ inline void project(const View& view, const Splats& splats, const FrameData& fra
                           (Real(static_cast<float>(view.width)) > x - reach_x) &
                           (Real(static_cast<float>(view.height)) > y - reach_y);
     const Real largest = 3e38f;
-    const Mask drawable = (p.det > Real(0.0f)) & (largest > p.det) & (largest > p.l11) &
-                          (Real(kRadiusMax) > radius) & (opacity >= Real(view.alpha_min));
+    const Mask resolved = (p.det > Real(0.0f)) & (largest > p.det) & (largest > p.l11);
+    const Mask drawable = resolved & (Real(kRadiusMax) > radius) & (opacity >= Real(view.alpha_min));
+    const Real published = published_radius(p);
+    const Mask in_view = in_view_of_tiles(view, x, y, published) & resolved & (Real(kRadiusMax) > published);
 
-    alignas(64) float visible[W], field[kGeometry][W], reach[W], half_x[W], half_y[W];
-    store(visible, zero_unless(in_image & drawable, 1.0f));
+    alignas(64) float drawn[W], field[kGeometry][W], radii[W], half_x[W], half_y[W];
+    store(drawn, zero_unless(in_image & drawable, 1.0f));
+    store(radii, zero_unless(in_view, published));
     store(field[kMeanX], x);
     store(field[kMeanY], y);
     for (int lane = 0; lane < W; ++lane) {
@@ -207,19 +225,17 @@ inline void project(const View& view, const Splats& splats, const FrameData& fra
     store(field[kL21], p.l21);
     store(field[kL22], p.l22);
     store(field[kLog2Opacity], log2_opacity);
-    store(reach, radius);
     store(half_x, extent_x);
     store(half_y, extent_y);
     for (int lane = 0; lane < used; ++lane) {
       const std::int64_t splat = first + lane;
       const bool in_depth = camera.z[lane] > view.near && camera.z[lane] < view.far;
-      if (!in_depth || visible[lane] == 0.0f) {
+      frame.radii[splat] = in_depth ? static_cast<std::int32_t>(radii[lane]) : 0;
+      if (!in_depth || drawn[lane] == 0.0f) {
         frame.depths[splat] = 0.0;
-        frame.radii[splat] = 0;
         continue;
       }
       frame.depths[splat] = camera.z[lane];
-      frame.radii[splat] = static_cast<std::int32_t>(reach[lane]);
       // A tenth of a pixel covers rounding; tiles that turn out untouched are dropped when pairs are found.
       const float w = half_x[lane] + 0.1f, h = half_y[lane] + 0.1f;
       const float center_x = field[kMeanX][lane], center_y = field[kMeanY][lane];

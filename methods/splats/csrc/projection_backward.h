@@ -115,11 +115,11 @@ inline void project_lanes_backward(const View& view, const Projection& p, const 
   view_gradient[15] = out.mean2d[1] - limit_y;
 }
 
-// Ask for the gradient records of splats visible[begin .. end).
+// Ask for the gradient records of splats drawn[begin .. end).
 HEADBENCH_INLINE void prefetch_records(const FrameData& frame, const Gradients& grads, std::int64_t begin,
                                        std::int64_t end) {
   for (std::int64_t i = begin; i < end; ++i) {
-    const EntryRange range = frame.ranges[frame.visible[i]];
+    const EntryRange range = frame.ranges[frame.drawn[i]];
     for (std::uint32_t e = range.begin; e < range.begin + range.count; ++e) {
       const float* record = grads.records + static_cast<std::size_t>(frame.places[e]) * grads.record_stride;
       for (int k = 0; k < grads.record_stride; k += 16) HEADBENCH_PREFETCH(record + k);
@@ -137,7 +137,7 @@ inline void project_backward(const View& view, const Splats& splats, const Frame
     SplatLanes in;
     alignas(64) float moments[kMoments][W], absolutes[kAbsolutes][W];
     for (int lane = 0; lane < W; ++lane) {
-      const std::int64_t splat = frame.visible[first + (lane < used ? lane : 0)];
+      const std::int64_t splat = frame.drawn[first + (lane < used ? lane : 0)];
       load_lane(splats, splat, lane, in);
       if (first + W + lane < end) prefetch_records(frame, grads, first + W + lane, first + W + lane + 1);
       if (lane >= used) {
@@ -181,7 +181,7 @@ inline void project_backward(const View& view, const Splats& splats, const Frame
       for (int lane = 0; lane < used; ++lane) view_gradient[k] += lane_view[lane];
     }
     for (int lane = 0; lane < used; ++lane) {
-      const std::int64_t splat = frame.visible[first + lane];
+      const std::int64_t splat = frame.drawn[first + lane];
       for (int k = 0; k < 3; ++k) grads.means[3 * splat + k] += mean[k][lane];
       for (int k = 0; k < 4; ++k) grads.quats[4 * splat + k] += quat[k][lane];
       for (int k = 0; k < 3; ++k) grads.scales[3 * splat + k] += scale[k][lane];

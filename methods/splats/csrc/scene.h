@@ -84,13 +84,13 @@ struct Pair {
 
 // What the stages hand on to each other.
 struct FrameData {
-  float* records;                // (N, record_stride(C)), set for visible splats
-  double* depths;                // (N,) camera z, 0 where culled
-  std::int32_t* radii;           // (N,)
+  float* records;                // (N, record_stride(C)), set for drawn splats
+  double* depths;                // (N,) camera z, 0 where not drawn
+  std::int32_t* radii;           // (N,) 0 where out of view; what is too faint to be drawn has one
   Rect* rects;                   // (N,)
-  EntryRange* ranges;            // (N,) set for visible splats
+  EntryRange* ranges;            // (N,) set for drawn splats
   Entry* entries;                // before they are sorted into pairs
-  const std::uint32_t* visible;  // (M,) ascending
+  const std::uint32_t* drawn;  // (M,) ascending
   const std::uint32_t* order;    // (M,) by depth
   Pair* pairs;                   // (P,) tile by tile, each by depth
   std::uint32_t* places;         // of each entry among the pairs
@@ -131,13 +131,13 @@ struct Stages {
   int lanes;
   // Project splats [begin, end): records, depths, radii, rects.
   void (*project)(const View&, const Splats&, const FrameData&, std::int64_t begin, std::int64_t end);
-  // Find the tiles and blocks that splats visible[begin .. end) reach.
+  // Find the tiles and blocks that splats drawn[begin .. end) reach.
   void (*find_entries)(const View&, const Splats&, const FrameData&, std::int64_t begin, std::int64_t end);
   std::size_t (*scratch_floats)(int channels);
   void (*draw_tile)(const View&, const Splats&, const FrameData&, const ImageOut&, int tile, float* scratch);
   void (*draw_tile_backward)(const View&, const Splats&, const FrameData&, const Gradients&, int tile,
                              float* scratch);
-  // Gather the gradient records of splats visible[begin .. end) and take them back to the inputs; adds to
+  // Gather the gradient records of splats drawn[begin .. end) and take them back to the inputs; adds to
   // view_gradient (kViewGradient numbers).
   void (*project_backward)(const View&, const Splats&, const FrameData&, const Gradients&,
                            std::int64_t begin, std::int64_t end, double* view_gradient);

@@ -1,17 +1,22 @@
 """A run is as it claims; every way of changing it on disk is found and told by file, expected and found."""
 
+import dataclasses
 import json
 
+import cv2
+import pandas as pd
 import pytest
 
 from headbench.bench import cli
-from headbench.bench.files import digest_file, read_json, write_json
+from headbench.bench.documents import read_json
+from headbench.bench.files import digest_file, write_json
 from headbench.bench.frames import read_png, write_png
-from headbench.bench.store import RunFolder, read_rows, write_rows
+from headbench.bench.rows import Rows
+from headbench.bench.store import RunFolder
 
 
 def verify(run, *options):
-    return cli.main(["verify", str(run), *options])
+    return cli.main(["verify", str(run), "--trust", *options])
 
 
 def cell_of(run):
@@ -29,6 +34,18 @@ def test_an_untouched_run_verifies_and_says_how_much_was_looked_at(run, capsys):
     assert (found["files"], found["values"], found["mismatches"]) == (6, 6, [])
 
 
+def test_captures_are_read_whole_whatever_is_remembered(run, toy, monkeypatch):
+    asked = []
+
+    def read(path, *, remembered=True):
+        asked.append(remembered)
+        return toy.ToyClip(path)
+
+    monkeypatch.setattr(toy, "read", read)
+    assert verify(run) == 0
+    assert asked == [False]
+
+
 def test_a_changed_frame_is_found_by_digest_and_by_metric(run, capsys):
     frame = frame_of(run)
     before = digest_file(frame)[:12]
@@ -43,7 +60,9 @@ def test_a_frame_recompressed_without_loss_has_another_digest_and_the_same_metri
     frame = frame_of(run)
     write_png(frame, read_png(frame))  # the same bytes again
     assert verify(run) == 0
-    frame.write_bytes(frame.read_bytes() + b"\0")
+    frame.write_bytes(
+        cv2.imencode(".png", cv2.imread(str(frame)), [cv2.IMWRITE_PNG_COMPRESSION, 9])[1].tobytes()
+    )
     capsys.readouterr()
     assert verify(run) == 1
     assert "1 mismatches" in capsys.readouterr().out
@@ -51,9 +70,9 @@ def test_a_frame_recompressed_without_loss_has_another_digest_and_the_same_metri
 
 def test_a_changed_value_is_found(run, capsys):
     folder = RunFolder(run)
-    rows = read_rows(folder.rows)
+    rows = pd.read_parquet(folder.rows)
     rows.loc[(rows["metric"] == "psnr") & (rows["timestep"] == 2), "value"] += 0.01
-    write_rows(folder.rows, rows)
+    Rows(rows).write(folder.rows)
     assert verify(run) == 1
     out = capsys.readouterr().out
     assert "1 mismatches" in out
@@ -63,10 +82,8 @@ def test_a_changed_value_is_found(run, capsys):
 @pytest.mark.parametrize(("change", "found"), [("drop", "a row with"), ("repeat", "found several")])
 def test_rows_that_are_missing_or_twice_are_found(run, change, found, capsys):
     folder = RunFolder(run)
-    rows = read_rows(folder.rows)
-    import pandas as pd
-
-    write_rows(folder.rows, rows.iloc[1:] if change == "drop" else pd.concat([rows, rows.iloc[:1]]))
+    rows = pd.read_parquet(folder.rows)
+    Rows(rows.iloc[1:] if change == "drop" else pd.concat([rows, rows.iloc[:1]])).write(folder.rows)
     assert verify(run) == 1
     assert found in capsys.readouterr().out
 
@@ -118,17 +135,22 @@ def test_a_changed_capture_is_found(run, toy, monkeypatch, capsys):
     assert "fingerprint of subject1: expected toy-subject1, found another" in capsys.readouterr().out
 
 
-def test_a_changed_frame_stays_found_after_the_run_is_started_again(run, toy, capsys):
+def test_a_run_started_again_renders_a_changed_frame_again(run, toy, capsys):
     from headbench.bench import runner
-    from headbench.bench.robustness.avatars import run_configuration
+    from headbench.bench.captures import run_configuration
+    from headbench.bench.run_options import RunOptions
 
     frame = frame_of(run)
+    before = digest_file(frame)
     write_png(frame, read_png(frame) + 3)
-    runner.run(run_configuration(run))
     assert verify(run) == 1
+    runner.run(run_configuration(run, RunOptions(trust=True)))
+    assert digest_file(frame) == before
+    assert verify(run) == 0
 
 
-def test_an_unfinished_run_is_bad_input(run, tmp_path, capsys):
-    RunFolder(run).write_manifest({**RunFolder(run).read_manifest(), "status": "started"})
-    assert verify(run) == 2
-    assert verify(tmp_path) == 2
+def test_an_unfinished_run_gives_no_verdict(run, tmp_path, capsys):
+    started = dataclasses.replace(RunFolder(run).read_manifest(), status="started")
+    started.write(RunFolder(run).manifest)
+    assert verify(run) == 3
+    assert verify(tmp_path) == 3

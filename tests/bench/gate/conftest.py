@@ -4,6 +4,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from headbench.bench import runner
@@ -54,8 +55,11 @@ def remeasured(config):
         assert frames
         for path in frames:
             write_png(path, change(read_png(path)))
-        (cell.folder / "measure.json").unlink()
-        return runner.run(config)
+        rendered = cell.stage("digests")
+        files = {**rendered["files"], **cell.digests(frames)}
+        cell.finish("digests", rendered["fingerprint"], files=files)
+        runner.run(config)
+        return pd.read_parquet(RunFolder(Path(config.out)).rows)
 
     return remeasured
 

@@ -10,8 +10,10 @@ import pandas as pd
 import pytest
 
 from headbench.bench import cli, runner
-from headbench.bench.files import read_json, write_json
-from headbench.bench.store import RunFolder, read_rows, write_rows
+from headbench.bench.documents import read_json
+from headbench.bench.files import write_json
+from headbench.bench.rows import Rows
+from headbench.bench.store import RunFolder
 
 
 @pytest.fixture
@@ -58,7 +60,7 @@ def test_an_unchanged_run_passes(run, baseline, capsys):
 
 
 def test_a_run_worse_by_0_3_db_fails_naming_metric_subject_and_size(run, baseline, remeasured, capsys):
-    before = psnr_of(read_rows(RunFolder(run).rows), "subject2", "self_reenactment")
+    before = psnr_of(pd.read_parquet(RunFolder(run).rows), "subject2", "self_reenactment")
     rows = remeasured("subject2", "self_reenactment", worse_by(0.3))
     loss = before - psnr_of(rows, "subject2", "self_reenactment")
     assert 0.3 <= loss < 0.5  # by whole pixels of a tiny image
@@ -70,7 +72,7 @@ def test_a_run_worse_by_0_3_db_fails_naming_metric_subject_and_size(run, baselin
 
 
 def test_a_noise_level_change_passes(run, baseline, remeasured, capsys):
-    before = read_rows(RunFolder(run).rows)
+    before = pd.read_parquet(RunFolder(run).rows)
 
     def change(image):
         image[0, 0, 0] += 1  # one channel of one pixel by one level
@@ -96,8 +98,8 @@ def test_an_improvement_passes_and_says_how_to_keep_it(run, baseline, remeasured
 
 def test_a_missing_subject_is_code_3(run, baseline, capsys):
     folder = RunFolder(run)
-    rows = read_rows(folder.rows)
-    write_rows(folder.rows, rows[rows["subject"] != "subject2"])
+    rows = pd.read_parquet(folder.rows)
+    Rows(rows[rows["subject"] != "subject2"]).write(folder.rows)
     assert gate(run, baseline) == 3
     out = capsys.readouterr().out
     assert "3 missing, 3 pass" in out
@@ -107,8 +109,8 @@ def test_a_missing_subject_is_code_3(run, baseline, capsys):
 def test_a_regression_beside_something_missing_is_code_3_and_both_are_told(run, baseline, remeasured, capsys):
     remeasured("subject1", "novel_view", lambda image: image + 20)
     folder = RunFolder(run)
-    rows = read_rows(folder.rows)
-    write_rows(folder.rows, rows[rows["subject"] != "subject2"])
+    rows = pd.read_parquet(folder.rows)
+    Rows(rows[rows["subject"] != "subject2"]).write(folder.rows)
     assert gate(run, baseline) == 3
     assert "3 missing, 1 regressed" in capsys.readouterr().out
 
@@ -121,13 +123,13 @@ def test_a_regression_beside_something_missing_is_code_3_and_both_are_told(run, 
             lambda rows: rows.assign(status=["failed", *rows["status"][1:]], reason="no gold"),
             "failed: no gold",
         ),
-        (lambda rows: rows.assign(value=[math.inf, *rows["value"][1:]]), "not finite"),
+        (lambda rows: rows.assign(value=[math.inf, *rows["value"][1:]]), "a finite value"),
         (lambda rows: pd.concat([rows, rows.iloc[:1]]), "measured twice"),
     ],
 )
 def test_rows_with_holes_give_no_number(run, baseline, spoil, why, capsys):
     folder = RunFolder(run)
-    write_rows(folder.rows, spoil(read_rows(folder.rows)))
+    Rows(spoil(pd.read_parquet(folder.rows))).write(folder.rows)
     assert gate(run, baseline) == 3
     assert why in capsys.readouterr().out
     assert gate(run, baseline, "--update") == 3  # a baseline with holes would hide them
@@ -154,7 +156,7 @@ def test_remade_captures_compare_where_the_baseline_says_so(run, baseline, confi
     assert "other captures" in capsys.readouterr().out
     assert gate(run, baseline, "--update", "--captures", "remade") == 0
     assert gate(other.out, baseline) == 0
-    assert "made anew" in capsys.readouterr().out
+    assert "made again" in capsys.readouterr().out
 
 
 def test_speed_is_judged_on_its_own_machine_alone(run, baseline, capsys):
@@ -171,9 +173,35 @@ def test_speed_is_judged_on_its_own_machine_alone(run, baseline, capsys):
     assert "Environment changed: processor: abacus to" in out
 
 
+def test_a_number_unavailable_in_the_baseline_too_is_no_loss(run, tmp_path, capsys):
+    folder, path = RunFolder(run), tmp_path / "baseline.json"
+    whole = pd.read_parquet(folder.rows)
+    lacking = (whole["subject"] == "subject2") & (whole["metric"] == "psnr")
+    without = whole.assign(
+        value=whole["value"].mask(lacking),
+        status=whole["status"].mask(lacking, "missing"),
+        reason=whole["reason"].mask(lacking, "no gold"),
+    )
+    Rows(without).write(folder.rows)
+    assert gate(run, path, "--update") == 0
+    assert "no gold" in capsys.readouterr().out
+    assert gate(run, path) == 0
+    assert "Unavailable here as in the baseline" in capsys.readouterr().out
+    Rows(whole).write(folder.rows)
+    assert gate(run, path) == 0
+    assert "new" in capsys.readouterr().out
+    assert gate(run, path, "--update") == 0
+    Rows(without).write(folder.rows)
+    assert gate(run, path) == 3  # it was there before
+    assert "missing: no gold" in capsys.readouterr().out
+    assert gate(run, path, "--update") == 3
+    assert "no gold" in capsys.readouterr().out
+
+
 def test_a_new_number_is_told_and_passes(run, baseline, capsys):
     record = read_json(baseline)
     record["values"] = {k: v for k, v in record["values"].items() if "/subject1/" in k}
+    record["count"] = len(record["values"])
     write_json(baseline, record)
     assert gate(run, baseline) == 0
     assert "3 new, 3 pass" in capsys.readouterr().out
@@ -204,9 +232,16 @@ def test_results_that_are_none_are_code_3_and_leave_no_stale_report(run, baselin
     assert gate(tmp_path / "nowhere", baseline, "--junit", str(junit)) == 3
     assert not junit.exists()
     assert gate(run, tmp_path / "no-baseline.json") == 3
-    RunFolder(run).write_manifest({**RunFolder(run).read_manifest(), "status": "started"})
+    started = dataclasses.replace(RunFolder(run).read_manifest(), status="started")
+    started.write(RunFolder(run).manifest)
     assert gate(run, baseline) == 3
     assert "Start the run again" in capsys.readouterr().out
+
+
+def more(record, key, value=1.0):
+    """Add a number to a baseline."""
+    record["values"][key] = value
+    record["count"] += 1
 
 
 @pytest.mark.parametrize(
@@ -214,9 +249,17 @@ def test_results_that_are_none_are_code_3_and_leave_no_stale_report(run, baselin
     [
         (lambda r: r.update(format=9), "format"),
         (lambda r: r.pop("values"), "values"),
-        (lambda r: r["values"].update({"a/b": 1.0}), "task/method/subject/region/metric"),
-        (lambda r: r["values"].update({"a/b/c/d/psnr": math.nan}), "a finite number"),
-        (lambda r: r["values"].update({"a/b/c/d/unheard": 1.0}), "an entry 'unheard'"),
+        (lambda r: r.update(values={}, count=0), "at least one number"),
+        (lambda r: r.update(values={}), "as many as count says, 6"),
+        (lambda r: r["values"].popitem(), "as many as count says, 6"),
+        (lambda r: r.pop("count"), "count"),
+        (lambda r: r.update(format=1), "Format 1 lacked"),
+        (lambda r: r.update(protocols={}), "protocols: expected an entry 'novel_view'"),
+        (lambda r: r["tolerances"]["psnr"].update(digits=10**9), "from 0 to"),
+        (lambda r: more(r, "a/b"), "task/method/subject/region/metric"),
+        (lambda r: more(r, f"novel_view/a/{'x' * 1000}/full/psnr"), "1 to 120 bytes"),
+        (lambda r: more(r, "a/b/c/d/psnr", math.nan), "a finite number"),
+        (lambda r: more(r, "a/b/c/d/unheard"), "an entry 'unheard'"),
         (lambda r: r["tolerances"]["psnr"].update(absolute=-1.0), "a finite number from 0"),
         (lambda r: r["tolerances"]["psnr"].update(absolut=1.0), "Did you mean 'absolute'"),
         (lambda r: r.update(captures="some"), "captures"),
@@ -229,6 +272,16 @@ def test_a_baseline_that_makes_no_sense_is_code_3_naming_what(run, baseline, cha
     baseline.write_text(json.dumps(record))
     assert gate(run, baseline) == 3
     assert match in capsys.readouterr().out
+
+
+def test_a_key_that_stands_twice_in_a_baseline_is_code_3(run, baseline, remeasured, capsys):
+    remeasured("subject2", "self_reenactment", worse_by(5.0))
+    assert gate(run, baseline) == 1
+    key = '"self_reenactment/toy/subject2/full/psnr"'
+    baseline.write_text(baseline.read_text().replace("\n }\n}", f",\n  {key}: 0.0\n }}\n}}"))
+    assert baseline.read_text().count(key) == 2
+    assert gate(run, baseline) == 3
+    assert "each key once" in capsys.readouterr().out
 
 
 def test_wrong_usage_is_code_2(run, baseline, capsys):

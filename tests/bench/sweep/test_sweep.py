@@ -1,9 +1,11 @@
 """A sweep of toy avatars: rows of known levels, resumed and refused."""
 
+import pandas as pd
 import pytest
 
 from headbench.bench import runner
 from headbench.bench.contracts import no_progress
+from headbench.bench.documents import read_json
 from headbench.bench.errors import InputError
 from headbench.bench.run_config import RunConfig
 from headbench.bench.store import RunFolder
@@ -34,7 +36,9 @@ def finished(toy, tmp_path, monkeypatch):
 
 
 def swept(run, **settings):
-    return sweep(SweepSettings(str(run), **settings), run / "sweep", no_progress)
+    """Table of the rows of a sweep."""
+    sweep(SweepSettings(str(run), trust=True, **settings), run / "sweep", no_progress)
+    return pd.read_parquet(RunFolder(run / "sweep").rows)
 
 
 def test_variants_are_scored_like_the_run_itself(finished, toy):
@@ -44,7 +48,7 @@ def test_variants_are_scored_like_the_run_itself(finished, toy):
     found = dict(zip(errors["method"], errors["value"]))
     assert found == {"varying": 128 - 61, "varying+dark": 64 - 61, "varying+light": 191 - 61}
     assert set(rows["metric"]) == {"error", "files"}  # nothing was trained: no metric of training
-    record, original = (RunFolder(path).read_manifest() for path in (finished / "sweep", finished))
+    record, original = (read_json(RunFolder(path).manifest) for path in (finished / "sweep", finished))
     assert record["protocols"]["novel_view"]["hash"] == original["protocols"]["novel_view"]["hash"]
     derived = {entry["name"]: entry.get("derived") for entry in record["methods"]}
     assert derived["varying"] is None

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -313,3 +315,15 @@ def test_command_writes_the_first_training_timestep(capture, tmp_path):
             ExportColmapSettings(str(capture.union), str(out), timesteps=(0, 99)),
             no_progress,
         )
+
+
+@pytest.mark.parametrize("module", ["records", "writer", "reader"])
+def test_sigterm_keeps_its_handler_with_pycolmap(module):
+    code = (
+        "import os, signal, sys\n"
+        "signal.signal(signal.SIGTERM, lambda *_: sys.exit(7))\n"
+        f"import headbench.datasets.colmap.{module}\n"
+        "os.kill(os.getpid(), signal.SIGTERM)\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
+    assert (ended.returncode, ended.stderr) == (7, "")

@@ -16,6 +16,34 @@ from .toy import toy_head
 
 HEAD = toy_head(80, eyelids=True)
 
+PUBLISHED = (
+    "0 31 30, 0 1 31, 1 32 31, 1 2 32, 2 33 32, 2 3 33, 3 34 33, "
+    "3 4 34, 4 35 34, 4 5 35, 5 36 35, 5 6 36, 6 37 36, 6 7 37, "
+    "7 8 37, 8 38 37, 8 9 38, 9 39 38, 9 10 39, 10 40 39, 10 11 40, "
+    "11 41 40, 11 12 41, 12 42 41, 12 13 42, 13 43 42, 13 14 43, 14 44 43, "
+    "60 75 76, 60 76 61, 61 76 77, 61 77 62, 62 77 78, 62 78 63, 63 78 79, "
+    "63 79 64, 64 79 80, 64 80 65, 65 80 81, 65 81 66, 66 81 82, 66 82 67, "
+    "67 82 68, 68 82 83, 68 83 69, 69 83 84, 69 84 70, 70 84 85, 70 85 71, "
+    "71 85 86, 71 86 72, 72 86 87, 72 87 73, 73 87 88, 73 88 74, 74 88 89, "
+    "75 30 76, 76 30 31, 76 31 77, 77 31 32, 77 32 78, 78 32 33, 78 33 79, "
+    "79 33 34, 79 34 80, 80 34 35, 80 35 81, 81 35 36, 81 36 82, 82 36 37, "
+    "82 37 38, 82 38 83, 83 38 39, 83 39 84, 84 39 40, 84 40 85, 85 40 41, "
+    "85 41 86, 86 41 42, 86 42 87, 87 42 43, 87 43 88, 88 43 44, 88 44 89, "
+    "45 46 15, 46 16 15, 46 47 16, 47 17 16, 47 48 17, 48 18 17, 48 49 18, "
+    "49 19 18, 49 50 19, 50 20 19, 50 51 20, 51 21 20, 51 52 21, 52 22 21, "
+    "52 23 22, 52 53 23, 53 24 23, 53 54 24, 54 25 24, 54 55 25, 55 26 25, "
+    "55 56 26, 56 27 26, 56 57 27, 57 28 27, 57 58 28, 58 29 28, 58 59 29, "
+    "90 106 105, 90 91 106, 91 107 106, 91 92 107, 92 108 107, 92 93 108, 93 109 108, "
+    "93 94 109, 94 110 109, 94 95 110, 95 111 110, 95 96 111, 96 112 111, 96 97 112, "
+    "97 98 112, 98 113 112, 98 99 113, 99 114 113, 99 100 114, 100 115 114, 100 101 115, "
+    "101 116 115, 101 102 116, 102 117 116, 102 103 117, 103 118 117, 103 104 118, 104 119 118, "
+    "105 106 45, 106 46 45, 106 107 46, 107 47 46, 107 108 47, 108 48 47, 108 109 48, "
+    "109 49 48, 109 110 49, 110 50 49, 110 111 50, 111 51 50, 111 112 51, 112 52 51, "
+    "112 53 52, 112 113 53, 113 54 53, 113 114 54, 114 55 54, 114 115 55, 115 56 55, "
+    "115 116 56, 116 57 56, 116 117 57, 117 58 57, 117 118 58, 118 59 58, 118 119 59, "
+)
+"""Triangles of the teeth in GaussianAvatars (flame_model/flame.py, commit 30cc4be), indices into the new vertices."""
+
 
 def ringed(columns, reverse=False):
     """The toy with rings of a given length."""
@@ -44,13 +72,19 @@ def test_counts_of_the_flame_layout():
     new = toothed.faces[len(big.faces) :] - len(big.template)
     assert new.min() == 0
     assert new.max() == 119
-    # Blocks of 15: upper root, lower root, upper edge, lower edge, upper root back, upper edge back, lower
-    # root back, lower edge back; strips of 28: upper front, back, edge, then lower front, back, edge.
-    blocks = [set(np.unique(strip // 15)) for strip in new.reshape(6, 28, 3)]
-    assert blocks == [{0, 2}, {4, 5}, {2, 5}, {1, 3}, {6, 7}, {3, 7}]
     upper = {*range(15), *range(30, 45), *range(60, 90)}
     assert set(toothed.regions["teeth_upper"] - len(big.template)) == upper
     assert set(toothed.regions["teeth_lower"] - len(big.template)) == set(range(120)) - upper
+
+
+def test_triangles_stand_in_the_published_order():
+    big = toy_head(96)
+    rings = {
+        name: big.regions[name][-2:0:-1] for name in RING_REGIONS
+    }  # from the left to the right, as published
+    new = with_teeth(replace(big, regions=big.regions | rings)).faces[len(big.faces) :] - len(big.template)
+    published = [[int(vertex) for vertex in row.split()] for row in PUBLISHED.split(",") if row.strip()]
+    np.testing.assert_array_equal(new, published)
 
 
 def test_positions_follow_the_recipe():
@@ -155,7 +189,7 @@ def test_rings_are_found_where_the_lips_turn_inwards(length):
     assert set(lower) <= set(true_lower)
     for ring in (upper, lower):
         x = head.template[ring, 0]
-        assert (np.diff(x) > 0).all()
+        assert (np.diff(x) < 0).all()  # from the left to the right, as published
         spacing = np.ptp(x) / (length - 1)
         assert np.abs(x - np.linspace(x[0], x[-1], length)).max() < spacing
     with_teeth(head).validate("toothed")
@@ -163,8 +197,8 @@ def test_rings_are_found_where_the_lips_turn_inwards(length):
 
 def test_all_of_a_short_rim_is_taken():
     upper, lower = lip_rings(without_rings(), 99)
-    np.testing.assert_array_equal(upper, HEAD.regions["lip_outside_ring_upper"])
-    np.testing.assert_array_equal(lower, HEAD.regions["lip_outside_ring_lower"])
+    np.testing.assert_array_equal(upper, HEAD.regions["lip_outside_ring_upper"][::-1])
+    np.testing.assert_array_equal(lower, HEAD.regions["lip_outside_ring_lower"][::-1])
 
 
 def test_says_what_rings_need():

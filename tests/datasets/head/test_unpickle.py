@@ -197,6 +197,64 @@ def test_a_few_bytes_cannot_ask_for_gigabytes(tmp_path, bomb):
         tracemalloc.stop()
 
 
+def amplified(count: int, size: int, what: str) -> bytes:
+    """A dictionary with ``count`` arrays, each made anew of the same ``size`` bytes, in a few operations each."""
+    raw = {"bytes": b"\x8e" + size.to_bytes(8, "little") + bytes(size)}
+    raw["text"] = b"\x8d" + size.to_bytes(8, "little") + b"a" * size
+    raw["encoded"] = b"c_codecs\nencode\n(" + raw["text"] + b"tR"
+    kind = b"cnumpy\ndtype\n(X\x02\0\0\0u1tR(K\x03X\x01\0\0\0<NNNJ\xff\xff\xff\xffJ\xff\xff\xff\xffK\0tb"
+    state = b"(K\x01(J" + size.to_bytes(4, "little") + b"t" + kind + b"\x89" + raw[what] + b"tq\x01"
+    array = ARRAY + b"(cnumpy\nndarray\n(K\0tX\x01\0\0\0btR"
+    names = [b"X\x04\0\0\0" + f"{number:04}".encode() for number in range(count)]
+    whole = b"\x80\x04}" + b"X\x05\0\0\0first" + array + state + b"bs"
+    return whole + b"".join(name + array + b"h\x01bs" for name in names) + b"."
+
+
+def test_one_such_array_is_read(tmp_path):
+    for what in ("bytes", "text", "encoded"):
+        (tmp_path / "x.pkl").write_bytes(amplified(0, 100, what))
+        assert read_pickle(tmp_path / "x.pkl")["first"].shape == (100,)
+
+
+TUPLES = b"(K\x01t" + b"2\x86" * 60  # a pair of a pair ..., 2^60 numbers
+LONG = b"\x8b\x40\x42\x0f\0" + b"\x01" * 1_000_000
+BOMBS = {
+    "many arrays of the same bytes": amplified(500, 2**20, "bytes"),
+    "many arrays of the same text": amplified(500, 2**20, "text"),
+    "many arrays of the same encoded text": amplified(500, 2**20, "encoded"),
+    "many small objects": b"\x80\x04" + b"\x8f" * 3_000_000 + b".",
+    "marks": b"\x80\x04" + b"(" * 3_000_000 + b".",
+    "a key of nested tuples": b"\x80\x04}" + TUPLES + b"Ns.",
+    "keys of nested tuples": b"\x80\x04}(" + TUPLES + b"Nu.",
+    "a set of nested tuples": b"\x80\x04\x8f(" + TUPLES + b"\x90.",
+    "a frozen set of nested tuples": b"\x80\x04(" + TUPLES + b"\x91.",
+    "long numbers as keys": b"\x80\x02}(" + LONG + b"q\x00N" + b"h\x00N" * 100_000 + b"u.",
+    "a long shape": amplified(0, 8, "bytes").replace(
+        b"(J\x08\0\0\0t", b"(" + b"J\xff\xff\xff\x7f" * 400_000 + b"t"
+    ),
+    "a shape of long numbers": amplified(0, 8, "bytes").replace(b"(J\x08\0\0\0t", b"(" + LONG + b"t"),
+    "a long name": b"c" + b"a" * 3_000_000 + b"\nb\n.",
+}
+
+
+@pytest.mark.parametrize("name", BOMBS)
+def test_memory_and_message_are_bounded_by_the_file(tmp_path, name):
+    tracemalloc.start()
+    try:
+        error = refusal(tmp_path / "bomb.pkl", BOMBS[name])
+        assert tracemalloc.get_traced_memory()[1] < 4 * len(BOMBS[name]) + 150_000_000
+    finally:
+        tracemalloc.stop()
+    assert len(str(error)) < 3000
+
+
+def test_matrices_that_are_named_often_are_made_once(tmp_path):
+    zeros = scipy.sparse.csr_matrix((2, 1_500_000))
+    (tmp_path / "x.pkl").write_bytes(pickle.dumps({str(number): zeros for number in range(100)}))
+    assert len({id(matrix) for matrix in read_pickle(tmp_path / "x.pkl").values()}) == 1
+    refusal(tmp_path / "y.pkl", pickle.dumps({str(number): zeros.copy() for number in range(3)}))
+
+
 def test_refuses_registered_extensions(tmp_path):
     copyreg.add_extension("os", "getcwd", 0x7FFF0001)
     try:

@@ -17,6 +17,7 @@ from headbench.bench.contracts import Camera, HeadPose
 from headbench.datasets.ga_writer import CapturePlan, CaptureWriter, SequencePlan, write_png
 from headbench.datasets.head.arrays import HeadArrays
 from headbench.datasets.head.model import HeadModel
+from headbench.datasets.head.teeth import with_teeth
 from headbench.datasets.mesh_pictures import rasterize_mesh
 
 from ..head.toy import toy_head
@@ -66,7 +67,7 @@ def smooth_poses(head: HeadArrays, count: int, phase: float) -> list[HeadPose]:
 
 def good_plan(**changes: Any) -> CapturePlan:
     """Two training sequences and FREE."""
-    head = changes.pop("head", None) or toy_head(16, version="toy2023")
+    head = changes.pop("head", None) or with_teeth(toy_head(16, version="toy2023"))
     vertices, _, identities = head.shape_basis.shape
     rng = np.random.default_rng(5)
     settings: dict[str, Any] = {

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import torch
 
+from headbench.bench.image_files import ImageInfo
 from headbench.datasets.ga_layout import Declaration
 from headbench.datasets.ga_writer import CaptureWriter, write_png
 from headbench.datasets.head.arrays import save_head
-from headbench.datasets.image_files import ImageInfo
 from headbench.datasets.lint.catalogue import GROUPS, RULES
 from headbench.datasets.lint.command import lint
 from headbench.datasets.lint.rules import apply

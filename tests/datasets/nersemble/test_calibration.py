@@ -113,7 +113,7 @@ K = [[100.0, 0, 24], [0, 100, 32], [0, 0, 1]]
         ({"intrinsics": None}, "intrinsics"),
         ({"intrinsics": (-np.array(K)).tolist()}, "intrinsics"),
         ({"intrinsics": [[100.0, 5, 24], *K[1:]]}, "intrinsics"),
-        ({"intrinsics": [[float("nan"), 0, 24], *K[1:]]}, "intrinsics"),
+        ({"intrinsics": [[float("nan"), 0, 24], *K[1:]]}, "intrinsics[0][0]"),
         ({"intrinsics": {"222200042": K}}, "intrinsics"),
         ({"height": 0}, "height"),
         ({"width": None}, "width"),

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from headbench.bench.errors import InputError
-from headbench.datasets.content_digests import CACHE_FILE
+from headbench.bench.lock import locked
 from headbench.datasets.ga_reader import read_capture
 from headbench.datasets.head.arrays import read_head, save_head
 from headbench.datasets.nersemble import export, image_pool, sequence
@@ -25,8 +25,8 @@ IMAGES = 3 * sum(SEQUENCES.values())
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """Every file below a folder by its name, but what the reader remembers."""
-    files = (path for path in folder.rglob("*") if path.is_file() and path.name != CACHE_FILE)
+    """Every file below a folder by its name."""
+    files = (path for path in folder.rglob("*") if path.is_file())
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 
@@ -210,10 +210,16 @@ def test_leftovers_of_a_killed_call_are_removed(whole, pristine_recording, tmp_p
     out = tmp_path / "out"
     folder = out / next(whole[0].glob(f"{SUBJECT}_FREE_*")).name
     prepared(pristine_recording, out)
-    (folder / "images" / ".00001_01-abc.png").write_bytes(b"half")
+    (folder / "images" / ".tmp-headbench-abc.png").write_bytes(b"half")
     (folder / "images" / "00001_01.png").unlink()
     prepared(pristine_recording, out)
     assert contents(out) == contents(whole[0])
+
+
+def test_a_subject_is_prepared_by_one_process_at_a_time(whole, pristine_recording, tmp_path):
+    union = tmp_path / whole[1].data[SUBJECT]["union"].name
+    with locked(union, beside=True), pytest.raises(InputError, match="no other process"):
+        prepared(pristine_recording, tmp_path)
 
 
 @pytest.mark.parametrize("change", [{"downscale": 4}, {"every": 2}, {"edges": "plain"}, {"colour": "none"}])

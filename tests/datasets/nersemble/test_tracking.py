@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from headbench.bench.errors import InputError
+from headbench.datasets.head.teeth import with_teeth
 from headbench.datasets.nersemble.tracking import find_tracked, read_tracked
 from headbench.datasets.nersemble.writer import write_tracked
 
@@ -54,7 +55,7 @@ def test_the_canonical_file_is_zero_but_for_identity_and_jaw(head, tmp_path):
 def test_without_a_static_offset_zeros_are_written_as_tools_need_one(head, tmp_path):
     path = written(tmp_path / "t.npz", head, static_offset=None)
     tracked = read_tracked(path, timesteps=COUNT, head=head)
-    assert tracked.constant["static_offset"].shape == (1, len(head.template), 3)
+    assert tracked.constant["static_offset"].shape == (1, len(with_teeth(head).template), 3)
     assert not tracked.constant["static_offset"].any()
     with pytest.raises(InputError) as error:
         read_tracked(path, timesteps=COUNT)

@@ -66,7 +66,7 @@ def test_principal_basis_has_the_covariance_of_its_activations():
     stack = np.stack([field.ravel() for field in shapes.values()])
     inverse = np.linalg.inv(basis.from_semantic)  # coefficients -> activations
     flat = basis.directions.reshape(-1, 3)
-    np.testing.assert_allclose(flat @ flat.T, stack.T @ (inverse.T @ inverse) @ stack, rtol=1e-9)
+    np.testing.assert_allclose(flat @ flat.T, stack.T @ (inverse.T @ inverse) @ stack, rtol=3e-5)
 
 
 def test_versions_share_topology_and_differ_in_bases(heads, play):

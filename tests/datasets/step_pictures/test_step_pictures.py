@@ -11,8 +11,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from headbench.bench.contracts import no_progress
+from headbench.bench.documents import read_json
 from headbench.bench.errors import InputError
-from headbench.bench.files import read_json
 from headbench.datasets.ga_reader import read_capture
 from headbench.datasets.step_pictures.class_figure import class_colour, draw_classes, frontal_key
 from headbench.datasets.step_pictures.command import run

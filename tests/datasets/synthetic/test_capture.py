@@ -1,5 +1,7 @@
 import json
 import os
+import subprocess
+import sys
 
 import cv2
 import numpy as np
@@ -71,8 +73,27 @@ def test_a_folder_of_part_of_the_performance_is_not_continued_with_all_of_it(cap
         synthesize(tmp_path, **SMALL)
 
 
-def test_foreign_folder_is_refused(tmp_path):
-    (tmp_path / "thesis.txt").write_text("irreplaceable")
+@pytest.mark.parametrize("left", [["README.txt"], [".tmp-headbench-a.json"], ["synthesis.json"], []])
+def test_a_start_killed_before_the_first_image_is_resumed(capture, tmp_path, monkeypatch, left):
+    class Planned(Exception):
+        pass
+
+    def plan(*_):
+        raise Planned
+
+    for name in left:
+        there = capture[0] / name
+        (tmp_path / name).write_bytes(there.read_bytes() if there.exists() else b"")
+    monkeypatch.setattr("headbench.datasets.synthetic.capture.plan_take", plan)
+    with pytest.raises(Planned):
+        synthesize(tmp_path, **SMALL)
+    for name in ("README.txt", "synthesis.json"):
+        assert (tmp_path / name).read_bytes() == (capture[0] / name).read_bytes()
+
+
+@pytest.mark.parametrize("name", ["thesis.txt", "README.txt", ".hidden"])
+def test_foreign_folder_is_refused(tmp_path, name):
+    (tmp_path / name).write_text("irreplaceable")
     with pytest.raises(InputError, match="other files"):
         synthesize(tmp_path, **SMALL)
 
@@ -109,3 +130,73 @@ def test_capture_says_that_it_is_synthetic(capture):
     assert json.loads((union / "headbench.json").read_text())["synthetic"]["seed"] == 0
     picture = cv2.imread(str(next(out.rglob("images/*.png"))))
     assert np.ptp(picture) > 100
+
+
+_NUMPY = [name for name in np.show_config(mode="dicts")["SIMD Extensions"].get("found", []) if name]
+_AVX512 = [name for name in _NUMPY if name.startswith(("AVX512", "X86_V4"))]
+_MACHINES = {
+    "as this one": {},
+    "one thread, SSE4": {
+        "OMP_NUM_THREADS": "1",
+        "OPENBLAS_CORETYPE": "Nehalem",
+        "ATEN_CPU_CAPABILITY": "default",
+        "NPY_DISABLE_CPU_FEATURES": " ".join(_NUMPY),
+        "MKL_ENABLE_INSTRUCTIONS": "SSE4_2",
+        "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX512F,-AVX2,-FMA",
+    },
+    "two threads, AVX2": {
+        "OMP_NUM_THREADS": "2",
+        "OPENBLAS_CORETYPE": "Haswell",
+        "ATEN_CPU_CAPABILITY": "avx2",
+        "NPY_DISABLE_CPU_FEATURES": " ".join(_AVX512),
+        "MKL_ENABLE_INSTRUCTIONS": "AVX2",
+        "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX512F",
+    },
+}
+_MAKE = """
+import sys
+from headbench.datasets.synthetic import capture
+
+class Blank:  # writes all but the pictures of a capture
+    def __init__(self, take):
+        self.take = take
+    def shoot(self, sequence, timestep, cameras):
+        import numpy as np
+        width, height = self.take.settings.size
+        for camera in cameras:
+            self.take.writer.write_frame(sequence, timestep, camera, np.zeros((height, width, 3), np.uint8))
+
+if sys.argv[2] == "blank":
+    capture.Photographer = Blank
+    capture._missing = lambda take, sequence, timestep: tuple(take.cameras)
+capture.synthesize(sys.argv[1], cameras=2, timesteps=8, size=(32, 46), samples_per_pixel=9,
+                   tracking_noise=0.1, workers=1)
+"""
+
+
+def files_by_machine(folder, pictures):
+    """Content by name of all files of the capture that each of the machines makes."""
+    runs = [
+        subprocess.Popen(
+            [sys.executable, "-c", _MAKE, str(folder / name), pictures], env={**os.environ, **settings}
+        )
+        for name, settings in _MACHINES.items()
+    ]
+    assert [run.wait() for run in runs] == [0] * len(runs)
+    return {
+        name: {
+            path.relative_to(folder / name).as_posix(): path.read_bytes()
+            for path in (folder / name).rglob("*")
+            if path.is_file()
+        }
+        for name in _MACHINES
+    }
+
+
+@pytest.mark.parametrize("pictures", ["blank", pytest.param("rendered", marks=pytest.mark.slow)])
+def test_threads_and_instruction_sets_leave_all_bytes(tmp_path, pictures):
+    first, *others = files_by_machine(tmp_path, pictures).values()
+    assert any(name.endswith("head_model.npz") for name in first)
+    for other in others:
+        assert [name for name in first if first[name] != other.get(name)] == []
+        assert first.keys() == other.keys()

@@ -6,12 +6,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
 from scipy.special import sph_harm_y
 
+from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.errors import InputError
+from headbench.datasets.ga_reader import read_capture
+from headbench.methods.configs import GAConfig
+from headbench.methods.ga import GA
+from headbench.methods.gaussian_ply import command
 from headbench.methods.gaussian_ply.command import neutral_pose, run
 from headbench.methods.gaussian_ply.harmonics_fit import BEHIND, fit_harmonics, sphere
 from headbench.methods.gaussian_ply.settings import ExportPlySettings
+from headbench.methods.gbs.config import GBSConfig
+from headbench.methods.gbs.method import GBS
 from headbench.methods.ours_avatar import OursAvatar
 from headbench.methods.sh import sh_basis
 from headbench.methods.splats import rasterize
@@ -83,11 +92,6 @@ def test_a_viewer_shows_what_the_avatar_shows(color, clip, tmp_path):
 
 
 def test_the_pose_of_a_capture_is_written(tmp_path):
-    from headbench.bench.contracts import Budget, no_progress
-    from headbench.datasets.ga_reader import read_capture
-    from headbench.methods.configs import GAConfig
-    from headbench.methods.ga import GA
-
     capture = write_tiny_capture(tmp_path / "capture").union
     clip = read_capture(capture)
     avatar = GA(GAConfig(refine_tracking=False)).fit(
@@ -108,6 +112,57 @@ def test_the_pose_of_a_capture_is_written(tmp_path):
         run(ExportPlySettings(str(tmp_path / "ga"), out="x", capture=str(capture), timestep=10**6))
     with pytest.raises(InputError, match="an avatar"):
         run(ExportPlySettings(str(tmp_path / "capture"), out="x"))
+
+
+def test_a_viewer_shows_a_blendshape_avatar_in_a_turned_pose(tmp_path):
+    capture = write_tiny_capture(tmp_path / "capture").union
+    clip = read_capture(capture)
+    method = GBS(GBSConfig(samples=200, teeth_samples=10, expressions=4))
+    method.fit(clip, tmp_path / "gbs", Budget(iterations=1), device="cpu", seed=0, progress=no_progress)
+    file = tmp_path / "gbs" / "avatar.safetensors"
+    with safe_open(file, "pt") as stream:
+        metadata, tensors = (
+            stream.metadata(),
+            {name: stream.get_tensor(name) for name in sorted(stream.keys())},
+        )
+    tensors["splats"][:, 11:] = 0.3 * torch.randn(tensors["splats"][:, 11:].shape)
+    save_file(tensors, file, metadata)
+    avatar = GBS(method.config).load(tmp_path / "gbs", device="cpu")
+    timestep = clip.timesteps("self_reenactment")[0]
+    pose = replace(clip.poses[timestep], rotation=np.array([0.3, -0.8, 0.2]))
+    fixed = {"poses": {**clip.poses, timestep: pose}}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(command, "read_capture", lambda *_, **__: replace(clip, **fixed))
+        run(
+            ExportPlySettings(
+                str(tmp_path / "gbs"), out=str(tmp_path / "x.ply"), capture=str(capture), timestep=timestep
+            )
+        )
+    table = parse(tmp_path / "x.ply")
+    assert np.abs(table[:, 9:54]).max() > 0.1
+    for camera in clip.cameras.values():
+        shown = viewed(table, camera).clip(0, 1)
+        assert np.ptp(shown) > 0.1
+        np.testing.assert_allclose(shown, avatar.render(camera, pose).rgb, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("files", "found"),
+    [
+        ({"avatar.safetensors": {"table": torch.zeros(1)}}, "an avatar of gha"),
+        ({"field.npz": None}, "an avatar of insta"),
+        ({"mean.npz": None}, "none of them"),
+        ({"run.json": None}, "avatars/ inside"),
+    ],
+)
+def test_what_cannot_be_exported_names_what_can(tmp_path, files, found):
+    for name, tensors in files.items():
+        (tmp_path / name).touch()
+        if tensors:
+            save_file(tensors, tmp_path / name)
+    with pytest.raises(InputError, match=found) as caught:
+        run(ExportPlySettings(str(tmp_path), out=str(tmp_path / "x.ply")))
+    assert "ours, ga or gbs" in caught.value.expected
 
 
 def test_colours_that_are_harmonics_are_found_exactly():

@@ -146,3 +146,12 @@ def test_a_triangle_of_no_size_has_a_finite_gradient_or_none_is_made(size):
     rest = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]], dtype=torch.float64) * size
     found = deformation_gradients(rest, rest)
     torch.testing.assert_close(found, torch.eye(3, dtype=torch.float64)[None], rtol=1e-3, atol=1e-3)
+
+
+def test_a_triangle_without_area_is_not_turned():
+    rest = torch.zeros(3, 3, 3, dtype=torch.float64)
+    rest[2] = torch.eye(3)
+    moved = rest + torch.randn(3, 3, 3, dtype=torch.float64)
+    found = deformation_gradients(rest, moved)
+    assert torch.equal(found[:2], torch.eye(3, dtype=torch.float64).expand(2, 3, 3))
+    assert torch.isfinite(found).all()

@@ -7,7 +7,7 @@ from safetensors.torch import load_file, save_file
 
 from headbench.bench.errors import InputError
 from headbench.methods.gbs.blend import Entries, difference_widths
-from headbench.methods.gbs.storage import AVATAR_FILE, EXPRESSIONS, TENSORS, read_avatar, write_avatar
+from headbench.methods.gbs.storage import AVATAR_FILE, EXPRESSIONS, MEMBERS, read_avatar, write_avatar
 from headbench.methods.gbs.surface import SurfacePoints, full_barycentric
 
 FACES, EXPRESSION_SIZE = 40, 60
@@ -95,7 +95,7 @@ def altered(path, change, said="50"):
     save_file(tensors, path, {EXPRESSIONS: said})
 
 
-@pytest.mark.parametrize("name", TENSORS)
+@pytest.mark.parametrize("name", MEMBERS)
 def test_no_tensor_can_be_missing_or_of_another_size(tmp_path, name):
     path = tmp_path / "x"
     write(path)

@@ -81,14 +81,16 @@ def test_the_loss_is_the_papers_sum(training, clip):
         camera.K,
         camera.width,
         camera.height,
-        background=clip.background,
     )
-    image, truth = rendering.image.double().numpy(), clip.image(key) / 255.0
+    coverage = clip.mask(key) / 255.0
+    assert np.any(clip.background), "on black already, nothing would be masked"
+    image = rendering.image.double().numpy()
+    truth = clip.image(key) / 255.0 - (1 - coverage[:, :, None]) * clip.background
     padded = [np.pad(x, ((10, 10), (10, 10), (0, 0))) for x in (image, truth)]
     options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1.0}
     _, similarity = structural_similarity(*padded, channel_axis=2, full=True, **options)
     expected = 0.8 * np.abs(image - truth).mean() + 0.2 * (1 - similarity[10:-10, 10:-10].mean())
-    expected += 10 * np.mean((rendering.alpha.double().numpy() - clip.mask(key) / 255.0) ** 2)
+    expected += 10 * np.mean((rendering.alpha.double().numpy() - coverage) ** 2)
     vertices = training.rig.mesh.canonical.numpy()
     room = mouth_room(vertices[head.regions["teeth"]])
     for row in ("teeth_upper", "teeth_lower"):
@@ -103,13 +105,21 @@ def test_the_loss_is_the_papers_sum(training, clip):
     assert found == pytest.approx(expected, rel=1e-4)
 
 
-def test_without_mattes_alpha_is_left_alone(clip):
+def test_without_mattes_alpha_and_background_are_left_alone(clip):
+    bare = replace(clip, masks=dict.fromkeys(clip.masks))
+    opaque = {key: np.full_like(mask, 255) for key, mask in clip.masks.items()}
+    covered = replace(clip, masks=opaque, background=np.zeros(3))
     found = []
-    for one, weight in ((clip, 0.0), (replace(clip, masks=dict.fromkeys(clip.masks)), 1000.0)):
+    for one, weight in (
+        (replace(bare, background=np.zeros(3)), 1000.0),
+        (covered, 0.0),
+        (bare, 1000.0),
+    ):
         training, _ = make(one, replace(SMALL, alpha_weight=weight))
         found.append(float(training.loss(1, 0).detach()))
         training.close()
     assert found[0] == pytest.approx(found[1], rel=1e-6)
+    assert found[2] != pytest.approx(found[1], rel=1e-2), "on the background that the clip has"
 
 
 def test_differences_step_at_the_rates_of_their_columns_times_the_mask(training):

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from headbench.methods.gha.driving import Motion, Signal
 from headbench.methods.gha.gaussian_head import Drawn, GaussianHead, enlarged, near_drawn
-from headbench.methods.gha.gaussian_training import reduced, zoomed
+from headbench.methods.gha.gaussian_training import Zoom, reduced, zoomed
 
 from ..toy_clip import look_at
 from .small import small_config
@@ -124,26 +124,61 @@ def test_reduction_takes_means_or_as_published_every_nth_pixel(height, width, fa
     np.testing.assert_array_equal(reduced(image, factor, "gha"), blocks[:, 0, :, 0])
 
 
-def test_zoom_keeps_features_and_truth_together():
+def interpolated(values, factor):
+    """(h, w, C) rescaled by the nearest pixel, by the function that the published code calls."""
+    planes = values.permute(2, 0, 1)[None]
+    return torch.nn.functional.interpolate(planes, scale_factor=factor)[0].permute(1, 2, 0)
+
+
+def a_picture():
     rows, columns = np.mgrid[:12, :16]
     planes = [rows, columns, rows * 0 + 1, rows + columns]
     features = torch.tensor(np.stack(planes, -1), dtype=torch.float64)
+    generator = torch.Generator().manual_seed(0)
+    truth = torch.rand(24, 32, 3, generator=generator, dtype=torch.float64)
+    return Drawn(features, torch.ones(12, 16)), truth
+
+
+@pytest.mark.parametrize("draws", [(0.0, 0.0, 0.0), (0.1, 0.7, 0.4), (0.3, 0.99, 0.99)])
+def test_a_smaller_picture_is_put_somewhere_on_the_background(draws):
+    drawn, truth = a_picture()
     ground = torch.tensor([0.25, 0.5, 0.75], dtype=torch.float64)
-    drawn, truth = Drawn(features, torch.ones(12, 16)), enlarged(features[..., :3], 2)
-    same = zoomed(drawn, truth, 1.0, ground)
-    assert torch.equal(same[0].features, features)
-    assert torch.equal(same[1], truth)
-    smaller, small_truth = zoomed(drawn, truth, 0.5, ground)
-    assert smaller.alpha[3:9, 4:12].all()
-    assert smaller.alpha.sum() == 6 * 8  # the rest is padding, drawn by nobody: background
-    undrawn = smaller.alpha == 0
-    for channel, value in enumerate((0.25, 0.5, 0.75, 1.0)):
-        assert (smaller.features[undrawn][:, channel] == value).all()
-    assert torch.equal(small_truth[enlarged(undrawn, 2)], ground.expand(4 * int(undrawn.sum()), 3))
-    larger, _ = zoomed(drawn, truth, 1.25, ground)
+    zoom = Zoom.of((12, 16), draws)
+    (height, width), (top, left) = zoom.size, (-start for start in zoom.start)
+    assert height < 12
+    assert 0 <= top <= 12 - height
+    assert 0 <= left <= 16 - width
+    smaller, small_truth = zoomed(drawn, truth, zoom, ground)
+    for found, whole, many, around in (
+        (smaller.features, drawn.features, 1, torch.tensor([*ground, 1.0])),
+        (small_truth, truth, 2, ground),
+    ):
+        expected = around.double().expand(found.shape).clone()
+        inside = interpolated(whole, zoom.factor)[: many * height, : many * width]
+        expected[many * top :, many * left :][: many * height, : many * width] = inside
+        assert torch.equal(found, expected)
+    assert smaller.alpha.sum() == height * width  # the rest is drawn by nobody: background
+
+
+@pytest.mark.parametrize("draws", [(0.99, 0.0, 0.0), (0.9, 0.3, 0.8), (0.7, 0.99, 0.99), (0.45, 0.5, 0.5)])
+def test_of_a_larger_picture_some_part_is_cut_out(draws):
+    drawn, truth = a_picture()
+    zoom = Zoom.of((12, 16), draws)
+    (height, width), (top, left) = zoom.size, zoom.start
+    assert 0 <= top <= height - 12
+    assert 0 <= left <= width - 16
+    larger, large_truth = zoomed(drawn, truth, zoom, torch.zeros(3, dtype=torch.float64))
+    for found, whole, many in ((larger.features, drawn.features, 1), (large_truth, truth, 2)):
+        cut = interpolated(whole, zoom.factor)[many * top :, many * left :]
+        assert torch.equal(found, cut[: many * 12, : many * 16])
     assert larger.alpha.all()
-    assert larger.features[6, 8, 0].item() == 6
-    assert small_truth.shape == truth.shape
+
+
+def test_zooms_cover_all_factors_and_places():
+    zooms = {Zoom.of((20, 15), torch.rand(3).tolist()) for _ in range(2000)}
+    assert {zoom.size[0] for zoom in zooms} == set(range(16, 25))
+    assert {zoom.start[0] for zoom in zooms if zoom.size[0] == 16} == set(range(-4, 1))
+    assert {zoom.start[1] for zoom in zooms if zoom.size[0] == 24} == set(range(4))
 
 
 def test_beyond_its_bounds_the_code_moves_points_but_changes_nothing_else():

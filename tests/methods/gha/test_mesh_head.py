@@ -1,5 +1,7 @@
 """The mesh stage: its start, its drawing, its losses, and that it learns a head."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -102,6 +104,25 @@ def test_the_start_is_what_it_was_asked_to_be(clip, start):
         neutral = scene.driver.canonical(scene.driver.neutral)
         distance = cKDTree(surface.vertices.numpy()).query(neutral.numpy())[0]
         assert np.median(distance) < 0.2  # canonical units; the head is some 2 of them high
+
+
+@pytest.mark.parametrize("masked", [True, False])
+def test_images_are_masked_on_black_where_there_are_mattes(clip, masked):
+    """As published; on another background than the clip's, for that to show."""
+    key = clip.splits["train"][0]
+    coverage, ground = clip.mask(key)[:, :, None] / 255, np.array([0.2, 0.6, 0.4])
+    image = np.round(255 * (clip.image(key) / 255 - (1 - coverage) * (1 - ground))).clip(0, 255)
+    other = replace(clip, images={**clip.images, key: image.astype(np.uint8)}, background=ground)
+    if not masked:
+        other = replace(other, masks=dict.fromkeys(clip.masks))
+    config = small_config()
+    scene = scene_of(other, config, "cpu", 0)
+    training = MeshTraining(scene, MeshHead.of(config, len(scene.expression_scale)), fitted=False)
+    _, found, mask, background = training._target(key)
+    assert (mask is not None) == masked
+    np.testing.assert_allclose(background, np.zeros(3) if masked else ground, atol=1e-6)
+    expected = image / 255 - ((1 - coverage) * ground if masked else 0)
+    np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
 def test_the_mesh_stage_learns_shape_motion_and_colour(clip, tmp_path):

@@ -10,8 +10,8 @@ from safetensors.torch import load_file, save_file
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from headbench.bench.contracts import Budget, no_progress
+from headbench.bench.documents import read_json
 from headbench.bench.errors import InputError
-from headbench.bench.files import read_json
 from headbench.methods.avatar_files import RECORD_FILE
 from headbench.methods.gha import mesh_stage, method
 from headbench.methods.gha.avatar import DRIVING_FILE, GHAAvatar

@@ -58,6 +58,37 @@ def test_values_that_are_not_finite_are_refused(backend, name, value):
         rasterize(*scene[:9], background=scene.background, backend=backend)
 
 
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        (
+            "scales",
+            -1e-6,
+            r"scales: expected values >= 0, found 1 outside, the first -1e-06 at index \(0, 0\)",
+        ),
+        ("opacities", 1.001, r"opacities: expected values in \[0, 1\], found 1 outside, the first 1.001"),
+        ("opacities", -0.001, r"opacities: expected values in \[0, 1\]"),
+        ("K", -10.0, r"K: expected focal lengths > 0, found 1 outside, the first -10"),
+        ("K", 0.0, r"K: expected focal lengths > 0"),
+    ],
+)
+def test_values_outside_of_their_range_are_refused(field, value, message):
+    scene = cloud(5, 8, 8)
+    bad = getattr(scene, field).clone()
+    bad.view(-1)[0] = value
+    scene = scene._replace(**{field: bad})
+    with pytest.raises(ValueError, match=message):
+        rasterize(*scene[:9])
+    assert torch.isfinite(rasterize(*scene[:9], check_values=False).alpha).all() or field == "K"
+
+
+def test_the_ends_of_ranges_are_accepted():
+    scene = cloud(5, 8, 8)
+    scene.scales[0], scene.opacities[0], scene.opacities[1] = 0.0, 0.0, 1.0
+    assert torch.isfinite(rasterize(*scene[:9]).image).all()
+    assert rasterize(*cloud(0, 8, 8)[:9]).radii.shape == (0,)
+
+
 def test_large_finite_values_are_not_mistaken_for_infinite():
     scene = cloud(5, 8, 8)
     scene.means[:] = 3e38  # their sum overflows
@@ -69,8 +100,8 @@ def test_unchecked_geometry_that_is_not_finite_is_culled(backend):
     scene = cloud(40, 20, 20, seed=1, size=0.1)
     for index, field in enumerate(("means", "quats", "scales", "opacities")):
         getattr(scene, field)[index] = float("nan")
-    result = rasterize(*scene[:9], backend=backend, check_finite=False)
-    assert result.radii[:4].tolist() == [0] * 4
+    result = rasterize(*scene[:9], backend=backend, check_values=False)
+    assert result.radii[:3].tolist() == [0] * 3, "opacity plays no part in these"
     without = rasterize(*[value[4:] for value in scene[:5]], *scene[5:9], backend=backend)
     assert torch.equal(result.image, without.image)
 
@@ -81,6 +112,7 @@ def test_unchecked_geometry_that_is_not_finite_is_culled(backend):
         ({"near": 0.0}, "near, far"),
         ({"near": 2.0, "far": 1.0}, "near, far"),
         ({"eps2d": -0.1}, "eps2d"),
+        ({"eps2d": float("inf")}, "eps2d"),
         ({"background": torch.zeros(4)}, r"background: expected shape \(3,\)"),
         ({"means2d_offset": torch.zeros(5, 3)}, r"means2d_offset: expected shape \(5, 2\)"),
         ({"backend": "gpu"}, "backend: expected one of 'auto'"),
@@ -187,8 +219,8 @@ def test_several_cameras_in_one_call_are_as_many_calls(backend, own_colors):
             means2d_abs=absolutes[view],
             backend=backend,
         )
-        for one, many in zip(single[:3], together.rendering[:3], strict=True):
-            assert torch.equal(one, many[view])
+        for field in ("image", "alpha", "radii"):
+            assert torch.equal(getattr(single, field), getattr(together.rendering, field)[view])
         torch.autograd.backward((single.image, single.alpha), (on_image[view], on_alpha[view]))
     for name, leaf in zip(DIFFERENTIABLE, [*leaves, backgrounds, offsets, absolutes], strict=True):
         assert relative_error(together.gradients[name], leaf.grad) < 1e-6, name

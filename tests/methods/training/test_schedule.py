@@ -14,7 +14,7 @@ PUBLISHED = SplatTraining()
 
 
 def schedule(total, settings=PUBLISHED):
-    return DensifySchedule.of(settings, Timeline(total, settings.schedule_length))
+    return DensifySchedule.of(settings, Timeline(total, settings.schedule_length), white=True)
 
 
 def test_published_length_gives_published_moments():
@@ -63,7 +63,7 @@ def test_intervals_never_vanish():
 
 def test_opacities_that_are_never_reset():
     never = replace(PUBLISHED, reset_every=None, reset_at_start=False)
-    schedule = DensifySchedule.of(never, Timeline(600_000, 600_000))
+    schedule = DensifySchedule.of(never, Timeline(600_000, 600_000), white=True)
     assert not any(schedule.is_reset(iteration) for iteration in range(1, 600_001, 500))
-    once = DensifySchedule.of(replace(never, reset_at_start=True), Timeline(600_000, 600_000))
+    once = DensifySchedule.of(replace(never, reset_at_start=True), Timeline(600_000, 600_000), white=True)
     assert once.is_reset(10_000)

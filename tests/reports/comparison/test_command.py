@@ -7,7 +7,9 @@ import pytest
 
 from headbench.bench import cli
 from headbench.bench.errors import InputError
-from headbench.bench.store import Row, RunFolder, to_frame, write_rows
+from headbench.bench.rows import Row, Rows
+from headbench.bench.specs import MetricSpec
+from headbench.bench.store import RunFolder
 from headbench.reports.comparison.command import run
 from headbench.reports.comparison.settings import CompareSettings
 
@@ -16,24 +18,20 @@ ERRORS = {"good": 1.0, "bad": 3.0, "floor": 9.0}
 
 
 @pytest.fixture
-def folder(tmp_path):
+def folder(tmp_path, write_manifest):
     """A finished run of seven subjects: error good < bad < floor on every subject, by other amounts."""
     tasks, seeds = ("novel_view", "self_reenactment"), (0, 1)
     folder = RunFolder(tmp_path / "run")
-    metric = {
-        "label": "Error",
-        "unit": "levels",
-        "higher_is_better": False,
-        "digits": 2,
-        "implementation": "m:e",
-    }
-    folder.write_manifest(
-        {
-            "metrics": [{"name": "error", **metric}, {"name": "size", **metric, "per_frame": False}],
-            "methods": [{"name": name, "trivial": name == "floor"} for name in ERRORS],
-            "protocols": {task: {"hash": f"hash-{task}", "keys": []} for task in tasks},
-            "configuration": {"seeds": seeds},
-        }
+    write_manifest(
+        folder,
+        [
+            MetricSpec("error", "Error", "levels", False, 2, "m:e"),
+            MetricSpec("size", "Error", "levels", False, 2, "m:e", per_frame=False),
+        ],
+        dict.fromkeys(ERRORS),
+        {task: f"hash-{task}" for task in tasks},
+        seeds,
+        trivial=("floor",),
     )
     rows = [
         Row(
@@ -61,7 +59,7 @@ def folder(tmp_path):
         for s in range(SUBJECTS)
         for seed in seeds
     ]
-    write_rows(folder.rows, to_frame(rows))
+    Rows.of(rows).write(folder.rows)
     return folder.root
 
 

@@ -3,6 +3,7 @@
 import csv
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -11,8 +12,9 @@ from PIL import Image
 
 from headbench.bench.errors import InputError
 from headbench.bench.files import plain
+from headbench.bench.rows import Row, Rows
 from headbench.bench.specs import MetricSpec
-from headbench.bench.store import Row, RunFolder, read_rows, to_frame, write_rows
+from headbench.bench.store import RunFolder
 from headbench.reports.pareto.command import run
 from headbench.reports.pareto.plot import free, log_ticks, ticks
 from headbench.reports.pareto.settings import ParetoSettings
@@ -26,7 +28,7 @@ METRICS = [
 
 
 @pytest.fixture
-def make_run(tmp_path):
+def make_run(tmp_path, write_manifest):
     """A finished run; methods give (psnr, lpips, megabytes, frames per second)."""
 
     def make(name, protocol="p1", **methods):
@@ -36,17 +38,12 @@ def make_run(tmp_path):
             for t, change in enumerate((-1.0, 1.0)):
                 frame = (method, "1", 0, "novel_view", "s", "EMO", t, "a", "full")
                 rows += [Row(*frame, "psnr", psnr + change, protocol), Row(*frame, "lpips", lpips, protocol)]
+                if t == 0:  # a region is not seen in every frame
+                    rows.append(Row(*frame[:-1], "face", "psnr", psnr - 10.0, protocol))
             avatar = (method, "1", 0, "", "s", "", -1, "", "full")
             rows += [Row(*avatar, "storage", size, ""), Row(*avatar, "fps", fps, "")]
-        write_rows(folder.rows, to_frame(rows))
-        folder.write_manifest(
-            {
-                "metrics": [plain(m) for m in METRICS],
-                "methods": [{"name": m, "trivial": m == "floor"} for m in methods],
-                "protocols": {"novel_view": {"hash": protocol}},
-                "machine": {"processor": "abacus"},
-            }
-        )
+        Rows.of(rows).write(folder.rows)
+        write_manifest(folder, METRICS, dict.fromkeys(methods), {"novel_view": protocol}, trivial=("floor",))
         return str(folder.root)
 
     return make
@@ -81,6 +78,13 @@ def test_points_of_several_runs_and_which_are_on_the_front(make_run, tmp_path):
     assert found.passed
 
 
+def test_the_published_result_has_its_points(tmp_path):
+    gallery = Path(__file__).parents[3] / "reports" / "gallery"
+    points = run(ParetoSettings((str(gallery),), str(tmp_path / "out"))).data["points"]
+    assert len(points) == 5  # its rows are of two regions
+    assert all(point["megabytes"] and point["milliseconds"] for point in points)
+
+
 def test_a_metric_where_less_is_better_turns_the_front_round(make_run, tmp_path):
     folder = make_run(
         "r", ours=(28.0, 0.10, 1.0, 200.0), ga=(27.0, 0.05, 2.0, 400.0), gbs=(30.0, 0.2, 3.0, 9.0)
@@ -106,17 +110,17 @@ def test_an_unknown_task_or_metric_is_refused(make_run, tmp_path, changes):
 
 def test_frame_time_is_the_metric_asked_for_and_the_median_before_the_mean_rate(make_run, tmp_path):
     folder = make_run("r", ours=(28.0, 0.1, 1.0, 200.0))
-    rows = read_rows(RunFolder(tmp_path / "r").rows)
-    median = rows[rows["metric"] == "fps"].assign(metric="latency_p50", value=4.0)
-    processor = median.assign(metric="processor_time", value=9.0)
-    write_rows(RunFolder(tmp_path / "r").rows, pd.concat([rows, median, processor], ignore_index=True))
-    run(ParetoSettings((folder,), str(tmp_path / "out")))
-    assert float(table(tmp_path / "out")[0]["milliseconds"]) == 4.0
     with pytest.raises(InputError, match="metric in ms: none"):
         run(ParetoSettings((folder,), str(tmp_path / "out"), time="processor_time"))
-    manifest = json.loads((tmp_path / "r" / "run.json").read_text())
-    manifest["metrics"].append(plain(replace(METRICS[3], name="processor_time", unit="ms")))
-    (tmp_path / "r" / "run.json").write_text(json.dumps(manifest))
+    manifest, rows = RunFolder(tmp_path / "r").manifest, RunFolder(tmp_path / "r").rows
+    record, parts = json.loads(manifest.read_text()), [pd.read_parquet(rows)]
+    for name, value in (("latency_p50", 4.0), ("processor_time", 9.0)):
+        record["metrics"].append(plain(replace(METRICS[3], name=name, unit="ms")))
+        parts.append(parts[0][parts[0]["metric"] == "fps"].assign(metric=name, value=value))
+    manifest.write_text(json.dumps(record))
+    Rows(pd.concat(parts, ignore_index=True)).write(rows)
+    run(ParetoSettings((folder,), str(tmp_path / "out")))
+    assert float(table(tmp_path / "out")[0]["milliseconds"]) == 4.0
     run(ParetoSettings((folder,), str(tmp_path / "out"), time="processor_time"))
     assert float(table(tmp_path / "out")[0]["milliseconds"]) == 9.0
 

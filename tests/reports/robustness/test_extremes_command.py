@@ -3,13 +3,14 @@
 import json
 
 import numpy as np
+import pandas as pd
 import pytest
 from PIL import Image
 
 from headbench.bench.errors import InputError
+from headbench.bench.lock import locked
 from headbench.bench.robustness.settings import ExtremesSettings
 from headbench.bench.robustness.trial import RECORD_FILE, ROWS_FILE, SHEET_FILE
-from headbench.bench.store import read_rows
 from headbench.reports.robustness.extremes_command import run
 from headbench.reports.robustness.extremes_sheet import BROKEN, EXTRAPOLATED
 
@@ -17,7 +18,7 @@ VIEWS, COMPONENTS, STEPS = 6, 2, 6
 
 
 def settings(folder, **changes):
-    return ExtremesSettings(str(folder), views=VIEWS, **changes)
+    return ExtremesSettings(str(folder), trust=True, views=VIEWS, **changes)
 
 
 def colours(path):
@@ -28,7 +29,7 @@ def test_an_avatar_that_nothing_moves_passes_and_every_pair_has_its_rows(ball_ru
     folder = ball_run("BALL", "FLOOR")
     found = run(settings(folder))
     assert found.passed
-    rows = read_rows(folder / "extremes" / ROWS_FILE)
+    rows = pd.read_parquet(folder / "extremes" / ROWS_FILE)
     frames = VIEWS * (1 + COMPONENTS * STEPS)  # the third coefficient never varies: no third component
     assert set(rows["method"]) == {"ball"}
     assert set(rows["task"]) == {"extremes"}
@@ -53,7 +54,7 @@ def test_a_burst_is_found_where_it_is_and_nowhere_else(ball_run):
     folder = ball_run("BURSTING", "BALL")
     found = run(settings(folder))
     assert not found.passed
-    rows = read_rows(folder / "extremes" / ROWS_FILE)
+    rows = pd.read_parquet(folder / "extremes" / ROWS_FILE)
     failed = rows[rows["status"] == "failed"]
     # The first coefficient has a deviation of 0.82 about 0: two and three of them are beyond 1.5.
     assert set(failed["sequence"]) == {"pc1-3", "pc1-2", "pc1+2", "pc1+3"}
@@ -80,7 +81,7 @@ def test_values_that_are_no_numbers_break_a_limit_and_leave_a_grey_box(ball_run)
 
 def test_a_splat_that_grows_is_found_in_the_splats_alone(ball_run):
     folder = ball_run("SPLATTY")
-    rows = run(settings(folder)) and read_rows(folder / "extremes" / ROWS_FILE)
+    rows = run(settings(folder)) and pd.read_parquet(folder / "extremes" / ROWS_FILE)
     failed = rows[rows["status"] == "failed"]
     assert set(failed["metric"]) == {"largest_splat"}
     assert set(failed["sequence"]) == {"pc1-3", "pc1-2", "pc1+2", "pc1+3"}
@@ -127,3 +128,15 @@ def test_a_run_of_floors_alone_has_nothing_to_try(ball_run):
 def test_settings_without_meaning_are_refused(changes):
     with pytest.raises(ValueError, match=next(iter(changes))):
         ExtremesSettings("run", **changes)
+
+
+def test_its_folder_is_locked_and_no_link_out_of_the_run(ball_run, tmp_path):
+    folder = ball_run("BALL")
+    with locked(folder / "extremes"), pytest.raises(InputError, match="no other process"):
+        run(settings(folder))
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    (folder / "extremes").symlink_to(outside)
+    with pytest.raises(InputError, match="a link to"):
+        run(settings(folder))
+    assert list(outside.iterdir()) == []

@@ -1,19 +1,26 @@
 import numpy as np
+import pandas as pd
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from headbench.bench.store import Row, to_frame
-from headbench.reports.statistics.comparisons import best_set, compare
+from headbench.bench.rows import Row, Rows
+from headbench.reports.statistics import comparisons
+from headbench.reports.statistics.comparisons import best_set
 from headbench.reports.statistics.holm import holm
 
 LEVELS = {"low": 20.0, "middle": 20.5, "high": 25.0}
 
 
+def compare(rows, pairs, task, metric, *, higher_is_better):
+    what = {"task": task, "metric": metric, "region": "full"}
+    return comparisons.compare(Rows(rows), pairs, **what, higher_is_better=higher_is_better)
+
+
 def rows_of(subjects, methods=LEVELS, metric="psnr", task="novel_view"):
     """Each method at its level, give or take a fixed pattern of 0.1 that no two subjects share."""
     generator = np.random.default_rng(0)
-    return to_frame(
+    return pd.DataFrame(
         Row(
             method,
             "1",
@@ -95,7 +102,7 @@ def test_an_incomplete_method_is_not_compared_and_does_not_count_in_the_family()
 
 
 def test_values_of_the_avatar_are_compared_too():
-    rows = to_frame(
+    rows = pd.DataFrame(
         Row(method, "1", seed, "", f"s{s}", "", -1, "", "full", "size", level + s, "")
         for method, level in (("a", 1.0), ("b", 3.0))
         for s in range(7)

@@ -1,12 +1,13 @@
 """Every numerical extreme on every backend, and that the bench would see a fault."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
 from headbench.bench.contracts import no_progress
-from headbench.methods.splats import Rendering, available_backends
+from headbench.methods.splats import available_backends
 from headbench.methods.splats.benchmark import stress
 from headbench.methods.splats.benchmark.extremes import CASES
 
@@ -53,9 +54,8 @@ def _spoilt(field, change):
         if dtype == torch.float64:
             return outcome
         if field == "image":
-            return outcome._replace(
-                rendering=Rendering(change(outcome.rendering.image), *outcome.rendering[1:])
-            )
+            image = change(outcome.rendering.image)
+            return outcome._replace(rendering=replace(outcome.rendering, image=image))
         return outcome._replace(gradients={**outcome.gradients, field: change(outcome.gradients[field])})
 
     return render

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from .contracts import Avatar, Clip, Frame, HeadPose, no_progress
-from .errors import InputError
-from .files import digest_file
-from .run_config import ResolvedMethod
-from .training_view import TrainingView
+from ..contracts import Avatar, Clip, Frame, HeadPose, no_progress
+from ..errors import InputError
+from ..files import digest_file
+from ..run_config import ResolvedMethod
+from ..training_view import TrainingView
 
 
 def check_method(method: ResolvedMethod, clip: Clip, out: Path, *, device: str = "cpu") -> list[str]:

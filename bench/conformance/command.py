@@ -1,0 +1,106 @@
+"""``headbench check-plugin``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from ..adaptation import MethodNeeds, carry_out, plan
+from ..captures import open_clips
+from ..configuration import parse_assignments
+from ..contracts import Clip, Progress, no_progress
+from ..demo import DemoConfig
+from ..device import check_device
+from ..errors import InputError
+from ..registry import SPEC_TYPES, Group, discover, get, resolve
+from ..run_config import ResolvedMethod, RunConfig, resolve_method
+from ..specs import DatasetSpec, Findings, MethodSpec, MetricSpec
+from .attempts import attempt
+from .methods import check_method
+from .metrics import check_metric
+from .readers import check_reader
+from .settings import CheckPluginSettings
+
+KINDS: dict[Group, str] = {"methods": "method", "datasets": "reader", "metrics": "metric"}
+TIMESTEPS = 4  # of the capture made on the spot
+
+
+def run(settings: CheckPluginSettings, progress: Progress = no_progress) -> Findings:
+    """Check one plug-in; passed where it has no breach.
+
+    Raises `InputError` for wrong usage, and `HeadbenchError` where the plug-in cannot be imported.
+    """
+    spec, kind = _find(settings)
+    values = parse_assignments(settings.set)
+    breaches: list[str] = []
+    if isinstance(spec, MethodSpec):
+        breaches = _check_method(spec, settings, values, progress)
+    elif isinstance(spec, DatasetSpec):
+        if settings.data is None:
+            raise InputError("command line", "--data", "a capture in the layout of the reader", "none")
+        breaches = check_reader(spec, Path(settings.data), values)
+    else:
+        if values:
+            raise InputError("command line", "--set", "no settings: a metric has none", "a setting")
+        breaches = check_metric(spec)
+    breaches = list(dict.fromkeys(breaches))  # one fault may be met by several checks
+    verdict = f"{spec.name}: a {kind} that keeps its contract"
+    if breaches:
+        count = "1 breach" if len(breaches) == 1 else f"{len(breaches)} breaches"
+        verdict = "\n".join(
+            [f"{spec.name}: {count} of the contract of a {kind}", *(f"- {b}" for b in breaches)]
+        )
+    return Findings(verdict, {"name": spec.name, "kind": kind, "breaches": breaches}, not breaches)
+
+
+def _find(settings: CheckPluginSettings) -> tuple[MethodSpec | DatasetSpec | MetricSpec, str]:
+    """The specification that the settings name, and what it is of."""
+    groups = [group for group in KINDS if settings.kind in (None, group)]
+    name = settings.plugin
+    if ":" in name:
+        spec: Any = resolve(name)
+        groups = [group for group in groups if isinstance(spec, SPEC_TYPES[group])]
+        if not groups:
+            expected = "a MethodSpec, a DatasetSpec or a MetricSpec"
+            raise InputError("command line", name, expected, f"a {type(spec).__name__}")
+    elif len(groups) > 1:
+        groups = [group for group in groups if name in discover(group)]
+        if not groups:
+            expected = 'a name that `headbench list` shows for methods, datasets or metrics, or "module:SPEC"'
+            raise InputError("command line", "plugin", expected, repr(name))
+        if len(groups) > 1:
+            expected = f"--kind, one of {', '.join(groups)}"
+            raise InputError("command line", name, expected, "a name that they share")
+    return get(groups[0], name), KINDS[groups[0]]
+
+
+def _check_method(
+    spec: MethodSpec, settings: CheckPluginSettings, values: dict[str, Any], progress: Progress
+) -> list[str]:
+    preset = settings.preset or ("smoke" if "smoke" in spec.presets else next(iter(spec.presets), "smoke"))
+    method = resolve_method(spec, preset, values)
+    check_device(settings.device)
+    breaches: list[str] = []
+    with TemporaryDirectory() as folder:
+        clip = _adapted(_clip(settings, Path(folder), progress), method, settings.reader, Path(folder))
+        with attempt(breaches, "training or rendering"):
+            breaches += check_method(method, clip, Path(folder) / "avatar", device=settings.device)
+    return breaches
+
+
+def _clip(settings: CheckPluginSettings, folder: Path, progress: Progress) -> Clip:
+    data = settings.data
+    if data is None:
+        tiny = DemoConfig(out=str(folder), preset="smoke", timesteps=TIMESTEPS)
+        resolve(get("datasets", "synthetic").implementation)(**tiny.capture_arguments(), progress=progress)
+        data = str(tiny.capture_folder)
+    clips = open_clips(RunConfig(data, str(folder / "run"), reader=settings.reader))
+    return clips[0]
+
+
+def _adapted(clip: Clip, method: ResolvedMethod, reader: str, folder: Path) -> Clip:
+    """The clip in the form that the method declares to need, as in a run."""
+    needs = MethodNeeds.of(method.spec)
+    planned = plan(clip, needs, get("datasets", reader), {})
+    return clip if planned is None else carry_out(planned, needs, folder / "adapted", "adapting").clip

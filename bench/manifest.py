@@ -1,0 +1,180 @@
+"""``run.json``: what made the numbers of a run. Written by a run, read by everything that looks at one."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any, Literal
+
+from typing_extensions import TypedDict
+
+from .contracts import FrameKey
+from .documents import checked, read_json, shown
+from .errors import InputError
+from .files import MAX_NAME_BYTES, check_name, digest, write_json
+from .protocol import Protocol
+from .run_config import RunConfig
+from .specs import MetricSpec
+
+Derived = TypedDict("Derived", {"from": str, "variant": str, "change": str})
+"""From which method's avatar one was derived without training, which variant it is, and what was changed."""
+
+
+@dataclass(frozen=True)
+class MethodRecord:
+    """A method as it ran; see `ResolvedMethod.record`. ``needs`` are those of a form other than the clip's own."""
+
+    name: str
+    version: str
+    implementation: str
+    trivial: bool
+    config: dict[str, Any] | None
+    budget: dict[str, Any]
+    needs: dict[str, Any] | None = None
+    derived: Derived | None = None
+
+
+@dataclass(frozen=True)
+class ClipRecord:
+    """What is known of a capture: its fingerprint, the steps that made it, frames of each split, frames left out."""
+
+    subject: str
+    fingerprint: str
+    steps: list[dict[str, Any]]
+    splits: dict[str, int]
+    excluded: dict[str, str]
+
+
+@dataclass(frozen=True)
+class AdaptedRecord:
+    """The steps that brought a clip into the form of a method, and the fingerprint they lead to."""
+
+    subject: str
+    method: str
+    fingerprint: str
+    steps: list[dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class ProtocolRecord:
+    """A `Protocol` with its id and hash."""
+
+    id: str
+    hash: str
+    task: str
+    keys: tuple[FrameKey, ...]
+    excluded: tuple[tuple[FrameKey, str], ...]
+    clips: tuple[tuple[str, str], ...]
+    resolution: str
+    background: tuple[float, float, float]
+    quantisation: str
+    metric_profile: str
+    conditions: tuple[tuple[str, str], ...] = ()
+
+    @classmethod
+    def of(cls, protocol: Protocol) -> ProtocolRecord:
+        """Record a protocol."""
+        own = {f.name: getattr(protocol, f.name) for f in fields(protocol)}
+        return cls(protocol.id, protocol.hash, **own)
+
+    @property
+    def design(self) -> str:
+        """Digest of all but the fingerprints of the captures."""
+        record = asdict(self)
+        del record["hash"], record["clips"]
+        return digest(record)[:12]
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """Everything that made the numbers of a run.
+
+    Attributes
+    ----------
+    paths : files and folders that the configuration names, by dotted key, relative to the run folder;
+        None where an earlier version wrote it.
+    metrics, methods, protocols : in the order of the configuration; protocols by task.
+    machine : processor, cores, memory in bytes, system, versions of packages, accelerators.
+    adapted : clips that were brought into another form for a method.
+    seconds, peak_memory_bytes : of the run's last start; None until it ended.
+    capture_seconds : how long the demo's capture took to make.
+    evaluated : the folder of images that were scored in place of renders.
+    sweep_of : the run whose avatars these were derived from.
+    """
+
+    configuration: RunConfig
+    methods: tuple[MethodRecord, ...]
+    metrics: tuple[MetricSpec, ...]
+    clips: tuple[ClipRecord, ...]
+    protocols: dict[str, ProtocolRecord]
+    machine: dict[str, Any]
+    status: Literal["started", "done"] = "started"
+    paths: dict[str, str] | None = None
+    adapted: tuple[AdaptedRecord, ...] = ()
+    seconds: float | None = None
+    peak_memory_bytes: int | None = None
+    capture_seconds: float | None = None
+    evaluated: str | None = None
+    sweep_of: str | None = None
+    format: Literal[1] = 1
+
+    @classmethod
+    def read(cls, path: Path) -> Manifest:
+        """Read ``run.json``. Raises `InputError` naming what is missing, unknown or of the wrong type.
+
+        Names that folders and files are found by are checked as `check_name` does.
+        """
+        record = read_json(path)
+        if record.get("format") != 1:
+            raise InputError(path, "format", "1", shown(record.get("format")))
+        manifest = checked(record, cls, path)
+        named: dict[str, set[str]] = {
+            "methods": {method.name for method in manifest.methods},
+            "metrics, tables": {table for metric in manifest.metrics for table in metric.tables},
+            "clips": {clip.subject for clip in manifest.clips},
+            "protocols": set(manifest.protocols),
+        }
+        for task, protocol in manifest.protocols.items():
+            named[f"protocols.{task}.keys"] = {
+                part for key in protocol.keys for part in (key.subject, key.sequence, key.camera)
+            }
+        for key, names in named.items():
+            for name in sorted(names):
+                check_name(name, path, key)
+        for key, texts in manifest._printed().items():
+            for text in texts:
+                if len(text) > MAX_NAME_BYTES or not text.isprintable():
+                    raise InputError(path, key, f"at most {MAX_NAME_BYTES} printable characters", repr(text))
+        for key in ("methods", "metrics"):
+            count = Counter(entry.name for entry in getattr(manifest, key))
+            twice = [name for name, number in count.items() if number > 1]
+            if twice:
+                raise InputError(path, key, "each name once", ", ".join(twice))
+        return manifest
+
+    def _printed(self) -> dict[str, list[str]]:
+        """What tables and errors print beside names, by key."""
+        protocols = self.protocols.values()
+        return {
+            "methods, version": [method.version for method in self.methods],
+            "metrics, label, unit": [text for metric in self.metrics for text in (metric.label, metric.unit)],
+            "clips, fingerprint": [clip.fingerprint for clip in self.clips],
+            "protocols, id, hash": [text for protocol in protocols for text in (protocol.id, protocol.hash)],
+            "machine, processor": [str(self.machine.get("processor", ""))],
+        }
+
+    def write(self, path: Path) -> None:
+        """Write ``run.json``, atomically."""
+        record = {name: value for name, value in asdict(self).items() if value is not None}
+        for method in record["methods"]:
+            for name in ("needs", "derived"):
+                if method[name] is None:
+                    del method[name]
+        write_json(path, record)
+
+    def check_done(self, path: Path) -> None:
+        """Raise `InputError` for a run that did not end."""
+        if self.status != "done":
+            remedy = "Start the run again; it continues."
+            raise InputError(path, "status", "'done'", repr(self.status), remedy)

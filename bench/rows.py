@@ -1,0 +1,285 @@
+"""Rows: what was measured, one for each method, seed, frame, region and metric, and the one query on them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from enum import Enum
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from .errors import InputError, shortened
+from .files import MAX_NAME_BYTES, atomic_path
+from .parquet_footer import SNAPPY, UNCOMPRESSED, column_codecs
+
+FRAME = ["subject", "sequence", "timestep", "camera"]
+"""Columns that name a frame."""
+STATUSES = ("ok", "missing", "failed")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One measured value, or why there is none. Per-avatar values have no task, timestep -1 and no camera."""
+
+    method: str
+    version: str
+    seed: int
+    task: str
+    subject: str
+    sequence: str
+    timestep: int
+    camera: str
+    region: str
+    metric: str
+    value: float
+    protocol: str
+    status: str = "ok"  # ok | missing | failed
+    reason: str = ""
+
+
+COLUMNS = tuple(f.name for f in fields(Row))
+WHOLE, NUMBERS = ("seed", "timestep"), ("seed", "timestep", "value")
+TEXTS = tuple(name for name in COLUMNS if name not in NUMBERS)
+
+MAX_FILE_BYTES = 256 * 2**20
+MAX_TEXT_BYTES = 256 * 2**20
+SPARE_ROWS = 100_000
+"""Rows that a file may have beyond one a byte: repeated rows, such as those of a metric that is missing, pack well."""
+MAX_REASON = 4_000
+"""Characters of a reason that are read; longer ones are cut in their middle."""
+
+
+class All(Enum):
+    """Every method, metric, task, region or seed; a value of its own, so that a query has to name it."""
+
+    ALL = "all"
+
+
+ALL: Final = All.ALL
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Rows of one or several runs. `select` is the only way to their values.
+
+    A frame has a row for each region, metric, task, seed and method; an average over rows that differ in one of
+    these by oversight is a wrong number, so a query names them all.
+    """
+
+    _table: pd.DataFrame
+
+    @classmethod
+    def of(cls, rows: Iterable[Row]) -> Rows:
+        """Rows that were just measured."""
+        frame = pd.DataFrame([asdict(row) for row in rows], columns=list(COLUMNS))
+        return cls(frame.astype({"seed": "int64", "timestep": "int64", "value": "float64"}))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Rows]) -> Rows:
+        """Several rows as one, in order; at least one part."""
+        return cls(pd.concat([part._table for part in parts], ignore_index=True))
+
+    @classmethod
+    def read(cls, path: Path) -> Rows:
+        """Read rows.
+
+        Raises `InputError` for a file that is not there, not Parquet as `write` leaves it, or larger than it may be;
+        for a column that is missing or of another type, an empty entry, an unknown status, and a measured value that
+        is not finite.
+        """
+        try:
+            table = _read_table(path)
+        except FileNotFoundError as error:
+            raise InputError(
+                path, "", "the rows of a finished run", "no such file", "Start the run again."
+            ) from error
+        except (OSError, ValueError, pa.ArrowException) as error:
+            raise InputError(path, "", "a Parquet file of rows", " ".join(str(error).split())) from error
+        return cls(_checked(table, path))
+
+    def write(self, path: Path) -> None:
+        """Write them as Parquet, atomically."""
+        with atomic_path(path) as temporary:
+            self._table.to_parquet(temporary, index=False)
+
+    def __len__(self) -> int:
+        return len(self._table)
+
+    def select(
+        self,
+        *,
+        method: str | All,
+        metric: str | All,
+        task: str | All,
+        region: str | All,
+        seeds: Collection[int] | All,
+        subject: str | All = ALL,
+    ) -> pd.DataFrame:
+        """Return the rows that agree with everything named, a table with the columns of `Row`.
+
+        ``task`` "" is for metrics of the avatar as a whole, whose region is the full image.
+        """
+        table = self._table
+        wanted = {"method": method, "metric": metric, "task": task, "region": region, "subject": subject}
+        chosen = np.ones(len(table), dtype=bool)
+        for column, value in wanted.items():
+            if value is not ALL:
+                chosen &= (table[column] == value).to_numpy()
+        if seeds is not ALL:
+            chosen &= table["seed"].isin(list(seeds)).to_numpy()
+        return table[chosen]
+
+    @property
+    def failed(self) -> list[str]:
+        """Methods that have a failed row, sorted."""
+        return sorted(set(self._table.loc[self._table["status"] == "failed", "method"]))
+
+    @property
+    def tasks(self) -> set[str]:
+        """Tasks that there are rows of; "" is none."""
+        return set(self._table["task"]) - {""}
+
+    @property
+    def methods(self) -> set[str]:
+        """Methods that there are rows of."""
+        return set(self._table["method"])
+
+    @property
+    def metrics(self) -> set[str]:
+        """Metrics that there are rows of."""
+        return set(self._table["metric"])
+
+    @property
+    def subjects(self) -> set[str]:
+        """Subjects that there are rows of."""
+        return set(self._table["subject"])
+
+    def seeds(self, method: str | All) -> set[int]:
+        """Seeds that a method was run with."""
+        return set(map(int, self._of(method)["seed"]))
+
+    def versions(self, method: str) -> list[str]:
+        """Versions of a method, sorted."""
+        return sorted(set(self._of(method)["version"].astype(str)))
+
+    def protocols(self, task: str) -> list[str]:
+        """Hashes of the protocols that a task was scored by, sorted."""
+        return sorted(set(self._table.loc[self._table["task"] == task, "protocol"].astype(str)))
+
+    def frames(self, task: str, region: str) -> set[tuple[str, str, int, str]]:
+        """Frames of a task: those that any method has a row for in a region."""
+        own = self.select(method=ALL, metric=ALL, task=task, region=region, seeds=ALL)
+        own = own[own["timestep"] >= 0]
+        return set(own[FRAME].drop_duplicates().itertuples(index=False, name=None))
+
+    def renamed(self, labels: Mapping[str, str]) -> Rows:
+        """The same rows, every method under another name."""
+        return Rows(self._table.assign(method=[labels[str(name)] for name in self._table["method"]]))
+
+    def check(self) -> None:
+        """Raise `InputError` for rows that repeat a frame, and for a method of several versions."""
+        rows = self._table
+        identity = ["method", "version", "seed", "task", *FRAME, "region", "metric"]
+        repeated = rows[rows.duplicated(identity)]
+        if len(repeated):
+            where = " ".join(str(repeated.iloc[0][column]) for column in identity)
+            raise InputError("rows", where, "each frame measured once", "a row that repeats it")
+        versions = rows.groupby("method")["version"].nunique()
+        mixed = versions[versions > 1]
+        if len(mixed):
+            found = ", ".join(self.versions(str(mixed.index[0])))
+            raise InputError("rows", f"version of {mixed.index[0]}", "one version of each method", found)
+
+    def check_protocols(self, source: Path | str, expected: Mapping[str, str] | None = None) -> None:
+        """Raise `InputError` where rows of one task come from several protocols, or from another than ``expected``.
+
+        Numbers of different protocols do not compare. ``expected`` holds the hash of each task's protocol.
+        """
+        for task in sorted(self.tasks):
+            found = self.protocols(task)
+            if len(found) > 1:
+                wanted = "one protocol: numbers of different protocols do not compare"
+                remedy = "Take the rows of each protocol for themselves."
+                raise InputError(source, f"protocol of {task}", wanted, ", ".join(found), remedy)
+            if expected is not None and found != [expected.get(task)]:
+                raise InputError(source, f"protocol of {task}", str(expected.get(task)), found[0])
+
+    def _of(self, method: str | All) -> pd.DataFrame:
+        return self.select(method=method, metric=ALL, task=ALL, region=ALL, seeds=ALL)
+
+
+def _read_table(path: Path) -> pa.Table:
+    """Read the columns of `Row`, text as dictionaries, so that what repeats takes no memory."""
+    if path.exists() and not path.is_file():
+        raise InputError(path, "", "a Parquet file of rows", "something that is no file")
+    size = path.stat().st_size
+    if size > MAX_FILE_BYTES:
+        raise InputError(path, "", f"rows of at most {MAX_FILE_BYTES} bytes", f"{size}")
+    about = pq.read_metadata(path)
+    if about.num_rows > size + SPARE_ROWS:
+        found = f"{about.num_rows} rows"
+        raise InputError(path, "", f"at most {size + SPARE_ROWS} rows in {size} bytes", found)
+    names = Counter(about.schema.column(index).path for index in range(about.num_columns))
+    wrong = [f"{names[name] or 'no'} {name}" for name in COLUMNS if names[name] != 1]
+    if wrong:
+        raise InputError(path, "columns", f"once each {', '.join(COLUMNS)}", ", ".join(wrong))
+    others = column_codecs(path) - {UNCOMPRESSED, SNAPPY}
+    if others:  # which can make a gigabyte of a small file
+        raise InputError(path, "compression", "SNAPPY or none", f"codec {min(others)} of the format")
+    with pq.ParquetFile(path, read_dictionary=list(TEXTS)) as file:
+        table = file.read(columns=list(COLUMNS), use_threads=False, use_pandas_metadata=False)
+        table.validate(full=True)
+        return table
+
+
+def _checked(table: pa.Table, path: Path) -> pd.DataFrame:
+    """Check columns and turn them into those that `Rows.of` makes."""
+    columns: dict[str, Any] = {}
+    for name in COLUMNS:
+        column = table.column(name).combine_chunks()
+        expected = "whole numbers" if name in WHOLE else "numbers" if name in NUMBERS else "text"
+        known = pa.types.is_int64 if name in WHOLE else pa.types.is_float64 if name in NUMBERS else _is_text
+        if not known(column.type) and not (pa.types.is_null(column.type) and not len(column)):
+            raise InputError(path, name, expected, f"{column.type}")
+        if name != "value" and column.null_count:
+            raise InputError(path, name, f"{expected} in every row", f"{column.null_count} empty entries")
+        columns[name] = _texts(column, path, name) if name in TEXTS else column.to_numpy(zero_copy_only=False)
+    frame = pd.DataFrame(columns).astype({"seed": "int64", "timestep": "int64", "value": "float64"})
+    strange = sorted(set(frame["status"]) - set(STATUSES))
+    if strange:
+        raise InputError(path, "status", f"one of {', '.join(STATUSES)}", ", ".join(map(repr, strange)))
+    undefined = frame[(frame["status"] == "ok") & ~np.isfinite(frame["value"])]
+    if len(undefined):
+        first = undefined.iloc[0]
+        where = f"{first['metric']} of {first['method']}, {first['subject']} {first['timestep']}"
+        raise InputError(path, where, "a finite value", str(first["value"]))
+    return frame
+
+
+def _is_text(kind: pa.DataType) -> bool:
+    return pa.types.is_dictionary(kind) and (
+        pa.types.is_string(kind.value_type) or pa.types.is_large_string(kind.value_type)
+    )
+
+
+def _texts(column: Any, path: Path, name: str) -> pd.Series[str]:
+    """Text of every row; reasons shortened, without control characters."""
+    if not len(column):
+        return pd.Series([], dtype="str")
+    words = [str(word) for word in column.dictionary.to_pylist()]
+    if name == "reason":
+        words = [shortened(word, MAX_REASON) for word in words]
+    for word in words:
+        if name != "reason" and (len(word) > MAX_NAME_BYTES or not word.isprintable()):
+            raise InputError(path, name, f"at most {MAX_NAME_BYTES} printable characters", repr(word))
+    indices = column.indices.to_numpy()
+    total = int(np.bincount(indices) @ [len(word.encode()) for word in words[: indices.max() + 1]])
+    if total > MAX_TEXT_BYTES:
+        raise InputError(path, name, f"at most {MAX_TEXT_BYTES} bytes of text", f"{total}")
+    return pd.Series(np.array(words, dtype=object)[indices], dtype="str")

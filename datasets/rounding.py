@@ -1,0 +1,30 @@
+"""Numbers rounded to a grid of powers of two, so that every x86-64 machine makes the same ones.
+
+The last digits of exp, sin, decompositions and long sums depend on instruction set, BLAS and threads. What a synthetic
+capture is made of is rounded where it is made, a thousand times coarser and more than those digits; products and sums of such
+numbers that fit into the 53 bits of a float64 are then exact, in whatever order they are taken.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..bench.contracts import FloatArray
+
+LENGTH_BITS = 27
+"""Grid of positions and displacements: 2**-27 m, or 7 nm."""
+SHARE_BITS = 24
+"""Grid of skinning weights, 6e-8; float32 holds no finer one at 1."""
+REGRESSOR_BITS = 30
+"""Grid of a joint regressor, whose rows have hundreds of entries of about 0.01."""
+COEFFICIENT_BITS = 20
+"""Grid of coefficients, of activations in [0, 1] or of standard deviations: 1e-6."""
+ANGLE_BITS = 30
+"""Grid of rotation matrices and of angles in radians: 1e-9, which moves no pixel by 1e-5."""
+
+
+def on_grid(values: FloatArray | float, bits: int) -> FloatArray:
+    """Round to the nearest multiples of 2**-bits, ties to even; zeros come out positive."""
+    scale = 2.0**bits
+    rounded: FloatArray = np.round(np.asarray(values, np.float64) * scale) / scale + 0.0
+    return rounded

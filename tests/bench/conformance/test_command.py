@@ -1,0 +1,108 @@
+"""``headbench check-plugin`` on plug-ins written outside, which import nothing but the root of headbench."""
+
+import ast
+import json
+import subprocess
+import sys
+
+import pytest
+
+import headbench
+from headbench.bench import cli, contracts, errors, specs
+from headbench.bench.conformance import command
+
+PLUGINS = ("grey:SPEC", "outside_reader:SPEC") + tuple(
+    f"outside_metric:{name}" for name in ("ERROR", "JUMP", "FILES", "HOURS")
+)
+
+
+@pytest.mark.parametrize("plugin", PLUGINS)
+def test_plugins_written_outside_conform(outside, npz_capture, capsys, plugin):
+    read_by = ["--reader", "outside_reader:SPEC", "--data", str(npz_capture)]
+    data = {"grey:SPEC": read_by, "outside_reader:SPEC": read_by[2:]}.get(plugin, [])
+    assert cli.main(["check-plugin", plugin, *data]) == 0
+    assert "keeps its contract" in capsys.readouterr().out
+
+
+def test_plugins_written_outside_import_the_root_alone(outside):
+    for path in outside.glob("*.py"):
+        names = {
+            node.module for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom)
+        }
+        assert {name for name in names if name.startswith("headbench")} <= {"headbench"}
+
+
+def test_breaches_are_listed_and_the_exit_code_is_one(outside, npz_capture, capsys, monkeypatch):
+    import grey
+
+    monkeypatch.setattr(grey.GreyAvatar, "files", lambda self: [])
+    given = ["check-plugin", "grey:SPEC", "--reader", "outside_reader:SPEC", "--data", str(npz_capture)]
+    assert cli.main(given) == 1
+    assert "1 breach of the contract of a method\n- files() names no file" in capsys.readouterr().out
+    assert cli.main([*given, "--json"]) == 1
+    assert json.loads(capsys.readouterr().out)["breaches"] == ["files() names no file"]
+
+
+def test_what_a_plugin_raises_is_a_breach_with_its_line(outside, npz_capture, capsys):
+    given = ["check-plugin", "grey:SPEC", "--reader", "outside_reader:SPEC", "--data", str(npz_capture)]
+    (outside / "grey.py").write_text((outside / "grey.py").read_text().replace("progress(1, 1)", "1 / 0"))
+    assert cli.main([*given, "--set", "level=high"]) == 2  # not of its type
+    assert cli.main(given) == 1
+    assert "ZeroDivisionError: division by zero (grey.py, line" in capsys.readouterr().out
+
+
+def test_without_data_a_method_is_tried_on_a_synthetic_capture(monkeypatch):
+    made, get = [], command.get
+    monkeypatch.setattr(command, "get", lambda group, name: made.append((group, name)) or get(group, name))
+    monkeypatch.setattr(command, "resolve", lambda reference: lambda **arguments: made.append(arguments))
+    monkeypatch.setattr(command, "open_clips", lambda config: [made.append(config.data)])
+    monkeypatch.setattr(command, "_adapted", lambda *_: None)
+    monkeypatch.setattr(command, "check_method", lambda *_, **__: [])
+    command.run(command.CheckPluginSettings("mean-image"))
+    names, arguments, data = made[-3:]
+    assert names == ("datasets", "synthetic")
+    assert str(arguments["out"]) == data
+    assert arguments["cameras"] * arguments["timesteps"] <= 12
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error"),
+    [
+        (["ga"], "--kind, one of methods, datasets"),
+        (["ga", "--kind", "datasets"], "--data: expected a capture"),
+        (["nothing"], "a name that `headbench list` shows"),
+        (["nothing", "--kind", "metrics"], "expected one of"),
+        (["no_module:SPEC"], "PYTHONPATH"),
+        (["outside_metric:hours"], "a MethodSpec, a DatasetSpec or a MetricSpec"),
+        (["psnr", "--set", "a=1"], "a metric has none"),
+        (["synthetic", "--data", "."], "one that makes captures"),
+        (["outside_reader:SPEC", "--data", "nowhere"], "no such file or folder"),
+        (["outside_reader:SPEC", "--data", ".", "--set", "drak=true"], "dark"),
+    ],
+)
+def test_wrong_usage_is_refused(outside, capsys, arguments, error):
+    assert cli.main(["check-plugin", *arguments]) == 2
+    assert error in capsys.readouterr().err
+
+
+def test_the_root_exports_what_plugins_need_and_imports_it_late():
+    code = (
+        "import sys, headbench\n"
+        "assert 'numpy' not in sys.modules\n"
+        "assert set(headbench.__all__) <= set(dir(headbench))\n"
+        "for name in headbench.__all__: getattr(headbench, name)\n"
+        "assert not {'torch', 'cv2', 'mitsuba'} & set(sys.modules)\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+    with pytest.raises(AttributeError, match="no attribute 'Nothing'"):
+        headbench.Nothing  # noqa: B018
+
+
+def test_every_specification_and_protocol_is_exported():
+    public = {
+        name
+        for module in (contracts, specs, errors)
+        for name, value in vars(module).items()
+        if isinstance(value, type) and value.__module__ == module.__name__
+    }
+    assert public - set(headbench.__all__) <= {"ExitCode", "Interruption"}

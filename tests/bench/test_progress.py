@@ -1,0 +1,201 @@
+"""What a waiting person reads: where the work is, and time left only where something is known of it."""
+
+import io
+import logging
+import re
+import sys
+
+import pytest
+
+from headbench.bench import progress as module
+from headbench.bench import runner
+from headbench.bench.progress import RunProgress, TimeLeft, duration, progress, run_progress
+from headbench.bench.run_config import RunConfig
+
+
+class Clock:
+    """Seconds that pass when they are told to."""
+
+    def __init__(self):
+        self.now = 1000.0
+
+    def __call__(self):
+        return self.now
+
+    def passes(self, seconds):
+        self.now += seconds
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    made = Clock()
+    monkeypatch.setattr(module.time, "monotonic", made)
+    return made
+
+
+@pytest.fixture
+def lines(monkeypatch):
+    """The lines logged, each as soon as there is something to show."""
+    monkeypatch.setattr(module, "LOG_EVERY_S", 0.0)
+    logged = []
+    handler = logging.Handler()
+    handler.emit = lambda record: logged.append(record.getMessage())
+    root = logging.getLogger("headbench")
+    monkeypatch.setattr(root, "level", logging.INFO)
+    monkeypatch.setattr(root, "handlers", [handler])
+    return logged
+
+
+def progress_of(cells, lines):
+    return RunProgress(cells, lambda text: lines.append(text()))
+
+
+def work(clock, report, total, seconds, start=0, note=""):
+    for done in range(start + 1, total + 1):
+        clock.passes(seconds)
+        report(done, total, note)
+
+
+@pytest.mark.parametrize(
+    ("waits", "steps", "left"),
+    [
+        ([], 1500, None),
+        ([100.0], 1500, None),  # a long preparation before the first step says nothing of the steps
+        ([100.0, 0.1], 1500, None),
+        ([0.0, 10.0], 1500, 1498 * 10.0),
+        ([100.0, *[2.0] * 9], 1500, 1490 * 2.0),
+        ([*[1.0] * 100, *[5.0] * 100], 1000, 800 * 5.0),  # the last while counts
+    ],
+)
+def test_time_left_is_told_by_steps_alone(clock, waits, steps, left):
+    found = TimeLeft()
+    for done, wait in enumerate(waits, start=1):
+        clock.passes(wait)
+        found.step(done, steps)
+    assert found.seconds == (None if left is None else pytest.approx(left))
+
+
+def test_steps_that_start_over_are_timed_anew(clock):
+    found = TimeLeft()
+    work(clock, lambda done, total, _: found.step(done, total), 20, 1.0)
+    found.step(1, 50)
+    assert found.seconds is None
+    work(clock, lambda done, total, _: found.step(done, 50), 9, 3.0, start=1)
+    assert found.seconds == 41 * 3.0
+
+
+def test_a_line_tells_steps_time_left_and_note(clock, lines):
+    with progress("measuring") as report:
+        work(clock, report, 10, 4.0, note="psnr")
+    assert lines[0] == "measuring: 1 of 10 (psnr)"
+    assert lines[4] == "measuring: 5 of 10, 20 s left (psnr)"
+
+
+def cells(*names, stages=("training", "rendering")):
+    return {f"{subject} {method}": dict.fromkeys(stages, method) for subject, method in names}
+
+
+def test_a_run_has_a_bound_until_all_of_it_has_a_basis(clock, lines):
+    run = progress_of(cells(("s1", "ga"), ("s1", "ours"), ("s2", "ga"), ("s2", "ours")), lines)
+    seconds = {"training": {"ga": 10.0, "ours": 20.0}, "rendering": {"ga": 1.0, "ours": 2.0}}
+    for cell in ("s1 ga", "s1 ours", "s2 ga", "s2 ours"):
+        for stage in ("training", "rendering"):
+            with run.stage(cell, stage) as report:
+                work(clock, report, 10, seconds[stage][cell[3:]])
+    told = [line for line in lines if re.search("ing 5 of", line)]
+    assert told == [
+        "cell 1 of 4, s1 ga: training 5 of 10, more than 50 s left",
+        "cell 1 of 4, s1 ga: rendering 5 of 10, more than 1 min 40 s left",
+        "cell 2 of 4, s1 ours: training 5 of 10, more than 3 min 30 s left",
+        "cell 2 of 4, s1 ours: rendering 5 of 10, more than 5 min 20 s left",
+        "cell 3 of 4, s2 ga: training 5 of 10, 4 min 40 s left",
+        "cell 3 of 4, s2 ga: rendering 5 of 10, 3 min 45 s left",
+        "cell 4 of 4, s2 ours: training 5 of 10, 2 min 00 s left",
+        "cell 4 of 4, s2 ours: rendering 5 of 10, 10 s left",
+    ]
+    assert lines[0] == "cell 1 of 4, s1 ga: training"
+
+
+def test_alike_stages_of_any_method_tell_of_each_other(clock, lines):
+    stages = {"measuring": ""}
+    run = progress_of({"s ga": stages, "s ours": stages}, lines)
+    with run.stage("s ga", "measuring"):
+        clock.passes(60)
+    with run.stage("s ours", "measuring"):
+        pass
+    assert lines[-1] == "cell 2 of 2, s ours: measuring, 1 min 00 s left"
+
+
+def test_what_an_earlier_start_did_counts_as_if_done_now(clock, lines):
+    run = progress_of(cells(("s1", "ga"), ("s2", "ga"), stages=("training",)), lines)
+    with run.stage("s1 ga", "training") as report:
+        clock.passes(30)
+        work(clock, report, 100, 1.0, start=90)
+    with run.stage("s2 ga", "training"):
+        pass
+    assert "2 min" in lines[-1]  # 30 s to prepare and a second for each of 100 steps
+
+
+def test_a_stage_that_fails_or_was_not_ahead_tells_nothing(clock, lines):
+    run = progress_of({**cells(("s1", "ga")), "s2 ga": {}, **cells(("s3", "ga"))}, lines)
+
+    def fail():
+        with run.stage("s1 ga", "training"):
+            clock.passes(50)
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        fail()
+    with run.stage("s2 ga", "rendering") as report:
+        work(clock, report, 10, 1.0)
+    with run.stage("s3 ga", "training"):
+        pass
+    assert lines[-1] == "cell 3 of 3, s3 ga: training"
+
+
+def test_on_a_terminal_the_line_is_written_over(clock, monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    with run_progress(cells(("s1", "ga"))) as run, run.stage("s1 ga", "training") as report:
+        work(clock, report, 10, 2.0, note="loss 1")
+    shown = terminal.getvalue()
+    assert "\rcell 1 of 1, s1 ga: training 9 of 10" in shown
+    assert "\n" not in shown
+
+
+def test_a_run_names_its_cells_in_order(toy, tmp_path, monkeypatch, lines):
+    monkeypatch.setattr(runner, "write_reports", lambda folder: [])
+    for name in ("subject1", "subject2"):
+        (tmp_path / "data" / name).mkdir(parents=True)
+    config = RunConfig(
+        data=str(tmp_path / "data"),
+        out=str(tmp_path / "out"),
+        methods=("toy_plugin:METHOD",),
+        preset="smoke",
+        metrics=("psnr", "toy_plugin:FILES"),
+        reader="toy_plugin:READER",
+    )
+    runner.run(config)
+    told = [line for line in lines if line.startswith("cell")]
+    cell = "cell 2 of 2, subject2 toy seed 0: "
+    for step in (
+        "training 2 of 2",
+        "rendering 5 of 5",
+        "measuring novel_view 3 of 3",
+        "measuring the avatar",
+    ):
+        assert any(line.startswith(cell + step) for line in told), step
+    lines.clear()
+    runner.run(config)
+    assert not [line for line in lines if line.startswith("cell")]
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(0.4, "0 s"), (59.4, "59 s"), (190, "3 min 10 s"), (7500, "2 h 05 min")]
+)
+def test_durations_are_written_as_people_read_them(seconds, text):
+    assert duration(seconds) == text

@@ -1,0 +1,131 @@
+import itertools
+import os
+import re
+
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from headbench.bench import rows as module
+from headbench.bench.errors import InputError
+from headbench.bench.rows import ALL, Row, Rows
+
+NAMED = {"method": ALL, "metric": ALL, "task": ALL, "region": ALL, "seeds": ALL}
+
+
+@pytest.fixture
+def rows():
+    """A row of every combination; the value numbers them."""
+    places = itertools.product(
+        "ab", (0, 1), ("novel_view", "self_reenactment"), ("full", "face"), ("psnr", "ssim")
+    )
+    return Rows.of(
+        Row(method, "1", seed, task, "s", "EMO", 0, "c", region, metric, float(index), f"hash-{task}")
+        for index, (method, seed, task, region, metric) in enumerate(places)
+    )
+
+
+@pytest.mark.parametrize("forgotten", NAMED)
+def test_a_query_that_forgets_a_name_is_refused(rows, forgotten):
+    named = {name: value for name, value in NAMED.items() if name != forgotten}
+    with pytest.raises(TypeError, match=forgotten):
+        rows.select(**named)
+
+
+@pytest.mark.parametrize(
+    ("named", "count"),
+    [
+        ({}, 32),
+        ({"region": "face"}, 16),
+        ({"region": "full", "metric": "psnr", "task": "novel_view", "method": "b", "seeds": (1,)}, 1),
+        ({"seeds": (0, 1), "method": "a"}, 16),
+        ({"seeds": ()}, 0),
+        ({"subject": "another"}, 0),
+    ],
+)
+def test_a_query_gives_what_agrees_with_every_name(rows, named, count):
+    found = rows.select(**{**NAMED, **named})
+    assert len(found) == count
+    for column in named.keys() - {"seeds"}:
+        assert set(found[column]) <= {named[column]}
+
+
+def test_rows_are_the_same_when_read_back(rows, tmp_path):
+    rows.write(tmp_path / "rows.parquet")
+    again = Rows.read(tmp_path / "rows.parquet")
+    assert again.select(**NAMED).equals(rows.select(**NAMED))
+
+
+def written(path, frame, **how):
+    frame.to_parquet(path, index=False, **how)
+    return path
+
+
+def replaced(path, old, new):
+    content = path.read_bytes()
+    assert old in content
+    path.write_bytes(content.replace(old, new))
+
+
+def twice(path, frame):
+    table = pa.Table.from_pandas(frame, preserve_index=False)
+    pq.write_table(table.append_column("task", table.column("task")), path)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "found"),
+    [
+        (lambda p, f: p.write_bytes(b""), "a Parquet file of rows"),
+        (lambda p, f: p.write_bytes(p.read_bytes()[:-400]), "a Parquet file of rows"),
+        (lambda p, f: (p.unlink(), p.mkdir()), "no file"),
+        (lambda p, f: (p.unlink(), os.mkfifo(p)), "no file"),
+        (lambda p, f: written(p, f.drop(columns="protocol")), "no protocol"),
+        (twice, "2 task"),
+        (lambda p, f: written(p, f.assign(value="1")), "value: expected numbers"),
+        (lambda p, f: written(p, f.assign(value=[[1.0]] * len(f))), "no value"),
+        (lambda p, f: written(p, f.assign(seed=0.5)), "seed: expected whole numbers"),
+        (lambda p, f: written(p, f.assign(method=1)), "method: expected text"),
+        (lambda p, f: written(p, f.assign(method=None)), "method: expected text"),
+        (lambda p, f: written(p, f.assign(task=[None] + ["a"] * (len(f) - 1))), "1 empty entries"),
+        (lambda p, f: written(p, f.assign(subject="\x1b[2J")), "printable characters"),
+        (lambda p, f: written(p, f.assign(camera="x" * 1000)), "at most 120"),
+        (lambda p, f: written(p, f.assign(status="good")), "'good'"),
+        (lambda p, f: written(p, f.assign(value=float("inf"))), "a finite value"),
+        (lambda p, f: written(p, f.assign(value=float("nan"))), "a finite value"),
+        (lambda p, f: written(p, f, compression="gzip"), "codec 2 of the format"),
+        (
+            lambda p, f: replaced(p, b"\x08protocol\x15\x02", b"\x08protocol\x15\x03"),
+            "codec -2 of the format",
+        ),
+        (lambda p, f: replaced(p, b"\x08protocol", b"\x08p\xecotocol"), "a Parquet file of rows"),
+        (lambda p, f: written(p, pd.concat([f] * 5000)), "at most"),
+    ],
+)
+def test_a_file_that_holds_no_rows_is_refused(rows, tmp_path, spoil, found):
+    path = tmp_path / "rows.parquet"
+    rows.write(path)
+    spoil(path, rows.select(**NAMED))
+    with pytest.raises(InputError, match=re.escape(found)) as caught:
+        Rows.read(path)
+    assert caught.value.file == str(path)
+
+
+def test_a_value_that_is_missing_is_none_and_its_reason_is_plain(rows, tmp_path):
+    frame = rows.select(**NAMED).assign(value=float("nan"), status="failed", reason="a\x1b[2J\nb")
+    again = Rows.read(written(tmp_path / "rows.parquet", frame)).select(**NAMED)
+    assert again["value"].isna().all()
+    assert set(again["reason"]) == {"a\\x1b[2J\nb"}
+
+
+def test_reasons_are_bounded_alone_and_together(rows, tmp_path, monkeypatch):
+    path = written(tmp_path / "rows.parquet", rows.select(**NAMED).assign(reason="x" * 10**6))
+    assert Rows.read(path).select(**NAMED)["reason"].str.len().max() < 5000
+    monkeypatch.setattr(module, "MAX_TEXT_BYTES", 10**4)
+    with pytest.raises(InputError, match="at most 10000 bytes of text"):
+        Rows.read(path)
+
+
+def test_no_rows_are_read_back_as_none(tmp_path):
+    Rows.of([]).write(tmp_path / "rows.parquet")
+    assert len(Rows.read(tmp_path / "rows.parquet")) == 0

@@ -1,0 +1,174 @@
+"""Signals at every stage of a command: one line, the exit code of the signal, and another start continues."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+CONSOLE_SCRIPT = "import sys\nfrom headbench.bench.start import main\nsys.exit(main())\n"
+LINES = {
+    signal.SIGINT: "headbench: interrupted; start it again to continue",
+    signal.SIGTERM: "headbench: ended by SIGTERM; start it again to continue",
+    signal.SIGHUP: "headbench: ended by SIGHUP; start it again to continue",
+}
+SIGNALS = pytest.mark.parametrize("number", list(LINES), ids=lambda number: number.name)
+
+METHOD = """
+import time
+from pathlib import Path
+import numpy as np
+from headbench.bench import start
+from headbench.bench.specs import MethodSpec
+from toy_plugin import ToyAvatar, ToyConfig
+
+class Slow:
+    def __init__(self, config):
+        self.config = config
+
+    def fit(self, clip, out, budget, *, device, seed, progress):
+        if not (out / "half").exists():
+            out.mkdir(parents=True, exist_ok=True)
+            (out / "half").touch()
+            train()
+        (out / "level.txt").write_text("0.5")
+        return self.load(out, device=device)
+
+    def load(self, path, *, device):
+        return ToyAvatar(path)
+
+def multiply():
+    values = np.ones((300, 300))
+    print("training", flush=True)
+    while True:
+        values = values @ values / 300
+
+def train_deaf():
+    while True:
+        try:
+            multiply()
+        except BaseException:
+            pass
+
+train = multiply
+if Path("deaf").exists():
+    start.GRACE_S, train = 0.1, train_deaf
+
+SPEC = MethodSpec("slow", "trains until it is interrupted", "slow_plugin:Slow", config="toy_plugin:ToyConfig")
+"""
+
+
+def restore_signals():
+    """Whatever ran the tests, for example in the background of a shell, the command starts without ignored signals."""
+    for number in LINES:
+        signal.signal(number, signal.SIG_DFL)
+
+
+@pytest.fixture
+def start(tmp_path):
+    """Start headbench with some words in an empty folder, in a process group of its own."""
+    (tmp_path / "slow_plugin.py").write_text(METHOD)
+    processes = []
+
+    def start(*words, flags=(), preexec_fn=restore_signals, **settings):
+        path = os.pathsep.join([str(tmp_path), str(Path(__file__).parent)])
+        process = subprocess.Popen(
+            [sys.executable, *flags, "-c", CONSOLE_SCRIPT, *map(str, words)],
+            cwd=tmp_path,
+            env={**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+            preexec_fn=preexec_fn,  # noqa: PLW1509 - nothing runs in another thread here
+            **settings,
+        )
+        processes.append(process)
+        return process
+
+    yield start
+    for process in processes:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+
+
+@pytest.mark.parametrize("module", ["csv", "numpy.linalg", "pandas._libs.tslibs", "tyro._docstrings"])
+def test_ctrl_c_while_modules_are_imported_is_a_line(start, module):
+    process = start("list", "methods", flags=("-X", "importtime"))
+    imported = re.compile(rf"\| +{re.escape(module)}$")
+    while not imported.search(process.stderr.readline().rstrip()):
+        assert process.poll() is None
+    process.send_signal(signal.SIGINT)
+    output, errors = process.communicate()
+    said = [line for line in errors.splitlines() if not line.startswith("import time:")]
+    assert (process.returncode, output, said) == (130, "", [LINES[signal.SIGINT]])
+
+
+@pytest.fixture
+def run_words(tmp_path):
+    (tmp_path / "data" / "subject1").mkdir(parents=True)
+    return [
+        *("run", "--data", "data", "--out", "out", "--methods", "slow_plugin:SPEC"),
+        *("--set", "reader=toy_plugin:READER", "--set", "metrics=psnr"),
+    ]
+
+
+@SIGNALS
+def test_a_signal_in_training_is_a_line_and_the_run_goes_on(start, run_words, number):
+    process = start(*run_words)
+    assert process.stdout.readline() == "training\n"
+    process.send_signal(number)
+    _, errors = process.communicate()
+    assert process.returncode == 128 + number
+    assert errors.splitlines()[-1] == LINES[number]
+    assert "Traceback" not in errors
+    again = start(*run_words)
+    _, errors = again.communicate()
+    assert again.returncode == 0, errors
+
+
+@pytest.mark.parametrize("deaf", [False, True])
+def test_an_end_that_a_method_swallows_comes_all_the_same(start, run_words, tmp_path, deaf):
+    if deaf:
+        (tmp_path / "deaf").touch()
+    process = start(*run_words)
+    assert process.stdout.readline() == "training\n"
+    process.send_signal(signal.SIGTERM)
+    _, errors = process.communicate()
+    assert (process.returncode, errors.splitlines()[-1]) == (143, LINES[signal.SIGTERM])
+    assert (tmp_path / "out" / "run.lock").exists() == deaf  # left to the next start
+
+
+def test_signals_that_the_caller_ignores_stay_ignored(start, run_words):
+    def ignore():
+        restore_signals()
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+
+    process = start(*run_words, preexec_fn=ignore)
+    assert process.stdout.readline() == "training\n"
+    process.send_signal(signal.SIGHUP)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate()
+    assert (process.returncode, errors.splitlines()[-1]) == (130, LINES[signal.SIGINT])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_workers_end_with_the_process_that_started_them(start, tmp_path, number):
+    process = start("synth", "--out", "capture", "--size", "96x136", "--timesteps", "40")
+    while not list(tmp_path.glob("capture/*/images/*.png")):
+        assert process.poll() is None
+    os.killpg(process.pid, number) if number == signal.SIGINT else process.kill()
+    _, errors = process.communicate()  # until the last of the workers has closed it
+    assert "Traceback" not in errors
+    if number == signal.SIGINT:
+        assert (process.returncode, errors.splitlines()[-1]) == (130, LINES[number])
+
+
+def test_the_entry_point_is_light():
+    code = "import sys, headbench.bench.start; sys.exit(bool({'numpy', 'tyro', 'torch'} & set(sys.modules)))"
+    subprocess.run([sys.executable, "-c", code], check=True)

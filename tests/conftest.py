@@ -1,0 +1,38 @@
+"""What all tests share: a user's cache of their own."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, settings
+
+from headbench.bench import files
+
+# How long an example takes says something of the machine's load, nothing of the code.
+settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("untimed")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def own_cache(tmp_path_factory):
+    """Digests of the tests' captures stay out of the user's cache; weights are still found in torch hub's."""
+    with pytest.MonkeyPatch.context() as patch:
+        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        patch.setenv("TORCH_HOME", os.environ.get("TORCH_HOME") or str(cache / "torch"))
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def no_flushes():
+    """Leave out the waiting for the disk, which takes more time than all else that tests do with files."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(files, "_flush", lambda path: None)
+        yield
+
+
+def pytest_collection_modifyitems(items):
+    """Put the slowest file first: with several processes the other files fill the time that it takes."""
+    items.sort(key=lambda item: item.path.name != "test_end_to_end.py")
