@@ -1,0 +1,269 @@
+"""Small valid inputs of every kind that headbench reads from outside, made once and kept in a folder.
+
+Each builder writes one sample into the folder it is given, and may take files from samples named before it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from headbench.bench import cli
+from headbench.bench.files import digest
+from headbench.datasets.colmap.writer import export_model
+from headbench.datasets.ga_reader import read_capture
+from headbench.datasets.head.arrays import save_head
+from headbench.methods.training.checkpoint import save_checkpoint
+from headbench.metrics.weights import network_spec
+
+from ..datasets.head.flame_files import write_flame
+from ..datasets.head.toy import toy_head
+from ..datasets.nersemble.recordings import write_recording
+from ..datasets.tiny_capture import make_plan, rig, write_tiny_capture
+from ..methods.gha.small import SMALL as SMALL_GHA
+from ..methods.insta.small import SMALL as SMALL_INSTA
+
+STAMP = "stamp"
+METHODS = ("mean-image", "nearest-camera", "ga", "gbs", "gha", "insta", "ours")
+ITERATIONS = {"budget": {"iterations": 2}}
+SETTINGS = {
+    "ga": ITERATIONS,
+    "gbs": {**ITERATIONS, "samples": 200, "teeth_samples": 20},
+    "gha": {**ITERATIONS, **SMALL_GHA, "start_steps": 2, "motion_steps": 2},
+    "insta": {**ITERATIONS, **SMALL_INSTA},
+    "ours": {
+        **ITERATIONS,
+        "plane_resolution": 8,
+        "line_resolution": 4,
+        "line_channels": 2,
+        "hidden": 8,
+        "storage": "exact",
+    },
+}
+"""Two iterations of the smallest form of each method."""
+
+
+def configuration(methods: tuple[str, ...], metrics: tuple[str, ...] = ("psnr", "storage")) -> dict:
+    """Settings of a run in a folder that has the capture in ``capture``."""
+    return {
+        "data": "capture",
+        "out": "run",
+        "methods": list(methods),
+        "preset": "smoke",
+        "metrics": list(metrics),
+        "frames_per_task": 1,
+        "settings": {name: SETTINGS[name] for name in methods if name in SETTINGS},
+    }
+
+
+def capture(folder: Path, samples: Path, subject: str = "901") -> None:
+    """A capture with a head model beside it: five timesteps, two cameras."""
+    lengths = {"FREE": 2, "EMO-1-shout+laugh": 2, "SEN-01-cramp_small_danger": 1}
+    cameras = rig(24, 32, 12.3, 15.1)[:2]
+    head = toy_head(16, version="procedural2020")  # the version that every method takes as it is
+    offset = np.zeros_like(head.template)
+    plan = make_plan(lengths=lengths, cameras=cameras, head=head, static_offset=offset, subject=subject)
+    write_tiny_capture(folder / "capture", plan)
+
+
+def heads(folder: Path, samples: Path) -> None:
+    """Head models of every kind, files with their regions, and a capture of another head model."""
+    shutil.copytree(samples / "capture" / "capture", folder / "capture")
+    head = toy_head(16)
+    save_head(folder / "head.npz", head)
+    save_head(folder / "eyelids.npz", toy_head(16, eyelids=True))
+    many = toy_head(16, shape_size=300, expression_size=10)
+    write_flame(folder / "flame2023.pkl", many, legacy=False)
+    write_flame(folder / "flame2020.pkl", many)
+    masks = {name: np.asarray(region) for name, region in head.regions.items() if "ring" not in name}
+    (folder / "FLAME_masks.pkl").write_bytes(pickle.dumps(masks, protocol=2))
+    rings = {name: np.asarray(region).tolist() for name, region in head.regions.items() if "ring" in name}
+    (folder / "regions.json").write_text(json.dumps(rings))
+    eyelids = toy_head(16, eyelids=True).eyelid_basis
+    assert eyelids is not None
+    for index, side in enumerate("lr"):
+        np.save(folder / f"{side}_eyelid.npy", eyelids[..., index])
+
+
+def recording(folder: Path, samples: Path) -> None:
+    """A raw recording as images with foreground masks, its tracking and its head model."""
+    write_recording(folder, sequences={"EMO-1-shout+laugh": 1, "FREE": 1})
+
+
+def videos(folder: Path, samples: Path) -> None:
+    """A raw recording as videos."""
+    write_recording(folder, images=False, sequences={"EMO-1-shout+laugh": 2, "FREE": 2})
+
+
+def run(folder: Path, samples: Path) -> None:
+    """A finished run of all methods, with its capture."""
+    _run(folder, samples, METHODS)
+
+
+def unfinished(folder: Path, samples: Path) -> None:
+    """A run that has not begun, with a checkpoint after every iteration."""
+    shutil.copytree(samples / "capture" / "capture", folder / "capture")
+    values = configuration(METHODS)
+    for name, settings in values["settings"].items():
+        often = {"checkpoint_every_s": 0.0}
+        values["settings"][name] = {**settings, **(often if name in ("gha", "insta") else {"splats": often})}
+    (folder / "config.json").write_text(json.dumps(values))
+
+
+def two_subjects(folder: Path, samples: Path) -> None:
+    """A finished run of one method on two subjects."""
+    capture(folder, samples)
+    capture(folder, samples, subject="902")
+    _run(folder, samples, ("mean-image", "ga"))
+
+
+def checkpoint(folder: Path, samples: Path) -> None:
+    """A checkpoint of a run called "run"."""
+    state = {
+        "iteration": 3,
+        "tensors": {"means": torch.zeros(4, 3)},
+        "moments": [torch.zeros(2), 0.5, "text"],
+    }
+    save_checkpoint(folder / "checkpoint.safetensors", "run", state)
+
+
+def compact(folder: Path, samples: Path) -> None:
+    """A compact avatar of ours, with the capture it is of."""
+    shutil.copytree(samples / "capture" / "capture", folder / "capture")
+    avatar = samples / "run" / "run" / "901" / "ours" / "seed-0" / "avatar"
+    _main("compact", str(avatar), "--out", str(folder / "avatar"))
+
+
+def ply(folder: Path, samples: Path) -> None:
+    """A PLY of GaussianAvatars, with the capture it is of."""
+    shutil.copytree(samples / "capture" / "capture", folder / "capture")
+    avatar = samples / "run" / "run" / "901" / "ga" / "seed-0" / "avatar"
+    shutil.copyfile(avatar / "point_cloud.ply", folder / "point_cloud.ply")
+
+
+def colmap(folder: Path, samples: Path) -> None:
+    """Sparse models of COLMAP, as text and binary."""
+    clip = read_capture(samples / "capture" / "capture")
+    for kind in ("bin", "txt"):
+        export_model(clip, list(clip.files)[:4], folder / kind, model_format=kind)  # type: ignore[arg-type]
+
+
+def exclusions(folder: Path, samples: Path) -> None:
+    """A file of frames to leave out, with the capture it is of."""
+    shutil.copytree(samples / "capture" / "capture", folder / "capture")
+    _main("tongue", str(folder / "capture"), "--out", str(folder / "reviewed"))
+
+
+def baseline(folder: Path, samples: Path) -> None:
+    """A finished run, and the baseline it is compared with."""
+    shutil.copytree(samples / "run", folder, dirs_exist_ok=True)
+    _main("gate", str(folder / "run"), "--baseline", str(folder / "baseline.json"), "--update")
+
+
+def settings(folder: Path, samples: Path) -> None:
+    """A file of settings."""
+    import yaml
+
+    values = {**configuration(METHODS), "data": "nowhere", "seeds": [0, 1], "regions": ["face"]}
+    (folder / "config.yaml").write_text(
+        yaml.safe_dump({**values, "reader_settings": {"background": [0, 0, 0]}})
+    )
+
+
+def weights(folder: Path, samples: Path) -> None:
+    """Weights of LPIPS' smallest backbone, drawn at random."""
+    torch.manual_seed(0)
+    torch.save(network_spec("squeeze").build().state_dict(), folder / "squeezenet1_1-b8a52dc0.pth")
+
+
+def images(folder: Path, samples: Path) -> None:
+    """A folder of images to evaluate, and the run whose protocol they follow."""
+    shutil.copytree(samples / "run", folder, dirs_exist_ok=True)
+    shutil.copytree(folder / "run" / "901" / "ga" / "seed-0" / "renders", folder / "images")
+
+
+def synthetic(folder: Path, samples: Path) -> None:
+    """A synthetic capture as `synth` leaves it."""
+    _main("synth", *SYNTH, "--out", str(folder / "synthetic"))
+
+
+SYNTH = ("--cameras", "2", "--timesteps", "7", "--size", "16x16")
+
+SAMPLES: dict[str, Callable[[Path, Path], None]] = {
+    sample.__name__: sample
+    for sample in (
+        *(capture, heads, recording, videos, run, unfinished, two_subjects, checkpoint, compact, ply, colmap),
+        *(exclusions, baseline, settings, weights, images, synthetic),
+    )
+}
+
+
+def make(root: Path) -> Path:
+    """Make every sample that ``root`` lacks, each whole or not at all; all, where the code has changed since."""
+    if not _is_current(root):
+        shutil.rmtree(root, ignore_errors=True)
+        root.mkdir(parents=True)
+        (root / STAMP).write_text(_sources())
+    for name, build in SAMPLES.items():
+        if not (root / name).exists():
+            partial = root / f".{name}"
+            shutil.rmtree(partial, ignore_errors=True)
+            partial.mkdir()
+            build(partial, root)
+            partial.rename(root / name)
+    return root
+
+
+def prepare_samples(root: Path) -> Path:
+    """Make the samples that ``root`` lacks, in another process, since that starts threads, which no fork survives."""
+    os.environ.update(OMP_NUM_THREADS="1", OMP_WAIT_POLICY="PASSIVE")
+    if _is_current(root) and all((root / name).exists() for name in SAMPLES):
+        return root.resolve()
+    words = [sys.executable, "-m", "headbench.tests.fuzz.samples", str(root)]
+    made = subprocess.run(words, check=False, capture_output=True, text=True)
+    if made.returncode:
+        raise RuntimeError(f"samples: {made.stdout[-5000:]}{made.stderr[-5000:]}")
+    return root.resolve()
+
+
+def _is_current(root: Path) -> bool:
+    """Whether the samples of a folder were made by the code as it is."""
+    return (root / STAMP).exists() and (root / STAMP).read_text() == _sources()
+
+
+def _sources() -> str:
+    """Digest of the code that samples depend on."""
+    top = Path(__file__).parents[2]
+    folders = ("bench", "datasets", "methods", "metrics", "reports", "tests/fuzz")
+    return digest(*(path.read_text() for name in folders for path in sorted((top / name).rglob("*.py"))))
+
+
+def _run(folder: Path, samples: Path, methods: tuple[str, ...]) -> None:
+    if not (folder / "capture").exists():
+        shutil.copytree(samples / "capture" / "capture", folder / "capture")
+    (folder / "config.json").write_text(json.dumps(configuration(methods)))
+    before = os.getcwd()
+    os.chdir(folder)
+    try:
+        _main("run", "--config", "config.json")
+    finally:
+        os.chdir(before)
+
+
+def _main(*words: str) -> None:
+    code = cli.main(list(words))
+    if code != 0:
+        raise RuntimeError(f"headbench {' '.join(words)} ended with {code}")
+
+
+if __name__ == "__main__":
+    make(Path(sys.argv[1]))
