@@ -76,12 +76,13 @@ def run_configuration(run: Path, options: RunOptions) -> RunConfig:
 
 
 def open_run_clips(
-    run: Path, options: RunOptions, *, altered: bool = False, remembered: bool = True
+    run: Path, options: RunOptions, *, out: Path | None = None, altered: bool = False, remembered: bool = True
 ) -> tuple[RunConfig, list[Clip]]:
     """Open the captures that a run was made from; return its settings as well, see `run_configuration`.
 
     Parameters
     ----------
+    out : becomes ``out`` of the settings, where opening may keep what took long; None: the run, whose lock is held.
     altered : return what is there even if it is not what the run was made from.
     remembered : see `open_clips`.
 
@@ -94,6 +95,7 @@ def open_run_clips(
     found: list[tuple[RunConfig, list[Clip]]] = []
     refused: list[InputError] = []
     for config in _configurations(run, options):
+        config = config if out is None else replace(config, out=str(out))
         try:
             clips = open_clips(config, remembered=remembered)
         except InputError as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shutil
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
@@ -17,7 +18,7 @@ from .captures import open_clips, relative_paths
 from .contracts import Clip
 from .device import check_device
 from .errors import HeadbenchError, InputError, UnavailableError
-from .files import output_inside
+from .files import atomic_path, output_inside
 from .lock import locked
 from .machine import machine_record, peak_memory_bytes
 from .manifest import AdaptedRecord, ClipRecord, Manifest, MethodRecord, ProtocolRecord
@@ -115,8 +116,13 @@ def adapt(
     methods: Sequence[ResolvedMethod],
     config: RunConfig,
     folder: RunFolder,
+    finished: RunFolder | None = None,
 ) -> Adapted:
-    """Bring every clip into every form that a method needs, once each; first make sure that all can be had."""
+    """Bring every clip into every form that a method needs, once each; first make sure that all can be had.
+
+    What takes long is kept in ``folder``, whose lock the caller holds. What the run ``finished`` kept is copied there
+    first: nothing is written in a run by what looks at it.
+    """
     reader: DatasetSpec = get("datasets", config.reader)
     planned = {}
     for clip in clips:
@@ -125,12 +131,26 @@ def adapt(
             if step is not None:
                 planned[clip.subject, needs] = step
     with output_inside(folder.root):
+        if finished is not None:
+            for subject in {subject for subject, _ in planned}:
+                _copy_kept(finished.adapted / subject, folder.adapted / subject)
         return {
             (subject, needs): adaptation.carry_out(
                 step, needs, folder.adapted / subject, f"adapting {subject}"
             )
             for (subject, needs), step in planned.items()
         }
+
+
+def _copy_kept(source: Path, folder: Path) -> None:
+    """Copy the files that are not in ``folder`` yet; never what a link leads to, for the run may come from anybody."""
+    if source.is_symlink() or source.parent.is_symlink():
+        return
+    for path in sorted(source.rglob("*")):
+        target = folder / path.relative_to(source)
+        if path.is_file() and not path.is_symlink() and not target.exists():
+            with atomic_path(target) as temporary:
+                shutil.copyfile(path, temporary)
 
 
 def make_jobs(

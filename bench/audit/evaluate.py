@@ -96,7 +96,9 @@ def _opened(settings: EvaluateSettings) -> tuple[RunConfig, list[Clip]]:
         raise InputError("command line", "--out", "a folder of its own", "that of the run")
     if settings.like is not None:
         options = RunOptions(data=settings.clip, head=settings.head, trust=settings.trust)
-        config, clips = open_run_clips(Path(settings.like), options, altered=settings.clip is not None)
+        config, clips = open_run_clips(
+            Path(settings.like), options, out=Path(settings.out), altered=settings.clip is not None
+        )
     else:
         config = RunConfig(
             data=str(settings.clip),

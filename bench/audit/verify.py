@@ -66,17 +66,18 @@ def run(settings: VerifySettings, progress: Progress = no_progress) -> Findings:
     A folder that is no finished run, and a capture that cannot be opened, are a finding too, with exit code 3.
     """
     try:
-        return _verify(settings, progress)
+        with tempfile.TemporaryDirectory() as scratch:
+            return _verify(settings, Path(scratch), progress)
     except InputError as error:
         text = f"Verify: missing or invalid: {error}"
         return Findings(text, {"error": str(error)}, False, ExitCode.NO_VERDICT)
 
 
-def _verify(settings: VerifySettings, progress: Progress) -> Findings:
+def _verify(settings: VerifySettings, scratch: Path, progress: Progress) -> Findings:
     folder = RunFolder(Path(settings.run))
     manifest = folder.read_manifest()
     manifest.check_done(folder.manifest)
-    config, clips = open_run_clips(folder.root, settings, altered=True, remembered=False)
+    config, clips = open_run_clips(folder.root, settings, out=scratch, altered=True, remembered=False)
     rows = folder.read_rows(manifest)
     methods = _methods(config, manifest)
     metrics = resolve_metrics(config) if _has_avatars(methods) else _of_frames(resolve_metrics(config))
@@ -87,7 +88,7 @@ def _verify(settings: VerifySettings, progress: Progress) -> Findings:
     if not report.mismatches:
         rows.check_protocols(folder.rows, {task: protocol.hash for task, protocol in protocols.items()})
         regions = {clip.subject: check_regions(clip, config.regions) for clip in clips}
-        adapted = adapt(clips, methods, config, folder) if _has_avatars(methods) else {}
+        adapted = adapt(clips, methods, config, RunFolder(scratch), folder) if _has_avatars(methods) else {}
         jobs = make_jobs(config, methods, clips, protocols, folder, adapted, regions)
         for index, job in enumerate(jobs):
             _verify_cell(job, metrics, rows, folder.rows, report)

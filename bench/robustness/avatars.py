@@ -15,7 +15,7 @@ from ..stages import Job
 from ..store import RunFolder
 
 
-def trained(run: Path, methods: Sequence[str], options: RunOptions) -> tuple[RunConfig, list[Job]]:
+def trained(run: Path, methods: Sequence[str], options: RunOptions, out: Path) -> tuple[RunConfig, list[Job]]:
     """Return the settings of a run and its cells whose avatar is trained; `load` reads one.
 
     Parameters
@@ -23,6 +23,7 @@ def trained(run: Path, methods: Sequence[str], options: RunOptions) -> tuple[Run
     run : folder of the run.
     methods : names of those wanted; empty: all but the floors, which nothing can drive to extremes.
     options : where the run's files are now.
+    out : folder to keep clips in that methods need in another form; its lock is held. It becomes ``out`` of the settings.
 
     Raises
     ------
@@ -39,8 +40,8 @@ def trained(run: Path, methods: Sequence[str], options: RunOptions) -> tuple[Run
     wanted = [m for m in resolved if (m.spec.name in methods if methods else not m.spec.trivial)]
     if not wanted:
         raise InputError(folder.manifest, "methods", "a method that is no floor", ", ".join(names))
-    config, clips = open_run_clips(run, options)
-    jobs = make_jobs(config, wanted, clips, {}, folder, adapt(clips, wanted, config, folder))
+    config, clips = open_run_clips(run, options, out=out)
+    jobs = make_jobs(config, wanted, clips, {}, folder, adapt(clips, wanted, config, RunFolder(out), folder))
     for job in jobs:
         state = job.cell.stage("fit")
         if state is None or state.get("status") != "done":

@@ -195,8 +195,9 @@ def _sources(jobs: Sequence[Job], settings: ReenactSettings) -> list[Job]:
     if settings.source is None:
         first = {(job.clip.subject, job.method.spec.name): job for job in reversed(jobs)}
         return sorted(first.values(), key=lambda job: job.clip.subject)
+    folder = RunFolder((Path(settings.out) if settings.out else Path(settings.run) / TASK) / "sources")
     config = run_configuration(Path(settings.run), replace(settings, data=settings.source))
-    folder = RunFolder(Path(settings.out) if settings.out else Path(settings.run) / TASK)
+    config = replace(config, out=str(folder.root))
     methods = list({job.method.spec.name: job.method for job in jobs}.values())
     clips = open_clips(config)
     adapted = adapt(clips, methods, config, folder)

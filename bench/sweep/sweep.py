@@ -40,7 +40,7 @@ def sweep(settings: SweepSettings, out: Path, progress: Progress) -> Rows:
     InputError
         For a folder that is no finished run, a method that derives nothing, a variant that none of them has.
     """
-    config, jobs = trained(Path(settings.run), settings.methods, settings)
+    config, jobs = trained(Path(settings.run), settings.methods, settings, out)
     able = [job for job in jobs if job.method.spec.variants]
     unable = sorted({job.method.spec.name for job in jobs} - {job.method.spec.name for job in able})
     if not able or (settings.methods and unable):
@@ -72,7 +72,7 @@ def sweep(settings: SweepSettings, out: Path, progress: Progress) -> Rows:
             records[job.method.spec.name] = _record(job, base, variant)
     rows = Rows.joined(frames)
     rows.write(folder.rows)
-    manifest = describe(replace(config, out=str(out)), [], metrics, clips, protocols)
+    manifest = describe(config, [], metrics, clips, protocols)
     done = replace(manifest, methods=tuple(records.values()), sweep_of=settings.run, status="done")
     done.write(folder.manifest)
     return rows

@@ -9,6 +9,7 @@ from ...bench.contracts import Progress, no_progress
 from ...bench.files import output_inside
 from ...bench.lock import locked
 from ...bench.specs import Findings
+from ...bench.store import RunFolder
 from ...bench.sweep.settings import SweepSettings
 from ...bench.sweep.sweep import sweep
 from .command import run as compare
@@ -21,6 +22,7 @@ def run(settings: SweepSettings, progress: Progress = no_progress) -> Findings:
     Raises `InputError` for a folder that is no finished run, and for methods and variants that there are not.
     """
     out = Path(settings.out) if settings.out else Path(settings.run) / "sweep"
+    RunFolder(Path(settings.run)).read_manifest()  # before a folder is made in what is no run
     with nullcontext() if settings.out else output_inside(Path(settings.run)), locked(out):
         sweep(settings, out, progress)
         what = settings.task, settings.metric, settings.time

@@ -15,6 +15,7 @@ from ...bench.robustness.settings import ExtremesSettings, ReenactSettings
 from ...bench.robustness.trial import SHEET_FILE, table
 from ...bench.specs import Findings
 from ...bench.stages import Job
+from ...bench.store import RunFolder
 
 Settings = TypeVar("Settings", ExtremesSettings, ReenactSettings)
 
@@ -29,8 +30,9 @@ def try_run(
     """Try the avatars of a run, write the contact sheet; did not pass where a limit is broken."""
     folder = Path(settings.run)
     out = Path(settings.out) if settings.out else folder / default_folder
-    _, jobs = trained(folder, settings.methods, settings)
+    RunFolder(folder).read_manifest()  # before a folder is made in what is no run
     with nullcontext() if settings.out else output_inside(folder), locked(out):
+        _, jobs = trained(folder, settings.methods, settings, out)
         summaries = attempt(jobs, settings, out, progress)
         write_sheet(out)
     text = f"{table(summaries)}\n{out / SHEET_FILE}"

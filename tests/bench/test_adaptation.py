@@ -5,15 +5,17 @@ import dataclasses
 import numpy as np
 import pytest
 
-from headbench.bench import runner
+from headbench.bench import cli, runner
 from headbench.bench.adaptation import MethodNeeds, plan
 from headbench.bench.captures import open_clips
 from headbench.bench.contracts import Camera
 from headbench.bench.documents import read_json
 from headbench.bench.errors import InputError
-from headbench.bench.files import digest
+from headbench.bench.files import digest, write_text
 from headbench.bench.frames import read_png
+from headbench.bench.robustness.avatars import trained
 from headbench.bench.run_config import RunConfig
+from headbench.bench.run_options import RunOptions
 from headbench.bench.specs import ResolutionRule
 from headbench.bench.store import RunFolder
 
@@ -80,6 +82,49 @@ def test_the_manifest_tells_the_steps_and_the_needs(config, toy, monkeypatch):
     assert [step["name"] for step in adapted["steps"]] == ["adapt"]
     assert adapted["steps"][0]["parameters"] == {"heads": {"flame2020": "somewhere"}}
     assert record["methods"][0]["needs"]["resolution"]["size"] == [16, 12]
+
+
+@pytest.mark.parametrize(
+    "look",
+    [
+        lambda run, out: cli.main(["verify", str(run), "--trust"]) == 0,
+        lambda run, out: trained(run, (), RunOptions(trust=True), out),
+    ],
+    ids=["verify", "sweep, extremes, reenact"],
+)
+def test_what_looks_at_a_run_takes_what_it_kept_and_writes_nothing_there(
+    config, toy, tmp_path, monkeypatch, look
+):
+    declare(monkeypatch, toy, resolution=TWICE)
+    adapt, found = toy.adapt, []
+
+    def keeping(clip, needs, heads):
+        def work(folder, progress):
+            found.append((folder / "kept").exists())
+            write_text(folder / "kept", "kept")
+            return adapt(clip, needs, heads)(folder, progress)
+
+        return work
+
+    monkeypatch.setattr(toy, "adapt", keeping)
+    config = dataclasses.replace(config, divide=2)
+    runner.run(config)
+    run, out = runner.Path(config.out), tmp_path / "looked"
+    # Reduction needs a folder, too: that of the run itself, where it is made.
+    kept = [run / "adapted" / "subject1" / "kept", run / "kept"]
+    assert found == [False, False]
+    times = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
+    assert look(run, out)
+    assert found[2:] == [False, True]
+    assert {path: path.stat().st_mtime_ns for path in run.rglob("*")} == times
+    for path in kept:
+        path.unlink()
+    (tmp_path / "secret").write_text("of another place")
+    kept[0].symlink_to(tmp_path / "secret")
+    assert look(run, tmp_path / "again")
+    assert found[4:] == [False, False]
+    assert kept[0].is_symlink()
+    assert not kept[1].exists()
 
 
 def test_methods_of_equal_needs_share_one_adapted_clip(config, toy, monkeypatch):

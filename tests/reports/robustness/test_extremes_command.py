@@ -8,9 +8,10 @@ import pytest
 from PIL import Image
 
 from headbench.bench.errors import InputError
-from headbench.bench.lock import locked
+from headbench.bench.lock import LOCK_FILE, locked
 from headbench.bench.robustness.settings import ExtremesSettings
 from headbench.bench.robustness.trial import RECORD_FILE, ROWS_FILE, SHEET_FILE
+from headbench.reports.robustness import command
 from headbench.reports.robustness.extremes_command import run
 from headbench.reports.robustness.extremes_sheet import BROKEN, EXTRAPOLATED
 
@@ -115,6 +116,9 @@ def test_what_is_not_there_is_refused_before_any_work(ball_run, tmp_path):
     with pytest.raises(InputError, match="a trained avatar"):
         run(settings(folder))
     assert not (folder / "extremes").exists()
+    with pytest.raises(InputError, match=r"run\.json"):
+        run(settings(tmp_path / "typo"))
+    assert not (tmp_path / "typo").exists()
 
 
 def test_a_run_of_floors_alone_has_nothing_to_try(ball_run):
@@ -128,6 +132,21 @@ def test_a_run_of_floors_alone_has_nothing_to_try(ball_run):
 def test_settings_without_meaning_are_refused(changes):
     with pytest.raises(ValueError, match=next(iter(changes))):
         ExtremesSettings("run", **changes)
+
+
+def test_clips_are_adapted_in_its_folder_while_that_is_locked(ball_run, monkeypatch):
+    seen = []
+
+    def trained(run, methods, options, out):
+        seen.append((out, (out / LOCK_FILE).exists()))
+        raise InputError("a", "b", "c", "d")
+
+    monkeypatch.setattr(command, "trained", trained)
+    folder = ball_run("BALL")
+    with pytest.raises(InputError):
+        run(settings(folder))
+    assert seen == [(folder / "extremes", True)]
+    assert not (folder / "extremes").exists()
 
 
 def test_its_folder_is_locked_and_no_link_out_of_the_run(ball_run, tmp_path):
