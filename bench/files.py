@@ -150,8 +150,9 @@ class _Writes:
 
     def flush(self, *writes: _Write) -> None:
         with self.lock:
+            folders, self.folders = self.folders, set()  # one that fails is not tried again by later writes
             tasks = [partial(_flush_file, write) for write in writes]
-            tasks += [partial(_flush_folder, folder) for folder in self.folders]
+            tasks += [partial(_flush_folder, folder) for folder in folders]
             if len(tasks) > 1:
                 with ThreadPoolExecutor(min(len(tasks), FLUSHES)) as pool:
                     for done in [pool.submit(task) for task in tasks]:
@@ -159,7 +160,6 @@ class _Writes:
             else:
                 for task in tasks:
                     task()
-            self.folders.clear()
 
 
 _writes = _Writes()

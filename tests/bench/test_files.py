@@ -207,6 +207,26 @@ def test_a_flush_that_fails_leaves_the_old_file_and_names_it(tmp_path, monkeypat
     assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"a": "old"}
 
 
+def test_a_folder_that_cannot_be_flushed_fails_one_write_and_not_those_after_it(tmp_path, monkeypatch):
+    for name in ("bad", "good"):
+        (tmp_path / name).mkdir()
+    flush_renames()
+    write_text(tmp_path / "bad" / "a", "a")  # its rename waits for the next flush
+    flush = files._flush
+
+    def fail(path):
+        if Path(path).name == "bad":
+            raise OSError(errno.EIO, "Input/output error")
+        flush(path)
+
+    monkeypatch.setattr(files, "_flush", fail)
+    with pytest.raises(OSError, match="Input/output") as caught:
+        write_text(tmp_path / "good" / "b", "b")
+    assert caught.value.filename == str(tmp_path / "bad")
+    write_text(tmp_path / "good" / "c", "c")
+    assert [path.name for path in (tmp_path / "good").iterdir()] == ["c"]
+
+
 WRITER = """
 import sys, time
 from pathlib import Path
