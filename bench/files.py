@@ -23,7 +23,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from .errors import InputError
+from .errors import InputError, UnavailableError
 
 MAX_NAME_BYTES = 120
 """Longest name of a subject, a sequence or a camera; a file name made of several has to fit into 255 bytes."""
@@ -410,9 +410,15 @@ def plain(value: Any) -> Any:
 def cache_folder() -> Path:
     """The user's cache: ``$XDG_CACHE_HOME/headbench``, by default ``~/.cache/headbench``.
 
-    Raises RuntimeError where the user has no home.
+    Raises `UnavailableError` where the user has no home.
     """
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "headbench"
+    try:
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "headbench"
+    except RuntimeError as error:
+        remedy = "Set HOME, or XDG_CACHE_HOME to a folder for caches."
+        raise UnavailableError(
+            "The user's cache has no place: the user has no home folder.", remedy
+        ) from error
 
 
 def digest(*values: Any) -> str:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from ..bench.contracts import Progress, no_progress
+from ..bench.errors import UnavailableError
 from ..bench.files import cache_folder, digest, digest_file, write_json
 
 _log = logging.getLogger(__name__)
@@ -72,7 +73,7 @@ def _place(folder: Path) -> Path | None:
     """File of the cache for a capture; None where the user has no home."""
     try:
         return cache_folder() / "digests" / f"{digest(os.path.abspath(folder))[:32]}.json"
-    except RuntimeError as error:
+    except UnavailableError as error:
         _log.info("digests are not kept: %s", error)
         return None
 

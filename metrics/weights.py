@@ -41,7 +41,7 @@ def find_backbone(spec: NetworkSpec, path: Path | None = None) -> Path:
     Raises
     ------
     InputError : ``path`` or the environment variable names something that is not there.
-    UnavailableError : not found anywhere and not to be fetched; says how to mend it.
+    UnavailableError : not in the folder named, or not found anywhere and not to be fetched; says how to mend it.
     """
     if path is not None:
         return _named(spec, path, "weights")
@@ -90,8 +90,14 @@ def _named(spec: NetworkSpec, path: Path, option: str) -> Path:
         return path
     if found := _in_folder(spec, path):
         return found
-    inside = f"a file, or a folder with {spec.file} or {spec.features_file}"
-    raise InputError(option, "", inside, f"{path}, {'without either' if path.is_dir() else 'not there'}")
+    if path.is_dir():
+        raise UnavailableError(
+            f"LPIPS needs the ImageNet weights of its {spec.name} network; {option} names {path}, which has none.",
+            f"Download {spec.url} and put it there.",
+        )
+    raise InputError(
+        option, "", f"a file, or a folder with {spec.file} or {spec.features_file}", f"{path}, not there"
+    )
 
 
 def _in_folder(spec: NetworkSpec, folder: Path) -> Path | None:

@@ -35,14 +35,12 @@ def test_places_are_searched_in_order(bare_machine, tmp_path, monkeypatch):
     assert bare_machine == []
 
 
-def test_a_named_place_without_weights_is_bad_input_not_a_reason_to_look_on(
-    bare_machine, tmp_path, monkeypatch
-):
+def test_a_named_place_without_weights_is_no_reason_to_look_on(bare_machine, tmp_path, monkeypatch):
     with pytest.raises(InputError, match="not there"):
         weights.find_backbone(SQUEEZE, tmp_path / "nowhere")
     monkeypatch.setenv(weights.VARIABLE, str(tmp_path))
-    with pytest.raises(InputError, match=f"{weights.VARIABLE}.*without either"):
-        weights.find_backbone(SQUEEZE)
+    with pytest.raises(UnavailableError, match=f"squeeze.*{weights.VARIABLE}.*Download {SQUEEZE.url}"):
+        weights.find_backbone(SQUEEZE)  # a folder may well hold those of another network
     assert bare_machine == []
 
 
@@ -53,6 +51,16 @@ def test_without_weights_or_network_it_says_how_to_mend_it_and_asks_once(bare_ma
         for part in ("the network is down", SQUEEZE.url, str(weights.cache_folder()), weights.VARIABLE):
             assert part in str(caught.value)
     assert bare_machine == [(SQUEEZE.url, weights.TIMEOUT_S)]
+
+
+def test_a_user_without_a_home_is_told_what_to_set(bare_machine, monkeypatch):
+    def homeless():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setattr(weights.Path, "home", homeless)
+    with pytest.raises(UnavailableError, match="Set HOME, or XDG_CACHE_HOME"):
+        weights.find_backbone(SQUEEZE)
 
 
 def test_what_is_fetched_is_kept_if_its_hash_is_right_and_not_otherwise(bare_machine, monkeypatch, state):
