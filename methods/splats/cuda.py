@@ -34,7 +34,15 @@ def usable() -> bool:
 
 
 def usable_or_warn(request: Request) -> bool:
-    """Tell whether gsplat is there and draws this request; if not, log why and what helps, once per process and reason."""
+    """Tell whether gsplat is there and draws this request; if a GPU is left without it, log why and what helps.
+
+    It is logged once per process and reason.
+    """
+    if not supports(request):
+        device = request.means.device.type
+        if request.means.dtype == torch.float32 and device != "cpu":
+            _warn_once(f"gsplat draws on NVIDIA GPUs alone, not on device {device!r}", "Draw on the CPU.")
+        return False
     if not usable():
         _warn_once("gsplat is not installed", REMEDY)
         return False

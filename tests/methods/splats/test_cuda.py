@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import logging
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -223,6 +224,24 @@ def test_a_slow_backend_on_a_gpu_is_warned_of_once(monkeypatch, caplog, installe
     cuda._warn_once.cache_clear()
     assert drawn == {"reference" if reason else "gsplat"}
     assert [reason in record.message for record in caplog.records] == ([True] if reason else [])
+
+
+@pytest.mark.parametrize(
+    ("device", "dtype", "warned"),
+    [
+        ("mps", torch.float32, 1),
+        ("xpu", torch.float32, 1),
+        ("xpu", torch.float64, 0),
+        ("cpu", torch.float64, 0),
+    ],
+)
+def test_float32_on_a_gpu_without_kernels_is_warned_of_once(caplog, device, dtype, warned):
+    request = SimpleNamespace(means=SimpleNamespace(dtype=dtype, device=torch.device(device)))
+    cuda._warn_once.cache_clear()
+    with caplog.at_level(logging.WARNING):
+        assert {slow._choose(request) for _ in range(2)} == {"reference"}
+    cuda._warn_once.cache_clear()
+    assert [f"not on device '{device}'" in record.message for record in caplog.records] == [True] * warned
 
 
 def test_what_gsplat_cannot_do_is_refused(monkeypatch):
