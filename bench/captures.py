@@ -18,7 +18,7 @@ from .progress import progress
 from .registry import get, resolve
 from .run_config import RunConfig
 from .run_options import RunOptions
-from .specs import DatasetSpec, ResolutionRule
+from .specs import LABEL, DatasetSpec, ResolutionRule, is_label
 from .store import RunFolder
 
 HARNESS = ("progress", "remembered")
@@ -196,9 +196,11 @@ def _reduced(clip: Clip, reader: DatasetSpec, config: RunConfig) -> Clip:
 
 
 def _checked(clip: Clip) -> Clip:
-    """Make sure that files and folders can be named after what the clip holds."""
+    """Make sure that files and folders can be named after what the clip holds, and results read."""
     source = f"clip {clip.subject}"
     check_name(clip.subject, source, "subject")
+    if not is_label(clip.fingerprint):
+        raise InputError(source, "fingerprint", LABEL, repr(clip.fingerprint))
     for camera in clip.cameras:
         check_name(camera, source, "camera")
     for sequence in {key.sequence for keys in clip.splits.values() for key in keys}:

@@ -12,10 +12,10 @@ from typing_extensions import TypedDict
 from .contracts import FrameKey
 from .documents import checked, read_json, shown
 from .errors import InputError
-from .files import MAX_NAME_BYTES, check_name, digest, write_json
+from .files import check_name, digest, write_json
 from .protocol import Protocol
 from .run_config import RunConfig
-from .specs import MetricSpec
+from .specs import LABEL, MetricSpec, is_label
 
 Derived = TypedDict("Derived", {"from": str, "variant": str, "change": str})
 """From which method's avatar one was derived without training, which variant it is, and what was changed."""
@@ -144,8 +144,8 @@ class Manifest:
                 check_name(name, path, key)
         for key, texts in manifest._printed().items():
             for text in texts:
-                if len(text) > MAX_NAME_BYTES or not text.isprintable():
-                    raise InputError(path, key, f"at most {MAX_NAME_BYTES} printable characters", repr(text))
+                if not is_label(text):
+                    raise InputError(path, key, LABEL, repr(text))
         for key in ("methods", "metrics"):
             count = Counter(entry.name for entry in getattr(manifest, key))
             twice = [name for name, number in count.items() if number > 1]
@@ -158,7 +158,6 @@ class Manifest:
         protocols = self.protocols.values()
         return {
             "methods, version": [method.version for method in self.methods],
-            "metrics, label, unit": [text for metric in self.metrics for text in (metric.label, metric.unit)],
             "clips, fingerprint": [clip.fingerprint for clip in self.clips],
             "protocols, id, hash": [text for protocol in protocols for text in (protocol.id, protocol.hash)],
             "machine, processor": [str(self.machine.get("processor", ""))],

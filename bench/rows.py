@@ -15,8 +15,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from .errors import InputError, shortened
-from .files import MAX_NAME_BYTES, atomic_path
+from .files import atomic_path
 from .parquet_footer import SNAPPY, UNCOMPRESSED, column_codecs
+from .specs import LABEL, is_label
 
 FRAME = ["subject", "sequence", "timestep", "camera"]
 """Columns that name a frame."""
@@ -276,8 +277,8 @@ def _texts(column: Any, path: Path, name: str) -> pd.Series[str]:
     if name == "reason":
         words = [shortened(word, MAX_REASON) for word in words]
     for word in words:
-        if name != "reason" and (len(word) > MAX_NAME_BYTES or not word.isprintable()):
-            raise InputError(path, name, f"at most {MAX_NAME_BYTES} printable characters", repr(word))
+        if name != "reason" and not is_label(word):
+            raise InputError(path, name, LABEL, repr(word))
     indices = column.indices.to_numpy()
     total = int(np.bincount(indices) @ [len(word.encode()) for word in words[: indices.max() + 1]])
     if total > MAX_TEXT_BYTES:

@@ -173,6 +173,9 @@ def resolve_metrics(config: RunConfig) -> list[MetricSpec]:
             raise InputError("metrics", spec.name, expected, "none of them does", "Leave it out.")
         found += of_profiles
     first = profiles[0].name
+    for metric in found:
+        for name in (metric.name, *metric.tables):
+            check_name(name, "registry of metrics", f"name and tables of {metric.name}")
     return [
         replace(m, tables=("comparison", *m.tables)) if m.profile == first != CANONICAL else m for m in found
     ]

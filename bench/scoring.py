@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 from .contracts import ByteArray, Clip, FrameKey, Progress, RegionalClip, no_progress
 from .errors import HeadbenchError, InputError, UnavailableError
+from .files import check_name
 from .registry import resolve
 from .specs import MetricSpec
 
@@ -61,6 +62,7 @@ def check_regions(clip: Clip, wanted: Sequence[str] | None) -> tuple[str, ...]:
         if name not in known:
             expected = f"one of {', '.join((FULL, *known))}, which clip {clip.subject} knows"
             raise InputError("regions", name, expected, "no such region")
+        check_name(name, f"clip {clip.subject}", "region")
     return names
 
 

@@ -10,6 +10,21 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
 
+MAX_LABEL = 120
+LABEL = f"at most {MAX_LABEL} printable characters"
+"""What names, units, versions and hashes are, in rows and manifests; see `is_label`."""
+
+
+def is_label(text: str) -> bool:
+    """Whether rows and manifests with this text can be read."""
+    return len(text) <= MAX_LABEL and text.isprintable()
+
+
+def _check_labels(**texts: str) -> None:
+    for name, text in texts.items():
+        if not is_label(text):
+            raise ValueError(f"{name} is {text[:60]!r}; {LABEL}")
+
 
 @dataclass(frozen=True)
 class ResolutionRule:
@@ -88,6 +103,10 @@ class MethodSpec:
     resolution: ResolutionRule = ResolutionRule()
     preset_resolutions: Mapping[str, ResolutionRule] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        """Refuse what no results could be read with."""
+        _check_labels(name=self.name, version=self.version)
+
     def at_preset(self, preset: str) -> MethodSpec:
         """This method with the image size of a preset."""
         rule = self.preset_resolutions.get(preset, self.resolution)
@@ -135,7 +154,8 @@ class MetricSpec:
     temporal: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse what no table could show."""
+        """Refuse what no table could show, and no results could be read with."""
+        _check_labels(name=self.name, label=self.label, unit=self.unit)
         if not 0 <= self.digits <= MAX_DIGITS:
             raise ValueError(f"digits is {self.digits}; from 0 to {MAX_DIGITS}")
 

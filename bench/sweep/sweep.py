@@ -82,7 +82,7 @@ def _chosen(job: Job, names: Sequence[str]) -> Iterator[Variant]:
     """Variants of a job's avatar, those named or all."""
     derive = resolve(job.method.spec.variants)
     for variant in derive(job.cell.avatar, job.form.clip, job.device):
-        check_name(variant.name, job.method.spec.variants, "name of a variant")
+        check_name(_name(job, variant), job.method.spec.variants, "name of a variant")
         if not names or variant.name in names:
             yield variant
 
@@ -90,13 +90,17 @@ def _chosen(job: Job, names: Sequence[str]) -> Iterator[Variant]:
 def _derived(base: Job, variant: Variant | None, protocols: Mapping[str, Protocol], folder: RunFolder) -> Job:
     """The cell of a variant in the sweep's folder; of the trained avatar itself where there is none."""
     spec = base.method.spec
-    name = spec.name if variant is None else f"{spec.name}{MARK}{variant.name}"
+    name = spec.name if variant is None else _name(base, variant)
     return replace(
         base,
         method=replace(base.method, spec=replace(spec, name=name)),
         protocols=protocols,
         cell=folder.cell(base.clip.subject, name, base.seed),
     )
+
+
+def _name(base: Job, variant: Variant) -> str:
+    return f"{base.method.spec.name}{MARK}{variant.name}"
 
 
 def _measured(job: Job, base: Job, variant: Variant | None, metrics: Sequence[MetricSpec]) -> Rows:

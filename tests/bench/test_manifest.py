@@ -1,5 +1,6 @@
 """The manifest of a run: read back as it was written; whatever a stranger put there is refused by its key."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -8,6 +9,8 @@ import pytest
 from headbench.bench.errors import InputError
 from headbench.bench.manifest import Manifest
 from headbench.bench.store import Cell
+from headbench.methods.specs import GA
+from headbench.metrics.specs import PSNR
 
 GALLERY = Path(__file__).parents[2] / "reports" / "gallery" / "run.json"
 
@@ -36,7 +39,7 @@ def test_the_published_manifest_is_written_as_it_was_read(published, tmp_path):
         (lambda m: m["methods"][0].update(name="../up"), "methods"),
         (lambda m: m["methods"].append(m["methods"][0]), "methods"),
         (lambda m: m["metrics"][0].update(digits=10**9), "metrics[0]"),
-        (lambda m: m["metrics"][0].update(label="\x1b[2J"), "metrics, label, unit"),
+        (lambda m: m["metrics"][0].update(label="\x1b[2J"), "metrics[0]"),
         (lambda m: m["machine"].update(processor="x" * 1000), "machine, processor"),
         (lambda m: m["metrics"][0].update(tables=["/etc/x"]), "metrics, tables"),
         (lambda m: m["clips"][0].pop("fingerprint"), "clips[0].fingerprint"),
@@ -58,6 +61,21 @@ def test_a_manifest_that_is_none_is_refused_by_its_key(published, tmp_path, chan
     with pytest.raises(InputError) as caught:
         Manifest.read(tmp_path / "run.json")
     assert caught.value.key == key
+
+
+@pytest.mark.parametrize(
+    ("spec", "changes"),
+    [
+        (PSNR, {"name": "\x1b[2J"}),
+        (PSNR, {"label": "x" * 121}),
+        (PSNR, {"unit": "d\nB"}),
+        (GA, {"name": "x" * 121}),
+        (GA, {"version": "1\0"}),
+    ],
+)
+def test_a_spec_that_no_results_could_be_read_with_is_refused(spec, changes):
+    with pytest.raises(ValueError, match="at most 120 printable characters"):
+        dataclasses.replace(spec, **changes)
 
 
 @pytest.mark.parametrize(

@@ -263,6 +263,35 @@ def test_bad_settings_are_refused_before_training(config, toy, changes, match):
     assert toy.FITS == []
 
 
+@pytest.mark.parametrize(
+    ("part", "match"),
+    [
+        ({"name": "a/b"}, "name and tables"),
+        ({"tables": ("../up",)}, "name and tables"),
+        ({"fingerprint": "x" * 121}, "fingerprint"),
+        ({"region_names": ("a/b",)}, "region: expected a name"),
+    ],
+)
+def test_what_results_could_not_be_read_with_is_refused_before_training(
+    config, toy, monkeypatch, part, match
+):
+    key = next(iter(part))
+    if hasattr(toy.ERROR, key):
+        monkeypatch.setattr(toy, "ERROR", dataclasses.replace(toy.ERROR, **part))
+    else:
+
+        def read(path):
+            clip = toy.ToyClip(path)
+            clip.region_masks = dict
+            vars(clip).update(part)
+            return clip
+
+        monkeypatch.setattr(toy, "read", read)
+    with pytest.raises(InputError, match=match):
+        runner.run(changed(config, metrics=("toy_plugin:ERROR",), regions=part.get("region_names")))
+    assert toy.FITS == []
+
+
 def test_an_unwritable_output_is_refused_before_training(config, toy, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="can be written"):
