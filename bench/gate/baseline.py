@@ -15,7 +15,7 @@ from ..specs import MAX_DIGITS, MetricSpec
 from .results import AVATAR, Place, ProtocolIdentity, Results
 from .settings import Captures
 
-FORMAT = 2
+FORMAT = 3
 LAST_DIGITS = 10
 MACHINE_SHARE = 0.3
 KEPT_DIGITS = 3
@@ -63,13 +63,14 @@ class Tolerance:
 class _File:
     """The file as it stands."""
 
-    format: Literal[2]
+    format: Literal[3]
     captures: Captures
     environment: dict[str, Any]
     protocols: dict[str, ProtocolIdentity]
     tolerances: dict[str, Tolerance]
     count: int
     values: dict[str, float]
+    frames: dict[str, int]
     unavailable: dict[str, str] = field(default_factory=dict)
 
 
@@ -77,6 +78,7 @@ class _File:
 class Baseline:
     """A baseline, read or made from results.
 
+    ``frames`` holds how many frames stand behind each value, since those in which a region is seen are not in the protocol.
     ``unavailable`` holds what could not be measured when it was made, with the reason: to lack it is no loss.
     """
 
@@ -85,6 +87,7 @@ class Baseline:
     protocols: Mapping[str, ProtocolIdentity]
     tolerances: Mapping[str, Tolerance]
     values: Mapping[Place, float]
+    frames: Mapping[Place, int]
     unavailable: Mapping[Place, str] = field(default_factory=dict)
 
     @classmethod
@@ -112,6 +115,7 @@ class Baseline:
             dict(results.protocols),
             {name: known.get(name) or Tolerance.default(results.metrics[name]) for name in metrics},
             dict(sorted(results.values.items())),
+            dict(sorted(results.frames.items())),
             dict(sorted(results.unavailable.items())),
         )
 
@@ -123,12 +127,15 @@ class Baseline:
         """
         record = read_json(path)
         if record.get("format") != FORMAT:
-            remedy = 'Format 1 lacked "count", the number of values.' if record.get("format") == 1 else ""
+            lacking = 'Formats 1 and 2 lack "frames": make the file anew, and copy its tolerances.'
+            remedy = lacking if record.get("format") in (1, 2) else ""
             raise InputError(path, "format", str(FORMAT), shown(record.get("format")), remedy)
         file = checked(record, _File, path)
         if file.count != len(file.values) or not file.values:
             expected = f"as many as count says, {file.count}" if file.count > 0 else "at least one number"
             raise InputError(path, "values", expected, str(len(file.values)))
+        if file.frames.keys() != file.values.keys() or min(file.frames.values()) < 1:
+            raise InputError(path, "frames", "a number from 1 for each of values", "others")
         values = {}
         for key, value in file.values.items():
             place = _place(key, path, "values")
@@ -138,7 +145,10 @@ class Baseline:
                 raise InputError(path, "protocols", f"an entry {place.task!r}", "none")
             values[place] = value
         unavailable = {_place(key, path, "unavailable"): why for key, why in file.unavailable.items()}
-        return cls(file.captures, file.environment, file.protocols, file.tolerances, values, unavailable)
+        frames = {place: file.frames[str(place)] for place in values}
+        return cls(
+            file.captures, file.environment, file.protocols, file.tolerances, values, frames, unavailable
+        )
 
     def write(self, path: Path) -> None:
         """Write the file. Numbers keep three digits more than tables show, so that a diff shows what has changed."""
@@ -154,6 +164,7 @@ class Baseline:
             "tolerances": {name: asdict(tolerance) for name, tolerance in self.tolerances.items()},
             "unavailable": {str(place): reason for place, reason in self.unavailable.items()},
             "count": len(values),
+            "frames": {str(place): self.frames[place] for place in self.values},
             "values": values,
         }
         write_json(path, record)

@@ -68,9 +68,13 @@ def _update(settings: GateSettings) -> Findings:
     baseline = Baseline.of(results, earlier, settings.captures)
     verdicts = judge(results, earlier) if earlier else []
     gone = sorted(earlier.values.keys() - baseline.values.keys()) if earlier else []
+    before = earlier.frames if earlier else {}
     baseline.write(path)
     lines = [f"{path}: {len(baseline.values)} numbers written."]
     lines += [f"  was: {verdict}" for verdict in verdicts if verdict.outcome not in ("pass", "missing")]
+    for place, count in baseline.frames.items():
+        if before.get(place, count) != count:
+            lines.append(f"  frames: {place}: {before[place]} to {count}")
     lines += [f"  gone: {place}" for place in gone]
     lines += [f"  unavailable: {place}: {reason}" for place, reason in baseline.unavailable.items()]
     data = {"baseline": path, "values": len(baseline.values), "gone": [str(place) for place in gone]}

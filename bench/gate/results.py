@@ -53,6 +53,7 @@ class ProtocolIdentity:
 class Results:
     """What was measured, and of what it lacks a number, with the reason.
 
+    ``frames`` tells how many frames of each seed a number is the mean of; 1 for a number of the avatar.
     ``unavailable`` numbers are those that no seed could have: an avatar that offers no stage times, a metric whose
     weights are not installed. ``problems`` are all others.
     """
@@ -62,6 +63,7 @@ class Results:
     problems: Mapping[Place, str]
     metrics: Mapping[str, MetricSpec]
     protocols: Mapping[str, ProtocolIdentity]
+    frames: Mapping[Place, int]
     environment: Mapping[str, Any] = field(default_factory=dict)
     unavailable: Mapping[Place, str] = field(default_factory=dict)
 
@@ -86,6 +88,7 @@ def read_results(root: Path) -> Results:
     seeds = set(manifest.configuration.seeds)
     rows.check_protocols(folder.rows, {task: identity.hash for task, identity in protocols.items()})
     values: dict[Place, float] = {}
+    frames: dict[Place, int] = {}
     problems: dict[Place, str] = {}
     unavailable: dict[Place, str] = {}
     columns = ["task", "method", "subject", "region", "metric"]
@@ -101,8 +104,9 @@ def read_results(root: Path) -> Results:
             problems[place] = reason
         else:
             values[place] = _mean(own)
+            frames[place] = len(own) // len(seeds)
     environment = {"device": manifest.configuration.device, **manifest.machine}
-    return Results(root, values, problems, metrics, protocols, environment, unavailable)
+    return Results(root, values, problems, metrics, protocols, frames, environment, unavailable)
 
 
 def _lacking(own: pd.DataFrame, frames: int, seeds: set[int]) -> str:

@@ -69,6 +69,9 @@ def judge(results: Results, baseline: Baseline) -> list[Verdict]:
                 results.problems.get(place) or results.unavailable.get(place) or "no rows; was it measured?"
             )
             verdicts.append(Verdict(place, "missing", None, expected, tolerance, reason))
+        elif results.frames[place] < baseline.frames[place]:
+            reason = f"{results.frames[place]} frames, {baseline.frames[place]} in the baseline"
+            verdicts.append(Verdict(place, "missing", None, expected, tolerance, reason))
         elif tolerance.machine_bound and not same_machine:
             reason = "measured on another machine"
             verdicts.append(Verdict(place, "unjudged", found, expected, tolerance, reason))

@@ -135,6 +135,30 @@ def test_rows_with_holes_give_no_number(run, baseline, spoil, why, capsys):
     assert gate(run, baseline, "--update") == 3  # a baseline with holes would hide them
 
 
+def test_a_region_of_fewer_frames_is_code_3(run, tmp_path, capsys):
+    """Which frames a region is seen in is not in the protocol: only the baseline tells how many there were."""
+    folder, path = RunFolder(run), tmp_path / "baseline.json"
+    rows = pd.read_parquet(folder.rows)
+    rows = pd.concat([rows, rows[rows["task"] != ""].assign(region="face")])
+    Rows(rows).write(folder.rows)
+    assert gate(run, path, "--update") == 0
+    place = "novel_view/toy/subject2/face/psnr"
+    frames = read_json(path)["frames"]
+    assert (frames[place], frames["avatar/toy/subject2/full/files"]) == (3, 1)
+    assert gate(run, path) == 0
+    dropped = (rows["region"] == "face") & (rows["subject"] == "subject2") & (rows["timestep"] == 1)
+    Rows(rows[~dropped]).write(folder.rows)
+    capsys.readouterr()
+    assert gate(run, path) == 3
+    told = capsys.readouterr().out
+    assert "psnr (face) of toy, subject subject2, novel_view: missing: 2 frames, 3 in the baseline" in told
+    assert "1 missing, 9 pass" in told
+    assert gate(run, path, "--update") == 0
+    assert f"frames: {place}: 3 to 2" in capsys.readouterr().out
+    Rows(rows).write(folder.rows)
+    assert gate(run, path) == 0
+
+
 def test_another_protocol_is_code_3_not_a_comparison(run, baseline, config, capsys):
     runner.run(dataclasses.replace(config, frames_per_task=1))
     assert gate(run, baseline) == 3
@@ -201,6 +225,7 @@ def test_a_number_unavailable_in_the_baseline_too_is_no_loss(run, tmp_path, caps
 def test_a_new_number_is_told_and_passes(run, baseline, capsys):
     record = read_json(baseline)
     record["values"] = {k: v for k, v in record["values"].items() if "/subject1/" in k}
+    record["frames"] = {k: v for k, v in record["frames"].items() if "/subject1/" in k}
     record["count"] = len(record["values"])
     write_json(baseline, record)
     assert gate(run, baseline) == 0
@@ -241,6 +266,7 @@ def test_results_that_are_none_are_code_3_and_leave_no_stale_report(run, baselin
 def more(record, key, value=1.0):
     """Add a number to a baseline."""
     record["values"][key] = value
+    record["frames"][key] = 1
     record["count"] += 1
 
 
@@ -253,7 +279,9 @@ def more(record, key, value=1.0):
         (lambda r: r.update(values={}), "as many as count says, 6"),
         (lambda r: r["values"].popitem(), "as many as count says, 6"),
         (lambda r: r.pop("count"), "count"),
-        (lambda r: r.update(format=1), "Format 1 lacked"),
+        (lambda r: r.update(format=2), 'Formats 1 and 2 lack "frames"'),
+        (lambda r: r["frames"].popitem(), "a number from 1 for each of values"),
+        (lambda r: r["frames"].update({"novel_view/toy/subject1/full/psnr": 0}), "a number from 1"),
         (lambda r: r.update(protocols={}), "protocols: expected an entry 'novel_view'"),
         (lambda r: r["tolerances"]["psnr"].update(digits=10**9), "from 0 to"),
         (lambda r: more(r, "a/b"), "task/method/subject/region/metric"),
@@ -279,7 +307,7 @@ def test_a_key_that_stands_twice_in_a_baseline_is_code_3(run, baseline, remeasur
     assert gate(run, baseline) == 1
     key = '"self_reenactment/toy/subject2/full/psnr"'
     baseline.write_text(baseline.read_text().replace("\n }\n}", f",\n  {key}: 0.0\n }}\n}}"))
-    assert baseline.read_text().count(key) == 2
+    assert baseline.read_text().count(key) == 3  # once among the frames
     assert gate(run, baseline) == 3
     assert "each key once" in capsys.readouterr().out
 

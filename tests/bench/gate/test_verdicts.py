@@ -22,8 +22,8 @@ PLACE = Place("t", "a", "s", "full", "m")
 
 
 def verdict_of(found, expected, tolerance, place=PLACE):
-    results = Results(Path("r"), {place: found}, {}, {"m": SPEC}, {})
-    return judge(results, Baseline("same", {}, {}, {"m": tolerance}, {place: expected}))[0]
+    results = Results(Path("r"), {place: found}, {}, {"m": SPEC}, {}, {place: 1})
+    return judge(results, Baseline("same", {}, {}, {"m": tolerance}, {place: expected}, {place: 1}))[0]
 
 
 @given(numbers, numbers, sizes, st.floats(0, 1), st.booleans())
@@ -67,9 +67,9 @@ def test_default_tolerances_are_ten_of_the_last_digit_shown_and_a_share_for_spee
 
 
 def test_a_number_without_rows_is_missing_with_the_reason():
-    baseline = Baseline("same", {}, {}, {"m": Tolerance(True, 0.1)}, {PLACE: 1.0})
-    nothing = Results(Path("r"), {}, {}, {"m": SPEC}, {})
-    failed = Results(Path("r"), {}, {PLACE: "failed: why"}, {"m": SPEC}, {})
+    baseline = Baseline("same", {}, {}, {"m": Tolerance(True, 0.1)}, {PLACE: 1.0}, {PLACE: 1})
+    nothing = Results(Path("r"), {}, {}, {"m": SPEC}, {}, {})
+    failed = Results(Path("r"), {}, {PLACE: "failed: why"}, {"m": SPEC}, {}, {})
     assert judge(nothing, baseline)[0].outcome == "missing"
     assert judge(failed, baseline)[0].reason == "failed: why"
 
