@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING as _TYPE_CHECKING
 from typing import Any as _Any
 
 if _TYPE_CHECKING:
-    from .bench.adaptation import AdaptedClip, MethodNeeds
     from .bench.conformance.methods import check_method
     from .bench.conformance.metrics import check_metric
     from .bench.conformance.readers import check_clip, check_reader
@@ -38,7 +37,8 @@ if _TYPE_CHECKING:
         Variant,
     )
     from .bench.errors import HeadbenchError, InputError, UnavailableError
-    from .bench.run_config import resolve_method
+    from .bench.runner.adaptation import AdaptedClip, MethodNeeds
+    from .bench.runner.config import resolve_method
     from .bench.specs import (
         BenchmarkSpec,
         CommandSpec,
@@ -96,12 +96,12 @@ __all__ = [
 ]
 
 _HOMES = {
-    "adaptation": ("AdaptedClip", "MethodNeeds"),
+    "runner.adaptation": ("AdaptedClip", "MethodNeeds"),
     "conformance.methods": ("check_method",),
     "conformance.metrics": ("check_metric",),
     "conformance.readers": ("check_clip", "check_reader"),
     "errors": ("HeadbenchError", "InputError", "UnavailableError"),
-    "run_config": ("resolve_method",),
+    "runner.config": ("resolve_method",),
     "specs": tuple(name for name in __all__ if name.endswith("Spec")) + ("Findings", "ResolutionRule"),
 }
 _HOME = {name: module for module, names in _HOMES.items() for name in names}

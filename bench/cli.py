@@ -20,18 +20,18 @@ import tyro
 
 from .commands import check_known, exit_code, offered_commands, prepare_streams, show, with_groups
 from .configuration import build, merge, parse_assignments
-from .demo import DemoConfig, demo_run_config, parse_size
 from .device import check_device
-from .documents import read_yaml
 from .errors import EXIT_CODES, ExitCode, HeadbenchError, InputError, Interruption
-from .files import check_writable, plain, write_json
-from .lock import locked
+from .io.documents import read_yaml
+from .io.files import check_writable, plain, write_json
+from .io.lock import locked
 from .progress import log_to, progress
 from .registry import Group, discover, get, resolve
-from .run_config import RunConfig, resolve_methods, resolve_metrics
-from .runner import run as run_comparison
+from .runner.config import RunConfig, resolve_methods, resolve_metrics
+from .runner.demo import DemoConfig, demo_run_config, parse_size
+from .runner.run import run as run_comparison
+from .runner.store import RunFolder
 from .specs import Findings
-from .store import RunFolder
 
 Preset = Literal["smoke", "demo", "fast", "paper"]
 Text = Annotated[str | None, tyro.conf.arg(metavar="TEXT")]

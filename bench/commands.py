@@ -16,8 +16,8 @@ from typing import Annotated, Any, Union
 import tyro
 
 from .errors import ExitCode, HeadbenchError, InputError
-from .files import plain
-from .lock import locked
+from .io.files import plain
+from .io.lock import locked
 from .progress import log_to, progress
 from .registry import discover, resolve
 from .specs import CommandSpec, Findings

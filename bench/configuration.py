@@ -11,8 +11,8 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from .documents import parse_setting, shown
 from .errors import InputError
+from .io.documents import parse_setting, shown
 from .registry import unknown
 
 T = TypeVar("T")

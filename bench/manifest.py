@@ -10,11 +10,11 @@ from typing import Any, Literal
 from typing_extensions import TypedDict
 
 from .contracts import FrameKey
-from .documents import checked, read_json, shown
 from .errors import InputError
-from .files import check_name, digest, write_json
+from .io.documents import checked, read_json, shown
+from .io.files import check_name, digest, write_json
 from .protocol import Protocol
-from .run_config import RunConfig
+from .runner.config import RunConfig
 from .specs import LABEL, MetricSpec, is_label
 
 Derived = TypedDict("Derived", {"from": str, "variant": str, "change": str})

@@ -15,7 +15,7 @@ from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from .contracts import Progress
-from .files import no_link
+from .io.files import no_link
 
 LOG_EVERY_S, SHOW_EVERY_S = 15.0, 0.2
 """Seconds between lines of a log, and between changes of the line on a terminal."""

@@ -12,7 +12,7 @@ from typing import Literal
 
 from .contracts import Clip, FrameKey, TaskName
 from .errors import InputError
-from .files import digest
+from .io.files import digest
 
 TASK_TITLES: Mapping[str, str] = {
     "novel_view": "Novel view",

@@ -15,8 +15,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from .errors import InputError, shortened
-from .files import atomic_path
-from .parquet_footer import SNAPPY, UNCOMPRESSED, column_codecs
+from .io.files import atomic_path
+from .io.parquet_footer import SNAPPY, UNCOMPRESSED, column_codecs
 from .specs import LABEL, is_label
 
 FRAME = ["subject", "sequence", "timestep", "camera"]

@@ -12,8 +12,8 @@ import numpy as np
 
 from ..bench.contracts import BoolArray, ByteArray, Camera, FloatArray, FrameKey, HeadPose, StepRecord
 from ..bench.errors import InputError
-from ..bench.files import digest
-from ..bench.frames import quantise
+from ..bench.io.files import digest
+from ..bench.io.frames import quantise
 from .head.arrays import HeadArrays
 from .images import ImageStore, read_image, read_mask
 from .region_masks import FOREGROUND, HeadRegions, select

@@ -13,8 +13,8 @@ EXPORT_COLMAP = CommandSpec(
 STEPS = CommandSpec(
     name="steps",
     summary="Draw the jaw bases and expression classes that a capture's training frames give, and their numbers.",
-    implementation="headbench.datasets.step_pictures.command:run",
-    settings="headbench.datasets.step_pictures.settings:StepsSettings",
+    implementation="headbench.datasets.steps.pictures.command:run",
+    settings="headbench.datasets.steps.pictures.settings:StepsSettings",
     writes="out",
 )
 
@@ -28,8 +28,8 @@ LINT = CommandSpec(
 INSPECT = CommandSpec(
     name="inspect",
     summary="Draw what a capture holds: camera rig, splits, tracked mesh on images, motion by sequence.",
-    implementation="headbench.datasets.inspection.command:run",
-    settings="headbench.datasets.inspection.settings:InspectSettings",
+    implementation="headbench.datasets.inspect.command:run",
+    settings="headbench.datasets.inspect.settings:InspectSettings",
     writes="out",
 )
 
@@ -51,15 +51,15 @@ RECORD_NERSEMBLE = CommandSpec(
 REFIT = CommandSpec(
     name="refit",
     summary="Carry a capture's tracking over to another head model; residuals in millimetres, a heat map.",
-    implementation="headbench.datasets.refit.command:run",
-    settings="headbench.datasets.refit.settings:RefitCommandSettings",
+    implementation="headbench.datasets.head.refit.command:run",
+    settings="headbench.datasets.head.refit.settings:RefitCommandSettings",
     writes="out",
 )
 
 TONGUE = CommandSpec(
     name="tongue",
     summary="Find the frames that show the tongue; scores, reasons, your overrides, and a contact sheet to review.",
-    implementation="headbench.datasets.tongue.command:run",
-    settings="headbench.datasets.tongue.settings:TongueSettings",
+    implementation="headbench.datasets.steps.tongue.command:run",
+    settings="headbench.datasets.steps.tongue.settings:TongueSettings",
     writes="out",
 )

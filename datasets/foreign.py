@@ -9,7 +9,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from .ga_layout import ALL_FRAMES_FILE, SPLIT_FILES
+from .ga.layout import ALL_FRAMES_FILE, SPLIT_FILES
 from .nersemble.names import is_subject
 
 VIDEOS = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".webm")

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..bench.contracts import ByteArray
 from ..bench.errors import InputError
-from ..bench.image_files import read_pixels
+from ..bench.io.images import read_pixels
 
 _ROWS = 64
 

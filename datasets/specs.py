@@ -5,8 +5,8 @@ from ..bench.specs import DatasetSpec
 GA_LAYOUT = DatasetSpec(
     name="ga",
     summary="A capture in the GaussianAvatars/VHAP layout: a UNION folder or a single sequence.",
-    implementation="headbench.datasets.ga_reader:read_capture",
-    find="headbench.datasets.ga_reader:find_captures",
+    implementation="headbench.datasets.ga.reader:read_capture",
+    find="headbench.datasets.ga.reader:find_captures",
     adapt="headbench.datasets.steps.for_method:clip_for_method",
 )
 

@@ -22,7 +22,7 @@ from torch.nn import functional
 
 from ..bench.contracts import ByteArray, FloatArray
 from ..bench.errors import InputError, UnavailableError
-from ..bench.files import digest
+from ..bench.io.files import digest
 from .pairs import check_pair
 from .weights import find_backbone, load_backbone, load_linear, network_spec
 

@@ -18,10 +18,10 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from ..bench.arrays import MAX_DIMENSIONS, check_numbers
 from ..bench.errors import InputError
-from ..bench.files import open_regular
-from ..bench.unpickle import ClosedUnpickler, Function, Malformed, Refused
+from ..bench.io.arrays import MAX_DIMENSIONS, check_numbers
+from ..bench.io.files import open_regular
+from ..bench.io.unpickle import ClosedUnpickler, Function, Malformed, Refused
 
 EXPECTED = "a PyTorch file of weights"
 MAGIC, PROTOCOL = 0x1950A86A20F9469CFC6C, 1001

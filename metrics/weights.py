@@ -27,7 +27,7 @@ import torch
 from torch import Tensor
 
 from ..bench.errors import InputError, UnavailableError
-from ..bench.files import atomic_path, cache_folder
+from ..bench.io.files import atomic_path, cache_folder
 from .networks import NETWORKS, NetworkSpec
 from .torch_file import read_weights
 

@@ -6,21 +6,21 @@ EXTREMES = CommandSpec(
     name="extremes",
     summary="Try a run's avatars on views and expressions beyond those of training: limits held or not, contact sheet.",
     implementation="headbench.reports.robustness.extremes_command:run",
-    settings="headbench.bench.robustness.settings:ExtremesSettings",
+    settings="headbench.reports.robustness.settings:ExtremesSettings",
 )
 
 REENACT = CommandSpec(
     name="reenact",
     summary="Drive a run's avatars with another subject's expressions: limits held or not, frames, contact sheet.",
     implementation="headbench.reports.robustness.reenact_command:run",
-    settings="headbench.bench.robustness.settings:ReenactSettings",
+    settings="headbench.reports.robustness.settings:ReenactSettings",
 )
 
 SWEEP = CommandSpec(
     name="sweep",
     summary="Derive smaller and faster avatars from a run's without training: quality against size and frame time.",
     implementation="headbench.reports.pareto.sweep_command:run",
-    settings="headbench.bench.sweep.settings:SweepSettings",
+    settings="headbench.reports.pareto.settings:SweepSettings",
 )
 
 PARETO = CommandSpec(

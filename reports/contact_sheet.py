@@ -12,7 +12,7 @@ from PIL import Image
 
 from ..bench.contracts import ByteArray, FloatArray
 from ..bench.errors import InputError
-from ..bench.files import atomic_path
+from ..bench.io.files import atomic_path
 from .drawing import INK, MUTED, Pen, colour_map, wrap
 
 Picture = ByteArray | Callable[[], ByteArray]

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from ..bench.configuration import build
-from ..bench.documents import read_json
 from ..bench.errors import InputError
+from ..bench.io.documents import read_json
 from ..bench.manifest import MethodRecord
 from .csv_table import column_name
 from .table_model import Table, TableCell

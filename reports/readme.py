@@ -12,11 +12,11 @@ from pathlib import Path
 import cv2
 
 from ..bench.errors import InputError
-from ..bench.files import atomic_path, write_text
-from ..bench.frames import read_png
+from ..bench.io.files import atomic_path, write_text
+from ..bench.io.frames import read_png
 from ..bench.rows import ALL, Rows
-from ..bench.scoring import FULL
-from ..bench.store import RunFolder
+from ..bench.runner.scoring import FULL
+from ..bench.runner.store import RunFolder
 from .table_report import table_text
 
 BEGIN, END = "<!-- demo:begin -->", "<!-- demo:end -->"

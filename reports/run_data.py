@@ -8,17 +8,17 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from ..bench.captures import open_run_clips
 from ..bench.contracts import ByteArray, Clip, FrameKey
 from ..bench.errors import InputError
-from ..bench.frames import read_png
-from ..bench.image_files import probe_image
+from ..bench.io.frames import read_png
+from ..bench.io.images import probe_image
 from ..bench.manifest import Derived, Manifest
 from ..bench.rows import ALL, Rows
-from ..bench.run_options import RunOptions
-from ..bench.scoring import FULL
+from ..bench.runner.captures import open_run_clips
+from ..bench.runner.options import RunOptions
+from ..bench.runner.scoring import FULL
+from ..bench.runner.store import RunFolder
 from ..bench.specs import MetricSpec
-from ..bench.store import RunFolder
 
 
 @dataclass(frozen=True)

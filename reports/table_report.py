@@ -8,7 +8,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from ..bench.errors import InputError
-from ..bench.files import grouped_writes, write_text
+from ..bench.io.files import grouped_writes, write_text
 from .csv_table import to_csv
 from .html_table import to_html
 from .latex import to_latex

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from ..bench.protocol import TASK_TITLES
 from ..bench.rows import ALL, Rows
-from ..bench.scoring import FULL
+from ..bench.runner.scoring import FULL
 from ..bench.specs import MetricSpec
 from .aggregate import Aggregate, summarise
 from .ranking import best_of_column, marking, ranked

@@ -7,11 +7,11 @@ from types import ModuleType
 import pandas as pd
 import pytest
 
-from headbench.bench import runner
-from headbench.bench.frames import read_png
-from headbench.bench.run_config import RunConfig
+from headbench.bench.io.frames import read_png
+from headbench.bench.runner import run as runner
+from headbench.bench.runner.config import RunConfig
+from headbench.bench.runner.store import RunFolder
 from headbench.bench.specs import ResolutionRule
-from headbench.bench.store import RunFolder
 from headbench.methods.specs import MEAN_IMAGE
 
 from .datasets.tiny_capture import write_tiny_capture

@@ -18,10 +18,10 @@ import pandas as pd
 import pytest
 
 from headbench.bench import cli
-from headbench.bench.documents import read_json
+from headbench.bench.io.documents import read_json
 from headbench.bench.registry import SPEC_TYPES, discover
-from headbench.bench.run_config import RunConfig, resolve_metrics
-from headbench.bench.store import RunFolder
+from headbench.bench.runner.config import RunConfig, resolve_metrics
+from headbench.bench.runner.store import RunFolder
 
 TINY = ("--preset", "smoke", "--set", "frames_per_task=3")
 METHODS = {"mean-image", "nearest-camera", "ga", "gbs", "gha", "insta", "ours"}

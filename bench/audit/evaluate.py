@@ -7,21 +7,21 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from ..captures import open_clips, open_run_clips
 from ..contracts import Avatar, Budget, Camera, Clip, Frame, FrameKey, HeadPose, Progress, no_progress
 from ..errors import HeadbenchError, InputError
-from ..files import atomic_path, check_name, digest, digest_file, grouped_writes
-from ..lock import locked
+from ..io.files import atomic_path, check_name, digest, digest_file, grouped_writes
+from ..io.lock import locked
 from ..protocol import Protocol, make_protocol
 from ..registry import discover, get, resolve
 from ..rows import Rows
-from ..run_config import ResolvedMethod, RunConfig, resolve_metrics
-from ..run_options import RunOptions
-from ..runner import describe, make_jobs, write_reports
-from ..scoring import check_regions
+from ..runner.captures import open_clips, open_run_clips
+from ..runner.config import ResolvedMethod, RunConfig, resolve_metrics
+from ..runner.options import RunOptions
+from ..runner.run import describe, make_jobs, write_reports
+from ..runner.scoring import check_regions
+from ..runner.stages import DIGESTS, Job, measure
+from ..runner.store import RunFolder
 from ..specs import Findings, MethodSpec
-from ..stages import DIGESTS, Job, measure
-from ..store import RunFolder
 from .folder_images import find_images
 from .settings import EvaluateSettings
 

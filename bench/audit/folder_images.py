@@ -9,9 +9,9 @@ from PIL import Image, UnidentifiedImageError
 
 from ..contracts import Clip, FrameKey
 from ..errors import InputError
-from ..image_files import probe_image
+from ..io.images import probe_image
 from ..protocol import Protocol
-from ..store import Cell
+from ..runner.store import Cell
 
 SHOWN = 3
 

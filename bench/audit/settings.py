@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import tyro
 
 from ..contracts import TaskName
-from ..run_options import RunOptions
+from ..runner.options import RunOptions
 
 
 @dataclass(frozen=True)

@@ -10,21 +10,21 @@ from typing import Any
 
 import pandas as pd
 
-from ..captures import open_run_clips
 from ..contracts import Avatar, Clip, FrameKey, Progress, no_progress
 from ..errors import ExitCode, HeadbenchError, InputError
-from ..files import digest_file
-from ..frames import read_png
+from ..io.files import digest_file
+from ..io.frames import read_png
 from ..manifest import Manifest, ProtocolRecord
 from ..protocol import Protocol, make_protocol
-from ..robustness.avatars import load
 from ..rows import ALL, FRAME, Rows
-from ..run_config import ResolvedMethod, RunConfig, resolve_methods, resolve_metrics
-from ..runner import adapt, make_jobs
-from ..scoring import check_regions
+from ..runner.avatars import load
+from ..runner.captures import open_run_clips
+from ..runner.config import ResolvedMethod, RunConfig, resolve_methods, resolve_metrics
+from ..runner.run import adapt, make_jobs
+from ..runner.scoring import check_regions
+from ..runner.stages import DIGESTS, Job, measure, recorded_frames
+from ..runner.store import Cell, RunFolder
 from ..specs import Findings, MetricSpec
-from ..stages import DIGESTS, Job, measure, recorded_frames
-from ..store import Cell, RunFolder
 from .evaluate import NoAvatar, images_method
 from .settings import VerifySettings
 

@@ -6,15 +6,15 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from ..adaptation import MethodNeeds, carry_out, plan
-from ..captures import open_clips
 from ..configuration import parse_assignments
 from ..contracts import Clip, Progress, no_progress
-from ..demo import DemoConfig
 from ..device import check_device
 from ..errors import InputError
 from ..registry import SPEC_TYPES, Group, discover, get, resolve
-from ..run_config import ResolvedMethod, RunConfig, resolve_method
+from ..runner.adaptation import MethodNeeds, carry_out, plan
+from ..runner.captures import open_clips
+from ..runner.config import ResolvedMethod, RunConfig, resolve_method
+from ..runner.demo import DemoConfig
 from ..specs import DatasetSpec, Findings, MethodSpec, MetricSpec
 from .attempts import attempt
 from .methods import check_method

@@ -10,9 +10,9 @@ import numpy as np
 
 from ..contracts import Avatar, Clip, Frame, HeadPose, no_progress
 from ..errors import InputError
-from ..files import digest_file
-from ..run_config import ResolvedMethod
-from ..training_view import TrainingView
+from ..io.files import digest_file
+from ..runner.config import ResolvedMethod
+from ..runner.training_view import TrainingView
 
 
 def check_method(method: ResolvedMethod, clip: Clip, out: Path, *, device: str = "cpu") -> list[str]:

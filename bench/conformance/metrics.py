@@ -14,8 +14,8 @@ import numpy as np
 
 from ..contracts import ByteArray, Camera, Frame, HeadPose, Measurement
 from ..errors import UnavailableError
-from ..files import check_name
-from ..scoring import make_metric
+from ..io.files import check_name
+from ..runner.scoring import make_metric
 from ..specs import MetricSpec
 from .attempts import attempt, refusal
 

@@ -14,7 +14,7 @@ import numpy as np
 from ..configuration import build_arguments
 from ..contracts import Camera, Clip, FrameKey, HeadAsset, HeadPose, TaskName
 from ..errors import InputError
-from ..files import check_name, plain
+from ..io.files import check_name, plain
 from ..registry import resolve
 from ..specs import DatasetSpec
 from .attempts import attempt, refusal

@@ -8,9 +8,9 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from ..documents import checked, read_json, shown
 from ..errors import InputError
-from ..files import check_name, write_json
+from ..io.documents import checked, read_json, shown
+from ..io.files import check_name, write_json
 from ..specs import MAX_DIGITS, MetricSpec
 from .results import AVATAR, Place, ProtocolIdentity, Results
 from .settings import Captures

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ..contracts import Progress, no_progress
 from ..errors import ExitCode, InputError
-from ..files import check_writable, write_text
+from ..io.files import check_writable, write_text
 from ..specs import Findings
 from .baseline import Baseline
 from .results import read_results

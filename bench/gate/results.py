@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import pandas as pd
 
 from ..rows import ALL, FRAME
-from ..scoring import FULL
+from ..runner.scoring import FULL
+from ..runner.store import RunFolder
 from ..specs import MetricSpec
-from ..store import RunFolder
 
 AVATAR = "avatar"
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from ..errors import ExitCode
-from ..scoring import FULL
+from ..runner.scoring import FULL
 from .baseline import Baseline, Tolerance
 from .results import Place, Results
 

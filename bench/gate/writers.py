@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Sequence
 from xml.etree import ElementTree
 
-from ..scoring import FULL
+from ..runner.scoring import FULL
 from .verdicts import ORDER, Verdict
 
 SHOWN = 20

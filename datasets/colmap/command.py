@@ -7,7 +7,7 @@ from pathlib import Path
 from ...bench.contracts import Progress
 from ...bench.errors import InputError
 from ...bench.specs import Findings
-from ..ga_reader import read_capture
+from ..ga.reader import read_capture
 from .settings import ExportColmapSettings
 from .writer import export_model
 

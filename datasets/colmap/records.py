@@ -14,7 +14,7 @@ import numpy as np
 import pycolmap as pycolmap  # noqa: PLC0414 - the writer imports it from here
 
 from ...bench.errors import InputError
-from ...bench.files import check_name
+from ...bench.io.files import check_name
 
 # Its import replaces the handler of SIGTERM by one that prints a stack, behind the interpreter's back.
 if threading.current_thread() is threading.main_thread():

@@ -17,7 +17,7 @@ import torch
 
 from ...bench.contracts import ByteArray, Camera, Clip, FloatArray, FrameKey, Progress, no_progress
 from ...bench.errors import InputError
-from ...bench.files import atomic_path, grouped_writes
+from ...bench.io.files import atomic_path, grouped_writes
 from ..head.model import HeadModel
 from ..mesh_pictures import rasterize_mesh
 from .records import pycolmap

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ...bench.arrays import MAX_MAGNITUDE, TEXT, Member, check_arrays, read_arrays
 from ...bench.contracts import FloatArray, IntArray
 from ...bench.errors import InputError
-from ...bench.files import atomic_path, digest
+from ...bench.io.arrays import MAX_MAGNITUDE, TEXT, Member, check_arrays, read_arrays
+from ...bench.io.files import atomic_path, digest
 
 JOINT_NAMES = ("root", "neck", "jaw", "left_eye", "right_eye")
 """Joint order of the layout; every pose argument of the model refers to it."""

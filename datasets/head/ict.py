@@ -16,9 +16,9 @@ from os import PathLike
 
 import numpy as np
 
-from ...bench.arrays import MAX_MAGNITUDE, Member, check_arrays
 from ...bench.contracts import FloatArray, IntArray
 from ...bench.errors import InputError
+from ...bench.io.arrays import MAX_MAGNITUDE, Member, check_arrays
 from ..rounding import LENGTH_BITS, REGRESSOR_BITS, SHARE_BITS, on_grid
 from .arrays import HeadArrays
 from .ict_regions import MeshParts, Profile, landmark_names, mesh_parts, regions_of

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from ...bench.arrays import MAX_MAGNITUDE, Member, check_arrays, read_npy, read_npz
 from ...bench.contracts import IntArray
-from ...bench.documents import read_json
 from ...bench.errors import InputError
+from ...bench.io.arrays import MAX_MAGNITUDE, Member, check_arrays, read_npy, read_npz
+from ...bench.io.documents import read_json
 from .arrays import RING_REGIONS, HeadArrays, read_head
 from .ict import ict_head, is_ict
 from .regions import with_derived_regions

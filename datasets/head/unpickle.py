@@ -19,8 +19,8 @@ from typing import Any, Literal, Self, cast
 import numpy as np
 
 from ...bench.errors import InputError
-from ...bench.files import read_bytes
-from ...bench.unpickle import ClosedUnpickler, Function, Malformed, Refused
+from ...bench.io.files import read_bytes
+from ...bench.io.unpickle import ClosedUnpickler, Function, Malformed, Refused
 
 MAX_DENSE_ELEMENTS = 5_000_000
 """Of all sparse matrices of a file together: a few bytes can declare any shape. A joint regressor has 25,000."""

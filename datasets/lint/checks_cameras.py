@@ -10,11 +10,11 @@ from itertools import combinations
 import numpy as np
 
 from ...bench.contracts import Camera, FloatArray
-from .. import ga_layout as layout
-from ..capture_cameras import FOCAL_TOLERANCE, ROTATION_TOLERANCE
+from ..ga import layout
+from ..ga.cameras import FOCAL_TOLERANCE, ROTATION_TOLERANCE
+from ..ga.principal_point import View, weigh_cy
+from ..ga.transforms import FrameEntry
 from ..images import read_mask
-from ..principal_point import View, weigh_cy
-from ..transforms import FrameEntry
 from .checks_images import sound_mask
 from .evidence import Evidence, by_camera
 from .rules import Hit, Rule, several, some

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 from itertools import pairwise
 
 from ...bench.errors import InputError
-from .. import ga_layout as layout
+from ..ga import layout
 from .evidence import Evidence, Slot
 from .rules import Hit, Rule, several, some, spans
 

@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Iterator
 from itertools import combinations
 
-from ..transforms import FrameEntry
+from ..ga.transforms import FrameEntry
 from .checks_images import unit_range
 from .evidence import Evidence
 from .rules import Hit, Rule, several, some, spans

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ...bench.errors import InputError
-from .. import ga_layout as layout
+from ..ga import layout
 from .checks_cameras import misplaced
 from .checks_mesh import mesh_misses
 from .evidence import Evidence

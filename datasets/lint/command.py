@@ -11,7 +11,7 @@ from typing import Any
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.specs import Findings
-from ..ga_reader import find_capture
+from ..ga.reader import find_capture
 from .catalogue import GROUPS, RULES
 from .evidence import Evidence, gather
 from .rules import SEVERITIES, Finding, apply, several

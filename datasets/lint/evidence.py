@@ -13,16 +13,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ...bench.contracts import Progress, no_progress
-from ...bench.documents import read_json
 from ...bench.errors import InputError
-from ...bench.image_files import ImageInfo, probe_image
-from .. import ga_layout as layout
-from ..capture_head import find_head
-from ..content_digests import content_digests
-from ..ga_reader import read_capture
+from ...bench.io.documents import read_json
+from ...bench.io.images import ImageInfo, probe_image
+from ..ga import layout
+from ..ga.content_digests import content_digests
+from ..ga.head import find_head
+from ..ga.reader import read_capture
+from ..ga.splits import sequence_names
+from ..ga.transforms import FrameEntry, parse_frame
 from ..head.arrays import HeadArrays
-from ..splits import sequence_names
-from ..transforms import FrameEntry, parse_frame
 from .expression_fit import ExpressionFit, weigh_expression
 from .parameters import Parameters, Subject, read_parameters
 from .settings import LintSettings

@@ -20,11 +20,11 @@ import numpy as np
 
 from ...bench.contracts import ByteArray, Camera, FloatArray
 from ...bench.errors import InputError
-from ...bench.image_files import ImageInfo
-from ..ga_layout import CyConvention
+from ...bench.io.images import ImageInfo
+from ..ga.layout import CyConvention
+from ..ga.transforms import FrameEntry
 from ..images import read_image
 from ..mesh_pictures import vertex_normals
-from ..transforms import FrameEntry
 from .parameters import Parameters, Subject
 from .views import ViewFacts, entry_camera
 

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ...bench.arrays import read_npz
 from ...bench.contracts import FloatArray, HeadPose, Progress, no_progress
 from ...bench.errors import InputError
-from ..flame_parameters import Tracking, read_tracking
+from ...bench.io.arrays import read_npz
+from ..ga.flame_parameters import Tracking, read_tracking
+from ..ga.transforms import FrameEntry
 from ..head.arrays import HeadArrays
 from ..head.model import HeadModel
-from ..transforms import FrameEntry
 
 OFFSETS = ("static_offset", "dynamic_offset")
 """Arrays with a row per vertex; too large to keep for every timestep."""

@@ -15,8 +15,8 @@ import numpy as np
 
 from ...bench.contracts import FloatArray, Progress, no_progress
 from ...bench.errors import InputError
+from ..ga.transforms import FrameEntry
 from ..images import read_image
-from ..transforms import FrameEntry
 
 SIDE = 32
 """Thumbnails are square with this many pixels a side."""

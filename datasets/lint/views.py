@@ -11,10 +11,10 @@ import numpy as np
 
 from ...bench.contracts import ByteArray, Camera, FloatArray, HeadPose, Progress, no_progress
 from ...bench.errors import InputError
-from ...bench.image_files import ImageInfo
-from ..ga_layout import CyConvention, extrinsics_from_json, intrinsics_from_json
+from ...bench.io.images import ImageInfo
+from ..ga.layout import CyConvention, extrinsics_from_json, intrinsics_from_json
+from ..ga.transforms import FrameEntry
 from ..images import read_image, read_mask
-from ..transforms import FrameEntry
 from .mesh_views import MeshFacts, lay_mesh
 from .parameters import Parameters, Subject
 

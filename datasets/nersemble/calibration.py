@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from ...bench.contracts import Camera, FloatArray
-from ...bench.documents import read_json
 from ...bench.errors import InputError
-from ...bench.files import check_name
+from ...bench.io.documents import read_json
+from ...bench.io.files import check_name
 from .names import FULL_SIZE
 
 _RIGID_TOLERANCE = 1e-4

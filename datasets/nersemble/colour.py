@@ -17,9 +17,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...bench.arrays import check_numbers, read_npy
 from ...bench.contracts import ByteArray, FloatArray
 from ...bench.errors import InputError
+from ...bench.io.arrays import check_numbers, read_npy
 from ..srgb import srgb_to_linear
 
 Correction = Callable[[ByteArray], ByteArray]

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 from ...bench.contracts import Camera, FloatArray
-from ...bench.documents import read_json
-from ...bench.files import atomic_path, grouped_writes, write_json, write_text
-from .. import ga_layout as layout
-from ..ga_documents import camera_record, file_record, save_npz, split_of, transforms_document
-from ..ga_writer import TRAIN_FRACTION
-from ..transforms import read_transforms
+from ...bench.io.documents import read_json
+from ...bench.io.files import atomic_path, grouped_writes, write_json, write_text
+from ..ga import layout
+from ..ga.documents import camera_record, file_record, save_npz, split_of, transforms_document
+from ..ga.transforms import read_transforms
+from ..ga.writer import TRAIN_FRACTION
 from .tracking import TrackedSequence
 
 BACKUP_FILE = "transforms_backup.json"

@@ -10,7 +10,7 @@ import cv2
 
 from ...bench.contracts import ByteArray
 from ...bench.errors import InputError
-from ...bench.image_files import read_pixels
+from ...bench.io.images import read_pixels
 from .sequence import View, open_video
 
 

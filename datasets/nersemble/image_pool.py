@@ -16,10 +16,10 @@ from pathlib import Path
 
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
-from ...bench.files import grouped_writes
-from ...bench.image_files import probe_image
+from ...bench.io.files import grouped_writes
+from ...bench.io.images import probe_image
 from ...bench.machine import processor_count
-from ..ga_writer import write_png
+from ..ga.writer import write_png
 from .frames import read_frames
 from .pixels import prepare_pixels, read_still
 from .plan import SequenceJob

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from ...bench.contracts import ByteArray
-from ...bench.image_files import read_pixels
+from ...bench.io.images import read_pixels
 from .colour import Correction
 
 

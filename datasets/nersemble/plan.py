@@ -11,11 +11,11 @@ from typing import Any
 
 from ...bench.contracts import Camera
 from ...bench.errors import InputError
-from ...bench.files import digest
-from .. import ga_layout as layout
+from ...bench.io.files import digest
+from ..ga import layout
 from ..head.arrays import HeadArrays
 from ..head.loaders import load_head
-from ..procedural.model import VERSIONS
+from ..head.procedural.model import VERSIONS
 from .calibration import read_calibration
 from .colour import Correction
 from .export import CY, SequenceExport

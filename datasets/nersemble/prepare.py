@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import Any
 
 from ...bench.contracts import Progress, no_progress
-from ...bench.documents import checked, read_json
 from ...bench.errors import InputError
-from ...bench.files import digest, remove_dead_temporaries, write_json
-from ...bench.lock import locked
-from .. import ga_layout as layout
+from ...bench.io.documents import checked, read_json
+from ...bench.io.files import digest, remove_dead_temporaries, write_json
+from ...bench.io.lock import locked
+from ..ga import layout
 from ..head.arrays import save_head
 from .export import write_union
 from .image_pool import write_images, writing

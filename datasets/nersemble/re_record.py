@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 from ...bench.contracts import ByteArray, Camera, FloatArray, FrameKey, HeadPose, Progress, no_progress
 from ...bench.specs import Findings
 from ..clip import CaptureClip
-from ..full_grid import require_full_grid
-from ..ga_layout import HEAD_FILE
-from ..ga_reader import read_capture
-from ..ga_writer import pose_to_parameters
+from ..ga.full_grid import require_full_grid
+from ..ga.layout import HEAD_FILE
+from ..ga.reader import read_capture
+from ..ga.writer import pose_to_parameters
 from ..head.arrays import save_head
 from .calibration import read_calibration
 from .settings import RecordSettings

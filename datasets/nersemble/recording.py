@@ -19,9 +19,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ...bench.documents import read_json
 from ...bench.errors import InputError
-from ...bench.files import check_name
+from ...bench.io.documents import read_json
+from ...bench.io.files import check_name
 from .colour import Correction, affine_correction, polynomial_correction
 from .names import BACKGROUND, is_subject, match_sequence, serial_of
 

@@ -12,7 +12,7 @@ from typing import Literal
 import cv2
 
 from ...bench.errors import InputError
-from ...bench.image_files import MAX_PIXELS, probe_image
+from ...bench.io.images import MAX_PIXELS, probe_image
 from .calibration import Calibration
 from .mp4 import check_boxes
 from .names import numbered, serial_of

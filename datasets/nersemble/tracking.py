@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ...bench.arrays import MAX_MAGNITUDE, check_numbers, read_npz
 from ...bench.contracts import FloatArray
 from ...bench.errors import InputError
-from ..flame_parameters import resolve_teeth
-from ..ga_layout import parse_sequence_folder
-from ..ga_writer import CANONICAL_JAW
+from ...bench.io.arrays import MAX_MAGNITUDE, check_numbers, read_npz
+from ..ga.flame_parameters import resolve_teeth
+from ..ga.layout import parse_sequence_folder
+from ..ga.writer import CANONICAL_JAW
 from ..head.arrays import HeadArrays
 
 PER_TIMESTEP = {"translation": 3, "rotation": 3, "neck_pose": 3, "jaw_pose": 3, "eyes_pose": 6}

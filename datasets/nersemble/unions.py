@@ -13,9 +13,9 @@ from pathlib import Path
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.specs import Findings
-from .. import ga_layout as layout
-from ..transforms import FrameEntry, read_transforms, timesteps_of
-from ..validate import check_images, check_timesteps
+from ..ga import layout
+from ..ga.transforms import FrameEntry, read_transforms, timesteps_of
+from ..ga.validate import check_images, check_timesteps
 from .export import write_union
 from .names import match_sequence
 from .presets import FRONTAL_INDEX, NOVEL_VIEW_CAMERA, TEST_SEQUENCE, UNION10_SEQUENCES, union10_held_out

@@ -18,8 +18,8 @@ import numpy as np
 
 from ...bench.contracts import ByteArray, Camera, FloatArray
 from ...bench.errors import InputError
-from ...bench.files import atomic_path, write_json, write_text
-from ..ga_documents import save_npz
+from ...bench.io.files import atomic_path, write_json, write_text
+from ..ga.documents import save_npz
 from .names import BACKGROUND, FPS, FULL_SIZE, is_subject
 from .recording import CAMERA_FILE, COLOUR_FILE, SEQUENCES_FILE
 

@@ -7,8 +7,8 @@ from os import PathLike
 from pathlib import Path
 
 from ...bench.contracts import FrameKey
-from ...bench.documents import read_json
 from ...bench.errors import InputError
+from ...bench.io.documents import read_json
 from ..clip import CaptureClip
 from .exclusion_file import read_exclusions
 

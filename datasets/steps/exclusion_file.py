@@ -25,9 +25,9 @@ from typing import Any, Literal
 import yaml
 from pydantic import NonNegativeInt
 
-from ...bench.documents import checked, read_yaml
 from ...bench.errors import InputError
-from ...bench.files import check_name, write_text
+from ...bench.io.documents import checked, read_yaml
+from ...bench.io.files import check_name, write_text
 
 FORMAT = "headbench-exclusions-1"
 KEEP = "keep"

@@ -1,6 +1,6 @@
 """A clip in the form that a method needs: the steps that lead there, in order, and the way back.
 
-Found by the harness through `DatasetSpec.adapt`, see `headbench.bench.adaptation`.
+Found by the harness through `DatasetSpec.adapt`, see `headbench.bench.runner.adaptation`.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
-from ...bench.adaptation import Adaptation, AdaptedClip, MethodNeeds
 from ...bench.contracts import FloatArray, FrameKey, Progress
 from ...bench.errors import InputError
-from ..capture_head import find_head
+from ...bench.runner.adaptation import Adaptation, AdaptedClip, MethodNeeds
 from ..clip import CaptureClip
+from ..ga.head import find_head
 from ..head.arrays import HeadArrays
-from ..procedural.model import VERSIONS, procedural_head
-from ..refit.refit import refit_clip
+from ..head.procedural.model import VERSIONS, procedural_head
+from ..head.refit.refit import refit_clip
 from .monocular import as_single_video
 from .resolution import align_clip, alignments
 

@@ -16,7 +16,7 @@ from scipy.special import ndtr
 
 from ...bench.contracts import Camera, FloatArray, FrameKey, HeadAsset, IntArray
 from ...bench.errors import InputError
-from ...bench.files import digest
+from ...bench.io.files import digest
 from ..clip import CaptureClip, FramePixels
 from ..head.model import HeadModel
 

@@ -19,10 +19,10 @@ import numpy as np
 import torch
 
 from ...bench.contracts import Progress, no_progress
-from ...bench.documents import read_json
 from ...bench.errors import InputError
-from ...bench.files import TEMPORARY, grouped_writes, write_json, write_text
-from ...bench.image_files import probe_image
+from ...bench.io.documents import read_json
+from ...bench.io.files import TEMPORARY, grouped_writes, write_json, write_text
+from ...bench.io.images import probe_image
 from ...bench.machine import processor_count
 from ...bench.start import end_with_parent, starting_workers
 from .geometry import load_geometry

@@ -6,12 +6,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ...bench.arrays import read_npz
 from ...bench.contracts import FloatArray
 from ...bench.errors import InputError
+from ...bench.io.arrays import read_npz
 from ..head.arrays import HeadArrays
 from ..head.ict import expression_names, ict_head, is_ict
-from ..procedural.model import procedural_head
+from ..head.procedural.model import procedural_head
 from .anatomy import Anatomy
 from .controls import EXPRESSION_CONTROLS, Translation
 from .mouth import MouthPart, procedural_parts, tongue

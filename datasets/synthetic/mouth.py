@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...bench.contracts import FloatArray, HeadAsset, IntArray
-from ..procedural.parts import render_parts
+from ..head.procedural.parts import render_parts
 from .anatomy import Anatomy
 from .curves import ramp
 from .noise import value_noise

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 
 from ...bench.contracts import Camera, FloatArray, HeadPose
-from ...bench.files import digest
-from ..ga_writer import CapturePlan, CaptureWriter, SequencePlan
+from ...bench.io.files import digest
+from ..ga.writer import CapturePlan, CaptureWriter, SequencePlan
 from ..head.model import HeadModel
 from ..rounding import COEFFICIENT_BITS, LENGTH_BITS, on_grid
 from . import rig

@@ -8,8 +8,8 @@ import numpy as np
 
 from ...bench.contracts import HeadAsset
 from ...bench.errors import InputError
-from ..procedural.expressions import SEMANTIC_NAMES
-from ..procedural.model import semantic_to_coefficients
+from ..head.procedural.expressions import SEMANTIC_NAMES
+from ..head.procedural.model import semantic_to_coefficients
 from .controls import EXPRESSION_CONTROLS, Translation
 
 # ICT-FaceKit's shapes carry ARKit's names with _L and _R.

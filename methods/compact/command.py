@@ -11,10 +11,10 @@ from typing import Any
 from ...bench.contracts import Clip, HeadAsset, Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.specs import Findings
-from ...datasets.ga_reader import read_capture
-from ..avatar_files import read_shared_head, save_shared_head
-from ..ours_avatar import OursAvatar
-from ..ours_storage import FIELD_FILE, Field
+from ...datasets.ga.reader import read_capture
+from ..ours.avatar import OursAvatar
+from ..ours.storage import FIELD_FILE, Field
+from ..shared.avatar_files import read_shared_head, save_shared_head
 from .container import write_content
 from .file import COMPACT_FILE, encode, exact_sizes, part_sizes
 from .measure import Comparison, Quality, avatar_of

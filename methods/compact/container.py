@@ -19,11 +19,11 @@ from typing import Any
 import numpy as np
 from safetensors.numpy import save
 
-from ...bench.arrays import Member
-from ...bench.documents import parse_json
 from ...bench.errors import InputError
-from ...bench.files import write_bytes
-from ..tensor_files import check_tensors, read_safetensors
+from ...bench.io.arrays import Member
+from ...bench.io.documents import parse_json
+from ...bench.io.files import write_bytes
+from ..shared.tensor_files import check_tensors, read_safetensors
 from .packing import DTYPES, MAX_BYTES, pack, unpack
 
 KEY, VERSION = "compact", 1

@@ -10,10 +10,10 @@ from torch import Tensor
 
 from ...bench.contracts import FloatArray
 from ...bench.errors import InputError
-from ..feature_lines import normalised_weight
-from ..ours_field import Box, plane_features
-from ..sh import C0
-from ..triplane import PAIRS
+from ..ours.feature_lines import normalised_weight
+from ..ours.field import Box, plane_features
+from ..shared.sh import C0
+from ..shared.triplane import PAIRS
 from .coded import Arrays, coded
 from .precision import Precision
 

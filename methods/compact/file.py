@@ -10,10 +10,10 @@ import torch
 
 from ...bench.contracts import HeadAsset
 from ...bench.errors import InputError
-from ..avatar_files import Subject
-from ..ours_field import CanonicalFrames
-from ..ours_storage import SPLAT_WIDTHS, Field, checked_field
-from ..subject_mesh import SubjectMesh
+from ..ours.field import CanonicalFrames
+from ..ours.storage import SPLAT_WIDTHS, Field, checked_field
+from ..shared.avatar_files import Subject
+from ..shared.subject_mesh import SubjectMesh
 from .coded import Arrays, coded
 from .container import Content, packed_sizes, read_content, write_content
 from .fields import MATRICES, PLANES, decode_field, encode_field

@@ -11,10 +11,10 @@ import numpy as np
 import torch
 
 from ...bench.contracts import ByteArray, Camera, Clip, FrameKey, HeadAsset, HeadPose
-from ...bench.frames import quantise
-from ..ours_avatar import OursAvatar
-from ..subject_mesh import SubjectMesh
-from ..training.losses import mean_ssim
+from ...bench.io.frames import quantise
+from ..ours.avatar import OursAvatar
+from ..shared.subject_mesh import SubjectMesh
+from ..shared.training.losses import mean_ssim
 from .container import Content
 from .file import COMPACT_FILE, decode
 

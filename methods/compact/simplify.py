@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from ...bench.contracts import Clip, HeadPose
-from ..ours_avatar import OursAvatar
-from ..ours_storage import SPLAT_WIDTHS, Field
+from ..ours.avatar import OursAvatar
+from ..ours.storage import SPLAT_WIDTHS, Field
 from ..splats.constants import ALPHA_MIN
 from .fields import negligible_lines
 from .precision import Precision

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from ...bench.contracts import FloatArray
 from ...bench.errors import InputError
-from ..ours_storage import SPLAT_WIDTHS
+from ..ours.storage import SPLAT_WIDTHS
 from .coded import Arrays, coded
 from .integers import dequantise, from_smallest_three, narrow, smallest_three
 from .precision import Precision

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from ...bench.contracts import Camera, Clip, HeadPose
-from ..bound_avatar import PosedSplats
+from ..shared.bound_avatar import PosedSplats
+from ..shared.views import view_of
 from ..splats import rasterize
-from ..views import view_of
 
 VIEWS = 64
 

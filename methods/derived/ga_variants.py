@@ -10,7 +10,15 @@ import torch
 from torch import Tensor
 
 from ...bench.contracts import Clip, HeadAsset, Variant
-from ..avatar_files import (
+from ..compact.coded import Arrays
+from ..compact.container import Content, read_content, write_content
+from ..compact.file import COMPACT_FILE, decode_subject, encode_subject
+from ..compact.precision import Precision
+from ..compact.splats import decode_splats, encode_splats
+from ..ga.method import GAAvatar
+from ..ga.storage import PLY_FILE, read_ga_splats, write_ga_splats
+from ..ours.storage import SPLAT_WIDTHS
+from ..shared.avatar_files import (
     SUBJECT_FILE,
     Subject,
     read_shared_head,
@@ -18,16 +26,8 @@ from ..avatar_files import (
     save_shared_head,
     write_subject,
 )
-from ..compact.coded import Arrays
-from ..compact.container import Content, read_content, write_content
-from ..compact.file import COMPACT_FILE, decode_subject, encode_subject
-from ..compact.precision import Precision
-from ..compact.splats import decode_splats, encode_splats
-from ..ga import GAAvatar
-from ..ga_files import PLY_FILE, read_ga_splats, write_ga_splats
-from ..ours_storage import SPLAT_WIDTHS
-from ..sh import coefficient_count
-from ..subject_mesh import SubjectMesh
+from ..shared.sh import coefficient_count
+from ..shared.subject_mesh import SubjectMesh
 from .contribution import contributions, most_contributing, training_views
 from .recipes import GA, Recipe
 from .reduced import read_reduced, write_reduced

@@ -11,14 +11,14 @@ import torch
 from torch import Tensor
 
 from ...bench.contracts import Clip, HeadAsset, Variant
-from ..avatar_files import SUBJECT_FILE, read_shared_head, save_shared_head, write_subject
 from ..compact.file import COMPACT_FILE, read_compact, write_compact
 from ..compact.precision import Precision
 from ..compact.simplify import simplify
 from ..compact.splats import HARMONICS
-from ..ours_avatar import OursAvatar
-from ..ours_storage import FIELD_FILE, Field, checked_field, read_field, save_field
-from ..subject_mesh import SubjectMesh
+from ..ours.avatar import OursAvatar
+from ..ours.storage import FIELD_FILE, Field, checked_field, read_field, save_field
+from ..shared.avatar_files import SUBJECT_FILE, read_shared_head, save_shared_head, write_subject
+from ..shared.subject_mesh import SubjectMesh
 from .contribution import contributions, most_contributing, training_views
 from .recipes import OURS, Recipe
 from .reduced import read_reduced, write_reduced

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from ..bound_avatar import USUAL, Cutoffs
+from ..shared.bound_avatar import USUAL, Cutoffs
 
 Storage = Literal["exact", "half", "8bit", "compact"]
 STORAGE_SUMMARIES: dict[Storage, str] = {

@@ -10,8 +10,8 @@ import torch
 from safetensors.torch import save
 from torch import Tensor
 
-from ...bench.files import write_bytes
-from ..tensor_files import read_safetensors
+from ...bench.io.files import write_bytes
+from ..shared.tensor_files import read_safetensors
 
 Kind = Literal["half", "8bit"]
 LEVELS = 255

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..triplane import PAIRS
+from ..shared.triplane import PAIRS
 
 
 def coarser_planes(tensors: dict[str, Tensor], resolution: int) -> dict[str, Tensor]:

@@ -10,18 +10,18 @@ import torch
 
 from ...bench.contracts import HeadAsset, HeadPose, Progress, no_progress
 from ...bench.errors import InputError
-from ...bench.files import check_writable
+from ...bench.io.files import check_writable
 from ...bench.specs import Findings
-from ...datasets.ga_reader import read_capture
-from ..avatar_files import read_shared_head
+from ...datasets.ga.reader import read_capture
 from ..compact.file import COMPACT_FILE
-from ..ga import GAAvatar
-from ..ga_files import PLY_FILE
+from ..ga.method import GAAvatar
+from ..ga.storage import PLY_FILE
 from ..gbs.avatar import GBSAvatar
 from ..insta.storage import FIELD_FILE as RADIANCE_FILE
-from ..ours_avatar import OursAvatar
-from ..ours_storage import FIELD_FILE
-from ..tensor_files import read_safetensors
+from ..ours.avatar import OursAvatar
+from ..ours.storage import FIELD_FILE
+from ..shared.avatar_files import read_shared_head
+from ..shared.tensor_files import read_safetensors
 from .harmonics_fit import fit_harmonics, sphere, turn_harmonics
 from .settings import ExportPlySettings
 from .table import write_gaussians

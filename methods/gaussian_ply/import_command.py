@@ -6,11 +6,11 @@ from pathlib import Path
 
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
-from ...bench.lock import LOCK_FILE
+from ...bench.io.lock import LOCK_FILE
 from ...bench.specs import Findings
-from ...datasets.ga_reader import read_capture
-from ..avatar_files import HEAD_FILE, SUBJECT_FILE, Subject, save_shared_head, write_subject
-from ..ga_files import PLY_FILE, read_ga_splats, write_ga_splats
+from ...datasets.ga.reader import read_capture
+from ..ga.storage import PLY_FILE, read_ga_splats, write_ga_splats
+from ..shared.avatar_files import HEAD_FILE, SUBJECT_FILE, Subject, save_shared_head, write_subject
 from .settings import ImportGASettings
 
 

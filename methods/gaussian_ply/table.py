@@ -8,9 +8,9 @@ import numpy as np
 from torch import Tensor
 
 from ...bench.contracts import FloatArray
-from ..bound_avatar import PosedSplats
-from ..ga_files import COLUMNS
-from ..ply import write_ply
+from ..ga.storage import COLUMNS
+from ..shared.bound_avatar import PosedSplats
+from ..shared.ply import write_ply
 
 STANDARD = COLUMNS[:-1]
 """62 float32: position, zero normals, harmonics (the rest channel by channel), opacity logit, log-scales, wxyz."""

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import embedding_bag, normalize
 
-from ..binding import WorldSplats, apply_matrices
-from ..sh import coefficient_count, sh_to_rgb
+from ..shared.binding import WorldSplats, apply_matrices
+from ..shared.sh import coefficient_count, sh_to_rgb
 from .rig import Carried
 
 LARGEST_SCALE = 0.1

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from ...bench.contracts import Budget, Clip, Progress
-from ..avatar_files import Subject, finish_fit, is_finished, run_digest
-from ..clip_checks import check_training_split
-from ..splat_trainer import run_trainer
-from ..training.loop import check_budget
-from ..training.sampling import ShuffledEpochs
+from ..shared.avatar_files import Subject, finish_fit, is_finished, run_digest
+from ..shared.clip_checks import check_training_split
+from ..shared.splat_trainer import run_trainer
+from ..shared.training.loop import check_budget
+from ..shared.training.sampling import ShuffledEpochs
 from .avatar import GBSAvatar
 from .config import GBSConfig
 from .mouth import padded_offset, with_mouth

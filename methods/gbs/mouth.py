@@ -14,7 +14,7 @@ from ...bench.contracts import FloatArray, HeadAsset, IntArray
 from ...datasets.head.arrays import HeadArrays
 from ...datasets.head.regions import faces_in_region
 from ...datasets.head.teeth import with_teeth_where_possible
-from ..avatar_files import head_arrays
+from ..shared.avatar_files import head_arrays
 from .config import Departure
 
 ROWS = ("teeth_upper", "teeth_lower")

@@ -11,8 +11,8 @@ from torch import Tensor
 from ...bench.contracts import FloatArray, HeadAsset, HeadPose
 from ...datasets.head.model import chain_transforms
 from ...datasets.head.rotations import axis_angle_to_matrix, matrix_to_quaternion, quaternion_to_matrix
-from ..binding import left_products
-from ..subject_mesh import SubjectMesh
+from ..shared.binding import left_products
+from ..shared.subject_mesh import SubjectMesh
 from .differences import SKINNING_STEPS, initial_turns, nearest_rotation
 from .surface import SurfacePoints
 

@@ -10,17 +10,17 @@ from torch import Tensor
 
 from ...bench.contracts import Clip
 from ...datasets.head.arrays import HeadArrays
-from ..avatar_files import Subject
-from ..known_poses import pose_key
-from ..seeds import torch_generator
-from ..sh import initial_coefficients
-from ..splat_trainer import Initial, SplatTrainer
-from ..subject_mesh import BoundedCache, SubjectMesh
-from ..training.densify import logit, rows_of_tables
-from ..training.images import recomposited
-from ..training.losses import photometric_loss
-from ..training.sampling import Sampler
-from ..training.schedule import Timeline
+from ..shared.avatar_files import Subject
+from ..shared.known_poses import pose_key
+from ..shared.seeds import torch_generator
+from ..shared.sh import initial_coefficients
+from ..shared.splat_trainer import Initial, SplatTrainer
+from ..shared.subject_mesh import BoundedCache, SubjectMesh
+from ..shared.training.densify import logit, rows_of_tables
+from ..shared.training.images import recomposited
+from ..shared.training.losses import photometric_loss
+from ..shared.training.sampling import Sampler
+from ..shared.training.schedule import Timeline
 from .blend import Entries, difference_widths, place
 from .config import GBSConfig
 from .differences import consistency_mask, entries_of

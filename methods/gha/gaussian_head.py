@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ...bench.contracts import Camera
 from ...datasets.head.rotations import matrix_to_quaternion
-from ..binding import WorldSplats, left_products
+from ..shared.binding import WorldSplats, left_products
 from ..splats import rasterize
 from .config import GHAConfig
 from .controllers import Controllers, encode_pose

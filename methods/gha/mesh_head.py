@@ -8,8 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..binding import WorldSplats
-from ..triplane import ENCODING_SIZE, encode
+from ..shared.binding import WorldSplats
+from ..shared.triplane import ENCODING_SIZE, encode
 from .config import GHAConfig
 from .controllers import Controllers, encode_pose
 from .driving import Motion, Signal

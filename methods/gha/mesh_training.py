@@ -10,12 +10,12 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ...bench.contracts import FrameKey
-from ..seeds import torch_generator
+from ..shared.seeds import torch_generator
+from ..shared.training.images import recomposited
+from ..shared.training.optimiser import Optimiser
+from ..shared.training.schedule import Timeline
+from ..shared.views import View, view_of
 from ..splats import rasterize
-from ..training.images import recomposited
-from ..training.optimiser import Optimiser
-from ..training.schedule import Timeline
-from ..views import View, view_of
 from .config import GHAConfig
 from .mesh_head import DISC_OPACITY, MeshHead, vertex_discs
 from .scene import Scene

@@ -23,17 +23,10 @@ import numpy as np
 from torch import Tensor
 
 from ...bench.contracts import Budget, Clip, Progress
-from ..avatar_files import (
-    TRACKED,
-    RefinedTracking,
-    Subject,
-    finish_fit,
-    is_finished,
-    run_digest,
-)
-from ..clip_checks import check_training_split
-from ..training.loop import Outcome, check_budget, train
-from ..training.sampling import ShuffledEpochs
+from ..shared.avatar_files import TRACKED, RefinedTracking, Subject, finish_fit, is_finished, run_digest
+from ..shared.clip_checks import check_training_split
+from ..shared.training.loop import Outcome, check_budget, train
+from ..shared.training.sampling import ShuffledEpochs
 from .avatar import DRIVING_FILE, GHAAvatar
 from .config import GHAConfig
 from .gaussian_head import GaussianHead

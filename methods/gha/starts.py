@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping
 
 from torch import Tensor, nn
 
-from ..training.optimiser import Optimiser
-from ..training.schedule import log_linear
+from ..shared.training.optimiser import Optimiser
+from ..shared.training.schedule import log_linear
 from .networks import Mlp
 
 

@@ -11,12 +11,12 @@ import torch
 from safetensors.torch import save
 from torch import Tensor
 
-from ...bench.arrays import Member
 from ...bench.configuration import build
-from ...bench.documents import parse_json
 from ...bench.errors import InputError
-from ...bench.files import write_bytes
-from ..tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors
+from ...bench.io.arrays import Member
+from ...bench.io.documents import parse_json
+from ...bench.io.files import write_bytes
+from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors
 from .config import GHAConfig
 from .gaussian_head import POINTS, GaussianHead
 

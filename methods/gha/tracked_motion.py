@@ -12,8 +12,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..seeds import torch_generator
-from ..triplane import encode
+from ..shared.seeds import torch_generator
+from ..shared.triplane import encode
 from .config import GHAConfig
 from .driving import Driver
 from .landmarks import influences

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 
 from ...bench.contracts import Camera, Frame, HeadPose
-from ..avatar_files import SUBJECT_FILE, Subject, read_shared_head, read_subject
-from ..known_poses import pose_key
-from ..subject_mesh import SubjectMesh
+from ..shared.avatar_files import SUBJECT_FILE, Subject, read_shared_head, read_subject
+from ..shared.known_poses import pose_key
+from ..shared.subject_mesh import SubjectMesh
 from .canonical import canonical_surface
 from .config import InstaConfig
 from .field import Architecture, Field, Parameters, Prior

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from ...bench.contracts import HeadAsset, HeadPose
-from ..subject_mesh import SubjectMesh
+from ..shared.subject_mesh import SubjectMesh
 from .config import InstaConfig
 from .marching import Backend, Surface
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from ...bench.contracts import Budget, Clip, Progress
-from ..avatar_files import Subject, finish_fit, is_finished, run_digest
-from ..clip_checks import check_training_split
-from ..subject_mesh import SubjectMesh
-from ..training.loop import check_budget, train
-from ..training.sampling import ShuffledEpochs
+from ..shared.avatar_files import Subject, finish_fit, is_finished, run_digest
+from ..shared.clip_checks import check_training_split
+from ..shared.subject_mesh import SubjectMesh
+from ..shared.training.loop import check_budget, train
+from ..shared.training.sampling import ShuffledEpochs
 from .avatar import InstaAvatar
 from .canonical import canonical_surface
 from .config import InstaConfig

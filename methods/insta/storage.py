@@ -11,12 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...bench.arrays import Member, read_arrays
 from ...bench.configuration import build
-from ...bench.documents import read_json
 from ...bench.errors import HeadbenchError, InputError
-from ...bench.files import write_json
-from ..avatar_files import write_arrays
+from ...bench.io.arrays import Member, read_arrays
+from ...bench.io.documents import read_json
+from ...bench.io.files import write_json
+from ..shared.avatar_files import write_arrays
 from .config import InstaConfig
 from .field import Architecture
 

@@ -11,11 +11,11 @@ from torch import Tensor, nn
 
 from ...bench.contracts import Clip, FrameKey
 from ...bench.errors import InputError
-from ..known_poses import pose_key
-from ..seeds import numpy_generator
-from ..subject_mesh import BoundedCache, SubjectMesh
-from ..training.optimiser import Optimiser
-from ..training.schedule import Timeline, log_linear
+from ..shared.known_poses import pose_key
+from ..shared.seeds import numpy_generator
+from ..shared.subject_mesh import BoundedCache, SubjectMesh
+from ..shared.training.optimiser import Optimiser
+from ..shared.training.schedule import Timeline, log_linear
 from .config import InstaConfig
 from .field import Architecture, Field, Prior
 from .losses import color_loss, depth_loss, true_colors

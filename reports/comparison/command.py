@@ -10,7 +10,7 @@ from pathlib import Path
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.protocol import TASK_TITLES
-from ...bench.scoring import FULL
+from ...bench.runner.scoring import FULL
 from ...bench.specs import Findings, MetricSpec
 from ..csv_table import csv_text
 from ..run_set import RunSet

@@ -7,15 +7,15 @@ from dataclasses import asdict, fields
 from pathlib import Path
 
 from ...bench.contracts import Progress, no_progress
-from ...bench.files import write_text
+from ...bench.io.files import write_text
+from ...bench.runner.store import RunFolder
 from ...bench.specs import Findings
-from ...bench.store import RunFolder
-from ...bench.sweep.sweep import MARK
 from ..csv_table import csv_text
 from .front import pareto_front
 from .plot import Panel, write_plot
 from .points import Point, read_points
 from .settings import ParetoSettings
+from .sweep import MARK
 
 COSTS = {"megabytes": "Size, MB", "milliseconds": "Frame time, ms"}
 

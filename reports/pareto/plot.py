@@ -10,7 +10,7 @@ from pathlib import Path
 
 from PIL import Image, ImageDraw
 
-from ...bench.files import atomic_path
+from ...bench.io.files import atomic_path
 from ..drawing import INK, MUTED, PAPER, RULE, Colour, font, text_width
 
 COLOURS: tuple[Colour, ...] = (  # Okabe and Ito's, told apart with any colour vision

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ...bench.errors import InputError
-from ...bench.scoring import FULL
+from ...bench.runner.scoring import FULL
 from ...bench.specs import MetricSpec
 from ..aggregate import summarise
 from ..run_data import RunData

@@ -6,14 +6,13 @@ from contextlib import nullcontext
 from pathlib import Path
 
 from ...bench.contracts import Progress, no_progress
-from ...bench.files import output_inside
-from ...bench.lock import locked
+from ...bench.io.files import output_inside
+from ...bench.io.lock import locked
+from ...bench.runner.store import RunFolder
 from ...bench.specs import Findings
-from ...bench.store import RunFolder
-from ...bench.sweep.settings import SweepSettings
-from ...bench.sweep.sweep import sweep
 from .command import run as compare
-from .settings import ParetoSettings
+from .settings import ParetoSettings, SweepSettings
+from .sweep import sweep
 
 
 def run(settings: SweepSettings, progress: Progress = no_progress) -> Findings:

@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from ...bench.contracts import Progress
-from ...bench.files import output_inside
-from ...bench.lock import locked
-from ...bench.robustness.avatars import trained
-from ...bench.robustness.settings import ExtremesSettings, ReenactSettings
-from ...bench.robustness.trial import SHEET_FILE, table
+from ...bench.io.files import output_inside
+from ...bench.io.lock import locked
+from ...bench.runner.avatars import trained
+from ...bench.runner.stages import Job
+from ...bench.runner.store import RunFolder
 from ...bench.specs import Findings
-from ...bench.stages import Job
-from ...bench.store import RunFolder
+from .settings import ExtremesSettings, ReenactSettings
+from .trial import SHEET_FILE, table
 
 Settings = TypeVar("Settings", ExtremesSettings, ReenactSettings)
 

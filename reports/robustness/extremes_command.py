@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from ...bench.contracts import Progress, no_progress
-from ...bench.robustness.extremes import TASK, try_extremes
-from ...bench.robustness.settings import ExtremesSettings
 from ...bench.specs import Findings
 from .command import try_run
+from .extremes import TASK, try_extremes
 from .extremes_sheet import write_extremes_sheet
+from .settings import ExtremesSettings
 
 
 def run(settings: ExtremesSettings, progress: Progress = no_progress) -> Findings:

@@ -10,12 +10,12 @@ import cv2
 from PIL import Image
 
 from ...bench.contracts import ByteArray
-from ...bench.documents import read_json
 from ...bench.errors import InputError
-from ...bench.files import atomic_path
-from ...bench.frames import read_png
-from ...bench.robustness.trial import RECORD_FILE, SHEET_FILE
+from ...bench.io.documents import read_json
+from ...bench.io.files import atomic_path
+from ...bench.io.frames import read_png
 from ..drawing import MUTED, Colour, Pen, wrap
+from .trial import RECORD_FILE, SHEET_FILE
 
 EXTRAPOLATED: Colour = (232, 135, 20)
 BROKEN: Colour = (205, 20, 45)

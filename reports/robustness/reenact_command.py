@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from ...bench.contracts import Progress, no_progress
-from ...bench.robustness.reenactment import TASK, reenact
-from ...bench.robustness.settings import ReenactSettings
 from ...bench.specs import Findings
 from .command import try_run
 from .reenact_sheet import write_reenact_sheet
+from .reenactment import TASK, reenact
+from .settings import ReenactSettings
 
 
 def run(settings: ReenactSettings, progress: Progress = no_progress) -> Findings:

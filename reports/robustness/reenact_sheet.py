@@ -9,13 +9,13 @@ from typing import Any
 
 from PIL import Image
 
-from ...bench.documents import read_json
 from ...bench.errors import InputError
-from ...bench.files import atomic_path
-from ...bench.frames import read_png
-from ...bench.robustness.trial import RECORD_FILE, SHEET_FILE
+from ...bench.io.documents import read_json
+from ...bench.io.files import atomic_path
+from ...bench.io.frames import read_png
 from ..drawing import MUTED, Pen
 from .extremes_sheet import BROKEN, GAP, LINE, MARGIN, SMALL, TEXT, TITLE, fitted
+from .trial import RECORD_FILE, SHEET_FILE
 
 LABELS, PANEL_WIDTH, COLUMNS = 120, 150, 8
 

@@ -12,8 +12,8 @@ import pandas as pd
 import pytest
 
 from headbench.bench import cli
-from headbench.bench.demo import DemoConfig, parse_size
 from headbench.bench.errors import HeadbenchError, InputError
+from headbench.bench.runner.demo import DemoConfig, parse_size
 
 GALLERY = Path(__file__).parents[2] / "reports" / "gallery"
 

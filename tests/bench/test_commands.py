@@ -8,7 +8,7 @@ import subprocess
 import pytest
 
 from headbench.bench import cli, commands, registry
-from headbench.bench.lock import locked
+from headbench.bench.io.lock import locked
 from headbench.bench.registry import Plugin
 from headbench.bench.specs import CommandSpec
 

@@ -8,7 +8,7 @@ import pytest
 
 from headbench.bench.errors import InputError
 from headbench.bench.manifest import Manifest
-from headbench.bench.store import Cell
+from headbench.bench.runner.store import Cell
 from headbench.methods.specs import GA
 from headbench.metrics.specs import PSNR
 

@@ -8,9 +8,9 @@ import sys
 import pytest
 
 from headbench.bench import progress as module
-from headbench.bench import runner
 from headbench.bench.progress import RunProgress, TimeLeft, duration, progress, run_progress
-from headbench.bench.run_config import RunConfig
+from headbench.bench.runner import run as runner
+from headbench.bench.runner.config import RunConfig
 
 
 class Clock:

@@ -5,7 +5,7 @@ import pytest
 
 from headbench.bench.contracts import FrameKey
 from headbench.bench.errors import InputError
-from headbench.bench.files import digest
+from headbench.bench.io.files import digest
 from headbench.bench.protocol import make_protocol, make_trial_protocol
 
 SIZE = (8, 6)

@@ -11,7 +11,7 @@ import pytest
 from headbench.bench.contracts import FrameKey
 from headbench.bench.errors import InputError
 from headbench.datasets import images
-from headbench.datasets.ga_reader import read_capture
+from headbench.datasets.ga.reader import read_capture
 
 from .tiny_capture import FRONTAL
 

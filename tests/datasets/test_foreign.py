@@ -6,7 +6,7 @@ import pytest
 
 from headbench.bench import cli
 from headbench.bench.errors import InputError
-from headbench.datasets.ga_reader import read_capture
+from headbench.datasets.ga.reader import read_capture
 
 RIGID = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 FRAME = {"file_path": "images/1.png", "transform_matrix": RIGID}

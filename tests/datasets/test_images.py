@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from headbench.bench.errors import InputError
 from headbench.datasets import images
-from headbench.datasets.ga_writer import write_png
+from headbench.datasets.ga.writer import write_png
 from headbench.datasets.images import ImageStore, read_image
 
 WHITE = (1.0, 1.0, 1.0)

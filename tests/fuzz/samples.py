@@ -18,11 +18,11 @@ import numpy as np
 import torch
 
 from headbench.bench import cli
-from headbench.bench.files import digest
+from headbench.bench.io.files import digest
 from headbench.datasets.colmap.writer import export_model
-from headbench.datasets.ga_reader import read_capture
+from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import save_head
-from headbench.methods.training.checkpoint import save_checkpoint
+from headbench.methods.shared.training.checkpoint import save_checkpoint
 from headbench.metrics.weights import network_spec
 
 from ..datasets.head.flame_files import write_flame

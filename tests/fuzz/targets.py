@@ -11,14 +11,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from headbench.bench import cli
-from headbench.bench.documents import read_yaml
+from headbench.bench.io.documents import read_yaml
 from headbench.bench.registry import get
-from headbench.bench.run_config import resolve_method
+from headbench.bench.runner.config import resolve_method
 from headbench.datasets.colmap.reader import model_cameras, read_model
-from headbench.datasets.ga_reader import read_capture
+from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.loaders import load_head, with_eyelids
 from headbench.datasets.steps.exclusion_file import read_exclusions
-from headbench.methods.training.checkpoint import load_checkpoint
+from headbench.methods.shared.training.checkpoint import load_checkpoint
 from headbench.metrics.weights import load_backbone, network_spec
 
 from .cases import ExitCode

@@ -2,10 +2,10 @@
 
 import torch
 
-from headbench.methods.avatar_files import SUBJECT_FILE, Subject, save_shared_head, write_subject
-from headbench.methods.ours_storage import FIELD_FILE, write_field
+from headbench.methods.ours.storage import FIELD_FILE, write_field
+from headbench.methods.shared.avatar_files import SUBJECT_FILE, Subject, save_shared_head, write_subject
 
-from .toy_ours import SMALL, make
+from .ours.toy import SMALL, make
 
 
 def store(clip, folder, config=SMALL, change=lambda values: None, copies=1):

@@ -18,12 +18,12 @@ from headbench.bench.contracts import (
     no_progress,
 )
 from headbench.bench.errors import InputError
-from headbench.methods.configs import GAConfig, OursConfig, SplatTraining
-from headbench.methods.ga import GA
-from headbench.methods.ga_files import COLUMNS
+from headbench.methods.ga.method import GA
+from headbench.methods.ga.storage import COLUMNS
 from headbench.methods.gbs.config import BlendshapeTraining, GBSConfig
 from headbench.methods.gbs.method import GBS
-from headbench.methods.ours import Ours
+from headbench.methods.ours.method import Ours
+from headbench.methods.shared.configs import GAConfig, OursConfig, SplatTraining
 
 FAST = SplatTraining(max_splats=1200, min_densify_every=40, min_settle=20)
 CONFIGS = {
@@ -244,7 +244,7 @@ def test_ga_ply_has_the_published_layout_byte_for_byte(clip, tmp_path):
 
 
 def test_ga_harmonics_are_stored_channel_by_channel(clip, tmp_path):
-    from headbench.methods.ga_files import read_ga_splats, write_ga_splats
+    from headbench.methods.ga.storage import read_ga_splats, write_ga_splats
 
     count = 4
     generator = torch.Generator().manual_seed(0)

@@ -7,12 +7,12 @@ import pytest
 
 from headbench.bench.conformance import check_method
 from headbench.bench.contracts import no_progress
-from headbench.bench.documents import read_json
-from headbench.bench.files import digest_file
+from headbench.bench.io.documents import read_json
+from headbench.bench.io.files import digest_file
 from headbench.bench.registry import discover
-from headbench.bench.run_config import resolve_method
+from headbench.bench.runner.config import resolve_method
 from headbench.bench.specs import MethodSpec
-from headbench.methods.avatar_files import RECORD_FILE
+from headbench.methods.shared.avatar_files import RECORD_FILE
 
 from .insta.small import SMALL as SMALL_INSTA
 from .toy_clip import toy_pose

@@ -4,7 +4,7 @@ import pytest
 
 from headbench.methods.specs import GA, GBS, OURS
 
-from .by_heart import psnr_by_heart
+from .single_frame import psnr_by_heart
 
 ITERATIONS = 500
 ENOUGH_DB = 45.0

@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 
 from headbench.bench.contracts import Budget, no_progress
-from headbench.methods.configs import GAConfig, OursConfig, SplatTraining
-from headbench.methods.ga import GA
+from headbench.methods.ga.method import GA
 from headbench.methods.gbs.config import BlendshapeTraining, GBSConfig
 from headbench.methods.gbs.method import GBS
-from headbench.methods.ours import Ours
-from headbench.methods.training.loop import CHECKPOINT
+from headbench.methods.ours.method import Ours
+from headbench.methods.shared.configs import GAConfig, OursConfig, SplatTraining
+from headbench.methods.shared.training.loop import CHECKPOINT
 
 from ..datasets.head.toy import toy_head
 from .toy_clip import toy_clip
@@ -103,7 +103,7 @@ def test_interrupted_and_continued_is_the_same_bit_for_bit(unbroken, clip, tmp_p
 
 
 def test_the_comparison_would_notice_a_lost_moment(unbroken, clip, tmp_path, monkeypatch):
-    from headbench.methods.training.optimiser import Optimiser
+    from headbench.methods.shared.training.optimiser import Optimiser
 
     name, expected = unbroken
     whole = Optimiser.state

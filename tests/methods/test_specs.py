@@ -5,12 +5,12 @@ import pytest
 from headbench.bench.configuration import build
 from headbench.bench.contracts import Budget
 from headbench.bench.registry import resolve
-from headbench.bench.run_config import resolve_method
-from headbench.methods.configs import GAConfig, OursConfig, SplatTraining
+from headbench.bench.runner.config import resolve_method
 from headbench.methods.gbs.config import GBSConfig
 from headbench.methods.gha.config import GHAConfig
+from headbench.methods.shared.configs import GAConfig, OursConfig, SplatTraining
+from headbench.methods.shared.training.schedule import DensifySchedule, Timeline
 from headbench.methods.specs import GA, GBS, GHA, INSTA, MEAN_IMAGE, NEAREST_CAMERA, OURS
-from headbench.methods.training.schedule import DensifySchedule, Timeline
 
 SPECS = {spec.name: spec for spec in (OURS, GA, GBS, GHA, INSTA, MEAN_IMAGE, NEAREST_CAMERA)}
 PRESETS = ("smoke", "demo", "fast", "paper")

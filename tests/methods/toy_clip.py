@@ -9,11 +9,11 @@ import numpy as np
 import torch
 
 from headbench.bench.contracts import Camera, FrameKey, HeadPose, StepRecord
-from headbench.bench.files import digest
+from headbench.bench.io.files import digest
 from headbench.datasets.head.arrays import HeadArrays
-from headbench.methods.binding import to_world
+from headbench.methods.shared.binding import to_world
+from headbench.methods.shared.subject_mesh import SubjectMesh
 from headbench.methods.splats import rasterize
-from headbench.methods.subject_mesh import SubjectMesh
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ import pytest
 
 from headbench.bench.contracts import STAGES, HeadPose
 from headbench.bench.registry import resolve
-from headbench.bench.run_config import COST_METRICS
+from headbench.bench.runner.config import COST_METRICS
 from headbench.bench.specs import MetricSpec
 from headbench.metrics import specs
 

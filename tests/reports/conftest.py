@@ -4,12 +4,12 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from headbench.bench import runner
 from headbench.bench.manifest import Manifest, MethodRecord, ProtocolRecord
 from headbench.bench.rows import Row, Rows
-from headbench.bench.run_config import RunConfig
+from headbench.bench.runner import run as runner
+from headbench.bench.runner.config import RunConfig
+from headbench.bench.runner.store import RunFolder
 from headbench.bench.specs import MetricSpec
-from headbench.bench.store import RunFolder
 
 PSNR = MetricSpec("psnr", "PSNR", "dB", True, 2, "m:psnr")
 LPIPS = MetricSpec("lpips", "LPIPS", "", False, 3, "m:lpips")

@@ -10,8 +10,8 @@ from PIL import Image
 from headbench.bench.errors import InputError
 from headbench.bench.registry import resolve
 from headbench.bench.rows import Rows
+from headbench.bench.runner.store import RunFolder
 from headbench.bench.specs import ReportSpec
-from headbench.bench.store import RunFolder
 from headbench.reports import specs
 from headbench.reports.run_data import RunData
 from headbench.reports.run_set import RunSet

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from headbench.bench import runner
-from headbench.bench.run_config import RunConfig
+from headbench.bench.runner import run as runner
+from headbench.bench.runner.config import RunConfig
 
 
 @pytest.fixture

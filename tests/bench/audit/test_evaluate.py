@@ -11,9 +11,9 @@ from headbench.bench import cli
 from headbench.bench.audit.evaluate import run as evaluate
 from headbench.bench.audit.settings import EvaluateSettings
 from headbench.bench.errors import InputError
-from headbench.bench.frames import read_png, write_png
+from headbench.bench.io.frames import read_png, write_png
 from headbench.bench.rows import ALL, COLUMNS
-from headbench.bench.store import RunFolder
+from headbench.bench.runner.store import RunFolder
 
 
 @pytest.fixture

@@ -8,11 +8,11 @@ import pandas as pd
 import pytest
 
 from headbench.bench import cli
-from headbench.bench.documents import read_json
-from headbench.bench.files import digest_file, write_json
-from headbench.bench.frames import read_png, write_png
+from headbench.bench.io.documents import read_json
+from headbench.bench.io.files import digest_file, write_json
+from headbench.bench.io.frames import read_png, write_png
 from headbench.bench.rows import Rows
-from headbench.bench.store import RunFolder
+from headbench.bench.runner.store import RunFolder
 
 
 def verify(run, *options):
@@ -136,9 +136,9 @@ def test_a_changed_capture_is_found(run, toy, monkeypatch, capsys):
 
 
 def test_a_run_started_again_renders_a_changed_frame_again(run, toy, capsys):
-    from headbench.bench import runner
-    from headbench.bench.captures import run_configuration
-    from headbench.bench.run_options import RunOptions
+    from headbench.bench.runner import run as runner
+    from headbench.bench.runner.captures import run_configuration
+    from headbench.bench.runner.options import RunOptions
 
     frame = frame_of(run)
     before = digest_file(frame)

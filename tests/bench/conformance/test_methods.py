@@ -6,7 +6,7 @@ import pytest
 from headbench.bench.conformance import check_method
 from headbench.bench.contracts import Frame
 from headbench.bench.errors import HeadbenchError
-from headbench.bench.run_config import resolve_method
+from headbench.bench.runner.config import resolve_method
 
 
 @pytest.fixture

@@ -7,10 +7,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from headbench.bench import runner
-from headbench.bench.frames import read_png, write_png
-from headbench.bench.run_config import RunConfig
-from headbench.bench.store import RunFolder
+from headbench.bench.io.frames import read_png, write_png
+from headbench.bench.runner import run as runner
+from headbench.bench.runner.config import RunConfig
+from headbench.bench.runner.store import RunFolder
 
 SUBJECTS = ("subject1", "subject2")
 

@@ -9,11 +9,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from headbench.bench import cli, runner
-from headbench.bench.documents import read_json
-from headbench.bench.files import write_json
+from headbench.bench import cli
+from headbench.bench.io.documents import read_json
+from headbench.bench.io.files import write_json
 from headbench.bench.rows import Rows
-from headbench.bench.store import RunFolder
+from headbench.bench.runner import run as runner
+from headbench.bench.runner.store import RunFolder
 
 
 @pytest.fixture

@@ -22,7 +22,7 @@ from headbench.datasets.colmap.command import run
 from headbench.datasets.colmap.reader import model_cameras, model_lenses, read_model
 from headbench.datasets.colmap.settings import ExportColmapSettings
 from headbench.datasets.colmap.writer import export_model, image_name
-from headbench.datasets.ga_reader import read_capture
+from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.model import HeadModel
 
 FILES = ("cameras", "images")

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from headbench.datasets.head.model import HeadModel
 from headbench.datasets.head.posing import FastPosing, joint_motions
-from headbench.datasets.procedural.model import procedural_head
+from headbench.datasets.head.procedural.model import procedural_head
 
 from .toy import toy_head
 

@@ -6,7 +6,7 @@ import shutil
 
 import pytest
 
-from headbench.datasets.ga_writer import CaptureWriter
+from headbench.datasets.ga.writer import CaptureWriter
 
 from .good_capture import GoodCapture, write_good_capture
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from headbench.datasets.ga_layout import Declaration
-from headbench.datasets.ga_writer import write_png
+from headbench.datasets.ga.layout import Declaration
+from headbench.datasets.ga.writer import write_png
 
 from .good_capture import HEIGHT, WIDTH, GoodCapture, read_rgb
 

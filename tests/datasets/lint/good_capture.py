@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from headbench.bench.contracts import Camera, HeadPose
-from headbench.datasets.ga_writer import CapturePlan, CaptureWriter, SequencePlan, write_png
+from headbench.datasets.ga.writer import CapturePlan, CaptureWriter, SequencePlan, write_png
 from headbench.datasets.head.arrays import HeadArrays
 from headbench.datasets.head.model import HeadModel
 from headbench.datasets.head.teeth import with_teeth

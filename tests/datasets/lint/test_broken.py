@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from headbench.bench.errors import InputError
-from headbench.datasets.ga_writer import CaptureWriter
+from headbench.datasets.ga.writer import CaptureWriter
 from headbench.datasets.lint.command import run
 from headbench.datasets.lint.settings import LintSettings
 

@@ -10,12 +10,12 @@ import pytest
 
 from headbench.bench.cli import main
 from headbench.bench.errors import InputError
-from headbench.datasets.ga_layout import Declaration
+from headbench.datasets.ga.layout import Declaration
 from headbench.datasets.head.arrays import read_head, save_head
+from headbench.datasets.head.procedural.model import procedural_head
 from headbench.datasets.lint.catalogue import RULES
 from headbench.datasets.lint.command import run
 from headbench.datasets.lint.settings import LintSettings
-from headbench.datasets.procedural.model import procedural_head
 from headbench.datasets.synthetic.capture import synthesize
 
 

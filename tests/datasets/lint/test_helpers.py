@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from headbench.datasets.ga_writer import write_png
+from headbench.datasets.ga.transforms import read_transforms
+from headbench.datasets.ga.writer import write_png
 from headbench.datasets.lint.rules import several, spans
 from headbench.datasets.lint.thumbnails import make_thumbnails, near_duplicates
 from headbench.datasets.lint.views import _fringe, pick_views
-from headbench.datasets.transforms import read_transforms
 
 from .good_capture import read_rgb
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from headbench.bench.image_files import ImageInfo
-from headbench.datasets.ga_layout import Declaration
-from headbench.datasets.ga_writer import CaptureWriter, write_png
+from headbench.bench.io.images import ImageInfo
+from headbench.datasets.ga.layout import Declaration
+from headbench.datasets.ga.writer import CaptureWriter, write_png
 from headbench.datasets.head.arrays import save_head
 from headbench.datasets.lint.catalogue import GROUPS, RULES
 from headbench.datasets.lint.command import lint

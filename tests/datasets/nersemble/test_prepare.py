@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from headbench.bench.errors import InputError
-from headbench.bench.lock import locked
-from headbench.datasets.ga_reader import read_capture
+from headbench.bench.io.lock import locked
+from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import read_head, save_head
 from headbench.datasets.nersemble import export, image_pool, sequence
 from headbench.datasets.nersemble.calibration import read_calibration

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from headbench.bench.errors import InputError
-from headbench.datasets.ga_reader import read_capture
+from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import save_head
 from headbench.datasets.head.model import HeadModel
 from headbench.datasets.nersemble.command import run as prepare

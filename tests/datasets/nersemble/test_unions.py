@@ -6,8 +6,8 @@ import shutil
 import pytest
 
 from headbench.bench.errors import InputError
-from headbench.datasets.ga_layout import DECLARATION_FILE
-from headbench.datasets.ga_reader import read_capture
+from headbench.datasets.ga.layout import DECLARATION_FILE
+from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.nersemble.command import run
 from headbench.datasets.nersemble.prepare import RECORD_FILE
 from headbench.datasets.nersemble.presets import UNION10_SEQUENCES, union10_held_out

@@ -14,7 +14,7 @@ from headbench.bench.contracts import Camera
 from headbench.bench.errors import InputError
 from headbench.bench.specs import ResolutionRule
 from headbench.datasets.clip import FrameFiles
-from headbench.datasets.ga_reader import read_capture
+from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.model import HeadModel
 from headbench.datasets.images import ImageStore
 from headbench.datasets.steps.mattes import (

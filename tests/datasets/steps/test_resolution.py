@@ -8,7 +8,7 @@ import pytest
 from headbench.bench.contracts import Camera
 from headbench.bench.errors import InputError
 from headbench.bench.specs import ResolutionRule
-from headbench.datasets.ga_reader import read_capture
+from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.steps.resolution import Alignment, Box, align_clip, scale_camera, take_box
 
 WHITE = (1.0, 1.0, 1.0)

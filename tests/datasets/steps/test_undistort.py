@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from headbench.bench.contracts import Camera
 from headbench.bench.errors import InputError
-from headbench.datasets.ga_reader import read_capture
+from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.steps.undistort import Lens, undistort_camera, undistort_clip, undistort_image
 
 WIDTH, HEIGHT = 240, 320

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from headbench.bench.errors import InputError
-from headbench.datasets.ga_reader import read_capture
+from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.synthetic.capture import synthesize
 from headbench.datasets.synthetic.rig import FRONTAL
 

@@ -7,15 +7,15 @@ import pytest
 
 from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.errors import InputError
-from headbench.datasets.ga_reader import read_capture
+from headbench.datasets.ga.reader import read_capture
 from headbench.methods.compact.command import run
 from headbench.methods.compact.settings import CompactSettings
-from headbench.methods.configs import SplatTraining
-from headbench.methods.ours import Ours
-from headbench.methods.ours_avatar import OursAvatar
+from headbench.methods.ours.avatar import OursAvatar
+from headbench.methods.ours.method import Ours
+from headbench.methods.shared.configs import SplatTraining
 
 from ...datasets.tiny_capture import make_plan, write_tiny_capture
-from ..toy_ours import SMALL
+from ..ours.toy import SMALL
 
 
 @pytest.fixture(scope="module")

@@ -9,18 +9,18 @@ from safetensors import safe_open
 
 from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.errors import InputError
-from headbench.methods.avatar_files import read_shared_head
 from headbench.methods.compact.container import Content, read_content, write_content
 from headbench.methods.compact.file import COMPACT_FILE, encode, exact_sizes, part_sizes, write_compact
 from headbench.methods.compact.precision import EXACT, Precision
 from headbench.methods.compact.simplify import simplify, training_poses
-from headbench.methods.configs import OursConfig, SplatTraining
-from headbench.methods.ours import Ours
-from headbench.methods.ours_avatar import OursAvatar
-from headbench.methods.ours_storage import FIELD_FILE
+from headbench.methods.ours.avatar import OursAvatar
+from headbench.methods.ours.method import Ours
+from headbench.methods.ours.storage import FIELD_FILE
+from headbench.methods.shared.avatar_files import read_shared_head
+from headbench.methods.shared.configs import OursConfig, SplatTraining
 
+from ..ours.toy import SMALL
 from ..stored_toy import store
-from ..toy_ours import SMALL
 
 CASES = {
     "opacity": SMALL,

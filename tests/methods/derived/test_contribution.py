@@ -3,10 +3,10 @@
 import numpy as np
 import torch
 
-from headbench.methods.bound_avatar import PosedSplats
 from headbench.methods.derived.contribution import contributions, most_contributing, training_views
+from headbench.methods.shared.bound_avatar import PosedSplats
+from headbench.methods.shared.views import view_of
 from headbench.methods.splats import rasterize
-from headbench.methods.views import view_of
 
 
 class Ball:

@@ -7,15 +7,15 @@ import pytest
 import torch
 
 from headbench.bench.contracts import Budget, no_progress
-from headbench.methods.configs import GAConfig, SplatTraining
 from headbench.methods.derived import ga_variants, ours_variants
 from headbench.methods.derived.recipes import EARLY, GA, OURS, Recipe
-from headbench.methods.ga import GA as GAMethod
-from headbench.methods.ga import GAAvatar
-from headbench.methods.ours_avatar import OursAvatar
+from headbench.methods.ga.method import GA as GAMethod
+from headbench.methods.ga.method import GAAvatar
+from headbench.methods.ours.avatar import OursAvatar
+from headbench.methods.shared.configs import GAConfig, SplatTraining
 
+from ..ours.toy import SMALL
 from ..stored_toy import store
-from ..toy_ours import SMALL
 
 
 @pytest.fixture(scope="module")

@@ -12,23 +12,23 @@ from scipy.special import sph_harm_y
 
 from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.errors import InputError
-from headbench.datasets.ga_reader import read_capture
-from headbench.methods.configs import GAConfig
-from headbench.methods.ga import GA
+from headbench.datasets.ga.reader import read_capture
+from headbench.methods.ga.method import GA
 from headbench.methods.gaussian_ply import command
 from headbench.methods.gaussian_ply.command import neutral_pose, run
 from headbench.methods.gaussian_ply.harmonics_fit import BEHIND, fit_harmonics, sphere
 from headbench.methods.gaussian_ply.settings import ExportPlySettings
 from headbench.methods.gbs.config import GBSConfig
 from headbench.methods.gbs.method import GBS
-from headbench.methods.ours_avatar import OursAvatar
-from headbench.methods.sh import sh_basis
+from headbench.methods.ours.avatar import OursAvatar
+from headbench.methods.shared.configs import GAConfig
+from headbench.methods.shared.sh import sh_basis
+from headbench.methods.shared.views import view_of
 from headbench.methods.splats import rasterize
-from headbench.methods.views import view_of
 
 from ...datasets.tiny_capture import write_tiny_capture
+from ..ours.toy import SMALL
 from ..stored_toy import store
-from ..toy_ours import SMALL
 
 NAMES = [
     *("x", "y", "z", "nx", "ny", "nz"),

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from headbench.bench.errors import InputError
-from headbench.datasets.ga_reader import read_capture
-from headbench.methods.ga import GA
+from headbench.datasets.ga.reader import read_capture
+from headbench.methods.ga.method import GA
 from headbench.methods.gaussian_ply.import_command import run
 from headbench.methods.gaussian_ply.settings import ImportGASettings
-from headbench.methods.subject_mesh import SubjectMesh
+from headbench.methods.shared.subject_mesh import SubjectMesh
 
 from ...datasets.tiny_capture import write_tiny_capture
 

@@ -2,14 +2,14 @@
 
 import pytest
 
-from headbench.bench import adaptation
-from headbench.bench.adaptation import MethodNeeds
-from headbench.datasets.ga_reader import read_capture
+from headbench.bench.runner import adaptation
+from headbench.bench.runner.adaptation import MethodNeeds
+from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.specs import GA_LAYOUT
 from headbench.datasets.synthetic.capture import synthesize
 from headbench.methods.specs import GBS
 
-from ..by_heart import psnr_by_heart
+from ..single_frame import psnr_by_heart
 
 ENOUGH_DB = 35.0
 

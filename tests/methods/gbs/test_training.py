@@ -8,15 +8,15 @@ import torch
 from skimage.metrics import structural_similarity
 
 from headbench.bench.contracts import Budget, no_progress
-from headbench.methods.avatar_files import Subject
 from headbench.methods.gbs.blend import difference_widths, place
 from headbench.methods.gbs.config import BlendshapeTraining, GBSConfig
 from headbench.methods.gbs.method import GBS
 from headbench.methods.gbs.mouth import mouth_room, padded_offset, with_mouth
 from headbench.methods.gbs.rig import Carried
 from headbench.methods.gbs.training import DIFFERENCES, GBSTraining, sample_count
+from headbench.methods.shared.avatar_files import Subject
+from headbench.methods.shared.training.schedule import Timeline
 from headbench.methods.splats import rasterize
-from headbench.methods.training.schedule import Timeline
 
 from ..toy_clip import look_at
 

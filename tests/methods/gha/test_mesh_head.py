@@ -15,7 +15,7 @@ from headbench.methods.gha.mesh_training import MeshTraining, roughness, soft_ov
 from headbench.methods.gha.scene import scene_of
 from headbench.methods.gha.signed_distance import TangentDistance, outer_vertices, vertex_normals
 from headbench.methods.gha.tetrahedra import marching_tetrahedra, tet_grid
-from headbench.methods.triplane import encode
+from headbench.methods.shared.triplane import encode
 
 from .small import small_config
 

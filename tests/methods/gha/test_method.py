@@ -10,9 +10,8 @@ from safetensors.torch import load_file, save_file
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from headbench.bench.contracts import Budget, no_progress
-from headbench.bench.documents import read_json
 from headbench.bench.errors import InputError
-from headbench.methods.avatar_files import RECORD_FILE
+from headbench.bench.io.documents import read_json
 from headbench.methods.gha import mesh_stage, method
 from headbench.methods.gha.avatar import DRIVING_FILE, GHAAvatar
 from headbench.methods.gha.gaussian_head import feature_camera
@@ -22,7 +21,8 @@ from headbench.methods.gha.mesh_training import MeshTraining
 from headbench.methods.gha.method import GHA, parted, within
 from headbench.methods.gha.storage import AVATAR_FILE
 from headbench.methods.gha.super_resolution import AT_ONCE
-from headbench.methods.training.loop import CHECKPOINT
+from headbench.methods.shared.avatar_files import RECORD_FILE
+from headbench.methods.shared.training.loop import CHECKPOINT
 
 from .small import SMALL, small_config
 

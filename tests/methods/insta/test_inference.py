@@ -16,7 +16,7 @@ from headbench.methods.insta.occupancy import Occupancy
 from headbench.methods.insta.parts import mouth_triangles
 from headbench.methods.insta.rays import camera_rays
 from headbench.methods.insta.rendering import Marching, Scene
-from headbench.methods.subject_mesh import SubjectMesh
+from headbench.methods.shared.subject_mesh import SubjectMesh
 
 from ..toy_clip import look_at
 from .small import SMALL

@@ -15,10 +15,10 @@ from headbench.methods.insta.avatar import InstaAvatar
 from headbench.methods.insta.config import InstaConfig
 from headbench.methods.insta.method import Insta
 from headbench.methods.insta.storage import FIELD_FILE, SETTINGS_FILE
+from headbench.methods.shared.training.loop import CHECKPOINT
 from headbench.methods.specs import INSTA
-from headbench.methods.training.loop import CHECKPOINT
 
-from ..by_heart import psnr_by_heart
+from ..single_frame import psnr_by_heart
 from .small import SMALL
 
 BUDGET = Budget(iterations=24)

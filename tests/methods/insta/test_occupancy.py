@@ -9,7 +9,7 @@ from headbench.methods.insta.config import InstaConfig
 from headbench.methods.insta.field import Architecture, Field, Prior
 from headbench.methods.insta.occupancy import Occupancy, occupied_space
 from headbench.methods.insta.parts import mouth_triangles
-from headbench.methods.subject_mesh import SubjectMesh
+from headbench.methods.shared.subject_mesh import SubjectMesh
 
 from .small import SMALL
 

@@ -2,11 +2,11 @@
 
 import pytest
 
-from headbench.datasets.ga_reader import read_capture
+from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.synthetic.capture import synthesize
 from headbench.methods.specs import INSTA
 
-from ..by_heart import psnr_by_heart
+from ..single_frame import psnr_by_heart
 
 ENOUGH_DB = 35.0
 

@@ -12,7 +12,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from headbench.methods.splats.benchmark.scenes import Scene
+from headbench.tests.benchmarks.splats.scenes import Scene
 
 
 class Dense(NamedTuple):

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from headbench.methods.splats import available_backends, cuda, rasterize
-from headbench.methods.splats.benchmark.compare import relative_error, render_with_gradients
-from headbench.methods.splats.benchmark.scenes import Scene, cloud
 from headbench.methods.splats.rasterize import make_request
+from headbench.tests.benchmarks.splats.compare import relative_error, render_with_gradients
+from headbench.tests.benchmarks.splats.scenes import Scene, cloud
 
 from .dense import render_dense
 

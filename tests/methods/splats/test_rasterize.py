@@ -9,8 +9,8 @@ import torch
 
 from headbench.bench.errors import UnavailableError
 from headbench.methods.splats import available_backends, cpu, rasterize
-from headbench.methods.splats.benchmark.compare import DIFFERENTIABLE, relative_error, render_with_gradients
-from headbench.methods.splats.benchmark.scenes import cloud
+from headbench.tests.benchmarks.splats.compare import DIFFERENTIABLE, relative_error, render_with_gradients
+from headbench.tests.benchmarks.splats.scenes import cloud
 
 BAD = {
     "means": [

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from headbench.methods.splats import rasterize
-from headbench.methods.splats.benchmark.compare import DIFFERENTIABLE, relative_error, render_with_gradients
-from headbench.methods.splats.benchmark.scenes import Scene, cloud
 from headbench.methods.splats.reference import rotation_matrices
+from headbench.tests.benchmarks.splats.compare import DIFFERENTIABLE, relative_error, render_with_gradients
+from headbench.tests.benchmarks.splats.scenes import Scene, cloud
 
 from .dense import render_dense
 

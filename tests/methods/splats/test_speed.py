@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from headbench.methods.splats import available_backends, rasterize
-from headbench.methods.splats.benchmark.scenes import Scene, head_shell
+from headbench.tests.benchmarks.splats.scenes import Scene, head_shell
 
 pytestmark = pytest.mark.skipif(
     "cpu" not in available_backends(), reason="the splat kernel is not installed: no C++ compiler was found"

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from headbench.methods.splats import available_backends, cuda, rasterize
-from headbench.methods.splats.benchmark.scenes import Scene, cloud
 from headbench.methods.splats.rasterize import make_request
+from headbench.tests.benchmarks.splats.scenes import Scene, cloud
 
 from .test_cuda import FakeGsplat
 

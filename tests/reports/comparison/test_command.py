@@ -8,8 +8,8 @@ import pytest
 from headbench.bench import cli
 from headbench.bench.errors import InputError
 from headbench.bench.rows import Row, Rows
+from headbench.bench.runner.store import RunFolder
 from headbench.bench.specs import MetricSpec
-from headbench.bench.store import RunFolder
 from headbench.reports.comparison.command import run
 from headbench.reports.comparison.settings import CompareSettings
 

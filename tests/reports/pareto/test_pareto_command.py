@@ -11,10 +11,10 @@ import pytest
 from PIL import Image
 
 from headbench.bench.errors import InputError
-from headbench.bench.files import plain
+from headbench.bench.io.files import plain
 from headbench.bench.rows import Row, Rows
+from headbench.bench.runner.store import RunFolder
 from headbench.bench.specs import MetricSpec
-from headbench.bench.store import RunFolder
 from headbench.reports.pareto.command import run
 from headbench.reports.pareto.plot import free, log_ticks, ticks
 from headbench.reports.pareto.settings import ParetoSettings

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 
 from headbench.bench.contracts import Camera, Frame, FrameKey, HeadPose
-from headbench.bench.robustness.viewpoints import look_at
 from headbench.bench.specs import DatasetSpec, MethodSpec
+from headbench.reports.robustness.viewpoints import look_at
 
 RADIUS = 0.1
 SIZE = (24, 30)

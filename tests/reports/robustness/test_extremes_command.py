@@ -8,12 +8,12 @@ import pytest
 from PIL import Image
 
 from headbench.bench.errors import InputError
-from headbench.bench.lock import LOCK_FILE, locked
-from headbench.bench.robustness.settings import ExtremesSettings
-from headbench.bench.robustness.trial import RECORD_FILE, ROWS_FILE, SHEET_FILE
+from headbench.bench.io.lock import LOCK_FILE, locked
 from headbench.reports.robustness import command
 from headbench.reports.robustness.extremes_command import run
 from headbench.reports.robustness.extremes_sheet import BROKEN, EXTRAPOLATED
+from headbench.reports.robustness.settings import ExtremesSettings
+from headbench.reports.robustness.trial import RECORD_FILE, ROWS_FILE, SHEET_FILE
 
 VIEWS, COMPONENTS, STEPS = 6, 2, 6
 

@@ -8,7 +8,7 @@ from scipy import stats
 
 from headbench.reports.statistics.bootstrap import block_length, interval
 from headbench.reports.statistics.pairs import SequencePairs, SubjectPairs
-from headbench.reports.statistics.simulation import Population
+from headbench.tests.benchmarks.simulation import Population
 
 
 def subjects_of(values):

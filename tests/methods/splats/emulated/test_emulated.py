@@ -11,9 +11,9 @@ import pytest
 import torch
 
 import headbench.methods.splats.reference
-from headbench.methods.splats.benchmark.compare import relative_error
-from headbench.methods.splats.benchmark.scenes import Scene, cloud, head_shell
 from headbench.methods.splats.rasterize import rasterize
+from headbench.tests.benchmarks.splats.compare import relative_error
+from headbench.tests.benchmarks.splats.scenes import Scene, cloud, head_shell
 
 COMPILER, EMULATOR = "aarch64-linux-gnu-g++", "qemu-aarch64"
 SOURCES = Path(headbench.methods.splats.reference.__file__).parent / "csrc"

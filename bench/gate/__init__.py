@@ -1,1 +1,0 @@
-"""The regression gate: results held against a committed baseline."""

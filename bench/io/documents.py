@@ -1,0 +1,297 @@
+"""JSON and YAML from outside: bounded in size and nesting, every key once, checked against dataclasses.
+
+A document that breaks a rule is refused by an `InputError` with the file, the dotted key, what was expected and what
+was found. Non-finite numbers are refused everywhere: JSON has none, and whoever measures nothing writes null.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import math
+import re
+import reprlib
+from collections.abc import Sequence
+from os import PathLike
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import yaml
+
+from ..errors import InputError
+from ..registry import unknown
+
+if TYPE_CHECKING:
+    from pydantic import TypeAdapter
+
+T = TypeVar("T")
+Source = str | PathLike[str]
+
+MAX_JSON_BYTES = 64 * 2**20
+"""Of the largest capture known, with 50,000 frames, the JSON has 35 MB. Objects take up to 25 times their text."""
+MAX_YAML_BYTES = 4 * 2**20
+"""YAML is written by people, or lists frames to leave out; its parser is slower than JSON's."""
+MAX_DEPTH = 64
+
+_TAG = "tag:yaml.org,2002:"
+_DECIMAL = re.compile(r"-?(0|[1-9][0-9]*)")
+_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON file whose top level is an object.
+
+    Raises `InputError` for a file that is missing, cannot be read, is larger than `MAX_JSON_BYTES`, does not parse,
+    nests deeper than `MAX_DEPTH`, repeats a key, holds a number that is not finite, or something else than an object.
+    """
+    return parse_json(_read(path, "JSON", MAX_JSON_BYTES), path)
+
+
+def parse_json(text: str | bytes, source: Source, key: str = "") -> dict[str, Any]:
+    """Read JSON that stands in ``key`` of some file, as `read_json` does."""
+    try:
+        value = json.loads(text, object_pairs_hook=_object, parse_constant=float)
+        if isinstance(value, (dict, list)):
+            _check_tree(value)
+    except _Refused as error:
+        raise InputError(source, _joined(key, error.key), error.expected, error.found) from None
+    except RecursionError as error:
+        raise InputError(source, key, f"JSON of at most {MAX_DEPTH} levels", "deeper nesting") from error
+    except ValueError as error:
+        raise InputError(source, key, "valid JSON", f"content that does not parse ({error})") from error
+    if not isinstance(value, dict):
+        raise InputError(source, key, "a JSON object", f"a {type(value).__name__}")
+    return value
+
+
+def read_yaml(path: Path) -> dict[Any, Any]:
+    """Read a YAML mapping; an empty file is an empty one. Data, never code.
+
+    Of YAML's types there are text, numbers, true and false, null, lists and mappings. Raises `InputError` as
+    `read_json` does, and for anchors that are used, tags, dates, and whole numbers that YAML 1.1 takes otherwise than
+    they look (057 is 47 to it, 1:30 is 90).
+    """
+    value = _parse_yaml(_read(path, "YAML", MAX_YAML_BYTES), path, "", literal=False)
+    if value is None:
+        return {}
+    if not isinstance(value, dict):
+        raise InputError(path, "", "a mapping", type(value).__name__)
+    return value
+
+
+def parse_setting(text: str, source: Source, key: str) -> Any:
+    """Read the YAML value of a setting on the command line; dates and numbers like 057 are text there."""
+    return _parse_yaml(text, source, key, literal=True)
+
+
+def read_document(path: Path, kind: type[T], *, foreign: bool = False) -> T:
+    """Read a JSON file into a dataclass; see `read_json` and `checked`."""
+    return checked(read_json(path), kind, path, foreign=foreign)
+
+
+def checked(value: Any, kind: type[T], source: Source, prefix: str = "", *, foreign: bool = False) -> T:
+    """Build a dataclass from a value that was read, nested ones included.
+
+    Parameters
+    ----------
+    kind : a dataclass, or what annotations can name. Numbers are no text, text is no number, 1.0 is no integer.
+    source : where the value comes from, for the error; ``prefix`` is its dotted key there.
+    foreign : another program's format, whose further entries mean nothing to us; they are refused otherwise.
+
+    Raises
+    ------
+    InputError : an entry is missing, unknown, or of the wrong type or range.
+    """
+    from pydantic import ValidationError
+
+    try:
+        # JSON knows neither tuples nor keys other than text, so this mode alone takes lists for tuples without
+        # taking text for numbers.
+        text = json.dumps(value, allow_nan=False)
+        extra = "ignore" if foreign else "forbid"
+        return _adapter(kind).validate_json(text, strict=True, extra=extra)  # type: ignore[arg-type]
+    except ValidationError as error:
+        _refuse(error.errors(include_url=False)[0], kind, source, prefix)
+    except (TypeError, ValueError) as error:
+        raise InputError(source, prefix, "plain values", str(error)) from error
+
+
+def shown(value: Any) -> str:
+    """A value for an error message, shortened, with its type."""
+    return f"{_REPR.repr(value)} ({type(value).__name__})"
+
+
+_REPR = reprlib.Repr()
+_REPR.maxstring = _REPR.maxother = _REPR.maxlong = 60
+_REPR.maxlevel = 2
+
+
+@functools.cache
+def _adapter(kind: Any) -> TypeAdapter[Any]:
+    from pydantic import TypeAdapter  # takes a third of the command line's own start
+
+    return TypeAdapter(kind)
+
+
+class _Refused(ValueError):
+    """A rule of this module that a document breaks."""
+
+    def __init__(self, expected: str, found: str, key: str = ""):
+        self.expected, self.found, self.key = expected, found, key
+        super().__init__(f"expected {expected}, found {found}")
+
+
+def _read(path: Path, what: str, limit: int) -> str:
+    article = f"a {what} file"
+    try:
+        if path.exists() and not path.is_file():
+            raise InputError(path, "", f"a readable {what} file", "something that is no file")
+        with path.open("rb") as stream:
+            content = stream.read(limit + 1)
+        if len(content) > limit:
+            raise InputError(path, "", f"{article} of at most {limit} bytes", "a larger one")
+        return content.decode("utf-8")
+    except FileNotFoundError as error:
+        raise InputError(path, "", article, "no such file") from error
+    except UnicodeDecodeError as error:
+        found = f"content that does not parse (no UTF-8 at byte {error.start})"
+        raise InputError(path, "", f"valid {what}", found) from error
+    except OSError as error:
+        raise InputError(path, "", f"a readable {what} file", error.strerror or str(error)) from error
+    except ValueError as error:  # a name that no file can have
+        raise InputError(path, "", f"a readable {what} file", str(error)) from error
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    result = dict(pairs)
+    if len(result) != len(pairs):
+        seen: set[str] = set()
+        twice = next(key for key, _ in pairs if key in seen or seen.add(key))  # type: ignore[func-returns-value]
+        raise _Refused("each key once", f"{_REPR.repr(twice)} again")
+    return result
+
+
+def _check_tree(value: Any) -> None:
+    """Bound the nesting and refuse numbers too large to be finite."""
+    level = [value]
+    for _ in range(MAX_DEPTH + 1):
+        below: list[Any] = []
+        for container in level:
+            for item in container.values() if isinstance(container, dict) else container:
+                kind = type(item)
+                if kind is dict or kind is list:
+                    below.append(item)
+                elif kind is float and not math.isfinite(item):
+                    raise _Refused("a finite number", str(item), _key_of(item, value) or "")
+        if not below:
+            return
+        level = below
+    raise _Refused(f"at most {MAX_DEPTH} levels", "deeper nesting")
+
+
+def _key_of(item: Any, value: Any) -> str | None:
+    """Dotted key of an object in a tree; None where it is not there."""
+    if value is item:
+        return ""
+    pairs = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for name, part in pairs:
+        below = _key_of(item, part)
+        if below is not None:
+            return _joined(f"[{name}]" if isinstance(value, list) else str(name), below)
+    return None
+
+
+def _joined(key: str, below: str) -> str:
+    return f"{key}.{below}" if key and below and not below.startswith("[") else key + below
+
+
+def _parse_yaml(text: str, source: Source, key: str, *, literal: bool) -> Any:
+    try:
+        depth = 0
+        for event in yaml.parse(text, Loader=_LOADER):
+            if isinstance(event, yaml.AliasEvent):
+                raise InputError(source, key, "values written out", f"the alias *{event.anchor}")
+            depth += isinstance(event, yaml.CollectionStartEvent)
+            depth -= isinstance(event, yaml.CollectionEndEvent)
+            if depth > MAX_DEPTH:
+                raise InputError(source, key, f"YAML of at most {MAX_DEPTH} levels", "deeper nesting")
+        node = yaml.compose(text, Loader=_LOADER)
+    except yaml.YAMLError as error:
+        raise InputError(source, key, "valid YAML", " ".join(str(error).split())) from error
+    return None if node is None else _value(node, source, key, literal)
+
+
+def _value(node: yaml.Node, source: Source, key: str, literal: bool) -> Any:
+    """The value of a node, its dotted key given."""
+    tag = node.tag.removeprefix(_TAG)
+    if isinstance(node, yaml.SequenceNode) and tag == "seq":
+        return [_value(item, source, f"{key}[{i}]", literal) for i, item in enumerate(node.value)]
+    if isinstance(node, yaml.MappingNode) and tag == "map":
+        result: dict[Any, Any] = {}
+        seen: set[str] = set()
+        for name_node, value_node in node.value:
+            name = _value(name_node, source, key, literal)
+            if not isinstance(name, (str, int)) or isinstance(name, bool):
+                raise InputError(source, key, "names, in quotes where YAML takes them otherwise", shown(name))
+            if str(name) in seen:  # 5 and "5" are one key to a reader of JSON
+                raise InputError(source, key, "each key once", f"{_REPR.repr(name)} again{_line(name_node)}")
+            seen.add(str(name))
+            result[name] = _value(value_node, source, f"{key}.{name}" if key else str(name), literal)
+        return result
+    if isinstance(node, yaml.ScalarNode):
+        return _scalar(node, tag, source, key, literal)
+    raise InputError(source, key, "plain values, without tags", f"{_REPR.repr(node.tag)}{_line(node)}")
+
+
+def _scalar(node: yaml.ScalarNode, tag: str, source: Source, key: str, literal: bool) -> Any:
+    text = str(node.value)
+    number = tag in ("int", "float") and (":" in text or (tag == "int" and not _DECIMAL.fullmatch(text)))
+    if tag == "str" or (literal and (number or tag in ("timestamp", "merge", "value"))):
+        return text
+    found = f"{_REPR.repr(text)}{_line(node)}"
+    if number:
+        raise InputError(source, key, "numbers without leading zeros, other words in quotes", found)
+    if tag not in ("null", "bool", "int", "float"):
+        what = {"timestamp": "a date: "}.get(tag, f"{_REPR.repr(node.tag)}: ")
+        raise InputError(source, key, "text in quotes, or a number", what + found)
+    try:
+        value = getattr(yaml.constructor.SafeConstructor(), f"construct_yaml_{tag}")(node)
+    except (ValueError, KeyError, IndexError) as error:
+        raise InputError(source, key, f"a value of the type {tag}", found) from error
+    if isinstance(value, float) and not math.isfinite(value) and not literal:
+        raise InputError(source, key, "a finite number", found)
+    return value
+
+
+def _entries(kind: Any, place: Sequence[str | int]) -> list[str]:
+    """Names that a dataclass or typed dictionary somewhere inside a type knows."""
+    for part in (*place, None):
+        if get_origin(kind) in (Union, UnionType):
+            kind = next(a for a in get_args(kind) if a is not NoneType)
+        if part is None:
+            break
+        if hasattr(kind, "__annotations__"):
+            kind = get_type_hints(kind)[str(part)]
+        elif get_args(kind):
+            kind = get_args(kind)[0 if isinstance(part, int) else -1]
+    return list(getattr(kind, "__annotations__", {}))
+
+
+def _line(node: yaml.Node) -> str:
+    return f" in line {node.start_mark.line + 1}"
+
+
+def _refuse(error: Any, kind: Any, source: Source, prefix: str) -> NoReturn:
+    """Raise the first fault that pydantic found, as an `InputError`."""
+    place = [part for part in error["loc"] if part != "[key]"]
+    key = prefix.rstrip(".")
+    for part in place:
+        key += f"[{part}]" if isinstance(part, int) else f".{part}" if key else part
+    if error["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
+        raise unknown(str(source), key, str(place[-1]), _entries(kind, place[:-1]))
+    if error["type"] == "missing":
+        raise InputError(source, key, "a value", "nothing")
+    if error["type"] == "value_error":
+        raise InputError(source, key, "valid values", error["msg"].removeprefix("Value error, "))
+    raise InputError(source, key, error["msg"].removeprefix("Input should be "), shown(error["input"]))

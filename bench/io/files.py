@@ -1,0 +1,442 @@
+"""Files written whole or not at all, names fit for files, fingerprints of content."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import hashlib
+import json
+import os
+import stat
+import tempfile
+import threading
+import time
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, is_dataclass
+from functools import partial
+from io import FileIO
+from itertools import takewhile
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from ..errors import InputError, UnavailableError
+
+MAX_NAME_BYTES = 120
+"""Longest name of a subject, a sequence or a camera; a file name made of several has to fit into 255 bytes."""
+
+GROUP_FILES, GROUP_SECONDS, FLUSHES = 64, 2.0, 16
+"""Most files of a group, how long the first of it waits, how many are flushed at once."""
+
+TEMPORARY = ".tmp-headbench-"
+"""How the names of temporary files begin; those of dead processes are removed by this."""
+
+_UMASK = os.umask(0o077)
+os.umask(_UMASK)
+
+
+@contextmanager
+def atomic_path(path: Path) -> Iterator[Path]:
+    """Give a temporary name beside ``path``; rename it to ``path`` if the block ends without an error.
+
+    The content is on disk before the rename, and every earlier rename as well: after a power cut no file is there
+    half, and none without those written before it. The temporary name keeps the suffix, since many writers choose
+    their format by it. A link at ``path`` is replaced, not followed.
+
+    Raises
+    ------
+    InputError : the folder lies outside the one that `output_inside` was given, by a link.
+    OSError : the system cannot write; ``filename`` is ``path``.
+    """
+    _check_target(path)
+    check_inside(path.parent)
+    _make_folder(path.parent)
+    write = _start(path)
+    try:
+        with _naming(write):
+            yield write.temporary
+    except BaseException:
+        write.drop()
+        raise
+    _writes.add(write)
+
+
+@contextmanager
+def grouped_writes() -> Iterator[None]:
+    """Flush and rename what the block writes with `atomic_path` in groups, which takes about half the time.
+
+    For loops over many small files, which must not read back in the block what they wrote in it.
+    """
+    _writes.groups += 1
+    try:
+        yield
+    finally:
+        _writes.groups -= 1
+        flush_renames()
+
+
+def flush_renames() -> None:
+    """Wait until all files written so far are on disk under their names."""
+    _writes.commit()
+    _writes.flush()
+
+
+@dataclass(frozen=True, eq=False)
+class _Write:
+    """A file written under a temporary name. The open ``stream`` locks it: its process lives."""
+
+    stream: FileIO
+    temporary: Path
+    path: Path
+
+    def rename(self) -> None:
+        with _naming(self), self.stream:
+            # mkstemp makes private files, and so do some writers; results are to be read by whoever may read the folder.
+            if os.stat(self.temporary).st_nlink == 1:  # not a file that lies elsewhere as well
+                os.chmod(self.temporary, 0o666 & ~_UMASK)
+            os.replace(self.temporary, self.path)
+
+    def drop(self) -> None:
+        with self.stream:
+            self.temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def _naming(write: _Write) -> Iterator[None]:
+    """Name the file meant in errors; the system reports a full disk without a name, or with the temporary one."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno is not None and error.filename in (None, str(write.temporary)):
+            error.filename, error.filename2 = str(write.path), None
+        raise
+
+
+class _Writes:
+    """Files that wait for their rename, and folders whose renames may not be on disk yet."""
+
+    def __init__(self) -> None:
+        self.lock = threading.RLock()
+        self.groups = 0
+        self.waiting: list[_Write] = []
+        self.since = 0.0
+        self.folders: set[Path] = set()
+
+    def add(self, write: _Write) -> None:
+        with self.lock:
+            if not self.waiting:
+                self.since = time.monotonic()
+            self.waiting.append(write)
+            late = time.monotonic() - self.since > GROUP_SECONDS
+            if not self.groups or late or len(self.waiting) >= GROUP_FILES:
+                self.commit()
+
+    def commit(self) -> None:
+        """Flush the waiting files and the earlier renames, all at once: the disk then takes them in one go."""
+        with self.lock:
+            writes, self.waiting = self.waiting, []
+            try:
+                if writes:
+                    self.flush(*writes)
+                while writes:
+                    writes[0].rename()
+                    self.folders.add(writes.pop(0).path.parent)
+            finally:
+                for write in writes:
+                    write.drop()
+
+    def flush(self, *writes: _Write) -> None:
+        with self.lock:
+            folders, self.folders = self.folders, set()  # one that fails is not tried again by later writes
+            tasks = [partial(_flush_file, write) for write in writes]
+            tasks += [partial(_flush_folder, folder) for folder in folders]
+            if len(tasks) > 1:
+                with ThreadPoolExecutor(min(len(tasks), FLUSHES)) as pool:
+                    for done in [pool.submit(task) for task in tasks]:
+                        done.result()
+            else:
+                for task in tasks:
+                    task()
+
+
+_writes = _Writes()
+
+
+def _flush_file(write: _Write) -> None:
+    with _naming(write):
+        _flush(write.temporary)  # by its name: some writers replace the file that they are given
+
+
+def _flush_folder(folder: Path) -> None:
+    try:
+        _flush(folder)
+    except (
+        OSError
+    ) as error:  # a file system that flushes no folders, one that may not be listed, one removed since
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP, errno.EACCES, errno.ENOENT):
+            error.filename = str(folder)
+            raise
+
+
+def _flush(path: Path) -> None:
+    """Wait until a file or a folder is on disk."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _make_folder(folder: Path) -> None:
+    """Make a folder with its parents; their names are flushed with the first file in it."""
+    missing = list(takewhile(lambda path: not path.exists(), (folder, *folder.parents)))
+    folder.mkdir(parents=True, exist_ok=True)
+    with _writes.lock:
+        _writes.folders.update(path.parent for path in missing)
+
+
+def _start(path: Path) -> _Write:
+    """A new file beside ``path``, open and locked, so that others see that its process lives."""
+    if path.parent not in _searched:
+        _searched.add(path.parent)
+        with os.scandir(path.parent) as entries:
+            _remove_dead(entry.path for entry in entries)
+    while True:
+        try:
+            handle, name = tempfile.mkstemp(dir=path.parent, prefix=TEMPORARY, suffix=path.suffix)
+        except OSError as error:
+            error.filename = str(path)
+            raise
+        stream = FileIO(handle, "r+")
+        if _lock(stream) is not False and os.fstat(handle).st_nlink:
+            return _Write(stream, Path(name), path)
+        stream.close()  # taken for a dead one's between its making and its lock
+
+
+def remove_dead_temporaries(folder: Path) -> None:
+    """Remove what processes that were killed left of unfinished files in a folder and all below."""
+    for root, _, names in os.walk(folder):
+        _remove_dead(os.path.join(root, name) for name in names)
+
+
+_searched: set[Path] = set()
+"""Folders in which this process has looked for temporary files of dead ones."""
+
+
+def _remove_dead(paths: Iterable[str]) -> None:
+    for path in paths:
+        if not os.path.basename(path).startswith(TEMPORARY):
+            continue
+        try:
+            stream = FileIO(path, "r+", opener=no_link)
+        except (OSError, InputError):
+            continue  # finished meanwhile, or not one of ours
+        with stream:
+            if _lock(stream):
+                Path(path).unlink(missing_ok=True)
+
+
+def _lock(stream: FileIO) -> bool | None:
+    """Lock an open file; False where another process has, None where the file system knows no locks."""
+    try:
+        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return None
+    return True
+
+
+_roots: list[Path] = []
+
+
+@contextmanager
+def output_inside(root: Path) -> Iterator[None]:
+    """Refuse to write by links out of ``root``, which may have come from a stranger, while the block runs."""
+    _roots.append(root)
+    try:
+        yield
+    finally:
+        _roots.remove(root)
+
+
+def check_inside(folder: Path) -> None:
+    """Raise `InputError` for a folder below one of `output_inside`'s that is a link out of it, or lies behind one."""
+    given = os.path.abspath(folder)
+    for root in _roots:
+        if _below(given, os.path.abspath(root)):
+            found = os.path.realpath(given)
+            if not _below(found, os.path.realpath(root)):
+                remedy = "Remove the link; nothing is written outside of the output folder."
+                raise InputError(folder, "", f"a folder inside {root}", f"a link to {found}", remedy)
+
+
+def refuse_links(folder: Path) -> None:
+    """Raise `InputError` for links that lead out of a folder that others than `atomic_path` are to write in."""
+    check_inside(folder)
+    for root, folders, names in os.walk(folder):
+        for path in (os.path.join(root, name) for name in (*folders, *names)):
+            if os.path.islink(path) and not _below(os.path.realpath(path), os.path.realpath(folder)):
+                raise InputError(path, "", f"files inside {folder}", "a link out of it", "Remove the link.")
+
+
+def _below(path: str, root: str) -> bool:
+    return os.path.commonpath([path, root]) == root
+
+
+def no_link(path: str, flags: int) -> int:
+    """Open as `os.open` does, but never through a link; an ``opener`` for `open`."""
+    try:
+        return os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
+    except OSError as error:
+        if error.errno != errno.ELOOP:
+            raise
+        raise InputError(path, "", "a file", "a link", "Remove it.") from error
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file atomically (UTF-8)."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Write a file of bytes atomically."""
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write a JSON file atomically, keys in the order given, numpy scalars and arrays as numbers and lists.
+
+    Raises `ValueError` for a number that is not finite: no reader would take it.
+    """
+    write_text(path, json.dumps(value, indent=1, default=plain, allow_nan=False) + "\n")
+
+
+def check_writable(path: Path, option: str) -> None:
+    """Make sure, before long work, that a file can be written at ``path``; makes its folder.
+
+    Raises `InputError`, naming the ``option`` that asked for the file.
+    """
+    try:
+        _check_target(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+    except (OSError, ValueError) as error:  # ValueError: a name that no file can have
+        found = getattr(error, "strerror", None) or str(error)
+        raise InputError(path, option, "a file that can be written", found) from error
+
+
+def _check_target(path: Path) -> None:
+    """Refuse what a rename must not replace; a device would be replaced by a file where the system lets us."""
+    try:
+        mode = os.stat(path).st_mode
+    except FileNotFoundError:
+        return
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if not stat.S_ISREG(mode):
+        raise FileExistsError(errno.EEXIST, "Not a regular file", str(path))
+
+
+@contextmanager
+def open_regular(path: Path, expected: str) -> Iterator[BinaryIO]:
+    """Open a file for reading bytes. Raises `InputError`, which names what was ``expected``, for anything else.
+
+    A pipe or a device of that name, which might never end, is refused without being waited for.
+    """
+    try:
+        handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+    except FileNotFoundError as error:
+        raise InputError(path, "", expected, "no such file") from error
+    except (OSError, ValueError) as error:  # ValueError: a name that no file can have
+        raise InputError(path, "", expected, getattr(error, "strerror", "") or str(error)) from error
+    kind = os.fstat(handle).st_mode
+    if not stat.S_ISREG(kind):
+        os.close(handle)
+        raise InputError(path, "", expected, "a folder" if stat.S_ISDIR(kind) else "a pipe or a device")
+    with os.fdopen(handle, "rb") as stream:
+        yield stream
+
+
+def read_bytes(path: Path, expected: str, limit: int) -> bytes:
+    """A file's content. Raises `InputError` as `open_regular` does, and for more than ``limit`` bytes."""
+    with open_regular(path, expected) as stream:
+        size = os.fstat(stream.fileno()).st_size
+        if size > limit:
+            raise InputError(path, "", f"{expected} of at most {limit} bytes", f"{size}")
+        try:
+            return stream.read(size)
+        except OSError as error:
+            raise InputError(path, "", expected, error.strerror or str(error)) from error
+
+
+def check_name(name: str, file: str | os.PathLike[str], key: str) -> str:
+    """Return a name if it can be one part of a path; it came from outside, and folders are named after it.
+
+    Raises `InputError` for an empty name, one that starts with a dot, one longer than `MAX_NAME_BYTES`, and one
+    with a slash, a backslash, a colon or a control character: such a name could lead out of the folder that it
+    is put in.
+    """
+    unfit = any(character in "/\\:" or not character.isprintable() for character in name)
+    if not name or name.startswith(".") or unfit or len(name.encode(errors="replace")) > MAX_NAME_BYTES:
+        expected = f"a name without slashes, colons and leading dots, of 1 to {MAX_NAME_BYTES} bytes"
+        raise InputError(file, key, expected, repr(name[:60]))
+    return name
+
+
+def plain(value: Any) -> Any:
+    """Turn a dataclass, array, path or set into what JSON knows; for ``json.dumps(default=plain)``."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return asdict(value)
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, Path):
+        return value.as_posix()
+    if isinstance(value, (set, frozenset)):
+        return sorted(value)
+    if isinstance(value, tuple):
+        return list(value)
+    raise TypeError(f"{type(value).__name__} has no JSON form")
+
+
+def cache_folder() -> Path:
+    """The user's cache: ``$XDG_CACHE_HOME/headbench``, by default ``~/.cache/headbench``.
+
+    Raises `UnavailableError` where the user has no home.
+    """
+    try:
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "headbench"
+    except RuntimeError as error:
+        remedy = "Set HOME, or XDG_CACHE_HOME to a folder for caches."
+        raise UnavailableError(
+            "The user's cache has no place: the user has no home folder.", remedy
+        ) from error
+
+
+def digest(*values: Any) -> str:
+    """Hex SHA-256 over arrays (dtype, shape, bytes), bytes, text and JSON-like values, in order."""
+    state = hashlib.sha256()
+    for value in values:
+        if isinstance(value, np.ndarray):
+            state.update(f"{value.dtype.str}{value.shape}".encode())
+            state.update(np.ascontiguousarray(value).tobytes())
+        elif isinstance(value, bytes):
+            state.update(value)
+        else:
+            state.update(json.dumps(value, sort_keys=True, default=plain).encode())
+        state.update(b"\0")
+    return state.hexdigest()
+
+
+def digest_file(path: Path) -> str:
+    """Hex SHA-256 of a file's bytes."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -1,0 +1,97 @@
+"""One process at a time in a folder: two that write the same frames and rows would mix their results."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import json
+import os
+import platform
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import IO
+
+from ..errors import InputError
+from .files import check_inside, flush_renames, no_link, output_inside, remove_dead_temporaries
+
+LOCK_FILE = "run.lock"
+_MOST = 1000  # characters of a lock file that are read
+
+
+@contextmanager
+def locked(folder: Path, *, beside: bool = False) -> Iterator[None]:
+    """Keep other processes out of ``folder`` while the block writes in it; the lock file names the owner.
+
+    The lock is the system's (``flock``), so that it ends with its process however that ends: a file left by a killed
+    one keeps nobody out. Under it, temporary files of dead processes are removed, and nothing is written through
+    links that lead out of the folder. ``beside``: the lock file lies beside the folder, which may have to be empty.
+
+    Raises
+    ------
+    InputError : another process works in the folder; says which, where and since when. The folder cannot be made,
+        or its lock file is a link.
+    """
+    path = folder.resolve().parent / f".{folder.resolve().name}.lock" if beside else folder / LOCK_FILE
+    check_inside(folder)
+    is_new = not folder.exists()
+    stream = _acquire(path)
+    try:
+        owner = {"process": os.getpid(), "host": platform.node(), "since": _now()}
+        stream.seek(0)
+        stream.truncate()
+        stream.write(json.dumps(owner) + "\n")
+        stream.flush()
+        remove_dead_temporaries(folder)
+        with output_inside(folder):
+            yield
+    finally:
+        try:
+            flush_renames()
+        finally:
+            path.unlink(missing_ok=True)  # while still locked: whoever waits sees that the file has gone
+            stream.close()
+            if is_new:
+                with suppress(OSError):  # unless it is empty: nothing came of it
+                    folder.rmdir()
+
+
+def _acquire(path: Path) -> IO[str]:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    while True:
+        stream = open(path, "a+", encoding="utf-8", opener=no_link)  # noqa: SIM115
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            stream.seek(0)
+            owner = _described(stream.read(_MOST))
+            stream.close()
+            if error.errno not in (errno.EACCES, errno.EAGAIN):
+                raise
+            remedy = "Wait for it to end, or choose another folder."
+            raise InputError(path, "", "a folder that no other process works in", owner, remedy) from None
+        if _is_still(path, stream):
+            return stream
+        stream.close()  # the owner before us removed the file between our opening and locking it
+
+
+def _is_still(path: Path, stream: IO[str]) -> bool:
+    """Whether the open file is the one that lies at ``path`` now."""
+    try:
+        return os.path.samestat(path.stat(), os.fstat(stream.fileno()))
+    except FileNotFoundError:
+        return False
+
+
+def _described(text: str) -> str:
+    """The owner in words; the file may be half written, or not ours."""
+    try:
+        owner = json.loads(text)
+        return f"process {int(owner['process'])} on {owner['host']}, since {owner['since']}"
+    except (ValueError, KeyError, TypeError):
+        return "another process, which does not tell its number"
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")

@@ -1,1 +1,0 @@
-"""Trained avatars beyond what was recorded: views, expressions and drivers without ground truth."""

@@ -1,0 +1,127 @@
+"""Brings clips into the form that a method declares: head model, image size, one video. Bench knows no steps.
+
+A reader's `DatasetSpec.adapt` names the function that does it::
+
+    adapt(clip, needs, heads) -> (folder, progress) -> AdaptedClip
+
+The outer call checks whether the needs can be met and raises `InputError` where they cannot, before any long work;
+the call it returns does the work and keeps under ``folder`` whatever took long. ``heads`` are files of head models
+by version.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ..contracts import Clip, FloatArray, FrameKey, Progress
+from ..errors import InputError
+from ..progress import progress
+from ..registry import resolve
+from ..specs import DatasetSpec, MethodSpec, ResolutionRule
+
+
+@dataclass(frozen=True)
+class MethodNeeds:
+    """The form in which a method takes a clip; see the attributes of `MethodSpec`."""
+
+    head_models: tuple[str, ...] = ()
+    monocular: bool = False
+    resolution: ResolutionRule = field(default_factory=ResolutionRule)
+
+    @classmethod
+    def of(cls, spec: MethodSpec) -> MethodNeeds:
+        """What a method declares."""
+        return cls(spec.head_models, spec.monocular, spec.resolution)
+
+
+def _same_key(key: FrameKey) -> FrameKey:
+    return key
+
+
+def _same_image(key: FrameKey, rgb: FloatArray) -> FloatArray:
+    return rgb
+
+
+@dataclass(frozen=True, eq=False)
+class AdaptedClip:
+    """A clip in the form that a method needs, and the way back to the frames of the protocol.
+
+    Attributes
+    ----------
+    clip : what the method is trained on. Its cameras and poses are those to render.
+    key : a frame's key in ``clip``, given its key in the protocol.
+    restore : takes a protocol key and the (H, W, 3) float render of that frame as ``clip`` has it, and returns
+        the render at the protocol's size, not yet quantised.
+    """
+
+    clip: Clip
+    key: Callable[[FrameKey], FrameKey] = _same_key
+    restore: Callable[[FrameKey, FloatArray], FloatArray] = _same_image
+
+
+Adaptation = Callable[[Path, Progress], AdaptedClip]
+
+
+def plan(clip: Clip, needs: MethodNeeds, reader: DatasetSpec, heads: Mapping[str, str]) -> Adaptation | None:
+    """Check that ``clip`` can be brought into the form needed; return what will do it, None where it has it.
+
+    A monocular method gets the clip as the reader's steps make it even where there is one view, since they also
+    move the head's rigid motion into the cameras.
+
+    Raises
+    ------
+    InputError
+        Where the clip lacks what the method needs and its reader knows no way there.
+    """
+    if _has_form(clip, needs) and not (needs.monocular and reader.adapt):
+        return None
+    if not reader.adapt:
+        check(clip, needs)
+    made: Adaptation = resolve(reader.adapt)(clip, needs, heads)
+    return made
+
+
+def carry_out(adaptation: Adaptation, needs: MethodNeeds, folder: Path, label: str) -> AdaptedClip:
+    """Run a planned adaptation and hold its result to the needs."""
+    with progress(label) as report:
+        adapted = adaptation(folder, report)
+    check(adapted.clip, MethodNeeds(needs.head_models, needs.monocular))
+    return adapted
+
+
+def check(clip: Clip, needs: MethodNeeds) -> None:
+    """Raise `InputError` for the first need that a clip does not meet as it is."""
+    where = f"clip {clip.subject}"
+    if needs.head_models and clip.head.version not in needs.head_models:
+        expected = f"a capture tracked with {' or '.join(needs.head_models)}"
+        raise InputError(where, "head_models", expected, clip.head.version)
+    views = _further_views(clip)
+    if needs.monocular and views:
+        expected = "a single video, one training frame at a timestep"
+        raise InputError(where, "monocular", expected, f"{views} further views")
+    if not needs.resolution.native:
+        raise InputError(where, "resolution", f"images made to {needs.resolution}", "images as recorded")
+
+
+def record(clip: Clip, adapted: AdaptedClip, method: str) -> dict[str, Any]:
+    """What the manifest says of an adapted clip: the steps added and the fingerprint they lead to."""
+    added: Sequence[Any] = adapted.clip.steps[len(clip.steps) :]
+    return {
+        "subject": clip.subject,
+        "method": method,
+        "fingerprint": adapted.clip.fingerprint,
+        "steps": [asdict(step) for step in added],
+    }
+
+
+def _has_form(clip: Clip, needs: MethodNeeds) -> bool:
+    fits = not needs.head_models or clip.head.version in needs.head_models
+    return fits and needs.resolution.native and not (needs.monocular and _further_views(clip))
+
+
+def _further_views(clip: Clip) -> int:
+    train = clip.splits["train"]
+    return len(train) - len({key.timestep for key in train})

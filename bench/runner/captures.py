@@ -1,0 +1,208 @@
+"""Opens the captures of a run through the reader asked for, and holds what it gives to the contract."""
+
+from __future__ import annotations
+
+import inspect
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import get_args, get_type_hints
+
+from ..configuration import build_arguments
+from ..contracts import Clip
+from ..errors import InputError
+from ..io.files import check_name
+from ..progress import progress
+from ..registry import get, resolve
+from ..specs import LABEL, DatasetSpec, ResolutionRule, is_label
+from .adaptation import MethodNeeds, carry_out, plan
+from .config import RunConfig
+from .options import RunOptions
+from .store import RunFolder
+
+HARNESS = ("progress", "remembered")
+"""Keywords of a reader that are no settings: the harness gives them, see `DatasetSpec`."""
+
+
+def open_clips(config: RunConfig, *, remembered: bool = True) -> list[Clip]:
+    """Open every capture under ``config.data``, each validated whole by its reader, at the size to be measured at.
+
+    ``remembered`` is False where every byte has to be read, whatever a reader remembers of an earlier time.
+
+    Raises `InputError` for a folder without captures, a setting the reader does not know or of the wrong type,
+    subjects that are not distinct, and whatever the reader finds wrong.
+    """
+    spec: DatasetSpec = get("datasets", config.reader)
+    if not spec.reads:
+        raise InputError("reader", spec.name, "a dataset that is read", "one that makes captures")
+    read = resolve(spec.implementation)
+    settings = build_arguments(read, config.reader_settings, "reader_settings", harness=HARNESS)
+    root = Path(config.data)
+    if not root.exists():
+        raise InputError(root, "--data", "a capture folder", "no such folder")
+    paths: Sequence[Path] = resolve(spec.find)(root) if spec.find else [root]
+    if not paths:
+        raise InputError(root, "--data", f"captures that reader {spec.name!r} knows", "none")
+    clips: list[Clip] = []
+    for path in paths:
+        with progress(f"reading {path.name}") as report:
+            offered = {"progress": report, "remembered": remembered}
+            given = {name: offered[name] for name in inspect.signature(read).parameters.keys() & HARNESS}
+            clips.append(_reduced(_checked(read(path, **settings, **given)), spec, config))
+    subjects = [clip.subject for clip in clips]
+    if len(set(subjects)) != len(subjects):
+        raise InputError(root, "subject", "a different subject in each capture", ", ".join(subjects))
+    return clips
+
+
+def relative_paths(config: RunConfig) -> dict[str, str]:
+    """Files and folders that settings name, by dotted key, relative to the run folder: both can be moved together."""
+    root = Path(config.out).resolve()
+    named = {key: Path(value).resolve() for key, value in _named(config).items()}
+    return {key: Path(os.path.relpath(path, root)).as_posix() for key, path in named.items()}
+
+
+def run_configuration(run: Path, options: RunOptions) -> RunConfig:
+    """Settings of a run, its folder and the files it names being where they are now.
+
+    Raises
+    ------
+    InputError
+        For a folder that is not a run's, plug-ins that only `RunOptions.trust` loads, and a capture or another file
+        that is neither at its recorded place relative to the run folder nor where the settings name it.
+    """
+    return next(_configurations(run, options))
+
+
+def open_run_clips(
+    run: Path, options: RunOptions, *, out: Path | None = None, altered: bool = False, remembered: bool = True
+) -> tuple[RunConfig, list[Clip]]:
+    """Open the captures that a run was made from; return its settings as well, see `run_configuration`.
+
+    Parameters
+    ----------
+    out : becomes ``out`` of the settings, where opening may keep what took long; None: the run, whose lock is held.
+    altered : return what is there even if it is not what the run was made from.
+    remembered : see `open_clips`.
+
+    Raises
+    ------
+    InputError
+        As `run_configuration` and `open_clips` do, and unless ``altered`` for a capture of another fingerprint.
+    """
+    recorded = {clip.subject: clip.fingerprint for clip in RunFolder(run).read_manifest().clips}
+    found: list[tuple[RunConfig, list[Clip]]] = []
+    refused: list[InputError] = []
+    for config in _configurations(run, options):
+        config = config if out is None else replace(config, out=str(out))
+        try:
+            clips = open_clips(config, remembered=remembered)
+        except InputError as error:
+            refused.append(error)
+            continue
+        if all(recorded.get(clip.subject) == clip.fingerprint for clip in clips):
+            return config, clips
+        found.append((config, clips))
+    if not found:
+        raise refused[0]
+    config, clips = found[0]
+    if altered:
+        return config, clips
+    other = next(clip for clip in clips if recorded.get(clip.subject) != clip.fingerprint)
+    raise InputError(
+        config.data,
+        f"subject {other.subject}",
+        f"the capture of the run ({str(recorded.get(other.subject))[:12]})",
+        f"another ({other.fingerprint[:12]})",
+        "Name the folder of the capture with --data, or run again.",
+    )
+
+
+def _configurations(run: Path, options: RunOptions) -> Iterator[RunConfig]:
+    """The settings of a run with every place where its capture may be; one at least."""
+    folder = RunFolder(run)
+    manifest = folder.read_manifest()
+    config = replace(manifest.configuration, out=str(run))
+    if not options.trust:
+        _check_registered(config, folder.manifest)
+    if options.head is not None:
+        config = replace(config, reader_settings={**config.reader_settings, "head": options.head})
+    given = {"data": options.data, "reader_settings.head": options.head}
+    places: dict[str, list[str]] = {}
+    for key, path in _named(config).items():
+        if given.get(key):
+            places[key] = [str(given[key])]
+            continue
+        relative = (manifest.paths or {}).get(key)
+        beside = [] if relative is None else [os.path.normpath(run.resolve() / relative)]
+        tried = [*beside, path]
+        places[key] = [place for place in tried if Path(place).exists()]
+        if not places[key]:
+            remedy = _REMEDIES.get(key, "Put it there.")
+            raise InputError(
+                folder.manifest, f"configuration.{key}", f"{' or '.join(tried)}", "neither there", remedy
+            )
+    settings, heads = dict(config.reader_settings), dict(config.heads)
+    for key, (place, *_) in places.items():
+        group, _, name = key.partition(".")
+        if name:
+            {"reader_settings": settings, "heads": heads}[group][name] = place
+    for place in places["data"]:
+        yield replace(config, data=place, reader_settings=settings, heads=heads)
+
+
+_REMEDIES = {
+    "data": "Name the folder of the capture with --data.",
+    "reader_settings.head": "Name the file of the head model with --head.",
+}
+
+
+def _named(config: RunConfig) -> dict[str, str]:
+    """The files and folders that settings name, by dotted key."""
+    hints = get_type_hints(resolve(get("datasets", config.reader).implementation))
+    files = {
+        f"reader_settings.{key}": value
+        for key, value in config.reader_settings.items()
+        if isinstance(value, str) and Path in (hints.get(key), *get_args(hints.get(key)))
+    }
+    return {"data": config.data, **files, **{f"heads.{key}": path for key, path in config.heads.items()}}
+
+
+def _check_registered(config: RunConfig, manifest: Path) -> None:
+    """Refuse names that would import a module which a run folder names: it may come from anybody."""
+    named: Mapping[str, Sequence[str]] = {
+        "methods": config.methods,
+        "metrics": config.metrics,
+        "metric_profiles": config.metric_profiles,
+        "reader": (config.reader,),
+    }
+    for key, names in named.items():
+        for name in names:
+            if ":" in name:
+                remedy = (
+                    "Give --trust to import it, if you trust who made the run; or register it as a plug-in."
+                )
+                raise InputError(manifest, f"configuration.{key}", "registered names", repr(name), remedy)
+
+
+def _reduced(clip: Clip, reader: DatasetSpec, config: RunConfig) -> Clip:
+    """The clip at the size that metrics are taken at."""
+    needs = MethodNeeds(resolution=ResolutionRule(divide=config.divide))
+    planned = plan(clip, needs, reader, {})
+    if planned is None:
+        return clip
+    return carry_out(planned, needs, Path(config.out), f"reducing {clip.subject}").clip
+
+
+def _checked(clip: Clip) -> Clip:
+    """Make sure that files and folders can be named after what the clip holds, and results read."""
+    source = f"clip {clip.subject}"
+    check_name(clip.subject, source, "subject")
+    if not is_label(clip.fingerprint):
+        raise InputError(source, "fingerprint", LABEL, repr(clip.fingerprint))
+    for camera in clip.cameras:
+        check_name(camera, source, "camera")
+    for sequence in {key.sequence for keys in clip.splits.values() for key in keys}:
+        check_name(sequence, source, "sequence")
+    return clip

@@ -1,0 +1,181 @@
+"""What a comparison is asked to do, resolved and checked whole before any work."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+from ..configuration import build, merge
+from ..contracts import Budget, TaskName
+from ..errors import InputError
+from ..io.files import check_name
+from ..registry import get, resolve, unknown
+from ..specs import MethodSpec, MetricSpec, ProfileSpec
+from .adaptation import MethodNeeds
+
+CANONICAL = "canonical"
+"""The metric profile that bare metric names belong to."""
+
+COST_METRICS = (
+    *("latency_p50", "latency_p95", "latency_p99", "latency_still", "processor_time", "throughput"),
+    *("stage_drive", "stage_deform", "stage_raster", "stage_post", "stage_read_back"),
+    *("storage_packed", "storage_shared", "primitives", "primitive_bytes", "driving_rate"),
+    *("training_time", "training_memory"),
+)
+"""Further numbers of the measurements of speed and storage, and of training: tables of their own show them."""
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Settings of ``headbench run``, as in its YAML file.
+
+    Attributes
+    ----------
+    data : capture folder, or a folder with several.
+    out : folder for everything the run makes.
+    methods : names of registered methods, or "package.module:SPEC".
+    preset : settings by name: smoke, demo, fast, paper.
+    seeds : one avatar is trained for each.
+    tasks, metrics : what is measured.
+    metric_profiles : sets of definitions to take the metrics by, see ``headbench list profiles``.
+    regions : parts of the frame to measure beside the whole of it, where a metric can; None: the face, where the
+        capture's reader knows it.
+    reader : which dataset reader opens the captures.
+    reader_settings : passed to it (for example ``head``: path of the head model).
+    frames_per_task : score at most so many frames per subject and task, evenly spaced; None: all.
+    device : "cpu", "cuda", ...
+    settings : per method, over the preset; the key ``budget`` holds iterations and seconds.
+    divide : reduce all images by this factor, by area means, before anything else: the size that metrics are
+        taken at is then that of the reduced images.
+    heads : files of further head models by version, for methods that want another than a capture was tracked
+        with; their tracking is refitted.
+    """
+
+    data: str
+    out: str
+    methods: tuple[str, ...] = ("mean-image", "nearest-camera", "ga", "ours")
+    preset: str = "fast"
+    seeds: tuple[int, ...] = (0,)
+    tasks: tuple[TaskName, ...] = ("novel_view", "self_reenactment")
+    metrics: tuple[str, ...] = ("psnr", "ssim", "lpips", "storage", "fps", *COST_METRICS)
+    metric_profiles: tuple[str, ...] = ("canonical",)
+    regions: tuple[str, ...] | None = None
+    reader: str = "ga"
+    reader_settings: dict[str, Any] = field(default_factory=dict)
+    frames_per_task: int | None = None
+    device: str = "cpu"
+    settings: dict[str, dict[str, Any]] = field(default_factory=dict)
+    divide: int = 1
+    heads: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Refuse what could only fail later."""
+        for name in ("methods", "seeds", "tasks", "metrics", "metric_profiles"):
+            values = getattr(self, name)
+            if not values:
+                raise ValueError(f"{name} is empty")
+            if len(set(values)) != len(values):
+                raise ValueError(f"{name} names something twice: {', '.join(map(str, values))}")
+        if not re.fullmatch(r"(cpu|cuda|mps|xpu)(:\d+)?", self.device):
+            raise ValueError(f"device is {self.device!r}; cpu, cuda, cuda:1 and the like")
+        if self.divide < 1:
+            raise ValueError(f"divide is {self.divide}; a whole number from 1")
+        if self.frames_per_task is not None and self.frames_per_task < 1:
+            raise ValueError(f"frames_per_task is {self.frames_per_task}; at least 1, or none for all")
+
+
+@dataclass(frozen=True)
+class ResolvedMethod:
+    """A method with its settings: spec, configuration and budget."""
+
+    spec: MethodSpec
+    config: Any
+    budget: Budget
+
+    def create(self) -> Any:
+        """Import the implementation and make the `Method`."""
+        implementation = resolve(self.spec.implementation)
+        return implementation() if self.config is None else implementation(self.config)
+
+    def record(self) -> dict[str, Any]:
+        """Everything that decides what this method does, for fingerprint and manifest."""
+        needs = MethodNeeds.of(self.spec)
+        return {
+            "name": self.spec.name,
+            "version": self.spec.version,
+            "implementation": self.spec.implementation,
+            "trivial": self.spec.trivial,
+            "config": None if self.config is None else asdict(self.config),
+            "budget": asdict(self.budget),
+            **({} if needs == MethodNeeds() else {"needs": asdict(needs)}),
+        }
+
+
+def resolve_methods(config: RunConfig) -> list[ResolvedMethod]:
+    """Resolve every method of a run. Raises `InputError` for unknown methods, presets and settings."""
+    specs: list[MethodSpec] = [get("methods", name) for name in config.methods]
+    for name, count in Counter(spec.name for spec in specs).items():
+        check_name(name, "registry of methods", "name")
+        if count > 1:
+            raise InputError("methods", name, "each method once", f"{count} of that name")
+    stray = set(config.settings) - {spec.name for spec in specs}
+    if stray:
+        raise unknown("settings", "method", min(stray), [spec.name for spec in specs])
+    return [resolve_method(spec, config.preset, config.settings.get(spec.name, {})) for spec in specs]
+
+
+def resolve_method(spec: MethodSpec, preset: str, settings: Mapping[str, Any]) -> ResolvedMethod:
+    """Lay ``settings`` over a preset. A method without presets takes any preset name."""
+    if spec.presets and preset not in spec.presets:
+        raise unknown(f"method {spec.name}", "preset", preset, spec.presets)
+    spec = spec.at_preset(preset)
+    source = f"settings of {spec.name}"
+    if not isinstance(settings, Mapping):
+        raise InputError(source, "", "a group of settings", repr(settings))
+    values = merge(spec.presets.get(preset, {}), settings)
+    budget = build(Budget, values.pop("budget", {}), source, "budget.")
+    if (budget.iterations is not None and budget.iterations < 1) or (
+        budget.seconds is not None and budget.seconds <= 0
+    ):
+        raise InputError(source, "budget", "a positive number of iterations or seconds", str(asdict(budget)))
+    if not spec.config:
+        if values:
+            raise InputError(source, next(iter(values)), "no settings: this method has none", "a setting")
+        return ResolvedMethod(spec, None, budget)
+    return ResolvedMethod(spec, build(resolve(spec.config), values, source), budget)
+
+
+def resolve_metrics(config: RunConfig) -> list[MetricSpec]:
+    """Resolve the metrics of a run by name, in every profile asked for that defines them.
+
+    Metrics of the avatar as a whole, and those that no profile defines, are taken as they are registered. The first
+    profile's stand in the comparison table, each further profile's in a table of its name.
+
+    Raises
+    ------
+    InputError : an unknown metric or profile, a metric that none of the profiles asked for defines.
+    """
+    profiles: list[ProfileSpec] = [get("profiles", name) for name in config.metric_profiles]
+    defined = {metric.name for metric in get("profiles", CANONICAL).metrics}
+    found: list[MetricSpec] = []
+    for name in config.metrics:
+        spec: MetricSpec = get("metrics", name)
+        if spec.name not in defined:
+            found.append(spec)
+            continue
+        named = [f"{spec.name}@{profile.name}" for profile in profiles]
+        of_profiles = [m for p in profiles for m in p.metrics if m.name == spec.name or m.name in named]
+        if not of_profiles:
+            expected = f"one that the profiles {', '.join(config.metric_profiles)} define"
+            raise InputError("metrics", spec.name, expected, "none of them does", "Leave it out.")
+        found += of_profiles
+    first = profiles[0].name
+    for metric in found:
+        for name in (metric.name, *metric.tables):
+            check_name(name, "registry of metrics", f"name and tables of {metric.name}")
+    return [
+        replace(m, tables=("comparison", *m.tables)) if m.profile == first != CANONICAL else m for m in found
+    ]

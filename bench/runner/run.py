@@ -1,0 +1,237 @@
+"""Runs a comparison: checks everything, then fits, renders and measures cell by cell, then reports."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..contracts import Clip
+from ..device import check_device
+from ..errors import HeadbenchError, InputError, UnavailableError
+from ..io.files import atomic_path, output_inside
+from ..io.lock import locked
+from ..machine import machine_record, peak_memory_bytes
+from ..manifest import AdaptedRecord, ClipRecord, Manifest, MethodRecord, ProtocolRecord
+from ..progress import duration, run_progress
+from ..protocol import Protocol, make_protocol
+from ..registry import discover, get, resolve
+from ..rows import Rows
+from ..specs import DatasetSpec, MetricSpec
+from . import adaptation
+from .adaptation import AdaptedClip, MethodNeeds
+from .captures import open_clips, relative_paths
+from .config import ResolvedMethod, RunConfig, resolve_methods, resolve_metrics
+from .scoring import check_regions, make_metric
+from .stages import Job, failed_rows, fit, measure, render, stages_ahead
+from .store import RunFolder
+
+log = logging.getLogger(__name__)
+
+
+def run(config: RunConfig, **record: Any) -> Rows:
+    """Run a comparison into ``config.out`` and return its rows; ``record`` is added to the manifest.
+
+    Everything that can be checked is checked before the first long step: settings, device, methods, captures, the
+    output folder, and that no other process works in it. A method that fails is recorded as failed and the others
+    go on. Started again with the same configuration after a kill, it keeps what is done and continues what is not.
+    """
+    methods, metrics = resolve_methods(config), resolve_metrics(config)
+    check_device(config.device)
+    folder = RunFolder(Path(config.out))
+    folder.prepare()
+    with locked(folder.root):
+        return _run(config, methods, metrics, folder, record)
+
+
+def _run(
+    config: RunConfig,
+    methods: Sequence[ResolvedMethod],
+    metrics: Sequence[MetricSpec],
+    folder: RunFolder,
+    record: Mapping[str, Any],
+) -> Rows:
+    start = time.perf_counter()
+    for method in methods:
+        method.create()  # an implementation that cannot be imported or made is not to be found out hours later
+    clips = open_clips(config)
+    protocols: dict[str, Protocol] = {
+        task: make_protocol(task, clips, config.frames_per_task) for task in config.tasks
+    }
+    regions = {clip.subject: check_regions(clip, config.regions) for clip in clips}
+    adapted = adapt(clips, methods, config, folder)
+    jobs = make_jobs(config, methods, clips, protocols, folder, adapted, regions)
+    for job in jobs:
+        job.check()
+    _warn_of_missing_metrics(metrics, clips[0])
+
+    forms = tuple(
+        AdaptedRecord(**adaptation.record(job.clip, job.adapted, job.method.spec.name))
+        for job in jobs
+        if job.adapted is not None and job.seed == config.seeds[0]
+    )
+    manifest = replace(describe(config, methods, metrics, clips, protocols), adapted=forms, **record)
+    manifest.write(folder.manifest)
+    for protocol in protocols.values():
+        log.info("%s, protocol %s: %d frames", protocol.task, protocol.hash, len(protocol.keys))
+    with run_progress({job.name: stages_ahead(job, metrics) for job in jobs}) as line:
+        frames = [_run_cell(replace(job, line=line), metrics) for job in jobs]
+    rows = Rows.joined(frames)
+    rows.write(folder.rows)
+    seconds = round(time.perf_counter() - start, 3)
+    done = replace(manifest, status="done", seconds=seconds, peak_memory_bytes=peak_memory_bytes())
+    done.write(folder.manifest)
+    write_reports(folder.root)
+    log.info("finished in %s: %s", duration(time.perf_counter() - start), folder.root)
+    return rows
+
+
+def write_reports(run_folder: Path) -> list[Path]:
+    """Write every registered report of a finished run. One that fails is logged and the others are written."""
+    written: list[Path] = []
+    for name, plugin in discover("reports").items():
+        if plugin.spec is None:
+            log.warning("report %r of %s is broken: %s", name, plugin.origin, plugin.error)
+        elif plugin.spec.writes:
+            try:
+                written += resolve(plugin.spec.implementation)(run_folder)
+            except (HeadbenchError, OSError) as error:
+                log.error("report %r of %s failed: %s; the rows are complete", name, plugin.origin, error)
+            except Exception:
+                log.exception("report %r of %s failed; the rows are complete", name, plugin.origin)
+    return written
+
+
+Adapted = Mapping[tuple[str, MethodNeeds], AdaptedClip]
+
+
+def adapt(
+    clips: Sequence[Clip],
+    methods: Sequence[ResolvedMethod],
+    config: RunConfig,
+    folder: RunFolder,
+    finished: RunFolder | None = None,
+) -> Adapted:
+    """Bring every clip into every form that a method needs, once each; first make sure that all can be had.
+
+    What takes long is kept in ``folder``, whose lock the caller holds. What the run ``finished`` kept is copied there
+    first: nothing is written in a run by what looks at it.
+    """
+    reader: DatasetSpec = get("datasets", config.reader)
+    planned = {}
+    for clip in clips:
+        for needs in {MethodNeeds.of(method.spec): None for method in methods}:
+            step = adaptation.plan(clip, needs, reader, config.heads)
+            if step is not None:
+                planned[clip.subject, needs] = step
+    with output_inside(folder.root):
+        if finished is not None:
+            for subject in {subject for subject, _ in planned}:
+                _copy_kept(finished.adapted / subject, folder.adapted / subject)
+        return {
+            (subject, needs): adaptation.carry_out(
+                step, needs, folder.adapted / subject, f"adapting {subject}"
+            )
+            for (subject, needs), step in planned.items()
+        }
+
+
+def _copy_kept(source: Path, folder: Path) -> None:
+    """Copy the files that are not in ``folder`` yet; never what a link leads to, for the run may come from anybody."""
+    if source.is_symlink() or source.parent.is_symlink():
+        return
+    for path in sorted(source.rglob("*")):
+        target = folder / path.relative_to(source)
+        if path.is_file() and not path.is_symlink() and not target.exists():
+            with atomic_path(target) as temporary:
+                shutil.copyfile(path, temporary)
+
+
+def make_jobs(
+    config: RunConfig,
+    methods: Sequence[ResolvedMethod],
+    clips: Sequence[Clip],
+    protocols: Mapping[str, Protocol],
+    folder: RunFolder,
+    adapted: Adapted,
+    regions: Mapping[str, tuple[str, ...]] | None = None,
+) -> list[Job]:
+    return [
+        Job(
+            clip,
+            method,
+            seed,
+            config.device,
+            folder.cell(clip.subject, method.spec.name, seed),
+            protocols,
+            adapted.get((clip.subject, MethodNeeds.of(method.spec))),
+            (regions or {}).get(clip.subject, ()),
+        )
+        for clip in clips
+        for method in methods
+        for seed in config.seeds
+    ]
+
+
+def _run_cell(job: Job, metrics: Sequence[MetricSpec]) -> Rows:
+    log.info("%s", job.name)
+    try:
+        avatar = fit(job)
+        render(job, avatar)
+        return measure(job, avatar, metrics)
+    except InputError as error:
+        log.error("%s failed: %s", job.name, error)
+        return failed_rows(job, metrics, error)
+    except Exception as error:
+        log.exception("%s failed", job.name)
+        return failed_rows(job, metrics, error)
+
+
+def _warn_of_missing_metrics(metrics: Sequence[MetricSpec], clip: Clip) -> None:
+    """Say before the training, not after it, which metric cannot be had."""
+    image = clip.image(clip.splits["train"][0])
+    for spec in metrics:
+        metric = make_metric(spec)
+        if not spec.per_frame:
+            continue
+        try:
+            value = metric(image, image, image, image) if spec.temporal else metric(image, image)
+        except UnavailableError as error:
+            log.warning("%s will be missing: %s", spec.label, error)
+        else:
+            if not np.isfinite(value):
+                raise HeadbenchError(f"metric {spec.name} gives {value} for identical images")
+
+
+def describe(
+    config: RunConfig,
+    methods: Sequence[ResolvedMethod],
+    metrics: Sequence[MetricSpec],
+    clips: Sequence[Clip],
+    protocols: Mapping[str, Protocol],
+) -> Manifest:
+    """The manifest of a run that starts."""
+    return Manifest(
+        configuration=config,
+        paths=relative_paths(config),
+        methods=tuple(MethodRecord(**method.record()) for method in methods),
+        metrics=tuple(metrics),
+        clips=tuple(
+            ClipRecord(
+                subject=clip.subject,
+                fingerprint=clip.fingerprint,
+                steps=[asdict(step) for step in clip.steps],
+                splits={name: len(keys) for name, keys in clip.splits.items()},
+                excluded={str(key): reason for key, reason in sorted(clip.excluded.items())},
+            )
+            for clip in clips
+        ),
+        protocols={task: ProtocolRecord.of(protocol) for task, protocol in protocols.items()},
+        machine=machine_record(),
+    )

@@ -1,0 +1,200 @@
+"""Scores frames against the truth: each is read once, by one pool of threads, with bounded memory."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from ..contracts import ByteArray, Clip, FrameKey, Progress, RegionalClip, no_progress
+from ..errors import HeadbenchError, InputError, UnavailableError
+from ..io.files import check_name
+from ..registry import resolve
+from ..specs import MetricSpec
+
+FULL = "full"
+"""The region that every metric is measured over: the whole frame."""
+
+_AHEAD = 8
+"""Frames decoded ahead of a metric that works through them in order."""
+
+
+class Score(NamedTuple):
+    """One metric of one frame over one region, or why there is none (status "missing", value not a number)."""
+
+    metric: str
+    key: FrameKey
+    region: str
+    value: float
+    status: str = "ok"
+    reason: str = ""
+
+
+class Frames(NamedTuple):
+    """Where the frames to score come from."""
+
+    render: Callable[[FrameKey], ByteArray]
+    """Reads a stored frame, (H, W, 3) 8-bit."""
+    clip: Clip
+    """Has the truth, and knows the regions if any are asked for."""
+
+
+def make_metric(spec: MetricSpec) -> Any:
+    """Import what a spec names; a class is made without arguments."""
+    implementation = resolve(spec.implementation)
+    return implementation() if isinstance(implementation, type) else implementation
+
+
+def check_regions(clip: Clip, wanted: Sequence[str] | None) -> tuple[str, ...]:
+    """Names of the regions to measure beside the whole frame; None asks for the face where the clip knows it.
+
+    Raises `InputError` for one that the clip does not know.
+    """
+    known = tuple(clip.region_names) if isinstance(clip, RegionalClip) else ()
+    if wanted is None:
+        return ("face",) if "face" in known else ()
+    names = tuple(name for name in dict.fromkeys(wanted) if name != FULL)
+    for name in names:
+        if name not in known:
+            expected = f"one of {', '.join((FULL, *known))}, which clip {clip.subject} knows"
+            raise InputError("regions", name, expected, "no such region")
+        check_name(name, f"clip {clip.subject}", "region")
+    return names
+
+
+def score_frames(
+    keys: Sequence[FrameKey],
+    frames: Frames,
+    specs: Sequence[MetricSpec],
+    regions: Sequence[str] = (),
+    progress: Progress = no_progress,
+) -> dict[str, list[Score]]:
+    """Score frames by per-frame metrics; return each metric's scores, in the order of ``keys``.
+
+    Parameters
+    ----------
+    regions : beside the whole frame, for metrics that know regions. A frame in which a region has no pixel has no
+        score there: what is seen is a property of the truth, so that it is missing alike for every method.
+
+    Raises
+    ------
+    HeadbenchError : a value that is not finite.
+    """
+    scored: dict[str, list[Score]] = {}
+    metrics: dict[str, Any] = {}
+    for spec in specs:
+        metrics[spec.name] = make_metric(spec)
+    at_once = [spec for spec in specs if not spec.temporal and not hasattr(metrics[spec.name], "batched")]
+    rest = [spec for spec in specs if spec not in at_once]
+    total, done = (bool(at_once) + len(rest)) * len(keys), 0
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        if at_once:
+            scorer = _FrameScorer(frames, [(spec, metrics[spec.name]) for spec in at_once], tuple(regions))
+            scored.update({spec.name: [] for spec in at_once})
+            for scores in pool.map(scorer, keys):
+                for score in scores:
+                    scored[score.metric].append(score)
+                done += 1
+                progress(done, total, "frames")
+        for spec in rest:
+            stream = _temporal if spec.temporal else _batched
+            scored[spec.name] = []
+            for score in stream(keys, frames, spec, metrics[spec.name], pool):
+                scored[spec.name].append(score)
+                done += 1
+                progress(done, total, spec.label)
+    for scores in scored.values():
+        for score in scores:
+            if score.status == "ok" and not math.isfinite(score.value):
+                found = f"{score.metric} of {score.key} is {score.value}"
+                raise HeadbenchError(f"{found}; a metric must be finite")
+    return scored
+
+
+@dataclass(frozen=True)
+class _FrameScorer:
+    """All metrics that look at one frame at a time, so that it is decoded once."""
+
+    frames: Frames
+    metrics: Sequence[tuple[MetricSpec, Any]]
+    regions: tuple[str, ...]
+
+    def __call__(self, key: FrameKey) -> list[Score]:
+        image, truth = self.frames.render(key), self.frames.clip.image(key)
+        masks: Mapping[str, Any] = {}
+        if self.regions and any(spec.regions for spec, _ in self.metrics):
+            assert isinstance(self.frames.clip, RegionalClip)
+            masks = self.frames.clip.region_masks(key, self.regions)
+        scores = []
+        for spec, metric in self.metrics:
+            try:
+                scores.append(Score(spec.name, key, FULL, float(metric(image, truth))))
+                if spec.regions and masks:
+                    values = metric.in_regions(image, truth, masks)
+                    scores += [Score(spec.name, key, name, float(value)) for name, value in values.items()]
+            except UnavailableError as error:
+                scores.append(_missing(spec, key, str(error)))
+        return scores
+
+
+def _batched(
+    keys: Sequence[FrameKey], frames: Frames, spec: MetricSpec, metric: Any, pool: ThreadPoolExecutor
+) -> Iterator[Score]:
+    """Scores of a metric that takes many frames in one pass, in order."""
+
+    def pair(key: FrameKey) -> tuple[ByteArray, ByteArray]:
+        return frames.render(key), frames.clip.image(key)
+
+    try:
+        values = metric.batched(_ahead(pool, pair, keys))
+        for key, value in zip(keys, values, strict=True):
+            yield Score(spec.name, key, FULL, float(value))
+    except UnavailableError as error:
+        yield from (_missing(spec, key, str(error)) for key in keys)
+
+
+def _temporal(
+    keys: Sequence[FrameKey], frames: Frames, spec: MetricSpec, metric: Any, pool: ThreadPoolExecutor
+) -> Iterator[Score]:
+    """Scores of a metric that compares the change between a frame and the neighbour in time before it.
+
+    The first frame after a gap takes the one after it, so that every frame has a value.
+    """
+    known = set(keys)
+
+    def score(key: FrameKey) -> Score:
+        beside = (key._replace(timestep=key.timestep + step) for step in (-1, 1))
+        neighbour = next((other for other in beside if other in known), None)
+        if neighbour is None:
+            return _missing(
+                spec, key, f"{spec.label} needs neighbouring timesteps; here frames are left out."
+            )
+        images = [frames.render(key), frames.clip.image(key)]
+        images += [frames.render(neighbour), frames.clip.image(neighbour)]
+        try:
+            return Score(spec.name, key, FULL, float(metric(*images)))
+        except UnavailableError as error:
+            return _missing(spec, key, str(error))
+
+    yield from _ahead(pool, score, keys)
+
+
+def _ahead(
+    pool: ThreadPoolExecutor, function: Callable[[FrameKey], Any], keys: Iterable[FrameKey]
+) -> Iterator[Any]:
+    """Results of ``function`` in order, computed by the pool a bounded number of frames ahead."""
+    waiting: deque[Future[Any]] = deque()
+    for key in keys:
+        waiting.append(pool.submit(function, key))
+        if len(waiting) > _AHEAD:
+            yield waiting.popleft().result()
+    while waiting:
+        yield waiting.popleft().result()
+
+
+def _missing(spec: MetricSpec, key: FrameKey, reason: str) -> Score:
+    return Score(spec.name, key, FULL, math.nan, "missing", reason)

@@ -1,0 +1,402 @@
+"""The stages of one cell (a subject, a method, a seed): fit, render, measure. Each picks up where it was."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import math
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..contracts import Avatar, Camera, Clip, FrameKey, HeadPose, Measurement, Progress
+from ..errors import HeadbenchError, InputError, UnavailableError
+from ..io.files import digest, digest_file, grouped_writes, refuse_links
+from ..io.frames import quantise, read_png, write_png
+from ..machine import PeakMemory
+from ..progress import RunProgress, duration, progress
+from ..protocol import Protocol
+from ..rows import ALL, Row, Rows
+from ..specs import MetricSpec
+from .adaptation import AdaptedClip
+from .config import ResolvedMethod
+from .scoring import FULL, Frames, make_metric, score_frames
+from .store import Cell
+from .training_view import TrainingView
+
+log = logging.getLogger(__name__)
+RESULT_FORMAT = 1  # raise when a stage changes what it leaves behind
+TRAINING, RENDERING, MEASURING_AVATAR = "training", "rendering", "measuring the avatar"
+DIGESTS = "digests"
+RECORD_EVERY_S = 10.0
+"""Seconds between records of the frames rendered; those after the last one are rendered again after a kill."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One cell with all it needs.
+
+    ``clip`` is what is compared: the truth of every metric. ``adapted`` is its form for this method, None where
+    that is the clip itself. ``regions`` are measured beside the whole frame. ``line`` shows the progress of the run.
+    """
+
+    clip: Clip
+    method: ResolvedMethod
+    seed: int
+    device: str
+    cell: Cell
+    protocols: Mapping[str, Protocol]
+    adapted: AdaptedClip | None = None
+    regions: tuple[str, ...] = ()
+    line: RunProgress | None = None
+
+    def progress(self, stage: str) -> AbstractContextManager[Progress]:
+        """The progress of a stage: of the run if this is a cell of one, else of its own."""
+        return self.line.stage(self.name, stage) if self.line else progress(f"{self.name}: {stage}")
+
+    @property
+    def form(self) -> AdaptedClip:
+        """The clip as the method sees it."""
+        return self.adapted or AdaptedClip(self.clip)
+
+    @property
+    def name(self) -> str:
+        return f"{self.clip.subject} {self.method.spec.name} seed {self.seed}"
+
+    @property
+    def fit_fingerprint(self) -> str:
+        """Digest of everything the trained avatar depends on."""
+        return digest(RESULT_FORMAT, self.method.record(), self.seed, self.device, self.form.clip.fingerprint)
+
+    @property
+    def frame_paths(self) -> dict[Path, tuple[Protocol, FrameKey]]:
+        """The frames to score, by where their renders lie."""
+        return {
+            self.cell.render(protocol.task, key): (protocol, key)
+            for protocol in self.protocols.values()
+            for key in protocol.keys
+            if key.subject == self.clip.subject
+        }
+
+    def check(self) -> None:
+        """Refuse a folder that holds an avatar made of something else, or links out of it.
+
+        Damaged records of stages are removed, with a warning.
+        """
+        refuse_links(self.cell.folder)
+        self.cell.drop_damaged_records()
+        state = self.cell.stage("fit")
+        if state is not None and state.get("fingerprint") != self.fit_fingerprint:
+            raise InputError(
+                self.cell.folder / "fit.json",
+                "fingerprint",
+                f"{self.fit_fingerprint[:12]}, that of this run's settings and data",
+                f"{str(state.get('fingerprint'))[:12]}, an avatar of other settings or data",
+                "Choose another --out, or delete that folder.",
+            )
+
+
+def stages_ahead(job: Job, metrics: Sequence[MetricSpec]) -> dict[str, str]:
+    """The stages of a cell that are not done, each with the kind of cells that it takes as long for."""
+    trained = job.cell.is_done("fit", job.fit_fingerprint)
+    if trained and job.cell.is_done("measure", job.fit_fingerprint):
+        return {}
+    method = job.method.spec.name
+    stages = {} if trained else {TRAINING: method}
+    stages[RENDERING] = method
+    if any(spec.per_frame for spec in metrics):
+        stages |= {_measuring(task): "" for task in job.protocols}
+    if not all(spec.per_frame for spec in metrics):
+        stages[MEASURING_AVATAR] = method
+    return stages
+
+
+def _measuring(task: str) -> str:
+    return f"measuring {task}"
+
+
+def fit(job: Job) -> Avatar:
+    """Train, or continue, or read what was trained; return the avatar as read back from disk.
+
+    A native method sees the images of the training split alone. An adapter gets the whole clip, since official
+    repositories want a whole capture. The record's ``seconds`` are those since the last of ``interruptions``. An avatar
+    with damaged files is trained again, with a warning.
+    """
+    method = job.method.create()
+    earlier = job.cell.stage("fit")
+    if earlier is not None and earlier["status"] == "done":
+        damaged = job.cell.damage(earlier.get("files", {}))
+        if damaged:
+            _warn(job, damaged, "it is trained again")
+            earlier = None
+    if earlier is None and job.cell.avatar.exists():
+        job.cell.set_aside(job.cell.avatar)  # no record says what it was made of, or it is damaged
+    if earlier is None or earlier["status"] != "done":
+        interruptions = 0 if earlier is None else earlier.get("interruptions", 0) + 1
+        job.cell.begin("fit", job.fit_fingerprint, interruptions=interruptions)
+        start = time.perf_counter()
+        with PeakMemory() as memory, job.progress(TRAINING) as report:
+            try:
+                _train(job, method, report)
+            except InputError as error:
+                kept = Path(error.file)
+                if earlier is None or not (job.cell.avatar in kept.parents and kept.is_file()):
+                    raise
+                log.warning("%s: %s It is trained from the start.", job.name, error)
+                job.cell.set_aside(job.cell.avatar)
+                _train(job, method, report)
+        seconds = time.perf_counter() - start
+        job.cell.finish(
+            "fit",
+            job.fit_fingerprint,
+            seconds=round(seconds, 3),
+            interruptions=interruptions,
+            peak_memory_bytes=memory.peak,
+            memory_before_bytes=memory.before,
+            method=job.method.record(),
+            files=job.cell.digests(path for path in job.cell.avatar.rglob("*") if path.is_file()),
+        )
+        log.info("%s: trained in %s", job.name, duration(seconds))
+    avatar: Avatar = method.load(job.cell.avatar, device=job.device)
+    return avatar
+
+
+def _train(job: Job, method: Any, report: Progress) -> None:
+    method.fit(
+        TrainingView(job.form.clip) if job.method.spec.native else job.form.clip,
+        job.cell.avatar,
+        job.method.budget,
+        device=job.device,
+        seed=job.seed,
+        progress=report,
+    )
+
+
+def _warn(job: Job, damaged: Mapping[str, str], remedy: str) -> None:
+    first, *more = (f"{job.cell.folder / name} {why}" for name, why in damaged.items())
+    log.warning("%s: %s%s; %s", job.name, first, f", {len(more)} more are damaged" if more else "", remedy)
+
+
+def render(job: Job, avatar: Avatar) -> None:
+    """Render every frame of every protocol to 8-bit PNG of the protocol's size.
+
+    Frames of this very avatar are kept if they are as they were written, by their recorded digests; damaged ones are
+    rendered again, with a warning, and those that a kill left without a record.
+    """
+    cell, form = job.cell, job.form
+    made_of = digest(job.fit_fingerprint, _avatar_record(job))
+    state = cell.stage(DIGESTS)
+    known = {} if state is None or state["fingerprint"] != made_of else dict(state.get("files", {}))
+    wanted = {cell.name(path): frame for path, frame in job.frame_paths.items()}
+    damaged = cell.damage({name: known[name] for name in wanted if name in known})
+    if damaged:
+        _warn(job, damaged, "rendered again")
+        known = {name: known[name] for name in known.keys() - damaged.keys()}
+    missing = {name: frame for name, frame in wanted.items() if name not in known}
+    if not missing and cell.is_done(DIGESTS, made_of):
+        return
+    recorded = time.monotonic()
+    with job.progress(RENDERING) as report, grouped_writes():
+        for index, (name, (protocol, key)) in enumerate(missing.items()):
+            seen = form.key(key)
+            camera, pose = form.clip.cameras[seen.camera], form.clip.poses[seen.timestep]
+            frame = avatar.render(camera, pose, protocol.background)
+            if frame.rgb.shape != (camera.height, camera.width, 3):
+                raise InputError(
+                    job.name, str(key), f"shape {(camera.height, camera.width, 3)}", f"{frame.rgb.shape}"
+                )
+            written = write_png(cell.folder / name, quantise(form.restore(key, frame.rgb)))
+            known[name] = hashlib.sha256(written).hexdigest()
+            if time.monotonic() - recorded > RECORD_EVERY_S:
+                cell.begin(DIGESTS, made_of, files=known)
+                recorded = time.monotonic()
+            report(index + 1, len(missing), protocol.task)
+        cell.finish(DIGESTS, made_of, files=dict(sorted(known.items())))
+
+
+def recorded_frames(job: Job) -> dict[str, str]:
+    """SHA-256 of the frames as they were rendered, by their place in the cell's folder."""
+    state = job.cell.stage(DIGESTS)
+    return {} if state is None else state.get("files", {})
+
+
+def _avatar_record(job: Job) -> tuple[str, Mapping[str, str]]:
+    """What tells one trained avatar from another of the same settings."""
+    state = job.cell.stage("fit")
+    return ("", {}) if state is None else (state.get("derived_from", ""), state.get("files", {}))
+
+
+def measure(job: Job, avatar: Avatar, metrics: Sequence[MetricSpec]) -> Rows:
+    """Score the stored frames and the avatar as a whole; what was measured already is read back.
+
+    Metrics of one implementation are one measurement: they are read back, or taken anew, together. A measurement that
+    gave any number is read back; one that could not be had is tried again. Damaged rows are measured again, with a
+    warning.
+    """
+    known, details, old = _measured_before(job)
+    rendered = recorded_frames(job)
+    earlier = {
+        spec.name: old.select(method=ALL, metric=spec.name, task=ALL, region=ALL, seeds=ALL)
+        for spec in metrics
+    }
+    fingerprints = {spec.name: _measure_fingerprint(job, spec, rendered) for spec in metrics}
+    had = {spec.implementation for spec in metrics if "ok" in set(earlier[spec.name]["status"])}
+    new = {spec.implementation for spec in metrics if known.get(spec.name) != fingerprints[spec.name]}
+    wanted = [spec for spec in metrics if spec.implementation not in had - new]
+    per_frame = [spec for spec in wanted if spec.per_frame]
+    scored = [_score(job, per_frame, protocol) for protocol in job.protocols.values() if per_frame]
+    measured: dict[str, Measurement | UnavailableError] = {}
+    of_avatar = [spec for spec in wanted if not spec.per_frame]
+    with job.progress(MEASURING_AVATAR) if of_avatar else nullcontext():
+        for spec in of_avatar:
+            if spec.implementation not in measured:
+                measured[spec.implementation] = outcome = _measure_avatar(job, spec, avatar)
+                details[spec.name] = _finite(outcome.details) if isinstance(outcome, Measurement) else {}
+    parts: list[Rows] = []
+    for spec in metrics:
+        if spec not in wanted:
+            parts.append(Rows(earlier[spec.name]))
+        elif spec.per_frame:
+            parts.append(Rows.of(row for of_protocol in scored for row in of_protocol[spec.name]))
+        else:
+            parts.append(Rows.of([_avatar_row(job, spec, measured[spec.implementation])]))
+    result = Rows.joined(parts)
+    job.cell.begin("measure", job.fit_fingerprint)  # a kill between the rows and their record is no damage
+    result.write(job.cell.rows)
+    job.cell.finish(
+        "measure",
+        job.fit_fingerprint,
+        fingerprints=fingerprints,
+        details=details,
+        rows=digest_file(job.cell.rows),
+    )
+    return result
+
+
+def _finite(details: Mapping[str, Any]) -> dict[str, Any]:
+    """The details without numbers that JSON does not have; a metric of one of them has a row of its own."""
+    return {k: v for k, v in details.items() if not isinstance(v, float) or math.isfinite(v)}
+
+
+def _measured_before(job: Job) -> tuple[dict[str, str], dict[str, Any], Rows]:
+    """Fingerprints and details of the measurements that were taken, by metric, and the rows."""
+    stage = job.cell.stage("measure")
+    if stage is None or stage["status"] != "done" or "rows" not in stage:
+        return {}, {}, Rows.of([])
+    damaged = job.cell.damage({job.cell.name(job.cell.rows): stage["rows"]})
+    if damaged:
+        _warn(job, damaged, "measured again")
+        return {}, {}, Rows.of([])
+    return stage.get("fingerprints", {}), dict(stage.get("details", {})), Rows.read(job.cell.rows)
+
+
+def _measure_fingerprint(job: Job, spec: MetricSpec, rendered: Mapping[str, str]) -> str:
+    """Digest of everything a metric's values depend on."""
+    protocols = sorted(protocol.hash for protocol in job.protocols.values())
+    what: list[Any] = [spec.name, spec.implementation, spec.detail, job.regions if spec.regions else ()]
+    if spec.per_frame:
+        what.append({name: rendered.get(name) for name in map(job.cell.name, job.frame_paths)})
+    else:
+        what.append(_avatar_record(job))
+    return digest(RESULT_FORMAT, job.fit_fingerprint, protocols, *what)
+
+
+def failed_rows(job: Job, metrics: Sequence[MetricSpec], error: Exception) -> Rows:
+    """Rows that show a failed cell as failed, with its error."""
+    reason = f"{type(error).__name__}: {error}"
+    rows = [
+        _row(job, spec, protocol, None, math.nan, "failed", reason)
+        for spec in metrics
+        for protocol in (job.protocols.values() if spec.per_frame else [None])
+    ]
+    return Rows.of(rows)
+
+
+def workload(
+    form: AdaptedClip, protocols: Mapping[str, Protocol], size: tuple[int, int] | None = None
+) -> list[tuple[Camera, HeadPose]]:
+    """Return a walk over the cameras and poses of the scored frames, a new camera and pose at every step.
+
+    ``size`` is the (width, height) that the cameras are brought to, None for their own.
+    """
+    clip = form.clip
+    keys = [form.key(k) for p in protocols.values() for k in p.keys if k.subject == clip.subject]
+    timesteps = sorted({k.timestep for k in keys})
+    cameras = [
+        camera if size is None else camera.resized(*size) for _, camera in sorted(clip.cameras.items())
+    ]
+    steps = max(len(timesteps), len(cameras), 2)
+    walk = [(cameras[i % len(cameras)], clip.poses[timesteps[i % len(timesteps)]]) for i in range(steps)]
+    first, last = walk[0], walk[-1]
+    return walk[:-1] if len(walk) > 2 and first[0] is last[0] and first[1] is last[1] else walk
+
+
+def _score(job: Job, specs: Sequence[MetricSpec], protocol: Protocol) -> dict[str, list[Row]]:
+    """Rows of each metric over a protocol's frames of the job's subject."""
+    keys = [key for key in protocol.keys if key.subject == job.clip.subject]
+    frames = Frames(lambda key: read_png(job.cell.render(protocol.task, key)), job.clip)
+    by_name = {spec.name: spec for spec in specs}
+    with job.progress(_measuring(protocol.task)) as report:
+        scored = score_frames(keys, frames, specs, job.regions, report)
+    return {
+        name: [
+            _row(job, by_name[name], protocol, s.key, s.value, s.status, s.reason, s.region) for s in scores
+        ]
+        for name, scores in scored.items()
+    }
+
+
+def _measure_avatar(job: Job, spec: MetricSpec, avatar: Avatar) -> Measurement | UnavailableError:
+    metric = make_metric(spec)
+    try:
+        if spec.training:
+            measured: Measurement = metric(job.cell.stage("fit") or {})
+        else:
+            size = job.method.spec.resolution.speed_size
+            measured = metric(avatar, workload(job.form, job.protocols, size))
+    except UnavailableError as error:
+        return error
+    return measured
+
+
+def _avatar_row(job: Job, spec: MetricSpec, outcome: Measurement | UnavailableError) -> Row:
+    if isinstance(outcome, UnavailableError):
+        return _row(job, spec, None, None, math.nan, "missing", str(outcome))
+    if not spec.detail:
+        return _row(job, spec, None, None, outcome.value, "ok", "")
+    if spec.detail not in outcome.details:
+        return _row(job, spec, None, None, math.nan, "missing", "This avatar does not tell it.")
+    return _row(job, spec, None, None, float(outcome.details[spec.detail]), "ok", "")
+
+
+def _row(
+    job: Job,
+    spec: MetricSpec,
+    protocol: Protocol | None,
+    key: FrameKey | None,
+    value: float,
+    status: str,
+    reason: str,
+    region: str = FULL,
+) -> Row:
+    if status == "ok" and not math.isfinite(value):
+        raise HeadbenchError(f"{job.name}: {spec.name} of {key} is {value}; a metric must be finite")
+    return Row(
+        method=job.method.spec.name,
+        version=job.method.spec.version,
+        seed=job.seed,
+        task=protocol.task if protocol else "",
+        subject=job.clip.subject,
+        sequence=key.sequence if key else "",
+        timestep=key.timestep if key else -1,
+        camera=key.camera if key else "",
+        region=region,
+        metric=spec.name,
+        value=value,
+        protocol=protocol.hash if protocol else "",
+        status=status,
+        reason=reason,
+    )

@@ -1,0 +1,213 @@
+"""The run folder: what a comparison leaves on disk, and how a killed one finds what is already there.
+
+::
+
+    run.json                      resolved configuration, machine, protocols, fingerprints
+    run.log
+    rows.parquet                  one row per method, seed, frame and metric
+    <subject>/<method>/seed-<n>/
+        fit.json                  what the avatar was made of, how long it took, digests of its files
+        avatar/                   what the method wrote
+        renders/<task>/*.png      8-bit frames, named by key
+        digests.json              digests of the frames as they were rendered
+        rows.parquet              what was measured
+        measure.json              what it was measured of, digest of the rows
+    adapted/<subject>/            tracking refitted for methods that want another head model
+    tables/, contact_sheet.png    views of the rows
+"""
+
+from __future__ import annotations
+
+import logging
+import tempfile
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any, Literal, Required
+
+from typing_extensions import TypedDict
+
+from ..contracts import FrameKey
+from ..errors import InputError
+from ..io.documents import checked, read_json
+from ..io.files import TEMPORARY, digest_file, write_json
+from ..manifest import Manifest
+from ..rows import Rows
+
+log = logging.getLogger(__name__)
+
+
+class Stage(TypedDict, total=False):
+    """What a stage of a cell records.
+
+    Attributes
+    ----------
+    fingerprint : digest of everything that its result depends on.
+    files : SHA-256 of the files that it left, by their place in the cell's folder.
+    rows : SHA-256 of ``rows.parquet``.
+    fingerprints, details : of the measurements, by metric.
+    seconds, interruptions, peak_memory_bytes, memory_before_bytes, method : of the training.
+    derived_from : digest of the trained avatar that this one was derived from without training.
+    """
+
+    fingerprint: Required[str]
+    status: Required[Literal["started", "done"]]
+    files: dict[str, str]
+    rows: str
+    fingerprints: dict[str, str]
+    details: dict[str, dict[str, Any]]
+    seconds: float
+    interruptions: int
+    peak_memory_bytes: int
+    memory_before_bytes: int
+    method: dict[str, Any]
+    derived_from: str
+
+
+STAGES = ("fit", "digests", "measure")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """The folder of one avatar: a subject, a method, a seed."""
+
+    folder: Path
+
+    @property
+    def avatar(self) -> Path:
+        return self.folder / "avatar"
+
+    @property
+    def rows(self) -> Path:
+        return self.folder / "rows.parquet"
+
+    def render(self, task: str, key: FrameKey) -> Path:
+        """Where the render of ``key`` lies."""
+        return self.folder / "renders" / task / f"{key.sequence}_{key.timestep:05d}_{key.camera}.png"
+
+    def stage(self, name: str) -> Stage | None:
+        """Return what `begin` or `finish` wrote for a stage, or None. Raises `InputError` for a damaged record."""
+        path = self.folder / f"{name}.json"
+        if not path.exists():
+            return None
+        stage: Stage = checked(read_json(path), Stage, path)
+        for file in map(PurePosixPath, stage.get("files", {})):
+            if file.is_absolute() or ".." in file.parts:
+                raise InputError(path, "files", f"files inside {self.folder}", str(file))
+        return stage
+
+    def drop_damaged_records(self) -> None:
+        """Remove records of stages that cannot be read, with a warning: what they record is made again."""
+        for name in STAGES:
+            try:
+                self.stage(name)
+            except InputError as error:
+                if isinstance(error.__cause__, OSError):
+                    raise  # not damaged: the disk or its permissions are at fault
+                log.warning("%s What it records is made again.", error)
+                (self.folder / f"{name}.json").unlink()
+
+    def set_aside(self, folder: Path) -> None:
+        """Move a folder of the cell whose files cannot be trusted to a name of its own beside it; nothing is deleted."""
+        number = 1
+        while (aside := folder.with_name(f"{folder.name}-damaged-{number}")).exists():
+            number += 1
+        folder.rename(aside)
+        log.info("%s was moved to %s.", folder, aside.name)
+
+    def digests(self, files: Iterable[Path]) -> dict[str, str]:
+        """SHA-256 of files in the cell's folder, by their place in it."""
+        return {self.name(path): digest_file(path) for path in sorted(files)}
+
+    def name(self, path: Path) -> str:
+        """The place of a file in the cell's folder."""
+        return path.relative_to(self.folder).as_posix()
+
+    def damage(self, files: Mapping[str, str]) -> dict[str, str]:
+        """Which of the files are not as their digests say, and what is wrong with each."""
+        found = {name: _damage(self.folder / name, known) for name, known in files.items()}
+        return {name: why for name, why in found.items() if why}
+
+    def is_done(self, name: str, fingerprint: str) -> bool:
+        """Say whether the stage ended with exactly these inputs."""
+        state = self.stage(name)
+        return state is not None and state.get("fingerprint") == fingerprint and state.get("status") == "done"
+
+    def begin(self, name: str, fingerprint: str, **record: Any) -> None:
+        """Record that the stage works on these inputs."""
+        write_json(self.folder / f"{name}.json", {"fingerprint": fingerprint, "status": "started", **record})
+
+    def finish(self, name: str, fingerprint: str, **record: Any) -> None:
+        """Record that the stage ended, with what it measured."""
+        write_json(self.folder / f"{name}.json", {"fingerprint": fingerprint, "status": "done", **record})
+
+
+def _damage(path: Path, known: str) -> str:
+    if not path.is_file():
+        return "is missing"
+    if not path.stat().st_size:
+        return "is empty"
+    return "" if digest_file(path) == known else "is not as it was written (SHA-256)"
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """The folder of a comparison."""
+
+    root: Path
+
+    @property
+    def manifest(self) -> Path:
+        return self.root / "run.json"
+
+    @property
+    def rows(self) -> Path:
+        return self.root / "rows.parquet"
+
+    @property
+    def adapted(self) -> Path:
+        """Folder of what was computed to bring clips into the form that a method needs, by subject."""
+        return self.root / "adapted"
+
+    @property
+    def tables(self) -> Path:
+        return self.root / "tables"
+
+    @property
+    def contact_sheet(self) -> Path:
+        return self.root / "contact_sheet.png"
+
+    def cell(self, subject: str, method: str, seed: int) -> Cell:
+        """Return the folder of one avatar."""
+        return Cell(self.root / subject / method / f"seed-{seed}")
+
+    def prepare(self) -> None:
+        """Make the folder and prove that it can be written, before any work."""
+        try:
+            self.root.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(
+                dir=self.root, prefix=TEMPORARY
+            ):  # has no name where the system can do without
+                pass
+        except (OSError, ValueError) as error:  # ValueError: a name that no file can have
+            found = getattr(error, "strerror", None) or str(error)
+            raise InputError(self.root, "--out", "a folder that can be written", found) from error
+
+    def read_manifest(self) -> Manifest:
+        """Read ``run.json``. Raises `InputError` where there is none, or one of another format."""
+        if not self.manifest.exists():
+            raise InputError(self.root, "run.json", "the folder of a run", "no run.json")
+        return Manifest.read(self.manifest)
+
+    def read_rows(self, manifest: Manifest) -> Rows:
+        """Read ``rows.parquet``. Raises `InputError` for rows of methods, metrics and tasks that the run does not have."""
+        rows = Rows.read(self.rows)
+        for what, found, known in (
+            ("method", rows.methods, {method.name for method in manifest.methods}),
+            ("metric", rows.metrics, {metric.name for metric in manifest.metrics}),
+            ("task", rows.tasks, manifest.protocols.keys()),
+        ):
+            if found - known:
+                names = ", ".join(sorted(known)), ", ".join(sorted(found - known))
+                raise InputError(self.rows, what, f"those of {self.manifest.name}: {names[0]}", names[1])
+        return rows

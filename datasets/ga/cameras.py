@@ -1,0 +1,194 @@
+"""One camera set for a capture: per-frame JSON entries to `Camera`s, sequences brought to one world.
+
+VHAP shifts the world of each sequence by the mean of its tracked translation and does not store the shift.
+A union of sequences therefore states each camera once per sequence, in worlds that differ by a translation.
+Here that translation is recovered from the cameras, so that a clip has one position per camera; the poses of
+the shifted sequences are to be moved along.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ...bench.contracts import Camera, FloatArray
+from ...bench.errors import InputError
+from ...bench.io.images import ImageInfo
+from .layout import CyConvention, extrinsics_from_json, intrinsics_from_json
+from .transforms import FrameEntry
+
+ROTATION_TOLERANCE = 1e-5
+POSITION_TOLERANCE = 2e-5  # metres; 0.04 px at a focal length of 2,000 px and a distance of 1 m
+FOCAL_TOLERANCE = 0.01  # relative, between fl_x and camera_angle_x
+
+
+@dataclass(frozen=True, eq=False)
+class CaptureCameras:
+    """Cameras of a capture and the shift of each sequence.
+
+    Attributes
+    ----------
+    views : representative frame entry by camera id, in the first sequence's world.
+    sizes : (width, height) by camera id.
+    shifts : (3,) metres to add to positions of a sequence, by sequence folder; zero for the first.
+    """
+
+    views: Mapping[str, FrameEntry]
+    sizes: Mapping[str, tuple[int, int]]
+    shifts: Mapping[str, FloatArray]
+
+    def resolve(self, cy: CyConvention) -> dict[str, Camera]:
+        """`Camera` by id, with the principal point read by the given convention."""
+        return {
+            name: Camera(
+                id=name,
+                width=self.sizes[name][0],
+                height=self.sizes[name][1],
+                K=intrinsics_from_json(view.intrinsics, *self.sizes[name], cy),
+                world_to_camera=extrinsics_from_json(view.camera_to_world),
+            )
+            for name, view in self.views.items()
+        }
+
+    def cy_matters(self) -> bool:
+        """Whether the readings from the top and from the bottom differ: some cy is off-centre by > 0.5 px."""
+        return any(
+            abs(view.intrinsics.get("cy", self.sizes[name][1] / 2) - self.sizes[name][1] / 2) > 0.5
+            for name, view in self.views.items()
+        )
+
+
+def collect_cameras(entries: Sequence[FrameEntry], infos: Mapping[Path, ImageInfo]) -> CaptureCameras:
+    """Gather the cameras of all frames.
+
+    Raises `InputError` where a camera moves or changes within a sequence, where sequences differ by more than
+    a translation, or where ``camera_index`` and ``camera_id`` do not go together.
+    """
+    _check_ids(entries)
+    groups: dict[str, dict[str, FrameEntry]] = {}
+    for entry in sorted(entries, key=lambda e: (e.timestep, e.camera_index)):
+        first = groups.setdefault(entry.sequence_folder, {}).setdefault(entry.camera_id, entry)
+        _check_same_optics(first, entry, infos)
+        _check_same_place(first, entry)
+    views: dict[str, FrameEntry] = {}
+    shifts: dict[str, FloatArray] = {}
+    for folder, group in groups.items():
+        shifts[folder] = _shift(views, group, infos) if views else np.zeros(3)
+        for name, entry in group.items():
+            views.setdefault(name, _moved(entry, shifts[folder]))
+    for entry in views.values():
+        _check_focal(entry, infos)
+    ordered = dict(sorted(views.items(), key=lambda item: item[1].camera_index))
+    return CaptureCameras(ordered, {name: _size(entry, infos) for name, entry in ordered.items()}, shifts)
+
+
+def _size(entry: FrameEntry, infos: Mapping[Path, ImageInfo]) -> tuple[int, int]:
+    info = infos[entry.image]
+    return info.width, info.height
+
+
+def _check_ids(entries: Sequence[FrameEntry]) -> None:
+    by_index: dict[int, FrameEntry] = {}
+    by_id: dict[str, FrameEntry] = {}
+    for entry in entries:
+        for other in (
+            by_index.setdefault(entry.camera_index, entry),
+            by_id.setdefault(entry.camera_id, entry),
+        ):
+            if (other.camera_id, other.camera_index) != (entry.camera_id, entry.camera_index):
+                raise InputError(
+                    entry.file,
+                    f"{entry.where}.camera_id",
+                    f"one camera_id per camera_index, as {other.where} with index {other.camera_index} has "
+                    f"{other.camera_id}",
+                    f"index {entry.camera_index} with {entry.camera_id}",
+                )
+
+
+def _check_same_optics(first: FrameEntry, entry: FrameEntry, infos: Mapping[Path, ImageInfo]) -> None:
+    same_keys = first.intrinsics.keys() == entry.intrinsics.keys()
+    if not same_keys or not all(
+        math.isclose(entry.intrinsics[key], value, rel_tol=1e-6, abs_tol=1e-9)
+        for key, value in first.intrinsics.items()
+    ):
+        raise InputError(
+            entry.file,
+            f"{entry.where}.{'/'.join(entry.intrinsics)}",
+            f"intrinsics of camera {entry.camera_id} as in {first.where}, {dict(first.intrinsics)}",
+            f"{dict(entry.intrinsics)}",
+        )
+    if _size(first, infos) != _size(entry, infos):
+        width, height = _size(first, infos)
+        found_width, found_height = _size(entry, infos)
+        raise InputError(
+            entry.image,
+            "",
+            f"{width}x{height} pixels, as other images of camera {entry.camera_id}",
+            f"{found_width}x{found_height}",
+        )
+
+
+def _check_same_place(first: FrameEntry, entry: FrameEntry) -> None:
+    moved = np.abs(first.camera_to_world - entry.camera_to_world).max()
+    if moved > ROTATION_TOLERANCE:
+        raise InputError(
+            entry.file,
+            f"{entry.where}.transform_matrix",
+            f"camera {entry.camera_id} where {first.where} has it, as cameras stand still",
+            f"entries that differ by {moved:.3g}",
+        )
+
+
+def _shift(
+    views: Mapping[str, FrameEntry], group: Mapping[str, FrameEntry], infos: Mapping[Path, ImageInfo]
+) -> FloatArray:
+    """Translation from a sequence's world to the first's, from the cameras they share."""
+    shared = [name for name in group if name in views]
+    any_entry = next(iter(group.values()))
+    if not shared:
+        raise InputError(
+            any_entry.file,
+            any_entry.where,
+            "a camera that the first sequence has too, to bring both to one world",
+            f"cameras {', '.join(group)} only",
+        )
+    for name in shared:
+        _check_same_optics(views[name], group[name], infos)
+    differences = np.array([views[n].camera_to_world - group[n].camera_to_world for n in shared])
+    shift = differences[:, :3, 3].mean(axis=0)
+    turn = np.abs(differences[:, :3, :3]).max()
+    spread = np.abs(differences[:, :3, 3] - shift).max()
+    if turn > ROTATION_TOLERANCE or spread > POSITION_TOLERANCE:
+        raise InputError(
+            any_entry.file,
+            f"{any_entry.where}.transform_matrix",
+            f"cameras of {any_entry.sequence_folder} that equal those of the first sequence but for one shift",
+            f"rotations that differ by {turn:.3g} and shifts by {spread:.3g} m",
+        )
+    # A difference at the level of the stored digits is none: the cameras then stay exactly as written.
+    return shift if np.abs(shift).max() > 1e-9 else np.zeros(3)
+
+
+def _moved(entry: FrameEntry, shift: FloatArray) -> FrameEntry:
+    matrix = entry.camera_to_world.copy()
+    matrix[:3, 3] += shift
+    return replace(entry, camera_to_world=matrix)
+
+
+def _check_focal(entry: FrameEntry, infos: Mapping[Path, ImageInfo]) -> None:
+    if {"fl_x", "camera_angle_x"} <= entry.intrinsics.keys():
+        width = _size(entry, infos)[0]
+        stated = entry.intrinsics["fl_x"]
+        implied = width / (2 * np.tan(entry.intrinsics["camera_angle_x"] / 2))
+        if abs(stated / implied - 1) > FOCAL_TOLERANCE:
+            raise InputError(
+                entry.file,
+                f"{entry.where}.fl_x",
+                f"{implied:.6g} px, which camera_angle_x and a width of {width} px imply",
+                f"{stated:.6g}",
+                "The intrinsics were probably not scaled with the images.",
+            )

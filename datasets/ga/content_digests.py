@@ -1,0 +1,108 @@
+"""Digests of file contents, remembered in the user's cache as long as the system has not touched the files."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import time
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import NamedTuple
+
+from ...bench.contracts import Progress, no_progress
+from ...bench.errors import UnavailableError
+from ...bench.io.files import cache_folder, digest, digest_file, write_json
+
+_log = logging.getLogger(__name__)
+_THREADS = 4  # hashing releases the interpreter lock; more threads only help slow disks
+
+MAX_CACHE_BYTES = 128 * 2**20
+"""Of all captures together, about half a million files; the captures read longest ago are forgotten first."""
+
+YOUNG_NS = 2 * 10**9
+"""A file that changed so recently may change again within one step of the system's clock; it is not remembered."""
+
+
+class Stamp(NamedTuple):
+    """What the system says of a file. Whoever writes to it can set ``modified`` back, but not ``changed``."""
+
+    device: int
+    inode: int
+    size: int
+    modified: int  # ns
+    changed: int  # ns
+
+    @classmethod
+    def of(cls, path: Path) -> Stamp:
+        """Ask the system."""
+        status = path.stat()
+        return cls(status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns)
+
+
+def content_digests(
+    files: Iterable[Path], *, remembered_for: Path | None = None, progress: Progress = no_progress
+) -> dict[Path, str]:
+    """Hex SHA-256 of each file's content.
+
+    Parameters
+    ----------
+    remembered_for : the capture that the files belong to: what is remembered of it is taken for files whose `Stamp`
+        is the same, and what is read is remembered. Nothing is kept in that folder, which may come from a stranger,
+        but in ``digests`` of `cache_folder`. None reads every byte.
+    """
+    paths = sorted(set(files))
+    place = _place(remembered_for) if remembered_for else None
+    known = _read_cache(place) if place else {}
+    stamps = {path: Stamp.of(path) for path in paths}
+    result = {path: known[_name(stamps[path])] for path in paths if _name(stamps[path]) in known}
+    missing = [path for path in paths if path not in result]
+    with ThreadPoolExecutor(_THREADS) as pool:
+        for done, (path, value) in enumerate(zip(missing, pool.map(digest_file, missing)), start=1):
+            result[path] = value
+            progress(done, len(missing), "reading file contents")
+    if place and missing:
+        limit = time.time_ns() - YOUNG_NS
+        settled = [path for path in paths if stamps[path].changed < limit and Stamp.of(path) == stamps[path]]
+        _write_cache(place, {_name(stamps[path]): result[path] for path in settled})
+    return result
+
+
+def _place(folder: Path) -> Path | None:
+    """File of the cache for a capture; None where the user has no home."""
+    try:
+        return cache_folder() / "digests" / f"{digest(os.path.abspath(folder))[:32]}.json"
+    except UnavailableError as error:
+        _log.info("digests are not kept: %s", error)
+        return None
+
+
+def _name(stamp: Stamp) -> str:
+    return "-".join(map(str, stamp))
+
+
+def _read_cache(path: Path) -> dict[str, str]:
+    """Entries of the cache; none where it is missing or not as `_write_cache` left it."""
+    try:
+        if path.stat().st_size > MAX_CACHE_BYTES:
+            return {}
+        content = json.loads(path.read_bytes())
+        entries: dict[str, str] = content["entries"]
+        return entries if content["digest"] == digest(entries) else {}
+    except (OSError, ValueError, TypeError, KeyError, IndexError, RecursionError):
+        return {}
+
+
+def _write_cache(path: Path, entries: dict[str, str]) -> None:
+    """Write the entries of one capture, and forget others until all fit into `MAX_CACHE_BYTES`."""
+    try:
+        write_json(path, {"digest": digest(entries), "entries": entries})
+        kept = [(other.stat().st_mtime_ns, other.stat().st_size, other) for other in path.parent.iterdir()]
+        total = 0
+        for _, size, other in sorted(kept, reverse=True):
+            total += size
+            if total > MAX_CACHE_BYTES:
+                other.unlink(missing_ok=True)
+    except OSError as error:
+        _log.info("digests are not kept, %s cannot be written: %s", path, error)

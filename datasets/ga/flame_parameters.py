@@ -1,0 +1,206 @@
+"""Tracked parameters of a capture: ``flame_param`` files to poses, identity and static offset."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from ...bench.contracts import FloatArray, HeadPose
+from ...bench.errors import InputError
+from ...bench.io.arrays import MAX_MAGNITUDE, check_numbers, read_npz
+from ..head.arrays import HeadArrays, check_size
+from ..head.teeth import with_teeth, with_teeth_where_possible
+
+TeethPolicy = Literal["auto", "add", "keep"]
+
+MAX_MOTION = 100.0  # metres; a wide open mouth takes 0.05
+
+_POSE_SIZES = {"translation": 3, "rotation": 3, "neck_pose": 3, "jaw_pose": 3, "eyes_pose": 6}
+
+
+@dataclass(frozen=True, eq=False)
+class Tracking:
+    """What the parameter files hold, for the head they were resolved with (teeth appended if they ask for it).
+
+    ``notes`` records what the layout leaves open and how it was settled.
+    """
+
+    head: HeadArrays
+    poses: Mapping[int, HeadPose]
+    shape: FloatArray  # (S,)
+    static_offset: FloatArray  # (V, 3)
+    notes: Mapping[str, Any] = field(default_factory=dict)
+
+
+def read_tracking(
+    files: Mapping[int, Path], head: HeadArrays, subject: str, *, teeth: TeethPolicy = "auto"
+) -> Tracking:
+    """Read and check the parameter file of every timestep.
+
+    Identity and static offset are those of the first timestep, as GaussianAvatars takes them; how far later
+    ones differ is noted. ``dynamic_offset`` is ignored; that it is not zero is noted. Coefficient vectors
+    shorter than the head's bases are padded with zeros.
+
+    Parameters
+    ----------
+    teeth : "auto" appends teeth (see `with_teeth`) to every head that has none, as GaussianAvatars does to FLAME, so
+        that all methods have the same; a head without lips to hang them on stays without, unless it is FLAME's or the
+        static offset has rows for them. "add" always appends them; "keep" takes the head as it is.
+
+    Raises
+    ------
+    InputError
+        For a missing or damaged file, a missing array, a wrong shape, numbers that are not finite or beyond
+        `MAX_MAGNITUDE`, and coefficients that make no head by its size.
+    """
+    poses: dict[int, HeadPose] = {}
+    shape = static = None
+    deviation = {"shape": 0.0, "static_offset_m": 0.0, "dynamic_offset_m": 0.0}
+    for timestep, path in sorted(files.items()):
+        arrays = read_npz(path)
+        identity = _vector(path, arrays, "shape", head.shape_basis.shape[2])
+        offset = _offset(path, arrays, "static_offset")
+        if shape is None:
+            shape, static = identity, offset
+            head, rows = resolve_teeth(head, len(offset) if offset is not None else None, teeth, path)
+        deviation["shape"] = max(deviation["shape"], _largest(identity - shape))
+        deviation["static_offset_m"] = max(deviation["static_offset_m"], _offset_change(path, offset, static))
+        dynamic = _offset(path, arrays, "dynamic_offset")
+        deviation["dynamic_offset_m"] = max(deviation["dynamic_offset_m"], _largest(dynamic))
+        poses[timestep] = _pose(path, arrays, head, subject, timestep)
+    assert shape is not None, "callers have checked that there are timesteps"
+    static_offset = np.zeros((len(head.template), 3), dtype=np.float32)
+    if static is not None:
+        static_offset[:rows] = static[:rows]
+    _check_motion(files, head, shape, static_offset, poses)
+    notes = {
+        "static_offset": "zeros, as the files have none" if static is None else f"{len(static)} rows",
+        "teeth": len(head.regions.get("teeth", ())),
+        "change_of_shape_ignored": deviation["shape"],
+        "change_of_static_offset_ignored_m": deviation["static_offset_m"],
+        "dynamic_offset_ignored_m": deviation["dynamic_offset_m"],
+    }
+    return Tracking(head, poses, shape, static_offset, notes)
+
+
+def resolve_teeth(
+    head: HeadArrays, rows: int | None, teeth: TeethPolicy, file: Path
+) -> tuple[HeadArrays, int]:
+    """Bring head and static offset together: the head to use, and how many rows of the offset to use.
+
+    ``rows`` is the row count of the files' static offset, None where they have none.
+    """
+    vertices = len(head.template)
+    if teeth != "keep" and not len(head.regions.get("teeth", ())):
+        required = teeth == "add" or head.version.startswith("flame") or (rows or 0) > vertices
+        head = with_teeth(head) if required else with_teeth_where_possible(head)
+    has_teeth = len(head.regions.get("teeth", ())) > 0
+    total = len(head.template)
+    if rows is None or rows == total:
+        return head, total
+    if teeth == "keep" and rows > total:
+        return head, total
+    last = np.arange(rows, total)
+    if rows < total and has_teeth and np.isin(last, head.regions["teeth"]).all():
+        return head, rows
+    expected = f"(1, {total}, 3) for head model {head.version}"
+    found = f"{rows} rows"
+    raise InputError(
+        file, "static_offset", expected, found, "Give the head model the capture was tracked with."
+    )
+
+
+def _check_motion(
+    files: Mapping[int, Path],
+    head: HeadArrays,
+    shape: FloatArray,
+    static_offset: FloatArray,
+    poses: Mapping[int, HeadPose],
+) -> None:
+    """Raise `InputError` where identity, or an expression, makes a mesh that is no head's by its size."""
+    neutral = head.template + head.shape_basis @ shape + static_offset
+    check_size(files[min(files)], "shape, static_offset", neutral, head.faces)
+    reach = np.abs(head.expression_basis).max(axis=(0, 1))  # (E,) metres per unit
+    for timestep, pose in poses.items():
+        moved = float(reach @ np.abs(pose.expression))
+        if not moved <= MAX_MOTION:
+            expected = f"coefficients that move no vertex further than {MAX_MOTION:g} m together"
+            raise InputError(files[timestep], "expr", expected, f"up to {moved:g} m")
+
+
+def _pose(
+    path: Path, arrays: Mapping[str, np.ndarray], head: HeadArrays, subject: str, timestep: int
+) -> HeadPose:
+    parts = {key: _row(path, arrays, key, size) for key, size in _POSE_SIZES.items()}
+    eyelids = None
+    if head.eyelid_basis is not None and "eyelids" in arrays:
+        eyelids = _row(path, arrays, "eyelids", head.eyelid_basis.shape[2])
+    return HeadPose(
+        head_model=head.version,
+        expression=_vector(path, arrays, "expr", head.expression_basis.shape[2]),
+        rotation=parts["rotation"],
+        neck=parts["neck_pose"],
+        jaw=parts["jaw_pose"],
+        eyes=parts["eyes_pose"],
+        translation=parts["translation"],
+        eyelids=eyelids,
+        subject=subject,
+        timestep=timestep,
+    )
+
+
+def _array(path: Path, arrays: Mapping[str, np.ndarray], key: str) -> FloatArray:
+    if key not in arrays:
+        raise InputError(path, key, "an array", f"only {', '.join(sorted(arrays))}")
+    array = arrays[key]
+    if array.dtype.kind not in "fiu":
+        raise InputError(path, key, "numbers", f"dtype {array.dtype}")
+    check_numbers(path, key, array, MAX_MAGNITUDE)
+    return array if array.dtype.kind == "f" else array.astype(np.float64)
+
+
+def _row(path: Path, arrays: Mapping[str, np.ndarray], key: str, size: int) -> FloatArray:
+    """A (1, size) or (size,) array as (size,)."""
+    array = _array(path, arrays, key)
+    if array.shape not in ((1, size), (size,)):
+        raise InputError(path, key, f"shape (1, {size})", f"shape {array.shape}")
+    return array.reshape(size)
+
+
+def _vector(path: Path, arrays: Mapping[str, np.ndarray], key: str, size: int) -> FloatArray:
+    """Coefficients, (n,) or (1, n) with n up to ``size``, zero-padded to (size,)."""
+    array = _array(path, arrays, key)
+    fits = array.ndim == 1 or (array.ndim == 2 and array.shape[0] == 1)
+    if not fits or array.size > size:
+        remedy = "Give the head model the capture was tracked with."
+        raise InputError(path, key, f"at most {size} coefficients in one row", f"shape {array.shape}", remedy)
+    return np.pad(array.reshape(-1), (0, size - array.size))
+
+
+def _offset(path: Path, arrays: Mapping[str, np.ndarray], key: str) -> FloatArray | None:
+    """A (1, n, 3) or (n, 3) array as (n, 3); None where the file has none."""
+    if key not in arrays:
+        return None
+    array = _array(path, arrays, key)
+    shape = array.shape[1:] if array.ndim == 3 and array.shape[0] == 1 else array.shape
+    if len(shape) != 2 or shape[1] != 3:
+        raise InputError(path, key, "shape (1, V, 3)", f"shape {array.shape}")
+    return array.reshape(shape)
+
+
+def _offset_change(path: Path, offset: FloatArray | None, first: FloatArray | None) -> float:
+    """Largest change of the static offset against the first timestep's, metres."""
+    if offset is None or first is None or offset.shape != first.shape:
+        if offset is None and first is None:
+            return 0.0
+        expected = "none" if first is None else f"{len(first)} rows, as at the first timestep"
+        raise InputError(path, "static_offset", expected, "none" if offset is None else f"{len(offset)} rows")
+    return _largest(offset - first)
+
+
+def _largest(values: FloatArray | None) -> float:
+    return float(np.abs(values).max(initial=0.0)) if values is not None else 0.0

@@ -1,0 +1,218 @@
+"""The GaussianAvatars/VHAP capture layout: its names, its keys and its conventions, both ways.
+
+A capture is a *union* folder beside its *sequence* folders::
+
+    UNION2_074/                         transforms_{train,val,test}.json, canonical_flame_param.npz,
+                                        sequences_trainval.txt, sequences_test.txt
+    074_EMO-1-shout+laugh_v16_.../      images/%05d_%02d.png (timestep_camera), fg_masks/%05d_%02d.png,
+                                        flame_param/%05d.npz, canonical_flame_param.npz,
+                                        transforms.json, transforms_{train,val,test}.json
+
+Two files of ours may stand beside the JSONs: ``headbench.json`` (a `Declaration`: what the layout itself
+leaves unsaid) and ``head_model.npz``. Tools of the field ignore them. `ga_writer` writes the layout,
+`ga_reader` reads it.
+
+Conventions: ``transform_matrix`` is camera-to-world with OpenGL axes (x right, y up, looking along -z);
+VHAP measures ``cy`` from the bottom edge since its commit 34afb35 (November 2024), from the top before.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from ...bench.contracts import Camera, FloatArray
+from ...bench.errors import InputError
+from ...bench.io.documents import checked, read_json, shown
+from ...bench.io.files import check_name, write_json
+from ..rounding import ANGLE_BITS, on_grid
+
+CyConvention = Literal["top", "bottom", "centre"]
+"""Where the principal point stands: ``cy`` from the top edge, from the bottom edge, or (as GaussianAvatars
+does) both ``cx`` and ``cy`` ignored and the image centre taken."""
+
+SPLIT_FILES = {
+    "train": "transforms_train.json",
+    "novel_view": "transforms_val.json",
+    "self_reenactment": "transforms_test.json",
+}
+ALL_FRAMES_FILE = "transforms.json"
+CANONICAL_FILE = "canonical_flame_param.npz"
+DECLARATION_FILE = "headbench.json"
+HEAD_FILE = "head_model.npz"
+TRAIN_SEQUENCES_FILE = "sequences_trainval.txt"
+TEST_SEQUENCES_FILE = "sequences_test.txt"
+FORMAT_VERSION = 1
+
+OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Turns a camera-to-world matrix between the OpenCV and the OpenGL axes when multiplied from the right."""
+
+_SEQUENCE_FOLDER = re.compile(r"(?P<subject>[^_]+)_(?P<sequence>.+?)(?:_v\d+(?:_.*)?)?")
+_UNION_FOLDER = re.compile(r"UNION\d*_(?P<subject>[^_]+)(?:_.*)?")
+
+
+def frame_name(timestep: int, camera_index: int) -> str:
+    """Stem of an image or mask: ``00012_08``."""
+    return f"{timestep:05d}_{camera_index:02d}"
+
+
+def sequence_folder_name(subject: str, sequence: str, cameras: int) -> str:
+    """Name of a sequence's folder in VHAP's manner: ``074_EMO-1-shout+laugh_v16_whiteBg_staticOffset``."""
+    return f"{subject}_{sequence}_v{cameras}_whiteBg_staticOffset"
+
+
+def parse_sequence_folder(name: str) -> tuple[str, str]:
+    """Subject and sequence that a sequence folder is named after; ("", name) where it follows no pattern."""
+    match = _SEQUENCE_FOLDER.fullmatch(name)
+    return (match["subject"], match["sequence"]) if match else ("", name)
+
+
+def parse_union_folder(name: str) -> str:
+    """Subject a union folder is named after, or "" where it follows no pattern."""
+    match = _UNION_FOLDER.fullmatch(name)
+    return match["subject"] if match else ""
+
+
+def intrinsics_to_json(camera: Camera, cy: CyConvention) -> dict[str, float | int]:
+    """Eight intrinsic entries of a frame. ``camera_angle_*`` are full angles in radians."""
+    width, height = camera.width, camera.height
+    fl_x, fl_y = float(camera.K[0, 0]), float(camera.K[1, 1])
+    cy_top = float(camera.K[1, 2])
+    return {
+        "cx": float(camera.K[0, 2]),
+        "cy": height - cy_top if cy == "bottom" else cy_top,
+        "fl_x": fl_x,
+        "fl_y": fl_y,
+        "h": height,
+        "w": width,
+        "camera_angle_x": float(on_grid(2 * math.atan(width / (2 * fl_x)), ANGLE_BITS)),
+        "camera_angle_y": float(on_grid(2 * math.atan(height / (2 * fl_y)), ANGLE_BITS)),
+    }
+
+
+def intrinsics_from_json(
+    entries: Mapping[str, float], width: int, height: int, cy: CyConvention
+) -> FloatArray:
+    """(3, 3) K in pixels of OpenCV's image axes, from whichever intrinsic entries a frame has.
+
+    ``fl_x`` (and ``fl_y``, ``cx``, ``cy``) where present; otherwise square pixels from ``camera_angle_x``
+    with the principal point at the image centre, as GaussianAvatars reads it.
+    """
+    fl_x = entries.get("fl_x") or width / (2 * math.tan(entries["camera_angle_x"] / 2))
+    fl_y = entries.get("fl_y") or fl_x
+    center_x, center_y = width / 2, height / 2
+    if cy != "centre":
+        center_x = entries.get("cx", center_x)
+        if "cy" in entries:
+            center_y = height - entries["cy"] if cy == "bottom" else entries["cy"]
+    return np.array([[fl_x, 0.0, center_x], [0.0, fl_y, center_y], [0.0, 0.0, 1.0]])
+
+
+def extrinsics_to_json(world_to_camera: FloatArray) -> list[list[float]]:
+    """4x4 camera-to-world with OpenGL axes, from world-to-camera with OpenCV axes."""
+    # The inverse by cofactors, in elementary operations: LAPACK's last digits differ between machines.
+    a, b, c = world_to_camera[:3, :3]
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
+    matrix[:3, :3] /= (a * matrix[:3, 0]).sum()
+    matrix[:3, 3] = -(matrix[:3, :3] * world_to_camera[:3, 3]).sum(axis=1)
+    matrix[:3, 1:3] *= -1.0
+    entries: list[list[float]] = (matrix + 0.0).tolist()
+    return entries
+
+
+def extrinsics_from_json(transform_matrix: FloatArray) -> FloatArray:
+    """4x4 world-to-camera with OpenCV axes, from camera-to-world with OpenGL axes."""
+    return np.linalg.inv(transform_matrix @ OPENGL_FROM_OPENCV)
+
+
+@dataclass(frozen=True)
+class Declaration:
+    """``headbench.json``: what the layout leaves unsaid.
+
+    Attributes
+    ----------
+    subject : subject id.
+    head_model : version of the head model the parameters belong to.
+    head_file : the head model's file, relative to the declaration's folder.
+    background : (r, g, b) in [0, 1] that the images are composited on.
+    cy : convention of the JSONs' principal point.
+    sequences : sequence name by sequence folder name.
+    excluded : reason by timestep index of the folder's JSONs: frames no split may hold.
+    synthetic : how the capture was synthesised; empty for a recording.
+    """
+
+    subject: str
+    head_model: str
+    head_file: str = HEAD_FILE
+    background: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    cy: CyConvention = "bottom"
+    sequences: Mapping[str, str] = field(default_factory=dict)
+    excluded: Mapping[int, str] = field(default_factory=dict)
+    synthetic: Mapping[str, Any] = field(default_factory=dict)
+
+    def write(self, folder: Path) -> None:
+        """Write ``headbench.json`` into ``folder``."""
+        value = {
+            "format_version": FORMAT_VERSION,
+            "subject": self.subject,
+            "head_model": self.head_model,
+            "head_file": self.head_file,
+            "background": list(self.background),
+            "cy": self.cy,
+            "sequences": dict(self.sequences),
+            "excluded": [{"timestep": t, "reason": reason} for t, reason in sorted(self.excluded.items())],
+            "synthetic": dict(self.synthetic),
+        }
+        write_json(folder / DECLARATION_FILE, value)
+
+    @classmethod
+    def read(cls, folder: Path) -> Declaration | None:
+        """Read ``headbench.json`` of ``folder``; None where there is none. Raises `InputError` on a bad one."""
+        path = folder / DECLARATION_FILE
+        if not path.exists():
+            return None
+        value = read_json(path)
+        found = value.get("format_version")
+        if found != FORMAT_VERSION:
+            remedy = "Read it with the release of headbench that wrote it."
+            raise InputError(path, "format_version", f"{FORMAT_VERSION}", shown(found), remedy)
+        file = checked(value, _DeclarationFile, path)
+        check_name(file.subject, path, "subject")
+        for part, name in file.sequences.items():
+            check_name(name, path, f"sequences.{part}")
+        if not all(0 <= channel <= 1 for channel in file.background):
+            raise InputError(path, "background", "three numbers in [0, 1]", str(file.background))
+        excluded = {entry.timestep: entry.reason for entry in file.excluded}
+        members = {name: getattr(file, name) for name in _PLAIN_MEMBERS}
+        return cls(**members, excluded=excluded)
+
+
+@dataclass(frozen=True)
+class _Exclusion:
+    timestep: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class _DeclarationFile:
+    """A declaration as its file has it."""
+
+    format_version: int
+    subject: str
+    head_model: str
+    head_file: str
+    background: tuple[float, float, float]
+    cy: CyConvention
+    sequences: dict[str, str]
+    excluded: tuple[_Exclusion, ...]
+    synthetic: dict[str, Any]
+
+
+_PLAIN_MEMBERS = ("subject", "head_model", "head_file", "background", "cy", "sequences", "synthetic")

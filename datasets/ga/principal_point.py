@@ -1,0 +1,198 @@
+"""Tell from the images whether ``cy`` was measured from the top edge or from the bottom.
+
+VHAP changed the convention in November 2024 and its files do not say which one they follow. The two readings
+shift every projection by h - 2 cy pixels, so the outline of the tracked mesh lies on the outline of the
+foreground under one of them only. Hair and clothes hide parts of the outline; what shows (brow, nose, chin,
+cheeks, ears) decides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+import torch
+
+from ...bench.contracts import ByteArray, Camera, FloatArray, HeadPose, IntArray
+from ...bench.errors import InputError
+from ..head.model import HeadModel
+from ..images import read_image, read_mask
+from .cameras import CaptureCameras
+from .flame_parameters import Tracking
+from .layout import CyConvention
+from .transforms import FrameEntry
+
+OUTLINE_SIGMA = 0.004
+"""Scale on which outlines agree, as a fraction of the image height."""
+
+MARGIN = 0.05
+"""Least relative difference between the two agreements that decides."""
+
+VOTES = 0.75
+"""Least fraction of the frames that must say the same."""
+
+FRAMES = 24
+"""Frames to judge by."""
+
+FOREGROUND_LEVELS = 8
+"""Least difference from the background, in 8-bit levels, that makes a pixel foreground without a mask."""
+
+_SUBPIXEL_BITS = 4
+
+
+@dataclass(frozen=True)
+class CyEvidence:
+    """How well outlines agree under each reading: means over frames, in [0, 1], and the share of frames
+    that favour the top. ``decision`` is None where they do not decide."""
+
+    top: float
+    bottom: float
+    votes_for_top: float
+
+    @property
+    def decision(self) -> Literal["top", "bottom"] | None:
+        best = max(self.top, self.bottom)
+        if best <= 0 or abs(self.top - self.bottom) < MARGIN * best:
+            return None
+        if self.top > self.bottom:
+            return "top" if self.votes_for_top >= VOTES else None
+        return "bottom" if self.votes_for_top <= 1 - VOTES else None
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A frame to judge by: the posed mesh (V, 3) in the world, the camera read from the top, the mask."""
+
+    vertices: FloatArray
+    camera: Camera
+    mask: Callable[[], ByteArray]
+
+
+def settle_cy(
+    folder: Path,
+    asked: CyConvention | Literal["auto"],
+    declared: CyConvention | None,
+    rig: CaptureCameras,
+    tracking: Tracking,
+    poses: Mapping[int, HeadPose],
+    entries: Sequence[FrameEntry],
+    background: Sequence[float],
+) -> tuple[CyConvention, dict[str, Any]]:
+    """Decide how to read ``cy``: as asked, else as declared, else as the images say.
+
+    Returns the convention and what it rests on, for the step record. Raises `InputError` where it matters
+    (some |cy - h/2| > 0.5 px) and the images do not decide.
+    """
+    if asked != "auto":
+        return asked, {"source": "argument"}
+    if declared is not None:
+        return declared, {"source": "declaration"}
+    if not rig.cy_matters():
+        return "top", {"source": "immaterial, within 0.5 px of the centre"}
+    evidence = weigh_cy(_pick_views(rig, tracking, poses, entries, background), tracking.head.faces)
+    if evidence.decision is None:
+        raise InputError(
+            folder,
+            "cy",
+            "outlines of the tracked mesh and the foreground that agree better under one reading of cy",
+            f"agreement {evidence.top:.3f} with cy from the top, {evidence.bottom:.3f} from the bottom",
+            'State the convention: cy="bottom" for VHAP exports since November 2024, "top" for older ones, '
+            '"centre" to ignore the principal point as GaussianAvatars does.',
+        )
+    return evidence.decision, {"source": "outlines", **asdict(evidence)}
+
+
+def _pick_views(
+    rig: CaptureCameras,
+    tracking: Tracking,
+    poses: Mapping[int, HeadPose],
+    entries: Sequence[FrameEntry],
+    background: Sequence[float],
+) -> list[View]:
+    """Up to `FRAMES` frames, spread over timesteps and, by a stride prime to most rigs, over cameras."""
+    cameras = rig.resolve("top")
+    ordered = sorted(entries, key=lambda e: (e.timestep, e.camera_index))
+    picks = np.unique(np.linspace(0, len(ordered) - 1, min(FRAMES, len(ordered))).round().astype(int))
+    chosen = [ordered[i] for i in picks]
+    model = HeadModel(tracking.head, dtype=torch.float64)
+    canonical = model.canonical(
+        torch.from_numpy(tracking.shape.astype(np.float64)),
+        torch.from_numpy(tracking.static_offset.astype(np.float64)),
+    )
+    views = []
+    for entry in chosen:
+        arguments = model.pose_arguments([poses[entry.timestep]])
+        vertices = model(canonical=canonical, **arguments)[0].numpy()
+        views.append(View(vertices, cameras[entry.camera_id], partial(_foreground, entry, background)))
+    return views
+
+
+def _foreground(entry: FrameEntry, background: Sequence[float]) -> ByteArray:
+    """The frame's mask, or where it has none the pixels that differ from the background."""
+    if entry.mask is not None:
+        return read_mask(entry.mask)
+    levels = np.round(np.asarray(background) * 255)
+    different = np.abs(read_image(entry.image, background) - levels).max(axis=2) > FOREGROUND_LEVELS
+    return (different * 255).astype(np.uint8)
+
+
+def weigh_cy(views: Sequence[View], faces: IntArray) -> CyEvidence:
+    """Compare both readings of ``cy`` over some frames.
+
+    For each frame: the mesh is projected and filled; agreement is the mean over its outline's pixels of
+    exp(-(d / sigma)^2) with d the distance to the foreground's outline. The image border is no outline, as it
+    cuts both.
+    """
+    top, bottom = [], []
+    for view in views:
+        foreground = (view.mask() > 127).astype(np.uint8)
+        distance = _distance_to_outline(foreground)
+        flipped = view.camera.height - 2 * float(view.camera.K[1, 2])
+        projected = _project(view.vertices, view.camera)
+        top.append(_agreement(projected, faces, distance))
+        bottom.append(_agreement(projected + np.array([0.0, flipped]), faces, distance))
+    favour = np.sign(np.array(top) - np.array(bottom))
+    return CyEvidence(float(np.mean(top)), float(np.mean(bottom)), float(np.mean((favour + 1) / 2)))
+
+
+def _project(vertices: FloatArray, camera: Camera) -> FloatArray:
+    """(V, 2) pixels."""
+    points = vertices @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    pixels = points @ camera.K.T
+    return pixels[:, :2] / np.maximum(pixels[:, 2:], 1e-6)
+
+
+def _agreement(pixels: FloatArray, faces: IntArray, distance: FloatArray) -> float:
+    height, width = distance.shape
+    filled = np.zeros((height, width), dtype=np.uint8)
+    # Pixel centres are at half-integers here and at integers in OpenCV.
+    corners = np.round((pixels - 0.5) * 2**_SUBPIXEL_BITS).astype(np.int32)
+    limit = 2**20  # far outside any image, near enough for fixed-point arithmetic
+    triangles = np.clip(corners, -limit, limit)[faces]
+    for triangle in triangles:
+        cv2.fillConvexPoly(filled, triangle, 1, shift=_SUBPIXEL_BITS)
+    outline = _outline(filled)
+    if not outline.any():
+        return 0.0
+    scale = max(1.0, OUTLINE_SIGMA * height)
+    return float(np.exp(-((distance[outline] / scale) ** 2)).mean())
+
+
+def _outline(filled: ByteArray) -> np.ndarray:
+    """Pixels of a filled shape next to unfilled ones; where the image border cuts the shape there are none."""
+    eroded = cv2.erode(filled, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
+    return (filled > 0) & (eroded == 0)
+
+
+def _distance_to_outline(foreground: ByteArray) -> FloatArray:
+    """(H, W) distance in pixels to the foreground's outline; far away everywhere where there is none."""
+    outline = _outline(foreground)
+    if not outline.any():
+        return np.full(foreground.shape, np.inf)
+    distance = cv2.distanceTransform((~outline).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return distance.astype(np.float64)

@@ -1,0 +1,267 @@
+"""Read a GaussianAvatars/VHAP capture, a union or a single sequence, into a `CaptureClip`.
+
+Everything is checked before anything long happens: JSON keys, images, parameters, timesteps, cameras, leaks
+between splits. What the layout leaves open (where ``cy`` counts from, teeth, shifted worlds) is settled as
+documented at the arguments, and the decisions stand in the clip's first step record.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from ...bench.contracts import FrameKey, HeadPose, Progress, StepRecord, no_progress
+from ...bench.errors import InputError
+from ...bench.io.files import check_name, digest
+from ...bench.io.images import ImageInfo
+from ..clip import CaptureClip, FrameFiles
+from ..foreign import describe
+from ..head.arrays import HeadArrays
+from ..images import ImageStore
+from ..steps.exclude import exclude_timesteps, read_reasons
+from ..steps.mattes import mask_below_neck, set_background
+from . import layout
+from .cameras import CaptureCameras, collect_cameras
+from .content_digests import content_digests
+from .flame_parameters import TeethPolicy, Tracking, read_tracking
+from .head import find_head
+from .principal_point import settle_cy
+from .splits import check_disjoint, sequence_names, split_by_holding_out
+from .transforms import FrameEntry, read_transforms
+from .validate import LeakPolicy, check_images, check_leaks, check_timesteps, find_leaks
+
+WHITE = (1.0, 1.0, 1.0)
+
+
+def read_capture(
+    path: str | Path,
+    *,
+    head: HeadArrays | str | Path | None = None,
+    masks: str | Path | None = None,
+    regions: str | Path | None = None,
+    subject: str = "",
+    cy: layout.CyConvention | Literal["auto"] = "auto",
+    teeth: TeethPolicy = "auto",
+    background: Sequence[float] | None = None,
+    below_neck: bool = True,
+    held_out_sequences: Sequence[str] = (),
+    held_out_cameras: Sequence[str] = (),
+    exclude: Mapping[int, str] | str | Path | None = None,
+    leaks: LeakPolicy = "error",
+    decode: bool = False,
+    cache_mb: float = 512.0,
+    remembered: bool = True,
+    progress: Progress = no_progress,
+) -> CaptureClip:
+    """Read a capture folder (or the folder that holds its one union).
+
+    The first call reads every file once for the fingerprint and keeps the digests in the user's cache, see
+    `content_digests`. Images are compared between splits by their bytes at every call.
+
+    Parameters
+    ----------
+    head, masks, regions : head model or its file, and files with regions; see `find_head`.
+    subject : subject id; "" takes it from ``headbench.json`` or the folder's name.
+    cy : convention of the principal point. "auto" takes what ``headbench.json`` declares, else compares the
+        tracked mesh with the masks; where the images do not decide and it matters, that is an `InputError`.
+        "centre" puts the principal point at the image centre, as GaussianAvatars does.
+    teeth : see `read_tracking`.
+    background : (r, g, b) in [0, 1]; None takes the declared one, else white. For images without alpha it is
+        exchanged by their masks, see `set_background`.
+    below_neck : keep what lies below the tracked neck; False turns it into background, see `mask_below_neck`.
+    held_out_sequences, held_out_cameras : make the splits anew instead of taking the JSONs': all frames of
+        these sequences (full names or unique prefixes) are self-reenactment, these cameras' other frames
+        novel view, the rest training.
+    exclude : frames to leave out, added to what ``headbench.json`` declares: reason by timestep, or a file for
+        `read_reasons`, such as the one that ``headbench tongue`` writes.
+    leaks : "error" refuses splits that share data; "record" notes it in the step record.
+    decode : decode every image when checking; finds damage in the middle of files.
+    cache_mb : bound of the decoded images held in memory, in 10^6 bytes.
+    remembered : take the digests of files that the system has not touched since from the user's cache. ``headbench
+        verify`` has it False.
+
+    Raises
+    ------
+    InputError
+        For the first fault found.
+    """
+    folder = find_capture(path)
+    declaration = layout.Declaration.read(folder)
+    entries = _read_splits(folder, bool(held_out_sequences or held_out_cameras))
+    everything = [entry for part in entries.values() for entry in part]
+    check_timesteps(folder, everything)
+    infos = check_images(everything, decode=decode, progress=progress)
+    rig = collect_cameras(everything, infos)
+    ground, wanted = _backgrounds(folder, declaration, background, everything, infos)
+    asset = find_head(folder, declaration, head, masks=masks, regions=regions)
+    subject = check_name(subject or _subject(folder, declaration, everything), folder, "subject")
+    files = {entry.timestep: entry.parameters for entry in everything}
+    tracking = read_tracking(files, asset, subject, teeth=teeth)
+    poses = _shift_poses(tracking, rig, everything)
+    declared = declaration.cy if declaration else None
+    convention, basis = settle_cy(folder, cy, declared, rig, tracking, poses, everything, ground)
+
+    names = sequence_names(everything, declaration.sequences if declaration else {})
+    splits, frames = _index_frames(folder, subject, names, entries, infos)
+    if held_out_sequences or held_out_cameras:
+        splits = split_by_holding_out(folder, frames, held_out_sequences, held_out_cameras)
+    used = _used_files(folder, everything)
+    digests = content_digests(used, remembered_for=folder if remembered else None, progress=progress)
+    found = find_leaks(splits, {key: frame.image for key, frame in frames.items()}, progress=progress)
+    record = {
+        "cy": convention,
+        "cy_from": basis,
+        "sequence_shifts_m": {names[k]: v.tolist() for k, v in rig.shifts.items() if v.any()},
+        "held_out_sequences": list(held_out_sequences),
+        "held_out_cameras": list(held_out_cameras),
+        "leaks": check_leaks(folder, found, leaks),
+        "synthetic": dict(declaration.synthetic) if declaration else {},
+        **tracking.notes,
+    }
+    contents = {Path(os.path.relpath(file, folder)).as_posix(): value for file, value in digests.items()}
+    source = digest(tracking.head.fingerprint(), contents, subject)
+    clip = CaptureClip(
+        subject=subject,
+        head=tracking.head,
+        shape=tracking.shape,
+        static_offset=tracking.static_offset,
+        cameras=rig.resolve(convention),
+        poses=poses,
+        splits=splits,
+        excluded={},
+        background=np.array(ground),
+        steps=(StepRecord("read_capture", record, source),),
+        files=frames,
+        source_fingerprint=source,
+        store=ImageStore(cache_mb),
+    )
+    clip = set_background(clip, wanted)
+    if not below_neck:
+        clip = mask_below_neck(clip)
+    if declaration and declaration.excluded:
+        clip = exclude_timesteps(clip, declaration.excluded, source=folder / layout.DECLARATION_FILE)
+    if isinstance(exclude, (str, Path)):
+        return exclude_timesteps(clip, read_reasons(Path(exclude), clip), source=exclude)
+    return exclude_timesteps(clip, exclude) if exclude else clip
+
+
+def find_captures(root: Path) -> list[Path]:
+    """Captures under ``root``: the folder itself if it holds transforms JSONs, else its union folders.
+
+    Raises `InputError` where there is none, with what lies there instead and the way from it to a capture.
+    """
+    expected = "a folder with a capture in the GaussianAvatars/VHAP layout"
+    if not root.exists():
+        raise InputError(root, "", expected, "no such folder")
+    if any((root / file).exists() for file in (*layout.SPLIT_FILES.values(), layout.ALL_FRAMES_FILE)):
+        return [root]
+    captures = sorted(path.parent for path in root.glob(f"UNION*/{layout.SPLIT_FILES['train']}"))
+    if not captures:
+        raise InputError(root, "", expected, *describe(root))
+    return captures
+
+
+def find_capture(path: str | Path) -> Path:
+    """The one capture at ``path``. Raises `InputError` where there is none or several."""
+    folder = Path(os.path.abspath(path))  # "." has no name to take a subject from
+    captures = find_captures(folder)
+    if len(captures) != 1:
+        found = ", ".join(capture.name for capture in captures)
+        raise InputError(
+            path, "", "one capture in the GaussianAvatars/VHAP layout", found, "Name one capture."
+        )
+    return captures[0]
+
+
+def _read_splits(folder: Path, resplit: bool) -> dict[str, list[FrameEntry]]:
+    """Entries by split name; with ``resplit``, ``transforms.json`` will do in place of the three."""
+    paths = {name: folder / file for name, file in layout.SPLIT_FILES.items()}
+    if not any(path.exists() for path in paths.values()):
+        entries = {"train": read_transforms(folder / layout.ALL_FRAMES_FILE)}
+        if resplit:
+            return entries
+        remedy = "Splits are made by reader_settings.held_out_sequences and .held_out_cameras."
+        raise InputError(
+            paths["train"], "", "a file for each split", f"{layout.ALL_FRAMES_FILE} alone", remedy
+        )
+    entries = {name: read_transforms(path) for name, path in paths.items()}
+    if not entries["train"]:
+        raise InputError(paths["train"], "frames", "at least one training frame", "an empty list")
+    return entries
+
+
+def _subject(folder: Path, declaration: layout.Declaration | None, entries: Sequence[FrameEntry]) -> str:
+    if declaration:
+        return declaration.subject
+    named = (
+        layout.parse_union_folder(folder.name) or layout.parse_sequence_folder(entries[0].sequence_folder)[0]
+    )
+    return named or folder.name
+
+
+def _backgrounds(
+    folder: Path,
+    declaration: layout.Declaration | None,
+    wanted: Sequence[float] | None,
+    entries: Iterable[FrameEntry],
+    infos: Mapping[Path, ImageInfo],
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """What images are read on, and what the clip is to be on: another where images are composited already."""
+    declared = declaration.background if declaration else WHITE
+    if wanted is None:
+        return declared, declared
+    colour = tuple(float(c) for c in wanted)
+    if len(colour) != 3 or not all(0 <= c <= 1 for c in colour):
+        raise InputError("read_capture", "background", "three numbers in [0, 1]", f"{colour}")
+    if colour == declared or all(info.has_alpha for info in infos.values()):
+        return colour, colour
+    bare = [entry.image for entry in entries if entry.mask is None and not infos[entry.image].has_alpha]
+    if bare:
+        expected = f"{declared}, which images are composited on, where one has neither mask nor alpha"
+        raise InputError(folder, "background", expected, f"{colour}, and no mask for {bare[0].name}")
+    return declared, colour
+
+
+def _shift_poses(
+    tracking: Tracking, rig: CaptureCameras, entries: Iterable[FrameEntry]
+) -> dict[int, HeadPose]:
+    """Poses moved into the first sequence's world."""
+    folders = {entry.timestep: entry.sequence_folder for entry in entries}
+    poses = {}
+    for timestep, pose in tracking.poses.items():
+        shift = rig.shifts[folders[timestep]].astype(pose.translation.dtype)
+        poses[timestep] = replace(pose, translation=pose.translation + shift)
+    return poses
+
+
+def _index_frames(
+    folder: Path,
+    subject: str,
+    names: Mapping[str, str],
+    entries: Mapping[str, Sequence[FrameEntry]],
+    infos: Mapping[Path, ImageInfo],
+) -> tuple[dict[str, tuple[FrameKey, ...]], dict[FrameKey, FrameFiles]]:
+    """Keys by split as the JSONs have them, and files by key. Without a mask, an alpha channel is the mask."""
+    splits: dict[str, tuple[FrameKey, ...]] = {}
+    frames: dict[FrameKey, FrameFiles] = {}
+    for part, group in entries.items():
+        keys = [FrameKey(subject, names[e.sequence_folder], e.timestep, e.camera_id) for e in group]
+        splits[part] = tuple(keys)
+        for key, entry in zip(keys, group):
+            own_alpha = entry.image if infos[entry.image].has_alpha else None
+            frames[key] = FrameFiles(entry.image, entry.mask or own_alpha)
+    check_disjoint(folder, splits)
+    return splits, frames
+
+
+def _used_files(folder: Path, entries: Iterable[FrameEntry]) -> set[Path]:
+    """Every file the clip depends on, but the head model, which may lie elsewhere and has its own digest."""
+    files = {folder / layout.DECLARATION_FILE} if (folder / layout.DECLARATION_FILE).exists() else set()
+    for entry in entries:
+        files |= {entry.file, entry.image, entry.parameters} | ({entry.mask} if entry.mask else set())
+    return files

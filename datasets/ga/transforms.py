@@ -1,0 +1,183 @@
+"""Read a transforms JSON into checked frame entries; every fault names its file and frame."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...bench.contracts import FloatArray
+from ...bench.errors import InputError
+from ...bench.io.documents import read_json
+from ...bench.io.files import check_name
+from ..foreign import frame_route
+
+INTRINSIC_KEYS = ("cx", "cy", "fl_x", "fl_y", "camera_angle_x")
+RIGID_TOLERANCE = 1e-4
+MAX_INTEGER = 2**31
+_IDENTITY, _LAST_ROW = np.eye(3), np.array([0.0, 0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True, eq=False)
+class FrameEntry:
+    """One frame of a transforms JSON, paths resolved, types checked, nothing interpreted.
+
+    ``where`` is the JSON's path to the entry ("frames[17]"), for error messages. ``intrinsics`` holds those
+    of `INTRINSIC_KEYS` that the frame or the document states. ``width`` and ``height`` are None where the
+    JSON leaves them to the image.
+    """
+
+    file: Path
+    where: str
+    timestep: int
+    camera_index: int
+    camera_id: str
+    sequence_folder: str
+    image: Path
+    mask: Path | None
+    parameters: Path
+    width: int | None
+    height: int | None
+    intrinsics: Mapping[str, float]
+    camera_to_world: FloatArray  # (4, 4), OpenGL axes
+
+
+def read_transforms(path: Path) -> list[FrameEntry]:
+    """Read and check the frames of a transforms JSON.
+
+    Raises `InputError` for text that is no JSON, missing keys, values of the wrong type or range, and
+    matrices that are no rigid motion.
+    """
+    document = read_json(path)
+    frames = document.get("frames")
+    if not isinstance(frames, list):
+        raise InputError(path, "frames", "a list of frames", _kind(document, "frames"))
+    return [parse_frame(path, f"frames[{i}]", frame, document) for i, frame in enumerate(frames)]
+
+
+def parse_frame(path: Path, where: str, frame: Any, document: Mapping[str, Any]) -> FrameEntry:
+    """Read and check one frame of the document at ``path``; see `read_transforms`.
+
+    Parameters
+    ----------
+    where : JSON path to the frame, for messages.
+    document : the whole document, which may state intrinsics for all frames.
+    """
+    if not isinstance(frame, dict):
+        raise InputError(path, where, "an object", type(frame).__name__)
+    reader = _Reader(path, where, frame, document)
+    way = frame_route(frame)
+    if way:
+        raise InputError(path, f"{where}.flame_param_path", "text", "no such key", way)
+    image = reader.text("file_path")
+    if ".png" not in image and ".jpg" not in image.lower():
+        image += ".png"  # the rule of GaussianAvatars, to which we add JPEG
+    mask = reader.text("fg_mask_path") if "fg_mask_path" in frame else None
+    camera_index = reader.integer("camera_index") if "camera_index" in frame else 0
+    intrinsics = {key: reader.number(key) for key in INTRINSIC_KEYS if reader.has(key)}
+    _check_intrinsics(path, where, intrinsics)
+    return FrameEntry(
+        file=path,
+        where=where,
+        timestep=reader.integer("timestep_index"),
+        camera_index=camera_index,
+        camera_id=reader.name("camera_id") if "camera_id" in frame else f"{camera_index:02d}",
+        sequence_folder=check_name(_sequence_folder(path.parent, image), path, f"{where}.file_path"),
+        image=path.parent / image,
+        mask=path.parent / mask if mask else None,
+        parameters=path.parent / reader.text("flame_param_path"),
+        width=reader.integer("w") if reader.has("w") else None,
+        height=reader.integer("h") if reader.has("h") else None,
+        intrinsics=intrinsics,
+        camera_to_world=reader.rigid("transform_matrix"),
+    )
+
+
+def _check_intrinsics(path: Path, where: str, intrinsics: Mapping[str, float]) -> None:
+    if "fl_x" not in intrinsics and "camera_angle_x" not in intrinsics:
+        raise InputError(path, where, "fl_x or camera_angle_x", "neither")
+    for key in ("fl_x", "fl_y"):
+        if intrinsics.get(key, 1.0) <= 0:
+            raise InputError(
+                path, f"{where}.{key}", "a positive focal length in pixels", f"{intrinsics[key]}"
+            )
+    angle = intrinsics.get("camera_angle_x", 1.0)
+    if not 0 < angle < np.pi:
+        raise InputError(path, f"{where}.camera_angle_x", "an angle in (0, pi) radians", f"{angle}")
+
+
+def _sequence_folder(folder: Path, image: str) -> str:
+    """Folder that holds ``images/``: the sequence's own, also when a union refers to it."""
+    parts = Path(image).parts
+    return parts[1] if len(parts) > 2 and parts[0] == ".." else folder.name
+
+
+def _kind(container: Mapping[str, Any], key: str) -> str:
+    return repr(container[key])[:60] if key in container else "no such key"
+
+
+class _Reader:
+    """Typed access to one frame; intrinsics and size may stand at the document's top level instead."""
+
+    def __init__(self, path: Path, where: str, frame: Mapping[str, Any], document: Mapping[str, Any]):
+        self._path, self._where, self._frame, self._document = path, where, frame, document
+
+    def has(self, key: str) -> bool:
+        return key in self._frame or key in self._document
+
+    def _fail(self, key: str, expected: str) -> InputError:
+        source = self._frame if key in self._frame else self._document
+        return InputError(self._path, f"{self._where}.{key}", expected, _kind(source, key))
+
+    def _get(self, key: str) -> Any:
+        return self._frame.get(key, self._document.get(key))
+
+    def text(self, key: str) -> str:
+        value = self._frame.get(key)
+        if not isinstance(value, str) or not value:
+            raise self._fail(key, "text")
+        return value
+
+    def name(self, key: str) -> str:
+        return check_name(self.text(key), self._path, f"{self._where}.{key}")
+
+    def integer(self, key: str) -> int:
+        value = self._get(key)
+        whole = isinstance(value, int) or (isinstance(value, float) and value.is_integer())
+        if isinstance(value, bool) or not whole or not 0 <= value < MAX_INTEGER:
+            raise self._fail(key, f"an integer from 0 to {MAX_INTEGER - 1}")
+        return int(value)
+
+    def number(self, key: str) -> float:
+        value = self._get(key)
+        number = math.nan
+        if isinstance(value, (int, float)) and not isinstance(value, bool):
+            with suppress(OverflowError):  # JSON integers have no bound
+                number = float(value)
+        if not math.isfinite(number):
+            raise self._fail(key, "a finite number")
+        return number
+
+    def rigid(self, key: str) -> FloatArray:
+        try:
+            matrix = np.array(self._frame.get(key), dtype=np.float64)
+        except (TypeError, ValueError, OverflowError):
+            raise self._fail(key, "a 4x4 matrix of numbers") from None
+        if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+            raise self._fail(key, "a 4x4 matrix of finite numbers")
+        rotation = matrix[:3, :3]
+        skew = np.abs(rotation @ rotation.T - _IDENTITY).max()
+        projective = np.abs(matrix[3] - _LAST_ROW).max()
+        if max(skew, projective) > RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
+            raise self._fail(key, "a rigid motion (orthonormal, right-handed, last row 0 0 0 1)")
+        return matrix
+
+
+def timesteps_of(entries: Sequence[FrameEntry]) -> list[int]:
+    """Distinct timesteps, sorted."""
+    return sorted({entry.timestep for entry in entries})

@@ -1,1 +1,0 @@
-"""Speed and numerical extremes of the head model."""

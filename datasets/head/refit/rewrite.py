@@ -1,0 +1,136 @@
+"""Write a clip with other tracking as a capture of its own; images are linked, never encoded again."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+from ....bench.contracts import FrameKey, Progress, no_progress
+from ....bench.errors import InputError
+from ....bench.io.files import atomic_path, grouped_writes
+from ...clip import CaptureClip
+from ...ga.full_grid import require_full_grid
+from ...ga.writer import CapturePlan, CaptureWriter, SequencePlan
+
+_SUFFIX = ".png"
+
+
+def write_capture(clip: CaptureClip, out: Path, progress: Progress = no_progress) -> Path:
+    """Write the clip under ``out`` in the GaussianAvatars/VHAP layout; return the union folder.
+
+    Frames keep their sequence and camera; splits, exclusions and background stay as they are.
+
+    Raises
+    ------
+    InputError
+        Where the layout cannot hold the clip: images that are no PNG or are changed by pixel steps, a camera
+        without a frame at some timestep, splits other than by held-out sequences and cameras, exclusions
+        other than of whole timesteps.
+    """
+    plan, first = capture_plan(clip)
+    writer = CaptureWriter(out, plan)
+    with grouped_writes():
+        for done, (key, files) in enumerate(sorted(clip.files.items())):
+            progress(done, len(clip.files), "linking images")
+            place = (key.sequence, key.timestep - first[key.sequence], key.camera)
+            if files.mask is not None:
+                link_or_copy(files.mask, writer.mask_path(*place))
+            link_or_copy(files.image, writer.image_path(*place))
+    return writer.write_metadata()
+
+
+def capture_plan(clip: CaptureClip, source: str | Path = "") -> tuple[CapturePlan, dict[str, int]]:
+    """Plan of the capture a clip makes, and the first timestep of each sequence.
+
+    Raises `InputError` as `write_capture` does, naming ``source``, the capture the clip was read from.
+    """
+    where = str(source) or f"clip of {clip.subject}"
+    _check_files(clip, where)
+    require_full_grid(clip, where)
+    _check_excluded(clip, where)
+    timesteps: dict[str, list[int]] = {}
+    for key in clip.files:
+        timesteps.setdefault(key.sequence, []).append(key.timestep)
+    first = {name: min(found) for name, found in timesteps.items()}
+    names = sorted(first, key=first.__getitem__)
+    for name in names:
+        distinct = sorted({*timesteps[name]})
+        if distinct != [*range(distinct[0], distinct[0] + len(distinct))]:
+            raise InputError(where, name, "timesteps without gaps", f"{len(distinct)} with gaps")
+    test = {key.sequence for key in clip.splits["self_reenactment"]}
+    novel = {key.camera for key in clip.splits["novel_view"]}
+    for split, keys in clip.splits.items():
+        for key in keys:
+            if split != _split(key, test, novel):
+                expected = "splits by held-out sequences and cameras, which the layout can hold"
+                raise InputError(where, "splits", expected, f"{key} in {split}")
+    background = tuple(float(value) for value in clip.background)
+    sequences = [
+        SequencePlan(
+            name,
+            [clip.poses[timestep] for timestep in sorted({*timesteps[name]})],
+            {
+                key.timestep - first[name]: reason
+                for key, reason in clip.excluded.items()
+                if key.sequence == name
+            },
+        )
+        for name in names
+    ]
+    plan = CapturePlan(
+        subject=clip.subject,
+        head=clip.head,
+        shape=clip.shape,
+        static_offset=clip.static_offset,
+        cameras=[*clip.cameras.values()],
+        sequences=sequences,
+        test_sequences=sorted(test),
+        novel_view_cameras=sorted(novel),
+        background=(background[0], background[1], background[2]),
+        synthetic=clip.steps[0].parameters.get("synthetic", {}) if clip.steps else {},
+    )
+    return plan, first
+
+
+def link_or_copy(source: Path, target: Path) -> None:
+    """Make ``target`` the same file as ``source``, or a copy where the file system cannot link; atomically."""
+    if target.exists() and os.path.samefile(source, target):
+        return
+    with atomic_path(target) as temporary:
+        temporary.unlink()
+        try:
+            os.link(source, temporary)
+        except OSError:
+            shutil.copyfile(source, temporary)
+
+
+def _split(key: FrameKey, test: set[str], novel: set[str]) -> str:
+    if key.sequence in test:
+        return "self_reenactment"
+    return "novel_view" if key.camera in novel else "train"
+
+
+def _check_files(clip: CaptureClip, where: str) -> None:
+    if clip.pixel_steps:
+        raise InputError(where, "pixel_steps", "images as they are on disk", "steps that change pixels")
+    for key, files in clip.files.items():
+        for path in (files.image, files.mask):
+            if path is not None and path.suffix.lower() != _SUFFIX:
+                raise InputError(path, "", "a PNG file, to be linked as it is", f"{path.suffix} of {key}")
+
+
+def _check_excluded(clip: CaptureClip, where: str) -> None:
+    """The layout excludes timesteps, each for one reason: whatever else would exclude frames anew, or lose a
+    reason."""
+    of_timestep: dict[int, FrameKey] = {}
+    for key in sorted(clip.files):
+        first = of_timestep.setdefault(key.timestep, key)
+        found, other = clip.excluded.get(key), clip.excluded.get(first)
+        if found != other:
+            expected = f"timestep {key.timestep} excluded with all its cameras for one reason, or not at all"
+            told = " and ".join(
+                f"{one} {f'excluded: {why}' if why is not None else 'kept'}"
+                for one, why in ((first, other), (key, found))
+            )
+            raise InputError(where, "excluded", expected, told)

@@ -1,0 +1,114 @@
+"""``headbench inspect``: what a capture holds, as one picture, as text and as JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...bench.contracts import Progress, no_progress
+from ...bench.errors import InputError
+from ...bench.io.files import write_json
+from ...bench.specs import Findings
+from ..clip import CaptureClip
+from ..ga.reader import read_capture
+from ..ga.writer import write_png
+from .expression_panel import space_summary
+from .figure import draw_figure
+from .settings import InspectSettings
+from .statistics import ExpressionSpace, SequenceRow, SplitRow, expression_space, sequence_rows, split_rows
+
+PICTURE, NUMBERS = "inspection.png", "inspection.json"
+
+
+def run(settings: InspectSettings, progress: Progress = no_progress) -> Findings:
+    """Read a capture, draw it, write picture and numbers to ``out``.
+
+    Raises `InputError` for a capture that the reader refuses (``headbench lint`` then tells all that is wrong),
+    for a clip without training frames that are not excluded, and for counts below 1.
+    """
+    for name in ("timesteps", "cameras"):
+        if getattr(settings, name) < 1:
+            raise InputError(f"--{name}", "", "at least 1", str(getattr(settings, name)))
+    clip = read_capture(settings.clip, head=settings.head, cy=settings.cy, leaks="record", progress=progress)
+    splits, sequences, space = split_rows(clip), sequence_rows(clip), expression_space(clip)
+    out = Path(settings.out)
+    picture = draw_figure(
+        clip,
+        splits,
+        sequences,
+        space,
+        timesteps=settings.timesteps,
+        cameras=settings.cameras,
+        progress=progress,
+    )
+    write_png(out / PICTURE, picture)
+    data = summary(clip, splits, sequences, space)
+    write_json(out / NUMBERS, data)
+    text = _text(clip, splits, sequences, space)
+    return Findings(f"{text}\n\nPicture: {out / PICTURE}", {**data, "picture": str(out / PICTURE)})
+
+
+def summary(
+    clip: CaptureClip, splits: Sequence[SplitRow], sequences: Sequence[SequenceRow], space: ExpressionSpace
+) -> dict[str, Any]:
+    """Everything the picture shows, as plain values."""
+    record = clip.steps[0].parameters
+    held_out = {key.camera for key in clip.splits.get("novel_view", ())}
+    return {
+        "subject": clip.subject,
+        "fingerprint": clip.fingerprint,
+        "head_model": clip.head.version,
+        "vertices": len(clip.head.template),
+        "expressions": clip.head.expression_basis.shape[2],
+        "background": clip.background.tolist(),
+        "cy": record["cy"],
+        "leaks": record["leaks"],
+        "synthetic": bool(record["synthetic"]),
+        "splits": [asdict(row) for row in splits],
+        "excluded": {
+            str(t): reason for t, reason in sorted({k.timestep: r for k, r in clip.excluded.items()}.items())
+        },
+        "cameras": [
+            {
+                "id": name,
+                "held_out": name in held_out,
+                "size": [camera.width, camera.height],
+                "focal_px": float(camera.K[0, 0]),
+                "principal_point_off_centre_px": (
+                    camera.K[:2, 2] - np.array([camera.width, camera.height]) / 2
+                ).tolist(),
+                "position_m": camera.center.tolist(),
+            }
+            for name, camera in clip.cameras.items()
+        ],
+        "sequences": [asdict(row) for row in sequences],
+        "expression_space": {
+            "explained_variance": space.explained.tolist(),
+            "components_for_95_percent": space.kept,
+            "novelty_of_test_mm": {str(t): value for t, value in space.novelty_mm.items()},
+        },
+    }
+
+
+def _text(
+    clip: CaptureClip, splits: Sequence[SplitRow], sequences: Sequence[SequenceRow], space: ExpressionSpace
+) -> str:
+    lines = [f"subject {clip.subject}, head model {clip.head.version}, {len(clip.cameras)} cameras", ""]
+    lines.append(f"{'split':<18}{'images':>8}{'timesteps':>11}{'cameras':>9}{'sequences':>11}")
+    for row in splits:
+        lines.append(f"{row.split:<18}{row.images:>8}{row.timesteps:>11}{row.cameras:>9}{row.sequences:>11}")
+    width = max(len("sequence"), *(len(row.sequence) for row in sequences)) + 2
+    lines += ["", f"{'sequence':<{width}}{'timesteps':>9}{'jaw deg':>14}{'head deg':>10}{'head mm':>9}"]
+    lines[-1] += f"{'expression mm':>15}{'rms sigma':>11}"
+    for sequence in sequences:
+        low, _, high = sequence.jaw_deg
+        lines.append(
+            f"{sequence.sequence:<{width}}{sequence.timesteps:>9}{f'{low:.1f} to {high:.1f}':>14}"
+            f"{sequence.head_deg:>10.1f}{sequence.head_mm:>9.1f}{sequence.reach_mm[1]:>15.1f}"
+            f"{sequence.expression_sigma:>11.2f}" + ("  held out" if sequence.held_out else "")
+        )
+    return "\n".join([*lines, "", space_summary(space) + "."])

@@ -1,1 +1,0 @@
-"""What a capture holds, on one picture and as numbers."""

@@ -1,1 +1,0 @@
-"""The protocol linter: faults of a capture that let a comparison run and make its numbers wrong."""

@@ -1,0 +1,132 @@
+"""``headbench tongue``: find the frames with the tongue out; write the decisions and pictures of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ....bench.contracts import Progress
+from ....bench.errors import InputError
+from ....bench.specs import Findings
+from ...clip import CaptureClip
+from ...ga.reader import find_captures, read_capture
+from ..exclusion_file import KEEP, Exclusions, read_exclusions, write_exclusions
+from .atlas import mouth_atlas
+from .decide import NEAR, decide
+from .evidence import find_evidence
+from .review import write_sheet
+from .sampling import facing_cameras, frames_by_timestep, sample_clip
+from .settings import TongueSettings
+
+DECISIONS_FILE = "tongue.yaml"
+
+
+def run(settings: TongueSettings, progress: Progress) -> Findings:
+    """Look at every subject under ``settings.capture``; see `TongueSettings`.
+
+    Raises `InputError` before any image is looked at, for captures and decisions that cannot be read.
+    """
+    _check(settings)
+    root, out = Path(settings.capture), Path(settings.out)
+    captures = find_captures(root)
+    path = out / DECISIONS_FILE
+    decided = read_exclusions(path) if path.exists() else {}
+    clips = [
+        read_capture(
+            capture,
+            head=settings.head,
+            masks=settings.masks,
+            cy=settings.cy,
+            leaks="record",
+            progress=progress,
+        )
+        for capture in captures
+    ]
+    text, data = [], {}
+    for clip in clips:
+        earlier = decided.get(clip.subject)
+        decided[clip.subject] = _look(clip, settings, earlier, out / f"tongue_{clip.subject}.png", progress)
+        # After every subject, so that a killed run keeps what it has found.
+        write_exclusions(path, decided)
+        text.append(_summary(clip.subject, decided[clip.subject]))
+        data[clip.subject] = _data(decided[clip.subject])
+    text.append(f"Decisions: {path}\nTo leave these frames out: --set reader_settings.exclude={path}")
+    return Findings("\n\n".join(text), data)
+
+
+def _look(
+    clip: CaptureClip, settings: TongueSettings, earlier: Exclusions | None, sheet: Path, progress: Progress
+) -> Exclusions:
+    """Decide on one subject and draw its contact sheet."""
+    overrides = earlier.overrides if earlier else {}
+    frames = frames_by_timestep(clip)
+    unknown = sorted(set(overrides) - set(frames))
+    if unknown:
+        where = f"subjects.{clip.subject}.overrides"
+        raise InputError(
+            Path(settings.out) / DECISIONS_FILE, where, "timesteps of the capture", str(unknown)[1:-1]
+        )
+    atlas = mouth_atlas(clip)
+    cameras = facing_cameras(clip, atlas, settings.cameras)
+    colours = sample_clip(clip, atlas, cameras, progress)
+    evidence = find_evidence(colours, atlas)
+    sequences = {t: next(iter(frames[t].values())).sequence for t in colours.timesteps}
+    decided = decide(sequences, evidence, tuple(cameras), settings.threshold, overrides)
+    write_sheet(sheet, clip, atlas, evidence, colours.timesteps, decided, settings.frames)
+    return decided
+
+
+def _check(settings: TongueSettings) -> None:
+    for name, least in (("cameras", 1), ("frames", 1)):
+        if getattr(settings, name) < least:
+            raise InputError(f"--{name}", "", f"at least {least}", str(getattr(settings, name)))
+    if settings.threshold is not None and not 0 < settings.threshold < float("inf"):
+        raise InputError("--threshold", "", "an area above 0, mm2", str(settings.threshold))
+
+
+def _summary(subject: str, decided: Exclusions) -> str:
+    """Tell a person what was decided, sequence by sequence."""
+    reasons = decided.reasons()
+    lines = [f"Subject {subject}: {len(reasons)} of {len(decided.frames)} timesteps left out"]
+    lines.append(
+        f"  Threshold {decided.threshold:g} mm2: {decided.basis}. Cameras {', '.join(decided.cameras)}"
+    )
+    sequences: dict[str, list[int]] = {}
+    for timestep in reasons:
+        frame = decided.frames.get(timestep)  # None where people left out what none of the cameras recorded
+        sequences.setdefault(frame.sequence if frame else "in no camera", []).append(timestep)
+    lines += [f"  {name}: {_ranges(timesteps)}" for name, timesteps in sequences.items()]
+    if near := _near(decided):
+        lines.append(f"  Worth a look, near the threshold: {_ranges(near)}")
+    if unseen := [t for t, frame in decided.frames.items() if frame.reason.startswith("mouth not seen")]:
+        lines.append(f"  Mouth not seen, kept: {_ranges(unseen)}")
+    if decided.overrides:
+        kept = sum(word == KEEP for word in decided.overrides.values())
+        lines.append(f"  Overrides: {kept} kept, {len(decided.overrides) - kept} left out by hand.")
+    return "\n".join(lines)
+
+
+def _data(decided: Exclusions) -> dict[str, object]:
+    return {
+        "timesteps": len(decided.frames),
+        "excluded": {str(t): reason for t, reason in decided.reasons().items()},
+        "threshold_mm2": decided.threshold,
+        "near_threshold": _near(decided),
+        "cameras": list(decided.cameras),
+    }
+
+
+def _near(decided: Exclusions) -> list[int]:
+    """Timesteps that nobody has decided and whose score is within `NEAR` of the threshold."""
+    low, high = decided.threshold / NEAR, decided.threshold * NEAR
+    return [t for t, f in decided.frames.items() if low <= f.score < high and t not in decided.overrides]
+
+
+def _ranges(timesteps: list[int]) -> str:
+    """Write [3, 4, 5, 9] as "3-5, 9"."""
+    parts: list[list[int]] = []
+    for timestep in sorted(timesteps):
+        if parts and timestep == parts[-1][1] + 1:
+            parts[-1][1] = timestep
+        else:
+            parts.append([timestep, timestep])
+    return ", ".join(f"{a}-{b}" if b > a else f"{a}" for a, b in parts)

@@ -1,0 +1,154 @@
+"""What covers lips and chin and is not the subject's own: evidence in every pixel of the mouth's map.
+
+The cue is pigment. Melanin, which colours skin and (less) lips, takes more blue than green; blood takes both alike.
+The tongue has blood and no melanin, so its green to blue ratio is below that of the skin around it, whereas blush,
+pallor, wrinkles, shadows and an opened mouth leave that ratio of skin and lips as it is. (Absorption: S. Jacques,
+"Optical properties of biological tissues: a review", Physics in Medicine and Biology 58, 2013, section 3.)
+
+Every comparison is with the subject's own canonical map (the median over timesteps), camera by camera, and forgives
+what the tracker may have shifted: a pixel counts only if nothing within `FORGIVEN` of its place looks like it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy import ndimage
+
+from ....bench.contracts import ByteArray, FloatArray
+from ...srgb import srgb_to_linear
+from .atlas import PITCH, MouthAtlas
+from .sampling import MouthColours
+
+FORGIVEN = 0.003
+"""Metres within which the canonical map is searched for a pixel's colour: three times a tracker's usual error."""
+
+LOOKS = 3.0
+"""Standard deviations from which on a pixel counts as covered."""
+
+CONNECTED = 8.0
+"""Millimetres below the line between the lips within which what comes out of the mouth has to begin. The first
+three are blind: there `FORGIVEN` lets the dark of the closed mouth explain what is seen."""
+
+PIGMENT_LOST = 0.35
+"""Share of the way from the skin's own green to blue ratio to that of tissue without melanin (about 1) that a pixel
+has to go: flushed, shaded lips go up to a quarter of it, a tongue more than half."""
+
+_LEAST_PIGMENT = 0.1  # log units; of paler skin than that, noise would be taken for a share
+_DARK = 0.001  # linear light added to every channel: below it ratios are noise
+_DARKER, _PALER = (
+    1.0,
+    0.25,
+)  # log units that a tongue may be darker, or less red, than the darkest and palest nearby
+_FLOORS = {"pink": 0.02, "red": 0.05, "light": 0.10}  # least spread, log units: quantisation and image noise
+_LEAST_SEEN = 0.2  # share of the timesteps that must show a pixel for it to have a canonical colour
+_LIMIT = 6.0  # standard deviations beyond which more is no better
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What was found in T timesteps.
+
+    Attributes
+    ----------
+    areas : (T,) mm² of the largest covered patch that begins at the mouth; 0 where there is none.
+    patches : (T, H, W) that patch.
+    strength : (T, H, W) float16 standard deviations by which each pixel looks covered; 0 where not seen.
+    seen : (T,) share of the lower lip that some camera saw.
+    """
+
+    areas: FloatArray
+    patches: np.ndarray
+    strength: FloatArray
+    seen: FloatArray
+
+
+def find_evidence(colours: MouthColours, atlas: MouthAtlas) -> Evidence:
+    """Look for what covers the mouth, camera by camera, and combine what the cameras see."""
+    count, cameras = colours.seen.shape[:2]
+    total = np.zeros((count, *atlas.shape), np.float32)
+    looks = np.zeros((count, *atlas.shape), np.uint8)
+    for camera in range(cameras):
+        strength, known = _camera_strength(colours.colours[:, camera], colours.seen[:, camera], atlas)
+        total += strength
+        looks += known
+    # The mean, of values that are bounded: what one camera alone sees before the skin is not upon it.
+    strength = total / np.maximum(looks, 1)
+    patches = np.stack([mouth_patch(part, atlas) for part in strength])
+    areas = patches.sum(axis=(1, 2)) * (PITCH * 1e3) ** 2
+    lip = atlas.lips & atlas.below
+    seen = (looks[:, lip] > 0).mean(axis=1)
+    return Evidence(areas, patches, strength.astype(np.float16), seen)
+
+
+def mouth_patch(strength: FloatArray, atlas: MouthAtlas) -> np.ndarray:
+    """(H, W) the largest connected patch of covered pixels that begins at the mouth's opening.
+
+    What lies between the patch and the opening belongs to it: a tongue comes out of the mouth.
+    """
+    labels, count = ndimage.label((strength > LOOKS) & atlas.below, np.ones((3, 3)))
+    opening = atlas.below & (atlas.height > -CONNECTED) & (atlas.lips & atlas.below).any(axis=0)
+    sizes = np.bincount(labels.ravel(), minlength=count + 1)
+    sizes[~np.isin(np.arange(count + 1), labels[opening])] = 0
+    sizes[0] = 0
+    if not sizes.any():
+        return np.zeros(atlas.shape, bool)
+    patch = labels == sizes.argmax()
+    above = np.cumsum(patch[::-1], axis=0)[::-1] > 0  # at or above the patch's lowest pixel in its column
+    return atlas.below & above
+
+
+def _camera_strength(
+    colours: ByteArray, seen: np.ndarray, atlas: MouthAtlas
+) -> tuple[FloatArray, np.ndarray]:
+    """(T, H, W) standard deviations by which one camera sees each pixel covered, and where it can tell."""
+    known = seen & (seen.mean(axis=0) > _LEAST_SEEN)
+    rows = known.any(axis=(1, 2))
+    strength = np.zeros(known.shape, np.float32)
+    if rows.any():
+        strength[rows] = _strength(_features(colours[rows], seen[rows]), known[rows])
+    return strength, known
+
+
+def _strength(values: dict[str, FloatArray], known: np.ndarray) -> FloatArray:
+    """(T, H, W) strength from features; every timestep has something known."""
+    size = 2 * round(FORGIVEN / PITCH) + 1
+    enough = known.any(axis=0)
+    spread, lowest = {}, {}
+    for name, value in values.items():
+        value[~known] = np.nan
+        canonical = np.zeros(enough.shape, np.float32)
+        canonical[enough] = np.nanmedian(value[:, enough], axis=0)
+        # Light and white balance of the moment, or a flush of the whole face.
+        value -= np.nanmedian((value - canonical)[:, enough], axis=1)[:, None, None]
+        deviation = np.zeros_like(canonical)
+        deviation[enough] = 1.4826 * np.nanmedian(np.abs(value - canonical)[:, enough], axis=0)
+        spread[name] = np.maximum(cv2.blur(deviation, (5, 5)), _FLOORS[name])
+        nearby = cv2.erode(np.where(enough, canonical, np.inf).astype(np.float32), np.ones((size, size)))
+        lowest[name] = np.where(enough, nearby, 0.0)
+    strength = np.clip((lowest["pink"] - values["pink"]) / spread["pink"], -_LIMIT, _LIMIT)
+    not_pale = values["red"] > lowest["red"] - _PALER
+    not_dark = values["light"] > lowest["light"] - _DARKER
+    lost = lowest["pink"] - values["pink"] > PIGMENT_LOST * np.maximum(lowest["pink"], _LEAST_PIGMENT)
+    strength = np.where(lost & not_pale & not_dark, strength, np.minimum(strength, 0))
+    found: FloatArray = np.where(known, strength, 0).astype(np.float32)
+    return found
+
+
+def _features(colours: ByteArray, seen: np.ndarray) -> dict[str, FloatArray]:
+    """(T, H, W) float32 log ratios of smoothed linear colours: ``pink`` (green to blue), ``red`` (red to green),
+    and ``light`` (brightness)."""
+    linear = srgb_to_linear(np.arange(256) / 255).astype(np.float32)
+    weight = seen.astype(np.float32)
+    total = ndimage.uniform_filter(weight, (0, 3, 3))
+    channels = [
+        np.log(
+            ndimage.uniform_filter(linear[colours[..., i]] * weight, (0, 3, 3)) / np.maximum(total, 0.1)
+            + _DARK
+        )
+        for i in range(3)
+    ]
+    red, green, blue = channels
+    return {"pink": green - blue, "red": red - green, "light": np.logaddexp(red, green)}

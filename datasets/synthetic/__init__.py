@@ -1,1 +1,0 @@
-"""Synthetic captures: a procedural person, performed, photographed by a path tracer, written as a capture."""

@@ -1,1 +1,0 @@
-"""How large an avatar of "ours" has to be, decided from its training data."""

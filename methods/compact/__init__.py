@@ -1,1 +1,0 @@
-"""Avatars of "ours" in about a fifteenth of the bytes."""

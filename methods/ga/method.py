@@ -1,0 +1,270 @@
+"""GaussianAvatars: Gaussians rigged to a tracked mesh.
+
+Qian et al., "GaussianAvatars: Photorealistic Head Avatars with Rigged 3D Gaussians", CVPR 2024.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...bench.contracts import Budget, Camera, Clip, Frame, HeadPose, Progress, no_stage
+from ..shared.avatar_files import (
+    HEAD_FILE,
+    SUBJECT_FILE,
+    TRACKED,
+    RefinedTracking,
+    Subject,
+    finish_fit,
+    is_finished,
+    read_shared_head,
+    read_subject,
+    run_digest,
+)
+from ..shared.binding import Frames, WorldSplats, to_world
+from ..shared.bound_avatar import USUAL, Cutoffs, Drawn, PosedSplats, draw_splats, posed_splats, read_back
+from ..shared.bound_training import Placed, run_bound_training
+from ..shared.clip_checks import check_training_split
+from ..shared.configs import GAConfig
+from ..shared.seeds import torch_generator
+from ..shared.sh import coefficient_count, initial_coefficients, occupied_degree, sh_to_rgb
+from ..shared.stored_splats import Carrier, HarmonicColors
+from ..shared.subject_mesh import BoundedCache, SubjectMesh
+from ..shared.training.loop import check_budget
+from ..shared.training.optimiser import Optimiser
+from ..shared.training.sampling import ShuffledEpochs
+from ..shared.training.schedule import Timeline
+from ..shared.views import View, view_of
+from .storage import PLY_FILE, read_ga_splats, write_ga_splats
+
+DRIVING_FILE = "driving.npz"
+STORED_DEGREE = 3  # the PLY layout has room for degree 3, whatever degree was trained
+POSES = ("rotation", "neck", "jaw", "eyes")
+
+
+class GAAppearance:
+    """Spherical harmonics in world directions, and tracking that is refined along with the splats."""
+
+    def __init__(self, mesh: SubjectMesh, clip: Clip, config: GAConfig, device: str, seed: int):
+        self._mesh, self._config, self._device, self._seed = mesh, config, device, seed
+        self.timesteps = sorted({key.timestep for key in clip.splits["train"]})
+        self._row = {timestep: row for row, timestep in enumerate(self.timesteps)}
+        self.tracked = mesh.arguments([clip.poses[timestep] for timestep in self.timesteps])
+        # A frame is 9 + 3 + 1 + 4 floats per triangle.
+        entries = config.splats.mesh_cache_mb * 2**20 // (4 * 17 * len(mesh.faces))
+        self._cached = BoundedCache(self._tracked_frames, entries)
+        self._degree_every = 1
+
+    def splat_parameters(self, count: int) -> dict[str, tuple[Tensor, float]]:
+        """Spherical harmonics: nearly zero at degree 0, zero above."""
+        rates = {"sh_dc": self._config.sh_dc_lr, "sh_rest": self._config.sh_rest_lr}
+        initial = initial_coefficients(count, STORED_DEGREE, torch_generator(self._seed, "sh"))
+        return {name: (value.to(self._device), rates[name]) for name, value in initial.items()}
+
+    def parameters(self) -> dict[str, tuple[Tensor, float]]:
+        """The tracked values of the training timesteps, (T, n) each, where they are refined."""
+        if not self._config.refine_tracking:
+            return {}
+        config = self._config
+        rates = {"expression": config.expression_lr, "translation": config.translation_lr}
+        rates |= dict.fromkeys(POSES, config.pose_lr)
+        return {name: (self.tracked[name].clone(), rates[name]) for name in TRACKED}
+
+    def begin(self, timeline: Timeline) -> None:
+        """Fit the steps of the harmonics' degree to the run."""
+        self._degree_every = timeline.every(self._config.sh_every, self._config.min_sh_every)
+
+    def frames(self, timestep: int, optimiser: Optimiser) -> Frames:
+        """Triangle frames; differentiable in the refined tracking."""
+        row = self._row[timestep]
+        if not self._config.refine_tracking:
+            return self._cached(row)
+        arguments = {name: values[row : row + 1] for name, values in self.tracked.items()}
+        arguments |= {name: optimiser[name][row : row + 1] for name in TRACKED}
+        return self._mesh.frames(self._mesh.posed(arguments))
+
+    def place(
+        self,
+        frames: Frames,
+        binding: Tensor,
+        view: View,
+        timestep: int,
+        optimiser: Optimiser,
+        iteration: int,
+    ) -> Placed:
+        """Colour by direction from the camera; opacity as it is."""
+        world = to_world(frames, binding, optimiser["means"], optimiser["log_scales"], optimiser["quats"])
+        degree = min(self._config.sh_degree, iteration // self._degree_every)
+        directions = torch.nn.functional.normalize(world.means - view.center, dim=1)
+        colors = sh_to_rgb(optimiser["sh_dc"], optimiser["sh_rest"], directions, degree)
+        return Placed(world, colors, torch.sigmoid(optimiser["opacities"]), None)
+
+    def refined(self, subject: str, optimiser: Optimiser) -> RefinedTracking | None:
+        """Tracking before and after, or None where it was left alone."""
+        if not self._config.refine_tracking:
+            return None
+        before = {name: self.tracked[name].cpu().numpy() for name in TRACKED}
+        after = {name: optimiser[name].detach().cpu().numpy() for name in TRACKED}
+        return RefinedTracking(subject, np.array(self.timesteps), before, after)
+
+    def _tracked_frames(self, row: int) -> Frames:
+        with torch.no_grad():
+            return self._mesh.frames(
+                self._mesh.posed({name: values[row : row + 1] for name, values in self.tracked.items()})
+            )
+
+
+class GAAvatar:
+    """A trained GaussianAvatars head.
+
+    Files: ``point_cloud.ply`` in GaussianAvatars' layout and ``subject.npz`` count as storage; beside them lie
+    the shared head model, and the refined tracking of the training timesteps, which is driving signal.
+
+    Attributes
+    ----------
+    mesh, subject : the subject's.
+    splat_tensors, binding : per-splat tensors by name, and the triangle of each.
+    refined : the tracking refined in training, None where it was left alone.
+    """
+
+    def __init__(
+        self,
+        stored: Sequence[Path],
+        mesh: SubjectMesh,
+        subject: Subject,
+        splats: dict[str, Tensor],
+        binding: Tensor,
+        refined: RefinedTracking | None,
+        device: str,
+        cutoffs: Cutoffs = USUAL,
+    ):
+        self.mesh, self.subject, self.refined = mesh, subject, refined
+        self.splat_tensors, self.binding = splats, binding
+        self._stored, self._device, self._cutoffs = stored, device, cutoffs
+        self._carry = Carrier(binding, splats["log_scales"], splats["quats"])
+        occupied = coefficient_count(occupied_degree(splats["sh_rest"])) - 1
+        self._shade = HarmonicColors(splats["sh_dc"], splats["sh_rest"][:, :, :occupied].contiguous())
+
+    @classmethod
+    def read(cls, folder: Path, device: str) -> GAAvatar:
+        """Read an avatar from its folder. Raises `InputError` for damaged or foreign files."""
+        head = read_shared_head(folder)
+        subject = read_subject(folder / SUBJECT_FILE, head)
+        mesh = SubjectMesh(head, subject.shape, subject.static_offset, device)
+        splats, binding = read_ga_splats(folder / PLY_FILE, len(mesh.faces), device)
+        driving = folder / DRIVING_FILE
+        refined = RefinedTracking.read(driving) if driving.exists() else None
+        stored = [folder / PLY_FILE, folder / SUBJECT_FILE]
+        return cls(stored, mesh, subject, splats, binding, refined, device)
+
+    def render(self, camera: Camera, pose: HeadPose, background: Sequence[float] = (1.0, 1.0, 1.0)) -> Frame:
+        """Render one frame. Raises `InputError` where the pose is of another head model."""
+        return self.read_back(self.draw(camera, pose, background))
+
+    @torch.no_grad()
+    def draw(
+        self,
+        camera: Camera,
+        pose: HeadPose,
+        background: Sequence[float],
+        done: Callable[[str], None] = no_stage,
+    ) -> Drawn:
+        """Draw one frame, stage by stage; see `StagedAvatar`."""
+        frames = self._frames(pose)
+        done("drive")
+        world = self._world(frames)
+        view = view_of(camera, self._device)
+        opacities, colors = self._opacities(), self._colors(world, view)
+        done("deform")
+        return draw_splats(world, opacities, colors, view, background, done, self._cutoffs)
+
+    def read_back(self, drawn: Drawn) -> Frame:
+        """A drawn frame in host memory."""
+        return read_back(drawn)
+
+    @torch.no_grad()
+    def splats(self, pose: HeadPose, camera: Camera | None = None) -> PosedSplats:
+        """Splats of a pose in the world; with colours where a camera says from where they are seen."""
+        world = self._world(self._frames(pose))
+        colors = None if camera is None else self._colors(world, view_of(camera, self._device))
+        return posed_splats(world, self._opacities(), colors)
+
+    def harmonics(self) -> tuple[Tensor, Tensor]:
+        """(N, 3) and (N, 3, 15) spherical harmonics along world directions; the pose does not change them."""
+        return self.splat_tensors["sh_dc"], self.splat_tensors["sh_rest"]
+
+    def files(self) -> Sequence[Path]:
+        """The PLY and the subject."""
+        return self._stored
+
+    def shared_files(self) -> Sequence[Path]:
+        """The head model."""
+        return [path.parent / HEAD_FILE for path in self._stored[:1]]
+
+    def _frames(self, pose: HeadPose) -> Frames:
+        if self.refined is not None:
+            pose = self.refined(pose)
+        return self.mesh.frames(self.mesh.posed(self.mesh.arguments([pose])))
+
+    def _world(self, frames: Frames) -> WorldSplats:
+        s = self.splat_tensors
+        return self._carry(frames, s["means"], s["log_scales"], s["quats"])
+
+    def _opacities(self) -> Tensor:
+        return torch.sigmoid(self.splat_tensors["opacities"])
+
+    def _colors(self, world: WorldSplats, view: View) -> Tensor:
+        return self._shade(world.means, view.center)
+
+
+class GA:
+    """The method: see the module."""
+
+    name, version = "ga", "2"
+
+    def __init__(self, config: GAConfig | None = None):
+        self.config = config or GAConfig()
+
+    def fit(
+        self, clip: Clip, out: Path, budget: Budget, *, device: str, seed: int, progress: Progress
+    ) -> GAAvatar:
+        """Train on the training split and write the avatar under ``out``; continues a killed run."""
+        check_budget(budget)
+        check_training_split(clip)
+        run = run_digest(self.name, self.version, self.config, clip, budget, seed)
+        if is_finished(out, run):
+            return self.load(out, device=device)
+        subject = Subject.of(clip)
+        mesh = SubjectMesh(clip.head, subject.shape, subject.static_offset, device)
+        appearance = GAAppearance(mesh, clip, self.config, device, seed)
+        sampler = ShuffledEpochs(len(clip.splits["train"]), seed)
+        training, outcome = run_bound_training(
+            clip,
+            self.config.splats,
+            appearance,
+            sampler,
+            len(mesh.faces),
+            budget=budget,
+            folder=out,
+            run=run,
+            device=device,
+            seed=seed,
+            progress=progress,
+        )
+        optimiser = training.optimiser
+        write_ga_splats(
+            out / PLY_FILE, {name: optimiser[name] for name in training.splat_names}, training.binding
+        )
+        refined = appearance.refined(clip.subject, optimiser)
+        if refined is not None:
+            refined.save(out / DRIVING_FILE)
+        finish_fit(out, run, outcome, subject, clip.head, splats=len(training.binding))
+        return self.load(out, device=device)
+
+    def load(self, path: Path, *, device: str) -> GAAvatar:
+        """Read an avatar that `fit` wrote."""
+        return GAAvatar.read(path, device)

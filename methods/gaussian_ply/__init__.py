@@ -1,1 +1,0 @@
-"""Avatars as splat PLY files: out to common viewers, in from GaussianAvatars."""

@@ -1,1 +1,0 @@
-"""GaussianBlendshapes: splats of a neutral head and linear differences for expressions."""

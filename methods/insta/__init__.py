@@ -1,1 +1,0 @@
-"""INSTA: a canonical hash-grid radiance field, warped by the nearest triangle of the tracked mesh."""

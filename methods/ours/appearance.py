@@ -1,0 +1,214 @@
+"""Training side of "ours": known timesteps prepared once, colour from planes, opacity from lines, the penalty."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...bench.contracts import Clip, FloatArray, HeadPose
+from ...datasets.head.regions import faces_in_region
+from ...datasets.head.rotations import axis_angle_to_matrix
+from ...datasets.steps.jaw_bases import jaw_bases, jaw_quaternions, jaw_weights
+from ..shared.binding import Frames, to_world
+from ..shared.bound_training import Placed
+from ..shared.configs import OursConfig
+from ..shared.seeds import torch_generator
+from ..shared.sh import initial_coefficients, sh_to_rgb
+from ..shared.subject_mesh import BoundedCache, SubjectMesh, centroid_displacements
+from ..shared.training.optimiser import Optimiser
+from ..shared.training.schedule import Timeline
+from ..shared.views import View
+from .dynamics import LocalSplats, apply_offsets, changed_colors
+from .feature_lines import blend_lines, line_offsets, line_position
+from .field import (
+    Box,
+    CanonicalFrames,
+    canonical_directions,
+    initial_parameters,
+    line_box,
+    plane_box,
+    plane_features,
+    shade,
+)
+
+FLOATS_PER_FACE = 17 + 9 + 1  # triangle frame, turn to canonical, penalty weight
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedTimestep:
+    """What does not change while training: frames, directions, driving coefficients, penalty weights."""
+
+    frames: Frames
+    turns: Tensor  # (F, 3, 3) world directions to canonical ones
+    expression: Tensor  # (E,)
+    jaw: Tensor  # (J,)
+    penalty: Tensor  # (F,)
+
+
+class OursAppearance:
+    """Tri-plane colour and feature-line opacity; tracking is left as it is.
+
+    ``lines_within`` bounds the lines in place of the box that ``config.line_bounds`` names.
+    """
+
+    def __init__(
+        self,
+        mesh: SubjectMesh,
+        clip: Clip,
+        config: OursConfig,
+        device: str,
+        seed: int,
+        *,
+        lines_within: Box | None = None,
+    ):
+        self._mesh, self._clip, self._config, self._device, self._seed = mesh, clip, config, device, seed
+        self.canonical = CanonicalFrames.of(mesh.frames(mesh.canonical))
+        self.plane_box = plane_box(mesh.canonical, config.plane_bounds)
+        self.line_box = lines_within or _line_box(mesh, clip, config)
+        self.expressions = min(config.expressions, clip.head.expression_basis.shape[2])
+        self.jaw_bases: FloatArray = np.zeros((0, 4))
+        if config.lines and config.jaw_bases:
+            self.jaw_bases = jaw_bases(clip, config.jaw_bases, compatibility=config.jaw_compatibility)
+        self._is_face = torch.zeros(len(mesh.faces), dtype=torch.bool, device=device)
+        if config.lines and config.penalty:
+            self._is_face[torch.from_numpy(faces_in_region(clip.head, "face")).to(device)] = True
+        entries = config.splats.mesh_cache_mb * 2**20 // (4 * FLOATS_PER_FACE * len(mesh.faces))
+        self._prepared = BoundedCache(self._prepare, entries)
+        self._lines_from, self._degree_every = 0, 1
+
+    def splat_parameters(self, count: int) -> dict[str, tuple[Tensor, float]]:
+        """None: a splat has geometry and opacity only. Spherical harmonics where they replace the planes."""
+        if self._config.color == "planes":
+            return {}
+        rates = {"sh_dc": self._config.sh_dc_lr, "sh_rest": self._config.sh_rest_lr}
+        generator = torch_generator(self._seed, "sh")
+        initial = initial_coefficients(count, self._config.sh_degree, generator)
+        return {name: (value.to(self._device), rates[name]) for name, value in initial.items()}
+
+    def parameters(self) -> dict[str, tuple[Tensor, float]]:
+        """Planes, lines and networks."""
+        generator = torch_generator(self._seed, "field")
+        initial = initial_parameters(self._config, self.expressions, len(self.jaw_bases), generator)
+        return {name: (value.to(self._device), rate) for name, (value, rate) in initial.items()}
+
+    def begin(self, timeline: Timeline) -> None:
+        """Fit the start of the lines, and the steps of the harmonics' degree, to the run."""
+        self._lines_from = timeline.at(self._config.lines_from)
+        self._degree_every = timeline.every(self._config.sh_every, self._config.min_sh_every)
+
+    def frames(self, timestep: int, optimiser: Optimiser) -> Frames:
+        """Triangle frames, without gradient."""
+        return self._prepared(timestep).frames
+
+    def place(
+        self,
+        frames: Frames,
+        binding: Tensor,
+        view: View,
+        timestep: int,
+        optimiser: Optimiser,
+        iteration: int,
+    ) -> Placed:
+        """Colour by canonical position and direction; what the lines change, once they are on."""
+        prepared = self._prepared(timestep)
+        positions = self.canonical.positions(binding, optimiser["means"])
+        splats = LocalSplats(*(optimiser[name] for name in ("means", "log_scales", "quats", "opacities")))
+        penalty = None
+        if self._config.lines and iteration > self._lines_from:
+            offsets = self.offsets(optimiser, positions.detach(), prepared.expression, prepared.jaw)
+            splats = apply_offsets(splats, offsets, self._config.dynamic)
+            if self._config.penalty:
+                weights = prepared.penalty.index_select(0, binding)
+                size = softened(offsets, self._config.penalty_softness)
+                penalty = self._config.penalty * (size * weights[:, None]).mean()
+        world = to_world(frames, binding, splats.means, splats.log_scales, splats.quats)
+        directions = canonical_directions(prepared.turns, binding, world.means, view.center)
+        if self._config.direction_noise:
+            directions = directions @ self._turn(iteration).t()
+        colors = self._colors(optimiser, positions, directions, iteration)
+        return Placed(world, changed_colors(colors, splats), torch.sigmoid(splats.logits), penalty)
+
+    def offsets(self, optimiser: Optimiser, positions: Tensor, expression: Tensor, jaw: Tensor) -> Tensor:
+        """(N, D) offsets; zero, and not computed, outside the lines' box."""
+        inside = self.line_box.contains(positions).nonzero().squeeze(1)
+        unit = self.line_box.unit(positions.index_select(0, inside))
+        blended = blend_lines(optimiser["lines"], expression, jaw)
+        position = line_position(unit, self._config.line_resolution)
+        offsets = line_offsets(optimiser, blended, position)
+        return offsets.new_zeros(len(positions), offsets.shape[1]).index_copy(0, inside, offsets)
+
+    def _turn(self, iteration: int) -> Tensor:
+        """(3, 3) small random rotation of this iteration."""
+        generator = torch_generator(self._seed, "directions", iteration)
+        angles = self._config.direction_noise * torch.randn(1, 3, generator=generator)
+        return axis_angle_to_matrix(angles)[0].to(self._device)
+
+    def _colors(self, optimiser: Optimiser, positions: Tensor, directions: Tensor, iteration: int) -> Tensor:
+        if self._config.color == "sh":
+            degree = min(self._config.sh_degree, iteration // self._degree_every)
+            return sh_to_rgb(optimiser["sh_dc"], optimiser["sh_rest"], -directions, degree)
+        return shade(optimiser, plane_features(optimiser, self.plane_box, positions), directions)
+
+    @torch.no_grad()
+    def _prepare(self, timestep: int) -> PreparedTimestep:
+        pose = self._clip.poses[timestep]
+        arguments = self._mesh.arguments([pose])
+        frames = self._mesh.frames(self._mesh.posed(arguments))
+        expression, jaw = driving_coefficients(pose, self.expressions, self.jaw_bases, self._device)
+        weights = frames.size.new_zeros(len(frames.size))
+        if self._config.lines and self._config.penalty:
+            unposed = self._mesh.unposed(arguments)
+            weights = penalty_weights(
+                unposed, self._mesh.canonical, self._mesh.faces, self._is_face, self._config
+            )
+        return PreparedTimestep(frames, self.canonical.turns(frames), expression, jaw, weights)
+
+
+def driving_coefficients(
+    pose: HeadPose, expressions: int, bases: FloatArray, device: str
+) -> tuple[Tensor, Tensor]:
+    """Blend coefficients of the lines: the first expression coefficients, and the jaw's weights on its bases."""
+    expression = torch.as_tensor(np.asarray(pose.expression)[:expressions], dtype=torch.float32)
+    jaw = np.zeros(0)
+    if len(bases):
+        jaw = jaw_weights(jaw_quaternions([pose]), bases)[0]
+    return expression.to(device), torch.as_tensor(jaw, dtype=torch.float32).to(device)
+
+
+def softened(offsets: Tensor, softness: float) -> Tensor:
+    """|offset|, below ``softness`` a parabola that meets it with the same slope (Huber 1964): offset^2 / (2 softness)."""
+    if softness == 0:
+        return offsets.abs()
+    return (
+        torch.nn.functional.huber_loss(offsets, torch.zeros_like(offsets), reduction="none", delta=softness)
+        / softness
+    )
+
+
+def penalty_weights(
+    unposed: Tensor, canonical: Tensor, faces: Tensor, is_face: Tensor, config: OursConfig
+) -> Tensor:
+    """(F,) weights of the adaptive truncated opacity penalty.
+
+    Where the expression moves a triangle's centroid by less than a threshold, its splats may not change their
+    opacity; where it moves it more, they may. The face region and the rest differ in threshold and weight.
+
+    Parameters
+    ----------
+    unposed, canonical : (V, 3) metres, with and without expression, jaw and eyes.
+    is_face : (F,) triangles of the face region.
+    """
+    millimetres = 1000 * centroid_displacements(unposed, canonical, faces)
+    still_face = (millimetres < config.penalty_face_mm).to(millimetres.dtype)
+    still_other = config.penalty_other_weight * (millimetres < config.penalty_other_mm).to(millimetres.dtype)
+    return torch.where(is_face, still_face, still_other)
+
+
+def _line_box(mesh: SubjectMesh, clip: Clip, config: OursConfig) -> Box:
+    if config.line_bounds == "head":
+        return line_box(mesh.canonical)
+    triangles = torch.from_numpy(faces_in_region(clip.head, "face")).to(mesh.faces.device)
+    return line_box(mesh.canonical[mesh.faces[triangles].reshape(-1)])

@@ -1,0 +1,212 @@
+"""What a stored avatar of "ours" computes per frame, prepared as far as it does not depend on the frame.
+
+Each of these is the fast twin of what `ours_appearance` trains with; `tests/methods/ours/test_formula.py` compares
+both with the definition in float64.
+
+Measured and left out, since they save less than they cost. A splat's offset cannot matter where the Lipschitz bound
+|W2| |W1|_2 |h(frame) - h(rest)| of the offset network changes its opacity by less than a tolerance: at 1e-3 this held
+for 0.02 to 6 % of the splats of two trained avatars. Splats that the projection culls, with the head in view: 0.2 and
+1.4 %; whose colour reaches no pixel, known only after drawing: 9 and 15 %. The middle layer in bfloat16: no faster,
+conversions included. Colours baked into spherical harmonics of degree 3, fitted over the half sphere that each splat
+faces: a fifth of the colour network's time, but on a trained avatar of the demo 0.69 dB and 0.003 LPIPS were lost in
+self-reenactment (0.27 dB won on the held-out camera; 15 and 5 frames).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..shared import avatar_kernel
+from ..shared.binding import Frames, WorldSplats
+from ..shared.networks import CPU_BLOCK
+from ..shared.row_sums import sum_rows
+from ..shared.sh import C0
+from ..shared.triplane import ENCODING_SIZE, FREQUENCIES
+from .dynamics import LocalSplats
+from .feature_lines import AXES, LinePosition, blend_lines, line_position, line_table, normalised_weight
+from .field import Box, canonical_directions
+
+
+class Posed(NamedTuple):
+    """What a pose decides, as far as it is worth keeping for known poses."""
+
+    frames: Frames
+    turns: Tensor
+    """(F, 3, 3) world directions to canonical ones."""
+    offsets: Tensor | None
+    """(N, D) of the lines; None without lines."""
+
+    @property
+    def bytes(self) -> int:
+        """Memory it takes."""
+        tensors = (*self.frames, self.turns, *(() if self.offsets is None else (self.offsets,)))
+        return sum(value.nbytes for value in tensors)
+
+
+class Placed(NamedTuple):
+    """Splats of a pose in the world, before a camera looks at them."""
+
+    splats: LocalSplats
+    world: WorldSplats
+    turns: Tensor
+    """(F, 3, 3) world directions to canonical ones."""
+
+
+class LineOffsets:
+    """Offsets of the splats inside the lines' box; the others have none.
+
+    Parameters
+    ----------
+    tensors : of a field with lines.
+    positions : (N, 3) canonical positions.
+    """
+
+    def __init__(self, tensors: Mapping[str, Tensor], positions: Tensor):
+        self._lines, self._count = tensors["lines"], len(positions)
+        box = Box(*tensors["line_box"])
+        inside = box.contains(positions).nonzero().squeeze(1)
+        unit = box.unit(positions.index_select(0, inside))
+        position = line_position(unit, self._lines.shape[2])
+        # Neighbours on the lines beside each other: they read the same rows, and turn the same units on.
+        order = _lexicographic(position.rows[:, :AXES], self._lines.shape[2])
+        self.inside = inside[order]
+        self._position = LinePosition(*(part[order] for part in position))
+        self._first, self._first_bias = normalised_weight(tensors, 0), tensors["line_bias_0"]
+        # Transposed once, as the products below want them.
+        self._second, self._last = (normalised_weight(tensors, layer).t().contiguous() for layer in (1, 2))
+        self._biases = tensors["line_bias_1"], tensors["line_bias_2"]
+        self._kernel: KernelOffsets | None = None
+        if avatar_kernel.usable(positions):
+            self._kernel = KernelOffsets(self.inside, self._position, self._second, self._last, self._biases)
+
+    def __call__(self, expression: Tensor, jaw: Tensor) -> Tensor:
+        """(N, D) offsets of all splats for a frame's coefficients."""
+        table = self.table(expression, jaw)
+        out = table.new_empty if len(self.inside) == self._count else table.new_zeros
+        offsets = out(self._count, self._last.shape[1])
+        if self._kernel is not None:
+            self._kernel(offsets, table)
+        else:
+            offsets.index_copy_(0, self.inside, self.by_torch(table))
+        return offsets
+
+    def table(self, expression: Tensor, jaw: Tensor) -> Tensor:
+        """(3 L, H) first layer at the samples of a frame's blended lines."""
+        table = line_table(blend_lines(self._lines, expression, jaw), self._first)
+        # The two weights of an axis add up to 1, so the bias on the rows of one axis reaches each splat once.
+        table[: self._lines.shape[2]] += self._first_bias
+        return table
+
+    def by_torch(self, table: Tensor) -> Tensor:
+        """(M, D) offsets of the splats inside."""
+        second_bias, last_bias = self._biases
+        rows, weights = self._position
+        inside = table.new_empty(len(rows), len(last_bias))
+        # Blocks whose activations stay in cache; one for other devices.
+        step = CPU_BLOCK if rows.device.type == "cpu" else max(len(rows), 1)
+        hidden = table.new_empty(min(step, len(rows)), self._second.shape[1])
+        for start in range(0, len(rows), step):
+            block = slice(start, min(start + step, len(rows)))
+            first = sum_rows(table, rows[block], weights[block]).relu_()
+            out = hidden[: len(first)]
+            torch.addmm(second_bias, first, self._second, out=out).relu_()
+            torch.addmm(last_bias, out, self._last, out=inside[block])
+        return inside
+
+
+class KernelOffsets:
+    """The offset network as the kernel reads it, made once."""
+
+    def __init__(
+        self,
+        inside: Tensor,
+        position: LinePosition,
+        second: Tensor,
+        last: Tensor,
+        biases: tuple[Tensor, Tensor],
+    ):
+        rows = position.rows[:, :AXES].to(torch.int32).contiguous()
+        self._splats = inside, rows, position.weights[:, AXES:].contiguous()
+        self._second = avatar_kernel.pad_units(second, 1)
+        self._second_bias = avatar_kernel.pad_units(biases[0], 0)
+        self._last, self._last_bias = avatar_kernel.pad_units(last.t(), 1), biases[1]
+
+    def __call__(self, out: Tensor, table: Tensor) -> None:
+        """Write the offsets of a frame's (3 L, H) table into (N, D) ``out``."""
+        splats, rows, fractions = self._splats
+        avatar_kernel.offsets_into(
+            *(out, splats, table, rows, fractions),
+            *(self._second, self._second_bias, self._last, self._last_bias),
+        )
+
+
+def _lexicographic(rows: Tensor, resolution: int) -> Tensor:
+    """(N,) order of (N, 3) rows by their last number, then the middle one, then the first."""
+    x, y, z = rows.unbind(1)
+    return torch.argsort((z * AXES * resolution + y) * AXES * resolution + x, stable=True)
+
+
+class PlaneColors:
+    """Colours of the planes as directions ask for them, where the part of the position is known.
+
+    Parameters
+    ----------
+    first, last : (H, C + 27) and (3, H) weights of the colour network.
+    from_position : (N, H), what the planes add to the hidden layer: `ours_field.position_part`.
+    """
+
+    def __init__(self, first: Tensor, last: Tensor, from_position: Tensor):
+        of_direction = first[:, first.shape[1] - ENCODING_SIZE :].t().contiguous()
+        self._fast = avatar_kernel.usable(from_position)
+        if self._fast:
+            from_position, of_direction, last = (
+                avatar_kernel.pad_units(values, 1) for values in (from_position, of_direction, last)
+            )
+        self.from_position, self._of_direction, self._last = from_position, of_direction, last
+        self._known: tuple[Tensor, Tensor, Tensor] | None = None
+
+    def __call__(self, means: Tensor, center: Tensor, turns: Tensor, binding: Tensor) -> Tensor:
+        """Colours (N, 3) >= 0 of splats at (N, 3) means as a camera at ``center`` sees them.
+
+        Parameters
+        ----------
+        turns : (F, 3, 3) world directions to canonical ones, by triangle.
+        binding : (N,) int64, the triangle of each splat.
+
+        The colours of the last call are kept, and given again for the same tensor of means seen from the same place.
+        """
+        if self._known is not None and self._known[0] is means and torch.equal(self._known[1], center):
+            return self._known[2]
+        if self._fast:
+            network = self.from_position, self._of_direction, self._last
+            colors = avatar_kernel.shade_network(*network, means, center, turns, binding)
+        else:
+            colors = self.along(-canonical_directions(turns, binding, means, center))
+        self._known = means, center, colors
+        return colors
+
+    def along(self, directions: Tensor) -> Tensor:
+        """Colours (N, 3) >= 0 along (N, 3) canonical unit vectors from the camera to the splats."""
+        encoded = encode_columns(-directions).t()
+        hidden = torch.addmm(self.from_position, encoded, self._of_direction).relu_()
+        return torch.addmm(hidden.new_tensor(0.5), hidden, self._last.t(), alpha=C0).relu_()
+
+
+def encode_columns(directions: Tensor) -> Tensor:
+    """(27, N), the transpose of `triplane.encode_directions`, from one sine and one cosine per coordinate.
+
+    The frequencies double, so the other waves follow by sin 2a = 2 sin a cos a and cos 2a = 1 - 2 sin^2 a; each step
+    doubles the rounding error, to 1e-6 at frequency 8 in float32.
+    """
+    angles = directions.t().contiguous()
+    encoded = angles.new_empty(ENCODING_SIZE // 3, *angles.shape)
+    encoded[0] = angles
+    sine, cosine = torch.sin(angles), torch.cos(angles)
+    for number in range(len(FREQUENCIES)):
+        encoded[1 + 2 * number], encoded[2 + 2 * number] = sine, cosine
+        sine, cosine = 2 * sine * cosine, 1 - 2 * sine * sine
+    return encoded.flatten(0, 1)

@@ -1,0 +1,162 @@
+"""The exact file of an avatar of "ours": float32 tensors by name, checked whole when read."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple, cast
+
+import numpy as np
+import torch
+from safetensors.torch import save
+from torch import Tensor
+
+from ...bench.errors import InputError
+from ...bench.io.arrays import Member
+from ...bench.io.files import write_bytes
+from ..shared.configs import Dynamic
+from ..shared.sh import coefficient_count
+from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors
+from ..shared.triplane import ENCODING_SIZE, PAIRS
+from .dynamics import WIDTHS, offset_width
+from .field import Box
+
+FIELD_FILE = "avatar.safetensors"
+DYNAMIC = "dynamic"
+"""Key of the file's metadata: what the lines change, in the order of the offset network's outputs."""
+
+SPLAT_WIDTHS = {"means": 3, "opacities": 1, "log_scales": 3, "quats": 4, "binding": 1}
+"""Columns of the (N, 12) float32 splat table, 48 bytes each; the triangle is exact up to 2^24."""
+
+
+def write_field(
+    path: Path,
+    splats: Mapping[str, Tensor],
+    binding: Tensor,
+    shared: Mapping[str, Tensor],
+    plane_box: Box,
+    line_box: Box,
+    jaw_bases: np.ndarray,
+    dynamic: Sequence[Dynamic],
+) -> None:
+    """Write splats, planes, lines, networks, boxes and jaw bases as float32 safetensors."""
+    columns = {**splats, "opacities": splats["opacities"][:, None], "binding": binding[:, None]}
+    table = torch.cat([columns[name].detach().to("cpu", torch.float32) for name in SPLAT_WIDTHS], dim=1)
+    tensors = {name: value.detach().cpu().contiguous() for name, value in shared.items()}
+    tensors |= {
+        "splats": table,
+        "plane_box": torch.stack(list(plane_box)).cpu(),
+        "line_box": torch.stack(list(line_box)).cpu(),
+        "jaw_bases": torch.from_numpy(np.asarray(jaw_bases, dtype=np.float32)),
+    }
+    tensors |= {
+        name: splats[name].detach().cpu().contiguous() for name in ("sh_dc", "sh_rest") if name in splats
+    }
+    save_field(path, Field(tensors, tuple(dynamic)))
+
+
+class Field(NamedTuple):
+    """What an avatar's file holds: its tensors by name, and what the lines change."""
+
+    tensors: dict[str, Tensor]
+    dynamic: tuple[Dynamic, ...]
+
+
+def save_field(path: Path, field: Field) -> None:
+    """Write the exact file of a field, whole or not at all."""
+    tensors = {name: value.cpu().contiguous() for name, value in field.tensors.items()}
+    write_bytes(path, save(tensors, {DYNAMIC: ",".join(field.dynamic)}))
+
+
+def read_field(path: Path, face_count: int, expression_size: int, device: str) -> Field:
+    """Read and check what `write_field` wrote. Raises `InputError` where a tensor is missing or does not fit."""
+    tensors, metadata = read_safetensors(path)
+    field = checked_field(path, tensors, metadata.get(DYNAMIC, "opacity"), face_count, expression_size)
+    return field._replace(tensors={name: value.to(device) for name, value in field.tensors.items()})
+
+
+def checked_field(
+    path: Path, tensors: dict[str, Tensor], names: str, face_count: int, expression_size: int
+) -> Field:
+    """Make a field of tensors that came from outside, and of what they say the lines change, by comma.
+
+    Raises `InputError` where a tensor is missing, is not finite float32 or does not fit the others.
+    """
+    given = names.split(",")
+    if len(set(given)) != len(given) or not set(given) <= set(WIDTHS):
+        raise InputError(path, DYNAMIC, f"names among {', '.join(WIDTHS)}, each once", repr(names)[:80])
+    dynamic = cast(tuple[Dynamic, ...], tuple(given))
+    needed = ["splats", "plane_box", "line_box", "jaw_bases"]
+    if "sh_dc" in tensors:
+        needed += ["sh_rest"]
+    else:
+        needed += ["color_weight_0", "color_weight_1", *(f"plane_{name}" for name, _, _ in PAIRS)]
+    if "lines" in tensors:
+        needed += [f"line_{part}_{layer}" for layer in range(3) for part in ("direction", "gain", "bias")]
+    number = Member("f", None, MAX_MAGNITUDE, "f4")
+    check_tensors(path, tensors, dict.fromkeys([*needed, *tensors], number))
+    _check_shapes(path, tensors, face_count, expression_size, offset_width(dynamic))
+    return Field(tensors, dynamic)
+
+
+def _check_shapes(
+    path: Path, tensors: Mapping[str, Tensor], face_count: int, expression_size: int, outputs: int
+) -> None:
+    """Raise `InputError` at the first tensor that does not fit the others, so that no rendering can."""
+
+    def require(name: str, fits: bool, expected: str) -> None:
+        if not fits:
+            raise InputError(path, name, expected, f"shape {tuple(tensors[name].shape)}")
+
+    def exactly(name: str, *shape: int) -> None:
+        require(name, tensors[name].shape == shape, f"shape {shape}")
+
+    splats = tensors["splats"]
+    width = sum(SPLAT_WIDTHS.values())
+    require("splats", splats.ndim == 2 and splats.shape[1] == width, f"(N, {width})")
+    binding = splats[:, -1]
+    if len(binding) and not (0 <= float(binding.min()) and float(binding.max()) < face_count):
+        found = f"{float(binding.min()):g} to {float(binding.max()):g}"
+        raise InputError(path, "splats, triangle", f"0 to {face_count - 1}", found)
+    check_sizes(
+        path, splats.split(list(SPLAT_WIDTHS.values()), dim=1)[list(SPLAT_WIDTHS).index("log_scales")]
+    )
+    for name in ("plane_box", "line_box"):
+        exactly(name, 2, 3)
+        if not (tensors[name][0] < tensors[name][1]).all():
+            raise InputError(path, name, "a low corner below the high one", str(tensors[name].tolist()))
+
+    if "sh_dc" in tensors:
+        exactly("sh_dc", len(splats), 3)
+        rest = tensors["sh_rest"]
+        counts = [coefficient_count(degree) - 1 for degree in range(4)]
+        fits = rest.shape[:2] == (len(splats), 3) and rest.ndim == 3 and rest.shape[2] in counts
+        require("sh_rest", fits, f"({len(splats)}, 3, K), K one of {counts}")
+    else:
+        planes = [f"plane_{pair}" for pair, _, _ in PAIRS]
+        for name in planes:
+            plane = tensors[name]
+            square = plane.ndim == 2 and round(len(plane) ** 0.5) ** 2 == len(plane) >= 4
+            require(
+                name, square and len(plane) == len(tensors[planes[0]]), "(R * R, C), R of all planes equal"
+            )
+        inputs = sum(tensors[name].shape[1] for name in planes) + ENCODING_SIZE
+        first = tensors["color_weight_0"]
+        require("color_weight_0", first.ndim == 2 and first.shape[1] == inputs, f"(H, {inputs})")
+        exactly("color_weight_1", 3, len(first))
+
+    bases = tensors["jaw_bases"]
+    require("jaw_bases", bases.ndim == 2 and bases.shape[1] == 4, "(J, 4)")
+    if "lines" not in tensors:
+        return
+    lines, jaws = tensors["lines"], len(bases)
+    fits = lines.ndim == 4 and lines.shape[1] == 3 and jaws <= len(lines) <= jaws + expression_size
+    require(
+        "lines", fits and lines.shape[2] >= 2, f"(E + {jaws}, 3, L, C), E at most {expression_size}, L > 1"
+    )
+    sizes = [6 * lines.shape[3], *(len(tensors[f"line_bias_{layer}"]) for layer in (0, 1)), outputs]
+    for layer, (fan_in, fan_out) in enumerate(pairwise(sizes)):
+        exactly(f"line_direction_{layer}", fan_out, fan_in)
+        exactly(f"line_gain_{layer}", fan_out, 1)
+        exactly(f"line_bias_{layer}", fan_out)

@@ -1,0 +1,209 @@
+"""Files that mesh-bound avatars share: the head model, the subject, refined tracking, the record of the run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...bench.contracts import Budget, Clip, FloatArray, HeadAsset, HeadPose
+from ...bench.errors import InputError
+from ...bench.io.arrays import MAX_MAGNITUDE, TEXT, Member, read_arrays
+from ...bench.io.documents import read_json
+from ...bench.io.files import atomic_path, digest, write_json
+from ...datasets.head.arrays import HeadArrays, read_head, save_head
+from .training.loop import CHECKPOINT, Outcome
+
+HEAD_FILE = "head_model.npz"
+SUBJECT_FILE = "subject.npz"
+RECORD_FILE = "training.json"
+_SIZES = {"rotation": 3, "neck": 3, "jaw": 3, "eyes": 6, "translation": 3}
+TRACKED = ("expression", "rotation", "neck", "jaw", "eyes", "translation")
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """Who an avatar shows: name, head model version, (S,) identity, (V, 3) static offset in metres."""
+
+    name: str
+    head_model: str
+    shape: FloatArray
+    static_offset: FloatArray
+
+    @classmethod
+    def of(cls, clip: Clip) -> Subject:
+        """The subject of a clip, in float32 as it is stored."""
+        shape, offset = np.asarray(clip.shape, np.float32), np.asarray(clip.static_offset, np.float32)
+        return cls(clip.subject, clip.head.version, shape, offset)
+
+
+def head_arrays(head: HeadAsset) -> HeadArrays:
+    """A head model as arrays that can be stored and changed."""
+    if isinstance(head, HeadArrays):
+        return head
+    return HeadArrays(
+        version=head.version,
+        template=head.template,
+        faces=head.faces,
+        shape_basis=head.shape_basis,
+        expression_basis=head.expression_basis,
+        pose_basis=head.pose_basis,
+        joint_regressor=head.joint_regressor,
+        skinning_weights=head.skinning_weights,
+        parents=head.parents,
+        eyelid_basis=head.eyelid_basis,
+        regions=head.regions,
+    )
+
+
+def save_shared_head(folder: Path, head: HeadAsset) -> None:
+    """Put the head model beside the avatar, so that the folder alone can be rendered. A shared asset."""
+    save_head(folder / HEAD_FILE, head_arrays(head))
+
+
+def read_shared_head(folder: Path) -> HeadArrays:
+    """Read the head model beside an avatar."""
+    return read_head(folder / HEAD_FILE)
+
+
+def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
+    """Write an uncompressed npz, whole or not at all; equal arrays give equal bytes."""
+    with atomic_path(path) as temporary, temporary.open("wb") as stream:
+        np.savez(stream, allow_pickle=False, **{name: np.asarray(value) for name, value in arrays.items()})
+
+
+def write_subject(path: Path, subject: Subject) -> None:
+    """Write identity coefficients and static offset as float32 npz."""
+    arrays: dict[str, Any] = {
+        "name": np.array(subject.name),
+        "head_model": np.array(subject.head_model),
+        "shape": subject.shape.astype(np.float32),
+        "static_offset": subject.static_offset.astype(np.float32),
+    }
+    write_arrays(path, arrays)
+
+
+def read_subject(path: Path, head: HeadAsset) -> Subject:
+    """Read what `write_subject` wrote. Raises `InputError` where it does not fit the head model."""
+    members = {
+        "name": TEXT,
+        "head_model": TEXT,
+        "shape": Member("f", ("S",), MAX_MAGNITUDE, "f4"),
+        "static_offset": Member("f", ("V", 3), MAX_MAGNITUDE, "f4"),
+    }
+    arrays = read_arrays(path, members, {"S": head.shape_basis.shape[2], "V": len(head.template)})
+    name, version = str(arrays["name"]), str(arrays["head_model"])
+    if version != head.version:
+        raise InputError(path, "head_model", repr(head.version), repr(version)[:80])
+    return Subject(name, version, arrays["shape"], arrays["static_offset"])
+
+
+class RefinedTracking:
+    """Tracking refined in training: replaces the tracked pose of a training timestep by what fits better.
+
+    It answers to the very signal it was refined from and to nothing else: subject, timestep and all tracked
+    values must be equal, so a held-out or foreign signal is never touched.
+
+    Parameters
+    ----------
+    tracked, refined : by name of `TRACKED`, (T, n) float32, rows in the order of ``timesteps``.
+    """
+
+    def __init__(
+        self,
+        subject: str,
+        timesteps: np.ndarray,
+        tracked: Mapping[str, FloatArray],
+        refined: Mapping[str, FloatArray],
+    ):
+        self._subject, self._tracked, self._refined = subject, dict(tracked), dict(refined)
+        self._timesteps = np.asarray(timesteps, dtype=np.int64)
+        self._row = {int(timestep): row for row, timestep in enumerate(self._timesteps)}
+
+    def __call__(self, pose: HeadPose) -> HeadPose:
+        """Return the pose to render for a driving pose."""
+        row = self._row.get(-1 if pose.timestep is None else pose.timestep)
+        if row is None or pose.timestep is None or pose.subject != self._subject:
+            return pose
+        for name in TRACKED:
+            if not np.array_equal(np.asarray(getattr(pose, name), np.float32), self._tracked[name][row]):
+                return pose
+        values: dict[str, Any] = {name: self._refined[name][row] for name in TRACKED}
+        return HeadPose(
+            pose.head_model,
+            **values,
+            eyelids=pose.eyelids,
+            subject=pose.subject,
+            timestep=pose.timestep,
+        )
+
+    def save(self, path: Path) -> None:
+        """Write as npz."""
+        arrays: dict[str, Any] = {"subject": np.array(self._subject), "timesteps": self._timesteps}
+        arrays |= {f"tracked_{name}": self._tracked[name] for name in TRACKED}
+        arrays |= {f"refined_{name}": self._refined[name] for name in TRACKED}
+        write_arrays(path, arrays)
+
+    @classmethod
+    def read(cls, path: Path) -> RefinedTracking:
+        """Read what `save` wrote."""
+        members = {"subject": TEXT, "timesteps": Member("iu", ("T",))} | {
+            f"{kind}_{name}": Member("f", ("T", _SIZES.get(name, f"size of {name}")), MAX_MAGNITUDE, "f4")
+            for kind in ("tracked", "refined")
+            for name in TRACKED
+        }
+        arrays = read_arrays(path, members)
+        timesteps = arrays["timesteps"]
+        tracked = {name: arrays[f"tracked_{name}"] for name in TRACKED}
+        refined = {name: arrays[f"refined_{name}"] for name in TRACKED}
+        return cls(str(arrays["subject"]), timesteps, tracked, refined)
+
+
+def run_digest(method: str, version: str, config: Any, clip: Clip, budget: Budget, seed: int) -> str:
+    """Digest of everything that decides how training goes."""
+    return digest(method, version, config, clip.fingerprint, budget, seed)
+
+
+def is_finished(folder: Path, run: str) -> bool:
+    """Whether this folder holds the finished avatar of this run.
+
+    Raises `InputError` where it holds that of another.
+    """
+    path = folder / RECORD_FILE
+    if not path.exists():
+        return False
+    found = read_json(path).get("run")
+    if found != run:
+        raise InputError(
+            path,
+            "run",
+            "the same method, clip, settings, budget and seed",
+            "the avatar of another run",
+            "Use another output folder, or delete this one.",
+        )
+    return True
+
+
+def write_record(folder: Path, run: str, outcome: Outcome, **more: Any) -> None:
+    """Write how the run went. The last file of a fit: its presence says that the avatar is whole."""
+    record = {
+        "run": run,
+        "iterations": outcome.iterations,
+        "planned_iterations": outcome.planned,
+        "seconds": round(outcome.seconds, 3),
+        **more,
+    }
+    write_json(folder / RECORD_FILE, record)
+
+
+def finish_fit(
+    folder: Path, run: str, outcome: Outcome, subject: Subject, head: HeadAsset, **more: Any
+) -> None:
+    """Write what every trained avatar has beside its own files, the record last; the checkpoint is done with."""
+    write_subject(folder / SUBJECT_FILE, subject)
+    save_shared_head(folder, head)
+    write_record(folder, run, outcome, **more)
+    (folder / CHECKPOINT).unlink(missing_ok=True)

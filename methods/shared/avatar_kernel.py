@@ -1,0 +1,172 @@
+"""What avatars compute of a frame before its splats are drawn, by the compiled kernel.
+
+Each function has a twin in torch, which is the definition and is used where the kernel is not: other devices, other
+dtypes, gradients, or no compiler at installation. The kernel's results do not depend on the number of threads.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from ..splats.cpu import instruction_sets, load
+from .binding import Frames, WorldSplats
+
+HARMONICS_BLOCK = 16
+"""Splats whose coefficients lie side by side."""
+UNITS_STEP = 16
+"""Layers of networks are padded with units that are 0 to a multiple of it."""
+
+
+def available() -> bool:
+    """Tell whether the kernel is there; one built from older sources, in an editable installation, counts as none."""
+    return hasattr(load(), "triangles")
+
+
+def usable(like: Tensor) -> bool:
+    """Tell whether the kernel is there and takes tensors like this one."""
+    return like.dtype == torch.float32 and like.device.type == "cpu" and available()
+
+
+def triangles(vertices: Tensor, faces: Tensor, backend: str = "cpu") -> Frames:
+    """Frames of the triangles of a mesh: the twin of `binding.triangle_frames`.
+
+    Parameters
+    ----------
+    vertices, faces : (V, 3), and (F, 3) int64.
+    """
+    count, empty = len(faces), vertices.new_empty
+    frames = Frames(empty(count, 3, 3), empty(count, 3), empty(count), empty(count, 4))
+    _call("triangles", vertices, faces, *frames, backend=backend)
+    return frames
+
+
+def carry(
+    frames: Frames, binding: Tensor, means: Tensor, quats: Tensor, scales: Tensor, backend: str = "cpu"
+) -> WorldSplats:
+    """Carry local splats to the world: the twin of `binding.to_world` for unit quaternions and scales.
+
+    Parameters
+    ----------
+    binding : (N,) int64, the triangle of each splat.
+    means, quats, scales : (N, 3) and (N, 3) in units of the triangle's size, (N, 4) unit quaternions wxyz.
+    """
+    world = WorldSplats(torch.empty_like(means), torch.empty_like(quats), torch.empty_like(scales))
+    _call(
+        "carry",
+        *(binding, frames.rotation, frames.center, frames.size, frames.quaternion, means, quats, scales),
+        *world,
+        backend=backend,
+    )
+    return world
+
+
+def pack_harmonics(dc: Tensor, rest: Tensor) -> Tensor:
+    """Coefficients as `shade` reads them: (ceil(N / 16), 3, K, 16) of (N, 3) and (N, 3, K - 1)."""
+    whole = torch.cat([dc[:, :, None], rest], dim=2)
+    blocks = -(-len(whole) // HARMONICS_BLOCK)
+    padded = pad(whole, (0, 0, 0, 0, 0, blocks * HARMONICS_BLOCK - len(whole)))
+    return padded.view(blocks, HARMONICS_BLOCK, *whole.shape[1:]).permute(0, 2, 3, 1).contiguous()
+
+
+def shade(
+    packed: Tensor,
+    means: Tensor,
+    center: Tensor,
+    turns: Tensor | None = None,
+    binding: Tensor | None = None,
+    backend: str = "cpu",
+) -> Tensor:
+    """Colours (N, 3) >= 0 as a camera sees them: the twin of `sh.sh_to_rgb` along the ways from the camera.
+
+    Parameters
+    ----------
+    packed : of `pack_harmonics`.
+    means, center : (N, 3) and (3,) in the world.
+    turns, binding : (F, 3, 3) applied to the directions of the splats of each triangle; both or neither.
+    """
+    colors = torch.empty_like(means)
+    turns = means.new_empty(0, 3, 3) if turns is None else turns
+    binding = torch.empty(0, dtype=torch.int64) if binding is None else binding
+    _call("shade", packed, means, turns, binding, center, colors, backend=backend)
+    return colors
+
+
+def pad_units(values: Tensor, *axes: int) -> Tensor:
+    """Zeros after the end of the given axes, up to a multiple of `UNITS_STEP`."""
+    for axis in axes:
+        missing = -values.shape[axis] % UNITS_STEP
+        shape = [
+            missing if number == axis % values.ndim else size for number, size in enumerate(values.shape)
+        ]
+        values = torch.cat([values, values.new_zeros(shape)], dim=axis)
+    return values.contiguous()
+
+
+def shade_network(
+    from_position: Tensor,
+    of_direction: Tensor,
+    last: Tensor,
+    means: Tensor,
+    center: Tensor,
+    turns: Tensor,
+    binding: Tensor,
+    backend: str = "cpu",
+) -> Tensor:
+    """Colours (N, 3) >= 0 as a camera sees them: the twin of `ours_field.shade_directions`.
+
+    Parameters
+    ----------
+    from_position, of_direction, last : (N, H), (27, H) and (3, H), each padded by `pad_units` along H.
+    """
+    colors = torch.empty_like(means)
+    _call(
+        "color_network",
+        *(from_position, of_direction, last, means, turns, binding, center, colors),
+        backend=backend,
+    )
+    return colors
+
+
+def offsets_into(
+    out: Tensor,
+    splats: Tensor,
+    table: Tensor,
+    rows: Tensor,
+    fractions: Tensor,
+    second: Tensor,
+    second_bias: Tensor,
+    last: Tensor,
+    last_bias: Tensor,
+    backend: str = "cpu",
+) -> None:
+    """Write offsets into the rows ``splats`` of (N, D) ``out``: the twin of `feature_lines.line_offsets`.
+
+    Units of the first layer that no place on the lines turns on are left out of the whole frame, those that none of a
+    few neighbours turns on are left out of their second layer.
+
+    Parameters
+    ----------
+    splats : (M,) int64.
+    table : (3 L, U), the first layer at the lines' samples, its bias included once.
+    rows, fractions : (M, 3) int32 lower samples, and ways from them to the next, 0 to 1.
+    second, second_bias, last : (U, H), (H,) and (D, H), padded by `pad_units` along H.
+    last_bias : (D,).
+    """
+    # What is interpolated on an axis is no more than its largest sample.
+    alive = table.view(3, -1, table.shape[1]).amax(1).sum(0) > 0
+    used = pad_units(table[:, alive], 1), pad_units(second[alive], 0)
+    _call(
+        "offset_network",
+        *(used[0], rows, fractions, used[1], second_bias, last, last_bias, splats, out),
+        backend=backend,
+    )
+
+
+def _call(name: str, *arrays: Tensor, backend: str) -> Any:
+    function = getattr(load(), name)
+    plain = [array.detach().contiguous().numpy() for array in arrays]
+    return function(*plain, instruction_sets()[backend], torch.get_num_threads())

@@ -1,0 +1,106 @@
+"""Rendering of splats bound to a mesh, shared by the avatars that differ in colour and opacity."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...bench.contracts import FloatArray, Frame, no_stage
+from ..splats import rasterize
+from ..splats.constants import ALPHA_MIN, TRANSMITTANCE_MIN
+from .binding import WorldSplats
+from .views import View
+
+
+@dataclass(frozen=True, eq=False)
+class PosedSplats:
+    """Splats of one pose in the world, as numpy float32.
+
+    Attributes
+    ----------
+    means, quats, scales : (N, 3) metres, (N, 4) unit quaternions wxyz, (N, 3) metres.
+    opacities : (N,).
+    colors : (N, 3) as the camera asked for sees them; None where no camera was given.
+    """
+
+    means: FloatArray
+    quats: FloatArray
+    scales: FloatArray
+    opacities: FloatArray
+    colors: FloatArray | None
+
+
+class Cutoffs(NamedTuple):
+    """Below what the renderer leaves work out; see `rasterize`. More is faster and less exact."""
+
+    alpha_min: float = ALPHA_MIN
+    transmittance_min: float = TRANSMITTANCE_MIN
+
+
+USUAL = Cutoffs()
+"""The renderer's defaults."""
+
+
+class Drawn(NamedTuple):
+    """A drawn frame, still where it was computed."""
+
+    image: Tensor
+    """(H, W, 3) in [0, 1]."""
+    alpha: Tensor
+    """(H, W) in [0, 1]."""
+
+
+def draw_splats(
+    world: WorldSplats,
+    opacities: Tensor,
+    colors: Tensor,
+    view: View,
+    background: Sequence[float],
+    done: Callable[[str], None] = no_stage,
+    cutoffs: Cutoffs = USUAL,
+) -> Drawn:
+    """Rasterise and clip to [0, 1]: the last two stages of `StagedAvatar.draw`."""
+    rendering = rasterize(
+        *(world.means, world.quats, world.scales, opacities, colors),
+        *(view.world_to_camera, view.K, view.camera.width, view.camera.height),
+        background=world.means.new_tensor([float(channel) for channel in background]),
+        alpha_min=cutoffs.alpha_min,
+        transmittance_min=cutoffs.transmittance_min,
+        check_values=False,
+    )
+    done("raster")
+    drawn = Drawn(rendering.image.clamp(0, 1), rendering.alpha.clamp(0, 1))
+    done("post")
+    return drawn
+
+
+def read_back(drawn: Drawn) -> Frame:
+    """Bring a drawn frame into host memory, as numpy."""
+    return Frame(_numpy(drawn.image), _numpy(drawn.alpha))
+
+
+def render_splats(
+    world: WorldSplats, opacities: Tensor, colors: Tensor, view: View, background: Sequence[float]
+) -> Frame:
+    """Rasterise to a numpy frame, clipped to [0, 1]."""
+    return read_back(draw_splats(world, opacities, colors, view, background))
+
+
+def posed_splats(world: WorldSplats, opacities: Tensor, colors: Tensor | None) -> PosedSplats:
+    """Copy to numpy: avatars keep tensors for the next frame."""
+    return PosedSplats(
+        _numpy(world.means).copy(),
+        _numpy(world.quats).copy(),
+        _numpy(world.scales).copy(),
+        _numpy(opacities).copy(),
+        None if colors is None else _numpy(colors).copy(),
+    )
+
+
+def _numpy(values: Tensor) -> np.ndarray:
+    return values.detach().to("cpu", torch.float32).numpy()

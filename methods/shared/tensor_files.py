@@ -1,0 +1,72 @@
+"""Tensors from safetensors files: read in one place, and checked by the same descriptions as the arrays of an npz."""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Mapping
+from pathlib import Path
+
+from safetensors import safe_open
+from torch import Tensor
+
+from ...bench.errors import InputError
+from ...bench.io.arrays import Member, check_arrays
+from ...bench.io.files import open_regular
+
+MAX_HEADER = 2**24
+"""Bytes of names, shapes and metadata; the largest of ours, a checkpoint's, has some ten thousand."""
+MAX_MAGNITUDE = 1e6
+"""Most that a number of an avatar may be: a network's weight, a feature, a position in the unit of its triangle."""
+MAX_LOGARITHM = 30.0
+"""Most that the logarithm of a size may be; larger ones overflow once they are squared and multiplied."""
+
+
+def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Read all tensors of a file, on the CPU, and its metadata.
+
+    The file has to be as large as its header says, so that nothing is larger than the file. Raises `InputError` for a
+    file that is missing, damaged, or none.
+    """
+    expected = "a safetensors file"
+    with open_regular(path, expected) as stream:
+        size, first = os.fstat(stream.fileno()).st_size, stream.read(8)
+    header = struct.unpack("<Q", first)[0] if len(first) == 8 else size
+    if header > min(size, MAX_HEADER):
+        raise InputError(path, "", expected, f"{size} bytes, {header} of them names and shapes")
+    try:
+        with safe_open(path, framework="pt", device="cpu") as file:
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
+            metadata = dict(file.metadata() or {})
+    except MemoryError:
+        raise  # says nothing of the file
+    except Exception as error:  # for a damaged file, safetensors and torch raise errors of many types
+        raise InputError(path, "", expected, f"{type(error).__name__}: {error}") from error
+    for name, value in tensors.items():
+        if any(side >= 2**31 for side in value.shape):  # a tensor without numbers may have any shape
+            raise InputError(path, name, "sides below 2^31", f"shape {tuple(value.shape)}")
+    return tensors, metadata
+
+
+def check_tensors(
+    path: Path,
+    tensors: Mapping[str, Tensor],
+    members: Mapping[str, Member],
+    sizes: Mapping[str, int] | None = None,
+) -> dict[str, int]:
+    """`check_arrays` for tensors on the CPU; sizes of the named axes."""
+    arrays = {}
+    for name in members.keys() & tensors.keys():
+        try:
+            arrays[name] = tensors[name].numpy()
+        except TypeError as error:  # a type that numpy does not have
+            expected = members[name].dtype or "numbers"
+            raise InputError(path, name, expected, str(tensors[name].dtype)) from error
+    return check_arrays(path, arrays, members, sizes)
+
+
+def check_sizes(path: Path, log_scales: Tensor) -> None:
+    """Raise `InputError` for splats of a size beyond `MAX_LOGARITHM`."""
+    largest = float(log_scales.max()) if log_scales.numel() else 0.0
+    if largest > MAX_LOGARITHM:
+        raise InputError(path, "log_scales", f"logarithms of sizes up to {MAX_LOGARITHM:g}", f"{largest:g}")

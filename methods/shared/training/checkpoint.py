@@ -1,0 +1,121 @@
+"""Checkpoints: tensors and plain containers, written whole or not at all, read as data only.
+
+A checkpoint is a safetensors file. Its metadata has one key, ``checkpoint``: JSON with ``layout``, ``run``, ``state``
+and ``digest``. In the state, tensors are named by number, and containers say what they are.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import save
+from torch import Tensor
+
+from ....bench.errors import InputError
+from ....bench.io.documents import parse_json
+from ....bench.io.files import write_bytes
+from ..tensor_files import read_safetensors
+
+LAYOUT = 2
+KEY = "checkpoint"
+REMEDY = "Delete it to start over."
+
+
+def save_checkpoint(path: Path, run: str, state: dict[str, Any]) -> None:
+    """Write the state of a run.
+
+    Parameters
+    ----------
+    run : digest of everything the run was started with; `load_checkpoint` refuses another run's file.
+    state : nested dicts, lists and tuples of tensors, numbers and text.
+    """
+    tensors: dict[str, Tensor] = {}
+    tree = _packed(state, tensors)
+    content = {"layout": LAYOUT, "run": run, "state": tree, "digest": _digest(tree, tensors)}
+    write_bytes(path, save(tensors, {KEY: json.dumps(content)}))
+
+
+def load_checkpoint(path: Path, run: str, device: str) -> dict[str, Any] | None:
+    """Read the state of a run, or None where there is no checkpoint.
+
+    Raises `InputError` for a damaged file or one that belongs to other settings, another clip, budget or seed.
+    """
+    if not path.exists():
+        return None
+    try:
+        tensors, metadata = read_safetensors(path)
+        content = parse_json(metadata.get(KEY, ""), path, KEY)
+    except InputError as error:
+        raise InputError(path, "", "a checkpoint", error.found, REMEDY) from error
+    if content.get("layout") != LAYOUT:
+        raise InputError(path, "layout", str(LAYOUT), "another layout", REMEDY)
+    if content.get("run") != run:
+        raise InputError(
+            path,
+            "run",
+            "a checkpoint of this method, clip, settings, budget and seed",
+            "one of another run",
+            "Use another output folder, or delete it to start over.",
+        )
+    if content.get("digest") != _digest(content.get("state"), tensors):
+        raise InputError(path, "digest", "what was written", "damaged data", REMEDY)
+    try:
+        # Copies, since the alignment of numbers in memory, too, decides how sums are rounded.
+        copies = {name: value.to(device, copy=True) for name, value in tensors.items()}
+        state = _unpacked(content["state"], copies)
+    except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+        raise InputError(path, "state", "containers and tensors of the file", str(error), REMEDY) from error
+    if not isinstance(state, dict):
+        raise InputError(path, "state", "a dictionary", type(state).__name__, REMEDY)
+    return state
+
+
+def _packed(value: Any, tensors: dict[str, Tensor]) -> Any:
+    """The value as JSON, its tensors by number."""
+    if isinstance(value, Tensor):
+        name, strides = str(len(tensors)), value.stride()
+        # The order of axes in memory decides how sums are rounded, and with it how the run goes on.
+        axes = sorted(range(value.ndim), key=lambda axis: strides[axis], reverse=True)
+        # A copy, as a file cannot have two tensors that share their numbers.
+        ordered = value.detach().permute(axes)
+        tensors[name] = ordered.to("cpu", copy=True, memory_format=torch.contiguous_format)
+        return {"tensor": [name, axes]}
+    if isinstance(value, Mapping):
+        return {"dict": [[_packed(key, tensors), _packed(entry, tensors)] for key, entry in value.items()]}
+    if isinstance(value, (list, tuple)):
+        kind = "list" if isinstance(value, list) else "tuple"
+        return {kind: [_packed(entry, tensors) for entry in value]}
+    if isinstance(value, float) and not math.isfinite(value):
+        return {"float": str(value)}
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    raise TypeError(f"{type(value).__name__} is nothing that a checkpoint can hold")
+
+
+def _unpacked(tree: Any, tensors: Mapping[str, Tensor]) -> Any:
+    """What `_packed` was given."""
+    if not isinstance(tree, dict):
+        return tree
+    ((kind, value),) = tree.items()
+    if kind == "tensor":
+        name, axes = value
+        return tensors[name].permute([axes.index(axis) for axis in range(len(axes))])
+    if kind == "float":
+        return float(value)
+    if kind == "dict":
+        return {_unpacked(key, tensors): _unpacked(entry, tensors) for key, entry in value}
+    return {"list": list, "tuple": tuple}[kind](_unpacked(entry, tensors) for entry in value)
+
+
+def _digest(tree: Any, tensors: Mapping[str, Tensor]) -> str:
+    state = hashlib.sha256(json.dumps(tree).encode())
+    for name, value in sorted(tensors.items()):
+        state.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
+        state.update(value.reshape(-1).view(torch.uint8).numpy())
+    return state.hexdigest()

@@ -1,0 +1,197 @@
+"""Adaptive density for splats bound to triangles: clone, split, prune, opacity reset.
+
+Kerbl et al., "3D Gaussian Splatting", section 5, with the inheritance of GaussianAvatars (section 3.3 there): a
+new splat belongs to its parent's triangle, and no triangle loses its last splat unless that is allowed. What splats
+are bound to may be anything else that children inherit, such as the points of a surface that they were put on.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ....datasets.head.rotations import quaternion_to_matrix
+from ..configs import DensifiedTraining
+from ..seeds import torch_generator
+from .optimiser import Optimiser
+from .schedule import DensifySchedule
+
+CHILDREN = 2
+SHRINK = 0.8 * CHILDREN  # a child's scale is its parent's over this
+
+
+class Densifier:
+    """Gathers projected gradients, and grows and thins the splats from them.
+
+    Per-splat parameters are the optimiser's groups ``names``; "means", "log_scales", "quats" and "opacities"
+    (logits) must be among them.
+
+    Parameters
+    ----------
+    names : the per-splat groups.
+    binding : (N,) int64, triangle of each splat.
+    face_count : number of triangles.
+    extent : size of the scene, metres (`scene_extent`).
+    seed : of the run.
+    thresholds : (F,) gradient that asks for a round, by triangle; None takes ``settings.densify_gradient`` for all.
+    keep_last : whether a triangle keeps its last splat.
+    tables : groups with any number of rows for each splat, all rows of the first splat first; splats on one triangle
+        have equally many. Children inherit them.
+    table_rows : (F,) int64, how many rows a splat on each triangle has in the tables.
+    """
+
+    def __init__(
+        self,
+        settings: DensifiedTraining,
+        optimiser: Optimiser,
+        names: tuple[str, ...],
+        binding: Tensor,
+        face_count: int,
+        extent: float,
+        seed: int,
+        *,
+        thresholds: Tensor | None = None,
+        keep_last: bool = True,
+        tables: tuple[str, ...] = (),
+        table_rows: Tensor | None = None,
+    ):
+        self.binding = binding
+        self._thresholds, self._keep_last = thresholds, keep_last
+        self._tables, self._table_rows = tables, table_rows
+        self._settings, self._optimiser, self._names = settings, optimiser, names
+        self._face_count, self._extent, self._seed = face_count, extent, seed
+        self._restart()
+
+    def observe(self, gradient: Tensor, visible: Tensor, width: int, height: int) -> None:
+        """Add one view: (N, 2) gradient by the projected means in pixels, and (N,) which splats were seen.
+
+        Pixels become normalised device units by half the image size, as the published thresholds have it.
+        """
+        half = gradient.new_tensor([0.5 * width, 0.5 * height])
+        seen = visible.to(gradient.dtype)
+        self._gradient_sum += torch.linalg.vector_norm(gradient * half, dim=1) * seen
+        self._views += seen
+
+    def run(self, iteration: int, schedule: DensifySchedule, face_sizes: Tensor) -> None:
+        """Clone, then split, then prune; then gather afresh.
+
+        Parameters
+        ----------
+        face_sizes : (F,) of the current frame, metres: what turns local scales into world scales.
+        """
+        gradient = self._gradient_sum / self._views.clamp_min(1)
+        if self._thresholds is None:
+            asks = gradient >= self._settings.densify_gradient
+        else:
+            asks = gradient >= self._thresholds.index_select(0, self.binding)
+        asks = self._within_bound(asks, gradient)
+        large = self._world_scale(face_sizes) > self._settings.densify_extent * self._extent
+        parents = asks & large
+        self._clone(asks & ~large)
+        self._split(parents, face_sizes, iteration)
+        self._prune(parents, face_sizes, schedule.prunes_large(iteration))
+        self._restart()
+
+    def reset_opacity(self) -> None:
+        """Cut opacities to the reset value and forget their moments."""
+        ceiling = logit(self._settings.reset_opacity)
+        logits = self._optimiser["opacities"].detach()
+        self._optimiser.set_values("opacities", logits.clamp_max(ceiling))
+
+    def state(self) -> dict[str, Any]:
+        """Binding and gathered statistics."""
+        return {"binding": self.binding, "gradient_sum": self._gradient_sum, "views": self._views}
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Take over what `state` gave."""
+        self.binding = state["binding"]
+        self._gradient_sum, self._views = state["gradient_sum"], state["views"]
+
+    def _restart(self) -> None:
+        like = self._optimiser["means"]
+        self._gradient_sum = torch.zeros(len(self.binding), dtype=like.dtype, device=like.device)
+        self._views = torch.zeros_like(self._gradient_sum)
+
+    def _world_scale(self, face_sizes: Tensor) -> Tensor:
+        largest = self._optimiser["log_scales"].detach().amax(1).exp()
+        return largest * face_sizes.index_select(0, self.binding)
+
+    def _within_bound(self, asks: Tensor, gradient: Tensor) -> Tensor:
+        """Where a bound on splats leaves room for some only, take those with the largest gradients."""
+        if self._settings.max_splats is None:
+            return asks
+        room = max(self._settings.max_splats - len(self.binding), 0)
+        if int(asks.sum()) <= room:
+            return asks
+        # Stable: equal gradients are taken in order, so that a resumed run takes the same ones.
+        order = torch.argsort(
+            torch.where(asks, gradient, gradient.new_tensor(-1.0)), descending=True, stable=True
+        )
+        chosen = torch.zeros_like(asks)
+        chosen[order[:room]] = True
+        return chosen
+
+    def _rows(self, rows: Tensor) -> dict[str, Tensor]:
+        taken = {name: self._optimiser[name].detach().index_select(0, rows) for name in self._names}
+        if self._table_rows is not None:
+            entries = rows_of_tables(self._table_rows.index_select(0, self.binding), rows)
+            taken |= {name: self._optimiser[name].detach().index_select(0, entries) for name in self._tables}
+        return taken
+
+    def _append(self, rows: dict[str, Tensor], binding: Tensor) -> None:
+        self._optimiser.append(rows)
+        self.binding = torch.cat([self.binding, binding])
+
+    def _clone(self, mask: Tensor) -> None:
+        rows = mask.nonzero().squeeze(1)
+        self._append(self._rows(rows), self.binding.index_select(0, rows))
+
+    def _split(self, parents: Tensor, face_sizes: Tensor, iteration: int) -> None:
+        """Add the children of the parents; `_prune` then takes the parents away."""
+        rows = parents.nonzero().squeeze(1).repeat(CHILDREN)
+        binding = self.binding.index_select(0, rows)
+        children = self._rows(rows)
+        scales = children["log_scales"].exp()
+        spread = scales
+        if self._settings.split_offsets == "world":
+            spread = scales * face_sizes.index_select(0, binding)[:, None]
+        generator = torch_generator(self._seed, "split", iteration)
+        noise = torch.randn(scales.shape, generator=generator, dtype=scales.dtype).to(scales.device)
+        offsets = quaternion_to_matrix(children["quats"]) @ (noise * spread)[:, :, None]
+        children["means"] = children["means"] + offsets[:, :, 0]
+        children["log_scales"] = (scales / SHRINK).log()
+        self._append(children, binding)
+
+    def _prune(self, parents: Tensor, face_sizes: Tensor, large_too: bool) -> None:
+        replaced = torch.zeros_like(self.binding, dtype=torch.bool)
+        replaced[: len(parents)] = parents
+        unfit = torch.sigmoid(self._optimiser["opacities"].detach()) < self._settings.prune_opacity
+        if large_too:
+            unfit |= self._world_scale(face_sizes) > self._settings.prune_extent * self._extent
+        if self._keep_last:
+            # A parent goes in any case: its children hold the face, fit or not.
+            kept = torch.bincount(self.binding[~(replaced | unfit)], minlength=self._face_count)
+            unfit &= kept.index_select(0, self.binding) > 0
+        keep = ~(replaced | unfit)
+        self._optimiser.select(self._names, keep)
+        if self._table_rows is not None:
+            entries = self._table_rows.index_select(0, self.binding)
+            self._optimiser.select(self._tables, keep.repeat_interleave(entries))
+        self.binding = self.binding[keep]
+
+
+def rows_of_tables(counts: Tensor, splats: Tensor) -> Tensor:
+    """Where the rows of some splats lie in a table that has ``counts`` (N,) rows for each splat, in their order."""
+    starts = counts.cumsum(0) - counts
+    chosen = counts.index_select(0, splats)
+    within = torch.arange(int(chosen.sum()), device=counts.device)
+    before = chosen.cumsum(0) - chosen
+    return within + (starts.index_select(0, splats) - before).repeat_interleave(chosen)
+
+
+def logit(probability: float) -> float:
+    """Inverse of the sigmoid."""
+    return math.log(probability / (1 - probability))

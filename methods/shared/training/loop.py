@@ -1,0 +1,183 @@
+"""The training loop, once for all methods: budget, sampling, steps, progress, checkpoints."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from torch import Tensor
+
+from ....bench.contracts import Budget, Progress
+from ....bench.errors import InputError
+from .checkpoint import REMEDY, load_checkpoint, save_checkpoint
+from .optimiser import Optimiser
+from .sampling import Sampler
+from .schedule import Timeline
+
+CHECKPOINT = "checkpoint.safetensors"
+TRIAL_STEPS = 5  # steps timed to turn seconds into iterations
+COST_GROWTH = 1.6  # a step late in training costs about so much more than one at its start: more splats
+REPORT_EVERY = 10  # iterations between looks at the loss, each of which waits for the device
+
+
+class Trainable(Protocol):
+    """What the loop trains. It draws random numbers by iteration (`methods.seeds`), never from a global state."""
+
+    @property
+    def optimiser(self) -> Optimiser: ...
+
+    def begin(self, timeline: Timeline) -> None:
+        """Fit schedules to the length of the run. Called before anything else, perhaps more than once."""
+
+    def loss(self, iteration: int, index: int) -> Tensor:
+        """Loss for training image ``index``. Must not change what training depends on."""
+
+    def after_backward(self, iteration: int) -> None:
+        """Use the gradients before the step: densification, resets, learning rates."""
+
+    def state(self) -> dict[str, Any]:
+        """Everything that training changes, as tensors and plain containers."""
+
+    def load_state(self, state: dict[str, Any]) -> None: ...
+
+    def note(self) -> str:
+        """A few words on the state of training, for progress."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a run went: iterations done of those planned, and seconds over all its parts."""
+
+    iterations: int
+    planned: int
+    seconds: float
+
+
+def train(
+    trainable: Trainable,
+    sampler: Sampler,
+    *,
+    published_length: int,
+    budget: Budget,
+    folder: Path,
+    run: str,
+    device: str,
+    progress: Progress,
+    checkpoint_every_s: float,
+    clock: Callable[[], float] = time.monotonic,
+    began: float | None = None,
+) -> Outcome:
+    """Train until the budget is spent; continue from ``folder``'s checkpoint if it is of the same run.
+
+    One iteration is: loss of one image, gradients, `after_backward` (densification), Adam step; the last
+    iteration has no Adam step, as published. A run that was killed and continued ends bit for bit like an
+    unbroken one on the same machine, unless seconds rule: then the clock decides how many iterations fit.
+
+    Parameters
+    ----------
+    published_length : iterations of the published run (`Timeline`).
+    run : digest of what the run was started with; another run's checkpoint is refused.
+    began : what the clock said before the preparation of ``trainable``, whose seconds then count like those of
+        iterations; by default counting begins here.
+
+    Raises
+    ------
+    InputError
+        For a budget without iterations and seconds, and for a checkpoint that is damaged or of another run.
+    """
+    check_budget(budget)
+    path = folder / CHECKPOINT
+    saved = load_checkpoint(path, run, device)
+    started = clock() if began is None else began
+    if saved is None:
+        iteration, spent = 0, 0.0
+        total = budget.iterations
+        if total is None:
+            assert budget.seconds is not None
+            left = budget.seconds if began is None else budget.seconds - (clock() - began)
+            total = _estimate(trainable, sampler, left, published_length, clock)
+        trainable.begin(Timeline(total, published_length))
+    else:
+        try:
+            iteration, total, spent = int(saved["iteration"]), int(saved["total"]), float(saved["seconds"])
+            trainable.begin(Timeline(total, published_length))
+            trainable.load_state(saved["trainable"])
+        except (KeyError, IndexError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+            found = f"another ({type(error).__name__}: {error})"
+            raise InputError(path, "state", "the state of this method", found, REMEDY) from error
+    estimated = "" if budget.iterations else f"{total} iterations estimated; "
+
+    def seconds() -> float:
+        return spent + clock() - started
+
+    last_save = clock()
+    while iteration < total and (budget.seconds is None or seconds() < budget.seconds):
+        iteration += 1
+        loss = trainable.loss(iteration, sampler(iteration))
+        loss.backward()
+        if iteration % REPORT_EVERY == 0 or iteration == 1:
+            _check_finite(loss, iteration, folder)
+        trainable.after_backward(iteration)
+        if iteration < total:
+            trainable.optimiser.step()
+        trainable.optimiser.zero_grad()
+        if clock() - last_save >= checkpoint_every_s and iteration < total:
+            state = {
+                "iteration": iteration,
+                "total": total,
+                "seconds": seconds(),
+                "trainable": trainable.state(),
+            }
+            save_checkpoint(path, run, state)
+            last_save = clock()
+        note = ""
+        if iteration % REPORT_EVERY == 0 or iteration == total:
+            note = f"{estimated}loss {loss.item():.4f}; {trainable.note()}"
+        progress(iteration, total, note)
+    return Outcome(iteration, total, seconds())
+
+
+def check_budget(budget: Budget) -> None:
+    """Raise `InputError` unless the budget bounds something."""
+    if budget.iterations is None and budget.seconds is None:
+        raise InputError("budget", "", "iterations, seconds or both", "neither")
+    for name in ("iterations", "seconds"):
+        value = getattr(budget, name)
+        if value is not None and not value > 0:
+            raise InputError("budget", name, "a positive number", str(value))
+
+
+def _estimate(
+    trainable: Trainable,
+    sampler: Sampler,
+    seconds: float,
+    published_length: int,
+    clock: Callable[[], float],
+) -> int:
+    """How many iterations fit into so many seconds, one at least, from a few trial steps that change nothing."""
+    trainable.begin(Timeline(published_length, published_length))
+    durations = []
+    for trial in range(1, TRIAL_STEPS + 2):
+        before = clock()
+        trainable.loss(1, sampler(trial)).backward()
+        trainable.optimiser.zero_grad()
+        durations.append(clock() - before)
+    # The first step pays for lazy initialisation; the median of the rest shrugs off a hiccup.
+    typical = sorted(durations[1:])[TRIAL_STEPS // 2]
+    return max(1, int(seconds / max(typical * COST_GROWTH, 1e-6)))
+
+
+def _check_finite(loss: Tensor, iteration: int, folder: Path) -> None:
+    value = loss.item()
+    if not math.isfinite(value):
+        raise InputError(
+            folder,
+            f"iteration {iteration}",
+            "a finite loss",
+            str(value),
+            "Training diverged; check the tracking (NaN?) or lower the learning rates.",
+        )

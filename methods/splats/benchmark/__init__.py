@@ -1,1 +1,0 @@
-"""Measurements of the splat renderer itself: speed, what accuracy costs, behaviour at numerical extremes."""

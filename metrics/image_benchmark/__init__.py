@@ -1,1 +1,0 @@
-"""How fast the image metrics are, next to the usual libraries."""

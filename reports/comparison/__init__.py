@@ -1,1 +1,0 @@
-"""``headbench compare``: paired differences between methods, with what they allow one to say."""

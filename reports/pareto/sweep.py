@@ -1,0 +1,123 @@
+"""Derives variants of a run's avatars, renders and measures them, and leaves a run folder of them."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from ...bench.contracts import Progress, Variant
+from ...bench.errors import InputError
+from ...bench.io.files import check_name, digest
+from ...bench.manifest import Derived, MethodRecord
+from ...bench.protocol import Protocol, make_protocol
+from ...bench.registry import resolve
+from ...bench.rows import Rows
+from ...bench.runner.avatars import load, trained
+from ...bench.runner.config import resolve_metrics
+from ...bench.runner.run import describe
+from ...bench.runner.stages import Job, measure, render
+from ...bench.runner.store import RunFolder
+from ...bench.specs import MetricSpec
+from .settings import SweepSettings
+
+log = logging.getLogger(__name__)
+NEEDED = ("storage", "fps", "latency_p50", "processor_time")
+"""Metrics of a sweep, whether the run took them or not."""
+MARK = "+"
+"""Between the name of a method and that of a variant."""
+
+
+def sweep(settings: SweepSettings, out: Path, progress: Progress) -> Rows:
+    """Derive, render and measure; return the rows of the run folder that it writes to ``out``.
+
+    The trained avatars are measured anew beside their variants, so that frame times were taken in one go. Started
+    again, it keeps what is measured.
+
+    Raises
+    ------
+    InputError
+        For a folder that is no finished run, a method that derives nothing, a variant that none of them has.
+    """
+    config, jobs = trained(Path(settings.run), settings.methods, settings, out)
+    able = [job for job in jobs if job.method.spec.variants]
+    unable = sorted({job.method.spec.name for job in jobs} - {job.method.spec.name for job in able})
+    if not able or (settings.methods and unable):
+        found = ", ".join(unable) or "none"
+        raise InputError(settings.run, "methods", "methods that derive variants", found)
+    if settings.frames is not None:
+        config = replace(config, frames_per_task=settings.frames)
+    clips = list({job.clip.subject: job.clip for job in able}.values())
+    protocols: dict[str, Protocol] = {
+        task: make_protocol(task, clips, config.frames_per_task) for task in config.tasks
+    }
+    config = replace(config, metrics=tuple(dict.fromkeys((*config.metrics, *NEEDED))))
+    metrics = [spec for spec in resolve_metrics(config) if not spec.training]
+    folder = RunFolder(out)
+    derived = [(job, list(_chosen(job, settings.variants))) for job in able]
+    known = {variant.name for _, variants in derived for variant in variants}
+    for name in settings.variants:
+        if name not in known:
+            raise InputError("sweep", "variants", "a variant of these methods", repr(name))
+
+    frames: list[Rows] = []
+    records: dict[str, MethodRecord] = {}
+    total = sum(len(variants) + 1 for _, variants in derived)
+    for base, variants in derived:
+        for variant in (None, *variants):
+            job = _derived(base, variant, protocols, folder)
+            progress(len(frames), total, job.name)
+            frames.append(_measured(job, base, variant, metrics))
+            records[job.method.spec.name] = _record(job, base, variant)
+    rows = Rows.joined(frames)
+    rows.write(folder.rows)
+    manifest = describe(config, [], metrics, clips, protocols)
+    done = replace(manifest, methods=tuple(records.values()), sweep_of=settings.run, status="done")
+    done.write(folder.manifest)
+    return rows
+
+
+def _chosen(job: Job, names: Sequence[str]) -> Iterator[Variant]:
+    """Variants of a job's avatar, those named or all."""
+    derive = resolve(job.method.spec.variants)
+    for variant in derive(job.cell.avatar, job.form.clip, job.device):
+        check_name(_name(job, variant), job.method.spec.variants, "name of a variant")
+        if not names or variant.name in names:
+            yield variant
+
+
+def _derived(base: Job, variant: Variant | None, protocols: Mapping[str, Protocol], folder: RunFolder) -> Job:
+    """The cell of a variant in the sweep's folder; of the trained avatar itself where there is none."""
+    spec = base.method.spec
+    name = spec.name if variant is None else _name(base, variant)
+    return replace(
+        base,
+        method=replace(base.method, spec=replace(spec, name=name)),
+        protocols=protocols,
+        cell=folder.cell(base.clip.subject, name, base.seed),
+    )
+
+
+def _name(base: Job, variant: Variant) -> str:
+    return f"{base.method.spec.name}{MARK}{variant.name}"
+
+
+def _measured(job: Job, base: Job, variant: Variant | None, metrics: Sequence[MetricSpec]) -> Rows:
+    job.check()
+    avatar = load(base) if variant is None else variant.make(job.cell.avatar)
+    source = base.cell.stage("fit")
+    assert source is not None  # `trained` saw to it
+    derived_from = digest(source["fingerprint"], source.get("files"))
+    files = job.cell.digests(path for path in job.cell.avatar.rglob("*") if path.is_file())
+    job.cell.finish("fit", job.fit_fingerprint, derived_from=derived_from, files=files)
+    render(job, avatar)
+    return measure(job, avatar, metrics)
+
+
+def _record(job: Job, base: Job, variant: Variant | None) -> MethodRecord:
+    """As a run records a method, and what it was derived from."""
+    derived: Derived | None = None
+    if variant is not None:
+        derived = {"from": base.method.spec.name, "variant": variant.name, "change": variant.summary}
+    return MethodRecord(**job.method.record(), derived=derived)

@@ -1,0 +1,204 @@
+"""How far a driven avatar's look stays its subject's own, where there is no ground truth and no licensed network.
+
+The parts of a head that expressions do not move (scalp and hair, ears, temples, as far as the camera sees them) have to
+look as in the subject's recordings whoever drives the avatar. The tracked mesh says where they are: the colour at
+every such vertex is compared with the median colour at the same vertex over the subject's recorded frames in the same
+camera, and the mean CIEDE2000 difference over the vertices is the number: 0 is the very look, 1 just noticeable, the
+difference of two people's hair or skin above 10.
+
+What it does not see: the face proper, whose look changes with expression; shape, but for its outline against other
+colours; a difference of people who look alike. It contains what the avatar lacks against recordings anyway, and the
+change of shading with the turn of the head; the same number of the subject's own recorded held-out performance
+(`own`) says how much that is, that of the driver's recordings against the target's look (`source`) what a complete
+exchange of identity would give.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from skimage.color import deltaE_ciede2000
+
+from ...bench.contracts import (
+    BoolArray,
+    ByteArray,
+    Camera,
+    Clip,
+    FloatArray,
+    Frame,
+    FrameKey,
+    HeadAsset,
+    HeadPose,
+    IntArray,
+)
+from ...bench.io.frames import quantise
+from .expressions import training_poses
+from .stability import Verdict
+
+STILL_M = 0.0005
+"""A vertex that training expressions move by less (one standard deviation of each) counts as unmoved."""
+RIGID_WEIGHT = 0.99
+FACING = 0.35
+"""Least cosine between a vertex' normal and the direction to the camera; more grazing ones are left out."""
+SMOOTHING = 0.01
+"""Deviation of the Gaussian that images are smoothed by, as a share of the head's height in the image."""
+LEAST_VERTICES = 20
+NO_LOOK = "no recorded frames of that camera, or no parts that expressions leave alone, to compare with"
+HIDDEN = ("teeth", "tongue", "eyeball", "lips", "mouth")
+"""Regions by part of their name that lie behind others, or open and close over them."""
+
+
+@dataclass(frozen=True, eq=False)
+class SteadyParts:
+    """The vertices of a clip's head that follow its rigid motion alone, in the rest pose.
+
+    Attributes
+    ----------
+    indices : (N,) of vertices.
+    points, normals : (N, 3) metres and unit length.
+    root, neck : (3,) joints, metres.
+    """
+
+    indices: IntArray
+    points: FloatArray
+    normals: FloatArray
+    root: FloatArray
+    neck: FloatArray
+
+    @classmethod
+    def of(cls, clip: Clip) -> SteadyParts:
+        """Find them from the head model and the training expressions."""
+        expressions = [pose.expression for pose in training_poses(clip)]
+        return cls.at(clip, np.flatnonzero(_steady(clip.head, expressions)))
+
+    @classmethod
+    def at(cls, clip: Clip, indices: IntArray) -> SteadyParts:
+        """Those at given vertices."""
+        head = clip.head
+        coefficients = np.asarray(clip.shape, np.float64)
+        shaped = (
+            head.template + head.shape_basis[..., : len(coefficients)] @ coefficients + clip.static_offset
+        )
+        root, neck = (head.joint_regressor @ shaped)[:2]
+        return cls(indices, shaped[indices], _normals(shaped, head.faces)[indices], root, neck)
+
+    def posed(self, pose: HeadPose) -> tuple[FloatArray, FloatArray]:
+        """(N, 3) points and normals of a pose: the head turns about the neck joint, the whole about the root."""
+        root, neck = (cv2.Rodrigues(np.asarray(r, np.float64))[0] for r in (pose.rotation, pose.neck))
+        local = (self.points - self.neck) @ neck.T + self.neck
+        points = (local - self.root) @ root.T + self.root + pose.translation
+        return np.asarray(points), np.asarray(self.normals @ (root @ neck).T)
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """The colours of a subject's steady parts in one camera; Lab, (N, 3), not a number where none was seen."""
+
+    parts: SteadyParts
+    colours: FloatArray
+
+    @classmethod
+    def recorded(cls, clip: Clip, camera: str, count: int) -> Look | None:
+        """The median over up to ``count`` recorded frames of training timesteps; None where the camera has too few."""
+        keys = sorted(
+            key
+            for split in ("train", "novel_view")
+            for key in clip.splits.get(split, ())
+            if key.camera == camera
+        )
+        parts = SteadyParts.of(clip)
+        if not keys or len(parts.indices) < LEAST_VERTICES:
+            return None
+        seen = np.array([colours_of(clip, parts, key) for key in keys[:: max(1, len(keys) // count)]])
+        known = np.isfinite(seen).any(axis=0)
+        median = np.full(seen.shape[1:], np.nan)
+        median[known] = np.nanmedian(seen[:, known], axis=0)
+        return cls(parts, median)
+
+    def difference(self, colours: FloatArray) -> float | None:
+        """Mean CIEDE2000 difference over the vertices that both have seen; None where they are too few."""
+        both = np.isfinite(self.colours).all(axis=1) & np.isfinite(colours).all(axis=1)
+        if both.sum() < LEAST_VERTICES:
+            return None
+        return float(deltaE_ciede2000(self.colours[both], colours[both]).mean())
+
+
+def identity(look: Look | None, frame: Frame, camera: Camera, pose: HeadPose) -> Verdict:
+    """The identity of a driven frame, without a limit: how much is too much depends on who drives whom."""
+    if look is None or not np.isfinite(frame.rgb).all():
+        absent = "not finite" if look is not None else NO_LOOK
+        return Verdict("identity", None, 0.0, math.inf, absent)
+    value = look.difference(sample(quantise(frame.rgb), camera, *look.parts.posed(pose)))
+    return Verdict("identity", value, 0.0, math.inf, "too little of the steady parts is seen")
+
+
+def of_recording(look: Look, clip: Clip, keys: Sequence[FrameKey], count: int) -> float | None:
+    """Mean identity of recorded frames of any subject, up to ``count`` of them; None where none has it.
+
+    The vertices are the look's, where this clip's head has them.
+    """
+    if not keys or len(clip.head.template) <= look.parts.indices.max():
+        return None
+    parts = SteadyParts.at(clip, look.parts.indices)
+    chosen = keys[:: max(1, len(keys) // count)]
+    return mean_known([look.difference(colours_of(clip, parts, key)) for key in chosen])
+
+
+def mean_known(values: Sequence[float | None]) -> float | None:
+    """Mean of the values that are there; None without any."""
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known else None
+
+
+def colours_of(clip: Clip, parts: SteadyParts, key: FrameKey) -> FloatArray:
+    """(N, 3) Lab colours of a clip's steady parts in a recorded frame."""
+    return sample(clip.image(key), clip.cameras[key.camera], *parts.posed(clip.poses[key.timestep]))
+
+
+def sample(image: ByteArray, camera: Camera, points: FloatArray, normals: FloatArray) -> FloatArray:
+    """(N, 3) Lab colours of points in an (H, W, 3) 8-bit image, not a number for those that the camera does not see.
+
+    What lies in front of a point that faces the camera is not known; the steady parts are convex but for ears.
+    """
+    motion = np.asarray(camera.world_to_camera, np.float64)
+    local = points @ motion[:3, :3].T + motion[:3, 3]
+    projected = local @ np.asarray(camera.K, np.float64).T
+    pixels = projected[:, :2] / np.where(local[:, 2:] > 0, projected[:, 2:], np.nan)
+    towards = camera.center - points
+    cosines = (normals * towards).sum(axis=1) / np.linalg.norm(towards, axis=1)
+    columns, lines = np.floor(np.nan_to_num(pixels, nan=-1.0)).T
+    seen = (cosines > FACING) & (columns >= 0) & (lines >= 0)
+    seen &= (columns < camera.width) & (lines < camera.height)
+    colours = np.full((len(points), 3), np.nan)
+    if seen.any():
+        height = float(np.ptp(pixels[seen, 1]))
+        smooth = cv2.GaussianBlur(image.astype(np.float32) / 255.0, (0, 0), max(0.5, SMOOTHING * height))
+        lab = cv2.cvtColor(smooth, cv2.COLOR_RGB2Lab)
+        colours[seen] = lab[lines[seen].astype(int), columns[seen].astype(int)]
+    return colours
+
+
+def _steady(head: HeadAsset, expressions: Sequence[FloatArray]) -> BoolArray:
+    """(V,) whether a vertex is neither moved by expressions nor by jaw and eyes, and lies open to sight."""
+    deviations = np.std(np.asarray(expressions, np.float64), axis=0)
+    basis = head.expression_basis[..., : len(deviations)]
+    steady: BoolArray = np.linalg.norm(basis * deviations, axis=(1, 2)) < STILL_M
+    steady &= head.skinning_weights[:, 1] >= RIGID_WEIGHT
+    for name, indices in head.regions.items():
+        if any(part in name for part in HIDDEN):
+            steady[indices] = False
+    return steady
+
+
+def _normals(points: FloatArray, faces: IntArray) -> FloatArray:
+    """(V, 3) unit normals, each face weighing by its area."""
+    a, b, c = (points[faces[:, corner]] for corner in range(3))
+    across = np.cross(b - a, c - a)
+    normals = np.zeros_like(points)
+    for corner in range(3):
+        np.add.at(normals, faces[:, corner], across)
+    return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12))

@@ -1,0 +1,166 @@
+"""A turntable of views between the training cameras and beyond them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...bench.contracts import Camera, FloatArray
+from ...bench.errors import InputError
+
+NEAR_M = 1e-6
+LEAST_SPREAD = 0.15
+"""Sideways spread of cameras, as the ratio of the singular values of their right axes, from which on they tell up."""
+
+
+@dataclass(frozen=True, eq=False)
+class Viewpoint:
+    """A new view.
+
+    Attributes
+    ----------
+    camera : where it is seen from; looks at the head.
+    extrapolated : lies beyond the outermost training cameras.
+    azimuth : degrees about the upward axis, 0 at the mean training direction, positive to the camera's right.
+    """
+
+    camera: Camera
+    extrapolated: bool
+    azimuth: float
+
+
+def turntable(
+    cameras: Sequence[Camera], center: FloatArray, count: int, beyond_degrees: float
+) -> list[Viewpoint]:
+    """Walk around a head through the directions of its training cameras, in even steps of azimuth.
+
+    Between two cameras that are neighbours in azimuth, the direction from the head is interpolated along the great
+    circle, the distance and the focal lengths linearly. Beyond the outermost two, the walk goes on at their
+    elevation and distance. Where the cameras stand all around, with no gap wider than twice ``beyond_degrees``,
+    the walk is closed and no view is extrapolated.
+
+    Parameters
+    ----------
+    cameras : training cameras, at least one; views have the size of the first.
+    center : (3,) what to look at, metres.
+    count : number of views, at least 1.
+    beyond_degrees : how far the walk goes on beyond the outermost cameras on either side, in [0, 180).
+
+    Returns
+    -------
+    Views ordered by azimuth.
+    """
+    if not cameras:
+        raise InputError("turntable", "cameras", "at least one", "none")
+    first = cameras[0]
+    sized = [camera.resized(first.width, first.height) for camera in cameras]
+    focal = np.array([[camera.K[0, 0], camera.K[1, 1]] for camera in sized])
+    offsets = np.array([camera.center for camera in cameras]) - center
+    distances = np.linalg.norm(offsets, axis=1)
+    if distances.min() < NEAR_M:
+        raise InputError("turntable", "cameras", "cameras away from the head", "one within it")
+    directions = offsets / distances[:, None]
+    axes = _axes(cameras, directions)
+    local = directions @ axes.T  # right, up, front
+    azimuths = np.degrees(np.arctan2(local[:, 0], local[:, 2]))
+
+    order = np.argsort(azimuths, kind="stable")
+    start, arc = _arc(azimuths[order])
+    order = np.roll(order, -start)
+    turns = (azimuths[order] - azimuths[order[0]]) % 360.0  # from the first of the arc on, rising
+    closed = 360.0 - arc <= 2.0 * beyond_degrees
+    if closed:
+        order, turns = np.append(order, order[0]), np.append(turns, 360.0)
+        steps = np.arange(count) * 360.0 / count
+    else:
+        steps = (
+            np.linspace(-beyond_degrees, arc + beyond_degrees, count) if count > 1 else np.array([arc / 2])
+        )
+    local, distances, focal = local[order], distances[order], focal[order]
+
+    views = []
+    for index, step in enumerate(steps):
+        inside = float(np.clip(step, 0.0, turns[-1]))
+        upper = int(np.clip(np.searchsorted(turns, inside), 1, max(len(turns) - 1, 1)))
+        lower = upper - 1
+        upper = min(upper, len(turns) - 1)
+        width = turns[upper] - turns[lower]
+        share = (inside - turns[lower]) / width if width > 0 else 0.0
+        direction = _slerp(local[lower], local[upper], share)
+        direction = _turned(direction, np.radians(step - inside))
+        distance = (1 - share) * distances[lower] + share * distances[upper]
+        fx, fy = (1 - share) * focal[lower] + share * focal[upper]
+        K = np.array([[fx, 0.0, first.width / 2], [0.0, fy, first.height / 2], [0.0, 0.0, 1.0]])
+        pose = look_at(center + distance * (direction @ axes), center, axes[1])
+        views.append(
+            Viewpoint(
+                Camera(f"turntable-{index:02d}", first.width, first.height, K, pose),
+                extrapolated=bool(abs(step - inside) > 1e-9),
+                azimuth=float(np.degrees(np.arctan2(direction[0], direction[2]))),
+            )
+        )
+    return views
+
+
+def look_at(position: FloatArray, target: FloatArray, up: FloatArray) -> FloatArray:
+    """(4, 4) world-to-camera motion, OpenCV axes, of a camera that has ``target`` on its axis and ``up`` upwards."""
+    forward = (target - position) / np.linalg.norm(target - position)
+    right = np.cross(forward, up)
+    if np.linalg.norm(right) < 1e-9:  # straight from above or below: any right will do
+        right = np.cross(forward, np.roll(up, 1) + np.array([1e-3, 0.0, 0.0]))
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    motion = np.eye(4)
+    motion[:3, :3], motion[:3, 3] = rotation, -rotation @ position
+    return motion
+
+
+def _axes(cameras: Sequence[Camera], directions: FloatArray) -> FloatArray:
+    """(3, 3) rows right, up, front of the rig in the world: front is the mean direction of the cameras."""
+    up = _up(cameras)
+    front = directions.mean(axis=0)
+    front = front - (front @ up) * up
+    if np.linalg.norm(front) < 1e-6:  # all around: any camera's direction serves
+        front = directions[0] - (directions[0] @ up) * up
+    if np.linalg.norm(front) < 1e-6:
+        front = np.cross(cameras[0].world_to_camera[0, :3], up)
+    front = front / np.linalg.norm(front)
+    return np.stack([np.cross(up, front), up, front])
+
+
+def _up(cameras: Sequence[Camera]) -> FloatArray:
+    """(3,) the world's upward direction: normal to the rows of the images, since cameras pitch but hardly roll.
+
+    Cameras side by side do not tell it that way; then it is the mean of their own upward directions.
+    """
+    mean = -np.mean([camera.world_to_camera[1, :3] for camera in cameras], axis=0)
+    if np.linalg.norm(mean) < 1e-6:
+        mean = -cameras[0].world_to_camera[1, :3]
+    _, spread, axes = np.linalg.svd(np.array([camera.world_to_camera[0, :3] for camera in cameras]))
+    if len(cameras) > 1 and spread[1] > LEAST_SPREAD * spread[0]:
+        return np.asarray(axes[2] * (1.0 if axes[2] @ mean >= 0 else -1.0))
+    return np.asarray(mean / np.linalg.norm(mean))
+
+
+def _arc(azimuths: FloatArray) -> tuple[int, float]:
+    """Index where the arc begins that holds all azimuths (sorted, degrees) but the widest gap, and its width."""
+    gaps = np.diff(np.append(azimuths, azimuths[0] + 360.0))
+    widest = int(np.argmax(gaps))
+    return (widest + 1) % len(azimuths), float(360.0 - gaps[widest])
+
+
+def _slerp(a: FloatArray, b: FloatArray, share: float) -> FloatArray:
+    angle = np.arccos(np.clip(a @ b, -1.0, 1.0))
+    if np.sin(angle) < 1e-9:
+        return a
+    mixed = (np.sin((1 - share) * angle) * a + np.sin(share * angle) * b) / np.sin(angle)
+    return np.asarray(mixed / np.linalg.norm(mixed))
+
+
+def _turned(direction: FloatArray, angle: float) -> FloatArray:
+    """Turn a direction (right, up, front) about the upward axis."""
+    right, up, front = direction
+    sin, cos = np.sin(angle), np.cos(angle)
+    return np.array([cos * right + sin * front, up, cos * front - sin * right])

@@ -1,1 +1,0 @@
-"""Inference from rows: the subject is the unit, pairs share their keys. Numpy, scipy and pandas alone."""

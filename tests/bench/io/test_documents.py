@@ -1,0 +1,238 @@
+"""Documents from outside: what breaks a rule is refused in one short paragraph that names the place."""
+
+import math
+import os
+from dataclasses import dataclass, field
+from typing import Literal, NamedTuple
+
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from headbench.bench.errors import InputError
+from headbench.bench.io import documents
+from headbench.bench.io.documents import (
+    checked,
+    parse_json,
+    parse_setting,
+    read_document,
+    read_json,
+    read_yaml,
+)
+from headbench.bench.io.files import write_json
+
+DEEP = 200_000
+ALIASES = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"{new}: &{new} [{','.join([f'*{old}'] * 9)}]\n" for old, new in zip("abcdefgh", "bcdefghi")
+)
+PLAIN = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(),
+    lambda below: st.lists(below, max_size=3) | st.dictionaries(st.text(), below, max_size=3),
+    max_leaves=10,
+)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *(
+            "",
+            "{",
+            "[1]",
+            "3",
+            '"text"',
+            "\ufeff{}",
+            "[" * DEEP,
+            '{"a":' * DEEP,
+            '{"a": ' + "[" * 70 + "]" * 70 + "}",
+        ),
+        *('{"a": NaN}', '{"a": -Infinity}', '{"a": [1e999]}', '{"a": {"b": 1, "b": 1}}'),
+        *('{"a": 1' + "0" * 5000 + "}", '{"a": "' + "x" * 10**6, '{"' + "k" * 10**6 + '": 1, "a": NaN}'),
+        b"\xff\xfe\x81",
+    ],
+    ids=lambda text: str(text[:12]),
+)
+def test_json_that_breaks_a_rule_is_refused_shortly(tmp_path, text):
+    path = tmp_path / "a.json"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(InputError) as caught:
+        read_json(path)
+    assert caught.value.file == str(path)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 1000
+
+
+def test_a_number_that_is_not_finite_is_named_by_its_dotted_key(tmp_path):
+    (tmp_path / "a.json").write_text('{"a": [1, {"b": [0.5, NaN]}]}')
+    with pytest.raises(InputError, match=r"a.json, a\[1\].b\[1\]: expected a finite number, found nan"):
+        read_json(tmp_path / "a.json")
+
+
+@pytest.mark.parametrize("read", [read_json, read_yaml])
+def test_what_is_no_file_to_read_is_refused(tmp_path, monkeypatch, read):
+    os.mkfifo(tmp_path / "pipe")
+    for name, found in {"none": "no such file", "": "no file", "pipe": "no file", "a\0": "null"}.items():
+        with pytest.raises(InputError, match=found):
+            read(tmp_path / name)
+    monkeypatch.setattr(documents, "MAX_JSON_BYTES", 20)
+    monkeypatch.setattr(documents, "MAX_YAML_BYTES", 20)
+    (tmp_path / "large").write_text("{" + " " * 30 + "}")
+    with pytest.raises(InputError, match="at most 20 bytes"):
+        read(tmp_path / "large")
+
+
+@given(st.dictionaries(st.text(), PLAIN, max_size=3))
+def test_json_that_keeps_the_rules_is_read_as_it_is(tmp_path_factory, value):
+    path = tmp_path_factory.mktemp("file") / "a.json"
+    write_json(path, value)
+    assert read_json(path) == value
+
+
+@pytest.mark.parametrize(
+    ("text", "key", "found"),
+    [
+        ("a: !!python/object/apply:os.system ['true']", "a", "python"),
+        ("a: 2024-01-01", "a", "a date: '2024-01-01' in line 1"),
+        ("a: [1, !!bool x]", "a[1]", "'x'"),
+        ("a: !!timestamp x", "a", "'x'"),
+        ("a: !!int ''", "a", "''"),
+        ("a: !!set {b}", "a", "set"),
+        ("a: !!binary aGk=", "a", "aGk="),
+        ("a: {b: .nan}", "a.b", ".nan"),
+        ("a: 057", "a", "057"),
+        ("a: 1:30", "a", "1:30"),
+        ("\n1:30: 1", "", "'1:30' in line 2"),
+        ("a: 1\na: 2", "", "'a' again in line 2"),
+        ("5: 1\n'5': 2", "", "again"),
+        ("true: 1", "", "True (bool)"),
+        ("[a]: 1", "", "list"),
+        ("a: {<<: {b: 1}}", "a", "merge"),
+        ("a: &x 1\nb: *x", "", "alias"),
+        (ALIASES, "", "alias"),
+        ("a: &a [*a]", "", "alias"),
+        ("- 1", "", "list"),
+        ("a: [", "", "while parsing"),
+        ("\x00", "", "characters are not allowed"),
+        ("[" * DEEP, "", "deeper"),
+        ("a: b\n---\na: c", "", "document"),
+    ],
+    ids=lambda text: str(text)[:20],
+)
+def test_yaml_that_breaks_a_rule_is_refused_with_its_place(tmp_path, text, key, found):
+    path = tmp_path / "a.yaml"
+    path.write_text(text)
+    with pytest.raises(InputError) as caught:
+        read_yaml(path)
+    assert (caught.value.file, caught.value.key) == (str(path), key)
+    assert found in caught.value.found
+    assert len(str(caught.value)) < 1000
+
+
+@given(st.dictionaries(st.text(st.characters(exclude_categories=("Cs", "Cc"))), PLAIN, max_size=3))
+def test_yaml_that_keeps_the_rules_is_read_as_it_is(tmp_path_factory, value):
+    path = tmp_path_factory.mktemp("file") / "a.yaml"
+    path.write_text(yaml.safe_dump(value))
+    assert read_yaml(path) == yaml.safe_load(path.read_text())
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        *(
+            ("1", 1),
+            ("-2.5", -2.5),
+            ("true", True),
+            ("null", None),
+            ("[a, 1]", ["a", 1]),
+            ("{a: 1}", {"a": 1}),
+        ),
+        *(("074", "074"), ("2024-01-01", "2024-01-01"), ("1:30", "1:30"), ("<<", "<<"), ("=", "=")),
+    ],
+)
+def test_settings_that_only_look_like_numbers_are_text(text, value):
+    assert parse_setting(text, "--set", "a") == value
+
+
+class Place(NamedTuple):
+    name: str
+    index: int
+
+
+@dataclass(frozen=True)
+class Part:
+    share: float
+    sides: tuple[int, ...] = ()
+
+    def __post_init__(self):
+        if self.share > 1:
+            raise ValueError(f"share is {self.share}; up to 1")
+
+
+@dataclass(frozen=True)
+class Document:
+    count: int
+    parts: dict[str, Part] = field(default_factory=dict)
+    places: tuple[Place, ...] = ()
+    kind: Literal["a", "b"] = "a"
+    optional: Part | None = None
+
+
+def test_a_document_becomes_its_dataclass(tmp_path):
+    value = {
+        "count": 1,
+        "parts": {"x": {"share": 1, "sides": [2, 3]}},
+        "places": [["n", 4]],
+        "optional": None,
+    }
+    write_json(tmp_path / "a.json", value)
+    assert read_document(tmp_path / "a.json", Document) == Document(
+        1, {"x": Part(1.0, (2, 3))}, (Place("n", 4),)
+    )
+    assert checked({**value, "more": 1}, Document, "a.json", foreign=True).count == 1
+
+
+@pytest.mark.parametrize(
+    ("value", "key"),
+    [
+        ({}, "count"),
+        ([], ""),
+        ({"count": True}, "count"),
+        ({"count": 1.0}, "count"),
+        ({"count": "1"}, "count"),
+        ({"count": 1, "parts": {"x": {"share": "1"}}}, "parts.x.share"),
+        ({"count": 1, "parts": {"x": {"share": 2}}}, "parts.x"),
+        ({"count": 1, "parts": {"x": {"share": 1, "sides": [1, 2.5]}}}, "parts.x.sides[1]"),
+        ({"count": 1, "places": [["n", 1], ["n"]]}, "places[1][1]"),
+        ({"count": 1, "kind": "c"}, "kind"),
+        ({"count": 1, "optional": 3}, "optional"),
+        ({"count": 1, "parts": {"x" * 10**6: None}}, None),
+        ({"count": "\x1b[31m" * 10**6}, "count"),
+        ({"count": math.nan}, ""),
+    ],
+    ids=lambda value: str(value)[:30],
+)
+def test_a_wrong_entry_is_named_by_its_dotted_key(value, key):
+    with pytest.raises(InputError) as caught:
+        checked(value, Document, "a.json")
+    assert key is None or caught.value.key == key
+    assert str(caught.value).isprintable()
+    assert len(str(caught.value)) < 1000
+
+
+@pytest.mark.parametrize(
+    ("value", "near"),
+    [
+        ({"count": 1, "part": {}}, "parts"),
+        ({"count": 1, "parts": {"x": {"share": 1, "side": []}}}, "sides"),
+        ({"count": 1, "optional": {"share": 1, "side": []}}, "sides"),
+    ],
+)
+def test_an_unknown_entry_is_answered_with_the_nearest(value, near):
+    with pytest.raises(InputError, match=f"Did you mean '{near}'"):
+        checked(value, Document, "a.json")
+
+
+def test_json_inside_another_file_is_named_with_it():
+    with pytest.raises(InputError, match="a.npz, settings: expected valid JSON"):
+        parse_json("{", "a.npz", "settings")

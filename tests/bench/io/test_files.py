@@ -1,0 +1,328 @@
+import errno
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from headbench.bench.errors import InputError
+from headbench.bench.io import files
+from headbench.bench.io.files import (
+    GROUP_FILES,
+    MAX_NAME_BYTES,
+    TEMPORARY,
+    atomic_path,
+    check_name,
+    digest,
+    digest_file,
+    flush_renames,
+    grouped_writes,
+    output_inside,
+    refuse_links,
+    remove_dead_temporaries,
+    write_json,
+    write_text,
+)
+
+
+def test_a_failed_write_leaves_the_old_file_and_no_rubbish(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+
+    def write_half():
+        with atomic_path(path) as temporary:
+            temporary.write_text("half")
+            raise RuntimeError("killed")
+
+    with pytest.raises(RuntimeError, match="killed"):
+        write_half()
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_results_are_readable_whatever_their_writer_makes_of_the_file(tmp_path):
+    """safetensors writes beside the file it is given and renames, which leaves the mode of a private file."""
+    path = tmp_path / "a.txt"
+    with atomic_path(path) as temporary:
+        private = temporary.with_name("private")
+        private.write_text("new")
+        private.chmod(0o600)
+        private.replace(temporary)
+    usual = tmp_path / "b.txt"
+    usual.write_text("usual")
+    assert path.stat().st_mode == usual.stat().st_mode
+
+
+def test_the_temporary_name_keeps_the_suffix(tmp_path):
+    with atomic_path(tmp_path / "new" / "a.png") as temporary:
+        assert temporary.suffix == ".png"
+
+
+def test_digests_tell_values_types_shapes_and_order_apart():
+    values = [
+        (np.zeros(4),),
+        (np.zeros((2, 2)),),
+        (np.zeros(4, np.float32),),
+        (np.ones(4),),
+        ("ab", "c"),
+        ("a", "bc"),
+        ({"a": 1},),
+        ({"a": 2},),
+    ]
+    assert len({digest(*value) for value in values}) == len(values)
+    assert digest({"a": 1, "b": 2}) == digest({"b": 2, "a": 1})
+
+
+def test_file_digest_is_sha256(tmp_path):
+    (tmp_path / "a").write_bytes(b"abc")
+    # FIPS 180-2, example B.1
+    assert digest_file(tmp_path / "a") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+
+
+def test_json_takes_numpy(tmp_path):
+    write_json(tmp_path / "a.json", {"x": np.float32(0.5), "y": np.arange(2), "p": tmp_path, "s": {"b", "a"}})
+    assert '"x": 0.5' in (tmp_path / "a.json").read_text()
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "",
+        ".",
+        "..",
+        ".hidden",
+        "../up",
+        "/root",
+        "a/b",
+        "a\\b",
+        "C:",
+        "a\0",
+        "a\n",
+        "x" * (MAX_NAME_BYTES + 1),
+    ],
+)
+def test_a_name_that_could_leave_its_folder_is_refused(name):
+    with pytest.raises(InputError) as caught:
+        check_name(name, "capture.json", "subject")
+    assert (caught.value.file, caught.value.key) == ("capture.json", "subject")
+
+
+@given(st.text(min_size=1, max_size=200))
+def test_an_accepted_name_stays_directly_in_its_folder(tmp_path_factory, name):
+    try:
+        check_name(name, "capture.json", "subject")
+    except InputError:
+        return
+    folder = tmp_path_factory.getbasetemp()
+    assert os.path.dirname(os.path.normpath(folder / name)) == str(folder)
+
+
+@pytest.mark.parametrize("name", ["074", "EMO-1-shout+laugh", "222200037", "Kopf 3 (neu)", "面", "a..b"])
+def test_names_of_the_field_are_accepted(name):
+    assert check_name(name, "", "") == name
+
+
+def test_a_disk_that_fills_up_is_told_with_the_file_meant(tmp_path):
+    with pytest.raises(OSError, match="a.png") as caught, atomic_path(tmp_path / "a.png"):
+        raise OSError(errno.ENOSPC, "No space left on device")
+    assert caught.value.filename == str(tmp_path / "a.png")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_error_of_ones_own_keeps_its_words(tmp_path):
+    with pytest.raises(OSError, match="^nothing of the system$"), atomic_path(tmp_path / "a.png"):
+        raise OSError("nothing of the system")
+
+
+@pytest.fixture
+def disk(monkeypatch):
+    """What is flushed and renamed, in order; renames of a folder's files reach the disk with the folder."""
+    events = []
+    replace = os.replace
+    monkeypatch.setattr(files, "_flush", lambda path: events.append(("flush", Path(path).name)))
+    monkeypatch.setattr(os, "replace", lambda a, b: (events.append(("rename", b.name)), replace(a, b)))
+    flush_renames()
+    events.clear()
+    return events
+
+
+def names(events):
+    return [(what, "temporary" if name.startswith(TEMPORARY) else name) for what, name in events]
+
+
+def test_a_file_is_on_disk_before_its_rename(tmp_path, disk):
+    write_text(tmp_path / "folder" / "a", "a")
+    assert names(disk) == [("flush", "temporary"), ("flush", tmp_path.name), ("rename", "a")]
+
+
+def test_earlier_renames_are_on_disk_before_later_ones(tmp_path, disk):
+    for name in ("x", "y"):
+        (tmp_path / name).mkdir()
+    write_text(tmp_path / "x" / "a", "a")
+    disk.clear()
+    write_text(tmp_path / "y" / "claims-a", "b")
+    assert sorted(names(disk)[:2]) == [("flush", "temporary"), ("flush", "x")]
+    assert names(disk)[2:] == [("rename", "claims-a")]
+    flush_renames()
+    assert names(disk)[3:] == [("flush", "y")]
+
+
+def test_a_group_is_flushed_at_once_and_renamed_in_order(tmp_path, disk):
+    written = [f"{number:03d}" for number in range(GROUP_FILES + 2)]
+    with grouped_writes():
+        for name in written:
+            write_text(tmp_path / name, name)
+        assert [name for what, name in disk if what == "rename"] == written[:GROUP_FILES]
+    assert names(disk)[:GROUP_FILES] == [("flush", "temporary")] * GROUP_FILES
+    assert [name for what, name in disk if what == "rename"] == written
+    assert names(disk)[-1] == ("flush", tmp_path.name)
+    assert [path.read_text() for path in sorted(tmp_path.iterdir())] == written
+
+
+def test_a_group_that_fails_keeps_what_was_written_before(tmp_path):
+    def write():
+        with grouped_writes():
+            write_text(tmp_path / "a", "a")
+            with atomic_path(tmp_path / "b"):
+                raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        write()
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
+
+
+def test_a_flush_that_fails_leaves_the_old_file_and_names_it(tmp_path, monkeypatch):
+    def fail(path):
+        raise OSError(errno.EIO, "Input/output error")
+
+    (tmp_path / "a").write_text("old")
+    monkeypatch.setattr(files, "_flush", fail)
+    with pytest.raises(OSError, match="Input/output") as caught:
+        write_text(tmp_path / "a", "new")
+    assert caught.value.filename == str(tmp_path / "a")
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"a": "old"}
+
+
+def test_a_folder_that_cannot_be_flushed_fails_one_write_and_not_those_after_it(tmp_path, monkeypatch):
+    for name in ("bad", "good"):
+        (tmp_path / name).mkdir()
+    flush_renames()
+    write_text(tmp_path / "bad" / "a", "a")  # its rename waits for the next flush
+    flush = files._flush
+
+    def fail(path):
+        if Path(path).name == "bad":
+            raise OSError(errno.EIO, "Input/output error")
+        flush(path)
+
+    monkeypatch.setattr(files, "_flush", fail)
+    with pytest.raises(OSError, match="Input/output") as caught:
+        write_text(tmp_path / "good" / "b", "b")
+    assert caught.value.filename == str(tmp_path / "bad")
+    write_text(tmp_path / "good" / "c", "c")
+    assert [path.name for path in (tmp_path / "good").iterdir()] == ["c"]
+
+
+WRITER = """
+import sys, time
+from pathlib import Path
+from headbench.bench.io.files import atomic_path
+with atomic_path(Path(sys.argv[1])) as temporary:
+    temporary.write_text("half")
+    print(temporary, flush=True)
+    time.sleep(60)
+"""
+
+
+@pytest.fixture
+def writer(tmp_path):
+    """A process in the middle of writing ``a.txt``, and its temporary file."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", WRITER, str(tmp_path / "a.txt")], stdout=subprocess.PIPE, text=True
+    )
+    yield process, Path(process.stdout.readline().strip())
+    process.kill()
+    process.wait()
+    process.stdout.close()
+
+
+@pytest.mark.parametrize("search", [remove_dead_temporaries, lambda folder: write_text(folder / "b.txt", "")])
+def test_temporary_files_of_dead_processes_alone_are_removed(tmp_path, writer, search, monkeypatch):
+    process, temporary = writer
+    (tmp_path / f"{TEMPORARY}link").symlink_to(__file__)
+    monkeypatch.setattr(files, "_searched", set())
+    search(tmp_path)
+    assert temporary.exists()
+    process.kill()
+    process.wait()
+    monkeypatch.setattr(files, "_searched", set())
+    search(tmp_path)
+    assert not temporary.exists()
+    assert Path(__file__).exists()
+
+
+def test_two_writers_of_a_file_leave_one_whole_content(tmp_path):
+    with atomic_path(tmp_path / "a") as one, atomic_path(tmp_path / "a") as other:
+        one.write_text("one")
+        other.write_text("other")
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("a", "one")]
+
+
+def test_a_link_is_replaced_and_its_target_left_alone(tmp_path):
+    (tmp_path / "victim").write_text("victim")
+    (tmp_path / "a").symlink_to(tmp_path / "victim")
+    write_text(tmp_path / "a", "ours")
+    assert (tmp_path / "victim").read_text() == "victim"
+    assert not (tmp_path / "a").is_symlink()
+
+
+def test_a_file_that_lies_elsewhere_too_keeps_its_mode(tmp_path):
+    (tmp_path / "original").touch(0o400)
+    with atomic_path(tmp_path / "a") as temporary:
+        temporary.unlink()
+        os.link(tmp_path / "original", temporary)
+    assert (tmp_path / "original").stat().st_mode & 0o777 == 0o400
+
+
+@pytest.mark.parametrize("depth", ["link/a.txt", "link/new/folder/a.txt", "below/link/a.txt"])
+def test_nothing_is_written_through_a_folder_that_leads_out(tmp_path, depth):
+    root, outside = tmp_path / "root", tmp_path / "outside"
+    outside.mkdir()
+    for link in (root / "link", root / "below" / "link"):
+        link.parent.mkdir(parents=True, exist_ok=True)
+        link.symlink_to(outside)
+    with output_inside(root), pytest.raises(InputError, match="a link to .*outside"):
+        write_text(root / depth, "")
+    assert list(outside.iterdir()) == []
+
+
+def test_an_output_folder_may_itself_be_a_link(tmp_path):
+    (tmp_path / "disk" / "b").mkdir(parents=True)
+    (tmp_path / "root").symlink_to(tmp_path / "disk")
+    (tmp_path / "disk" / "inside").symlink_to(tmp_path / "disk" / "b")
+    with output_inside(tmp_path / "root"):
+        write_text(tmp_path / "root" / "a", "a")
+        write_text(tmp_path / "root" / "inside" / "a", "a")
+    assert (tmp_path / "disk" / "b" / "a").exists()
+
+
+@pytest.mark.parametrize(("target", "refused"), [("../outside", True), ("a", False), ("none", False)])
+def test_links_that_lead_out_are_refused_for_writers_of_others(tmp_path, target, refused):
+    folder = tmp_path / "avatar"
+    folder.mkdir()
+    (folder / "link").symlink_to(target)
+    if refused:
+        with pytest.raises(InputError, match="a link out of it"):
+            refuse_links(folder)
+    else:
+        refuse_links(folder)
+
+
+def test_a_device_is_not_replaced(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(FileExistsError, match="Not a regular file"):
+        write_text(tmp_path / "pipe", "")

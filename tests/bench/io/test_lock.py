@@ -1,0 +1,113 @@
+"""The lock of a folder against real processes: held, released, and freed by a kill."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from headbench.bench.errors import InputError
+from headbench.bench.io.files import TEMPORARY
+from headbench.bench.io.lock import LOCK_FILE, locked
+from headbench.bench.progress import log_to
+
+HOLDER = """
+import sys, time
+from pathlib import Path
+from headbench.bench.io.lock import locked
+with locked(Path(sys.argv[1])):
+    print("held", flush=True)
+    time.sleep(60)
+"""
+
+
+@pytest.fixture
+def holder(tmp_path):
+    process = subprocess.Popen(
+        [sys.executable, "-c", HOLDER, str(tmp_path)], stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout.readline() == "held\n"
+    yield process
+    process.kill()
+    process.wait()
+    process.stdout.close()
+
+
+def test_a_folder_that_another_process_works_in_is_refused_naming_it(tmp_path, holder):
+    with (
+        pytest.raises(InputError, match=rf"run\.lock.*process {holder.pid} on .*, since 20"),
+        locked(tmp_path),
+    ):
+        pytest.fail("entered a folder that was taken")
+    assert (tmp_path / LOCK_FILE).exists()  # the owner's, untouched
+
+
+def test_a_killed_owner_keeps_nobody_out(tmp_path, holder):
+    holder.send_signal(signal.SIGKILL)
+    holder.wait()
+    assert (tmp_path / LOCK_FILE).exists()
+    with locked(tmp_path):
+        assert json.loads((tmp_path / LOCK_FILE).read_text())["process"] == os.getpid()
+
+
+def test_the_lock_is_gone_after_the_block_and_after_an_error_in_it(tmp_path):
+    with pytest.raises(RuntimeError), locked(tmp_path):
+        raise RuntimeError("in the block")
+    assert list(tmp_path.iterdir()) == []
+    with locked(tmp_path):
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_one_process_does_not_enter_twice(tmp_path):
+    with locked(tmp_path), pytest.raises(InputError, match=f"process {os.getpid()}"), locked(tmp_path):
+        pytest.fail("entered twice")
+
+
+def test_a_lock_file_of_nonsense_is_no_obstacle_and_tells_nothing(tmp_path):
+    (tmp_path / LOCK_FILE).write_text("[1, 2")
+    with locked(tmp_path):
+        (tmp_path / LOCK_FILE).write_text("[1, 2")
+        with pytest.raises(InputError, match="does not tell its number"), locked(tmp_path):
+            pytest.fail("entered twice")
+
+
+@pytest.mark.parametrize("name", [LOCK_FILE, "run.log"])
+def test_lock_and_log_are_never_links(tmp_path, name):
+    victim, folder = tmp_path / "victim", tmp_path / "run"
+    victim.write_text("victim")
+    folder.mkdir()
+    (folder / name).symlink_to(victim)
+    with (
+        pytest.raises(InputError, match="expected a file, found a link"),
+        log_to(folder / "run.log"),
+        locked(folder),
+    ):
+        pytest.fail("went on")
+    assert victim.read_text() == "victim"
+
+
+def test_what_dead_processes_left_is_removed_under_the_lock(tmp_path):
+    (tmp_path / "below").mkdir()
+    left = tmp_path / "below" / f"{TEMPORARY}x.png"
+    left.touch()
+    with locked(tmp_path):
+        assert not left.exists()
+
+
+def test_a_lock_beside_leaves_the_folder_empty(tmp_path):
+    with locked(tmp_path / "new", beside=True):
+        assert [path.name for path in tmp_path.iterdir()] == [".new.lock"]
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("there", [False, True])
+def test_a_new_folder_in_which_nothing_came_of_it_is_removed(tmp_path, there):
+    folder = tmp_path / "out"
+    if there:
+        folder.mkdir()
+    with pytest.raises(RuntimeError), locked(folder):
+        raise RuntimeError
+    assert folder.exists() == there

@@ -1,0 +1,215 @@
+"""A run that is started again with files damaged makes them again, says so in one line, and ends as an unbroken one."""
+
+import dataclasses
+import json
+import logging
+
+import cv2
+import pytest
+
+from headbench.bench import cli
+from headbench.bench.errors import InputError
+from headbench.bench.io.documents import read_json
+from headbench.bench.io.files import digest_file, write_json
+from headbench.bench.io.frames import read_png, write_png
+from headbench.bench.runner import run as runner
+from headbench.bench.runner import stages
+from headbench.bench.runner.config import RunConfig
+from headbench.bench.runner.store import RunFolder
+
+FRAME = "renders/novel_view/EMO_00001_b.png"
+AVATAR = "avatar/level.txt"
+
+
+@pytest.fixture
+def config(toy, tmp_path, monkeypatch):
+    monkeypatch.setattr(runner, "write_reports", lambda folder: [])
+    monkeypatch.setattr(logging.getLogger("headbench"), "propagate", True)
+    (tmp_path / "data" / "subject1").mkdir(parents=True)
+    return RunConfig(
+        data=str(tmp_path / "data"),
+        out=str(tmp_path / "run"),
+        methods=("toy_plugin:METHOD",),
+        preset="smoke",
+        metrics=("psnr", "toy_plugin:FILES"),
+        reader="toy_plugin:READER",
+    )
+
+
+@pytest.fixture
+def run(config, toy):
+    """A finished run: its folder, its cell's folder, its rows."""
+    rows = runner.run(config)
+    toy.FITS.clear()
+    folder = RunFolder(runner.Path(config.out))
+    return folder.root, folder.cell("subject1", "toy", 0).folder, rows
+
+
+def warnings(caplog):
+    return [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+
+
+def altered(path):
+    write_png(path, read_png(path) + 3)
+
+
+def set_json(**values):
+    return lambda path: write_json(path, {**read_json(path), **values})
+
+
+DAMAGE = {
+    "empty": lambda path: path.write_bytes(b""),
+    "cut": lambda path: path.write_bytes(path.read_bytes()[:-5]),
+    "noise": lambda path: path.write_bytes(bytes(range(256))),
+    "gone": lambda path: path.unlink(),
+    "altered": altered,
+    "longer": lambda path: path.write_bytes(path.read_bytes() + b"5"),
+    "types": set_json(fingerprint=5, status=[]),
+    "names": set_json(files={"../../../other": "0"}),
+    "format": set_json(further="entry"),
+}
+CASES = [
+    *((FRAME, how, "rendered again", False) for how in ("empty", "cut", "noise", "gone", "altered")),
+    *((AVATAR, how, "trained again", True) for how in ("empty", "cut", "gone", "longer")),
+    *(("rows.parquet", how, "measured again", False) for how in ("empty", "cut", "noise", "gone", "longer")),
+    *(("fit.json", how, "made again", True) for how in ("empty", "cut", "types", "names", "format")),
+    *(("digests.json", how, "made again", False) for how in ("empty", "noise", "types", "names")),
+    *(("measure.json", how, "made again", False) for how in ("empty", "cut", "types", "format")),
+]
+
+
+@pytest.mark.parametrize(("name", "how", "remedy", "trains"), CASES)
+def test_a_damaged_file_is_made_again_and_named(run, config, toy, caplog, name, how, remedy, trains):
+    root, cell, rows = run
+    frame = digest_file(cell / FRAME)
+    DAMAGE[how](cell / name)
+    again = runner.run(config)
+    (told,) = warnings(caplog)
+    assert str(cell / name) in told
+    assert remedy in told
+    assert again._table.equals(rows._table)
+    assert digest_file(cell / FRAME) == frame
+    assert toy.FITS == ["subject1"] * trains
+    assert cli.main(["verify", str(root), "--trust"]) == 0
+    caplog.clear()
+    runner.run(config)
+    assert warnings(caplog) == []
+
+
+@pytest.mark.parametrize("name", ["run.json", "rows.parquet", "run.log"])
+@pytest.mark.parametrize("how", ["empty", "noise", "gone"])
+def test_damaged_files_of_the_whole_run_are_written_over(run, config, name, how):
+    root, _, rows = run
+    (root / name).touch()
+    DAMAGE[how](root / name)
+    assert runner.run(config)._table.equals(rows._table)
+    assert cli.main(["verify", str(root), "--trust"]) == 0
+
+
+def test_many_damaged_frames_are_told_in_one_line(run, config, caplog):
+    _, cell, _ = run
+    for path in cell.glob("renders/*/*.png"):
+        path.write_bytes(b"")
+    runner.run(config)
+    (told,) = warnings(caplog)
+    assert "is empty, 4 more are damaged; rendered again" in told
+
+
+def test_what_depends_on_a_remade_file_is_made_again(run, config, toy, monkeypatch):
+    """Another training gives another avatar: its frames, and what was measured of them, are its own."""
+    root, cell, rows = run
+    (cell / AVATAR).unlink()
+    monkeypatch.setattr(
+        toy.ToyMethod, "__init__", lambda self, config: setattr(self, "config", toy.ToyConfig(0.75))
+    )
+    again = runner.run(config)
+    assert not again._table.equals(rows._table)
+    assert (read_png(cell / FRAME) == 191).all()
+    assert cli.main(["verify", str(root), "--trust"]) == 0
+
+
+def test_a_renderer_that_renders_otherwise_is_measured_again(run, config, toy, monkeypatch):
+    root, cell, rows = run
+    (cell / FRAME).unlink()
+    original = toy.ToyAvatar.render
+
+    def darker(self, *arguments):
+        frame = original(self, *arguments)
+        return frame._replace(rgb=frame.rgb / 2)
+
+    monkeypatch.setattr(toy.ToyAvatar, "render", darker)
+    again = runner.run(config)
+    assert (again._table["value"] != rows._table["value"]).sum() == 1
+    assert again._table.drop(columns="value").equals(rows._table.drop(columns="value"))
+    assert cli.main(["verify", str(root), "--trust"]) == 0
+
+
+def test_frames_without_a_record_are_rendered_again(config, toy, monkeypatch, caplog):
+    whole = runner.run(dataclasses.replace(config, out=config.out + "-whole"))
+    original = toy.ToyAvatar.render
+    rendered = []
+
+    def killed(self, *arguments):
+        if len(rendered) == 3:
+            raise KeyboardInterrupt
+        rendered.append(1)
+        return original(self, *arguments)
+
+    monkeypatch.setattr(stages, "RECORD_EVERY_S", -1.0)
+    with monkeypatch.context() as patch:
+        patch.setattr(toy.ToyAvatar, "render", killed)
+        with pytest.raises(KeyboardInterrupt):
+            runner.run(config)
+    cell = RunFolder(runner.Path(config.out)).cell("subject1", "toy", 0)
+    record = cell.stage("digests")
+    assert len(record["files"]) == 3
+    del record["files"][FRAME]
+    write_json(cell.folder / "digests.json", record)
+    (cell.folder / FRAME).write_bytes(b"half a frame")
+    rendered.clear()
+    monkeypatch.setattr(toy.ToyAvatar, "render", lambda *a: rendered.append(1) or original(*a))
+    assert runner.run(config)._table.equals(whole._table)
+    assert len(rendered) == 3
+    assert warnings(caplog) == []
+
+
+def test_a_training_whose_checkpoint_is_damaged_starts_over(config, toy, monkeypatch, caplog):
+    original = toy.ToyMethod.fit
+
+    def fit(self, clip, out, budget, **settings):
+        checkpoint = out / "checkpoint"
+        if checkpoint.exists() and checkpoint.read_text() != "whole":
+            raise InputError(checkpoint, "", "a checkpoint", "noise")
+        out.mkdir(parents=True, exist_ok=True)
+        checkpoint.write_text("half")
+        if not self.config.fail:
+            checkpoint.unlink()
+        return original(self, clip, out, budget, **settings)
+
+    monkeypatch.setattr(toy.ToyMethod, "fit", fit)
+    rows = runner.run(config)
+    cell = RunFolder(runner.Path(config.out)).cell("subject1", "toy", 0)
+    state = cell.stage("fit")
+    cell.begin("fit", state["fingerprint"])
+    (cell.avatar / "checkpoint").write_text("half")
+    assert runner.run(config)._table.equals(rows._table)
+    (told,) = warnings(caplog)
+    assert f"{cell.avatar / 'checkpoint'}: expected a checkpoint, found noise" in told
+    assert "trained from the start" in told
+
+
+def test_verify_names_frames_that_cannot_be_scored(run, capsys):
+    root, cell, _ = run
+    (cell / FRAME).write_bytes(b"noise")
+    other = cell / "renders/self_reenactment/FREE_00003_a.png"
+    other.write_bytes(cv2.imencode(".png", read_png(other)[:3])[1].tobytes())
+    assert cli.main(["verify", str(root), "--trust", "--json"]) == 1
+    found = json.loads(capsys.readouterr().out)["mismatches"]
+    assert [entry["file"] for entry in found] == [str(cell / FRAME), str(other)]
+
+
+def test_verify_wants_a_digest_of_each_file_of_an_avatar(run, capsys):
+    root, cell, _ = run
+    set_json(files={})(cell / "fit.json")
+    assert cli.main(["verify", str(root), "--trust"]) == 1
+    assert f"{cell / 'fit.json'}, files, {AVATAR}: expected a digest, found none" in capsys.readouterr().out

@@ -1,0 +1,157 @@
+"""Where a run's files are looked for, and which of the modules that it names are imported."""
+
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from headbench.bench import cli
+from headbench.bench.errors import InputError
+from headbench.bench.io.documents import read_json
+from headbench.bench.io.files import write_json
+from headbench.bench.runner import run as runner
+from headbench.bench.runner.captures import open_run_clips, run_configuration
+from headbench.bench.runner.config import RunConfig
+from headbench.bench.runner.options import RunOptions
+
+TRUSTED = RunOptions(trust=True)
+
+
+@pytest.fixture
+def run(toy, tmp_path, monkeypatch):
+    """A run made in a folder of its own: run, capture and head model by relative paths."""
+    monkeypatch.setattr(runner, "write_reports", lambda folder: [])
+    monkeypatch.setattr(toy, "read", with_head(toy.ToyClip))
+    home = tmp_path / "home"
+    (home / "data" / "subject1").mkdir(parents=True)
+    for name in ("head.npz", "other.npz"):
+        (home / name).write_text(name)
+    with monkeypatch.context() as patch:
+        patch.chdir(home)
+        runner.run(
+            RunConfig(
+                data="data",
+                out="run",
+                methods=("toy_plugin:METHOD",),
+                preset="smoke",
+                metrics=("psnr",),
+                reader="toy_plugin:READER",
+                reader_settings={"head": "head.npz"},
+                heads={"other": "other.npz"},
+            )
+        )
+    return home / "run"
+
+
+def with_head(clip_type):
+    """A reader whose fingerprint depends on what the capture and the head model hold."""
+
+    def read(path, head: str | Path | None = None):
+        clip = clip_type(path)
+        clip.fingerprint += Path(head).read_text() + ",".join(sorted(os.listdir(path)))
+        return clip
+
+    return read
+
+
+def test_a_run_records_where_its_files_lie_from_its_folder(run):
+    paths = read_json(run / "run.json")["paths"]
+    assert paths == {
+        "data": "../data",
+        "reader_settings.head": "../head.npz",
+        "heads.other": "../other.npz",
+    }
+
+
+def test_a_run_works_from_any_directory_and_after_a_move(run, tmp_path, monkeypatch):
+    assert cli.main(["verify", str(run), "--trust"]) == 0
+    run.parent.rename(tmp_path / "moved")
+    monkeypatch.chdir(tmp_path / "moved" / "run")
+    assert cli.main(["verify", ".", "--trust"]) == 0
+    config, _ = open_run_clips(Path(), TRUSTED)
+    assert config.data == str(tmp_path / "moved" / "data")
+    assert config.heads == {"other": str(tmp_path / "moved" / "other.npz")}
+
+
+def test_of_two_captures_that_of_the_run_is_taken(run, tmp_path, monkeypatch):
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (run.parent / "data").rename(elsewhere / "data")
+    (run.parent / "data" / "subject1").mkdir(parents=True)
+    (run.parent / "data" / "subject1" / "another.png").touch()
+    monkeypatch.chdir(elsewhere)
+    config, _ = open_run_clips(run, TRUSTED)
+    assert config.data == "data"
+    (elsewhere / "data").rename(elsewhere / "gone")
+    with pytest.raises(InputError, match="found another .*Name the folder of the capture with --data"):
+        open_run_clips(run, TRUSTED)
+    assert cli.main(["verify", str(run), "--trust"]) == 1
+
+
+@pytest.mark.parametrize(
+    ("gone", "key", "option"),
+    [("data", "data", "--data"), ("head.npz", "reader_settings.head", "--head"), ("other.npz", "heads", "")],
+)
+def test_what_is_gone_is_told_with_places_and_option(run, tmp_path, capsys, gone, key, option):
+    (run.parent / gone).rename(tmp_path / gone)
+    assert cli.main(["verify", str(run), "--trust"]) == 3
+    told = capsys.readouterr().out
+    assert f"configuration.{key}" in told
+    assert f"expected {run.parent / gone} or {gone}, found neither" in told
+    assert option in told
+    if option:
+        assert cli.main(["verify", str(run), "--trust", option, str(tmp_path / gone)]) == 0
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"methods": ["stranger:SPEC"]},
+        {"metrics": ["stranger:SPEC"]},
+        {"metric_profiles": ["stranger:SPEC"]},
+        {"reader": "stranger:SPEC"},
+    ],
+)
+def test_a_module_that_a_run_names_is_not_imported(run, monkeypatch, tmp_path, capsys, change):
+    (tmp_path / "stranger.py").write_text("")
+    monkeypatch.syspath_prepend(tmp_path)
+    record = read_json(run / "run.json")
+    registered = {"methods": ["ga"], "metrics": ["psnr"], "reader": "ga", "reader_settings": {}}
+    record["configuration"] |= registered | change
+    for entry in (*record["metrics"], *record["methods"]):
+        entry["implementation"] = "stranger:Class"
+    write_json(run / "run.json", record)
+    for command, code in (
+        (["verify"], 3),
+        (["sweep"], 2),
+        (["extremes"], 2),
+        (["reenact"], 2),
+        (["evaluate", str(run), "--out", str(tmp_path / "out"), "--like"], 2),
+    ):
+        assert cli.main([*command, str(run)]) == code
+        told = "".join(capsys.readouterr())
+        assert f"configuration.{next(iter(change))}" in told
+        assert "--trust" in told
+        assert "'stranger:SPEC'" in told
+    assert cli.main(["table", str(run)]) in (0, 2)
+    assert "stranger" not in sys.modules
+
+
+def test_definitions_come_from_the_registry_never_from_the_run(run, monkeypatch, tmp_path):
+    (tmp_path / "stranger.py").write_text("")
+    monkeypatch.syspath_prepend(tmp_path)
+    record = read_json(run / "run.json")
+    record["metrics"][0]["implementation"] = "stranger:psnr"
+    write_json(run / "run.json", record)
+    assert cli.main(["verify", str(run), "--trust"]) == 0
+    assert cli.main(["table", str(run)]) == 0
+    assert "stranger" not in sys.modules
+
+
+def test_a_run_of_an_earlier_version_is_found_where_it_says(run, monkeypatch):
+    record = read_json(run / "run.json")
+    del record["paths"]
+    write_json(run / "run.json", record)
+    monkeypatch.chdir(run.parent)
+    assert run_configuration(run, TRUSTED).data == "data"

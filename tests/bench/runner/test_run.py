@@ -1,0 +1,383 @@
+"""The harness on toy plug-ins: what a run leaves, resumes, refuses and records."""
+
+import dataclasses
+import json
+import math
+import types
+
+import pandas as pd
+import pytest
+
+from headbench.bench import cli
+from headbench.bench.errors import HeadbenchError, InputError
+from headbench.bench.io.documents import read_json
+from headbench.bench.io.lock import locked
+from headbench.bench.registry import Plugin
+from headbench.bench.runner import run as runner
+from headbench.bench.runner.config import RunConfig
+from headbench.bench.runner.store import RunFolder
+from headbench.bench.specs import ReportSpec
+
+
+@pytest.fixture
+def capture(tmp_path):
+    for name in ("subject1", "subject2"):
+        (tmp_path / "data" / name).mkdir(parents=True)
+    return tmp_path / "data"
+
+
+@pytest.fixture
+def config(toy, capture, tmp_path, monkeypatch):
+    monkeypatch.setattr(runner, "write_reports", lambda folder: [])
+    return RunConfig(
+        data=str(capture),
+        out=str(tmp_path / "out"),
+        methods=("toy_plugin:METHOD",),
+        preset="smoke",
+        metrics=("toy_plugin:ERROR", "toy_plugin:FILES"),
+        reader="toy_plugin:READER",
+    )
+
+
+def rows_of(config):
+    """Table of the rows of a run."""
+    runner.run(config)
+    return pd.read_parquet(RunFolder(runner.Path(config.out)).rows)
+
+
+def changed(config, **changes):
+    return dataclasses.replace(config, **changes)
+
+
+def test_rows_hold_every_frame_of_every_task_keyed(config):
+    rows = rows_of(config)
+    errors = rows[rows["metric"] == "error"]
+    assert len(errors) == 2 * (3 + 2)  # subjects x (novel-view + self-reenactment frames)
+    row = errors[
+        (errors["subject"] == "subject2") & (errors["task"] == "novel_view") & (errors["timestep"] == 2)
+    ]
+    # rendered level round(0.5 * 255) = 128 against 40 + 20 + 1
+    assert row["value"].tolist() == [128 - 61]
+    assert row["protocol"].nunique() == 1
+    per_avatar = rows[rows["metric"] == "files"]
+    assert per_avatar["value"].tolist() == [1.0, 1.0]
+    assert (per_avatar["timestep"] == -1).all()
+
+
+def test_the_manifest_names_everything_that_made_the_numbers(config):
+    runner.run(config)
+    record = read_json(RunFolder(runner.Path(config.out)).manifest)
+    assert record["status"] == "done"
+    assert record["methods"][0]["config"] == {"level": 0.5, "fail": False}
+    assert record["methods"][0]["budget"] == {"iterations": 2, "seconds": None}
+    assert [clip["fingerprint"] for clip in record["clips"]] == ["toy-subject1", "toy-subject2"]
+    assert record["clips"][0]["excluded"] == {"subject1/FREE/00004/a": "tongue out"}
+    assert set(record["protocols"]) == {"novel_view", "self_reenactment"}
+    assert record["machine"]["packages"]["numpy"]
+
+
+def test_a_second_run_trains_nothing_again_and_gives_the_same_rows(config, toy):
+    first = rows_of(config)
+    toy.FITS.clear()
+    assert rows_of(config).equals(first)
+    assert toy.FITS == []
+
+
+def test_a_run_killed_in_training_continues(config, toy, monkeypatch):
+    whole = rows_of(changed(config, out=config.out + "-whole"))
+
+    def killed(self, *args, **kwargs):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(toy.ToyAvatar, "render", killed)
+        with pytest.raises(KeyboardInterrupt):
+            runner.run(config)
+    toy.FITS.clear()
+    assert rows_of(config).equals(whole)
+    assert toy.FITS == ["subject2"]  # the first had been trained
+
+
+def test_the_record_of_training_says_how_often_it_was_interrupted(config, toy, monkeypatch):
+    def killed(self, *args, **kwargs):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(toy.ToyMethod, "fit", killed)
+        for _ in range(2):
+            with pytest.raises(KeyboardInterrupt):
+                runner.run(config)
+    runner.run(config)
+    folder = RunFolder(runner.Path(config.out))
+    assert folder.cell("subject1", "toy", 0).stage("fit")["interruptions"] == 2
+    assert folder.cell("subject2", "toy", 0).stage("fit")["interruptions"] == 0
+
+
+def test_a_method_that_looks_at_held_out_frames_fails(config):
+    rows = rows_of(changed(config, methods=("toy_plugin:PEEKING",)))
+    assert set(rows["status"]) == {"failed"}
+    assert rows["reason"].str.contains("not a training frame").all()
+
+
+def test_an_adapter_is_given_the_whole_capture(config, toy, monkeypatch):
+    monkeypatch.setattr(toy, "PEEKING", dataclasses.replace(toy.PEEKING, native=False))
+    rows = rows_of(changed(config, methods=("toy_plugin:PEEKING",)))
+    assert set(rows["status"]) == {"ok"}
+
+
+@pytest.mark.parametrize(
+    ("needs", "fits"),
+    [
+        ({"head_models": ("flame2020", "flame2023")}, False),
+        ({"head_models": ("toy",)}, True),
+        ({"monocular": True}, True),
+        ({"implementation": "toy_plugin:NoSuchClass"}, False),
+    ],
+)
+def test_what_a_method_needs_is_looked_for_before_training(config, toy, monkeypatch, needs, fits):
+    monkeypatch.setattr(toy.ToyClip, "head", types.SimpleNamespace(version="toy"))
+    monkeypatch.setattr(toy, "SAME_NAME", dataclasses.replace(toy.METHOD, name="needy", **needs))
+    both = changed(config, methods=("toy_plugin:METHOD", "toy_plugin:SAME_NAME"))
+    if fits:
+        assert set(rows_of(both)["status"]) == {"ok"}
+        return
+    with pytest.raises(HeadbenchError):
+        runner.run(both)
+    assert toy.FITS == []
+
+
+def test_a_monocular_method_refuses_several_views(config, toy, monkeypatch):
+    class TwoViews(toy.ToyClip):
+        def __init__(self, path):
+            super().__init__(path)
+            self.splits["train"] += tuple(key._replace(camera="c") for key in self.splits["train"])
+
+    monkeypatch.setattr(toy, "read", lambda path: TwoViews(path))
+    monkeypatch.setattr(toy, "METHOD", dataclasses.replace(toy.METHOD, monocular=True))
+    with pytest.raises(InputError, match="3 further views"):
+        runner.run(config)
+    assert toy.FITS == []
+
+
+def test_another_setting_in_the_same_folder_is_refused_before_work(config, toy):
+    runner.run(config)
+    toy.FITS.clear()
+    with pytest.raises(InputError, match="Choose another --out"):
+        runner.run(changed(config, settings={"toy": {"level": 0.75}}))
+    assert toy.FITS == []
+
+
+def test_measuring_something_else_trains_nothing_again(config, toy):
+    runner.run(config)
+    toy.FITS.clear()
+    rows = rows_of(changed(config, metrics=("toy_plugin:ERROR",), tasks=("novel_view",)))
+    assert set(rows["task"]) == {"novel_view"}
+    assert toy.FITS == []
+
+
+def test_a_failing_method_is_recorded_and_the_others_go_on(config):
+    rows = rows_of(changed(config, methods=("toy_plugin:FAILING", "toy_plugin:METHOD")))
+    failed = rows[rows["method"] == "failing"]
+    assert set(failed["status"]) == {"failed"}
+    assert failed["reason"].str.contains("the training diverged").all()
+    assert failed["value"].isna().all()
+    assert (rows[rows["method"] == "toy"]["status"] == "ok").all()
+
+
+def test_a_metric_that_cannot_be_had_is_missing_with_reason_and_said_before_training(config, toy, caplog):
+    import logging
+
+    logging.getLogger("headbench").propagate = True
+    rows = rows_of(changed(config, metrics=("toy_plugin:NOT_HERE", "toy_plugin:ERROR")))
+    missing = rows[rows["metric"] == "not_here"]
+    assert set(missing["status"]) == {"missing"}
+    assert missing["reason"].str.contains("Put them there").all()
+    assert all(math.isnan(v) for v in missing["value"])
+    assert "Absent will be missing" in caplog.records[0].getMessage()
+
+
+def test_what_was_missing_is_measured_once_it_is_there_and_nothing_else_again(config, toy, monkeypatch):
+    counted = []
+    original = toy.mean_error
+    monkeypatch.setattr(toy, "mean_error", lambda *pair: counted.append(1) or original(*pair))
+    both = changed(config, metrics=("toy_plugin:NOT_HERE", "toy_plugin:ERROR"))
+    runner.run(both)
+    counted.clear()
+    monkeypatch.setattr(toy, "not_here", lambda image, truth: 1.0)
+    rows = rows_of(both)
+    assert (rows["status"] == "ok").all()
+    assert len(counted) == 1  # the check before training, nothing else
+
+
+def test_metrics_of_one_measurement_are_taken_together_and_once(config, toy, monkeypatch):
+    counted = []
+    original = toy.files_in_avatar
+    monkeypatch.setattr(toy, "files_in_avatar", lambda *arguments: counted.append(1) or original(*arguments))
+    group = ("toy_plugin:FILES_NONE", "toy_plugin:FILES", "toy_plugin:FILES_LOAD")
+    rows = rows_of(changed(config, metrics=group)).set_index(["subject", "metric"])
+    assert len(counted) == 2  # subjects
+    assert rows.loc[("subject1", "files"), "value"] == 1.0
+    assert rows.loc[("subject1", "files_load"), "value"] == 4.0  # frames of the workload
+    assert rows.loc[("subject1", "files_none"), "status"] == "missing"
+    again = rows_of(changed(config, metrics=group)).set_index(["subject", "metric"])
+    assert again.equals(rows)
+    assert len(counted) == 2
+    runner.run(changed(config, out=config.out + "-less", metrics=group[1:2]))
+    assert len(counted) == 4
+    runner.run(changed(config, out=config.out + "-less", metrics=group))
+    assert len(counted) == 6  # another number of it: all of it anew
+
+
+def test_a_metric_of_training_sees_the_record_of_the_fit(config):
+    rows = rows_of(changed(config, metrics=("toy_plugin:STEPS",)))
+    assert rows["value"].tolist() == [2.0, 2.0]
+    folder = RunFolder(runner.Path(config.out))
+    measured = folder.cell("subject1", "toy", 0).stage("measure")["details"]["steps"]
+    assert measured["peak"] >= folder.cell("subject1", "toy", 0).stage("fit")["memory_before_bytes"] > 0
+
+
+def test_a_preset_and_settings_reach_the_method(config):
+    runner.run(changed(config, preset="fast", settings={"toy": {"budget": {"iterations": 3}}}))
+    record = read_json(RunFolder(runner.Path(config.out)).manifest)
+    assert record["methods"][0]["config"]["level"] == 0.25
+    assert record["methods"][0]["budget"]["iterations"] == 3
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"preset": "smok"}, "Did you mean 'smoke'"),
+        ({"settings": {"toi": {}}}, "Did you mean 'toy'"),
+        ({"settings": {"toy": {"levl": 1}}}, "Did you mean 'level'"),
+        ({"settings": {"toy": {"budget": {"iterations": 0}}}}, "positive"),
+        ({"settings": {"toy": {"budget": 3}}}, "budget: expected a group of settings"),
+        ({"settings": {"toy": 3}}, "settings of toy: expected a group of settings"),
+        ({"methods": ("toy_plugin:METHOD", "toy_plugin:SAME_NAME")}, "each method once"),
+        ({"data": "nowhere"}, "no such folder"),
+        ({"reader_settings": {"shfit": 1}}, "shfit"),
+        ({"methods": ("ors",)}, "Did you mean 'ours'"),
+    ],
+)
+def test_bad_settings_are_refused_before_training(config, toy, changes, match):
+    with pytest.raises(InputError, match=match):
+        runner.run(changed(config, **changes))
+    assert toy.FITS == []
+
+
+@pytest.mark.parametrize(
+    ("part", "match"),
+    [
+        ({"name": "a/b"}, "name and tables"),
+        ({"tables": ("../up",)}, "name and tables"),
+        ({"fingerprint": "x" * 121}, "fingerprint"),
+        ({"region_names": ("a/b",)}, "region: expected a name"),
+    ],
+)
+def test_what_results_could_not_be_read_with_is_refused_before_training(
+    config, toy, monkeypatch, part, match
+):
+    key = next(iter(part))
+    if hasattr(toy.ERROR, key):
+        monkeypatch.setattr(toy, "ERROR", dataclasses.replace(toy.ERROR, **part))
+    else:
+
+        def read(path):
+            clip = toy.ToyClip(path)
+            clip.region_masks = dict
+            vars(clip).update(part)
+            return clip
+
+        monkeypatch.setattr(toy, "read", read)
+    with pytest.raises(InputError, match=match):
+        runner.run(changed(config, metrics=("toy_plugin:ERROR",), regions=part.get("region_names")))
+    assert toy.FITS == []
+
+
+def test_an_unwritable_output_is_refused_before_training(config, toy, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="can be written"):
+        runner.run(changed(config, out=str(tmp_path / "file" / "out")))
+    assert toy.FITS == []
+
+
+def test_a_device_that_is_not_there_is_refused_once_before_training(config, toy, monkeypatch):
+    torch = pytest.importorskip("torch")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(InputError, match="cuda"):
+        runner.run(changed(config, device="cuda:0"))
+    assert toy.FITS == []
+
+
+def test_two_runs_in_one_folder_are_refused_before_training(config, toy):
+    folder = RunFolder(runner.Path(config.out))
+    folder.prepare()
+    with locked(folder.root), pytest.raises(InputError, match="no other process works in"):
+        runner.run(config)
+    assert toy.FITS == []
+    runner.run(config)
+    assert not (folder.root / "run.lock").exists()
+
+
+def test_settings_that_contradict_themselves_are_refused():
+    with pytest.raises(ValueError, match="twice"):
+        RunConfig("a", "b", methods=("ga", "ga"))
+    with pytest.raises(ValueError, match="empty"):
+        RunConfig("a", "b", tasks=())
+
+
+def test_a_damaged_manifest_is_refused(tmp_path):
+    folder = RunFolder(tmp_path)
+    with pytest.raises(InputError, match=r"no run\.json"):
+        folder.read_manifest()
+    folder.manifest.write_text(json.dumps({"format": 99}))
+    with pytest.raises(InputError, match="format"):
+        folder.read_manifest()
+
+
+def test_every_registered_report_is_written_and_a_failing_one_stops_no_other(
+    monkeypatch, toy, tmp_path, caplog
+):
+    caplog.set_level("WARNING", logger="headbench")
+    plugins = [
+        Plugin("broken", "other 1", None, "ImportError: no"),
+        Plugin("failing", "other 1", ReportSpec("failing", "", "toy_plugin:failing_report")),
+        Plugin("text", "other 1", ReportSpec("text", "", "toy_plugin:failing_report", writes=False)),
+        Plugin("mine", "other 1", ReportSpec("mine", "", "toy_plugin:report")),
+    ]
+    monkeypatch.setattr(runner, "discover", lambda group: {plugin.name: plugin for plugin in plugins})
+    assert runner.write_reports(tmp_path) == [tmp_path / "mine.txt"]
+    assert (tmp_path / "mine.txt").read_text() == "mine"
+    messages = [record.getMessage() for record in caplog.records]
+    assert len(messages) == 2
+    assert "'broken' of other 1 is broken: ImportError: no" in messages[0]
+    assert "'failing' of other 1 failed" in messages[1]
+
+
+LINKED = (
+    *("run.json", "rows.parquet", "contact_sheet.png", "tables", "subject1"),
+    *(f"subject1/toy{below}" for below in ("", "/seed-0", "/seed-0/avatar", "/seed-0/avatar/level.txt")),
+    *(
+        f"subject1/toy/seed-0/{name}"
+        for name in ("fit.json", "renders", "renders/novel_view", "rows.parquet")
+    ),
+)
+
+
+@pytest.mark.parametrize("place", LINKED)
+def test_a_received_run_is_not_written_through_its_links(toy, capture, tmp_path, place, capsys):
+    run = RunFolder(tmp_path / "out")
+    words = ["run", "--data", str(capture), "--out", str(run.root), "--methods", "toy_plugin:METHOD"]
+    words += ["--set", "reader=toy_plugin:READER", "--set", "metrics=psnr"]
+    outside = tmp_path / "outside"
+    link = run.root / place
+    link.parent.mkdir(parents=True)
+    if link.suffix:
+        outside.write_text("victim")
+    else:
+        outside.mkdir()
+    link.symlink_to(outside)
+    code = cli.main(words)
+    error = capsys.readouterr().err
+    assert "Traceback" not in error
+    assert outside.read_text() == "victim" if link.suffix else not list(outside.iterdir())
+    assert code == (2 if place.startswith("subject1") else 0), error  # a file is replaced, a report left out

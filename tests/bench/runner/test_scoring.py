@@ -1,0 +1,180 @@
+"""Scoring of stored frames: what a metric is called with, and what becomes of frames it cannot score."""
+
+import math
+import threading
+import types
+
+import numpy as np
+import pytest
+
+from headbench.bench.contracts import FrameKey
+from headbench.bench.errors import HeadbenchError, InputError, UnavailableError
+from headbench.bench.runner import scoring
+from headbench.bench.runner.config import RunConfig, resolve_metrics
+from headbench.bench.runner.scoring import Frames, check_regions, score_frames
+from headbench.bench.specs import MetricSpec
+
+KEYS = [FrameKey("s", sequence, t, "a") for sequence, t in [("EMO", 0), ("EMO", 1), ("EMO", 2), ("FREE", 7)]]
+
+
+class RegionalToyClip:
+    """Truth of level 10 t; the right half is the face, which nobody sees at timestep 2."""
+
+    subject = "s"
+    region_names = ("face", "hair")
+
+    def image(self, key):
+        return np.full((4, 6, 3), 10 * key.timestep, np.uint8)
+
+    def region_masks(self, key, names):
+        half = np.zeros((4, 6), bool)
+        half[:, 3:] = key.timestep != 2
+        return dict.fromkeys(names, half)
+
+
+def render(key):
+    image = np.full((4, 6, 3), 10 * key.timestep + 1, np.uint8)
+    image[:, 3:] += 4
+    return image
+
+
+class Difference:
+    """Mean difference in levels."""
+
+    def __call__(self, image, truth):
+        return float((image.astype(float) - truth).mean())
+
+    def in_regions(self, image, truth, masks):
+        return {n: float((image.astype(float) - truth)[m].mean()) for n, m in masks.items() if m.any()}
+
+
+class Batched(Difference):
+    """The same by batches."""
+
+    def batched(self, pairs):
+        for image, truth in pairs:
+            yield self(image, truth)
+
+
+def change(image, truth, other_image, other_truth):
+    return float(image.astype(float).mean() - other_image.astype(float).mean())
+
+
+def unavailable(image, truth):
+    raise UnavailableError("no weights.", "Get some.")
+
+
+def not_finite(image, truth):
+    return math.inf
+
+
+@pytest.fixture
+def spec(monkeypatch):
+    def make(name, implementation, **fields):
+        monkeypatch.setattr(scoring, "resolve", lambda reference: globals()[reference])
+        return MetricSpec(name, name, "", True, 2, implementation, **fields)
+
+    return make
+
+
+FRAMES = Frames(render, RegionalToyClip())
+
+
+def test_whole_frames_and_regions_are_scored_in_the_order_of_the_keys(spec):
+    scored = score_frames(KEYS, FRAMES, [spec("d", "Difference", regions=True)], ["face"])["d"]
+    full = [s for s in scored if s.region == "full"]
+    assert [(s.key, s.value, s.status) for s in full] == [(key, 3.0, "ok") for key in KEYS]
+    face = [s for s in scored if s.region == "face"]
+    # nobody sees the face at timestep 2: no row there, for any method
+    assert [(s.key.timestep, s.value) for s in face] == [(0, 5.0), (1, 5.0), (7, 5.0)]
+
+
+def test_a_metric_without_regions_is_asked_for_none(spec):
+    scored = score_frames(KEYS, FRAMES, [spec("d", "Difference")], ["face"])["d"]
+    assert {s.region for s in scored} == {"full"}
+
+
+def test_a_metric_by_batches_has_the_same_scores(spec):
+    specs = [spec("one", "Difference"), spec("many", "Batched")]
+    scored = score_frames(KEYS, FRAMES, specs)
+    assert [s[1:] for s in scored["one"]] == [s[1:] for s in scored["many"]]
+
+
+def test_batches_read_a_bounded_number_of_frames_ahead(spec, monkeypatch):
+    keys = [FrameKey("s", "EMO", t, "a") for t in range(200)]
+    lock, read, asked, worst = threading.Lock(), [0], [0], [0]
+
+    def counted(key):
+        with lock:
+            read[0] += 1
+            worst[0] = max(worst[0], read[0] - asked[0])
+        return np.zeros((4, 6, 3), np.uint8)
+
+    class Slow:
+        def batched(self, pairs):
+            for _ in pairs:
+                asked[0] += 1
+                yield 0.0
+
+    clip = types.SimpleNamespace(image=lambda key: np.zeros((4, 6, 3), np.uint8))
+    many = spec("many", "Batched")
+    monkeypatch.setattr(scoring, "resolve", lambda reference: Slow)
+    assert len(score_frames(keys, Frames(counted, clip), [many])["many"]) == 200
+    assert worst[0] <= scoring._AHEAD + 2
+
+
+def test_a_temporal_metric_sees_the_frame_before_and_at_a_start_the_one_after(spec):
+    scored = score_frames(KEYS, FRAMES, [spec("t", "change", temporal=True)])["t"]
+    assert [s.value for s in scored[:3]] == [-10.0, 10.0, 10.0]
+    assert scored[3].status == "missing"
+    assert "neighbouring" in scored[3].reason
+
+
+def test_what_cannot_be_had_is_missing_with_the_reason(spec):
+    scored = score_frames(KEYS, FRAMES, [spec("u", "unavailable")])["u"]
+    assert {(s.status, s.reason) for s in scored} == {("missing", "no weights. Get some.")}
+    assert all(math.isnan(s.value) for s in scored)
+
+
+def test_a_value_that_is_not_finite_is_an_error(spec):
+    with pytest.raises(HeadbenchError, match=r"s/EMO/00000/a is inf"):
+        score_frames(KEYS, FRAMES, [spec("n", "not_finite")])
+
+
+def test_regions_default_to_the_face_where_the_clip_knows_it():
+    clip = RegionalToyClip()
+    assert check_regions(clip, None) == ("face",)
+    assert check_regions(clip, ("full", "hair", "hair")) == ("hair",)
+    assert check_regions(clip, ()) == ()
+    plain = types.SimpleNamespace(subject="s")
+    assert check_regions(plain, None) == ()
+    with pytest.raises(InputError, match=r"regions, mouth: expected one of full, face, hair"):
+        check_regions(clip, ("mouth",))
+
+
+def resolved(**settings):
+    return [spec.name for spec in resolve_metrics(RunConfig("data", "out", **settings))]
+
+
+def test_metrics_are_resolved_in_every_profile_and_others_once():
+    assert resolved()[:5] == ["psnr", "ssim", "lpips", "storage", "fps"]
+    names = resolved(metrics=("psnr", "ssim", "fps"), metric_profiles=("canonical", "3dgs"))
+    assert names == ["psnr", "psnr@3dgs", "ssim", "ssim@3dgs", "fps"]
+    assert resolved(metrics=("ssim",), metric_profiles=("skimage",)) == ["ssim@skimage"]
+
+
+def test_the_first_profile_stands_in_the_comparison_and_others_in_tables_of_their_own():
+    names = ("3dgs", "canonical", "skimage")
+    specs = resolve_metrics(RunConfig("data", "out", metrics=("ssim",), metric_profiles=names))
+    assert {spec.name: spec.tables for spec in specs} == {
+        "ssim@3dgs": ("comparison", "3dgs"),
+        "ssim": ("comparison",),
+        "ssim@skimage": ("skimage",),
+    }
+
+
+def test_unknown_profiles_and_metrics_that_none_defines_are_refused():
+    with pytest.raises(InputError, match="Did you mean 'skimage'"):
+        resolved(metric_profiles=("skimge",))
+    with pytest.raises(InputError, match=r"metrics, lpips: expected one that the profiles skimage define"):
+        resolved(metric_profiles=("skimage",))

@@ -1,0 +1,120 @@
+"""Digests by content, and when the remembered ones are used."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+
+import pytest
+
+from headbench.bench.io.files import digest
+from headbench.datasets.ga import content_digests as module
+from headbench.datasets.ga.content_digests import content_digests
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    """The folder of remembered digests, where also files that were just written are remembered."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(module, "YOUNG_NS", -(10**9))
+    return tmp_path / "cache" / "headbench" / "digests"
+
+
+@pytest.fixture
+def capture(tmp_path):
+    folder = tmp_path / "capture"
+    folder.mkdir()
+    for name in ("a", "b", "c"):
+        (folder / name).write_text(name)
+    return folder
+
+
+@pytest.fixture
+def reads(monkeypatch):
+    """Names of the files whose bytes were read."""
+    names = []
+    original = module.digest_file
+    monkeypatch.setattr(module, "digest_file", lambda path: names.append(path.name) or original(path))
+    return names
+
+
+def expected(folder):
+    return {path: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(folder.iterdir())}
+
+
+def test_only_what_changed_is_read_again(capture, cache, reads):
+    for change in (None, None, ("b", "other"), ("c", "C")):
+        if change:
+            name, text = change
+            before = (capture / name).stat()
+            (capture / name).write_text(text)
+            os.utime(capture / name, ns=(before.st_atime_ns, before.st_mtime_ns))
+        else:
+            name = "abc" if not cache.exists() else ""
+        reads.clear()
+        assert content_digests(capture.iterdir(), remembered_for=capture) == expected(capture)
+        assert "".join(sorted(reads)) == name
+    assert sorted(path.name for path in capture.iterdir()) == ["a", "b", "c"]
+
+
+def test_without_memory_every_byte_is_read(capture, cache, reads):
+    content_digests(capture.iterdir(), remembered_for=capture)
+    for path in cache.iterdir():  # what is remembered is wrong, as it cannot be but on purpose
+        entries = dict.fromkeys(json.loads(path.read_text())["entries"], "0" * 64)
+        path.write_text(json.dumps({"digest": digest(entries), "entries": entries}))
+    assert content_digests(capture.iterdir(), remembered_for=capture) != expected(capture)
+    reads.clear()
+    assert content_digests(capture.iterdir()) == expected(capture)
+    assert sorted(reads) == ["a", "b", "c"]
+
+
+def test_a_file_of_digests_inside_a_capture_is_ignored(capture, cache):
+    digests = expected(capture)
+    stamps = {path.name: path.stat() for path in digests}
+    lies = {name: [stamp.st_size, stamp.st_mtime_ns, "0" * 64] for name, stamp in stamps.items()}
+    (capture / ".headbench-digests.json").write_text(json.dumps(lies))
+    assert content_digests(digests, remembered_for=capture) == digests
+
+
+@pytest.mark.parametrize(
+    "rubbish", ["", "[]", '{"entries": 1}', '{"digest": "0", "entries": {"a": "b"}}', "\0", "[" * 100_000]
+)
+def test_a_damaged_cache_is_ignored(capture, cache, rubbish):
+    content_digests(capture.iterdir(), remembered_for=capture)
+    for path in cache.iterdir():
+        path.write_text(rubbish)
+    assert content_digests(capture.iterdir(), remembered_for=capture) == expected(capture)
+
+
+def test_a_file_that_just_changed_is_not_remembered(capture, cache, monkeypatch):
+    monkeypatch.setattr(module, "YOUNG_NS", 60 * 10**9)
+    content_digests(capture.iterdir(), remembered_for=capture)
+    assert all(json.loads(path.read_text())["entries"] == {} for path in cache.iterdir())
+
+
+def test_the_captures_read_longest_ago_are_forgotten(capture, cache, monkeypatch):
+    for number in range(4):
+        content_digests(capture.iterdir(), remembered_for=capture / str(number))
+        for path in cache.iterdir():
+            os.utime(path, (path.stat().st_atime, path.stat().st_mtime - 60))
+    first, *_ = sorted(cache.iterdir(), key=lambda path: path.stat().st_mtime)
+    monkeypatch.setattr(module, "MAX_CACHE_BYTES", 4 * first.stat().st_size)
+    content_digests(capture.iterdir(), remembered_for=capture)
+    assert not first.exists()
+    assert len([*cache.iterdir()]) == 4
+
+
+@pytest.mark.parametrize("home", ["a file", "none"])
+def test_a_home_that_cannot_be_written_is_no_obstacle(capture, tmp_path, monkeypatch, home):
+    if home == "a file":
+        (tmp_path / "cache").write_text("no folder")
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    else:
+
+        def homeless():
+            raise RuntimeError("Could not determine home directory.")
+
+        monkeypatch.delenv("XDG_CACHE_HOME")
+        monkeypatch.setattr(module.Path, "home", homeless)
+    assert content_digests(capture.iterdir(), remembered_for=capture) == expected(capture)

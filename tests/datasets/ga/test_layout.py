@@ -1,0 +1,107 @@
+"""Names and conventions of the layout, against closed forms."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from headbench.bench.contracts import Camera
+from headbench.datasets.ga import layout
+
+finite = st.floats(-3, 3)
+
+
+@settings(deadline=None)
+@given(
+    axis=st.tuples(finite, finite, finite),
+    place=st.tuples(finite, finite, finite),
+    focal=st.tuples(st.floats(10, 9000), st.floats(10, 9000)),
+    center=st.tuples(st.floats(0, 550), st.floats(0, 802)),
+    cy=st.sampled_from(["top", "bottom"]),
+)
+def test_cameras_survive_the_json(axis, place, focal, center, cy):
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = Rotation.from_rotvec(axis).as_matrix(), place
+    K = np.array([[focal[0], 0, center[0]], [0, focal[1], center[1]], [0, 0, 1]])
+    camera = Camera("c", 550, 802, K, matrix)
+    entries = layout.intrinsics_to_json(camera, cy)
+    np.testing.assert_allclose(layout.intrinsics_from_json(entries, 550, 802, cy), K, rtol=0, atol=1e-12)
+    stored = np.array(layout.extrinsics_to_json(matrix))
+    np.testing.assert_allclose(layout.extrinsics_from_json(stored), matrix, rtol=0, atol=1e-12)
+
+
+def test_a_point_ahead_of_an_opengl_camera_is_ahead_in_opencv_axes():
+    """Camera at (0, 0, 1) with OpenGL axes equal to the world's looks along -z: at the origin."""
+    stored = np.eye(4)
+    stored[2, 3] = 1.0
+    world_to_camera = layout.extrinsics_from_json(stored)
+    np.testing.assert_allclose(world_to_camera @ [0, 0, 0, 1], [0, 0, 1, 1], atol=1e-15)
+    np.testing.assert_allclose(world_to_camera @ [0.2, 0.1, 0, 1], [0.2, -0.1, 1, 1], atol=1e-15)  # up is -y
+
+
+def test_field_of_view_alone_means_square_pixels_and_a_centred_principal_point():
+    K = layout.intrinsics_from_json({"camera_angle_x": math.pi / 2}, 200, 300, "bottom")
+    np.testing.assert_allclose(K, [[100, 0, 100], [0, 100, 150], [0, 0, 1]], rtol=1e-12)
+
+
+def test_centre_ignores_the_principal_point():
+    entries = {"fl_x": 50.0, "fl_y": 60.0, "cx": 7.0, "cy": 9.0}
+    np.testing.assert_array_equal(
+        layout.intrinsics_from_json(entries, 40, 30, "centre"), [[50, 0, 20], [0, 60, 15], [0, 0, 1]]
+    )
+
+
+@pytest.mark.parametrize(
+    ("folder", "subject", "sequence"),
+    [
+        ("074_EMO-1_v16_DS4_whiteBg_staticOffset_maskBelowLine", "074", "EMO-1"),
+        ("074_EMO-1-shout+laugh_v16_DS4_whiteBg", "074", "EMO-1-shout+laugh"),
+        ("306_SEN-01-cramp_small_danger_v16_DS2-0.5x_lmkSTAR", "306", "SEN-01-cramp_small_danger"),
+        ("306_FREE", "306", "FREE"),
+        ("306_EXP-3-cheeks+nose_v8", "306", "EXP-3-cheeks+nose"),
+        ("obama", "", "obama"),
+    ],
+)
+def test_sequence_folder_names(folder, subject, sequence):
+    assert layout.parse_sequence_folder(folder) == (subject, sequence)
+
+
+def test_folder_names_written_are_folder_names_read():
+    for sequence in ("FREE", "EMO-1-shout+laugh", "SEN-01-cramp_small_danger"):
+        assert layout.parse_sequence_folder(layout.sequence_folder_name("074", sequence, 16)) == (
+            "074",
+            sequence,
+        )
+
+
+@pytest.mark.parametrize(
+    ("folder", "subject"),
+    [
+        ("UNION10_306_EMO1234EXP234589_v16_DS2-0.5x_lmkSTAR_teethV3_SMOOTH", "306"),
+        ("UNION_074", "074"),
+        ("UNION20_a1", "a1"),
+        ("074_EMO-1_v16", ""),
+    ],
+)
+def test_union_folder_names(folder, subject):
+    assert layout.parse_union_folder(folder) == subject
+
+
+def test_declaration_survives(tmp_path):
+    declaration = layout.Declaration(
+        subject="s",
+        head_model="procedural2023",
+        background=(0.25, 0.5, 1.0),
+        cy="top",
+        sequences={"s_FREE_v16": "FREE"},
+        excluded={12: "tongue out", 3: "blur"},
+        synthetic={"seed": 7},
+    )
+    declaration.write(tmp_path)
+    assert layout.Declaration.read(tmp_path) == declaration
+    assert layout.Declaration.read(tmp_path / "elsewhere") is None

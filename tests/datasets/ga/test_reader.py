@@ -1,0 +1,370 @@
+"""Reading what the writer wrote and what the field's tools write."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from headbench.bench.contracts import Clip, FrameKey
+from headbench.bench.errors import InputError
+from headbench.datasets.ga.reader import find_captures, read_capture
+from headbench.datasets.ga.writer import CaptureWriter, write_png
+from headbench.datasets.head.regions import with_derived_regions
+from headbench.datasets.head.teeth import with_teeth
+
+from ..head.toy import toy_head
+from ..tiny_capture import FRONTAL, SERIALS, make_plan, posed_vertices, rig, write_tiny_capture
+
+# Union timesteps follow the plan's training sequences, then FREE.
+ORDER = [("EMO-1-shout+laugh", 2), ("SEN-01-cramp_small_danger", 2), ("FREE", 3)]
+PLACES = [(name, local) for name, count in ORDER for local in range(count)]
+
+
+@pytest.fixture(scope="module")
+def clip(pristine_capture):
+    return read_capture(pristine_capture.union)
+
+
+def test_clip_fulfils_the_contract(clip):
+    assert isinstance(clip, Clip)
+    assert clip.subject == "901"
+
+
+def test_cameras_survive_the_round_trip(clip, pristine_capture):
+    assert [*clip.cameras] == [*SERIALS]
+    for camera in pristine_capture.writer.plan.cameras:
+        read = clip.cameras[camera.id]
+        np.testing.assert_allclose(read.K, camera.K, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(read.world_to_camera, camera.world_to_camera, rtol=0, atol=1e-12)
+        assert (read.width, read.height) == (camera.width, camera.height)
+
+
+def test_poses_identity_and_offset_survive_exactly(clip, pristine_capture):
+    plan = pristine_capture.writer.plan
+    for timestep, (sequence, local) in enumerate(PLACES):
+        written, read = plan.sequence(sequence).poses[local], clip.poses[timestep]
+        for field in ("expression", "rotation", "neck", "jaw", "eyes", "translation"):
+            np.testing.assert_array_equal(getattr(read, field), getattr(written, field))
+        assert (read.head_model, read.subject, read.timestep) == (plan.head.version, "901", timestep)
+    np.testing.assert_array_equal(clip.shape, plan.shape)
+    np.testing.assert_array_equal(clip.static_offset, plan.static_offset)
+    assert clip.head.fingerprint() == with_derived_regions(plan.head).fingerprint()
+
+
+def test_images_and_masks_survive_exactly(clip, pristine_capture):
+    for key in clip.files:
+        sequence, local = PLACES[key.timestep]
+        assert key.sequence == sequence
+        image, mask = pristine_capture.frames[sequence, local, key.camera]
+        np.testing.assert_array_equal(clip.image(key), image)
+        np.testing.assert_array_equal(clip.mask(key), mask)
+
+
+def test_splits_hold_out_the_frontal_camera_and_free_without_its_tongue(clip):
+    others = [name for name in SERIALS if name != FRONTAL]
+
+    def keys(timesteps, cameras):
+        return {FrameKey("901", PLACES[t][0], t, c) for t in timesteps for c in cameras}
+
+    assert set(clip.splits["train"]) == keys(range(4), others)
+    assert set(clip.splits["novel_view"]) == keys(range(4), [FRONTAL])
+    assert set(clip.splits["self_reenactment"]) == keys((4, 5), SERIALS)
+    assert clip.excluded == dict.fromkeys(keys([6], SERIALS), "tongue out")
+
+
+def test_eyelids_survive(tmp_path):
+    plan = make_plan(head=toy_head(16, eyelids=True), lengths={"FREE": 1, "HAIR": 1})
+    written = write_tiny_capture(tmp_path, plan)
+    clip = read_capture(written.union)
+    np.testing.assert_array_equal(clip.poses[0].eyelids, plan.sequence("HAIR").poses[0].eyelids)
+
+
+def test_single_sequence_is_read_with_the_head_its_declaration_names(pristine_capture):
+    clip = read_capture(pristine_capture.writer.sequence_folder("SEN-01-cramp_small_danger"))
+    assert clip.subject == "901"
+    assert {key.sequence for key in clip.files} == {"SEN-01-cramp_small_danger"}
+    assert clip.timesteps("train") == [0, 1]
+    assert {key.camera for key in clip.splits["novel_view"]} == {FRONTAL}
+    tongue = read_capture(pristine_capture.writer.sequence_folder("FREE"))
+    assert {key.timestep for key in tongue.excluded} == {2}
+
+
+def test_one_camera_has_no_novel_view(tmp_path):
+    plan = make_plan(cameras=rig()[:1], novel_view_cameras=())
+    clip = read_capture(write_tiny_capture(tmp_path, plan).union)
+    assert {name: len(keys) for name, keys in clip.splits.items()} == {
+        "train": 4,
+        "novel_view": 0,
+        "self_reenactment": 2,
+    }
+
+
+def test_captures_are_found_from_the_folder_above(pristine_capture, tmp_path):
+    root = pristine_capture.writer.root
+    assert find_captures(root) == [pristine_capture.union]
+    assert read_capture(root).fingerprint == read_capture(pristine_capture.union).fingerprint
+    with pytest.raises(InputError, match="an empty folder"):
+        read_capture(tmp_path)
+
+
+# ------------------------------------------------------------------ files in the field's own manner
+
+
+def write_ga_style(root: Path, plan, *, shifts=(0.0, 0.0), offset_rows: int | None = None) -> Path:
+    """A union as GaussianAvatars reads it: ``camera_angle_x`` alone, no extension, no serials, RGB only.
+
+    Two sequences of two timesteps; each world is shifted along x as VHAP does per sequence.
+    """
+    names = ["074_EMO-1_v16_DS4_whiteBg", "074_EXP-2_v16_DS4_whiteBg"]
+    splits: dict[str, list] = {"train": [], "val": [], "test": []}
+    for number, (name, shift) in enumerate(zip(names, shifts)):
+        for local, pose in enumerate(plan.sequences[number].poses[:2]):
+            offset = plan.static_offset[None, :offset_rows].astype(np.float32)
+            (root / name / "flame_param").mkdir(parents=True, exist_ok=True)
+            np.savez(
+                root / name / "flame_param" / f"{local:05d}.npz",
+                translation=pose.translation[None] + np.float32([shift, 0, 0]),
+                rotation=pose.rotation[None],
+                neck_pose=pose.neck[None],
+                jaw_pose=pose.jaw[None],
+                eyes_pose=pose.eyes[None],
+                expr=pose.expression[None],
+                shape=plan.shape,
+                static_offset=offset,
+            )
+            for index, camera in enumerate(plan.cameras):
+                image = np.full((camera.height, camera.width, 3), 40 * number + 10 * local + index, np.uint8)
+                write_png(root / name / "images" / f"{local:05d}_{index:02d}.png", image)
+                matrix = np.linalg.inv(camera.world_to_camera) @ np.diag([1, -1, -1, 1])
+                matrix[0, 3] += shift
+                frame = {
+                    "timestep_index": 2 * number + local,
+                    "camera_index": index,
+                    "camera_angle_x": 2 * math.atan(camera.width / (2 * camera.K[0, 0])),
+                    "transform_matrix": matrix.tolist(),
+                    "file_path": f"../{name}/images/{local:05d}_{index:02d}",
+                    "flame_param_path": f"../{name}/flame_param/{local:05d}.npz",
+                }
+                splits["test" if number else "val" if index == 1 else "train"].append(frame)
+    union = root / "UNION10_074_EMO1234EXP234589_v16_DS2-0.5x_lmkSTAR_teethV3_SMOOTH_offsetS_whiteBg"
+    union.mkdir()
+    for part, frames in splits.items():
+        (union / f"transforms_{part}.json").write_text(json.dumps({"frames": frames}))
+    return union
+
+
+def test_ga_style_json_with_camera_angle_alone(tmp_path):
+    plan = make_plan()
+    clip = read_capture(write_ga_style(tmp_path, plan), head=plan.head)
+    assert clip.subject == "074"
+    assert {key.sequence for key in clip.files} == {"EMO-1", "EXP-2"}
+    assert [*clip.cameras] == ["00", "01", "02"]
+    focal = plan.cameras[0].K[0, 0]
+    expected = [[focal, 0, 24], [0, focal, 32], [0, 0, 1]]
+    np.testing.assert_allclose(clip.cameras["00"].K, expected, rtol=1e-12)
+    assert [len(clip.splits[name]) for name in ("train", "novel_view", "self_reenactment")] == [4, 2, 6]
+    assert clip.mask(clip.splits["train"][0]) is None
+    np.testing.assert_array_equal(clip.background, [1, 1, 1])
+
+
+def test_shifted_sequence_worlds_are_brought_together(tmp_path):
+    plan = make_plan()
+    union = write_ga_style(tmp_path, plan, shifts=(0.01, -0.03))
+    clip = read_capture(union, head=plan.head)
+    # The second sequence moves by +0.04 m into the first's world, cameras and poses alike.
+    record = clip.steps[0].parameters["sequence_shifts_m"]
+    np.testing.assert_allclose(record["EXP-2"], [0.04, 0, 0], atol=1e-12)
+    first, second = (plan.sequences[number].poses[0] for number in (0, 1))
+    np.testing.assert_allclose(clip.poses[0].translation, first.translation + [0.01, 0, 0], atol=1e-7)
+    np.testing.assert_allclose(clip.poses[2].translation, second.translation + [0.01, 0, 0], atol=1e-7)
+    for name, camera in zip(("00", "01", "02"), plan.cameras):
+        np.testing.assert_allclose(clip.cameras[name].center, camera.center + [0.01, 0, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize("rows_in_file", ["with teeth", "without teeth"])
+def test_teeth_are_appended_and_the_offset_padded(tmp_path, rows_in_file):
+    bare = toy_head(16)
+    toothed = with_teeth(bare)
+    plan = make_plan(head=toothed)
+    rows = None if rows_in_file == "with teeth" else len(bare.template)
+    union = write_ga_style(tmp_path, plan, offset_rows=rows)
+    clip = read_capture(union, head=bare, teeth="auto" if rows is None else "add")
+    assert clip.head.fingerprint() == toothed.fingerprint()
+    np.testing.assert_array_equal(
+        clip.static_offset[: len(bare.template)], plan.static_offset[: len(bare.template)]
+    )
+    expected = plan.static_offset[len(bare.template) :] if rows is None else 0
+    np.testing.assert_array_equal(clip.static_offset[len(bare.template) :] - expected, 0)
+
+
+@pytest.mark.parametrize("version", ["flame2023", "toy"])
+def test_every_head_without_teeth_gets_them(tmp_path, version):
+    head = toy_head(16, version=version)
+    union = write_ga_style(tmp_path, make_plan(head=head))
+    assert read_capture(union, head=head).head.fingerprint() == with_teeth(head).fingerprint()
+    assert read_capture(union, head=head, teeth="keep").head.fingerprint() == head.fingerprint()
+
+
+def test_static_offset_that_fits_no_head_is_refused(tmp_path):
+    plan = make_plan()
+    union = write_ga_style(tmp_path, plan, offset_rows=len(toy_head(16).template) - 7)
+    with pytest.raises(InputError, match="static_offset: expected .1, .* rows"):
+        read_capture(union, head=plan.head)
+
+
+# ------------------------------------------------------------------ the principal point
+
+
+@pytest.mark.parametrize("written", ["top", "bottom"])
+def test_undeclared_cy_is_told_from_the_images(tmp_path, written):
+    plan = make_plan(cy=written, cameras=rig(72, 96, cy=44.0), lengths={"FREE": 2, "EMO-1-shout+laugh": 4})
+    capture = write_tiny_capture(tmp_path, plan)
+    (capture.union / "headbench.json").unlink()
+    clip = read_capture(capture.union)
+    assert clip.steps[0].parameters["cy"] == written
+    assert clip.cameras[FRONTAL].K[1, 2] == pytest.approx(44.0)
+    # The wrong reading would have been off by 8 px.
+    assert clip.steps[0].parameters["cy_from"]["source"] == "outlines"
+
+
+def test_cy_is_told_without_masks_too(tmp_path):
+    plan = make_plan(cameras=rig(72, 96, cy=44.0), lengths={"FREE": 2, "EMO-1-shout+laugh": 4})
+    capture = write_tiny_capture(tmp_path, plan)
+    (capture.union / "headbench.json").unlink()
+
+    def without_masks(document):
+        for frame in document["frames"]:
+            del frame["fg_mask_path"]
+
+    for part in ("train", "val", "test"):
+        capture.edit(f"transforms_{part}.json", without_masks)
+    assert read_capture(capture.union).steps[0].parameters["cy"] == "bottom"
+
+
+def test_undecidable_cy_asks_for_a_declaration(capture):
+    (capture.union / "headbench.json").unlink()
+    for path in capture.writer.root.rglob("fg_masks/*.png"):
+        write_png(path, np.full((64, 48), 255, np.uint8))
+    with pytest.raises(InputError, match='State the convention: cy="bottom"'):
+        read_capture(capture.union)
+    assert read_capture(capture.union, cy="bottom").cameras[FRONTAL].K[1, 2] == pytest.approx(29.3)
+    assert read_capture(capture.union, cy="top").cameras[FRONTAL].K[1, 2] == pytest.approx(64 - 29.3)
+    np.testing.assert_array_equal(
+        read_capture(capture.union, cy="centre").cameras[FRONTAL].K[:2, 2], [24, 32]
+    )
+
+
+def test_cy_near_the_centre_needs_no_decision(tmp_path):
+    capture = write_tiny_capture(tmp_path, make_plan(cameras=rig(cy=32.4)))
+    (capture.union / "headbench.json").unlink()
+    assert "immaterial" in read_capture(capture.union).steps[0].parameters["cy_from"]["source"]
+
+
+def test_projected_mesh_lies_on_the_mask(clip):
+    """Cameras, poses, offset and principal point together: vertices fall on the foreground."""
+    plan = make_plan()
+    for key in clip.splits["self_reenactment"]:
+        camera = clip.cameras[key.camera]
+        vertices = posed_vertices(plan, clip.poses[key.timestep])
+        points = vertices @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        x, y = np.floor((points @ camera.K.T)[:, :2] / points[:, 2:]).astype(int).T
+        inside = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+        near = cv2.dilate(clip.mask(key), np.ones((3, 3), np.uint8))  # a vertex may touch an uncovered pixel
+        assert inside.mean() > 0.95
+        assert (near[y[inside], x[inside]] > 0).all()
+
+
+# ------------------------------------------------------------------ splits, heads, fingerprints
+
+
+def test_splits_can_be_made_anew(capture):
+    clip = read_capture(capture.union, held_out_sequences=["SEN-01"], held_out_cameras=[SERIALS[0]])
+    assert {key.sequence for key in clip.splits["self_reenactment"]} == {"SEN-01-cramp_small_danger"}
+    assert {key.sequence for key in clip.splits["train"]} == {"EMO-1-shout+laugh", "FREE"}
+    assert {key.camera for key in clip.splits["novel_view"]} == {SERIALS[0]}
+    assert FRONTAL in {key.camera for key in clip.splits["train"]}
+    with pytest.raises(InputError, match="held_out_sequences: expected one sequence"):
+        read_capture(capture.union, held_out_sequences=["HAIR"])
+    with pytest.raises(InputError, match="held_out_cameras"):
+        read_capture(capture.union, held_out_cameras=["7"])
+
+
+def test_missing_head_model_is_named_with_a_way_to_get_it(capture):
+    (capture.union / "head_model.npz").unlink()
+    with pytest.raises(InputError, match=r"head_model.npz: .*no such file.*flame2023.pkl"):
+        read_capture(capture.union)
+
+
+def test_head_of_another_version_is_refused(capture):
+    with pytest.raises(InputError, match="head_model: expected other"):
+        read_capture(capture.union, head=toy_head(16, version="other"))
+
+
+def test_rgba_is_composited_on_the_background_asked_for(tmp_path):
+    plan = make_plan(lengths={"FREE": 1, "HAIR": 1})
+    writer = CaptureWriter(tmp_path, plan)
+    rng = np.random.default_rng(0)
+    frames = {}
+    for sequence in plan.sequences:
+        for camera in plan.cameras:
+            rgba = rng.integers(0, 256, size=(camera.height, camera.width, 4)).astype(np.uint8)
+            frames[sequence.name, camera.id] = rgba
+            writer.write_frame(sequence.name, 0, camera.id, rgba)
+    clip = read_capture(writer.write_metadata(), background=(0.0, 0.5, 1.0))
+    for key in clip.files:
+        rgba = frames[key.sequence, key.camera].astype(np.float64)
+        alpha = rgba[..., 3:] / 255
+        expected = rgba[..., :3] * alpha + np.array([0, 127.5, 255]) * (1 - alpha)
+        assert np.abs(clip.image(key) - expected).max() <= 0.5 + 1e-4
+        np.testing.assert_array_equal(clip.mask(key), rgba[..., 3])
+
+
+def test_rgb_images_change_their_background_by_their_masks(capture):
+    clip = read_capture(capture.union, background=(0, 0, 1))
+    np.testing.assert_array_equal(clip.background, [0, 0, 1])
+    assert [step.name for step in clip.steps][1] == "set_background"
+    plain = read_capture(capture.union)
+    for key in list(clip.files)[:4]:
+        inside = clip.mask(key) == 255
+        np.testing.assert_array_equal(clip.image(key)[inside], plain.image(key)[inside])
+        assert (clip.image(key)[~inside] == [0, 0, 255]).all()
+
+
+def test_rgb_images_without_masks_keep_their_background(capture):
+    def forget_masks(document):
+        for frame in document["frames"]:
+            del frame["fg_mask_path"]
+
+    for file in ("transforms_train.json", "transforms_val.json", "transforms_test.json"):
+        capture.edit(file, forget_masks)
+    with pytest.raises(InputError, match="background: expected .*neither mask nor alpha"):
+        read_capture(capture.union, background=(0, 0, 0))
+
+
+def test_what_lies_below_the_neck_can_be_left_out(capture):
+    clip = read_capture(capture.union, below_neck=False)
+    assert [step.name for step in clip.steps][1] == "mask_below_neck"
+    assert read_capture(capture.union).fingerprint != clip.fingerprint
+
+
+def test_fingerprint_follows_content_and_not_place(capture, pristine_capture):
+    original = read_capture(pristine_capture.union)
+    assert read_capture(capture.union).fingerprint == original.fingerprint
+    assert read_capture(capture.union, cy="centre").fingerprint != original.fingerprint
+    assert read_capture(capture.union, exclude={0: "blur"}).fingerprint != original.fingerprint
+    path = capture.writer.image_path("FREE", 0, FRONTAL)
+    write_png(path, 255 - np.asarray(original.image(FrameKey("901", "FREE", 4, FRONTAL))))
+    assert read_capture(capture.union).fingerprint != original.fingerprint
+
+
+def test_fingerprint_sees_a_parameter_change(capture, pristine_capture):
+    path = next(capture.writer.sequence_folder("FREE").glob("flame_param/*.npz"))
+    with np.load(path, allow_pickle=False) as archive:
+        arrays = dict(archive)
+    np.savez(path, **arrays | {"jaw_pose": arrays["jaw_pose"] + np.float32(0.01)})
+    assert read_capture(capture.union).fingerprint != read_capture(pristine_capture.union).fingerprint

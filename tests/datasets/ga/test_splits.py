@@ -1,0 +1,63 @@
+"""Sequence names and splits."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from headbench.bench.contracts import FrameKey
+from headbench.bench.errors import InputError
+from headbench.datasets.ga.splits import check_disjoint, sequence_names, split_by_holding_out
+
+KEYS = [
+    FrameKey("s", sequence, t, camera)
+    for t, sequence in enumerate(["EMO-1-shout+laugh", "EMO-2-surprise+fear", "FREE"])
+    for camera in "abc"
+]
+
+
+def test_names_are_declared_or_parsed_and_never_shared():
+    entries = [SimpleNamespace(sequence_folder=f) for f in ("1_A_v16_x", "1_B_v16_x", "1_B_v16_y", "odd")]
+    assert sequence_names(entries, {"1_A_v16_x": "declared"}) == {
+        "1_A_v16_x": "declared",
+        "1_B_v16_x": "1_B_v16_x",
+        "1_B_v16_y": "1_B_v16_y",
+        "odd": "odd",
+    }
+
+
+@settings(deadline=None)
+@given(
+    cameras=st.sets(st.sampled_from("abc")), sequences=st.sets(st.sampled_from(["EMO-1", "EMO-2", "FREE"]))
+)
+def test_every_frame_is_in_exactly_one_split_and_held_out_data_is_held_out(cameras, sequences):
+    splits = split_by_holding_out("x", KEYS, sorted(sequences), sorted(cameras))
+    assert sorted(key for keys in splits.values() for key in keys) == sorted(KEYS)
+    check_disjoint("x", splits)
+    for key in splits["train"]:
+        assert key.camera not in cameras
+        assert not any(key.sequence.startswith(prefix) for prefix in sequences)
+    assert all(key.camera in cameras for key in splits["novel_view"])
+    assert {k for k in KEYS if any(k.sequence.startswith(p) for p in sequences)} == set(
+        splits["self_reenactment"]
+    )
+
+
+def test_prefix_that_fits_two_sequences_is_refused():
+    with pytest.raises(InputError, match=r"'EMO', which fits EMO-1-shout\+laugh, EMO-2"):
+        split_by_holding_out("x", KEYS, ["EMO"], [])
+
+
+def test_full_name_wins_over_prefix():
+    keys = [FrameKey("s", name, t, "a") for t, name in enumerate(["FREE", "FREE-2"])]
+    assert split_by_holding_out("x", keys, ["FREE"], [])["self_reenactment"] == (keys[0],)
+
+
+def test_repeated_and_shared_keys_are_refused():
+    with pytest.raises(InputError, match="every frame once"):
+        check_disjoint("x", {"train": (KEYS[0], KEYS[1], KEYS[0])})
+    with pytest.raises(InputError, match="2 frames in both"):
+        check_disjoint("x", {"train": tuple(KEYS[:3]), "novel_view": tuple(KEYS[1:4])})

@@ -1,0 +1,111 @@
+"""Any JSON at all is read or refused, never crashed on."""
+
+from __future__ import annotations
+
+import json
+from contextlib import suppress
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+
+from headbench.bench.errors import InputError
+from headbench.datasets.ga.reader import read_capture
+from headbench.datasets.ga.transforms import read_transforms
+
+from ..tiny_capture import SERIALS
+
+BEYOND_FLOAT = 10**309
+numbers = st.one_of(st.integers(), st.floats(), st.just(BEYOND_FLOAT), st.booleans(), st.none())
+values = st.recursive(
+    st.one_of(numbers, st.text(max_size=8), st.just("x" * 5000), st.just("a\0b")),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=4), inner, max_size=3),
+    max_leaves=8,
+)
+KEYS = [
+    *("timestep_index", "camera_index", "camera_id", "cx", "cy", "fl_x", "fl_y", "h", "w"),
+    *("camera_angle_x", "transform_matrix", "file_path", "fg_mask_path", "flame_param_path"),
+]
+
+
+@settings(max_examples=120, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(key=st.sampled_from(KEYS), value=values)
+@example(key="w", value=BEYOND_FLOAT)
+@example(key="fl_x", value=BEYOND_FLOAT)
+@example(key="transform_matrix", value=[[BEYOND_FLOAT] * 4] * 4)
+@example(key="file_path", value="x" * 5000)
+@example(key="flame_param_path", value="x" * 5000)
+@example(key="fg_mask_path", value="a\0b")
+@example(key="flame_param_path", value=".")
+@example(key="file_path", value=".png")
+def test_any_value_of_a_frame_is_read_or_refused(capture, key, value):
+    path = capture.union / "transforms_train.json"
+    original = path.read_text()
+    document = json.loads(original)
+    document["frames"][1][key] = value
+    path.write_text(json.dumps(document))
+    with suppress(InputError):
+        read_capture(capture.union)
+    path.write_text(original)
+
+
+@pytest.mark.parametrize("name", ["x" * 5000, "a\0b", "."])
+@pytest.mark.parametrize("key", ["file_path", "fg_mask_path", "flame_param_path"])
+def test_paths_no_file_can_have_are_refused(capture, key, name):
+    def change(document):
+        for frame in document["frames"]:
+            folder = frame[key].rsplit("/", 2)[0]
+            frame[key] = f"{folder}/{name}"
+
+    for part in ("train", "val", "test"):
+        capture.edit(f"transforms_{part}.json", change)
+    with pytest.raises(InputError):
+        read_capture(capture.union)
+
+
+def test_entries_carry_what_the_frame_says(pristine_capture):
+    entries = read_transforms(pristine_capture.union / "transforms_train.json")
+    camera = pristine_capture.writer.plan.cameras[2]
+    entry = entries[1]
+    assert (entry.where, entry.timestep, entry.camera_index, entry.camera_id) == (
+        "frames[1]",
+        0,
+        2,
+        SERIALS[2],
+    )
+    assert (entry.width, entry.height) == (48, 64)
+    assert entry.intrinsics["fl_x"] == camera.K[0, 0]
+    assert entry.sequence_folder == "901_EMO-1-shout+laugh_v3_whiteBg_staticOffset"
+    assert (
+        entry.image.resolve()
+        == pristine_capture.writer.image_path("EMO-1-shout+laugh", 0, SERIALS[2]).resolve()
+    )
+    np.testing.assert_allclose(entry.camera_to_world[:3, 3], camera.center, atol=1e-15)
+
+
+def test_size_and_intrinsics_may_stand_at_the_top_level(tmp_path):
+    frame = {
+        "timestep_index": 0.0,  # some writers store whole numbers as floats
+        "file_path": "./images/0",
+        "flame_param_path": "flame_param/00000.npz",
+        "transform_matrix": np.eye(4).tolist(),
+    }
+    document = {"frames": [frame], "camera_angle_x": 0.5, "w": 40, "h": 30, "cx": 19.0}
+    path = tmp_path / "transforms_train.json"
+    path.write_text(json.dumps(document))
+    (entry,) = read_transforms(path)
+    assert entry.intrinsics == {"camera_angle_x": 0.5, "cx": 19.0}
+    assert (entry.width, entry.height, entry.timestep, entry.camera_id) == (40, 30, 0, "00")
+    assert entry.image == tmp_path / "images" / "0.png"
+    assert entry.sequence_folder == tmp_path.name
+    frame["cx"] = 21.0
+    path.write_text(json.dumps(document))
+    assert read_transforms(path)[0].intrinsics["cx"] == 21.0
+
+
+def test_deeply_nested_json_is_refused(tmp_path):
+    path = tmp_path / "transforms_train.json"
+    path.write_text("[" * 100_000)
+    with pytest.raises(InputError, match="deeper nesting"):
+        read_transforms(path)

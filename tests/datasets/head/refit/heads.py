@@ -1,0 +1,60 @@
+"""Heads for refit tests: small ones, and one surface in two topologies."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from headbench.datasets.head.arrays import HeadArrays
+
+from ..toy import toy_head
+
+
+def toy_pair(eyelids: bool = True) -> tuple[HeadArrays, HeadArrays]:
+    """Source and target: equal but for the version's name, so that a refit has an exact solution."""
+    target = toy_head(24, eyelids=eyelids, version="target")
+    return replace(target, version="source"), target
+
+
+def subdivided(head: HeadArrays, seed: int = 0) -> HeadArrays:
+    """The same surface with every triangle cut in four and vertices in random order: another topology.
+
+    New vertices lie in the middle of edges and move as their two ends do, so the surface at rest is the same to
+    the last bit; the joint regressor keeps to the old vertices.
+    """
+    edges = np.sort(head.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    unique, index = np.unique(edges, axis=0, return_inverse=True)
+    old = len(head.template)
+    middle = old + index.reshape(-1, 3)  # of edges 01, 12, 20
+    a, b, c = head.faces.T
+    ab, bc, ca = middle.T
+    quarters = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
+    faces = np.concatenate([np.stack(quarter, axis=1) for quarter in quarters])
+    order = np.random.default_rng(seed).permutation(old + len(unique))
+    place = np.argsort(order)  # new index of a vertex
+
+    def along(values):
+        values = np.asarray(values, dtype=np.float64)
+        return np.concatenate([values, values[unique].mean(axis=1)])[order]
+
+    def members(region):
+        both = np.isin(unique, region).all(axis=1)
+        return np.sort(place[np.concatenate([region, old + np.flatnonzero(both)])])
+
+    regressor = np.concatenate([head.joint_regressor, np.zeros((5, len(unique)))], axis=1)[:, order]
+    lids = None if head.eyelid_basis is None else along(head.eyelid_basis)
+    return replace(
+        head,
+        version=f"{head.version}-subdivided",
+        template=along(head.template),
+        faces=place[faces],
+        shape_basis=along(head.shape_basis),
+        expression_basis=along(head.expression_basis),
+        pose_basis=along(head.pose_basis),
+        joint_regressor=regressor,
+        skinning_weights=along(head.skinning_weights),
+        eyelid_basis=lids,
+        regions={name: members(region) for name, region in head.regions.items() if "ring" not in name},
+        landmarks={},
+    )

@@ -1,0 +1,173 @@
+"""``headbench refit`` on a capture on disk: what it writes reads back, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from headbench.bench.errors import InputError
+from headbench.datasets.ga.reader import read_capture
+from headbench.datasets.head.arrays import save_head
+from headbench.datasets.head.refit import block
+from headbench.datasets.head.refit.command import run, target_head
+from headbench.datasets.head.refit.heat_map import colour_scale
+from headbench.datasets.head.refit.rewrite import capture_plan, link_or_copy
+from headbench.datasets.head.refit.settings import RefitCommandSettings
+
+from ...tiny_capture import make_plan, write_tiny_capture
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A capture, its head under another name as target, and what the command made of them."""
+    root = tmp_path_factory.mktemp("refit")
+    offset = np.zeros_like(make_plan().static_offset)
+    tiny = write_tiny_capture(root / "capture", make_plan(static_offset=offset))
+    save_head(root / "other.npz", replace(tiny.writer.plan.head, version="other"))
+    settings = RefitCommandSettings(str(tiny.union), str(root / "other.npz"), str(root / "out"))
+    return root, settings, run(settings)
+
+
+def test_the_new_capture_holds_the_same_frames_with_other_tracking(finished):
+    _, settings, findings = finished
+    old, new = read_capture(settings.capture), read_capture(findings.data["capture"])
+    assert new.head.version == "other"
+    assert {name: set(keys) for name, keys in new.splits.items()} == {
+        name: set(keys) for name, keys in old.splits.items()
+    }
+    assert dict(new.excluded) == dict(old.excluded)
+    for key, files in old.files.items():
+        assert os.path.samefile(files.image, new.files[key].image)
+        assert os.path.samefile(files.mask, new.files[key].mask)
+    for name, camera in old.cameras.items():
+        np.testing.assert_allclose(new.cameras[name].K, camera.K, atol=1e-6)
+    for timestep, pose in old.poses.items():
+        np.testing.assert_allclose(new.poses[timestep].jaw, pose.jaw, atol=0.01)
+
+
+def test_report_and_picture(finished):
+    root, _, findings = finished
+    stored = json.loads((root / "out" / "refit.json").read_text())
+    assert stored["timesteps"] == len(stored["frames"]) == 7
+    assert stored["mean_mm"] == pytest.approx(np.mean([frame["mean_mm"] for frame in stored["frames"]]))
+    assert stored["mean_mm"] < 0.15
+    assert f"mean {stored['mean_mm']:.3f}" in findings.text
+    assert sum(value is None for value in stored["vertices_mm"]) > 0
+    picture = cv2.imread(str(root / "out" / "heat_map.png"))
+    assert picture is not None
+    assert picture.shape == (484, 880, 3)
+    middle = picture[66:426, 320:560].reshape(-1, 3).astype(int)
+    coloured = np.ptp(middle, axis=1) > 60
+    assert coloured.mean() > 0.05  # the face; the rest of the head is grey
+
+
+def test_started_again_it_fits_nothing_anew(finished, monkeypatch):
+    _, settings, findings = finished
+    monkeypatch.setattr(block, "solve_frame", lambda *_: pytest.fail("fitted again"))
+    assert run(settings).data == findings.data
+
+
+def test_a_target_of_the_same_version_is_refused(finished):
+    _, settings, findings = finished
+    again = replace(settings, capture=findings.data["capture"], out=settings.out + "2")
+    with pytest.raises(InputError, match="another head model"):
+        run(again)
+
+
+def test_writing_into_the_capture_is_refused(finished):
+    root, settings, _ = finished
+    with pytest.raises(InputError, match="apart from the capture"):
+        run(replace(settings, out=str(root / "capture")))
+
+
+def test_targets_by_name():
+    assert target_head("2020").version == target_head("procedural2020").version == "procedural2020"
+    with pytest.raises(InputError, match="no-such-head"):
+        target_head("no-such-head")
+
+
+def test_a_hole_in_the_grid_is_refused_before_the_fit(finished, tmp_path, monkeypatch):
+    """A frame no JSON lists, its image still on disk: the layout written has no place to say so."""
+    root, settings, _ = finished
+    shutil.copytree(root / "capture", tmp_path / "capture")
+    union = next((tmp_path / "capture").glob("UNION*"))
+    path = union / "transforms_train.json"
+    value = json.loads(path.read_text())
+    gone = value["frames"].pop(1)
+    path.write_text(json.dumps(value))
+    lost = {*read_capture(settings.capture).files} - {*read_capture(union).files}
+    monkeypatch.setattr(block, "solve_frame", lambda *_: pytest.fail("fitted"))
+    with pytest.raises(InputError) as caught:
+        run(replace(settings, capture=str(union), out=str(tmp_path / "out")))
+    assert caught.value.file == str(union)
+    assert caught.value.key == f"frame {lost.pop()}"
+    assert f"/{gone['timestep_index']:05d}/{gone['camera_id']}" in caught.value.key
+    assert "no such frame" in caught.value.found
+    assert not lost
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("other", [None, "another reason"])
+def test_exclusions_of_part_of_a_timestep_are_refused(other, finished):
+    """The layout excludes whole timesteps for one reason: one camera's exclusion would become all cameras'."""
+    _, settings, _ = finished
+    clip = read_capture(settings.capture)
+    capture_plan(clip)
+    keys = sorted(clip.excluded)
+    assert len(keys) == len(clip.cameras) > 1
+    excluded = dict(clip.excluded)
+    splits = dict(clip.splits)
+    if other is None:
+        del excluded[keys[1]]
+        splits["self_reenactment"] = (*splits["self_reenactment"], keys[1])
+    else:
+        excluded[keys[1]] = other
+    with pytest.raises(InputError) as caught:
+        capture_plan(replace(clip, excluded=excluded, splits=splits), settings.capture)
+    assert caught.value.key == "excluded"
+    assert str(keys[0]) in caught.value.found
+    assert f"{keys[1]} {f'excluded: {other}' if other else 'kept'}" in caught.value.found
+
+
+def test_splits_the_layout_cannot_hold_are_refused(finished):
+    _, settings, _ = finished
+    clip = read_capture(settings.capture)
+    train = clip.splits["train"]
+    # One training frame is called a novel view: its camera is then held out, and not all its frames are.
+    swapped = {**clip.splits, "train": train[1:], "novel_view": (*clip.splits["novel_view"], train[0])}
+    with pytest.raises(InputError, match="splits"):
+        capture_plan(replace(clip, splits=swapped))
+
+
+def test_images_that_are_no_png_are_refused(finished):
+    _, settings, _ = finished
+    clip = read_capture(settings.capture)
+    key = next(iter(clip.files))
+    files = {**clip.files, key: clip.files[key]._replace(image=clip.files[key].image.with_suffix(".jpg"))}
+    with pytest.raises(InputError, match="PNG"):
+        capture_plan(replace(clip, files=files))
+
+
+def test_files_are_copied_where_they_cannot_be_linked(tmp_path, monkeypatch):
+    source = tmp_path / "a.png"
+    source.write_bytes(b"content")
+
+    def refuse(*_):
+        raise OSError("no links here")
+
+    monkeypatch.setattr(os, "link", refuse)
+    link_or_copy(source, tmp_path / "b" / "c.png")
+    assert (tmp_path / "b" / "c.png").read_bytes() == b"content"
+    assert [path.name for path in (tmp_path / "b").iterdir()] == ["c.png"]
+    shutil.rmtree(tmp_path / "b")
+
+
+def test_colours_run_from_dark_to_light():
+    brightness = colour_scale(np.linspace(0, 1, 11)) @ [0.299, 0.587, 0.114]
+    assert (np.diff(brightness) > 0).all()

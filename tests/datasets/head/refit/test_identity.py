@@ -1,0 +1,100 @@
+"""Identity, alignment and counterparts, over one topology and over two."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from headbench.bench.errors import InputError
+from headbench.datasets.head.procedural.model import procedural_head
+from headbench.datasets.head.refit.identity import (
+    fit_shape,
+    fitted_vertices,
+    match,
+    rigid_alignment,
+    same_topology,
+)
+from headbench.datasets.head.refit.settings import RefitSettings
+
+from ..toy import toy_head
+from .heads import subdivided
+
+HEAD = procedural_head("2020")
+SETTINGS = RefitSettings()
+
+
+@pytest.fixture(scope="module")
+def shape():
+    return np.random.default_rng(4).normal(size=HEAD.shape_basis.shape[2])
+
+
+def test_the_neutral_face_gives_the_identity_back(shape):
+    vertices, weights = fitted_vertices(HEAD, SETTINGS)
+    neutral = HEAD.template.astype(float) + HEAD.shape_basis.astype(float) @ shape
+    found = fit_shape(HEAD, vertices, weights, neutral[vertices], RefitSettings(prior_mm=1e-6))
+    fitted = HEAD.template + HEAD.shape_basis @ found
+    assert np.abs(fitted - neutral)[vertices].max() < 1e-6
+    bounded = fit_shape(HEAD, vertices, weights, neutral[vertices], RefitSettings(coefficient_bound=0.5))
+    assert np.abs(bounded).max() == 0.5
+
+
+def test_weights_are_those_of_the_regions():
+    settings = RefitSettings(eyeballs=0.3, lips=2.0, eye_region=4.0)
+    vertices, weights = fitted_vertices(HEAD, settings)
+    by_vertex = dict(zip(vertices.tolist(), weights.tolist()))
+    plain = np.setdiff1d(HEAD.regions["face"], np.union1d(HEAD.regions["lips"], HEAD.regions["eye_region"]))
+    lips = np.setdiff1d(
+        np.intersect1d(HEAD.regions["face"], HEAD.regions["lips"]), HEAD.regions["eye_region"]
+    )
+    assert {by_vertex[v] for v in plain.tolist()} == {1.0}
+    assert {by_vertex[v] for v in lips.tolist()} == {2.0}
+    assert by_vertex[int(HEAD.regions["left_eyeball"][0])] == 0.3
+    assert len(fitted_vertices(HEAD, RefitSettings(eyeballs=0.0))[0]) == len(HEAD.regions["face"])
+
+
+def test_rigid_alignment_is_found_and_is_no_reflection():
+    rng = np.random.default_rng(0)
+    points, turn, shift = rng.normal(size=(20, 3)), Rotation.from_rotvec([1, 2, -0.5]).as_matrix(), [1, 2, 3]
+    motion = rigid_alignment(points, points @ turn.T + shift, rng.uniform(0.1, 1, 20))
+    np.testing.assert_allclose(motion[:3], np.column_stack([turn, shift]), atol=1e-12)
+    mirrored = rigid_alignment(points, points * [-1, 1, 1], np.ones(20))
+    assert np.linalg.det(mirrored[:3, :3]) == pytest.approx(1)
+
+
+def test_another_topology_in_another_place_is_matched(shape):
+    """The same surface cut finer, vertices in random order, turned and shifted: counterparts are the old vertices."""
+    source = subdivided(HEAD)
+    assert not same_topology(source, HEAD)
+    neutral = source.template + source.shape_basis @ shape
+    turn = Rotation.from_rotvec([0.1, -0.2, 0.15]).as_matrix()
+    moved = neutral @ turn.T + [0.02, -0.03, 0.01]
+    matching = match(source, moved, HEAD, RefitSettings(prior_mm=0.001))
+    assert len(matching.vertices) > 0.95 * len(fitted_vertices(HEAD, SETTINGS)[0])
+    np.testing.assert_allclose(matching.counterparts.sum(axis=1), 1)
+    wanted = HEAD.template + HEAD.shape_basis @ shape
+    aligned = (matching.counterparts @ moved) @ matching.alignment[:3, :3].T + matching.alignment[:3, 3]
+    # Identity and alignment may share a rigid part, and counterparts a slide along the surface.
+    placed = aligned_surface(aligned, wanted[matching.vertices])
+    assert np.linalg.norm(aligned - placed, axis=1).mean() < 0.5e-3
+    fitted = (HEAD.template + HEAD.shape_basis @ matching.shape)[matching.vertices]
+    assert np.linalg.norm(fitted - aligned, axis=1).mean() < 0.2e-3
+
+
+def aligned_surface(points, other):
+    """``other`` moved rigidly onto ``points``."""
+    motion = rigid_alignment(other, points, np.ones(len(other)))
+    return other @ motion[:3, :3].T + motion[:3, 3]
+
+
+def test_heads_without_a_face_are_refused():
+    head = toy_head(16)
+    faceless = type(head)(**{**vars(head), "regions": {k: v for k, v in head.regions.items() if k != "face"}})
+    with pytest.raises(InputError, match="face"):
+        fitted_vertices(faceless, SETTINGS)
+
+
+def test_heads_far_from_each_other_are_refused():
+    head = toy_head(16)
+    other = subdivided(head)
+    squashed = other.template * [1.0, 1.0, 0.1]
+    with pytest.raises(InputError, match="counterpart"):
+        match(other, 3 * squashed, head, SETTINGS)

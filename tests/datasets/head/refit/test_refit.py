@@ -1,0 +1,253 @@
+"""The whole refit: floors where a solution exists, what stays, what is refused, and that it continues."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from threadpoolctl import threadpool_limits
+
+from headbench.bench.contracts import Camera
+from headbench.bench.errors import InputError
+from headbench.datasets.head.head_frame import camera_in_head_frame, pose_in_head_frame, rigid_motions
+from headbench.datasets.head.model import HeadModel
+from headbench.datasets.head.procedural.model import procedural_head
+from headbench.datasets.head.refit import block
+from headbench.datasets.head.refit.refit import BLOCK, refit, refit_clip
+from headbench.datasets.head.refit.settings import RefitSettings
+from headbench.datasets.head.teeth import with_teeth
+from headbench.tests.benchmarks.refit import EXACT_MEAN_MM, EXACT_P95_MM, performance
+
+from ..toy import toy_head
+from .heads import subdivided, toy_pair
+
+SOURCE, TARGET = toy_pair()
+
+
+def vertices(clip, timesteps):
+    """(T, V, 3) meshes of a clip in the world."""
+    model = HeadModel(clip.head, dtype=torch.float64)
+    shape = torch.from_numpy(np.asarray(clip.shape, float))
+    canonical = model.canonical(shape, torch.from_numpy(np.asarray(clip.static_offset, float)))
+    return model(canonical=canonical, **model.pose_arguments([clip.poses[t] for t in timesteps])).numpy()
+
+
+@pytest.fixture(scope="module")
+def exact():
+    source = replace(procedural_head("2020"), version="source")
+    return performance(source, 24), procedural_head("2020")
+
+
+def test_an_exact_solution_is_found(exact):
+    clip, target = exact
+    refitted = refit(clip, target)
+    summary = refitted.report.summary()
+    assert summary["mean_mm"] < EXACT_MEAN_MM / 10
+    assert summary["p95_mm"] < EXACT_P95_MM / 10
+    face = target.regions["face"]
+    timesteps = sorted(clip.poses)
+    gaps = (
+        1e3 * np.linalg.norm(vertices(refitted.clip, timesteps) - vertices(clip, timesteps), axis=2)[:, face]
+    )
+    np.testing.assert_allclose([f.mean_mm for f in refitted.report.frames], gaps.mean(axis=1))
+    np.testing.assert_allclose([f.p95_mm for f in refitted.report.frames], np.percentile(gaps, 95, axis=1))
+    assert np.nanmean(refitted.report.vertex_mm[face]) == pytest.approx(gaps.mean())
+
+
+def test_another_basis_is_fitted_and_the_step_recorded():
+    clip = performance(procedural_head("2023"), 12)
+    target = procedural_head("2020")
+    derived = refit_clip(clip, target)
+    step = derived.steps[-1]
+    assert (step.name, step.input_fingerprint) == ("refit_head", clip.fingerprint)
+    assert step.parameters["target_fingerprint"] == target.fingerprint()
+    assert step.parameters["residual"]["mean_mm"] < 0.15
+    assert derived.fingerprint != clip.fingerprint
+    assert {pose.head_model for pose in derived.poses.values()} == {target.version}
+    assert {pose.timestep for pose in derived.poses.values()} == set(clip.poses)
+    assert derived.splits == clip.splits
+    blinking = np.array([pose.eyelids for pose in derived.poses.values()])
+    assert np.ptp(blinking, axis=0).min() > 0.1  # 2023 blinks by its expression, 2020 by eyelids
+
+
+@pytest.mark.parametrize("neck", ["fold", "keep"])
+def test_the_rigid_motion_of_the_head_stays(neck):
+    clip = performance(SOURCE, 6)
+    derived = refit_clip(clip, TARGET, RefitSettings(neck=neck))
+    timesteps = sorted(clip.poses)
+    motions = [
+        rigid_motions(c.head, c.shape, c.static_offset, [c.poses[t] for t in timesteps])
+        for c in (clip, derived)
+    ]
+    np.testing.assert_allclose(motions[1], motions[0], atol=1e-12)
+    turned = np.abs([pose.neck for pose in derived.poses.values()]).max()
+    assert turned == (0 if neck == "fold" else np.abs([p.neck for p in clip.poses.values()]).max())
+
+
+def test_a_camera_that_carries_the_motion_sees_the_same_mesh():
+    """With the neck folded in, every vertex projects where it did, shoulders and eyelids included."""
+    derived = refit_clip(performance(SOURCE, 4), TARGET)
+    timesteps = sorted(derived.poses)
+    motions = rigid_motions(
+        TARGET, derived.shape, derived.static_offset, [derived.poses[t] for t in timesteps]
+    )
+    world_to_camera = np.diag([1.0, -1.0, -1.0, 1.0])
+    world_to_camera[2, 3] = 1.2
+    camera = Camera("c", 550, 802, np.array([[1500.0, 0, 280], [0, 1500, 390], [0, 0, 1]]), world_to_camera)
+    still = replace(derived, poses={t: pose_in_head_frame(derived.poses[t]) for t in timesteps})
+
+    def project(points, seen):
+        rotated = points @ seen.world_to_camera[:3, :3].T + seen.world_to_camera[:3, 3]
+        pixels = rotated @ seen.K.T
+        return pixels[:, :2] / pixels[:, 2:]
+
+    for world, local, motion in zip(vertices(derived, timesteps), vertices(still, timesteps), motions):
+        moved = camera_in_head_frame(camera, motion)
+        np.testing.assert_allclose(project(local, moved), project(world, camera), atol=1e-8)
+    assert np.abs(motions[:, :3, 3]).max() > 0.01
+
+
+def test_a_residual_offset_makes_the_neutral_head_exact():
+    clip = performance(procedural_head("2023"), 2)
+    bumpy = replace(
+        clip, static_offset=0.002 * np.random.default_rng(0).normal(size=clip.head.template.shape)
+    )
+    target = procedural_head("2020")
+    without, kept = (
+        refit(bumpy, target, RefitSettings(static_offset=choice)) for choice in ("zero", "residual")
+    )
+    assert not without.clip.static_offset.any()
+    assert without.report.neutral_mm > 1.0
+    assert kept.report.neutral_mm < 1e-4
+
+
+def test_teeth_are_given_to_the_target_where_the_source_has_them():
+    clip = performance(with_teeth(SOURCE), 2)
+    derived = refit_clip(clip, TARGET)
+    assert len(derived.head.template) == len(clip.head.template)
+    assert derived.steps[-1].parameters["residual"]["mean_mm"] < 0.1
+
+
+@pytest.mark.slow
+def test_another_topology_is_refitted(exact):
+    """The same model on a finer mesh in another order; only correspondence is in the way of an exact solution."""
+    _, target = exact
+    clip = performance(subdivided(target), 6, strength=0.7)
+    refitted = refit(clip, target)
+    assert refitted.clip.head is target
+    assert refitted.report.summary()["mean_mm"] < 2 * EXACT_MEAN_MM
+    with pytest.raises(InputError, match="static offset"):
+        refit(clip, target, RefitSettings(static_offset="residual"))
+
+
+# ------------------------------------------------------------------ extremes
+
+
+def test_a_target_out_of_reach_ends_at_bounds_that_are_reported():
+    clip = performance(SOURCE, 3, strength=30.0)
+    report = refit(clip, TARGET, RefitSettings(coefficient_bound=3.0, jaw_bound=0.1)).report
+    bounded = {name for frame in report.frames for name in frame.at_bound}
+    assert any(name.startswith("expression[") for name in bounded)
+    assert "jaw[0]" in bounded
+    assert all(np.isfinite(frame.mean_mm) for frame in report.frames)
+    assert report.summary()["timesteps_at_bound"] == 3
+
+
+def test_no_timestep_is_refused():
+    with pytest.raises(InputError, match="timestep"):
+        refit_clip(replace(performance(SOURCE, 1), poses={}), TARGET)
+
+
+def test_the_number_of_threads_does_not_change_the_clip():
+    clip, target = performance(procedural_head("2023"), 3), procedural_head("2020")
+    found = set()
+    for threads in (1, 2):
+        with threadpool_limits(threads):
+            found.add(refit_clip(clip, target).fingerprint)
+    assert len(found) == 1
+
+
+def test_identical_timesteps_give_identical_poses():
+    clip = performance(SOURCE, 1)
+    pose = replace(clip.poses[0], eyelids=np.zeros(2))
+    derived = refit_clip(replace(clip, poses={t: replace(pose, timestep=t) for t in range(4)}), TARGET)
+    first = derived.poses[0]
+    for other in derived.poses.values():
+        np.testing.assert_allclose(other.expression, first.expression, atol=1e-4)
+        np.testing.assert_allclose(other.jaw, first.jaw, atol=1e-5)
+
+
+@pytest.mark.parametrize("field", ["expression", "rotation", "neck", "jaw", "eyes", "translation", "eyelids"])
+def test_numbers_that_are_not_finite_are_refused(field):
+    clip = performance(SOURCE, 3)
+    values = getattr(clip.poses[1], field).copy()
+    values[0] = np.nan
+    broken = {**clip.poses, 1: replace(clip.poses[1], **{field: values})}
+    with pytest.raises(InputError, match=f"{field}, timestep 1"):
+        refit_clip(replace(clip, poses=broken), TARGET)
+
+
+def test_an_identity_that_is_not_finite_is_refused():
+    clip = performance(SOURCE, 1)
+    with pytest.raises(InputError, match="shape"):
+        refit_clip(replace(clip, shape=np.full_like(clip.shape, np.inf)), TARGET)
+
+
+def test_half_a_turn_of_head_and_jaw(exact):
+    clip, target = exact
+    turned = replace(clip.poses[0], rotation=np.array([0, np.pi, 0]), jaw=np.array([0.9, 0, 0]))
+    refitted = refit(replace(clip, poses={0: turned}), target)
+    assert refitted.report.frames[0].mean_mm < EXACT_MEAN_MM
+
+
+@pytest.mark.parametrize(("name", "value"), [("prior_mm", 0.0), ("jaw_bound", np.nan), ("lips", -1.0)])
+def test_settings_out_of_range_are_refused(name, value):
+    with pytest.raises(InputError, match=name):
+        RefitSettings(**{name: value})
+
+
+# ------------------------------------------------------------------ blocks on disk
+
+
+def test_a_second_call_continues_at_the_first_block_that_is_missing(tmp_path, monkeypatch):
+    clip = performance(SOURCE, 2 * BLOCK + 5)
+    whole = refit_clip(clip, TARGET, folder=tmp_path)
+    assert len(list(tmp_path.iterdir())) == 3
+    (tmp_path / "refit-00001.npz").unlink()
+    solved: list[object] = []
+    solve = block.solve_frame
+
+    def counted(problem, frame, *rest):
+        solved.append(frame)
+        return solve(problem, frame, *rest)
+
+    monkeypatch.setattr(block, "solve_frame", counted)
+    again = refit_clip(clip, TARGET, folder=tmp_path)
+    assert len(solved) == BLOCK
+    for t, pose in whole.poses.items():
+        np.testing.assert_array_equal(again.poses[t].expression, pose.expression)
+        np.testing.assert_array_equal(again.poses[t].translation, pose.translation)
+    assert again.fingerprint == whole.fingerprint
+
+
+def test_blocks_of_other_input_are_not_taken(tmp_path):
+    clip = performance(SOURCE, 4)
+    refit_clip(clip, TARGET, folder=tmp_path)
+    other = {t: replace(pose, jaw=pose.jaw * 0.5) for t, pose in clip.poses.items()}
+    again = refit_clip(replace(clip, poses=other), TARGET, folder=tmp_path)
+    fresh = refit_clip(replace(clip, poses=other), TARGET)
+    np.testing.assert_array_equal(again.poses[2].jaw, fresh.poses[2].jaw)
+
+
+def test_progress_is_told():
+    told = []
+    refit_clip(performance(SOURCE, 3), TARGET, progress=lambda *a: told.append(a[:2]))
+    assert told[0] == (0, 3)
+    assert told[-1] == (3, 3)
+
+
+def test_a_head_of_another_version_is_kept_apart():
+    clip = performance(toy_head(16, version="x"), 2)
+    wrong = {t: replace(pose, head_model="y") for t, pose in clip.poses.items()}
+    with pytest.raises(InputError, match="head_model"):
+        refit_clip(replace(clip, poses=wrong), toy_head(16, version="z"))

@@ -1,0 +1,50 @@
+"""``headbench inspect`` writes picture and numbers, and refuses what cannot be shown."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from headbench.bench.errors import InputError
+from headbench.datasets.inspect.command import NUMBERS, PICTURE, run
+from headbench.datasets.inspect.settings import InspectSettings
+
+from ..lint.good_capture import read_rgb
+
+
+def test_picture_numbers_and_text(capture, clip, tmp_path):
+    calls = []
+    settings = InspectSettings(str(capture.union), out=str(tmp_path / "out"), timesteps=1, cameras=2)
+    findings = run(settings, lambda *arguments: calls.append(arguments))
+    assert findings.passed
+    assert calls
+    picture = read_rgb(tmp_path / "out" / PICTURE)
+    assert picture.shape[1] == 1600
+    numbers = json.loads((tmp_path / "out" / NUMBERS).read_text())
+    assert numbers["fingerprint"] == clip.fingerprint
+    assert {row["split"]: row["images"] for row in numbers["splits"]} == {
+        "train": 36,
+        "novel_view": 12,
+        "self_reenactment": 40,
+    }
+    held_out = [camera for camera in numbers["cameras"] if camera["held_out"]]
+    assert [camera["id"] for camera in held_out] == ["222200037"]
+    assert held_out[0]["principal_point_off_centre_px"] == pytest.approx([0.4, -0.6])
+    assert held_out[0]["position_m"] == pytest.approx(clip.cameras["222200037"].center)
+    assert "novel_view" in findings.text
+    assert "FREE" in findings.text
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [NUMBERS, PICTURE]
+
+
+@pytest.mark.parametrize("changes", [{"timesteps": 0}, {"cameras": 0}])
+def test_counts_below_one_are_refused(capture, tmp_path, changes):
+    with pytest.raises(InputError, match="at least 1"):
+        run(InspectSettings(str(capture.union), out=str(tmp_path), **changes))
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_capture_that_does_not_read_is_refused_before_anything_is_written(tmp_path):
+    with pytest.raises(InputError):
+        run(InspectSettings(str(tmp_path / "nothing"), out=str(tmp_path / "out")))
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,129 @@
+"""The parts of the picture: cameras on their side, outlines on silhouettes, choices of what to show."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from headbench.bench.contracts import FrameKey
+from headbench.datasets.inspect.canvas import HELD_OUT, TRAIN, Canvas
+from headbench.datasets.inspect.expression_panel import space_summary
+from headbench.datasets.inspect.figure import WIDTH, draw_figure
+from headbench.datasets.inspect.overlay_panel import OUTLINE, overlay, pick_cameras, pick_timesteps
+from headbench.datasets.inspect.rig_panel import draw_rig, head_frame
+from headbench.datasets.inspect.statistics import (
+    ExpressionSpace,
+    expression_space,
+    posed_meshes,
+    sequence_rows,
+    split_rows,
+)
+
+from ..lint.good_capture import FRONTAL
+from ..tiny_capture import look_at
+
+
+def near(picture: np.ndarray, colour: tuple[int, int, int]) -> np.ndarray:
+    """(N, 2) x, y of pixels of about a colour."""
+    return np.argwhere(np.abs(picture.astype(int) - colour).max(axis=2) < 40)[:, ::-1]
+
+
+@pytest.fixture(scope="module")
+def head(clip):
+    vertices = clip.head.template
+    face = clip.head.regions["face"]
+    return vertices, clip.head.faces, head_frame(vertices, clip.head.template, face)
+
+
+def test_the_head_frame_undoes_a_rigid_motion(clip):
+    template = clip.head.template
+    angle = 0.7
+    turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    moved = template @ turn.T + [0.3, -0.2, 0.1]
+    frame = head_frame(moved, template, np.arange(len(template)))
+    back = moved @ frame[:3, :3].T + frame[:3, 3]
+    assert back == pytest.approx(template - template.mean(axis=0), abs=1e-12)
+
+
+@pytest.mark.parametrize("above", [True, False])
+def test_cameras_stand_on_their_side_of_the_head(head, above):
+    """One before the head and to its left and above, held out; one before it, lower."""
+    cameras = {
+        "front": look_at("front", np.array([0.0, -0.1, 1.0]), 60, 80, 30, 40),
+        "aside": look_at("aside", np.array([0.8, 0.5, 0.6]), 60, 80, 30, 40),
+    }
+    canvas = Canvas(400, 400)
+    draw_rig(canvas, (0, 0, 400, 400), cameras, {"aside"}, *head, above=above)
+    picture = canvas.finish()
+    front, aside = near(picture, TRAIN).mean(axis=0), near(picture, HELD_OUT).mean(axis=0)
+    grey = (
+        (np.ptp(picture.astype(int), axis=2) < 12) & (picture.max(axis=2) < 215) & (picture.min(axis=2) > 60)
+    )
+    rows, columns = np.nonzero(cv2.erode(grey.astype(np.uint8), np.ones((7, 7), np.uint8)))
+    middle = np.array([columns.mean(), rows.mean()])
+    if above:  # the subject's left is the page's right, its front the page's foot
+        assert front[1] > middle[1] + 50
+        assert abs(front[0] - middle[0]) < 25
+        assert aside[0] > front[0] + 50
+    else:  # the front is the page's right, up is up
+        assert front[0] > middle[0] + 50
+        assert aside[1] < front[1] - 50
+
+
+def test_the_outline_lies_on_the_silhouette(clip):
+    key = clip.splits["train"][0]
+    camera, height = clip.cameras[key.camera], 320
+    vertices = posed_meshes(clip, [key.timestep])[0]
+    outlined, covered = overlay(clip.image(key), vertices, clip.head.faces, camera, height)
+    assert outlined.shape == covered.shape == (height, 240, 3)
+    drawn = near(outlined, OUTLINE)
+    mask = cv2.resize(clip.mask(key), (240, height), interpolation=cv2.INTER_LINEAR) > 127
+    edge = mask & ~cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
+    distance = cv2.distanceTransform((~edge).astype(np.uint8), cv2.DIST_L2, 5)
+    assert np.percentile(distance[drawn[:, 1], drawn[:, 0]], 95) < 4  # one image pixel is four here
+    assert len(drawn) > 200
+    inside = cv2.erode(mask.astype(np.uint8), np.ones((15, 15), np.uint8)).astype(bool)
+    assert np.ptp(covered[inside].astype(int), axis=1).mean() < 45  # clay over skin
+
+
+def test_held_out_cameras_come_first(clip):
+    assert pick_cameras(clip, 3) == [FRONTAL, "222200042", "222200049"]
+    assert pick_cameras(clip, 1) == [FRONTAL]
+    assert sorted(pick_cameras(clip, 99)) == sorted(clip.cameras)
+    without = replace(clip, splits={**clip.splits, "novel_view": ()})
+    assert pick_cameras(without, 2) == ["222200042", "222200049"]
+
+
+def test_timesteps_are_distinct_and_told_why(clip):
+    space = expression_space(clip)
+    for count in (1, 3, 6):
+        chosen = pick_timesteps(clip, space, count)
+        assert len({timestep for timestep, _ in chosen}) == len(chosen) == count
+    reasons = {reason: timestep for timestep, reason in pick_timesteps(clip, space, 3)}
+    assert reasons["widest jaw"] == max(clip.poses, key=lambda t: np.linalg.norm(clip.poses[t].jaw))
+    assert reasons["calmest face"] == min(clip.poses, key=lambda t: np.linalg.norm(clip.poses[t].expression))
+
+
+def test_a_clip_with_holes_and_without_tests_is_drawn(clip):
+    """One camera did not record a timestep; nothing is held out."""
+    gone = FrameKey(clip.subject, "FREE", 14, "222200042")
+    kept = {key: files for key, files in clip.files.items() if key != gone}
+    whole = tuple(kept)
+    bare = replace(clip, files=kept, splits={"train": whole, "novel_view": (), "self_reenactment": ()})
+    picture = draw_figure(
+        bare, split_rows(bare), sequence_rows(bare), expression_space(bare), timesteps=22, cameras=2
+    )
+    assert picture.shape[1] == WIDTH
+    assert len(np.argwhere((picture == 238).all(axis=2))) > 500, "the missing frame is a grey field"
+
+
+@pytest.mark.parametrize(
+    ("explained", "begins"),
+    [((0.97, 0.03), "1 component explains 95%"), ((0.8, 0.2), "2 components explain 95%")],
+)
+def test_the_summary_of_expressions_counts_in_singular_and_plural(explained, begins):
+    space = ExpressionSpace([0], np.zeros(1, bool), np.zeros((1, 2)), np.array(explained), {})
+    assert space_summary(space).startswith(begins)

@@ -1,0 +1,111 @@
+"""Statistics against scipy's rotations and an explicit PCA over vertices."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from headbench.datasets.inspect.statistics import expression_space, posed_meshes, sequence_rows, split_rows
+from headbench.datasets.steps.exclude import exclude_timesteps
+
+from ..lint.good_capture import LENGTHS
+
+
+@pytest.fixture(scope="module")
+def space(clip):
+    return expression_space(clip)
+
+
+def face_displacements(clip, timesteps):
+    """(T, F, 3) millimetres that the face moves by expression."""
+    face = clip.head.regions["face"]
+    basis = clip.head.expression_basis[face]
+    return 1000 * np.stack([basis @ clip.poses[t].expression for t in timesteps]).astype(np.float64)
+
+
+def test_split_rows_count_what_the_splits_hold(clip):
+    rows = {row.split: row for row in split_rows(clip)}
+    assert set(rows) == {"train", "novel_view", "self_reenactment"}
+    train = rows["train"]
+    assert (train.images, train.timesteps, train.cameras, train.sequences) == (36, 12, 3, 2)
+    assert (rows["novel_view"].images, rows["novel_view"].cameras) == (12, 1)
+    assert (rows["self_reenactment"].images, rows["self_reenactment"].cameras) == (40, 4)
+
+
+def test_excluded_timesteps_are_counted_and_left_out(clip):
+    without = exclude_timesteps(clip, {12: "tongue out"})
+    assert [row.images for row in split_rows(without) if row.split == "excluded"] == [4]
+    row = next(row for row in sequence_rows(without) if row.sequence == "FREE")
+    assert (row.timesteps, row.excluded) == (LENGTHS["FREE"] - 1, 1)
+    assert 12 not in expression_space(without).timesteps
+
+
+def test_sequence_rows_agree_with_scipy(clip):
+    rows = sequence_rows(clip)
+    assert [row.sequence for row in rows] == list(LENGTHS)
+    assert [row.held_out for row in rows] == [False, False, True]
+    timesteps = sorted({k.timestep for k in clip.splits["self_reenactment"]})
+    poses = [clip.poses[t] for t in timesteps]
+    turns = Rotation.from_rotvec([p.rotation for p in poses]) * Rotation.from_rotvec([p.neck for p in poses])
+    away = np.degrees((turns.mean().inv() * turns).magnitude()).max()
+    free = rows[-1]
+    assert free.head_deg == pytest.approx(away, rel=1e-3)
+    jaw = np.degrees(Rotation.from_rotvec([p.jaw for p in poses]).magnitude())
+    assert free.jaw_deg == pytest.approx((jaw.min(), np.median(jaw), jaw.max()), rel=1e-5)
+    places = np.stack([p.translation for p in poses])
+    assert free.head_mm == pytest.approx(
+        1000 * np.linalg.norm(places - places.mean(0), axis=1).max(), rel=1e-4
+    )
+    everywhere = np.stack([clip.head.expression_basis @ p.expression for p in poses])
+    reach = 1000 * np.linalg.norm(everywhere, axis=2).max(axis=1)
+    assert free.reach_mm == pytest.approx((np.median(reach), reach.max()), rel=1e-5)
+
+
+def test_the_space_of_expressions_is_the_pca_of_the_faces(clip, space):
+    faces = face_displacements(clip, space.timesteps)
+    count = faces.shape[1]
+    flat = faces.reshape(len(faces), -1)
+    train = flat[~space.held_out]
+    _, singular, axes = np.linalg.svd(train - train.mean(axis=0), full_matrices=False)
+    explained = singular**2 / (singular**2).sum()
+    kept = min(len(explained), len(space.explained), 6)
+    assert space.explained[:kept] == pytest.approx(explained[:kept], abs=1e-8)
+    scores = (flat - train.mean(axis=0)) @ axes.T / np.sqrt(count)
+    for component in range(3):
+        ours, theirs = space.scores_mm[:, component], scores[:, component]
+        assert min(np.abs(ours - theirs).max(), np.abs(ours + theirs).max()) < 1e-6
+    assert np.cumsum(space.explained)[space.kept - 1] >= 0.95
+    assert space.kept == 1 or np.cumsum(space.explained)[space.kept - 2] < 0.95
+
+
+def test_novelty_is_the_distance_to_the_nearest_training_face(clip, space):
+    faces = face_displacements(clip, space.timesteps)
+    train = faces[~space.held_out]
+    for timestep, face in zip(space.timesteps, faces):
+        if timestep in space.novelty_mm:
+            rms = np.sqrt(((train - face) ** 2).sum(axis=2).mean(axis=1))
+            assert space.novelty_mm[timestep] == pytest.approx(rms.min(), rel=1e-6)
+    assert set(space.novelty_mm) == {t for t, new in zip(space.timesteps, space.held_out) if new}
+
+
+def test_a_test_face_that_was_trained_on_is_not_new(clip):
+    from dataclasses import replace
+
+    twin = dict(clip.poses)
+    twin[15] = replace(clip.poses[15], expression=clip.poses[3].expression)
+    novelty = expression_space(replace(clip, poses=twin)).novelty_mm
+    assert novelty[15] < 1e-6
+    assert min(value for t, value in novelty.items() if t != 15) > 0.01
+
+
+def test_posed_meshes_are_where_the_images_show_them(clip):
+    key = clip.splits["train"][0]
+    camera = clip.cameras[key.camera]
+    points = posed_meshes(clip, [key.timestep])[0]
+    points = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    pixels = (points @ camera.K.T)[:, :2] / points[:, 2:]
+    mask = clip.mask(key)
+    rows, columns = np.nonzero(mask > 0)
+    assert pixels[:, 0].min() == pytest.approx(columns.min() + 0.5, abs=1.0)
+    assert pixels[:, 1].max() == pytest.approx(rows.max() + 0.5, abs=1.0)

@@ -1,0 +1,132 @@
+"""Numbers of the figures against brute force, and that the pictures show what they say."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from headbench.bench.contracts import no_progress
+from headbench.bench.errors import InputError
+from headbench.bench.io.documents import read_json
+from headbench.datasets.ga.reader import read_capture
+from headbench.datasets.steps.expression_clusters import cluster_expressions
+from headbench.datasets.steps.pictures.class_figure import class_colour, draw_classes, frontal_key
+from headbench.datasets.steps.pictures.command import run
+from headbench.datasets.steps.pictures.jaw_figure import draw_jaw_bases, find_jaw_bases
+from headbench.datasets.steps.pictures.meshes import draw_meshes, unposed_meshes
+from headbench.datasets.steps.pictures.settings import StepsSettings
+
+from .clips import make_clip, with_poses
+
+
+@pytest.fixture(scope="module")
+def clip(pristine_capture):
+    return read_capture(pristine_capture.union)
+
+
+def turn_between(one, other):
+    """Angle between two axis-angle rotations, degrees."""
+    return np.degrees((Rotation.from_rotvec(one).inv() * Rotation.from_rotvec(other)).magnitude())
+
+
+def test_jaw_numbers_are_those_of_brute_force():
+    clip = make_clip(30, test=5)
+    found = find_jaw_bases(clip, 6)
+    jaws = np.array([clip.poses[t].jaw for t in range(30)])
+    gaps = np.array([[turn_between(jaw, np.radians(base)) for base in found.angles] for jaw in jaws])
+    assert np.isclose(found.largest_gap, gaps.min(axis=1).max(), atol=1e-6)
+    nearest = Counter(gaps.argmin(axis=1).tolist())
+    np.testing.assert_allclose(found.shares, [nearest[i] / 30 for i in range(6)])
+    np.testing.assert_allclose(np.radians(found.train), jaws, atol=1e-12)
+    assert len(found.held_out) == 5
+    assert found.record()["leaks"] == []
+
+
+def test_published_bases_are_said_to_leak():
+    clip = make_clip(10, test=20)
+    found = find_jaw_bases(clip, 5, compatibility="tga")
+    assert "held-out" in found.record()["leaks"][0]
+    assert np.abs(found.angles[0]).max() == pytest.approx(180)
+
+
+def test_unposed_meshes_know_no_rigid_motion_and_pictures_show_the_jaw():
+    clip = make_clip(3)
+    poses = [
+        clip.poses[0],
+        replace(clip.poses[0], rotation=np.ones(3), neck=np.ones(3), translation=np.ones(3)),
+    ]
+    meshes = unposed_meshes(clip, [*poses, replace(poses[0], jaw=poses[0].jaw + [0.3, 0, 0])])
+    # Rows of a batch round alike on some processors only.
+    np.testing.assert_allclose(meshes[0], meshes[1], rtol=0, atol=1e-8)
+    first, second, third = draw_meshes(clip, meshes, 40, 50)
+    np.testing.assert_array_equal(first, second)
+    assert (first != third).any()
+    assert first.shape == (50, 40, 3)
+
+
+def test_the_medoids_camera_is_the_one_the_face_looks_at(clip):
+    timestep = clip.timesteps("train")[0]
+    cameras = {key.camera for key in clip.splits["train"] if key.timestep == timestep}
+    assert len(cameras) > 1
+    for name in cameras:
+        towards = clip.cameras[name].center / np.linalg.norm(clip.cameras[name].center)
+        turn, _ = Rotation.align_vectors([towards], [[0.0, 0.0, 1.0]])
+        looking = with_poses(
+            clip, rotation=lambda t, turn=turn: turn.as_rotvec(), translation=lambda t: np.zeros(3)
+        )
+        assert frontal_key(looking, timestep).camera == name
+
+
+def test_class_figure_shows_every_class_in_its_share_of_the_strips(clip):
+    clusters = cluster_expressions(clip, 2)
+    picture = draw_classes(clip, clusters)
+    sizes = sorted(Counter(clusters.labels.tolist()).values(), reverse=True)
+    lengths = Counter(key.sequence for key in {k._replace(camera="") for k in clip.splits["train"]})
+    rows = picture[-24 - 22 * len(lengths) :, 174:]  # right of the sequences' names
+    areas = [
+        (np.abs(rows.astype(int) - class_colour(rank)).max(axis=2) < 8).sum() for rank in range(len(sizes))
+    ]
+    np.testing.assert_allclose(np.array(areas) / sum(areas), np.array(sizes) / sum(sizes), atol=0.04)
+
+
+def test_colours_of_sixteen_classes_differ():
+    colours = np.array([class_colour(rank) for rank in range(16)], dtype=float)
+    distances = np.linalg.norm(colours[:, None] - colours, axis=2) + 1e3 * np.eye(16)
+    assert distances.min() > 20
+
+
+@pytest.mark.parametrize("compatibility", ["", "tga"])
+def test_command_writes_pictures_and_numbers(pristine_capture, tmp_path, compatibility):
+    settings = StepsSettings(
+        str(pristine_capture.union), str(tmp_path), classes=2, compatibility=compatibility
+    )
+    findings = run(settings)
+    clip = read_capture(pristine_capture.union)
+    stored = read_json(tmp_path / "steps.json")
+    assert stored["clip"] == clip.fingerprint
+    assert stored["jaw_bases"]["leaks"] == list(findings.data["jaw_bases"]["leaks"])
+    assert bool(stored["jaw_bases"]["leaks"]) == (compatibility == "tga") == ("Leak" in findings.text)
+    assert sum(stored["expression_classes"]["class_sizes"]) == len(clip.timesteps("train"))
+    for name in ("jaw_bases.png", "expression_classes.png"):
+        picture = cv2.imread(str(tmp_path / name))
+        assert picture is not None
+        assert picture.std() > 10
+
+
+def test_a_clip_with_one_timestep_still_has_figures(clip):
+    first = clip.timesteps("train")[0]
+    train = tuple(key for key in clip.splits["train"] if key.timestep == first)
+    single = clip.derive("test", {}, splits={**clip.splits, "train": train, "self_reenactment": ()})
+    assert draw_classes(single, cluster_expressions(single)).std() > 5
+    assert draw_jaw_bases(single, find_jaw_bases(single)).std() > 5
+
+
+def test_counts_below_one_are_refused(pristine_capture, tmp_path):
+    with pytest.raises(InputError, match="--classes"):
+        run(StepsSettings(str(pristine_capture.union), str(tmp_path), classes=0), no_progress)
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,144 @@
+"""The command on a painted capture, and its file as a setting of the reader."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from headbench.bench.errors import InputError
+from headbench.bench.protocol import make_protocol
+from headbench.datasets.ga.reader import read_capture
+from headbench.datasets.ga.writer import CapturePlan, CaptureWriter, SequencePlan
+from headbench.datasets.steps.exclusion_file import read_exclusions, write_exclusions
+from headbench.datasets.steps.tongue.command import DECISIONS_FILE, run
+from headbench.datasets.steps.tongue.settings import TongueSettings
+
+from .painted import TONGUE, Moment, geometry, painted_clip
+
+TALK = [Moment({"jaw_open": 0.12 * (t % 4), "head_turn": 0.03 * t}) for t in range(6)]
+FREE = [
+    Moment({"jaw_open": 0.4}, blob=TONGUE),
+    Moment({"jaw_open": 0.8}),
+    Moment({"jaw_open": 0.3}, blob=TONGUE),
+]
+OUT = {6, 8}  # timesteps of the union, in which training comes first
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    clip = painted_clip([*TALK, *FREE])
+    poses = list(clip.poses.values())
+    plan = CapturePlan(
+        subject="900",
+        head=geometry().head,
+        shape=clip.shape,
+        static_offset=clip.static_offset,
+        cameras=list(clip.cameras.values()),
+        sequences=[SequencePlan("EMO-1", poses[: len(TALK)]), SequencePlan("FREE", poses[len(TALK) :])],
+        test_sequences=["FREE"],
+        novel_view_cameras=["at1"],
+        cy="top",
+    )
+    writer = CaptureWriter(tmp_path_factory.mktemp("painted"), plan)
+    for key, image in clip.images.items():
+        free = key.timestep >= len(TALK)
+        start = len(TALK) if free else 0
+        writer.write_frame("FREE" if free else "EMO-1", key.timestep - start, key.camera, image)
+    return writer.write_metadata()
+
+
+def look(capture, out, **changes):
+    seen = []
+    settings = replace(TongueSettings(str(capture), str(out)), **changes)
+    findings = run(settings, lambda done, total, note="": seen.append((done, total)))
+    assert seen
+    return findings
+
+
+def test_decisions_overrides_and_exclusion(capture, tmp_path):
+    findings = look(capture, tmp_path)
+    path = tmp_path / DECISIONS_FILE
+    assert set(read_exclusions(path)["900"].reasons()) == OUT
+    assert set(findings.data["900"]["excluded"]) == {"6", "8"}
+    assert "FREE: 6, 8" in findings.text
+    assert findings.passed
+    sheet = cv2.imread(str(tmp_path / "tongue_900.png"))
+    assert sheet is not None
+    # Two tiles have the border of frames left out, seven that of those kept.
+    red = (sheet == [40, 40, 200]).all(axis=2).sum()
+    green = (sheet == [80, 140, 60]).all(axis=2).sum()
+    assert green == pytest.approx(3.5 * red, rel=0.2)
+
+    decided = read_exclusions(path)
+    edited = replace(decided["900"], overrides={8: "keep", 3: "blink"})
+    write_exclusions(path, {"900": edited, "other": decided["900"]})
+    look(capture, tmp_path)
+    again = read_exclusions(path)
+    assert again["900"].overrides == {8: "keep", 3: "blink"}
+    assert again["other"].reasons() == decided["900"].reasons()
+
+    clip = read_capture(capture, exclude=path)
+    assert {key.timestep for key in clip.excluded} == {3, 6}
+    assert {reason for key, reason in clip.excluded.items() if key.timestep == 3} == {"blink"}
+    assert all(key.timestep not in (3, 6) for keys in clip.splits.values() for key in keys)
+    assert clip.steps[-1].name == "exclude_timesteps"
+    protocol = make_protocol("self_reenactment", [clip])
+    assert {key.timestep: reason for key, reason in protocol.excluded}[6].startswith("tongue out")
+
+
+def test_what_people_leave_out_need_not_be_in_the_cameras_looked_at(capture, tmp_path):
+    """The camera that the mouth faces most has no frame of timestep 3, which somebody left out."""
+    copy = tmp_path / "captures"
+    shutil.copytree(capture.parent, copy)
+    union = copy / capture.name
+    for path in union.glob("transforms_*.json"):
+        document = json.loads(path.read_text())
+        document["frames"] = [
+            f for f in document["frames"] if (f["timestep_index"], f["camera_id"]) != (3, "at0")
+        ]
+        path.write_text(json.dumps(document))
+    out = tmp_path / "out"
+    look(union, out, cameras=1)
+    path = out / DECISIONS_FILE
+    decided = read_exclusions(path)["900"]
+    assert (decided.cameras, 3 in decided.frames) == (("at0",), False)
+    write_exclusions(path, {"900": replace(decided, overrides={3: "blink"})})
+    findings = look(union, out, cameras=1)
+    assert "in no camera: 3" in findings.text
+    assert "3" in findings.data["900"]["excluded"]
+
+
+def test_given_threshold_is_used(capture, tmp_path):
+    look(capture, tmp_path, threshold=1e5)
+    decided = read_exclusions(tmp_path / DECISIONS_FILE)["900"]
+    assert (decided.threshold, decided.basis, decided.reasons()) == (1e5, "given", {})
+
+
+@pytest.mark.parametrize(
+    ("changes", "where"),
+    [
+        ({"threshold": -1.0}, "--threshold"),
+        ({"threshold": np.inf}, "--threshold"),
+        ({"cameras": 0}, "--cameras"),
+        ({"frames": 0}, "--frames"),
+    ],
+)
+def test_settings_out_of_range_are_refused(capture, tmp_path, changes, where):
+    with pytest.raises(InputError) as caught:
+        look(capture, tmp_path, **changes)
+    assert caught.value.file == where
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_folder_without_captures_and_stray_overrides_are_refused(capture, tmp_path):
+    with pytest.raises(InputError):
+        look(tmp_path, tmp_path / "out")
+    look(capture, tmp_path)
+    path = tmp_path / DECISIONS_FILE
+    decided = read_exclusions(path)
+    write_exclusions(path, {"900": replace(decided["900"], overrides={99: "keep"})})
+    with pytest.raises(InputError, match="99"):
+        look(capture, tmp_path)

@@ -1,0 +1,158 @@
+"""What training data say of the capacity needed, against displacements computed the long way."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
+
+from headbench.datasets.steps.jaw_bases import IDENTITY, farthest_quaternions, jaw_quaternions, jaw_weights
+from headbench.methods.ours.capacity.evidence import (
+    displacement_without,
+    jaw_lever,
+    largest_displacements,
+    leading_directions,
+    pixel_footprint,
+    spanning_jaw_bases,
+    surface_area,
+)
+from headbench.methods.shared.subject_mesh import SubjectMesh
+
+from ...toy_clip import toy_clip, toy_pose
+
+
+def random_expressions(seed, timesteps=70, size=9):
+    rng = np.random.default_rng(seed)
+    strength = rng.uniform(0, 1, size) ** 4
+    return rng.normal(size=(timesteps, size)) * strength + rng.normal(size=size), rng.normal(
+        size=(11, 3, size)
+    )
+
+
+def left_out(coefficients, basis, kept):
+    """Float64, all at once."""
+    deviation = coefficients - coefficients.mean(0)
+    fields = np.einsum("te,vce->tvc", deviation[:, kept:], basis[:, :, kept:])
+    return np.linalg.norm(fields, axis=2).max()
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0.02, 5))
+def test_leading_directions_are_the_fewest_that_leave_out_less_than_the_tolerance(seed, tolerance):
+    coefficients, basis = random_expressions(seed)
+    kept = leading_directions(coefficients, basis, tolerance)
+    for count in range(kept, basis.shape[2] + 1):
+        assert left_out(coefficients, basis, count) <= tolerance * (1 + 1e-5)
+    assert kept == 0 or left_out(coefficients, basis, kept - 1) > tolerance * (1 - 1e-5)
+    np.testing.assert_allclose(
+        displacement_without(coefficients, basis, kept),
+        left_out(coefficients, basis, kept),
+        rtol=1e-4,
+        atol=1e-5,
+    )
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0.02, 5), st.floats(1, 4))
+def test_more_tolerance_never_asks_for_more_directions(seed, tolerance, factor):
+    coefficients, basis = random_expressions(seed)
+    less = leading_directions(coefficients, basis, tolerance * factor)
+    assert less <= leading_directions(coefficients, basis, tolerance)
+
+
+def test_a_face_that_is_held_needs_no_direction():
+    _, basis = random_expressions(0)
+    assert leading_directions(np.ones((5, basis.shape[2])), basis, 1e-4) == 0
+
+
+def jaws(head, *angles):
+    pose = toy_pose(head, np.random.default_rng(0), 0, "toy")
+    return [replace(pose, jaw=np.array(angle, dtype=np.float64)) for angle in angles]
+
+
+def test_a_jaw_that_only_opens_needs_two_bases_and_a_still_one_none(head):
+    opening = jaws(head, *([x, 0, 0] for x in np.linspace(0, 0.4, 12)))
+    assert spanning_jaw_bases(opening, 16, 0.1, 1e-5)[0] == 2
+    assert spanning_jaw_bases(jaws(head, *[[0.2, 0.1, 0]] * 5), 16, 0.1, 1e-5) == (
+        0,
+        pytest.approx(0, abs=1e-9),
+    )
+    every = jaws(head, *np.random.default_rng(1).uniform(-0.3, 0.3, (40, 3)))
+    assert spanning_jaw_bases(every, 16, 0.1, 1e-5)[0] == 4
+    assert spanning_jaw_bases(every, 3, 0.1, 1e-5)[0] == 3
+
+
+def test_lines_of_the_bases_kept_can_say_what_all_sixteen_say(head):
+    """The claim behind `spanning_jaw_bases`: up to a scale common to a frame, by least squares over the frames."""
+    poses = jaws(head, *(np.random.default_rng(2).uniform(-0.3, 0.3, (60, 3)) * [1, 0.3, 0]))
+    quaternions = jaw_quaternions(poses)
+    count, _ = spanning_jaw_bases(poses, 16, 0.1, 1e-9)
+    assert count < 16
+    every = farthest_quaternions(quaternions, IDENTITY, 16)
+    full, few = jaw_weights(quaternions, every), jaw_weights(quaternions, every[:count])
+    # Undo the common scale of a frame, which the weights' sum to one hides.
+    full = full * np.abs(quaternions @ every.T).sum(1, keepdims=True)
+    few = few * np.abs(quaternions @ every[:count].T).sum(1, keepdims=True)
+    solution = np.linalg.lstsq(few, full, rcond=None)[0]
+    np.testing.assert_allclose(few @ solution, full, atol=1e-9)
+    fewer = np.linalg.lstsq(few[:, :-1], full, rcond=None)[0]
+    assert np.abs(few[:, :-1] @ fewer - full).max() > 1e-6
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(1e-6, 0.05))
+def test_the_residual_rotation_moves_no_vertex_further_than_said(seed, tolerance):
+    rng = np.random.default_rng(seed)
+    rotations = rng.uniform(-0.4, 0.4, (20, 3)) * [1, 0.2, 0.05]
+    poses: list[Any] = [SimpleNamespace(jaw=rotation) for rotation in rotations]
+    lever = 0.1
+    count, rest = spanning_jaw_bases(poses, 16, lever, tolerance)
+    quaternions = jaw_quaternions(poses)
+    if count == 0:
+        spanning = quaternions.mean(0)[None]
+    else:
+        spanning = farthest_quaternions(quaternions, IDENTITY, 16)[:count]
+    assert rest <= tolerance or count == 16
+    nearest = quaternions @ np.linalg.pinv(spanning) @ spanning
+    nearest /= np.linalg.norm(nearest, axis=1, keepdims=True)
+    turns = (
+        Rotation.from_quat(quaternions[:, [1, 2, 3, 0]]) * Rotation.from_quat(nearest[:, [1, 2, 3, 0]]).inv()
+    )
+    farthest = (2 * lever * np.sin(turns.magnitude() / 2)).max()
+    assert farthest <= rest * 1.1 + 1e-12
+
+
+def test_lever_bounds_what_the_jaw_moves(head):
+    mesh = SubjectMesh(head, np.zeros(head.shape_basis.shape[2]), np.zeros_like(head.template), "cpu")
+    angle = 0.3
+    still = jaws(head, [0, 0, 0])[0]
+    still = replace(still, expression=np.zeros_like(still.expression), eyes=np.zeros(6))
+    opened = replace(still, jaw=np.array([angle, 0, 0]))
+    one, other = (mesh.unposed(mesh.arguments([pose])) for pose in (still, opened))
+    moved = float((one - other).norm(dim=1).max())
+    bound = 2 * jaw_lever(mesh) * np.sin(angle / 2)
+    assert 0.5 * bound < moved <= 1.25 * bound
+
+
+def test_largest_displacements_are_those_of_the_moving_pose(head):
+    mesh = SubjectMesh(head, np.zeros(head.shape_basis.shape[2]), np.zeros_like(head.template), "cpu")
+    pose = jaws(head, [0.2, 0, 0])[0]
+    rest = replace(pose, expression=0 * pose.expression, jaw=np.zeros(3), eyes=np.zeros(6))
+    assert largest_displacements(mesh, [rest]).max() < 1e-7
+    both = largest_displacements(mesh, [pose, rest])
+    vertices = mesh.unposed(mesh.arguments([pose])).numpy()
+    expected = np.linalg.norm((vertices - mesh.canonical.numpy())[head.faces].mean(1), axis=1)
+    np.testing.assert_allclose(both, expected, atol=1e-7)
+
+
+def test_footprint_is_depth_over_focal_length(head):
+    clip = toy_clip(head, timesteps=2, cameras=3, width=20, height=24)
+    focal = 0.5 * 24 / np.tan(np.radians(20))
+    np.testing.assert_allclose(pixel_footprint(clip, np.zeros(3)), 0.5 / focal, rtol=0.02)
+
+
+def test_area_is_that_of_a_convex_hull():
+    hull = ConvexHull(np.random.default_rng(0).normal(size=(50, 3)))
+    np.testing.assert_allclose(surface_area(hull.points, hull.simplices), hull.area, rtol=1e-12)

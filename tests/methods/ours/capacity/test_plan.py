@@ -1,0 +1,195 @@
+"""Capacity plans of toy clips: what is not there costs nothing, and what is planned trains."""
+
+import json
+import logging
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from headbench.bench.contracts import Budget, no_progress
+from headbench.bench.runner.training_view import TrainingView
+from headbench.methods.ours.capacity.plan import plan_capacity
+from headbench.methods.ours.method import Ours
+from headbench.methods.shared.avatar_files import RECORD_FILE, Subject
+from headbench.methods.shared.configs import OursConfig, SplatTraining
+from headbench.methods.shared.subject_mesh import SubjectMesh
+
+from ...toy_clip import ToyClip
+
+SMALL = OursConfig(
+    splats=SplatTraining(max_splats=2000, min_densify_every=40, min_settle=20),
+    line_resolution=8,
+    line_channels=4,
+    hidden=16,
+    penalty_face_mm=0.1,
+    penalty_other_mm=0.2,
+    capacity="auto",
+)
+MEGAPIXEL = 40
+"""Enlarges the toy's cameras so that its millimetres are pixels."""
+
+
+def plan(clip, config=SMALL):
+    subject = Subject.of(clip)
+    mesh = SubjectMesh(clip.head, subject.shape, subject.static_offset, "cpu")
+    return plan_capacity(clip, mesh, config)
+
+
+def chosen(clip, config=SMALL):
+    return {each.name: each.chosen for each in plan(clip, config).decisions}
+
+
+def with_poses(clip, change):
+    return replace(clip, poses={t: replace(pose, **change(pose)) for t, pose in clip.poses.items()})
+
+
+def enlarged(clip, factor):
+    cameras = {name: c.resized(factor * c.width, factor * c.height) for name, c in clip.cameras.items()}
+    return replace(clip, cameras=cameras)
+
+
+@pytest.fixture(scope="module")
+def sharp(clip):
+    return enlarged(clip, MEGAPIXEL)
+
+
+def still(pose):
+    return {"expression": 0 * pose.expression, "jaw": np.zeros(3), "eyes": np.zeros(6)}
+
+
+def test_all_of_an_expressive_sharp_clip_is_modelled(sharp):
+    sizes = chosen(sharp)
+    assert sizes["expressions"] == sharp.head.expression_basis.shape[2]
+    assert sizes["jaw_bases"] == 2
+    assert sizes["plane_resolution"] == SMALL.plane_resolution
+    assert sizes["max_splats"] == SMALL.splats.max_splats
+    assert plan(sharp).lines
+
+
+def test_a_still_face_has_no_lines(sharp):
+    found = plan(with_poses(sharp, still))
+    assert not found.lines
+    assert not found.apply(SMALL).lines
+    assert found.lines_within is None
+
+
+def test_a_still_jaw_has_no_bases(sharp):
+    sizes = chosen(with_poses(sharp, lambda pose: {"jaw": np.zeros(3)}))
+    assert sizes["jaw_bases"] == 0
+    assert sizes["expressions"] > 0
+
+
+def test_a_jaw_without_expressions_has_lines_for_the_jaw_alone(sharp):
+    sizes = chosen(with_poses(sharp, lambda pose: {"expression": 0 * pose.expression}))
+    assert sizes["expressions"] == 0
+    assert sizes["jaw_bases"] == 2
+
+
+def test_only_the_directions_in_use_are_modelled(sharp):
+    def leading(pose):
+        return {"expression": np.where(np.arange(len(pose.expression)) < 3, pose.expression, 0.4)}
+
+    assert chosen(with_poses(sharp, leading))["expressions"] == 3
+
+
+def test_motion_that_no_pixel_shows_is_none(clip):
+    tiny = with_poses(clip, lambda pose: {"expression": 1e-3 * pose.expression, "jaw": 1e-3 * pose.jaw})
+    assert not plan(tiny).lines
+
+
+def test_lines_reach_no_further_than_what_moves(sharp):
+    found = plan(sharp)
+    low, high = map(np.array, found.lines_within)
+    subject = Subject.of(sharp)
+    mesh = SubjectMesh(sharp.head, subject.shape, subject.static_offset, "cpu")
+    canonical = mesh.canonical.numpy()
+    assert (low >= canonical.min(0) - 1e-7).all()
+    assert (high <= canonical.max(0) + 1e-7).all()
+    strict = plan(sharp, replace(SMALL, penalty_face_mm=6.0, penalty_other_mm=6.0))
+    smaller = np.prod(np.subtract(*strict.lines_within[::-1]))
+    assert 0 < smaller < np.prod(high - low)
+
+
+def test_doubling_the_images_raises_planes_and_splats(clip):
+    config = replace(SMALL, plane_resolution=1000, splats=SplatTraining())
+    once, twice = (chosen(enlarged(clip, factor), config) for factor in (4, 8))
+    assert once["plane_resolution"] < twice["plane_resolution"] <= 2 * once["plane_resolution"]
+    assert once["max_splats"] <= twice["max_splats"]
+    assert chosen(clip)["plane_resolution"] < 40
+
+
+def test_half_the_detail_halves_the_planes_samples(sharp):
+    whole = chosen(sharp, replace(SMALL, plane_resolution=10**6))["plane_resolution"] - 1
+    half = chosen(sharp, replace(SMALL, plane_resolution=10**6, capacity_detail=0.5))["plane_resolution"] - 1
+    assert 2 * half - 1 <= whole <= 2 * half
+
+
+@settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.floats(0.05, 50), st.floats(1, 10))
+def test_more_tolerance_never_asks_for_more(sharp, tolerance, factor):
+    fine, coarse = (chosen(sharp, replace(SMALL, capacity_tolerance=tolerance * f)) for f in (1, factor))
+    for name in ("expressions", "jaw_bases", "plane_resolution", "max_splats"):
+        assert coarse[name] <= fine[name]
+
+
+def test_configured_sizes_are_limits_and_can_be_kept(sharp, clip):
+    config = replace(SMALL, expressions=2, jaw_bases=1, plane_resolution=9)
+    assert chosen(sharp, config)["expressions"] == 2
+    assert chosen(sharp, config)["jaw_bases"] == 1
+    assert chosen(sharp, config)["plane_resolution"] == 9
+    kept = replace(SMALL, capacity_keep=("expressions", "plane_resolution", "line_bounds"))
+    found = plan(with_poses(clip, still), kept)
+    resolved = found.apply(kept)
+    assert (resolved.expressions, resolved.plane_resolution) == (80, 128)
+    assert resolved.lines
+    assert found.lines_within is None
+
+
+def test_held_out_poses_and_images_decide_nothing(clip):
+    class Guarded(ToyClip):
+        def image(self, key):
+            raise AssertionError("a plan reads no image")
+
+    held = {key.timestep for key in clip.splits["self_reenactment"]}
+    other = {
+        t: replace(pose, expression=50 * pose.expression, jaw=-3 * pose.jaw, translation=pose.translation + 1)
+        if t in held
+        else pose
+        for t, pose in clip.poses.items()
+    }
+    guarded = Guarded(**{**vars(clip), "poses": other})
+    assert plan(TrainingView(guarded)) == plan(clip)
+
+
+@pytest.mark.parametrize("change", ["expressive", "still"])
+def test_a_planned_avatar_trains_renders_and_keeps_its_plan(clip, tmp_path, caplog, change):
+    if change == "still":
+        clip = with_poses(clip, still)
+    config = replace(SMALL, storage="compact" if change == "still" else "exact", capacity_tolerance=0.02)
+    with caplog.at_level(logging.INFO, "headbench"):
+        avatar = Ours(config).fit(
+            clip, tmp_path, Budget(iterations=30), device="cpu", seed=0, progress=no_progress
+        )
+    key = clip.splits["train"][0]
+    image = avatar.render(clip.cameras[key.camera], clip.poses[key.timestep]).rgb
+    truth = clip.image(key) / 255
+    assert np.abs(image - truth).mean() < np.abs(1 - truth).mean()
+    assert "capacity for motion above" in caplog.text
+    record = json.loads((tmp_path / RECORD_FILE).read_text())["capacity"]
+    assert record["lines"] == (change == "expressive") == ("lines" in avatar.field.tensors)
+    planned = {each["name"]: each for each in record["decisions"]}
+    assert len(avatar.field.tensors["plane_xy"]) == planned["plane_resolution"]["chosen"] ** 2
+    assert planned["plane_resolution"]["numbers"]["longest_px"] > 0
+    again = Ours(config).fit(
+        clip, tmp_path, Budget(iterations=30), device="cpu", seed=0, progress=no_progress
+    )
+    np.testing.assert_array_equal(again.render(clip.cameras[key.camera], clip.poses[key.timestep]).rgb, image)
+
+
+def test_a_fixed_capacity_has_no_plan(clip, tmp_path):
+    config = replace(SMALL, capacity="fixed", plane_resolution=8)
+    Ours(config).fit(clip, tmp_path, Budget(iterations=5), device="cpu", seed=0, progress=no_progress)
+    assert json.loads((tmp_path / RECORD_FILE).read_text())["capacity"] is None

@@ -1,0 +1,138 @@
+"""The training side of the tensorial method: what is detached, when lines start, whom the penalty asks."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from headbench.datasets.head.regions import faces_in_region
+from headbench.methods.ours.appearance import penalty_weights, softened
+from headbench.methods.shared.configs import OursConfig
+
+from .toy import SMALL, make, place
+
+
+def test_lines_start_after_their_iteration(clip):
+    appearance, optimiser, binding = make(clip)
+    before = place(clip, appearance, optimiser, binding, 60_000)
+    assert before.penalty is None
+    np.testing.assert_array_equal(before.opacities.detach(), np.full(len(binding), 0.5))
+    after = place(clip, appearance, optimiser, binding, 60_001)
+    assert after.opacities.detach().std() > 0
+    assert after.penalty > 0
+
+
+def test_opacity_branch_is_detached_from_positions(clip):
+    appearance, optimiser, binding = make(clip)
+    shading = place(clip, appearance, optimiser, binding, 60_001)
+    (shading.opacities.sum() + shading.penalty).backward()
+    assert optimiser["means"].grad is None
+    assert optimiser["lines"].grad.abs().sum() > 0
+    assert optimiser["opacities"].grad.abs().sum() > 0
+
+
+def test_colour_branch_moves_positions(clip):
+    appearance, optimiser, binding = make(clip)
+    place(clip, appearance, optimiser, binding, 1).colors.sum().backward()
+    assert optimiser["means"].grad.abs().sum() > 0
+    assert optimiser["plane_xy"].grad.abs().sum() > 0
+    assert optimiser["lines"].grad is None
+
+
+def test_splats_outside_the_lines_box_have_no_offset(clip):
+    appearance, optimiser, binding = make(clip)
+    optimiser["means"].data[3] = torch.tensor([0.0, 1000.0, 0.0])
+    shading = place(clip, appearance, optimiser, binding, 60_001)
+    assert shading.opacities[3] == 0.5
+    assert shading.opacities[4] != 0.5
+
+
+def test_face_bounds_reach_fewer_splats_than_head_bounds(clip):
+    moved = {}
+    for bounds in ("head", "face"):
+        appearance, optimiser, binding = make(clip, replace(SMALL, line_bounds=bounds))
+        shading = place(clip, appearance, optimiser, binding, 60_001)
+        moved[bounds] = int((shading.opacities != 0.5).sum())
+    assert 0 < moved["face"] < moved["head"]
+
+
+@pytest.mark.parametrize("switch", ["lines", "penalty"])
+def test_switches(clip, switch):
+    appearance, optimiser, binding = make(
+        clip, replace(SMALL, **{switch: False if switch == "lines" else 0.0})
+    )
+    shading = place(clip, appearance, optimiser, binding, 60_001)
+    assert shading.penalty is None
+    assert (shading.opacities.detach().std() > 0) == (switch == "penalty")
+    assert ("lines" in appearance.parameters()) == (switch == "penalty")
+
+
+def test_penalty_weights_equal_a_loop_over_triangles(clip, head):
+    appearance, _, _ = make(clip)
+    mesh = appearance._mesh
+    canonical = mesh.canonical.double().numpy()
+    rng = np.random.default_rng(0)
+    # Displacements around both thresholds.
+    unposed = canonical + rng.normal(size=(len(canonical), 1)) * np.array([0.002, 0.001, 0.001])
+    face = set(faces_in_region(head, "face").tolist())
+    expected = []
+    for number, triangle in enumerate(np.asarray(head.faces)):
+        moved = np.linalg.norm(unposed[triangle].mean(0) - canonical[triangle].mean(0))
+        if number in face:
+            expected.append(1.0 if moved < 0.001 else 0.0)
+        else:
+            expected.append(10.0 if moved < 0.002 else 0.0)
+    is_face = torch.tensor([number in face for number in range(len(head.faces))])
+    found = penalty_weights(
+        torch.from_numpy(unposed), torch.from_numpy(canonical), mesh.faces, is_face, SMALL
+    )
+    np.testing.assert_array_equal(found, expected)
+    assert set(expected) == {0.0, 1.0, 10.0}
+    assert len({e for n, e in enumerate(expected) if n in face}) == 2
+
+
+def test_penalty_is_the_mean_over_all_splats(clip):
+    appearance, optimiser, binding = make(clip)
+    shading = place(clip, appearance, optimiser, binding, 60_001)
+    offsets = torch.logit(shading.opacities.detach())
+    weights = appearance._prepared(clip.splits["train"][0].timestep).penalty
+    total = 0.0
+    for offset, weight in zip(offsets.tolist(), weights.tolist()):
+        total += abs(offset) * weight
+    assert float(shading.penalty.detach()) == pytest.approx(total / len(binding), rel=1e-4)
+
+
+def test_capacity_follows_the_clip(clip, head):
+    appearance, _, _ = make(clip, OursConfig())
+    assert appearance.expressions == head.expression_basis.shape[2]  # fewer than the 80 asked for
+    assert 1 <= len(appearance.jaw_bases) <= len(clip.poses)
+    lines = appearance.parameters()["lines"][0]
+    assert len(lines) == appearance.expressions + len(appearance.jaw_bases)
+
+
+def test_view_directions_waver_in_training_and_only_they(clip):
+    steady, optimiser, binding = make(clip)
+    wavering = make(clip, replace(SMALL, direction_noise=0.2))[0]
+    one, other = (place(clip, wavering, optimiser, binding, i) for i in (1, 2))
+    again = place(clip, wavering, optimiser, binding, 1)
+    straight = place(clip, steady, optimiser, binding, 1)
+    assert torch.equal(one.colors, again.colors)  # so that a resumed run draws the same
+    assert not torch.equal(one.colors, other.colors)
+    assert not torch.equal(one.colors, straight.colors)
+    for left, right in zip(one.world, straight.world):
+        assert torch.equal(left, right)
+    turns = torch.stack([wavering._turn(i) for i in range(1, 2001)])
+    np.testing.assert_allclose(turns @ turns.transpose(1, 2), np.tile(np.eye(3), (2000, 1, 1)), atol=1e-5)
+    # Each of three angles has the deviation asked for: the mean squared angle is three times its square.
+    angles = torch.acos(((turns.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2).clamp(-1, 1))
+    assert float(angles.square().mean()) == pytest.approx(3 * 0.2**2, rel=0.1)
+
+
+def test_a_softened_penalty_is_the_published_one_but_for_a_parabola_around_nothing():
+    offsets = torch.tensor([-3.0, -0.1, -0.05, 0.0, 0.02, 0.1, 0.5], dtype=torch.float64, requires_grad=True)
+    np.testing.assert_array_equal(softened(offsets, 0.0).detach(), offsets.detach().abs())
+    soft = softened(offsets, 0.1)
+    soft.sum().backward()
+    np.testing.assert_allclose(soft.detach(), [2.95, 0.05, 0.0125, 0.0, 0.002, 0.05, 0.45])
+    np.testing.assert_allclose(offsets.grad, [-1, -1, -0.5, 0, 0.2, 1, 1], atol=1e-12)

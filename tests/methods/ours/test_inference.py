@@ -1,0 +1,193 @@
+"""The fast ways of a stored avatar against the slow ones, and what it keeps from frame to frame."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from headbench.bench.errors import InputError
+from headbench.methods.ours.avatar import OursAvatar
+from headbench.methods.ours.feature_lines import blend_lines, line_offsets, line_position
+from headbench.methods.ours.field import Box, shade
+from headbench.methods.ours.inference import LineOffsets, PlaneColors, encode_columns
+from headbench.methods.shared.known_poses import KnownPoses, pose_key
+from headbench.methods.shared.networks import CPU_BLOCK
+from headbench.methods.shared.triplane import encode_directions
+
+from ..stored_toy import store
+from .toy import SMALL
+
+
+def directions(count, seed=0, dtype=torch.float32):
+    generator = torch.Generator().manual_seed(seed)
+    return torch.nn.functional.normalize(torch.randn(count, 3, generator=generator, dtype=dtype), dim=1)
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 3e-6), (torch.float64, 1e-14)])
+def test_doubling_gives_the_same_waves(dtype, tolerance):
+    given = torch.cat([directions(500, dtype=dtype), torch.eye(3, dtype=dtype), -torch.eye(3, dtype=dtype)])
+    exact = encode_directions(given.double())
+    np.testing.assert_allclose(encode_columns(given).t(), exact, atol=tolerance)
+
+
+def planes(count=200, dtype=torch.float64):
+    generator = torch.Generator().manual_seed(1)
+    first, last = (torch.randn(*shape, generator=generator, dtype=dtype) for shape in ((16, 40), (3, 16)))
+    features = torch.randn(count, 13, generator=generator, dtype=dtype)
+    return first, last, features
+
+
+def test_colours_are_those_of_the_whole_network():
+    first, last, features = planes()
+    given = directions(200, dtype=torch.float64)
+    colors = PlaneColors(first, last, features @ first[:, :13].t())
+    expected = shade({"color_weight_0": first, "color_weight_1": last}, (features,), given)
+    np.testing.assert_allclose(colors.along(-given), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_colours_are_kept_for_the_same_place_and_no_other(dtype):
+    first, last, features = planes(dtype=dtype)
+    colors = PlaneColors(first, last, features @ first[:, :13].t())
+    means, center = directions(200, seed=3, dtype=dtype), torch.tensor([0.0, 0, 4], dtype=dtype)
+    turns, binding = torch.eye(3, dtype=dtype)[None], torch.zeros(200, dtype=torch.int64)
+    one = colors(means, center, turns, binding)
+    assert colors(means, center.clone(), turns, binding) is one
+    for moved, place in ((means + 0.5, center), (means, center + 0.5)):
+        expected = colors.along(torch.nn.functional.normalize(moved - place, dim=1))
+        np.testing.assert_allclose(colors(moved, place, turns, binding), expected, atol=1e-5)
+        assert (colors(moved, place, turns, binding) - one).abs().max() > 0.01
+    np.testing.assert_array_equal(colors(means, center, turns, binding), one)
+
+
+def test_offsets_are_those_of_training(clip, tmp_path):
+    tensors = OursAvatar.read(store(clip, tmp_path), "cpu").field.tensors
+    low, high = tensors["line_box"]
+    points = low + (high - low) * (
+        1.4 * torch.rand(15000, 3, generator=torch.Generator().manual_seed(0)) - 0.2
+    )
+    generator = torch.Generator().manual_seed(4)
+    jaw = torch.rand(2, generator=generator)
+    expression = torch.randn(len(tensors["lines"]) - 2, generator=generator)
+    found = LineOffsets(tensors, points)(expression, jaw)
+    box = Box(low, high)
+    inside = box.contains(points)
+    assert 2 * CPU_BLOCK < inside.sum() < 15000  # several blocks, the last one short
+    blended = blend_lines(tensors["lines"], expression, jaw)
+    position = line_position(box.unit(points[inside]), tensors["lines"].shape[2])
+    np.testing.assert_allclose(found[inside], line_offsets(tensors, blended, position), atol=1e-5)
+    assert not found[~inside].any()
+    exact = {name: value.double() for name, value in tensors.items()}
+    slow = LineOffsets(exact, points.double())(expression.double(), jaw.double())
+    np.testing.assert_allclose(found, slow, atol=1e-5)
+
+
+CASES = {
+    "opacity": SMALL,
+    "others": replace(SMALL, dynamic=("position", "rotation", "scale", "color")),
+    "harmonics": replace(SMALL, color="sh", sh_degree=2),
+    "no lines": replace(SMALL, lines=False),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_frames_do_not_depend_on_what_was_drawn_before(case, clip, tmp_path):
+    """Any walk over poses and cameras, prepared or not, gives each frame bit for bit as a fresh avatar does."""
+    folder = store(clip, tmp_path, CASES[case])
+    avatar = OursAvatar.read(folder, "cpu")
+    cameras, poses = list(clip.cameras.values()), list(clip.poses.values())
+    walk = [(0, 0), (1, 0), (1, 0), (1, 1), (0, 1), (0, 0), (2, 3), (2, 2)]
+    fresh = {
+        step: OursAvatar.read(folder, "cpu").render(cameras[step[0]], poses[step[1]]) for step in set(walk)
+    }
+    for prepared in (False, True):
+        if prepared:
+            assert avatar.prepare(poses[:2]) == 2
+        for step in walk:
+            found = avatar.render(cameras[step[0]], poses[step[1]])
+            np.testing.assert_array_equal(found.rgb, fresh[step].rgb)
+            np.testing.assert_array_equal(found.alpha, fresh[step].alpha)
+
+
+def test_what_an_avatar_hands_out_is_not_what_it_keeps(clip, tmp_path):
+    avatar = OursAvatar.read(store(clip, tmp_path), "cpu")
+    key = clip.splits["train"][0]
+    camera, pose = clip.cameras[key.camera], clip.poses[key.timestep]
+    before = avatar.render(camera, pose).rgb.copy()
+    splats = avatar.splats(pose, camera)
+    for name in ("means", "quats", "scales", "opacities", "colors"):
+        getattr(splats, name)[:] = 0
+    avatar.render(camera, pose).rgb[:] = 0
+    np.testing.assert_array_equal(avatar.render(camera, pose).rgb, before)
+
+
+def test_a_pose_is_known_by_its_numbers_and_not_by_its_timestep(clip, tmp_path):
+    avatar = OursAvatar.read(store(clip, tmp_path), "cpu")
+    pose = clip.poses[0]
+    camera = next(iter(clip.cameras.values()))
+    avatar.prepare([pose])
+    first = avatar.render(camera, pose).rgb
+    for name in ("expression", "jaw", "rotation", "neck", "eyes", "translation"):
+        other = replace(pose, **{name: np.asarray(getattr(pose, name)) + np.float32(0.02)})
+        assert pose_key(other) != pose_key(pose)
+        if name != "eyes":  # the toy's eyes are small
+            assert np.abs(avatar.render(camera, other).rgb - first).max() > 0
+    with pytest.raises(InputError, match="head_model"):
+        avatar.render(camera, replace(pose, head_model="another"))
+    assert pose_key(replace(pose, eyelids=np.zeros(2))) != pose_key(pose)
+    assert pose_key(replace(pose, subject="b", timestep=99)) == pose_key(pose)
+
+
+def test_no_more_poses_are_prepared_than_fit(clip, tmp_path):
+    avatar = OursAvatar.read(store(clip, tmp_path), "cpu")
+    poses = list(clip.poses.values())
+    counts = [avatar.prepare(poses, megabytes=size) for size in (0, 0.13, 0.25, 100)]
+    assert counts[0] == 0
+    assert 0 < counts[1] < counts[2] <= counts[3] == len(poses)
+
+
+def test_known_values_are_bounded_and_computed_once():
+    class Value:
+        bytes = 10
+
+    computed = []
+
+    def compute(pose):
+        computed.append(pose)
+        return Value()
+
+    class Pose:
+        head_model, eyelids = "m", None
+
+        def __init__(self, number):
+            self.expression = self.rotation = self.neck = self.jaw = self.eyes = self.translation = np.array(
+                [number]
+            )
+
+    poses = [Pose(number) for number in range(5)]
+    known = KnownPoses(compute, 35)
+    assert known.prepare([poses[0], poses[0], *poses[1:]]) == 4
+    assert len(computed) == 4
+    assert known(poses[1]) is known(poses[1])
+    assert len(computed) == 4
+    known(poses[4])
+    known(poses[4])
+    assert len(computed) == 6
+
+
+@pytest.mark.parametrize("case", ["opacity", "harmonics"])
+def test_colours_by_direction_are_those_of_a_camera_far_away(case, clip, tmp_path):
+    avatar = OursAvatar.read(store(clip, tmp_path, CASES[case]), "cpu")
+    pose = replace(clip.poses[0], rotation=np.array([0.3, -0.8, 0.5], np.float32))
+    seen = avatar.seen_from(pose)
+    for direction in directions(4).double():
+        camera = next(iter(clip.cameras.values()))
+        matrix = np.eye(4)
+        matrix[:3, 3] = -1e4 * direction.numpy()
+        found = avatar.splats(pose, replace(camera, world_to_camera=matrix)).colors
+        np.testing.assert_allclose(seen.radiance(direction.float()), found, atol=1e-3)
+    vertices = avatar.mesh.posed(avatar.mesh.arguments([pose])).double()
+    corners = vertices[avatar.mesh.faces[avatar.field.tensors["splats"][:, -1].long()]]
+    normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    np.testing.assert_allclose(seen.normals, torch.nn.functional.normalize(normals, dim=1), atol=1e-4)

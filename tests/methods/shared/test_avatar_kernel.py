@@ -1,0 +1,194 @@
+"""The compiled kernel against its twins in torch, in float64, for every instruction set of this machine."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from headbench.methods.ours.feature_lines import offset_network
+from headbench.methods.ours.field import canonical_directions, shade_directions
+from headbench.methods.shared import avatar_kernel
+from headbench.methods.shared.binding import Frames, to_world, triangle_frames
+from headbench.methods.shared.sh import sh_to_rgb
+from headbench.methods.splats.cpu import instruction_sets
+
+BACKENDS = list(instruction_sets()) if avatar_kernel.available() else []
+needs_kernel = pytest.mark.skipif(not BACKENDS, reason="no compiled kernel here, or an old one")
+pytestmark = [needs_kernel, pytest.mark.parametrize("backend", BACKENDS or ["cpu"])]
+
+COUNTS = st.sampled_from([0, 1, 3, 8, 15, 16, 17, 33, 1025])
+
+
+def numbers(seed):
+    generator = torch.Generator().manual_seed(seed)
+    return lambda *shape: torch.randn(*shape, generator=generator)
+
+
+def mesh(normal, triangles):
+    """Frames of separate triangles, in float32."""
+    corners = normal(3 * triangles, 3)
+    return triangle_frames(corners, torch.arange(3 * triangles).view(-1, 3))
+
+
+def double(frames):
+    return Frames(*(value.double() for value in frames))
+
+
+def unit(vectors):
+    return torch.nn.functional.normalize(vectors, dim=1)
+
+
+@settings(max_examples=20, deadline=None)
+@given(count=COUNTS, seed=st.integers(0, 1000))
+def test_frames_of_triangles_are_those_of_their_definition(backend, count, seed):
+    """Turned any way, so that each of the quaternion's four numbers is the largest somewhere."""
+    vertices = 0.1 * numbers(seed)(30, 3)
+    faces = torch.stack(
+        [torch.randperm(30, generator=torch.Generator().manual_seed(n))[:3] for n in range(count)]
+        or [torch.empty(0, dtype=torch.int64)]
+    ).view(-1, 3)
+    found = avatar_kernel.triangles(vertices, faces, backend)
+    expected = triangle_frames(vertices.double(), faces)
+    # A thin triangle's normal and the quaternion of a half turn are known less well.
+    corners = vertices.double()[faces]
+    edges = corners - corners.roll(1, 1)
+    area = torch.linalg.cross(edges[:, 0], edges[:, 1]).norm(dim=1)
+    tolerance = 1e-6 + 1e-6 * (edges.square().sum((1, 2)) / area).numpy()
+    off = (found.rotation - expected.rotation).abs().flatten(1).amax(1).numpy() if count else np.zeros(0)
+    assert (off < tolerance).all()
+    np.testing.assert_allclose(found.center, expected.center, atol=1e-7)
+    np.testing.assert_allclose(found.size, expected.size, rtol=1e-5)
+    alike = (found.quaternion.double() * expected.quaternion).sum(1).abs().numpy()
+    assert (1 - alike < tolerance).all()
+    np.testing.assert_allclose(found.quaternion.norm(dim=1), 1, atol=1e-6)
+
+
+def test_a_triangle_without_area_has_a_finite_frame(backend):
+    vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
+    faces = torch.tensor([[0, 1, 2], [0, 0, 0]])
+    for one, other in zip(
+        avatar_kernel.triangles(vertices, faces, backend), triangle_frames(vertices, faces)
+    ):
+        assert torch.isfinite(one).all()
+        np.testing.assert_allclose(one, other, atol=1e-6)
+    for number in (-1, 3):
+        with pytest.raises(ValueError, match="fit"):
+            avatar_kernel.triangles(vertices, torch.tensor([[0, 1, number]]), backend)
+
+
+@settings(max_examples=20, deadline=None)
+@given(count=COUNTS, seed=st.integers(0, 1000))
+def test_splats_are_carried_as_defined(backend, count, seed):
+    normal = numbers(seed)
+    frames = mesh(normal, 40)
+    binding = torch.randint(40, (count,), generator=torch.Generator().manual_seed(seed))
+    means, log_scales, quats = normal(count, 3), normal(count, 3), normal(count, 4)
+    found = avatar_kernel.carry(frames, binding, means, unit(quats), log_scales.exp(), backend)
+    expected = to_world(double(frames), binding, means.double(), log_scales.double(), quats.double())
+    for one, other in zip(found, expected):
+        np.testing.assert_allclose(one, other, rtol=1e-5, atol=2e-5)
+
+
+@settings(max_examples=30, deadline=None)
+@given(count=COUNTS, degree=st.integers(0, 3), turned=st.booleans(), seed=st.integers(0, 1000))
+def test_harmonics_are_those_of_their_definition(backend, count, degree, turned, seed):
+    normal = numbers(seed)
+    means, center = normal(count, 3), 3 * normal(3)
+    dc, rest = normal(count, 3), 0.3 * normal(count, 3, (degree + 1) ** 2 - 1)
+    turns, binding = mesh(normal, 7).rotation, torch.arange(count) % 7
+    packed = avatar_kernel.pack_harmonics(dc, rest)
+    chosen = (turns, binding) if turned else ()
+    found = avatar_kernel.shade(packed, means, center, *chosen, backend=backend)
+    directions = unit(means.double() - center.double())
+    if turned:
+        directions = torch.einsum("nij,nj->ni", turns[binding].double(), directions)
+    expected = sh_to_rgb(dc.double(), rest.double(), directions, degree)
+    np.testing.assert_allclose(found, expected, atol=2e-5)
+
+
+@settings(max_examples=20, deadline=None)
+@given(count=COUNTS, hidden=st.sampled_from([1, 8, 16, 40, 128]), seed=st.integers(0, 1000))
+def test_the_colour_network_is_that_of_its_definition(backend, count, hidden, seed):
+    normal = numbers(seed)
+    means, center = normal(count, 3), 3 * normal(3)
+    turns, binding = mesh(normal, 7).rotation, torch.arange(count) % 7
+    first, last, known = 0.3 * normal(hidden, 27), normal(3, hidden) / hidden**0.5, normal(count, hidden)
+    network = (avatar_kernel.pad_units(values, 1) for values in (known, first.t(), last))
+    found = avatar_kernel.shade_network(*network, means, center, turns, binding, backend)
+    directions = canonical_directions(turns.double(), binding, means.double(), center.double())
+    weights = {"color_weight_0": first.double(), "color_weight_1": last.double()}
+    expected = shade_directions(weights, known.double(), directions)
+    np.testing.assert_allclose(found, expected, atol=3e-5)
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    count=COUNTS,
+    units=st.sampled_from([1, 16, 30, 128]),
+    hidden=st.sampled_from([1, 16, 48, 128]),
+    outputs=st.sampled_from([1, 13]),
+    off=st.sampled_from([0.0, 3.0, 100.0]),
+    seed=st.integers(0, 1000),
+)
+def test_the_offset_network_is_that_of_its_definition(backend, count, units, hidden, outputs, off, seed):
+    """Whether all units are on somewhere, few are, or none is; splats not named keep what they have."""
+    normal, samples = numbers(seed), 5
+    table = normal(3 * samples, units) - off / 3
+    rows = torch.randint(samples - 1, (count, 3), generator=torch.Generator().manual_seed(seed))
+    rows = rows + samples * torch.arange(3)
+    fractions = torch.rand(count, 3, generator=torch.Generator().manual_seed(seed))
+    second, second_bias = normal(units, hidden) / units**0.5, normal(hidden)
+    last, last_bias = normal(outputs, hidden) / hidden**0.5, normal(outputs)
+    out = torch.full((count + 5, outputs), 7.0)
+    splats = torch.randperm(count + 5, generator=torch.Generator().manual_seed(seed))[:count]
+    avatar_kernel.offsets_into(
+        *(out, splats, table, rows.to(torch.int32), fractions),
+        *(avatar_kernel.pad_units(second, 1), avatar_kernel.pad_units(second_bias, 0)),
+        *(avatar_kernel.pad_units(last, 1), last_bias),
+        backend=backend,
+    )
+    exact = table.double()
+    summed = (
+        exact[rows] * (1 - fractions.double())[:, :, None] + exact[rows + 1] * fractions.double()[:, :, None]
+    ).sum(1)
+    rest = (second.t(), second_bias, last, last_bias)
+    expected = offset_network(summed, exact.new_zeros(units), *(value.double() for value in rest))
+    np.testing.assert_allclose(out[splats], expected, atol=5e-5)
+    others = torch.ones(count + 5, dtype=torch.bool).index_fill(0, splats, False)
+    assert (out[others] == 7).all()
+
+
+def test_results_do_not_depend_on_the_number_of_threads(backend):
+    normal = numbers(0)
+    frames, binding = mesh(normal, 40), torch.arange(5000) % 40
+    means, quats, scales = normal(5000, 3), unit(normal(5000, 4)), normal(5000, 3).exp()
+    known, first, last = normal(5000, 32), normal(27, 32), normal(3, 32)
+    before = torch.get_num_threads()
+    results = []
+    try:
+        for threads in (1, 3):
+            torch.set_num_threads(threads)
+            world = avatar_kernel.carry(frames, binding, means, quats, scales, backend)
+            network = known, first, last, world.means, normal(3) * 0 + 2, frames.rotation, binding
+            results.append((*world, avatar_kernel.shade_network(*network, backend)))
+    finally:
+        torch.set_num_threads(before)
+    for one, other in zip(*results):
+        assert torch.equal(one, other)
+
+
+def test_what_would_read_beyond_an_array_is_refused(backend):
+    normal = numbers(0)
+    frames = mesh(normal, 4)
+    for triangle in (-1, 4):
+        with pytest.raises(ValueError, match="fit"):
+            avatar_kernel.carry(
+                *(frames, torch.tensor([triangle]), normal(1, 3), normal(1, 4), normal(1, 3)), backend
+            )
+    arguments = normal(1, 1).new_zeros(2, 1), torch.tensor([0]), normal(6, 16)
+    layers = normal(16, 16), normal(16), normal(1, 16), normal(1)
+    for row in (-1, 5):
+        rows = torch.tensor([[0, 2, row]], dtype=torch.int32)
+        with pytest.raises(ValueError, match="fit"):
+            avatar_kernel.offsets_into(*arguments, rows, torch.zeros(1, 3), *layers, backend=backend)

@@ -1,0 +1,69 @@
+"""PLY reading and writing."""
+
+import struct
+
+import numpy as np
+import pytest
+
+from headbench.bench.errors import InputError
+from headbench.methods.shared.ply import read_names, read_ply, write_ply
+
+TABLE = np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32)
+
+
+def test_columns_come_back_by_name_in_any_order(tmp_path):
+    path = tmp_path / "a.ply"
+    write_ply(path, ("x", "y", "z"), TABLE)
+    np.testing.assert_array_equal(read_ply(path, ("z", "x")), TABLE[:, [2, 0]])
+
+
+def test_another_program_reads_the_positions(tmp_path):
+    pymeshlab = pytest.importorskip("pymeshlab")
+    path = tmp_path / "a.ply"
+    write_ply(path, ("x", "y", "z"), TABLE)
+    meshes = pymeshlab.MeshSet()
+    meshes.load_new_mesh(str(path))
+    np.testing.assert_allclose(meshes.current_mesh().vertex_matrix(), TABLE, rtol=1e-6)
+
+
+def test_columns_of_other_types_and_line_ends_are_read(tmp_path):
+    """As other programs rewrite such files; the row is packed by hand."""
+    header = b"ply\r\nformat binary_little_endian 1.0\r\ncomment by hand\r\nelement vertex 2\r\n"
+    header += b"property double x\r\nproperty uchar red\r\nproperty int binding_0\r\nend_header\r\n"
+    path = tmp_path / "a.ply"
+    path.write_bytes(header + struct.pack("<dBi", 1.5, 7, 16777215) + struct.pack("<dBi", -2.25, 255, 3))
+    np.testing.assert_array_equal(read_ply(path, ("binding_0", "x")), [[16777215, 1.5], [3, -2.25]])
+    assert read_names(path) == ("x", "red", "binding_0")
+
+
+HEADER = "ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nend_header\n"
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (b"", "PLY header"),
+        (b"ply\nnothing", "PLY header"),
+        (HEADER.replace("binary_little_endian", "ascii").encode() + b"1.0\n", "binary_little_endian"),
+        (HEADER.encode() + b"\0" * 3, "4 bytes"),
+        (HEADER.encode() + b"\0" * 8, "4 bytes"),
+        (HEADER.replace("float x", "list uchar int x").encode() + b"\0" * 4, "scalar property"),
+        (HEADER.replace("float x", "half x").encode() + b"\0" * 2, "scalar property"),
+        (HEADER.replace("float x\n", "float x\nproperty float x\n").encode() + b"\0" * 8, "each name once"),
+        (HEADER.replace("property float x\n", "").encode(), "with properties"),
+        (HEADER.replace("float x", "double x").encode() + np.float64(1e300).tobytes(), "finite"),
+        (HEADER.replace("float x", "float y").encode() + b"\0" * 4, "property of that name"),
+        (HEADER.replace("vertex 1", "vertex 99999999999").encode() + b"\0" * 4, "bytes"),
+        (HEADER.encode() + np.float32(np.nan).tobytes(), "finite"),
+    ],
+)
+def test_other_files_are_refused(tmp_path, content, says):
+    path = tmp_path / "bad.ply"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=says):
+        read_ply(path, ("x",))
+
+
+def test_a_missing_file_is_an_input_error(tmp_path):
+    with pytest.raises(InputError, match="none.ply"):
+        read_ply(tmp_path / "none.ply", ("x",))

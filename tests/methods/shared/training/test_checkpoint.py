@@ -1,0 +1,123 @@
+"""Checkpoints: restored as they were, refused when they are not ours."""
+
+import pickle
+
+import pytest
+import torch
+
+from headbench.bench.contracts import Budget, no_progress
+from headbench.bench.errors import InputError
+from headbench.methods.shared.training.checkpoint import load_checkpoint, save_checkpoint
+from headbench.methods.shared.training.loop import CHECKPOINT, train
+
+
+def test_what_was_saved_comes_back(tmp_path):
+    path = tmp_path / "checkpoint.safetensors"
+    shared = torch.randn(4, 3)
+    state = {
+        "iteration": 3,
+        "deep": {"x": shared, "row": shared[1], "turned": shared.T, "name": "a", 7: None},
+        "list": [
+            1.5,
+            2,
+            float("inf"),
+            -0.1,
+            True,
+            (1, [torch.zeros(0, 2), torch.tensor(3, dtype=torch.uint8)]),
+        ],
+        "small": torch.ones(2, dtype=torch.bfloat16),
+    }
+    save_checkpoint(path, "run", state)
+    found = load_checkpoint(path, "run", "cpu")
+    assert str(found) == str(state)
+    assert all(torch.equal(found["deep"][name], state["deep"][name]) for name in ("x", "row", "turned"))
+    assert found["deep"]["turned"].stride() == state["deep"]["turned"].stride()
+    assert found["list"][5][1][1].dtype == torch.uint8
+
+
+def test_no_file_is_no_checkpoint(tmp_path):
+    assert load_checkpoint(tmp_path / "checkpoint.safetensors", "run", "cpu") is None
+
+
+def test_another_runs_checkpoint_is_refused(tmp_path):
+    path = tmp_path / "checkpoint.safetensors"
+    save_checkpoint(path, "one", {})
+    with pytest.raises(InputError, match="another run"):
+        load_checkpoint(path, "two", "cpu")
+
+
+class Touches:
+    """Would run code if it were unpickled without restriction."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return (open, (str(self.path), "w"))
+
+
+def test_code_in_a_checkpoint_is_not_run(tmp_path):
+    path, witness = tmp_path / "checkpoint.safetensors", tmp_path / "witness"
+    path.write_bytes(pickle.dumps(Touches(witness), protocol=2))
+    with pytest.raises(InputError):
+        load_checkpoint(path, "run", "cpu")
+    torch.save({"layout": 1, "run": "run", "state": Touches(witness)}, path)
+    with pytest.raises(InputError):
+        load_checkpoint(path, "run", "cpu")
+    assert not witness.exists()
+
+
+def test_damage_anywhere_is_found(tmp_path):
+    path = tmp_path / "checkpoint.safetensors"
+    save_checkpoint(path, "run", {"x": torch.randn(10), "name": [1, "a", None]})
+    whole = path.read_bytes()
+    damaged = [
+        whole[:200],
+        b"",
+        whole + b"\0",
+        *(whole[:i] + b"!" + whole[i + 1 :] for i in range(0, len(whole), 3)),
+    ]
+    for content in damaged:
+        path.write_bytes(content)
+        with pytest.raises(InputError, match=r"[Dd]elete it"):
+            load_checkpoint(path, "run", "cpu")
+
+
+@pytest.mark.parametrize(
+    "state",
+    [
+        {},
+        {"iteration": 1, "total": 2, "seconds": None},
+        {"iteration": 1, "total": 2, "seconds": 0.0, "trainable": []},
+    ],
+)
+def test_a_state_that_is_none_of_the_method_is_refused(tmp_path, state):
+    class Method:
+        def begin(self, timeline):
+            pass
+
+        def load_state(self, state):
+            state["means"]
+
+    save_checkpoint(tmp_path / CHECKPOINT, "run", state)
+    with pytest.raises(InputError, match="the state of this method"):
+        train(
+            Method(),
+            lambda iteration: 0,
+            published_length=1,
+            budget=Budget(iterations=2),
+            folder=tmp_path,
+            run="run",
+            device="cpu",
+            progress=no_progress,
+            checkpoint_every_s=1.0,
+        )
+
+
+def test_a_failed_write_leaves_the_old_checkpoint(tmp_path):
+    path = tmp_path / "checkpoint.safetensors"
+    save_checkpoint(path, "run", {"x": 1})
+    with pytest.raises((AttributeError, TypeError, pickle.PicklingError, RuntimeError)):
+        save_checkpoint(path, "run", {"x": lambda: None})
+    assert load_checkpoint(path, "run", "cpu") == {"x": 1}
+    assert [p.name for p in tmp_path.iterdir()] == ["checkpoint.safetensors"]

@@ -1,0 +1,74 @@
+"""Training images: the right one, once, and faults reported where they are."""
+
+import threading
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from headbench.bench.errors import InputError
+from headbench.methods.shared.training.images import TrainingImages
+from headbench.methods.shared.training.sampling import ShuffledEpochs
+
+
+class Counting:
+    """A clip that remembers who asked for what."""
+
+    def __init__(self, clip):
+        self.clip, self.cameras, self.asked, self.threads = clip, clip.cameras, [], set()
+
+    def image(self, key):
+        self.asked.append(key)
+        self.threads.add(threading.get_ident())
+        return self.clip.image(key)
+
+
+def test_images_come_as_the_sampler_says_each_decoded_once_and_ahead(clip):
+    keys = clip.splits["train"]
+    sampler = ShuffledEpochs(len(keys), 0)
+    counting = Counting(clip)
+    images = TrainingImages(counting, keys, sampler, "cpu")
+    for iteration in range(1, 10):
+        image = images.get(iteration, sampler(iteration))
+        expected = clip.image(keys[sampler(iteration)]) / np.float32(255)
+        np.testing.assert_allclose(image, expected, atol=1e-7)
+    images.close()
+    assert counting.asked == [keys[sampler(i)] for i in range(1, 1 + len(counting.asked))]
+    assert len(counting.asked) in (9, 10)  # the tenth was begun, or cancelled
+    assert threading.get_ident() not in counting.threads
+
+
+def test_a_jump_in_the_order_is_served(clip):
+    keys = clip.splits["train"]
+    images = TrainingImages(clip, keys, ShuffledEpochs(len(keys), 0), "cpu")
+    for index in (3, 1, 1, 0):
+        np.testing.assert_allclose(images.get(1, index), clip.image(keys[index]) / 255.0, atol=1e-7)
+    images.close()
+
+
+def test_an_image_of_another_size_than_its_camera_is_an_input_error(clip):
+    keys = clip.splits["train"]
+    cameras = {name: replace(camera, width=camera.width + 1) for name, camera in clip.cameras.items()}
+    images = TrainingImages(replace(clip, cameras=cameras), keys, ShuffledEpochs(len(keys), 0), "cpu")
+    with pytest.raises(InputError, match="image"):
+        images.get(1, 0)
+    images.close()
+
+
+def test_mattes_come_as_a_fourth_channel(clip):
+    keys = clip.splits["train"]
+    images = TrainingImages(clip, keys, ShuffledEpochs(len(keys), 0), "cpu", mattes=True)
+    image = images.get(1, 2)
+    images.close()
+    np.testing.assert_allclose(image[:, :, :3], clip.image(keys[2]) / np.float32(255), atol=1e-7)
+    np.testing.assert_allclose(image[:, :, 3], clip.mask(keys[2]) / np.float32(255), atol=1e-7)
+
+
+@pytest.mark.parametrize("matte", [None, np.zeros((3, 3), np.uint8)])
+def test_a_matte_that_is_missing_or_does_not_fit_is_an_input_error(clip, matte):
+    keys = clip.splits["train"]
+    faulty = replace(clip, masks=dict.fromkeys(clip.masks, matte))
+    images = TrainingImages(faulty, keys, ShuffledEpochs(len(keys), 0), "cpu", mattes=True)
+    with pytest.raises(InputError, match="mask"):
+        images.get(1, 0)
+    images.close()

@@ -1,0 +1,169 @@
+"""The loop on a model small enough to know its course in closed form."""
+
+import pytest
+import torch
+from torch import nn
+
+from headbench.bench.contracts import Budget, no_progress
+from headbench.bench.errors import InputError
+from headbench.methods.shared.training.loop import CHECKPOINT, train
+from headbench.methods.shared.training.optimiser import Optimiser
+
+
+class Drift:
+    """One number with a gradient of one per step; remembers which calls it saw."""
+
+    def __init__(self, clock=None, cost=0.0, loss=None):
+        self.optimiser = Optimiser({"x": nn.Parameter(torch.zeros(1, dtype=torch.float64))}, {"x": 0.5})
+        self.calls, self.clock, self.cost, self.value = [], clock, cost, loss
+
+    def begin(self, timeline):
+        self.timeline = timeline
+
+    def loss(self, iteration, index):
+        self.calls.append((iteration, index))
+        if self.clock is not None:
+            self.clock.now += self.cost
+        factor = 1.0 if self.value is None else self.value
+        return (self.optimiser["x"] * factor).sum()
+
+    def after_backward(self, iteration):
+        pass
+
+    def state(self):
+        return {"optimiser": self.optimiser.state()}
+
+    def load_state(self, state):
+        self.optimiser.load_state(state["optimiser"])
+
+    def note(self):
+        return "drifting"
+
+
+class Clock:
+    now = 0.0
+
+    def __call__(self):
+        return self.now
+
+
+def run(model, folder, budget, progress=no_progress, clock=None, every=1e9, name="run", began=None):
+    return train(
+        model,
+        lambda iteration: iteration % 3,
+        published_length=100,
+        budget=budget,
+        folder=folder,
+        run=name,
+        device="cpu",
+        progress=progress,
+        checkpoint_every_s=every,
+        clock=clock or Clock(),
+        began=began,
+    )
+
+
+def test_iterations_are_counted_from_one_and_the_last_makes_no_step(tmp_path):
+    model = Drift()
+    outcome = run(model, tmp_path, Budget(iterations=7))
+    assert model.calls == [(i, i % 3) for i in range(1, 8)]
+    # Adam's step for a constant gradient is the learning rate: six steps of 0.5.
+    assert model.optimiser["x"].item() == pytest.approx(-3.0)
+    assert (outcome.iterations, outcome.planned) == (7, 7)
+    assert (model.timeline.total, model.timeline.published) == (7, 100)
+
+
+def test_seconds_alone_estimate_iterations_before_training_and_say_so(tmp_path):
+    clock, notes = Clock(), []
+    model = Drift(clock, cost=0.1)
+    outcome = run(
+        model, tmp_path, Budget(seconds=16.0), lambda d, n, note="": notes.append((d, n, note)), clock
+    )
+    assert outcome.planned == 100  # 16 s / (0.1 s * 1.6)
+    assert outcome.iterations == 100
+    assert "100 iterations estimated" in notes[-1][2]
+    # The trial steps changed nothing: training still starts at its first iteration from zero.
+    assert model.optimiser["x"].item() == pytest.approx(-0.5 * 99)
+
+
+def test_whichever_bound_comes_first_ends_the_run(tmp_path):
+    clock = Clock()
+    outcome = run(Drift(clock, cost=1.0), tmp_path, Budget(iterations=50, seconds=10.0), clock=clock)
+    assert (outcome.iterations, outcome.planned) == (10, 50)
+
+
+def test_progress_sees_every_iteration(tmp_path):
+    seen = []
+    run(Drift(), tmp_path, Budget(iterations=12), lambda d, n, note="": seen.append((d, n, note)))
+    assert [d for d, _, _ in seen] == list(range(1, 13))
+    assert "drifting" in seen[9][2]
+
+
+@pytest.mark.parametrize("kill_at", [1, 2, 5, 11])
+def test_a_killed_run_goes_on_from_its_checkpoint(tmp_path, kill_at):
+    def killer(done, total, note=""):
+        if done == kill_at:
+            raise KeyboardInterrupt
+
+    unbroken = Drift()
+    run(unbroken, tmp_path / "a", Budget(iterations=12))
+    with pytest.raises(KeyboardInterrupt):
+        run(Drift(), tmp_path / "b", Budget(iterations=12), killer, every=0.0)
+    assert (tmp_path / "b" / CHECKPOINT).exists()
+    again = Drift()
+    run(again, tmp_path / "b", Budget(iterations=12))
+    assert again.calls[0][0] == kill_at + 1
+    assert torch.equal(again.optimiser["x"], unbroken.optimiser["x"])
+
+
+def test_seconds_add_up_over_the_parts_of_a_run(tmp_path):
+    clock = Clock()
+
+    def killer(done, total, note=""):
+        if done == 4:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(Drift(clock, 1.0), tmp_path, Budget(iterations=9), killer, clock, every=0.0)
+    clock.now += 1000  # time between the parts does not count
+    outcome = run(Drift(clock, 1.0), tmp_path, Budget(iterations=9), clock=clock)
+    assert outcome.seconds == pytest.approx(9.0)
+
+
+def test_seconds_of_preparation_count(tmp_path):
+    clock = Clock()
+    clock.now = 30.0
+    outcome = run(Drift(clock, 1.0), tmp_path / "seconds", Budget(seconds=40.0), clock=clock, began=6.0)
+    assert outcome.planned == 10  # (40 s - 24 s) / (1 s * 1.6)
+    assert outcome.seconds == pytest.approx(40.0)
+
+    def killer(done, total, note=""):
+        if done == 4:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(Drift(clock, 1.0), tmp_path, Budget(iterations=9), killer, clock, every=0.0, began=clock.now - 5)
+    clock.now += 1000
+    outcome = run(Drift(clock, 1.0), tmp_path, Budget(iterations=9), clock=clock, began=clock.now - 2)
+    assert outcome.seconds == pytest.approx(5 + 2 + 9)
+
+
+def test_another_runs_checkpoint_is_refused(tmp_path):
+    def killer(done, total, note=""):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(Drift(), tmp_path, Budget(iterations=9), killer, every=0.0)
+    with pytest.raises(InputError, match="another run"):
+        run(Drift(), tmp_path, Budget(iterations=9), name="other")
+
+
+def test_divergence_is_reported(tmp_path):
+    with pytest.raises(InputError, match="diverged"):
+        run(Drift(loss=float("nan")), tmp_path, Budget(iterations=20))
+
+
+@pytest.mark.parametrize("budget", [Budget(), Budget(iterations=0), Budget(seconds=-1.0)])
+def test_an_empty_budget_is_refused(tmp_path, budget):
+    with pytest.raises(InputError, match="budget"):
+        run(Drift(), tmp_path, budget)

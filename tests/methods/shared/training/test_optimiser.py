@@ -1,0 +1,90 @@
+"""Adam with growing tensors against the textbook update."""
+
+import numpy as np
+import torch
+from torch import nn
+
+from headbench.methods.shared.training.optimiser import Optimiser
+
+
+def textbook(values, gradients, rate):
+    """Kingma and Ba 2015, algorithm 1, in float64; eps 1e-15."""
+    m = v = np.zeros_like(values)
+    for t, g in enumerate(gradients, 1):
+        m, v = 0.9 * m + 0.1 * g, 0.999 * v + 0.001 * g * g
+        values = values - rate * (m / (1 - 0.9**t)) / (np.sqrt(v / (1 - 0.999**t)) + 1e-15)
+    return values
+
+
+def make(rows=4):
+    values = torch.arange(rows * 3, dtype=torch.float64).reshape(rows, 3)
+    optimiser = Optimiser(
+        {"a": nn.Parameter(values.clone()), "b": nn.Parameter(torch.zeros(2, dtype=torch.float64))},
+        {"a": 0.1, "b": 0.2},
+    )
+    return optimiser, values.numpy()
+
+
+def step(optimiser, gradient):
+    optimiser["a"].grad = torch.as_tensor(gradient)
+    optimiser.step()
+    optimiser.zero_grad()
+
+
+def test_steps_are_adams():
+    optimiser, start = make()
+    gradients = np.random.default_rng(0).normal(size=(5, 4, 3))
+    for gradient in gradients:
+        step(optimiser, gradient)
+    np.testing.assert_allclose(optimiser["a"].detach(), textbook(start, gradients, 0.1), rtol=1e-12)
+    assert (optimiser["b"] == 0).all()  # no gradient, no step
+
+
+def test_select_keeps_rows_with_their_moments():
+    optimiser, start = make()
+    gradients = np.random.default_rng(1).normal(size=(4, 4, 3))
+    for gradient in gradients[:2]:
+        step(optimiser, gradient)
+    optimiser.select(["a"], torch.tensor([True, False, True, True]))
+    for gradient in gradients[2:]:
+        step(optimiser, gradient[[0, 2, 3]])
+    expected = textbook(start, gradients, 0.1)[[0, 2, 3]]
+    np.testing.assert_allclose(optimiser["a"].detach(), expected, rtol=1e-12)
+
+
+def test_appended_rows_start_with_zero_moments_and_old_rows_keep_theirs():
+    optimiser, _ = make()
+    step(optimiser, np.ones((4, 3)))
+    before = {name: value.clone() for name, value in optimiser.moments("a").items()}
+    optimiser.append({"a": torch.full((2, 3), 7.0, dtype=torch.float64)})
+    after = optimiser.moments("a")
+    assert after["exp_avg"].shape == (6, 3)
+    for name in ("exp_avg", "exp_avg_sq"):
+        assert (after[name][:4] == before[name]).all()
+        assert (before[name] > 0).all()
+        assert (after[name][4:] == 0).all()
+    assert (optimiser["a"][4:] == 7).all()
+    assert optimiser["a"].requires_grad
+
+
+def test_new_values_forget_the_moments():
+    optimiser, _ = make()
+    step(optimiser, np.ones((4, 3)))
+    optimiser.set_values("a", torch.zeros(4, 3, dtype=torch.float64))
+    assert (optimiser["a"] == 0).all()
+    assert (optimiser.moments("a")["exp_avg"] == 0).all()
+    assert (optimiser.moments("a")["exp_avg_sq"] == 0).all()
+
+
+def test_state_restores_another_number_of_rows_and_the_same_course():
+    one, _ = make()
+    gradients = np.random.default_rng(2).normal(size=(4, 3, 3))
+    step(one, np.ones((4, 3)))
+    one.select(["a"], torch.tensor([True, True, False, True]))
+    one.set_learning_rate("a", 0.05)
+    other, _ = make()
+    other.load_state(one.state())
+    for gradient in gradients:
+        step(one, gradient)
+        step(other, gradient)
+    assert torch.equal(one["a"], other["a"])

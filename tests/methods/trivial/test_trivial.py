@@ -1,0 +1,151 @@
+"""The trivial avatars, exactly."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from headbench.bench.contracts import Avatar, Budget, Method, no_progress
+from headbench.bench.errors import InputError
+from headbench.methods.shared.configs import NearestCameraConfig
+from headbench.methods.trivial.method import INDEX_FILE, MEAN_FILE, MeanImage, NearestCamera, resize
+
+
+def fit(method, clip, folder):
+    return method.fit(clip, folder, Budget(iterations=1), device="cpu", seed=0, progress=no_progress)
+
+
+def show(avatar, clip, key, **options):
+    return avatar.render(clip.cameras[key.camera], clip.poses[key.timestep], **options)
+
+
+@pytest.mark.parametrize("method", [MeanImage, NearestCamera])
+def test_contracts_and_reloading(method, clip, tmp_path):
+    avatar = fit(method(), clip, tmp_path)
+    assert isinstance(method(), Method)
+    assert isinstance(avatar, Avatar)
+    key = clip.splits["novel_view"][0]
+    again = method().load(tmp_path, device="cpu")
+    np.testing.assert_array_equal(show(avatar, clip, key).rgb, show(again, clip, key).rgb)
+    assert all(path.exists() for path in avatar.files())
+    pose = replace(clip.poses[0], head_model="another")
+    with pytest.raises(InputError, match="head_model"):
+        avatar.render(clip.cameras["00"], pose)
+
+
+def test_mean_image_is_the_mean_of_training_images_alone(clip, tmp_path):
+    avatar = fit(MeanImage(), clip, tmp_path)
+    keys = clip.splits["train"]
+    expected = np.mean([clip.image(key) / 255.0 for key in keys], axis=0)
+    coverage = np.mean([clip.mask(key) / 255.0 for key in keys], axis=0)
+    for split in clip.splits:
+        frame = show(avatar, clip, clip.splits[split][0])
+        np.testing.assert_allclose(frame.rgb, expected, atol=1e-6)
+        np.testing.assert_allclose(frame.alpha, coverage, atol=1e-6)
+
+
+def test_nearest_camera_returns_a_training_frame_itself(clip, tmp_path):
+    avatar = fit(NearestCamera(), clip, tmp_path)
+    for key in clip.splits["train"]:
+        frame = show(avatar, clip, key)
+        np.testing.assert_array_equal(frame.rgb, (clip.image(key) / np.float32(255)).astype(np.float32))
+        np.testing.assert_array_equal(frame.alpha, (clip.mask(key) / np.float32(255)).astype(np.float32))
+
+
+def test_a_held_out_view_shows_the_same_timestep_from_the_nearest_camera(clip, tmp_path):
+    avatar = fit(NearestCamera(), clip, tmp_path)
+    training = {key.camera for key in clip.splits["train"]}
+    for key in clip.splits["novel_view"]:
+        wanted = clip.cameras[key.camera].center - clip.poses[key.timestep].translation
+        angles = {}
+        for name in training:
+            direction = clip.cameras[name].center - clip.poses[key.timestep].translation
+            cosine = direction @ wanted / np.linalg.norm(direction) / np.linalg.norm(wanted)
+            angles[name] = np.arccos(cosine)
+        source = key._replace(camera=min(angles, key=angles.__getitem__))
+        np.testing.assert_allclose(show(avatar, clip, key).rgb, clip.image(source) / 255.0, atol=1e-6)
+
+
+def test_a_held_out_expression_shows_the_nearest_training_timestep(clip, tmp_path):
+    avatar = fit(NearestCamera(), clip, tmp_path)
+    pose = clip.poses[1]
+    nudged = replace(
+        pose, expression=pose.expression + np.float32(1e-3), timestep=None, subject="somebody else"
+    )
+    key = next(key for key in clip.splits["train"] if key.timestep == 1)
+    frame = avatar.render(clip.cameras[key.camera], nudged)
+    np.testing.assert_allclose(frame.rgb, clip.image(key) / 255.0, atol=1e-6)
+
+
+def test_held_out_images_are_never_shown(clip, tmp_path):
+    marked = {
+        key: image if key in clip.splits["train"] else np.full_like(image, 77)
+        for key, image in clip.images.items()
+    }
+    leaky = replace(clip, images=marked)
+    for method in (MeanImage, NearestCamera):
+        avatar = fit(method(), leaky, tmp_path / method.name)
+        for split in ("novel_view", "self_reenactment"):
+            rgb = show(avatar, leaky, leaky.splits[split][0]).rgb
+            assert abs(rgb - 77 / 255).max() > 0.2
+
+
+def test_the_background_is_exchanged_under_the_mask(clip, tmp_path):
+    avatar = fit(NearestCamera(), clip, tmp_path)
+    key = clip.splits["train"][0]
+    white, alpha = show(avatar, clip, key)
+    black, _ = show(avatar, clip, key, background=(0, 0, 0))
+    expected = np.clip(white - (1 - alpha[..., None]), 0, 1)
+    np.testing.assert_allclose(black, expected, atol=1e-6)
+
+
+def test_storage_can_be_bounded(clip, tmp_path):
+    avatar = fit(NearestCamera(NearestCameraConfig(max_timesteps=1)), clip, tmp_path)
+    cameras = {key.camera for key in clip.splits["train"]}
+    assert len(avatar.files()) == 1 + len(cameras)
+    assert len(list((tmp_path / "images").iterdir())) == len(cameras)
+
+
+def test_resize_keeps_means_and_leaves_its_own_size_alone():
+    image = np.random.default_rng(0).random((12, 8, 4)).astype(np.float32)
+    assert resize(image, 8, 12) is image
+    np.testing.assert_allclose(resize(image, 4, 6), image.reshape(6, 2, 4, 2, 4).mean((1, 3)), atol=1e-6)
+    assert resize(image, 16, 24).shape == (24, 16, 4)
+
+
+def test_cameras_of_other_sizes_are_met_by_resizing(clip, tmp_path):
+    avatar = fit(MeanImage(), clip, tmp_path)
+    camera = replace(clip.cameras["00"], width=14, height=18)
+    assert avatar.render(camera, clip.poses[0]).rgb.shape == (18, 14, 3)
+
+
+@pytest.mark.parametrize(
+    ("method", "file", "name", "change"),
+    [
+        (MeanImage, MEAN_FILE, "rgba", lambda v: np.full_like(v, np.nan)),
+        (MeanImage, MEAN_FILE, "rgba", lambda v: v[:0]),
+        (MeanImage, MEAN_FILE, "background", lambda v: v[:2]),
+        (NearestCamera, INDEX_FILE, "images", lambda v: v + 10**6),
+        (NearestCamera, INDEX_FILE, "images", lambda v: v - 10),
+        (NearestCamera, INDEX_FILE, "images", lambda v: np.full_like(v, -1)),
+        (NearestCamera, INDEX_FILE, "images", lambda v: v[:1]),
+        (NearestCamera, INDEX_FILE, "signals", lambda v: v * np.nan),
+        (NearestCamera, INDEX_FILE, "scales", lambda v: v * 0),
+        (NearestCamera, INDEX_FILE, "centers", lambda v: v[:, :2]),
+    ],
+)
+def test_a_damaged_avatar_is_refused_when_loaded(clip, tmp_path, method, file, name, change):
+    fit(method(), clip, tmp_path)
+    with np.load(tmp_path / file) as archive:
+        arrays = dict(archive)
+    np.savez(tmp_path / file, **{**arrays, name: change(arrays[name])})
+    with pytest.raises(InputError) as caught:
+        method().load(tmp_path, device="cpu")
+    assert caught.value.key == name
+
+
+def test_an_image_that_is_gone_is_named_when_loaded(clip, tmp_path):
+    avatar = fit(NearestCamera(), clip, tmp_path)
+    avatar.files()[-1].unlink()
+    with pytest.raises(InputError, match="000.*png"):
+        NearestCamera().load(tmp_path, device="cpu")

@@ -1,0 +1,95 @@
+"""A sweep of toy avatars: rows of known levels, resumed and refused."""
+
+import pandas as pd
+import pytest
+
+from headbench.bench.contracts import no_progress
+from headbench.bench.errors import InputError
+from headbench.bench.io.documents import read_json
+from headbench.bench.runner import run as runner
+from headbench.bench.runner.config import RunConfig
+from headbench.bench.runner.store import RunFolder
+from headbench.reports.pareto import sweep as module
+from headbench.reports.pareto.settings import SweepSettings
+from headbench.reports.pareto.sweep import sweep
+
+
+@pytest.fixture
+def finished(toy, tmp_path, monkeypatch):
+    """The folder of a finished run of two methods, one of which has variants."""
+    monkeypatch.setattr(runner, "write_reports", lambda folder: [])
+    monkeypatch.setattr(module, "NEEDED", ())
+    toy.MADE.clear()
+    for subject in ("subject1", "subject2"):
+        (tmp_path / "data" / subject).mkdir(parents=True)
+    runner.run(
+        RunConfig(
+            data=str(tmp_path / "data"),
+            out=str(tmp_path / "run"),
+            methods=("toy_plugin:METHOD", "toy_plugin:VARYING"),
+            metrics=("toy_plugin:ERROR", "toy_plugin:FILES", "toy_plugin:STEPS"),
+            reader="toy_plugin:READER",
+            preset="smoke",
+        )
+    )
+    return tmp_path / "run"
+
+
+def swept(run, **settings):
+    """Table of the rows of a sweep."""
+    sweep(SweepSettings(str(run), trust=True, **settings), run / "sweep", no_progress)
+    return pd.read_parquet(RunFolder(run / "sweep").rows)
+
+
+def test_variants_are_scored_like_the_run_itself(finished, toy):
+    rows = swept(finished)
+    errors = rows[(rows["metric"] == "error") & (rows["subject"] == "subject2") & (rows["timestep"] == 2)]
+    # Rendered level 255 times the grey, against 40 + 20 + 1.
+    found = dict(zip(errors["method"], errors["value"]))
+    assert found == {"varying": 128 - 61, "varying+dark": 64 - 61, "varying+light": 191 - 61}
+    assert set(rows["metric"]) == {"error", "files"}  # nothing was trained: no metric of training
+    record, original = (read_json(RunFolder(path).manifest) for path in (finished / "sweep", finished))
+    assert record["protocols"]["novel_view"]["hash"] == original["protocols"]["novel_view"]["hash"]
+    derived = {entry["name"]: entry.get("derived") for entry in record["methods"]}
+    assert derived["varying"] is None
+    assert derived["varying+dark"] == {"from": "varying", "variant": "dark", "change": "level 0.25"}
+
+
+def test_only_what_is_asked_for_is_derived_and_frames_can_be_fewer(finished, toy):
+    rows = swept(finished, variants=("light",), frames=1)
+    assert set(rows["method"]) == {"varying", "varying+light"}
+    assert set(toy.MADE) == {0.75}
+    assert (rows[rows["metric"] == "error"].groupby(["method", "subject", "task"]).size() == 1).all()
+
+
+def test_a_second_sweep_measures_nothing_again(finished, toy, monkeypatch):
+    first = swept(finished)
+
+    def never(*arguments):
+        raise AssertionError("measured again")
+
+    monkeypatch.setattr(toy, "mean_error", never)
+    monkeypatch.setattr(toy, "files_in_avatar", never)
+    assert swept(finished).equals(first)
+
+
+def test_variants_of_another_training_are_refused(finished, toy):
+    swept(finished)
+    cell = RunFolder(finished / "sweep").cell("subject1", "varying+dark", 0)
+    cell.finish("fit", "of another")
+    with pytest.raises(InputError, match="Choose another --out"):
+        swept(finished)
+
+
+@pytest.mark.parametrize(
+    ("settings", "match"),
+    [
+        ({"methods": ("toy",)}, "methods that derive variants"),
+        ({"methods": ("varying", "toy")}, "methods that derive variants, found toy"),
+        ({"variants": ("drak",)}, "a variant of these methods"),
+    ],
+)
+def test_what_cannot_be_derived_is_refused_before_work(finished, toy, settings, match):
+    with pytest.raises(InputError, match=match):
+        swept(finished, **settings)
+    assert toy.MADE == []

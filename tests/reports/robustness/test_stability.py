@@ -1,0 +1,118 @@
+"""Stability measures against hand-made frames, and limits against their statement."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from headbench.bench.contracts import Camera, Frame
+from headbench.reports.robustness.stability import MEASURES, Limits, Measures, judge, measure, typical
+
+CAMERA = Camera("c", 40, 20, np.array([[50.0, 0, 20], [0, 50, 10], [0, 0, 1]]), np.eye(4))
+
+
+def frame(alpha):
+    return Frame(np.zeros((*alpha.shape, 3), np.float32), alpha.astype(np.float32))
+
+
+def splats(means, radius=0.01, opacity=0.5):
+    means = np.atleast_2d(np.asarray(means, np.float32))
+    scales = np.full((len(means), 3), 0.001, np.float32)
+    scales[:, 1] = radius / 3
+    opacities = np.broadcast_to(np.float32(opacity), len(means)).copy()
+    return SimpleNamespace(means=means, scales=scales, quats=np.ones((len(means), 4)), opacities=opacities)
+
+
+def test_coverage_and_translucency_of_a_frame_counted_by_hand():
+    alpha = np.zeros((20, 40))
+    alpha[:4, :10] = 1.0
+    alpha[4, :10] = 0.5
+    alpha[5, :10] = 0.04  # as good as nothing
+    found = measure(frame(alpha), CAMERA)
+    assert found.coverage == pytest.approx(45.4, rel=1e-5)
+    assert found.translucent == pytest.approx(10 / 50)
+    assert found.largest_splat is None
+    assert found.mean_opacity is None
+
+
+def test_an_empty_frame_has_no_translucent_share():
+    assert measure(frame(np.zeros((20, 40))), CAMERA).translucent == 0.0
+
+
+def test_the_share_of_values_that_are_no_numbers():
+    broken = frame(np.zeros((20, 40)))
+    broken.rgb[0, 0] = np.nan, np.inf, 0.0
+    assert measure(broken, CAMERA).non_finite == pytest.approx(2 / (20 * 40 * 4))
+    bad = splats([0, 0, 1])
+    bad.quats[0, 0] = np.nan
+    assert measure(frame(np.zeros((20, 40))), CAMERA, bad).non_finite > 0
+
+
+@pytest.mark.parametrize(
+    ("means", "opacity", "expected"),
+    [
+        ([[0, 0, 1]], 0.5, 50 * 0.01 / 20),
+        ([[0, 0, 2]], 0.5, 50 * 0.01 / 2 / 20),
+        ([[0, 0, 2], [0, 0, 0.5]], 0.5, 50 * 0.01 / 0.5 / 20),
+        ([[0, 0, -1]], 0.5, 0.0),  # behind
+        ([[5, 0, 1]], 0.5, 0.0),  # off screen
+        ([[0, 0, 1]], 0.01, 0.0),  # not to be seen
+    ],
+)
+def test_the_largest_splat_is_the_pinhole_projection_of_three_deviations(means, opacity, expected):
+    found = measure(frame(np.ones((20, 40))), CAMERA, splats(means, opacity=opacity))
+    assert found.largest_splat == pytest.approx(expected, rel=1e-5)
+    assert found.mean_opacity == pytest.approx(opacity)
+
+
+def test_a_splat_whose_middle_is_off_screen_counts_where_it_reaches_in():
+    near = splats([[0.45, 0, 1]], radius=0.1)  # 2.5 px beyond the border, radius 5 px
+    assert measure(frame(np.ones((20, 40))), CAMERA, near).largest_splat == pytest.approx(5 / 20, rel=1e-5)
+
+
+STEADY = Measures(0.0, 100.0, 0.2, 0.04, 0.5)
+
+
+def broken(**changes):
+    return [v.measure for v in judge(replace(STEADY, **changes), STEADY, Limits()) if not v.passed]
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({}, []),
+        ({"coverage": 81.0}, []),
+        ({"coverage": 79.0}, ["coverage"]),
+        ({"coverage": 126.0}, ["coverage"]),
+        ({"coverage": float("nan")}, ["coverage"]),
+        ({"translucent": 0.29}, []),
+        ({"translucent": 0.31}, ["translucent"]),
+        ({"largest_splat": 0.099}, []),
+        ({"largest_splat": 0.101}, ["largest_splat"]),
+        ({"mean_opacity": 0.3}, ["mean_opacity"]),
+        ({"mean_opacity": 0.8}, ["mean_opacity"]),
+        ({"non_finite": 1e-9}, ["non_finite"]),
+    ],
+)
+def test_each_limit_holds_on_one_side_and_breaks_on_the_other(changes, expected):
+    assert broken(**changes) == expected
+
+
+def test_verdicts_stand_in_the_order_of_the_measures_and_skip_what_cannot_be_measured():
+    verdicts = judge(Measures(0.0, 100.0, 0.2), Measures(0.0, 100.0, 0.2), Limits())
+    assert tuple(v.measure for v in verdicts) == MEASURES
+    assert [v.value is None for v in verdicts] == [False, False, False, True, True]
+    assert all(v.passed for v in verdicts)
+
+
+def test_a_reference_that_shows_nothing_is_no_excuse():
+    nothing = replace(STEADY, coverage=0.0)
+    assert not judge(STEADY, nothing, Limits())[1].passed
+    assert judge(nothing, nothing, Limits())[1].passed
+
+
+def test_the_typical_frame_is_the_median_of_each_measure():
+    many = [replace(STEADY, coverage=c, translucent=t) for c, t in ((1, 0.9), (2, 0.1), (9, 0.5))]
+    assert typical(many) == replace(STEADY, coverage=2.0, translucent=0.5)
+    assert typical([Measures(0, 1, 0)]).largest_splat is None

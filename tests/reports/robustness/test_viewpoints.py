@@ -1,0 +1,126 @@
+"""The turntable: closed forms on a rig whose geometry is known."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from headbench.bench.contracts import Camera
+from headbench.bench.errors import InputError
+from headbench.reports.robustness.viewpoints import look_at, turntable
+
+CENTER = np.array([0.1, 1.5, -0.2])
+UP = np.array([0.0, 1.0, 0.0])
+
+
+def camera(azimuth, elevation=0.0, distance=1.0, name="", up=UP):
+    a, e = np.radians([azimuth, elevation])
+    direction = np.array([np.sin(a) * np.cos(e), np.sin(e), np.cos(a) * np.cos(e)])
+    K = np.array([[300.0, 0, 40], [0, 300, 70], [0, 0, 1]])
+    return Camera(name, 100, 140, K, look_at(CENTER + distance * direction, CENTER, up))
+
+
+def azimuth_of(view):
+    x, _, z = view.camera.center - CENTER
+    return np.degrees(np.arctan2(x, z))
+
+
+def test_looking_at_a_point_puts_it_on_the_axis_and_up_upwards():
+    motion = look_at(np.array([1.0, 2.0, 3.0]), CENTER, UP)
+    assert np.allclose(motion[:3, :3] @ motion[:3, :3].T, np.eye(3))
+    assert np.linalg.det(motion[:3, :3]) > 0
+    x, y, z = (motion @ [*CENTER, 1.0])[:3]
+    assert np.allclose([x, y], 0)
+    assert np.isclose(z, np.linalg.norm(CENTER - [1, 2, 3]))
+    above = motion @ [*(CENTER + 0.1 * UP), 1.0]
+    assert above[1] < 0
+    assert np.isclose(above[0], 0)
+
+
+def test_views_step_evenly_from_beyond_one_end_to_beyond_the_other():
+    rig = [camera(a) for a in (40, -60, 0, 80)]
+    views = turntable(rig, CENTER, 11, 30.0)
+    assert np.allclose([azimuth_of(v) for v in views], np.linspace(-90, 110, 11))
+    assert [v.extrapolated for v in views] == [not -60 <= a <= 80 for a in np.linspace(-90, 110, 11)]
+    assert all(np.isclose(np.linalg.norm(v.camera.center - CENTER), 1.0) for v in views)
+
+
+def test_a_view_at_a_training_camera_has_its_place_distance_and_focal_lengths():
+    rig = [camera(-20, 10, 1.0), camera(0, -5, 1.4), camera(30, 20, 0.8)]
+    start, *_, end = turntable(rig, CENTER, 5, 0.0)
+    assert np.allclose(start.camera.center, rig[0].center)
+    assert np.allclose(end.camera.center, rig[2].center)
+    second = turntable(rig, CENTER, 6, 0.0)[2]  # 0.4 of the way from -20 to 30 is 0
+    assert np.allclose(second.camera.center, rig[1].center)
+    assert np.allclose(np.diag(second.camera.K), [300, 300, 1])
+
+
+def test_between_two_cameras_the_way_is_the_great_circle():
+    low, high = camera(-30, 0), camera(30, 50)
+    middle = turntable([low, high], CENTER, 3, 0.0)[1].camera.center - CENTER
+    bisector = (low.center + high.center) / 2 - CENTER
+    assert np.allclose(middle, bisector / np.linalg.norm(bisector))
+
+
+def test_beyond_the_ends_elevation_and_distance_stay():
+    first = turntable([camera(-10, 25, 1.3), camera(10, 0)], CENTER, 5, 40.0)[0]
+    offset = first.camera.center - CENTER
+    assert np.isclose(np.linalg.norm(offset), 1.3)
+    assert np.isclose(np.degrees(np.arcsin(offset[1] / 1.3)), 25)
+    assert np.isclose(azimuth_of(first), -50)
+    assert first.extrapolated
+
+
+def test_a_rig_all_around_gives_a_closed_walk():
+    views = turntable([camera(a) for a in range(-150, 200, 50)], CENTER, 8, 30.0)
+    azimuths = np.array([azimuth_of(v) for v in views]) % 360
+    assert not any(v.extrapolated for v in views)
+    assert np.allclose(np.diff(np.sort(azimuths)), 45)
+
+
+def test_an_arc_across_the_back_is_found():
+    views = turntable([camera(a) for a in (150, 180, -150)], CENTER, 3, 0.0)
+    assert np.allclose(sorted(azimuth_of(v) % 360 for v in views), [150, 180, 210])
+
+
+def test_one_camera_is_enough():
+    views = turntable([camera(15)], CENTER, 3, 20.0)
+    assert np.allclose([azimuth_of(v) for v in views], [-5, 15, 35])
+    assert [v.extrapolated for v in views] == [True, False, True]
+
+
+def test_a_turned_world_turns_the_views_with_it():
+    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    turn *= np.sign(np.linalg.det(turn))
+    motion = np.eye(4)
+    motion[:3, :3] = turn.T
+    rig = [camera(a, e) for a, e in ((-50, 10), (0, 0), (45, -10))]
+    turned = [Camera("", c.width, c.height, c.K, c.world_to_camera @ motion) for c in rig]
+    for a, b in zip(turntable(rig, CENTER, 7, 30.0), turntable(turned, turn @ CENTER, 7, 30.0)):
+        assert np.allclose(turn @ a.camera.center, b.camera.center)
+        assert np.allclose(a.camera.world_to_camera @ motion, b.camera.world_to_camera)
+
+
+@given(
+    st.lists(st.tuples(st.floats(-180, 180), st.floats(-60, 60)), min_size=1, max_size=20),
+    st.integers(1, 20),
+    st.floats(0, 170),
+)
+def test_every_view_is_a_rigid_camera_that_sees_the_head(angles, count, beyond):
+    rig = [camera(a, e) for a, e in angles]
+    views = turntable(rig, CENTER, count, beyond)
+    assert len(views) == count
+    for view in views:
+        rotation = view.camera.world_to_camera[:3, :3]
+        assert np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)
+        x, y, w = view.camera.K @ (view.camera.world_to_camera @ [*CENTER, 1.0])[:3]
+        assert w > 0.5
+        assert np.allclose([x / w, y / w], [50, 70], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "rig", [[], [Camera("", 4, 4, np.eye(3), look_at(CENTER, CENTER + UP, np.eye(3)[0]))]]
+)
+def test_no_cameras_or_one_in_the_head_are_refused(rig):
+    with pytest.raises(InputError):
+        turntable(rig, CENTER, 4, 0.0)
