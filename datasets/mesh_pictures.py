@@ -14,6 +14,7 @@ import numpy as np
 
 from ..bench.contracts import ByteArray, Camera, FloatArray, IntArray
 from ..bench.errors import InputError
+from .head.geometry import vertex_normals
 
 PAPER = (1.0, 1.0, 1.0)
 CLAY = (0.78, 0.76, 0.74)
@@ -124,16 +125,6 @@ def rasterize_mesh(vertices: FloatArray, faces: IntArray, camera: Camera) -> Fra
     return Fragments(
         result.face.reshape(shape), result.weights.reshape(*shape, 3), result.depth.reshape(shape)
     )
-
-
-def vertex_normals(vertices: FloatArray, faces: IntArray) -> FloatArray:
-    """(V, 3) unit normals, area-weighted means of the triangles around; 0 at vertices without any area."""
-    edges = vertices[faces[:, 1:]] - vertices[faces[:, :1]]
-    areas = np.cross(edges[:, 0], edges[:, 1])
-    sums = np.stack(
-        [np.bincount(faces.ravel(), np.repeat(areas[:, i], 3), len(vertices)) for i in range(3)], axis=1
-    )
-    return sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), np.finfo(np.float64).tiny)
 
 
 def portrait_camera(

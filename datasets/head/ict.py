@@ -21,15 +21,14 @@ from ...bench.errors import InputError
 from ...bench.io.arrays import MAX_MAGNITUDE, Member, check_arrays
 from ..rounding import LENGTH_BITS, REGRESSOR_BITS, SHARE_BITS, on_grid
 from .arrays import HeadArrays
+from .geometry import fit_sphere, smoothstep
 from .ict_regions import MeshParts, Profile, landmark_names, mesh_parts, regions_of
 from .rigging import (
     Hinge,
     fit_hinge,
-    fit_sphere,
     hinge_correctives,
     hinge_weights,
     regressor_row,
-    smoothstep,
 )
 
 VERSION = "ict-facekit"

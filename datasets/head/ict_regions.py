@@ -17,6 +17,7 @@ from scipy.sparse.csgraph import connected_components
 
 from ...bench.contracts import FloatArray, IntArray
 from ...bench.errors import InputError
+from .geometry import border_edges, mesh_edges
 
 _CONTOUR, _BROWS, _NOSE, _OUTER_LIPS = range(17), range(17, 27), range(27, 36), range(48, 60)
 _NASION, _CHIN = 27, 8
@@ -179,14 +180,14 @@ def regions_of(
     regions = {name: everything[mask] for name, mask in masks.items()}
     pieces = {name: getattr(parts, name) for name in MeshParts.__dataclass_fields__}
     del pieces["face_material"], pieces["outer_back"]
-    return regions | pieces | {"boundary": np.intersect1d(_open_edges(faces), everything[skin | outer])}
+    return regions | pieces | {"boundary": np.intersect1d(border_edges(faces), everything[skin | outer])}
 
 
 def _pieces(vertices: IntArray, faces: IntArray) -> list[IntArray]:
     """Connected pieces of the mesh restricted to the vertices."""
     renumbered = np.full(int(faces.max()) + 1, -1)
     renumbered[vertices] = np.arange(len(vertices))
-    edges = renumbered[np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])]
+    edges = renumbered[mesh_edges(faces)]
     edges = edges[(edges >= 0).all(1)]
     graph = coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(len(vertices),) * 2)
     count, labels = connected_components(graph, directed=False)
@@ -195,13 +196,6 @@ def _pieces(vertices: IntArray, faces: IntArray) -> list[IntArray]:
 
 def _together(pieces: list[IntArray]) -> IntArray:
     return np.sort(np.concatenate([np.empty(0, np.int64), *pieces]))
-
-
-def _open_edges(faces: IntArray) -> IntArray:
-    """Vertices of edges that belong to one triangle only."""
-    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    unique, count = np.unique(edges, axis=0, return_counts=True)
-    return np.unique(unique[count == 1])
 
 
 def _near(template: FloatArray, points: FloatArray, radius: float) -> np.ndarray:

@@ -13,6 +13,7 @@ import numpy as np
 from ...bench.contracts import HeadAsset, IntArray
 from ...bench.errors import InputError
 from .arrays import JOINT_NAMES, RING_REGIONS
+from .geometry import mesh_edges
 
 RING_LENGTH = 15
 """Vertices of each ring in GaussianAvatars."""
@@ -71,7 +72,7 @@ def _rim(asset: HeadAsset, where: str) -> IntArray:
     face = np.zeros_like(lips)
     face[asset.regions["face"]] = True
     outer, inner = lips & face, lips & ~face
-    edges = np.concatenate([asset.faces[:, pair] for pair in ([0, 1], [1, 2], [2, 0])])
+    edges = mesh_edges(asset.faces)
     edges = np.concatenate([edges, edges[:, ::-1]])
     rim = np.unique(edges[outer[edges[:, 0]] & inner[edges[:, 1]], 0])
     if not len(rim):

@@ -77,14 +77,6 @@ def hinge_correctives(
     return basis
 
 
-def fit_sphere(points: FloatArray) -> tuple[FloatArray, float]:
-    """Centre and radius of the sphere through points (n, 3): linear (algebraic) least squares."""
-    system = np.column_stack([2 * points, np.ones(len(points))])
-    solution = np.linalg.lstsq(system, (points**2).sum(1), rcond=None)[0]
-    center = solution[:3]
-    return center, float(np.sqrt(solution[3] + center @ center))
-
-
 def regressor_row(vertices: FloatArray, support: IntArray, target: FloatArray) -> FloatArray:
     """(V,) weights on the support that sum to 1 and reproduce the target, as even as possible.
 
@@ -105,8 +97,3 @@ def regressor_row(vertices: FloatArray, support: IntArray, target: FloatArray) -
     row[support] = weights
     return row
 
-
-def smoothstep(values: FloatArray, low: float, high: float) -> FloatArray:
-    """0 below ``low``, 1 above ``high``, with zero slope at both."""
-    t = np.clip((values - low) / (high - low), 0.0, 1.0)
-    return t * t * (3 - 2 * t)

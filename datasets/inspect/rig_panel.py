@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Mapping
 import numpy as np
 
 from ...bench.contracts import Camera, FloatArray, IntArray
-from ..head.rigid import rigid_alignment
+from ..head.geometry import rigid_alignment
 from ..mesh_pictures import draw_mesh
 from .canvas import FINE, HELD_OUT, INK, MUTED, TRAIN, Canvas, Point, nice_ticks
 

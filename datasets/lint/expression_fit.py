@@ -23,8 +23,8 @@ from ...bench.errors import InputError
 from ...bench.io.images import ImageInfo
 from ..ga.layout import CyConvention
 from ..ga.transforms import FrameEntry
+from ..head.geometry import vertex_normals
 from ..images import read_image
-from ..mesh_pictures import vertex_normals
 from .parameters import Parameters, Subject
 from .views import ViewFacts, entry_camera
 

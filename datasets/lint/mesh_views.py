@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from ...bench.contracts import ByteArray, Camera, FloatArray, HeadPose, IntArray
-from ..head.rigid import rigid_alignment
+from ..head.geometry import rigid_alignment
 from ..mesh_pictures import rasterize_mesh
 from .parameters import Subject
 

@@ -14,6 +14,7 @@ from skimage.measure import find_contours
 
 from ...bench.contracts import FloatArray, HeadAsset, IntArray
 from ...bench.errors import InputError
+from ..head.geometry import fit_sphere
 
 SIDES = ("left", "right")
 _IBUG = {
@@ -93,7 +94,7 @@ def measure(head: HeadAsset, vertices: FloatArray) -> Anatomy:
     for region in ("left_eyeball", "right_eyeball"):
         if region not in head.regions:
             raise InputError(head.version, f"regions[{region!r}]", "the eyeball's vertices", "no such region")
-    balls = {side: _fit_sphere(vertices[head.regions[f"{side}_eyeball"]]) for side in SIDES}
+    balls = {side: fit_sphere(vertices[head.regions[f"{side}_eyeball"]]) for side in SIDES}
     scale = float(np.linalg.norm(balls["left"][0] - balls["right"][0])) / _REFERENCE_EYE_DISTANCE
     skin = skin_triangles(head)
     eyes = {}
@@ -131,15 +132,6 @@ def skin_triangles(head: HeadAsset) -> IntArray:
     # of the volume they enclose tells (divergence theorem).
     a, b, c = head.template[skin].astype(np.float64).transpose(1, 0, 2)
     return skin if np.einsum("ni,ni->", np.cross(a, b), c) > 0 else skin[:, ::-1]
-
-
-def _fit_sphere(points: FloatArray) -> tuple[FloatArray, float]:
-    """Algebraic least-squares sphere (centre, radius) through (n, 3) points."""
-    middle = points.mean(axis=0)
-    local = points - middle
-    design = np.concatenate([2.0 * local, np.ones((len(local), 1))], axis=1)
-    solution = np.linalg.lstsq(design, (local**2).sum(axis=1), rcond=None)[0]
-    return middle + solution[:3], float(np.sqrt(solution[3] + solution[:3] @ solution[:3]))
 
 
 def _opening(

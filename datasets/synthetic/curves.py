@@ -14,12 +14,6 @@ def blob(points: FloatArray, center: FloatArray, radius: float | FloatArray) -> 
     return np.exp(-0.5 * (((points - center) / np.asarray(radius)) ** 2).sum(axis=-1))
 
 
-def ramp(value: FloatArray, low: float, high: float) -> FloatArray:
-    """Smooth step from 0 at ``low`` to 1 at ``high`` (which may be the lesser)."""
-    t = np.clip((value - low) / (high - low), 0.0, 1.0)
-    return t * t * (3.0 - 2.0 * t)
-
-
 def polyline_distance(points: FloatArray, line: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Distance to a polyline and the place of the nearest point on it.
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...bench.contracts import FloatArray, IntArray
+from ..head.geometry import smoothstep
 from .anatomy import Eye
-from .curves import ramp
 from .noise import value_noise
 from .people import Person
 
@@ -38,7 +38,7 @@ def eye_mesh(person: Person, eye: Eye, *, inset: float = 0.0) -> EyeMesh:
     theta, phi = np.meshgrid(polar[1:-1], around, indexing="ij")
     theta, phi = (np.concatenate([[0.0], a.ravel(), [b]]) for a, b in ((theta, np.pi), (phi, 0.0)))
     unit = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=1)
-    lift = 1.0 + _CORNEA_LIFT * ramp(theta, 1.15 * _IRIS_ANGLE, 0.0)
+    lift = 1.0 + _CORNEA_LIFT * smoothstep(theta, 1.15 * _IRIS_ANGLE, 0.0)
     vertices = eye.center + (eye.radius - inset) * lift[:, None] * unit
     return EyeMesh(vertices, _ball_faces(rings, spokes), _paint(person, eye, theta, phi, unit))
 
@@ -61,8 +61,8 @@ def _paint(person: Person, eye: Eye, theta: FloatArray, phi: FloatArray, unit: F
     radius = theta / _IRIS_ANGLE  # 1 at the limbus
     white = np.tile(np.array([0.70, 0.66, 0.63]), (len(theta), 1))
     # Veins and warmth grow towards the corners.
-    side = ramp(np.abs(unit[:, 0]), 0.35, 0.8)
-    veins = ramp(np.abs(value_noise(unit * np.array([4.0, 14.0, 4.0]), person.seed + 71)), 0.08, 0.0)
+    side = smoothstep(np.abs(unit[:, 0]), 0.35, 0.8)
+    veins = smoothstep(np.abs(value_noise(unit * np.array([4.0, 14.0, 4.0]), person.seed + 71)), 0.08, 0.0)
     white *= (
         1.0
         - side[:, None] * np.array([0.10, 0.26, 0.28])
@@ -70,10 +70,10 @@ def _paint(person: Person, eye: Eye, theta: FloatArray, phi: FloatArray, unit: F
     )
     ring = np.stack([np.cos(phi), np.sin(phi), np.zeros_like(phi)], axis=1)
     fibres = value_noise(np.concatenate([ring[:, :2] * 9.0, radius[:, None] * 1.5], axis=1), person.seed + 72)
-    glow = 0.8 + 0.55 * ramp(radius, 0.9, 0.45) + 0.35 * fibres
+    glow = 0.8 + 0.55 * smoothstep(radius, 0.9, 0.45) + 0.35 * fibres
     iris = person.iris[None] * np.clip(glow, 0.3, 2.0)[:, None]
-    iris *= (1.0 - 0.75 * ramp(radius, 0.80, 1.0))[:, None]  # limbal ring
-    color = white + ramp(radius, 1.06, 0.96)[:, None] * (iris - white)
+    iris *= (1.0 - 0.75 * smoothstep(radius, 0.80, 1.0))[:, None]  # limbal ring
+    color = white + smoothstep(radius, 1.06, 0.96)[:, None] * (iris - white)
     return np.clip(
-        color * (1.0 - 0.985 * ramp(radius, _PUPIL_SHARE + 0.05, _PUPIL_SHARE - 0.05))[:, None], 0.002, 0.9
+        color * (1.0 - 0.985 * smoothstep(radius, _PUPIL_SHARE + 0.05, _PUPIL_SHARE - 0.05))[:, None], 0.002, 0.9
     )

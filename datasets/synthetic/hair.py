@@ -13,8 +13,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ...bench.contracts import FloatArray, IntArray
+from ..head.geometry import smoothstep
 from .anatomy import SIDES, Anatomy
-from .curves import ramp
 from .noise import fractal_noise, value_noise
 from .people import Person
 from .strands import Strands, grow, ribbons
@@ -71,7 +71,7 @@ def hair_share(person: Person, anatomy: Anatomy, points: FloatArray, ears: Float
     azimuth = np.arctan2(np.abs(points[:, 0]), points[:, 2] - middle_z)
     line = anatomy["glabella"][1] + s * np.interp(azimuth, _AZIMUTH, _HEIGHT)
     ragged = 0.0035 * s * fractal_noise(points, 0.012 * s, person.seed + 80, 3)
-    grown = ramp(points[:, 1] - line + ragged, -0.002 * s, 0.009 * s)
+    grown = smoothstep(points[:, 1] - line + ragged, -0.002 * s, 0.009 * s)
     return grown * (1.0 - ears) * (1.0 - _around_lobes(points, ears, s))
 
 
@@ -82,7 +82,7 @@ def _around_lobes(points: FloatArray, ears: FloatArray, s: float) -> FloatArray:
         return np.zeros(len(points))
     middle = ear[:, 1].mean()
     distance, _ = cKDTree(ear[ear[:, 1] <= middle]).query(points)
-    return ramp(distance, 0.016 * s, 0.010 * s) * ramp(points[:, 1], middle + 0.004 * s, middle - 0.008 * s)
+    return smoothstep(distance, 0.016 * s, 0.010 * s) * smoothstep(points[:, 1], middle + 0.004 * s, middle - 0.008 * s)
 
 
 def make_hair(
@@ -129,8 +129,8 @@ def make_hair(
         _, nearest = tree.query(place)
         normal = normals[nearest]
         side = np.tanh((place[:, 0] - parting) / (0.015 * s))
-        top = ramp(normal[:, 1], 0.1, 0.8)
-        front = ramp(place[:, 2], anatomy["vertex_top"][2] - 0.02 * s, anatomy["glabella"][2])
+        top = smoothstep(normal[:, 1], 0.1, 0.8)
+        front = smoothstep(place[:, 2], anatomy["vertex_top"][2] - 0.02 * s, anatomy["glabella"][2])
         wish = np.stack(
             [
                 style.sweep * side * (0.3 + 0.7 * top),
@@ -142,7 +142,7 @@ def make_hair(
         away = place - (anatomy["vertex_top"] + np.array([0.0, 0.0, -0.03]) * s)
         wish += 0.35 * away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
         # Off the skull, hair hangs.
-        free = ramp(place[:, 1], anatomy["nose_tip"][1] + 0.02 * s, anatomy["mouth"][1])[:, None]
+        free = smoothstep(place[:, 1], anatomy["nose_tip"][1] + 0.02 * s, anatomy["mouth"][1])[:, None]
         wish = (1.0 - free) * wish + free * np.array([0.0, -1.0, -0.10])
         wish -= (1.0 - free) * np.einsum("ni,ni->n", wish, normal)[:, None] * normal
         wish /= np.maximum(np.linalg.norm(wish, axis=1, keepdims=True), 1e-9)
@@ -169,7 +169,7 @@ def _face_limit(anatomy: Anatomy) -> Callable[[FloatArray], FloatArray]:
     high, low = anatomy["forehead"][2] + 0.03 * s, anatomy["left_ear"][2] + 0.042 * s
 
     def limit(points: FloatArray) -> FloatArray:
-        return low + (high - low) * ramp(points[:, 1], brow + 0.018 * s, brow + 0.062 * s)
+        return low + (high - low) * smoothstep(points[:, 1], brow + 0.018 * s, brow + 0.062 * s)
 
     return limit
 
@@ -182,7 +182,7 @@ def ear_share(anatomy: Anatomy, points: FloatArray, labelled: FloatArray) -> Flo
     for side in SIDES:
         middle = anatomy[f"{side}_ear"] * np.array([0.93, 1.0, 1.0]) + np.array([0.0, -0.008, 0.008]) * s
         distance = np.sqrt(((((points - middle) / s) / np.array([0.018, 0.034, 0.024])) ** 2).sum(axis=1))
-        total = np.maximum(total, ramp(distance, 1.15, 0.9))
+        total = np.maximum(total, smoothstep(distance, 1.15, 0.9))
     return total
 
 

@@ -9,17 +9,19 @@ import numpy as np
 import torch
 
 from ...bench.contracts import FloatArray, HeadAsset, HeadPose, IntArray
+from ..head.geometry import vertex_normals
 from ..head.model import HeadModel, chain_transforms
 from ..head.rotations import axis_angle_to_matrix
-from . import brows, skin
 from .anatomy import SIDES, Anatomy, measure
+from .brows import make_brows_and_lashes
 from .controls import Activations
 from .eyes import eye_mesh
 from .geometry import Geometry
 from .hair import ear_share, make_hair
 from .mouth import tracked_parts
 from .people import Person
-from .refine import FineMesh, refine, vertex_normals
+from .refine import FineMesh, refine
+from .skin import paint_skin
 from .wrinkles import make_folds
 
 HEAD_JOINT, EYE_JOINTS = 1, (3, 4)
@@ -58,14 +60,14 @@ class Likeness:
         points = self._fine.positions(self.neutral)
         normals = vertex_normals(points, self._fine.faces)
         cavity = _region_share(self._fine, head, ("mouth_socket",))
-        paint = skin.paint_skin(person, self.anatomy, points, normals, cavity)
+        paint = paint_skin(person, self.anatomy, points, normals, cavity)
         ears = ear_share(self.anatomy, points, _region_share(self._fine, head, ("left_ear", "right_ear")))
         hair = make_hair(person, self.anatomy, points, normals, self._fine.faces, ears)
         under = paint.albedo + hair.share[:, None] * (0.55 * person.hair - paint.albedo)
         self._folds = make_folds(person, self.anatomy, points, paint.lips, 1.0 - hair.share)
         self._skin_albedo, self._cap = under, hair.cap
         self._hair = hair.strands
-        self._rooted = brows.make_brows_and_lashes(person, self.anatomy, points, normals)
+        self._rooted = make_brows_and_lashes(person, self.anatomy, points, normals)
         self._rest_points = points
         self._eyes = {side: eye_mesh(person, self.anatomy.eyes[side]) for side in SIDES}
         self._mouth = tuple(geometry.mouth(person, self.anatomy, self.shape))

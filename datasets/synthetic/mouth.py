@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...bench.contracts import FloatArray, HeadAsset, IntArray
+from ..head.geometry import smoothstep
 from ..head.procedural.parts import render_parts
 from .anatomy import Anatomy
-from .curves import ramp
 from .noise import value_noise
 from .people import Person
 
@@ -80,13 +80,13 @@ def tongue(person: Person, anatomy: Anatomy, joints: int) -> MouthPart:
     phi = np.linspace(0.0, 2.0 * np.pi, around, endpoint=False)
     uu, pp = (grid.ravel() for grid in np.meshgrid(u, phi, indexing="ij"))
     section = np.sqrt(np.clip(1.0 - np.clip((uu - 0.72) / 0.28, 0.0, 1.0) ** 2.4, 0.0, 1.0))
-    groove = 0.0016 * np.exp(-0.5 * (np.cos(pp) / 0.22) ** 2) * (np.sin(pp) > 0) * ramp(uu, 0.1, 0.4)
+    groove = 0.0016 * np.exp(-0.5 * (np.cos(pp) / 0.22) ** 2) * (np.sin(pp) > 0) * smoothstep(uu, 0.1, 0.4)
 
     def body(
         back: FloatArray, length: float, bend: float, half_width: float, half_height: float
     ) -> FloatArray:
         # The middle line runs straight over the lower teeth and lip, then turns down by ``bend`` radians.
-        turn = bend * ramp(u, 0.62, 1.0)
+        turn = bend * smoothstep(u, 0.62, 1.0)
         z = np.concatenate([[0.0], np.cumsum(np.cos(turn[1:]))]) * length / (along - 1)
         y = -np.concatenate([[0.0], np.cumsum(np.sin(turn[1:]))]) * length / (along - 1)
         turn, z, y = (np.repeat(line, around) for line in (turn, z, y))
@@ -105,7 +105,7 @@ def tongue(person: Person, anatomy: Anatomy, joints: int) -> MouthPart:
     )
     buds = 1.0 + 0.14 * value_noise(inside / (0.0014 * s), person.seed + 95)
     weights = np.zeros((len(inside), joints))
-    weights[:, _JAW_JOINT] = _LIP_ON_JAW * ramp(uu, -0.3, 0.35)
+    weights[:, _JAW_JOINT] = _LIP_ON_JAW * smoothstep(uu, -0.3, 0.35)
     weights[:, _NECK_JOINT] = 1.0 - weights[:, _JAW_JOINT]
     return MouthPart("tongue", inside, out, faces, _TONGUE * buds[:, None], weights, "tongue", 0.008 * s)
 

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from ...bench.contracts import ByteArray, HeadPose
-from . import rig
 from .controls import CONTROLS, Activations
 from .likeness import Likeness
+from .rig import lights
 from .scene import Studio, develop
 from .take import Take
 
@@ -20,7 +20,7 @@ class Photographer:
     def __init__(self, take: Take):
         self._take = take
         self._likeness = Likeness(take.person, take.geometry, take.shape)
-        self._studio = Studio(rig.lights(), take.settings.samples_per_pixel, threads=1)
+        self._studio = Studio(lights(), take.settings.samples_per_pixel, threads=1)
         rest = dict.fromkeys(CONTROLS, 0.0)
         pose = take.geometry.translation.pose(rest, take.person.name, None)
         surfaces = self._likeness.surfaces(pose, rest)

@@ -12,22 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...bench.contracts import FloatArray, IntArray
+from ..head.geometry import vertex_normals
 
 ROUNDING = 0.6  # share of the full projection; Boubekeur and Alexa use 3/4
-
-
-def vertex_normals(vertices: FloatArray, faces: IntArray) -> FloatArray:
-    """Area-weighted unit vertex normals, (V, 3); zero where a vertex has no triangle."""
-    corner = vertices[faces]
-    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    total = np.stack(
-        [
-            np.bincount(faces.ravel(), np.repeat(normal[:, axis], 3), minlength=len(vertices))
-            for axis in range(3)
-        ],
-        axis=-1,
-    )
-    return total / np.maximum(np.linalg.norm(total, axis=-1, keepdims=True), 1e-20)
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...bench.contracts import FloatArray
+from ..head.geometry import smoothstep
 from .anatomy import SIDES, Anatomy
-from .curves import blob, polygon_distance, polyline_distance, ramp, smooth_curve
+from .curves import blob, polygon_distance, polyline_distance, smooth_curve
 from .noise import fractal_noise, spots, value_noise
 from .people import Person
 
@@ -43,7 +44,7 @@ def paint_skin(
     color *= (1.0 + 0.10 * fractal_noise(points, 0.03 * s, seed, 3))[:, None]
     color[:, 1:] *= (1.0 - 0.06 * fractal_noise(points, 0.012 * s, seed + 7, 3))[:, None]
     color *= (1.0 + 0.05 * value_noise(points / (0.0014 * s), seed + 8))[:, None]
-    facing = ramp(normals[:, 2], 0.0, _FRONT)
+    facing = smoothstep(normals[:, 2], 0.0, _FRONT)
     color = _mix(
         color, person.skin * np.array([0.62, 0.44, 0.34]), person.freckles * _freckles(anatomy, points, seed)
     )
@@ -83,7 +84,7 @@ def brow_share(person: Person, anatomy: Anatomy, points: FloatArray) -> FloatArr
         half = 0.0042 * anatomy.scale * person.brow_thickness * (1.0 - 0.75 * place**2)
         strands = value_noise(points / (np.array([0.0022, 0.0013, 0.0022]) * anatomy.scale), person.seed + 50)
         edge = distance / half + 0.28 * strands
-        total = np.maximum(total, ramp(edge, 1.15, 0.55) * (0.80 + 0.2 * strands))
+        total = np.maximum(total, smoothstep(edge, 1.15, 0.55) * (0.80 + 0.2 * strands))
     return np.clip(total, 0.0, 1.0)
 
 
@@ -92,7 +93,7 @@ def lip_share(anatomy: Anatomy, points: FloatArray) -> FloatArray:
     s, outline = anatomy.scale, anatomy.lip_outline
     near = _near(points, anatomy["mouth"], 0.06 * s)
     share = np.zeros(len(points))
-    share[near] = ramp(polygon_distance(points[near, :2], outline[:, :2]), 0.0006 * s, -0.0010 * s)
+    share[near] = smoothstep(polygon_distance(points[near, :2], outline[:, :2]), 0.0006 * s, -0.0010 * s)
     return share * (points[:, 2] > outline[:, 2].min() - 0.008 * s)
 
 
@@ -145,7 +146,7 @@ def _lid_lines(anatomy: Anatomy, points: FloatArray) -> FloatArray:
             share = (
                 strength
                 * np.exp(-0.5 * (distance / (width * s)) ** 2)
-                * (0.45 + 0.55 * ramp(place, 0.05, 0.5))
+                * (0.45 + 0.55 * smoothstep(place, 0.05, 0.5))
             )
             total[near] = np.maximum(total[near], share)
     return total
@@ -157,7 +158,7 @@ def _nostrils(anatomy: Anatomy, points: FloatArray, normals: FloatArray) -> Floa
     for sign in (1.0, -1.0):
         middle = anatomy["nose_base"] + np.array([sign * 0.0068, 0.0025, 0.0]) * s
         total += blob(points, middle, np.array([0.0034, 0.0030, 0.0055]) * s)
-    return np.minimum(1.6 * total, 1.0) * ramp(-normals[:, 1], 0.1, 0.55)
+    return np.minimum(1.6 * total, 1.0) * smoothstep(-normals[:, 1], 0.1, 0.55)
 
 
 def _freckles(anatomy: Anatomy, points: FloatArray, seed: int) -> FloatArray:
@@ -171,10 +172,10 @@ def _beard(anatomy: Anatomy, points: FloatArray, seed: int) -> FloatArray:
     """Where a beard would grow, grained as stubble."""
     s = anatomy.scale
     mouth, chin = anatomy["mouth"], anatomy["chin"]
-    low = ramp(points[:, 1], mouth[1] + 0.018 * s, mouth[1] - 0.006 * s) * ramp(
+    low = smoothstep(points[:, 1], mouth[1] + 0.018 * s, mouth[1] - 0.006 * s) * smoothstep(
         points[:, 1], chin[1] - 0.03 * s, chin[1]
     )
-    front = ramp(points[:, 2], anatomy["left_ear"][2] + 0.012 * s, anatomy["left_ear"][2] + 0.035 * s)
+    front = smoothstep(points[:, 2], anatomy["left_ear"][2] + 0.012 * s, anatomy["left_ear"][2] + 0.035 * s)
     cheeks = sum(blob(points, anatomy[f"{side}_cheek"], np.array([0.02, 0.026, 0.03]) * s) for side in SIDES)
     grain = 0.75 + 0.35 * value_noise(points / (0.0016 * s), seed + 60)
     return np.clip(low * front * (1.0 - 0.9 * np.minimum(cheeks, 1.0)) * grain, 0.0, 1.0)

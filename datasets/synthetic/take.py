@@ -15,12 +15,12 @@ from ...bench.io.files import digest
 from ..ga.writer import CapturePlan, CaptureWriter, SequencePlan
 from ..head.model import HeadModel
 from ..rounding import COEFFICIENT_BITS, LENGTH_BITS, on_grid
-from . import rig
 from .anatomy import Anatomy, measure
 from .geometry import Geometry
 from .hair import STYLES, Style
 from .people import Person, person
 from .performance import HELD_OUT, Kind, Performed, perform, share_out
+from .rig import FRONTAL, cameras
 from .tongue_labels import share_that_shows
 from .tracking import with_tracking_noise
 
@@ -93,7 +93,7 @@ def plan_take(out: Path, index: int, geometry: Geometry, settings: Settings) -> 
     anatomy = measure(head, neutral)
     target = _middle(anatomy, neutral, STYLES[who.style])
     tongue_shows = share_that_shows(geometry.mouth(who, anatomy, shape), anatomy, neutral)
-    views = rig.cameras(settings.cameras, width, height, target, seed=settings.seed + 101 * index)
+    views = cameras(settings.cameras, width, height, target, seed=settings.seed + 101 * index)
     performed, poses = {}, {}
     for sequence, count in share_out(settings.timesteps).items():
         performed[sequence] = perform(
@@ -116,7 +116,7 @@ def plan_take(out: Path, index: int, geometry: Geometry, settings: Settings) -> 
             for sequence, exact in poses.items()
         ],
         test_sequences=[HELD_OUT],
-        novel_view_cameras=[rig.FRONTAL],
+        novel_view_cameras=[FRONTAL],
         synthetic={**settings.described(), "head": geometry.source, "style": who.style},
     )
     return Take(index, who, geometry, shape, views, performed, poses, CaptureWriter(out, plan), settings)

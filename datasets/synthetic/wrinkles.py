@@ -13,9 +13,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ...bench.contracts import FloatArray
+from ..head.geometry import smoothstep
 from .anatomy import SIDES, Anatomy
 from .controls import Activations
-from .curves import blob, polyline_distance, ramp, smooth_curve
+from .curves import blob, polyline_distance, smooth_curve
 from .noise import value_noise
 from .people import Person
 
@@ -165,7 +166,7 @@ class _Sketch:
                 < np.linalg.norm(on_skin - on_skin.mean(axis=0), axis=1).max() + 8.0 * width * self.s
             )
             distance, place = polyline_distance(self.points[near], on_skin)
-            end = ramp(place, 0.0, 0.22) * ramp(place, 1.0, 0.72)
+            end = smoothstep(place, 0.0, 0.22) * smoothstep(place, 1.0, 0.72)
             x = distance / (width * self.s)
             groove = np.exp(-0.5 * x * x)
             banks = np.exp(-0.5 * ((x - 2.6) / 1.2) ** 2)
@@ -195,8 +196,8 @@ class _Sketch:
             lines.append(np.stack([x, y, z], axis=1)[cut])
         height, shade = self._lines(lines, 0.0010)
         x = self.points[:, 0]
-        left = ramp(x, 0.006 * s, 0.026 * s)
-        right = ramp(x, -0.006 * s, -0.026 * s)
+        left = smoothstep(x, 0.006 * s, 0.026 * s)
+        right = smoothstep(x, -0.006 * s, -0.026 * s)
         parts = {"forehead_mid": 1.0 - left - right, "forehead_left": left, "forehead_right": right}
         return {name: (height * share, shade * share) for name, share in parts.items()}
 
@@ -267,7 +268,7 @@ class _Sketch:
         where = blob(
             self.points, a["chin"] + np.array([0.0, 0.012, 0.002]) * s, np.array([0.014, 0.010, 0.015]) * s
         )
-        pits = ramp(value_noise(self.points / (0.0042 * s), self.person.seed + 91), 0.05, 0.6)
+        pits = smoothstep(value_noise(self.points / (0.0042 * s), self.person.seed + 91), 0.05, 0.6)
         return -0.0011 * s * where * pits, 0.45 * where * pits
 
     def _dimple(self, side: str, sign: float) -> tuple[FloatArray, FloatArray]:
@@ -280,7 +281,7 @@ class _Sketch:
         a, s = self.anatomy, self.s
         around = blob(self.points, a["mouth"], np.array([0.020, 0.013, 0.02]) * s)
         angle = np.arctan2(self.points[:, 1] - a["mouth"][1], self.points[:, 0] - a["mouth"][0])
-        ray = ramp(
+        ray = smoothstep(
             np.cos(26.0 * angle + 1.5 * value_noise(self.points / (0.006 * s), self.person.seed + 92)),
             0.1,
             1.0,
@@ -292,7 +293,7 @@ class _Sketch:
         where = blob(
             self.points, a["chin"] + np.array([0.0, -0.055, -0.03]) * s, np.array([0.045, 0.028, 0.045]) * s
         )
-        bands = np.cos(self.points[:, 0] / (0.0085 * s)) * ramp(
+        bands = np.cos(self.points[:, 0] / (0.0085 * s)) * smoothstep(
             a["chin"][1] - self.points[:, 1], 0.0, 0.02 * s
         )
-        return 0.0014 * s * where * bands, 0.18 * where * ramp(-bands, 0.0, 1.0)
+        return 0.0014 * s * where * bands, 0.18 * where * smoothstep(-bands, 0.0, 1.0)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ...bench.contracts import FloatArray, IntArray
 from ...datasets.head.arrays import HeadArrays
-from ...datasets.head.rigid import rigid_alignment
+from ...datasets.head.geometry import rigid_alignment
 from ...datasets.head.rotations import matrix_to_quaternion
 
 POLAR_STEPS = 8

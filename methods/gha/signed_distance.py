@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ...bench.contracts import FloatArray, IntArray
+from ...datasets.head.geometry import vertex_normals
 
 INNER_PARTS = ("teeth", "mouth_socket")
 """Regions behind the skin: what lies about them says nothing of inside and outside."""
@@ -40,17 +41,6 @@ class TangentDistance:
         distance, nearest = self._tree.query(places)
         side = np.einsum("ni,ni->n", places - self._points[nearest], self._normals[nearest])
         return np.where(side < 0, -distance, distance)
-
-
-def vertex_normals(vertices: FloatArray, faces: IntArray) -> FloatArray:
-    """(V, 3) unit normals, triangles weighted by area; zero for vertices without a triangle."""
-    corners = vertices[faces]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals = np.zeros_like(vertices)
-    for corner in range(3):
-        np.add.at(normals, faces[:, corner], across)
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    return normals / np.maximum(length, 1e-30)
 
 
 def outer_vertices(vertices: FloatArray, faces: IntArray, regions: Mapping[str, IntArray]) -> IntArray:

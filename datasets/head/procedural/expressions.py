@@ -14,9 +14,10 @@ import numpy as np
 
 from ....bench.contracts import FloatArray
 from ...rounding import COEFFICIENT_BITS, LENGTH_BITS, on_grid
+from ..geometry import smoothstep
 from .anatomy import MOUTH_HALF_WIDTH, lip_arc
 from .eyelids import blink, keep_off_eyes, lid_turn
-from .rig import jaw_weight, smoothstep
+from .rig import jaw_weight
 from .surface import Surface
 
 _MIXING_BITS = 25  # 2**-25 times 2**-27 m leaves two metres of room in a float64

@@ -8,8 +8,8 @@ from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import splu
 
 from ....bench.contracts import FloatArray
+from ..geometry import mesh_edges, smoothstep
 from .anatomy import EYE_CENTER, EYE_RADIUS, eye_front, lid_curves
-from .rig import smoothstep
 from .surface import Surface
 
 MEETING = 0.14  # where closing lids meet: share of the way from the lower to the upper margin
@@ -58,7 +58,7 @@ def lid_turn(surface: Surface, upper: FloatArray | float, lower: FloatArray | fl
 def harmonic(surface: Surface, field: FloatArray, free: NDArray[np.bool_]) -> FloatArray:
     """The field with its values at ``free`` vertices made the mean of their neighbours' (uniform weights)."""
     count = len(surface.vertices)
-    edges = np.concatenate([surface.faces[:, [0, 1]], surface.faces[:, [1, 2]], surface.faces[:, [2, 0]]])
+    edges = mesh_edges(surface.faces)
     pairs = np.unique(np.concatenate([edges, edges[:, ::-1]]), axis=0)
     adjacency = coo_matrix((np.ones(len(pairs)), pairs.T), (count, count)).tocsr()
     inside, known = np.flatnonzero(free), np.flatnonzero(~free)

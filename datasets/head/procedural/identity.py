@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 
 from ....bench.contracts import FloatArray
+from ..geometry import smoothstep
 from .anatomy import EYE_CENTER
 from .expressions import principal_basis
-from .rig import smoothstep
 from .surface import MIRROR, Surface
 
 Field = Callable[[FloatArray], FloatArray]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ....bench.contracts import IntArray
+from ..geometry import border_edges
 from .anatomy import (
     EYE_CENTER,
     FLOOR,
@@ -20,7 +21,6 @@ from .anatomy import (
 )
 from .cranium import head_mass
 from .features import EAR_ORIGIN
-from .remesh import border_edges
 from .surface import Surface
 
 RING_LENGTH = 15

@@ -13,6 +13,7 @@ from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from ....bench.contracts import FloatArray, IntArray
+from ..geometry import mesh_edges
 
 
 def vertex_areas(vertices: FloatArray, faces: IntArray) -> FloatArray:
@@ -22,19 +23,12 @@ def vertex_areas(vertices: FloatArray, faces: IntArray) -> FloatArray:
     return np.bincount(faces.ravel(), np.repeat(area, 3), len(vertices)).astype(float)
 
 
-def border_edges(faces: IntArray) -> IntArray:
-    """(B, 2) directed edges that belong to one triangle."""
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    _, inverse, count = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
-    return edges[count[inverse.ravel()] == 1]
-
-
 def surface_graph(vertices: FloatArray, faces: IntArray, size: FloatArray, *, diagonals: bool) -> csr_matrix:
     """Edges of the mesh, and the short diagonals across them if asked, weighted by length over wanted length.
 
     Diagonals make distances more even in all directions, but let one cluster leap over another.
     """
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    edges = mesh_edges(faces)
     opposite = np.concatenate([faces[:, 2], faces[:, 0], faces[:, 1]])
     key = np.sort(edges, axis=1)
     order = np.lexsort(key.T)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ....bench.contracts import FloatArray
+from ..geometry import smoothstep
 from .anatomy import EYE_CENTER, FLOOR, MOUTH_HALF_WIDTH, lip_arc
 from .surface import MIRROR, Surface
 
@@ -13,12 +14,6 @@ ROOT, NECK, JAW, LEFT_EYE, RIGHT_EYE = range(5)
 JOINTS = np.array(
     [[0, -0.165, -0.052], [0, -0.080, -0.030], [0, 0.000, -0.004], EYE_CENTER, EYE_CENTER * MIRROR]
 )
-
-
-def smoothstep(value: FloatArray, low: float | FloatArray, high: float | FloatArray) -> FloatArray:
-    """0 up to ``low``, 1 from ``high``, a cubic between."""
-    t = np.clip((value - low) / (high - low), 0, 1)
-    return t * t * (3 - 2 * t)
 
 
 def jaw_weight(surface: Surface) -> FloatArray:

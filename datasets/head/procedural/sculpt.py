@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from ....bench.contracts import FloatArray, IntArray
 from ....bench.io.files import atomic_path
+from ..geometry import border_edges
 from .anatomy import (
     CLOSED_LIP_GAP,
     EYE_CENTER,
@@ -30,7 +31,7 @@ from .anatomy import (
 )
 from .features import EAR_ORIGIN, sculpture
 from .polygonise import polygonise
-from .remesh import border_edges, coarsen
+from .remesh import coarsen
 
 SHORTEST_EDGE = 0.00035  # metres; the sheets of lids and lips are sculpted several times further apart
 LOW, HIGH = (0.0, FLOOR, -0.13), (0.115, 0.15, 0.11)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from importlib.resources import as_file, files
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +11,11 @@ from numpy.typing import NDArray
 
 from ....bench.contracts import FloatArray, IntArray
 from ....bench.io.arrays import Member, read_arrays
+from ..geometry import vertex_normals
 from .anatomy import EYE_CENTER, EYE_RADIUS, LID_CLEARANCE, MOUTH_CAVITY, slit_height
 
 MIRROR = np.array([-1.0, 1.0, 1.0])
+PACKAGED = Path(__file__).with_name("head.npz")
 EYE_RINGS, EYE_SECTORS = 16, 24
 
 
@@ -86,15 +87,6 @@ class Surface:
         return int(candidates[np.argmin(np.linalg.norm(self.vertices[candidates] - point, axis=1))])
 
 
-def vertex_normals(vertices: FloatArray, faces: IntArray) -> FloatArray:
-    """(V, 3) unit normals, each the area-weighted mean of those of the triangles around a vertex."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    total = np.zeros_like(vertices)
-    for corner in range(3):
-        np.add.at(total, faces[:, corner], np.cross(b - a, c - a))
-    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)
-
-
 def eyeball(rings: int = EYE_RINGS, sectors: int = EYE_SECTORS) -> tuple[FloatArray, IntArray]:
     """Unit sphere around the z axis, a pole in front: vertices (2 + (rings-1) sectors, 3) and triangles."""
     polar = np.linspace(0, np.pi, rings + 1)[1:-1, None]
@@ -130,7 +122,7 @@ def assemble(skin: FloatArray, faces: IntArray, mirror: IntArray) -> Surface:
     )
 
 
-def load_surface(path: Path | None = None) -> Surface:
+def load_surface(path: Path = PACKAGED) -> Surface:
     """The surface that `sculpt` wrote: the packaged one, or the one at ``path``.
 
     Raises
@@ -138,9 +130,6 @@ def load_surface(path: Path | None = None) -> Surface:
     InputError
         Where the file is no such npz.
     """
-    if path is None:
-        with as_file(files(__package__) / "head.npz") as packaged:
-            return load_surface(packaged)
     members = {
         "vertices": Member("f", ("V", 3)),
         "faces": Member("iu", ("F", 3)),

@@ -9,9 +9,8 @@ from scipy.sparse import csr_array, eye_array
 
 from ....bench.contracts import FloatArray, HeadAsset, IntArray
 from ....bench.errors import InputError
-from ...mesh_pictures import vertex_normals
+from ..geometry import rigid_alignment, vertex_normals
 from ..regions import faces_in_region
-from ..rigid import rigid_alignment
 from .bounded import solve_bounded
 from .correspondence import closest_points
 from .settings import RefitSettings

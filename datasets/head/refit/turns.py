@@ -15,7 +15,7 @@ _GENERATORS = np.array(
     ],
     dtype=np.float64,
 )
-_SERIES_BELOW = 1e-2  # squared angle under which the third coefficient's closed form cancels
+_DERIVATIVE_SERIES_BELOW = 1e-2  # squared angle under which the third coefficient's closed form cancels
 
 
 def matrices(axis_angles: FloatArray) -> FloatArray:
@@ -33,7 +33,7 @@ def matrices_and_derivatives(axis_angles: FloatArray) -> tuple[FloatArray, Float
     angle = np.sqrt(squared)
     a = np.sinc(angle / np.pi)
     b = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
-    near = squared < _SERIES_BELOW
+    near = squared < _DERIVATIVE_SERIES_BELOW
     series = 1 / 6 - squared / 120 * (1 - squared / 42 * (1 - squared / 72))
     c = np.where(near, series, (1 - a) / np.where(near, 1.0, squared))
     cross = np.tensordot(axis_angles, _GENERATORS, 1)

@@ -15,8 +15,9 @@ import torch
 from ....bench.contracts import Camera, Clip, FloatArray, HeadAsset, IntArray
 from ....bench.errors import InputError
 from ...head.arrays import JOINT_NAMES
+from ...head.geometry import vertex_normals
 from ...head.model import HeadModel
-from ...mesh_pictures import rasterize_mesh, vertex_normals
+from ...mesh_pictures import rasterize_mesh
 
 PITCH = 0.0015
 """Edge of a pixel of the map, metres: about half the height of what a tongue's tip shows first."""

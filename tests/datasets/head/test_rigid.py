@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from headbench.datasets.head.rigid import rigid_alignment
+from headbench.datasets.head.geometry import rigid_alignment
 
 
 def points(count=20, seed=0):

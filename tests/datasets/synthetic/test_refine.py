@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from headbench.datasets.synthetic.refine import refine, vertex_normals
+from headbench.datasets.head.geometry import vertex_normals
+from headbench.datasets.synthetic.refine import refine
 
 
 @pytest.fixture(scope="module")

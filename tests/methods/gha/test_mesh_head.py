@@ -9,11 +9,12 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from headbench.bench.contracts import Budget, no_progress
+from headbench.datasets.head.geometry import vertex_normals
 from headbench.methods.gha.mesh_head import DISC_RADIUS, DISC_THICKNESS, MeshHead, vertex_discs
 from headbench.methods.gha.mesh_stage import mesh_stage
 from headbench.methods.gha.mesh_training import MeshTraining, roughness, soft_overlap
 from headbench.methods.gha.scene import scene_of
-from headbench.methods.gha.signed_distance import TangentDistance, outer_vertices, vertex_normals
+from headbench.methods.gha.signed_distance import TangentDistance, outer_vertices
 from headbench.methods.gha.tetrahedra import marching_tetrahedra, tet_grid
 from headbench.methods.shared.triplane import encode
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from headbench.datasets.head.procedural.rig import JOINTS, smoothstep
+from headbench.datasets.head.geometry import smoothstep
+from headbench.datasets.head.procedural.rig import JOINTS
 
 OPEN = (0.30, 0.0, 0.0)
 

@@ -8,9 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from headbench.datasets.head.procedural import fields
+import headbench.datasets.head.procedural.sculpture as fields
+from headbench.datasets.head.geometry import border_edges
 from headbench.datasets.head.procedural.polygonise import polygonise
-from headbench.datasets.head.procedural.remesh import border_edges, coarsen, vertex_areas
+from headbench.datasets.head.procedural.remesh import coarsen, vertex_areas
 from headbench.datasets.head.procedural.sculpt import Settings, main, mirrored
 from headbench.datasets.head.procedural.surface import load_surface
 

@@ -7,7 +7,8 @@ import pymeshlab
 import pytest
 
 from headbench.bench.errors import InputError
-from headbench.datasets.head.procedural.surface import MIRROR, eyeball, load_surface, vertex_normals
+from headbench.datasets.head.geometry import vertex_normals
+from headbench.datasets.head.procedural.surface import MIRROR, eyeball, load_surface
 
 
 def distance(head, a, b):

@@ -1,0 +1,61 @@
+"""Geometry of points and triangle meshes in numpy."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...bench.contracts import FloatArray, IntArray
+
+
+def smoothstep(values: FloatArray, low: float | FloatArray, high: float | FloatArray) -> FloatArray:
+    """0 at ``low``, 1 at ``high`` (which may be the lesser), a cubic with zero slope at both ends between."""
+    t = np.clip((values - low) / (high - low), 0.0, 1.0)
+    return t * t * (3.0 - 2.0 * t)
+
+
+def mesh_edges(faces: IntArray) -> IntArray:
+    """(3 F, 2) directed edges: those from corner 0 to 1 of all triangles, then 1 to 2, then 2 to 0."""
+    return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+
+
+def border_edges(faces: IntArray) -> IntArray:
+    """(B, 2) directed edges that belong to one triangle only."""
+    edges = mesh_edges(faces)
+    _, inverse, count = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
+    return edges[count[inverse.ravel()] == 1]
+
+
+def vertex_normals(vertices: FloatArray, faces: IntArray) -> FloatArray:
+    """(V, 3) unit normals, area-weighted means of the triangles around; 0 at vertices without any area."""
+    edges = vertices[faces[:, 1:]] - vertices[faces[:, :1]]
+    areas = np.cross(edges[:, 0], edges[:, 1])
+    sums = np.stack(
+        [np.bincount(faces.ravel(), np.repeat(areas[:, i], 3), len(vertices)) for i in range(3)], axis=1
+    )
+    return sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+
+
+def fit_sphere(points: FloatArray) -> tuple[FloatArray, float]:
+    """Centre and radius of the sphere through points (n, 3): linear (algebraic) least squares."""
+    middle = points.mean(axis=0)
+    local = points - middle
+    design = np.concatenate([2.0 * local, np.ones((len(local), 1))], axis=1)
+    solution = np.linalg.lstsq(design, (local**2).sum(axis=1), rcond=None)[0]
+    return middle + solution[:3], float(np.sqrt(solution[3] + solution[:3] @ solution[:3]))
+
+
+def rigid_alignment(points: FloatArray, wanted: FloatArray, weights: FloatArray | None = None) -> FloatArray:
+    """(4, 4) rigid motion that takes points (n, 3) nearest to ``wanted``, by weighted squared distance.
+
+    Kabsch, "A solution for the best rotation to relate two sets of vectors", Acta Cryst. A32, 1976; with the
+    sign that excludes reflections. Without weights all points count the same.
+    """
+    weights = np.ones(len(points)) if weights is None else weights
+    share = (weights / weights.sum())[:, None]
+    middle, wanted_middle = (share * points).sum(axis=0), (share * wanted).sum(axis=0)
+    u, _, vt = np.linalg.svd((share * (points - middle)).T @ (wanted - wanted_middle))
+    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    motion = np.eye(4)
+    motion[:3, :3] = (u @ sign @ vt).T
+    motion[:3, 3] = wanted_middle - motion[:3, :3] @ middle
+    return motion
