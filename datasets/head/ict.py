@@ -12,26 +12,25 @@ skeleton, so the skeleton is fitted here:
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from os import PathLike
+from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from ...bench.contracts import FloatArray, IntArray
 from ...bench.errors import InputError
 from ...bench.io.arrays import MAX_MAGNITUDE, Member, check_arrays
 from ..rounding import LENGTH_BITS, REGRESSOR_BITS, SHARE_BITS, on_grid
 from .arrays import HeadArrays
-from .geometry import fit_sphere, smoothstep
-from .ict_regions import MeshParts, Profile, landmark_names, mesh_parts, regions_of
-from .rigging import (
-    Hinge,
-    fit_hinge,
-    hinge_correctives,
-    hinge_weights,
-    regressor_row,
-)
+from .geometry import border_edges, fit_sphere, mesh_edges, smoothstep
 
 VERSION = "ict-facekit"
+LANDMARKS = tuple(f"ibug_{index:02d}" for index in range(68))
+"""Names of the landmarks, in iBUG's order."""
+
 JAW_SHAPE = "jawOpen"
 DROPPED_SHAPES = (JAW_SHAPE, "mouthClose")
 """Not in the expression basis: the jaw joint replaces the first, the second only corrects the first."""
@@ -47,7 +46,7 @@ _KEYS = {
     "expr_names": Member("U", ("E",)),
     "expr_deltas": Member("f", ("E", "V", 3), _LARGEST),
     "id_deltas": Member("f", ("S", "V", 3), _LARGEST),
-    "idx_to_landmark_verts": Member("iu", (len(landmark_names()),)),
+    "idx_to_landmark_verts": Member("iu", (len(LANDMARKS),)),
 }
 
 
@@ -119,14 +118,8 @@ def _rigged(file: str | PathLike[str], content: Mapping[str, np.ndarray]) -> Hea
         skinning_weights=weights,
         parents=np.array([-1, 0, 1, 1, 1]),
         regions=regions_of(template, faces, parts, profile, landmarks),
-        landmarks=dict(zip(landmark_names(), landmarks.tolist())),
+        landmarks=dict(zip(LANDMARKS, landmarks.tolist())),
     )
-
-
-def fitted_jaw(head: HeadArrays, displacement: FloatArray) -> Hinge:
-    """The hinge of a rigged kit, from ``jawOpen``'s displacement (V, 3) in metres; its angle opens the jaw."""
-    teeth = head.regions["teeth_lower"]
-    return fit_hinge(head.template[teeth], head.template[teeth] + displacement[teeth])
 
 
 def _check(file: str | PathLike[str], content: Mapping[str, np.ndarray]) -> None:
@@ -195,3 +188,285 @@ def _around_axis(template: FloatArray, skin: IntArray, hinge: Hinge, each_side: 
     distances = [distance[template[skin, 0] > 0], distance[template[skin, 0] < 0]]
     nearest = [side[np.argsort(away)[:each_side]] for side, away in zip(sides, distances)]
     return np.unique(np.concatenate(nearest))
+
+
+_CONTOUR, _BROWS, _NOSE, _OUTER_LIPS = range(17), range(17, 27), range(27, 36), range(48, 60)
+_NASION, _CHIN = 27, 8
+_MATERIALS = (
+    *("M_Face", "M_BackHead", "M_GumsTongue", "M_Teeth", "M_EyeLashes", "M_LacrimalFluid"),
+    *("M_EyeOcclusion", "M_EyeBlend", "M_ScleraLeft", "M_ScleraRight", "M_IrisLeft", "M_IrisRight"),
+)
+_EYES = {"right": range(36, 42), "left": range(42, 48)}
+
+
+@dataclass(frozen=True, eq=False)
+class MeshParts:
+    """Sorted vertex indices of what the kit is put together from."""
+
+    face_material: IntArray
+    outer_back: IntArray  # scalp, back of the neck, shoulders
+    mouth_socket: IntArray
+    eye_sockets: IntArray
+    gums_and_tongue: IntArray
+    teeth: IntArray
+    teeth_upper: IntArray
+    teeth_lower: IntArray
+    left_eyeball: IntArray
+    right_eyeball: IntArray
+    left_sclera: IntArray
+    right_sclera: IntArray
+    eyelashes: IntArray
+    lacrimal_fluid: IntArray
+    eye_occlusion: IntArray
+    eye_blend: IntArray
+
+
+@dataclass(frozen=True)
+class Profile:
+    """The head from the side: proportions that place the neck. Metres.
+
+    Attributes
+    ----------
+    length : from nasion to chin.
+    neck_top, neck_base : heights along the neck where the head begins and the shoulders begin.
+    """
+
+    length: float
+    neck_top: float
+    neck_base: float
+
+    # The neck leans forward by about 25 degrees: the throat begins lower than the nape.
+    _UP = np.array([0.0, np.cos(0.43), np.sin(0.43)])
+
+    @classmethod
+    def of(cls, template: FloatArray, landmarks: IntArray) -> Profile:
+        """Profile of a head with 68 landmarks."""
+        length = float(np.linalg.norm(template[landmarks[_NASION]] - template[landmarks[_CHIN]]))
+        chin = float(template[landmarks[_CHIN]] @ cls._UP)
+        return cls(length, chin - 0.24 * length, chin - 0.87 * length)
+
+    def height(self, points: FloatArray) -> FloatArray:
+        """Height of points (n, 3) along the neck."""
+        return points @ self._UP
+
+
+def mesh_parts(
+    file: str | PathLike[str],
+    template: FloatArray,
+    faces: IntArray,
+    materials: Mapping[str, IntArray],
+    jaw_open: FloatArray,
+) -> MeshParts:
+    """Take the mesh apart.
+
+    Parameters
+    ----------
+    materials : vertices of each material's triangles.
+    jaw_open : (V, 3) displacement of ``jawOpen``, which tells lower teeth from upper ones.
+    """
+    for name in _MATERIALS:
+        if name not in materials or not len(materials[name]):
+            raise InputError(file, "material_names", f"triangles of {name}", ", ".join(sorted(materials)))
+    # Behind the face material lie the outer head and, each a piece of its own, the mouth and eye sockets.
+    back = np.setdiff1d(materials["M_BackHead"], materials["M_Face"])
+    pieces = sorted(_pieces(back, faces), key=lambda piece: -template[piece, 1].max())
+    outer, inner = pieces[0], pieces[1:]
+    sockets = [piece for piece in inner if len(np.unique(template[piece, 0] > 0)) == 1]
+    mouth = [piece for piece in inner if len(np.unique(template[piece, 0] > 0)) == 2]
+    motion = np.linalg.norm(jaw_open[materials["M_Teeth"]], axis=1)
+    lower = motion > 0.25 * motion.max()
+    return MeshParts(
+        face_material=materials["M_Face"],
+        outer_back=outer,
+        mouth_socket=_together(mouth),
+        eye_sockets=_together(sockets),
+        gums_and_tongue=materials["M_GumsTongue"],
+        teeth=materials["M_Teeth"],
+        teeth_upper=materials["M_Teeth"][~lower],
+        teeth_lower=materials["M_Teeth"][lower],
+        left_eyeball=np.union1d(materials["M_ScleraLeft"], materials["M_IrisLeft"]),
+        right_eyeball=np.union1d(materials["M_ScleraRight"], materials["M_IrisRight"]),
+        left_sclera=materials["M_ScleraLeft"],
+        right_sclera=materials["M_ScleraRight"],
+        eyelashes=materials["M_EyeLashes"],
+        lacrimal_fluid=materials["M_LacrimalFluid"],
+        eye_occlusion=materials["M_EyeOcclusion"],
+        eye_blend=materials["M_EyeBlend"],
+    )
+
+
+def regions_of(
+    template: FloatArray, faces: IntArray, parts: MeshParts, profile: Profile, landmarks: IntArray
+) -> dict[str, IntArray]:
+    """Regions by name: FLAME's, and the kit's own pieces."""
+    points = template[landmarks]
+    length = profile.length
+    everything = np.arange(len(template))
+    skin = np.zeros(len(template), dtype=bool)
+    skin[parts.face_material] = True
+    x, y, z = template.T
+
+    # From the side the contour runs from the ear down to the chin; the face lies in front of it. The
+    # landmarks sit before the ear, so the line is moved back to it, less and less towards the chin; above
+    # the ear the face reaches as far back as its material.
+    ear_line, ear_top = points[0, 1], points[0, 1] + 0.05 * length
+    contour = points[list(_CONTOUR)[: _CHIN + 1]]
+    order = np.argsort(contour[:, 1])
+    along = np.interp(y, contour[order, 1], contour[order, 2])
+    rise = np.clip((y - points[_CHIN, 1]) / (ear_line - points[_CHIN, 1]), 0, 1)
+    in_front = (z > along - (0.01 + 0.17 * rise) * length) | (y > ear_top)
+    face = skin & in_front & (y > contour[:, 1].min() - 0.02 * length)
+    ear = skin & ~face & (y <= ear_top) & (y > ear_line - 0.58 * length)
+    ear &= np.abs(x) > 0.93 * np.abs(points[0, 0])
+    height = profile.height(template)
+    outer = np.zeros_like(skin)
+    outer[parts.outer_back] = True
+    neck = (skin | outer) & ~face & ~ear & (height < profile.neck_top) & (height > profile.neck_base)
+
+    brow = points[list(_BROWS), 1].max()
+    nose = points[list(_NOSE)]
+    masks = {
+        "face": face,
+        "forehead": face & (y > brow),
+        "nose": face & _near(template, nose, 0.12 * length) & (y > nose[:, 1].min() - 0.02 * length),
+        "lips": skin
+        & _inside(template[:, :2], points[list(_OUTER_LIPS), :2], 0.02 * length)
+        & (z > points[list(_OUTER_LIPS), 2].min() - 0.06 * length),
+        "left_ear": ear & (x > 0),
+        "right_ear": ear & (x < 0),
+        "neck": neck,
+        "scalp": outer & (height >= profile.neck_top),
+        "shoulders": (skin | outer) & (height <= profile.neck_base),
+    }
+    for side, corners in _EYES.items():
+        eye = points[list(corners)]
+        width = np.ptp(eye[:, 0])
+        masks[f"{side}_eye_region"] = face & (np.linalg.norm(template - eye.mean(0), axis=1) < 0.85 * width)
+    masks["eye_region"] = masks["left_eye_region"] | masks["right_eye_region"]
+    regions = {name: everything[mask] for name, mask in masks.items()}
+    pieces = {name: getattr(parts, name) for name in MeshParts.__dataclass_fields__}
+    del pieces["face_material"], pieces["outer_back"]
+    return regions | pieces | {"boundary": np.intersect1d(border_edges(faces), everything[skin | outer])}
+
+
+def _pieces(vertices: IntArray, faces: IntArray) -> list[IntArray]:
+    """Connected pieces of the mesh restricted to the vertices."""
+    renumbered = np.full(int(faces.max()) + 1, -1)
+    renumbered[vertices] = np.arange(len(vertices))
+    edges = renumbered[mesh_edges(faces)]
+    edges = edges[(edges >= 0).all(1)]
+    graph = coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(len(vertices),) * 2)
+    count, labels = connected_components(graph, directed=False)
+    return [vertices[labels == label] for label in range(count)]
+
+
+def _together(pieces: list[IntArray]) -> IntArray:
+    return np.sort(np.concatenate([np.empty(0, np.int64), *pieces]))
+
+
+def _near(template: FloatArray, points: FloatArray, radius: float) -> np.ndarray:
+    """Whether each vertex is within the radius of one of the points."""
+    distance = np.linalg.norm(template[:, None] - points[None], axis=2)
+    return distance.min(1) < radius
+
+
+def _inside(points: FloatArray, polygon: FloatArray, margin: float) -> np.ndarray:
+    """Whether each 2D point is inside the polygon widened from its middle by about the margin (even-odd rule)."""
+    middle = polygon.mean(0)
+    away = polygon - middle
+    polygon = polygon + margin * away / np.linalg.norm(away, axis=1, keepdims=True)
+    inside = np.zeros(len(points), dtype=bool)
+    for start, end in zip(polygon, np.roll(polygon, -1, axis=0)):
+        crosses = (start[1] > points[:, 1]) != (end[1] > points[:, 1])
+        slope = (end[0] - start[0]) / (end[1] - start[1]) if end[1] != start[1] else 0.0
+        inside ^= crosses & (points[:, 0] < start[0] + slope * (points[:, 1] - start[1]))
+    return inside
+
+
+class Hinge(NamedTuple):
+    """A rotation about an axis parallel to x: the motion of a jaw that opens."""
+
+    angle: float  # radians, positive opens (from +y towards +z)
+    center: FloatArray  # (3,) a point of the axis, with x = 0
+
+    @property
+    def matrix(self) -> FloatArray:
+        """(3, 3) rotation."""
+        c, s = np.cos(self.angle), np.sin(self.angle)
+        return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+
+    def displacement(self, points: FloatArray) -> FloatArray:
+        """What the full motion adds at points (n, 3)."""
+        return (points - self.center) @ (self.matrix - np.eye(3)).T
+
+
+def fit_hinge(points: FloatArray, moved: FloatArray) -> Hinge:
+    """Least-squares hinge that takes points to moved points, both (n, 3).
+
+    Planar case of the orthogonal Procrustes problem (Schoenemann 1966); the centre is the fixed point of the
+    fitted rigid motion of the y-z plane.
+
+    Raises
+    ------
+    ValueError
+        Where the points hardly turn, so that the motion has no centre.
+    """
+    plane, target = points[:, 1:], moved[:, 1:]
+    middle, target_middle = plane.mean(0), target.mean(0)
+    a, b = plane - middle, target - target_middle
+    angle = float(np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum()))
+    if abs(angle) < 1e-3:
+        raise ValueError(f"a motion of {angle:.2g} radians has no centre of rotation")
+    turn = Hinge(angle, np.zeros(3)).matrix[1:, 1:]
+    center = np.linalg.solve(np.eye(2) - turn, target_middle - turn @ middle)
+    return Hinge(angle, np.array([0.0, *center]))
+
+
+def hinge_weights(hinge: Hinge, points: FloatArray, displacement: FloatArray, softness: float) -> FloatArray:
+    """Share of the hinge's motion that each point follows, in [0, 1].
+
+    The least-squares factor of the rigid motion that explains the displacement; ``softness`` (metres) damps
+    it where the rigid motion itself is small, near the axis, and the quotient says little.
+    """
+    rigid = hinge.displacement(points)
+    share = (rigid * displacement).sum(1) / ((rigid**2).sum(1) + softness**2)
+    return np.clip(share, 0.0, 1.0)
+
+
+def hinge_correctives(
+    hinge: Hinge, points: FloatArray, displacement: FloatArray, weights: FloatArray
+) -> FloatArray:
+    """(n, 3, 9) pose basis of the hinge's joint: what skinning leaves unexplained of the displacement.
+
+    Added to the points before skinning, at the full angle it makes skinning end exactly at
+    ``points + displacement``. It goes with the sine of the angle: half each in the two off-diagonal elements
+    of R - I about x.
+    """
+    blended = weights[:, None, None] * (hinge.matrix - np.eye(3)) + np.eye(3)
+    shift = weights[:, None] * (hinge.center - hinge.matrix @ hinge.center)
+    wanted = np.linalg.solve(blended, (points + displacement - shift)[..., None])[..., 0] - points
+    basis = np.zeros((len(points), 3, 9))
+    basis[:, :, 7] = wanted / (2 * np.sin(hinge.angle))  # element (2, 1), +sine
+    basis[:, :, 5] = -basis[:, :, 7]  # element (1, 2), -sine
+    return basis
+
+
+def regressor_row(vertices: FloatArray, support: IntArray, target: FloatArray) -> FloatArray:
+    """(V,) weights on the support that sum to 1 and reproduce the target, as even as possible.
+
+    The target then moves with the support in every translation, rotation and scaling of the mesh.
+
+    Raises
+    ------
+    ValueError
+        Where the support does not span the target.
+    """
+    constraints = np.vstack([vertices[support].T, np.ones(len(support))])
+    even = np.full(len(support), 1 / len(support))
+    wanted = np.array([*target, 1.0])
+    weights = even + np.linalg.lstsq(constraints, wanted - constraints @ even, rcond=None)[0]
+    if not np.allclose(constraints @ weights, wanted, atol=1e-6):
+        raise ValueError("the support does not span the target")
+    row = np.zeros(len(vertices))
+    row[support] = weights
+    return row

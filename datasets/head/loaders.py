@@ -12,11 +12,10 @@ import numpy as np
 
 from ...bench.contracts import IntArray
 from ...bench.errors import InputError
-from ...bench.io.arrays import MAX_MAGNITUDE, Member, check_arrays, read_npy, read_npz
+from ...bench.io.arrays import read_npz
 from ...bench.io.documents import read_json
-from .arrays import RING_REGIONS, HeadArrays, read_head
+from .arrays import RING_REGIONS, HeadArrays, read_head, with_derived_regions
 from .ict import ict_head, is_ict
-from .regions import with_derived_regions
 from .unpickle import read_pickle
 
 FLAME_IDENTITY_SIZE = 300
@@ -108,16 +107,6 @@ def read_regions(path: str | PathLike[str]) -> dict[str, IntArray]:
             raise InputError(path, name, "a list of vertex indices", reprlib.repr(members))
         result[name] = _members(path, name, np.array(members, dtype=np.int64))
     return result
-
-
-def with_eyelids(head: HeadArrays, left: str | PathLike[str], right: str | PathLike[str]) -> HeadArrays:
-    """Add the eyelid bases of the metrical tracker: ``l_eyelid.npy`` and ``r_eyelid.npy``, (V, 3) metres."""
-    columns = []
-    for path in (left, right):
-        column = read_npy(Path(path))
-        check_arrays(path, {"": column}, {"": Member("f", head.template.shape, MAX_MAGNITUDE)})
-        columns.append(column)
-    return replace(head, eyelid_basis=np.stack(columns, axis=-1)).validate(left)
 
 
 def _members(path: str | PathLike[str], name: str, members: Any) -> IntArray:

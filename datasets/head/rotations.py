@@ -8,9 +8,13 @@ and derivatives of any order keep full precision there.
 
 from __future__ import annotations
 
+import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.nn.functional import normalize
+
+from ...bench.contracts import FloatArray
 
 # Below this squared argument the series is used. Five terms leave a truncation error under 3e-15; above it
 # the derivative of the direct formula loses at most a factor 1/0.04 of the working precision.
@@ -46,9 +50,6 @@ def axis_angle_to_matrix(axis_angle: Tensor) -> Tensor:
     cross = skew(axis_angle)
     identity = torch.eye(3, dtype=axis_angle.dtype, device=axis_angle.device)
     return identity + _sinc(squared) * cross + _versine(squared) * (cross @ cross)
-
-
-rodrigues = axis_angle_to_matrix
 
 
 def axis_angle_to_quaternion(axis_angle: Tensor) -> Tensor:
@@ -127,31 +128,44 @@ def matrix_to_axis_angle(matrix: Tensor) -> Tensor:
     return quaternion_to_axis_angle(matrix_to_quaternion(matrix))
 
 
-def quaternion_multiply(left: Tensor, right: Tensor) -> Tensor:
-    """Hamilton product: rotates by ``right`` first, then by ``left``. (..., 4) with (..., 4), broadcast."""
-    a, b, c, d = left.unbind(-1)
-    e, f, g, h = right.unbind(-1)
-    product = [
-        a * e - b * f - c * g - d * h,
-        a * f + b * e + c * h - d * g,
-        a * g - b * h + c * e + d * f,
-        a * h + b * g - c * f + d * e,
-    ]
-    return torch.stack(product, dim=-1)
+_GENERATORS = np.array(
+    [
+        [[0, 0, 0], [0, 0, -1], [0, 1, 0]],
+        [[0, 0, 1], [0, 0, 0], [-1, 0, 0]],
+        [[0, -1, 0], [1, 0, 0], [0, 0, 0]],
+    ],
+    dtype=np.float64,
+)
+_DERIVATIVE_SERIES_BELOW = 1e-2  # squared angle under which the third coefficient's closed form cancels
 
 
-def rotation_6d_to_matrix(rotation: Tensor) -> Tensor:
-    """Matrices of 6D rotations whose halves are the first two *rows*. (..., 6) to (..., 3, 3).
+def matrices(axis_angles: FloatArray) -> FloatArray:
+    """(n, 3, 3) rotation matrices of (n, 3) axis-angle vectors, radians."""
+    return np.asarray(Rotation.from_rotvec(axis_angles).as_matrix())
 
-    The convention of PyTorch3D and the metrical tracker (Zhou et al., "On the Continuity of Rotation
-    Representations in Neural Networks", CVPR 2019, section B, there with columns).
+
+def matrices_and_derivatives(axis_angles: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Rotation matrices (n, 3, 3) and their derivatives (n, 3, 3, 3), the last axis being the vector's component.
+
+    With K = skew(v), t = |v|: R = I + a K + b K^2 for a = sin(t)/t, b = (1 - cos t)/t^2, and
+    dR/dv_k = R skew(J e_k) with the right Jacobian J = I - b K + c K^2, c = (t - sin t)/t^3.
     """
-    first = normalize(rotation[..., :3], dim=-1)
-    second = rotation[..., 3:]
-    second = normalize(second - (first * second).sum(-1, keepdim=True) * first, dim=-1)
-    return torch.stack([first, second, torch.linalg.cross(first, second)], dim=-2)
+    squared = np.einsum("ni,ni->n", axis_angles, axis_angles)[:, None, None]
+    angle = np.sqrt(squared)
+    a = np.sinc(angle / np.pi)
+    b = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
+    near = squared < _DERIVATIVE_SERIES_BELOW
+    series = 1 / 6 - squared / 120 * (1 - squared / 42 * (1 - squared / 72))
+    c = np.where(near, series, (1 - a) / np.where(near, 1.0, squared))
+    cross = np.tensordot(axis_angles, _GENERATORS, 1)
+    square = cross @ cross
+    identity = np.eye(3)
+    rotation = identity + a * cross + b * square
+    jacobian = identity - b * cross + c * square
+    # skew(J e_k) = sum_i J_ik G_i
+    return rotation, np.einsum("nrs,isc,nik->nrck", rotation, _GENERATORS, jacobian, optimize=False)
 
 
-def matrix_to_rotation_6d(matrix: Tensor) -> Tensor:
-    """First two rows of a rotation matrix. (..., 3, 3) to (..., 6)."""
-    return matrix[..., :2, :].flatten(-2)
+def axis_angles(rotations: FloatArray) -> FloatArray:
+    """(n, 3) axis-angle vectors of rotation matrices (n, 3, 3), of length at most pi."""
+    return np.asarray(Rotation.from_matrix(rotations).as_rotvec())

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from ...bench.contracts import Camera, FrameKey, HeadPose
 from ..clip import CaptureClip, FrameFiles
-from ..head.head_frame import camera_in_head_frame, pose_in_head_frame, rigid_motions
+from ..head.subject import PosedSubject, camera_in_head_frame, pose_in_head_frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,8 +55,8 @@ def as_single_video(clip: CaptureClip, *, head_frame: bool = True) -> SingleVide
     cameras: dict[str, Camera] = dict(clip.cameras)
     if head_frame:
         timesteps = sorted({key.timestep for key in order})
-        motions = rigid_motions(
-            clip.head, clip.shape, clip.static_offset, [clip.poses[timestep] for timestep in timesteps]
+        motions = PosedSubject(clip.head, clip.shape, clip.static_offset).motions(
+            [clip.poses[timestep] for timestep in timesteps]
         )
         motion = dict(zip(timesteps, motions))
         poses = {timestep: pose_in_head_frame(pose) for timestep, pose in poses.items()}

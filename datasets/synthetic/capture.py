@@ -25,12 +25,9 @@ from ...bench.io.files import TEMPORARY, grouped_writes, write_json, write_text
 from ...bench.io.images import probe_image
 from ...bench.machine import processor_count
 from ...bench.start import end_with_parent, starting_workers
-from .geometry import load_geometry
 from .performance import KINDS, Kind, share_out
-from .photographer import Photographer
-from .rig import SERIALS
-from .scene import default_samples, sample_count
-from .take import Settings, Take, plan_take
+from .studio import Photographer, default_samples, sample_count
+from .take import SERIALS, Settings, Take, load_geometry, plan_take
 
 MANIFEST = "synthesis.json"
 _VERSION = 3

@@ -14,10 +14,9 @@ from scipy.spatial import cKDTree
 
 from ...bench.contracts import FloatArray, IntArray
 from ..head.geometry import smoothstep
-from .anatomy import SIDES, Anatomy
-from .noise import fractal_noise, value_noise
-from .people import Person
-from .strands import Strands, grow, ribbons
+from .anatomy import SIDES, Anatomy, Eye, Person
+from .brushes import fractal_noise, value_noise
+from .skin import brow_color, brow_curve
 
 
 @dataclass(frozen=True)
@@ -82,7 +81,9 @@ def _around_lobes(points: FloatArray, ears: FloatArray, s: float) -> FloatArray:
         return np.zeros(len(points))
     middle = ear[:, 1].mean()
     distance, _ = cKDTree(ear[ear[:, 1] <= middle]).query(points)
-    return smoothstep(distance, 0.016 * s, 0.010 * s) * smoothstep(points[:, 1], middle + 0.004 * s, middle - 0.008 * s)
+    return smoothstep(distance, 0.016 * s, 0.010 * s) * smoothstep(
+        points[:, 1], middle + 0.004 * s, middle - 0.008 * s
+    )
 
 
 def make_hair(
@@ -194,3 +195,188 @@ def _sample(
     area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
     chance = area * np.where(share[faces].mean(axis=1) > 0.15, 0.25 + 0.75 * share[faces].mean(axis=1), 0.0)
     return rng.choice(len(faces), count, p=chance / chance.sum())
+
+
+Field = Callable[[FloatArray, float], FloatArray]
+"""Growth direction (n, 3) at points (n, 3), for a share in [0, 1] of the strand's length."""
+
+
+@dataclass(frozen=True, eq=False)
+class Strands:
+    """Ribbons at rest. ``root`` (n,) numbers the strand of each vertex."""
+
+    vertices: FloatArray
+    faces: IntArray
+    albedo: FloatArray
+    strand: IntArray
+
+    def joined(self, other: Strands) -> Strands:
+        """Both, the strands of ``other`` numbered after these."""
+        return Strands(
+            np.concatenate([self.vertices, other.vertices]),
+            np.concatenate([self.faces, other.faces + len(self.vertices)]),
+            np.concatenate([self.albedo, other.albedo]),
+            np.concatenate([self.strand, other.strand + 1 + self.strand.max(initial=-1)]),
+        )
+
+
+def grow(
+    roots: FloatArray,
+    lengths: FloatArray,
+    field: Field,
+    keep_out: Callable[[FloatArray, float], FloatArray],
+    segments: int,
+) -> FloatArray:
+    """Polylines (n, segments + 1, 3) from ``roots`` along ``field``, each of its own length.
+
+    ``keep_out(points, share)`` moves points that sank into the head back out of it.
+    """
+    path = [roots]
+    step = (lengths / segments)[:, None]
+    for index in range(segments):
+        share = (index + 1) / segments
+        direction = field(path[-1], share)
+        direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-12)
+        path.append(keep_out(path[-1] + step * direction, share))
+    return np.stack(path, axis=1)
+
+
+def ribbons(
+    paths: FloatArray,
+    outward: FloatArray,
+    width: FloatArray,
+    color: FloatArray,
+    *,
+    tip_shade: float = 1.0,
+    tip_width: float = 0.25,
+    arch: float = 0.0,
+) -> Strands:
+    """Tapered ribbons around paths (n, k, 3).
+
+    Parameters
+    ----------
+    outward : (n, k, 3) or (n, 1, 3) direction that a ribbon's flat side faces.
+    width : (n,) metres, at the root.
+    color : (n, c, 3) linear reflectance across each ribbon, c >= 2 columns.
+    tip_shade : factor on the colour at the tip (above 1 for sun-bleached tips).
+    tip_width : width at the tip as a share of the width at the root.
+    arch : how far the middle stands out from the edges, as a share of the width.
+    """
+    count, points = paths.shape[:2]
+    columns = color.shape[1]
+    outward = np.broadcast_to(outward, paths.shape)
+    across = np.cross(np.gradient(paths, axis=1), outward)
+    across /= np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-12)
+    taper = np.interp(np.linspace(0.0, 1.0, points), [0.0, 0.6, 1.0], [1.0, 0.9, tip_width])
+    wide = (width[:, None] * taper)[:, :, None, None]
+    u = np.linspace(-1.0, 1.0, columns)[None, None, :, None]
+    vertices = paths[:, :, None] + wide * (
+        0.5 * u * across[:, :, None] + arch * (1.0 - u * u) * outward[:, :, None]
+    )
+    index = np.arange(count * points * columns).reshape(count, points, columns)
+    a, b, c, d = (index[:, :-1, :-1], index[:, :-1, 1:], index[:, 1:, :-1], index[:, 1:, 1:])
+    faces = np.concatenate([np.stack([a, b, d], -1).reshape(-1, 3), np.stack([a, d, c], -1).reshape(-1, 3)])
+    shade = np.linspace(1.0, tip_shade, points)[None, :, None, None]
+    albedo = np.clip(color[:, None] * shade, 0.003, 0.9)
+    strand = np.repeat(np.arange(count), points * columns)
+    return Strands(vertices.reshape(-1, 3), faces, albedo.reshape(-1, 3), strand)
+
+
+_BROW_HAIRS = 260
+_UPPER_LASHES, _LOWER_LASHES = 70, 40
+
+
+@dataclass(frozen=True, eq=False)
+class RootedStrands:
+    """Ribbons at rest and the fine skin point (n,) that each grows from."""
+
+    strands: Strands
+    root: IntArray
+
+
+def make_brows_and_lashes(
+    person: Person, anatomy: Anatomy, points: FloatArray, normals: FloatArray
+) -> RootedStrands:
+    """Both brows and all four rows of lashes of a neutral subject."""
+    rng = np.random.default_rng(person.seed + 70)
+    tree, made, roots = cKDTree(points), None, []
+    for side, sign in zip(SIDES, (1.0, -1.0)):
+        for paths, width, color in (
+            _brow(person, anatomy, side, sign, rng, points, normals, tree),
+            *_lashes(person, anatomy, anatomy.eyes[side], sign, rng, points, tree),
+        ):
+            _, root = tree.query(paths[:, 0])
+            shades = color[None] * np.exp(0.2 * rng.standard_normal((len(paths), 1)))
+            facing = normals[root][:, None] + rng.normal(0.0, 0.3, (len(paths), 1, 3))
+            widths = np.full(len(paths), width * anatomy.scale)
+            strands = ribbons(paths, facing, widths, np.repeat(shades[:, None], 2, axis=1))
+            made = strands if made is None else made.joined(strands)
+            roots.append(root)
+    assert made is not None
+    return RootedStrands(made, np.concatenate(roots))
+
+
+def _brow(
+    person: Person,
+    anatomy: Anatomy,
+    side: str,
+    sign: float,
+    rng: np.random.Generator,
+    points: FloatArray,
+    normals: FloatArray,
+    tree: cKDTree,
+) -> tuple[FloatArray, float, FloatArray]:
+    """Hairs that start along the brow's curve, rise near the nose and lie down outwards."""
+    s = anatomy.scale
+    curve = brow_curve(anatomy, side, 64)
+    place = rng.uniform(0.0, 0.95, _BROW_HAIRS)
+    half = 0.0034 * s * person.brow_thickness * (1.0 - 0.75 * place**2)
+    at = np.stack([np.interp(place, np.linspace(0, 1, 64), curve[:, axis]) for axis in range(3)], axis=1)
+    at[:, 1] += half * rng.uniform(-1.0, 0.8, _BROW_HAIRS)
+    _, root = tree.query(at)
+    start, normal = points[root], normals[root]
+    lean = np.stack([sign * (0.45 + 0.9 * place), 0.85 - 1.25 * place, -0.25 * place], axis=1)
+    lean += 0.18 * rng.standard_normal(lean.shape)
+    lean -= np.einsum("ni,ni->n", lean, normal)[:, None] * normal
+    lean /= np.linalg.norm(lean, axis=1, keepdims=True)
+    length = 0.0068 * s * rng.uniform(0.6, 1.1, _BROW_HAIRS)
+    t = np.linspace(0.0, 1.0, 4)[None, :, None]
+    rise = (0.0002 + 0.0009 * t * (1.0 - 0.5 * t)) * s
+    paths = start[:, None] + t * length[:, None, None] * lean[:, None] + rise * normal[:, None]
+    return paths, 0.00055, brow_color(person)
+
+
+def _lashes(
+    person: Person,
+    anatomy: Anatomy,
+    eye: Eye,
+    sign: float,
+    rng: np.random.Generator,
+    points: FloatArray,
+    tree: cKDTree,
+) -> list[tuple[FloatArray, float, FloatArray]]:
+    """Upper lashes curve up and outwards, lower ones down and are shorter and thinner."""
+    s, made = anatomy.scale, []
+    color = np.minimum(0.4 * person.hair, 0.03)
+    for curve, up, count, reach in (
+        (eye.upper, 1.0, _UPPER_LASHES, 0.0070),
+        (eye.lower, -1.0, _LOWER_LASHES, 0.0038),
+    ):
+        place = np.sort(rng.uniform(0.12, 0.98, count))
+        flat = np.stack(
+            [np.interp(place, np.linspace(0, 1, len(curve)), curve[:, axis]) for axis in (0, 1)], 1
+        )
+        depth = eye.radius**2 - ((flat - eye.center[:2]) ** 2).sum(axis=1)
+        z = eye.center[2] + np.sqrt(np.maximum(depth, 0.0)) + 0.0006 * s
+        _, root = tree.query(np.concatenate([flat, z[:, None]], axis=1))
+        start = points[root]
+        outwards = np.stack([sign * 1.1 * (place - 0.35), np.zeros(count), np.ones(count)], axis=1)
+        outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
+        length = reach * s * (0.55 + 0.45 * place) * rng.uniform(0.8, 1.1, count)
+        t = np.linspace(0.0, 1.0, 4)[None, :, None]
+        rise = np.array([0.0, up, 0.0])
+        paths = start[:, None] + length[:, None, None] * (
+            0.85 * t * outwards[:, None] + (0.1 * t + 0.75 * t**2) * rise
+        )
+        made.append((paths, 0.00042 if up > 0 else 0.0003, color))
+    return made

@@ -7,17 +7,76 @@ monotone cubics, so nothing overshoots and a held face stays held. Blinks, gaze 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
-from ...bench.contracts import FloatArray
+from ...bench.contracts import FloatArray, HeadAsset, HeadPose
 from ...bench.errors import InputError
+from ..head.procedural.expressions import SEMANTIC_NAMES
+from ..head.procedural.model import semantic_to_coefficients
 from ..rounding import COEFFICIENT_BITS, on_grid
 from .anatomy import SIDES
-from .controls import CONTROLS, EXPRESSION_CONTROLS
+
+Activations = Mapping[str, float]
+
+_PAIRED = (
+    *("brow_down", "brow_outer_up", "blink", "squint", "eye_wide", "cheek_raise", "nose_sneer", "smile"),
+    *("mouth_stretch", "upper_lip_up", "lower_lip_down"),
+)
+EXPRESSION_CONTROLS = (
+    "brow_inner_up",
+    *(f"{name}_{side}" for name in _PAIRED for side in ("left", "right")),
+    *("cheek_puff", "mouth_frown", "pucker", "funnel", "lip_press", "lip_roll", "chin_raise"),
+    *("mouth_left", "mouth_right"),
+)
+"""Shapes of the skin; each is 0 at rest and 1 at its natural extreme."""
+
+POSE_CONTROLS = (
+    *("jaw_open", "jaw_side", "gaze_left", "gaze_up", "head_turn", "head_nod", "head_tilt"),
+    *("neck_turn", "neck_nod", "sway_x", "sway_y", "sway_z", "tongue_out"),
+)
+"""Jaw and tongue in [0, 1] (sideways and gaze in [-1, 1]); head, neck in radians; sway in metres."""
+
+CONTROLS = (*EXPRESSION_CONTROLS, *POSE_CONTROLS)
+
+_JAW_OPEN = 0.36  # radians at jaw_open = 1
+_JAW_SIDE = 0.09
+_GAZE_SIDE, _GAZE_UP = 0.45, 0.32
+
+
+@dataclass(frozen=True, eq=False)
+class Translation:
+    """From expression controls to one head model: ``expression`` (K, E) and, where it has them, eyelids (K, 2).
+
+    Both stand on the grid of coefficients, as activations do: their products and sums are exact.
+    """
+
+    head_model: str
+    expression: FloatArray
+    eyelids: FloatArray | None
+
+    def pose(self, activations: Activations, subject: str, timestep: int | None) -> HeadPose:
+        """The head pose of one moment, rounded to float32 as it will be stored."""
+        a = activations
+        values = np.array([a[name] for name in EXPRESSION_CONTROLS])
+        gaze = [-_GAZE_UP * a["gaze_up"], _GAZE_SIDE * a["gaze_left"], 0.0]
+        fields = {
+            "expression": values @ self.expression,
+            "rotation": np.array([a["head_nod"], a["head_turn"], a["head_tilt"]]),
+            "neck": np.array([a["neck_nod"], a["neck_turn"], 0.0]),
+            "jaw": np.array([_JAW_OPEN * a["jaw_open"], _JAW_SIDE * a["jaw_side"], 0.0]),
+            "eyes": np.array(gaze + gaze),
+            "translation": np.array([a["sway_x"], a["sway_y"], a["sway_z"]]),
+        }
+        stored = {name: value.astype(np.float32).astype(np.float64) for name, value in fields.items()}
+        eyelids = (
+            None if self.eyelids is None else (values @ self.eyelids).astype(np.float32).astype(np.float64)
+        )
+        return HeadPose(self.head_model, **stored, eyelids=eyelids, subject=subject, timestep=timestep)
+
 
 Face = Mapping[str, float]
 
@@ -291,3 +350,85 @@ def _drift(time: FloatArray, period: float, rng: np.random.Generator) -> FloatAr
     return 0.65 * np.sin(2.0 * np.pi * time / period + a) + 0.35 * np.sin(
         2.0 * np.pi * time / (0.381 * period) + b
     )
+
+
+# ICT-FaceKit's shapes carry ARKit's names with _L and _R.
+_ICT_PAIRED = {
+    "brow_down": "browDown",
+    "brow_outer_up": "browOuterUp",
+    "blink": "eyeBlink",
+    "squint": "eyeSquint",
+    "eye_wide": "eyeWide",
+    "cheek_raise": "cheekSquint",
+    "nose_sneer": "noseSneer",
+    "smile": "mouthSmile",
+    "mouth_stretch": "mouthStretch",
+    "upper_lip_up": "mouthUpperUp",
+    "lower_lip_down": "mouthLowerDown",
+}
+_ICT_SINGLE = {
+    "brow_inner_up": ("browInnerUp_L", "browInnerUp_R"),
+    "cheek_puff": ("cheekPuff_L", "cheekPuff_R"),
+    "mouth_frown": ("mouthFrown_L", "mouthFrown_R"),
+    "pucker": ("mouthPucker",),
+    "funnel": ("mouthFunnel",),
+    "lip_press": ("mouthPress_L", "mouthPress_R"),
+    "lip_roll": ("mouthRollLower", "mouthRollUpper"),
+    "chin_raise": ("mouthShrugLower", "mouthShrugUpper"),
+    "mouth_left": ("mouthLeft",),
+    "mouth_right": ("mouthRight",),
+}
+
+
+def ict_targets(control: str) -> tuple[str, ...]:
+    """ICT-FaceKit shapes that play an expression control."""
+    if control in _ICT_SINGLE:
+        return _ICT_SINGLE[control]
+    name, _, side = control.rpartition("_")
+    return (f"{_ICT_PAIRED[name]}_{side[0].upper()}",)
+
+
+def named_translation(
+    head: HeadAsset, names: Sequence[str], targets: Mapping[str, Mapping[str, float]]
+) -> Translation:
+    """Translation for a head whose expression directions have names.
+
+    ``targets`` gives, for each control, the weights of named directions.
+    """
+    matrix = np.zeros((len(EXPRESSION_CONTROLS), head.expression_basis.shape[2]))
+    for row, control in enumerate(EXPRESSION_CONTROLS):
+        for name, weight in targets.get(control, {}).items():
+            if name not in names:
+                raise InputError(head.version, "expression names", name, f"{len(names)} others")
+            matrix[row, list(names).index(name)] = weight
+    return Translation(head.version, matrix, None)
+
+
+def procedural_translation(head: HeadAsset) -> Translation:
+    """The procedural head speaks these controls itself; its coefficients are combinations of them."""
+    expression, eyelids = semantic_to_coefficients(head.version)
+    rows = [SEMANTIC_NAMES.index(control) for control in EXPRESSION_CONTROLS]
+    return Translation(head.version, expression[rows], None if eyelids is None else eyelids[rows])
+
+
+_FIELDS = ("expression", "rotation", "neck", "jaw", "eyes", "translation", "eyelids")
+
+
+def with_tracking_noise(poses: Sequence[HeadPose], amount: float, seed: int) -> list[HeadPose]:
+    """Add Gaussian noise to every parameter, independent from timestep to timestep.
+
+    Its standard deviation is ``amount`` times that parameter's own over ``poses``, so a parameter that never
+    moves stays exact. ``amount`` 0 returns the poses as they are.
+    """
+    if amount == 0.0:
+        return list(poses)
+    rng = np.random.default_rng([seed, 5])
+    changed: list[dict[str, Any]] = [{} for _ in poses]
+    for name in _FIELDS:
+        if getattr(poses[0], name) is None:
+            continue
+        values = np.stack([getattr(pose, name) for pose in poses])
+        noisy = values + amount * values.std(axis=0) * rng.standard_normal(values.shape)
+        for fields, row in zip(changed, noisy):
+            fields[name] = row.astype(np.float32).astype(np.float64)
+    return [replace(pose, **fields) for pose, fields in zip(poses, changed)]

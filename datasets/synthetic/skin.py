@@ -6,16 +6,25 @@ Painting is a function of the neutral shape and the subject's traits alone; what
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from ...bench.contracts import FloatArray
 from ..head.geometry import smoothstep
-from .anatomy import SIDES, Anatomy
-from .curves import blob, polygon_distance, polyline_distance, smooth_curve
-from .noise import fractal_noise, spots, value_noise
-from .people import Person
+from .anatomy import SIDES, Anatomy, Person
+from .brushes import (
+    blob,
+    fractal_noise,
+    polygon_distance,
+    polyline_distance,
+    smooth_curve,
+    spots,
+    value_noise,
+)
+from .performance import Activations
 
 _FRONT = 0.35  # z component of the normal from which on a point counts as facing front
 
@@ -179,3 +188,282 @@ def _beard(anatomy: Anatomy, points: FloatArray, seed: int) -> FloatArray:
     cheeks = sum(blob(points, anatomy[f"{side}_cheek"], np.array([0.02, 0.026, 0.03]) * s) for side in SIDES)
     grain = 0.75 + 0.35 * value_noise(points / (0.0016 * s), seed + 60)
     return np.clip(low * front * (1.0 - 0.9 * np.minimum(cheeks, 1.0)) * grain, 0.0, 1.0)
+
+
+_FOLD_WIDTH = 0.0013  # standard deviation of a line's groove, metres
+_SHADE = 0.62  # darkening in the bottom of a fold of full strength
+
+
+@dataclass(frozen=True, eq=False)
+class Folds:
+    """Groups of folds over N fine points, and flushes.
+
+    ``height`` (G, N) metres along the normal at activation 1 (negative is a groove), ``shade`` (G, N)
+    darkening in [0, 1]; ``flush`` (F, N) shares and ``tint`` (F, 3) colour factors at activation 1.
+    """
+
+    height: FloatArray
+    shade: FloatArray
+    flush: FloatArray
+    tint: FloatArray
+
+    def apply(self, activations: Activations, albedo: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Displacement (N,) in metres and reflectance (N, 3) of skin under an expression."""
+        fold, blood = fold_strengths(activations), flush_strengths(activations)
+        color = albedo * (1.0 - np.clip(fold @ self.shade, 0.0, 0.9))[:, None] ** np.array([0.85, 1.1, 1.15])
+        change = (blood[:, None] * self.flush).T @ np.log(self.tint)
+        return fold @ self.height, np.clip(color * np.exp(change), 0.003, 0.95)
+
+
+_FOLDS = (
+    *("forehead_mid", "forehead_left", "forehead_right", "glabella", "crow_left", "crow_right"),
+    *("nasolabial_left", "nasolabial_right", "bunny", "under_eye_left", "under_eye_right"),
+    *("chin", "dimple_left", "dimple_right", "lip_lines", "neck"),
+)
+_FLUSHES = {
+    "cheeks": (1.04, 0.83, 0.84),
+    "forehead_pale": (1.10, 1.17, 1.18),
+    "lips_pale": (1.05, 1.55, 1.5),
+    "lips_full": (0.92, 0.62, 0.66),
+    "anger": (1.04, 0.84, 0.85),
+    "nose": (1.04, 0.80, 0.82),
+}
+
+
+def fold_strengths(a: Activations) -> FloatArray:
+    """(G,) activation of each group of folds, from semantic controls."""
+    smile = {side: np.clip(a[f"smile_{side}"], 0.0, 1.2) for side in SIDES}
+    raised = {side: a[f"cheek_raise_{side}"] for side in SIDES}
+    squint = {side: max(a[f"squint_{side}"], 0.7 * smile[side], raised[side]) for side in SIDES}
+    sneer = 0.5 * (a["nose_sneer_left"] + a["nose_sneer_right"])
+    strengths: Mapping[str, float] = {
+        "forehead_mid": max(a["brow_inner_up"], 0.0),
+        "forehead_left": max(a["brow_outer_up_left"], 0.0),
+        "forehead_right": max(a["brow_outer_up_right"], 0.0),
+        "glabella": 0.5 * (a["brow_down_left"] + a["brow_down_right"]) + 0.35 * sneer,
+        **{f"crow_{side}": squint[side] for side in SIDES},
+        **{
+            f"nasolabial_{side}": smile[side]
+            + 0.7 * a[f"nose_sneer_{side}"]
+            + 0.35 * a[f"mouth_stretch_{side}"]
+            for side in SIDES
+        },
+        "bunny": sneer,
+        **{f"under_eye_{side}": squint[side] for side in SIDES},
+        "chin": max(a["chin_raise"], 0.8 * a["lip_press"], 0.6 * a["mouth_frown"]),
+        **{f"dimple_{side}": smile[side] for side in SIDES},
+        "lip_lines": a["pucker"],
+        "neck": 0.5 * (a["mouth_stretch_left"] + a["mouth_stretch_right"]),
+    }
+    return np.clip([strengths[name] for name in _FOLDS], 0.0, 1.3)
+
+
+def flush_strengths(a: Activations) -> FloatArray:
+    """(F,) activation of each flush, from semantic controls."""
+    smile = 0.5 * (a["smile_left"] + a["smile_right"])
+    down = 0.5 * (a["brow_down_left"] + a["brow_down_right"])
+    strengths = {
+        "cheeks": smile + 0.7 * a["cheek_puff"],
+        "forehead_pale": max(a["brow_inner_up"], 0.5 * (a["brow_outer_up_left"] + a["brow_outer_up_right"])),
+        "lips_pale": max(a["lip_press"], 0.6 * smile, 0.6 * a["mouth_stretch_left"]),
+        "lips_full": a["pucker"],
+        "anger": down,
+        "nose": 0.5 * (a["nose_sneer_left"] + a["nose_sneer_right"]),
+    }
+    return np.clip([strengths[name] for name in _FLUSHES], 0.0, 1.2)
+
+
+def make_folds(
+    person: Person, anatomy: Anatomy, points: FloatArray, lips: FloatArray, bare: FloatArray
+) -> Folds:
+    """Lay the folds out on the neutral fine skin, (N, 3) points.
+
+    ``lips`` (N,) is the share of the lips' red; ``bare`` (N,) is 0 where hair hides the skin.
+    """
+    sketch = _Sketch(person, anatomy, points)
+    groups = sketch.groups()
+    height = np.stack([groups[name][0] for name in _FOLDS]) * (person.lines * person.dynamics)
+    shade = np.stack([groups[name][1] for name in _FOLDS]) * (
+        np.minimum(person.lines, 1.15) * person.dynamics
+    )
+    keep = (1.0 - 0.9 * lips) * bare
+    keep_lip_lines = np.where(np.array([name == "lip_lines" for name in _FOLDS])[:, None], 1.0, keep)
+    flush = np.stack([sketch.flush(name, lips) for name in _FLUSHES]) * (bare * person.dynamics)
+    tint = np.array(list(_FLUSHES.values()))
+    return Folds(height * keep_lip_lines, shade * keep_lip_lines, flush, tint)
+
+
+class _Sketch:
+    """Draws groups of folds as (height, shade) pairs."""
+
+    def __init__(self, person: Person, anatomy: Anatomy, points: FloatArray):
+        self.person, self.anatomy, self.points, self.s = person, anatomy, points, anatomy.scale
+        self._front = cKDTree(points)
+
+    def groups(self) -> dict[str, tuple[FloatArray, FloatArray]]:
+        made = self._forehead() | {"glabella": self._glabella(), "bunny": self._bunny()}
+        made |= {"chin": self._chin(), "lip_lines": self._lip_lines(), "neck": self._neck()}
+        for side, sign in zip(SIDES, (1.0, -1.0)):
+            made[f"crow_{side}"] = self._crow(side, sign)
+            made[f"nasolabial_{side}"] = self._nasolabial(side, sign)
+            made[f"under_eye_{side}"] = self._under_eye(side)
+            made[f"dimple_{side}"] = self._dimple(side, sign)
+        return made
+
+    def flush(self, name: str, lips: FloatArray) -> FloatArray:
+        a, p, s = self.anatomy, self.points, self.s
+        face = blob(p, a["nose_bridge"], np.array([0.055, 0.075, 0.05]) * s) * (1.0 - lips)
+        if name == "cheeks":
+            return np.minimum(sum(blob(p, a[f"{side}_cheek"], 0.020 * s) for side in SIDES), 1.0)
+        if name == "forehead_pale":
+            return blob(p, a["forehead"], np.array([0.045, 0.022, 0.04]) * s)
+        if name in ("lips_pale", "lips_full"):
+            return lips
+        if name == "nose":
+            return blob(p, a["nose_tip"], 0.014 * s)
+        return face
+
+    def _lines(
+        self, lines: list[FloatArray], depth: float, width: float = _FOLD_WIDTH, bulge: float = 0.35
+    ) -> tuple[FloatArray, FloatArray]:
+        """Grooves along polylines that lie near the skin, fading at their ends, with raised banks."""
+        height, shade = np.zeros(len(self.points)), np.zeros(len(self.points))
+        for line in lines:
+            _, nearest = self._front.query(line)
+            on_skin = self.points[nearest]
+            near = np.flatnonzero(
+                np.linalg.norm(self.points - on_skin.mean(axis=0), axis=1)
+                < np.linalg.norm(on_skin - on_skin.mean(axis=0), axis=1).max() + 8.0 * width * self.s
+            )
+            distance, place = polyline_distance(self.points[near], on_skin)
+            end = smoothstep(place, 0.0, 0.22) * smoothstep(place, 1.0, 0.72)
+            x = distance / (width * self.s)
+            groove = np.exp(-0.5 * x * x)
+            banks = np.exp(-0.5 * ((x - 2.6) / 1.2) ** 2)
+            profile = depth * self.s * end * (bulge * banks - groove)
+            height[near] = np.where(np.abs(profile) > np.abs(height[near]), profile, height[near])
+            shade[near] = np.maximum(shade[near], _SHADE * end * np.exp(-0.5 * (x / 0.9) ** 2))
+        return height, shade
+
+    def _wobble(self, number: int, count: int) -> FloatArray:
+        """Smooth irregularity in [-1, 1] along a line."""
+        t = np.linspace(0.0, 3.0, count)
+        return value_noise(
+            np.stack([t, np.full(count, 3.1 * number), np.zeros(count)], 1), self.person.seed + 90
+        )
+
+    def _forehead(self) -> dict[str, tuple[FloatArray, FloatArray]]:
+        a, s = self.anatomy, self.s
+        low = a["glabella"][1] + 0.013 * s
+        wide = 1.05 * abs(a["left_brow_outer"][0])
+        lines = []
+        for number in range(4):
+            x = np.linspace(-wide, wide, 41)
+            arch = 0.0035 * np.cos(np.pi * x / wide) ** 2 + 0.0018 * self._wobble(number, 41)
+            y = low + (0.0105 * number + 0.002) * s + arch * s
+            cut = np.abs(x) < wide * (1.0 - 0.10 * number)
+            z = np.array([a["glabella"][2] - 0.35 * x[i] ** 2 / wide for i in range(41)])
+            lines.append(np.stack([x, y, z], axis=1)[cut])
+        height, shade = self._lines(lines, 0.0010)
+        x = self.points[:, 0]
+        left = smoothstep(x, 0.006 * s, 0.026 * s)
+        right = smoothstep(x, -0.006 * s, -0.026 * s)
+        parts = {"forehead_mid": 1.0 - left - right, "forehead_left": left, "forehead_right": right}
+        return {name: (height * share, shade * share) for name, share in parts.items()}
+
+    def _glabella(self) -> tuple[FloatArray, FloatArray]:
+        a, s = self.anatomy, self.s
+        lines = []
+        for sign, tilt in ((1.0, 0.30), (-1.0, 0.22)):
+            y = np.linspace(-0.010, 0.013, 15) * s
+            x = sign * (0.0062 * s + tilt * y * 0.4)
+            lines.append(np.stack([x, a["glabella"][1] + y, np.full(15, a["glabella"][2])], axis=1))
+        x = np.linspace(-0.010, 0.010, 11) * s
+        lines.append(
+            np.stack([x, np.full(11, a["nose_bridge"][1] + 0.004 * s), np.full(11, a["nose_bridge"][2])], 1)
+        )
+        return self._lines(lines, 0.0014, 0.0014)
+
+    def _crow(self, side: str, sign: float) -> tuple[FloatArray, FloatArray]:
+        corner = self.anatomy[f"{side}_eye_outer"]
+        lines = []
+        for number, angle in enumerate(np.radians([34.0, 12.0, -10.0, -32.0])):
+            reach = np.linspace(0.006, 0.026 - 0.002 * abs(number - 1.5), 13) * self.s
+            bend = 0.0010 * self.s * self._wobble(10 + number, 13)
+            line = corner + np.stack(
+                [sign * reach * np.cos(angle), reach * np.sin(angle) + bend, -0.75 * reach], 1
+            )
+            lines.append(line)
+        return self._lines(lines, 0.0009, 0.0011)
+
+    def _nasolabial(self, side: str, sign: float) -> tuple[FloatArray, FloatArray]:
+        a, s = self.anatomy, self.s
+        ala, corner = a[f"{side}_ala"], a[f"{side}_mouth_corner"]
+        line = smooth_curve(
+            np.stack(
+                [
+                    ala + np.array([sign * 0.003, 0.006, 0.0]) * s,
+                    0.55 * ala + 0.45 * corner + np.array([sign * 0.007, 0.002, 0.0]) * s,
+                    corner + np.array([sign * 0.010, 0.002, 0.0]) * s,
+                    corner + np.array([sign * 0.011, -0.012, -0.002]) * s,
+                ]
+            ),
+            25,
+        )
+        height, shade = self._lines([line], 0.0020, 0.0021, bulge=0.5)
+        cheek = blob(self.points, a[f"{side}_cheek"], 0.014 * s)
+        return height + 0.0012 * s * cheek, 0.7 * shade
+
+    def _bunny(self) -> tuple[FloatArray, FloatArray]:
+        a, s = self.anatomy, self.s
+        lines = []
+        for sign in (1.0, -1.0):
+            for number in range(3):
+                start = a["nose_bridge"] + np.array([sign * 0.004, -0.002 - 0.0055 * number, 0.0]) * s
+                reach = np.linspace(0.0, 1.0, 9)[:, None]
+                lines.append(start + reach * np.array([sign * 0.010, 0.0065, -0.008]) * s)
+        return self._lines(lines, 0.0009, 0.0011)
+
+    def _under_eye(self, side: str) -> tuple[FloatArray, FloatArray]:
+        eye, s = self.anatomy.eyes[side], self.s
+        z = self.anatomy[f"{side}_eye_inner"][2]
+        lines = []
+        for drop in (0.0055, 0.0095):
+            curve = eye.lower[4:-3:2] - np.array([0.0, drop * s])
+            lines.append(np.concatenate([curve, np.full((len(curve), 1), z)], axis=1))
+        return self._lines(lines, 0.0007, 0.0011)
+
+    def _chin(self) -> tuple[FloatArray, FloatArray]:
+        a, s = self.anatomy, self.s
+        where = blob(
+            self.points, a["chin"] + np.array([0.0, 0.012, 0.002]) * s, np.array([0.014, 0.010, 0.015]) * s
+        )
+        pits = smoothstep(value_noise(self.points / (0.0042 * s), self.person.seed + 91), 0.05, 0.6)
+        return -0.0011 * s * where * pits, 0.45 * where * pits
+
+    def _dimple(self, side: str, sign: float) -> tuple[FloatArray, FloatArray]:
+        a, s = self.anatomy, self.s
+        corner = a[f"{side}_mouth_corner"]
+        line = corner + np.linspace(-1.0, 1.0, 9)[:, None] * np.array([0.0, 0.007, 0.0]) * s
+        return self._lines([line + np.array([sign * 0.0045, 0.001, 0.0]) * s], 0.0010, 0.0016)
+
+    def _lip_lines(self) -> tuple[FloatArray, FloatArray]:
+        a, s = self.anatomy, self.s
+        around = blob(self.points, a["mouth"], np.array([0.020, 0.013, 0.02]) * s)
+        angle = np.arctan2(self.points[:, 1] - a["mouth"][1], self.points[:, 0] - a["mouth"][0])
+        ray = smoothstep(
+            np.cos(26.0 * angle + 1.5 * value_noise(self.points / (0.006 * s), self.person.seed + 92)),
+            0.1,
+            1.0,
+        )
+        return -0.0006 * s * around * ray, 0.40 * around * ray
+
+    def _neck(self) -> tuple[FloatArray, FloatArray]:
+        a, s = self.anatomy, self.s
+        where = blob(
+            self.points, a["chin"] + np.array([0.0, -0.055, -0.03]) * s, np.array([0.045, 0.028, 0.045]) * s
+        )
+        bands = np.cos(self.points[:, 0] / (0.0085 * s)) * smoothstep(
+            a["chin"][1] - self.points[:, 1], 0.0, 0.02 * s
+        )
+        return 0.0014 * s * where * bands, 0.18 * where * smoothstep(-bands, 0.0, 1.0)

@@ -11,8 +11,7 @@ import torch
 from torch import Tensor
 
 from ...bench.contracts import FloatArray, HeadAsset, IntArray
-from ...datasets.head.arrays import HeadArrays
-from ...datasets.head.regions import faces_in_region
+from ...datasets.head.arrays import HeadArrays, faces_in_region
 from ...datasets.head.teeth import with_teeth_where_possible
 from ..shared.avatar_files import head_arrays
 from .config import Departure

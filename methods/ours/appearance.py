@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ...bench.contracts import Clip, FloatArray, HeadPose
-from ...datasets.head.regions import faces_in_region
+from ...datasets.head.arrays import faces_in_region
 from ...datasets.head.rotations import axis_angle_to_matrix
 from ...datasets.steps.jaw_bases import jaw_bases, jaw_quaternions, jaw_weights
 from ..shared.binding import Frames, to_world

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from ...bench.contracts import Budget, Clip, Progress
-from ...datasets.head.regions import faces_in_region
+from ...datasets.head.arrays import faces_in_region
 from ...datasets.steps.expression_clusters import cluster_expressions
 from ...datasets.steps.jaw_bases import leaks
 from ..compact.file import COMPACT_FILE, write_compact

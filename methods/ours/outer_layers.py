@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ...bench.contracts import Clip
-from ...datasets.head.regions import faces_in_region
+from ...datasets.head.arrays import faces_in_region
 from ..shared.binding import NORMAL
 from ..shared.bound_training import Start, one_per_triangle
 from ..shared.configs import OursConfig

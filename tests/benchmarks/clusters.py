@@ -26,8 +26,8 @@ from ...datasets.steps.expression_clusters import (
 )
 from ...datasets.steps.face_distances import expression_displacements, farthest_meshes, mean_vertex_distances
 from ...datasets.steps.spectral import nystrom_embedding, similarities
-from ...datasets.synthetic.geometry import load_geometry
 from ...datasets.synthetic.performance import HELD_OUT, perform, share_out
+from ...datasets.synthetic.take import load_geometry
 
 SIZES, QUICK_SIZES = (300, 1000, 2000, 5000), (300, 1000)
 AGREEMENT_SIZE, AGREEMENT_LANDMARKS = 300, 150

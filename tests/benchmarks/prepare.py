@@ -24,7 +24,7 @@ from ...bench.specs import Findings
 from ...datasets.nersemble.command import run
 from ...datasets.nersemble.settings import PrepareSettings
 from ...datasets.nersemble.writer import RecordingWriter, video_codec
-from ...datasets.synthetic.rig import cameras
+from ...datasets.synthetic.take import cameras
 
 SUBJECT = "999"
 SEQUENCE = "EMO-1-shout+laugh"

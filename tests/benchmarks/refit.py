@@ -17,14 +17,12 @@ from ...bench.contracts import FloatArray, FrameKey, HeadPose, Progress
 from ...bench.specs import Findings
 from ...datasets.clip import CaptureClip, FrameFiles
 from ...datasets.head.arrays import HeadArrays
-from ...datasets.head.head_frame import pose_in_head_frame
 from ...datasets.head.procedural.model import procedural_head
 from ...datasets.head.refit.identity import match
-from ...datasets.head.refit.problem import FitProblem, Frame
+from ...datasets.head.refit.problem import FitProblem, Frame, angle_bounds, solve_frame
 from ...datasets.head.refit.refit import refit
 from ...datasets.head.refit.settings import RefitSettings
-from ...datasets.head.refit.solve import angle_bounds, solve_frame
-from ...datasets.head.refit.subject import Subject
+from ...datasets.head.subject import PosedSubject, pose_in_head_frame
 from ...datasets.images import ImageStore
 from .head.sized import FLAME_SIZES, sized_head
 
@@ -143,9 +141,9 @@ def _against_scipy(
     clip: CaptureClip, target: HeadArrays, settings: RefitSettings, count: int
 ) -> dict[str, float]:
     """The same problem, start and bounds for both solvers, in one run; targets are the true meshes, head at rest."""
-    subject = Subject(clip.head, clip.shape, clip.static_offset)
+    subject = PosedSubject(clip.head, clip.shape, clip.static_offset)
     matching = match(clip.head, subject.neutral, target, settings)
-    neutral = Subject(target, matching.shape, np.zeros(target.template.shape)).neutral
+    neutral = PosedSubject(target, matching.shape, np.zeros(target.template.shape)).neutral
     problem = FitProblem(target, neutral, matching.vertices, matching.weights, settings)
     poses = [pose_in_head_frame(clip.poses[t]) for t in sorted(clip.poses)[: count + 1]]
     targets = subject.meshes(poses)[:, matching.vertices]

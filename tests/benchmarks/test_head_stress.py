@@ -3,7 +3,7 @@
 import pytest
 
 from headbench.bench.contracts import no_progress
-from headbench.datasets.head.posing import FastPosing
+from headbench.datasets.head.model import FastPosing
 from headbench.datasets.head.rotations import axis_angle_to_matrix
 from headbench.tests.benchmarks.head import stress
 

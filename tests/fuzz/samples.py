@@ -88,10 +88,6 @@ def heads(folder: Path, samples: Path) -> None:
     (folder / "FLAME_masks.pkl").write_bytes(pickle.dumps(masks, protocol=2))
     rings = {name: np.asarray(region).tolist() for name, region in head.regions.items() if "ring" in name}
     (folder / "regions.json").write_text(json.dumps(rings))
-    eyelids = toy_head(16, eyelids=True).eyelid_basis
-    assert eyelids is not None
-    for index, side in enumerate("lr"):
-        np.save(folder / f"{side}_eyelid.npy", eyelids[..., index])
 
 
 def recording(folder: Path, samples: Path) -> None:

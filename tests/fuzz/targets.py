@@ -16,7 +16,7 @@ from headbench.bench.registry import get
 from headbench.bench.runner.config import resolve_method
 from headbench.datasets.colmap.reader import model_cameras, read_model
 from headbench.datasets.ga.reader import read_capture
-from headbench.datasets.head.loaders import load_head, with_eyelids
+from headbench.datasets.head.loaders import load_head
 from headbench.datasets.steps.exclusion_file import read_exclusions
 from headbench.methods.shared.training.checkpoint import load_checkpoint
 from headbench.metrics.weights import load_backbone, network_spec
@@ -135,13 +135,6 @@ TARGETS = [
     ),
     Target(
         "head regions", "heads", lambda: load_head("head.npz", regions="regions.json"), ("regions.json",), 400
-    ),
-    Target(
-        "head lids",
-        "heads",
-        lambda: with_eyelids(load_head("head.npz"), "l_eyelid.npy", "r_eyelid.npy"),
-        ("*.npy",),
-        300,
     ),
     Target("recording check", "recording", command(*PREPARE, "--check"), share=800),
     Target("recording", "recording", command(*PREPARE), share=300),

@@ -8,12 +8,25 @@ from ....bench.contracts import FloatArray
 from ....bench.errors import InputError
 from ...rounding import LENGTH_BITS, REGRESSOR_BITS, SHARE_BITS, on_grid
 from ..arrays import HeadArrays
-from .expressions import LIDS, SEMANTIC_NAMES, ExpressionBasis, principal_basis, semantic_shapes
-from .eyelids import keep_off_eyes
-from .identity import identity_basis
-from .regions import landmarks, regions
-from .rig import PARENTS, joint_regressor, pose_basis, skinning_weights
-from .surface import Surface, load_surface
+from .expressions import (
+    LIDS,
+    SEMANTIC_NAMES,
+    ExpressionBasis,
+    identity_basis,
+    keep_off_eyes,
+    principal_basis,
+    semantic_shapes,
+)
+from .surface import (
+    PARENTS,
+    Surface,
+    joint_regressor,
+    landmarks,
+    load_surface,
+    pose_basis,
+    regions,
+    skinning_weights,
+)
 
 VERSIONS = ("procedural2020", "procedural2023")
 _SEEDS = {"procedural2020": 2020, "procedural2023": 2023}

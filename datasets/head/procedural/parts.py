@@ -12,8 +12,8 @@ import numpy as np
 
 from ....bench.contracts import FloatArray, HeadAsset, IntArray
 from ....bench.errors import InputError
-from .fields import resample
-from .rig import JAW, NECK, PARENTS
+from .sculpture import resample
+from .surface import JAW, NECK, PARENTS
 
 # Mesiodistal widths from the midline, millimetres (Wheeler's Dental Anatomy), incisors to second premolar:
 # molars would stand in the wall of the mouth.

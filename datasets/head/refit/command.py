@@ -17,8 +17,7 @@ from ..arrays import HeadArrays
 from ..loaders import load_head
 from ..procedural.model import VERSIONS, procedural_head
 from .heat_map import draw_heat_map
-from .refit import refit
-from .report import RefitReport
+from .refit import RefitReport, refit
 from .rewrite import capture_plan, write_capture
 from .settings import RefitCommandSettings
 

@@ -8,8 +8,8 @@ import numpy as np
 from ....bench.contracts import ByteArray, FloatArray
 from ...inspect.canvas import FINE, MUTED, Canvas, nice_ticks
 from ...mesh_pictures import CLAY, draw_mesh, portrait_camera
+from ..subject import PosedSubject
 from .refit import Refitted
-from .subject import Subject
 
 _YAWS = (-0.75, 0.0, 0.75)
 _VIEW = (280, 360)
@@ -21,7 +21,7 @@ _SHOWN = 99  # percentile of the residuals at the upper end of the scale
 def draw_heat_map(refitted: Refitted) -> ByteArray:
     """(H, W, 3) picture of the head from three sides with a scale; vertices that were not fitted are grey."""
     clip, report = refitted.clip, refitted.report
-    neutral = Subject(clip.head, clip.shape, clip.static_offset).neutral
+    neutral = PosedSubject(clip.head, clip.shape, clip.static_offset).neutral
     fitted = np.isfinite(report.vertex_mm)
     top = max(float(np.percentile(report.vertex_mm[fitted], _SHOWN)), 1e-3)
     colours = np.tile(np.array(CLAY), (len(neutral), 1))

@@ -21,14 +21,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import nlopt
 import numpy as np
+from scipy.linalg.lapack import dposv
 
 from ....bench.contracts import FloatArray, HeadAsset, IntArray
 from ....bench.errors import InputError
 from ..arrays import JOINT_NAMES
-from .bounded import solve_bounded
+from ..rotations import matrices_and_derivatives
 from .settings import RefitSettings
-from .turns import matrices_and_derivatives
 
 ROOT, NECK, JAW, LEFT_EYE, RIGHT_EYE = range(len(JOINT_NAMES))
 SEARCHED = (JAW, LEFT_EYE, RIGHT_EYE)
@@ -283,3 +284,123 @@ def _used_correctives(head: HeadAsset, vertices: IntArray, neck: bool) -> Sequen
     return [
         (joint, entry) for joint in joints for entry in range(9) if basis[:, :, 9 * (joint - 1) + entry].any()
     ]
+
+
+_ITERATIONS = 100
+
+
+def solve_bounded(gram: FloatArray, right: FloatArray, bound: FloatArray) -> FloatArray:
+    """Minimise x' G x / 2 - r' x over |x_i| <= b_i.
+
+    Projected Newton steps (Bertsekas, "Projected Newton methods for optimization problems with simple
+    constraints", SIAM J. Control Optim. 20, 1982): components held at their bound by the gradient are fixed, the
+    others take a Newton step, cut back until it descends. Without active bounds that is one Cholesky solution.
+
+    Parameters
+    ----------
+    gram : (n, n) symmetric positive definite; only the lower triangle is read.
+    right : (n,).
+    bound : (n,) positive.
+
+    Raises
+    ------
+    ValueError
+        Where ``gram`` is not positive definite.
+    """
+    x = _solve(gram, right)
+    if (np.abs(x) <= bound).all():
+        return x
+    whole = np.tril(gram) + np.tril(gram, -1).T
+    x = np.clip(x, -bound, bound)
+    for _ in range(_ITERATIONS):
+        gradient = whole @ x - right
+        held = (np.abs(x) >= bound) & (gradient * x < 0)
+        free = np.flatnonzero(~held)
+        step = np.zeros_like(x)
+        if len(free):
+            step[free] = _solve(whole[np.ix_(free, free)], -gradient[free])
+        scale = 1.0
+        while scale > 1e-10:
+            moved = np.clip(x + scale * step, -bound, bound)
+            change = moved - x
+            if gradient @ change + 0.5 * change @ whole @ change <= 1e-4 * gradient @ change:
+                break
+            scale *= 0.5
+        else:
+            return x
+        done = np.abs(change).max(initial=0.0) <= 1e-12 * (1 + np.abs(x).max())
+        x = moved
+        if done:
+            return x
+    return x
+
+
+def _solve(gram: FloatArray, right: FloatArray) -> FloatArray:
+    _, solution, failed = dposv(gram, right, lower=1)
+    if failed:
+        raise ValueError("the normal equations are not positive definite")
+    return np.asarray(solution)
+
+
+_ALGORITHMS = {"slsqp": nlopt.LD_SLSQP, "lbfgs": nlopt.LD_LBFGS, "mma": nlopt.LD_MMA}
+
+
+class Solution(NamedTuple):
+    """A fitted timestep."""
+
+    coefficients: FloatArray
+    """(E + L,) expression, then eyelids."""
+    angles: FloatArray
+    """(9,) jaw, left eye, right eye; axis-angle, radians."""
+    value: float
+    """Of the objective, mm^2."""
+    evaluations: int
+
+
+def angle_bounds(settings: RefitSettings) -> FloatArray:
+    """(9,) largest magnitudes of the angles."""
+    return np.repeat([settings.jaw_bound] + [settings.eye_bound] * (len(SEARCHED) - 1), 3)
+
+
+def solve_frame(
+    problem: FitProblem, frame: Frame, start: FloatArray, fixed: FloatArray, settings: RefitSettings
+) -> Solution:
+    """Fit one timestep.
+
+    Parameters
+    ----------
+    start : (9,) angles to start from, such as the previous timestep's.
+    fixed : (9,) values of the angles that move no vertex with a target, and so are not searched.
+    """
+    searched, limit = problem.searched, angle_bounds(settings)
+    scale = problem.scale[searched]
+    best: list[Solution] = []
+    count = 0
+
+    def objective(values: FloatArray, gradient: FloatArray) -> float:
+        nonlocal count
+        count += 1
+        angles = np.where(searched, 0.0, fixed)
+        angles[searched] = values * scale
+        found = problem.evaluate(frame, angles)
+        if gradient.size:
+            gradient[:] = found.gradient[searched] * scale
+        if not best or found.value < best[0].value:
+            best[:] = [Solution(found.coefficients, angles, found.value, count)]
+        return found.value
+
+    first = np.clip(start, -limit, limit)[searched] / scale
+    if not searched.any():
+        objective(first, np.zeros(0))
+        return best[0]
+    search = nlopt.opt(_ALGORITHMS[settings.algorithm], int(searched.sum()))
+    search.set_min_objective(objective)
+    search.set_lower_bounds(-limit[searched] / scale)
+    search.set_upper_bounds(limit[searched] / scale)
+    search.set_xtol_abs(settings.tolerance / scale)
+    search.set_maxeval(settings.evaluations)
+    try:
+        search.optimize(first)
+    except (nlopt.RoundoffLimited, nlopt.runtime_error):
+        pass  # No step descends further, or a line search gave up: the best point so far is the answer.
+    return best[0]._replace(evaluations=count)

@@ -41,7 +41,7 @@ import torch
 from torch import Tensor
 
 from ....bench.contracts import Clip, FloatArray, HeadPose
-from ....datasets.head.regions import faces_in_region
+from ....datasets.head.arrays import faces_in_region
 from ...compact.simplify import training_poses
 from ...shared.configs import OursConfig, Planned
 from ...shared.subject_mesh import SubjectMesh

@@ -14,7 +14,7 @@ from headbench.bench.contracts import Clip, FrameKey
 from headbench.bench.errors import InputError
 from headbench.datasets.ga.reader import find_captures, read_capture
 from headbench.datasets.ga.writer import CaptureWriter, write_png
-from headbench.datasets.head.regions import with_derived_regions
+from headbench.datasets.head.arrays import with_derived_regions
 from headbench.datasets.head.teeth import with_teeth
 
 from ..head.toy import toy_head

@@ -8,8 +8,8 @@ import torch
 
 from headbench.bench.contracts import Camera, HeadPose
 from headbench.bench.errors import InputError
-from headbench.datasets.head.head_frame import BATCH, camera_in_head_frame, pose_in_head_frame, rigid_motions
 from headbench.datasets.head.model import HeadModel
+from headbench.datasets.head.subject import BATCH, PosedSubject, camera_in_head_frame, pose_in_head_frame
 
 from .toy import toy_head
 
@@ -40,7 +40,7 @@ def test_motions_carry_rigid_vertices_from_the_head_frame_to_the_world(head):
     rng = np.random.default_rng(1)
     shape, offset = rng.normal(size=6), 0.002 * rng.normal(size=head.template.shape)
     poses = make_poses(head, BATCH + 3)
-    motions = rigid_motions(head, shape, offset, poses)
+    motions = PosedSubject(head, shape, offset).motions(poses)
     assert motions.shape == (BATCH + 3, 4, 4)
     correctives = head.pose_basis.copy()
     correctives[:, :, :9] = 0
@@ -58,7 +58,7 @@ def test_motions_carry_rigid_vertices_from_the_head_frame_to_the_world(head):
 
 
 def test_a_moved_camera_sees_the_head_frame_as_it_saw_the_world(head):
-    motion = rigid_motions(head, np.zeros(6), np.zeros_like(head.template), make_poses(head, 1))[0]
+    motion = PosedSubject(head, np.zeros(6), np.zeros_like(head.template)).motions(make_poses(head, 1))[0]
     world_to_camera = np.eye(4)
     world_to_camera[:3, 3] = [0.1, -0.2, 1.5]
     camera = Camera("c", 10, 10, np.eye(3), world_to_camera)
@@ -70,10 +70,12 @@ def test_a_moved_camera_sees_the_head_frame_as_it_saw_the_world(head):
 
 def test_without_motion_nothing_moves(head):
     pose = pose_in_head_frame(make_poses(head, 1)[0])
-    motion = rigid_motions(head, np.ones(6), np.zeros_like(head.template), [pose])
+    motion = PosedSubject(head, np.ones(6), np.zeros_like(head.template)).motions([pose])
     assert motion[0] == pytest.approx(np.eye(4), abs=1e-15)
 
 
 def test_poses_of_another_head_model_are_refused(head):
     with pytest.raises(InputError, match="head_model"):
-        rigid_motions(head, np.zeros(6), np.zeros_like(head.template), make_poses(head, 1, version="other"))
+        PosedSubject(head, np.zeros(6), np.zeros_like(head.template)).motions(
+            make_poses(head, 1, version="other")
+        )

@@ -9,7 +9,7 @@ import pytest
 
 from headbench.bench.errors import InputError
 from headbench.datasets.head.arrays import RING_REGIONS, save_head
-from headbench.datasets.head.loaders import flame_version, load_head, read_masks, with_eyelids
+from headbench.datasets.head.loaders import flame_version, load_head, read_masks
 
 from .flame_files import flame_content, legacy_pickle, write_flame
 from .toy import toy_head
@@ -145,17 +145,3 @@ def test_region_files_are_checked(tmp_path, text):
     (tmp_path / "regions.json").write_text(text)
     with pytest.raises(InputError, match=r"regions\.json"):
         load_head(path, regions=tmp_path / "regions.json")
-
-
-def test_eyelid_files(tmp_path):
-    bases = np.random.default_rng(0).normal(size=(2, *FLAME.template.shape))
-    np.save(tmp_path / "l.npy", bases[0])
-    np.save(tmp_path / "r.npy", bases[1])
-    head = with_eyelids(FLAME, tmp_path / "l.npy", tmp_path / "r.npy")
-    np.testing.assert_array_equal(head.eyelid_basis[:, :, 1], bases[1])
-    np.save(tmp_path / "short.npy", bases[0, :-1])
-    np.save(tmp_path / "object.npy", np.array([{}], dtype=object), allow_pickle=True)
-    (tmp_path / "cut.npy").write_bytes((tmp_path / "l.npy").read_bytes()[:200])
-    for name in ("short.npy", "object.npy", "cut.npy", "none.npy"):
-        with pytest.raises(InputError, match=name):
-            with_eyelids(FLAME, tmp_path / "l.npy", tmp_path / name)

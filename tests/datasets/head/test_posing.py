@@ -9,8 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from headbench.datasets.head.model import HeadModel
-from headbench.datasets.head.posing import FastPosing, joint_motions
+from headbench.datasets.head.model import FastPosing, HeadModel, joint_motions
 from headbench.datasets.head.procedural.model import procedural_head
 
 from .toy import toy_head

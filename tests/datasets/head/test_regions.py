@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from headbench.bench.errors import InputError
-from headbench.datasets.head.regions import derived_regions, faces_in_region, with_derived_regions
+from headbench.datasets.head.arrays import derived_regions, faces_in_region, with_derived_regions
 
 from .toy import toy_head
 

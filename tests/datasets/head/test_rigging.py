@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from headbench.datasets.head.rigging import (
+from headbench.datasets.head.ict import (
     Hinge,
     fit_hinge,
     fit_sphere,

@@ -8,9 +8,8 @@ import torch
 
 from headbench.bench.errors import InputError
 from headbench.datasets.head.arrays import RING_REGIONS
-from headbench.datasets.head.lips import lip_rings
 from headbench.datasets.head.model import HeadModel
-from headbench.datasets.head.teeth import with_teeth
+from headbench.datasets.head.teeth import lip_rings, with_teeth
 
 from .toy import toy_head
 

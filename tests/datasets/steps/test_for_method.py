@@ -12,7 +12,7 @@ from headbench.bench.runner.adaptation import MethodNeeds, plan
 from headbench.bench.specs import ResolutionRule
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import save_head
-from headbench.datasets.head.refit.block import BlockFitter
+from headbench.datasets.head.refit.refit import BlockFitter
 from headbench.datasets.specs import GA_LAYOUT
 from headbench.datasets.steps import for_method
 from headbench.datasets.steps.for_method import clip_for_method

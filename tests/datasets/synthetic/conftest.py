@@ -4,11 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from headbench.datasets.synthetic.controls import CONTROLS
-from headbench.datasets.synthetic.geometry import load_geometry
 from headbench.datasets.synthetic.likeness import Likeness
-from headbench.datasets.synthetic.scene import default_samples
-from headbench.datasets.synthetic.take import Settings, plan_take
+from headbench.datasets.synthetic.performance import CONTROLS
+from headbench.datasets.synthetic.studio import default_samples
+from headbench.datasets.synthetic.take import Settings, load_geometry, plan_take
 
 
 @pytest.fixture(scope="session")

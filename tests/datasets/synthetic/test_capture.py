@@ -10,7 +10,7 @@ import pytest
 from headbench.bench.errors import InputError
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.synthetic.capture import synthesize
-from headbench.datasets.synthetic.rig import FRONTAL
+from headbench.datasets.synthetic.take import FRONTAL
 
 SMALL = {"cameras": 2, "timesteps": 8, "size": (32, 46), "samples_per_pixel": 9, "workers": 1}
 

@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from headbench.datasets.synthetic.controls import CONTROLS, EXPRESSION_CONTROLS
 from headbench.datasets.synthetic.likeness import Likeness
-from headbench.datasets.synthetic.wrinkles import make_folds
+from headbench.datasets.synthetic.performance import CONTROLS, EXPRESSION_CONTROLS
+from headbench.datasets.synthetic.skin import make_folds
 
 
 def test_tracked_vertices_lie_on_the_skin_that_is_rendered(take, likeness, rest):

@@ -7,9 +7,8 @@ import pytest
 import torch
 
 from headbench.datasets.head.model import HeadModel
-from headbench.datasets.synthetic.anatomy import front_depth, measure
-from headbench.datasets.synthetic.geometry import load_geometry
-from headbench.datasets.synthetic.people import person
+from headbench.datasets.synthetic.anatomy import front_depth, measure, person
+from headbench.datasets.synthetic.take import load_geometry
 
 ICT = Path(__file__).parents[3].parent / "shared/data/ict_facekit/ict_facekit_f16.npz"
 

@@ -2,8 +2,14 @@ import numpy as np
 import pytest
 
 from headbench.bench.errors import InputError
-from headbench.datasets.synthetic.controls import CONTROLS, EXPRESSION_CONTROLS
-from headbench.datasets.synthetic.performance import HELD_OUT, SEQUENCES, perform, share_out
+from headbench.datasets.synthetic.performance import (
+    CONTROLS,
+    EXPRESSION_CONTROLS,
+    HELD_OUT,
+    SEQUENCES,
+    perform,
+    share_out,
+)
 
 
 @pytest.mark.parametrize("timesteps", [4, 8, 15, 16, 40, 60, 88, 300])

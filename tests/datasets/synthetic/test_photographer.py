@@ -9,9 +9,8 @@ from skimage.data import lbp_frontal_face_cascade_filename
 from skimage.draw import polygon2mask
 from skimage.feature import Cascade
 
-from headbench.datasets.synthetic.photographer import Photographer
-from headbench.datasets.synthetic.rig import FRONTAL
-from headbench.datasets.synthetic.take import Settings, plan_take
+from headbench.datasets.synthetic.studio import Photographer
+from headbench.datasets.synthetic.take import FRONTAL, Settings, plan_take
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,7 @@ import pytest
 from scipy.spatial import ConvexHull
 
 from headbench.datasets.head.geometry import vertex_normals
-from headbench.datasets.synthetic.refine import refine
+from headbench.datasets.synthetic.likeness import refine
 
 
 @pytest.fixture(scope="module")

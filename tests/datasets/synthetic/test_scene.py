@@ -7,8 +7,8 @@ from skimage.draw import polygon2mask
 
 from headbench.bench.contracts import Camera
 from headbench.bench.errors import InputError
-from headbench.datasets.synthetic.rig import lights
-from headbench.datasets.synthetic.scene import Studio, develop, sample_count, window
+from headbench.datasets.synthetic.studio import Studio, develop, sample_count, window
+from headbench.datasets.synthetic.take import lights
 
 
 def ball(center, radius, steps=24):

@@ -7,10 +7,9 @@ import torch
 from headbench.bench.contracts import Camera
 from headbench.datasets.head.model import HeadModel
 from headbench.datasets.mesh_pictures import rasterize_mesh
-from headbench.datasets.synthetic.anatomy import measure
-from headbench.datasets.synthetic.geometry import load_geometry
-from headbench.datasets.synthetic.people import person
-from headbench.datasets.synthetic.tongue_labels import HIDES, share_that_shows
+from headbench.datasets.synthetic.anatomy import measure, person
+from headbench.datasets.synthetic.parts import HIDES, share_that_shows
+from headbench.datasets.synthetic.take import load_geometry
 
 FAR = 50.0
 

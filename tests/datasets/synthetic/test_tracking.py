@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from headbench.bench.contracts import HeadPose
-from headbench.datasets.synthetic.tracking import with_tracking_noise
+from headbench.datasets.synthetic.performance import with_tracking_noise
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from headbench.bench.errors import InputError
-from headbench.datasets.head.head_frame import rigid_motions
+from headbench.datasets.head.subject import PosedSubject
 from headbench.methods.gha.driving import Driver, code_size, expression_codes
 
 from ...datasets.head.toy import toy_head
@@ -30,7 +30,7 @@ def rigged():
 
 def test_motion_is_the_head_models_rigid_motion(rigged):
     head, shape, offset, driver, poses = rigged
-    expected = rigid_motions(head, shape, offset, poses)
+    expected = PosedSubject(head, shape, offset).motions(poses)
     for signal, whole in zip(driver.signals(driver.arguments(poses)), expected):
         motion = driver.motion(signal)
         np.testing.assert_allclose(motion.rotation, whole[:3, :3], atol=1e-6)

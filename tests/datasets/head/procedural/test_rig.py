@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from headbench.datasets.head.geometry import smoothstep
-from headbench.datasets.head.procedural.rig import JOINTS
+from headbench.datasets.head.procedural.surface import JOINTS
 
 OPEN = (0.30, 0.0, 0.0)
 

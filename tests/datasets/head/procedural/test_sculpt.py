@@ -10,9 +10,14 @@ from hypothesis import strategies as st
 
 import headbench.datasets.head.procedural.sculpture as fields
 from headbench.datasets.head.geometry import border_edges
-from headbench.datasets.head.procedural.polygonise import polygonise
-from headbench.datasets.head.procedural.remesh import coarsen, vertex_areas
-from headbench.datasets.head.procedural.sculpt import Settings, main, mirrored
+from headbench.datasets.head.procedural.sculpt import (
+    Settings,
+    coarsen,
+    main,
+    mirrored,
+    polygonise,
+    vertex_areas,
+)
 from headbench.datasets.head.procedural.surface import load_surface
 
 unit = st.floats(-1, 1, allow_nan=False)

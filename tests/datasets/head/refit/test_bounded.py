@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
-from headbench.datasets.head.refit.bounded import solve_bounded
+from headbench.datasets.head.refit.problem import solve_bounded
 
 
 @settings(max_examples=60, deadline=None)

@@ -14,7 +14,7 @@ import pytest
 from headbench.bench.errors import InputError
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import save_head
-from headbench.datasets.head.refit import block
+from headbench.datasets.head.refit import refit as block
 from headbench.datasets.head.refit.command import run, target_head
 from headbench.datasets.head.refit.heat_map import colour_scale
 from headbench.datasets.head.refit.rewrite import capture_plan, link_or_copy

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from headbench.datasets.head.refit.correspondence import closest_points
+from headbench.datasets.head.refit.identity import closest_points
 
 
 def sampled(points, vertices, faces, steps=24):

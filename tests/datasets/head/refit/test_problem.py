@@ -12,7 +12,7 @@ from headbench.bench.errors import InputError
 from headbench.datasets.head.model import HeadModel
 from headbench.datasets.head.refit.problem import SEARCHED, FitProblem
 from headbench.datasets.head.refit.settings import RefitSettings
-from headbench.datasets.head.refit.turns import matrices
+from headbench.datasets.head.rotations import matrices
 
 from ..toy import toy_head
 

@@ -9,12 +9,12 @@ from threadpoolctl import threadpool_limits
 
 from headbench.bench.contracts import Camera
 from headbench.bench.errors import InputError
-from headbench.datasets.head.head_frame import camera_in_head_frame, pose_in_head_frame, rigid_motions
 from headbench.datasets.head.model import HeadModel
 from headbench.datasets.head.procedural.model import procedural_head
-from headbench.datasets.head.refit import block
+from headbench.datasets.head.refit import refit as block
 from headbench.datasets.head.refit.refit import BLOCK, refit, refit_clip
 from headbench.datasets.head.refit.settings import RefitSettings
+from headbench.datasets.head.subject import PosedSubject, camera_in_head_frame, pose_in_head_frame
 from headbench.datasets.head.teeth import with_teeth
 from headbench.tests.benchmarks.refit import EXACT_MEAN_MM, EXACT_P95_MM, performance
 
@@ -76,7 +76,7 @@ def test_the_rigid_motion_of_the_head_stays(neck):
     derived = refit_clip(clip, TARGET, RefitSettings(neck=neck))
     timesteps = sorted(clip.poses)
     motions = [
-        rigid_motions(c.head, c.shape, c.static_offset, [c.poses[t] for t in timesteps])
+        PosedSubject(c.head, c.shape, c.static_offset).motions([c.poses[t] for t in timesteps])
         for c in (clip, derived)
     ]
     np.testing.assert_allclose(motions[1], motions[0], atol=1e-12)
@@ -88,8 +88,8 @@ def test_a_camera_that_carries_the_motion_sees_the_same_mesh():
     """With the neck folded in, every vertex projects where it did, shoulders and eyelids included."""
     derived = refit_clip(performance(SOURCE, 4), TARGET)
     timesteps = sorted(derived.poses)
-    motions = rigid_motions(
-        TARGET, derived.shape, derived.static_offset, [derived.poses[t] for t in timesteps]
+    motions = PosedSubject(TARGET, derived.shape, derived.static_offset).motions(
+        [derived.poses[t] for t in timesteps]
     )
     world_to_camera = np.diag([1.0, -1.0, -1.0, 1.0])
     world_to_camera[2, 3] = 1.2

@@ -6,10 +6,9 @@ import nlopt
 import numpy as np
 import pytest
 
-from headbench.datasets.head.refit.problem import FitProblem
+from headbench.datasets.head.refit.problem import FitProblem, angle_bounds, solve_frame
 from headbench.datasets.head.refit.settings import RefitSettings
-from headbench.datasets.head.refit.solve import angle_bounds, solve_frame
-from headbench.datasets.head.refit.turns import matrices
+from headbench.datasets.head.rotations import matrices
 from headbench.tests.benchmarks.refit import solve_dense
 
 from .test_problem import ANGLES, EXPRESSION, HEAD, LIDS, NECK, NEUTRAL, make, wanted

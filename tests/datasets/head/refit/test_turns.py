@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from headbench.datasets.head.refit.turns import axis_angles, matrices, matrices_and_derivatives
+from headbench.datasets.head.rotations import axis_angles, matrices, matrices_and_derivatives
 
 DIAGONAL = np.ones(3) / np.sqrt(3)
 VECTORS = [

@@ -9,8 +9,8 @@ import numpy as np
 from headbench.bench.contracts import FrameKey
 from headbench.datasets.mesh_pictures import draw_mesh, portrait_camera
 from headbench.datasets.steps.tongue.sampling import posed_meshes
-from headbench.datasets.synthetic.controls import CONTROLS
-from headbench.datasets.synthetic.geometry import load_geometry
+from headbench.datasets.synthetic.performance import CONTROLS
+from headbench.datasets.synthetic.take import load_geometry
 
 SKIN = np.array([0.62, 0.36, 0.22])  # linear reflectance
 LIPS = SKIN * [0.86, 0.5, 0.5]

@@ -1,8 +1,17 @@
-"""The features of the face: eyes, nose, lips, ears, and the clay strokes that model the planes between."""
+"""Implicit-surface vocabulary of the sculpture: primitives, smooth booleans and clay strokes.
+
+Every function works on points ``(N, 3)`` in metres and returns ``(N,)`` approximate signed distances,
+negative inside. The bounds are those of I. Quilez, "Distance functions" and "Smooth minimum".
+"""
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Callable, Sequence
+from functools import wraps
+
 import numpy as np
+from scipy.interpolate import CubicSpline, PchipInterpolator
 
 from ....bench.contracts import FloatArray
 from .anatomy import (
@@ -17,8 +26,178 @@ from .anatomy import (
     lid_curves,
     slit_height,
 )
-from .cranium import head_mass
-from .fields import ellipsoid, intersection, ridge, rotation_xyz, stroke, subtraction, tube, union, within
+
+Point = Sequence[float]
+
+
+def rotation_xyz(degrees: Point) -> FloatArray:
+    """(3, 3) rotation about x, then y, then z; the angles are in degrees."""
+    (a, b, c) = np.radians(np.asarray(degrees, float))
+    about_x = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
+    about_y = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
+    about_z = np.array([[np.cos(c), -np.sin(c), 0], [np.sin(c), np.cos(c), 0], [0, 0, 1]])
+    return about_z @ about_y @ about_x
+
+
+def local(points: FloatArray, center: Point, degrees: Point | None = None) -> FloatArray:
+    """Points in the frame at ``center``, turned by ``degrees`` (see `rotation_xyz`)."""
+    relative = points - np.asarray(center, points.dtype)
+    return relative if degrees is None else relative @ rotation_xyz(degrees).astype(points.dtype)
+
+
+def ellipsoid(points: FloatArray, center: Point, radii: Point, degrees: Point | None = None) -> FloatArray:
+    """Ellipsoid; exact on the surface and first-order right near it."""
+    scaled = local(points, center, degrees) / np.asarray(radii, points.dtype)
+    length = np.linalg.norm(scaled, axis=1)
+    slope = np.linalg.norm(scaled / np.asarray(radii, points.dtype), axis=1)
+    return length * (length - 1) / np.maximum(slope, 1e-6)
+
+
+def capsule(points: FloatArray, a: Point, b: Point, radius_a: float, radius_b: float) -> FloatArray:
+    """Capsule between two points whose radius runs linearly from ``radius_a`` to ``radius_b``."""
+    start = np.asarray(a, points.dtype)
+    axis = np.asarray(b, points.dtype) - start
+    relative = points - start
+    along = np.clip(relative @ axis / (axis @ axis), 0, 1)
+    distance = np.linalg.norm(relative - along[:, None] * axis, axis=1)
+    return distance - (radius_a + along * (radius_b - radius_a))
+
+
+def tube(points: FloatArray, knots: Sequence[Point], radii: Point, samples: int = 12) -> FloatArray:
+    """Tube of varying radius along the cubic spline through ``knots``."""
+    path = resample(np.column_stack([np.asarray(knots, float), np.asarray(radii, float)]), samples)
+    pieces = [capsule(points, a[:3], b[:3], float(a[3]), float(b[3])) for a, b in itertools.pairwise(path)]
+    return np.minimum.reduce(pieces)
+
+
+def resample(knots: FloatArray, samples: int) -> FloatArray:
+    """``samples`` rows at equal parameter steps on the chord-length cubic spline through ``knots``."""
+    knots = np.asarray(knots, float)
+    chord = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(knots[:, :3], axis=0), axis=1))])
+    return CubicSpline(chord / chord[-1], knots)(np.linspace(0, 1, samples))
+
+
+def union(a: FloatArray, b: FloatArray, blend: float) -> FloatArray:
+    """Smooth union (quadratic smooth minimum); ``blend`` metres is the width of the fillet."""
+    overlap = np.maximum(blend - np.abs(a - b), 0)
+    return np.minimum(a, b) - overlap**2 / (4 * blend)
+
+
+def intersection(a: FloatArray, b: FloatArray, blend: float) -> FloatArray:
+    """Smooth intersection; the convex edge is rounded over ``blend`` metres."""
+    return -union(-a, -b, blend)
+
+
+def subtraction(a: FloatArray, b: FloatArray, blend: float) -> FloatArray:
+    """``a`` without ``b``, the edge rounded over ``blend`` metres."""
+    return intersection(a, -b, blend)
+
+
+def stroke(points: FloatArray, center: Point, sigma: Point, degrees: Point | None = None) -> FloatArray:
+    """Weight in [0, 1] of a Gaussian clay stroke: subtract ``height * stroke`` to add clay."""
+    scaled = local(points, center, degrees) / np.asarray(sigma, points.dtype)
+    return np.exp(-0.5 * np.einsum("ij,ij->i", scaled, scaled))
+
+
+def ridge(points: FloatArray, knots: Sequence[Point], width: float, samples: int = 10) -> FloatArray:
+    """Weight in [0, 1] of a stroke along a spline: Gaussian of its distance, of deviation ``width``."""
+    distance = tube(points, knots, [0.0] * len(knots), samples)
+    return np.exp(-0.5 * (distance / width) ** 2)
+
+
+Feature = Callable[[FloatArray, FloatArray], FloatArray]
+
+
+def within(low: Point, high: Point) -> Callable[[Feature], Feature]:
+    """Decorate ``feature(head, points) -> head`` to touch only a box, which must hold all it changes."""
+
+    def decorate(feature: Feature) -> Feature:
+        @wraps(feature)
+        def bounded(head: FloatArray, points: FloatArray) -> FloatArray:
+            inside = np.all((points > np.asarray(low)) & (points < np.asarray(high)), axis=1)
+            if not inside.any():
+                return head
+            changed = head.copy()
+            changed[inside] = feature(head[inside], points[inside])
+            return changed
+
+        return bounded
+
+    return decorate
+
+
+# One row per height, metres: midline depth of the face without nose and lips, half width, depth of the widest
+# place, exponent of the superellipse that joins them.
+FACE_SECTIONS = np.array(
+    [
+        # y, front, half width, widest at, exponent
+        [0.080, 0.0650, 0.0600, 0.000, 2.10],
+        [0.060, 0.0690, 0.0625, 0.002, 2.05],
+        [0.042, 0.0705, 0.0640, 0.004, 2.00],
+        [0.020, 0.0660, 0.0655, 0.006, 2.05],
+        [0.000, 0.0690, 0.0665, 0.008, 2.10],
+        [-0.020, 0.0730, 0.0640, 0.006, 2.10],
+        [-0.035, 0.0765, 0.0610, 0.004, 2.05],
+        [-0.050, 0.0780, 0.0565, 0.002, 2.00],
+        [-0.068, 0.0730, 0.0500, 0.002, 2.05],
+        [-0.082, 0.0745, 0.0430, 0.006, 2.10],
+        [-0.095, 0.0720, 0.0370, 0.012, 2.10],
+        [-0.115, 0.0600, 0.0300, 0.015, 2.00],
+    ]
+)
+
+
+def face_mass(points: FloatArray) -> FloatArray:
+    """Face from brow to chin: superelliptic sections over height, cut below by the plane of the jaw."""
+    x, y, z = points.T
+    rows = FACE_SECTIONS[::-1]
+    front, half, widest, power = PchipInterpolator(rows[:, 0], rows[:, 1:])(
+        np.clip(y, rows[0, 0], rows[-1, 0])
+    ).T.astype(points.dtype)
+    u = np.abs(x) / half + 1e-6
+    v = np.maximum(z - widest, 0) / (front - widest) + 1e-6
+    radius = (u**power + v**power) ** (1 / power)
+    slope = np.hypot((u / radius) ** (power - 1) / half, (v / radius) ** (power - 1) / (front - widest))
+    section = (radius - 1) / np.maximum(slope, 1e-3)
+    below = -0.900 * (y + 0.0960) - 0.436 * (z - 0.058)
+    behind = -0.010 - z
+    top = y - 0.075
+    jaw = intersection(section, below, 0.016)
+    return intersection(intersection(jaw, behind, 0.030), top, 0.030)
+
+
+def neck_mass(points: FloatArray) -> FloatArray:
+    """Neck with sternomastoid and larynx, and the slope of the shoulders."""
+    mirrored = np.column_stack([np.abs(points[:, 0]), points[:, 1:]])
+    neck = tube(
+        points,
+        [(0, -0.030, -0.038), (0, -0.090, -0.042), (0, -0.150, -0.049), (0, -0.210, -0.056)],
+        [0.050, 0.0515, 0.055, 0.064],
+        samples=6,
+    )
+    trapezius = tube(
+        mirrored,
+        [(0.015, -0.060, -0.078), (0.030, -0.120, -0.082), (0.060, -0.175, -0.078), (0.085, -0.215, -0.070)],
+        [0.020, 0.022, 0.026, 0.030],
+        samples=6,
+    )
+    mass = union(neck, trapezius, 0.04)
+    sternomastoid = capsule(mirrored, (0.058, -0.028, -0.030), (0.016, -0.195, 0.004), 0.008, 0.0065)
+    mass = union(mass, sternomastoid, 0.018)
+    mass -= 0.0030 * stroke(points, (0, -0.128, 0.006), (0.009, 0.012, 0.012))
+    return mass
+
+
+def head_mass(points: FloatArray) -> FloatArray:
+    """Cranium, face and neck joined."""
+    skull = ellipsoid(points, (0, 0.052, -0.019), (0.0765, 0.083, 0.0950))
+    occiput = ellipsoid(points, (0, 0.030, -0.055), (0.062, 0.062, 0.056))
+    skull = union(skull, occiput, 0.03)
+    forehead = ellipsoid(points, (0, 0.062, 0.006), (0.060, 0.056, 0.0640))
+    skull = union(skull, forehead, 0.03)
+    head = union(skull, face_mass(points), 0.022)
+    return union(head, neck_mass(points), 0.022)
+
 
 # Clay strokes on the left half: height (metres, positive adds), centre, deviations, turn in degrees.
 PLANES: tuple[tuple[float, tuple[float, ...], tuple[float, ...], tuple[float, ...] | None], ...] = (
