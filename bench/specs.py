@@ -187,8 +187,6 @@ class DatasetSpec:
     of every file have to be read, whatever it remembers of an earlier time. ``reads`` is False for one that
     makes captures instead: its function takes ``out`` and settings and writes what another reader reads.
     Settings whose annotation admits a `Path` name files; a run finds them again after it was moved together with them.
-
-    ``adapt`` names a function that brings clips into the form a method needs, see `adaptation`; "" for none.
     """
 
     name: str
@@ -196,7 +194,6 @@ class DatasetSpec:
     implementation: str
     find: str = ""
     reads: bool = True
-    adapt: str = ""
 
 
 @dataclass(frozen=True)

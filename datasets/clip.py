@@ -10,19 +10,32 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from ..bench.contracts import BoolArray, ByteArray, Camera, FloatArray, FrameKey, HeadPose, StepRecord
+from ..bench.contracts import (
+    BoolArray,
+    ByteArray,
+    Camera,
+    Clip,
+    FloatArray,
+    FrameKey,
+    HeadAsset,
+    HeadPose,
+    StepRecord,
+)
 from ..bench.errors import InputError
 from ..bench.io.files import digest
 from ..bench.io.frames import quantise
-from .head.arrays import HeadArrays
+from .head.arrays import STORED, HeadArrays
 from .images import ImageStore, read_image, read_mask
 from .region_masks import FOREGROUND, HeadRegions, select
 
 
 class FrameFiles(NamedTuple):
-    """Where a frame's pixels are, and which frame they were recorded as if a step gave it another key since."""
+    """Where a frame's pixels are, and which frame they were recorded as if a step gave it another key since.
 
-    image: Path
+    A clip of a reader from outside may have no files; its pixels come from `CaptureClip.source`.
+    """
+
+    image: Path | None
     mask: Path | None
     recorded: FrameKey | None = None
 
@@ -52,6 +65,7 @@ class CaptureClip:
     store : decodes images and bounds the memory they take; shared by clips derived from one another.
     pixel_steps : applied in order when a frame is read, with one rounding to 8 bits at the end.
     read_background : what straight-alpha files are composited on before the pixel steps; None: `background`.
+    source : the clip that gives the pixels of frames without files, see `as_capture`.
     """
 
     subject: str
@@ -69,6 +83,7 @@ class CaptureClip:
     store: ImageStore
     pixel_steps: tuple[PixelStep, ...] = ()
     read_background: FloatArray | None = None
+    source: Clip | None = None
 
     @cached_property
     def fingerprint(self) -> str:
@@ -82,22 +97,32 @@ class CaptureClip:
 
         Raises `InputError` for a key the clip does not have.
         """
-        if not self.pixel_steps:
-            return self.store.image(self._files(key).image, self.background)
-        return self._processed(key, "image")
+        if self.pixel_steps:
+            return self._processed(key, "image")
+        files = self._files(key)
+        if files.image is None:
+            return self._source.image(files.recorded or key)
+        return self.store.image(files.image, self.background)
 
     def mask(self, key: FrameKey) -> ByteArray | None:
         """(H, W) 8-bit foreground coverage, read-only; None where the capture has none."""
-        path = self._files(key).mask
-        if path is None:
+        if not self.has_mask(key):
             return None
-        return self._processed(key, "mask") if self.pixel_steps else self.store.mask(path)
+        if self.pixel_steps:
+            return self._processed(key, "mask")
+        files = self._files(key)
+        return self._source.mask(files.recorded or key) if files.mask is None else self.store.mask(files.mask)
+
+    def has_mask(self, key: FrameKey) -> bool:
+        """Whether a frame has a mask; nothing is decoded where it has a file."""
+        files = self._files(key)
+        return files.mask is not None if files.image is not None else self._source_has_masks
 
     @cached_property
     def region_names(self) -> tuple[str, ...]:
         """Regions that `region_masks` knows here, see `region_masks` the module."""
-        matted = all(files.mask is not None for files in self.files.values())
-        return ((FOREGROUND,) if matted else ()) + self._head_regions.names
+        masked = all(map(self.has_mask, self.files))
+        return ((FOREGROUND,) if masked else ()) + self._head_regions.names
 
     def region_masks(self, key: FrameKey, names: Sequence[str]) -> dict[str, BoolArray]:
         """(H, W) masks of the pixels in which each region is seen; all False where it is not."""
@@ -140,8 +165,13 @@ class CaptureClip:
             return found
         files = self._files(key)
         ground = self.background if self.read_background is None else self.read_background
-        coverage = None if files.mask is None else _unit_range(read_mask(files.mask))
-        pixels = FramePixels(_unit_range(read_image(files.image, ground)), coverage)
+        if files.image is None:
+            recorded = files.recorded or key
+            image, mask = self._source.image(recorded), self._source.mask(recorded)
+        else:
+            image = read_image(files.image, ground)
+            mask = None if files.mask is None else read_mask(files.mask)
+        pixels = FramePixels(_unit_range(image), None if mask is None else _unit_range(mask))
         for change in self.pixel_steps:
             pixels = change(files.recorded or key, pixels)
         parts = {"image": quantise(pixels.image)}
@@ -151,11 +181,56 @@ class CaptureClip:
             self.store.keep((self.fingerprint, key, name), array)
         return parts[part]
 
+    @property
+    def _source(self) -> Clip:
+        assert self.source is not None, "frames without files come from a source"
+        return self.source
+
+    @cached_property
+    def _source_has_masks(self) -> bool:
+        """By one frame: all frames of a clip have a mask, or none."""
+        return (
+            self._source.mask(next(key for keys in self._source.splits.values() for key in keys)) is not None
+        )
+
     def _files(self, key: FrameKey) -> FrameFiles:
         try:
             return self.files[key]
         except KeyError:
             raise InputError("clip", "frame key", f"a frame of subject {self.subject}", str(key)) from None
+
+
+def as_capture(clip: Clip) -> CaptureClip:
+    """Any clip as a `CaptureClip`, so that every step and command works on it; one that is such comes back itself.
+
+    Pixels stay where they are and are asked of ``clip``. Raises `InputError` where its head model is none in FLAME's
+    layout.
+    """
+    if isinstance(clip, CaptureClip):
+        return clip
+    where = f"clip {clip.subject}"
+    if not isinstance(clip.head, HeadAsset):
+        raise InputError(where, "head", "a head model in FLAME's layout", type(clip.head).__name__)
+    regions = {name: np.asarray(members) for name, members in clip.head.regions.items()}
+    arrays: dict[str, Any] = {name: np.asarray(getattr(clip.head, name)) for name in STORED}
+    head = HeadArrays(clip.head.version, **arrays, eyelid_basis=clip.head.eyelid_basis, regions=regions)
+    keys = [key for part in clip.splits.values() for key in part]
+    return CaptureClip(
+        subject=clip.subject,
+        head=head.validate(where),
+        shape=np.asarray(clip.shape),
+        static_offset=np.asarray(clip.static_offset),
+        cameras=clip.cameras,
+        poses=clip.poses,
+        splits=clip.splits,
+        excluded=clip.excluded,
+        background=np.asarray(clip.background, np.float64),
+        steps=tuple(clip.steps),
+        files=dict.fromkeys([*keys, *clip.excluded], FrameFiles(None, None)),
+        source_fingerprint=clip.fingerprint,
+        store=ImageStore(),
+        source=clip,
+    )
 
 
 def _unit_range(levels: ByteArray) -> FloatArray:

@@ -7,7 +7,13 @@ GA_LAYOUT = DatasetSpec(
     summary="A capture in the GaussianAvatars/VHAP layout: a UNION folder or a single sequence.",
     implementation="headbench.datasets.ga.reader:read_capture",
     find="headbench.datasets.ga.reader:find_captures",
-    adapt="headbench.datasets.steps.for_method:clip_for_method",
+)
+
+COLMAP = DatasetSpec(
+    name="colmap",
+    summary="A COLMAP dataset with tracked FLAME parameters beside its model, as `export colmap --tracking` writes.",
+    implementation="headbench.datasets.colmap.reader:read_dataset",
+    find="headbench.datasets.colmap.reader:find_datasets",
 )
 
 SYNTHETIC = DatasetSpec(

@@ -83,7 +83,7 @@ def _check_method(
     check_device(settings.device)
     breaches: list[str] = []
     with TemporaryDirectory() as folder:
-        clip = _adapted(_clip(settings, Path(folder), progress), method, settings.reader, Path(folder))
+        clip = _adapted(_clip(settings, Path(folder), progress), method, Path(folder))
         with attempt(breaches, "training or rendering"):
             breaches += check_method(method, clip, Path(folder) / "avatar", device=settings.device)
     return breaches
@@ -99,8 +99,8 @@ def _clip(settings: CheckPluginSettings, folder: Path, progress: Progress) -> Cl
     return clips[0]
 
 
-def _adapted(clip: Clip, method: ResolvedMethod, reader: str, folder: Path) -> Clip:
+def _adapted(clip: Clip, method: ResolvedMethod, folder: Path) -> Clip:
     """The clip in the form that the method declares to need, as in a run."""
     needs = MethodNeeds.of(method.spec)
-    planned = plan(clip, needs, get("datasets", reader), {})
+    planned = plan(clip, needs, {})
     return clip if planned is None else carry_out(planned, needs, folder / "adapted", "adapting").clip

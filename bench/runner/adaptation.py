@@ -1,6 +1,6 @@
 """Brings clips into the form that a method declares: head model, image size, one video. Bench knows no steps.
 
-A reader's `DatasetSpec.adapt` names the function that does it::
+One function does it for the clips of every reader, the entry point of the group ``headbench.adaptation``::
 
     adapt(clip, needs, heads) -> (folder, progress) -> AdaptedClip
 
@@ -13,14 +13,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
 from ..contracts import Clip, FloatArray, FrameKey, Progress
-from ..errors import InputError
+from ..errors import HeadbenchError, InputError
 from ..progress import progress
-from ..registry import resolve
-from ..specs import DatasetSpec, MethodSpec, ResolutionRule
+from ..specs import MethodSpec, ResolutionRule
 
 
 @dataclass(frozen=True)
@@ -65,35 +65,45 @@ class AdaptedClip:
 Adaptation = Callable[[Path, Progress], AdaptedClip]
 
 
-def plan(clip: Clip, needs: MethodNeeds, reader: DatasetSpec, heads: Mapping[str, str]) -> Adaptation | None:
+Adapter = Callable[[Clip, MethodNeeds, Mapping[str, str]], Adaptation]
+
+
+def adapter() -> Adapter:
+    """The function that adapts clips, see the module."""
+    entries = entry_points(group="headbench.adaptation")
+    if not entries:
+        raise HeadbenchError("nothing is registered as headbench.adaptation; install headbench again")
+    found: Adapter = next(iter(entries)).load()
+    return found
+
+
+def plan(clip: Clip, needs: MethodNeeds, heads: Mapping[str, str]) -> Adaptation | None:
     """Check that ``clip`` can be brought into the form needed; return what will do it, None where it has it.
 
-    A monocular method gets the clip as the reader's steps make it even where there is one view, since they also
-    move the head's rigid motion into the cameras.
+    A monocular method gets the clip as the steps make it even where there is one view, since they also move the
+    head's rigid motion into the cameras.
 
     Raises
     ------
     InputError
-        Where the clip lacks what the method needs and its reader knows no way there.
+        Where the clip lacks what the method needs and there is no way there.
     """
-    if _has_form(clip, needs) and not (needs.monocular and reader.adapt):
+    fits = not needs.head_models or clip.head.version in needs.head_models
+    if fits and needs.resolution.native and not needs.monocular:
         return None
-    if not reader.adapt:
-        check(clip, needs)
-    made: Adaptation = resolve(reader.adapt)(clip, needs, heads)
-    return made
+    return adapter()(clip, needs, heads)
 
 
 def carry_out(adaptation: Adaptation, needs: MethodNeeds, folder: Path, label: str) -> AdaptedClip:
     """Run a planned adaptation and hold its result to the needs."""
     with progress(label) as report:
         adapted = adaptation(folder, report)
-    check(adapted.clip, MethodNeeds(needs.head_models, needs.monocular))
+    check(adapted.clip, needs)
     return adapted
 
 
 def check(clip: Clip, needs: MethodNeeds) -> None:
-    """Raise `InputError` for the first need that a clip does not meet as it is."""
+    """Raise `InputError` for a head model or further views that a method does not take; sizes are not looked at."""
     where = f"clip {clip.subject}"
     if needs.head_models and clip.head.version not in needs.head_models:
         expected = f"a capture tracked with {' or '.join(needs.head_models)}"
@@ -102,8 +112,6 @@ def check(clip: Clip, needs: MethodNeeds) -> None:
     if needs.monocular and views:
         expected = "a single video, one training frame at a timestep"
         raise InputError(where, "monocular", expected, f"{views} further views")
-    if not needs.resolution.native:
-        raise InputError(where, "resolution", f"images made to {needs.resolution}", "images as recorded")
 
 
 def record(clip: Clip, adapted: AdaptedClip, method: str) -> dict[str, Any]:
@@ -115,11 +123,6 @@ def record(clip: Clip, adapted: AdaptedClip, method: str) -> dict[str, Any]:
         "fingerprint": adapted.clip.fingerprint,
         "steps": [asdict(step) for step in added],
     }
-
-
-def _has_form(clip: Clip, needs: MethodNeeds) -> bool:
-    fits = not needs.head_models or clip.head.version in needs.head_models
-    return fits and needs.resolution.native and not (needs.monocular and _further_views(clip))
 
 
 def _further_views(clip: Clip) -> int:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import inspect
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import get_args, get_type_hints
+from typing import Any, get_args, get_type_hints
 
 from ..configuration import build_arguments
-from ..contracts import Clip
+from ..contracts import Clip, Progress
 from ..errors import InputError
 from ..io.files import check_name
 from ..progress import progress
@@ -34,26 +34,44 @@ def open_clips(config: RunConfig, *, remembered: bool = True) -> list[Clip]:
     subjects that are not distinct, and whatever the reader finds wrong.
     """
     spec: DatasetSpec = get("datasets", config.reader)
-    if not spec.reads:
-        raise InputError("reader", spec.name, "a dataset that is read", "one that makes captures")
-    read = resolve(spec.implementation)
-    settings = build_arguments(read, config.reader_settings, "reader_settings", harness=HARNESS)
     root = Path(config.data)
     if not root.exists():
         raise InputError(root, "--data", "a capture folder", "no such folder")
-    paths: Sequence[Path] = resolve(spec.find)(root) if spec.find else [root]
-    if not paths:
-        raise InputError(root, "--data", f"captures that reader {spec.name!r} knows", "none")
     clips: list[Clip] = []
-    for path in paths:
+    for path, read in found_captures(spec, root, config.reader_settings, remembered=remembered):
         with progress(f"reading {path.name}") as report:
-            offered = {"progress": report, "remembered": remembered}
-            given = {name: offered[name] for name in inspect.signature(read).parameters.keys() & HARNESS}
-            clips.append(_reduced(_checked(read(path, **settings, **given)), spec, config))
+            clips.append(_reduced(_checked(read(report)), config))
     subjects = [clip.subject for clip in clips]
     if len(set(subjects)) != len(subjects):
         raise InputError(root, "subject", "a different subject in each capture", ", ".join(subjects))
     return clips
+
+
+def found_captures(
+    spec: DatasetSpec, root: Path, settings: Mapping[str, Any], *, remembered: bool = True
+) -> list[tuple[Path, Callable[[Progress], Clip]]]:
+    """Path of each capture that a reader finds under ``root``, and what reads it.
+
+    Raises `InputError` where there is none, for what is no reader, and for settings that it does not know.
+    """
+    if not spec.reads:
+        raise InputError("reader", spec.name, "a dataset that is read", "one that makes captures")
+    read = resolve(spec.implementation)
+    arguments = build_arguments(read, settings, "reader_settings", harness=HARNESS)
+    paths: Sequence[Path] = resolve(spec.find)(root) if spec.find else [root]
+    if not paths:
+        raise InputError(root, "", f"captures that reader {spec.name!r} knows", "none")
+    asked = inspect.signature(read).parameters.keys() & HARNESS
+
+    def reads(path: Path) -> Callable[[Progress], Clip]:
+        def one(report: Progress) -> Clip:
+            offered = {"progress": report, "remembered": remembered}
+            clip: Clip = read(path, **arguments, **{name: offered[name] for name in asked})
+            return clip
+
+        return one
+
+    return [(Path(path), reads(path)) for path in paths]
 
 
 def relative_paths(config: RunConfig) -> dict[str, str]:
@@ -186,10 +204,10 @@ def _check_registered(config: RunConfig, manifest: Path) -> None:
                 raise InputError(manifest, f"configuration.{key}", "registered names", repr(name), remedy)
 
 
-def _reduced(clip: Clip, reader: DatasetSpec, config: RunConfig) -> Clip:
+def _reduced(clip: Clip, config: RunConfig) -> Clip:
     """The clip at the size that metrics are taken at."""
     needs = MethodNeeds(resolution=ResolutionRule(divide=config.divide))
-    planned = plan(clip, needs, reader, {})
+    planned = plan(clip, needs, {})
     if planned is None:
         return clip
     return carry_out(planned, needs, Path(config.out), f"reducing {clip.subject}").clip

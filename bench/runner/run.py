@@ -21,9 +21,9 @@ from ..machine import machine_record, peak_memory_bytes
 from ..manifest import AdaptedRecord, ClipRecord, Manifest, MethodRecord, ProtocolRecord
 from ..progress import duration, run_progress
 from ..protocol import Protocol, make_protocol
-from ..registry import discover, get, resolve
+from ..registry import discover, resolve
 from ..rows import Rows
-from ..specs import DatasetSpec, MetricSpec
+from ..specs import MetricSpec
 from . import adaptation
 from .adaptation import AdaptedClip, MethodNeeds
 from .captures import open_clips, relative_paths
@@ -123,11 +123,10 @@ def adapt(
     What takes long is kept in ``folder``, whose lock the caller holds. What the run ``finished`` kept is copied there
     first: nothing is written in a run by what looks at it.
     """
-    reader: DatasetSpec = get("datasets", config.reader)
     planned = {}
     for clip in clips:
         for needs in {MethodNeeds.of(method.spec): None for method in methods}:
-            step = adaptation.plan(clip, needs, reader, config.heads)
+            step = adaptation.plan(clip, needs, config.heads)
             if step is not None:
                 planned[clip.subject, needs] = step
     with output_inside(folder.root):

@@ -1,55 +1,53 @@
-"""The cameras of a COLMAP sparse model as ours.
+"""Read a COLMAP dataset with a tracked head, and the cameras of a COLMAP sparse model.
+
+COLMAP gives cameras and images. What methods need besides is the tracked head: parameter files of VHAP beside the
+model, one for each timestep, and the head model they belong to. `export colmap --tracking` writes such a dataset::
+
+    images/<subject>/<sequence>/<timestep>/<camera>.png     or images/<timestep>_<camera>.png
+    masks/<the image's name>.png                            optional; 255 is the subject
+    sparse/0/{cameras,images}.{bin,txt}
+    flame_param/<timestep as %05d>.npz                      as in the GaussianAvatars/VHAP layout
+    head_model.npz                                          unless given as head=
+    headbench.json                                          optional, see `ga.layout.Declaration`
 
 Both put the centre of the top left pixel at (0.5, 0.5), and both map the world to the camera with OpenCV's axes,
 so that numbers are taken over as they are. A model's world is its own: position, orientation and scale are those
-of the reconstruction, metres only where it was made from metric poses.
+of the reconstruction, metres only where it was made from metric poses; tracking has to be in the same world.
 """
 
 from __future__ import annotations
 
-from os import PathLike
+import os
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ...bench.contracts import Camera
+from ...bench.contracts import Camera, FrameKey, Progress, StepRecord, no_progress
 from ...bench.errors import InputError
-from ..steps.undistort import Lens
-from .binary import read_cameras_binary, read_images_binary
-from .records import ColmapModel
-from .text import read_cameras_text, read_images_text
+from ...bench.io.files import check_name, digest
+from ...bench.io.images import probe_image
+from ..clip import CaptureClip, FrameFiles
+from ..ga.content_digests import content_digests
+from ..ga.flame_parameters import read_tracking
+from ..ga.head import find_head
+from ..ga.layout import DECLARATION_FILE, Declaration, parameter_name
+from ..ga.splits import split_by_holding_out
+from ..images import ImageStore
+from ..steps.exclude import exclude_given, exclude_timesteps
+from ..steps.mattes import check_colour
+from ..steps.undistort import Lens, undistort_clip
+from .model import ColmapModel, find_model, read_model
 
-_PLACES = (".", "sparse/0", "sparse")
+TRACKING_FOLDER = "flame_param"
+SAME_CAMERA = 1e-4
+"""Largest difference of two entries of world-to-camera matrices that are one camera's, metres."""
 
-
-def read_model(path: str | PathLike[str]) -> ColmapModel:
-    """Read cameras and images of the model in a folder, or in its ``sparse/0`` or ``sparse``; bin before txt.
-
-    Raises
-    ------
-    InputError
-        Where there is no model, a file is cut short or damaged, or an image's camera is missing.
-    """
-    root = Path(path)
-    for place in _PLACES:
-        folder = root / place
-        for suffix, cameras_of, images_of in (
-            (".bin", read_cameras_binary, read_images_binary),
-            (".txt", read_cameras_text, read_images_text),
-        ):
-            files = folder / f"cameras{suffix}", folder / f"images{suffix}"
-            if not all(file.is_file() for file in files):
-                continue
-            model = ColmapModel(folder, cameras_of(files[0]), images_of(files[1]))
-            for number, image in model.images.items():
-                if image.camera not in model.cameras:
-                    expected = "one of the model's cameras"
-                    raise InputError(files[1], f"image {number}, camera", expected, str(image.camera))
-            return model
-    expected = "a COLMAP model: cameras.bin and images.bin, or cameras.txt and images.txt"
-    raise InputError(root, "", expected, "none in it, in sparse/0 or in sparse")
+_VHAP_NAME = re.compile(r"(?P<timestep>\d+)_(?P<camera>.+)")
 
 
 def model_cameras(
@@ -104,3 +102,138 @@ def _lens(model: ColmapModel, number: int) -> Lens:
         raise InputError(
             model.folder, f"camera {number}", error.expected, error.found, error.remedy
         ) from error
+
+
+def find_datasets(root: Path) -> list[Path]:
+    """The folder itself where it holds a sparse model and a folder of images."""
+    return [root] if (root / "images").is_dir() and find_model(root) is not None else []
+
+
+def read_dataset(
+    path: str | Path,
+    *,
+    head: str | Path | None = None,
+    masks: str | Path | None = None,
+    subject: str = "",
+    background: Sequence[float] | None = None,
+    held_out_sequences: Sequence[str] = (),
+    held_out_cameras: Sequence[str] = (),
+    exclude: Mapping[int, str] | str | Path | None = None,
+    cache_mb: float = 512.0,
+    remembered: bool = True,
+    progress: Progress = no_progress,
+) -> CaptureClip:
+    """Read a COLMAP dataset as a clip; lens distortion is taken out of images and masks as they are read.
+
+    Parameters
+    ----------
+    head, masks : head model and file with its regions, see `find_head`.
+    subject : subject id; "" takes that of the images' names, else the folder's name.
+    background : what the images are composited on, (r, g, b) in [0, 1]; None takes the declared one, else white.
+    held_out_sequences, held_out_cameras : splits as of the reader ``ga``. Without them every frame is for training.
+    exclude, cache_mb, remembered : as of the reader ``ga``.
+
+    Raises
+    ------
+    InputError
+        Without tracking, for images whose names give no timestep and camera, for a camera that moves, and for
+        whatever is wrong with a file.
+    """
+    root = Path(os.path.abspath(path))
+    model = read_model(root)
+    if not (root / TRACKING_FOLDER).is_dir():
+        raise InputError(
+            root,
+            TRACKING_FOLDER,
+            f"tracked parameters, {TRACKING_FOLDER}/{parameter_name(0)} and on, one file for each timestep",
+            "no such folder: a COLMAP dataset has cameras and no tracked head",
+            "Track with VHAP in the model's world, or export with `headbench export colmap --tracking`.",
+        )
+    declaration = Declaration.read(root)
+    keys = {name: _frame_key(root, name) for name in sorted(i.name for i in model.images.values())}
+    subjects = {
+        subject or key.subject or (declaration.subject if declaration else "") for key in keys.values()
+    }
+    if len(subjects) > 1:
+        raise InputError(root, "images", "one subject", ", ".join(sorted(subjects)))
+    subject = check_name(next(iter(subjects), "") or root.name, root, "subject")
+    keys = {name: key._replace(subject=subject) for name, key in keys.items()}
+    timesteps = {key.timestep: root / TRACKING_FOLDER / parameter_name(key.timestep) for key in keys.values()}
+    asset = find_head(root, declaration, head, masks=masks)
+    tracking = read_tracking(timesteps, asset, subject)
+    cameras, lenses = _rig(model, keys)
+    files = {key: _frame_files(root, name) for name, key in keys.items()}
+    splits = split_by_holding_out(root, files, held_out_sequences, held_out_cameras)
+    if not splits["train"]:
+        raise InputError(root, "splits", "training frames left", "none left")
+    used = {*timesteps.values(), *model.files}
+    used |= {file for frame in files.values() for file in (frame.image, frame.mask) if file is not None}
+    digests = content_digests(used, remembered_for=root if remembered else None, progress=progress)
+    contents = {Path(os.path.relpath(file, root)).as_posix(): value for file, value in digests.items()}
+    declared = declaration.background if declaration else (1.0, 1.0, 1.0)
+    ground = check_colour(declared if background is None else background)
+    source = digest(tracking.head.fingerprint(), contents, subject, ground)
+    record = {
+        "model": model.folder.relative_to(root).as_posix(),
+        "held_out_sequences": list(held_out_sequences),
+        "held_out_cameras": list(held_out_cameras),
+        **tracking.notes,
+    }
+    clip = CaptureClip(
+        subject=subject,
+        head=tracking.head,
+        shape=tracking.shape,
+        static_offset=tracking.static_offset,
+        cameras=cameras,
+        poses=tracking.poses,
+        splits=splits,
+        excluded={},
+        background=ground,
+        steps=(StepRecord("read_colmap", record, source),),
+        files=files,
+        source_fingerprint=source,
+        store=ImageStore(cache_mb),
+    )
+    clip = undistort_clip(clip, lenses)
+    if declaration and declaration.excluded:
+        clip = exclude_timesteps(clip, declaration.excluded, source=root / DECLARATION_FILE)
+    return exclude_given(clip, exclude)
+
+
+def _frame_key(root: Path, name: str) -> FrameKey:
+    """Key of an image by its name; no subject, and the folder as sequence, where the name has none."""
+    parts = Path(name).with_suffix("").parts
+    if len(parts) == 4 and parts[2].isdecimal():
+        return FrameKey(parts[0], parts[1], int(parts[2]), parts[3])
+    match = _VHAP_NAME.fullmatch(parts[-1])
+    if match and len(parts) == 1:
+        return FrameKey("", "capture", int(match["timestep"]), match["camera"])
+    expected = (
+        "<subject>/<sequence>/<timestep>/<camera> or <timestep>_<camera>, which tell timestep and camera"
+    )
+    raise InputError(root, f"image {name}", expected, name)
+
+
+def _frame_files(root: Path, name: str) -> FrameFiles:
+    image = root / "images" / name
+    probe_image(image)
+    # COLMAP's own convention: the image's whole name and one more suffix.
+    mask = root / "masks" / f"{name}.png"
+    return FrameFiles(image, mask if mask.exists() else None)
+
+
+def _rig(model: ColmapModel, keys: Mapping[str, FrameKey]) -> tuple[dict[str, Camera], dict[str, Lens]]:
+    """Camera and lens by camera id; a camera has to be the same in all its images."""
+    found = model_cameras(model, distortion="left to the images")
+    lens_of = model_lenses(model)
+    cameras: dict[str, Camera] = {}
+    lenses: dict[str, Lens] = {}
+    for name, key in keys.items():
+        camera = replace(found[name], id=key.camera)
+        first = cameras.setdefault(key.camera, camera)
+        lens = lenses.setdefault(key.camera, lens_of[name])
+        moved = float(np.abs(first.world_to_camera - camera.world_to_camera).max())
+        if moved > SAME_CAMERA or lens != lens_of[name]:
+            expected = f"camera {key.camera} as in its other images"
+            raise InputError(model.folder, f"image {name}", expected, f"one that differs by {moved:.3g}")
+    return cameras, lenses

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -18,9 +18,15 @@ import torch
 from ...bench.contracts import ByteArray, Camera, Clip, FloatArray, FrameKey, Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.io.files import atomic_path, grouped_writes
+from ..clip import CaptureClip
+from ..ga import layout
+from ..ga.documents import save_npz
+from ..ga.writer import identity_parameters, pose_to_parameters
+from ..head.arrays import save_head
 from ..head.model import HeadModel
 from ..mesh_pictures import rasterize_mesh
-from .records import pycolmap
+from .model import pycolmap
+from .reader import TRACKING_FOLDER
 
 ModelFormat = Literal["bin", "txt"]
 _DEPTH_TOLERANCE = (
@@ -106,6 +112,21 @@ def export_model(
     return Exported(
         model.num_cameras(), model.num_images(), model.num_points3D(), model.compute_num_observations()
     )
+
+
+def export_tracking(clip: CaptureClip, timesteps: Collection[int], out: Path) -> None:
+    """Write what the reader ``colmap`` needs beside the model: parameters by timestep, head model, conventions."""
+    identity = identity_parameters(clip.shape, clip.static_offset)
+    with grouped_writes():
+        for timestep in sorted(timesteps):
+            path = out / TRACKING_FOLDER / layout.parameter_name(timestep)
+            save_npz(path, pose_to_parameters(clip.poses[timestep]) | identity)
+    save_head(out / layout.HEAD_FILE, clip.head)
+    red, green, blue = clip.background.tolist()
+    excluded = {key.timestep: reason for key, reason in clip.excluded.items() if key.timestep in timesteps}
+    layout.Declaration(
+        clip.subject, clip.head.version, background=(red, green, blue), cy="top", excluded=excluded
+    ).write(out)
 
 
 def _pinhole(number: int, camera: Camera) -> pycolmap.Camera:

@@ -62,6 +62,11 @@ def frame_name(timestep: int, camera_index: int) -> str:
     return f"{timestep:05d}_{camera_index:02d}"
 
 
+def parameter_name(timestep: int) -> str:
+    """File of a timestep's tracked parameters: ``00012.npz``."""
+    return f"{timestep:05d}.npz"
+
+
 def sequence_folder_name(subject: str, sequence: str, cameras: int) -> str:
     """Name of a sequence's folder in VHAP's manner: ``074_EMO-1-shout+laugh_v16_whiteBg_staticOffset``."""
     return f"{subject}_{sequence}_v{cameras}_whiteBg_staticOffset"

@@ -23,8 +23,8 @@ from ..clip import CaptureClip, FrameFiles
 from ..foreign import describe
 from ..head.arrays import HeadArrays
 from ..images import ImageStore
-from ..steps.exclude import exclude_timesteps, read_reasons
-from ..steps.mattes import mask_below_neck, set_background
+from ..steps.exclude import exclude_given, exclude_timesteps
+from ..steps.mattes import check_colour, mask_below_neck, set_background
 from . import layout
 from .cameras import CaptureCameras, collect_cameras
 from .content_digests import content_digests
@@ -111,8 +111,11 @@ def read_capture(
     if held_out_sequences or held_out_cameras:
         splits = split_by_holding_out(folder, frames, held_out_sequences, held_out_cameras)
     used = _used_files(folder, everything)
+    images = {
+        FrameKey(subject, names[e.sequence_folder], e.timestep, e.camera_id): e.image for e in everything
+    }
     digests = content_digests(used, remembered_for=folder if remembered else None, progress=progress)
-    found = find_leaks(splits, {key: frame.image for key, frame in frames.items()}, progress=progress)
+    found = find_leaks(splits, images, progress=progress)
     record = {
         "cy": convention,
         "cy_from": basis,
@@ -145,9 +148,7 @@ def read_capture(
         clip = mask_below_neck(clip)
     if declaration and declaration.excluded:
         clip = exclude_timesteps(clip, declaration.excluded, source=folder / layout.DECLARATION_FILE)
-    if isinstance(exclude, (str, Path)):
-        return exclude_timesteps(clip, read_reasons(Path(exclude), clip), source=exclude)
-    return exclude_timesteps(clip, exclude) if exclude else clip
+    return exclude_given(clip, exclude)
 
 
 def find_captures(root: Path) -> list[Path]:
@@ -215,9 +216,7 @@ def _backgrounds(
     declared = declaration.background if declaration else WHITE
     if wanted is None:
         return declared, declared
-    colour = tuple(float(c) for c in wanted)
-    if len(colour) != 3 or not all(0 <= c <= 1 for c in colour):
-        raise InputError("read_capture", "background", "three numbers in [0, 1]", f"{colour}")
+    colour = tuple(check_colour(wanted).tolist())
     if colour == declared or all(info.has_alpha for info in infos.values()):
         return colour, colour
     bare = [entry.image for entry in entries if entry.mask is None and not infos[entry.image].has_alpha]

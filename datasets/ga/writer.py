@@ -176,10 +176,13 @@ class CaptureWriter:
 
     def _write_sequence(self, sequence: SequencePlan) -> None:
         folder = self.sequence_folder(sequence.name)
-        constant = self._constant_parameters()
+        constant = identity_parameters(self.plan.shape, self.plan.static_offset)
         with grouped_writes():
             for timestep, pose in enumerate(sequence.poses):
-                save_npz(folder / "flame_param" / f"{timestep:05d}.npz", pose_to_parameters(pose) | constant)
+                save_npz(
+                    folder / "flame_param" / layout.parameter_name(timestep),
+                    pose_to_parameters(pose) | constant,
+                )
         self._write_canonical(folder)
         boundary = math.ceil(TRAIN_FRACTION * len(sequence.poses))
         frames = list(self._frames(sequence, 0, ""))
@@ -235,17 +238,14 @@ class CaptureWriter:
         shared = layout.intrinsics_to_json(self.plan.cameras[-1], self.plan.cy)
         write_json(path, transforms_document(frames, shared))
 
-    def _constant_parameters(self) -> dict[str, FloatArray]:
-        return {
-            "shape": self.plan.shape.astype(np.float32),
-            "static_offset": self.plan.static_offset[None].astype(np.float32),
-        }
-
     def _write_canonical(self, folder: Path) -> None:
         pose = self.plan.sequences[0].poses[0]
         zeros = {key: np.zeros_like(value) for key, value in pose_to_parameters(pose).items()}
         zeros["jaw_pose"] = np.array([CANONICAL_JAW], dtype=np.float64)
-        save_npz(folder / layout.CANONICAL_FILE, zeros | self._constant_parameters())
+        save_npz(
+            folder / layout.CANONICAL_FILE,
+            zeros | identity_parameters(self.plan.shape, self.plan.static_offset),
+        )
 
     def _declaration(self, sequences: Sequence[SequencePlan], head_file: str) -> layout.Declaration:
         starts = np.cumsum([0, *(len(sequence.poses) for sequence in sequences)])
@@ -289,3 +289,8 @@ def pose_to_parameters(pose: HeadPose) -> dict[str, FloatArray]:
     if pose.eyelids is not None:
         parameters["eyelids"] = pose.eyelids
     return {key: np.asarray(value, dtype=np.float32)[None] for key, value in parameters.items()}
+
+
+def identity_parameters(shape: FloatArray, static_offset: FloatArray) -> dict[str, FloatArray]:
+    """Part of a ``flame_param`` file that is the same for all timesteps, float32."""
+    return {"shape": shape.astype(np.float32), "static_offset": static_offset[None].astype(np.float32)}

@@ -31,7 +31,7 @@ MAX_EXTENT, MAX_AREA = 10.0, 100.0
 a tangle of triangles across the room, take the time and memory of thousands of heads wherever a mesh is drawn."""
 
 _ARRAYS = ("template", "faces", "shape_basis", "expression_basis", "pose_basis", "joint_regressor")
-_STORED = (*_ARRAYS, "skinning_weights", "parents")
+STORED = (*_ARRAYS, "skinning_weights", "parents")
 _MEMBERS = {
     "template": Member("f", ("V", 3), MAX_MAGNITUDE),
     "faces": Member("iu", ("F", 3)),
@@ -104,14 +104,14 @@ class HeadArrays:
 
     def fingerprint(self) -> str:
         """Hex digest of the content: version, all arrays, regions and landmarks."""
-        arrays = [np.asarray(getattr(self, name)) for name in _STORED]
+        arrays = [np.asarray(getattr(self, name)) for name in STORED]
         if self.eyelid_basis is not None:
             arrays.append(self.eyelid_basis)
         regions = [part for name in sorted(self.regions) for part in (name, self.regions[name])]
         return digest(self.version, *arrays, *regions, dict(sorted(self.landmarks.items())))
 
     def _validate_arrays(self, file: str | PathLike[str]) -> None:
-        arrays = {name: np.asarray(getattr(self, name)) for name in _STORED}
+        arrays = {name: np.asarray(getattr(self, name)) for name in STORED}
         if self.eyelid_basis is not None:
             arrays["eyelid_basis"] = self.eyelid_basis
         sizes = {"J": len(JOINT_NAMES), "9 (J - 1)": 9 * (len(JOINT_NAMES) - 1)}
@@ -194,7 +194,7 @@ def _check_indices(file: str | PathLike[str], key: str, indices: IntArray, count
 
 
 _FILE = {
-    **dict.fromkeys(_STORED, Member("biufU")),
+    **dict.fromkeys(STORED, Member("biufU")),
     "version": TEXT,
     "landmark_names": Member("U", ("L",)),
     "landmark_vertices": Member("iu", ("L",)),
@@ -209,7 +209,7 @@ def save_head(path: Path, arrays: HeadArrays) -> None:
     uncompressed, since what a compressor makes of them depends on its version.
     """
     content: dict[str, np.ndarray] = {"format": np.array(FORMAT), "version": np.array(arrays.version)}
-    content |= {name: np.asarray(getattr(arrays, name)) for name in _STORED}
+    content |= {name: np.asarray(getattr(arrays, name)) for name in STORED}
     if arrays.eyelid_basis is not None:
         content["eyelid_basis"] = arrays.eyelid_basis
     content |= {f"region/{name}": members for name, members in arrays.regions.items()}
@@ -237,7 +237,7 @@ def read_head(path: Path) -> HeadArrays:
     names, vertices = content["landmark_names"], content["landmark_vertices"]
     return HeadArrays(
         version=str(content["version"]),
-        **{name: content[name] for name in _STORED},
+        **{name: content[name] for name in STORED},
         eyelid_basis=content.get("eyelid_basis"),
         regions=regions,
         landmarks={str(name): int(vertex) for name, vertex in zip(names, vertices)},

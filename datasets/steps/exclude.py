@@ -47,6 +47,13 @@ def exclude_timesteps(
     return clip.derive("exclude_timesteps", parameters, splits=splits, excluded=excluded)
 
 
+def exclude_given(clip: CaptureClip, exclude: Mapping[int, str] | str | Path | None) -> CaptureClip:
+    """Leave out what a reader's setting ``exclude`` names: reason by timestep, or a file for `read_reasons`."""
+    if isinstance(exclude, (str, Path)):
+        return exclude_timesteps(clip, read_reasons(Path(exclude), clip), source=exclude)
+    return exclude_timesteps(clip, exclude) if exclude else clip
+
+
 def read_labels(path: Path) -> dict[int, str]:
     """Read frame labels: a JSON object {"<timestep>": "<reason>"}; `InputError` where it is none."""
     labels = {}

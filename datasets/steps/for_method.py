@@ -1,6 +1,6 @@
 """A clip in the form that a method needs: the steps that lead there, in order, and the way back.
 
-Found by the harness through `DatasetSpec.adapt`, see `headbench.bench.runner.adaptation`.
+Found by the harness as the entry point of `headbench.adaptation`, see `headbench.bench.runner.adaptation`.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ...bench.contracts import FloatArray, FrameKey, Progress
+from ...bench.contracts import Clip, FloatArray, FrameKey, Progress
 from ...bench.errors import InputError
 from ...bench.runner.adaptation import Adaptation, AdaptedClip, MethodNeeds
-from ..clip import CaptureClip
+from ..clip import CaptureClip, as_capture
 from ..ga.head import find_head
 from ..head.arrays import HeadArrays
 from ..head.procedural.model import VERSIONS, procedural_head
@@ -23,7 +23,7 @@ from .monocular import as_single_video
 from .resolution import align_clip, alignments
 
 
-def clip_for_method(clip: CaptureClip, needs: MethodNeeds, heads: Mapping[str, str]) -> Adaptation:
+def clip_for_method(source: Clip, needs: MethodNeeds, heads: Mapping[str, str]) -> Adaptation:
     """Check that a clip can be brought into the form needed, and return what does it.
 
     The order is: tracking refitted to a head model the method accepts, images aligned to its size, views joined
@@ -39,6 +39,7 @@ def clip_for_method(clip: CaptureClip, needs: MethodNeeds, heads: Mapping[str, s
         Where the method accepts none of the head models at hand, a file holds another version than it is said to,
         or images are too small for the resolution rule.
     """
+    clip = as_capture(source)
     target = None
     if needs.head_models and clip.head.version not in needs.head_models:
         target = _target(clip, needs.head_models, heads)

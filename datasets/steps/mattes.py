@@ -77,12 +77,13 @@ def foreground_colours(image: FloatArray, coverage: FloatArray, background: Grou
 
 def set_background(clip: CaptureClip, background: Sequence[float]) -> CaptureClip:
     """The clip on another background. Raises `InputError` where a frame has no mask."""
-    colour = _colour(background)
+    colour = check_colour(background)
     if np.array_equal(colour, clip.background):
         return clip
     _check_masks(clip, "set_background")
     parameters = {"background": colour.tolist(), "was": np.asarray(clip.background).tolist()}
-    if not clip.pixel_steps and all(files.mask == files.image for files in clip.files.values()):
+    straight = all(files.image is not None and files.mask == files.image for files in clip.files.values())
+    if straight and not clip.pixel_steps:
         # Straight colours on file: composited on the new background at once, without rounding in between.
         return clip.derive("set_background", parameters, background=colour)
     old = np.asarray(clip.background, dtype=np.float32)
@@ -118,7 +119,7 @@ def clean_edges(clip: CaptureClip, recorded_on: Sequence[float] | Mapping[str, F
         by_recorded: dict[str, Ground] = {clip.recorded(key).camera: sets[key.camera] for key in clip.files}
         said: object = {name: digest(image) for name, image in sorted(sets.items())}
     else:
-        colour = _colour(recorded_on).astype(np.float32)
+        colour = check_colour(recorded_on).astype(np.float32)
         by_recorded = {clip.recorded(key).camera: colour for key in clip.files}
         said = colour.tolist()
     ground = np.asarray(clip.background, dtype=np.float32)
@@ -248,10 +249,11 @@ def _posed(clip: CaptureClip, vertices: IntArray) -> dict[int, FloatArray]:
     return places
 
 
-def _colour(values: Sequence[float]) -> FloatArray:
+def check_colour(values: Sequence[float] | FloatArray) -> FloatArray:
+    """A colour as (3,) float64; raises `InputError` unless it is three numbers in [0, 1]."""
     colour = np.asarray(values, dtype=np.float64)
     if colour.shape != (3,) or not ((colour >= 0) & (colour <= 1)).all():
-        raise InputError("matte", "background", "three numbers in [0, 1]", str(values))
+        raise InputError("colour", "background", "three numbers in [0, 1]", str(values))
     return colour
 
 
@@ -264,7 +266,7 @@ def _set_image(camera: Camera, images: Mapping[str, FloatArray]) -> FloatArray:
 
 
 def _check_masks(clip: CaptureClip, step: str) -> None:
-    bare = [key for key, files in clip.files.items() if files.mask is None]
+    bare = [key for key in clip.files if not clip.has_mask(key)]
     if bare:
         found = f"{len(bare)} without, such as {bare[0]}"
         raise InputError(

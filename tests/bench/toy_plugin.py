@@ -103,9 +103,6 @@ def renumbered(key):
     return key._replace(timestep=100 + key.timestep)
 
 
-ADAPTING_READER = replace(READER, adapt="toy_plugin:adapt")
-
-
 @dataclass(frozen=True)
 class ToyConfig:
     level: float = 0.5

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from pathlib import Path
 
 import pytest
 
@@ -21,3 +22,13 @@ def capture(pristine_capture, tmp_path) -> TinyCapture:
     root = tmp_path / "capture"
     shutil.copytree(pristine_capture.writer.root, root)
     return pristine_capture.moved(root)
+
+
+@pytest.fixture
+def plain_folder(pristine_capture, tmp_path, monkeypatch):
+    """A folder with a capture in the layout of `plain_reader`, which is importable by its name."""
+    monkeypatch.syspath_prepend(Path(__file__).parent)
+    folder = tmp_path / "plain"
+    folder.mkdir()
+    (folder / "capture.plain").write_text(str(pristine_capture.union))
+    return folder

@@ -14,7 +14,8 @@ from headbench.bench import cli
 from headbench.bench.io.documents import read_yaml
 from headbench.bench.registry import get
 from headbench.bench.runner.config import resolve_method
-from headbench.datasets.colmap.reader import model_cameras, read_model
+from headbench.datasets.colmap.model import read_model
+from headbench.datasets.colmap.reader import model_cameras
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.loaders import load_head
 from headbench.datasets.steps.exclusion_file import read_exclusions

@@ -39,7 +39,8 @@ def run(settings: RefitCommandSettings, progress: Progress = no_progress) -> Fin
             "command line", "--target", f"another head model than {clip.head.version}", target.version
         )
     capture_plan(clip, settings.capture)  # What cannot be written again is found before the fit.
-    if any(Path(out).resolve() in path.image.resolve().parents for path in clip.files.values()):
+    images = [files.image for files in clip.files.values() if files.image is not None]
+    if any(out.resolve() in image.resolve().parents for image in images):
         raise InputError("command line", "--out", "a folder apart from the capture", str(out))
     refitted = refit(clip, target, settings.settings, folder=out / BLOCKS_FOLDER, progress=progress)
     write_png(out / "heat_map.png", draw_heat_map(refitted))

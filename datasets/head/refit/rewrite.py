@@ -1,10 +1,11 @@
-"""Write a clip with other tracking as a capture of its own; images are linked, never encoded again."""
+"""Write a clip with other tracking as a capture of its own; PNG files that no step changes are linked."""
 
 from __future__ import annotations
 
 import os
 import shutil
 from pathlib import Path
+from typing import TypeGuard
 
 from ....bench.contracts import FrameKey, Progress, no_progress
 from ....bench.errors import InputError
@@ -12,8 +13,6 @@ from ....bench.io.files import atomic_path, grouped_writes
 from ...clip import CaptureClip
 from ...ga.full_grid import require_full_grid
 from ...ga.writer import CapturePlan, CaptureWriter, SequencePlan
-
-_SUFFIX = ".png"
 
 
 def write_capture(clip: CaptureClip, out: Path, progress: Progress = no_progress) -> Path:
@@ -24,16 +23,23 @@ def write_capture(clip: CaptureClip, out: Path, progress: Progress = no_progress
     Raises
     ------
     InputError
-        Where the layout cannot hold the clip: images that are no PNG or are changed by pixel steps, a camera
-        without a frame at some timestep, splits other than by held-out sequences and cameras, exclusions
-        other than of whole timesteps.
+        Where the layout cannot hold the clip: a camera without a frame at some timestep, splits other than by
+        held-out sequences and cameras, exclusions other than of whole timesteps.
     """
     plan, first = capture_plan(clip)
     writer = CaptureWriter(out, plan)
     with grouped_writes():
         for done, (key, files) in enumerate(sorted(clip.files.items())):
-            progress(done, len(clip.files), "linking images")
+            progress(done, len(clip.files), "writing images")
             place = (key.sequence, key.timestep - first[key.sequence], key.camera)
+            if (
+                clip.pixel_steps
+                or not _is_png(files.image)
+                or not (files.mask is None or _is_png(files.mask))
+            ):
+                sequence, timestep, camera = place
+                writer.write_frame(sequence, timestep, camera, clip.image(key), clip.mask(key))
+                continue
             if files.mask is not None:
                 link_or_copy(files.mask, writer.mask_path(*place))
             link_or_copy(files.image, writer.image_path(*place))
@@ -46,7 +52,6 @@ def capture_plan(clip: CaptureClip, source: str | Path = "") -> tuple[CapturePla
     Raises `InputError` as `write_capture` does, naming ``source``, the capture the clip was read from.
     """
     where = str(source) or f"clip of {clip.subject}"
-    _check_files(clip, where)
     require_full_grid(clip, where)
     _check_excluded(clip, where)
     timesteps: dict[str, list[int]] = {}
@@ -111,13 +116,8 @@ def _split(key: FrameKey, test: set[str], novel: set[str]) -> str:
     return "novel_view" if key.camera in novel else "train"
 
 
-def _check_files(clip: CaptureClip, where: str) -> None:
-    if clip.pixel_steps:
-        raise InputError(where, "pixel_steps", "images as they are on disk", "steps that change pixels")
-    for key, files in clip.files.items():
-        for path in (files.image, files.mask):
-            if path is not None and path.suffix.lower() != _SUFFIX:
-                raise InputError(path, "", "a PNG file, to be linked as it is", f"{path.suffix} of {key}")
+def _is_png(path: Path | None) -> TypeGuard[Path]:
+    return path is not None and path.suffix.lower() == ".png"
 
 
 def _check_excluded(clip: CaptureClip, where: str) -> None:

@@ -11,6 +11,7 @@ from headbench.bench.errors import InputError
 from headbench.bench.io.documents import read_json
 from headbench.bench.io.files import digest, write_text
 from headbench.bench.io.frames import read_png
+from headbench.bench.runner import adaptation
 from headbench.bench.runner import run as runner
 from headbench.bench.runner.adaptation import MethodNeeds, plan
 from headbench.bench.runner.avatars import trained
@@ -27,13 +28,14 @@ TWICE = ResolutionRule(size=(16, 12), speed_size=(32, 24))
 def config(toy, tmp_path, monkeypatch):
     (tmp_path / "data" / "subject1").mkdir(parents=True)
     monkeypatch.setattr(runner, "write_reports", lambda folder: [])
+    monkeypatch.setattr(adaptation, "adapter", lambda: toy.adapt)
     return RunConfig(
         data=str(tmp_path / "data"),
         out=str(tmp_path / "out"),
         methods=("toy_plugin:MIRROR",),
         preset="smoke",
         metrics=("toy_plugin:ERROR", "toy_plugin:FILES"),
-        reader="toy_plugin:ADAPTING_READER",
+        reader="toy_plugin:READER",
     )
 
 
@@ -43,7 +45,7 @@ def declare(monkeypatch, toy, name="MIRROR", **needs):
 
 def test_a_method_without_needs_gets_the_clip_itself(config, toy):
     clip = toy.ToyClip("subject1")
-    assert plan(clip, MethodNeeds(), toy.ADAPTING_READER, {}) is None
+    assert plan(clip, MethodNeeds(), {}) is None
     runner.run(config)
     assert toy.ADAPTED == []
     record = read_json(RunFolder(runner.Path(config.out)).manifest)
@@ -144,10 +146,10 @@ def test_a_need_that_cannot_be_met_is_refused_before_any_adaptation(config, toy,
     assert toy.ADAPTED == []
 
 
-def test_a_reader_without_steps_refuses_another_size(config, toy, monkeypatch):
-    declare(monkeypatch, toy, resolution=TWICE)
-    with pytest.raises(InputError, match="resolution"):
-        runner.run(dataclasses.replace(config, reader="toy_plugin:READER"))
+def test_a_clip_without_a_head_model_cannot_be_adapted(config, toy, monkeypatch):
+    monkeypatch.undo()
+    with pytest.raises(InputError, match="a head model in FLAME's layout"):
+        plan(toy.ToyClip("subject1"), MethodNeeds(resolution=TWICE), {})
 
 
 def test_an_adaptation_that_does_not_deliver_is_refused(config, toy, monkeypatch):

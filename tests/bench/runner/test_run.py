@@ -13,6 +13,7 @@ from headbench.bench.errors import HeadbenchError, InputError
 from headbench.bench.io.documents import read_json
 from headbench.bench.io.lock import locked
 from headbench.bench.registry import Plugin
+from headbench.bench.runner import adaptation
 from headbench.bench.runner import run as runner
 from headbench.bench.runner.config import RunConfig
 from headbench.bench.runner.store import RunFolder
@@ -130,7 +131,7 @@ def test_an_adapter_is_given_the_whole_capture(config, toy, monkeypatch):
     [
         ({"head_models": ("flame2020", "flame2023")}, False),
         ({"head_models": ("toy",)}, True),
-        ({"monocular": True}, True),
+        ({"monocular": True}, False),  # the toy's head is none whose motion could go into the cameras
         ({"implementation": "toy_plugin:NoSuchClass"}, False),
     ],
 )
@@ -146,7 +147,7 @@ def test_what_a_method_needs_is_looked_for_before_training(config, toy, monkeypa
     assert toy.FITS == []
 
 
-def test_a_monocular_method_refuses_several_views(config, toy, monkeypatch):
+def test_several_views_after_adaptation_to_a_monocular_method_are_refused(config, toy, monkeypatch):
     class TwoViews(toy.ToyClip):
         def __init__(self, path):
             super().__init__(path)
@@ -154,6 +155,8 @@ def test_a_monocular_method_refuses_several_views(config, toy, monkeypatch):
 
     monkeypatch.setattr(toy, "read", lambda path: TwoViews(path))
     monkeypatch.setattr(toy, "METHOD", dataclasses.replace(toy.METHOD, monocular=True))
+    unchanged = lambda clip, needs, heads: lambda folder, progress: adaptation.AdaptedClip(clip)
+    monkeypatch.setattr(adaptation, "adapter", lambda: unchanged)
     with pytest.raises(InputError, match="3 further views"):
         runner.run(config)
     assert toy.FITS == []

@@ -16,14 +16,17 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from headbench.bench.conformance.readers import check_clip
 from headbench.bench.contracts import no_progress
 from headbench.bench.errors import InputError
 from headbench.datasets.colmap.command import run
-from headbench.datasets.colmap.reader import model_cameras, model_lenses, read_model
+from headbench.datasets.colmap.model import read_model
+from headbench.datasets.colmap.reader import model_cameras, model_lenses
 from headbench.datasets.colmap.settings import ExportColmapSettings
-from headbench.datasets.colmap.writer import export_model, image_name
+from headbench.datasets.colmap.writer import export_model, export_tracking, image_name
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.model import HeadModel
+from headbench.datasets.open import open_clip
 
 FILES = ("cameras", "images")
 
@@ -317,7 +320,78 @@ def test_command_writes_the_first_training_timestep(capture, tmp_path):
         )
 
 
-@pytest.mark.parametrize("module", ["records", "writer", "reader"])
+@pytest.fixture
+def dataset(clip, tmp_path):
+    """A COLMAP dataset of all frames, with tracking."""
+    export_model(clip, list(clip.files), tmp_path / "dataset")
+    export_tracking(clip, set(clip.poses), tmp_path / "dataset")
+    return tmp_path / "dataset"
+
+
+def test_an_exported_dataset_with_tracking_is_read_back(clip, dataset):
+    found = open_clip(dataset, held_out_cameras=[next(iter(clip.splits["novel_view"])).camera])
+    assert found.subject == clip.subject
+    assert set(found.files) == set(clip.files)
+    assert found.excluded == clip.excluded
+    assert check_clip(found) == []
+    assert found.head.fingerprint() == clip.head.fingerprint()
+    for timestep, pose in clip.poses.items():
+        np.testing.assert_allclose(found.poses[timestep].expression, pose.expression, atol=1e-6)
+    for key in clip.files:
+        np.testing.assert_array_equal(found.image(key), clip.image(key))
+        np.testing.assert_array_equal(found.mask(key), clip.mask(key))
+        np.testing.assert_allclose(found.cameras[key.camera].K, clip.cameras[key.camera].K)
+
+
+def renamed(dataset, name):
+    """Give every image another name, in the model and on disk."""
+    model = theirs(dataset)
+    for image in model.images.values():
+        new = name(image.name)
+        for folder, suffix in (("images", ""), ("masks", ".png")):
+            path = dataset / folder / f"{new}{suffix}"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            (dataset / folder / f"{image.name}{suffix}").rename(path)
+        image.name = new
+    model.write_binary(dataset / "sparse" / "0")
+
+
+def test_images_named_as_vhap_does_are_read(clip, dataset):
+    renamed(dataset, lambda name: "{2}_{3}".format(*name.split("/")))
+    found = open_clip(dataset)
+    assert {(key.timestep, key.camera) for key in found.files} == {
+        (key.timestep, key.camera) for key in clip.files
+    }
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda d: shutil.rmtree(d / "flame_param"), "no tracked head.*export colmap --tracking"),
+        (lambda d: (d / "flame_param" / "00001.npz").unlink(), "00001.npz"),
+        (lambda d: (d / "head_model.npz").unlink(), "head model the capture was tracked with"),
+        (lambda d: renamed(d, lambda name: name.replace("/", "-")), "tell timestep and camera"),
+        (lambda d: shutil.rmtree(d / "images" / "901"), "no such file"),
+    ],
+)
+def test_what_a_dataset_lacks_is_named(dataset, damage, message):
+    damage(dataset)
+    with pytest.raises(InputError, match=message):
+        open_clip(dataset)
+
+
+def test_a_camera_that_moves_is_refused(dataset):
+    model = theirs(dataset)
+    frame = max(model.frames.values(), key=lambda frame: frame.frame_id)
+    moved = frame.rig_from_world
+    moved.translation = moved.translation + 0.01
+    frame.rig_from_world = moved
+    model.write_binary(dataset / "sparse" / "0")
+    with pytest.raises(InputError, match="as in its other images"):
+        open_clip(dataset)
+
+
+@pytest.mark.parametrize("module", ["model", "writer", "reader"])
 def test_sigterm_keeps_its_handler_with_pycolmap(module):
     code = (
         "import os, signal, sys\n"

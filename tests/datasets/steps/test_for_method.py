@@ -13,7 +13,6 @@ from headbench.bench.specs import ResolutionRule
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import save_head
 from headbench.datasets.head.refit.refit import BlockFitter
-from headbench.datasets.specs import GA_LAYOUT
 from headbench.datasets.steps import for_method
 from headbench.datasets.steps.for_method import clip_for_method
 
@@ -58,11 +57,10 @@ def adapted(clip, folder, heads=None, **needs):
     return clip_for_method(clip, MethodNeeds(**needs), heads or {})(folder, no_progress)
 
 
-def test_the_reader_names_it_and_a_method_without_needs_never_comes_here(clip):
-    assert GA_LAYOUT.adapt
-    assert plan(clip, MethodNeeds(), GA_LAYOUT, {}) is None
-    assert plan(clip, MethodNeeds(head_models=(clip.head.version,)), GA_LAYOUT, {}) is None
-    assert plan(clip, MethodNeeds(monocular=True), GA_LAYOUT, {}) is not None
+def test_a_method_without_needs_gets_no_adaptation(clip):
+    assert plan(clip, MethodNeeds(), {}) is None
+    assert plan(clip, MethodNeeds(head_models=(clip.head.version,)), {}) is None
+    assert plan(clip, MethodNeeds(monocular=True), {}) is not None
 
 
 def test_needs_that_change_nothing_give_the_clip_itself(clip, tmp_path):

@@ -17,8 +17,9 @@ from headbench.datasets.head.arrays import save_head
 from headbench.datasets.head.refit import refit as block
 from headbench.datasets.head.refit.command import run, target_head
 from headbench.datasets.head.refit.heat_map import colour_scale
-from headbench.datasets.head.refit.rewrite import capture_plan, link_or_copy
+from headbench.datasets.head.refit.rewrite import capture_plan, link_or_copy, write_capture
 from headbench.datasets.head.refit.settings import RefitCommandSettings
+from headbench.datasets.steps.mattes import set_background
 
 from ...tiny_capture import make_plan, write_tiny_capture
 
@@ -145,13 +146,13 @@ def test_splits_the_layout_cannot_hold_are_refused(finished):
         capture_plan(replace(clip, splits=swapped))
 
 
-def test_images_that_are_no_png_are_refused(finished):
+def test_images_that_a_step_changed_are_written_as_they_are_now(finished, tmp_path):
     _, settings, _ = finished
-    clip = read_capture(settings.capture)
-    key = next(iter(clip.files))
-    files = {**clip.files, key: clip.files[key]._replace(image=clip.files[key].image.with_suffix(".jpg"))}
-    with pytest.raises(InputError, match="PNG"):
-        capture_plan(replace(clip, files=files))
+    clip = set_background(read_capture(settings.capture), (0.0, 0.0, 0.0))
+    written = read_capture(write_capture(clip, tmp_path))
+    assert not written.pixel_steps
+    for key in sorted(clip.files):
+        np.testing.assert_array_equal(written.image(key), clip.image(key))
 
 
 def test_files_are_copied_where_they_cannot_be_linked(tmp_path, monkeypatch):

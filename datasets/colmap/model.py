@@ -1,0 +1,312 @@
+"""Read cameras and images of a COLMAP sparse model, binary or text.
+
+The files come from outside, and pycolmap's own reader trusts them: cut short, they make it return wrong numbers,
+run out of memory or not return at all. Every count and length is held against the bytes there before it is used.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import struct
+import threading
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cache, partial
+from os import PathLike
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+import pycolmap as pycolmap  # noqa: PLC0414 - the writer imports it from here
+
+from ...bench.errors import InputError
+from ...bench.io.files import check_name
+
+# Its import replaces the handler of SIGTERM by one that prints a stack, behind the interpreter's back.
+if threading.current_thread() is threading.main_thread():
+    signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)
+
+_MAX_PIXELS = 1 << 20  # along one side: far beyond any sensor
+_UNIT_TOLERANCE = 1e-3  # of a quaternion's length; COLMAP itself normalises what it reads
+
+
+@dataclass(frozen=True)
+class ColmapCamera:
+    """Intrinsics. ``params`` are in the order of COLMAP's camera model ``model``, pixels."""
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class ColmapImage:
+    """A registered image: its pose maps world points to camera points, quaternion with the real part first."""
+
+    name: str
+    camera: int
+    quaternion: tuple[float, ...]
+    translation: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class ColmapModel:
+    """Cameras and images of a model by COLMAP's numbers. The unit of length is the model's own."""
+
+    files: tuple[Path, Path]  # of the cameras and of the images
+    cameras: Mapping[int, ColmapCamera]
+    images: Mapping[int, ColmapImage]
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the files."""
+        return self.files[0].parent
+
+
+@cache
+def camera_models() -> dict[int, tuple[str, int]]:
+    """Name and number of parameters of the camera models pycolmap knows, by COLMAP's number."""
+    models = {}
+    for name, number in pycolmap.CameraModelId.__members__.items():
+        if name != "INVALID":
+            camera = pycolmap.Camera.create_from_model_name(1, name, 1.0, 1, 1)
+            models[int(number)] = (name, len(camera.params))
+    return models
+
+
+def checked_camera(file: Path, number: int, camera: ColmapCamera) -> ColmapCamera:
+    """Return the camera, or raise `InputError` where its size or a parameter makes no sense."""
+    key = f"camera {number}"
+    if not (0 < camera.width <= _MAX_PIXELS and 0 < camera.height <= _MAX_PIXELS):
+        raise InputError(file, key, "an image size in pixels", f"{camera.width}x{camera.height}")
+    if not np.isfinite(camera.params).all():
+        raise InputError(file, key, "finite parameters", str(camera.params))
+    return camera
+
+
+def checked_image(file: Path, number: int, image: ColmapImage) -> ColmapImage:
+    """Return the image, or raise `InputError` for an unfit name or a pose that is no rigid motion."""
+    key = f"image {number}"
+    for part in image.name.split("/"):
+        check_name(part, file, f"{key}, name")
+    if not np.isfinite([*image.quaternion, *image.translation]).all():
+        raise InputError(file, key, "a finite pose", f"{image.quaternion}, {image.translation}")
+    length = math.hypot(*image.quaternion)
+    if abs(length - 1) > _UNIT_TOLERANCE:
+        raise InputError(file, key, "a unit quaternion", f"one of length {length:.4g}")
+    return image
+
+
+_LONGEST_NAME = 1024
+_POINT = struct.calcsize("<ddQ")  # x, y and the number of a point of the model
+
+
+class _Reader:
+    """Takes numbers off a file; `InputError` where it ends too early."""
+
+    def __init__(self, file: Path, stream: BinaryIO) -> None:
+        self.file, self._stream = file, stream
+        self._size = os.fstat(stream.fileno()).st_size
+
+    @property
+    def left(self) -> int:
+        """Bytes that remain."""
+        return self._size - self._stream.tell()
+
+    def take(self, layout: str, key: str) -> tuple[Any, ...]:
+        """Read numbers in a little-endian `struct` layout."""
+        size = struct.calcsize("<" + layout)
+        self._need(size, key)
+        return struct.unpack("<" + layout, self._stream.read(size))
+
+    def count(self, least: int, key: str) -> int:
+        """Read how many entries follow, each of at least ``least`` bytes."""
+        (number,) = self.take("Q", key)
+        self._need(number * least, f"{number} of {key}")
+        return int(number)
+
+    def name(self, key: str) -> str:
+        """Read a text that ends with a zero byte."""
+        start = self._stream.tell()
+        text, end, _ = self._stream.read(_LONGEST_NAME + 1).partition(b"\0")
+        if not end:
+            raise InputError(self.file, key, f"a name of at most {_LONGEST_NAME} bytes", "no end of it")
+        self._stream.seek(start + len(text) + 1)
+        try:
+            return text.decode("utf-8")
+        except UnicodeDecodeError as error:
+            raise InputError(self.file, key, "a name in UTF-8", repr(text[:60])) from error
+
+    def skip(self, size: int, key: str) -> None:
+        """Pass over bytes."""
+        self._need(size, key)
+        self._stream.seek(size, os.SEEK_CUR)
+
+    def _need(self, size: int, key: str) -> None:
+        if size > self.left:
+            expected = f"{size} more bytes at byte {self._stream.tell()}"
+            raise InputError(
+                self.file, key, expected, f"{self.left}", "The file was cut short or is damaged."
+            )
+
+    def finish(self) -> None:
+        """Check that nothing is left over."""
+        if self.left:
+            raise InputError(
+                self.file, "", "the end of the file after the last entry", f"{self.left} more bytes"
+            )
+
+
+def read_cameras_binary(file: Path) -> dict[int, ColmapCamera]:
+    """Cameras by number; `InputError` for whatever is wrong with the file."""
+    models = camera_models()
+    cameras: dict[int, ColmapCamera] = {}
+    with file.open("rb") as stream:
+        reader = _Reader(file, stream)
+        for _ in range(reader.count(struct.calcsize("<IiQQ"), "cameras")):
+            number, model, width, height = reader.take("IiQQ", "camera")
+            key = f"camera {number}"
+            if model not in models:
+                raise InputError(file, key, "a camera model pycolmap knows", f"number {model}")
+            name, length = models[model]
+            params = reader.take(f"{length}d", key)
+            if number in cameras:
+                raise InputError(file, key, "each camera once", "a second one")
+            cameras[number] = checked_camera(file, number, ColmapCamera(name, width, height, params))
+        reader.finish()
+    return cameras
+
+
+def read_images_binary(file: Path) -> dict[int, ColmapImage]:
+    """Images by number; `InputError` for whatever is wrong with the file."""
+    images: dict[int, ColmapImage] = {}
+    with file.open("rb") as stream:
+        reader = _Reader(file, stream)
+        for _ in range(reader.count(struct.calcsize("<I7dIQ") + 1, "images")):
+            number, *pose, camera = reader.take("I7dI", "image")
+            key = f"image {number}"
+            name = reader.name(key)
+            points = reader.count(_POINT, f"{key}, points")
+            reader.skip(points * _POINT, key)
+            if number in images:
+                raise InputError(file, key, "each image once", "a second one")
+            image = ColmapImage(name, camera, tuple(pose[:4]), tuple(pose[4:]))
+            images[number] = checked_image(file, number, image)
+        reader.finish()
+    return images
+
+
+_LONGEST_LINE = 2**23  # 300,000 points of an image; words take ten times the memory of their line
+_IMAGE_WORDS = 10  # number, quaternion, translation, camera, name
+
+
+def read_cameras_text(file: Path) -> dict[int, ColmapCamera]:
+    """Cameras by number; `InputError` for whatever is wrong with the file."""
+    lengths = dict(camera_models().values())
+    cameras: dict[int, ColmapCamera] = {}
+    for line, words in _lines(file):
+        if not words:
+            continue
+        key = f"line {line}"
+        if len(words) < 4 or words[1] not in lengths:
+            raise InputError(
+                file, key, "a number, a camera model pycolmap knows and a size", " ".join(words)[:80]
+            )
+        if len(words) != 4 + lengths[words[1]]:
+            expected = f"{lengths[words[1]]} parameters of {words[1]}"
+            raise InputError(file, key, expected, f"{len(words) - 4}")
+        number, width, height = _whole(file, key, [words[0], words[2], words[3]])
+        if number in cameras:
+            raise InputError(file, key, "each camera once", f"camera {number} again")
+        camera = ColmapCamera(words[1], width, height, _real(file, key, words[4:]))
+        cameras[number] = checked_camera(file, number, camera)
+    return cameras
+
+
+def read_images_text(file: Path) -> dict[int, ColmapImage]:
+    """Images by number; `InputError` for whatever is wrong with the file."""
+    images: dict[int, ColmapImage] = {}
+    lines = _lines(file)
+    for line, words in lines:
+        if not words:
+            continue
+        key = f"line {line}"
+        if len(words) != _IMAGE_WORDS:
+            raise InputError(file, key, f"{_IMAGE_WORDS} words of an image", f"{len(words)}")
+        number, camera = _whole(file, key, [words[0], words[8]])
+        if number in images:
+            raise InputError(file, key, "each image once", f"image {number} again")
+        pose = _real(file, key, words[1:8])
+        image = ColmapImage(words[9], camera, pose[:4], pose[4:])
+        images[number] = checked_image(file, number, image)
+        _, points = next(lines, (0, ["missing"]))
+        if len(points) % 3:
+            raise InputError(
+                file, f"line {line + 1}", "the image's points, three numbers each", "another line"
+            )
+    return images
+
+
+def _lines(file: Path) -> Iterator[tuple[int, list[str]]]:
+    """Number and words of each line that is no comment. An empty line may be an image without points."""
+    try:
+        with file.open(encoding="utf-8") as stream:
+            for number, line in enumerate(iter(partial(stream.readline, _LONGEST_LINE + 1), ""), start=1):
+                if len(line) > _LONGEST_LINE:
+                    expected = f"at most {_LONGEST_LINE} characters in a line"
+                    raise InputError(file, f"line {number}", expected, "more")
+                if not line.startswith("#"):
+                    yield number, line.split()
+    except UnicodeDecodeError as error:
+        raise InputError(file, "", "text in UTF-8", str(error)) from error
+
+
+def _whole(file: Path, key: str, words: list[str]) -> list[int]:
+    if not all(word.isascii() and word.isdigit() and len(word) < 20 for word in words):
+        raise InputError(file, key, "whole numbers", ", ".join(words)[:80])
+    return [int(word) for word in words]
+
+
+def _real(file: Path, key: str, words: list[str]) -> tuple[float, ...]:
+    try:
+        return tuple(float(word) for word in words)
+    except ValueError as error:
+        raise InputError(file, key, "numbers", " ".join(words)[:80]) from error
+
+
+_PLACES = (".", "sparse/0", "sparse")
+
+
+def find_model(path: str | PathLike[str]) -> tuple[Path, Path] | None:
+    """The files of cameras and images of the model in a folder, or in its ``sparse/0`` or ``sparse``; bin before txt."""
+    for place in _PLACES:
+        for suffix in (".bin", ".txt"):
+            files = Path(path) / place / f"cameras{suffix}", Path(path) / place / f"images{suffix}"
+            if all(file.is_file() for file in files):
+                return files
+    return None
+
+
+def read_model(path: str | PathLike[str]) -> ColmapModel:
+    """Read cameras and images of the model that `find_model` finds.
+
+    Raises
+    ------
+    InputError
+        Where there is no model, a file is cut short or damaged, or an image's camera is missing.
+    """
+    files = find_model(path)
+    if files is None:
+        expected = "a COLMAP model: cameras.bin and images.bin, or cameras.txt and images.txt"
+        raise InputError(path, "", expected, "none in it, in sparse/0 or in sparse")
+    binary = files[0].suffix == ".bin"
+    cameras = (read_cameras_binary if binary else read_cameras_text)(files[0])
+    images = (read_images_binary if binary else read_images_text)(files[1])
+    for number, image in images.items():
+        if image.camera not in cameras:
+            expected = "one of the model's cameras"
+            raise InputError(files[1], f"image {number}, camera", expected, str(image.camera))
+    return ColmapModel(files, cameras, images)

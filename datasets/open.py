@@ -1,0 +1,91 @@
+"""Opens captures of any layout: the reader is found through the registry, by its name or by the folder's content."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Iterator, Mapping
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+from ..bench.contracts import Progress, no_progress
+from ..bench.errors import HeadbenchError, InputError
+from ..bench.registry import discover, get, resolve
+from ..bench.runner.captures import found_captures
+from ..bench.specs import DatasetSpec
+from .clip import CaptureClip, as_capture
+from .foreign import describe
+
+
+def find_reader(path: str | PathLike[str], name: str = "") -> DatasetSpec:
+    """The reader called ``name``, see `registry.get`; with no name, the one that finds captures under ``path``.
+
+    Raises
+    ------
+    InputError
+        Where no reader finds a capture, or several do.
+    """
+    if name:
+        spec: DatasetSpec = get("datasets", name)
+        return spec
+    root = Path(path)
+    readers = {n: p.spec for n, p in discover("datasets").items() if p.spec is not None and p.spec.reads}
+    expected = f"a capture that a reader knows ({', '.join(readers)})"
+    if not root.exists():
+        raise InputError(root, "", expected, "no such file or folder")
+    fitting = [spec for spec in readers.values() if _finds(spec, root)]
+    if not fitting:
+        raise InputError(root, "", expected, *describe(root))
+    if len(fitting) > 1:
+        names = ", ".join(spec.name for spec in fitting)
+        raise InputError(
+            root, "", "a capture that one reader knows", f"one for {names}", "Choose with --reader."
+        )
+    return fitting[0]
+
+
+def open_clips(
+    path: str | PathLike[str],
+    reader: str = "",
+    *,
+    wishes: Mapping[str, Any] | None = None,
+    progress: Progress = no_progress,
+    **settings: Any,
+) -> Iterator[CaptureClip]:
+    """Read every capture under a folder, one after the other.
+
+    Parameters
+    ----------
+    reader : see `find_reader`.
+    wishes : settings for readers that have them, such as ``leaks``; others do without.
+    settings : of the reader; those that are None are not given.
+
+    Raises
+    ------
+    InputError
+        As `find_reader` does, for a setting that the reader does not have, and whatever it finds wrong.
+    """
+    spec = find_reader(path, reader)
+    known = inspect.signature(resolve(spec.implementation)).parameters
+    given = {key: value for key, value in (wishes or {}).items() if key in known}
+    given |= {key: value for key, value in settings.items() if value is not None}
+    for _, read in found_captures(spec, Path(path), given):
+        yield as_capture(read(progress))
+
+
+def open_clip(path: str | PathLike[str], reader: str = "", **options: Any) -> CaptureClip:
+    """Read the one capture at ``path``; parameters and errors as of `open_clips`."""
+    spec = find_reader(path, reader)
+    found = resolve(spec.find)(Path(path)) if spec.find else [Path(path)]
+    if len(found) > 1:
+        names = ", ".join(Path(one).name for one in found)
+        raise InputError(path, "", "one capture", names, "Name one capture.")
+    return next(open_clips(path, reader, **options))
+
+
+def _finds(spec: DatasetSpec, root: Path) -> bool:
+    """Whether a reader finds captures; one that cannot be imported or that looks at nothing finds none."""
+    try:
+        return bool(spec.find and resolve(spec.find)(root))
+    except (HeadbenchError, InputError):
+        return False

@@ -1,0 +1,82 @@
+"""The reader of a capture is found by what the folder holds, or by name; its settings are checked."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from headbench.bench import registry
+from headbench.bench.contracts import no_progress
+from headbench.bench.errors import InputError
+from headbench.bench.runner.adaptation import MethodNeeds, adapter
+from headbench.bench.specs import ResolutionRule
+from headbench.datasets.clip import as_capture
+from headbench.datasets.ga.reader import read_capture
+from headbench.datasets.open import find_reader, open_clip
+from headbench.datasets.steps.mattes import set_background
+from headbench.datasets.steps.resolution import align_clip
+
+
+def test_a_capture_is_opened_by_the_reader_that_finds_it(pristine_capture):
+    assert find_reader(pristine_capture.union).name == "ga"
+    clip = open_clip(pristine_capture.union, wishes={"leaks": "record", "unheard of": 1}, head=None)
+    assert clip.fingerprint == read_capture(pristine_capture.union, leaks="record").fingerprint
+
+
+def test_settings_that_the_reader_lacks_are_refused(pristine_capture):
+    with pytest.raises(InputError, match="reader_settings, hed: expected .*head.*found"):
+        open_clip(pristine_capture.union, hed="x")
+
+
+@pytest.mark.parametrize(
+    ("fill", "found"),
+    [
+        (lambda folder: None, "an empty folder"),
+        (lambda folder: (folder / "a.mp4").touch(), "a folder of videos"),
+        (lambda folder: folder.rmdir(), "no such file or folder"),
+    ],
+)
+def test_what_is_no_capture_is_described(tmp_path, fill, found):
+    folder = tmp_path / "data"
+    folder.mkdir()
+    fill(folder)
+    with pytest.raises(InputError, match=rf"a reader knows .*colmap.*{found}"):
+        open_clip(folder)
+
+
+def test_of_several_fitting_readers_one_has_to_be_named(pristine_capture, monkeypatch):
+    known = registry.discover("datasets")
+    twin = replace(known["ga"], name="other", spec=replace(known["ga"].spec, name="other"))
+    monkeypatch.setattr("headbench.datasets.open.discover", lambda group: {**known, "other": twin})
+    with pytest.raises(InputError, match=r"one for ga, other. Choose with --reader"):
+        open_clip(pristine_capture.union)
+    assert open_clip(pristine_capture.union, "ga").poses
+
+
+def test_a_clip_of_another_reader_passes_through_steps(plain_folder, pristine_capture):
+    clip, same = open_clip(plain_folder, "plain_reader:SPEC"), read_capture(pristine_capture.union)
+    assert as_capture(clip) is clip
+    assert clip.source_fingerprint == f"plain-{same.fingerprint}"
+    changed, expected = (
+        align_clip(set_background(one, (0.0, 0.5, 1.0)), ResolutionRule(divide=2)) for one in (clip, same)
+    )
+    for key in sorted(same.files):
+        np.testing.assert_array_equal(clip.image(key), same.image(key))
+        np.testing.assert_array_equal(clip.mask(key), same.mask(key))
+        np.testing.assert_array_equal(changed.image(key), expected.image(key))
+        np.testing.assert_array_equal(changed.mask(key), expected.mask(key))
+    assert clip.region_names == same.region_names
+
+
+def test_a_clip_of_another_reader_is_adapted_to_methods(plain_folder, pristine_capture, tmp_path):
+    needs = MethodNeeds(monocular=True, resolution=ResolutionRule(divide=2))
+    adapted = [
+        adapter()(clip, needs, {})(tmp_path, no_progress)
+        for clip in (
+            open_clip(plain_folder, "plain_reader:SPEC").source,
+            read_capture(pristine_capture.union),
+        )
+    ]
+    key = read_capture(pristine_capture.union).splits["novel_view"][0]
+    images = [one.clip.image(one.key(key)) for one in adapted]
+    np.testing.assert_array_equal(*images)
