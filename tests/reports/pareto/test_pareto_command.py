@@ -1,6 +1,7 @@
 """``headbench pareto`` on run folders with known rows."""
 
 import csv
+import itertools
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -8,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.figure import Figure
+from matplotlib.transforms import Bbox
 from PIL import Image
 
 from headbench.bench.errors import InputError
@@ -16,7 +19,7 @@ from headbench.bench.rows import Row, Rows
 from headbench.bench.runner.store import RunFolder
 from headbench.bench.specs import MetricSpec
 from headbench.reports.pareto.command import run
-from headbench.reports.pareto.plot import free, log_ticks, ticks
+from headbench.reports.pareto.plot import Panel, label_points, write_plot
 from headbench.reports.pareto.settings import ParetoSettings
 
 METRICS = [
@@ -68,7 +71,7 @@ def test_points_of_several_runs_and_which_are_on_the_front(make_run, tmp_path):
     assert on_time == set(rows)  # every faster one is worse
     assert float(rows["small", "ours"]["milliseconds"]) == pytest.approx(5.0)
     assert float(rows["small", "ours"]["quality"]) == pytest.approx(28.0)
-    picture = np.asarray(Image.open(tmp_path / "out" / "pareto.png"))
+    picture = np.asarray(Image.open(tmp_path / "out" / "pareto.png").convert("RGB"))
     # Steps of the front in each method's colour: a long horizontal line of it in either panel.
     for colour in ((0, 114, 178), (213, 94, 0)):
         own = (picture == colour).all(axis=2)
@@ -138,16 +141,22 @@ def test_derived_avatars_are_told_from_trained_ones(make_run, tmp_path):
 
 
 def test_labels_touch_neither_points_nor_each_other():
-    taken = [(94.0, 94.0, 106.0, 106.0)]
-    for _ in range(4):
-        box = free(100, 100, "half", taken, (0, 620))
-        assert box is not None
-        for other in taken:
-            assert box[2] < other[0] or other[2] < box[0] or box[3] < other[1] or other[3] < box[1]
-        taken.append(box)
-    assert free(100, 100, "half", taken, (0, 620)) is None
+    costs, variants = [1.0] * 5 + [10.0], ["half"] * 5 + [""]
+    panel = Panel("MB", costs, [20.0] * 5 + [30.0], [0, 1, 2, 3, 4], ["ga"] * 6, variants, {})
+    axes = Figure(dpi=200).subplots()
+    axes.scatter(panel.costs, panel.qualities)
+    axes.figure.draw_without_rendering()
+    label_points(axes, panel)
+    boxes = [label.get_window_extent() for label in axes.texts]
+    assert 2 <= len(boxes) < 5  # not every one has room
+    point = Bbox.from_bounds(*axes.transData.transform((1.0, 20.0)), 0, 0).padded(9)
+    for one, other in itertools.combinations([*boxes, point], 2):
+        assert not one.overlaps(other)
 
 
-def test_ticks_are_round_and_within():
-    assert ticks(27.3, 30.2) == [28.0, 29.0, 30.0]
-    assert log_ticks(0.8, 25) == [1, 2, 5, 10, 20]
+def test_a_plot_without_a_measured_cost_says_so_and_names_are_literal(tmp_path):
+    panel = Panel("ms", [None], [20.0], [], ["a$b_$"], ["$x"], {"a$b_$": []})
+    measured = Panel("MB", [1.0], [20.0], [0], ["a$b_$"], ["$x"], {"a$b_$": [0]})
+    write_plot(tmp_path / "plot.png", [measured, panel], "PSNR", "here")
+    width, height = Image.open(tmp_path / "plot.png").size
+    assert width > 2 * height
