@@ -1,136 +1,229 @@
-"""Text, rules and colour maps on a sheet that grows downwards."""
+"""Sheets of pictures: rows and columns of images under headings, with labels, captions and a legend."""
 
 from __future__ import annotations
 
-from functools import cache
+import textwrap
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
 
-import cv2
+import matplotlib
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from PIL import Image
 
 from ..bench.contracts import ByteArray, FloatArray
+from ..bench.io.files import atomic_path
 
-Colour = tuple[int, int, int]
-PAPER: Colour = (255, 255, 255)
-INK: Colour = (30, 30, 30)
-MUTED: Colour = (110, 110, 110)
-RULE: Colour = (205, 205, 205)
-BOX: Colour = (225, 225, 225)
-ELLIPSIS = "..."
+INK, MUTED, LINE, BOX = "#1e1e1e", "#6e6e6e", "#cdcdcd", "#e1e1e1"
+GAP, MARGIN, MARKED = 8, 24, 3
+TITLE, TEXT, SMALL = 20, 15, 13
+"""Sizes of text, pixels."""
+SMALLEST_WIDTH = 760
+"""Pixels that a sheet's own text needs."""
+DPI = 100
+WHITE: ByteArray = np.full((12, 12, 3), 255, np.uint8)
 
 
-class Pen:
-    """Draws at the current height of a white sheet of fixed width.
+@dataclass(frozen=True)
+class Tile:
+    """An (H, W, 3) 8-bit image at the size it is shown, or the reason why there is none.
+
+    ``mark`` is the colour of a broad line around it; "" for a hairline (white images need an edge on white paper).
+    """
+
+    picture: ByteArray | str
+    caption: str = ""
+    mark: str = ""
+
+
+@dataclass(frozen=True)
+class TileRow:
+    """Images side by side, and short lines to their left."""
+
+    labels: Sequence[str]
+    tiles: Sequence[Tile]
+
+
+@dataclass(frozen=True)
+class SheetSection:
+    """Rows under a heading, with a head over each column."""
+
+    title: str
+    heads: Sequence[str]
+    rows: Sequence[TileRow]
+
+
+@dataclass(frozen=True)
+class TilePlace:
+    """Where an image lies on the sheet, pixels; rows are counted over all sections."""
+
+    row: int
+    column: int
+    left: int
+    top: int
+    width: int
+    height: int
+
+
+@dataclass
+class _Paper:
+    """White paper of fixed width that is written on downwards from the height ``y``; coordinates are pixels."""
+
+    width: int
+    y: int = MARGIN
+    images: list[tuple[int, int, ByteArray]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.figure = Figure(dpi=DPI)
+        self.axes = self.figure.add_axes((0.0, 0.0, 1.0, 1.0))
+        self.axes.set_axis_off()
+
+    def text(
+        self, left: float, text: str, size: int, colour: str = INK, *, drop: int = 0, width: int | None = None
+    ) -> None:
+        """Write one line, its top ``drop`` below the current height, cut to about ``width``."""
+        limit = len(text) if width is None else characters(width, size)
+        text = text if len(text) <= limit else text[: limit - 1] + "…"
+        points = size * 72 / DPI
+        self.axes.text(left, self.y + drop, text, size=points, color=colour, va="top", parse_math=False)
+
+    def fill(self, left: int, width: int, height: int, colour: str, *, drop: int = 0) -> None:
+        """Colour a rectangle."""
+        rgb = np.rint(255 * np.array(to_rgb(colour))).astype(np.uint8)
+        self.images.append((left, self.y + drop, np.tile(rgb, (height, width, 1))))
+
+    def framed(self, left: int, image: ByteArray, colour: str, line: int) -> None:
+        """Put an image with a line around it, outside its pixels."""
+        height, width = image.shape[:2]
+        self.fill(left - line, width + 2 * line, height + 2 * line, colour, drop=-line)
+        self.images.append((left, self.y, image))
+
+    def tile(self, left: int, tile: Tile, width: int, height: int) -> None:
+        """An image, or a grey box with its reason, as much of it as fits."""
+        if isinstance(tile.picture, str):
+            self.axes.add_patch(Rectangle((left, self.y), width, height, color=BOX, linewidth=0))
+            lines = max(1, (height - 8) // (SMALL + 4))
+            words = textwrap.wrap(
+                tile.picture, characters(width - 16, SMALL), max_lines=lines, placeholder=" …"
+            )
+            for index, line in enumerate(words):
+                self.text(left + 8, line, SMALL, MUTED, drop=8 + index * (SMALL + 4))
+        else:
+            height, width = tile.picture.shape[:2]
+            self.framed(left, tile.picture, tile.mark or LINE, MARKED if tile.mark else 1)
+        if tile.caption:
+            self.text(left, tile.caption, SMALL, MUTED, drop=height + 3, width=width)
+
+    def save(self, path: Path) -> None:
+        """Write the paper down to the current height as a PNG, atomically."""
+        self.figure.set_size_inches(self.width / DPI, self.y / DPI)
+        self.axes.set(xlim=(0, self.width), ylim=(self.y, 0))
+        canvas = FigureCanvasAgg(self.figure)
+        canvas.draw()
+        pixels = np.array(canvas.buffer_rgba())[..., :3]
+        for left, top, image in self.images:  # pixel for pixel
+            pixels[top : top + image.shape[0], left : left + image.shape[1]] = image
+        with atomic_path(path) as temporary:
+            Image.fromarray(pixels).save(temporary, optimize=True)
+
+
+def write_sheet(
+    path: Path,
+    sections: Sequence[SheetSection],
+    *,
+    title: str,
+    subtitle: str,
+    marks: Mapping[str, str] | None = None,
+    error_scale: tuple[int, str] | None = None,
+    pairs: bool = False,
+    label_width: int = 120,
+) -> list[TilePlace]:
+    """Draw sections below each other and write a PNG, atomically.
 
     Parameters
     ----------
-    width : of the sheet, pixels.
-    top : height to begin at.
+    title, subtitle : above everything.
+    marks : legend of the colours around images: meaning by colour.
+    error_scale : level of the brightest colour of error maps and what follows it, for a colour bar.
+    pairs : keep columns 1 and 2, 3 and 4, ... closer together.
+    label_width : pixels for the labels left of the rows.
+
+    Returns
+    -------
+    Where each image lies, for those who want to find it again.
     """
+    tiles = [tile for section in sections for row in section.rows for tile in row.tiles]
+    width = max((t.picture.shape[1] for t in tiles if not isinstance(t.picture, str)), default=label_width)
 
-    def __init__(self, width: int, top: int) -> None:
-        self.width, self.y = width, top
-        self._sheet = Image.new("RGB", (width, 1024), PAPER)
-        self._draw = ImageDraw.Draw(self._sheet)
+    def left(column: int) -> int:
+        return MARGIN + label_width + column * (width + GAP) + (GAP * ((column + 1) // 2) if pairs else 0)
 
-    def advance(self, pixels: int) -> None:
-        """Move down."""
-        self.y += pixels
+    columns = max(len(row.tiles) for section in sections for row in section.rows)
+    paper = _Paper(max(left(columns) + MARGIN - GAP, SMALLEST_WIDTH))
+    paper.text(MARGIN, title, TITLE)
+    paper.y += TITLE + 10
+    for line in textwrap.wrap(subtitle, characters(paper.width - 2 * MARGIN, SMALL)):
+        paper.text(MARGIN, line, SMALL, MUTED)
+        paper.y += SMALL + 5
+    paper.y += 8
+    for index, (colour, meaning) in enumerate((marks or {}).items()):
+        paper.framed(MARGIN + 260 * index, WHITE, colour, MARKED)
+        paper.text(MARGIN + 260 * index + 28, meaning, SMALL, MUTED)
+    paper.y += SMALL + 10 if marks else 0
+    if error_scale is not None:
+        _colour_bar(paper, *error_scale)
 
-    def text(
-        self,
-        left: int,
-        text: str,
-        size: int,
-        colour: Colour = INK,
-        anchor: str = "left",
-        *,
-        drop: int = 0,
-        limit: int | None = None,
-    ) -> None:
-        """Write one line, its top ``drop`` pixels below the current height, shortened to ``limit`` pixels."""
-        text = text if limit is None else shorten(text, size, limit)
-        self._reserve(drop + 2 * size)
-        shift = {"left": 0.0, "centre": 0.5, "right": 1.0}[anchor] * text_width(text, size)
-        self._draw.text((round(left - shift), self.y + drop), text, fill=colour, font=font(size), anchor="la")
-
-    def image(self, left: int, image: ByteArray) -> None:
-        """Put an (H, W, 3) image with its top at the current height."""
-        self._reserve(image.shape[0] + 1)
-        self._sheet.paste(Image.fromarray(np.ascontiguousarray(image)), (left, self.y))
-
-    def rule(self, left: int, right: int) -> None:
-        """Draw a horizontal hairline."""
-        self._reserve(1)
-        self._draw.line((left, self.y, right, self.y), fill=RULE)
-
-    def frame(self, left: int, width: int, height: int, colour: Colour = RULE, thickness: int = 1) -> None:
-        """Draw a line around an image, outside its pixels: white images need an edge on white paper."""
-        self._reserve(height + thickness)
-        t = thickness
-        box = (left - t, self.y - t, left + width - 1 + t, self.y + height - 1 + t)
-        self._draw.rectangle(box, outline=colour, width=thickness)
-
-    def grey_box(self, left: int, width: int, height: int, text: str, size: int) -> None:
-        """Draw a grey box with wrapped text in its middle, as much of it as fits."""
-        self._reserve(height + 1)
-        self._draw.rectangle((left, self.y, left + width - 1, self.y + height - 1), fill=BOX)
-        step = size + 4
-        lines = wrap(text, size, width - 16)
-        room = max(1, (height - 8) // step)
-        if len(lines) > room:
-            lines = [*lines[: room - 1], shorten(lines[room - 1] + ELLIPSIS, size, width - 16)]
-        top = (height - step * len(lines)) // 2
-        for index, line in enumerate(lines):
-            self.text(left + width // 2, line, size, MUTED, "centre", drop=top + index * step)
-
-    def finish(self) -> ByteArray:
-        """Return the sheet down to the current height, (H, W, 3)."""
-        self._reserve(0)
-        return np.asarray(self._sheet)[: self.y].copy()
-
-    def _reserve(self, pixels: int) -> None:
-        """Lengthen the sheet if the next ``pixels`` rows are not on it."""
-        if self.y + pixels <= self._sheet.height:
-            return
-        longer = Image.new("RGB", (self.width, max(2 * self._sheet.height, self.y + pixels)), PAPER)
-        longer.paste(self._sheet, (0, 0))
-        self._sheet, self._draw = longer, ImageDraw.Draw(longer)
+    places: list[TilePlace] = []
+    number = 0
+    for section in sections:
+        paper.y += 10
+        paper.text(MARGIN, section.title, TEXT)
+        paper.y += TEXT + 8
+        paper.fill(MARGIN, paper.width - 2 * MARGIN, 1, LINE)
+        paper.y += 8
+        for column, head in enumerate(section.heads):
+            paper.text(left(column), head, SMALL, width=width)
+        paper.y += SMALL + 8
+        for row in section.rows:
+            sizes = [t.picture.shape[:2] for t in row.tiles if not isinstance(t.picture, str)]
+            height = max((h for h, _ in sizes), default=width)
+            for index, label in enumerate(row.labels):
+                colour, drop = MUTED if index else INK, index * (SMALL + 6)
+                paper.text(MARGIN, label, SMALL, colour, drop=drop, width=label_width - 8)
+            for column, tile in enumerate(row.tiles):
+                paper.tile(left(column), tile, width, height)
+                if not isinstance(tile.picture, str):
+                    shown = tile.picture.shape
+                    places.append(TilePlace(number, column, left(column), paper.y, shown[1], shown[0]))
+            caption = SMALL + 7 if any(tile.caption for tile in row.tiles) else 0
+            paper.y += max(height + caption, len(row.labels) * (SMALL + 6)) + GAP
+            number += 1
+    paper.y += MARGIN - GAP
+    paper.save(path)
+    return places
 
 
-@cache
-def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    """Pillow's own font, so that a sheet looks the same on every machine."""
-    return ImageFont.load_default(size)
+def _colour_bar(paper: _Paper, top: int, more: str) -> None:
+    length, height, left = 220, 12, MARGIN + 150
+    paper.text(MARGIN, "Absolute error", SMALL, MUTED)
+    paper.images.append((left, paper.y, colour_map(np.tile(np.linspace(0.0, 1.0, length), (height, 1)))))
+    note = "8-bit levels, mean over channels; one scale for all maps"
+    paper.text(left + length + 10, note, SMALL, MUTED)
+    paper.y += height + 3
+    for share, label in ((0.0, "0"), (0.5, f"{top / 2:g}"), (1.0, f"{top}{more}")):
+        paper.text(left + share * length, label, SMALL, MUTED)
+    paper.y += SMALL + 10
 
 
-def text_width(text: str, size: int) -> float:
-    """Width of one line, pixels."""
-    return font(size).getlength(text)
-
-
-def shorten(text: str, size: int, limit: int) -> str:
-    """Cut a line so that it is at most ``limit`` pixels wide, an ellipsis showing the cut."""
-    if text_width(text, size) <= limit:
-        return text
-    while text and text_width(text + ELLIPSIS, size) > limit:
-        text = text[:-1]
-    return text.rstrip(". ") + ELLIPSIS
-
-
-def wrap(text: str, size: int, limit: int) -> list[str]:
-    """Break a text into lines of at most ``limit`` pixels, between words; a longer word is shortened."""
-    lines: list[str] = []
-    for word in text.split():
-        candidate = f"{lines[-1]} {word}" if lines else word
-        if lines and text_width(candidate, size) <= limit:
-            lines[-1] = candidate
-        else:
-            lines.append(shorten(word, size, limit))
-    return lines
+def characters(width: int, size: int) -> int:
+    """About how many characters of a text size go into a width, both pixels."""
+    return max(2, int(width / (0.6 * size)))
 
 
 def colour_map(values: FloatArray) -> ByteArray:
     """Map (H, W) values in [0, 1], clamped, to (H, W, 3) colours of the perceptually uniform map "magma"."""
-    levels = np.rint(np.clip(values, 0.0, 1.0) * 255.0).astype(np.uint8)
-    return np.asarray(cv2.cvtColor(cv2.applyColorMap(levels, cv2.COLORMAP_MAGMA), cv2.COLOR_BGR2RGB))
+    return matplotlib.colormaps["magma"](np.clip(values, 0.0, 1.0), bytes=True)[..., :3]

@@ -20,5 +20,5 @@ TABLE_TEXT = ReportSpec(
 CONTACT_SHEET = ReportSpec(
     name="contact-sheet",
     summary="Some frames of each task side by side: truth, renders and error maps of all methods, as PNG.",
-    implementation="headbench.reports.sheet_report:write_contact_sheet",
+    implementation="headbench.reports.contact_sheet:write_contact_sheet",
 )

@@ -1,37 +1,180 @@
-"""The tables of finished runs, as files or as text: the comparison, those of costs, the paper's layouts."""
+"""Tables by name: those that a run's metrics ask for, and the layouts of the paper's tables.
+
+The paper is "3D Gaussian Head Avatars with Expressive Dynamic Appearances by Compact Tensorial Representations"
+(CVPR 2025, arXiv 2504.14967).
+"""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
+from typing import Any
 
+from ..bench.configuration import build
 from ..bench.errors import InputError
+from ..bench.io.documents import read_json
 from ..bench.io.files import grouped_writes, write_text
-from .csv_table import to_csv
-from .html_table import to_html
-from .latex import to_latex
-from .layouts import PAPER
-from .markdown import to_markdown
-from .published import with_published
-from .run_set import RunSet
-from .table_model import Table
-from .tables import AVATAR_TITLE, build_table
+from ..bench.manifest import MethodRecord
+from ..bench.specs import MetricSpec
+from .runs import RunSet
+from .tables import AVATAR_TITLE, Table, TableCell, build_table
+from .writers import WRITERS, column_name
 
-
-def to_json(table: Table) -> str:
-    """Write the typed table as it is."""
-    return json.dumps({**asdict(table), "caption": table.caption}, indent=1, ensure_ascii=False) + "\n"
-
-
-WRITERS: dict[str, tuple[str, Callable[[Table], str]]] = {
-    "md": ("md", to_markdown),
-    "csv": ("csv", to_csv),
-    "latex": ("tex", to_latex),
-    "html": ("html", to_html),
-    "json": ("json", to_json),
+NAMES = {
+    "insta": "INSTA",
+    "gha": "GaussianHeadAvatar",
+    "gbs": "GaussianBlendshapes",
+    "ga": "GaussianAvatars",
+    "ours": "Ours",
 }
+"""Methods as papers write them, in the order of their tables."""
+
+TASKS = ("novel_view", "self_reenactment")
+QUALITY = {"psnr": 2, "ssim": 3, "lpips": 3}
+
+
+@dataclass(frozen=True)
+class PaperLayout:
+    """A table of the paper.
+
+    Attributes
+    ----------
+    digits : of each metric, in the order of the columns.
+    methods : names of those that it compares; () for all.
+    """
+
+    summary: str
+    digits: Mapping[str, int] = field(default_factory=lambda: {**QUALITY, "storage": 1, "fps": 0})
+    methods: tuple[str, ...] = ()
+
+    def metrics(self, runs: RunSet, name: str) -> tuple[MetricSpec, ...]:
+        """Columns. Raises `InputError` for a metric or a task that the runs lack."""
+        known = {spec.name: spec for spec in runs.metrics}
+        for what, wanted, there in (("metrics", self.digits, known), ("tasks", TASKS, runs.tasks)):
+            lacking = [item for item in wanted if item not in there]
+            if lacking:
+                raise InputError(
+                    runs.runs[0].folder.root, f"{what} of layout {name}", ", ".join(wanted), ", ".join(there)
+                )
+        return tuple(replace(known[metric], digits=digits) for metric, digits in self.digits.items())
+
+    def labels(self, runs: RunSet, name: str) -> dict[str, str]:
+        """Rows: labels of methods and how the paper writes them, in its order; floors have no place in it."""
+        order = list(NAMES)
+        chosen = [
+            label for label in runs.ranked if not self.methods or runs.records[label].name in self.methods
+        ]
+        if not chosen:
+            found = ", ".join(runs.methods)
+            raise InputError(runs.runs[0].folder.root, f"layout {name}", ", ".join(self.methods), found)
+
+        def place(label: str) -> tuple[bool, int]:
+            known = runs.records[label].name
+            # Methods that no table of the paper has come before "ours", which is last.
+            return known == "ours", order.index(known) if known in order else len(order)
+
+        own = {label: runs.records[label].name for label in chosen}
+        return {
+            label: NAMES.get(own[label], own[label]) + label.removeprefix(own[label])
+            for label in sorted(chosen, key=place)
+        }
+
+
+PAPER: Mapping[str, PaperLayout] = {
+    "paper-1": PaperLayout("every method: both tasks' quality, storage, speed"),
+    "paper-3": PaperLayout("INSTA and ours: both tasks' quality, storage, speed", methods=("insta", "ours")),
+    "paper-4": PaperLayout(
+        "settings of ours, one run each: both tasks' quality", digits=QUALITY, methods=("ours",)
+    ),
+}
+
+
+FILE = Path(__file__).with_name("published.json")
+
+
+@dataclass(frozen=True)
+class PublishedRow:
+    """A row of a paper's table.
+
+    Attributes
+    ----------
+    source : key of the paper.
+    table, data : where in the paper, and what the figures are of.
+    layout : of the table it may stand in.
+    method, settings : the method's name here, and the settings that a measured one needs to be the same.
+    values : as printed, by ``task/metric``.
+    """
+
+    source: str
+    table: str
+    data: str
+    layout: str
+    method: str
+    settings: dict[str, Any]
+    values: dict[str, str]
+
+    def is_of(self, record: MethodRecord) -> bool:
+        """Whether a measured method, as in a run's manifest, is the one of this row."""
+        config = record.config or {}
+        settled = all(name in config and config[name] == value for name, value in self.settings.items())
+        return record.name == self.method and settled
+
+
+@cache
+def published_rows() -> tuple[tuple[PublishedRow, str], ...]:
+    """All rows, each with its source in words. Raises `InputError` for a file that is not as it should be."""
+    content = read_json(FILE)
+    rows = [
+        build(PublishedRow, entry, str(FILE), f"figures.{i}.") for i, entry in enumerate(content["figures"])
+    ]
+    for row in rows:
+        if row.source not in content["sources"]:
+            raise InputError(FILE, "source", ", ".join(content["sources"]), row.source)
+    return tuple((row, str(content["sources"][row.source])) for row in rows)
+
+
+def with_published(table: Table, layout: str, records: Mapping[str, MethodRecord]) -> Table:
+    """Put a column "published" behind each measured one that a paper's table of this layout has a figure for.
+
+    Parameters
+    ----------
+    records : by label of the table's methods, what they were, as in a run's manifest.
+    """
+    notes = list(table.notes)
+    figures: dict[str, tuple[Mapping[str, str], int]] = {}
+    for row in table.rows:
+        for published, source in published_rows():
+            if published.layout == layout and published.is_of(records[row.method]):
+                note = f"Published: {published.table} ({published.data}) of {source}."
+                if note not in notes:
+                    notes.append(note)
+                figures[row.method] = published.values, notes.index(note)
+    known = {name for values, _ in figures.values() for name in values}
+    shown = [column_name(column) in known for column in table.columns]
+    columns = []
+    for column, beside in zip(table.columns, shown):
+        columns += [column, replace(column, published=True)] if beside else [column]
+
+    def cells(method: str, measured: tuple[TableCell, ...]) -> tuple[TableCell, ...]:
+        values, note = figures.get(method, ({}, 0))
+        result = []
+        for column, cell, beside in zip(table.columns, measured, shown):
+            result.append(cell)
+            if beside:
+                text = values.get(column_name(column))
+                none = TableCell("none", None, "")
+                result.append(none if text is None else TableCell("published", float(text), text, note=note))
+        return tuple(result)
+
+    groups = tuple(
+        (title, tuple(replace(row, cells=cells(row.method, row.cells)) for row in rows))
+        for title, rows in table.groups
+    )
+    return replace(table, columns=tuple(columns), groups=groups, notes=tuple(notes))
+
+
 COMPARISON = "comparison"
 TITLES = {"speed": "Speed", "cost": "Storage and training"}
 

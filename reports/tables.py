@@ -1,16 +1,212 @@
-"""Builds the comparison table from rows."""
+"""The table as a typed model: what the writers lay out, and nothing else.
+
+A value is a mean of means: frames -> sequence -> subject -> seed, each level weighing its members equally
+(macro), so that a long sequence or a subject with many frames does not outvote the others.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
 
 from ..bench.protocol import TASK_TITLES
 from ..bench.rows import ALL, Rows
 from ..bench.runner.scoring import FULL
 from ..bench.specs import MetricSpec
-from .aggregate import Aggregate, summarise
-from .ranking import best_of_column, marking, ranked
-from .table_model import Column, Table, TableCell, TableRow, TaskSummary
+from .aggregate import Aggregate, subject_means, summarise
+from .statistics.comparisons import LEVEL, BestSet, best_set
+
+
+@dataclass(frozen=True)
+class Column:
+    """One metric of one task (``task`` "" for a metric of the avatar as a whole).
+
+    ``published`` columns hold what a paper printed, beside the measured column before them.
+    """
+
+    task: str
+    title: str
+    metric: str
+    label: str
+    unit: str
+    digits: int
+    higher_is_better: bool
+    published: bool = False
+
+    @property
+    def arrow(self) -> str:
+        """Which way is better: an arrow up or down."""
+        return "↑" if self.higher_is_better else "↓"
+
+
+@dataclass(frozen=True)
+class TableCell:
+    """A value, or why there is none.
+
+    Attributes
+    ----------
+    status : "ok", "missing" (could not or was not measured), "failed" (the method ended in an error), "published"
+        (a paper's figure, not measured) or "none" (no paper's figure).
+    value : full precision; None unless ok or published.
+    text : as displayed.
+    spread : standard deviation over seeds, as displayed; "" with one seed.
+    rank : 1 for all that may be the best, then 2, 3, ... for the next displayed values; None where nothing is ranked.
+    note : index into `Table.notes`, or None.
+    """
+
+    status: Literal["ok", "missing", "failed", "published", "none"]
+    value: float | None
+    text: str
+    spread: str = ""
+    rank: int | None = None
+    note: int | None = None
+
+    @property
+    def shown(self) -> str:
+        """Value and spread."""
+        return f"{self.text} ± {self.spread}" if self.spread else self.text
+
+
+@dataclass(frozen=True)
+class TableRow:
+    """A method's cells, one per column; a trivial method is a floor and never ranked."""
+
+    method: str
+    version: str
+    trivial: bool
+    cells: tuple[TableCell, ...]
+
+
+@dataclass(frozen=True)
+class TaskSummary:
+    """What stands behind a task's columns."""
+
+    task: str
+    title: str
+    protocol_id: str
+    protocol_hash: str
+    frames: int
+    subjects: int
+
+
+@dataclass(frozen=True)
+class Table:
+    """A comparison, ready to be written in any format. ``marking`` tells what the ranks say, and by which test."""
+
+    columns: tuple[Column, ...]
+    groups: tuple[tuple[str, tuple[TableRow, ...]], ...]  # (title, rows); empty groups are left out
+    notes: tuple[str, ...]
+    tasks: tuple[TaskSummary, ...]
+    seeds: int
+    marking: str = ""
+    image_size: str = ""
+    machine: str = ""
+
+    @property
+    def rows(self) -> tuple[TableRow, ...]:
+        """All rows, in order."""
+        return tuple(row for _, rows in self.groups for row in rows)
+
+    @property
+    def caption(self) -> str:
+        """One paragraph: what was measured, on how much, under which protocol, and how it was averaged."""
+        parts = []
+        for task in self.tasks:
+            frames = "1 frame" if task.frames == 1 else f"{task.frames} frames"
+            subjects = "1 subject" if task.subjects == 1 else f"{task.subjects} subjects"
+            name = f"{task.protocol_id} " if task.protocol_id else ""
+            parts.append(f"{task.title}: {frames}, {subjects}, protocol {name}({task.protocol_hash}).")
+        if self.image_size:
+            parts.append(f"Images of {self.image_size} pixels.")
+        parts.append("Mean over frames, then sequences, then subjects; one seed.")
+        if self.seeds > 1:
+            spread = f"mean of {self.seeds} seeds ± its standard deviation from seed to seed."
+            parts[-1] = f"Mean over frames, then sequences, then subjects; {spread}"
+        parts += [self.marking] if self.marking else []
+        if any(column.published for column in self.columns):
+            parts.append(
+                "Columns headed published: figures from papers, of other data and code, not comparable."
+            )
+        if self.machine and any(column.metric == "fps" for column in self.columns):
+            parts.append(f"Speed measured on {self.machine}.")
+        return " ".join(parts)
+
+
+def best_of_column(
+    rows: Rows, lines: Sequence[TableRow], index: int, column: Column, region: str
+) -> BestSet | None:
+    """Find the methods that may be the best of a column; None where fewer than two have values.
+
+    Floors do not compete.
+    """
+    competing = _competing(lines, index)
+    if len(competing) < 2:
+        return None
+    means = {
+        method: subject_means(
+            rows.select(method=method, metric=column.metric, task=column.task, region=region, seeds=ALL)
+        )
+        for method in competing
+    }
+    return best_set(means, higher_is_better=column.higher_is_better)
+
+
+def ranked(
+    lines: Sequence[TableRow], columns: Sequence[Column], bests: Sequence[BestSet | None]
+) -> list[TableRow]:
+    """Rank each column: 1 for all that may be the best and for all that look like one of them, then by digits.
+
+    Where nothing can be told, digits alone decide. Values that look equal share a rank, and the next distinct
+    one has the next.
+    """
+    cells = [list(line.cells) for line in lines]
+    for index, (column, best) in enumerate(zip(columns, bests)):
+        if best is None:
+            continue
+        competing = _competing(lines, index)
+        shown = {i: float(cells[i][index].text) for i, line in enumerate(lines) if line.method in competing}
+        order = sorted(set(shown.values()), reverse=column.higher_is_better)
+        first = {value for i, value in shown.items() if best.methods and lines[i].method in best.methods}
+        first = first or {order[0]}
+        others = [value for value in order if value not in first]
+        for i, value in shown.items():
+            rank = 1 if value in first else others.index(value) + 2
+            cells[i][index] = replace(cells[i][index], rank=rank)
+    return [replace(line, cells=tuple(row)) for line, row in zip(lines, cells)]
+
+
+def marking(columns: Sequence[Column], lines: Sequence[TableRow], bests: Sequence[BestSet | None]) -> str:
+    """Say what the marks of a table mean, and by which test; "" where nothing is ranked."""
+    ranks = {cell.rank for line in lines for cell in line.cells}
+    if not ranks - {None}:
+        return ""
+    tested = [best for best in bests if best is not None and best.methods is not None]
+    open_ = [(c, best) for c, best in zip(columns, bests) if best is not None and best.methods is None]
+    places = ", ".join(["second underlined"] + ["third italic"] * (3 in ranks))
+    if not tested:
+        subjects = " or ".join(sorted({_count(best.subjects) for _, best in open_}))
+        needed = max(best.needed for _, best in open_)
+        return (
+            f"Best bold, {places}, by the digits shown alone: with {subjects} no test can tell the best"
+            f" (it takes {needed})."
+        )
+    subjects = " or ".join(sorted({_count(best.subjects) for best in tested}))
+    test = f"exact sign-flip test over {subjects}, each method against all others, Holm, {LEVEL:.0%}"
+    text = f"Bold: every method that cannot be told from the best ({test}); the others by the digits shown, {places}."
+    if open_:
+        names = ", ".join(f"{column.title} {column.label}" for column, _ in open_)
+        text += f" Too few subjects for the test, so that the digits alone decide: {names}."
+    return text
+
+
+def _competing(lines: Sequence[TableRow], index: int) -> list[str]:
+    return [line.method for line in lines if not line.trivial and line.cells[index].status == "ok"]
+
+
+def _count(subjects: int) -> str:
+    return "1 subject" if subjects == 1 else f"{subjects} subjects"
+
 
 AVATAR_TITLE = "Avatar"
 METHODS_TITLE = "Methods"

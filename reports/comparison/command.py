@@ -12,11 +12,11 @@ from ...bench.errors import InputError
 from ...bench.protocol import TASK_TITLES
 from ...bench.runner.scoring import FULL
 from ...bench.specs import Findings, MetricSpec
-from ..csv_table import csv_text
-from ..run_set import RunSet
+from ..runs import RunSet
 from ..statistics.comparisons import Comparison, compare
 from ..table_report import COMPARISON
 from ..tables import AVATAR_TITLE
+from ..writers import csv_text
 from .settings import CompareSettings
 
 FIELDS = (

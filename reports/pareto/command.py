@@ -10,10 +10,9 @@ from ...bench.contracts import Progress, no_progress
 from ...bench.io.files import write_text
 from ...bench.runner.store import RunFolder
 from ...bench.specs import Findings
-from ..csv_table import csv_text
-from .front import pareto_front
+from ..writers import csv_text
 from .plot import Panel, write_plot
-from .points import Point, read_points
+from .points import Point, pareto_front, read_points
 from .settings import ParetoSettings
 from .sweep import MARK
 

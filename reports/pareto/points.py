@@ -1,4 +1,4 @@
-"""Points of quality, size and frame time from the rows of finished runs."""
+"""The Pareto front of costs and qualities."""
 
 from __future__ import annotations
 
@@ -10,7 +10,28 @@ from ...bench.errors import InputError
 from ...bench.runner.scoring import FULL
 from ...bench.specs import MetricSpec
 from ..aggregate import summarise
-from ..run_data import RunData
+from ..runs import RunData
+
+
+def pareto_front(costs: Sequence[float], qualities: Sequence[float]) -> list[int]:
+    """Indices of the points that no other point beats, by rising cost.
+
+    One point beats another if it costs no more and is no worse, and is strictly better in one of the two. Equal
+    points do not beat each other. Lower costs and higher qualities are better; all numbers are finite.
+    """
+    order = sorted(range(len(costs)), key=lambda i: (costs[i], -qualities[i]))
+    front: list[int] = []
+    for index in order:
+        last = front[-1] if front else None
+        if (
+            last is None
+            or qualities[index] > qualities[last]
+            or qualities[index] == qualities[last]
+            and costs[index] == costs[last]
+        ):
+            front.append(index)
+    return front
+
 
 SIZE, SPEED, LATENCY = "storage", "fps", "latency_p50"
 

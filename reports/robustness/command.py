@@ -15,7 +15,7 @@ from ...bench.runner.stages import Job
 from ...bench.runner.store import RunFolder
 from ...bench.specs import Findings
 from .settings import ExtremesSettings, ReenactSettings
-from .trial import SHEET_FILE, table
+from .stability import SHEET_FILE, table
 
 Settings = TypeVar("Settings", ExtremesSettings, ReenactSettings)
 

@@ -6,8 +6,8 @@ from ...bench.contracts import Progress, no_progress
 from ...bench.specs import Findings
 from .command import try_run
 from .extremes import TASK, try_extremes
-from .extremes_sheet import write_extremes_sheet
 from .settings import ExtremesSettings
+from .sheets import write_extremes_sheet
 
 
 def run(settings: ExtremesSettings, progress: Progress = no_progress) -> Findings:

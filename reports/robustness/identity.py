@@ -36,7 +36,7 @@ from ...bench.contracts import (
     IntArray,
 )
 from ...bench.io.frames import quantise
-from .expressions import training_poses
+from .extremes import training_poses
 from .stability import Verdict
 
 STILL_M = 0.0005

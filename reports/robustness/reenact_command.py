@@ -5,9 +5,9 @@ from __future__ import annotations
 from ...bench.contracts import Progress, no_progress
 from ...bench.specs import Findings
 from .command import try_run
-from .reenact_sheet import write_reenact_sheet
 from .reenactment import TASK, reenact
 from .settings import ReenactSettings
+from .sheets import write_reenact_sheet
 
 
 def run(settings: ReenactSettings, progress: Progress = no_progress) -> Findings:

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from ...bench.contracts import FloatArray
-from ...reports.statistics.pairs import SequencePairs, SubjectPairs
+from ...reports.statistics.bootstrap import SequencePairs, SubjectPairs
 
 
 @dataclass(frozen=True)

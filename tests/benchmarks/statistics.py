@@ -13,10 +13,8 @@ from scipy import stats
 
 from ...bench.contracts import Progress, no_progress
 from ...bench.specs import Findings
-from ...reports.statistics.bootstrap import interval
-from ...reports.statistics.comparisons import LEVEL, best_set
-from ...reports.statistics.pairs import SubjectPairs
-from ...reports.statistics.sign_flip import least_p, sign_flip_p
+from ...reports.statistics.bootstrap import SubjectPairs, interval
+from ...reports.statistics.comparisons import LEVEL, best_set, least_p, sign_flip_p
 from .simulation import Population
 
 TRIALS, QUICK_TRIALS = 2_000, 100

@@ -1,11 +1,12 @@
 import cv2
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
 from PIL import Image
 
 from headbench.bench.errors import InputError
-from headbench.reports.contact_sheet import Missing, SheetRow, contact_sheet
-from headbench.reports.drawing import BOX, colour_map, shorten, text_width, wrap
+from headbench.reports.contact_sheet import ComparedFrame, contact_sheet, evenly_spaced
+from headbench.reports.drawing import BOX, SheetSection, Tile, TileRow, colour_map, write_sheet
 
 
 def picture(seed, height=90, width=60):
@@ -13,116 +14,120 @@ def picture(seed, height=90, width=60):
     return cv2.GaussianBlur(noise, (0, 0), 2)
 
 
+def flat(level, height=40, width=30):
+    return np.full((height, width, 3), level, np.uint8)
+
+
 def crop(sheet, place):
     return sheet[place.top : place.top + place.height, place.left : place.left + place.width]
 
 
-def draw(tmp_path, rows, methods, **options):
-    places = contact_sheet(rows, methods, tmp_path / "sheet.png", **{"panel_width": 30, **options})
+def draw(tmp_path, truth, renders, width=30, **options):
+    """Images of a sheet of one frame: the ground truth, then render and error map of each method."""
+    frame = ComparedFrame.of("Novel view", ["EMO"], truth, renders, {}, width)
+    places = contact_sheet([frame], list(renders), tmp_path / "sheet.png", **options)
     sheet = np.asarray(Image.open(tmp_path / "sheet.png").convert("RGB"))
-    return sheet, {(place.row, place.column): place for place in places}
+    return {place.column: crop(sheet, place) for place in places}
 
 
-def test_images_are_shown_pixel_for_pixel_where_they_fit(tmp_path):
+def test_rows_stand_below_each_other_and_sections_further_apart(tmp_path):
     truths, renders = [picture(i) for i in range(3)], [picture(10 + i) for i in range(3)]
-    rows = [
-        SheetRow(
-            section, ["EMO", f"timestep {i}"], truths[i], {"a": lambda i=i: renders[i]}, {"a": "PSNR 1 dB"}
-        )
+    frames = [
+        ComparedFrame.of(section, ["EMO"], truths[i], {"a": renders[i]}, {"a": "PSNR 1 dB"}, 100)
         for i, section in enumerate(["Novel view", "Novel view", "Self-reenactment"])
     ]
-    sheet, places = draw(tmp_path, rows, ["a"], title="Title", panel_width=100)
+    places = contact_sheet(frames, ["a"], tmp_path / "sheet.png", title="Title")
+    sheet = np.asarray(Image.open(tmp_path / "sheet.png").convert("RGB"))
+    assert [(p.row, p.column) for p in places] == [(row, column) for row in range(3) for column in range(3)]
     for i in range(3):
-        np.testing.assert_array_equal(crop(sheet, places[i, "truth"]), truths[i])
-        np.testing.assert_array_equal(crop(sheet, places[i, "render a"]), renders[i])
-    tops = [places[i, "truth"].top for i in range(3)]
-    assert tops == sorted(tops)
-    assert tops[1] - tops[0] < tops[2] - tops[1]  # a heading between the sections
-    assert len({places[i, "truth"].left for i in range(3)}) == 1
+        np.testing.assert_array_equal(crop(sheet, places[3 * i]), truths[i])
+        np.testing.assert_array_equal(crop(sheet, places[3 * i + 1]), renders[i])
+    tops, lefts = [p.top for p in places[::3]], [p.left for p in places[:3]]
+    assert 0 < tops[1] - tops[0] < tops[2] - tops[1]
+    assert 0 < lefts[2] - lefts[1] < lefts[1] - lefts[0]  # a render and its error map are closer together
 
 
-def test_small_images_are_enlarged_by_whole_pixels(tmp_path):
+@pytest.mark.parametrize(("width", "factor"), [(60, 1), (100, 1), (199, 3)])
+def test_small_images_are_enlarged_by_whole_pixels(tmp_path, width, factor):
     truth, render = picture(0), picture(1)
-    sheet, places = draw(tmp_path, [SheetRow("N", [], truth, {"a": render})], ["a"], panel_width=199)
-    for name, image in (("truth", truth), ("render a", render)):
-        np.testing.assert_array_equal(crop(sheet, places[0, name]), image.repeat(3, axis=0).repeat(3, axis=1))
+    images = draw(tmp_path, truth, {"a": render}, width)
+    for column, image in enumerate((truth, render)):
+        np.testing.assert_array_equal(images[column], image.repeat(factor, axis=0).repeat(factor, axis=1))
 
 
 def test_large_images_are_reduced_by_area(tmp_path):
     truth = picture(0)
-    sheet, places = draw(tmp_path, [SheetRow("N", [], truth, {})], [], panel_width=30)
     expected = truth.reshape(45, 2, 30, 2, 3).mean(axis=(1, 3))
-    assert np.abs(crop(sheet, places[0, "truth"]) - expected).max() <= 0.5
+    assert np.abs(draw(tmp_path, truth, {})[0] - expected).max() <= 0.5
 
 
-def test_error_maps_share_one_scale_in_levels(tmp_path):
-    truth = np.full((40, 30, 3), 100, np.uint8)
-    errors = {"a": 10, "b": 5}
-    renders = {m: truth + np.uint8(e) for m, e in errors.items()}
-    sheet, places = draw(tmp_path, [SheetRow("Novel view", [], truth, renders)], ["a", "b"])
-    for method, error in errors.items():
-        expected = colour_map(np.full((40, 30), error / 10))
-        np.testing.assert_array_equal(crop(sheet, places[0, f"error {method}"]), expected)
-
-
-def test_a_floor_can_be_kept_from_setting_the_scale(tmp_path):
-    truth = np.full((40, 30, 3), 100, np.uint8)
-    renders = {"a": truth + np.uint8(10), "floor": truth + np.uint8(150)}
-    sheet, places = draw(tmp_path, [SheetRow("N", [], truth, renders)], ["a", "floor"], scaled_by=["a"])
-    top = colour_map(np.ones((40, 30)))
-    np.testing.assert_array_equal(crop(sheet, places[0, "error a"]), top)
-    np.testing.assert_array_equal(crop(sheet, places[0, "error floor"]), top)
+@pytest.mark.parametrize(
+    ("errors", "scaled_by", "shares"),
+    [
+        ({"a": 10, "b": 5}, (), (1.0, 0.5)),
+        ({"a": 10, "trivial": 150}, ("a",), (1.0, 1.0)),
+        ({"a": 0}, (), (0.0,)),
+    ],
+)
+def test_error_maps_share_one_scale_in_levels(tmp_path, errors, scaled_by, shares):
+    renders = {method: flat(100 + error) for method, error in errors.items()}
+    images = draw(tmp_path, flat(100), renders, scaled_by=scaled_by)
+    for index, share in enumerate(shares):
+        np.testing.assert_array_equal(images[2 + 2 * index], colour_map(np.full((40, 30), share)))
 
 
 def test_errors_of_opposite_sign_do_not_cancel_in_a_reduced_map(tmp_path):
-    truth = np.full((80, 60, 3), 100, np.uint8)
-    signs = np.indices((80, 60, 3)).sum(axis=0) % 2
+    truth = flat(100, 80, 60)
+    signs = np.indices(truth.shape).sum(axis=0) % 2
     render = np.where(signs, truth + 20, truth - 20).astype(np.uint8)
-    sheet, places = draw(tmp_path, [SheetRow("N", [], truth, {"a": render})], ["a"], panel_width=30)
-    place = places[0, "error a"]
-    assert (place.width, place.height) == (30, 40)
-    np.testing.assert_array_equal(crop(sheet, place), colour_map(np.ones((40, 30))))
+    np.testing.assert_array_equal(draw(tmp_path, truth, {"a": render})[2], colour_map(np.ones((40, 30))))
 
 
-def test_a_missing_render_is_a_labelled_grey_box(tmp_path):
+def test_a_missing_render_is_a_grey_box_with_its_reason(tmp_path):
     truth = picture(0, 120, 100)
-    row = SheetRow("N", [], truth, {"a": truth, "b": Missing("RuntimeError: diverged " * 40)})
-    sheet, places = draw(tmp_path, [row], ["a", "b"], panel_width=100)
-    assert (0, "render b") not in places
-    pitch = places[0, "error a"].left - places[0, "truth"].left
-    group = places[0, "error a"].left - places[0, "render a"].left
-    left = places[0, "render a"].left + pitch
-    box = sheet[places[0, "truth"].top :, left : left + 100][:120]
-    assert group < pitch
-    grey = (box == BOX).all(axis=2)
-    assert grey[[0, 0, -1, -1], [0, -1, 0, -1]].all()
-    assert 0.5 < grey.mean() < 0.99  # text on it
+    images = draw(tmp_path, truth, {"a": truth, "b": "RuntimeError: diverged " * 40}, 100)
+    assert sorted(images) == [0, 1, 2]
+    sheet = np.asarray(Image.open(tmp_path / "sheet.png").convert("RGB"))
+    grey = (sheet == np.round(np.array(to_rgb(BOX)) * 255)).all(axis=2)
+    columns = np.flatnonzero(grey.sum(axis=0) > 20)
+    assert len(columns) == 200  # in place of the render and of its error map
+    box = grey[:, columns[:100]]
+    box = box[box.sum(axis=1) > 15]
+    assert len(box) == 120
+    assert 0.5 < box.mean() < 0.99  # text on it
 
 
-def test_writes_the_same_file_again(tmp_path):
-    row = SheetRow("N", ["x"], picture(0), {"a": picture(1)}, {"a": "PSNR 3.00 dB"})
+def test_the_same_frames_make_the_same_file(tmp_path):
+    frame = ComparedFrame.of("N", ["x"], picture(0), {"a": picture(1)}, {"a": "PSNR $3.00_ dB"})
     for name in ("one.png", "two.png"):
-        contact_sheet([row], ["a"], tmp_path / name)
+        contact_sheet([frame], ["a"], tmp_path / name)
     assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
 
 
 def test_faulty_input_is_refused_and_leaves_no_file(tmp_path):
     with pytest.raises(InputError, match="at least one frame"):
         contact_sheet([], ["a"], tmp_path / "x.png")
-    row = SheetRow("N", [], picture(0), {"a": picture(0, 30, 30)})
     with pytest.raises(InputError, match="render of a"):
-        contact_sheet([row], ["a"], tmp_path / "x.png")
+        ComparedFrame.of("N", [], picture(0), {"a": picture(0, 30, 30)}, {})
     assert list(tmp_path.iterdir()) == []
 
 
-def test_text_keeps_within_its_limit():
-    text = "The quick brown fox jumps over an extraordinarily-long-hyphenated-compound-word today"
-    for limit in (60, 100, 300):
-        lines = wrap(text, 13, limit)
-        assert all(text_width(line, 13) <= limit for line in lines)
-    assert " ".join(wrap(text, 13, 900)) == text
-    assert shorten("short", 13, 500) == "short"
-    assert text_width(shorten(text, 13, 80), 13) <= 80
+def test_marked_images_have_a_frame_outside_their_pixels(tmp_path):
+    tiles = [Tile(flat(200), mark="#ff0000"), Tile(flat(255))]
+    marked, plain = write_sheet(
+        tmp_path / "x.png",
+        [SheetSection("A", ["long head " * 20] * 2, [TileRow(["label"], tiles)])],
+        title="T",
+        subtitle="S " * 300,
+        marks={"#ff0000": "a limit is broken"},
+    )
+    sheet = np.asarray(Image.open(tmp_path / "x.png"))
+    assert (crop(sheet, marked) == 200).all()
+    assert (crop(sheet, plain) == 255).all()
+    for offset in (1, 2, 3):
+        assert (sheet[marked.top - offset, marked.left : marked.left + 30] == (255, 0, 0)).all()
+    assert (sheet[plain.top - 1, plain.left : plain.left + 30] < 255).all()
+    assert (sheet[plain.top - 2, plain.left : plain.left + 30] == 255).all()
 
 
 def test_the_colour_map_grows_brighter_steadily():
@@ -132,3 +137,11 @@ def test_the_colour_map_grows_brighter_steadily():
     assert (steps > 0).all()
     assert steps.max() < 2 * steps.mean()  # perceptually uniform
     np.testing.assert_array_equal(colour_map(np.array([[-1.0, 2.0]]))[0], colours[0, [0, -1]])
+
+
+@pytest.mark.parametrize(
+    ("items", "count", "chosen"),
+    [(range(10), 2, [2, 7]), (range(9), 3, [1, 4, 7]), ("ab", 5, ["a", "b"]), ([], 3, [])],
+)
+def test_frames_are_spread_evenly(items, count, chosen):
+    assert evenly_spaced(items, count) == chosen

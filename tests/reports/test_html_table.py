@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from headbench.bench.rows import Rows
-from headbench.reports.html_table import to_html
 from headbench.reports.tables import build_table
+from headbench.reports.writers import to_html
 
 VOID = {"meta", "br"}
 

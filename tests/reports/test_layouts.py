@@ -1,9 +1,8 @@
 import pytest
 
 from headbench.bench.errors import InputError
-from headbench.reports.published import published_rows, with_published
-from headbench.reports.run_set import RunSet
-from headbench.reports.table_report import table_of, table_text
+from headbench.reports.runs import RunSet
+from headbench.reports.table_report import published_rows, table_of, table_text, with_published
 
 METRICS = ("psnr", "ssim", "lpips", "storage", "fps")
 OPACITY, GEOMETRY = {"dynamic": ["opacity"]}, {"dynamic": ["position", "rotation", "scale"]}

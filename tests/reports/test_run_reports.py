@@ -13,9 +13,8 @@ from headbench.bench.rows import Rows
 from headbench.bench.runner.store import RunFolder
 from headbench.bench.specs import ReportSpec
 from headbench.reports import specs
-from headbench.reports.run_data import RunData
-from headbench.reports.run_set import RunSet
-from headbench.reports.sheet_report import evenly_spaced, write_contact_sheet
+from headbench.reports.contact_sheet import evenly_spaced, write_contact_sheet
+from headbench.reports.runs import RunData, RunSet
 from headbench.reports.table_report import layouts, table_of, table_text, write_tables
 
 
@@ -105,13 +104,6 @@ def test_a_damaged_render_is_named(toy_run):
         table_text([toy_run])
 
 
-def test_frames_are_spread_evenly():
-    assert evenly_spaced(range(10), 2) == [2, 7]
-    assert evenly_spaced(range(9), 3) == [1, 4, 7]
-    assert evenly_spaced("ab", 5) == ["a", "b"]
-    assert evenly_spaced([], 3) == []
-
-
 @pytest.mark.parametrize(
     "spec", [v for v in vars(specs).values() if isinstance(v, ReportSpec)], ids=lambda s: s.name
 )
@@ -120,7 +112,7 @@ def test_every_report_is_there(spec):
 
 
 def test_reports_need_no_torch():
-    code = "import sys, headbench.reports.sheet_report, headbench.reports.table_report; sys.exit('torch' in sys.modules)"
+    code = "import sys, headbench.reports.contact_sheet, headbench.reports.table_report; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 

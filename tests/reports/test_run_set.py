@@ -4,7 +4,7 @@ import pytest
 
 from headbench.bench.errors import InputError
 from headbench.bench.rows import ALL
-from headbench.reports.run_set import RunSet
+from headbench.reports.runs import RunSet
 
 
 def change_manifest(folder, change):

@@ -9,11 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from headbench.bench.rows import Rows
-from headbench.reports import latex, markdown
-from headbench.reports.csv_table import csv_text, to_csv
-from headbench.reports.latex import to_latex
-from headbench.reports.markdown import to_markdown
 from headbench.reports.tables import build_table
+from headbench.reports.writers import csv_text, escape_latex, escape_markdown, to_csv, to_latex, to_markdown
 
 NASTY = "a_b%&{x}$#^~\\|*<i>`é"
 
@@ -48,7 +45,7 @@ def test_markdown_is_a_table_of_equal_lines(table):
 
 @given(st.text(max_size=40))
 def test_markdown_text_stays_in_its_cell(text):
-    escaped = markdown.escape(text)
+    escaped = escape_markdown(text)
     assert "\n" not in escaped
     assert len(cells_of(f"| {escaped} | x |")) == 2
     assert re.sub(r"\\(.)", r"\1", escaped) == " ".join(text.split())
@@ -88,7 +85,7 @@ def test_csv_holds_no_formula_of_a_spreadsheet(value, cell):
 def test_every_csv_is_written_in_one_place():
     root = Path(__file__).parents[2]
     writers = {path.name for path in (root / "reports").rglob("*.py") if "csv.writer(" in path.read_text()}
-    assert writers == {"csv_table.py"}
+    assert writers == {"writers.py"}
 
 
 def balance(text):
@@ -125,12 +122,12 @@ def test_latex_is_a_balanced_booktabs_table(table):
 
 def test_latex_of_a_nasty_name():
     expected = r"a\_b\%\&\{x\}\$\#\textasciicircum{}\textasciitilde{}\textbackslash{}\textbar{}*\textless{}i\textgreater{}`é"
-    assert latex.escape(NASTY) == expected
+    assert escape_latex(NASTY) == expected
 
 
 @given(st.text(max_size=40))
 def test_latex_text_has_no_live_character(text):
-    escaped = latex.escape(text)
+    escaped = escape_latex(text)
     assert balance(escaped) == 0
     bare = re.sub(r"\$\\[a-z]+\$|\\[a-zA-Z]+|\\[{}$&#%_]", "", escaped)
     assert not set(bare) & set("\\$&#%_^~\n")

@@ -72,7 +72,7 @@ def test_the_table_shown_holds_the_run_and_the_images(run, images, tmp_path):
 
 
 def test_the_rows_stand_in_one_table_with_the_runs_and_verify(run, images, tmp_path):
-    from headbench.reports.run_set import RunSet
+    from headbench.reports.runs import RunSet
 
     worse = tmp_path / "worse"
     shutil.copytree(images, worse)

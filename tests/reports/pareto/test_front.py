@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from headbench.reports.pareto.front import pareto_front
+from headbench.reports.pareto.points import pareto_front
 
 SMALL = st.integers(0, 6)  # many ties
 

@@ -7,7 +7,7 @@ import pytest
 from sklearn.decomposition import PCA
 
 from headbench.bench.contracts import FrameKey, HeadPose
-from headbench.reports.robustness.expressions import ExpressionComponents, extremes, typical_pose
+from headbench.reports.robustness.extremes import ExpressionComponents, extremes, typical_pose
 
 
 @pytest.fixture

@@ -11,9 +11,9 @@ from headbench.bench.errors import InputError
 from headbench.bench.io.lock import LOCK_FILE, locked
 from headbench.reports.robustness import command
 from headbench.reports.robustness.extremes_command import run
-from headbench.reports.robustness.extremes_sheet import BROKEN, EXTRAPOLATED
 from headbench.reports.robustness.settings import ExtremesSettings
-from headbench.reports.robustness.trial import RECORD_FILE, ROWS_FILE, SHEET_FILE
+from headbench.reports.robustness.sheets import BROKEN, EXTRAPOLATED
+from headbench.reports.robustness.stability import RECORD_FILE, ROWS_FILE, SHEET_FILE
 
 VIEWS, COMPONENTS, STEPS = 6, 2, 6
 
@@ -23,7 +23,10 @@ def settings(folder, **changes):
 
 
 def colours(path):
-    return {tuple(pixel) for pixel in np.asarray(Image.open(path)).reshape(-1, 3)}
+    return {
+        f"#{r:02x}{g:02x}{b:02x}"
+        for r, g, b in np.unique(np.asarray(Image.open(path)).reshape(-1, 3), axis=0)
+    }
 
 
 def test_an_avatar_that_nothing_moves_passes_and_every_pair_has_its_rows(ball_run):

@@ -10,7 +10,7 @@ from headbench.bench.errors import InputError
 from headbench.bench.io.frames import read_png
 from headbench.reports.robustness.reenact_command import run
 from headbench.reports.robustness.settings import ReenactSettings
-from headbench.reports.robustness.trial import RECORD_FILE, ROWS_FILE, SHEET_FILE
+from headbench.reports.robustness.stability import RECORD_FILE, ROWS_FILE, SHEET_FILE
 
 
 def settings(folder, **changes):

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from headbench.bench.contracts import HeadPose
 from headbench.bench.errors import InputError
-from headbench.reports.robustness.retarget import RigidMean, check_heads, retarget
+from headbench.reports.robustness.reenactment import RigidMean, check_heads, retarget
 
 
 def poses(seed, count=5, spread=0.3, timestep=0):

@@ -6,8 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from headbench.reports.statistics.bootstrap import block_length, interval
-from headbench.reports.statistics.pairs import SequencePairs, SubjectPairs
+from headbench.reports.statistics.bootstrap import SequencePairs, SubjectPairs, block_length, interval
 from headbench.tests.benchmarks.simulation import Population
 
 

@@ -6,8 +6,7 @@ from hypothesis import strategies as st
 
 from headbench.bench.rows import Row, Rows
 from headbench.reports.statistics import comparisons
-from headbench.reports.statistics.comparisons import best_set
-from headbench.reports.statistics.holm import holm
+from headbench.reports.statistics.comparisons import best_set, holm
 
 LEVELS = {"low": 20.0, "middle": 20.5, "high": 25.0}
 

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from headbench.reports.statistics.holm import holm
+from headbench.reports.statistics.comparisons import holm
 
 p_values = st.lists(st.floats(0, 1), min_size=1, max_size=7)
 

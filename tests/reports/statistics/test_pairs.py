@@ -4,7 +4,7 @@ import pytest
 
 from headbench.bench.errors import InputError
 from headbench.reports.aggregate import macro_mean
-from headbench.reports.statistics.pairs import pair
+from headbench.reports.statistics.bootstrap import pair
 
 
 @pytest.fixture

@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from headbench.reports.statistics import sign_flip
-from headbench.reports.statistics.sign_flip import least_p, sign_flip_p, subjects_needed
+from headbench.reports.statistics import comparisons as sign_flip
+from headbench.reports.statistics.comparisons import least_p, sign_flip_p, subjects_needed
 
 differences = st.lists(st.integers(-50, 50), min_size=1, max_size=8)
 

@@ -1,0 +1,269 @@
+"""Writers of a table: Markdown, LaTeX, HTML, CSV and JSON."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import re
+import unicodedata
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict
+from itertools import groupby
+from pathlib import Path
+
+from .tables import Column, Table, TableCell
+
+# ---- Markdown
+
+MARKDOWN_RANKS = {1: ("**", "**"), 2: ("<ins>", "</ins>"), 3: ("*", "*")}
+
+
+def to_markdown(table: Table) -> str:
+    """Write a pipe table, aligned so that it also reads well unrendered. Header: tasks, first body row: metrics.
+
+    First bold, second underlined (``<ins>``), third italic.
+    """
+    tasks, names = [""], ["**Method**"]
+    for title, count in _spans(table):
+        tasks += [escape_markdown(title), *[""] * (count - 1)]
+    for column in table.columns:
+        unit = f" ({escape_markdown(column.unit)})" if column.unit else ""
+        measured = f"**{escape_markdown(column.label)}**{unit} {column.arrow}"
+        names.append("*published*" if column.published else measured)
+    lines = [tasks, names]
+    for title, rows in table.groups:
+        if len(table.groups) > 1:
+            lines.append([f"*{escape_markdown(title)}*", *[""] * len(table.columns)])
+        lines += [[escape_markdown(row.method), *map(_markdown_cell, row.cells)] for row in rows]
+    widths = [max(3, *(len(line[i]) for line in lines)) for i in range(len(names))]
+    body = [[line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])] for line in lines]
+    rule = [":" + "-" * (widths[0] - 1), *("-" * (width - 1) + ":" for width in widths[1:])]
+    text = "\n".join(f"| {' | '.join(cells)} |" for cells in (body[0], rule, *body[1:]))
+    notes = [f"<sup>{i}</sup> {escape_markdown(note)}  " for i, note in enumerate(table.notes, 1)]
+    return "\n\n".join([text, escape_markdown(table.caption), *(["\n".join(notes)] if notes else [])]) + "\n"
+
+
+def escape_markdown(text: str) -> str:
+    """Make text stand for itself in Markdown, on one line; an underscore within a word already does."""
+    return re.sub(r"([\\`*{}\[\]<>|#~&]|(?<!\w)_|_(?!\w))", r"\\\1", " ".join(text.split()))
+
+
+def _markdown_cell(cell: TableCell) -> str:
+    before, after = MARKDOWN_RANKS.get(cell.rank or 0, ("", ""))
+    text = f"{before}{escape_markdown(cell.shown)}{after}"
+    return text if cell.note is None else f"{text}<sup>{cell.note + 1}</sup>"
+
+
+# ---- LaTeX
+
+LATEX_ESCAPES = {
+    **{c: f"\\{c}" for c in "{}$&#%_"},
+    "\\": r"\textbackslash{}",
+    "^": r"\textasciicircum{}",
+    "~": r"\textasciitilde{}",
+    "<": r"\textless{}",
+    ">": r"\textgreater{}",
+    "|": r"\textbar{}",
+    '"': "''",
+    "[": "{[}",
+    "]": "{]}",
+    "–": "--",
+    "—": "---",
+    "…": r"\dots{}",
+    "×": r"$\times$",
+    "±": r"$\pm$",
+    "µ": r"$\mu$",
+    "↑": r"$\uparrow$",
+    "↓": r"$\downarrow$",
+    "→": r"$\rightarrow$",
+}
+LATEX_MACROS = {
+    "tabfirst": r"\textbf{#1}",
+    "tabsecond": r"\underline{#1}",
+    "tabthird": r"\textit{#1}",
+    "tabspread": r"{\scriptsize\,$\pm$\,#1}",
+    "tabpublished": r"\textsf{#1}",
+}
+LATEX_RANKS = {1: "tabfirst", 2: "tabsecond", 3: "tabthird"}
+LATEX_PAGE = r"""% For coloured cells load colortbl and, before this file:
+% \newcommand{\tabfirst}[1]{\cellcolor[rgb]{1,0.6,0.6}#1}, likewise \tabsecond and \tabthird.
+MACROS
+\begin{table*}[t]
+\centeringNARROW
+\caption{CAPTION}
+\label{LABEL}
+\sbox{0}{\begin{tabular}{COLUMNS}
+\toprule
+HEAD
+\midrule
+BODY
+\bottomrule
+\end{tabular}}
+\ifdim\wd0>\linewidth\resizebox{\linewidth}{!}{\usebox{0}}\else\usebox{0}\fi\parNOTES
+\end{table*}
+"""
+NARROW = 8
+"""Columns up to which a table keeps the distance between them."""
+
+
+def to_latex(table: Table, label: str = "tab:headbench") -> str:
+    r"""Write a ``table*`` environment for ``\input``, with booktabs rules.
+
+    It needs the packages booktabs and graphicx; a table wider than the page is scaled to fit it. The macros
+    ``\tabfirst``, ``\tabsecond``, ``\tabthird``, ``\tabspread`` and ``\tabpublished`` are provided only if the author
+    has not defined them before; define them to restyle every table at once. The protocol stands in a comment, too.
+    """
+    heads, rules, start = [""], [], 2
+    for title, count in _spans(table):
+        heads.append(rf"\multicolumn{{{count}}}{{c}}{{{escape_latex(title)}}}")
+        rules.append(rf"\cmidrule(lr){{{start}-{start + count - 1}}}")
+        start += count
+    names = ["Method"]
+    for column in table.columns:
+        unit = rf"\,({escape_latex(column.unit)})" if column.unit else ""
+        measured = f"{escape_latex(column.label)}{unit} {escape_latex(column.arrow)}"
+        names.append(r"\tabpublished{\scriptsize published}" if column.published else measured)
+    body: list[str] = []
+    for index, (title, rows) in enumerate(table.groups):
+        body += [r"\midrule"] if index else []
+        if len(table.groups) > 1:
+            body.append(rf"\multicolumn{{{len(names)}}}{{l}}{{\emph{{{escape_latex(title)}}}}} \\")
+        body += [
+            " & ".join([escape_latex(row.method), *map(_latex_cell, row.cells)]) + r" \\" for row in rows
+        ]
+    notes = [rf"\par\textsuperscript{{{i}}}~{escape_latex(note)}" for i, note in enumerate(table.notes, 1)]
+    if notes:
+        notes = ["", r"\begin{minipage}{\linewidth}", r"\footnotesize", *notes, r"\end{minipage}"]
+    parts = {
+        "MACROS": "\n".join(rf"\providecommand{{\{name}}}[1]{{{x}}}" for name, x in LATEX_MACROS.items()),
+        "NARROW": "\n" + r"\setlength{\tabcolsep}{3pt}" if len(table.columns) > NARROW else "",
+        "CAPTION": escape_latex(table.caption),
+        "LABEL": re.sub(r"[^A-Za-z0-9:.-]", "-", label),
+        "COLUMNS": "l" + "r" * len(table.columns),
+        "HEAD": "\n".join([" & ".join(heads) + r" \\", " ".join(rules), " & ".join(names) + r" \\"]),
+        "BODY": "\n".join(body),
+        "NOTES": "\n".join(notes),
+    }
+    comments = [f"{t.title}: protocol {t.protocol_id} {t.protocol_hash}" for t in table.tasks]
+    page = re.sub("|".join(parts), lambda match: parts[match[0]], LATEX_PAGE)
+    return "".join(f"% {' '.join(text.split())}\n" for text in comments) + page
+
+
+def escape_latex(text: str) -> str:
+    """Make text stand for itself in LaTeX, on one line.
+
+    What the default fonts and inputs of pdfLaTeX do not know (anything beyond Latin letters with accents) is
+    written as its code point rather than left to break the author's paper.
+    """
+
+    def escaped(character: str) -> str:
+        known = 32 <= ord(character) < 127 or (192 <= ord(character) < 256 and character.isalpha())
+        return LATEX_ESCAPES.get(character, character if known else rf"\texttt{{U+{ord(character):04X}}}")
+
+    return "".join(map(escaped, unicodedata.normalize("NFC", " ".join(text.split()))))
+
+
+def _latex_cell(cell: TableCell) -> str:
+    text = escape_latex(cell.text)
+    macro = "tabpublished" if cell.status == "published" else LATEX_RANKS.get(cell.rank or 0)
+    text = rf"\{macro}{{{text}}}" if macro else text
+    text += rf"\tabspread{{{escape_latex(cell.spread)}}}" if cell.spread else ""
+    return text if cell.note is None else rf"{text}\textsuperscript{{{cell.note + 1}}}"
+
+
+# ---- HTML
+
+
+def to_html(table: Table) -> str:
+    """Write one page that needs no script, font or network. Values in full precision stand in tooltips."""
+    from jinja2 import Environment
+
+    template = Path(__file__).with_name("table.html").read_text(encoding="utf-8")
+    ranks = {1: "first", 2: "second", 3: "third"}
+    page = Environment(autoescape=True, keep_trailing_newline=True).from_string(template)
+    return page.render(table=table, spans=_spans(table), ranks=ranks)
+
+
+# ---- CSV
+
+FORMULA_STARTS = ("=", "+", "-", "@")
+
+
+def to_csv(table: Table) -> str:
+    """Write one line per method, in full precision.
+
+    Columns: method, version, group; per column of the table the value (``novel_view/psnr``, empty where there is
+    none), its rank (``.../rank``), its status (``.../status``) and, with several seeds, its standard deviation from
+    seed to seed as displayed (``.../spread``), or for a published column the paper's figure alone; notes; protocol.
+    """
+    header = ["method", "version", "group"]
+    extras = ["rank", "status", *(["spread"] if table.seeds > 1 else [])]
+    for column in table.columns:
+        name = column_name(column)
+        header += [name] if column.published else [name, *(f"{name}/{extra}" for extra in extras)]
+    lines: list[list[object]] = [[*header, "notes", "protocol"]]
+    protocol = " ".join(f"{task.task}={task.protocol_hash}" for task in table.tasks)
+    for title, rows in table.groups:
+        for row in rows:
+            line: list[object] = [row.method, row.version, title]
+            for column, cell in zip(table.columns, row.cells):
+                line.append("" if cell.value is None else repr(cell.value))
+                if not column.published:
+                    line += [str(cell.rank or ""), cell.status, cell.spread][: len(extras)]
+            notes = sorted({cell.note for cell in row.cells if cell.note is not None})
+            lines.append([*line, " ".join(table.notes[note] for note in notes), protocol])
+    return csv_text(lines)
+
+
+def csv_text(lines: Iterable[Sequence[object]]) -> str:
+    """Write lines as CSV, None as an empty cell.
+
+    Text that a spreadsheet would take for a formula has an apostrophe in front, as OWASP advises ("CSV Injection").
+    """
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerows([_without_formula(value) for value in line] for line in lines)
+    return stream.getvalue()
+
+
+def _without_formula(value: object) -> object:
+    if not isinstance(value, str):
+        return value
+    value = value.replace("\r", " ")  # which the writer leaves bare, and readers take for the end of the line
+    if not value.lstrip().startswith(FORMULA_STARTS):
+        return value
+    try:
+        float(value)
+    except ValueError:
+        return f"'{value}"
+    return value
+
+
+def column_name(column: Column) -> str:
+    """``task/metric``, or the metric alone for one of the avatar as a whole; ``.../published`` for a paper's."""
+    name = f"{column.task}/{column.metric}" if column.task else column.metric
+    return f"{name}/published" if column.published else name
+
+
+# ---- all
+
+
+def to_json(table: Table) -> str:
+    """Write the typed table as it is."""
+    return json.dumps({**asdict(table), "caption": table.caption}, indent=1, ensure_ascii=False) + "\n"
+
+
+WRITERS: dict[str, tuple[str, Callable[[Table], str]]] = {
+    "md": ("md", to_markdown),
+    "csv": ("csv", to_csv),
+    "latex": ("tex", to_latex),
+    "html": ("html", to_html),
+    "json": ("json", to_json),
+}
+"""By name of the format: suffix of its files, and the writer."""
+
+
+def _spans(table: Table) -> list[tuple[str, int]]:
+    """Titles over the columns, each with how many neighbouring columns it is of."""
+    return [(title, len(list(members))) for title, members in groupby(table.columns, key=lambda c: c.title)]
