@@ -12,7 +12,7 @@ from headbench.bench.runner import run as runner
 from headbench.bench.runner.config import RunConfig
 from headbench.bench.runner.store import RunFolder
 from headbench.bench.specs import ResolutionRule
-from headbench.methods.specs import MEAN_IMAGE
+from headbench.methods.trivial.spec import MEAN_IMAGE
 
 from .datasets.tiny_capture import write_tiny_capture
 

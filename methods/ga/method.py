@@ -29,7 +29,6 @@ from ..shared.binding import Frames, WorldSplats, to_world
 from ..shared.bound_avatar import USUAL, Cutoffs, Drawn, PosedSplats, draw_splats, posed_splats, read_back
 from ..shared.bound_training import Placed, run_bound_training
 from ..shared.clip_checks import check_training_split
-from ..shared.configs import GAConfig
 from ..shared.seeds import torch_generator
 from ..shared.sh import coefficient_count, initial_coefficients, occupied_degree, sh_to_rgb
 from ..shared.stored_splats import Carrier, HarmonicColors
@@ -39,6 +38,7 @@ from ..shared.training.optimiser import Optimiser
 from ..shared.training.sampling import ShuffledEpochs
 from ..shared.training.schedule import Timeline
 from ..shared.views import View, view_of
+from .config import GAConfig
 from .storage import PLY_FILE, read_ga_splats, write_ga_splats
 
 DRIVING_FILE = "driving.npz"

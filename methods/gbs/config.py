@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from ..shared.configs import DensifiedTraining
+from ..shared.config import DensifiedTraining
 
 Departure = Literal["triple_correctives", "blended_lower_teeth"]
 """What the published code does otherwise than the paper says."""

@@ -14,13 +14,13 @@ from ...datasets.head.rotations import axis_angle_to_matrix
 from ...datasets.steps.jaw_bases import jaw_bases, jaw_quaternions, jaw_weights
 from ..shared.binding import Frames, to_world
 from ..shared.bound_training import Placed
-from ..shared.configs import OursConfig
 from ..shared.seeds import torch_generator
 from ..shared.sh import initial_coefficients, sh_to_rgb
 from ..shared.subject_mesh import BoundedCache, SubjectMesh, centroid_displacements
 from ..shared.training.optimiser import Optimiser
 from ..shared.training.schedule import Timeline
 from ..shared.views import View
+from .config import OursConfig
 from .dynamics import LocalSplats, apply_offsets, changed_colors
 from .feature_lines import blend_lines, line_offsets, line_position
 from .field import (

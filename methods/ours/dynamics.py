@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..shared.configs import Dynamic
+from .config import Dynamic
 
 WIDTHS: Mapping[Dynamic, int] = {"opacity": 1, "position": 3, "rotation": 4, "scale": 3, "color": 3}
 """Numbers per splat of each thing that may change."""

@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from ..shared.binding import Frames, apply_matrices
-from ..shared.configs import OursConfig
 from ..shared.networks import color_network
 from ..shared.sh import C0
 from ..shared.triplane import ENCODING_SIZE, PAIRS, encode_directions, sample_triplane
+from .config import OursConfig
 from .dynamics import offset_width
 from .feature_lines import AXES, Parameters, initial_line_network, uniform
 

@@ -29,13 +29,13 @@ from ..shared.avatar_files import (
 )
 from ..shared.bound_training import BoundTraining, run_bound_training
 from ..shared.clip_checks import check_training_split
-from ..shared.configs import OursConfig
 from ..shared.subject_mesh import SubjectMesh
 from ..shared.training.loop import CHECKPOINT, check_budget
 from ..shared.training.sampling import Sampler, ShuffledEpochs, Weighted, balanced_weights
 from .appearance import OursAppearance
 from .avatar import OursAvatar
 from .capacity.plan import plan_capacity
+from .config import OursConfig
 from .outer_layers import shell_start
 from .storage import FIELD_FILE, write_field
 

@@ -14,8 +14,8 @@ from ...bench.contracts import Clip
 from ...datasets.head.arrays import faces_in_region
 from ..shared.binding import NORMAL
 from ..shared.bound_training import Start, one_per_triangle
-from ..shared.configs import OursConfig
 from ..shared.subject_mesh import SubjectMesh, centroid_displacements
+from .config import OursConfig
 
 
 def shell_start(mesh: SubjectMesh, clip: Clip, config: OursConfig, device: str) -> Start:

@@ -15,10 +15,10 @@ from torch import Tensor
 from ...bench.errors import InputError
 from ...bench.io.arrays import Member
 from ...bench.io.files import write_bytes
-from ..shared.configs import Dynamic
 from ..shared.sh import coefficient_count
 from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors
 from ..shared.triplane import ENCODING_SIZE, PAIRS
+from .config import Dynamic
 from .dynamics import WIDTHS, offset_width
 from .field import Box
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ...bench.contracts import Budget, Clip, Progress
 from .binding import Frames, WorldSplats
-from .configs import SplatTraining
+from .config import SplatTraining
 from .splat_trainer import SplatTrainer, run_trainer
 from .training.loop import Outcome
 from .training.losses import photometric_loss, position_penalty, scale_penalty

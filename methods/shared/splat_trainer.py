@@ -14,7 +14,7 @@ from ...bench.contracts import Budget, Camera, Clip, FrameKey, Progress
 from ..splats import rasterize
 from ..splats.request import Rendering
 from .binding import WorldSplats
-from .configs import DensifiedTraining
+from .config import DensifiedTraining
 from .training.densify import Densifier
 from .training.images import TrainingImages
 from .training.loop import Outcome, train

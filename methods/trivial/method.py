@@ -19,8 +19,8 @@ from ...bench.io.files import atomic_path
 from ...bench.io.images import read_pixels
 from ..shared.avatar_files import TRACKED, is_finished, run_digest, write_arrays, write_record
 from ..shared.clip_checks import check_training_split
-from ..shared.configs import NearestCameraConfig
 from ..shared.training.loop import Outcome
+from .spec import NearestCameraConfig
 
 MEAN_FILE = "mean.npz"
 INDEX_FILE = "index.npz"

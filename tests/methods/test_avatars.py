@@ -18,12 +18,14 @@ from headbench.bench.contracts import (
     no_progress,
 )
 from headbench.bench.errors import InputError
+from headbench.methods.ga.config import GAConfig
 from headbench.methods.ga.method import GA
 from headbench.methods.ga.storage import COLUMNS
 from headbench.methods.gbs.config import BlendshapeTraining, GBSConfig
 from headbench.methods.gbs.method import GBS
+from headbench.methods.ours.config import OursConfig
 from headbench.methods.ours.method import Ours
-from headbench.methods.shared.configs import GAConfig, OursConfig, SplatTraining
+from headbench.methods.shared.config import SplatTraining
 
 FAST = SplatTraining(max_splats=1200, min_densify_every=40, min_settle=20)
 CONFIGS = {

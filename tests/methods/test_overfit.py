@@ -2,7 +2,9 @@
 
 import pytest
 
-from headbench.methods.specs import GA, GBS, OURS
+from headbench.methods.ga.spec import GA
+from headbench.methods.gbs.spec import GBS
+from headbench.methods.ours.spec import OURS
 
 from .single_frame import psnr_by_heart
 

@@ -11,11 +11,13 @@ from pathlib import Path
 import pytest
 
 from headbench.bench.contracts import Budget, no_progress
+from headbench.methods.ga.config import GAConfig
 from headbench.methods.ga.method import GA
 from headbench.methods.gbs.config import BlendshapeTraining, GBSConfig
 from headbench.methods.gbs.method import GBS
+from headbench.methods.ours.config import OursConfig
 from headbench.methods.ours.method import Ours
-from headbench.methods.shared.configs import GAConfig, OursConfig, SplatTraining
+from headbench.methods.shared.config import SplatTraining
 from headbench.methods.shared.training.loop import CHECKPOINT
 
 from ..datasets.head.toy import toy_head

@@ -6,11 +6,18 @@ from headbench.bench.configuration import build
 from headbench.bench.contracts import Budget
 from headbench.bench.registry import resolve
 from headbench.bench.runner.config import resolve_method
+from headbench.methods.ga.config import GAConfig
+from headbench.methods.ga.spec import GA
 from headbench.methods.gbs.config import GBSConfig
+from headbench.methods.gbs.spec import GBS
 from headbench.methods.gha.config import GHAConfig
-from headbench.methods.shared.configs import GAConfig, OursConfig, SplatTraining
+from headbench.methods.gha.spec import GHA
+from headbench.methods.insta.spec import INSTA
+from headbench.methods.ours.config import OursConfig
+from headbench.methods.ours.spec import OURS
+from headbench.methods.shared.config import SplatTraining
 from headbench.methods.shared.training.schedule import DensifySchedule, Timeline
-from headbench.methods.specs import GA, GBS, GHA, INSTA, MEAN_IMAGE, NEAREST_CAMERA, OURS
+from headbench.methods.trivial.spec import MEAN_IMAGE, NEAREST_CAMERA
 
 SPECS = {spec.name: spec for spec in (OURS, GA, GBS, GHA, INSTA, MEAN_IMAGE, NEAREST_CAMERA)}
 PRESETS = ("smoke", "demo", "fast", "paper")

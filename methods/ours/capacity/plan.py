@@ -43,8 +43,8 @@ from torch import Tensor
 from ....bench.contracts import Clip, FloatArray, HeadPose
 from ....datasets.head.arrays import faces_in_region
 from ...compact.simplify import training_poses
-from ...shared.configs import OursConfig, Planned
 from ...shared.subject_mesh import SubjectMesh
+from ..config import OursConfig, Planned
 from ..field import PLANE_MARGIN, Box, line_box, plane_box
 from .evidence import (
     displacement_without,

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ....datasets.head.rotations import quaternion_to_matrix
-from ..configs import DensifiedTraining
+from ..config import DensifiedTraining
 from ..seeds import torch_generator
 from .optimiser import Optimiser
 from .schedule import DensifySchedule

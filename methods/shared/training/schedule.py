@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from ..configs import DensifiedTraining
+from ..config import DensifiedTraining
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,10 @@ import torch
 from ....bench.contracts import Camera, HeadAsset, HeadPose
 from ....datasets.steps.jaw_bases import jaw_quaternions
 from ....methods.ours.avatar import OursAvatar
+from ....methods.ours.config import OursConfig
 from ....methods.ours.field import initial_parameters, line_box, plane_box
 from ....methods.ours.storage import Field
 from ....methods.shared.avatar_files import Subject
-from ....methods.shared.configs import OursConfig
 from ....methods.shared.seeds import numpy_generator, torch_generator
 from ....methods.shared.subject_mesh import SubjectMesh
 

@@ -12,7 +12,7 @@ from headbench.methods.compact.command import run
 from headbench.methods.compact.settings import CompactSettings
 from headbench.methods.ours.avatar import OursAvatar
 from headbench.methods.ours.method import Ours
-from headbench.methods.shared.configs import SplatTraining
+from headbench.methods.shared.config import SplatTraining
 
 from ...datasets.tiny_capture import make_plan, write_tiny_capture
 from ..ours.toy import SMALL

@@ -14,10 +14,11 @@ from headbench.methods.compact.file import COMPACT_FILE, encode, exact_sizes, pa
 from headbench.methods.compact.precision import EXACT, Precision
 from headbench.methods.compact.simplify import simplify, training_poses
 from headbench.methods.ours.avatar import OursAvatar
+from headbench.methods.ours.config import OursConfig
 from headbench.methods.ours.method import Ours
 from headbench.methods.ours.storage import FIELD_FILE
 from headbench.methods.shared.avatar_files import read_shared_head
-from headbench.methods.shared.configs import OursConfig, SplatTraining
+from headbench.methods.shared.config import SplatTraining
 
 from ..ours.toy import SMALL
 from ..stored_toy import store

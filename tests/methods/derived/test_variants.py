@@ -9,10 +9,11 @@ import torch
 from headbench.bench.contracts import Budget, no_progress
 from headbench.methods.derived import ga_variants, ours_variants
 from headbench.methods.derived.recipes import EARLY, GA, OURS, Recipe
+from headbench.methods.ga.config import GAConfig
 from headbench.methods.ga.method import GA as GAMethod
 from headbench.methods.ga.method import GAAvatar
 from headbench.methods.ours.avatar import OursAvatar
-from headbench.methods.shared.configs import GAConfig, SplatTraining
+from headbench.methods.shared.config import SplatTraining
 
 from ..ours.toy import SMALL
 from ..stored_toy import store

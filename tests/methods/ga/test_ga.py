@@ -5,9 +5,9 @@ import pytest
 import torch
 from torch import nn
 
+from headbench.methods.ga.config import GAConfig
 from headbench.methods.ga.method import GAAppearance
 from headbench.methods.shared.avatar_files import TRACKED
-from headbench.methods.shared.configs import GAConfig
 from headbench.methods.shared.sh import C0, C1
 from headbench.methods.shared.subject_mesh import SubjectMesh
 from headbench.methods.shared.training.optimiser import Optimiser

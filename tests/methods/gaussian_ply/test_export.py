@@ -13,6 +13,7 @@ from scipy.special import sph_harm_y
 from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.errors import InputError
 from headbench.datasets.ga.reader import read_capture
+from headbench.methods.ga.config import GAConfig
 from headbench.methods.ga.method import GA
 from headbench.methods.gaussian_ply import command
 from headbench.methods.gaussian_ply.command import neutral_pose, run
@@ -21,7 +22,6 @@ from headbench.methods.gaussian_ply.settings import ExportPlySettings
 from headbench.methods.gbs.config import GBSConfig
 from headbench.methods.gbs.method import GBS
 from headbench.methods.ours.avatar import OursAvatar
-from headbench.methods.shared.configs import GAConfig
 from headbench.methods.shared.sh import sh_basis
 from headbench.methods.shared.views import view_of
 from headbench.methods.splats import rasterize

@@ -7,7 +7,7 @@ from headbench.bench.runner.adaptation import MethodNeeds
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.specs import GA_LAYOUT
 from headbench.datasets.synthetic.capture import synthesize
-from headbench.methods.specs import GBS
+from headbench.methods.gbs.spec import GBS
 
 from ..single_frame import psnr_by_heart
 

@@ -4,7 +4,7 @@ import pytest
 
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.synthetic.capture import synthesize
-from headbench.methods.specs import GHA
+from headbench.methods.gha.spec import GHA
 
 from ..single_frame import psnr_by_heart
 from ..toy_clip import ToyClip

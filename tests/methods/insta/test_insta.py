@@ -14,9 +14,9 @@ from headbench.methods.insta import kernel
 from headbench.methods.insta.avatar import InstaAvatar
 from headbench.methods.insta.config import InstaConfig
 from headbench.methods.insta.method import Insta
+from headbench.methods.insta.spec import INSTA
 from headbench.methods.insta.storage import FIELD_FILE, SETTINGS_FILE
 from headbench.methods.shared.training.loop import CHECKPOINT
-from headbench.methods.specs import INSTA
 
 from ..single_frame import psnr_by_heart
 from .small import SMALL

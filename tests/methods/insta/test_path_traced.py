@@ -4,7 +4,7 @@ import pytest
 
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.synthetic.capture import synthesize
-from headbench.methods.specs import INSTA
+from headbench.methods.insta.spec import INSTA
 
 from ..single_frame import psnr_by_heart
 

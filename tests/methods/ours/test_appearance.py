@@ -8,7 +8,7 @@ import torch
 
 from headbench.datasets.head.arrays import faces_in_region
 from headbench.methods.ours.appearance import penalty_weights, softened
-from headbench.methods.shared.configs import OursConfig
+from headbench.methods.ours.config import OursConfig
 
 from .toy import SMALL, make, place
 

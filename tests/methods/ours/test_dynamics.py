@@ -8,6 +8,7 @@ import torch
 
 from headbench.bench.errors import InputError
 from headbench.methods.ours.avatar import OursAvatar
+from headbench.methods.ours.config import OursConfig
 from headbench.methods.ours.dynamics import (
     WIDTHS,
     LocalSplats,
@@ -17,7 +18,6 @@ from headbench.methods.ours.dynamics import (
 )
 from headbench.methods.ours.storage import FIELD_FILE, write_field
 from headbench.methods.shared.avatar_files import SUBJECT_FILE, Subject, save_shared_head, write_subject
-from headbench.methods.shared.configs import OursConfig
 
 from .toy import SMALL, make, place
 

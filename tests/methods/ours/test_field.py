@@ -5,6 +5,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from headbench.methods.ours.config import OursConfig
 from headbench.methods.ours.field import (
     Box,
     CanonicalFrames,
@@ -18,7 +19,6 @@ from headbench.methods.ours.field import (
     shade_directions,
 )
 from headbench.methods.shared.binding import to_world, triangle_frames
-from headbench.methods.shared.configs import OursConfig
 
 GENERATOR = torch.Generator().manual_seed(0)
 

@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 from headbench.bench.contracts import Budget, no_progress
 from headbench.datasets.head.model import HeadModel
 from headbench.methods.ours.appearance import OursAppearance
+from headbench.methods.ours.config import OursConfig
 from headbench.methods.ours.method import Ours
-from headbench.methods.shared.configs import OursConfig, SplatTraining
+from headbench.methods.shared.config import SplatTraining
 from headbench.methods.shared.subject_mesh import SubjectMesh
 from headbench.methods.shared.training.optimiser import Optimiser
 from headbench.methods.shared.training.schedule import Timeline

@@ -4,8 +4,8 @@ import torch
 from torch import nn
 
 from headbench.methods.ours.appearance import OursAppearance
+from headbench.methods.ours.config import OursConfig
 from headbench.methods.shared.avatar_files import Subject
-from headbench.methods.shared.configs import OursConfig
 from headbench.methods.shared.subject_mesh import SubjectMesh
 from headbench.methods.shared.training.optimiser import Optimiser
 from headbench.methods.shared.training.schedule import Timeline

@@ -12,7 +12,7 @@ from headbench.bench.errors import InputError
 from headbench.methods.shared.binding import to_world
 from headbench.methods.shared.bound_training import BoundTraining, Placed
 from headbench.methods.shared.clip_checks import check_training_split
-from headbench.methods.shared.configs import SplatTraining
+from headbench.methods.shared.config import SplatTraining
 from headbench.methods.shared.subject_mesh import SubjectMesh
 from headbench.methods.shared.training.schedule import Timeline
 from headbench.methods.shared.views import scene_extent

@@ -7,8 +7,8 @@ import pytest
 
 from headbench.bench.contracts import Avatar, Budget, Method, no_progress
 from headbench.bench.errors import InputError
-from headbench.methods.shared.configs import NearestCameraConfig
 from headbench.methods.trivial.method import INDEX_FILE, MEAN_FILE, MeanImage, NearestCamera, resize
+from headbench.methods.trivial.spec import NearestCameraConfig
 
 
 def fit(method, clip, folder):

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import nn
 
-from headbench.methods.shared.configs import SplatTraining
+from headbench.methods.shared.config import SplatTraining
 from headbench.methods.shared.training.densify import SHRINK, Densifier, logit, rows_of_tables
 from headbench.methods.shared.training.optimiser import Optimiser
 from headbench.methods.shared.training.schedule import DensifySchedule

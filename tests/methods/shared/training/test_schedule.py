@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from headbench.methods.shared.configs import SplatTraining
+from headbench.methods.shared.config import SplatTraining
 from headbench.methods.shared.training.schedule import DensifySchedule, Timeline, log_linear
 
 PUBLISHED = SplatTraining()

@@ -1,139 +1,11 @@
-"""Settings of the methods, as frozen dataclasses. Light: neither torch nor numpy is imported here.
-
-The defaults are the published values (600,000 iterations), but for published slips and for bounds wider than the
-head; there the published behaviour is an option, which the preset "paper" takes unless it leaks held-out data.
-
-Moments in training are written on the published scale and mapped to the budget at hand as fractions
-(`training.schedule`); the ``min_...`` fields say how many iterations a thing needs in any run to do more good than
-harm, and rule only in runs much shorter than published.
-"""
+"""Settings of "ours". Light: neither torch nor numpy is imported here."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from typing import Literal
 
-
-@dataclass(frozen=True)
-class DensifiedTraining:
-    """How splats are trained and their number is adapted: 3DGS, section 5, with GaussianAvatars' values.
-
-    Attributes
-    ----------
-    schedule_length : iterations of the published run; every ``..._from``, ``..._every`` below is on its scale.
-    position_lr, position_lr_final : log-linear from one to the other over the run, times the scene extent.
-    final_rate : part of their learning rate that all other tensors end with, log-linearly over the last half of
-        the run; 1 keeps them constant, as published. A short run has not the steps to average Adam's noise away.
-    ssim_weight : the loss is ``(1 - w) L1 + w (1 - SSIM)``.
-    densify_from, densify_every, densify_until : rounds of cloning, splitting and pruning.
-    densify_gradient : mean gradient of the projected mean, in normalised device units, that asks for a round.
-    densify_extent : splats larger than this part of the scene extent are split, smaller ones cloned.
-    split_offsets : "local" scatters the two children of a split over the parent. "world" is the compatibility
-        option for the published code, which uses world-space scales in local coordinates and so puts both
-        children almost onto the parent.
-    prune_opacity : splats below it are removed.
-    prune_extent, prune_extent_from : so are splats larger than this part of the extent, from then on.
-    reset_every, reset_at_start, reset_opacity : opacities are cut to ``reset_opacity`` regularly (None: never), and
-        once when densification starts, if the background is white, as published.
-    max_splats : densification stops adding above this number; None for no bound.
-    min_densify_every, min_reset_every : in iterations of the actual run. A gradient mean needs some views, and
-        opacities some steps to recover.
-    min_settle : no densification and no reset in the last so many iterations of the actual run.
-    mesh_cache_mb : memory for the posed meshes of known timesteps.
-    checkpoint_every_s : seconds between checkpoints.
-    """
-
-    schedule_length: int = 600_000
-    position_lr: float = 5e-3
-    position_lr_final: float = 5e-5
-    opacity_lr: float = 0.05
-    scale_lr: float = 0.017
-    rotation_lr: float = 1e-3
-    final_rate: float = 1.0
-    ssim_weight: float = 0.2
-    initial_opacity: float = 0.1
-    densify_from: int = 10_000
-    densify_every: int = 2_000
-    densify_until: int = 600_000
-    densify_gradient: float = 2e-4
-    densify_extent: float = 0.01
-    split_offsets: Literal["local", "world"] = "local"
-    prune_opacity: float = 0.005
-    prune_extent: float = 0.1
-    prune_extent_from: int = 60_000
-    reset_every: int | None = 60_000
-    reset_at_start: bool = True
-    reset_opacity: float = 0.01
-    max_splats: int | None = None
-    min_densify_every: int = 100
-    min_reset_every: int = 3_000
-    min_settle: int = 300
-    mesh_cache_mb: int = 512
-    checkpoint_every_s: float = 120.0
-
-    def __post_init__(self) -> None:
-        for name in (
-            "schedule_length",
-            "densify_every",
-            "reset_every",
-            "min_densify_every",
-            "min_reset_every",
-        ):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise ValueError(f"{name} must be at least 1, found {value}")
-        if not 0 < self.initial_opacity < 1 or not 0 < self.reset_opacity < 1:
-            raise ValueError("initial_opacity and reset_opacity must lie between 0 and 1")
-        if not 0 < self.final_rate <= 1:
-            raise ValueError(f"final_rate must lie in (0, 1], found {self.final_rate}")
-        if not 0 <= self.ssim_weight <= 1:
-            raise ValueError(f"ssim_weight must lie in [0, 1], found {self.ssim_weight}")
-        if self.max_splats is not None and self.max_splats < 1:
-            raise ValueError(f"max_splats must be at least 1 or null, found {self.max_splats}")
-
-
-@dataclass(frozen=True)
-class SplatTraining(DensifiedTraining):
-    """How splats bound to a mesh are trained: GaussianAvatars (CVPR 2024), section 3 and its code.
-
-    Attributes
-    ----------
-    position_weight, position_threshold : penalty on local positions longer than the threshold (triangle sizes).
-    scale_weight, scale_threshold : penalty on local scales above the threshold (triangle sizes).
-    """
-
-    position_weight: float = 0.01
-    position_threshold: float = 1.0
-    scale_weight: float = 1.0
-    scale_threshold: float = 0.6
-
-
-@dataclass(frozen=True)
-class GAConfig:
-    """GaussianAvatars: spherical harmonics per splat, and tracking refined with the avatar.
-
-    Attributes
-    ----------
-    sh_degree, sh_every, min_sh_every : degree of the spherical harmonics at the end; one degree more each
-        ``sh_every`` iterations (published scale), but at least ``min_sh_every`` of the actual run.
-    refine_tracking : optimise expression, poses and translation of the training timesteps.
-    """
-
-    splats: SplatTraining = field(default_factory=SplatTraining)
-    sh_degree: int = 3
-    sh_every: int = 1_000
-    min_sh_every: int = 100
-    sh_dc_lr: float = 0.0025
-    sh_rest_lr: float = 0.000125
-    refine_tracking: bool = True
-    expression_lr: float = 1e-3
-    pose_lr: float = 1e-5
-    translation_lr: float = 1e-6
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.sh_degree <= 3:
-            raise ValueError(f"sh_degree must be 0 to 3, found {self.sh_degree}")
-
+from ..shared.config import SplatTraining
 
 Dynamic = Literal["opacity", "position", "rotation", "scale", "color"]
 """What an expression may change about a splat."""
@@ -247,10 +119,3 @@ class OursConfig:
             raise ValueError(f"sh_degree must be 0 to 3, found {self.sh_degree}")
         if not self.dynamic or len(set(self.dynamic)) != len(self.dynamic):
             raise ValueError(f"dynamic must name each thing once, and one at least, found {self.dynamic}")
-
-
-@dataclass(frozen=True)
-class NearestCameraConfig:
-    """Nearest training image. ``max_timesteps`` keeps that many, evenly spaced, and bounds the storage."""
-
-    max_timesteps: int | None = None

@@ -1,19 +1,13 @@
-"""Presets of GHA that scale with the capture, for CPUs. Light: nothing is imported.
-
-The published design (`config`) splats 32 channels at 512 pixels for images of 2048, with networks of 836,000 numbers
-over some 100,000 Gaussians: hours on a GPU. These presets take the capture at its own size, with fewer Gaussians than
-it has pixels and networks to match. "demo" and "smoke" are for captures smaller than what the published design splats,
-so they splat at the full size, and one block sharpens; "fast" splats at half of it.
-
-What the published method learns of thousands of timesteps, motion in all directions of the expression code, the tracked
-head model teaches here (`tracked_motion`), about a neutral head whose mouth is open a little.
-"""
+"""What there is to know of Gaussian Head Avatar before it is imported. Light: no implementation is imported."""
 
 from __future__ import annotations
 
 from typing import Any
 
-_SHORT: dict[str, Any] = {
+from ...bench.specs import MethodSpec, ResolutionRule
+from ..shared.config import PAPER_ITERATIONS
+
+SHORT: dict[str, Any] = {
     "start": "mesh",
     "mesh_fraction": 0.12,
     "start_steps": 600,
@@ -53,15 +47,30 @@ _SHORT: dict[str, Any] = {
     "final_rate": 0.1,
     "augment": False,
 }
+"""Short presets scale with the capture, for CPUs (README.md)."""
 
-GHA_SHORT: dict[str, dict[str, Any]] = {
+SHORT_PRESETS: dict[str, dict[str, Any]] = {
     "smoke": {
         "budget": {"iterations": 60},
-        **_SHORT,
+        **SHORT,
         "max_points": 2_000,
         "start_steps": 200,
         "motion_steps": 200,
     },
-    "demo": {"budget": {"iterations": 1_500}, **_SHORT},
-    "fast": {"budget": {"iterations": 4_000}, **_SHORT, "max_points": 20_000, "sr_widths": (32, 16)},
+    "demo": {"budget": {"iterations": 1_500}, **SHORT},
+    "fast": {"budget": {"iterations": 4_000}, **SHORT, "max_points": 20_000, "sr_widths": (32, 16)},
 }
+
+
+GHA = MethodSpec(
+    name="gha",
+    version="3",
+    summary="Gaussian Head Avatar: splats driven by networks, drawn as features, sharpened by another network.",
+    implementation="headbench.methods.gha.method:GHA",
+    config="headbench.methods.gha.config:GHAConfig",
+    presets={**SHORT_PRESETS, "paper": {"budget": {"iterations": PAPER_ITERATIONS}}},
+    preset_resolutions={
+        "paper": ResolutionRule(square="pad", size=(2048, 2048), speed_size=(1024, 1024)),
+    },
+    source="Gaussian Head Avatar: Ultra High-fidelity Head Avatar via Dynamic Gaussians, CVPR 2024, arXiv 2312.03029",
+)

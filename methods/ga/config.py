@@ -1,0 +1,34 @@
+"""Settings of GaussianAvatars. Light: neither torch nor numpy is imported here."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from ..shared.config import SplatTraining
+
+
+@dataclass(frozen=True)
+class GAConfig:
+    """GaussianAvatars: spherical harmonics per splat, and tracking refined with the avatar.
+
+    Attributes
+    ----------
+    sh_degree, sh_every, min_sh_every : degree of the spherical harmonics at the end; one degree more each
+        ``sh_every`` iterations (published scale), but at least ``min_sh_every`` of the actual run.
+    refine_tracking : optimise expression, poses and translation of the training timesteps.
+    """
+
+    splats: SplatTraining = field(default_factory=SplatTraining)
+    sh_degree: int = 3
+    sh_every: int = 1_000
+    min_sh_every: int = 100
+    sh_dc_lr: float = 0.0025
+    sh_rest_lr: float = 0.000125
+    refine_tracking: bool = True
+    expression_lr: float = 1e-3
+    pose_lr: float = 1e-5
+    translation_lr: float = 1e-6
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.sh_degree <= 3:
+            raise ValueError(f"sh_degree must be 0 to 3, found {self.sh_degree}")

@@ -1,0 +1,22 @@
+"""What there is to know of GaussianAvatars before it is imported. Light: no implementation is imported."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ...bench.specs import MethodSpec
+from ..shared.config import splat_presets
+
+SHORT: dict[str, Any] = {"sh_dc_lr": 0.01, "sh_rest_lr": 5e-4}
+"""Of runs much shorter than published (README.md, "Presets")."""
+
+GA = MethodSpec(
+    name="ga",
+    version="2",
+    summary="GaussianAvatars: splats with spherical harmonics rigged to the triangles of the tracked mesh.",
+    implementation="headbench.methods.ga.method:GA",
+    config="headbench.methods.ga.config:GAConfig",
+    variants="headbench.methods.derived.ga_variants:variants",
+    presets=splat_presets(SHORT, {}),
+    source="GaussianAvatars: Photorealistic Head Avatars with Rigged 3D Gaussians, CVPR 2024, arXiv 2312.02069",
+)

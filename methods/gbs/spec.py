@@ -1,0 +1,64 @@
+"""What there is to know of GaussianBlendshapes before it is imported. Light: no implementation is imported."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ...bench.specs import MethodSpec
+
+SHORT: dict[str, Any] = {
+    "sample_spacing": 2.0,
+    "sh_dc_lr": 0.01,
+    "sh_rest_lr": 5e-4,
+    "difference_sh_degree": 0,
+    "difference_position_lr": 1e-5,
+    "difference_sh_lr": 0.01,
+    "difference_scale_lr": 2e-3,
+    "difference_rotation_lr": 1e-3,
+    "difference_opacity_lr": 5e-3,
+}
+"""Rates of runs much shorter than published (README.md, "Presets")."""
+SHORT_SPLATS: dict[str, Any] = {
+    "initial_opacity": 0.5,
+    "final_rate": 0.1,
+    "position_lr": 4e-4,
+    "position_lr_final": 4e-6,
+}
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "smoke": {
+        "budget": {"iterations": 60},
+        **SHORT,
+        "samples": 3_000,
+        "teeth_samples": 300,
+        "splats": SHORT_SPLATS,
+    },
+    "demo": {
+        "budget": {"iterations": 2_000},
+        **SHORT,
+        "samples": 12_000,
+        "teeth_samples": 600,
+        "splats": {**SHORT_SPLATS, "max_splats": 20_000},
+    },
+    "fast": {
+        "budget": {"iterations": 5_000},
+        **SHORT,
+        "difference_sh_degree": 1,
+        "samples": 30_000,
+        "teeth_samples": 1_500,
+        "splats": {**SHORT_SPLATS, "max_splats": 40_000},
+    },
+    "paper": {"budget": {"iterations": 40_000}},
+}
+
+GBS = MethodSpec(
+    name="gbs",
+    version="3",
+    summary="GaussianBlendshapes: splats of a neutral head plus linear differences for each expression, skinned.",
+    implementation="headbench.methods.gbs.method:GBS",
+    config="headbench.methods.gbs.config:GBSConfig",
+    presets=PRESETS,
+    head_models=("flame2020", "procedural2020", "ict-facekit"),
+    monocular=True,
+    source="3D Gaussian Blendshapes for Head Avatar Animation, SIGGRAPH 2024, arXiv 2404.19398",
+)

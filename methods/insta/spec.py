@@ -1,0 +1,57 @@
+"""What there is to know of INSTA before it is imported. Light: no implementation is imported."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ...bench.specs import MethodSpec
+
+SHORT: dict[str, Any] = {
+    "levels": 8,
+    "level_features": 4,
+    "log2_table": 15,
+    "finest_resolution": 384,
+    "hidden": 32,
+    "density_layers": 1,
+    "color_layers": 2,
+    "density_bias": 4.5,
+    "prior_depth": 4.0,
+    "fog_weight": 9e-4,
+    "depth_weight": 3.75,
+    "step": 0.004,
+    "shell_outside": 0.04,
+    "shell_inside": 0.006,
+    "occupancy_resolution": 80,
+    "occupancy_every": 8,
+    "occupancy_decay": 0.8,
+    "occupancy_whole": 100_000,
+    "samples_per_iteration": 2**14,
+    "first_rays": 1024,
+    "images_per_iteration": 8,
+    "round_samples": 8,
+    "stop_transmittance": 0.01,
+    "learning_rate": 1e-2,
+    "final_rate": 0.05,
+}
+"""For a few minutes of two cores (README.md, "Presets")."""
+
+INSTA = MethodSpec(
+    name="insta",
+    version="2",
+    summary="INSTA: a canonical hash-grid radiance field, warped by the nearest triangle of the tracked mesh.",
+    implementation="headbench.methods.insta.method:Insta",
+    config="headbench.methods.insta.config:InstaConfig",
+    presets={
+        "smoke": {"budget": {"iterations": 40}, **SHORT},
+        "demo": {"budget": {"iterations": 400}, **SHORT},
+        "fast": {
+            "budget": {"iterations": 3_000},
+            **SHORT,
+            "log2_table": 17,
+            "finest_resolution": 768,
+        },
+        "paper": {"budget": {"iterations": 20_000}},
+    },
+    monocular=True,
+    source="Instant Volumetric Head Avatars, CVPR 2023, arXiv 2211.12499",
+)

@@ -1,0 +1,33 @@
+"""What there is to know of "ours" before it is imported. Light: no implementation is imported."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ...bench.specs import MethodSpec
+from ..shared.config import splat_presets
+
+SHORT: dict[str, Any] = {
+    "plane_lr": 8e-3,
+    "color_mlp_lr": 1.5e-3,
+    "line_lr": 2e-2,
+    "line_mlp_lr": 1e-3,
+    "direction_noise": 0.15,
+    "shells": 1,
+    "penalty": 1e-3,
+    "penalty_softness": 0.1,
+    "storage": "compact",
+}
+"""Of runs much shorter than published (README.md, "Presets")."""
+
+OURS = MethodSpec(
+    name="ours",
+    version="2",
+    summary="Mesh-bound splats with tri-plane colour and expression-driven opacity along feature lines.",
+    implementation="headbench.methods.ours.method:Ours",
+    config="headbench.methods.ours.config:OursConfig",
+    variants="headbench.methods.derived.ours_variants:variants",
+    presets=splat_presets(SHORT, {"plane_bounds": "published"}),
+    source="3D Gaussian Head Avatars with Expressive Dynamic Appearances by Compact Tensorial Representations, "
+    "CVPR 2025, arXiv 2504.14967",
+)

@@ -1,0 +1,129 @@
+"""Settings and presets that methods trained with splats share. Light: neither torch nor numpy is imported here.
+
+The defaults are the published values (600,000 iterations). Where the authors' program departs from the paper, a setting
+``<what>_variant`` chooses between "paper" and "official".
+
+Moments in training are written on the published scale and mapped to the budget at hand as fractions
+(`training.Timeline`); the ``min_...`` fields are the iterations that a thing needs in any run to do more good than harm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+
+@dataclass(frozen=True)
+class DensifiedTraining:
+    """How splats are trained and their number is adapted: 3DGS, section 5, with GaussianAvatars' values.
+
+    Attributes
+    ----------
+    schedule_length : iterations of the published run; every ``..._from``, ``..._every`` below is on its scale.
+    position_lr, position_lr_final : log-linear from one to the other over the run, times the scene extent.
+    final_rate : part of their learning rate that all other tensors end with, log-linearly over the last half of
+        the run; 1 keeps them constant, as published. A short run has not the steps to average Adam's noise away.
+    ssim_weight : the loss is ``(1 - w) L1 + w (1 - SSIM)``.
+    densify_from, densify_every, densify_until : rounds of cloning, splitting and pruning.
+    densify_gradient : mean gradient of the projected mean, in normalised device units, that asks for a round.
+    densify_extent : splats larger than this part of the scene extent are split, smaller ones cloned.
+    split_offsets : "local" scatters the two children of a split over the parent. "world" is the compatibility
+        option for the published code, which uses world-space scales in local coordinates and so puts both
+        children almost onto the parent.
+    prune_opacity : splats below it are removed.
+    prune_extent, prune_extent_from : so are splats larger than this part of the extent, from then on.
+    reset_every, reset_at_start, reset_opacity : opacities are cut to ``reset_opacity`` regularly (None: never), and
+        once when densification starts, if the background is white, as published.
+    max_splats : densification stops adding above this number; None for no bound.
+    min_densify_every, min_reset_every : in iterations of the actual run. A gradient mean needs some views, and
+        opacities some steps to recover.
+    min_settle : no densification and no reset in the last so many iterations of the actual run.
+    mesh_cache_mb : memory for the posed meshes of known timesteps.
+    checkpoint_every_s : seconds between checkpoints.
+    """
+
+    schedule_length: int = 600_000
+    position_lr: float = 5e-3
+    position_lr_final: float = 5e-5
+    opacity_lr: float = 0.05
+    scale_lr: float = 0.017
+    rotation_lr: float = 1e-3
+    final_rate: float = 1.0
+    ssim_weight: float = 0.2
+    initial_opacity: float = 0.1
+    densify_from: int = 10_000
+    densify_every: int = 2_000
+    densify_until: int = 600_000
+    densify_gradient: float = 2e-4
+    densify_extent: float = 0.01
+    split_offsets: Literal["local", "world"] = "local"
+    prune_opacity: float = 0.005
+    prune_extent: float = 0.1
+    prune_extent_from: int = 60_000
+    reset_every: int | None = 60_000
+    reset_at_start: bool = True
+    reset_opacity: float = 0.01
+    max_splats: int | None = None
+    min_densify_every: int = 100
+    min_reset_every: int = 3_000
+    min_settle: int = 300
+    mesh_cache_mb: int = 512
+    checkpoint_every_s: float = 120.0
+
+    def __post_init__(self) -> None:
+        for name in (
+            "schedule_length",
+            "densify_every",
+            "reset_every",
+            "min_densify_every",
+            "min_reset_every",
+        ):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"{name} must be at least 1, found {value}")
+        if not 0 < self.initial_opacity < 1 or not 0 < self.reset_opacity < 1:
+            raise ValueError("initial_opacity and reset_opacity must lie between 0 and 1")
+        if not 0 < self.final_rate <= 1:
+            raise ValueError(f"final_rate must lie in (0, 1], found {self.final_rate}")
+        if not 0 <= self.ssim_weight <= 1:
+            raise ValueError(f"ssim_weight must lie in [0, 1], found {self.ssim_weight}")
+        if self.max_splats is not None and self.max_splats < 1:
+            raise ValueError(f"max_splats must be at least 1 or null, found {self.max_splats}")
+
+
+@dataclass(frozen=True)
+class SplatTraining(DensifiedTraining):
+    """How splats bound to a mesh are trained: GaussianAvatars (CVPR 2024), section 3 and its code.
+
+    Attributes
+    ----------
+    position_weight, position_threshold : penalty on local positions longer than the threshold (triangle sizes).
+    scale_weight, scale_threshold : penalty on local scales above the threshold (triangle sizes).
+    """
+
+    position_weight: float = 0.01
+    position_threshold: float = 1.0
+    scale_weight: float = 1.0
+    scale_threshold: float = 0.6
+
+
+PAPER_ITERATIONS = 600_000
+
+SHORT_SPLATS: Mapping[str, Any] = {
+    "initial_opacity": 0.5,
+    "final_rate": 0.1,
+    "position_lr": 0.1,
+    "position_lr_final": 1e-3,
+}
+"""Of runs much shorter than published: splats start half opaque and move far before rates fall (`ga/README.md`)."""
+
+
+def splat_presets(short: Mapping[str, Any], paper: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Presets of a mesh-bound method: its own settings for short runs and for the published one, budgets, splats."""
+    return {
+        "smoke": {"budget": {"iterations": 60}, **short, "splats": SHORT_SPLATS},
+        "demo": {"budget": {"iterations": 2_000}, **short, "splats": {**SHORT_SPLATS, "max_splats": 20_000}},
+        "fast": {"budget": {"iterations": 4_000}, **short, "splats": {**SHORT_SPLATS, "max_splats": 40_000}},
+        "paper": {"budget": {"iterations": PAPER_ITERATIONS}, **paper, "splats": {"split_offsets": "world"}},
+    }

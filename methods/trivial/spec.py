@@ -1,0 +1,34 @@
+"""The trivial baselines: specs and settings. Light: no implementation is imported."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ...bench.specs import MethodSpec
+
+
+@dataclass(frozen=True)
+class NearestCameraConfig:
+    """Nearest training image. ``max_timesteps`` keeps that many, evenly spaced, and bounds the storage."""
+
+    max_timesteps: int | None = None
+
+
+PRESETS = {name: {"budget": {"iterations": 1}} for name in ("smoke", "demo", "fast", "paper")}
+
+MEAN_IMAGE = MethodSpec(
+    name="mean-image",
+    summary="The mean of all training images, whatever is asked for: the floor of every table.",
+    implementation="headbench.methods.trivial.method:MeanImage",
+    trivial=True,
+    presets=PRESETS,
+)
+
+NEAREST_CAMERA = MethodSpec(
+    name="nearest-camera",
+    summary="The training image of the nearest pose and camera, as it is: what memorising alone achieves.",
+    implementation="headbench.methods.trivial.method:NearestCamera",
+    trivial=True,
+    config="headbench.methods.trivial.spec:NearestCameraConfig",
+    presets=PRESETS,
+)
