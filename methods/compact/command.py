@@ -16,9 +16,9 @@ from ..ours.avatar import OursAvatar
 from ..ours.storage import FIELD_FILE, Field
 from ..shared.avatar_files import read_shared_head, save_shared_head
 from .container import write_content
+from .encoding import EXACT, Precision
 from .file import COMPACT_FILE, encode, exact_sizes, part_sizes
 from .measure import Comparison, Quality, avatar_of
-from .precision import EXACT, Precision
 from .settings import CompactSettings
 from .simplify import simplify, training_poses
 

@@ -14,11 +14,17 @@ from ..ours.field import CanonicalFrames
 from ..ours.storage import SPLAT_WIDTHS, Field, checked_field
 from ..shared.avatar_files import Subject
 from ..shared.subject_mesh import SubjectMesh
-from .coded import Arrays, coded
-from .container import Content, packed_sizes, read_content, write_content
-from .fields import MATRICES, PLANES, decode_field, encode_field
-from .precision import Precision
-from .splats import HARMONICS, decode_splats, encode_splats
+from .container import Arrays, Content, coded, packed_sizes, read_content, write_content
+from .encoding import (
+    HARMONICS,
+    MATRICES,
+    PLANES,
+    Precision,
+    decode_field,
+    decode_splats,
+    encode_field,
+    encode_splats,
+)
 
 COMPACT_FILE = "compact.safetensors"
 

@@ -13,8 +13,8 @@ import torch
 from ...bench.contracts import ByteArray, Camera, Clip, FrameKey, HeadAsset, HeadPose
 from ...bench.io.frames import quantise
 from ..ours.avatar import OursAvatar
+from ..shared.losses import mean_ssim
 from ..shared.subject_mesh import SubjectMesh
-from ..shared.training.losses import mean_ssim
 from .container import Content
 from .file import COMPACT_FILE, decode
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import tyro
 
-from .precision import Precision
+from .encoding import Precision
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,7 @@ from ...bench.contracts import Clip, HeadPose
 from ..ours.avatar import OursAvatar
 from ..ours.storage import SPLAT_WIDTHS, Field
 from ..splats.constants import ALPHA_MIN
-from .fields import negligible_lines
-from .precision import Precision
-from .splats import HARMONICS
+from .encoding import HARMONICS, Precision, negligible_lines
 
 LINE_NETWORK = "line_"
 

@@ -10,11 +10,9 @@ import torch
 from torch import Tensor
 
 from ...bench.contracts import Clip, HeadAsset, Variant
-from ..compact.coded import Arrays
-from ..compact.container import Content, read_content, write_content
+from ..compact.container import Arrays, Content, read_content, write_content
+from ..compact.encoding import Precision, decode_splats, encode_splats
 from ..compact.file import COMPACT_FILE, decode_subject, encode_subject
-from ..compact.precision import Precision
-from ..compact.splats import decode_splats, encode_splats
 from ..ga.method import GAAvatar
 from ..ga.storage import PLY_FILE, read_ga_splats, write_ga_splats
 from ..ours.storage import SPLAT_WIDTHS
@@ -26,11 +24,9 @@ from ..shared.avatar_files import (
     save_shared_head,
     write_subject,
 )
-from ..shared.sh import coefficient_count
+from ..shared.networks import coefficient_count
 from ..shared.subject_mesh import SubjectMesh
-from .contribution import contributions, most_contributing, training_views
-from .recipes import GA, Recipe
-from .reduced import read_reduced, write_reduced
+from .recipes import GA, Recipe, contributions, most_contributing, read_reduced, training_views, write_reduced
 
 REDUCED_FILE = "splats.safetensors"
 TRIANGLES = "binding"

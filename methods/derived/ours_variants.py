@@ -11,18 +11,24 @@ import torch
 from torch import Tensor
 
 from ...bench.contracts import Clip, HeadAsset, Variant
+from ..compact.encoding import HARMONICS, Precision
 from ..compact.file import COMPACT_FILE, read_compact, write_compact
-from ..compact.precision import Precision
 from ..compact.simplify import simplify
-from ..compact.splats import HARMONICS
 from ..ours.avatar import OursAvatar
 from ..ours.storage import FIELD_FILE, Field, checked_field, read_field, save_field
 from ..shared.avatar_files import SUBJECT_FILE, read_shared_head, save_shared_head, write_subject
 from ..shared.subject_mesh import SubjectMesh
-from .contribution import contributions, most_contributing, training_views
-from .recipes import OURS, Recipe
-from .reduced import read_reduced, write_reduced
-from .resampled import coarser_lines, coarser_planes
+from .recipes import (
+    OURS,
+    Recipe,
+    coarser_lines,
+    coarser_planes,
+    contributions,
+    most_contributing,
+    read_reduced,
+    training_views,
+    write_reduced,
+)
 
 EXACT_PARTS = ("plane_box", "line_box", "jaw_bases")
 TRIANGLES = "triangles"

@@ -2,10 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from pathlib import Path
+from typing import Literal, Protocol
 
-from ..shared.bound_avatar import USUAL, Cutoffs
+import numpy as np
+import torch
+from safetensors.torch import save
+from torch import Tensor
+
+from ...bench.contracts import Camera, Clip, HeadPose
+from ...bench.io.files import write_bytes
+from ..shared.networks import PAIRS
+from ..shared.rendering import USUAL, Cutoffs, PosedSplats, view_of
+from ..shared.tensor_files import read_safetensors
+from ..splats import rasterize
 
 Storage = Literal["exact", "half", "8bit", "compact"]
 STORAGE_SUMMARIES: dict[Storage, str] = {
@@ -89,3 +101,136 @@ OURS = (
     *(Recipe(planes=resolution, lines=16, storage="compact") for resolution in (64, 32)),
     *(Recipe(splats=f, planes=64, lines=16, storage="compact") for f in (0.75, 0.5, 0.25)),
 )
+
+
+VIEWS = 64
+
+
+class SplatAvatar(Protocol):
+    """An avatar that tells its splats."""
+
+    def splats(self, pose: HeadPose, camera: Camera | None = None) -> PosedSplats: ...
+
+
+def training_views(clip: Clip, count: int = VIEWS) -> list[tuple[Camera, HeadPose]]:
+    """At most ``count`` training frames, evenly spread over their sorted keys."""
+    keys = sorted(clip.splits["train"])
+    chosen = np.unique(np.linspace(0, len(keys) - 1, min(count, len(keys))).round().astype(int))
+    return [(clip.cameras[keys[i].camera], clip.poses[keys[i].timestep]) for i in chosen]
+
+
+def contributions(avatar: SplatAvatar, views: Iterable[tuple[Camera, HeadPose]]) -> Tensor:
+    """(N,) blending weights of each splat, summed over all pixels of all views.
+
+    The weight of a splat in a pixel is its alpha times the transmittance in front of it; the sum over pixels is the
+    derivative of the sum of a one-channel image by the splat's colour. As importance for pruning: Fang and Wang,
+    "Mini-Splatting", ECCV 2024, section 4.
+    """
+    total: Tensor | None = None
+    for camera, pose in views:
+        posed, view = avatar.splats(pose), view_of(camera, "cpu")
+        means, quats, scales, opacities = map(
+            torch.from_numpy, (posed.means, posed.quats, posed.scales, posed.opacities)
+        )
+        colors = torch.ones(len(means), 1, requires_grad=True)
+        image = rasterize(
+            *(means, quats, scales, opacities, colors),
+            *(view.world_to_camera, view.K, camera.width, camera.height),
+        ).image
+        (weights,) = torch.autograd.grad(image.sum(), colors)
+        total = weights[:, 0] if total is None else total + weights[:, 0]
+    if total is None:
+        raise ValueError("views: expected one at least, found none")
+    return total
+
+
+def most_contributing(weights: Tensor, fraction: float) -> Tensor:
+    """Numbers, rising, of the given fraction of splats that contribute most; ties by number."""
+    count = max(1, round(fraction * len(weights)))
+    return torch.argsort(weights, descending=True, stable=True)[:count].sort().values
+
+
+Kind = Literal["half", "8bit"]
+LEVELS = 255
+LOW, STEP = "/low", "/step"
+"""Endings of the names under which an 8-bit tensor's lowest values and steps lie, by column."""
+
+
+def write_reduced(path: Path, tensors: Mapping[str, Tensor], kind: Kind, exact: Collection[str] = ()) -> None:
+    """Write float tensors as 16-bit floats ("half") or 8-bit numbers ("8bit"); those in ``exact``, vectors and whole numbers as they are."""
+    stored: dict[str, Tensor] = {}
+    for name, value in tensors.items():
+        if name in exact or value.ndim < 2 or not value.is_floating_point():
+            stored[name] = value.contiguous()
+        elif kind == "half":
+            stored[name] = value.to(torch.float16).contiguous()
+        else:
+            stored |= _eight_bits(name, value)
+    write_bytes(path, save(stored))
+
+
+def read_reduced(path: Path) -> dict[str, Tensor]:
+    """What `write_reduced` wrote, as float32 up to rounding; exact tensors as they were."""
+    stored, _ = read_safetensors(path)
+    result: dict[str, Tensor] = {}
+    for name, value in stored.items():
+        if name.endswith((LOW, STEP)):
+            continue
+        if f"{name}{STEP}" in stored:
+            value = stored[f"{name}{LOW}"] + value.to(torch.float32) * stored[f"{name}{STEP}"]
+        elif value.dtype == torch.float16:
+            value = value.to(torch.float32)
+        result[name] = value
+    return result
+
+
+def _eight_bits(name: str, value: Tensor) -> dict[str, Tensor]:
+    """Levels, lowest value and step of each column (index of the last axis)."""
+    columns = value.reshape(-1, value.shape[-1])
+    if not len(columns):
+        return {name: value.contiguous()}
+    low = columns.amin(0)
+    step = (columns.amax(0) - low) / LEVELS
+    # A constant column has the step 0, and level 0 throughout.
+    levels = torch.where(step > 0, (columns - low) / step.clamp_min(torch.finfo(step.dtype).tiny), 0.0)
+    quantised = levels.round().clamp(0, LEVELS).to(torch.uint8).reshape(value.shape)
+    return {name: quantised.contiguous(), f"{name}{LOW}": low, f"{name}{STEP}": step}
+
+
+def coarser_planes(tensors: dict[str, Tensor], resolution: int) -> dict[str, Tensor]:
+    """The same tensors with (resolution^2, C) planes; unchanged where they have no more samples."""
+    result = dict(tensors)
+    for name, _, _ in PAIRS:
+        key = f"plane_{name}"
+        if key in result:
+            result[key] = _coarser_plane(result[key], resolution)
+    return result
+
+
+def coarser_lines(tensors: dict[str, Tensor], resolution: int) -> dict[str, Tensor]:
+    """The same tensors with lines of (K, 3, resolution, C); unchanged where they have no more samples."""
+    lines = tensors.get("lines")
+    if lines is None or lines.shape[2] <= resolution:
+        return dict(tensors)
+    fit = fitting_matrix(lines.shape[2], resolution).to(lines)
+    return {**tensors, "lines": torch.einsum("rl,kalc->karc", fit, lines).contiguous()}
+
+
+def _coarser_plane(plane: Tensor, resolution: int) -> Tensor:
+    side = round(len(plane) ** 0.5)
+    if side <= resolution:
+        return plane
+    fit = fitting_matrix(side, resolution).to(plane)
+    image = plane.reshape(side, side, -1)
+    return torch.einsum("ry,sx,yxc->rsc", fit, fit, image).reshape(resolution**2, -1).contiguous()
+
+
+def fitting_matrix(samples: int, fewer: int) -> Tensor:
+    """(fewer, samples) float64: takes samples to the fewer ones that interpolate back to them in least squares.
+
+    Samples lie evenly with the outermost on the ends (align-corners), ``fewer`` from 2 to ``samples``.
+    """
+    places = torch.linspace(0, fewer - 1, samples, dtype=torch.float64)
+    nodes = torch.arange(fewer, dtype=torch.float64)
+    interpolation = (1 - (places[:, None] - nodes).abs()).clamp_min(0)
+    return torch.linalg.pinv(interpolation)

@@ -25,19 +25,25 @@ from ..shared.avatar_files import (
     read_subject,
     run_digest,
 )
+from ..shared.avatar_kernel import Carrier, HarmonicColors
 from ..shared.binding import Frames, WorldSplats, to_world
-from ..shared.bound_avatar import USUAL, Cutoffs, Drawn, PosedSplats, draw_splats, posed_splats, read_back
-from ..shared.bound_training import Placed, run_bound_training
-from ..shared.clip_checks import check_training_split
-from ..shared.seeds import torch_generator
-from ..shared.sh import coefficient_count, initial_coefficients, occupied_degree, sh_to_rgb
-from ..shared.stored_splats import Carrier, HarmonicColors
+from ..shared.loop import check_budget, check_training_split
+from ..shared.networks import coefficient_count, initial_coefficients, occupied_degree, sh_to_rgb
+from ..shared.optimisation import Optimiser
+from ..shared.rendering import (
+    USUAL,
+    Cutoffs,
+    Drawn,
+    PosedSplats,
+    View,
+    draw_splats,
+    posed_splats,
+    read_back,
+    view_of,
+)
+from ..shared.schedule import ShuffledEpochs, Timeline, torch_generator
+from ..shared.splat_training import Placed, run_bound_training
 from ..shared.subject_mesh import BoundedCache, SubjectMesh
-from ..shared.training.loop import check_budget
-from ..shared.training.optimiser import Optimiser
-from ..shared.training.sampling import ShuffledEpochs
-from ..shared.training.schedule import Timeline
-from ..shared.views import View, view_of
 from .config import GAConfig
 from .storage import PLY_FILE, read_ga_splats, write_ga_splats
 

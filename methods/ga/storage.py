@@ -9,8 +9,8 @@ from torch import Tensor
 
 from ...bench.errors import InputError
 from ...bench.io.arrays import check_numbers
+from ..shared.networks import coefficient_count
 from ..shared.ply import read_names, read_ply, write_ply
-from ..shared.sh import coefficient_count
 from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes
 
 PLY_FILE = "point_cloud.ply"

@@ -22,9 +22,8 @@ from ..ours.avatar import OursAvatar
 from ..ours.storage import FIELD_FILE
 from ..shared.avatar_files import read_shared_head
 from ..shared.tensor_files import read_safetensors
-from .harmonics_fit import fit_harmonics, sphere, turn_harmonics
+from .harmonics import fit_harmonics, sphere, turn_harmonics, write_gaussians
 from .settings import ExportPlySettings
-from .table import write_gaussians
 
 EXPORTED = "an avatar of ours, ga or gbs"
 DRAWN = "A PLY cannot hold it; `headbench extremes` and `headbench reenact` draw its frames."

@@ -10,10 +10,9 @@ from torch import Tensor
 
 from ...bench.contracts import Camera, Frame, HeadPose, no_stage
 from ..shared.avatar_files import HEAD_FILE, SUBJECT_FILE, Subject, read_shared_head, read_subject
-from ..shared.bound_avatar import Drawn, PosedSplats, draw_splats, posed_splats, read_back
-from ..shared.known_poses import pose_key
-from ..shared.sh import sh_degree
-from ..shared.views import view_of
+from ..shared.networks import sh_degree
+from ..shared.rendering import Drawn, PosedSplats, draw_splats, posed_splats, read_back, view_of
+from ..shared.subject_mesh import pose_key
 from .blend import Placed, place
 from .rig import Carried, Rig
 from .storage import AVATAR_FILE, Stored, read_avatar

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import embedding_bag, normalize
 
 from ..shared.binding import WorldSplats, apply_matrices
-from ..shared.sh import coefficient_count, sh_to_rgb
+from ..shared.networks import coefficient_count, sh_to_rgb
 from .rig import Carried
 
 LARGEST_SCALE = 0.1

@@ -11,10 +11,9 @@ import numpy as np
 
 from ...bench.contracts import Budget, Clip, Progress
 from ..shared.avatar_files import Subject, finish_fit, is_finished, run_digest
-from ..shared.clip_checks import check_training_split
-from ..shared.splat_trainer import run_trainer
-from ..shared.training.loop import check_budget
-from ..shared.training.sampling import ShuffledEpochs
+from ..shared.loop import check_budget, check_training_split
+from ..shared.schedule import ShuffledEpochs
+from ..shared.splat_training import run_trainer
 from .avatar import GBSAvatar
 from .config import GBSConfig
 from .mouth import padded_offset, with_mouth

@@ -15,7 +15,7 @@ from ...bench.contracts import IntArray
 from ...bench.errors import InputError
 from ...bench.io.arrays import Member
 from ...bench.io.files import write_bytes
-from ..shared.sh import coefficient_count
+from ..shared.networks import coefficient_count
 from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors
 from .blend import Entries, difference_widths
 from .surface import SurfacePoints, full_barycentric

@@ -9,7 +9,7 @@ import pymeshlab
 from scipy.spatial import cKDTree
 
 from ...bench.contracts import FloatArray, IntArray
-from ..shared.seeds import numpy_generator
+from ..shared.schedule import numpy_generator
 
 CANDIDATES = 20
 """Random points drawn for each that is kept."""

@@ -11,16 +11,13 @@ from torch import Tensor
 from ...bench.contracts import Clip
 from ...datasets.head.arrays import HeadArrays
 from ..shared.avatar_files import Subject
-from ..shared.known_poses import pose_key
-from ..shared.seeds import torch_generator
-from ..shared.sh import initial_coefficients
-from ..shared.splat_trainer import Initial, SplatTrainer
-from ..shared.subject_mesh import BoundedCache, SubjectMesh
-from ..shared.training.densify import logit, rows_of_tables
-from ..shared.training.images import recomposited
-from ..shared.training.losses import photometric_loss
-from ..shared.training.sampling import Sampler
-from ..shared.training.schedule import Timeline
+from ..shared.loop import recomposited
+from ..shared.losses import photometric_loss
+from ..shared.networks import initial_coefficients
+from ..shared.optimisation import logit, rows_of_tables
+from ..shared.schedule import Sampler, Timeline, torch_generator
+from ..shared.splat_training import Initial, SplatTrainer
+from ..shared.subject_mesh import BoundedCache, SubjectMesh, pose_key
 from .blend import Entries, difference_widths, place
 from .config import GBSConfig
 from .differences import consistency_mask, entries_of

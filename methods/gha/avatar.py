@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ...bench.contracts import Camera, Frame, HeadPose
 from ..shared.avatar_files import SUBJECT_FILE, RefinedTracking, read_shared_head, read_subject
-from ..shared.bound_avatar import PosedSplats, posed_splats
+from ..shared.rendering import PosedSplats, posed_splats
 from .driving import Driver, code_size
 from .gaussian_head import GaussianHead, Splats
 from .storage import AVATAR_FILE, read_avatar

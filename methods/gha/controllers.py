@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..shared.triplane import ENCODING_SIZE, encode
+from ..shared.networks import ENCODING_SIZE, encode
 from .config import GHAConfig
 from .driving import POSE_SIZE
 from .landmarks import Influence

@@ -12,13 +12,10 @@ from torch import Tensor, nn
 
 from ...bench.contracts import Camera
 from ...bench.errors import InputError
-from ..shared.seeds import torch_generator
-from ..shared.training.densify import logit
-from ..shared.training.images import TrainingImages
-from ..shared.training.losses import mean_ssim
-from ..shared.training.optimiser import Optimiser
-from ..shared.training.sampling import Sampler
-from ..shared.training.schedule import Timeline, log_linear
+from ..shared.loop import TrainingImages
+from ..shared.losses import mean_ssim
+from ..shared.optimisation import Optimiser, logit
+from ..shared.schedule import Sampler, Timeline, log_linear, torch_generator
 from .config import GHAConfig
 from .driving import POSE_SIZE, Signal
 from .gaussian_head import Drawn, GaussianHead, feature_background

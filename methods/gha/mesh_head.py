@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ..shared.binding import WorldSplats
-from ..shared.triplane import ENCODING_SIZE, encode
+from ..shared.networks import ENCODING_SIZE, encode
 from .config import GHAConfig
 from .controllers import Controllers, encode_pose
 from .driving import Motion, Signal

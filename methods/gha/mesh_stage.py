@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 from torch import Tensor
 
 from ...bench.contracts import Budget, Progress
-from ..shared.training.checkpoint import load_checkpoint, save_checkpoint
-from ..shared.training.loop import CHECKPOINT, train
-from ..shared.training.sampling import ShuffledEpochs
+from ..shared.checkpoint import load_checkpoint, save_checkpoint
+from ..shared.loop import CHECKPOINT, train
+from ..shared.schedule import ShuffledEpochs
 from .mesh_head import MeshHead
 from .mesh_training import MeshTraining, Scene
 

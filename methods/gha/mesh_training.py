@@ -10,11 +10,10 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ...bench.contracts import FrameKey
-from ..shared.seeds import torch_generator
-from ..shared.training.images import recomposited
-from ..shared.training.optimiser import Optimiser
-from ..shared.training.schedule import Timeline
-from ..shared.views import View, view_of
+from ..shared.loop import recomposited
+from ..shared.optimisation import Optimiser
+from ..shared.rendering import View, view_of
+from ..shared.schedule import Timeline, torch_generator
 from ..splats import rasterize
 from .config import GHAConfig
 from .mesh_head import DISC_OPACITY, MeshHead, vertex_discs

@@ -24,9 +24,8 @@ from torch import Tensor
 
 from ...bench.contracts import Budget, Clip, Progress
 from ..shared.avatar_files import TRACKED, RefinedTracking, Subject, finish_fit, is_finished, run_digest
-from ..shared.clip_checks import check_training_split
-from ..shared.training.loop import Outcome, check_budget, train
-from ..shared.training.sampling import ShuffledEpochs
+from ..shared.loop import Outcome, check_budget, check_training_split, train
+from ..shared.schedule import ShuffledEpochs
 from .avatar import DRIVING_FILE, GHAAvatar
 from .config import GHAConfig
 from .gaussian_head import GaussianHead

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ...bench.contracts import Clip, FrameKey, IntArray
 from ..shared.avatar_files import Subject
-from ..shared.views import View, view_of
+from ..shared.rendering import View, view_of
 from .config import GHAConfig
 from .driving import ANGLES, Driver, Signal, code_size
 from .landmarks import landmark_vertices

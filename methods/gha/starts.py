@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping
 
 from torch import Tensor, nn
 
-from ..shared.training.optimiser import Optimiser
-from ..shared.training.schedule import log_linear
+from ..shared.optimisation import Optimiser
+from ..shared.schedule import log_linear
 from .networks import Mlp
 
 

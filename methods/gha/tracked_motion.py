@@ -12,8 +12,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..shared.seeds import torch_generator
-from ..shared.triplane import encode
+from ..shared.networks import encode
+from ..shared.schedule import torch_generator
 from .config import GHAConfig
 from .driving import Driver
 from .landmarks import influences

@@ -10,8 +10,7 @@ import torch
 
 from ...bench.contracts import Camera, Frame, HeadPose
 from ..shared.avatar_files import SUBJECT_FILE, Subject, read_shared_head, read_subject
-from ..shared.known_poses import pose_key
-from ..shared.subject_mesh import SubjectMesh
+from ..shared.subject_mesh import SubjectMesh, pose_key
 from .canonical import canonical_surface
 from .config import InstaConfig
 from .field import Architecture, Field, Parameters, Prior

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..shared.seeds import torch_generator
-from ..shared.sh import sh_basis
+from ..shared.networks import sh_basis
+from ..shared.schedule import torch_generator
 from .config import InstaConfig
 from .hash_grid import INITIAL, Level, encode, make_levels, table_rows
 from .networks import initial_weights, layer_shapes, network

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..shared.training.images import recomposited
+from ..shared.loop import recomposited
 from .config import InstaConfig
 
 COLOR_PART = 0.2  # the published program divides the Huber loss by 5

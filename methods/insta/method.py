@@ -6,10 +6,9 @@ from pathlib import Path
 
 from ...bench.contracts import Budget, Clip, Progress
 from ..shared.avatar_files import Subject, finish_fit, is_finished, run_digest
-from ..shared.clip_checks import check_training_split
+from ..shared.loop import check_budget, check_training_split, train
+from ..shared.schedule import ShuffledEpochs
 from ..shared.subject_mesh import SubjectMesh
-from ..shared.training.loop import check_budget, train
-from ..shared.training.sampling import ShuffledEpochs
 from .avatar import InstaAvatar
 from .canonical import canonical_surface
 from .config import InstaConfig

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..shared.seeds import numpy_generator
+from ..shared.schedule import numpy_generator
 from .config import InstaConfig
 from .field import Box, Field, Parameters
 from .marching import Space, Surface

@@ -11,11 +11,9 @@ from torch import Tensor, nn
 
 from ...bench.contracts import Clip, FrameKey
 from ...bench.errors import InputError
-from ..shared.known_poses import pose_key
-from ..shared.seeds import numpy_generator
-from ..shared.subject_mesh import BoundedCache, SubjectMesh
-from ..shared.training.optimiser import Optimiser
-from ..shared.training.schedule import Timeline, log_linear
+from ..shared.optimisation import Optimiser
+from ..shared.schedule import Timeline, log_linear, numpy_generator
+from ..shared.subject_mesh import BoundedCache, SubjectMesh, pose_key
 from .config import InstaConfig
 from .field import Architecture, Field, Prior
 from .losses import color_loss, depth_loss, true_colors

@@ -12,23 +12,26 @@ from ...bench.contracts import Clip, FloatArray, HeadPose
 from ...datasets.head.arrays import faces_in_region
 from ...datasets.head.rotations import axis_angle_to_matrix
 from ...datasets.steps.jaw_bases import jaw_bases, jaw_quaternions, jaw_weights
-from ..shared.binding import Frames, to_world
-from ..shared.bound_training import Placed
-from ..shared.seeds import torch_generator
-from ..shared.sh import initial_coefficients, sh_to_rgb
+from ..shared.binding import NORMAL, Frames, to_world
+from ..shared.networks import initial_coefficients, sh_to_rgb
+from ..shared.optimisation import Optimiser
+from ..shared.rendering import View
+from ..shared.schedule import Timeline, torch_generator
+from ..shared.splat_training import Placed, Start, one_per_triangle
 from ..shared.subject_mesh import BoundedCache, SubjectMesh, centroid_displacements
-from ..shared.training.optimiser import Optimiser
-from ..shared.training.schedule import Timeline
-from ..shared.views import View
 from .config import OursConfig
-from .dynamics import LocalSplats, apply_offsets, changed_colors
-from .feature_lines import blend_lines, line_offsets, line_position
 from .field import (
     Box,
     CanonicalFrames,
+    LocalSplats,
+    apply_offsets,
+    blend_lines,
     canonical_directions,
+    changed_colors,
     initial_parameters,
     line_box,
+    line_offsets,
+    line_position,
     plane_box,
     plane_features,
     shade,
@@ -212,3 +215,35 @@ def _line_box(mesh: SubjectMesh, clip: Clip, config: OursConfig) -> Box:
         return line_box(mesh.canonical)
     triangles = torch.from_numpy(faces_in_region(clip.head, "face")).to(mesh.faces.device)
     return line_box(mesh.canonical[mesh.faces[triangles].reshape(-1)])
+
+
+def shell_start(mesh: SubjectMesh, clip: Clip, config: OursConfig, device: str) -> Start:
+    """One splat per triangle, and ``config.shells`` more outwards over each of `expressive_triangles`.
+
+    Without lines there is no opacity to change, hence no shells.
+    """
+    start = one_per_triangle(len(mesh.faces), config.splats.initial_opacity, device)
+    if not config.lines or not config.shells:
+        return start
+    chosen = expressive_triangles(mesh, clip, config.penalty_face_mm, device)
+    size = mesh.frames(mesh.canonical).size.index_select(0, chosen)
+    parts = [start]
+    for shell in range(1, config.shells + 1):
+        means = torch.zeros(len(chosen), 3, device=device)
+        means[:, NORMAL] = shell * config.shell_gap / size
+        parts.append(Start(chosen, means, torch.full((len(chosen),), config.shell_opacity, device=device)))
+    return Start(*(torch.cat(column) for column in zip(*parts)))
+
+
+@torch.no_grad()
+def expressive_triangles(mesh: SubjectMesh, clip: Clip, millimetres: float, device: str) -> Tensor:
+    """Indices of face triangles whose centroid a training expression moves by ``millimetres`` or more, ascending.
+
+    There, at some time, the penalty lets opacity change (`ours_appearance.penalty_weights`).
+    """
+    face = torch.from_numpy(faces_in_region(clip.head, "face")).to(device)
+    moved = torch.zeros(len(face), dtype=torch.bool, device=device)
+    for timestep in sorted({key.timestep for key in clip.splits["train"]}):
+        unposed = mesh.unposed(mesh.arguments([clip.poses[timestep]]))
+        moved |= 1000 * centroid_displacements(unposed, mesh.canonical, mesh.faces[face]) >= millimetres
+    return face[moved]

@@ -13,15 +13,29 @@ from torch import Tensor
 from ...bench.contracts import Camera, Frame, HeadPose, no_stage
 from ..compact.file import COMPACT_FILE, read_compact
 from ..shared.avatar_files import HEAD_FILE, SUBJECT_FILE, Subject, read_shared_head, read_subject
+from ..shared.avatar_kernel import Carrier, HarmonicColors
 from ..shared.binding import NORMAL, WorldSplats
-from ..shared.bound_avatar import USUAL, Cutoffs, Drawn, PosedSplats, draw_splats, posed_splats, read_back
-from ..shared.known_poses import KnownPoses, pose_key
-from ..shared.stored_splats import Carrier, HarmonicColors
-from ..shared.subject_mesh import SubjectMesh
-from ..shared.views import view_of
+from ..shared.rendering import (
+    USUAL,
+    Cutoffs,
+    Drawn,
+    PosedSplats,
+    draw_splats,
+    posed_splats,
+    read_back,
+    view_of,
+)
+from ..shared.subject_mesh import KnownPoses, SubjectMesh, pose_key
 from .appearance import driving_coefficients
-from .dynamics import LocalSplats, apply_offsets, changed_colors
-from .field import Box, CanonicalFrames, plane_features, position_part
+from .field import (
+    Box,
+    CanonicalFrames,
+    LocalSplats,
+    apply_offsets,
+    changed_colors,
+    plane_features,
+    position_part,
+)
 from .inference import LineOffsets, Placed, PlaneColors, Posed
 from .storage import FIELD_FILE, SPLAT_WIDTHS, Field, read_field
 

@@ -1,24 +1,170 @@
-"""The tensorial appearance of "ours" as functions of canonical position: colour and opacity offset.
+"""What an expression may change about a splat: its opacity as published, or, for the ablation, everything else.
 
 "3D Gaussian Head Avatars with Expressive Dynamic Appearances by Compact Tensorial Representations" (CVPR 2025,
-arXiv 2504.14967), sections 3.2 and 3.3.
+arXiv 2504.14967), section 3.3 and Table 4: offsets on position, rotation and scale win novel views and lose novel
+expressions.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from itertools import pairwise
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
 from ..shared.binding import Frames, apply_matrices
-from ..shared.networks import color_network
-from ..shared.sh import C0
-from ..shared.triplane import ENCODING_SIZE, PAIRS, encode_directions, sample_triplane
-from .config import OursConfig
-from .dynamics import offset_width
-from .feature_lines import AXES, Parameters, initial_line_network, uniform
+from ..shared.networks import (
+    C0,
+    ENCODING_SIZE,
+    PAIRS,
+    color_network,
+    encode_directions,
+    offset_network,
+    sample_triplane,
+    sum_rows,
+)
+from .config import Dynamic, OursConfig
+
+WIDTHS: Mapping[Dynamic, int] = {"opacity": 1, "position": 3, "rotation": 4, "scale": 3, "color": 3}
+"""Numbers per splat of each thing that may change."""
+
+
+class LocalSplats(NamedTuple):
+    """Splats in their triangles' frames, before an expression changes them or after.
+
+    Attributes
+    ----------
+    means : (N, 3) in units of the triangle's size.
+    log_scales : (N, 3) logarithms in the same unit.
+    quats : (N, 4), real part first, of any length.
+    logits : (N,) of the opacities.
+    color_change : (N, 3) added to the colours before they are cut at 0; None where nothing is added.
+    """
+
+    means: Tensor
+    log_scales: Tensor
+    quats: Tensor
+    logits: Tensor
+    color_change: Tensor | None = None
+
+
+def offset_width(dynamic: Sequence[Dynamic]) -> int:
+    """Outputs of the offset network."""
+    return sum(WIDTHS[name] for name in dynamic)
+
+
+def apply_offsets(splats: LocalSplats, offsets: Tensor, dynamic: Sequence[Dynamic]) -> LocalSplats:
+    """Add (N, `offset_width`) offsets, in the order of ``dynamic``: to logits, local means, quaternions, log-scales."""
+    parts = dict(zip(dynamic, offsets.split([WIDTHS[name] for name in dynamic], dim=1)))
+    changed = splats
+    if "opacity" in parts:
+        changed = changed._replace(logits=splats.logits + parts["opacity"][:, 0])
+    if "position" in parts:
+        changed = changed._replace(means=splats.means + parts["position"])
+    if "rotation" in parts:
+        changed = changed._replace(quats=splats.quats + parts["rotation"])
+    if "scale" in parts:
+        changed = changed._replace(log_scales=splats.log_scales + parts["scale"])
+    return changed._replace(color_change=parts.get("color"))
+
+
+def changed_colors(colors: Tensor, splats: LocalSplats) -> Tensor:
+    """(N, 3) >= 0."""
+    return colors if splats.color_change is None else torch.relu(colors + splats.color_change)
+
+
+AXES = 3
+
+
+class Parameters(Protocol):
+    """Tensors by name: an optimiser in training, a dict in an avatar."""
+
+    def __getitem__(self, name: str, /) -> Tensor: ...
+
+
+class LinePosition(NamedTuple):
+    """Where points lie on the three lines: rows of the (3 L)-row table and linear weights, (N, 6) each."""
+
+    rows: Tensor
+    weights: Tensor
+
+
+def line_position(points: Tensor, resolution: int) -> LinePosition:
+    """Positions of (N, 3) points in [0, 1] on lines of ``resolution`` samples: sample ``t (L - 1)``."""
+    position = (points * (resolution - 1)).clamp(0, resolution - 1)
+    lower = position.floor().clamp_max(resolution - 2)
+    fraction = position - lower
+    start = torch.arange(AXES, device=points.device) * resolution
+    rows = lower.to(torch.int64) + start
+    return LinePosition(
+        torch.cat([rows, rows + 1], dim=1), torch.cat([1 - fraction, fraction], dim=1).to(points.dtype)
+    )
+
+
+def blend_lines(lines: Tensor, expression: Tensor, jaw: Tensor) -> Tensor:
+    """Blend once per frame: (2, 3, L, C), expression lines first, then jaw lines.
+
+    Parameters
+    ----------
+    lines : (E + J, 3, L, C).
+    expression, jaw : (E,) coefficients and (J,) weights.
+    """
+    flat = lines.flatten(1)
+    count = len(expression)
+    blended = torch.stack([expression @ flat[:count], jaw @ flat[count:]])
+    return blended.view(2, *lines.shape[1:])
+
+
+def line_offsets(parameters: Parameters, blended: Tensor, position: LinePosition) -> Tensor:
+    """(N, D) offsets: 6 C features -> hidden -> hidden -> D, ReLU, weight-normalised; D = 1 is the opacity logit.
+
+    The features are [e_x e_y e_z j_x j_y j_z]; none of the inputs but the lines and the network has a gradient.
+    """
+    table = line_table(blended, normalised_weight(parameters, 0))
+    return offset_network(
+        sum_rows(table, *position),
+        *(parameters["line_bias_0"],),
+        *(normalised_weight(parameters, 1), parameters["line_bias_1"]),
+        *(normalised_weight(parameters, 2), parameters["line_bias_2"]),
+    )
+
+
+def line_table(blended: Tensor, first: Tensor) -> Tensor:
+    """(3 L, H): what each sample of the (2, 3, L, C) blended lines adds to the first layer of (H, 6 C) weights."""
+    kinds, axes, resolution, channels = blended.shape
+    weights = first.view(-1, kinds, axes, channels)
+    return torch.einsum("kalc,hkac->alh", blended, weights).reshape(axes * resolution, -1)
+
+
+def normalised_weight(parameters: Parameters, layer: int) -> Tensor:
+    """Weight of a layer: gain times direction, normalised per output row (Salimans and Kingma 2016, eq. 2)."""
+    direction = parameters[f"line_direction_{layer}"]
+    return direction * (
+        parameters[f"line_gain_{layer}"] / torch.linalg.vector_norm(direction, dim=1, keepdim=True)
+    )
+
+
+def initial_line_network(
+    channels: int, hidden: int, outputs: int, generator: torch.Generator
+) -> dict[str, Tensor]:
+    """Directions, gains and biases of the three layers, uniform within 1 / sqrt(fan-in)."""
+    sizes = [2 * AXES * channels, hidden, hidden, outputs]
+    network: dict[str, Tensor] = {}
+    for layer, (fan_in, fan_out) in enumerate(pairwise(sizes)):
+        direction = uniform((fan_out, fan_in), fan_in**-0.5, generator)
+        network[f"line_direction_{layer}"] = direction
+        network[f"line_gain_{layer}"] = torch.linalg.vector_norm(direction, dim=1, keepdim=True)
+        network[f"line_bias_{layer}"] = uniform((fan_out,), fan_in**-0.5, generator)
+    return network
+
+
+def uniform(shape: tuple[int, ...], bound: float, generator: torch.Generator) -> Tensor:
+    """Uniform numbers in [-bound, bound]."""
+    return (torch.rand(shape, generator=generator) * 2 - 1) * bound
+
 
 PLANE_MARGIN = 0.005  # metres around the canonical mesh
 PLANE_MARGIN_BELOW = 0.025  # metres more at the bottom: splats of the neck hang below the mesh

@@ -22,13 +22,18 @@ from torch import Tensor
 
 from ..shared import avatar_kernel
 from ..shared.binding import Frames, WorldSplats
-from ..shared.networks import CPU_BLOCK
-from ..shared.row_sums import sum_rows
-from ..shared.sh import C0
-from ..shared.triplane import ENCODING_SIZE, FREQUENCIES
-from .dynamics import LocalSplats
-from .feature_lines import AXES, LinePosition, blend_lines, line_position, line_table, normalised_weight
-from .field import Box, canonical_directions
+from ..shared.networks import C0, CPU_BLOCK, ENCODING_SIZE, FREQUENCIES, sum_rows
+from .field import (
+    AXES,
+    Box,
+    LinePosition,
+    LocalSplats,
+    blend_lines,
+    canonical_directions,
+    line_position,
+    line_table,
+    normalised_weight,
+)
 
 
 class Posed(NamedTuple):

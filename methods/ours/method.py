@@ -15,8 +15,8 @@ from ...bench.contracts import Budget, Clip, Progress
 from ...datasets.head.arrays import faces_in_region
 from ...datasets.steps.expression_clusters import cluster_expressions
 from ...datasets.steps.jaw_bases import leaks
+from ..compact.encoding import Precision
 from ..compact.file import COMPACT_FILE, write_compact
-from ..compact.precision import Precision
 from ..compact.simplify import simplify, training_poses
 from ..shared.avatar_files import (
     SUBJECT_FILE,
@@ -27,16 +27,14 @@ from ..shared.avatar_files import (
     write_record,
     write_subject,
 )
-from ..shared.bound_training import BoundTraining, run_bound_training
-from ..shared.clip_checks import check_training_split
+from ..shared.loop import CHECKPOINT, check_budget, check_training_split
+from ..shared.schedule import Sampler, ShuffledEpochs, Weighted, balanced_weights
+from ..shared.splat_training import BoundTraining, run_bound_training
 from ..shared.subject_mesh import SubjectMesh
-from ..shared.training.loop import CHECKPOINT, check_budget
-from ..shared.training.sampling import Sampler, ShuffledEpochs, Weighted, balanced_weights
-from .appearance import OursAppearance
+from .appearance import OursAppearance, shell_start
 from .avatar import OursAvatar
-from .capacity.plan import plan_capacity
+from .capacity import plan_capacity
 from .config import OursConfig
-from .outer_layers import shell_start
 from .storage import FIELD_FILE, write_field
 
 log = logging.getLogger(__name__)

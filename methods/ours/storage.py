@@ -15,12 +15,10 @@ from torch import Tensor
 from ...bench.errors import InputError
 from ...bench.io.arrays import Member
 from ...bench.io.files import write_bytes
-from ..shared.sh import coefficient_count
+from ..shared.networks import ENCODING_SIZE, PAIRS, coefficient_count
 from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors
-from ..shared.triplane import ENCODING_SIZE, PAIRS
 from .config import Dynamic
-from .dynamics import WIDTHS, offset_width
-from .field import Box
+from .field import WIDTHS, Box, offset_width
 
 FIELD_FILE = "avatar.safetensors"
 DYNAMIC = "dynamic"

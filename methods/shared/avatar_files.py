@@ -15,7 +15,7 @@ from ...bench.io.arrays import MAX_MAGNITUDE, TEXT, Member, read_arrays
 from ...bench.io.documents import read_json
 from ...bench.io.files import atomic_path, digest, write_json
 from ...datasets.head.arrays import HeadArrays, read_head, save_head
-from .training.loop import CHECKPOINT, Outcome
+from .loop import CHECKPOINT, Outcome
 
 HEAD_FILE = "head_model.npz"
 SUBJECT_FILE = "subject.npz"

@@ -6,14 +6,13 @@ in moving activations of all splats to memory and back.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Any
 
 import torch
 from torch import Tensor
-
-from .sh import C0
-from .triplane import ENCODING_SIZE, FREQUENCIES, encode_directions
+from torch.nn.functional import embedding_bag
 
 CPU_BLOCK = 2048  # rows; their activations fit a core's second-level cache
 
@@ -132,3 +131,172 @@ def _encoding_adjoint(encoded: Tensor, gradient: Tensor) -> Tensor:
 def _blocks(rows: Tensor) -> Iterator[slice]:
     step = CPU_BLOCK if rows.device.type == "cpu" else max(len(rows), 1)
     return (slice(start, start + step) for start in range(0, len(rows), step))
+
+
+def sum_rows(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
+    """(N, C) sums over k of ``weights[:, k] * table[rows[:, k]]``; differentiable in table and weights.
+
+    Parameters
+    ----------
+    table : (T, C).
+    rows : (N, K) int64.
+    weights : (N, K), of the table's dtype.
+    """
+    return _SumRows.apply(table, rows, weights)  # type: ignore[no-untyped-call]
+
+
+class _SumRows(torch.autograd.Function):
+    """The adjoint by the table is one sparse product: torch's own sorts all the row numbers first."""
+
+    @staticmethod
+    def forward(ctx: Any, table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
+        ctx.save_for_backward(table, rows, weights)
+        return embedding_bag(rows, table, per_sample_weights=weights, mode="sum")
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        table, rows, weights = ctx.saved_tensors
+        gradient = grads[0].contiguous()
+        by_table = by_weights = None
+        if ctx.needs_input_grad[0]:
+            owners = torch.arange(len(rows), device=rows.device).repeat_interleave(rows.shape[1])
+            entries = torch.stack([rows.reshape(-1), owners])
+            spread = torch.sparse_coo_tensor(
+                entries, weights.reshape(-1), (len(table), len(rows)), check_invariants=False
+            )
+            by_table = spread @ gradient
+        if ctx.needs_input_grad[2]:
+            with torch.enable_grad():
+                leaf = weights.detach().requires_grad_()
+                summed = embedding_bag(rows, table.detach(), per_sample_weights=leaf, mode="sum")
+            (by_weights,) = torch.autograd.grad(summed, leaf, gradient)
+        return by_table, None, by_weights
+
+
+PAIRS = (("xy", 0, 1), ("xz", 0, 2), ("yz", 1, 2))
+"""Planes in the order of their features: name, coordinate along the width, coordinate along the height."""
+
+
+FREQUENCIES = (1.0, 2.0, 4.0, 8.0)
+ENCODING_SIZE = 3 + 2 * 3 * len(FREQUENCIES)
+
+
+def sample_plane(plane: Tensor, coordinates: Tensor, resolution: int) -> Tensor:
+    """Features (N, C) of a (R * R, C) plane at (N, 2) coordinates in [-1, 1], width first; clamped outside.
+
+    Bilinear, align-corners, border padding, as ``torch.nn.functional.grid_sample`` defines them.
+    """
+    position = ((coordinates + 1) * (0.5 * (resolution - 1))).clamp(0, resolution - 1)
+    corner = position.detach().floor().clamp_max(resolution - 2)
+    u, v = (position - corner).unbind(1)
+    column, row = corner.to(torch.int64).unbind(1)
+    first = row * resolution + column
+    indices = torch.stack([first, first + 1, first + resolution, first + resolution + 1], dim=1)
+    weights = torch.stack([(1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v], dim=1)
+    return sum_rows(plane, indices, weights)
+
+
+def sample_triplane(planes: dict[str, Tensor], points: Tensor, resolution: int) -> tuple[Tensor, ...]:
+    """Features of the three planes at (N, 3) points in [-1, 1], in the order of `PAIRS`."""
+    return tuple(
+        sample_plane(planes[name], points[:, [width, height]], resolution) for name, width, height in PAIRS
+    )
+
+
+def encode(values: Tensor) -> Tensor:
+    """(N, 9 D) positional encoding of (N, D) values: identity, then sin and cos at 1, 2, 4, 8 (no pi)."""
+    frequencies = values.new_tensor(FREQUENCIES)
+    angles = frequencies[:, None] * values[:, None, :]
+    waves = torch.stack([torch.sin(angles), torch.cos(angles)], dim=2)
+    return torch.cat([values, waves.flatten(1)], dim=1)
+
+
+def encode_directions(directions: Tensor) -> Tensor:
+    """(N, 27) positional encoding of (N, 3) unit vectors."""
+    return encode(directions)
+
+
+C0 = 0.28209479177387814
+C1 = 0.4886025119029199
+C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
+C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
+
+
+def coefficient_count(degree: int) -> int:
+    """Number of coefficients up to a degree."""
+    return (degree + 1) ** 2
+
+
+def sh_degree(rest: Tensor) -> int:
+    """Degree of (N, 3, K - 1) coefficients above degree 0."""
+    return math.isqrt(rest.shape[2] + 1) - 1
+
+
+def occupied_degree(rest: Tensor) -> int:
+    """Highest degree of which (N, 3, K - 1) coefficients above degree 0 have any other than zero."""
+    degree = sh_degree(rest)
+    while degree and not rest[:, :, coefficient_count(degree - 1) - 1 :].any():
+        degree -= 1
+    return degree
+
+
+def sh_basis(directions: Tensor, degree: int) -> Tensor:
+    """Real spherical harmonics of unit directions, (N, (degree+1)^2).
+
+    Order and signs are those of 3DGS: degree by degree, m from -l to l, with the Condon-Shortley phase kept
+    (so the m = +-1 terms of degree 1 are -y and -x). Degrees above 3 are not stored by any tool of the field.
+    """
+    x, y, z = directions.unbind(1)
+    terms = [torch.full_like(x, C0)]
+    if degree >= 1:
+        terms += [-C1 * y, C1 * z, -C1 * x]
+    if degree >= 2:
+        xx, yy, zz = x * x, y * y, z * z
+        terms += [C2[0] * x * y, -C2[0] * y * z, C2[1] * (2 * zz - xx - yy), -C2[0] * x * z]
+        terms += [C2[2] * (xx - yy)]
+    if degree >= 3:
+        terms += [-C3[0] * y * (3 * xx - yy), C3[1] * x * y * z, -C3[2] * y * (4 * zz - xx - yy)]
+        terms += [C3[3] * z * (2 * zz - 3 * xx - 3 * yy), -C3[2] * x * (4 * zz - xx - yy)]
+        terms += [C3[4] * z * (xx - yy), -C3[0] * x * (xx - 3 * yy)]
+    return torch.stack(terms, dim=1)
+
+
+def initial_coefficients(count: int, degree: int, generator: torch.Generator) -> dict[str, Tensor]:
+    """Coefficients to start training from, as 3DGS stores them: nearly zero at degree 0, zero above.
+
+    Returns
+    -------
+    ``sh_dc`` (N, 3) and ``sh_rest`` (N, 3, K - 1), K the `coefficient_count` of ``degree``.
+    """
+    dc = torch.rand(count, 3, generator=generator) / 255
+    return {"sh_dc": dc, "sh_rest": torch.zeros(count, 3, coefficient_count(degree) - 1)}
+
+
+class _Weigh(torch.autograd.Function):
+    """(N, 3, K) coefficients times (N, K) basis values; spares autograd's two passes over the coefficients."""
+
+    @staticmethod
+    def forward(ctx: Any, coefficients: Tensor, basis: Tensor) -> Tensor:
+        ctx.save_for_backward(coefficients, basis)
+        return torch.bmm(coefficients, basis[:, :, None])[:, :, 0]
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor]:
+        coefficients, basis = ctx.saved_tensors
+        gradient = grads[0]
+        return gradient[:, :, None] * basis[:, None, :], torch.bmm(gradient[:, None, :], coefficients)[:, 0]
+
+
+def sh_to_rgb(dc: Tensor, rest: Tensor, directions: Tensor, degree: int) -> Tensor:
+    """Colours (N, 3) >= 0 seen along unit directions (from the camera to the splat): relu(0.5 + SH).
+
+    Parameters
+    ----------
+    dc : (N, 3) coefficient of degree 0.
+    rest : (N, 3, 15) coefficients of degrees 1 to 3 by channel; those above ``degree`` are not used.
+    """
+    if degree == 0:
+        return torch.relu(0.5 + C0 * dc)
+    basis = sh_basis(directions, degree)[:, 1:].contiguous()
+    view = _Weigh.apply(rest[:, :, : basis.shape[1]].contiguous(), basis)  # type: ignore[no-untyped-call]
+    return torch.relu(0.5 + C0 * dc + view)

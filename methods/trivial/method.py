@@ -18,8 +18,7 @@ from ...bench.io.arrays import MAX_MAGNITUDE, TEXT, Member, read_arrays
 from ...bench.io.files import atomic_path
 from ...bench.io.images import read_pixels
 from ..shared.avatar_files import TRACKED, is_finished, run_digest, write_arrays, write_record
-from ..shared.clip_checks import check_training_split
-from ..shared.training.loop import Outcome
+from ..shared.loop import Outcome, check_training_split
 from .spec import NearestCameraConfig
 
 MEAN_FILE = "mean.npz"

@@ -22,7 +22,7 @@ from headbench.bench.io.files import digest
 from headbench.datasets.colmap.writer import export_model
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import save_head
-from headbench.methods.shared.training.checkpoint import save_checkpoint
+from headbench.methods.shared.checkpoint import save_checkpoint
 from headbench.metrics.weights import network_spec
 
 from ..datasets.head.flame_files import write_flame

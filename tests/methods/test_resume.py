@@ -18,7 +18,7 @@ from headbench.methods.gbs.method import GBS
 from headbench.methods.ours.config import OursConfig
 from headbench.methods.ours.method import Ours
 from headbench.methods.shared.config import SplatTraining
-from headbench.methods.shared.training.loop import CHECKPOINT
+from headbench.methods.shared.loop import CHECKPOINT
 
 from ..datasets.head.toy import toy_head
 from .toy_clip import toy_clip
@@ -105,7 +105,7 @@ def test_interrupted_and_continued_is_the_same_bit_for_bit(unbroken, clip, tmp_p
 
 
 def test_the_comparison_would_notice_a_lost_moment(unbroken, clip, tmp_path, monkeypatch):
-    from headbench.methods.shared.training.optimiser import Optimiser
+    from headbench.methods.shared.optimisation import Optimiser
 
     name, expected = unbroken
     whole = Optimiser.state

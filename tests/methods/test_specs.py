@@ -16,7 +16,7 @@ from headbench.methods.insta.spec import INSTA
 from headbench.methods.ours.config import OursConfig
 from headbench.methods.ours.spec import OURS
 from headbench.methods.shared.config import SplatTraining
-from headbench.methods.shared.training.schedule import DensifySchedule, Timeline
+from headbench.methods.shared.schedule import DensifySchedule, Timeline
 from headbench.methods.trivial.spec import MEAN_IMAGE, NEAREST_CAMERA
 
 SPECS = {spec.name: spec for spec in (OURS, GA, GBS, GHA, INSTA, MEAN_IMAGE, NEAREST_CAMERA)}

@@ -15,29 +15,25 @@ from torch import Tensor
 from ....bench.contracts import Camera, HeadAsset, HeadPose
 from ....methods.ours.appearance import driving_coefficients
 from ....methods.ours.avatar import OursAvatar
-from ....methods.ours.dynamics import apply_offsets
-from ....methods.ours.feature_lines import (
-    LinePosition,
-    blend_lines,
-    line_offsets,
-    line_position,
-    normalised_weight,
-)
 from ....methods.ours.field import (
     Box,
     CanonicalFrames,
+    LinePosition,
+    apply_offsets,
+    blend_lines,
     canonical_directions,
+    line_offsets,
+    line_position,
+    normalised_weight,
     plane_features,
     position_part,
     shade,
     shade_directions,
 )
+from ....methods.shared.avatar_kernel import Carrier
 from ....methods.shared.binding import to_world
-from ....methods.shared.bound_avatar import render_splats
-from ....methods.shared.networks import offset_network
-from ....methods.shared.row_sums import sum_rows
-from ....methods.shared.stored_splats import Carrier
-from ....methods.shared.views import view_of
+from ....methods.shared.networks import offset_network, sum_rows
+from ....methods.shared.rendering import render_splats, view_of
 from ..splats.timing import take_turns
 from .untrained import cameras_around, random_poses, untrained_avatar
 

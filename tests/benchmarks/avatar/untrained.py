@@ -12,7 +12,7 @@ from ....methods.ours.config import OursConfig
 from ....methods.ours.field import initial_parameters, line_box, plane_box
 from ....methods.ours.storage import Field
 from ....methods.shared.avatar_files import Subject
-from ....methods.shared.seeds import numpy_generator, torch_generator
+from ....methods.shared.schedule import numpy_generator, torch_generator
 from ....methods.shared.subject_mesh import SubjectMesh
 
 DISTANCE = 1.0  # metres, from the camera to the middle of the head

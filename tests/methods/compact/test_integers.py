@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.spatial.transform import Rotation
 
-from headbench.methods.compact.integers import dequantise, from_smallest_three, quantise, smallest_three
+from headbench.methods.compact.container import dequantise, from_smallest_three, quantise, smallest_three
 
 
 @given(

@@ -11,8 +11,16 @@ from hypothesis.extra import numpy as hnp
 from safetensors.numpy import load_file, save_file
 
 from headbench.bench.errors import InputError
-from headbench.methods.compact.container import KEY, Content, read_content, write_content
-from headbench.methods.compact.packing import DTYPES, MAX_BYTES, pack, unpack
+from headbench.methods.compact.container import (
+    DTYPES,
+    KEY,
+    MAX_BYTES,
+    Content,
+    pack,
+    read_content,
+    unpack,
+    write_content,
+)
 
 
 @given(

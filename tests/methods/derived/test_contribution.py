@@ -3,9 +3,8 @@
 import numpy as np
 import torch
 
-from headbench.methods.derived.contribution import contributions, most_contributing, training_views
-from headbench.methods.shared.bound_avatar import PosedSplats
-from headbench.methods.shared.views import view_of
+from headbench.methods.derived.recipes import contributions, most_contributing, training_views
+from headbench.methods.shared.rendering import PosedSplats, view_of
 from headbench.methods.splats import rasterize
 
 

@@ -8,9 +8,14 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from headbench.methods.derived.reduced import read_reduced, write_reduced
-from headbench.methods.derived.resampled import coarser_lines, coarser_planes, fitting_matrix
-from headbench.methods.shared.triplane import PAIRS, sample_plane
+from headbench.methods.derived.recipes import (
+    coarser_lines,
+    coarser_planes,
+    fitting_matrix,
+    read_reduced,
+    write_reduced,
+)
+from headbench.methods.shared.networks import PAIRS, sample_plane
 
 
 def ramp_plane(side, channels=2):

@@ -8,11 +8,11 @@ from torch import nn
 from headbench.methods.ga.config import GAConfig
 from headbench.methods.ga.method import GAAppearance
 from headbench.methods.shared.avatar_files import TRACKED
-from headbench.methods.shared.sh import C0, C1
+from headbench.methods.shared.networks import C0, C1
+from headbench.methods.shared.optimisation import Optimiser
+from headbench.methods.shared.rendering import view_of
+from headbench.methods.shared.schedule import Timeline
 from headbench.methods.shared.subject_mesh import SubjectMesh
-from headbench.methods.shared.training.optimiser import Optimiser
-from headbench.methods.shared.training.schedule import Timeline
-from headbench.methods.shared.views import view_of
 
 
 def make(clip, config=None):

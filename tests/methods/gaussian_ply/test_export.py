@@ -17,13 +17,13 @@ from headbench.methods.ga.config import GAConfig
 from headbench.methods.ga.method import GA
 from headbench.methods.gaussian_ply import command
 from headbench.methods.gaussian_ply.command import neutral_pose, run
-from headbench.methods.gaussian_ply.harmonics_fit import BEHIND, fit_harmonics, sphere
+from headbench.methods.gaussian_ply.harmonics import BEHIND, fit_harmonics, sphere
 from headbench.methods.gaussian_ply.settings import ExportPlySettings
 from headbench.methods.gbs.config import GBSConfig
 from headbench.methods.gbs.method import GBS
 from headbench.methods.ours.avatar import OursAvatar
-from headbench.methods.shared.sh import sh_basis
-from headbench.methods.shared.views import view_of
+from headbench.methods.shared.networks import sh_basis
+from headbench.methods.shared.rendering import view_of
 from headbench.methods.splats import rasterize
 
 from ...datasets.tiny_capture import write_tiny_capture

@@ -15,7 +15,7 @@ from headbench.methods.gbs.mouth import mouth_room, padded_offset, with_mouth
 from headbench.methods.gbs.rig import Carried
 from headbench.methods.gbs.training import DIFFERENCES, GBSTraining, sample_count
 from headbench.methods.shared.avatar_files import Subject
-from headbench.methods.shared.training.schedule import Timeline
+from headbench.methods.shared.schedule import Timeline
 from headbench.methods.splats import rasterize
 
 from ..toy_clip import look_at

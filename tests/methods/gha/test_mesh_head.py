@@ -16,7 +16,7 @@ from headbench.methods.gha.mesh_training import MeshTraining, roughness, soft_ov
 from headbench.methods.gha.scene import scene_of
 from headbench.methods.gha.signed_distance import TangentDistance, outer_vertices
 from headbench.methods.gha.tetrahedra import marching_tetrahedra, tet_grid
-from headbench.methods.shared.triplane import encode
+from headbench.methods.shared.networks import encode
 
 from .small import small_config
 

@@ -22,7 +22,7 @@ from headbench.methods.gha.method import GHA, parted, within
 from headbench.methods.gha.storage import AVATAR_FILE
 from headbench.methods.gha.super_resolution import AT_ONCE
 from headbench.methods.shared.avatar_files import RECORD_FILE
-from headbench.methods.shared.training.loop import CHECKPOINT
+from headbench.methods.shared.loop import CHECKPOINT
 
 from .small import SMALL, small_config
 

@@ -7,7 +7,7 @@ from headbench.datasets.head.model import HeadModel
 from headbench.methods.gha.controllers import Controllers
 from headbench.methods.gha.scene import bounds, scene_of
 from headbench.methods.gha.tracked_motion import TrackedMotion
-from headbench.methods.shared.triplane import encode
+from headbench.methods.shared.networks import encode
 
 from .small import small_config
 

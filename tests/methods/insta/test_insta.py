@@ -16,7 +16,7 @@ from headbench.methods.insta.config import InstaConfig
 from headbench.methods.insta.method import Insta
 from headbench.methods.insta.spec import INSTA
 from headbench.methods.insta.storage import FIELD_FILE, SETTINGS_FILE
-from headbench.methods.shared.training.loop import CHECKPOINT
+from headbench.methods.shared.loop import CHECKPOINT
 
 from ..single_frame import psnr_by_heart
 from .small import SMALL

@@ -9,13 +9,7 @@ import torch
 from headbench.bench.errors import InputError
 from headbench.methods.ours.avatar import OursAvatar
 from headbench.methods.ours.config import OursConfig
-from headbench.methods.ours.dynamics import (
-    WIDTHS,
-    LocalSplats,
-    apply_offsets,
-    changed_colors,
-    offset_width,
-)
+from headbench.methods.ours.field import WIDTHS, LocalSplats, apply_offsets, changed_colors, offset_width
 from headbench.methods.ours.storage import FIELD_FILE, write_field
 from headbench.methods.shared.avatar_files import SUBJECT_FILE, Subject, save_shared_head, write_subject
 

@@ -5,7 +5,7 @@ import torch
 from torch import nn
 from torch.nn.utils.parametrizations import weight_norm
 
-from headbench.methods.ours.feature_lines import (
+from headbench.methods.ours.field import (
     blend_lines,
     initial_line_network,
     line_offsets,

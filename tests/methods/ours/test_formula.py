@@ -15,10 +15,10 @@ from headbench.methods.ours.appearance import OursAppearance
 from headbench.methods.ours.config import OursConfig
 from headbench.methods.ours.method import Ours
 from headbench.methods.shared.config import SplatTraining
+from headbench.methods.shared.optimisation import Optimiser
+from headbench.methods.shared.rendering import view_of
+from headbench.methods.shared.schedule import Timeline
 from headbench.methods.shared.subject_mesh import SubjectMesh
-from headbench.methods.shared.training.optimiser import Optimiser
-from headbench.methods.shared.training.schedule import Timeline
-from headbench.methods.shared.views import view_of
 
 CONFIG = OursConfig(
     splats=SplatTraining(min_densify_every=10, min_settle=4),

@@ -8,12 +8,10 @@ import torch
 
 from headbench.bench.errors import InputError
 from headbench.methods.ours.avatar import OursAvatar
-from headbench.methods.ours.feature_lines import blend_lines, line_offsets, line_position
-from headbench.methods.ours.field import Box, shade
+from headbench.methods.ours.field import Box, blend_lines, line_offsets, line_position, shade
 from headbench.methods.ours.inference import LineOffsets, PlaneColors, encode_columns
-from headbench.methods.shared.known_poses import KnownPoses, pose_key
-from headbench.methods.shared.networks import CPU_BLOCK
-from headbench.methods.shared.triplane import encode_directions
+from headbench.methods.shared.networks import CPU_BLOCK, encode_directions
+from headbench.methods.shared.subject_mesh import KnownPoses, pose_key
 
 from ..stored_toy import store
 from .toy import SMALL

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from headbench.datasets.head.arrays import faces_in_region
+from headbench.methods.ours.appearance import expressive_triangles, shell_start
 from headbench.methods.ours.config import OursConfig
-from headbench.methods.ours.outer_layers import expressive_triangles, shell_start
 from headbench.methods.shared.subject_mesh import SubjectMesh
 
 

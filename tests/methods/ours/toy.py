@@ -6,10 +6,10 @@ from torch import nn
 from headbench.methods.ours.appearance import OursAppearance
 from headbench.methods.ours.config import OursConfig
 from headbench.methods.shared.avatar_files import Subject
+from headbench.methods.shared.optimisation import Optimiser
+from headbench.methods.shared.rendering import view_of
+from headbench.methods.shared.schedule import Timeline
 from headbench.methods.shared.subject_mesh import SubjectMesh
-from headbench.methods.shared.training.optimiser import Optimiser
-from headbench.methods.shared.training.schedule import Timeline
-from headbench.methods.shared.views import view_of
 
 SMALL = OursConfig(plane_resolution=8, plane_channels=(4, 2, 2), hidden=8, line_resolution=6, line_channels=3)
 

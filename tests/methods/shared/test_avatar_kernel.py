@@ -6,11 +6,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from headbench.methods.ours.feature_lines import offset_network
-from headbench.methods.ours.field import canonical_directions, shade_directions
+from headbench.methods.ours.field import canonical_directions, offset_network, shade_directions
 from headbench.methods.shared import avatar_kernel
 from headbench.methods.shared.binding import Frames, to_world, triangle_frames
-from headbench.methods.shared.sh import sh_to_rgb
+from headbench.methods.shared.networks import sh_to_rgb
 from headbench.methods.splats.cpu import instruction_sets
 
 BACKENDS = list(instruction_sets()) if avatar_kernel.available() else []

@@ -10,12 +10,12 @@ from skimage.metrics import structural_similarity
 from headbench.bench.contracts import Camera
 from headbench.bench.errors import InputError
 from headbench.methods.shared.binding import to_world
-from headbench.methods.shared.bound_training import BoundTraining, Placed
-from headbench.methods.shared.clip_checks import check_training_split
 from headbench.methods.shared.config import SplatTraining
+from headbench.methods.shared.loop import check_training_split
+from headbench.methods.shared.rendering import scene_extent
+from headbench.methods.shared.schedule import Timeline
+from headbench.methods.shared.splat_training import BoundTraining, Placed
 from headbench.methods.shared.subject_mesh import SubjectMesh
-from headbench.methods.shared.training.schedule import Timeline
-from headbench.methods.shared.views import scene_extent
 from headbench.methods.splats import rasterize
 
 PENALTY = 7.0

@@ -5,9 +5,7 @@ import pytest
 import torch
 
 from headbench.methods.shared import networks
-from headbench.methods.shared.networks import color_network, offset_network
-from headbench.methods.shared.row_sums import sum_rows
-from headbench.methods.shared.triplane import encode_directions
+from headbench.methods.shared.networks import color_network, encode_directions, offset_network, sum_rows
 
 POINTS, HIDDEN = 23, 6
 

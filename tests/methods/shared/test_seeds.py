@@ -2,7 +2,7 @@
 
 import torch
 
-from headbench.methods.shared.seeds import numpy_generator, torch_generator
+from headbench.methods.shared.schedule import numpy_generator, torch_generator
 
 
 def draw(*where):

@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.special import sph_harm_y
 
-from headbench.methods.shared.sh import C0, coefficient_count, sh_basis, sh_to_rgb
+from headbench.methods.shared.networks import C0, coefficient_count, sh_basis, sh_to_rgb
 
 
 def real_harmonics(directions, degree):

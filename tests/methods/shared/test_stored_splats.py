@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
+from headbench.methods.shared.avatar_kernel import Carrier, HarmonicColors
 from headbench.methods.shared.binding import to_world, triangle_frames
-from headbench.methods.shared.stored_splats import Carrier, HarmonicColors
 
 
 def normal(*shape, seed=0):

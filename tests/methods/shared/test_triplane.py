@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch.nn.functional import grid_sample
 
-from headbench.methods.shared.triplane import PAIRS, encode_directions, sample_plane, sample_triplane
+from headbench.methods.shared.networks import PAIRS, encode_directions, sample_plane, sample_triplane
 
 RESOLUTION, CHANNELS = 9, 4
 

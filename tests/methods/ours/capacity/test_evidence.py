@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from headbench.datasets.steps.jaw_bases import IDENTITY, farthest_quaternions, jaw_quaternions, jaw_weights
-from headbench.methods.ours.capacity.evidence import (
+from headbench.methods.ours.capacity import (
     displacement_without,
     jaw_lever,
     largest_displacements,

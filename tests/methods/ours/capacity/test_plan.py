@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.runner.training_view import TrainingView
-from headbench.methods.ours.capacity.plan import plan_capacity
+from headbench.methods.ours.capacity import plan_capacity
 from headbench.methods.ours.config import OursConfig
 from headbench.methods.ours.method import Ours
 from headbench.methods.shared.avatar_files import RECORD_FILE, Subject

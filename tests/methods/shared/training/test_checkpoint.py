@@ -7,8 +7,8 @@ import torch
 
 from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.errors import InputError
-from headbench.methods.shared.training.checkpoint import load_checkpoint, save_checkpoint
-from headbench.methods.shared.training.loop import CHECKPOINT, train
+from headbench.methods.shared.checkpoint import load_checkpoint, save_checkpoint
+from headbench.methods.shared.loop import CHECKPOINT, train
 
 
 def test_what_was_saved_comes_back(tmp_path):

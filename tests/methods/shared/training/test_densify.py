@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 from torch import nn
 
 from headbench.methods.shared.config import SplatTraining
-from headbench.methods.shared.training.densify import SHRINK, Densifier, logit, rows_of_tables
-from headbench.methods.shared.training.optimiser import Optimiser
-from headbench.methods.shared.training.schedule import DensifySchedule
+from headbench.methods.shared.optimisation import SHRINK, Densifier, Optimiser, logit, rows_of_tables
+from headbench.methods.shared.schedule import DensifySchedule
 
 NAMES = ("means", "log_scales", "quats", "opacities", "extra")
 ALWAYS = DensifySchedule(0, 1, 10**9, 10**9, None, prune_extent_from=100)

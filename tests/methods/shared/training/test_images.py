@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from headbench.bench.errors import InputError
-from headbench.methods.shared.training.images import TrainingImages
-from headbench.methods.shared.training.sampling import ShuffledEpochs
+from headbench.methods.shared.loop import TrainingImages
+from headbench.methods.shared.schedule import ShuffledEpochs
 
 
 class Counting:

@@ -6,8 +6,8 @@ from torch import nn
 
 from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.errors import InputError
-from headbench.methods.shared.training.loop import CHECKPOINT, train
-from headbench.methods.shared.training.optimiser import Optimiser
+from headbench.methods.shared.loop import CHECKPOINT, train
+from headbench.methods.shared.optimisation import Optimiser
 
 
 class Drift:

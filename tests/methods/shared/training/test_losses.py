@@ -5,7 +5,7 @@ import pytest
 import torch
 from skimage.metrics import structural_similarity
 
-from headbench.methods.shared.training.losses import (
+from headbench.methods.shared.losses import (
     mean_over_visible,
     mean_ssim,
     photometric_loss,

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from headbench.methods.shared.training.optimiser import Optimiser
+from headbench.methods.shared.optimisation import Optimiser
 
 
 def textbook(values, gradients, rate):

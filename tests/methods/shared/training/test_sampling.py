@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import chisquare
 
-from headbench.methods.shared.training.sampling import BLOCK, ShuffledEpochs, Weighted, balanced_weights
+from headbench.methods.shared.schedule import BLOCK, ShuffledEpochs, Weighted, balanced_weights
 
 
 def test_every_image_once_per_epoch_in_an_order_of_its_own():

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from headbench.methods.shared.config import SplatTraining
-from headbench.methods.shared.training.schedule import DensifySchedule, Timeline, log_linear
+from headbench.methods.shared.schedule import DensifySchedule, Timeline, log_linear
 
 PUBLISHED = SplatTraining()
 

@@ -17,10 +17,10 @@ import torch
 from safetensors.torch import save
 from torch import Tensor
 
-from ....bench.errors import InputError
-from ....bench.io.documents import parse_json
-from ....bench.io.files import write_bytes
-from ..tensor_files import read_safetensors
+from ...bench.errors import InputError
+from ...bench.io.documents import parse_json
+from ...bench.io.files import write_bytes
+from .tensor_files import read_safetensors
 
 LAYOUT = 2
 KEY = "checkpoint"
