@@ -25,7 +25,7 @@ help:
 setup: $(VENV)/.installed
 
 # Reinstalled when packaging or the kernel changes; Python sources are used in place.
-KERNEL := $(shell git ls-files "*CMakeLists.txt" "*.cpp" "*.h" 2>/dev/null)
+KERNEL := $(shell git ls-files "*CMakeLists.txt" "*.cmake" "*.cpp" "*.h" 2>/dev/null)
 $(VENV)/.installed: pyproject.toml constraints.txt __init__.py $(KERNEL)
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "headbench needs Python 3.11 or newer; set PYTHON=")'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)

@@ -17,7 +17,7 @@ import numpy as np
 
 from ..bench.contracts import ByteArray, FloatArray
 from .pairs import Mask, check_pair, stack_masks
-from .structural import instruction_sets, kernel
+from .structural import KERNEL
 
 C1, C2 = (0.01 * 255.0) ** 2, (0.03 * 255.0) ** 2
 
@@ -85,7 +85,7 @@ class Ssim:
     def __call__(self, image: ByteArray, truth: ByteArray) -> float:
         """Mean over all windows of two (H, W, 3) images."""
         check_pair(image, truth, self.form.smallest)
-        if kernel() is None or _blocks(self.form, truth) > 1:
+        if KERNEL.load_or_warn() is None or _blocks(self.form, truth) > 1:
             return float(ssim_map(image, truth, self.form).mean())
         inset = self.form.inset
         windows = (image.shape[0] - 2 * inset) * (image.shape[1] - 2 * inset)
@@ -100,7 +100,7 @@ class Ssim:
             stack = np.stack([_block_means(mask, blocks) >= 0.5 for mask in stack]).astype(np.uint8)
         centres = stack[:, inset : stack.shape[1] - inset, inset : stack.shape[2] - inset] != 0
         counts = dict(zip(masks, centres.sum(axis=(1, 2))))
-        if kernel() is None or blocks > 1:
+        if KERNEL.load_or_warn() is None or blocks > 1:
             local = ssim_map(image, truth, self.form).sum(axis=2)
             sums = [float(local[inside].sum()) for inside in centres]
         else:
@@ -109,14 +109,13 @@ class Ssim:
 
     def _sums(self, image: ByteArray, truth: ByteArray, masks: ByteArray) -> list[float]:
         """Sum of the local similarities of the image, then inside each mask, by the kernel."""
-        module = kernel()
-        assert module is not None
+        module = KERNEL.load()
         form = self.form
         arrays = (np.ascontiguousarray(array) for array in (image, truth, masks))
         taps = np.ascontiguousarray(form.weights[form.radius :])
         border = _KERNEL_BORDERS[form.border]
         sums: list[float] = module.similarity(
-            *arrays, taps, border, form.covariance_scale, C1, C2, instruction_sets()[0]
+            *arrays, taps, border, form.covariance_scale, C1, C2, KERNEL.instruction_sets[0]
         )
         return sums
 

@@ -6,35 +6,14 @@ uses the whole machine. Its variants for different instruction sets give the sam
 
 from __future__ import annotations
 
-import functools
-import importlib
-import logging
-from types import ModuleType
-
 import numpy as np
 
 from ..bench.contracts import ByteArray, IntArray
+from ..bench.native.loader import Kernel
 
-log = logging.getLogger(__name__)
-
-REMEDY = "Install a C++17 compiler and reinstall headbench; numpy does meanwhile, more slowly."
-
-
-@functools.cache
-def kernel() -> ModuleType | None:
-    """The compiled module; None where it is missing, which is logged once."""
-    try:
-        return importlib.import_module("._structural", __package__)
-    except ImportError as error:
-        log.warning("The kernel of the image metrics cannot be used (%s). %s", error, REMEDY)
-        return None
-
-
-@functools.cache
-def instruction_sets() -> tuple[str, ...]:
-    """Variants of the kernel that run here, the fastest first; empty where it is missing."""
-    module = kernel()
-    return () if module is None else tuple(module.instruction_sets())
+KERNEL = Kernel(
+    "headbench.metrics._structural", "The kernel of the image metrics", "numpy does meanwhile, more slowly"
+)
 
 
 def squared_errors(image: ByteArray, truth: ByteArray, masks: ByteArray) -> IntArray:
@@ -45,11 +24,11 @@ def squared_errors(image: ByteArray, truth: ByteArray, masks: ByteArray) -> IntA
     image, truth : (H, W, 3) 8-bit.
     masks : (R, H, W) 8-bit, not 0 inside.
     """
-    module = kernel()
+    module = KERNEL.load_or_warn()
     if module is None:
         return squared_errors_numpy(image, truth, masks)
     arrays = (np.ascontiguousarray(array) for array in (image, truth, masks))
-    sums = module.squared_error(*arrays, instruction_sets()[0])
+    sums = module.squared_error(*arrays, KERNEL.instruction_sets[0])
     return np.array(sums, dtype=np.int64).reshape(-1, 3)
 
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from ..splats.cpu import instruction_sets, load
+from ..splats.cpu import KERNEL, instruction_sets
 from .binding import Frames, WorldSplats, apply_matrices, to_world
 from .networks import sh_degree, sh_to_rgb
 
@@ -24,7 +24,7 @@ UNITS_STEP = 16
 
 def available() -> bool:
     """Tell whether the kernel is there; one built from older sources, in an editable installation, counts as none."""
-    return hasattr(load(), "triangles")
+    return hasattr(KERNEL.imported, "to_world")
 
 
 def usable(like: Tensor) -> bool:
@@ -57,7 +57,7 @@ def carry(
     """
     world = WorldSplats(torch.empty_like(means), torch.empty_like(quats), torch.empty_like(scales))
     _call(
-        "carry",
+        "to_world",
         *(binding, frames.rotation, frames.center, frames.size, frames.quaternion, means, quats, scales),
         *world,
         backend=backend,
@@ -168,7 +168,7 @@ def offsets_into(
 
 
 def _call(name: str, *arrays: Tensor, backend: str) -> Any:
-    function = getattr(load(), name)
+    function = getattr(KERNEL.load(), name)
     plain = [array.detach().contiguous().numpy() for array in arrays]
     return function(*plain, instruction_sets()[backend], torch.get_num_threads())
 

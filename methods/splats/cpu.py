@@ -2,42 +2,27 @@
 
 from __future__ import annotations
 
-import functools
-import importlib
-import logging
 from collections.abc import Sequence
-from types import ModuleType
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from ...bench.errors import UnavailableError
+from ...bench.native.loader import Kernel
 from .request import Rendering, Request
 
-log = logging.getLogger(__name__)
-
-REMEDY = "Install a C++17 compiler and reinstall headbench; the reference backend works meanwhile, slowly."
-
-
-@functools.cache
-def load() -> ModuleType | ImportError:
-    """The kernel module, or why it cannot be imported."""
-    try:
-        return importlib.import_module("._kernel", __package__)
-    except ImportError as error:
-        return error
+KERNEL = Kernel(
+    "headbench.methods.splats._kernel",
+    "The splat renderer's kernel",
+    "the reference backend works meanwhile, slowly",
+)
 
 
-@functools.cache
 def instruction_sets() -> dict[str, str]:
     """What the kernel can be run with here, by backend name, the fastest first; empty where it is missing."""
-    module = load()
-    if isinstance(module, ImportError):
-        return {}
-    available = module.instruction_sets()
-    return {"cpu": available[0], **{f"cpu-{name}": name for name in available}}
+    available = KERNEL.instruction_sets
+    return {"cpu": available[0], **{f"cpu-{name}": name for name in available}} if available else {}
 
 
 def supports(request: Request) -> bool:
@@ -45,24 +30,13 @@ def supports(request: Request) -> bool:
     return request.means.dtype == torch.float32 and request.means.device.type == "cpu"
 
 
-@functools.cache
-def usable_or_warn() -> bool:
-    """Tell whether the kernel is there; if not, say why in one logged warning per process."""
-    module = load()
-    if isinstance(module, ImportError):
-        log.warning("The splat kernel cannot be used (%s). %s", module, REMEDY)
-        return False
-    return True
-
-
 def rasterize_cpu(request: Request, backend: str, threads: int | None) -> Rendering:
     """Render with the kernel; see `rasterize`."""
     if not supports(request):
         found = f"{request.means.dtype} on {request.means.device}"
         raise ValueError(f"means: expected torch.float32 on the CPU for backend {backend!r}, found {found}.")
-    module, available = load(), instruction_sets()
-    if isinstance(module, ImportError):
-        raise UnavailableError(f"The renderer's backend {backend!r} is not available: {module}.", REMEDY)
+    KERNEL.load()
+    available = instruction_sets()
     if backend not in available:
         names = ", ".join(map(repr, ("auto", *available, "reference")))
         raise ValueError(f"backend: expected one of {names} on this machine, found {backend!r}.")
@@ -120,7 +94,7 @@ class _Rasterize(torch.autograd.Function):
         alphas = means.new_empty(views, *size)
         radii = torch.empty(views, len(means), dtype=torch.int32)
         ctx.frames = [
-            _kernel().forward(
+            KERNEL.load().forward(
                 *_of_view(_arrays(*inputs), view),
                 *_arrays(viewmats[view], Ks[view]),
                 *settings,
@@ -149,7 +123,7 @@ class _Rasterize(torch.autograd.Function):
         grad_images = grad_images.contiguous().view(views, *grad_images.shape[-3:])
         grad_alphas = grad_alphas.contiguous().view(views, *grad_alphas.shape[-2:])
         for view, frame in enumerate(ctx.frames):
-            _kernel().backward(
+            KERNEL.load().backward(
                 frame,
                 *_of_view(_arrays(*inputs), view),
                 *_arrays(grad_images[view], grad_alphas[view]),
@@ -173,7 +147,7 @@ def _of_view(arrays: Sequence[Any], view: int) -> list[Any]:
 
 def peak_flops(backend: str) -> float:
     """Measured multiply-add rate of one thread in a backend's instruction set, floating-point operations a second."""
-    return _kernel().peak_flops(instruction_sets()[backend])
+    return KERNEL.load().peak_flops(instruction_sets()[backend])
 
 
 def work(node: Any) -> tuple[int, int]:
@@ -184,12 +158,6 @@ def work(node: Any) -> tuple[int, int]:
 def stage_seconds(node: Any) -> dict[str, float]:
     """Processor time of the calling thread by stage, of the first camera of an autograd node of the kernel."""
     return node.frames[0].stage_seconds
-
-
-def _kernel() -> ModuleType:
-    module = load()
-    assert isinstance(module, ModuleType)
-    return module
 
 
 def _arrays(*tensors: Tensor) -> list[Any]:

@@ -124,6 +124,6 @@ def available_backends(device: str = "cpu") -> tuple[str, ...]:
 
 
 def _choose(request: Request) -> str:
-    if cpu.supports(request) and cpu.usable_or_warn():
+    if cpu.supports(request) and cpu.KERNEL.load_or_warn():
         return "cpu"
     return "cuda" if cuda.usable_or_warn(request) else "reference"

@@ -1,8 +1,7 @@
-// What the kernels compute, and the variants of them this machine can run.
+// What the kernels compute: plain data, shared by all instruction sets.
 #pragma once
 
 #include <cstdint>
-#include <vector>
 
 namespace headbench::metrics {
 
@@ -19,7 +18,7 @@ enum class Border : int {
 // Two 8-bit images (height, width, 3) and any number of masks (height, width) that are not 0 inside.
 struct Pair {
   const std::uint8_t* image;
-  const std::uint8_t* truth;
+  const std::uint8_t* reference;
   const std::uint8_t* masks;
   std::int64_t height, width, regions;
 };
@@ -41,31 +40,5 @@ struct Kernels {
   // Sum of the squared differences of each channel (3,): first over the image, then over each region.
   void (*squared_error)(const Pair&, std::uint64_t* sums);
 };
-
-namespace portable {
-extern const Kernels kernels;
-}
-#ifdef HEADBENCH_X86
-namespace avx2 {
-extern const Kernels kernels;
-}
-namespace avx512 {
-extern const Kernels kernels;
-}
-#endif
-
-// Fastest first; the portable one is always there.
-inline std::vector<const Kernels*> runnable_kernels() {
-  std::vector<const Kernels*> found;
-#ifdef HEADBENCH_X86
-  __builtin_cpu_init();
-  if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") &&
-      __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512vl"))
-    found.push_back(&avx512::kernels);
-  if (__builtin_cpu_supports("avx2")) found.push_back(&avx2::kernels);
-#endif
-  found.push_back(&portable::kernels);
-  return found;
-}
 
 }  // namespace headbench::metrics

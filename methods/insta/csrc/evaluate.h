@@ -1,9 +1,9 @@
-// The field at canonical points, one sample to a lane. Included once per instruction set, after its simd header.
+// The field at canonical points, one sample to a lane.
 //
 // The formulas are those of field.py, the encoding's those of hash_grid.py.
 #pragma once
 
-#include "../../splats/csrc/harmonics_basis.h"
+#include "bench/native/spherical_harmonics.h"
 #include "field.h"
 
 namespace headbench::HEADBENCH_ISA {

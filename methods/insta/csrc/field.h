@@ -1,13 +1,18 @@
-// The field as plain arrays, and samples of it.
+// The field as plain arrays, samples of it, and the functions of them that are compiled once per instruction set.
 #pragma once
 
 #include <cstddef>
 #include <cstdint>
-#include <vector>
 
-#include "hash_grid.h"
+#include "search.h"
 
 namespace headbench::insta {
+
+struct Level {
+  float scale;                // cells per unit length
+  std::int32_t resolution;    // samples per side
+  std::int64_t first, count;  // rows of the table
+};
 
 constexpr int kDirections = 16;  // spherical harmonics up to degree 3
 
@@ -46,6 +51,17 @@ struct Points {
 struct Values {
   float* left;      // what a step leaves of the light
   float* color[3];  // in (0, 1)
+};
+
+// What is compiled once per instruction set.
+struct Kernels {
+  const char* name;
+  Nearest nearest;
+  std::size_t (*scratch)(const Field& field);  // floats
+  // Values of `count` samples at steps of `step` metres. `starts` is (2, outputs of the first layer): what the
+  // conditions add to that layer's sums outside the mouth and at it.
+  void (*evaluate)(const Field& field, const float* starts, float step, const Points& points, std::int64_t count,
+                   const Values& values, float* scratch);
 };
 
 }  // namespace headbench::insta

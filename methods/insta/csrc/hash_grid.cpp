@@ -4,7 +4,7 @@
 #include <cmath>
 #include <stdexcept>
 
-#include "../../splats/csrc/thread_pool.h"
+#include "bench/native/thread_pool.h"
 
 namespace headbench::insta {
 

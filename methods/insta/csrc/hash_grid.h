@@ -1,16 +1,11 @@
 // Multi-resolution hash encoding, forward and backward.
 #pragma once
 
-#include <cstdint>
 #include <vector>
 
-namespace headbench::insta {
+#include "field.h"
 
-struct Level {
-  float scale;                // cells per unit length
-  std::int32_t resolution;    // samples per side
-  std::int64_t first, count;  // rows of the table
-};
+namespace headbench::insta {
 
 // (N, levels features) values at (N, 3) positions in [0, 1].
 void encode(const float* positions, std::int64_t count, const float* table, const std::vector<Level>& levels,

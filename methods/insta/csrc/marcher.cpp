@@ -88,7 +88,7 @@ bool Marcher::next(Progress& progress, const std::vector<Interval>& intervals, S
         progress.index += static_cast<std::int32_t>((away - interval.reach) / step_);
         continue;
       }
-      const Placed placed = place(point, progress.direction, hit.triangle);
+      const CanonicalPoint placed = place(point, progress.direction, hit.triangle);
       progress.index += passed(placed, last - static_cast<float>(index));
       const float reach = reach_[hit.triangle];
       if (free_at(placed.cells) != 0 || reach < 0 || away > reach) continue;
@@ -139,10 +139,10 @@ void Marcher::near_intervals(Vec3 origin, Vec3 direction, std::vector<Interval>&
   intervals.resize(kept);
 }
 
-Marcher::Placed Marcher::place(Vec3 point, Vec3 direction, std::int32_t triangle) const {
+Marcher::CanonicalPoint Marcher::place(Vec3 point, Vec3 direction, std::int32_t triangle) const {
   float m[12];
   matrix(point, triangle, m);
-  Placed placed;
+  CanonicalPoint placed;
   const Vec3 p = placed.position = {m[0] * point.x + m[1] * point.y + m[2] * point.z + m[3],
                                     m[4] * point.x + m[5] * point.y + m[6] * point.z + m[7],
                                     m[8] * point.x + m[9] * point.y + m[10] * point.z + m[11]};
@@ -154,7 +154,7 @@ Marcher::Placed Marcher::place(Vec3 point, Vec3 direction, std::int32_t triangle
 }
 
 // How many lattice points in a row, up to `most`, follow a point into free cells.
-std::int32_t Marcher::passed(const Placed& placed, float most) const {
+std::int32_t Marcher::passed(const CanonicalPoint& placed, float most) const {
   const Vec3 step = (step_ * grid_.cells_per_metre) * placed.way;
   const float length = std::sqrt(dot(step, step)), bend = kBend * length;
   if (!(length > 0)) return 0;  // a triangle without area leads nowhere

@@ -60,15 +60,15 @@ class Marcher {
 
  private:
   // A point of a ray in canonical space.
-  struct Placed {
+  struct CanonicalPoint {
     Vec3 position, way;  // metres; the ray's direction there, not of unit length
     Vec3 cells;          // the position in cells of the grid
   };
 
   void near_intervals(Vec3 origin, Vec3 direction, std::vector<Interval>& intervals) const;
   void enter(Progress& progress, const std::vector<Interval>& intervals) const;
-  Placed place(Vec3 point, Vec3 direction, std::int32_t triangle) const;
-  std::int32_t passed(const Placed& placed, float most) const;
+  CanonicalPoint place(Vec3 point, Vec3 direction, std::int32_t triangle) const;
+  std::int32_t passed(const CanonicalPoint& placed, float most) const;
   int free_at(Vec3 cells) const;
   bool clear_around(Vec3 cells, float half) const;
   void matrix(Vec3 point, std::int32_t triangle, float* m) const;

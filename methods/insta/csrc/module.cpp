@@ -1,24 +1,18 @@
 // INSTA's kernel as a Python module. Arrays are typed and contiguous.
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
 #include <nanobind/stl/shared_ptr.h>
-#include <nanobind/stl/string.h>
 #include <nanobind/stl/tuple.h>
-#include <nanobind/stl/vector.h>
 
 #include <memory>
-#include <stdexcept>
 #include <string>
 #include <tuple>
 #include <utility>
 #include <vector>
 
-#include "../../splats/csrc/thread_pool.h"
+#include "bench/native/module.h"
+#include "bench/native/thread_pool.h"
 #include "hash_grid.h"
-#include "instruction_sets.h"
-#include "march.h"
 #include "mesh_search.h"
-#include "render.h"
+#include "rays.h"
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -26,14 +20,7 @@ using namespace nb::literals;
 namespace headbench::insta {
 namespace {
 
-template <class T, nb::ssize_t... Shape>
-using Array = nb::ndarray<T, nb::shape<Shape...>, nb::c_contig, nb::device::cpu>;
-
 constexpr std::int64_t kPointsPerTask = 256;
-
-void require(bool fits) {
-  if (!fits) throw std::invalid_argument("arrays do not fit together");
-}
 
 // Hands a vector's memory to numpy.
 template <class T>
@@ -49,17 +36,16 @@ std::shared_ptr<Tree> make_tree(const Array<const std::int32_t, -1, 3>& faces, c
   return std::make_shared<Tree>(faces.data(), faces.shape(0), vertices.data(), vertices.shape(0));
 }
 
-// The instruction set of a name; of none, the fastest.
-const InstructionSet& instruction_set(const std::string& name) {
-  for (const InstructionSet* set : instruction_sets())
-    if (name.empty() || name == set->name) return *set;
-  throw std::invalid_argument("no such instruction set here: " + name);
+// The kernels of an instruction set; of no name, the fastest.
+const Kernels& kernels_of(const std::string& name) {
+  static const std::vector<const Kernels*> runnable = runnable_kernels();
+  return name.empty() ? *runnable.front() : variant_of(runnable, name);
 }
 
 std::shared_ptr<Posed> make_posed(std::shared_ptr<Tree> tree, const Array<const float, -1, 3>& vertices,
                                   const std::string& isa) {
   require(static_cast<std::int64_t>(vertices.shape(0)) == tree->vertex_count());
-  return std::make_shared<Posed>(std::move(tree), vertices.data(), instruction_set(isa).nearest);
+  return std::make_shared<Posed>(std::move(tree), vertices.data(), kernels_of(isa).nearest);
 }
 
 template <class Query>
@@ -230,12 +216,6 @@ class Trained {
   Field field_;
 };
 
-std::vector<std::string> instruction_set_names() {
-  std::vector<std::string> names;
-  for (const InstructionSet* set : instruction_sets()) names.push_back(set->name);
-  return names;
-}
-
 std::int64_t render_rays(const Guide& guide, const Trained& trained, const Array<const float, 2, -1>& starts,
                          const Array<const std::uint8_t, -1>& mouth, const Array<const float, -1, 3>& origins,
                          const Array<const float, -1, 3>& directions, const Array<const float, -1>& jitter, float step,
@@ -245,12 +225,12 @@ std::int64_t render_rays(const Guide& guide, const Trained& trained, const Array
   require(directions.shape(0) == count && jitter.shape(0) == count && color.shape(0) == count &&
           transmittance.shape(0) == count && mouth.shape(0) == guide.face_count() && round_samples >= 1 && threads >= 1 &&
           static_cast<int>(starts.shape(1)) == trained.field().density.layers[0].outputs);
-  const InstructionSet& set = instruction_set(isa);
+  const Kernels& kernels = kernels_of(isa);
   const Marcher marcher = guide.marcher(step);
-  const View view{static_cast<std::int64_t>(count), origins.data(), directions.data(), jitter.data(), round_samples,
+  const RenderRays rays{static_cast<std::int64_t>(count), origins.data(), directions.data(), jitter.data(), round_samples,
                   stop_transmittance};
   nb::gil_scoped_release unlocked;
-  return render(marcher, set, trained.field(), starts.data(), mouth.data(), step, view,
+  return render(marcher, kernels, trained.field(), starts.data(), mouth.data(), step, rays,
                 {color.data(), transmittance.data()}, threads);
 }
 
@@ -258,6 +238,7 @@ std::int64_t render_rays(const Guide& guide, const Trained& trained, const Array
 }  // namespace headbench::insta
 
 NB_MODULE(_kernel, m) {
+  using namespace headbench;
   using namespace headbench::insta;
   // A mesh that is alive when the interpreter ends keeps its tree; that is no leak.
   nb::set_leak_warnings(false);
@@ -284,7 +265,8 @@ NB_MODULE(_kernel, m) {
       .def(nb::init<const std::vector<LevelTuple>&, Array<const float, -1, -1>, const Array<const float, 3>&, float,
                     float, float, float, Weights, Weights>(),
            "levels"_a, "table"_a, "low"_a, "side"_a, "bias"_a, "depth"_a, "scale"_a, "density"_a, "color"_a);
-  m.def("instruction_sets", &instruction_set_names, "Instruction sets that this machine can run, the fastest first.");
+  m.def("instruction_sets", [] { return names_of(runnable_kernels()); },
+        "Variants this machine can run, the fastest first.");
   m.def("render", &render_rays, "guide"_a, "trained"_a, "starts"_a, "mouth"_a, "origins"_a, "directions"_a, "jitter"_a,
         "step"_a, "round_samples"_a, "stop_transmittance"_a, "color"_a, "transmittance"_a, "isa"_a, "threads"_a,
         "Write what rays see and what they leave; return the number of samples.");

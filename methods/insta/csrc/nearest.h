@@ -1,9 +1,9 @@
-// The search for the nearest triangle. Included once per instruction set, after its simd header.
+// The search for the nearest triangle.
 #pragma once
 
 #include <math.h>
 
-#include "../../splats/csrc/vector_math.h"
+#include "bench/native/simd.h"
 #include "search.h"
 
 namespace headbench::HEADBENCH_ISA {

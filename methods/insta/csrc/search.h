@@ -4,7 +4,7 @@
 #include <cstdint>
 #include <limits>
 
-#include "../../splats/csrc/inlining.h"
+#include "bench/native/simd.h"
 
 namespace headbench::insta {
 

@@ -1,16 +1,11 @@
 // What avatars compute of a pose, as functions of the Python module: triangles and splats are dealt out to threads, no two of which
 // write to one place, so that results are equal bit for bit for any number of them.
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
-#include <nanobind/stl/string.h>
-
 #include <algorithm>
-#include <stdexcept>
 #include <string>
 
-#include "avatar_module.h"
+#include "bench/native/module.h"
+#include "bench/native/thread_pool.h"
 #include "frame.h"
-#include "thread_pool.h"
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -18,16 +13,8 @@ using namespace nb::literals;
 namespace headbench {
 namespace {
 
-template <class T, nb::ssize_t... Shape>
-using Array = nb::ndarray<T, nb::shape<Shape...>, nb::c_contig, nb::device::cpu>;
-
 constexpr std::int64_t kPerTask = 1024;
 static_assert(kPerTask % kHarmonicsBlock == 0);
-
-// Shapes are checked in Python; this only keeps memory safe.
-void require(bool fit) {
-  if (!fit) throw std::invalid_argument("arrays do not fit together");
-}
 
 template <class T>
 bool below(const T* values, std::size_t count, std::size_t limit) {
@@ -67,12 +54,12 @@ void triangles(const Array<const float, -1, 3>& vertices, const Array<const std:
   require(rotations.shape(0) == count && centers.shape(0) == count && sizes.shape(0) == count);
   require(quaternions.shape(0) == count && below(faces.data(), 3 * count, vertices.shape(0)));
   const Triangles in{vertices.data(), faces.data(), rotations.data(), centers.data(), sizes.data(), quaternions.data()};
-  const Stages& stages = stages_by_name(instruction_set);
+  const Kernels& kernels = variant_of(runnable_kernels(), instruction_set);
   nb::gil_scoped_release unlocked;
-  share_out(count, threads, [&](std::int64_t begin, std::int64_t end, int) { stages.triangles(in, begin, end); });
+  share_out(count, threads, [&](std::int64_t begin, std::int64_t end, int) { kernels.triangles(in, begin, end); });
 }
 
-void carry(const Array<const std::int64_t, -1>& binding, const Array<const float, -1, 3, 3>& rotations,
+void to_world(const Array<const std::int64_t, -1>& binding, const Array<const float, -1, 3, 3>& rotations,
            const Array<const float, -1, 3>& centers, const Array<const float, -1>& sizes,
            const Array<const float, -1, 4>& quaternions, const Array<const float, -1, 3>& means,
            const Array<const float, -1, 4>& quats, const Array<const float, -1, 3>& scales,
@@ -83,15 +70,15 @@ void carry(const Array<const std::int64_t, -1>& binding, const Array<const float
   require(means.shape(0) == count && quats.shape(0) == count && scales.shape(0) == count);
   require(world_means.shape(0) == count && world_quats.shape(0) == count && world_scales.shape(0) == count);
   require(below(binding.data(), count, triangles));
-  const Carry in{binding.data(), rotations.data(), centers.data(),     sizes.data(),       quaternions.data(),  means.data(),
+  const ToWorld in{binding.data(), rotations.data(), centers.data(),     sizes.data(),       quaternions.data(),  means.data(),
                  quats.data(),   scales.data(),    world_means.data(), world_quats.data(), world_scales.data()};
-  const Stages& stages = stages_by_name(instruction_set);
+  const Kernels& kernels = variant_of(runnable_kernels(), instruction_set);
   nb::gil_scoped_release unlocked;
-  share_out(count, threads, [&](std::int64_t begin, std::int64_t end, int) { stages.carry(in, begin, end); });
+  share_out(count, threads, [&](std::int64_t begin, std::int64_t end, int) { kernels.to_world(in, begin, end); });
 }
 
 void shade(const Array<const float, -1, 3, -1, kHarmonicsBlock>& coefficients, const Array<const float, -1, 3>& means,
-           const Array<const float, -1, 3, 3>& turns, const Array<const std::int64_t, -1>& binding,
+           const Array<const float, -1, 3, 3>& rotations, const Array<const std::int64_t, -1>& binding,
            const Array<const float, 3>& center, const Array<float, -1, 3>& colors, const std::string& instruction_set,
            int threads) {
   const std::size_t count = means.shape(0);
@@ -100,34 +87,34 @@ void shade(const Array<const float, -1, 3, -1, kHarmonicsBlock>& coefficients, c
     ++in.degree;
   require(static_cast<std::size_t>((in.degree + 1) * (in.degree + 1)) == coefficients.shape(2));
   require(coefficients.shape(0) * kHarmonicsBlock >= count && colors.shape(0) == count);
-  if (turns.shape(0)) {
-    require(binding.shape(0) == count && below(binding.data(), count, turns.shape(0)));
-    in.turns = turns.data();
+  if (rotations.shape(0)) {
+    require(binding.shape(0) == count && below(binding.data(), count, rotations.shape(0)));
+    in.rotations = rotations.data();
     in.binding = binding.data();
   }
   for (int k = 0; k < 3; ++k) in.center[k] = center(k);
-  const Stages& stages = stages_by_name(instruction_set);
+  const Kernels& kernels = variant_of(runnable_kernels(), instruction_set);
   nb::gil_scoped_release unlocked;
-  share_out(count, threads, [&](std::int64_t begin, std::int64_t end, int) { stages.shade(in, begin, end); });
+  share_out(count, threads, [&](std::int64_t begin, std::int64_t end, int) { kernels.shade(in, begin, end); });
 }
 
 void color_network(const Array<const float, -1, -1>& positions, const Array<const float, kEncoding, -1>& second,
                    const Array<const float, 3, -1>& last, const Array<const float, -1, 3>& means,
-                   const Array<const float, -1, 3, 3>& turns, const Array<const std::int64_t, -1>& binding,
+                   const Array<const float, -1, 3, 3>& rotations, const Array<const std::int64_t, -1>& binding,
                    const Array<const float, 3>& center, const Array<float, -1, 3>& colors,
                    const std::string& instruction_set, int threads) {
   const std::size_t count = means.shape(0), hidden = positions.shape(1);
   require(hidden % kUnitsStep == 0 && second.shape(1) == hidden && last.shape(1) == hidden);
   require(positions.shape(0) == count && binding.shape(0) == count && colors.shape(0) == count);
-  require(below(binding.data(), count, turns.shape(0)));
+  require(below(binding.data(), count, rotations.shape(0)));
   ColorNetwork net{static_cast<int>(hidden), positions.data(), second.data(), last.data(),  means.data(),
-                   turns.data(),             binding.data(),   {},            colors.data()};
+                   rotations.data(),             binding.data(),   {},            colors.data()};
   for (int k = 0; k < 3; ++k) net.center[k] = center(k);
-  const Stages& stages = stages_by_name(instruction_set);
+  const Kernels& kernels = variant_of(runnable_kernels(), instruction_set);
   nb::gil_scoped_release unlocked;
-  const Scratch scratch(stages.color_scratch(net.hidden), threads);
+  const Scratch scratch(kernels.color_scratch(net.hidden), threads);
   share_out(count, threads, [&](std::int64_t begin, std::int64_t end, int worker) {
-    stages.color_network(net, begin, end, scratch.of(worker));
+    kernels.color_network(net, begin, end, scratch.of(worker));
   });
 }
 
@@ -146,11 +133,11 @@ void offset_network(const Array<const float, -1, -1>& table, const Array<const s
                           table.data(),            rows.data(),              fractions.data(),
                           second.data(),           second_bias.data(),       last.data(),
                           last_bias.data(),        splats.data(),            offsets.data()};
-  const Stages& stages = stages_by_name(instruction_set);
+  const Kernels& kernels = variant_of(runnable_kernels(), instruction_set);
   nb::gil_scoped_release unlocked;
-  const Scratch scratch(stages.offset_scratch(net.units, net.hidden), threads);
+  const Scratch scratch(kernels.offset_scratch(net.units, net.hidden), threads);
   share_out(count, threads, [&](std::int64_t begin, std::int64_t end, int worker) {
-    stages.offset_network(net, begin, end, scratch.of(worker));
+    kernels.offset_network(net, begin, end, scratch.of(worker));
   });
 }
 
@@ -159,12 +146,12 @@ void offset_network(const Array<const float, -1, -1>& table, const Array<const s
 void bind_avatar(nb::module_& m) {
   m.def("triangles", &triangles, "vertices"_a, "faces"_a, "rotations"_a, "centers"_a, "sizes"_a, "quaternions"_a,
         "instruction_set"_a, "threads"_a, "Write the frames of a mesh's triangles.");
-  m.def("carry", &carry, "binding"_a, "rotations"_a, "centers"_a, "sizes"_a, "quaternions"_a, "means"_a, "quats"_a,
+  m.def("to_world", &to_world, "binding"_a, "rotations"_a, "centers"_a, "sizes"_a, "quaternions"_a, "means"_a, "quats"_a,
         "scales"_a, "world_means"_a, "world_quats"_a, "world_scales"_a, "instruction_set"_a, "threads"_a,
         "Write the splats' means, quaternions and scales in the world.");
-  m.def("shade", &shade, "coefficients"_a, "means"_a, "turns"_a, "binding"_a, "center"_a, "colors"_a,
-        "instruction_set"_a, "threads"_a, "Write the colours of spherical harmonics; empty turns turn nothing.");
-  m.def("color_network", &color_network, "positions"_a, "second"_a, "last"_a, "means"_a, "turns"_a, "binding"_a,
+  m.def("shade", &shade, "coefficients"_a, "means"_a, "rotations"_a, "binding"_a, "center"_a, "colors"_a,
+        "instruction_set"_a, "threads"_a, "Write the colours of spherical harmonics; empty rotations rotate nothing.");
+  m.def("color_network", &color_network, "positions"_a, "second"_a, "last"_a, "means"_a, "rotations"_a, "binding"_a,
         "center"_a, "colors"_a, "instruction_set"_a, "threads"_a, "Write the colours of the colour network.");
   m.def("offset_network", &offset_network, "table"_a, "rows"_a, "fractions"_a, "second"_a, "second_bias"_a, "last"_a,
         "last_bias"_a, "splats"_a, "offsets"_a, "instruction_set"_a, "threads"_a,

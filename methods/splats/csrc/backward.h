@@ -155,7 +155,7 @@ HEADBENCH_INLINE void repeat_rows(const float* colors, int channels, float* by_r
 // Walk one block's list from its end; `gradients` are the chunk's records, row by row. Nothing is made of what is added
 // to `spare`.
 template <int C, bool Absolute>
-inline void composite_block_backward(const View& view, const Chunk& chunk, int index, const Block& block,
+inline void composite_block_backward(const Camera& view, const Chunk& chunk, int index, const Block& block,
                                      int channels, float* state, float* gradients, float* spare) {
   constexpr int kColors = C ? C : 1;
   const int count = C ? C : channels, stride = record_stride(count), width = gradient_stride(count, Absolute);
@@ -214,7 +214,7 @@ inline void composite_block_backward(const View& view, const Chunk& chunk, int i
 
 // Read a block's gradients into its state, and add those of the background, lane by lane, to `background`.
 template <int C>
-inline void read_block(const View& view, const Splats& splats, const FrameData& frame, const Gradients& grads,
+inline void read_block(const Camera& view, const Splats& splats, const FrameData& frame, const Gradients& grads,
                        int tile, int index, const Block& block, float* state, Real* background) {
   const int channels = C ? C : splats.channels;
   const std::size_t kept = static_cast<std::size_t>(tile) * kTilePixels + index * W;
@@ -245,7 +245,7 @@ inline void read_block(const View& view, const Splats& splats, const FrameData& 
 }
 
 template <int C, bool Absolute>
-inline void draw_tile_backward_with(const View& view, const Splats& splats, const FrameData& frame,
+inline void draw_tile_backward_with(const Camera& view, const Splats& splats, const FrameData& frame,
                                     const Gradients& grads, int tile, float* scratch) {
   const int channels = C ? C : splats.channels, state_floats = (kBack + channels) * W;
   const int width = gradient_stride(channels, Absolute);
@@ -293,7 +293,7 @@ inline void draw_tile_backward_with(const View& view, const Splats& splats, cons
 }
 
 template <bool Absolute>
-inline void draw_tile_backward_as(const View& view, const Splats& splats, const FrameData& frame,
+inline void draw_tile_backward_as(const Camera& view, const Splats& splats, const FrameData& frame,
                                const Gradients& grads, int tile, float* scratch) {
   switch (splats.channels) {
     case 1: return draw_tile_backward_with<1, Absolute>(view, splats, frame, grads, tile, scratch);
@@ -303,7 +303,7 @@ inline void draw_tile_backward_as(const View& view, const Splats& splats, const 
   }
 }
 
-inline void draw_tile_backward(const View& view, const Splats& splats, const FrameData& frame,
+inline void draw_tile_backward(const Camera& view, const Splats& splats, const FrameData& frame,
                                const Gradients& grads, int tile, float* scratch) {
   if (grads.means2d_abs) return draw_tile_backward_as<true>(view, splats, frame, grads, tile, scratch);
   draw_tile_backward_as<false>(view, splats, frame, grads, tile, scratch);

@@ -17,7 +17,7 @@ struct Spans {
 };
 
 // `radius2` is the level of the ellipse in the units of u² + v².
-HEADBENCH_INLINE void find_spans(const View& view, const float* record, float radius2, int tile_y, Spans& spans) {
+HEADBENCH_INLINE void find_spans(const Camera& view, const float* record, float radius2, int tile_y, Spans& spans) {
   const Real x = record[kMeanX], inv_l11 = 1.0f / record[kL11], slope = record[kL21] / record[kL11];
   const Real l22 = record[kL22], nowhere = 3e38f;
   const Real width = static_cast<float>(view.width), per_block = 1.0f / kBlockWidth;
@@ -62,7 +62,7 @@ HEADBENCH_INLINE bool find_columns(const Spans& spans, int left, float* columns)
 }
 
 // Enter the tiles of up to kTileRows tile rows whose bands' spans are given; gives the next free entry.
-HEADBENCH_INLINE std::uint32_t enter_tile_rows(const View& view, const FrameData& frame, const Rect& rect, int tile_y,
+HEADBENCH_INLINE std::uint32_t enter_tile_rows(const Camera& view, const FrameData& frame, const Rect& rect, int tile_y,
                                                const Spans& spans, std::uint32_t entry) {
   const int rows = rect.y1 - tile_y + 1 < kTileRows ? rect.y1 - tile_y + 1 : kTileRows;
   for (int group = rect.x0; group <= rect.x1; group += kGroup) {
@@ -90,7 +90,7 @@ HEADBENCH_INLINE std::uint32_t enter_tile_rows(const View& view, const FrameData
   return entry;
 }
 
-inline void find_entries(const View& view, const Splats& splats, const FrameData& frame, std::int64_t begin,
+inline void find_entries(const Camera& view, const Splats& splats, const FrameData& frame, std::int64_t begin,
                          std::int64_t end) {
   const int stride = record_stride(splats.channels);
   for (std::int64_t i = begin; i < end; ++i) {

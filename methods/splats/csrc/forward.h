@@ -20,7 +20,7 @@ inline std::size_t forward_scratch(int channels) {
 // Composite one block's list over its state; false once no pixel lets light through. C = 0 means that the
 // number of channels is known only at run time.
 template <int C>
-inline bool composite_block(const View& view, const Chunk& chunk, int index, const Block& block, int channels, float* state) {
+inline bool composite_block(const Camera& view, const Chunk& chunk, int index, const Block& block, int channels, float* state) {
   constexpr int kColors = C ? C : kChannelsMax;
   constexpr int kStep = 8;  // splats between two looks at whether the block is finished
   const int count = C ? C : channels, stride = record_stride(count);
@@ -59,7 +59,7 @@ inline bool composite_block(const View& view, const Chunk& chunk, int index, con
 }
 
 template <int C>
-inline void write_block(const View& view, const Splats& splats, const FrameData& frame, const ImageOut& out,
+inline void write_block(const Camera& view, const Splats& splats, const FrameData& frame, const ImageOut& out,
                         int tile, int index, const Block& block, float* state) {
   const int channels = C ? C : splats.channels;
   const Real remaining = load(state + kRemaining * W);
@@ -85,7 +85,7 @@ inline void write_block(const View& view, const Splats& splats, const FrameData&
 }
 
 template <int C>
-inline void draw_tile_with(const View& view, const Splats& splats, const FrameData& frame, const ImageOut& out,
+inline void draw_tile_with(const Camera& view, const Splats& splats, const FrameData& frame, const ImageOut& out,
                            int tile, float* scratch) {
   const int channels = splats.channels, state_floats = (kFront + channels) * W;
   float* states = scratch;
@@ -120,7 +120,7 @@ inline void draw_tile_with(const View& view, const Splats& splats, const FrameDa
       write_block<C>(view, splats, frame, out, tile, b, block_of(view, tile, b), states + b * state_floats);
 }
 
-inline void draw_tile(const View& view, const Splats& splats, const FrameData& frame, const ImageOut& out,
+inline void draw_tile(const Camera& view, const Splats& splats, const FrameData& frame, const ImageOut& out,
                       int tile, float* scratch) {
   switch (splats.channels) {
     case 1: return draw_tile_with<1>(view, splats, frame, out, tile, scratch);

@@ -10,8 +10,8 @@
 #include <utility>
 #include <vector>
 
-#include "inlining.h"
-#include "thread_pool.h"
+#include "bench/native/simd.h"
+#include "bench/native/thread_pool.h"
 
 namespace headbench {
 
@@ -49,10 +49,10 @@ double thread_seconds() {
   return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch()).count();
 }
 
-Frame::Frame(const View& view, const Splats& splats, const ImageOut& out, std::int32_t* radii,
-             const Stages& stages, int threads)
+Frame::Frame(const Camera& view, const Splats& splats, const ImageOut& out, std::int32_t* radii,
+             const Kernels& kernels, int threads)
     : view_(view),
-      stages_(stages),
+      kernels_(kernels),
       count_(splats.count),
       channels_(splats.channels),
       has_offset_(splats.offset != nullptr) {
@@ -70,7 +70,7 @@ Frame::Frame(const View& view, const Splats& splats, const ImageOut& out, std::i
   ThreadPool& pool = ThreadPool::instance();
   pool.run(task_count(splats.count), threads, [&](std::int64_t task, int) {
     const std::int64_t begin = task * kSplatsPerTask;
-    stages.project(view_, splats, data_, begin, std::min(begin + kSplatsPerTask, splats.count));
+    kernels.project(view_, splats, data_, begin, std::min(begin + kSplatsPerTask, splats.count));
   });
   clock.ends(kProject);
   list_drawn(splats.count);
@@ -80,11 +80,11 @@ Frame::Frame(const View& view, const Splats& splats, const ImageOut& out, std::i
   fill_tiles(splats, threads);
   clock.ends(kFindPairs);
 
-  const std::size_t scratch_stride = round_up(stages.scratch_floats(splats.channels), 16);
+  const std::size_t scratch_stride = round_up(kernels.scratch_floats(splats.channels), 16);
   Buffer<float> scratch;
   scratch.resize(scratch_stride * threads);
   pool.run(static_cast<std::int64_t>(tiles), threads, [&](std::int64_t tile, int worker) {
-    stages.draw_tile(view_, splats, data_, out, static_cast<int>(tile), scratch.data() + worker * scratch_stride);
+    kernels.draw_tile(view_, splats, data_, out, static_cast<int>(tile), scratch.data() + worker * scratch_stride);
   });
   clock.ends(kDraw);
   // Of these the backward pass needs nothing.
@@ -163,7 +163,7 @@ void Frame::fill_tiles(const Splats& splats, int threads) {
   ThreadPool& pool = ThreadPool::instance();
   pool.run(task_count(drawn_count_), threads, [&](std::int64_t task, int) {
     const std::int64_t begin = task * kSplatsPerTask;
-    stages_.find_entries(view_, splats, data_, begin, std::min(begin + kSplatsPerTask, drawn_count_));
+    kernels_.find_entries(view_, splats, data_, begin, std::min(begin + kSplatsPerTask, drawn_count_));
   });
 
   const std::size_t tiles = static_cast<std::size_t>(view_.tiles_x) * view_.tiles_y;
@@ -221,16 +221,16 @@ void Frame::backward(const Splats& splats, Gradients grads, float* background, f
   StageClock clock(seconds_);
   const std::int64_t tiles = static_cast<std::int64_t>(view_.tiles_x) * view_.tiles_y;
   const int channels = splats.channels;
-  const std::size_t scratch_stride = round_up(stages_.scratch_floats(channels), 16);
+  const std::size_t scratch_stride = round_up(kernels_.scratch_floats(channels), 16);
   Buffer<float> scratch, records;
   scratch.resize(scratch_stride * threads);
-  grads.record_stride = static_cast<int>(round_up(kMoments + channels + (grads.means2d_abs ? kAbsolutes : 0), stages_.lanes));
+  grads.record_stride = static_cast<int>(round_up(kMoments + channels + (grads.means2d_abs ? kAbsolutes : 0), kernels_.lanes));
   grads.records = records.resize(data_.tile_begin[tiles] * std::size_t{1} * grads.record_stride);
   std::vector<double> tile_background(static_cast<std::size_t>(tiles) * channels);
   grads.background = tile_background.data();
   ThreadPool& pool = ThreadPool::instance();
   pool.run(tiles, threads, [&](std::int64_t tile, int worker) {
-    stages_.draw_tile_backward(view_, splats, data_, grads, static_cast<int>(tile),
+    kernels_.draw_tile_backward(view_, splats, data_, grads, static_cast<int>(tile),
                                scratch.data() + worker * scratch_stride);
   });
 
@@ -241,7 +241,7 @@ void Frame::backward(const Splats& splats, Gradients grads, float* background, f
   std::vector<double> task_view(static_cast<std::size_t>(tasks) * kViewGradient, 0.0);
   pool.run(tasks, threads, [&](std::int64_t task, int) {
     const std::int64_t begin = task * kSplatsPerTask;
-    stages_.project_backward(view_, splats, data_, grads, begin, std::min(begin + kSplatsPerTask, drawn_count_),
+    kernels_.project_backward(view_, splats, data_, grads, begin, std::min(begin + kSplatsPerTask, drawn_count_),
                              &task_view[task * kViewGradient]);
   });
   for (int c = 0; c < channels; ++c) {
@@ -259,10 +259,10 @@ void Frame::backward(const Splats& splats, Gradients grads, float* background, f
 
 Work Frame::work(const Splats& splats) const {
   Buffer<float> scratch;
-  scratch.resize(stages_.scratch_floats(splats.channels));
+  scratch.resize(kernels_.scratch_floats(splats.channels));
   Work work;
   for (int tile = 0; tile < view_.tiles_x * view_.tiles_y; ++tile)
-    stages_.count_work(view_, splats, data_, tile, scratch.data(), work);
+    kernels_.count_work(view_, splats, data_, tile, scratch.data(), work);
   return work;
 }
 

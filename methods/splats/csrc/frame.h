@@ -1,4 +1,4 @@
-// One rendered frame: drives the stages, and keeps what the backward pass needs.
+// One rendered frame: calls the kernels, and keeps what the backward pass needs.
 //
 //   forward   project (splats) -> sort by depth -> find pairs (splats) -> draw (tiles)
 //   backward  draw backward (tiles), a record for every pair -> gather and project backward (splats)
@@ -12,48 +12,24 @@
 #pragma once
 
 #include <array>
-#include <cstddef>
 
+#include "bench/native/instruction_sets.h"
 #include "scene.h"
 #include "workspace.h"
 
 namespace headbench {
-
-// Uninitialised memory on cache-line boundaries.
-template <class T>
-class Buffer {
- public:
-  Buffer() = default;
-  Buffer(const Buffer&) = delete;
-  Buffer& operator=(const Buffer&) = delete;
-  ~Buffer() { release(); }
-
-  T* resize(std::size_t count) {
-    release();
-    data_ = static_cast<T*>(workspace::take(count * sizeof(T)));
-    bytes_ = count * sizeof(T);
-    return data_;
-  }
-  void release() {
-    workspace::give(data_, bytes_);
-    data_ = nullptr;
-  }
-  T* data() const { return data_; }
-
- private:
-  T* data_ = nullptr;
-  std::size_t bytes_ = 0;
-};
 
 // The stages of a frame that are timed.
 enum Stage { kProject, kSort, kFindPairs, kDraw, kDrawBackward, kProjectBackward, kStageCount };
 constexpr const char* kStageNames[kStageCount] = {"project", "sort",          "find pairs",
                                                   "draw",    "draw backward", "project backward"};
 
+HEADBENCH_VARIANTS(Kernels, kernels)
+
 class Frame {
  public:
   // Draws at once. Throws std::length_error where splats touch more tiles than 32 bits can count.
-  Frame(const View& view, const Splats& splats, const ImageOut& out, std::int32_t* radii, const Stages& stages,
+  Frame(const Camera& view, const Splats& splats, const ImageOut& out, std::int32_t* radii, const Kernels& kernels,
         int threads);
 
   // `splats` must hold the same values as when drawn. Adds to the splats' gradients in `grads`, so that views can be
@@ -81,8 +57,8 @@ class Frame {
   void fill_tiles(const Splats& splats, int threads);
   EntryRange fetch_entries(const std::uint32_t* order, std::int64_t i, std::int64_t end) const;
 
-  const View view_;
-  const Stages& stages_;
+  const Camera view_;
+  const Kernels& kernels_;
   const std::int64_t count_;
   const int channels_;
   const bool has_offset_;

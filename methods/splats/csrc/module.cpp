@@ -1,23 +1,17 @@
 // The kernel as a Python module. Arrays are typed and contiguous; outputs are allocated by the caller.
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
 #include <nanobind/stl/map.h>
 #include <nanobind/stl/pair.h>
-#include <nanobind/stl/string.h>
 #include <nanobind/stl/unique_ptr.h>
-#include <nanobind/stl/vector.h>
 
 #include <algorithm>
 #include <cmath>
 #include <limits>
 #include <map>
 #include <memory>
-#include <stdexcept>
 #include <string>
 #include <utility>
-#include <vector>
 
-#include "avatar_module.h"
+#include "bench/native/module.h"
 #include "frame.h"
 
 namespace nb = nanobind;
@@ -25,16 +19,9 @@ using namespace nb::literals;
 
 namespace headbench {
 
-const Stages& stages_by_name(const std::string& name) {
-  for (const Stages* stages : runnable_stages())
-    if (name == stages->name) return *stages;
-  throw std::invalid_argument("instruction set " + name + " is not available here");
-}
+void bind_avatar(nb::module_& m);  // avatar.cpp
 
 namespace {
-
-template <class T, nb::ssize_t... Shape>
-using Array = nb::ndarray<T, nb::shape<Shape...>, nb::c_contig, nb::device::cpu>;
 
 // The inputs in the order of `rasterize`; `offset` is empty (0, 2) where there is none.
 struct Inputs {
@@ -53,16 +40,16 @@ struct Inputs {
                      colors.shape(0) == count && (offset.shape(0) == count || offset.shape(0) == 0) &&
                      background.shape(0) == colors.shape(1) && colors.shape(1) >= 1 &&
                      colors.shape(1) <= static_cast<std::size_t>(kChannelsMax) && count < (std::size_t{1} << 32);
-    if (!fit) throw std::invalid_argument("arrays do not fit together");
+    require(fit);
     return {static_cast<std::int64_t>(count), static_cast<int>(colors.shape(1)), means.data(), quats.data(),
             scales.data(), opacities.data(), colors.data(), offset.shape(0) ? offset.data() : nullptr,
             background.data()};
   }
 };
 
-View make_view(const Array<const float, 4, 4>& viewmat, const Array<const float, 3, 3>& K, double near, double far,
+Camera make_view(const Array<const float, 4, 4>& viewmat, const Array<const float, 3, 3>& K, double near, double far,
                float eps2d, bool antialiased, double alpha_min, double transmittance_min, std::size_t width, std::size_t height) {
-  View view{};
+  Camera view{};
   for (int i = 0; i < 3; ++i) {
     for (int j = 0; j < 3; ++j) view.rotation[3 * i + j] = viewmat(i, j);
     view.translation[i] = viewmat(i, 3);
@@ -98,14 +85,14 @@ std::unique_ptr<Frame> forward(const Array<const float, -1, 3>& means, const Arr
                                const Array<std::int32_t, -1>& radii, const std::string& instruction_set,
                                int threads) {
   const Splats splats = Inputs{means, quats, scales, opacities, colors, offset, background}.splats();
-  const View view = make_view(viewmat, K, near, far, eps2d, antialiased, alpha_min, transmittance_min, image.shape(1),
+  const Camera view = make_view(viewmat, K, near, far, eps2d, antialiased, alpha_min, transmittance_min, image.shape(1),
                               image.shape(0));
   if (image.shape(2) != colors.shape(1) || alpha.shape(0) != image.shape(0) || alpha.shape(1) != image.shape(1) ||
       radii.shape(0) != means.shape(0) || threads < 1)
     throw std::invalid_argument("outputs do not fit the inputs");
-  const Stages& stages = stages_by_name(instruction_set);
+  const Kernels& kernels = variant_of(runnable_kernels(), instruction_set);
   nb::gil_scoped_release unlocked;
-  return std::make_unique<Frame>(view, splats, ImageOut{image.data(), alpha.data()}, radii.data(), stages, threads);
+  return std::make_unique<Frame>(view, splats, ImageOut{image.data(), alpha.data()}, radii.data(), kernels, threads);
 }
 
 void backward(Frame& frame, const Array<const float, -1, 3>& means, const Array<const float, -1, 4>& quats,
@@ -177,24 +164,18 @@ std::pair<std::uint64_t, std::uint64_t> work(const Frame& frame, const Array<con
 
 // Fastest of several short runs, in floating-point operations per second of one thread.
 double peak_flops(const std::string& instruction_set) {
-  const Stages& stages = stages_by_name(instruction_set);
+  const Kernels& kernels = variant_of(runnable_kernels(), instruction_set);
   constexpr std::int64_t kRounds = 1 << 17;
   constexpr int kRuns = 20;
   double best = std::numeric_limits<double>::infinity();
   volatile float keep;
   for (int run = 0; run < kRuns; ++run) {
     const double start = thread_seconds();
-    keep = stages.multiply_add(kRounds);
+    keep = kernels.multiply_add(kRounds);
     best = std::min(best, thread_seconds() - start);
   }
   static_cast<void>(keep);
-  return 2.0 * kRounds * stages.chains * stages.lanes / best;
-}
-
-std::vector<std::string> instruction_sets() {
-  std::vector<std::string> names;
-  for (const Stages* stages : runnable_stages()) names.emplace_back(stages->name);
-  return names;
+  return 2.0 * kRounds * kernels.chains * kernels.lanes / best;
 }
 
 }  // namespace
@@ -220,5 +201,5 @@ NB_MODULE(_kernel, m) {
         "grad_absolute"_a, "threads"_a,
         "Add the gradients of drawn splats; write those of background and camera. An empty grad_absolute asks for none.");
   bind_avatar(m);
-  m.def("instruction_sets", &instruction_sets, "Variants this machine can run, the fastest first.");
+  m.def("instruction_sets", [] { return names_of(runnable_kernels()); }, "Variants this machine can run, the fastest first.");
 }

@@ -6,8 +6,8 @@
 
 #include <math.h>
 
+#include "bench/native/simd.h"
 #include "scene.h"
-#include "vector_math.h"
 
 namespace headbench::HEADBENCH_ISA {
 
@@ -37,7 +37,7 @@ struct CameraLanes {
   alignas(64) double x[W], y[W], z[W], ratio_x[W], ratio_y[W];  // ratios to z
 };
 
-HEADBENCH_INLINE void to_camera(const View& view, const SplatLanes& in, CameraLanes& out) {
+HEADBENCH_INLINE void to_camera(const Camera& view, const SplatLanes& in, CameraLanes& out) {
   double r[9], t[3];
   for (int k = 0; k < 9; ++k) r[k] = view.rotation[k];
   for (int k = 0; k < 3; ++k) t[k] = view.translation[k];
@@ -101,7 +101,7 @@ HEADBENCH_INLINE void cross3(const Real* a, const Real* b, Real* out) {
 
 HEADBENCH_INLINE Real absolute(Real a) { return max(a, Real(0.0f) - a); }
 
-inline void project_lanes(const View& view, const SplatLanes& in, const CameraLanes& camera, Projection& p) {
+inline void project_lanes(const Camera& view, const SplatLanes& in, const CameraLanes& camera, Projection& p) {
   for (int k = 0; k < 3; ++k) p.mean[k] = load(in.mean[k]);
   for (int k = 0; k < 3; ++k) p.scale[k] = load(in.scale[k]);
   p.inv_z = Real(1.0f) / load_rounded(camera.z);
@@ -170,13 +170,13 @@ HEADBENCH_INLINE Real published_radius(const Projection& p) {
 }
 
 // Where that rasteriser finds at least one whole tile: its pixel centres lie at whole numbers, half a pixel from ours.
-HEADBENCH_INLINE Mask in_view_of_tiles(const View& view, Real x, Real y, Real radius) {
+HEADBENCH_INLINE Mask in_view_of_tiles(const Camera& view, Real x, Real y, Real radius) {
   return (x + radius >= Real(1.5f)) & (y + radius >= Real(1.5f)) &
          (Real(static_cast<float>(view.tiles_x * kTile) + 0.5f) > x - radius) &
          (Real(static_cast<float>(view.tiles_y * kTile) + 0.5f) > y - radius);
 }
 
-inline void project(const View& view, const Splats& splats, const FrameData& frame, std::int64_t begin,
+inline void project(const Camera& view, const Splats& splats, const FrameData& frame, std::int64_t begin,
                     std::int64_t end) {
   for (std::int64_t first = begin; first < end; first += W) {
     const int used = static_cast<int>(end - first < W ? end - first : W);

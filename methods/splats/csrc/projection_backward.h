@@ -27,7 +27,7 @@ struct SplatGradients {
 
 // Add the derivative of the antialiasing factor. Its logarithm is half of log area² - log det, and `along` is what
 // the logarithm of the opacity receives; 1/area² - 1/det is written without a difference of near equals.
-HEADBENCH_INLINE void compensation_backward(const View& view, const Projection& p, Real along, Real* dq0, Real* dq1) {
+HEADBENCH_INLINE void compensation_backward(const Camera& view, const Projection& p, Real along, Real* dq0, Real* dq1) {
   const Real eps = view.eps2d, gap = eps * (p.xx + p.yy - eps);
   const Real by_area = along * gap / (p.area2 * p.det), by_det = along * eps / p.det;
   Real beside0[3], beside1[3];
@@ -42,7 +42,7 @@ HEADBENCH_INLINE void compensation_backward(const View& view, const Projection& 
 // `moments` are sums over pixels of v, v dx, v dy, v dx², v dx dy, v dy² with v = alpha dL/dalpha (zero where
 // alpha was clamped) and (dx, dy) the pixel's centre minus the splat's mean. With A the inverse covariance,
 //   dL/dmean2d = A Σ v d,    dL/dcovariance = 1/2 A (Σ v d dᵀ) A,    A = 2 ln2 L Lᵀ.
-inline void project_lanes_backward(const View& view, const Projection& p, const Real* moments, Real opacity,
+inline void project_lanes_backward(const Camera& view, const Projection& p, const Real* moments, Real opacity,
                                    SplatGradients& out, Real* view_gradient) {
   out.opacity = moments[kSum] / opacity;
 
@@ -127,7 +127,7 @@ HEADBENCH_INLINE void prefetch_records(const FrameData& frame, const Gradients& 
   }
 }
 
-inline void project_backward(const View& view, const Splats& splats, const FrameData& frame,
+inline void project_backward(const Camera& view, const Splats& splats, const FrameData& frame,
                              const Gradients& grads, std::int64_t begin, std::int64_t end,
                              double* view_gradient) {
   const int stride = grads.record_stride, vectors = stride / W, channels = splats.channels;

@@ -1,14 +1,11 @@
-// What a rendering call works on: plain data, shared by all instruction sets.
+// What a rendering call and an avatar's pose work on: plain data, shared by all instruction sets.
 //
-// N splats, C channels, P pairs of a tile and a splat that touches it. Everything here is pointers and
-// numbers: inline code in this header could otherwise be compiled for one instruction set and, the linker
-// keeping only one copy, be run on a processor that lacks it.
+// N splats, C channels, P pairs of a tile and a splat that touches it. There is no inline code here,
+// see bench/native/simd.h.
 #pragma once
 
 #include <cstddef>
 #include <cstdint>
-
-#include "avatar.h"
 
 namespace headbench {
 
@@ -35,7 +32,7 @@ constexpr int kAbsolutes = 2;
 // Rows of the rotation, the translation, then fx, fy, cx, cy.
 constexpr int kViewGradient = 16;
 
-struct View {
+struct Camera {
   float rotation[9], translation[3];
   float fx, fy, cx, cy;
   double near, far;
@@ -82,7 +79,7 @@ struct Pair {
   std::uint32_t splat;
 };
 
-// What the stages hand on to each other.
+// What the kernels hand on to each other.
 struct FrameData {
   float* records;                // (N, record_stride(C)), set for drawn splats
   double* depths;                // (N,) camera z, 0 where not drawn
@@ -125,29 +122,105 @@ struct Work {
   std::uint64_t drawn = 0;   // the splat contributed to the pixel
 };
 
-// The stages compiled for one instruction set.
-struct Stages {
+// What an avatar computes of a pose before its splats are drawn: F triangles.
+
+// Frames of the triangles of a mesh of V vertices.
+struct Triangles {
+  const float* vertices;      // (V, 3)
+  const std::int64_t* faces;  // (F, 3)
+  float* rotations;           // (F, 3, 3)
+  float* centers;             // (F, 3)
+  float* sizes;               // (F,)
+  float* quaternions;         // (F, 4)
+};
+
+// Splats from their triangles' frames to the world; the formulas of binding.py, `to_world`.
+struct ToWorld {
+  const std::int64_t* binding;  // (N,) triangles
+  const float* rotations;       // (F, 3, 3)
+  const float* centers;         // (F, 3)
+  const float* sizes;           // (F,)
+  const float* quaternions;     // (F, 4)
+  const float* means;           // (N, 3)
+  const float* quats;           // (N, 4) unit
+  const float* scales;          // (N, 3)
+  float* world_means;           // (N, 3)
+  float* world_quats;           // (N, 4)
+  float* world_scales;          // (N, 3)
+};
+
+// Coefficients lie in blocks of so many splats, those of one block and one coefficient side by side.
+constexpr int kHarmonicsBlock = 16;
+constexpr int kDegreeMax = 3;
+
+// Colours of spherical harmonics along the directions from the camera to the splats; the formulas of sh.py, `sh_to_rgb`.
+struct Harmonics {
+  int degree;
+  const float* coefficients;    // (ceil(N / 16), 3, (degree + 1)^2, 16)
+  const float* means;           // (N, 3) in the world
+  const float* rotations;       // (F, 3, 3) applied to the directions, or null
+  const std::int64_t* binding;  // (N,) triangles; null without rotations
+  float center[3];              // of the camera
+  float* colors;                // (N, 3)
+};
+
+// Both networks' layers are this wide, or multiples of it.
+constexpr int kUnitsStep = 16;
+
+// The colour network of ours_field.py, `shade_directions`: what is known of the position, plus the encoded direction from
+// the splat to the camera by its weights, ReLU, a layer.
+constexpr int kEncoding = 27;
+
+struct ColorNetwork {
+  int hidden;
+  const float* positions;       // (N, hidden)
+  const float* second;          // (27, hidden)
+  const float* last;            // (3, hidden)
+  const float* means;           // (N, 3) in the world
+  const float* rotations;       // (F, 3, 3) applied to the directions
+  const std::int64_t* binding;  // (N,) triangles
+  float center[3];              // of the camera
+  float* colors;                // (N, 3)
+};
+
+// The offset network of feature_lines.py for M splats: rows of a table interpolated on three axes and added, ReLU, a
+// layer, ReLU, a layer.
+struct OffsetNetwork {
+  int units, hidden, outputs;
+  const float* table;         // (T, units), T > rows + 1
+  const std::int32_t* rows;   // (M, 3) the lower of two neighbours
+  const float* fractions;     // (M, 3) from the lower to the upper
+  const float* second;        // (units, hidden)
+  const float* second_bias;   // (hidden,)
+  const float* last;          // (outputs, hidden)
+  const float* last_bias;     // (outputs,)
+  const std::int64_t* splats; // (M,) which splat each is
+  float* offsets;             // (N, outputs)
+};
+
+// The functions compiled for one instruction set.
+struct Kernels {
   const char* name;
   int lanes;
   // Project splats [begin, end): records, depths, radii, rects.
-  void (*project)(const View&, const Splats&, const FrameData&, std::int64_t begin, std::int64_t end);
+  void (*project)(const Camera&, const Splats&, const FrameData&, std::int64_t begin, std::int64_t end);
   // Find the tiles and blocks that splats drawn[begin .. end) reach.
-  void (*find_entries)(const View&, const Splats&, const FrameData&, std::int64_t begin, std::int64_t end);
+  void (*find_entries)(const Camera&, const Splats&, const FrameData&, std::int64_t begin, std::int64_t end);
   std::size_t (*scratch_floats)(int channels);
-  void (*draw_tile)(const View&, const Splats&, const FrameData&, const ImageOut&, int tile, float* scratch);
-  void (*draw_tile_backward)(const View&, const Splats&, const FrameData&, const Gradients&, int tile,
+  void (*draw_tile)(const Camera&, const Splats&, const FrameData&, const ImageOut&, int tile, float* scratch);
+  void (*draw_tile_backward)(const Camera&, const Splats&, const FrameData&, const Gradients&, int tile,
                              float* scratch);
   // Gather the gradient records of splats drawn[begin .. end) and take them back to the inputs; adds to
   // view_gradient (kViewGradient numbers).
-  void (*project_backward)(const View&, const Splats&, const FrameData&, const Gradients&,
+  void (*project_backward)(const Camera&, const Splats&, const FrameData&, const Gradients&,
                            std::int64_t begin, std::int64_t end, double* view_gradient);
   // For the speed bench alone.
-  void (*count_work)(const View&, const Splats&, const FrameData&, int tile, float* scratch, Work& work);
+  void (*count_work)(const Camera&, const Splats&, const FrameData&, int tile, float* scratch, Work& work);
   float (*multiply_add)(std::int64_t rounds);  // `chains` vectors a round
   int chains;
   // Of avatars, for triangles or splats [begin, end).
   void (*triangles)(const Triangles&, std::int64_t begin, std::int64_t end);
-  void (*carry)(const Carry&, std::int64_t begin, std::int64_t end);
+  void (*to_world)(const ToWorld&, std::int64_t begin, std::int64_t end);
   void (*shade)(const Harmonics&, std::int64_t begin, std::int64_t end);
   std::size_t (*color_scratch)(int hidden);
   void (*color_network)(const ColorNetwork&, std::int64_t begin, std::int64_t end, float* scratch);

@@ -27,7 +27,7 @@ struct Block {
 alignas(64) constexpr float kLaneColumns[16] = {0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3};
 alignas(64) constexpr float kLaneRows[16] = {0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3};
 
-HEADBENCH_INLINE Block block_of(const View& view, int tile, int index) {
+HEADBENCH_INLINE Block block_of(const Camera& view, int tile, int index) {
   Block b;
   const int tile_left = tile % view.tiles_x * kTile, tile_top = tile / view.tiles_x * kTile;
   b.x = index % kColumns * kBlockWidth;
@@ -39,17 +39,6 @@ HEADBENCH_INLINE Block block_of(const View& view, int tile, int index) {
   b.inside = (Real(static_cast<float>(view.width - tile_left)) > b.pixel_x) &
              (Real(static_cast<float>(view.height - tile_top)) > b.pixel_y);
   return b;
-}
-
-// Highest bit of a non-zero word, as an index.
-HEADBENCH_INLINE int highest_bit(std::uint64_t bits) {
-#if defined(__GNUC__) || defined(__clang__)
-  return 63 - __builtin_clzll(bits);
-#else
-  int index = 0;
-  while (bits >>= 1) ++index;
-  return index;
-#endif
 }
 
 // A row of a chunk's parameters is the splat's record with the mean counted from the tile's corner, where a float
@@ -96,7 +85,7 @@ HEADBENCH_INLINE void transpose_bits(const std::uint64_t* blocks, std::uint64_t*
 // Fill the chunk with pairs [begin, end) of the tile's list, for the blocks in `wanted`. C = 0 means that the number of
 // channels is known only at run time.
 template <int C>
-inline void fill_chunk(const View& view, const Splats& splats, const FrameData& frame, int tile, int begin, int end,
+inline void fill_chunk(const Camera& view, const Splats& splats, const FrameData& frame, int tile, int begin, int end,
                        std::uint64_t wanted, Chunk& chunk) {
   const Pair* pairs = frame.pairs + frame.tile_begin[tile];
   const int stride = record_stride(C ? C : splats.channels);
@@ -128,7 +117,7 @@ inline void fill_chunk(const View& view, const Splats& splats, const FrameData& 
 }
 
 // Ask for the rows of an image, `channels` numbers a pixel, that a tile covers.
-HEADBENCH_INLINE void prefetch_tile(const View& view, const float* image, int channels, int tile) {
+HEADBENCH_INLINE void prefetch_tile(const Camera& view, const float* image, int channels, int tile) {
   if (tile >= view.tiles_x * view.tiles_y) return;
   const int left = tile % view.tiles_x * kTile, top = tile / view.tiles_x * kTile;
   const int bottom = top + kTile < view.height ? top + kTile : view.height;
@@ -146,7 +135,7 @@ struct Alpha {
 
 // Alpha of the splat in `row` at a block's pixels. Forward and backward both come here: were the two to differ
 // by a rounding, pixels at a threshold would get gradients of another image.
-HEADBENCH_INLINE Alpha alpha_of(const View& view, const float* row, const Block& block) {
+HEADBENCH_INLINE Alpha alpha_of(const Camera& view, const float* row, const Block& block) {
   const Real dx = block.pixel_x - Real(row[kMeanX]), dy = block.pixel_y - Real(row[kMeanY]);
   const Real u = fma(row[kL11], dx, Real(row[kL21]) * dy), v = Real(row[kL22]) * dy;
   const Real exponent = fnma(v, v, fnma(u, u, row[kLog2Opacity]));

@@ -1,4 +1,4 @@
-// Memory for frames, kept from one frame to the next: getting megabytes anew from the system costs a page fault for
+// Memory for frames, kept from one frame to the next: getting megabytes again from the system costs a page fault for
 // every four kilobytes.
 #pragma once
 
@@ -16,3 +16,33 @@ void* take(std::size_t bytes);
 void give(void* block, std::size_t bytes);
 
 }  // namespace headbench::workspace
+
+namespace headbench {
+
+// Uninitialised memory on cache-line boundaries.
+template <class T>
+class Buffer {
+ public:
+  Buffer() = default;
+  Buffer(const Buffer&) = delete;
+  Buffer& operator=(const Buffer&) = delete;
+  ~Buffer() { release(); }
+
+  T* resize(std::size_t count) {
+    release();
+    data_ = static_cast<T*>(workspace::take(count * sizeof(T)));
+    bytes_ = count * sizeof(T);
+    return data_;
+  }
+  void release() {
+    workspace::give(data_, bytes_);
+    data_ = nullptr;
+  }
+  T* data() const { return data_; }
+
+ private:
+  T* data_ = nullptr;
+  std::size_t bytes_ = 0;
+};
+
+}  // namespace headbench

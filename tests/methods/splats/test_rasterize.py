@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from headbench.bench.errors import UnavailableError
+from headbench.bench.native.loader import Kernel
 from headbench.methods.splats import available_backends, cpu, rasterize
 from headbench.tests.benchmarks.splats.compare import DIFFERENTIABLE, relative_error, render_with_gradients
 from headbench.tests.benchmarks.splats.scenes import cloud
@@ -158,30 +159,22 @@ def test_double_precision_goes_to_the_reference():
 
 @pytest.fixture
 def without_kernel(monkeypatch):
-    """Make the kernel's import fail, as on a machine without a compiler."""
-
-    def fail(*_):
-        raise ImportError("no kernel here")
-
-    for cached in (cpu.load, cpu.instruction_sets, cpu.usable_or_warn):
-        cached.cache_clear()
-    monkeypatch.setattr(cpu.importlib, "import_module", fail)
-    yield
-    for cached in (cpu.load, cpu.instruction_sets, cpu.usable_or_warn):
-        cached.cache_clear()
+    """A kernel that cannot be imported, as on a machine without a compiler."""
+    missing = Kernel("headbench.no_such_kernel", "The kernel", "the reference works meanwhile")
+    monkeypatch.setattr(cpu, "KERNEL", missing)
+    return missing
 
 
-@pytest.mark.usefixtures("without_kernel")
-def test_without_the_kernel_the_reference_draws_and_says_so_once(caplog):
+def test_without_the_kernel_the_reference_draws_and_warns_once(caplog, without_kernel):
     scene = cloud(10, 9, 9)
     assert available_backends() == ("reference",)
     with caplog.at_level(logging.WARNING):
         images = [rasterize(*scene[:9]).image for _ in range(2)]
     assert torch.equal(images[0], rasterize(*scene[:9], backend="reference").image)
-    assert [record.message for record in caplog.records] == [
-        f"The splat kernel cannot be used (no kernel here). {cpu.REMEDY}"
-    ]
-    with pytest.raises(UnavailableError, match="no kernel here.*compiler"):
+    (message,) = (record.message for record in caplog.records)
+    assert message.startswith("The kernel cannot be used (")
+    assert message.endswith(without_kernel.remedy)
+    with pytest.raises(UnavailableError, match="no_such_kernel.*compiler"):
         rasterize(*scene[:9], backend="cpu")
 
 

@@ -9,7 +9,6 @@
 #include <vector>
 
 #include "frame.h"
-#include "instruction_sets.h"
 
 using namespace headbench;
 
@@ -39,7 +38,7 @@ int main(int argc, char** argv) {
   const std::vector<float> on_alpha = take<float>(in, width * height);
   if (on_alpha.size() != width * height) return 3;
 
-  View view{};
+  Camera view{};
   std::memcpy(view.rotation, camera.data(), sizeof view.rotation);
   std::memcpy(view.translation, camera.data() + 9, sizeof view.translation);
   view.fx = camera[12], view.fy = camera[13], view.cx = camera[14], view.cy = camera[15];
@@ -50,13 +49,13 @@ int main(int argc, char** argv) {
   const Splats splats{static_cast<std::int64_t>(count), static_cast<int>(channels), inputs[0].data(), inputs[1].data(),
                       inputs[2].data(), inputs[3].data(), inputs[4].data(), nullptr, background.data()};
 
-  for (const Stages* stages : runnable_stages()) {
+  for (const Kernels* kernels : runnable_kernels()) {
     char name[16] = {};
-    std::strncpy(name, stages->name, sizeof name - 1);
+    std::strncpy(name, kernels->name, sizeof name - 1);
     std::fwrite(name, 1, sizeof name, out);
     std::vector<float> image(width * height * channels), alpha(width * height), gradients[5];
     std::vector<std::int32_t> radii(count);
-    Frame frame(view, splats, {image.data(), alpha.data()}, radii.data(), *stages, 2);
+    Frame frame(view, splats, {image.data(), alpha.data()}, radii.data(), *kernels, 2);
     for (int k = 0; k < 5; ++k) gradients[k].assign(count * fields[k], 0.0f);
     Gradients grads{};
     grads.image = on_image.data(), grads.alpha = on_alpha.data();

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 import torch
 
-import headbench.methods.splats.reference
 from headbench.methods.splats.rasterize import rasterize
 from headbench.tests.benchmarks.splats.compare import relative_error
 from headbench.tests.benchmarks.splats.scenes import Scene, cloud, head_shell
 
 COMPILER, EMULATOR = "aarch64-linux-gnu-g++", "qemu-aarch64"
-SOURCES = Path(headbench.methods.splats.reference.__file__).parent / "csrc"
+ROOT = Path(__file__).parents[4]
+SOURCES = ROOT / "methods/splats/csrc"
 OPTIONS = [
     "-std=c++17",
     "-O2",
@@ -39,19 +39,16 @@ pytestmark = [
 def driver(tmp_path_factory) -> Path:
     """The kernel and the driver as one program for 64-bit ARM."""
     program = tmp_path_factory.mktemp("driver") / "driver"
-    kernel = ("frame.cpp", "thread_pool.cpp", "workspace.cpp", "isa_portable.cpp", "isa_neon.cpp")
-    sources = [Path(__file__).with_name("driver.cpp"), *(SOURCES / name for name in kernel)]
-    command = [
-        COMPILER,
-        *OPTIONS,
-        f"-I{SOURCES}",
-        "-static",
-        "-pthread",
-        *map(str, sources),
-        "-o",
-        str(program),
-    ]
-    subprocess.run(command, check=True)
+    sources = [Path(__file__).with_name("driver.cpp"), ROOT / "bench/native/thread_pool.cpp"]
+    sources += [SOURCES / name for name in ("frame.cpp", "workspace.cpp")]
+    compiler = [COMPILER, *OPTIONS, f"-I{ROOT}", f"-I{SOURCES}"]
+    for name in ("neon", "portable"):
+        sources.append(tmp_path_factory.getbasetemp() / f"{name}.o")
+        isa = [f"-DHEADBENCH_ISA={name}", f"-DHEADBENCH_ISA_{name}"]
+        subprocess.run(
+            [*compiler, *isa, "-c", str(SOURCES / "variants.cpp"), "-o", str(sources[-1])], check=True
+        )
+    subprocess.run([*compiler, "-static", "-pthread", *map(str, sources), "-o", str(program)], check=True)
     return program
 
 

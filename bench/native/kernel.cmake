@@ -1,0 +1,48 @@
+# headbench_kernel(NAME name FOLDER folder [THREADS] SOURCES file... [AVX512 option...])
+#
+# Build folder/csrc/<file>... as the Python module headbench.<folder>.<name>. Of them variants.cpp is compiled once per
+# instruction set and chosen when run (instruction_sets.h); everything else stays at the platform's baseline. No
+# multiply-add is formed that the source does not ask for: passes that must agree, and variants, compute the same numbers.
+# THREADS adds the thread pool, AVX512 further options for that variant.
+set(HEADBENCH_NATIVE ${CMAKE_CURRENT_LIST_DIR})
+
+function(headbench_kernel)
+  cmake_parse_arguments(KERNEL "THREADS" "NAME;FOLDER" "SOURCES;AVX512" ${ARGN})
+  string(REPLACE "/" "_" target ${KERNEL_FOLDER}${KERNEL_NAME})
+  set(folder ${PROJECT_SOURCE_DIR}/${KERNEL_FOLDER}/csrc)
+  list(TRANSFORM KERNEL_SOURCES PREPEND ${folder}/)
+  nanobind_add_module(${target} NB_STATIC NOMINSIZE ${KERNEL_SOURCES})
+  set_target_properties(${target} PROPERTIES OUTPUT_NAME ${KERNEL_NAME}
+    LIBRARY_OUTPUT_DIRECTORY ${CMAKE_CURRENT_BINARY_DIR}/${KERNEL_FOLDER})
+  target_include_directories(${target} PRIVATE ${PROJECT_SOURCE_DIR})
+  target_compile_options(${target} PRIVATE
+    # Vectors are handed over by inlined functions alone: how others would pass them does not matter.
+    -O3 -ffp-contract=off -fno-math-errno -fno-trapping-math -Wall -Wextra -Wno-psabi)
+  if(KERNEL_THREADS)
+    target_sources(${target} PRIVATE ${HEADBENCH_NATIVE}/thread_pool.cpp)
+    target_link_libraries(${target} PRIVATE Threads::Threads)
+  endif()
+
+  set(options_portable "")
+  set(options_neon "")
+  set(options_avx2 -mavx2 -mfma)
+  # GCC's own header warns of a register it leaves undefined on purpose (GCC bug 105593).
+  set(options_avx512 -mavx2 -mfma -mavx512f -mavx512dq -mavx512bw -mavx512vl -Wno-uninitialized
+    -Wno-maybe-uninitialized ${KERNEL_AVX512})
+  set(sets portable)
+  if(CMAKE_SYSTEM_PROCESSOR MATCHES "^(x86_64|AMD64|amd64)$")
+    list(APPEND sets avx2 avx512)
+    target_compile_definitions(${target} PRIVATE HEADBENCH_X86)
+  elseif(CMAKE_SYSTEM_PROCESSOR MATCHES "^(aarch64|arm64|ARM64)$")
+    list(APPEND sets neon)
+    target_compile_definitions(${target} PRIVATE HEADBENCH_NEON)
+  endif()
+  foreach(set IN LISTS sets)
+    set(variant ${CMAKE_CURRENT_BINARY_DIR}/${target}_${set}.cpp)
+    file(CONFIGURE OUTPUT ${variant} CONTENT "#include \"${folder}/variants.cpp\"\n")
+    set_source_files_properties(${variant} PROPERTIES
+      COMPILE_DEFINITIONS "HEADBENCH_ISA=${set};HEADBENCH_ISA_${set}" COMPILE_OPTIONS "${options_${set}}")
+    target_sources(${target} PRIVATE ${variant})
+  endforeach()
+  install(TARGETS ${target} LIBRARY DESTINATION headbench/${KERNEL_FOLDER})
+endfunction()

@@ -1,0 +1,60 @@
+"""Compiled kernels that may be missing, as where there was no C++ compiler at installation."""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import logging
+from functools import cached_property
+from types import ModuleType
+
+from ..errors import UnavailableError
+
+log = logging.getLogger(__name__)
+
+
+class Kernel:
+    """A compiled module, imported when first used.
+
+    Parameters
+    ----------
+    module : absolute name of the module, built by ``bench/native/kernel.cmake``.
+    label : what messages call it.
+    substitute : what is used where it is missing.
+    """
+
+    def __init__(self, module: str, label: str, substitute: str) -> None:
+        self.module, self.label = module, label
+        self.remedy = f"Install a C++17 compiler and reinstall headbench; {substitute}."
+
+    @cached_property
+    def imported(self) -> ModuleType | ImportError:
+        """The module, or why it cannot be imported."""
+        try:
+            return importlib.import_module(self.module)
+        except ImportError as error:
+            return error
+
+    def load(self) -> ModuleType:
+        """The module. Raises `UnavailableError` where it is missing."""
+        if isinstance(self.imported, ImportError):
+            raise UnavailableError(f"{self.label} is not available: {self.imported}.", self.remedy)
+        return self.imported
+
+    def load_or_warn(self) -> ModuleType | None:
+        """The module; None where it is missing, and then one warning per process says why."""
+        if isinstance(self.imported, ImportError):
+            _warn_once(self.label, str(self.imported), self.remedy)
+            return None
+        return self.imported
+
+    @cached_property
+    def instruction_sets(self) -> tuple[str, ...]:
+        """Variants that run on this machine, the fastest first; empty where the module is missing."""
+        found = self.imported
+        return () if isinstance(found, ImportError) else tuple(found.instruction_sets())
+
+
+@functools.cache
+def _warn_once(label: str, reason: str, remedy: str) -> None:
+    log.warning("%s cannot be used (%s). %s", label, reason, remedy)

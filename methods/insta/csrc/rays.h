@@ -1,0 +1,53 @@
+// Samples of many rays, and rays through the field without gradients: marched, evaluated and composited task by task.
+#pragma once
+
+#include <cstdint>
+#include <vector>
+
+#include "bench/native/instruction_sets.h"
+#include "field.h"
+#include "marcher.h"
+
+namespace headbench {
+
+HEADBENCH_VARIANTS(insta::Kernels, kernels)
+
+}  // namespace headbench
+
+namespace headbench::insta {
+
+struct Rays {
+  std::int64_t count;
+  const float *origins, *directions;  // (R, 3), directions of unit length
+  const std::int32_t* first;          // (R,) lattice index to start at
+  const float* jitter;                // (R,) in [0, 1)
+  std::int32_t samples_max;
+};
+
+struct Samples {
+  std::vector<float> positions, directions;  // (N, 3) canonical; directions of unit length
+  std::vector<float> distances;                // (N,) metres from the surface, posed
+  std::vector<std::int32_t> rays, indices, triangles;
+  std::vector<std::int32_t> next;  // (R,) lattice index to continue at; -1 where nothing is left
+};
+
+// The next samples of every ray, at most `samples_max` of each.
+Samples march(const Marcher& marcher, const Rays& rays, int threads);
+
+struct RenderRays {
+  std::int64_t count;
+  const float *origins, *directions, *jitter;  // (R, 3), (R, 3), (R,)
+  std::int32_t round_samples;                  // of a ray between two looks at its transmittance
+  float stop_transmittance;
+};
+
+struct Seen {
+  float* color;          // (R, 3) not yet composited on anything
+  float* transmittance;  // (R,)
+};
+
+// `starts` is that of `Kernels`, `mouth` (F,) says where its second row counts. Returns the number of samples.
+std::int64_t render(const Marcher& marcher, const Kernels& kernels, const Field& field, const float* starts,
+                    const std::uint8_t* mouth, float step, const RenderRays& all, const Seen& seen, int threads);
+
+}  // namespace headbench::insta
