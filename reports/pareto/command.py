@@ -58,12 +58,7 @@ def run(settings: ParetoSettings, progress: Progress = no_progress) -> Findings:
     write_plot(
         out / "pareto.png", panels, f"{metric.label}{unit}, {settings.task.replace('_', ' ')}", machines
     )
-    data = {
-        "out": out,
-        "points": [asdict(point) for point in points],
-        "fronts": fronts,
-        "left_out": left_out,
-    }
+    data = {"out": out, "points": [asdict(point) for point in points], "fronts": fronts, "left_out": left_out}
     return Findings(_text(points, fronts, left_out, metric.label, metric.digits), data)
 
 
@@ -79,11 +74,7 @@ def _series(points: Sequence[Point]) -> list[str]:
 
 
 def _text(
-    points: Sequence[Point],
-    fronts: dict[str, list[int]],
-    left_out: Sequence[str],
-    label: str,
-    digits: int,
+    points: Sequence[Point], fronts: dict[str, list[int]], left_out: Sequence[str], label: str, digits: int
 ) -> str:
     wide = max([16, *(len(point.method) + 2 for point in points)])
     lines = [f"{'method':<{wide}}{label:>10}{'MB':>12}{'ms':>12}  run (* on the front of size, of time)"]

@@ -29,11 +29,7 @@ import numpy as np
 import pandas as pd
 
 from .cases import Place, changed, load_everything
-from .samples import SYNTH, prepare_samples
-
-PREPARE = ("prepare", "nersemble", "--root", "recording", "--tracking", "tracking", "--head", "head.npz")
-PREPARE = (*PREPARE, *("--subjects", "901", "--sequences", "EMO-1,FREE", "--downscale", "2", "--every", "1"))
-AVATAR = "run/901/{}/seed-0/avatar"
+from .samples import AVATAR, PREPARE, SYNTH, prepare_samples
 
 
 @dataclass(frozen=True)
@@ -42,45 +38,33 @@ class Writer:
 
     name: str
     sample: str
-    words: tuple[str, ...]
+    line: str
     measured: tuple[str, ...] = ()
 
 
+MEASURED_FILES = ("measure.json", "points.csv", "pareto.png", "cost.*")
 WRITERS = [
-    Writer("synth", "settings", ("synth", *SYNTH, "--out", "out")),
-    Writer("run", "unfinished", ("run", "--config", "config.json")),
-    Writer("prepare", "recording", (*PREPARE, "--out", "out")),
-    Writer("record", "synthetic", ("record", "nersemble", "synthetic/UNION2_900", "--out", "out")),
-    Writer("refit", "heads", ("refit", "capture", "--target", "head.npz", "--out", "out")),
-    Writer(
-        "evaluate", "images", ("evaluate", "images", "--like", "run", "--out", "out", "--label", "theirs")
-    ),
-    Writer(
-        "sweep",
-        "run",
-        ("sweep", "run", "--methods", "ga", "--variants", "half"),
-        ("measure.json", "points.csv", "pareto.png", "cost.*"),
-    ),
-    Writer(
-        "extremes", "run", ("extremes", "run", "--views", "1", "--dimensions", "1", "--methods", "ga", "ours")
-    ),
-    Writer("reenact", "two_subjects", ("reenact", "run", "--frames", "1")),
-    Writer("pareto", "run", ("pareto", "run", "--out", "out")),
-    Writer(
-        "gate",
-        "baseline",
-        ("gate", "run", "--baseline", "baseline.json", "--junit", "a.xml", "--markdown", "a.md"),
-    ),
-    Writer("gate update", "baseline", ("gate", "run", "--baseline", "baseline.json", "--update")),
-    Writer("compact", "run", ("compact", AVATAR.format("ours"), "--out", "out", "--compare", "capture")),
-    Writer("export ply", "run", ("export", "ply", AVATAR.format("ga"), "--out", "out.ply")),
-    Writer("export colmap", "capture", ("export", "colmap", "capture", "--out", "out")),
-    Writer("import ga", "ply", ("import", "ga", "point_cloud.ply", "--capture", "capture", "--out", "out")),
-    Writer("tongue", "exclusions", ("tongue", "capture", "--out", "reviewed")),
-    Writer("inspect", "capture", ("inspect", "capture", "--out", "out")),
-    Writer("steps", "capture", ("steps", "capture", "--out", "out")),
-    Writer("lint", "capture", ("lint", "capture")),
-    Writer("verify", "run", ("verify", "run")),
+    Writer("synth", "settings", f"synth {SYNTH} --out out"),
+    Writer("run", "unfinished", "run --config config.json"),
+    Writer("prepare", "recording", f"{PREPARE} --out out"),
+    Writer("record", "synthetic", "record nersemble synthetic/UNION2_900 --out out"),
+    Writer("refit", "heads", "refit capture --target head.npz --out out"),
+    Writer("evaluate", "images", "evaluate images --like run --out out --label theirs"),
+    Writer("sweep", "run", "sweep run --methods ga --variants half", MEASURED_FILES),
+    Writer("extremes", "run", "extremes run --views 1 --dimensions 1 --methods ga ours"),
+    Writer("reenact", "two_subjects", "reenact run --frames 1"),
+    Writer("pareto", "run", "pareto run --out out"),
+    Writer("gate", "baseline", "gate run --baseline baseline.json --junit a.xml --markdown a.md"),
+    Writer("gate update", "baseline", "gate run --baseline baseline.json --update"),
+    Writer("compact", "run", f"compact {AVATAR.format('ours')} --out out --compare capture"),
+    Writer("export ply", "run", f"export ply {AVATAR.format('ga')} --out out.ply"),
+    Writer("export colmap", "capture", "export colmap capture --out out"),
+    Writer("import ga", "ply", "import ga point_cloud.ply --capture capture --out out"),
+    Writer("tongue", "exclusions", "tongue capture --out reviewed"),
+    Writer("inspect", "capture", "inspect capture --out out"),
+    Writer("steps", "capture", "steps capture --out out"),
+    Writer("lint", "capture", "lint capture"),
+    Writer("verify", "run", "verify run"),
 ]
 
 
@@ -103,7 +87,7 @@ def start(writer: Writer, place: Place, kill_at: int | None) -> tuple[int | None
             os.chdir(place.work)
             place.isolate(audit=False)
             count = _count(place.work, write, kill_at)
-            code = _call(writer.words)
+            code = _call(writer.line)
             next(count)  # no change that comes after this is one of the command's
         except BaseException:  # noqa: BLE001 - this process must end here
             traceback.print_exc()
@@ -119,11 +103,11 @@ def start(writer: Writer, place: Place, kill_at: int | None) -> tuple[int | None
     return None if os.WIFSIGNALED(status) else os.WEXITSTATUS(status), changes, text
 
 
-def _call(words: tuple[str, ...]) -> int:
+def _call(line: str) -> int:
     from headbench.bench import cli
 
     try:
-        return int(cli.main(list(words)))
+        return int(cli.main(line.split()))
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else 1
 

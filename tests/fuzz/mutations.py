@@ -9,13 +9,13 @@ from __future__ import annotations
 import copy
 import io
 import json
-import math
 import pickle
 import shutil
 import struct
 import zipfile
 import zlib
 from collections.abc import Callable
+from math import inf, nan
 from pathlib import Path
 from typing import Any
 
@@ -30,86 +30,32 @@ from safetensors.numpy import load, save
 
 Change = Callable[[bytes, Generator], bytes]
 
-SCALARS: list[Any] = [
-    *(
-        None,
-        True,
-        False,
-        0,
-        1,
-        -1,
-        2**31,
-        2**63,
-        -(2**63),
-        2**64,
-        10**30,
-        0.5,
-        -0.0,
-        1e38,
-        1e300,
-        -1e300,
-        5e-324,
-    ),
-    *(
-        math.nan,
-        math.inf,
-        -math.inf,
-        "",
-        " ",
-        "0",
-        "nan",
-        "1e999",
-        "a" * 100_000,
-        "é\u0301\U0001f600",
-        "\x00",
-        "\ud800",
-    ),
-    *(
-        "../../outside",
-        "/dev/zero",
-        ".",
-        "a/b",
-        "CON",
-        "x\n\x1b[31my",
-        "=1+1",
-        [],
-        {},
-        [[]],
-        [None],
-        {"": None},
-    ),
-    *([0] * 1000, {"a": {"b": {"c": 1}}}, [[1, 2], [3]], "2026-01-01", "os:system"),
-]
-NUMBERS = (
-    math.nan,
-    math.inf,
-    -math.inf,
-    0,
-    1,
-    -1,
-    255,
-    2**31 - 1,
-    -(2**31),
-    2**40,
-    1e38,
-    -1e38,
-    1e300,
-    1e-320,
+
+def pick(rng: Generator, *choices: Any) -> Any:
+    return choices[rng.integers(len(choices))]
+
+
+WHOLE = (0, 1, -1, 2**31, 2**63, -(2**63), 2**64, 10**30)
+REAL = (nan, inf, -inf, 0.5, -0.0, 1e38, 1e300, -1e300, 5e-324)
+TEXTS = (
+    "",
+    " ",
+    "0",
+    "nan",
+    "1e999",
+    "a" * 100_000,
+    "é\u0301\U0001f600",
+    "\x00",
+    "\ud800",
+    ".",
+    "a/b",
+    "CON",
 )
-DTYPES = (
-    "float16",
-    "float32",
-    "float64",
-    "int8",
-    "int64",
-    "uint8",
-    "bool",
-    "complex64",
-    "U4",
-    "S3",
-    "M8[s]",
-    ">f4",
-)
+ODD_TEXTS = ("../../outside", "/dev/zero", "x\n\x1b[31my", "=1+1", "2026-01-01", "os:system")
+TREES = ([], {}, [[]], [None], {"": None}, [0] * 1000, {"a": {"b": {"c": 1}}}, [[1, 2], [3]])
+SCALARS: list[Any] = [None, True, False, *WHOLE, *REAL, *TEXTS, *ODD_TEXTS, *TREES]
+NUMBERS = (nan, inf, -inf, 0, 1, -1, 255, 2**31 - 1, -(2**31), 2**40, 1e38, -1e38, 1e300, 1e-320)
+DTYPES = ("f2", "f4", "f8", "i1", "i8", "u1", "?", "c8", "U4", "S3", "M8[s]", ">f4")
 
 
 def mutate(path: Path, outside: Path, rng: Generator) -> str:
@@ -119,7 +65,7 @@ def mutate(path: Path, outside: Path, rng: Generator) -> str:
     """
     changes: list[tuple[str, Any]] = [*BYTES, *(BY_SUFFIX.get(path.suffix, []) * 3)]
     names = [*changes, *([] if rng.random() < 0.8 else PLACES)]
-    name, change = names[rng.integers(len(names))]
+    name, change = pick(rng, *names)
     if (name, change) in PLACES:
         change(path, outside, rng)
         return name
@@ -173,18 +119,8 @@ def repeat(content: bytes, rng: Generator) -> bytes:
 
 def foreign(content: bytes, rng: Generator) -> bytes:
     """The start of a file of another kind."""
-    kinds = (
-        b"PK\x03\x04",
-        b"\x80\x04",
-        b"\x89PNG\r\n\x1a\n",
-        b"{}",
-        b"[]",
-        b"null",
-        b"PAR1",
-        b"\xff\xd8\xff",
-        b"\xef\xbb\xbf",
-    )
-    return kinds[rng.integers(len(kinds))] + (content if rng.random() < 0.5 else b"")
+    starts = (b"PK\x03\x04", b"\x80\x04", b"\x89PNG\r\n\x1a\n", b"PAR1", b"\xff\xd8\xff", b"\xef\xbb\xbf")
+    return pick(rng, *starts, b"{}", b"[]", b"null") + (content if rng.random() < 0.5 else b"")
 
 
 def number(content: bytes, rng: Generator) -> bytes:
@@ -192,7 +128,7 @@ def number(content: bytes, rng: Generator) -> bytes:
     code = ["<H", "<I", "<Q", ">H", ">I", ">Q", "<i", "<f", "<d"][rng.integers(9)]
     size = struct.calcsize(code)
     if code[1] in "fd":
-        value: Any = (math.nan, math.inf, 1e38, -1.0)[rng.integers(4)]
+        value: Any = (nan, inf, 1e38, -1.0)[rng.integers(4)]
     else:
         value = (2 ** (8 * size - 1) - 1, 2 ** (8 * size - 2), 1, 0)[rng.integers(4)]
     end = min(len(content), 256) if rng.random() < 0.5 else len(content)
@@ -263,7 +199,7 @@ def nodes(tree: Any, depth: int = 0) -> list[tuple[Any, Any]]:
 
 def scalar(rng: Generator) -> Any:
     """A value that does not belong where it is put."""
-    return copy.deepcopy(SCALARS[rng.integers(len(SCALARS))])
+    return copy.deepcopy(pick(rng, *SCALARS))
 
 
 def change_tree(tree: Any, rng: Generator) -> Any:
@@ -271,7 +207,7 @@ def change_tree(tree: Any, rng: Generator) -> Any:
     places = nodes(tree)
     if not places or rng.random() < 0.03:
         return scalar(rng)
-    container, key = places[rng.integers(len(places))]
+    container, key = pick(rng, *places)
     kind = rng.integers(10)
     if kind == 0:
         del container[key]
@@ -280,7 +216,7 @@ def change_tree(tree: Any, rng: Generator) -> Any:
     elif kind == 1:
         container.insert(key, container[key])
     elif kind == 2:
-        other, name = places[rng.integers(len(places))]
+        other, name = pick(rng, *places)
         container[key] = copy.deepcopy(other[name])
     elif kind <= 4:
         container[key] = scalar(rng)
@@ -296,40 +232,14 @@ def change_value(value: Any, rng: Generator) -> Any:
     if isinstance(value, bool) or value is None:
         return (0, 1, "true", "null")[rng.integers(4)]
     if isinstance(value, (int, float)):
-        changes = (
-            -value,
-            value * 1e9,
-            value + 1,
-            value - 1,
-            float(value),
-            str(value),
-            [value],
-            *NUMBERS,
-            2**70,
-        )
-        return changes[rng.integers(len(changes))]
+        near = (-value, value * 1e9, value + 1, value - 1, float(value), str(value), [value])
+        return pick(rng, *near, *NUMBERS, 2**70)
     if isinstance(value, str):
-        changes = (
-            f"{value} ",
-            value[: len(value) // 2],
-            value * 50,
-            f"../{value}",
-            f"/{value}",
-            f"{value}\0",
-            7,
-            [value],
-        )
-        return changes[rng.integers(len(changes))]
+        longer = (f"{value} ", value * 50, f"../{value}", f"/{value}", f"{value}\0")
+        return pick(rng, *longer, value[: len(value) // 2], 7, [value])
     if isinstance(value, list):
-        changes = (
-            value[:-1],
-            value + value,
-            [value],
-            value[::-1],
-            dict(enumerate(map(str, value))),
-            value[:1] * 5,
-        )
-        return changes[rng.integers(len(changes))]
+        table = dict(enumerate(map(str, value)))
+        return pick(rng, value[:-1], value * 2, [value], value[::-1], table, value[:1] * 5)
     return scalar(rng)
 
 
@@ -340,20 +250,13 @@ def change_array(array: np.ndarray, rng: Generator) -> np.ndarray:
     if kind <= 2 and array.size:
         flat = array.reshape(-1)
         count = 1 if rng.random() < 0.6 else flat.size
-        value = NUMBERS[rng.integers(len(NUMBERS))]
-        flat[rng.integers(flat.size, size=count)] = np.asarray(value).astype(array.dtype)
+        flat[rng.integers(flat.size, size=count)] = np.asarray(pick(rng, *NUMBERS)).astype(array.dtype)
         return array
     if kind == 3:
-        return array.astype(DTYPES[rng.integers(len(DTYPES))])
+        return array.astype(pick(rng, *DTYPES))
     if kind == 4:
-        shapes = (
-            array.reshape(-1),
-            array[None],
-            array[..., None],
-            array.T,
-            array.reshape(-1)[:1].reshape(()),
-        )
-        return shapes[rng.integers(len(shapes))]
+        flat = array.reshape(-1)
+        return pick(rng, flat, array[None], array[..., None], array.T, flat[:1].reshape(()))
     if kind == 5 and array.ndim:
         axis = rng.integers(array.ndim)
         return np.concatenate([array, array], axis) if rng.random() < 0.5 else np.delete(array, 0, axis)
@@ -380,11 +283,10 @@ def json_twice(content: bytes, rng: Generator) -> bytes:
     """A key twice in one object."""
     text = content.decode()
     colons = [i for i, c in enumerate(text) if c == "{"]
-    start = colons[rng.integers(len(colons))] + 1
+    start = pick(rng, *colons) + 1
     key = text[start:].split('"')[1]
-    return f'{text[:start]}"{key}": {json.dumps(SCALARS[rng.integers(30)])}, {text[start:]}'.encode(
-        "utf-8", "surrogatepass"
-    )
+    value = json.dumps(pick(rng, *SCALARS))
+    return f'{text[:start]}"{key}": {value}, {text[start:]}'.encode("utf-8", "surrogatepass")
 
 
 def json_deep(content: bytes, rng: Generator) -> bytes:
@@ -396,63 +298,32 @@ def json_number(content: bytes, rng: Generator) -> bytes:
     """A number that is long, or none, in place of one."""
     text = content.decode()
     digits = [i for i, c in enumerate(text) if c.isdigit()]
-    start = digits[rng.integers(len(digits))]
+    start = pick(rng, *digits)
     words = ("9" * 5000, "1e400", "NaN", "-Infinity", "0x1", "01", "-", "1" + "0" * 100_000, "null", '"1"')
-    return (text[:start] + words[rng.integers(len(words))] + text[start + 1 :]).encode()
+    return (text[:start] + pick(rng, *words) + text[start + 1 :]).encode()
 
 
 def dump_json(tree: Any) -> bytes:
     return json.dumps(tree, default=repr).encode("utf-8", "surrogatepass")
 
 
+YAML_TAGS = ("bool x", "timestamp x", "int x", "float x", "binary '='", "set {a, b}", "omap [a: 1]")
+YAML_CALLS = ("!!python/object/apply:os.system [ls]", "!!python/name:os.system", "!unknown x")
+YAML_PLAIN = ("2026-01-01", "1:30:00", "0o7", "~", "yes", ".nan", "-.inf", "|\n  block", "@", "\t", "'", '"')
+YAML_ODD = ("&a [*a]", "*nothing", "'\0'", "---\na: 1", "%YAML 9.9", '"\\ud800"')
+YAML_MAPS = ("&x {<<: *x}", "{<<: 1}", "{[1]: 2}", "{? {a: 1} : 2}", *YAML_ODD)
+YAML_LONG = ("[" * 3000 + "]" * 3000, "{a: " * 1000 + "1" + "}" * 1000, "1" * 5000, "'" + "é" * 50_000 + "'")
+YAML_VALUES = (*(f"!!{tag}" for tag in YAML_TAGS), *YAML_CALLS, *YAML_PLAIN, *YAML_MAPS, *YAML_LONG)
+
+
 def yaml_odd(content: bytes, rng: Generator) -> bytes:
     """What YAML knows beside plain values."""
     text = content.decode()
-    values = [
-        *(
-            "!!bool x",
-            "!!timestamp x",
-            "!!int x",
-            "!!float x",
-            "!!binary '='",
-            "!!set {a, b}",
-            "!!omap [a: 1]",
-        ),
-        *(
-            "!!python/object/apply:os.system [ls]",
-            "!!python/name:os.system",
-            "!unknown x",
-            "2026-01-01",
-            "1:30:00",
-        ),
-        *(
-            "&a [*a]",
-            "*nothing",
-            "&x {<<: *x}",
-            "{<<: 1}",
-            "{[1]: 2}",
-            "{? {a: 1} : 2}",
-            "0o7",
-            "~",
-            "yes",
-            ".nan",
-            "-.inf",
-        ),
-        *(
-            "[" * 3000 + "]" * 3000,
-            "{a: " * 1000 + "1" + "}" * 1000,
-            '"\\ud800"',
-            "'\0'",
-            "1" * 5000,
-            "'" + "é" * 50_000 + "'",
-        ),
-        *("|\n  block", "---\na: 1", "%YAML 9.9", "@", "\t", "'", '"'),
-    ]
-    value = values[rng.integers(len(values))]
+    value = pick(rng, *YAML_VALUES)
     colons = [i for i, c in enumerate(text) if c == ":"]
     if not colons or rng.random() < 0.2:
         return value.encode("utf-8", "surrogatepass")
-    start = colons[rng.integers(len(colons))] + 1
+    start = pick(rng, *colons) + 1
     end = text.find("\n", start)
     return f"{text[:start]} {value}{text[end:]}".encode("utf-8", "surrogatepass")
 
@@ -482,6 +353,12 @@ def write_npy(array: np.ndarray) -> bytes:
     return stream.getvalue()
 
 
+def npy_header(dtype: str, count: int) -> bytes:
+    """The first 128 bytes of an npy of so many numbers."""
+    text = f"{{'descr': '{dtype}', 'fortran_order': False, 'shape': ({count},), }}"
+    return b"\x93NUMPY\x01\x00\x76\x00" + text.encode().ljust(117) + b"\n"
+
+
 def npy(content: bytes, rng: Generator) -> bytes:
     return write_npy(change_array(np.load(io.BytesIO(content)), rng))
 
@@ -492,39 +369,14 @@ def zip_members(content: bytes, rng: Generator) -> bytes:
         members = [(info.filename, archive.read(info)) for info in archive.infolist()]
     index = rng.integers(len(members))
     name, data = members[index]
-    names = (
-        name,
-        "../../outside/evil.npy",
-        "/evil.npy",
-        f"{name}.txt",
-        "a/b.npy",
-        "x" * 300 + ".npy",
-        "",
-        "file.npy",
-    )
-    bomb = (
-        b"\x93NUMPY\x01\x00\x76\x00"
-        + b"{'descr': '<f8', 'fortran_order': False, 'shape': (9999999999,), }".ljust(117)
-        + b"\n"
-    )
-    contents = (
-        flip(data, rng),
-        truncate(data, rng),
-        b"",
-        b"text",
-        pickle.dumps([1]),
-        bomb,
-        number(data, rng),
-    )
-    changed = (
-        names[rng.integers(len(names))] if rng.random() < 0.4 else name,
-        contents[rng.integers(len(contents))],
-    )
+    names = ("../../outside/evil.npy", "/evil.npy", "a/b.npy", "file.npy", f"{name}.txt", "x" * 300, "")
+    damaged = (flip(data, rng), truncate(data, rng), number(data, rng))
+    other = pick(rng, *damaged, b"", b"text", pickle.dumps([1]), npy_header("<f8", 9_999_999_999))
+    changed = (pick(rng, *names) if rng.random() < 0.4 else name, other)
     members[index : index + int(rng.random() < 0.7)] = [changed]
     stream = io.BytesIO()
-    with zipfile.ZipFile(
-        stream, "w", (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_LZMA)[rng.integers(3)]
-    ) as archive:
+    packing = pick(rng, zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_LZMA)
+    with zipfile.ZipFile(stream, "w", packing) as archive:
         for member in members:
             archive.writestr(*member)
     return stream.getvalue()
@@ -540,38 +392,31 @@ def npz_bomb(content: bytes, rng: Generator) -> bytes:
             if other != name:
                 archive.writestr(f"{other}.npy", write_npy(array))
         count = int(10 ** rng.uniform(7, 8.5))
-        header = (
-            f"{{'descr': '|u1', 'fortran_order': False, 'shape': ({count},), }}".encode().ljust(117) + b"\n"
-        )
         with archive.open(f"{name}.npy", "w") as member:
-            member.write(b"\x93NUMPY\x01\x00\x76\x00" + header)
+            member.write(npy_header("|u1", count))
             for _ in range(count // 10**6):
                 member.write(bytes(10**6))
     return stream.getvalue()
 
 
-def png_size(content: bytes, rng: Generator) -> bytes:
-    """Another width and height in the header, with a right checksum."""
-    sizes = (
-        (0, 0),
-        (1, 1),
-        (20_000, 20_000),
-        (70_000, 70_000),
-        (2**31 - 1, 1),
-        (2**31, 2**31),
-        (25, 33),
-        (32, 24),
-    )
-    header = b"IHDR" + struct.pack(">II", *sizes[rng.integers(len(sizes))]) + content[24:29]
+def png_header(content: bytes, fields: bytes) -> bytes:
+    """A PNG with other fields in its header, with a right checksum."""
+    header = b"IHDR" + fields
     return content[:12] + header + struct.pack(">I", zlib.crc32(header)) + content[33:]
+
+
+def png_size(content: bytes, rng: Generator) -> bytes:
+    """Another width and height."""
+    large = ((20_000, 20_000), (70_000, 70_000), (2**31 - 1, 1), (2**31, 2**31))
+    size = pick(rng, (0, 0), (1, 1), (25, 33), (32, 24), *large)
+    return png_header(content, struct.pack(">II", *size) + content[24:29])
 
 
 def png_kind(content: bytes, rng: Generator) -> bytes:
-    """Another depth, colour type, compression or interlacing in the header."""
+    """Another depth, colour type, compression or interlacing."""
     fields = bytearray(content[24:29])
-    fields[rng.integers(5)] = (0, 1, 2, 3, 4, 6, 8, 16, 255)[rng.integers(9)]
-    header = content[12:24] + bytes(fields)
-    return content[:12] + header + struct.pack(">I", zlib.crc32(header)) + content[33:]
+    fields[rng.integers(5)] = pick(rng, 0, 1, 2, 3, 4, 6, 8, 16, 255)
+    return png_header(content, content[16:24] + bytes(fields))
 
 
 def png_bomb(content: bytes, rng: Generator) -> bytes:
@@ -594,22 +439,15 @@ def image_other(content: bytes, rng: Generator) -> bytes:
     """Another size, number of channels, depth or format."""
     image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     colour = image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
-    forms = (
-        *(
-            image[:-1],
-            image[:, :-1],
-            np.concatenate([image, image]),
-            image[:1, :1],
-            colour[..., 0],
-            colour[..., :3],
-        ),
-        np.dstack([colour[..., :3], np.zeros(image.shape[:2], np.uint8)]),
-        colour.astype(np.uint16) * 257,
+    form = pick(
+        rng,
+        *(image[:-1], image[:, :-1], np.concatenate([image, image]), image[:1, :1], np.zeros_like(image)),
+        *(colour[..., 0], colour[..., :3], colour.astype(np.uint16) * 257),
         cv2.resize(image, None, fx=2, fy=2),
-        np.zeros_like(image),
+        np.dstack([colour[..., :3], np.zeros(image.shape[:2], np.uint8)]),
     )
-    suffix = (".png", ".png", ".png", ".jpg", ".bmp", ".tiff", ".webp")[rng.integers(7)]
-    return cv2.imencode(suffix, forms[rng.integers(len(forms))])[1].tobytes()
+    suffix = pick(rng, ".png", ".png", ".png", ".jpg", ".bmp", ".tiff", ".webp")
+    return cv2.imencode(suffix, form)[1].tobytes()
 
 
 def read_parquet(content: bytes) -> dict[str, list]:
@@ -627,47 +465,20 @@ def parquet_column(content: bytes, rng: Generator) -> bytes:
     table = pq.read_table(io.BytesIO(content))
     index = int(rng.integers(table.num_columns))
     name, rows = table.column_names[index], table.num_rows
-    columns: list[Any] = [
-        *(
-            [None] * rows,
-            [[1.0]] * rows,
-            ["x"] * rows,
-            [b"\xff"] * rows,
-            [{"a": 1}] * rows,
-            [math.nan] * rows,
-            [True] * rows,
-        ),
-        *(
-            [2**62] * rows,
-            [-1] * rows,
-            [math.inf] * rows,
-            [""] * rows,
-            ["a" * 10_000] * rows,
-            ["../x"] * rows,
-        ),
-    ]
-    types = (
-        pa.float16(),
-        pa.int8(),
-        pa.timestamp("s"),
-        pa.decimal128(10, 2),
-        pa.string(),
-        pa.binary(),
-        pa.dictionary(pa.int32(), pa.string()),
-    )
+    values = (None, [1.0], "x", b"\xff", {"a": 1}, nan, inf, True, 2**62, -1, "", "a" * 10_000, "../x")
+    types = (pa.float16(), pa.int8(), pa.timestamp("s"), pa.decimal128(10, 2), pa.string(), pa.binary())
     kind = rng.integers(6)
     if kind == 0:
         table = table.remove_column(index)
     elif kind == 1:
         table = table.append_column(name, table.column(index))
     elif kind == 2:
-        table = table.set_column(
-            index, name, table.column(index).cast(types[rng.integers(len(types))], safe=False)
-        )
+        other = pick(rng, *types, pa.dictionary(pa.int32(), pa.string()))
+        table = table.set_column(index, name, table.column(index).cast(other, safe=False))
     elif kind == 3:
         table = table.slice(0, int(rng.integers(0, 2)))
     else:
-        table = table.set_column(index, name, pa.array(columns[rng.integers(len(columns))]))
+        table = table.set_column(index, name, pa.array([pick(rng, *values)] * rows))
     stream = io.BytesIO()
     pq.write_table(table, stream)
     return stream.getvalue()
@@ -694,25 +505,19 @@ def safetensors_values(content: bytes, rng: Generator) -> bytes:
 
 def torch_tree(content: bytes, rng: Generator) -> bytes:
     """Other tensors and values in a file of torch."""
+
+    def converted(value: Any, kind: type, convert: Callable) -> Any:
+        if isinstance(value, kind):
+            return convert(value)
+        if isinstance(value, dict):
+            return {key: converted(item, kind, convert) for key, item in value.items()}
+        return [converted(item, kind, convert) for item in value] if isinstance(value, list) else value
+
     tree = {"top": torch.load(io.BytesIO(content), weights_only=True)}
-
-    def arrays(value: Any) -> Any:
-        if isinstance(value, torch.Tensor):
-            return value.numpy()
-        if isinstance(value, dict):
-            return {key: arrays(item) for key, item in value.items()}
-        return [arrays(item) for item in value] if isinstance(value, list) else value
-
-    def tensors(value: Any) -> Any:
-        if isinstance(value, np.ndarray):
-            return torch.from_numpy(np.ascontiguousarray(value))
-        if isinstance(value, dict):
-            return {key: tensors(item) for key, item in value.items()}
-        return [tensors(item) for item in value] if isinstance(value, list) else value
-
+    changed = change_tree(converted(tree, torch.Tensor, torch.Tensor.numpy), rng)
     stream = io.BytesIO()
-    changed = change_tree(arrays(tree), rng)
-    torch.save(tensors(changed.get("top") if isinstance(changed, dict) else changed), stream)
+    top = changed.get("top") if isinstance(changed, dict) else changed
+    torch.save(converted(top, np.ndarray, lambda a: torch.from_numpy(np.ascontiguousarray(a))), stream)
     return stream.getvalue()
 
 
@@ -740,7 +545,7 @@ def pickle_bomb(content: bytes, rng: Generator) -> bytes:
         b"\x80\x04" + b"(" * count + b".",
         b"\x80\x04\x95" + struct.pack("<Q", 2**60) + b".",
     )
-    return streams[rng.integers(len(streams))]
+    return pick(rng, *streams)
 
 
 def text_line(content: bytes, rng: Generator) -> bytes:
@@ -748,26 +553,14 @@ def text_line(content: bytes, rng: Generator) -> bytes:
     lines = content.split(b"\n")
     index = int(rng.integers(min(len(lines), 40)))
     words = lines[index].split(b" ")
-    tokens = (
-        b"",
-        b"-1",
-        b"nan",
-        b"1e999",
-        b"99999999999999999999",
-        b"../x",
-        b"\xff",
-        b"x" * 1000,
-        b"0",
-        b"1 1",
-        b"#",
-    )
+    numbers = (b"-1", b"nan", b"1e999", b"99999999999999999999", b"0", b"1 1")
     kind = rng.integers(5)
     if kind == 0:
         del lines[index]
     elif kind == 1:
         lines.insert(index, lines[index])
     else:
-        words[rng.integers(len(words))] = tokens[rng.integers(len(tokens))]
+        words[rng.integers(len(words))] = pick(rng, *numbers, b"", b"../x", b"\xff", b"x" * 1000, b"#")
         lines[index] = b" ".join(words)
     return b"\n".join(lines)
 
@@ -776,52 +569,33 @@ def ply_values(content: bytes, rng: Generator) -> bytes:
     """Other numbers behind the header."""
     start = content.index(b"end_header\n") + 11
     values = np.frombuffer(content[start : start + (len(content) - start) // 4 * 4], "<f4").copy()
-    values[rng.integers(values.size, size=int(rng.integers(1, 50)))] = NUMBERS[rng.integers(len(NUMBERS))]
+    values[rng.integers(values.size, size=int(rng.integers(1, 50)))] = pick(rng, *NUMBERS)
     return content[:start] + values.tobytes()
 
 
 def boxes(content: bytes, rng: Generator) -> bytes:
     """A length in the structure of an MP4 that is not right."""
-    names = [
-        i
-        for n in (b"moov", b"trak", b"mdia", b"stbl", b"stsz", b"stco", b"stsc", b"mdat", b"stts")
-        if (i := content.find(n)) > 0
-    ]
-    start = names[rng.integers(len(names))] + (-4, 4, 8, 12)[rng.integers(4)]
-    return (
-        content[:start]
-        + struct.pack(">I", (0, 1, 2**31, 2**32 - 1, 7)[rng.integers(5)])
-        + content[start + 4 :]
-    )
+    kinds = (b"moov", b"trak", b"mdia", b"stbl", b"stsz", b"stco", b"stsc", b"mdat", b"stts")
+    found = [place for kind in kinds if (place := content.find(kind)) > 0]
+    start = pick(rng, *found) + pick(rng, -4, 4, 8, 12)
+    length = struct.pack(">I", pick(rng, 0, 1, 2**31, 2**32 - 1, 7))
+    return content[:start] + length + content[start + 4 :]
 
 
-JSON = tree_change(json.loads, dump_json)
-YAML = tree_change(
-    yaml.safe_load, lambda tree: yaml.safe_dump(tree, allow_unicode=True).encode("utf-8", "surrogatepass")
-)
-NPZ = tree_change(read_npz, write_npz)
-PNG = [
-    ("size", png_size),
-    ("kind", png_kind),
-    ("bomb", png_bomb),
-    ("other", image_other),
-    ("other", image_other),
-]
+def dump_yaml(tree: Any) -> bytes:
+    return yaml.safe_dump(tree, allow_unicode=True).encode("utf-8", "surrogatepass")
 
+
+JSON, NPZ = tree_change(json.loads, dump_json), tree_change(read_npz, write_npz)
+YAML, ROWS = tree_change(yaml.safe_load, dump_yaml), tree_change(read_parquet, write_parquet)
 BY_SUFFIX: dict[str, list[tuple[str, Change]]] = {
     ".json": [*[("tree", JSON)] * 7, ("twice", json_twice), ("deep", json_deep), ("number", json_number)],
-    ".yaml": [
-        *[("tree", YAML)] * 4,
-        ("odd", yaml_odd),
-        ("odd", yaml_odd),
-        ("bomb", yaml_bomb),
-        ("line", text_line),
-    ],
-    ".npz": [*[("tree", NPZ)] * 7, ("member", zip_members), ("member", zip_members), ("bomb", npz_bomb)],
+    ".yaml": [*[("tree", YAML)] * 4, *[("odd", yaml_odd)] * 2, ("bomb", yaml_bomb), ("line", text_line)],
+    ".npz": [*[("tree", NPZ)] * 7, *[("member", zip_members)] * 2, ("bomb", npz_bomb)],
     ".npy": [("array", npy)],
-    ".png": PNG,
+    ".png": [("size", png_size), ("kind", png_kind), ("bomb", png_bomb), *[("other", image_other)] * 2],
     ".jpg": [("other", image_other)],
-    ".parquet": [("tree", tree_change(read_parquet, write_parquet)), ("column", parquet_column)],
+    ".parquet": [("tree", ROWS), ("column", parquet_column)],
     ".safetensors": [("header", safetensors_header), ("values", safetensors_values)],
     ".pkl": [("tree", pickle_tree), ("bomb", pickle_bomb)],
     ".pt": [("tree", torch_tree), ("member", zip_members)],

@@ -33,6 +33,13 @@ from ..methods.gha.small import SMALL as SMALL_GHA
 from ..methods.insta.small import SMALL as SMALL_INSTA
 
 STAMP = "stamp"
+AVATAR = "run/901/{}/seed-0/avatar"
+CHECKPOINT, BACKBONE = "checkpoint.safetensors", "squeezenet1_1-b8a52dc0.pth"
+SYNTH = "--cameras 2 --timesteps 7 --size 16x16"
+PREPARE = (
+    "prepare nersemble --root recording --tracking tracking --head head.npz --subjects 901 "
+    "--sequences EMO-1,FREE --downscale 2 --every 1"
+)
 METHODS = ("mean-image", "nearest-camera", "ga", "gbs", "gha", "insta", "ours")
 ITERATIONS = {"budget": {"iterations": 2}}
 SETTINGS = {
@@ -129,7 +136,7 @@ def checkpoint(folder: Path, samples: Path) -> None:
         "tensors": {"means": torch.zeros(4, 3)},
         "moments": [torch.zeros(2), 0.5, "text"],
     }
-    save_checkpoint(folder / "checkpoint.safetensors", "run", state)
+    save_checkpoint(folder / CHECKPOINT, "run", state)
 
 
 def compact(folder: Path, samples: Path) -> None:
@@ -178,7 +185,7 @@ def settings(folder: Path, samples: Path) -> None:
 def weights(folder: Path, samples: Path) -> None:
     """Weights of LPIPS' smallest backbone, drawn at random."""
     torch.manual_seed(0)
-    torch.save(network_spec("squeeze").build().state_dict(), folder / "squeezenet1_1-b8a52dc0.pth")
+    torch.save(network_spec("squeeze").build().state_dict(), folder / BACKBONE)
 
 
 def images(folder: Path, samples: Path) -> None:
@@ -189,10 +196,8 @@ def images(folder: Path, samples: Path) -> None:
 
 def synthetic(folder: Path, samples: Path) -> None:
     """A synthetic capture as `synth` leaves it."""
-    _main("synth", *SYNTH, "--out", str(folder / "synthetic"))
+    _main("synth", *SYNTH.split(), "--out", str(folder / "synthetic"))
 
-
-SYNTH = ("--cameras", "2", "--timesteps", "7", "--size", "16x16")
 
 SAMPLES: dict[str, Callable[[Path, Path], None]] = {
     sample.__name__: sample

@@ -23,9 +23,9 @@ from headbench.methods.shared.checkpoint import load_checkpoint
 from headbench.metrics.weights import load_backbone, network_spec
 
 from .cases import ExitCode
-from .samples import METHODS, SETTINGS, SYNTH
+from .samples import AVATAR, BACKBONE, CHECKPOINT, METHODS, PREPARE, SETTINGS, SYNTH
 
-AVATAR = "run/901/{}/seed-0/avatar"
+EXCLUSIONS = "reviewed/tongue.yaml"
 
 
 @dataclass(frozen=True)
@@ -39,12 +39,12 @@ class Target:
     share: int = 100
 
 
-def command(*words: str) -> Callable[[], None]:
+def command(line: str) -> Callable[[], None]:
     """A call of the command line; a code that is not 0 is raised."""
 
     def call() -> None:
         try:
-            code = cli.main(list(words))
+            code = cli.main(line.split())
         except SystemExit as end:
             code = end.code if isinstance(end.code, int) else 0 if end.code is None else 1
         if code:
@@ -84,146 +84,76 @@ def _sound_clip():
     return _clips[0]
 
 
-def heads(file: str) -> Callable[[], object]:
-    """Load a head model."""
-    return lambda: load_head(file)
-
-
 def colmap(folder: str) -> Callable[[], object]:
     """Read a sparse model and its cameras."""
     return lambda: model_cameras(read_model(folder), distortion="left to the images")
 
 
 RUN = ("run/run.json", "run/rows.parquet")
-CELLS = ("run/run.json", "run/rows.parquet", "run/901/**/*")
-PREPARE = ("prepare", "nersemble", "--root", "recording", "--tracking", "tracking", "--head", "head.npz")
-PREPARE = (
-    *PREPARE,
-    "--subjects",
-    "901",
-    "--sequences",
-    "EMO-1,FREE",
-    "--downscale",
-    "2",
-    "--every",
-    "1",
-    "--out",
-    "out",
-)
-MEAN = ("--methods", "mean-image", "--preset", "smoke", "--set", "metrics=psnr", "--set", "frames_per_task=1")
+CELLS = (*RUN, "run/901/**/*")
+MEAN = "--methods mean-image --preset smoke --set metrics=psnr --set frames_per_task=1"
+GATE = "gate run --baseline baseline.json"
+OURS = AVATAR.format("ours")
+
+
+def reader(
+    name: str,
+    sample: str,
+    read: str | Callable[[], object],
+    files: str | tuple[str, ...] = "**/*",
+    share: int = 100,
+) -> Target:
+    """A target; ``read`` may be a command line, ``files`` one pattern."""
+    call = command(read) if isinstance(read, str) else read
+    return Target(name, sample, call, (files,) if isinstance(files, str) else files, share)
+
 
 TARGETS = [
-    Target("capture", "capture", read_clip, share=3000),
-    Target("capture run", "capture", command("run", "--data", "capture", "--out", "out", *MEAN), share=100),
-    Target("capture lint", "capture", command("lint", "capture"), share=200),
-    Target("capture inspect", "capture", command("inspect", "capture", "--out", "out"), share=60),
-    Target("capture tongue", "capture", command("tongue", "capture", "--out", "out"), share=60),
-    Target("capture steps", "capture", command("steps", "capture", "--out", "out"), share=40),
-    Target("capture colmap", "capture", command("export", "colmap", "capture", "--out", "out"), share=100),
-    Target(
-        "capture refit", "capture", command("refit", "capture", "--target", "2020", "--out", "out"), share=10
+    reader("capture", "capture", read_clip, share=3000),
+    reader("capture run", "capture", f"run --data capture --out out {MEAN}"),
+    reader("capture lint", "capture", "lint capture", share=200),
+    reader("capture inspect", "capture", "inspect capture --out out", share=60),
+    reader("capture tongue", "capture", "tongue capture --out out", share=60),
+    reader("capture steps", "capture", "steps capture --out out", share=40),
+    reader("capture colmap", "capture", "export colmap capture --out out"),
+    reader("capture refit", "capture", "refit capture --target 2020 --out out", share=10),
+    reader("head npz", "heads", lambda: load_head("head.npz"), "head.npz", 800),
+    reader("head eyelids", "heads", lambda: load_head("eyelids.npz"), "eyelids.npz", 200),
+    reader("head flame2023", "heads", lambda: load_head("flame2023.pkl"), "flame2023.pkl", 800),
+    reader("head flame2020", "heads", lambda: load_head("flame2020.pkl"), "flame2020.pkl", 400),
+    reader(
+        "head masks", "heads", lambda: load_head("head.npz", masks="FLAME_masks.pkl"), "FLAME_masks.pkl", 600
     ),
-    Target("head npz", "heads", heads("head.npz"), ("head.npz",), 800),
-    Target("head eyelids", "heads", heads("eyelids.npz"), ("eyelids.npz",), 200),
-    Target("head flame2023", "heads", heads("flame2023.pkl"), ("flame2023.pkl",), 800),
-    Target("head flame2020", "heads", heads("flame2020.pkl"), ("flame2020.pkl",), 400),
-    Target(
-        "head masks",
-        "heads",
-        lambda: load_head("head.npz", masks="FLAME_masks.pkl"),
-        ("FLAME_masks.pkl",),
-        600,
+    reader(
+        "head regions", "heads", lambda: load_head("head.npz", regions="regions.json"), "regions.json", 400
     ),
-    Target(
-        "head regions", "heads", lambda: load_head("head.npz", regions="regions.json"), ("regions.json",), 400
-    ),
-    Target("recording check", "recording", command(*PREPARE, "--check"), share=800),
-    Target("recording", "recording", command(*PREPARE), share=300),
-    Target("videos", "videos", command(*PREPARE), ("recording/**/*",), 200),
-    Target("run table", "run", command("table", "run"), RUN, 1200),
-    Target(
-        "run table cost", "run", command("table", "run", "--layout", "cost", "--format", "html"), RUN, 200
-    ),
-    Target("run compare", "run", command("compare", "run"), RUN, 500),
-    Target("run pareto", "run", command("pareto", "run", "--out", "out"), RUN, 300),
-    Target(
-        "run gate",
-        "baseline",
-        command("gate", "run", "--baseline", "baseline.json"),
-        (*RUN, "baseline.json"),
-        500,
-    ),
-    Target(
-        "baseline", "baseline", command("gate", "run", "--baseline", "baseline.json"), ("baseline.json",), 800
-    ),
-    Target("run verify", "run", command("verify", "run"), CELLS, 200),
-    Target("run extremes", "run", command("extremes", "run", "--views", "1", "--dimensions", "1"), CELLS, 30),
-    Target("run sweep", "run", command("sweep", "run", "--methods", "ga", "--variants", "half"), CELLS, 20),
-    Target("run reenact", "two_subjects", command("reenact", "run", "--frames", "1"), share=30),
-    Target("run continued", "run", command("run", "--config", "config.json"), CELLS, 150),
-    Target(
-        "images",
-        "images",
-        command("evaluate", "images", "--like", "run", "--out", "out", "--label", "theirs"),
-        ("images/**/*",),
-        200,
-    ),
-    *(
-        Target(f"avatar {name}", "run", draw(name, AVATAR.format(name)), (f"{AVATAR.format(name)}/*",), 600)
-        for name in METHODS
-    ),
-    Target("avatar compact", "compact", draw("ours", "avatar"), ("avatar/*",), 1000),
-    Target(
-        "avatar export",
-        "run",
-        command("export", "ply", AVATAR.format("ours"), "--out", "out.ply", "--capture", "capture"),
-        (f"{AVATAR.format('ours')}/*",),
-        100,
-    ),
-    Target(
-        "avatar to compact",
-        "run",
-        command("compact", AVATAR.format("ours"), "--out", "out"),
-        ("run/901/ours/**/*",),
-        100,
-    ),
-    Target(
-        "ply",
-        "ply",
-        command("import", "ga", "point_cloud.ply", "--capture", "capture", "--out", "out"),
-        ("point_cloud.ply",),
-        500,
-    ),
-    Target("colmap bin", "colmap", colmap("bin"), ("bin/sparse/**/*",), 800),
-    Target("colmap txt", "colmap", colmap("txt"), ("txt/sparse/**/*",), 800),
-    Target(
-        "exclusions",
-        "exclusions",
-        lambda: read_exclusions(Path("reviewed/tongue.yaml")),
-        ("reviewed/tongue.yaml",),
-        700,
-    ),
-    Target(
-        "exclusions tongue",
-        "exclusions",
-        command("tongue", "capture", "--out", "reviewed"),
-        ("reviewed/tongue.yaml",),
-        60,
-    ),
-    Target("settings", "settings", command("run", "--config", "config.yaml"), share=600),
-    Target("settings yaml", "settings", lambda: read_yaml(Path("config.yaml")), share=500),
-    Target(
-        "checkpoint",
-        "checkpoint",
-        lambda: load_checkpoint(Path("checkpoint.safetensors"), "run", "cpu"),
-        share=700,
-    ),
-    Target(
-        "weights",
-        "weights",
-        lambda: load_backbone(network_spec("squeeze"), Path("squeezenet1_1-b8a52dc0.pth")),
-        share=200,
-    ),
-    Target("synthetic", "synthetic", command("synth", *SYNTH, "--out", "synthetic"), share=6),
+    reader("recording check", "recording", f"{PREPARE} --out out --check", share=800),
+    reader("recording", "recording", f"{PREPARE} --out out", share=300),
+    reader("videos", "videos", f"{PREPARE} --out out", "recording/**/*", 200),
+    reader("run table", "run", "table run", RUN, 1200),
+    reader("run table cost", "run", "table run --layout cost --format html", RUN, 200),
+    reader("run compare", "run", "compare run", RUN, 500),
+    reader("run pareto", "run", "pareto run --out out", RUN, 300),
+    reader("run gate", "baseline", GATE, (*RUN, "baseline.json"), 500),
+    reader("baseline", "baseline", GATE, "baseline.json", 800),
+    reader("run verify", "run", "verify run", CELLS, 200),
+    reader("run extremes", "run", "extremes run --views 1 --dimensions 1", CELLS, 30),
+    reader("run sweep", "run", "sweep run --methods ga --variants half", CELLS, 20),
+    reader("run reenact", "two_subjects", "reenact run --frames 1", share=30),
+    reader("run continued", "run", "run --config config.json", CELLS, 150),
+    reader("images", "images", "evaluate images --like run --out out --label theirs", "images/**/*", 200),
+    *(reader(f"avatar {m}", "run", draw(m, AVATAR.format(m)), f"{AVATAR.format(m)}/*", 600) for m in METHODS),
+    reader("avatar compact", "compact", draw("ours", "avatar"), "avatar/*", 1000),
+    reader("avatar export", "run", f"export ply {OURS} --out out.ply --capture capture", f"{OURS}/*"),
+    reader("avatar to compact", "run", f"compact {OURS} --out out", "run/901/ours/**/*"),
+    reader("ply", "ply", "import ga point_cloud.ply --capture capture --out out", "point_cloud.ply", 500),
+    reader("colmap bin", "colmap", colmap("bin"), "bin/sparse/**/*", 800),
+    reader("colmap txt", "colmap", colmap("txt"), "txt/sparse/**/*", 800),
+    reader("exclusions", "exclusions", lambda: read_exclusions(Path(EXCLUSIONS)), EXCLUSIONS, 700),
+    reader("exclusions tongue", "exclusions", "tongue capture --out reviewed", EXCLUSIONS, 60),
+    reader("settings", "settings", "run --config config.yaml", share=600),
+    reader("settings yaml", "settings", lambda: read_yaml(Path("config.yaml")), share=500),
+    reader("checkpoint", "checkpoint", lambda: load_checkpoint(Path(CHECKPOINT), "run", "cpu"), share=700),
+    reader("weights", "weights", lambda: load_backbone(network_spec("squeeze"), Path(BACKBONE)), share=200),
+    reader("synthetic", "synthetic", f"synth {SYNTH} --out synthetic", share=6),
 ]
-BY_NAME = {target.name: target for target in TARGETS}

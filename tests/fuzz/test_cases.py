@@ -59,11 +59,7 @@ READERS = {
     "spins": (spin, {"finding"}, "TooSlow"),
     "dies": (lambda: os.kill(os.getpid(), signal.SIGKILL), {"finding"}, "signal 9"),
     "exits": (lambda: sys.exit(3), {"finding"}, "SystemExit"),
-    "writes outside": (
-        lambda: Path("../outside/x").write_text(""),
-        {"finding"},
-        "wrote outside: open /",
-    ),
+    "writes outside": (lambda: Path("../outside/x").write_text(""), {"finding"}, "wrote outside: open /"),
     "makes a folder": (lambda: Path("../outside/x").mkdir(), {"finding"}, "wrote outside: os.mkdir"),
     "writes inside": (lambda: Path("x").write_text(""), {"accepted"}, ""),
 }

@@ -59,9 +59,9 @@ COMMANDS = {
 @pytest.mark.parametrize("name", COMMANDS)
 def test_what_a_command_leaves_is_found(name, tmp_path, monkeypatch):
     command, expected = COMMANDS[name]
-    monkeypatch.setattr(kills, "_call", lambda words: command() or 0)
+    monkeypatch.setattr(kills, "_call", lambda line: command() or 0)
     (tmp_path / "sample").mkdir()
-    tried = kills.Kills(kills.Writer(name, "sample", ()), tmp_path, 0)
+    tried = kills.Kills(kills.Writer(name, "sample", ""), tmp_path, 0)
     while tried.waiting:
         tried.kill(tried.waiting.pop(0))
     assert tried.done == tried.changes > 0

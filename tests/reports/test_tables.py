@@ -131,11 +131,7 @@ def test_the_caption_tells_protocol_frames_and_size(make_rows, metrics):
 
 
 @settings(deadline=None, max_examples=40)
-@given(
-    st.lists(st.floats(0, 50), min_size=2, max_size=6),
-    st.booleans(),
-    st.integers(0, 3),
-)
+@given(st.lists(st.floats(0, 50), min_size=2, max_size=6), st.booleans(), st.integers(0, 3))
 def test_ranks_agree_with_a_count_of_better_displayed_values(values, higher, digits):
     metric = MetricSpec("m", "M", "", higher, digits, "m:m")
     names = [f"method{i}" for i in range(len(values))]
