@@ -5,11 +5,13 @@ import pandas as pd
 import pytest
 
 from headbench.bench.manifest import Manifest, MethodRecord, ProtocolRecord
-from headbench.bench.rows import Row, Rows
+from headbench.bench.rows import Rows
 from headbench.bench.runner import run as runner
 from headbench.bench.runner.config import RunConfig
 from headbench.bench.runner.store import RunFolder
 from headbench.bench.specs import MetricSpec
+
+from .made_rows import avatar_row, row
 
 PSNR = MetricSpec("psnr", "PSNR", "dB", True, 2, "m:psnr")
 LPIPS = MetricSpec("lpips", "LPIPS", "", False, 3, "m:lpips")
@@ -35,11 +37,11 @@ def make_rows():
         for (method, value), seed in itertools.product(values.items(), seeds):
             for task, frame, metric in itertools.product(tasks, frames, ("psnr", "lpips")):
                 number = value(metric, seed, *frame) if callable(value) else value
-                place = (method, "1", seed, task, *frame, "full", metric)
-                rows.append(Row(*place, number, f"hash-{task}"))
-            for subject in ("s1", "s2"):
-                number = (size or {}).get(method, 1.0)
-                rows.append(Row(method, "1", seed, "", subject, "", -1, "", "full", "size", number, ""))
+                rows.append(
+                    row(method, metric, number, *frame, seed=seed, task=task, protocol=f"hash-{task}")
+                )
+            number = (size or {}).get(method, 1.0)
+            rows += [avatar_row(method, "size", number, subject, seed=seed) for subject in ("s1", "s2")]
         return pd.DataFrame(rows)
 
     return make
@@ -79,21 +81,10 @@ def toy(monkeypatch):
 
 
 @pytest.fixture
-def toy_run(toy, tmp_path, monkeypatch):
+def toy_run(make_run):
     """The folder of a finished run: a good method, one that fails, a metric that is not available."""
-    monkeypatch.setattr(runner, "write_reports", lambda folder: [])
-    for subject in ("subject1", "subject2"):
-        (tmp_path / "data" / subject).mkdir(parents=True)
-    config = RunConfig(
-        data=str(tmp_path / "data"),
-        out=str(tmp_path / "out"),
-        methods=("toy_plugin:METHOD", "toy_plugin:FAILING"),
-        metrics=("toy_plugin:ERROR", "toy_plugin:NOT_HERE", "toy_plugin:FILES"),
-        reader="toy_plugin:READER",
-        preset="smoke",
-    )
-    runner.run(config)
-    return tmp_path / "out"
+    metrics = ("toy_plugin:ERROR", "toy_plugin:NOT_HERE", "toy_plugin:FILES")
+    return make_run("out", methods=("toy_plugin:METHOD", "toy_plugin:FAILING"), metrics=metrics)
 
 
 @pytest.fixture
@@ -126,17 +117,12 @@ def write_run(tmp_path, write_manifest):
 
     def write(name, methods, settings=None):
         folder = RunFolder(tmp_path / name)
+        of_avatar = ("storage", "fps")
         specs = [
             MetricSpec(
-                metric,
-                metric.upper(),
-                "",
-                metric not in ("lpips", "storage"),
-                4,
-                "m:m",
-                per_frame=metric not in ("storage", "fps"),
+                m, m.upper(), "", m not in ("lpips", "storage"), 4, "m:m", per_frame=m not in of_avatar
             )
-            for metric in lines
+            for m in lines
         ]
         tasks = ("novel_view", "self_reenactment")
         write_manifest(
@@ -150,10 +136,11 @@ def write_run(tmp_path, write_manifest):
         for (method, level), subject, spec in itertools.product(methods.items(), "abcd", specs):
             offset, slope = lines[spec.name]
             number = offset + slope * level
-            for task in tasks if spec.per_frame else ("",):
-                place = (subject, "EMO", 0, "c") if task else (subject, "", -1, "")
-                protocol = f"hash-{task}" if task else ""
-                rows.append(Row(method, "1", 0, task, *place, "full", spec.name, number, protocol))
+            if spec.per_frame:
+                places = [{"task": task, "protocol": f"hash-{task}"} for task in tasks]
+                rows += [row(method, spec.name, number, subject, **place) for place in places]
+            else:
+                rows.append(avatar_row(method, spec.name, number, subject))
         Rows.of(rows).write(folder.rows)
         return folder.root
 

@@ -12,7 +12,7 @@ def labels(table):
     return [row.method for row in table.rows]
 
 
-def test_paper_1_shows_every_method_in_the_papers_words_and_ours_last(write_run):
+def test_paper_1_shows_every_method_and_ours_last(write_run):
     folder = write_run("a", {"ours": 33.0, "mine": 32.0, "ga": 31.0, "insta": 28.0, "mean-image": 17.0})
     table = table_of(RunSet.read([folder]), "paper-1")
     assert labels(table) == ["INSTA", "GaussianAvatars", "mine", "Ours"]
@@ -29,7 +29,7 @@ def test_paper_1_shows_every_method_in_the_papers_words_and_ours_last(write_run)
     assert table.rows[-1].cells[0].text == "33.00"
 
 
-def test_paper_3_compares_insta_and_ours_with_published_columns_apart(write_run):
+def test_paper_3_compares_insta_and_ours(write_run):
     folder = write_run("a", {"ours": 33.0, "ga": 31.0, "insta": 28.0}, {"ours": OPACITY})
     table = table_of(RunSet.read([folder]), "paper-3", published=True)
     assert labels(table) == ["INSTA", "Ours"]
@@ -56,7 +56,7 @@ def test_paper_4_puts_settings_of_ours_from_runs_side_by_side(write_run):
     assert [c.text for c in second] == ["36.39", "0.97", "0.018", "30.97", "0.96", "0.030"]
 
 
-def test_another_setting_of_a_method_is_not_given_the_papers_figures(write_run):
+def test_other_settings_are_not_given_the_papers_figures(write_run):
     folder = write_run("a", {"ours": 33.0, "insta": 28.0}, {"ours": {"dynamic": ["color"]}})
     table = table_of(RunSet.read([folder]), "paper-3", published=True)
     assert {c.status for c in table.rows[1].cells[1::2]} == {"none"}

@@ -44,7 +44,7 @@ def test_settings_too_long_for_a_label_give_way_to_the_folder(make_run):
     assert RunSet.read([first, second]).methods == ("toy (a)", "toy (b)")
 
 
-def test_the_same_training_twice_is_refused_unless_it_is_another_run(make_run):
+def test_the_same_training_twice_is_refused(make_run):
     first, second = make_run("a"), make_run("b")
     assert RunSet.read([first, second]).methods == ("toy (a)", "toy (b)")
     with pytest.raises(InputError, match="each training once"):

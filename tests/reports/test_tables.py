@@ -5,9 +5,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from headbench.bench.errors import InputError
-from headbench.bench.rows import Row, Rows
+from headbench.bench.rows import Rows
 from headbench.bench.specs import MetricSpec
 from headbench.reports.tables import build_table
+
+from .made_rows import row
 
 
 def ranks(table, task, metric):
@@ -31,20 +33,6 @@ def test_columns_are_tasks_then_the_avatar(make_rows, metrics):
     ]
 
 
-def test_direction_decides_the_rank(make_rows, metrics):
-    table = build_table(Rows(make_rows({"a": 1.0, "b": 3.0, "c": 2.0})), metrics, ["a", "b", "c"])
-    assert ranks(table, "novel_view", "psnr") == {"a": 3, "b": 1, "c": 2}
-    assert ranks(table, "novel_view", "lpips") == {"a": 1, "b": 3, "c": 2}
-
-
-def test_values_that_look_equal_share_a_rank(make_rows, metrics):
-    values = {"a": 30.004, "b": 29.996, "c": 29.99, "d": 12.0}
-    table = build_table(Rows(make_rows(values)), metrics, list(values))
-    assert [cell(table, m, "novel_view", "psnr").text for m in "abc"] == ["30.00", "30.00", "29.99"]
-    assert ranks(table, "novel_view", "psnr") == {"a": 1, "b": 1, "c": 2, "d": 3}
-    assert cell(table, "a", "novel_view", "psnr").value == pytest.approx(30.004)
-
-
 def test_a_floor_is_listed_apart_and_never_ranked(make_rows, metrics):
     values = {"floor": 99.0, "a": 1.0, "b": 2.0}
     table = build_table(Rows(make_rows(values)), metrics, list(values), trivial=["floor"])
@@ -66,33 +54,9 @@ def test_missing_and_failed_cells_say_why_and_are_not_ranked(make_rows, metrics)
     lpips = rows["metric"] == "lpips"
     rows.loc[lpips, ["status", "value", "reason"]] = ["missing", np.nan, "No weights. Put them there."]
     rows = rows[rows["method"] != "c"]
-    failed = [
-        Row(
-            "c",
-            "1",
-            0,
-            task,
-            subject,
-            "",
-            -1,
-            "",
-            "full",
-            metric,
-            np.nan,
-            protocol,
-            "failed",
-            "RuntimeError: diverged",
-        )
-        for subject in ("s1", "s2")
-        for task, metric, protocol in [
-            ("novel_view", "psnr", "hash-novel_view"),
-            ("novel_view", "lpips", "hash-novel_view"),
-            ("self_reenactment", "psnr", "hash-self_reenactment"),
-            ("self_reenactment", "lpips", "hash-self_reenactment"),
-            ("", "size", ""),
-        ]
-    ]
-    rows = pd.concat([rows, pd.DataFrame(failed)], ignore_index=True)
+    given = {"value": np.nan, "status": "failed", "reason": "RuntimeError: diverged"}
+    failed = make_rows({"c": 0.0}).assign(**given)
+    rows = pd.concat([rows, failed], ignore_index=True)
     table = build_table(Rows(rows), metrics, ["a", "b", "c", "d"])
     absent = cell(table, "a", "novel_view", "lpips")
     assert (absent.text, absent.rank, table.notes[absent.note]) == ("–", None, "No weights. Put them there.")
@@ -135,21 +99,19 @@ def test_the_caption_tells_protocol_frames_and_size(make_rows, metrics):
 def test_ranks_agree_with_a_count_of_better_displayed_values(values, higher, digits):
     metric = MetricSpec("m", "M", "", higher, digits, "m:m")
     names = [f"method{i}" for i in range(len(values))]
-    rows = pd.DataFrame(
-        Row(n, "1", 0, "novel_view", "s", "q", 0, "a", "full", "m", v, "h") for n, v in zip(names, values)
-    )
+    rows = pd.DataFrame(row(n, "m", v) for n, v in zip(names, values))
     table = build_table(Rows(rows), [metric], names)
     shown = [float(f"{v:.{digits}f}") for v in values]
-    for row, own in zip(table.rows, shown):
+    for line, own in zip(table.rows, shown):
         better = {other for other in shown if (other > own if higher else other < own)}
-        assert row.cells[0].rank == 1 + len(better)
+        assert line.cells[0].rank == 1 + len(better)
 
 
 def many_subjects(methods, subjects=9, seeds=(0,), spread=0.0):
     """Rows of methods at levels, each subject and method a little off; ``spread`` moves whole seeds."""
     generator = np.random.default_rng(1)
     return pd.DataFrame(
-        Row(m, "1", seed, "novel_view", f"s{s}", "q", t, "a", "full", "m", level + noise + spread * seed, "h")
+        row(m, "m", level + noise + spread * seed, f"s{s}", timestep=t, seed=seed)
         for m, level in methods.items()
         for s in range(subjects)
         for noise in [generator.normal(0, 0.2)]
@@ -171,7 +133,7 @@ def test_all_that_cannot_be_told_from_the_best_are_marked_best():
     assert "third italic" in table.caption
 
 
-def test_with_few_subjects_the_digits_alone_decide_and_the_caption_says_so():
+def test_with_few_subjects_the_digits_alone_decide():
     levels = {"a": 30.0, "b": 30.5, "c": 28.0, "d": 25.0}
     table = build_table(Rows(many_subjects(levels, 5)), [METRIC], list(levels))
     assert sorted(ranks(table, "novel_view", "m").values()) == [1, 2, 3, 4]

@@ -55,7 +55,7 @@ def test_variants_are_scored_like_the_run_itself(finished, toy):
     assert derived["varying+dark"] == {"from": "varying", "variant": "dark", "change": "level 0.25"}
 
 
-def test_only_what_is_asked_for_is_derived_and_frames_can_be_fewer(finished, toy):
+def test_only_the_named_variants_and_frames_are_measured(finished, toy):
     rows = swept(finished, variants=("light",), frames=1)
     assert set(rows["method"]) == {"varying", "varying+light"}
     assert set(toy.MADE) == {0.75}

@@ -147,7 +147,7 @@ def test_the_own_look_stays_near_whatever_pose_and_expression(globe, look, rotat
     assert value(look, globe, pose) < 2.0
 
 
-def test_another_persons_look_is_far_and_swapping_subjects_makes_both_worse(globe, look):
+def test_another_persons_look_is_far_for_both_subjects(globe, look):
     other = Globe("dark", dark)
     others = Look.recorded(other, "c", 12)
     pose = posed("fair", [0, 0.2, 0])
@@ -168,7 +168,7 @@ def test_an_uncoloured_avatar_is_worse_the_further_it_goes(globe, look):
     assert differences[2] > differences[0] + 3
 
 
-def test_recordings_tell_what_the_number_is_without_and_with_a_full_exchange(globe, look):
+def test_recordings_of_the_subject_are_near_and_others_far(globe, look):
     other = Globe("dark", dark)
     assert of_recording(look, globe, globe.splits["self_reenactment"], 12) < 2.0
     assert of_recording(look, other, other.splits["self_reenactment"], 12) > 10.0

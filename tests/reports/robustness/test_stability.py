@@ -60,13 +60,13 @@ def test_the_share_of_values_that_are_no_numbers():
         ([[0, 0, 1]], 0.01, 0.0),  # not to be seen
     ],
 )
-def test_the_largest_splat_is_the_pinhole_projection_of_three_deviations(means, opacity, expected):
+def test_the_largest_splat_is_three_deviations_projected(means, opacity, expected):
     found = measure(frame(np.ones((20, 40))), CAMERA, splats(means, opacity=opacity))
     assert found.largest_splat == pytest.approx(expected, rel=1e-5)
     assert found.mean_opacity == pytest.approx(opacity)
 
 
-def test_a_splat_whose_middle_is_off_screen_counts_where_it_reaches_in():
+def test_a_splat_that_reaches_into_the_image_counts():
     near = splats([[0.45, 0, 1]], radius=0.1)  # 2.5 px beyond the border, radius 5 px
     assert measure(frame(np.ones((20, 40))), CAMERA, near).largest_splat == pytest.approx(5 / 20, rel=1e-5)
 
@@ -99,7 +99,7 @@ def test_each_limit_holds_on_one_side_and_breaks_on_the_other(changes, expected)
     assert broken(**changes) == expected
 
 
-def test_verdicts_stand_in_the_order_of_the_measures_and_skip_what_cannot_be_measured():
+def test_what_cannot_be_measured_breaks_no_limit():
     verdicts = judge(Measures(0.0, 100.0, 0.2), Measures(0.0, 100.0, 0.2), Limits())
     assert tuple(v.measure for v in verdicts) == MEASURES
     assert [v.value is None for v in verdicts] == [False, False, False, True, True]

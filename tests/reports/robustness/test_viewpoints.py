@@ -37,7 +37,7 @@ def test_looking_at_a_point_puts_it_on_the_axis_and_up_upwards():
     assert np.isclose(above[0], 0)
 
 
-def test_views_step_evenly_from_beyond_one_end_to_beyond_the_other():
+def test_views_step_evenly_beyond_both_ends():
     rig = [camera(a) for a in (40, -60, 0, 80)]
     views = turntable(rig, CENTER, 11, 30.0)
     assert np.allclose([azimuth_of(v) for v in views], np.linspace(-90, 110, 11))
@@ -45,7 +45,7 @@ def test_views_step_evenly_from_beyond_one_end_to_beyond_the_other():
     assert all(np.isclose(np.linalg.norm(v.camera.center - CENTER), 1.0) for v in views)
 
 
-def test_a_view_at_a_training_camera_has_its_place_distance_and_focal_lengths():
+def test_a_view_at_a_training_camera_is_that_camera():
     rig = [camera(-20, 10, 1.0), camera(0, -5, 1.4), camera(30, 20, 0.8)]
     start, *_, end = turntable(rig, CENTER, 5, 0.0)
     assert np.allclose(start.camera.center, rig[0].center)

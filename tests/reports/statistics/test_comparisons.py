@@ -1,12 +1,17 @@
+import itertools
+
 import numpy as np
 import pandas as pd
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import stats
 
-from headbench.bench.rows import Row, Rows
+from headbench.bench.rows import Rows
 from headbench.reports.statistics import comparisons
-from headbench.reports.statistics.comparisons import best_set, holm
+from headbench.reports.statistics.comparisons import best_set, holm, least_p, sign_flip_p, subjects_needed
+
+from ..made_rows import avatar_row, row
 
 LEVELS = {"low": 20.0, "middle": 20.5, "high": 25.0}
 
@@ -16,24 +21,11 @@ def compare(rows, pairs, task, metric, *, higher_is_better):
     return comparisons.compare(Rows(rows), pairs, **what, higher_is_better=higher_is_better)
 
 
-def rows_of(subjects, methods=LEVELS, metric="psnr", task="novel_view"):
+def rows_of(subjects, methods=LEVELS, metric="psnr"):
     """Each method at its level, give or take a fixed pattern of 0.1 that no two subjects share."""
     generator = np.random.default_rng(0)
     return pd.DataFrame(
-        Row(
-            method,
-            "1",
-            0,
-            task,
-            f"s{s:02}",
-            "EMO",
-            t,
-            "a",
-            "full",
-            metric,
-            level + generator.normal(0, 0.1),
-            "h",
-        )
+        row(method, metric, level + generator.normal(0, 0.1), f"s{s:02}", timestep=t)
         for method, level in methods.items()
         for s in range(subjects)
         for t in range(4)
@@ -91,7 +83,7 @@ def test_no_difference_cannot_be_told():
     assert found.low < 0 < found.high
 
 
-def test_an_incomplete_method_is_not_compared_and_does_not_count_in_the_family():
+def test_an_incomplete_method_does_not_count_in_the_family():
     rows = rows_of(9)
     rows = rows.drop(rows[(rows["method"] == "low")].index[0])
     found = compare(rows, [("high", "low"), ("high", "middle")], "novel_view", "psnr", higher_is_better=True)
@@ -102,7 +94,7 @@ def test_an_incomplete_method_is_not_compared_and_does_not_count_in_the_family()
 
 def test_values_of_the_avatar_are_compared_too():
     rows = pd.DataFrame(
-        Row(method, "1", seed, "", f"s{s}", "", -1, "", "full", "size", level + s, "")
+        avatar_row(method, "size", level + s, f"s{s}", seed=seed)
         for method, level in (("a", 1.0), ("b", 3.0))
         for s in range(7)
         for seed in (0, 1)
@@ -119,7 +111,7 @@ def means_of(rows):
     return {method: means[method].to_dict() for method in LEVELS}
 
 
-def test_the_best_are_those_that_nothing_is_told_to_be_better_than():
+def test_the_best_are_those_that_nothing_is_better_than():
     means = means_of(rows_of(9, {"low": 20.0, "middle": 25.0, "high": 25.0}))
     assert best_set(means, higher_is_better=True).methods == {"middle", "high"}
     assert best_set(means, higher_is_better=False).methods == {"low"}
@@ -155,3 +147,93 @@ def test_the_set_holds_the_highest_mean_and_leaves_out_by_holm(methods, subjects
         ]
         better = [(values[j].mean() > values[i].mean()) == higher for j in others]
         assert (str(i) not in found) == any(p <= 0.05 and b for p, b in zip(holm(p_values), better))
+
+
+differences = st.lists(st.integers(-50, 50), min_size=1, max_size=8)
+
+
+@given(differences)
+def test_equals_the_enumeration_of_all_assignments(values):
+    # Whole numbers: sums are exact, so that ties are decided without a tolerance.
+    observed = abs(sum(values))
+    sums = [
+        sum(s * v for s, v in zip(signs, values)) for signs in itertools.product((1, -1), repeat=len(values))
+    ]
+    assert sign_flip_p(values) == pytest.approx(np.mean([abs(total) >= observed for total in sums]))
+
+
+def test_equals_scipys_permutation_test():
+    values = np.random.default_rng(3).normal(0.3, 1, 11)
+    expected = stats.permutation_test(
+        (values,), np.mean, permutation_type="samples", n_resamples=np.inf, vectorized=True
+    )
+    assert sign_flip_p(values) == pytest.approx(expected.pvalue)
+
+
+@given(differences, st.floats(1e-6, 1e6))
+def test_neither_unit_nor_direction_matters(values, scale):
+    assert sign_flip_p(np.array(values) * scale) == sign_flip_p(values) == sign_flip_p([-v for v in values])
+
+
+@pytest.mark.parametrize(("subjects", "p"), [(5, 0.0625), (6, 0.03125), (9, 0.00390625), (10, 0.001953125)])
+def test_the_least_p_is_that_of_differences_of_one_sign(subjects, p):
+    assert least_p(subjects) == sign_flip_p(np.arange(1, subjects + 1)) == p
+
+
+def test_assignments_of_many_subjects_are_drawn(monkeypatch):
+    values = np.random.default_rng(0).normal(0.1, 1, 80)
+    drawn = sign_flip_p(values)
+    normal = 2 * stats.norm.sf(abs(values.sum()) / np.sqrt((values**2).sum()))
+    assert drawn == pytest.approx(normal, abs=0.01)
+    assert sign_flip_p(np.ones(80)) == least_p(80) > 0
+    monkeypatch.setattr(comparisons, "EXACT_UP_TO", 5)
+    assert sign_flip_p(values[:12]) == pytest.approx(_exact(values[:12]), abs=0.005)
+
+
+def _exact(values):
+    signs = np.array(list(itertools.product((1, -1), repeat=len(values))))
+    return np.mean(np.abs(signs @ values) >= abs(values.sum()) - 1e-9)
+
+
+def test_nothing_and_no_difference_reject_nothing():
+    assert sign_flip_p([]) == sign_flip_p([0.0] * 9) == least_p(0) == 1
+    with pytest.raises(ValueError, match="finite"):
+        sign_flip_p([1.0, np.nan])
+
+
+@pytest.mark.parametrize(("comparisons", "subjects"), [(1, 6), (4, 8), (10, 9), (15, 10)])
+def test_the_subjects_that_a_family_needs(comparisons, subjects):
+    assert subjects_needed(0.05, comparisons) == subjects
+    assert comparisons * least_p(subjects) <= 0.05 < comparisons * least_p(subjects - 1)
+
+
+p_values = st.lists(st.floats(0, 1), min_size=1, max_size=7)
+
+
+def rejected_step_by_step(values, level):
+    """Holm's own description: go on from the least p-value while it is at most the level over those left."""
+    rejected = set()
+    for done, index in enumerate(sorted(range(len(values)), key=values.__getitem__)):
+        if values[index] * (len(values) - done) > level:
+            break
+        rejected.add(index)
+    return rejected
+
+
+@given(p_values, st.sampled_from([0.01, 0.05, 0.1]))
+def test_rejects_what_the_sequential_procedure_rejects(values, level):
+    adjusted = holm(values)
+    assert {i for i, p in enumerate(adjusted) if p <= level} == rejected_step_by_step(values, level)
+
+
+@given(p_values)
+def test_lies_between_p_and_bonferroni_and_keeps_the_order(values):
+    adjusted = np.array(holm(values))
+    assert (adjusted >= values).all()
+    assert (adjusted <= np.minimum(1, len(values) * np.array(values))).all()
+    assert (np.diff(adjusted[np.argsort(values, kind="stable")]) >= 0).all()
+
+
+def test_an_example_by_hand():
+    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert holm([]) == []

@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 from PIL import Image
@@ -20,6 +22,7 @@ from headbench.bench.runner.store import RunFolder
 from headbench.bench.specs import MetricSpec
 from headbench.reports.pareto.command import run
 from headbench.reports.pareto.plot import Panel, label_points, write_plot
+from headbench.reports.pareto.points import pareto_front
 from headbench.reports.pareto.settings import ParetoSettings
 
 METRICS = [
@@ -111,7 +114,7 @@ def test_an_unknown_task_or_metric_is_refused(make_run, tmp_path, changes):
         run(ParetoSettings((make_run("r", ours=(1.0, 1.0, 1.0, 1.0)),), str(tmp_path / "out"), **changes))
 
 
-def test_frame_time_is_the_metric_asked_for_and_the_median_before_the_mean_rate(make_run, tmp_path):
+def test_frame_time_is_the_named_metric_or_else_the_median(make_run, tmp_path):
     folder = make_run("r", ours=(28.0, 0.1, 1.0, 200.0))
     with pytest.raises(InputError, match="metric in ms: none"):
         run(ParetoSettings((folder,), str(tmp_path / "out"), time="processor_time"))
@@ -154,9 +157,24 @@ def test_labels_touch_neither_points_nor_each_other():
         assert not one.overlaps(other)
 
 
-def test_a_plot_without_a_measured_cost_says_so_and_names_are_literal(tmp_path):
+def test_a_plot_without_measured_costs_is_drawn(tmp_path):
     panel = Panel("ms", [None], [20.0], [], ["a$b_$"], ["$x"], {"a$b_$": []})
     measured = Panel("MB", [1.0], [20.0], [0], ["a$b_$"], ["$x"], {"a$b_$": [0]})
     write_plot(tmp_path / "plot.png", [measured, panel], "PSNR", "here")
     width, height = Image.open(tmp_path / "plot.png").size
     assert width > 2 * height
+
+
+SMALL = st.integers(0, 6)  # many ties
+
+
+def beaten(point, others):
+    return any(c <= point[0] and q >= point[1] and (c, q) != point for c, q in others)
+
+
+@given(st.lists(st.tuples(SMALL, SMALL), max_size=25))
+def test_the_front_is_what_no_other_point_beats(points):
+    front = pareto_front([c for c, _ in points], [q for _, q in points])
+    assert set(front) == {i for i, point in enumerate(points) if not beaten(point, points)}
+    assert len(front) == len(set(front))
+    assert [points[i][0] for i in front] == sorted(points[i][0] for i in front)

@@ -1,5 +1,6 @@
 import csv
 import io
+import itertools
 import json
 
 import pandas as pd
@@ -7,11 +8,13 @@ import pytest
 
 from headbench.bench import cli
 from headbench.bench.errors import InputError
-from headbench.bench.rows import Row, Rows
+from headbench.bench.rows import Rows
 from headbench.bench.runner.store import RunFolder
 from headbench.bench.specs import MetricSpec
 from headbench.reports.comparison.command import run
 from headbench.reports.comparison.settings import CompareSettings
+
+from ..made_rows import avatar_row, row
 
 SUBJECTS = 7
 ERRORS = {"good": 1.0, "bad": 3.0, "floor": 9.0}
@@ -34,32 +37,18 @@ def folder(tmp_path, write_manifest):
         trivial=("floor",),
     )
     rows = [
-        Row(
-            name,
-            "1",
-            seed,
-            task,
-            f"s{s}",
-            "EMO",
-            0,
-            "a",
-            "full",
-            "error",
-            level * (1 + s / 10) + seed,
-            f"hash-{task}",
-        )
-        for name, level in ERRORS.items()
-        for s in range(SUBJECTS)
-        for seed in seeds
-        for task in tasks
-    ]
-    rows += [
-        Row(name, "1", seed, "", f"s{s}", "", -1, "", "full", "size", 2.0, "")
-        for name in ERRORS
+        [
+            *(
+                row(n, "error", level * (1 + s / 10) + seed, f"s{s}", seed=seed, task=t, protocol=f"hash-{t}")
+                for t in tasks
+            ),
+            avatar_row(n, "size", 2.0, f"s{s}", seed=seed),
+        ]
+        for n, level in ERRORS.items()
         for s in range(SUBJECTS)
         for seed in seeds
     ]
-    Rows.of(rows).write(folder.rows)
+    Rows.of(itertools.chain(*rows)).write(folder.rows)
     return folder.root
 
 
