@@ -1,4 +1,4 @@
-"""The README keeps its word: its links lead somewhere, its example is a method, its commands exist."""
+"""README and pages: links lead somewhere, commands exist, the CI example fits, the table is generated."""
 
 import re
 import subprocess
@@ -12,13 +12,18 @@ from headbench.bench.cli import COMMANDS
 from headbench.bench.registry import discover
 
 ROOT = Path(__file__).parents[1]
+PACKAGES = ("bench", "datasets", "methods", "metrics", "reports")
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-LINKS = [link for link in re.findall(r"\]\(([^)#]+)\)", README) if "://" not in link]
+PAGES = [
+    ROOT / "README.md",
+    *(path for name in PACKAGES for path in sorted((ROOT / name).rglob("README.md"))),
+]
 
 
-@pytest.mark.parametrize("link", LINKS)
-def test_links_lead_somewhere(link):
-    assert (ROOT / link).exists()
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_lead_somewhere(page):
+    links = re.findall(r"\]\(([^)#]+)\)", page.read_text(encoding="utf-8"))
+    assert [link for link in links if "://" not in link and not (page.parent / link).exists()] == []
 
 
 def test_the_commands_are_those_of_the_command_line():
@@ -30,7 +35,8 @@ def test_the_commands_are_those_of_the_command_line():
 
 
 def test_the_ci_example_installs_from_checkouts():
-    block = re.search(r"```yaml\n(# \.github/workflows.*?)```", README, re.DOTALL)
+    page = (ROOT / "bench" / "README.md").read_text(encoding="utf-8")
+    block = re.search(r"```yaml\n(# \.github/workflows.*?)```", page, re.DOTALL)
     steps = yaml.safe_load(block[1])["jobs"]["quality"]["steps"]
     checked_out = {
         step.get("with", {}).get("path", ".") for step in steps if "checkout" in step.get("uses", "")
