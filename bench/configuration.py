@@ -14,6 +14,7 @@ from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 from .errors import InputError
 from .io.documents import parse_setting, shown
 from .registry import unknown
+from .specs import Renamed
 
 T = TypeVar("T")
 
@@ -65,6 +66,10 @@ def build(cls: type[T], values: Mapping[str, Any], source: str, prefix: str = ""
     fields = {f.name: f for f in dataclasses.fields(cls) if f.init}  # type: ignore[arg-type]
     arguments: dict[str, Any] = {}
     for key, value in values.items():
+        new = _new_names(cls, str(key), value)
+        if new:
+            expected = " or ".join(f"{prefix}{entry.new}" for entry in new.values())
+            raise InputError(source, f"{prefix}{key}", f"its new name, {expected}", "the old one")
         if key not in fields:
             raise unknown(source, f"{prefix}{key}", str(key), fields)
         arguments[key] = _convert(hints[key], value, source, f"{prefix}{key}")
@@ -76,6 +81,68 @@ def build(cls: type[T], values: Mapping[str, Any], source: str, prefix: str = ""
         return cls(**arguments)
     except ValueError as error:
         raise InputError(source, prefix.rstrip(".") or cls.__name__, "valid settings", str(error)) from error
+
+
+def with_new_names(cls: type, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings of ``cls`` as an earlier version stored them, by the names that they have now (`Renamed`)."""
+    hints = get_type_hints(cls)
+    result: dict[str, Any] = {}
+    for key, value in values.items():
+        new = _new_names(cls, key, value)
+        hint = hints.get(key)
+        if not new:
+            if isinstance(value, Mapping) and isinstance(hint, type) and dataclasses.is_dataclass(hint):
+                value = with_new_names(hint, value)
+            result = merge(result, {key: value})
+        for old, entry in new.items():
+            element = old.partition(":")[2]
+            renamed = _exchanged(value, entry.values)
+            if element:
+                renamed = "official" if element in value else "paper"
+            for name in reversed(entry.new.split(".")):
+                renamed = {name: renamed}
+            result = merge(result, renamed)
+    return result
+
+
+def with_first_names(config: Any) -> Any:
+    """The settings of a dataclass by the names that they first had: digests of them outlive a change of names."""
+    if isinstance(config, tuple):
+        return tuple(map(with_first_names, config))
+    if not dataclasses.is_dataclass(config):
+        return config
+    result = {
+        field.name: with_first_names(getattr(config, field.name)) for field in dataclasses.fields(config)
+    }
+    first: dict[str, Any] = {}
+    for old, entry in getattr(config, "renamed", {}).items():
+        *path, last = entry.new.split(".")
+        group = result
+        for name in path:
+            group = group[name]
+        value = group.pop(last)
+        old, _, element = old.partition(":")
+        if element:
+            first[old] = (*first.get(old, ()), *((element,) if value == "official" else ()))
+        else:
+            first[old] = _exchanged(value, {new: before for before, new in entry.values.items()})
+        if path and not group:
+            del result[path[0]]
+    return {f"{name}." if name in first else name: value for name, value in result.items()} | first
+
+
+def _new_names(cls: type, key: str, value: Any) -> dict[str, Renamed]:
+    """What became of a setting, by old name; nothing where ``key`` is none that was renamed."""
+    entries: Mapping[str, Renamed] = getattr(cls, "renamed", {})
+    if isinstance(value, Mapping):  # a group that is called like a setting once was
+        return {}
+    return {old: entry for old, entry in entries.items() if old.partition(":")[0] == key}
+
+
+def _exchanged(value: Any, values: Mapping[Any, Any]) -> Any:
+    if isinstance(value, (list, tuple)):
+        return type(value)(_exchanged(each, values) for each in value)
+    return values.get(value, value)
 
 
 def build_arguments(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,7 +14,7 @@ from .errors import InputError
 from .io.documents import checked, read_json, shown
 from .io.files import check_name, digest, write_json
 from .protocol import Protocol
-from .runner.config import RunConfig
+from .runner.config import RunConfig, stored_settings
 from .specs import LABEL, MetricSpec, is_label
 
 Derived = TypedDict("Derived", {"from": str, "variant": str, "change": str})
@@ -151,7 +151,20 @@ class Manifest:
             twice = [name for name, number in count.items() if number > 1]
             if twice:
                 raise InputError(path, key, "each name once", ", ".join(twice))
-        return manifest
+        return manifest._renamed()
+
+    def _renamed(self) -> Manifest:
+        """With settings of methods by the names that they have now."""
+        settings = {name: stored_settings(name, each) for name, each in self.configuration.settings.items()}
+        methods = (
+            method
+            if method.config is None
+            else replace(method, config=stored_settings(method.name, method.config))
+            for method in self.methods
+        )
+        return replace(
+            self, configuration=replace(self.configuration, settings=settings), methods=tuple(methods)
+        )
 
     def _printed(self) -> dict[str, list[str]]:
         """What tables and errors print beside names, by key."""

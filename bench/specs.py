@@ -67,6 +67,23 @@ class ResolutionRule:
 
 
 @dataclass(frozen=True)
+class Renamed:
+    """The name of a setting that once had another.
+
+    A settings class lists them in a class variable ``renamed``, by old name, or ``old:element`` where a list of names
+    became settings of their own. The old name is refused with the new one; what was stored under it is still read.
+
+    Attributes
+    ----------
+    new : dotted, relative to that class.
+    values : new values by old one, of those that changed; "official" stands for an element that was listed.
+    """
+
+    new: str
+    values: Mapping[Any, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class MethodSpec:
     """What listing a method needs. Loading a spec imports neither torch nor the implementation.
 

@@ -103,7 +103,7 @@ class PublishedRow:
     source : key of the paper.
     table, data : where in the paper, and what the figures are of.
     layout : of the table it may stand in.
-    method, settings : the method's name here, and the settings that a measured one needs to be the same.
+    method, settings : the method's name here, and the settings, by dotted name, that a measured one needs to be the same.
     values : as printed, by ``task/metric``.
     """
 
@@ -117,9 +117,15 @@ class PublishedRow:
 
     def is_of(self, record: MethodRecord) -> bool:
         """Whether a measured method, as in a run's manifest, is the one of this row."""
-        config = record.config or {}
-        settled = all(name in config and config[name] == value for name, value in self.settings.items())
+        settled = all(_setting(record.config, name) == value for name, value in self.settings.items())
         return record.name == self.method and settled
+
+
+def _setting(config: Any, name: str) -> Any:
+    """A setting by dotted name; None where there is none."""
+    for part in name.split("."):
+        config = config.get(part) if isinstance(config, Mapping) else None
+    return config
 
 
 @cache

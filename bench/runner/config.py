@@ -8,11 +8,11 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-from ..configuration import build, merge
+from ..configuration import build, merge, with_first_names, with_new_names
 from ..contracts import Budget, TaskName
 from ..errors import InputError
 from ..io.files import check_name
-from ..registry import get, resolve, unknown
+from ..registry import discover, get, resolve, unknown
 from ..specs import MethodSpec, MetricSpec, ProfileSpec
 from .adaptation import MethodNeeds
 
@@ -101,7 +101,7 @@ class ResolvedMethod:
         return implementation() if self.config is None else implementation(self.config)
 
     def record(self) -> dict[str, Any]:
-        """Everything that decides what this method does, for fingerprint and manifest."""
+        """Everything that decides what this method does, for the manifest."""
         needs = MethodNeeds.of(self.spec)
         return {
             "name": self.spec.name,
@@ -112,6 +112,22 @@ class ResolvedMethod:
             "budget": asdict(self.budget),
             **({} if needs == MethodNeeds() else {"needs": asdict(needs)}),
         }
+
+    def identity(self) -> dict[str, Any]:
+        """The same for fingerprints, which do not change with the names of settings."""
+        return {**self.record(), "config": with_first_names(self.config)}
+
+
+def stored_settings(method: str, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings of a method as an earlier version stored them, by their names now; as they are for a method unknown here."""
+    plugin = next(
+        (found for found in discover("methods").values() if getattr(found.spec, "name", "") == method), None
+    )
+    if plugin is None or plugin.spec is None or not plugin.spec.config:
+        return dict(settings)
+    budget = {key: value for key, value in settings.items() if key == "budget"}
+    own = {key: value for key, value in settings.items() if key != "budget"}
+    return {**budget, **with_new_names(resolve(plugin.spec.config), own)}
 
 
 def resolve_methods(config: RunConfig) -> list[ResolvedMethod]:

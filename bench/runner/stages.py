@@ -69,7 +69,9 @@ class Job:
     @property
     def fit_fingerprint(self) -> str:
         """Digest of everything the trained avatar depends on."""
-        return digest(RESULT_FORMAT, self.method.record(), self.seed, self.device, self.form.clip.fingerprint)
+        return digest(
+            RESULT_FORMAT, self.method.identity(), self.seed, self.device, self.form.clip.fingerprint
+        )
 
     @property
     def frame_paths(self) -> dict[Path, tuple[Protocol, FrameKey]]:

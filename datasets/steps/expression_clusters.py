@@ -3,7 +3,7 @@
 "3D Gaussian Head Avatars with Expressive Dynamic Appearances by Compact Tensorial Representations"
 (CVPR 2025, arXiv 2504.14967), class-balanced sampling: spectral clustering of the unposed training meshes
 under the mean vertex distance of the face. The published code draws on training timesteps alone, so nothing
-leaks; it compares all pairs, and its k-means starts at random. Its behaviour is ``compatibility="tga"``.
+leaks; it compares all pairs, and its k-means starts at random. Its behaviour is ``variant="official"``.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class ExpressionClusters:
     medoids : (classes,) timestep of each class that is the nearest to its centre in the spectral embedding.
     landmarks : timesteps that stood for all; T where all pairs were compared.
     radius : metres within which every face has a landmark; 0 where all pairs were compared.
-    compatibility : "tga" where the published behaviour was asked for.
+    variant : "official" where the published behaviour was asked for.
     """
 
     timesteps: IntArray
@@ -47,7 +47,7 @@ class ExpressionClusters:
     medoids: IntArray
     landmarks: int
     radius: float
-    compatibility: str = ""
+    variant: str = "paper"
 
     @property
     def by_timestep(self) -> dict[int, int]:
@@ -62,7 +62,7 @@ class ExpressionClusters:
             "medoids": self.medoids.tolist(),
             "landmarks": self.landmarks,
             "radius_mm": round(1000 * self.radius, 4),
-            "compatibility": self.compatibility,
+            "variant": self.variant,
         }
 
 
@@ -72,7 +72,7 @@ def cluster_expressions(
     *,
     seed: int = 0,
     limit: int = LANDMARK_LIMIT,
-    compatibility: Literal["", "tga"] = "",
+    variant: Literal["paper", "official"] = "paper",
     progress: Progress = no_progress,
 ) -> ExpressionClusters:
     """Cluster the training timesteps of a clip by the shape of the face.
@@ -83,8 +83,8 @@ def cluster_expressions(
 
     Parameters
     ----------
-    seed : decides the first landmark, or the random starts of "tga"; all pairs without it need none.
-    compatibility : "tga" reproduces the published code: all pairs however many, k-means from ten random starts.
+    seed : decides the first landmark, or the random starts of "official"; all pairs without it need none.
+    variant : "official" reproduces the published code: all pairs however many, k-means from ten random starts.
         It sees training timesteps alone, as the default does.
 
     Raises
@@ -94,20 +94,20 @@ def cluster_expressions(
     """
     timesteps = np.array(sorted({key.timestep for key in clip.splits["train"]}))
     faces = expression_displacements(clip, timesteps.tolist())
-    if len(faces) <= limit or compatibility == "tga":
+    if len(faces) <= limit or variant == "official":
         distances = mean_vertex_distances(faces)
-        labels, embedding = cluster_by_distance(distances, classes, seed=seed, compatibility=compatibility)
+        labels, embedding = cluster_by_distance(distances, classes, seed=seed, variant=variant)
         landmarks, radius = len(faces), 0.0
     else:
         found = farthest_meshes(faces, limit, seed=seed, tolerance=LANDMARK_TOLERANCE, progress=progress)
         labels, embedding = cluster_by_landmarks(found.distances, found.indices, classes)
         landmarks, radius = len(found.indices), found.radius
     medoids = timesteps[_medoids(labels, embedding)]
-    return ExpressionClusters(timesteps, labels, medoids, landmarks, radius, compatibility)
+    return ExpressionClusters(timesteps, labels, medoids, landmarks, radius, variant)
 
 
 def cluster_by_distance(
-    distances: FloatArray, classes: int, *, seed: int = 0, compatibility: Literal["", "tga"] = ""
+    distances: FloatArray, classes: int, *, seed: int = 0, variant: Literal["paper", "official"] = "paper"
 ) -> tuple[IntArray, FloatArray]:
     """Spectral clustering of all pairs under the similarity 1 - d / max d.
 
@@ -126,7 +126,7 @@ def cluster_by_distance(
         return _trivial(len(distances), classes)
     similarity = similarities(distances, largest)
     embedding = exact_embedding(similarity, classes)
-    if compatibility == "tga":
+    if variant == "official":
         published = SpectralClustering(classes, affinity="precomputed", random_state=seed)
         labels = np.unique(published.fit_predict(similarity), return_inverse=True)[1].astype(np.int64)
         return labels, embedding

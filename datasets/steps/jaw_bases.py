@@ -3,7 +3,7 @@
 "3D Gaussian Head Avatars with Expressive Dynamic Appearances by Compact Tensorial Representations"
 (CVPR 2025, arXiv 2504.14967), section on feature lines. The paper's code draws the bases from validation and
 test poses and seeds them with a half turn; here they come from training poses alone and are seeded with the
-identity. The published behaviour is ``compatibility="tga"``.
+identity. The published behaviour is ``variant="official"``.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ TGA_TEST_STRIDE = 16
 """The published code takes every 16th test frame: with 16 cameras, each timestep once."""
 
 
-def leaks(compatibility: str) -> tuple[str, ...]:
+def leaks(variant: str) -> tuple[str, ...]:
     """What of the test signal the bases have seen; for records that stand beside results."""
-    return ("jaw bases drawn from held-out poses (published behaviour)",) if compatibility == "tga" else ()
+    return ("jaw bases drawn from held-out poses (published behaviour)",) if variant == "official" else ()
 
 
 def jaw_quaternions(poses: Sequence[HeadPose]) -> FloatArray:
@@ -68,7 +68,7 @@ def farthest_quaternions(
 
 
 def jaw_bases(
-    clip: Clip, count: int = DEFAULT_COUNT, *, compatibility: Literal["", "tga"] = ""
+    clip: Clip, count: int = DEFAULT_COUNT, *, variant: Literal["paper", "official"] = "paper"
 ) -> FloatArray:
     """Jaw bases of a clip, (n, 4) unit quaternions with the real part first, n <= ``count``.
 
@@ -77,10 +77,10 @@ def jaw_bases(
 
     Parameters
     ----------
-    compatibility : "tga" reproduces the published code: candidates are the poses of all novel-view frames
+    variant : "official" reproduces the published code: candidates are the poses of all novel-view frames
         and of every 16th self-reenactment frame (**a leak of the test signal**), seeded with `HALF_TURN`.
     """
-    if compatibility == "tga":
+    if variant == "official":
         test = sorted(clip.splits["self_reenactment"], key=lambda key: (key.timestep, key.camera))
         keys = [*sorted(clip.splits["novel_view"]), *test[::TGA_TEST_STRIDE]]
         candidates = jaw_quaternions([clip.poses[key.timestep] for key in keys])

@@ -54,7 +54,7 @@ class PreparedTimestep:
 class OursAppearance:
     """Tri-plane colour and feature-line opacity; tracking is left as it is.
 
-    ``lines_within`` bounds the lines in place of the box that ``config.line_bounds`` names.
+    ``lines_within`` bounds the lines in place of the box that ``config.lines.bounds`` names.
     """
 
     def __init__(
@@ -69,14 +69,14 @@ class OursAppearance:
     ):
         self._mesh, self._clip, self._config, self._device, self._seed = mesh, clip, config, device, seed
         self.canonical = CanonicalFrames.of(mesh.frames(mesh.canonical))
-        self.plane_box = plane_box(mesh.canonical, config.plane_bounds)
+        self.plane_box = plane_box(mesh.canonical, config.planes.bounds_variant)
         self.line_box = lines_within or _line_box(mesh, clip, config)
-        self.expressions = min(config.expressions, clip.head.expression_basis.shape[2])
+        self.expressions = min(config.lines.expressions, clip.head.expression_basis.shape[2])
         self.jaw_bases: FloatArray = np.zeros((0, 4))
-        if config.lines and config.jaw_bases:
-            self.jaw_bases = jaw_bases(clip, config.jaw_bases, compatibility=config.jaw_compatibility)
+        if config.lines.enabled and config.lines.jaw_bases:
+            self.jaw_bases = jaw_bases(clip, config.lines.jaw_bases, variant=config.lines.jaw_bases_variant)
         self._is_face = torch.zeros(len(mesh.faces), dtype=torch.bool, device=device)
-        if config.lines and config.penalty:
+        if config.lines.enabled and config.penalty.weight:
             self._is_face[torch.from_numpy(faces_in_region(clip.head, "face")).to(device)] = True
         entries = config.splats.mesh_cache_mb * 2**20 // (4 * FLOATS_PER_FACE * len(mesh.faces))
         self._prepared = BoundedCache(self._prepare, entries)
@@ -99,7 +99,7 @@ class OursAppearance:
 
     def begin(self, timeline: Timeline) -> None:
         """Fit the start of the lines, and the steps of the harmonics' degree, to the run."""
-        self._lines_from = timeline.at(self._config.lines_from)
+        self._lines_from = timeline.at(self._config.lines.start)
         self._degree_every = timeline.every(self._config.sh_every, self._config.min_sh_every)
 
     def frames(self, timestep: int, optimiser: Optimiser) -> Frames:
@@ -120,16 +120,16 @@ class OursAppearance:
         positions = self.canonical.positions(binding, optimiser["means"])
         splats = LocalSplats(*(optimiser[name] for name in ("means", "log_scales", "quats", "opacities")))
         penalty = None
-        if self._config.lines and iteration > self._lines_from:
+        if self._config.lines.enabled and iteration > self._lines_from:
             offsets = self.offsets(optimiser, positions.detach(), prepared.expression, prepared.jaw)
-            splats = apply_offsets(splats, offsets, self._config.dynamic)
-            if self._config.penalty:
+            splats = apply_offsets(splats, offsets, self._config.lines.dynamic)
+            if self._config.penalty.weight:
                 weights = prepared.penalty.index_select(0, binding)
-                size = softened(offsets, self._config.penalty_softness)
-                penalty = self._config.penalty * (size * weights[:, None]).mean()
+                size = softened(offsets, self._config.penalty.softness)
+                penalty = self._config.penalty.weight * (size * weights[:, None]).mean()
         world = to_world(frames, binding, splats.means, splats.log_scales, splats.quats)
         directions = canonical_directions(prepared.turns, binding, world.means, view.center)
-        if self._config.direction_noise:
+        if self._config.direction_jitter:
             directions = directions @ self._turn(iteration).t()
         colors = self._colors(optimiser, positions, directions, iteration)
         return Placed(world, changed_colors(colors, splats), torch.sigmoid(splats.logits), penalty)
@@ -139,14 +139,14 @@ class OursAppearance:
         inside = self.line_box.contains(positions).nonzero().squeeze(1)
         unit = self.line_box.unit(positions.index_select(0, inside))
         blended = blend_lines(optimiser["lines"], expression, jaw)
-        position = line_position(unit, self._config.line_resolution)
+        position = line_position(unit, self._config.lines.resolution)
         offsets = line_offsets(optimiser, blended, position)
         return offsets.new_zeros(len(positions), offsets.shape[1]).index_copy(0, inside, offsets)
 
     def _turn(self, iteration: int) -> Tensor:
         """(3, 3) small random rotation of this iteration."""
         generator = torch_generator(self._seed, "directions", iteration)
-        angles = self._config.direction_noise * torch.randn(1, 3, generator=generator)
+        angles = self._config.direction_jitter * torch.randn(1, 3, generator=generator)
         return axis_angle_to_matrix(angles)[0].to(self._device)
 
     def _colors(self, optimiser: Optimiser, positions: Tensor, directions: Tensor, iteration: int) -> Tensor:
@@ -162,7 +162,7 @@ class OursAppearance:
         frames = self._mesh.frames(self._mesh.posed(arguments))
         expression, jaw = driving_coefficients(pose, self.expressions, self.jaw_bases, self._device)
         weights = frames.size.new_zeros(len(frames.size))
-        if self._config.lines and self._config.penalty:
+        if self._config.lines.enabled and self._config.penalty.weight:
             unposed = self._mesh.unposed(arguments)
             weights = penalty_weights(
                 unposed, self._mesh.canonical, self._mesh.faces, self._is_face, self._config
@@ -205,33 +205,35 @@ def penalty_weights(
     is_face : (F,) triangles of the face region.
     """
     millimetres = 1000 * centroid_displacements(unposed, canonical, faces)
-    still_face = (millimetres < config.penalty_face_mm).to(millimetres.dtype)
-    still_other = config.penalty_other_weight * (millimetres < config.penalty_other_mm).to(millimetres.dtype)
+    still_face = (millimetres < config.penalty.face_mm).to(millimetres.dtype)
+    still_other = config.penalty.other_weight * (millimetres < config.penalty.other_mm).to(millimetres.dtype)
     return torch.where(is_face, still_face, still_other)
 
 
 def _line_box(mesh: SubjectMesh, clip: Clip, config: OursConfig) -> Box:
-    if config.line_bounds == "head":
+    if config.lines.bounds == "head":
         return line_box(mesh.canonical)
     triangles = torch.from_numpy(faces_in_region(clip.head, "face")).to(mesh.faces.device)
     return line_box(mesh.canonical[mesh.faces[triangles].reshape(-1)])
 
 
 def shell_start(mesh: SubjectMesh, clip: Clip, config: OursConfig, device: str) -> Start:
-    """One splat per triangle, and ``config.shells`` more outwards over each of `expressive_triangles`.
+    """One splat per triangle, and ``config.outer_layers.count`` more outwards over each of `expressive_triangles`.
 
     Without lines there is no opacity to change, hence no shells.
     """
     start = one_per_triangle(len(mesh.faces), config.splats.initial_opacity, device)
-    if not config.lines or not config.shells:
+    if not config.lines.enabled or not config.outer_layers.count:
         return start
-    chosen = expressive_triangles(mesh, clip, config.penalty_face_mm, device)
+    chosen = expressive_triangles(mesh, clip, config.penalty.face_mm, device)
     size = mesh.frames(mesh.canonical).size.index_select(0, chosen)
     parts = [start]
-    for shell in range(1, config.shells + 1):
+    for shell in range(1, config.outer_layers.count + 1):
         means = torch.zeros(len(chosen), 3, device=device)
-        means[:, NORMAL] = shell * config.shell_gap / size
-        parts.append(Start(chosen, means, torch.full((len(chosen),), config.shell_opacity, device=device)))
+        means[:, NORMAL] = shell * config.outer_layers.gap / size
+        parts.append(
+            Start(chosen, means, torch.full((len(chosen),), config.outer_layers.opacity, device=device))
+        )
     return Start(*(torch.cat(column) for column in zip(*parts)))
 
 

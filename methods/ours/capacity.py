@@ -2,31 +2,7 @@
 
 The configured sizes are upper limits; the plan says how much of them the training data require. What a capture does
 not show costs nothing: no lines without changes of expression, no jaw bases without jaw motion, no planes finer than
-the images.
-
-Measured against fixed sizes on path-traced captures of one subject, preset "demo", one seed (96x136: 5 training
-cameras, 8 training timesteps, 300 iterations; 144x208: 7, 45, 600): held-out camera and held-out sequence in dB, LPIPS
-of the held-out camera, its PSNR in the face, exact storage in MB.
-
-=========================================  =====  =====  ======  =====  ====
-capture, sizes                             NVS    SR     LPIPS   face   MB
-=========================================  =====  =====  ======  =====  ====
-still, 96x136, fixed                       27.22  30.77  0.0468  27.71  6.05
-still, planned                             27.27  30.80  0.0467  27.26  4.45
-still, planned, 2 samples fewer            27.23  30.89  0.0461  27.50  4.33
-still, planned, half the detail            27.41  30.78  0.0495  27.62  1.65
-expressions without jaw, 96x136, fixed     26.30  30.05  0.0460  26.82  6.05
-expressions without jaw, planned           26.33  30.13  0.0462  26.57  4.85
-the same, 2 samples fewer                  26.32  30.17  0.0463  26.72  4.73
-the same, half the detail                  26.45  30.09  0.0487  27.00  2.05
-expressions and jaw, 144x208, fixed        32.24  33.98  0.0398  29.83  6.58
-expressions and jaw, half the detail       32.18  34.03  0.0420  29.57  3.97
-the same, 0.35 samples a pixel             32.28  33.73  0.0428  29.77  2.80
-=========================================  =====  =====  ======  =====  ====
-
-Rows two samples apart tell how much is chance: up to 0.24 dB in the face. PSNR alone would allow half a sample a
-pixel; LPIPS does not, hence one by default. Half the channels at one sample a pixel cost as much LPIPS as half the
-samples and saved fewer bytes (expressions: 26.22, 30.05, 0.0487, 2.90 MB).
+the images. README.md has measurements.
 """
 
 from __future__ import annotations
@@ -75,7 +51,7 @@ class CapacityPlan:
     pixel : metres that a pixel covers on the head, median over training frames.
     decisions : one for each size that was not kept.
     lines : whether anything is dynamic.
-    lines_within : corners of the lines' box, metres, where it is not that of ``line_bounds``.
+    lines_within : corners of the lines' box, metres, where it is not that of ``lines.bounds``.
     """
 
     tolerance: float
@@ -86,10 +62,13 @@ class CapacityPlan:
 
     def apply(self, config: OursConfig) -> OursConfig:
         """The configuration with the planned sizes in it."""
-        sizes: dict[str, Any] = {each.name: each.chosen for each in self.decisions}
-        sizes.pop("line_bounds", None)
-        splats = replace(config.splats, max_splats=sizes.pop("max_splats", config.splats.max_splats))
-        return replace(config, splats=splats, lines=self.lines, capacity="fixed", **sizes)
+        sizes: dict[str, dict[str, Any]] = {"lines": {"enabled": self.lines}, "capacity": {"mode": "fixed"}}
+        for each in self.decisions:
+            group, _, size = each.name.partition(".")
+            if each.name != "lines.bounds":
+                sizes.setdefault(group, {})[size] = each.chosen
+        groups = {name: replace(getattr(config, name), **chosen) for name, chosen in sizes.items()}
+        return replace(config, **groups)
 
     def box(self, device: str) -> Box | None:
         """Box of the lines as tensors, or None where the configured one holds."""
@@ -115,12 +94,12 @@ def plan_capacity(clip: Clip, mesh: SubjectMesh, config: OursConfig) -> Capacity
     Parameters
     ----------
     mesh : of the clip's subject.
-    config : its sizes are upper limits, those in ``capacity_keep`` are left alone.
+    config : its sizes are upper limits, those in ``capacity.keep`` are left alone.
     """
     planner = _Planner(clip, mesh, config)
     decisions = [*planner.lines(), planner.planes(), planner.splats()]
     return CapacityPlan(
-        config.capacity_tolerance,
+        config.capacity.tolerance,
         planner.pixel,
         tuple(each for each in decisions if each is not None),
         planner.dynamic,
@@ -136,19 +115,19 @@ class _Planner:
         self._canonical = mesh.canonical.cpu().numpy().astype(np.float64)
         self._poses: list[HeadPose] = training_poses(clip)
         self.pixel = pixel_footprint(clip, 0.5 * (self._canonical.min(0) + self._canonical.max(0)))
-        self._metres = config.capacity_tolerance * self.pixel
-        self.dynamic = config.lines
+        self._metres = config.capacity.tolerance * self.pixel
+        self.dynamic = config.lines.enabled
         self.within: tuple[tuple[float, ...], tuple[float, ...]] | None = None
 
     def _kept(self, name: Planned) -> bool:
-        return name in self._config.capacity_keep
+        return name in self._config.capacity.keep
 
     def lines(self) -> list[Decision]:
         """Directions, jaw bases, box and samples of the lines; nothing where there are none."""
-        if not self._config.lines:
+        if not self._config.lines.enabled:
             return []
         driving = [self._expressions(), self._jaw_bases()]
-        counts = [self._config.expressions, self._config.jaw_bases]
+        counts = [self._config.lines.expressions, self._config.lines.jaw_bases]
         counts = [count if each is None else int(each.chosen or 0) for count, each in zip(counts, driving)]
         self.dynamic = sum(counts) > 0
         decisions = [each for each in driving if each is not None]
@@ -158,36 +137,40 @@ class _Planner:
         return decisions
 
     def _expressions(self) -> Decision | None:
-        if self._kept("expressions"):
+        if self._kept("lines.expressions"):
             return None
         basis = np.asarray(self._clip.head.expression_basis)
-        limit = min(self._config.expressions, basis.shape[2])
+        limit = min(self._config.lines.expressions, basis.shape[2])
         coefficients = np.array([pose.expression for pose in self._poses], dtype=np.float64)
         chosen = min(leading_directions(coefficients, basis, self._metres), limit)
         rest = displacement_without(coefficients, basis, chosen) / self.pixel
         total = displacement_without(coefficients, basis, 0) / self.pixel
         reason = f"expressions move the surface by up to {total:.2f} px, {rest:.2f} px without these"
         numbers = {"moved_px": total, "left_out_px": rest}
-        return Decision("expressions", self._config.expressions, chosen, reason, numbers)
+        return Decision("lines.expressions", self._config.lines.expressions, chosen, reason, numbers)
 
     def _jaw_bases(self) -> Decision | None:
-        # The published choice looks at held-out poses; it is reproduced as it is or not at all.
-        if self._kept("jaw_bases") or self._config.jaw_compatibility or not self._config.jaw_bases:
+        # The official choice looks at held-out poses; it is reproduced as it is or not at all.
+        if (
+            self._kept("lines.jaw_bases")
+            or self._config.lines.jaw_bases_variant == "official"
+            or not self._config.lines.jaw_bases
+        ):
             return None
         lever = jaw_lever(self._mesh)
-        chosen, rest = spanning_jaw_bases(self._poses, self._config.jaw_bases, lever, self._metres)
+        chosen, rest = spanning_jaw_bases(self._poses, self._config.lines.jaw_bases, lever, self._metres)
         reason = f"without more the jaw moves the surface by {rest / self.pixel:.2f} px at most"
         numbers = {"lever_m": lever, "left_out_px": rest / self.pixel}
-        return Decision("jaw_bases", self._config.jaw_bases, chosen, reason, numbers)
+        return Decision("lines.jaw_bases", self._config.lines.jaw_bases, chosen, reason, numbers)
 
     def _bounds(self) -> Decision | None:
-        if self._kept("line_bounds"):
+        if self._kept("lines.bounds"):
             return None
         moves = self._moving()
         if not moves.any():
             self.dynamic = False
             reason = "no triangle moves enough in training that the penalty lets it change"
-            return Decision("line_bounds", self._config.line_bounds, None, reason, {"triangles": 0})
+            return Decision("lines.bounds", self._config.lines.bounds, None, reason, {"triangles": 0})
         corners = self._canonical[np.asarray(self._clip.head.faces)[moves].ravel()]
         whole = self._configured_line_box()
         low = np.maximum(corners.min(0) - PLANE_MARGIN, whole.low.numpy())
@@ -196,19 +179,19 @@ class _Planner:
         self.within = tuple(map(float, low)), tuple(map(float, high))
         reason = f"{moves.mean():.0%} of the triangles move, {share:.0%} of the volume holds them"
         numbers = {"triangles": float(moves.sum()), "volume_share": share}
-        return Decision("line_bounds", self._config.line_bounds, "moving", reason, numbers)
+        return Decision("lines.bounds", self._config.lines.bounds, "moving", reason, numbers)
 
     def _moving(self) -> np.ndarray:
         """(F,) whether the penalty lets a triangle's splats change in some training timestep, visibly."""
         least = np.full(len(self._mesh.faces), self._metres)
-        if self._config.penalty:
+        if self._config.penalty.weight:
             is_face = np.zeros(len(least), dtype=bool)
             is_face[faces_in_region(self._clip.head, "face")] = True
             config = self._config
-            millimetres = np.where(is_face, config.penalty_face_mm, config.penalty_other_mm)
+            millimetres = np.where(is_face, config.penalty.face_mm, config.penalty.other_mm)
             least = np.maximum(least, 1e-3 * millimetres)
         displaced = largest_displacements(self._mesh, self._poses) >= least
-        if self._config.line_bounds == "face":
+        if self._config.lines.bounds == "face":
             inside = np.zeros(len(least), dtype=bool)
             inside[faces_in_region(self._clip.head, "face")] = True
             displaced &= inside
@@ -216,42 +199,42 @@ class _Planner:
 
     def _configured_line_box(self) -> Box:
         vertices: FloatArray = self._canonical
-        if self._config.line_bounds == "face":
+        if self._config.lines.bounds == "face":
             faces = np.asarray(self._clip.head.faces)[faces_in_region(self._clip.head, "face")]
             vertices = vertices[faces.ravel()]
         return line_box(torch.from_numpy(vertices))
 
     def _line_resolution(self) -> Decision | None:
-        if self._kept("line_resolution") or not self.dynamic:
+        if self._kept("lines.resolution") or not self.dynamic:
             return None
         whole = self._configured_line_box()
         size = (whole.high - whole.low).numpy()
         inside = size if self.within is None else np.subtract(self.within[1], self.within[0])
-        configured = self._config.line_resolution
+        configured = self._config.lines.resolution
         # On no axis finer than configured, and not finer than the images.
         spacing = np.maximum(size / (configured - 1), self.pixel / LINE_SAMPLES_PER_PIXEL)
         needed = 1 + ceil(float((inside / spacing).max()) - 1e-6)
         chosen = min(configured, max(needed, MINIMUM_LINE))
         reason = f"a sample each {1000 * float(inside.max()) / (chosen - 1):.1f} mm of {1000 * inside.max():.0f} mm"
         numbers = {"longest_m": float(inside.max())}
-        return Decision("line_resolution", configured, chosen, reason, numbers)
+        return Decision("lines.resolution", configured, chosen, reason, numbers)
 
     def planes(self) -> Decision | None:
         """Samples per side of the planes."""
-        if self._kept("plane_resolution") or self._config.color != "planes":
+        if self._kept("planes.resolution") or self._config.color != "planes":
             return None
-        box = plane_box(self._mesh.canonical.cpu(), self._config.plane_bounds)
+        box = plane_box(self._mesh.canonical.cpu(), self._config.planes.bounds_variant)
         side = float((box.high - box.low).max())
         pixels = side / self.pixel
-        needed = 1 + ceil(self._config.capacity_detail * pixels)
-        chosen = min(self._config.plane_resolution, max(needed, MINIMUM_PLANE))
+        needed = 1 + ceil(self._config.capacity.detail * pixels)
+        chosen = min(self._config.planes.resolution, max(needed, MINIMUM_PLANE))
         reason = f"the planes' longest side covers {pixels:.0f} px"
         numbers = {"longest_m": side, "longest_px": pixels}
-        return Decision("plane_resolution", self._config.plane_resolution, chosen, reason, numbers)
+        return Decision("planes.resolution", self._config.planes.resolution, chosen, reason, numbers)
 
     def splats(self) -> Decision | None:
         """Bound on the number of splats; training starts with one on each triangle, so never fewer."""
-        if self._kept("max_splats"):
+        if self._kept("splats.max_splats"):
             return None
         area = surface_area(self._canonical, np.asarray(self._clip.head.faces)) / self.pixel**2
         needed = max(ceil(SPLATS_PER_PIXEL * area), len(self._mesh.faces))
@@ -259,7 +242,7 @@ class _Planner:
         chosen = needed if configured is None else min(needed, configured)
         reason = f"the surface covers {area:.0f} px, unrolled, in {len(self._mesh.faces)} triangles"
         numbers = {"surface_px": area, "triangles": float(len(self._mesh.faces))}
-        return Decision("max_splats", configured, chosen, reason, numbers)
+        return Decision("splats.max_splats", configured, chosen, reason, numbers)
 
 
 _BLOCK = 64  # timesteps whose displacement fields are held at once

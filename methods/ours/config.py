@@ -2,19 +2,175 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import ClassVar, Literal
 
+from ...bench.specs import Renamed
 from ..shared.config import SplatTraining
 
 Dynamic = Literal["opacity", "position", "rotation", "scale", "color"]
 """What an expression may change about a splat."""
 
-
 Planned = Literal[
-    "expressions", "jaw_bases", "line_bounds", "line_resolution", "plane_resolution", "max_splats"
+    "lines.expressions",
+    "lines.jaw_bases",
+    "lines.bounds",
+    "lines.resolution",
+    "planes.resolution",
+    "splats.max_splats",
 ]
 """Sizes that a capacity plan decides."""
+
+
+@dataclass(frozen=True)
+class Planes:
+    """The tri-plane and its colour network.
+
+    Attributes
+    ----------
+    resolution, channels : samples per side, and channels of the (x,y), (x,z) and (y,z) planes.
+    bounds_variant : "mesh" fits the planes to the canonical mesh in all directions; "paper" sets x to +-0.25 m, which
+        leaves half the samples in x unused on a head without long hair.
+    lr, network_lr : learning rates of the planes and of the network.
+    """
+
+    resolution: int = 128
+    channels: tuple[int, int, int] = (32, 16, 16)
+    bounds_variant: Literal["mesh", "paper"] = "mesh"
+    lr: float = 2e-3
+    network_lr: float = 1e-4
+
+    def __post_init__(self) -> None:
+        if self.resolution < 2 or min(self.channels) < 1:
+            raise ValueError("resolution must be at least 2, and channels at least 1")
+
+
+@dataclass(frozen=True)
+class Lines:
+    """The feature lines and their network.
+
+    Attributes
+    ----------
+    enabled : dynamic appearance on or off.
+    dynamic : what the lines change. The paper's method is opacity alone; position, rotation and scale are its Table 4,
+        colour our addition to that ablation.
+    resolution, channels : samples and channels per line.
+    expressions, jaw_bases : how many leading expression coefficients (as many as there are, if fewer) and jaw bases
+        have lines.
+    jaw_bases_variant : "paper" takes jaw bases from training poses, seeded with the identity. "official" draws them
+        from held-out poses as the authors' program does: a leak, for comparison with it only.
+    bounds : box in which splats have dynamic opacity: the "head" (whole mesh) or the "face" region.
+    start : iteration (published scale) at which lines and penalty start.
+    lr, network_lr : learning rates of the lines and of the network.
+    """
+
+    enabled: bool = True
+    dynamic: tuple[Dynamic, ...] = ("opacity",)
+    resolution: int = 64
+    channels: int = 32
+    expressions: int = 80
+    jaw_bases: int = 16
+    jaw_bases_variant: Literal["paper", "official"] = "paper"
+    bounds: Literal["head", "face"] = "head"
+    start: int = 60_000
+    lr: float = 2e-3
+    network_lr: float = 1e-4
+
+    def __post_init__(self) -> None:
+        if self.resolution < 2 or self.channels < 1:
+            raise ValueError("resolution must be at least 2, and channels at least 1")
+        if self.expressions < 0 or self.jaw_bases < 0:
+            raise ValueError("expressions and jaw_bases must not be negative")
+        if not self.dynamic or len(set(self.dynamic)) != len(self.dynamic):
+            raise ValueError(f"dynamic must name each thing once, and one at least, found {self.dynamic}")
+
+
+@dataclass(frozen=True)
+class Penalty:
+    """The adaptive truncated opacity penalty.
+
+    Attributes
+    ----------
+    weight : 0 turns it off.
+    softness : offsets under which |offset| is rounded off to a parabola (Huber 1964), so that its gradient does not
+        change sign around 0 and outweigh the image's in the optimiser's second moments; 0 as published.
+    face_mm, other_mm, other_weight : surface displacement under which opacity may not change, in the face region and
+        elsewhere, and the weight elsewhere.
+    """
+
+    weight: float = 1.0
+    softness: float = 0.0
+    face_mm: float = 1.0
+    other_mm: float = 2.0
+    other_weight: float = 10.0
+
+    def __post_init__(self) -> None:
+        if self.softness < 0:
+            raise ValueError(f"softness must not be negative, found {self.softness}")
+
+
+@dataclass(frozen=True)
+class OuterLayers:
+    """Further splats at the start, outwards over each face triangle that training expressions move.
+
+    Attributes
+    ----------
+    count : layers; 0 as published.
+    gap : metres between two.
+    opacity : of their splats.
+    """
+
+    count: int = 0
+    gap: float = 1.5e-3
+    opacity: float = 0.1
+
+    def __post_init__(self) -> None:
+        if self.count < 0 or not 0 < self.opacity < 1 or not self.gap > 0:
+            raise ValueError("count must not be negative, opacity lie between 0 and 1, gap be above 0 metres")
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """Which training images are drawn.
+
+    Attributes
+    ----------
+    balanced, expression_clusters : each of so many clusters of expressions has an equal share.
+    clusters_variant : "paper" finds the same clusters every time and needs no comparison of all pairs of timesteps;
+        "official" finds them as the authors' program does. Both see training timesteps alone.
+    """
+
+    balanced: bool = True
+    expression_clusters: int = 16
+    clusters_variant: Literal["paper", "official"] = "paper"
+
+
+@dataclass(frozen=True)
+class Capacity:
+    """How large the avatar is.
+
+    Attributes
+    ----------
+    mode : "fixed" takes the configured sizes as they are. "auto" takes them as upper limits and decides from the training
+        data how much of them the scene requires (`capacity.plan_capacity`).
+    tolerance : pixels; motion of the surface below it counts as none.
+    detail : samples of the planes per pixel, along the longest side of their box. 1 keeps PSNR and LPIPS; 0.5 keeps PSNR
+        alone, in half the bytes (README.md).
+    keep : sizes that "auto" leaves as they are.
+    """
+
+    mode: Literal["fixed", "auto"] = "fixed"
+    tolerance: float = 0.25
+    detail: float = 1.0
+    keep: tuple[Planned, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.tolerance > 0 or not self.detail > 0:
+            raise ValueError("tolerance (pixels) and detail must be above 0")
+
+
+VARIANT = {"": "paper", "tga": "official"}
 
 
 @dataclass(frozen=True)
@@ -23,99 +179,81 @@ class OursConfig:
 
     Attributes
     ----------
-    plane_resolution, plane_channels : samples per side, and channels of the (x,y), (x,z) and (y,z) planes.
-    plane_bounds : "mesh" fits the planes to the canonical mesh in all directions; "published" sets x to +-0.25 m
-        as the paper does, which leaves half the samples in x unused on a head without long hair.
-    direction_noise : standard deviation, radians, of a random turn of all view directions in each iteration. What
-        a colour does between the training cameras no image says; of the order of the cameras' spacing, noise keeps
-        it from being anything but smooth. 0 as published.
+    hidden : units of the hidden layers of both networks.
+    direction_jitter : standard deviation, radians, of a random rotation of all view directions in each iteration. What
+        a colour does between the training cameras no image shows; of the order of the cameras' spacing, jitter keeps
+        it smooth. 0 as published.
     color : "planes" reads colour from the tri-plane; "sh" gives every splat spherical harmonics of degree
         ``sh_degree`` in canonical directions instead (an ablation).
-    lines : dynamic appearance on or off.
-    dynamic : what the lines change. The paper's method is opacity alone; position, rotation and scale are its
-        Table 4, colour our addition to that ablation.
-    line_resolution, line_channels, expressions, jaw_bases : samples and channels per line; how many leading
-        expression coefficients (as many as there are, if fewer) and jaw bases have lines.
-    line_bounds : box in which splats have dynamic opacity: the "head" (whole mesh) or the "face" region.
-    lines_from : iteration (published scale) at which lines and penalty start.
-    jaw_compatibility : "" takes jaw bases from training poses, seeded with the identity. "tga" reproduces the
-        published code, which draws them from held-out poses: a leak, for comparison with it only.
-    penalty : weight of the adaptive truncated opacity penalty; 0 turns it off.
-    shells, shell_gap, shell_opacity : splats more at the start over each face triangle that training expressions
-        move, outwards, metres apart (`shells`); 0 as published.
-    penalty_softness : offsets under which the penalty's |offset| is rounded off to a parabola (Huber 1964), so that
-        it does not chatter around 0 and drown what images say in the optimiser's second moments; 0 as published.
-    penalty_face_mm, penalty_other_mm, penalty_other_weight : surface displacement under which opacity may not
-        change, in the face region and elsewhere, and the weight elsewhere.
-    balanced_sampling, expression_classes : draw images so that each class of expressions has an equal share.
-    expression_compatibility : "" parts the classes the same way every time and needs no comparison of all pairs of
-        timesteps; "tga" parts them as the published code does. Both see training timesteps alone.
+    sh_degree, sh_every, min_sh_every, sh_dc_lr, sh_rest_lr : as those of `GAConfig`.
     storage : "exact" keeps the avatar as float32; "compact" writes a quantised file beside it (`compact.file`), which
         is what is then loaded, rendered, measured and counted.
-    capacity : "fixed" takes the sizes above as they are. "auto" takes them as upper limits and decides from the
-        training data how much of them the scene requires: see `capacity.plan`.
-    capacity_tolerance : pixels; motion of the surface below it counts as none.
-    capacity_detail : samples of the planes per pixel, along the longest side of their box. 1 keeps PSNR and LPIPS;
-        0.5 keeps PSNR alone, in half the bytes (`capacity.plan` has the figures).
-    capacity_keep : sizes that "auto" leaves as they are.
     """
 
     splats: SplatTraining = field(default_factory=SplatTraining)
-    plane_resolution: int = 128
-    plane_channels: tuple[int, int, int] = (32, 16, 16)
-    plane_bounds: Literal["mesh", "published"] = "mesh"
-    plane_lr: float = 2e-3
-    color_mlp_lr: float = 1e-4
+    planes: Planes = field(default_factory=Planes)
+    lines: Lines = field(default_factory=Lines)
+    penalty: Penalty = field(default_factory=Penalty)
+    outer_layers: OuterLayers = field(default_factory=OuterLayers)
+    sampling: Sampling = field(default_factory=Sampling)
+    capacity: Capacity = field(default_factory=Capacity)
     hidden: int = 128
-    direction_noise: float = 0.0
+    direction_jitter: float = 0.0
     color: Literal["planes", "sh"] = "planes"
     sh_degree: int = 3
     sh_every: int = 1_000
     min_sh_every: int = 100
     sh_dc_lr: float = 0.0025
     sh_rest_lr: float = 0.000125
-    lines: bool = True
-    dynamic: tuple[Dynamic, ...] = ("opacity",)
-    line_resolution: int = 64
-    line_channels: int = 32
-    expressions: int = 80
-    jaw_bases: int = 16
-    jaw_compatibility: Literal["", "tga"] = ""
-    line_bounds: Literal["head", "face"] = "head"
-    lines_from: int = 60_000
-    line_lr: float = 2e-3
-    line_mlp_lr: float = 1e-4
-    penalty: float = 1.0
-    penalty_softness: float = 0.0
-    shells: int = 0
-    shell_gap: float = 1.5e-3
-    shell_opacity: float = 0.1
-    penalty_face_mm: float = 1.0
-    penalty_other_mm: float = 2.0
-    penalty_other_weight: float = 10.0
-    balanced_sampling: bool = True
-    expression_classes: int = 16
-    expression_compatibility: Literal["", "tga"] = ""
     storage: Literal["exact", "compact"] = "exact"
-    capacity: Literal["fixed", "auto"] = "fixed"
-    capacity_tolerance: float = 0.25
-    capacity_detail: float = 1.0
-    capacity_keep: tuple[Planned, ...] = ()
+
+    renamed: ClassVar[Mapping[str, Renamed]] = {
+        "plane_resolution": Renamed("planes.resolution"),
+        "plane_channels": Renamed("planes.channels"),
+        "plane_bounds": Renamed("planes.bounds_variant", {"published": "paper"}),
+        "plane_lr": Renamed("planes.lr"),
+        "color_mlp_lr": Renamed("planes.network_lr"),
+        "direction_noise": Renamed("direction_jitter"),
+        "lines": Renamed("lines.enabled"),
+        "dynamic": Renamed("lines.dynamic"),
+        "line_resolution": Renamed("lines.resolution"),
+        "line_channels": Renamed("lines.channels"),
+        "expressions": Renamed("lines.expressions"),
+        "jaw_bases": Renamed("lines.jaw_bases"),
+        "jaw_compatibility": Renamed("lines.jaw_bases_variant", VARIANT),
+        "line_bounds": Renamed("lines.bounds"),
+        "lines_from": Renamed("lines.start"),
+        "line_lr": Renamed("lines.lr"),
+        "line_mlp_lr": Renamed("lines.network_lr"),
+        "penalty": Renamed("penalty.weight"),
+        "penalty_softness": Renamed("penalty.softness"),
+        "penalty_face_mm": Renamed("penalty.face_mm"),
+        "penalty_other_mm": Renamed("penalty.other_mm"),
+        "penalty_other_weight": Renamed("penalty.other_weight"),
+        "shells": Renamed("outer_layers.count"),
+        "shell_gap": Renamed("outer_layers.gap"),
+        "shell_opacity": Renamed("outer_layers.opacity"),
+        "balanced_sampling": Renamed("sampling.balanced"),
+        "expression_classes": Renamed("sampling.expression_clusters"),
+        "expression_compatibility": Renamed("sampling.clusters_variant", VARIANT),
+        "capacity": Renamed("capacity.mode"),
+        "capacity_tolerance": Renamed("capacity.tolerance"),
+        "capacity_detail": Renamed("capacity.detail"),
+        "capacity_keep": Renamed(
+            "capacity.keep",
+            {
+                "expressions": "lines.expressions",
+                "jaw_bases": "lines.jaw_bases",
+                "line_bounds": "lines.bounds",
+                "line_resolution": "lines.resolution",
+                "plane_resolution": "planes.resolution",
+                "max_splats": "splats.max_splats",
+            },
+        ),
+    }
 
     def __post_init__(self) -> None:
-        if not self.capacity_tolerance > 0:
-            raise ValueError(f"capacity_tolerance must be above 0 pixels, found {self.capacity_tolerance}")
-        if not self.capacity_detail > 0:
-            raise ValueError(f"capacity_detail must be above 0, found {self.capacity_detail}")
-        if self.plane_resolution < 2 or self.line_resolution < 2:
-            raise ValueError("plane_resolution and line_resolution must be at least 2")
-        if min(self.plane_channels) < 1 or self.line_channels < 1 or self.hidden < 1:
-            raise ValueError("channel counts must be at least 1")
-        if self.expressions < 0 or self.jaw_bases < 0 or self.shells < 0 or self.penalty_softness < 0:
-            raise ValueError("expressions, jaw_bases, shells and penalty_softness must not be negative")
-        if not 0 < self.shell_opacity < 1 or not self.shell_gap > 0:
-            raise ValueError("shell_opacity must lie between 0 and 1, shell_gap above 0 metres")
+        if self.hidden < 1:
+            raise ValueError(f"hidden must be at least 1, found {self.hidden}")
         if not 0 <= self.sh_degree <= 3:
             raise ValueError(f"sh_degree must be 0 to 3, found {self.sh_degree}")
-        if not self.dynamic or len(set(self.dynamic)) != len(self.dynamic):
-            raise ValueError(f"dynamic must name each thing once, and one at least, found {self.dynamic}")

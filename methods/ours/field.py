@@ -168,7 +168,7 @@ def uniform(shape: tuple[int, ...], bound: float, generator: torch.Generator) ->
 
 PLANE_MARGIN = 0.005  # metres around the canonical mesh
 PLANE_MARGIN_BELOW = 0.025  # metres more at the bottom: splats of the neck hang below the mesh
-PUBLISHED_HALF_WIDTH = 0.25  # metres
+PAPER_HALF_WIDTH = 0.25  # metres
 
 
 class Box(NamedTuple):
@@ -186,13 +186,13 @@ class Box(NamedTuple):
         return ((points >= self.low) & (points <= self.high)).all(1)
 
 
-def plane_box(canonical: Tensor, bounds: str) -> Box:
-    """Bounds of the planes around (V, 3) canonical vertices; ``bounds`` as in `OursConfig`."""
+def plane_box(canonical: Tensor, variant: str) -> Box:
+    """Bounds of the planes around (V, 3) canonical vertices; ``variant`` is ``planes.bounds_variant``."""
     low = canonical.amin(0) - PLANE_MARGIN
     high = canonical.amax(0) + PLANE_MARGIN
     low[1] -= PLANE_MARGIN_BELOW
-    if bounds == "published":
-        low[0], high[0] = -PUBLISHED_HALF_WIDTH, PUBLISHED_HALF_WIDTH
+    if variant == "paper":
+        low[0], high[0] = -PAPER_HALF_WIDTH, PAPER_HALF_WIDTH
     return Box(low, high)
 
 
@@ -275,23 +275,25 @@ def initial_parameters(
     result: dict[str, tuple[Tensor, float]] = {}
     if config.color == "planes":
         result |= _initial_planes(config, generator)
-    if config.lines:
-        shape = (expressions + jaw_bases, AXES, config.line_resolution, config.line_channels)
-        result["lines"] = (torch.zeros(shape), config.line_lr)
-        outputs = offset_width(config.dynamic)
-        network = initial_line_network(config.line_channels, config.hidden, outputs, generator)
-        result |= {name: (value, config.line_mlp_lr) for name, value in network.items()}
+    if config.lines.enabled:
+        shape = (expressions + jaw_bases, AXES, config.lines.resolution, config.lines.channels)
+        result["lines"] = (torch.zeros(shape), config.lines.lr)
+        outputs = offset_width(config.lines.dynamic)
+        network = initial_line_network(config.lines.channels, config.hidden, outputs, generator)
+        result |= {name: (value, config.lines.network_lr) for name, value in network.items()}
     return result
 
 
 def _initial_planes(config: OursConfig, generator: torch.Generator) -> dict[str, tuple[Tensor, float]]:
     result: dict[str, tuple[Tensor, float]] = {}
-    for (name, _, _), channels in zip(PAIRS, config.plane_channels):
-        plane = uniform((config.plane_resolution**2, channels), 0.1, generator)
-        result[f"plane_{name}"] = (plane, config.plane_lr)
-    inputs = sum(config.plane_channels) + ENCODING_SIZE
+    for (name, _, _), channels in zip(PAIRS, config.planes.channels):
+        plane = uniform((config.planes.resolution**2, channels), 0.1, generator)
+        result[f"plane_{name}"] = (plane, config.planes.lr)
+    inputs = sum(config.planes.channels) + ENCODING_SIZE
     weights = [
         uniform((config.hidden, inputs), inputs**-0.5, generator),
         uniform((3, config.hidden), config.hidden**-0.5, generator),
     ]
-    return result | {f"color_weight_{layer}": (w, config.color_mlp_lr) for layer, w in enumerate(weights)}
+    return result | {
+        f"color_weight_{layer}": (w, config.planes.network_lr) for layer, w in enumerate(weights)
+    }

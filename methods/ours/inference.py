@@ -1,15 +1,7 @@
 """What a stored avatar of "ours" computes per frame, prepared as far as it does not depend on the frame.
 
 Each of these is the fast twin of what `ours_appearance` trains with; `tests/methods/ours/test_formula.py` compares
-both with the definition in float64.
-
-Measured and left out, since they save less than they cost. A splat's offset cannot matter where the Lipschitz bound
-|W2| |W1|_2 |h(frame) - h(rest)| of the offset network changes its opacity by less than a tolerance: at 1e-3 this held
-for 0.02 to 6 % of the splats of two trained avatars. Splats that the projection culls, with the head in view: 0.2 and
-1.4 %; whose colour reaches no pixel, known only after drawing: 9 and 15 %. The middle layer in bfloat16: no faster,
-conversions included. Colours baked into spherical harmonics of degree 3, fitted over the half sphere that each splat
-faces: a fifth of the colour network's time, but on a trained avatar of the demo 0.69 dB and 0.003 LPIPS were lost in
-self-reenactment (0.27 dB won on the held-out camera; 15 and 5 frames).
+both with the definition in float64. README.md lists what was measured and left out.
 """
 
 from __future__ import annotations

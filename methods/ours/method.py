@@ -55,14 +55,16 @@ class Ours:
         check_budget(budget)
         check_training_split(clip)
         config = self.config
-        if config.balanced_sampling or (config.lines and (config.penalty or config.line_bounds == "face")):
+        if config.sampling.balanced or (
+            config.lines.enabled and (config.penalty.weight or config.lines.bounds == "face")
+        ):
             faces_in_region(
                 clip.head, "face"
             )  # raises before the long work where the head has no face region
         subject = Subject.of(clip)
         mesh = SubjectMesh(clip.head, subject.shape, subject.static_offset, device)
         plan = None
-        if config.capacity == "auto":
+        if config.capacity.mode == "auto":
             plan = plan_capacity(clip, mesh, config)
             config = plan.apply(config)
         # The sizes, and not the measurements behind them, whose last digits depend on the number of threads.
@@ -100,7 +102,7 @@ class Ours:
             outcome,
             splats=len(training.binding),
             jaw_bases=len(appearance.jaw_bases),
-            leaks=leaks(config.jaw_compatibility) if len(appearance.jaw_bases) else (),
+            leaks=leaks(config.lines.jaw_bases_variant) if len(appearance.jaw_bases) else (),
             capacity=None if plan is None else plan.record(),
         )
         (out / CHECKPOINT).unlink(missing_ok=True)
@@ -112,13 +114,13 @@ class Ours:
 
     def _sampler(self, clip: Clip, seed: int) -> Sampler:
         keys = clip.splits["train"]
-        if not self.config.balanced_sampling:
+        if not self.config.sampling.balanced:
             return ShuffledEpochs(len(keys), seed)
         clusters = cluster_expressions(
             clip,
-            self.config.expression_classes,
+            self.config.sampling.expression_clusters,
             seed=seed,
-            compatibility=self.config.expression_compatibility,
+            variant=self.config.sampling.clusters_variant,
         )
         timesteps = np.array([key.timestep for key in keys])
         return Weighted(balanced_weights(timesteps, clusters.by_timestep), seed)
@@ -138,5 +140,5 @@ class Ours:
             appearance.plane_box,
             appearance.line_box,
             appearance.jaw_bases,
-            self.config.dynamic,
+            self.config.lines.dynamic,
         )

@@ -8,14 +8,11 @@ from ...bench.specs import MethodSpec
 from ..shared.config import splat_presets
 
 SHORT: dict[str, Any] = {
-    "plane_lr": 8e-3,
-    "color_mlp_lr": 1.5e-3,
-    "line_lr": 2e-2,
-    "line_mlp_lr": 1e-3,
-    "direction_noise": 0.15,
-    "shells": 1,
-    "penalty": 1e-3,
-    "penalty_softness": 0.1,
+    "planes": {"lr": 8e-3, "network_lr": 1.5e-3},
+    "lines": {"lr": 2e-2, "network_lr": 1e-3},
+    "penalty": {"weight": 1e-3, "softness": 0.1},
+    "outer_layers": {"count": 1},
+    "direction_jitter": 0.15,
     "storage": "compact",
 }
 """Of runs much shorter than published (README.md, "Presets")."""
@@ -27,7 +24,7 @@ OURS = MethodSpec(
     implementation="headbench.methods.ours.method:Ours",
     config="headbench.methods.ours.config:OursConfig",
     variants="headbench.methods.derived.ours_variants:variants",
-    presets=splat_presets(SHORT, {"plane_bounds": "published"}),
+    presets=splat_presets(SHORT, {"planes": {"bounds_variant": "paper"}}),
     source="3D Gaussian Head Avatars with Expressive Dynamic Appearances by Compact Tensorial Representations, "
     "CVPR 2025, arXiv 2504.14967",
 )

@@ -11,7 +11,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
+
+from ...bench.specs import Renamed
 
 
 @dataclass(frozen=True)
@@ -28,9 +30,8 @@ class DensifiedTraining:
     densify_from, densify_every, densify_until : rounds of cloning, splitting and pruning.
     densify_gradient : mean gradient of the projected mean, in normalised device units, that asks for a round.
     densify_extent : splats larger than this part of the scene extent are split, smaller ones cloned.
-    split_offsets : "local" scatters the two children of a split over the parent. "world" is the compatibility
-        option for the published code, which uses world-space scales in local coordinates and so puts both
-        children almost onto the parent.
+    split_variant : "paper" scatters the two children of a split over the parent. "official" does as the authors' program,
+        which uses world-space scales in local coordinates and so puts both children almost onto the parent.
     prune_opacity : splats below it are removed.
     prune_extent, prune_extent_from : so are splats larger than this part of the extent, from then on.
     reset_every, reset_at_start, reset_opacity : opacities are cut to ``reset_opacity`` regularly (None: never), and
@@ -57,7 +58,7 @@ class DensifiedTraining:
     densify_until: int = 600_000
     densify_gradient: float = 2e-4
     densify_extent: float = 0.01
-    split_offsets: Literal["local", "world"] = "local"
+    split_variant: Literal["paper", "official"] = "paper"
     prune_opacity: float = 0.005
     prune_extent: float = 0.1
     prune_extent_from: int = 60_000
@@ -70,6 +71,10 @@ class DensifiedTraining:
     min_settle: int = 300
     mesh_cache_mb: int = 512
     checkpoint_every_s: float = 120.0
+
+    renamed: ClassVar[Mapping[str, Renamed]] = {
+        "split_offsets": Renamed("split_variant", {"local": "paper", "world": "official"})
+    }
 
     def __post_init__(self) -> None:
         for name in (
@@ -125,5 +130,9 @@ def splat_presets(short: Mapping[str, Any], paper: Mapping[str, Any]) -> dict[st
         "smoke": {"budget": {"iterations": 60}, **short, "splats": SHORT_SPLATS},
         "demo": {"budget": {"iterations": 2_000}, **short, "splats": {**SHORT_SPLATS, "max_splats": 20_000}},
         "fast": {"budget": {"iterations": 4_000}, **short, "splats": {**SHORT_SPLATS, "max_splats": 40_000}},
-        "paper": {"budget": {"iterations": PAPER_ITERATIONS}, **paper, "splats": {"split_offsets": "world"}},
+        "paper": {
+            "budget": {"iterations": PAPER_ITERATIONS},
+            **paper,
+            "splats": {"split_variant": "official"},
+        },
     }

@@ -249,7 +249,7 @@ class Densifier:
         children = self._rows(rows)
         scales = children["log_scales"].exp()
         spread = scales
-        if self._settings.split_offsets == "world":
+        if self._settings.split_variant == "official":
             spread = scales * face_sizes.index_select(0, binding)[:, None]
         generator = torch_generator(self._seed, "split", iteration)
         noise = torch.randn(scales.shape, generator=generator, dtype=scales.dtype).to(scales.device)

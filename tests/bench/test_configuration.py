@@ -1,12 +1,13 @@
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import asdict, dataclass, field
+from typing import ClassVar, Literal
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from headbench.bench.configuration import build, merge, parse_assignments
+from headbench.bench.configuration import build, merge, parse_assignments, with_first_names, with_new_names
 from headbench.bench.errors import InputError
+from headbench.bench.specs import Renamed
 
 
 @dataclass(frozen=True)
@@ -87,3 +88,53 @@ def test_merge_lays_one_over_the_other_without_changing_either():
 )
 def test_merging_with_itself_or_nothing_changes_nothing(values):
     assert merge(values, values) == merge(values, {}) == merge({}, values) == values
+
+
+@dataclass(frozen=True)
+class Group:
+    on: bool = True
+    variant: Literal["paper", "official"] = "paper"
+    later: int = 0
+
+
+@dataclass(frozen=True)
+class Now:
+    """Once flat: ``group`` was the switch, ``how`` and the list ``odd`` what the variants were chosen by."""
+
+    inner: Inner = field(default_factory=Inner)
+    group: Group = field(default_factory=Group)
+    odd_variant: Literal["paper", "official"] = "paper"
+    renamed: ClassVar = {
+        "group": Renamed("group.on"),
+        "how": Renamed("group.variant", {"": "paper", "code": "official"}),
+        "odd:teeth": Renamed("odd_variant"),
+    }
+
+
+@pytest.mark.parametrize(
+    ("values", "new"),
+    [({"group": False}, "group.on"), ({"how": "code"}, "group.variant"), ({"odd": ["teeth"]}, "odd_variant")],
+)
+def test_an_old_name_is_refused_with_the_new_one(values, new):
+    with pytest.raises(InputError, match=rf"a\.{new}"):
+        build(Now, values, "file", "a.")
+
+
+def test_settings_stored_by_old_names_are_read_and_digested_alike():
+    stored = {"inner": {"rate": 0.5, "steps": 3}, "group": False, "how": "code", "odd": ["teeth"]}
+    now = Now(Inner(0.5), Group(on=False, variant="official"), odd_variant="official")
+    assert build(Now, with_new_names(Now, stored), "file") == now
+    assert with_new_names(Now, asdict(now)) == asdict(now)
+    first = with_first_names(now)
+    assert first == {
+        **stored,
+        "odd": ("teeth",),
+        "group.": {"later": 0},
+    }  # a setting added since has no first name
+    assert with_first_names(Now()) == {
+        "inner": asdict(Inner()),
+        "group": True,
+        "how": "",
+        "odd": (),
+        "group.": {"later": 0},
+    }

@@ -9,7 +9,7 @@ import pytest
 from headbench.bench.errors import InputError
 from headbench.bench.manifest import Manifest
 from headbench.bench.runner.store import Cell
-from headbench.methods.specs import GA
+from headbench.methods.ga.spec import GA
 from headbench.metrics.specs import PSNR
 
 GALLERY = Path(__file__).parents[2] / "reports" / "gallery" / "run.json"

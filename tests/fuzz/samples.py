@@ -49,9 +49,8 @@ SETTINGS = {
     "insta": {**ITERATIONS, **SMALL_INSTA},
     "ours": {
         **ITERATIONS,
-        "plane_resolution": 8,
-        "line_resolution": 4,
-        "line_channels": 2,
+        "planes": {"resolution": 8},
+        "lines": {"resolution": 4, "channels": 2},
         "hidden": 8,
         "storage": "exact",
     },

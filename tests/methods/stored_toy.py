@@ -40,7 +40,7 @@ def store(clip, folder, config=SMALL, change=lambda values: None, copies=1):
         appearance.plane_box,
         appearance.line_box,
         appearance.jaw_bases,
-        config.dynamic,
+        config.lines.dynamic,
     )
     write_subject(folder / SUBJECT_FILE, Subject.of(clip))
     save_shared_head(folder, clip.head)

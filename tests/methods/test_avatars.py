@@ -23,7 +23,7 @@ from headbench.methods.ga.method import GA
 from headbench.methods.ga.storage import COLUMNS
 from headbench.methods.gbs.config import BlendshapeTraining, GBSConfig
 from headbench.methods.gbs.method import GBS
-from headbench.methods.ours.config import OursConfig
+from headbench.methods.ours.config import Lines, OursConfig, Planes
 from headbench.methods.ours.method import Ours
 from headbench.methods.shared.config import SplatTraining
 
@@ -31,7 +31,9 @@ FAST = SplatTraining(max_splats=1200, min_densify_every=40, min_settle=20)
 CONFIGS = {
     "ga": lambda: GA(GAConfig(splats=FAST)),
     "ours": lambda: Ours(
-        OursConfig(splats=FAST, plane_resolution=16, line_resolution=8, line_channels=4, hidden=16)
+        OursConfig(
+            splats=FAST, hidden=16, planes=Planes(resolution=16), lines=Lines(resolution=8, channels=4)
+        )
     ),
     "gbs": lambda: GBS(
         GBSConfig(
@@ -291,7 +293,9 @@ def test_ours_costs_48_bytes_per_splat_beside_what_is_fixed(clip, tmp_path):
 def test_a_single_frame_is_overfitted(name, clip, tmp_path):
     key = clip.splits["train"][1]
     single = replace(clip, splits={**clip.splits, "train": (key,)})
-    method = Ours(OursConfig(splats=FAST, plane_resolution=64)) if name == "ours" else CONFIGS[name]()
+    method = (
+        Ours(OursConfig(splats=FAST, planes=Planes(resolution=64))) if name == "ours" else CONFIGS[name]()
+    )
     avatar = method.fit(single, tmp_path, Budget(iterations=250), device="cpu", seed=0, progress=no_progress)
     rgb = avatar.render(clip.cameras[key.camera], clip.poses[key.timestep]).rgb
     error = float(np.mean((rgb - clip.image(key) / 255.0) ** 2))

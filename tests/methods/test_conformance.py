@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from headbench.bench.configuration import merge
 from headbench.bench.conformance import check_method
 from headbench.bench.contracts import no_progress
 from headbench.bench.io.documents import read_json
@@ -28,7 +29,7 @@ OWN_TRAINING = {
 }
 """Methods that do not train splats bound to the mesh, with their own short settings."""
 SMALL = {
-    "ours": {"plane_resolution": 16, "line_resolution": 8, "line_channels": 4, "hidden": 16},
+    "ours": {"planes": {"resolution": 16}, "lines": {"resolution": 8, "channels": 4}, "hidden": 16},
     "gbs": {"samples": 300, "teeth_samples": 30},
 }
 SPECS = {
@@ -41,7 +42,7 @@ SPECS = {
 def resolved(name, **more):
     """The method at its smoke preset, shorter and smaller where it trains."""
     settings = {} if SPECS[name].trivial else OWN_TRAINING.get(name, TRAINED)
-    return resolve_method(SPECS[name], "smoke", {**settings, **SMALL.get(name, {}), **more})
+    return resolve_method(SPECS[name], "smoke", merge({**settings, **SMALL.get(name, {})}, more))
 
 
 def stored(method, clip, folder):
@@ -81,12 +82,12 @@ def test_nothing_held_out_reaches_the_avatar(name, clip, altered, tmp_path):
 
 
 def test_the_published_leak_would_be_noticed(clip, altered, tmp_path):
-    leaky = resolved("ours", jaw_compatibility="tga")
+    leaky = resolved("ours", lines={"jaw_bases_variant": "official"})
     assert stored(leaky, clip, tmp_path / "one") != stored(leaky, altered, tmp_path / "other")
 
 
 def test_the_published_leak_is_on_the_avatars_record(clip, tmp_path):
-    for compatibility in ("", "tga"):
-        stored(resolved("ours", jaw_compatibility=compatibility), clip, tmp_path / f"a{compatibility}")
-        leaks = read_json(tmp_path / f"a{compatibility}" / RECORD_FILE)["leaks"]
-        assert bool(leaks) == (compatibility == "tga")
+    for variant in ("paper", "official"):
+        stored(resolved("ours", lines={"jaw_bases_variant": variant}), clip, tmp_path / variant)
+        leaks = read_json(tmp_path / variant / RECORD_FILE)["leaks"]
+        assert bool(leaks) == (variant == "official")

@@ -11,7 +11,7 @@ from .single_frame import psnr_by_heart
 ITERATIONS = 500
 ENOUGH_DB = 45.0
 OVER = {
-    "ours": {"balanced_sampling": False},  # one timestep has no classes
+    "ours": {"sampling": {"balanced": False}},  # one timestep has no clusters
     "gbs": {"sample_spacing": 0.5},  # the toy's texture changes from triangle to triangle
 }
 

@@ -15,7 +15,7 @@ from headbench.methods.ga.config import GAConfig
 from headbench.methods.ga.method import GA
 from headbench.methods.gbs.config import BlendshapeTraining, GBSConfig
 from headbench.methods.gbs.method import GBS
-from headbench.methods.ours.config import OursConfig
+from headbench.methods.ours.config import Lines, OursConfig, Planes
 from headbench.methods.ours.method import Ours
 from headbench.methods.shared.config import SplatTraining
 from headbench.methods.shared.loop import CHECKPOINT
@@ -34,7 +34,9 @@ SPLATS = SplatTraining(
 METHODS = {
     "ga": lambda: GA(GAConfig(splats=SPLATS, min_sh_every=5)),
     "ours": lambda: Ours(
-        OursConfig(splats=SPLATS, plane_resolution=16, line_resolution=8, line_channels=4, hidden=16)
+        OursConfig(
+            splats=SPLATS, hidden=16, planes=Planes(resolution=16), lines=Lines(resolution=8, channels=4)
+        )
     ),
     # A round each eighth iteration from the first on; nothing is reset.
     "gbs": lambda: GBS(

@@ -13,7 +13,7 @@ from headbench.methods.gbs.spec import GBS
 from headbench.methods.gha.config import GHAConfig
 from headbench.methods.gha.spec import GHA
 from headbench.methods.insta.spec import INSTA
-from headbench.methods.ours.config import OursConfig
+from headbench.methods.ours.config import Capacity, Lines, OursConfig, OuterLayers, Penalty, Planes
 from headbench.methods.ours.spec import OURS
 from headbench.methods.shared.config import SplatTraining
 from headbench.methods.shared.schedule import DensifySchedule, Timeline
@@ -50,7 +50,7 @@ def test_paper_presets_are_the_published_values():
         settings = dict(spec.presets["paper"])
         assert settings.pop("budget") == {"iterations": 600_000}
         config = build(resolve(spec.config), settings, "preset")
-        assert config.splats == SplatTraining(split_offsets="world")
+        assert config.splats == SplatTraining(split_variant="official")
     splats = SplatTraining()
     rates = (
         splats.position_lr,
@@ -65,10 +65,10 @@ def test_paper_presets_are_the_published_values():
     rates = (ga.sh_dc_lr, ga.sh_rest_lr, ga.expression_lr, ga.pose_lr, ga.translation_lr)
     assert rates == (0.0025, 0.000125, 1e-3, 1e-5, 1e-6)
     published = build(OursConfig, {k: v for k, v in OURS.presets["paper"].items() if k != "budget"}, "preset")
-    assert published.plane_bounds == "published"
-    rates = (published.plane_lr, published.color_mlp_lr, published.line_lr, published.line_mlp_lr)
+    assert published.planes.bounds_variant == "paper"
+    rates = (published.planes.lr, published.planes.network_lr, published.lines.lr, published.lines.network_lr)
     assert rates == (2e-3, 1e-4, 2e-3, 1e-4)
-    assert published.lines_from == 60_000
+    assert published.lines.start == 60_000
 
 
 def test_the_paper_preset_of_gha_is_the_published_design():
@@ -139,10 +139,14 @@ def test_the_paper_preset_of_gbs_is_the_paper():
         (GBSConfig, {"difference_sh_degree": 4}),
         (GBSConfig, {"mask_floor_mm": 6.0}),
         (GBSConfig, {"departures": ("triple_correctives",) * 2}),
-        (OursConfig, {"plane_resolution": 1}),
-        (OursConfig, {"expressions": -1}),
-        (OursConfig, {"capacity_tolerance": 0.0}),
-        (OursConfig, {"capacity_detail": 0.0}),
+        (Planes, {"resolution": 1}),
+        (Lines, {"expressions": -1}),
+        (Capacity, {"tolerance": 0.0}),
+        (Capacity, {"detail": 0.0}),
+        (OuterLayers, {"count": -1}),
+        (OuterLayers, {"gap": 0.0}),
+        (OuterLayers, {"opacity": 1.0}),
+        (Penalty, {"softness": -1.0}),
     ],
 )
 def test_settings_out_of_range_are_refused(config, wrong):

@@ -5,7 +5,9 @@ from headbench.reports.runs import RunSet
 from headbench.reports.table_report import published_rows, table_of, table_text, with_published
 
 METRICS = ("psnr", "ssim", "lpips", "storage", "fps")
-OPACITY, GEOMETRY = {"dynamic": ["opacity"]}, {"dynamic": ["position", "rotation", "scale"]}
+OPACITY, GEOMETRY = (
+    {"lines": {"dynamic": [*names]}} for names in (["opacity"], ["position", "rotation", "scale"])
+)
 
 
 def labels(table):
@@ -57,7 +59,7 @@ def test_paper_4_puts_settings_of_ours_from_runs_side_by_side(write_run):
 
 
 def test_other_settings_are_not_given_the_papers_figures(write_run):
-    folder = write_run("a", {"ours": 33.0, "insta": 28.0}, {"ours": {"dynamic": ["color"]}})
+    folder = write_run("a", {"ours": 33.0, "insta": 28.0}, {"ours": {"lines": {"dynamic": ["color"]}}})
     table = table_of(RunSet.read([folder]), "paper-3", published=True)
     assert {c.status for c in table.rows[1].cells[1::2]} == {"none"}
     assert {c.text for c in table.rows[1].cells[1::2]} == {""}

@@ -90,7 +90,7 @@ def class_colour(rank: int) -> tuple[int, int, int]:
 
 def _origin(clusters: ExpressionClusters) -> str:
     count = len(clusters.timesteps)
-    if clusters.compatibility == "tga":
+    if clusters.variant == "official":
         return f"the published clustering of {count} training timesteps"
     if clusters.landmarks == count:
         return f"all pairs of {count} training timesteps"

@@ -30,9 +30,9 @@ def run(settings: StepsSettings, progress: Progress = no_progress) -> Findings:
         if getattr(settings, name) < 1:
             raise InputError(f"--{name}", "", "at least 1", str(getattr(settings, name)))
     clip = read_capture(settings.capture, head=settings.head, leaks="record", progress=progress)
-    jaws = find_jaw_bases(clip, settings.bases, compatibility=settings.compatibility)
+    jaws = find_jaw_bases(clip, settings.bases, variant=settings.variant)
     clusters = cluster_expressions(
-        clip, settings.classes, seed=settings.seed, compatibility=settings.compatibility, progress=progress
+        clip, settings.classes, seed=settings.seed, variant=settings.variant, progress=progress
     )
     out = Path(settings.out)
     write_png(out / JAW_PICTURE, draw_jaw_bases(clip, jaws))

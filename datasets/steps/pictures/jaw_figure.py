@@ -36,13 +36,13 @@ class JawFindings(NamedTuple):
     """(T, 3) rotation vectors of the training timesteps, degrees."""
     held_out: FloatArray
     """The same of the held-out timesteps."""
-    compatibility: str
+    variant: str
 
     def record(self) -> dict[str, Any]:
         """As plain values."""
         return {
-            "compatibility": self.compatibility,
-            "leaks": list(leaks(self.compatibility)),
+            "variant": self.variant,
+            "leaks": list(leaks(self.variant)),
             "bases": self.bases.round(6).tolist(),
             "degrees": self.angles.round(2).tolist(),
             "shares": self.shares.round(4).tolist(),
@@ -53,10 +53,10 @@ class JawFindings(NamedTuple):
 
 
 def find_jaw_bases(
-    clip: CaptureClip, count: int = DEFAULT_COUNT, *, compatibility: Literal["", "tga"] = ""
+    clip: CaptureClip, count: int = DEFAULT_COUNT, *, variant: Literal["paper", "official"] = "paper"
 ) -> JawFindings:
     """Find the bases of a clip and what of its poses they cover."""
-    bases = jaw_bases(clip, count, compatibility=compatibility)
+    bases = jaw_bases(clip, count, variant=variant)
     train = clip.timesteps("train")
     held_out = [t for t in clip.timesteps("self_reenactment") if t not in set(train)]
     quaternions = jaw_quaternions([clip.poses[t] for t in train])
@@ -70,7 +70,7 @@ def find_jaw_bases(
         float(np.degrees(2 * np.arccos(likeness.min()))),
         _degrees(quaternions),
         _degrees(jaw_quaternions([clip.poses[t] for t in held_out])),
-        compatibility,
+        variant,
     )
 
 
@@ -81,7 +81,7 @@ def draw_jaw_bases(clip: CaptureClip, found: JawFindings) -> ByteArray:
     plot_top = _TOP + rows * (_HEIGHT + _LABEL) + 14
     canvas = Canvas(width, plot_top + _PLOT + 40 + 26)
     canvas.text((_MARGIN, 16), f"Jaw bases, subject {clip.subject}", 19)
-    notes = leaks(found.compatibility)
+    notes = leaks(found.variant)
     origin = f"Leak: {notes[0]}" if notes else "from training poses alone, the neutral jaw first"
     canvas.text((width - _MARGIN, 20), origin, 13, _LEAK if notes else MUTED, "ra")
     neutral = next(iter(clip.poses.values()))

@@ -27,8 +27,8 @@ class StepsSettings:
     seed: int = 0
     """Seeds the choice of landmarks in long captures."""
 
-    compatibility: Literal["", "tga"] = ""
-    """"tga" shows what the published code makes: jaw bases from held-out poses (a leak, and said so)."""
+    variant: Literal["paper", "official"] = "paper"
+    """"official" shows what the published code makes: jaw bases from held-out poses (a leak, and said so)."""
 
     head: str | None = None
     """Head model for a capture that brings none: FLAME pickle or npz."""

@@ -143,7 +143,7 @@ class Bench:
         )
 
     def _outside(self) -> Pair:
-        """Lines over the front half of the head, as with ``line_bounds: face``, against the whole."""
+        """Lines over the front half of the head, as with ``lines.bounds: face``, against the whole."""
         field = self.avatar.field
         low, high = field.tensors["line_box"]
         front = torch.stack([torch.stack([low[0], low[1], 0.5 * (low[2] + high[2])]), high])

@@ -49,8 +49,8 @@ def untrained_avatar(
         ],
         dim=1,
     )
-    expressions = min(config.expressions, head.expression_basis.shape[2])
-    poses = random_poses(head, config.jaw_bases, seed=seed + 1)
+    expressions = min(config.lines.expressions, head.expression_basis.shape[2])
+    poses = random_poses(head, config.lines.jaw_bases, seed=seed + 1)
     tensors = {
         name: value for name, (value, _) in initial_parameters(config, expressions, len(poses), rng).items()
     }
@@ -58,11 +58,11 @@ def untrained_avatar(
         tensors["lines"] = 0.05 * normal(*tensors["lines"].shape)
     tensors |= {
         "splats": table,
-        "plane_box": torch.stack(list(plane_box(mesh.canonical, config.plane_bounds))),
+        "plane_box": torch.stack(list(plane_box(mesh.canonical, config.planes.bounds_variant))),
         "line_box": torch.stack(list(line_box(mesh.canonical))),
         "jaw_bases": torch.from_numpy(jaw_quaternions(poses).astype(np.float32)),
     }
-    return OursAvatar([], mesh, subject, Field(tensors, config.dynamic), "cpu")
+    return OursAvatar([], mesh, subject, Field(tensors, config.lines.dynamic), "cpu")
 
 
 def random_poses(head: HeadAsset, count: int, *, seed: int = 0) -> list[HeadPose]:

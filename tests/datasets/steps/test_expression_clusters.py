@@ -89,9 +89,9 @@ def test_published_behaviour_is_that_of_scikit_learn():
     expected = SpectralClustering(6, affinity="precomputed", random_state=5).fit_predict(
         np.maximum(1 - distances / distances.max(), 1e-6)
     )
-    found = cluster_expressions(clip, 6, seed=5, limit=10, compatibility="tga")  # all pairs nevertheless
+    found = cluster_expressions(clip, 6, seed=5, limit=10, variant="official")  # all pairs nevertheless
     assert adjusted_rand_score(expected, found.labels) == 1
-    assert found.record()["compatibility"] == "tga"
+    assert found.record()["variant"] == "official"
     assert found.landmarks == 50
 
 

@@ -78,7 +78,7 @@ def test_published_behaviour_draws_on_held_out_poses_and_a_half_turn():
     test = tuple(FrameKey("s", "q", t, c) for t in range(10, 14) for c in cameras)
     poses = make_clip(10, test=4).poses
     clip = clip.derive("test", {}, splits={**clip.splits, "self_reenactment": test}, poses=poses)
-    bases = jaw_bases(clip, 13, compatibility="tga")
+    bases = jaw_bases(clip, 13, variant="official")
     candidates = jaw_quaternions([poses[t] for t in [*range(10), 10, 12]])
     np.testing.assert_array_equal(bases, brute_force_farthest(candidates, HALF_TURN, 13))
 

@@ -49,7 +49,7 @@ def test_jaw_numbers_are_those_of_brute_force():
 
 def test_published_bases_are_said_to_leak():
     clip = make_clip(10, test=20)
-    found = find_jaw_bases(clip, 5, compatibility="tga")
+    found = find_jaw_bases(clip, 5, variant="official")
     assert "held-out" in found.record()["leaks"][0]
     assert np.abs(found.angles[0]).max() == pytest.approx(180)
 
@@ -100,17 +100,15 @@ def test_colours_of_sixteen_classes_differ():
     assert distances.min() > 20
 
 
-@pytest.mark.parametrize("compatibility", ["", "tga"])
-def test_command_writes_pictures_and_numbers(pristine_capture, tmp_path, compatibility):
-    settings = StepsSettings(
-        str(pristine_capture.union), str(tmp_path), classes=2, compatibility=compatibility
-    )
+@pytest.mark.parametrize("variant", ["paper", "official"])
+def test_command_writes_pictures_and_numbers(pristine_capture, tmp_path, variant):
+    settings = StepsSettings(str(pristine_capture.union), str(tmp_path), classes=2, variant=variant)
     findings = run(settings)
     clip = read_capture(pristine_capture.union)
     stored = read_json(tmp_path / "steps.json")
     assert stored["clip"] == clip.fingerprint
     assert stored["jaw_bases"]["leaks"] == list(findings.data["jaw_bases"]["leaks"])
-    assert bool(stored["jaw_bases"]["leaks"]) == (compatibility == "tga") == ("Leak" in findings.text)
+    assert bool(stored["jaw_bases"]["leaks"]) == (variant == "official") == ("Leak" in findings.text)
     assert sum(stored["expression_classes"]["class_sizes"]) == len(clip.timesteps("train"))
     for name in ("jaw_bases.png", "expression_classes.png"):
         picture = cv2.imread(str(tmp_path / name))

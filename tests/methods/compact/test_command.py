@@ -1,7 +1,6 @@
 """``headbench compact`` on an avatar trained on a capture on disk."""
 
 import re
-from dataclasses import replace
 
 import pytest
 
@@ -15,7 +14,7 @@ from headbench.methods.ours.method import Ours
 from headbench.methods.shared.config import SplatTraining
 
 from ...datasets.tiny_capture import make_plan, write_tiny_capture
-from ..ours.toy import SMALL
+from ..ours.toy import SMALL, changed
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +22,9 @@ def trained(tmp_path_factory):
     """Capture and folder of an avatar."""
     root = tmp_path_factory.mktemp("compact")
     capture = write_tiny_capture(root / "capture").union
-    config = replace(SMALL, splats=SplatTraining(min_settle=4), penalty=0.0, balanced_sampling=False)
+    config = changed(
+        SMALL, splats=SplatTraining(min_settle=4), penalty={"weight": 0.0}, sampling={"balanced": False}
+    )
     Ours(config).fit(
         read_capture(capture),
         root / "avatar",

@@ -14,20 +14,20 @@ from headbench.methods.compact.encoding import EXACT, Precision
 from headbench.methods.compact.file import COMPACT_FILE, encode, exact_sizes, part_sizes, write_compact
 from headbench.methods.compact.simplify import simplify, training_poses
 from headbench.methods.ours.avatar import OursAvatar
-from headbench.methods.ours.config import OursConfig
+from headbench.methods.ours.config import Lines, OursConfig, Planes
 from headbench.methods.ours.method import Ours
 from headbench.methods.ours.storage import FIELD_FILE
 from headbench.methods.shared.avatar_files import read_shared_head
 from headbench.methods.shared.config import SplatTraining
 
-from ..ours.toy import SMALL
+from ..ours.toy import SMALL, changed
 from ..stored_toy import store
 
 CASES = {
     "opacity": SMALL,
-    "others": replace(SMALL, dynamic=("position", "rotation", "scale", "color")),
+    "others": changed(SMALL, lines={"dynamic": ("position", "rotation", "scale", "color")}),
     "harmonics": replace(SMALL, color="sh", sh_degree=2),
-    "no lines": replace(SMALL, lines=False),
+    "no lines": changed(SMALL, lines={"enabled": False}),
 }
 
 
@@ -102,7 +102,7 @@ def test_defaults_cost_little_and_each_coarser_part_costs_more(case, clip, tmp_p
 
 def test_fewer_bytes_than_a_tenth_at_a_trained_avatars_numbers(clip, tmp_path):
     """Sizes whose plane numbers, as in training, need few steps; the ratio is a floor, measured at 19 on a real one."""
-    config = OursConfig(plane_resolution=64, lines=False)
+    config = OursConfig(planes=Planes(resolution=64), lines=Lines(enabled=False))
     folder = store(clip, tmp_path, config, lambda values: values["color_weight_0"].mul_(0.3), copies=4)
     before, after = compacted(folder, Precision())
     exact, compact = (sum(path.stat().st_size for path in avatar.files()) for avatar in (before, after))

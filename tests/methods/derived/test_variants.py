@@ -1,7 +1,5 @@
 """Variants of toy avatars: what each recipe must leave the same, and what it must not."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -15,7 +13,7 @@ from headbench.methods.ga.method import GAAvatar
 from headbench.methods.ours.avatar import OursAvatar
 from headbench.methods.shared.config import SplatTraining
 
-from ..ours.toy import SMALL
+from ..ours.toy import SMALL, changed
 from ..stored_toy import store
 
 
@@ -31,7 +29,7 @@ def ga(clip, tmp_path_factory):
 @pytest.fixture(scope="module")
 def ours(clip, tmp_path_factory):
     folder = tmp_path_factory.mktemp("ours")
-    store(clip, folder, replace(SMALL, plane_resolution=80, line_resolution=20), copies=2)
+    store(clip, folder, changed(SMALL, planes={"resolution": 80}, lines={"resolution": 20}), copies=2)
     return folder
 
 

@@ -1,7 +1,5 @@
 """The training side of the tensorial method: what is detached, when lines start, whom the penalty asks."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -10,7 +8,7 @@ from headbench.datasets.head.arrays import faces_in_region
 from headbench.methods.ours.appearance import penalty_weights, softened
 from headbench.methods.ours.config import OursConfig
 
-from .toy import SMALL, make, place
+from .toy import SMALL, changed, make, place
 
 
 def test_lines_start_after_their_iteration(clip):
@@ -51,7 +49,7 @@ def test_splats_outside_the_lines_box_have_no_offset(clip):
 def test_face_bounds_reach_fewer_splats_than_head_bounds(clip):
     moved = {}
     for bounds in ("head", "face"):
-        appearance, optimiser, binding = make(clip, replace(SMALL, line_bounds=bounds))
+        appearance, optimiser, binding = make(clip, changed(SMALL, lines={"bounds": bounds}))
         shading = place(clip, appearance, optimiser, binding, 60_001)
         moved[bounds] = int((shading.opacities != 0.5).sum())
     assert 0 < moved["face"] < moved["head"]
@@ -60,7 +58,10 @@ def test_face_bounds_reach_fewer_splats_than_head_bounds(clip):
 @pytest.mark.parametrize("switch", ["lines", "penalty"])
 def test_switches(clip, switch):
     appearance, optimiser, binding = make(
-        clip, replace(SMALL, **{switch: False if switch == "lines" else 0.0})
+        clip,
+        changed(
+            SMALL, **{"lines": {"lines": {"enabled": False}}, "penalty": {"penalty": {"weight": 0.0}}}[switch]
+        ),
     )
     shading = place(clip, appearance, optimiser, binding, 60_001)
     assert shading.penalty is None
@@ -113,7 +114,7 @@ def test_capacity_follows_the_clip(clip, head):
 
 def test_view_directions_waver_in_training_and_only_they(clip):
     steady, optimiser, binding = make(clip)
-    wavering = make(clip, replace(SMALL, direction_noise=0.2))[0]
+    wavering = make(clip, changed(SMALL, direction_jitter=0.2))[0]
     one, other = (place(clip, wavering, optimiser, binding, i) for i in (1, 2))
     again = place(clip, wavering, optimiser, binding, 1)
     straight = place(clip, steady, optimiser, binding, 1)

@@ -8,12 +8,12 @@ import torch
 
 from headbench.bench.errors import InputError
 from headbench.methods.ours.avatar import OursAvatar
-from headbench.methods.ours.config import OursConfig
+from headbench.methods.ours.config import Lines, OursConfig
 from headbench.methods.ours.field import WIDTHS, LocalSplats, apply_offsets, changed_colors, offset_width
 from headbench.methods.ours.storage import FIELD_FILE, write_field
 from headbench.methods.shared.avatar_files import SUBJECT_FILE, Subject, save_shared_head, write_subject
 
-from .toy import SMALL, make, place
+from .toy import SMALL, changed, make, place
 
 OTHERS = ("position", "rotation", "scale", "color")
 
@@ -53,10 +53,10 @@ def test_colours_do_not_fall_below_zero():
 
 CASES = {
     "opacity": SMALL,
-    "others": replace(SMALL, dynamic=OTHERS),
-    "everything": replace(SMALL, dynamic=("color", "opacity", "position")),
+    "others": changed(SMALL, lines={"dynamic": OTHERS}),
+    "everything": changed(SMALL, lines={"dynamic": ("color", "opacity", "position")}),
     "harmonics": replace(SMALL, color="sh", sh_degree=2),
-    "harmonics, others": replace(SMALL, color="sh", dynamic=OTHERS),
+    "harmonics, others": changed(SMALL, color="sh", lines={"dynamic": OTHERS}),
 }
 
 
@@ -77,7 +77,7 @@ def test_a_stored_avatar_places_its_splats_as_training_does(case, clip, tmp_path
         appearance.plane_box,
         appearance.line_box,
         appearance.jaw_bases,
-        CASES[case].dynamic,
+        CASES[case].lines.dynamic,
     )
     write_subject(tmp_path / SUBJECT_FILE, Subject.of(clip))
     save_shared_head(tmp_path, clip.head)
@@ -103,7 +103,7 @@ def test_the_others_change_geometry_and_leave_opacity(clip):
 @pytest.mark.parametrize("dynamic", [(), ("opacity", "opacity")])
 def test_a_choice_that_means_nothing_is_refused(dynamic):
     with pytest.raises(ValueError, match="dynamic"):
-        OursConfig(dynamic=dynamic)
+        OursConfig(lines=Lines(dynamic=dynamic))
 
 
 def test_a_foreign_name_in_a_file_is_refused(clip, tmp_path):

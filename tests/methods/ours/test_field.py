@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from headbench.methods.ours.config import OursConfig
+from headbench.methods.ours.config import Lines, OursConfig, Planes
 from headbench.methods.ours.field import (
     Box,
     CanonicalFrames,
@@ -28,11 +28,11 @@ def mesh(seed=0, faces=5):
     return torch.from_numpy(rng.normal(size=(3 * faces, 3))), torch.arange(3 * faces).view(faces, 3)
 
 
-@pytest.mark.parametrize("bounds", ["mesh", "published"])
-def test_plane_bounds(bounds):
+@pytest.mark.parametrize("variant", ["mesh", "paper"])
+def test_plane_bounds(variant):
     vertices = torch.tensor([[-0.1, -0.2, -0.05], [0.08, 0.15, 0.12]])
-    low, high = plane_box(vertices, bounds)
-    width = (-0.25, 0.25) if bounds == "published" else (-0.105, 0.085)
+    low, high = plane_box(vertices, variant)
+    width = (-0.25, 0.25) if variant == "paper" else (-0.105, 0.085)
     np.testing.assert_allclose(low, [width[0], -0.2 - 0.005 - 0.025, -0.055], atol=1e-7)
     np.testing.assert_allclose(high, [width[1], 0.155, 0.125], atol=1e-7)
 
@@ -90,7 +90,7 @@ def test_initial_values():
 
 
 def test_colour_is_the_network_on_concatenated_features_and_encoding():
-    config = OursConfig(plane_resolution=6, plane_channels=(3, 2, 2), hidden=5, lines=False)
+    config = OursConfig(hidden=5, planes=Planes(resolution=6, channels=(3, 2, 2)), lines=Lines(enabled=False))
     parameters = {k: v.double() for k, (v, _) in initial_parameters(config, 0, 0, GENERATOR).items()}
     box = Box(*(torch.tensor(v, dtype=torch.float64) for v in ([-1.0, -2, -1], [1.0, 1, 3])))
     positions = torch.rand(8, 3, dtype=torch.float64, generator=GENERATOR)

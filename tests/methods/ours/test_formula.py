@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from headbench.bench.contracts import Budget, no_progress
 from headbench.datasets.head.model import HeadModel
 from headbench.methods.ours.appearance import OursAppearance
-from headbench.methods.ours.config import OursConfig
+from headbench.methods.ours.config import Lines, OursConfig, Planes
 from headbench.methods.ours.method import Ours
 from headbench.methods.shared.config import SplatTraining
 from headbench.methods.shared.optimisation import Optimiser
@@ -22,14 +22,9 @@ from headbench.methods.shared.subject_mesh import SubjectMesh
 
 CONFIG = OursConfig(
     splats=SplatTraining(min_densify_every=10, min_settle=4),
-    plane_resolution=7,
-    plane_channels=(4, 3, 2),
     hidden=6,
-    line_resolution=5,
-    line_channels=3,
-    expressions=5,
-    jaw_bases=3,
-    line_lr=0.05,
+    planes=Planes(resolution=7, channels=(4, 3, 2)),
+    lines=Lines(resolution=5, channels=3, expressions=5, jaw_bases=3, lr=0.05),
 )
 
 

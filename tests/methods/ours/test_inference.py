@@ -14,7 +14,7 @@ from headbench.methods.shared.networks import CPU_BLOCK, encode_directions
 from headbench.methods.shared.subject_mesh import KnownPoses, pose_key
 
 from ..stored_toy import store
-from .toy import SMALL
+from .toy import SMALL, changed
 
 
 def directions(count, seed=0, dtype=torch.float32):
@@ -83,9 +83,9 @@ def test_offsets_are_those_of_training(clip, tmp_path):
 
 CASES = {
     "opacity": SMALL,
-    "others": replace(SMALL, dynamic=("position", "rotation", "scale", "color")),
+    "others": changed(SMALL, lines={"dynamic": ("position", "rotation", "scale", "color")}),
     "harmonics": replace(SMALL, color="sh", sh_degree=2),
-    "no lines": replace(SMALL, lines=False),
+    "no lines": changed(SMALL, lines={"enabled": False}),
 }
 
 

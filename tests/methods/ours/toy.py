@@ -1,17 +1,29 @@
 """The tensorial method at toy size, with parameters that make every part of it matter."""
 
+from dataclasses import replace
+
 import torch
 from torch import nn
 
 from headbench.methods.ours.appearance import OursAppearance
-from headbench.methods.ours.config import OursConfig
+from headbench.methods.ours.config import Lines, OursConfig, Planes
 from headbench.methods.shared.avatar_files import Subject
 from headbench.methods.shared.optimisation import Optimiser
 from headbench.methods.shared.rendering import view_of
 from headbench.methods.shared.schedule import Timeline
 from headbench.methods.shared.subject_mesh import SubjectMesh
 
-SMALL = OursConfig(plane_resolution=8, plane_channels=(4, 2, 2), hidden=8, line_resolution=6, line_channels=3)
+SMALL = OursConfig(
+    hidden=8, planes=Planes(resolution=8, channels=(4, 2, 2)), lines=Lines(resolution=6, channels=3)
+)
+
+
+def changed(config, **settings):
+    """The configuration with other settings; those of a group as a dict."""
+    groups = {name: value for name, value in settings.items() if isinstance(value, dict)}
+    return replace(
+        config, **settings | {name: replace(getattr(config, name), **value) for name, value in groups.items()}
+    )
 
 
 def make(clip, config=SMALL):

@@ -12,22 +12,21 @@ from hypothesis import strategies as st
 from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.runner.training_view import TrainingView
 from headbench.methods.ours.capacity import plan_capacity
-from headbench.methods.ours.config import OursConfig
+from headbench.methods.ours.config import Capacity, Lines, OursConfig, Penalty
 from headbench.methods.ours.method import Ours
 from headbench.methods.shared.avatar_files import RECORD_FILE, Subject
 from headbench.methods.shared.config import SplatTraining
 from headbench.methods.shared.subject_mesh import SubjectMesh
 
+from ...ours.toy import changed
 from ...toy_clip import ToyClip
 
 SMALL = OursConfig(
     splats=SplatTraining(max_splats=2000, min_densify_every=40, min_settle=20),
-    line_resolution=8,
-    line_channels=4,
     hidden=16,
-    penalty_face_mm=0.1,
-    penalty_other_mm=0.2,
-    capacity="auto",
+    lines=Lines(resolution=8, channels=4),
+    penalty=Penalty(face_mm=0.1, other_mm=0.2),
+    capacity=Capacity(mode="auto"),
 )
 MEGAPIXEL = 40
 """Enlarges the toy's cameras so that its millimetres are pixels."""
@@ -63,37 +62,37 @@ def still(pose):
 
 def test_all_of_an_expressive_sharp_clip_is_modelled(sharp):
     sizes = chosen(sharp)
-    assert sizes["expressions"] == sharp.head.expression_basis.shape[2]
-    assert sizes["jaw_bases"] == 2
-    assert sizes["plane_resolution"] == SMALL.plane_resolution
-    assert sizes["max_splats"] == SMALL.splats.max_splats
+    assert sizes["lines.expressions"] == sharp.head.expression_basis.shape[2]
+    assert sizes["lines.jaw_bases"] == 2
+    assert sizes["planes.resolution"] == SMALL.planes.resolution
+    assert sizes["splats.max_splats"] == SMALL.splats.max_splats
     assert plan(sharp).lines
 
 
 def test_a_still_face_has_no_lines(sharp):
     found = plan(with_poses(sharp, still))
     assert not found.lines
-    assert not found.apply(SMALL).lines
+    assert not found.apply(SMALL).lines.enabled
     assert found.lines_within is None
 
 
 def test_a_still_jaw_has_no_bases(sharp):
     sizes = chosen(with_poses(sharp, lambda pose: {"jaw": np.zeros(3)}))
-    assert sizes["jaw_bases"] == 0
-    assert sizes["expressions"] > 0
+    assert sizes["lines.jaw_bases"] == 0
+    assert sizes["lines.expressions"] > 0
 
 
 def test_a_jaw_without_expressions_has_lines_for_the_jaw_alone(sharp):
     sizes = chosen(with_poses(sharp, lambda pose: {"expression": 0 * pose.expression}))
-    assert sizes["expressions"] == 0
-    assert sizes["jaw_bases"] == 2
+    assert sizes["lines.expressions"] == 0
+    assert sizes["lines.jaw_bases"] == 2
 
 
 def test_only_the_directions_in_use_are_modelled(sharp):
     def leading(pose):
         return {"expression": np.where(np.arange(len(pose.expression)) < 3, pose.expression, 0.4)}
 
-    assert chosen(with_poses(sharp, leading))["expressions"] == 3
+    assert chosen(with_poses(sharp, leading))["lines.expressions"] == 3
 
 
 def test_motion_that_no_pixel_shows_is_none(clip):
@@ -109,42 +108,47 @@ def test_lines_reach_no_further_than_what_moves(sharp):
     canonical = mesh.canonical.numpy()
     assert (low >= canonical.min(0) - 1e-7).all()
     assert (high <= canonical.max(0) + 1e-7).all()
-    strict = plan(sharp, replace(SMALL, penalty_face_mm=6.0, penalty_other_mm=6.0))
+    strict = plan(sharp, changed(SMALL, penalty={"face_mm": 6.0, "other_mm": 6.0}))
     smaller = np.prod(np.subtract(*strict.lines_within[::-1]))
     assert 0 < smaller < np.prod(high - low)
 
 
 def test_doubling_the_images_raises_planes_and_splats(clip):
-    config = replace(SMALL, plane_resolution=1000, splats=SplatTraining())
+    config = changed(SMALL, splats=SplatTraining(), planes={"resolution": 1000})
     once, twice = (chosen(enlarged(clip, factor), config) for factor in (4, 8))
-    assert once["plane_resolution"] < twice["plane_resolution"] <= 2 * once["plane_resolution"]
-    assert once["max_splats"] <= twice["max_splats"]
-    assert chosen(clip)["plane_resolution"] < 40
+    assert once["planes.resolution"] < twice["planes.resolution"] <= 2 * once["planes.resolution"]
+    assert once["splats.max_splats"] <= twice["splats.max_splats"]
+    assert chosen(clip)["planes.resolution"] < 40
 
 
 def test_half_the_detail_halves_the_planes_samples(sharp):
-    whole = chosen(sharp, replace(SMALL, plane_resolution=10**6))["plane_resolution"] - 1
-    half = chosen(sharp, replace(SMALL, plane_resolution=10**6, capacity_detail=0.5))["plane_resolution"] - 1
+    whole = chosen(sharp, changed(SMALL, planes={"resolution": 10**6}))["planes.resolution"] - 1
+    half = (
+        chosen(sharp, changed(SMALL, planes={"resolution": 10**6}, capacity={"detail": 0.5}))[
+            "planes.resolution"
+        ]
+        - 1
+    )
     assert 2 * half - 1 <= whole <= 2 * half
 
 
 @settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.floats(0.05, 50), st.floats(1, 10))
 def test_more_tolerance_never_asks_for_more(sharp, tolerance, factor):
-    fine, coarse = (chosen(sharp, replace(SMALL, capacity_tolerance=tolerance * f)) for f in (1, factor))
-    for name in ("expressions", "jaw_bases", "plane_resolution", "max_splats"):
+    fine, coarse = (chosen(sharp, changed(SMALL, capacity={"tolerance": tolerance * f})) for f in (1, factor))
+    for name in ("lines.expressions", "lines.jaw_bases", "planes.resolution", "splats.max_splats"):
         assert coarse[name] <= fine[name]
 
 
 def test_configured_sizes_are_limits_and_can_be_kept(sharp, clip):
-    config = replace(SMALL, expressions=2, jaw_bases=1, plane_resolution=9)
-    assert chosen(sharp, config)["expressions"] == 2
-    assert chosen(sharp, config)["jaw_bases"] == 1
-    assert chosen(sharp, config)["plane_resolution"] == 9
-    kept = replace(SMALL, capacity_keep=("expressions", "plane_resolution", "line_bounds"))
+    config = changed(SMALL, lines={"expressions": 2, "jaw_bases": 1}, planes={"resolution": 9})
+    assert chosen(sharp, config)["lines.expressions"] == 2
+    assert chosen(sharp, config)["lines.jaw_bases"] == 1
+    assert chosen(sharp, config)["planes.resolution"] == 9
+    kept = changed(SMALL, capacity={"keep": ("lines.expressions", "planes.resolution", "lines.bounds")})
     found = plan(with_poses(clip, still), kept)
     resolved = found.apply(kept)
-    assert (resolved.expressions, resolved.plane_resolution) == (80, 128)
+    assert (resolved.lines.expressions, resolved.planes.resolution) == (80, 128)
     assert resolved.lines
     assert found.lines_within is None
 
@@ -169,7 +173,7 @@ def test_held_out_poses_and_images_decide_nothing(clip):
 def test_a_planned_avatar_trains_renders_and_keeps_its_plan(clip, tmp_path, caplog, change):
     if change == "still":
         clip = with_poses(clip, still)
-    config = replace(SMALL, storage="compact" if change == "still" else "exact", capacity_tolerance=0.02)
+    config = changed(SMALL, storage="compact" if change == "still" else "exact", capacity={"tolerance": 0.02})
     with caplog.at_level(logging.INFO, "headbench"):
         avatar = Ours(config).fit(
             clip, tmp_path, Budget(iterations=30), device="cpu", seed=0, progress=no_progress
@@ -182,8 +186,8 @@ def test_a_planned_avatar_trains_renders_and_keeps_its_plan(clip, tmp_path, capl
     record = json.loads((tmp_path / RECORD_FILE).read_text())["capacity"]
     assert record["lines"] == (change == "expressive") == ("lines" in avatar.field.tensors)
     planned = {each["name"]: each for each in record["decisions"]}
-    assert len(avatar.field.tensors["plane_xy"]) == planned["plane_resolution"]["chosen"] ** 2
-    assert planned["plane_resolution"]["numbers"]["longest_px"] > 0
+    assert len(avatar.field.tensors["plane_xy"]) == planned["planes.resolution"]["chosen"] ** 2
+    assert planned["planes.resolution"]["numbers"]["longest_px"] > 0
     again = Ours(config).fit(
         clip, tmp_path, Budget(iterations=30), device="cpu", seed=0, progress=no_progress
     )
@@ -191,6 +195,6 @@ def test_a_planned_avatar_trains_renders_and_keeps_its_plan(clip, tmp_path, capl
 
 
 def test_a_fixed_capacity_has_no_plan(clip, tmp_path):
-    config = replace(SMALL, capacity="fixed", plane_resolution=8)
+    config = changed(SMALL, capacity={"mode": "fixed"}, planes={"resolution": 8})
     Ours(config).fit(clip, tmp_path, Budget(iterations=5), device="cpu", seed=0, progress=no_progress)
     assert json.loads((tmp_path / RECORD_FILE).read_text())["capacity"] is None

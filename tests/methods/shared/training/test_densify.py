@@ -72,11 +72,11 @@ def test_large_splats_are_split_and_their_parent_goes():
     assert not torch.equal(offsets[0], offsets[1])
 
 
-@pytest.mark.parametrize(("offsets", "factor"), [("local", 1.0), ("world", 0.001)])
-def test_children_scatter_by_the_parents_scale_in_its_own_axes(offsets, factor):
+@pytest.mark.parametrize(("variant", "factor"), [("paper", 1.0), ("official", 0.001)])
+def test_children_scatter_by_the_parents_scale_in_its_own_axes(variant, factor):
     # A thousand needles along one local axis, on faces of size 1 mm.
     count = 1000
-    config = replace(SplatTraining(), split_offsets=offsets, densify_extent=0.0)
+    config = replace(SplatTraining(), split_variant=variant, densify_extent=0.0)
     densifier, optimiser, values = make([0] * count, [1.0] * count, [0.5] * count, 1, config)
     log_scales = torch.log(torch.tensor([2.0, 1e-6, 1e-6], dtype=torch.float64)).expand(count, 3)
     optimiser["log_scales"].data.copy_(log_scales)
