@@ -41,7 +41,6 @@ if _TYPE_CHECKING:
     from .bench.runner.config import resolve_method
     from .bench.specs import (
         BenchmarkSpec,
-        CommandSpec,
         DatasetSpec,
         Findings,
         MethodSpec,
@@ -49,6 +48,7 @@ if _TYPE_CHECKING:
         ProfileSpec,
         ReportSpec,
         ResolutionRule,
+        writes,
     )
 
 __all__ = [
@@ -60,7 +60,6 @@ __all__ = [
     "Budget",
     "Camera",
     "Clip",
-    "CommandSpec",
     "DatasetSpec",
     "Findings",
     "Frame",
@@ -93,6 +92,7 @@ __all__ = [
     "check_metric",
     "check_reader",
     "resolve_method",
+    "writes",
 ]
 
 _HOMES = {
@@ -102,7 +102,8 @@ _HOMES = {
     "conformance.readers": ("check_clip", "check_reader"),
     "errors": ("HeadbenchError", "InputError", "UnavailableError"),
     "runner.config": ("resolve_method",),
-    "specs": tuple(name for name in __all__ if name.endswith("Spec")) + ("Findings", "ResolutionRule"),
+    "specs": tuple(name for name in __all__ if name.endswith("Spec"))
+    + ("Findings", "ResolutionRule", "writes"),
 }
 _HOME = {name: module for module, names in _HOMES.items() for name in names}
 

@@ -23,14 +23,12 @@ from .configuration import build, merge, parse_assignments
 from .device import check_device
 from .errors import EXIT_CODES, ExitCode, HeadbenchError, InputError, Interruption
 from .io.documents import read_yaml
-from .io.files import check_writable, plain, write_json
+from .io.files import check_writable, plain, prepare_folder, write_json
 from .io.lock import locked
 from .progress import log_to, progress
 from .registry import Group, discover, get, resolve
 from .runner.config import RunConfig, resolve_methods, resolve_metrics
 from .runner.demo import DemoConfig, demo_run_config, parse_size
-from .runner.run import run as run_comparison
-from .runner.store import RunFolder
 from .specs import Findings
 
 Preset = Literal["smoke", "demo", "fast", "paper"]
@@ -69,7 +67,7 @@ def demo(
     resolve_methods(comparison)
     resolve_metrics(comparison)
     check_device(comparison.device)
-    RunFolder(Path(out)).prepare()
+    prepare_folder(Path(out))
     with log_to(_log_file(Path(out))):
         start = time.perf_counter()
         with locked(Path(out)):
@@ -107,7 +105,7 @@ def synth(
         performance: `expressions` leaves out jaw and tongue, `still` moves only head, neck and eyes.
         dynamics: Scales what expressions do to skin beyond moving it (wrinkles, blush), 0 to 3.
     """
-    RunFolder(Path(out)).prepare()
+    prepare_folder(Path(out))
     with log_to(None), locked(Path(out), beside=True):  # a capture is made in an empty folder
         _synthesise(
             {
@@ -211,7 +209,11 @@ def list_(
     for name, plugin in discover(group).items():
         entry: dict[str, Any] = {"name": name, "origin": plugin.origin, "error": plugin.error}
         if plugin.spec is not None:
-            entry = {**entry, **asdict(plugin.spec), "name": name}
+            entry = {
+                **entry,
+                **{key: _reference(value) for key, value in asdict(plugin.spec).items()},
+                "name": name,
+            }
         entries.append(entry)
     if what == "presets":
         entries = [
@@ -357,6 +359,8 @@ def _synthesise(arguments: dict[str, Any]) -> None:
 
 
 def _run(config: RunConfig, as_json: bool, **record: Any) -> int:
+    from .runner.run import run as run_comparison
+
     rows = run_comparison(config, **record)
     if as_json:
         _print_json({"out": config.out, "failed": rows.failed, "means": _means(Path(config.out))})
@@ -407,6 +411,11 @@ def _log_file(out: Path) -> Path | None:
     except (OSError, ValueError):
         return None
     return out / "run.log" if os.access(out, os.W_OK) else None
+
+
+def _reference(value: Any) -> Any:
+    """Functions and classes as "package.module:name"."""
+    return f"{value.__module__}:{value.__qualname__}" if callable(value) else value
 
 
 def _settings_line(values: dict[str, Any]) -> str:

@@ -1,6 +1,6 @@
-"""Commands of the command line that the rooms offer: found in the registry, described by their settings."""
+"""Commands of the command line that are found in the registry, described by their settings."""
 
-from __future__ import annotations
+# Without `from __future__ import annotations`: the parser reads annotations that are made when a command is found.
 
 import codecs
 import difflib
@@ -19,7 +19,7 @@ from .errors import ExitCode, HeadbenchError, InputError
 from .io.files import plain
 from .io.lock import locked
 from .progress import log_to, progress
-from .registry import discover, resolve
+from .registry import discover
 from .specs import CommandSpec, Findings
 
 Command = Callable[..., int]
@@ -55,7 +55,7 @@ WORDS_OF_OTHERS = {
 def offered_commands() -> dict[str, Command | dict[str, Command]]:
     """Commands by name; a word that several share ("prepare nersemble") leads to a table of its own.
 
-    A command whose settings cannot be loaded is listed; it raises when it is called.
+    A command that cannot be loaded is listed; it raises when it is called.
     """
     found: dict[str, Command | dict[str, Command]] = {}
     for name, plugin in sorted(discover("commands").items()):
@@ -145,27 +145,17 @@ def exit_code(findings: Findings) -> int:
 
 
 def _command(spec: CommandSpec) -> Command:
-    try:
-        settings_type = resolve(spec.settings)
-    except HeadbenchError as error:
-        return _broken(spec.name, str(error))
+    settings_type: Any = Annotated[spec.settings, tyro.conf.OmitArgPrefixes]
 
-    def command(settings: Any, json: bool = False) -> int:
-        implementation = resolve(spec.implementation)
+    def command(settings: settings_type, json: bool = False) -> int:
         folder = getattr(settings, spec.writes) if spec.writes else None
         lock = locked(Path(folder)) if folder else nullcontext()
         with log_to(None), lock, progress(spec.name) as report:
-            findings: Findings = implementation(settings, report)
+            findings = spec.function(settings, report)
         show(json_module.dumps(findings.data, indent=1, default=plain) if json else findings.text)
         return exit_code(findings)
 
-    # The options are those of this command's own settings, which only its specification knows.
-    command.__annotations__ = {
-        "settings": Annotated[settings_type, tyro.conf.OmitArgPrefixes],
-        "json": Annotated[bool, tyro.conf.arg(help="Print the result as JSON.")],
-        "return": int,
-    }
-    command.__doc__ = spec.summary
+    command.__doc__ = f"{spec.summary}\n\nArgs:\n    json: Print the result as JSON."
     return command
 
 
@@ -178,12 +168,12 @@ def _broken(name: str, why: str) -> Command:
 
 
 def _nested(group: Mapping[str, Command]) -> Command:
-    def command(what: int) -> int:
-        return what
-
     # The parser calls the command that the second word names, and gives what it returned.
     choices = [Annotated[Any, tyro.conf.subcommand(name=n, constructor=c)] for n, c in sorted(group.items())]
-    union: Any = Union[(*choices, Annotated[None, tyro.conf.Suppress])]
-    command.__annotations__ = {"what": union, "return": int}
+    choice: Any = Union[(*choices, Annotated[None, tyro.conf.Suppress])]
+
+    def command(what: choice) -> int:
+        return what
+
     command.__doc__ = f"Followed by one of: {', '.join(sorted(group))}."
     return command

@@ -116,6 +116,8 @@ def _load(entry: EntryPoint, group: str) -> Plugin:
 
 
 def _checked(spec: Any, group: str, name: str) -> Any:
+    if group == "commands":
+        return CommandSpec.of(name, spec)
     if not isinstance(spec, SPEC_TYPES[group]):
         raise InputError(
             f"registry of {group}", name, f"a {SPEC_TYPES[group].__name__}", f"a {type(spec).__name__}"

@@ -6,9 +6,10 @@ resolved when it is used. The behaviours behind the names are in `contracts`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from typing import Any, Literal, NamedTuple
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, is_dataclass, replace
+from typing import Any, Literal, NamedTuple, get_type_hints
 
 MAX_LABEL = 120
 LABEL = f"at most {MAX_LABEL} printable characters"
@@ -228,7 +229,7 @@ class ReportSpec:
 
 
 class Findings(NamedTuple):
-    """What a benchmark of the toolkit itself, or a command that a room offers, found out."""
+    """What a command, or a benchmark of the toolkit itself, found out."""
 
     text: str
     """Tables for a terminal."""
@@ -255,19 +256,48 @@ class BenchmarkSpec:
     stress: str = ""
 
 
+CommandFunction = Callable[..., Findings]
+
+
 @dataclass(frozen=True)
 class CommandSpec:
-    """A command of the command line that a room offers.
+    """A command of the command line, as its entry point gives it: a function ``(settings, progress) -> Findings``.
 
-    ``name`` may have two words ("prepare nersemble"). ``settings`` names a frozen dataclass in a module that is
-    light to import; its attributes, described in its docstring, become the options. ``implementation`` names a
-    function ``(settings, progress) -> Findings``; the exit code is 0, or 1 where it did not pass, unless the findings
-    give one. ``writes`` names the setting with the folder that the command writes, if it has one: no other process
-    works in it meanwhile.
+    The module that defines the function must be light to import: every start of the command line loads it.
+
+    Attributes
+    ----------
+    name : the entry point's; may have two words ("prepare nersemble").
+    summary : the first line of the function's docstring.
+    function : called with the settings and a `Progress`. The exit code is 0, or 1 where the findings did not pass,
+        unless they give one.
+    settings : annotation of the function's first parameter: a frozen dataclass whose attributes, described in
+        docstrings, become the options.
+    writes : the setting with the folder that the command writes, see `writes`; "" for none.
     """
 
     name: str
     summary: str
-    implementation: str
-    settings: str
+    function: CommandFunction
+    settings: type
     writes: str = ""
+
+    @classmethod
+    def of(cls, name: str, function: Any) -> CommandSpec:
+        """Describe a function. Raises `TypeError` for what is no command."""
+        parameters = list(inspect.signature(function).parameters)
+        settings = get_type_hints(function).get(parameters[0]) if parameters else None
+        if not isinstance(settings, type) or not is_dataclass(settings):
+            raise TypeError(f"{function!r}: the first parameter of a command is annotated with a dataclass")
+        summary = (function.__doc__ or "").strip().partition("\n")[0]
+        return cls(name, summary, function, settings, getattr(function, "writes", ""))
+
+
+def writes(setting: str) -> Callable[[CommandFunction], CommandFunction]:
+    """Declare the setting that names the folder a command writes: no other process works in it meanwhile."""
+
+    def declare(function: CommandFunction) -> CommandFunction:
+        function.__dict__["writes"] = setting
+        return function
+
+    return declare

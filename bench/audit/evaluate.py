@@ -1,4 +1,4 @@
-"""``headbench evaluate``: scores a folder of images as if a method of a run had rendered them."""
+"""``headbench evaluate``."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 from ..contracts import Avatar, Budget, Camera, Clip, Frame, FrameKey, HeadPose, Progress, no_progress
 from ..errors import HeadbenchError, InputError
-from ..io.files import atomic_path, check_name, digest, digest_file, grouped_writes
+from ..io.files import atomic_path, check_name, digest, digest_file, grouped_writes, prepare_folder
 from ..io.lock import locked
 from ..protocol import Protocol, make_protocol
 from ..registry import discover, get, resolve
@@ -22,8 +22,8 @@ from ..runner.scoring import check_regions
 from ..runner.stages import DIGESTS, Job, measure
 from ..runner.store import RunFolder
 from ..specs import Findings, MethodSpec
+from .command import EvaluateSettings
 from .folder_images import find_images
-from .settings import EvaluateSettings
 
 
 class NoAvatar:
@@ -43,7 +43,7 @@ def images_method(label: str, version: str) -> ResolvedMethod:
     return ResolvedMethod(MethodSpec(label, "images of a folder", "", version=version), None, Budget())
 
 
-def run(settings: EvaluateSettings, progress: Progress = no_progress) -> Findings:
+def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress) -> Findings:
     """Check everything, copy the images into the layout of a run, score them, write rows, manifest and reports.
 
     The text is the table, together with the run named by ``like``.
@@ -61,7 +61,7 @@ def run(settings: EvaluateSettings, progress: Progress = no_progress) -> Finding
     digests = [[task, str(key), digest_file(path)] for (task, key), path in sorted(images.items())]
     method = images_method(config.methods[0], digest(digests)[:12])
     folder = RunFolder(Path(config.out))
-    folder.prepare()
+    prepare_folder(folder.root)
     with locked(folder.root):
         regions = {clip.subject: check_regions(clip, config.regions) for clip in clips}
         jobs = make_jobs(config, [method], clips, protocols, folder, {}, regions)

@@ -1,4 +1,4 @@
-"""``headbench verify``: everything that a run claims, computed again from the files it left."""
+"""``headbench verify``."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from ..runner.scoring import check_regions
 from ..runner.stages import DIGESTS, Job, measure, recorded_frames
 from ..runner.store import Cell, RunFolder
 from ..specs import Findings, MetricSpec
+from .command import VerifySettings
 from .evaluate import NoAvatar, images_method
-from .settings import VerifySettings
 
 KEY = ["method", "seed", "task", *FRAME, "region", "metric"]
 SHOWN = 20
@@ -56,7 +56,7 @@ class _Report:
     unverified: int = 0
 
 
-def run(settings: VerifySettings, progress: Progress = no_progress) -> Findings:
+def verify_run(settings: VerifySettings, progress: Progress = no_progress) -> Findings:
     """Verify a run; did not pass where anything differs.
 
     Recomputed: fingerprints of the captures, hashes of the protocols, fingerprint of what each avatar was made of,

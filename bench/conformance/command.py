@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Annotated, Any, Literal
+
+import tyro
 
 from ..configuration import parse_assignments
 from ..contracts import Clip, Progress, no_progress
@@ -12,7 +15,6 @@ from ..device import check_device
 from ..errors import InputError
 from ..registry import SPEC_TYPES, Group, discover, get, resolve
 from ..runner.adaptation import MethodNeeds, carry_out, plan
-from ..runner.captures import open_clips
 from ..runner.config import ResolvedMethod, RunConfig, resolve_method
 from ..runner.demo import DemoConfig
 from ..specs import DatasetSpec, Findings, MethodSpec, MetricSpec
@@ -20,14 +22,44 @@ from .attempts import attempt
 from .methods import check_method
 from .metrics import check_metric
 from .readers import check_reader
-from .settings import CheckPluginSettings
+
+
+@dataclass(frozen=True)
+class CheckPluginSettings:
+    """Try a method, a reader or a metric and list every breach of its contract.
+
+    Exit code 0: it conforms; 1: it does not; 2: wrong usage, or the plug-in cannot be imported.
+    """
+
+    plugin: tyro.conf.Positional[str]
+    """The plug-in: "package.module:SPEC", or a name that `headbench list` shows."""
+
+    kind: Literal["methods", "datasets", "metrics"] | None = None
+    """What it is, where several have the name."""
+
+    data: str | None = None
+    """Capture: for a reader one in its layout (required); for a method default: a tiny synthetic one, made on the
+    spot."""
+
+    reader: str = "ga"
+    """Which reader opens --data for a method."""
+
+    preset: str | None = None
+    """Preset of the method; default: smoke if it has that, else its first."""
+
+    set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="KEY=VALUE")] = ()
+    """A setting of the method or reader, such as `budget.iterations=5`; repeatable."""
+
+    device: str = "cpu"
+    """Where the method trains."""
+
 
 KINDS: dict[Group, str] = {"methods": "method", "datasets": "reader", "metrics": "metric"}
 TIMESTEPS = 4  # of the capture made on the spot
 
 
-def run(settings: CheckPluginSettings, progress: Progress = no_progress) -> Findings:
-    """Check one plug-in; passed where it has no breach.
+def check_plugin(settings: CheckPluginSettings, progress: Progress = no_progress) -> Findings:
+    """Try a method, a reader or a metric and list every breach of its contract; exit code 1 where there is one.
 
     Raises `InputError` for wrong usage, and `HeadbenchError` where the plug-in cannot be imported.
     """
@@ -90,6 +122,8 @@ def _check_method(
 
 
 def _clip(settings: CheckPluginSettings, folder: Path, progress: Progress) -> Clip:
+    from ..runner.captures import open_clips
+
     data = settings.data
     if data is None:
         tiny = DemoConfig(out=str(folder), preset="smoke", timesteps=TIMESTEPS)

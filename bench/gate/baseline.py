@@ -12,8 +12,8 @@ from ..errors import InputError
 from ..io.documents import checked, read_json, shown
 from ..io.files import check_name, write_json
 from ..specs import MAX_DIGITS, MetricSpec
+from .command import Captures
 from .results import AVATAR, Place, ProtocolIdentity, Results
-from .settings import Captures
 
 FORMAT = 3
 LAST_DIGITS = 10

@@ -2,22 +2,54 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Literal
+
+import tyro
 
 from ..contracts import Progress, no_progress
 from ..errors import ExitCode, InputError
 from ..io.files import check_writable, write_text
 from ..specs import Findings
-from .baseline import Baseline
-from .results import read_results
-from .settings import GateSettings
-from .verdicts import environment_changes, exit_code, judge
-from .writers import to_junit, to_markdown, to_text
+
+Captures = Literal["same", "remade"]
 
 
-def run(settings: GateSettings, progress: Progress = no_progress) -> Findings:
-    """Judge results, or write them into the baseline.
+@dataclass(frozen=True)
+class GateSettings:
+    """Hold the results of a run against a baseline file.
+
+    Exit code 0: nothing got worse; 1: something did; 2: wrong usage; 3: results or baseline missing or invalid.
+    """
+
+    results: tyro.conf.Positional[str]
+    """Folder of a finished run, or of `headbench evaluate`."""
+
+    baseline: str
+    """Baseline file (JSON), to be kept under version control."""
+
+    update: bool = False
+    """Write the results into the baseline instead of judging them; tolerances already in the file are kept."""
+
+    captures: Captures | None = None
+    """With --update: `same` (default) demands the very same captures, by fingerprint, ever after; `remade` is for ones
+    synthesised again for every run, whose pictures differ in last bits between processors: all else must be the same."""
+
+    junit: str | None = None
+    """Also write a JUnit XML file: one test case for every task, method, subject and metric."""
+
+    markdown: str | None = None
+    """Also write a Markdown summary."""
+
+    def __post_init__(self) -> None:
+        """Refuse what contradicts itself."""
+        if self.captures is not None and not self.update:
+            raise ValueError("--captures is written into the baseline: give it with --update")
+
+
+def gate(settings: GateSettings, progress: Progress = no_progress) -> Findings:
+    """Hold a run against a committed baseline: exit code 1 where a number got worse, 3 where one is missing.
 
     Results or a baseline that are missing or invalid are a finding too, with exit code 3, so that CI can tell them
     from a usage error. Nothing is written then but the reports asked for.
@@ -37,6 +69,11 @@ def run(settings: GateSettings, progress: Progress = no_progress) -> Findings:
 
 
 def _judge(settings: GateSettings) -> Findings:
+    from .baseline import Baseline
+    from .results import read_results
+    from .verdicts import environment_changes, exit_code, judge
+    from .writers import to_junit, to_markdown, to_text
+
     baseline, results = Baseline.read(Path(settings.baseline)), read_results(Path(settings.results))
     verdicts = judge(results, baseline)
     code = exit_code(verdicts)
@@ -62,6 +99,10 @@ def _judge(settings: GateSettings) -> Findings:
 
 
 def _update(settings: GateSettings) -> Findings:
+    from .baseline import Baseline
+    from .results import read_results
+    from .verdicts import judge
+
     path = Path(settings.baseline)
     earlier = Baseline.read(path) if path.exists() else None
     results = read_results(Path(settings.results))

@@ -332,6 +332,18 @@ def check_writable(path: Path, option: str) -> None:
         raise InputError(path, option, "a file that can be written", found) from error
 
 
+def prepare_folder(folder: Path) -> None:
+    """Make the folder of ``--out`` and prove that it can be written, before any work. Raises `InputError`."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        # Such a file has no name where the system can do without.
+        with tempfile.TemporaryFile(dir=folder, prefix=TEMPORARY):
+            pass
+    except (OSError, ValueError) as error:  # ValueError: a name that no file can have
+        found = getattr(error, "strerror", None) or str(error)
+        raise InputError(folder, "--out", "a folder that can be written", found) from error
+
+
 def _check_target(path: Path) -> None:
     """Refuse what a rename must not replace; a device would be replaced by a file where the system lets us."""
     try:

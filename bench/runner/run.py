@@ -15,7 +15,7 @@ import numpy as np
 from ..contracts import Clip
 from ..device import check_device
 from ..errors import HeadbenchError, InputError, UnavailableError
-from ..io.files import atomic_path, output_inside
+from ..io.files import atomic_path, output_inside, prepare_folder
 from ..io.lock import locked
 from ..machine import machine_record, peak_memory_bytes
 from ..manifest import AdaptedRecord, ClipRecord, Manifest, MethodRecord, ProtocolRecord
@@ -45,7 +45,7 @@ def run(config: RunConfig, **record: Any) -> Rows:
     methods, metrics = resolve_methods(config), resolve_metrics(config)
     check_device(config.device)
     folder = RunFolder(Path(config.out))
-    folder.prepare()
+    prepare_folder(folder.root)
     with locked(folder.root):
         return _run(config, methods, metrics, folder, record)
 

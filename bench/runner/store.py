@@ -19,7 +19,6 @@
 from __future__ import annotations
 
 import logging
-import tempfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -30,7 +29,7 @@ from typing_extensions import TypedDict
 from ..contracts import FrameKey
 from ..errors import InputError
 from ..io.documents import checked, read_json
-from ..io.files import TEMPORARY, digest_file, write_json
+from ..io.files import digest_file, write_json
 from ..manifest import Manifest
 from ..rows import Rows
 
@@ -180,18 +179,6 @@ class RunFolder:
     def cell(self, subject: str, method: str, seed: int) -> Cell:
         """Return the folder of one avatar."""
         return Cell(self.root / subject / method / f"seed-{seed}")
-
-    def prepare(self) -> None:
-        """Make the folder and prove that it can be written, before any work."""
-        try:
-            self.root.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryFile(
-                dir=self.root, prefix=TEMPORARY
-            ):  # has no name where the system can do without
-                pass
-        except (OSError, ValueError) as error:  # ValueError: a name that no file can have
-            found = getattr(error, "strerror", None) or str(error)
-            raise InputError(self.root, "--out", "a folder that can be written", found) from error
 
     def read_manifest(self) -> Manifest:
         """Read ``run.json``. Raises `InputError` where there is none, or one of another format."""

@@ -1,35 +1,63 @@
-"""``headbench inspect``: what a capture holds, as one picture, as text and as JSON."""
+"""``headbench inspect``."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
+import tyro
 
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.io.files import write_json
-from ...bench.specs import Findings
-from ..clip import CaptureClip
-from ..ga.reader import read_capture
-from ..ga.writer import write_png
-from .expression_panel import space_summary
-from .figure import draw_figure
-from .settings import InspectSettings
-from .statistics import ExpressionSpace, SequenceRow, SplitRow, expression_space, sequence_rows, split_rows
+from ...bench.specs import Findings, writes
+
+if TYPE_CHECKING:
+    from ..clip import CaptureClip
+    from .statistics import ExpressionSpace, SequenceRow, SplitRow
+
+
+@dataclass(frozen=True)
+class InspectSettings:
+    """Which capture, and how much of it to show."""
+
+    clip: Annotated[str, tyro.conf.Positional]
+    """Capture in the GaussianAvatars/VHAP layout: a UNION folder, a sequence folder, or the folder of one union."""
+
+    out: str = "inspection"
+    """Folder for inspection.png and inspection.json."""
+
+    head: str | None = None
+    """Head model for captures that bring none: FLAME pickle or npz."""
+
+    cy: Literal["auto", "top", "bottom", "centre"] = "auto"
+    """How the principal point is read; auto takes the declared convention, else lets the images decide."""
+
+    timesteps: int = 3
+    """Rows of overlays."""
+
+    cameras: int = 4
+    """Columns of overlays: held-out cameras first, then evenly over the rig."""
+
 
 PICTURE, NUMBERS = "inspection.png", "inspection.json"
 
 
-def run(settings: InspectSettings, progress: Progress = no_progress) -> Findings:
-    """Read a capture, draw it, write picture and numbers to ``out``.
+@writes("out")
+def inspect(settings: InspectSettings, progress: Progress = no_progress) -> Findings:
+    """Draw what a capture holds: camera rig, splits, tracked mesh on images, motion by sequence.
 
     Raises `InputError` for a capture that the reader refuses (``headbench lint`` then tells all that is wrong),
     for a clip without training frames that are not excluded, and for counts below 1.
     """
+    from ..ga.reader import read_capture
+    from ..ga.writer import write_png
+    from .figure import draw_figure
+    from .statistics import expression_space, sequence_rows, split_rows
+
     for name in ("timesteps", "cameras"):
         if getattr(settings, name) < 1:
             raise InputError(f"--{name}", "", "at least 1", str(getattr(settings, name)))
@@ -97,6 +125,8 @@ def summary(
 def _text(
     clip: CaptureClip, splits: Sequence[SplitRow], sequences: Sequence[SequenceRow], space: ExpressionSpace
 ) -> str:
+    from .expression_panel import space_summary
+
     lines = [f"subject {clip.subject}, head model {clip.head.version}, {len(clip.cameras)} cameras", ""]
     lines.append(f"{'split':<18}{'images':>8}{'timesteps':>11}{'cameras':>9}{'sequences':>11}")
     for row in splits:

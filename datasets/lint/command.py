@@ -1,30 +1,72 @@
-"""``headbench lint``: run every rule over a capture and report."""
+"""``headbench lint``."""
 
 from __future__ import annotations
 
 import textwrap
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
 
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.specs import Findings
-from ..ga.reader import find_capture
-from .catalogue import GROUPS, RULES
-from .evidence import Evidence, gather
 from .rules import SEVERITIES, Finding, apply, several
-from .settings import LintSettings
+
+if TYPE_CHECKING:
+    from .evidence import Evidence
+
+
+@dataclass(frozen=True)
+class LintSettings:
+    """What to look at, and how strictly."""
+
+    clip: Annotated[str, tyro.conf.Positional] = ""
+    """Capture in the GaussianAvatars/VHAP layout: a UNION folder, a sequence folder, or the folder of one union."""
+
+    head: str | None = None
+    """Head model for captures that bring none: FLAME pickle or npz."""
+
+    cy: Literal["auto", "top", "bottom", "centre"] = "auto"
+    """How the principal point is read; auto takes the declared convention, else lets the images decide."""
+
+    strict: bool = False
+    """Exit with 1 on warnings too."""
+
+    ignore: tuple[str, ...] = ()
+    """Codes not to report, such as HB406."""
+
+    list: bool = False
+    """Explain every code and stop."""
+
+    views: int = 48
+    """Frames to decode for the checks of colour, mattes and tracking, spread over timesteps and cameras."""
+
+    duplicates: int = 600
+    """Images to decode in the search for near-duplicates between splits. Equal files are found among all."""
+
+    thorough: bool = False
+    """Decode every image for both; minutes for a recording of thousands of timesteps."""
+
+    min_test_timesteps: int = 10
+    """Shortest self-reenactment sequence that raises no warning."""
+
 
 _WIDTH = 100
 
 
-def run(settings: LintSettings, progress: Progress = no_progress) -> Findings:
-    """Lint a capture, or explain the codes. Passed without errors; with ``strict``, without warnings too.
+def lint(settings: LintSettings, progress: Progress = no_progress) -> Findings:
+    """Search a capture for faults that make a comparison unfair or wrong; --list explains the codes.
+
+    Passed without errors; with ``strict``, without warnings too.
 
     Raises `InputError` where there is no capture to look at, or a code to ignore does not exist.
     """
+    from .catalogue import RULES
+
     unknown = sorted(set(settings.ignore) - {rule.code for rule in RULES})
     if unknown:
         raise InputError("--ignore", "", "codes that `headbench lint --list` shows", ", ".join(unknown))
@@ -32,7 +74,7 @@ def run(settings: LintSettings, progress: Progress = no_progress) -> Findings:
         return _explained()
     if not settings.clip:
         raise InputError("command line", "CLIP", "the folder of a capture, or --list", "nothing")
-    evidence, findings = lint(settings, progress)
+    evidence, findings = lint_capture(settings, progress)
     counts = Counter(finding.severity for finding in findings)
     passed = not counts["error"] and not (settings.strict and counts["warning"])
     data = {
@@ -45,13 +87,19 @@ def run(settings: LintSettings, progress: Progress = no_progress) -> Findings:
     return Findings(_report(evidence, findings, passed), data, passed)
 
 
-def lint(settings: LintSettings, progress: Progress = no_progress) -> tuple[Evidence, list[Finding]]:
+def lint_capture(settings: LintSettings, progress: Progress = no_progress) -> tuple[Evidence, list[Finding]]:
     """Findings for a capture, worst first, and what they rest on."""
+    from ..ga.reader import find_capture
+    from .catalogue import RULES
+    from .evidence import gather
+
     evidence = gather(find_capture(settings.clip), settings, progress)
     return evidence, apply(RULES, evidence, settings.ignore, base=evidence.folder.parent)
 
 
 def _looked_at(evidence: Evidence) -> dict[str, Any]:
+    from .catalogue import RULES
+
     return {
         "frames": len(evidence.entries),
         "timesteps": len({entry.timestep for entry in evidence.entries}),
@@ -97,6 +145,8 @@ def _filled(head: str, text: str) -> list[str]:
 
 
 def _explained() -> Findings:
+    from .catalogue import GROUPS, RULES
+
     lines = []
     for digit, group in GROUPS.items():
         lines += [f"HB{digit}xx {group}", ""]

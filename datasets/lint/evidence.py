@@ -23,9 +23,9 @@ from ..ga.reader import read_capture
 from ..ga.splits import sequence_names
 from ..ga.transforms import FrameEntry, parse_frame
 from ..head.arrays import HeadArrays
+from .command import LintSettings
 from .expression_fit import ExpressionFit, weigh_expression
 from .parameters import Parameters, Subject, read_parameters
-from .settings import LintSettings
 from .thumbnails import Thumbnail, make_thumbnails
 from .views import ViewFacts, look, pick_views
 

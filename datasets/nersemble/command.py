@@ -1,25 +1,98 @@
-"""``headbench prepare nersemble``."""
+"""``headbench prepare nersemble`` and ``headbench record nersemble``."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import tyro
 
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
-from ...bench.specs import Findings
-from .plan import SubjectPlan, plan_subject
-from .prepare import SubjectResult, prepare
+from ...bench.specs import Findings, writes
+from ..ga.layout import HEAD_FILE
+from ..head.arrays import save_head
 from .presets import SUBJECT_NAMES, chosen_subjects
-from .recording import participants
-from .settings import PrepareSettings
-from .unions import check_unions
+
+if TYPE_CHECKING:
+    from .plan import SubjectPlan
+    from .prepare import SubjectResult
 
 
-def run(settings: PrepareSettings, progress: Progress = no_progress) -> Findings:
-    """Prepare recordings, or check captures that were exported elsewhere.
+@dataclass(frozen=True)
+class PrepareSettings:
+    """What to prepare, from where, and how."""
+
+    root: str = ""
+    """Folder with raw recordings: the one that holds the participants' folders."""
+    out: str = "nersemble-captures"
+    """Folder for the captures."""
+    subjects: str = "paper"
+    """Ids separated by commas, "paper" (the nine of the comparison) or "ablation" (306)."""
+    sequences: str = "paper"
+    """Names or unique prefixes separated by commas; "paper" (the ten of UNION10, and FREE); "all" (but the tongue
+    and GLASSES)."""
+    split: Literal["free", "union10"] = "free"
+    """"free" holds out FREE for self-reenactment; "union10" holds out one of the ten sequences by VHAP's seeded
+    rule. The frontal camera is held out for novel views either way."""
+    tracking: str = ""
+    """Folder with VHAP's results. Without it images and cameras are written; call again once there is one."""
+    head: str = ""
+    """Head model the tracking belongs to (flame2023.pkl, or npz): checked against it, never copied if FLAME's."""
+    head_model: str = ""
+    """Version of the head model the tracking belongs to; default: that of --head, or flame2023 without --head."""
+    cameras: str = ""
+    """Serials separated by commas; default: all the calibration has."""
+    downscale: int = 4
+    """Width and height are divided by this, averaging areas; 4 makes 550x802 of 2200x3208."""
+    source: Literal["auto", "video", "images"] = "auto"
+    """What to take where a sequence has both; "auto" takes images where they come with mattes."""
+    every: int = 0
+    """Keep every so many frames; 0 stands for 3 with the 73-per-second videos and 1 with VHAP's images."""
+    colour: Literal["auto", "none"] = "auto"
+    """"auto" corrects colours where the recording has a calibration for that; "none" never."""
+    edges: Literal["unblend", "plain"] = "unblend"
+    """Soft edges with mattes: "unblend" takes the light of the BACKGROUND still out, where there are stills; "plain"
+    multiplies by the matte, as VHAP does, and leaves fringes."""
+    cut: bool = False
+    """Keep the frames that all cameras have where they differ, instead of an error; tracking of all frames is cut
+    with them."""
+    workers: int = 0
+    """Cameras worked on at one time; 0 stands for one per processor core."""
+    check: bool = False
+    """Only look whether everything needed is there."""
+    union_root: str = ""
+    """Instead of preparing, check captures exported elsewhere: a folder of UNION folders, such as GaussianAvatars'
+    download."""
+    rejoin: bool = False
+    """With --union-root, also write unions of the paper's split (FREE held out) beside them; copies nothing."""
+
+
+@dataclass(frozen=True)
+class RecordSettings:
+    """What to write as a raw recording."""
+
+    capture: tyro.conf.Positional[str]
+    """Synthetic capture: a UNION folder, as `headbench synth` writes them."""
+    out: str
+    """Folder to write: recording/ is for --root of `headbench prepare nersemble`, tracking/ for --tracking,
+    head_model.npz for --head."""
+    release: Literal["v2", "v1", "paper2023"] = "v2"
+    """Whose folders: of the second release, of the first, or of the 2023 paper."""
+    frames: Literal["images", "video"] = "images"
+    """"images" with mattes, as VHAP's preprocessing leaves them, or "video" without."""
+
+
+def prepare_nersemble(settings: PrepareSettings, progress: Progress = no_progress) -> Findings:
+    """Turn raw NeRSemble recordings into captures that methods train on; continues after a kill.
 
     Everything about every subject is checked before the first frame is decoded.
     """
+    from .plan import plan_subject
+    from .prepare import prepare
+    from .unions import check_unions
+
     subjects = chosen_subjects(settings.subjects)
     if bool(settings.root) == bool(settings.union_root):
         found = "both" if settings.root else "neither"
@@ -40,6 +113,8 @@ def run(settings: PrepareSettings, progress: Progress = no_progress) -> Findings
 
 def _check_named(settings: PrepareSettings, subjects: list[str]) -> None:
     """Raise `InputError` where a name stands for subjects of which none is there."""
+    from .recording import participants
+
     known = participants(Path(settings.root))
     if settings.subjects not in SUBJECT_NAMES or set(subjects) & set(known):
         return
@@ -94,3 +169,36 @@ def _done(results: list[SubjectResult], plans: list[SubjectPlan], settings: Prep
     }
     passed = not settings.tracking or all(result.union is not None for result in results)
     return Findings("\n".join(lines), data, passed)
+
+
+@writes("out")
+def record_nersemble(settings: RecordSettings, progress: Progress = no_progress) -> Findings:
+    """Write a synthetic capture as a raw NeRSemble recording with VHAP's tracking, to try prepare on.
+
+    ``headbench record nersemble``: for synthetic captures, as they bring their own head model."""
+    from ..ga.reader import read_capture
+    from .re_record import re_record
+    from .writer import video_codec
+
+    clip = read_capture(settings.capture)
+    out = Path(settings.out)
+    mattes = settings.frames == "images"
+    sequences = re_record(
+        clip,
+        out / "recording",
+        tracking=out / "tracking",
+        release=settings.release,
+        mattes=mattes,
+        source=settings.capture,
+        progress=progress,
+    )
+    save_head(out / HEAD_FILE, clip.head)
+    codec = "" if mattes or settings.release == "paper2023" else video_codec()
+    text = (
+        f"Subject {clip.subject}, {len(sequences)} sequences, {len(clip.cameras)} cameras"
+        f"{f', videos in {codec}' if codec else ''}.\n"
+        f"Prepare it: headbench prepare nersemble --root {out / 'recording'} --tracking {out / 'tracking'} "
+        f"--head {out / HEAD_FILE} --subjects {clip.subject} --sequences {','.join(sequences)} --downscale 1"
+    )
+    data = {"subject": clip.subject, "sequences": sequences, "cameras": [*clip.cameras], "codec": codec}
+    return Findings(text, data)

@@ -18,12 +18,12 @@ from ..head.loaders import load_head
 from ..head.procedural.model import VERSIONS
 from .calibration import read_calibration
 from .colour import Correction
+from .command import PrepareSettings
 from .export import CY, SequenceExport
 from .names import SEQUENCES, TONGUE_SEQUENCES
 from .presets import NOVEL_VIEW_CAMERA, PAPER_SEQUENCES, TEST_SEQUENCE, UNION10_SEQUENCES, union10_held_out
 from .recording import Participant, participant
 from .sequence import RecordedSequence, read_sequence
-from .settings import PrepareSettings
 from .tracking import TrackedSequence, find_tracked, read_tracked
 
 IMAGES_VERSION = 1

@@ -10,16 +10,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ...bench.contracts import ByteArray, Camera, FloatArray, FrameKey, HeadPose, Progress, no_progress
-from ...bench.specs import Findings
 from ..clip import CaptureClip
 from ..ga.full_grid import require_full_grid
-from ..ga.layout import HEAD_FILE
-from ..ga.reader import read_capture
 from ..ga.writer import pose_to_parameters
-from ..head.arrays import save_head
 from .calibration import read_calibration
-from .settings import RecordSettings
-from .writer import RecordingWriter, Release, video_codec, write_tracked
+from .writer import RecordingWriter, Release, write_tracked
 
 
 def re_record(
@@ -129,29 +124,3 @@ def root_joint(clip: CaptureClip, pose: HeadPose) -> FloatArray:
 def _stacked(poses: Sequence[HeadPose]) -> dict[str, FloatArray]:
     rows = [pose_to_parameters(pose) for pose in poses]
     return {key: np.concatenate([row[key] for row in rows]) for key in rows[0]}
-
-
-def run(settings: RecordSettings, progress: Progress = no_progress) -> Findings:
-    """``headbench record nersemble``: for synthetic captures, as they bring their own head model."""
-    clip = read_capture(settings.capture)
-    out = Path(settings.out)
-    mattes = settings.frames == "images"
-    sequences = re_record(
-        clip,
-        out / "recording",
-        tracking=out / "tracking",
-        release=settings.release,
-        mattes=mattes,
-        source=settings.capture,
-        progress=progress,
-    )
-    save_head(out / HEAD_FILE, clip.head)
-    codec = "" if mattes or settings.release == "paper2023" else video_codec()
-    text = (
-        f"Subject {clip.subject}, {len(sequences)} sequences, {len(clip.cameras)} cameras"
-        f"{f', videos in {codec}' if codec else ''}.\n"
-        f"Prepare it: headbench prepare nersemble --root {out / 'recording'} --tracking {out / 'tracking'} "
-        f"--head {out / HEAD_FILE} --subjects {clip.subject} --sequences {','.join(sequences)} --downscale 1"
-    )
-    data = {"subject": clip.subject, "sequences": sequences, "cameras": [*clip.cameras], "codec": codec}
-    return Findings(text, data)

@@ -1,36 +1,77 @@
-"""``headbench compact``: what each part of an avatar takes, exact and compact, and what that costs in quality."""
+"""``headbench compact``."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import tyro
 
 from ...bench.contracts import Clip, HeadAsset, Progress, no_progress
 from ...bench.errors import InputError
-from ...bench.specs import Findings
-from ...datasets.ga.reader import read_capture
-from ..ours.avatar import OursAvatar
-from ..ours.storage import FIELD_FILE, Field
-from ..shared.avatar_files import read_shared_head, save_shared_head
-from .container import write_content
-from .encoding import EXACT, Precision
-from .file import COMPACT_FILE, encode, exact_sizes, part_sizes
-from .measure import Comparison, Quality, avatar_of
-from .settings import CompactSettings
-from .simplify import simplify, training_poses
+from ...bench.specs import Findings, writes
+from .precision import EXACT, Precision
+
+if TYPE_CHECKING:
+    from ..ours.avatar import OursAvatar
+    from ..ours.storage import Field
+    from .measure import Comparison, Quality
+
+
+@dataclass(frozen=True)
+class CompactSettings:
+    """Store an avatar of ours in about a fifteenth of its bytes."""
+
+    avatar: tyro.conf.Positional[str]
+    """Folder of the avatar, with its exact file."""
+
+    out: str
+    """Folder to write: the compact file, and the head model beside it."""
+
+    compare: str | None = None
+    """Capture that the avatar was trained on. Splats that none of its training poses shows are left out, and the
+    quality is measured on its held-out frames."""
+
+    head: str | None = None
+    """Head model for a capture that brings none: FLAME pickle or npz."""
+
+    frames: int = 8
+    """Held-out frames to compare on, evenly spread over both held-out splits."""
+
+    scale: int = 1
+    """Enlarge the compared images so many times. Above 1 there is no truth to compare with, only the exact avatar."""
+
+    precision: Precision = field(default_factory=Precision)
+    """How finely each part is stored."""
+
+    def __post_init__(self) -> None:
+        if self.frames < 1 or self.scale < 1:
+            raise ValueError(f"frames and scale must be at least 1, found {self.frames} and {self.scale}")
+
 
 SIMPLIFIED, WHOLE = "left out", "all"
 
 
-def run(settings: CompactSettings, progress: Progress = no_progress) -> Findings:
-    """Write the compact file and tell its parts; with a capture, also each part's cost in quality alone.
+@writes("out")
+def compact(settings: CompactSettings, progress: Progress = no_progress) -> Findings:
+    """Store an avatar of ours in about a fifteenth of its bytes; with a capture, measure the cost in quality.
+
+    With a capture, each part's cost in quality is measured alone.
 
     Raises `InputError` for a folder without the exact file of an avatar of ours, and for the capture of another
     subject.
     """
+    from ..ours.avatar import OursAvatar
+    from ..ours.storage import FIELD_FILE
+    from ..shared.avatar_files import read_shared_head, save_shared_head
+    from .container import write_content
+    from .file import COMPACT_FILE, encode, exact_sizes, part_sizes
+    from .measure import Comparison
+    from .simplify import simplify, training_poses
+
     folder, out = Path(settings.avatar), Path(settings.out)
     if not (folder / FIELD_FILE).exists():
         raise InputError(folder, FIELD_FILE, "the exact file of an avatar of ours", "none")
@@ -66,6 +107,8 @@ def run(settings: CompactSettings, progress: Progress = no_progress) -> Findings
 
 
 def _clip(settings: CompactSettings, subject: str, progress: Progress) -> Clip | None:
+    from ...datasets.ga.reader import read_capture
+
     if settings.compare is None:
         return None
     clip = read_capture(settings.compare, head=settings.head, progress=progress)
@@ -83,6 +126,9 @@ def _costs(
     progress: Progress,
 ) -> dict[str, dict[str, float | None]]:
     """Quality with one part rounded alone, by part; with all; and with none, only what no pose shows left out."""
+    from .file import encode, exact_sizes
+    from .measure import avatar_of
+
     variants = {
         part.name: replace(EXACT, **{part.name: getattr(precision, part.name)}) for part in fields(precision)
     }

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
@@ -15,56 +14,7 @@ from ..ours.field import Box, normalised_weight, plane_features
 from ..ours.storage import SPLAT_WIDTHS
 from ..shared.networks import C0, PAIRS
 from .container import Arrays, coded, dequantise, from_smallest_three, narrow, smallest_three
-
-
-@dataclass(frozen=True)
-class Precision:
-    """Quantisation steps of the parts of a compact avatar; smaller is finer, and 0 keeps a part as float32.
-
-    Each step is in a unit in which equal errors look equally bad, so that one number serves a whole part, whatever
-    its range: the entropy coder, not a fixed number of bits, pays for rare large values. The defaults cost less than
-    0.1 dB together (``headbench compact --compare`` measures each).
-    """
-
-    positions: float = 0.08
-    """Of local positions, in the splat's own size (geometric mean of its three standard deviations)."""
-
-    scales: float = 0.06
-    """Of log-scales: 0.06 is an error of at most 3 %."""
-
-    rotations: float = 0.02
-    """Of the three smaller components of unit quaternions: 0.02 is an error of about 1 degree."""
-
-    opacities: float = 0.1
-    """Of opacity logits: an opacity is off by 0.0125 at most."""
-
-    harmonics: float = 0.02
-    """Of spherical-harmonics coefficients, where they hold the colour: 0.0056 of colour in degree 0."""
-
-    planes: float = 0.005
-    """Of the colour that one plane channel contributes, in [0, 1], as the colour network weighs it."""
-
-    lines: float = 0.001
-    """Of the offset (logits) that one channel of one line contributes at coefficient 1, as the offset network weighs
-    it. Small, since the errors of thousands of channels add up: at 0.003 a trained avatar lost 0.13 dB, at 0.001
-    nothing, for 16 kB more."""
-
-    networks: float = 0.01
-    """Of network weights, in the largest weight of the same row: 1/127 would be 8 bits."""
-
-    subject: float = 2e-6
-    """Of the subject's static offset, metres."""
-
-    def __post_init__(self) -> None:
-        for part in fields(self):
-            step = getattr(self, part.name)
-            if not 0 <= step < 1:
-                raise ValueError(f"{part.name} must be at least 0 and below 1, found {step}")
-
-
-EXACT = Precision(**{part.name: 0.0 for part in fields(Precision)})
-"""Nothing is rounded."""
-
+from .precision import Precision
 
 PLANES = tuple(f"plane_{pair}" for pair, _, _ in PAIRS)
 MATRICES = ("color_weight_0", "color_weight_1", *(f"line_direction_{layer}" for layer in range(3)))

@@ -19,12 +19,12 @@ from .encoding import (
     HARMONICS,
     MATRICES,
     PLANES,
-    Precision,
     decode_field,
     decode_splats,
     encode_field,
     encode_splats,
 )
+from .precision import Precision
 
 COMPACT_FILE = "compact.safetensors"
 

@@ -11,7 +11,8 @@ from ...bench.contracts import Clip, HeadPose
 from ..ours.avatar import OursAvatar
 from ..ours.storage import SPLAT_WIDTHS, Field
 from ..splats.constants import ALPHA_MIN
-from .encoding import HARMONICS, Precision, negligible_lines
+from .encoding import HARMONICS, negligible_lines
+from .precision import Precision
 
 LINE_NETWORK = "line_"
 

@@ -11,8 +11,9 @@ from torch import Tensor
 
 from ...bench.contracts import Clip, HeadAsset, Variant
 from ..compact.container import Arrays, Content, read_content, write_content
-from ..compact.encoding import Precision, decode_splats, encode_splats
+from ..compact.encoding import decode_splats, encode_splats
 from ..compact.file import COMPACT_FILE, decode_subject, encode_subject
+from ..compact.precision import Precision
 from ..ga.method import GAAvatar
 from ..ga.storage import PLY_FILE, read_ga_splats, write_ga_splats
 from ..ours.storage import SPLAT_WIDTHS

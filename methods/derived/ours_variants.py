@@ -11,8 +11,9 @@ import torch
 from torch import Tensor
 
 from ...bench.contracts import Clip, HeadAsset, Variant
-from ..compact.encoding import HARMONICS, Precision
+from ..compact.encoding import HARMONICS
 from ..compact.file import COMPACT_FILE, read_compact, write_compact
+from ..compact.precision import Precision
 from ..compact.simplify import simplify
 from ..ours.avatar import OursAvatar
 from ..ours.storage import FIELD_FILE, Field, checked_field, read_field, save_field

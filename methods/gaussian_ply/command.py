@@ -1,39 +1,92 @@
-"""``headbench export ply``."""
+"""``headbench export ply`` and ``headbench import ga``."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
+import tyro
 
 from ...bench.contracts import HeadAsset, HeadPose, Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.io.files import check_writable
-from ...bench.specs import Findings
-from ...datasets.ga.reader import read_capture
-from ..compact.file import COMPACT_FILE
-from ..ga.method import GAAvatar
-from ..ga.storage import PLY_FILE
-from ..gbs.avatar import GBSAvatar
-from ..insta.storage import FIELD_FILE as RADIANCE_FILE
-from ..ours.avatar import OursAvatar
-from ..ours.storage import FIELD_FILE
-from ..shared.avatar_files import read_shared_head
-from ..shared.tensor_files import read_safetensors
-from .harmonics import fit_harmonics, sphere, turn_harmonics, write_gaussians
-from .settings import ExportPlySettings
+from ...bench.io.lock import LOCK_FILE
+from ...bench.specs import Findings, writes
+
+if TYPE_CHECKING:
+    from ..ga.method import GAAvatar
+    from ..gbs.avatar import GBSAvatar
+    from ..ours.avatar import OursAvatar
+
+
+@dataclass(frozen=True)
+class ExportPlySettings:
+    """Write an avatar in one pose as a 3D Gaussian splatting PLY that common viewers open."""
+
+    avatar: tyro.conf.Positional[str]
+    """Folder of an avatar of ours, ga or gbs (RUN/avatars/...)."""
+
+    out: str
+    """PLY file to write."""
+
+    capture: str | None = None
+    """Capture with the pose to write; without one the pose is neutral."""
+
+    timestep: int | None = None
+    """Timestep of the capture; default: the first of its training frames."""
+
+    head: str | None = None
+    """Head model for a capture that brings none: FLAME pickle or npz."""
+
+    directions: int = 96
+    """Viewing directions, even over the sphere, at which colours that are not spherical harmonics are sampled."""
+
+    def __post_init__(self) -> None:
+        if self.timestep is not None and self.capture is None:
+            raise ValueError("timestep needs a capture")
+        if self.directions < 32:
+            raise ValueError(
+                f"directions must be at least 32, twice the coefficients, found {self.directions}"
+            )
+
+
+@dataclass(frozen=True)
+class ImportGASettings:
+    """Make an avatar of a GaussianAvatars PLY and the capture it was trained on."""
+
+    ply: tyro.conf.Positional[str]
+    """The PLY, with a column binding_0 (`point_cloud/iteration_<N>/point_cloud.ply`)."""
+
+    capture: str
+    """Capture in the GaussianAvatars/VHAP layout: it brings the head model, the shape and the static offset."""
+
+    out: str
+    """Folder to write; `headbench export ply` and the method ga load it."""
+
+    head: str | None = None
+    """Head model for a capture that brings none: FLAME pickle or npz."""
+
 
 EXPORTED = "an avatar of ours, ga or gbs"
 DRAWN = "A PLY cannot hold it; `headbench extremes` and `headbench reenact` draw its frames."
 
 
-def run(settings: ExportPlySettings, progress: Progress = no_progress) -> Findings:
-    """Write one pose of an avatar; its findings state how well harmonics take up its colours.
+def export_ply(settings: ExportPlySettings, progress: Progress = no_progress) -> Findings:
+    """Write an avatar in one pose as a 3D Gaussian splatting PLY that common viewers open.
+
+    The findings state how well harmonics represent its colours.
 
     Raises `InputError` for a folder that holds no avatar of ours, ga or gbs, and for a timestep that the capture lacks.
     """
+    import torch
+
+    from ..ga.method import GAAvatar
+    from ..gbs.avatar import GBSAvatar
+    from ..shared.avatar_files import read_shared_head
+    from .harmonics import fit_harmonics, sphere, turn_harmonics, write_gaussians
+
     folder, out = Path(settings.avatar), Path(settings.out)
     check_writable(out, "--out")
     avatar = _read(folder)
@@ -63,6 +116,14 @@ def run(settings: ExportPlySettings, progress: Progress = no_progress) -> Findin
 
 
 def _read(folder: Path) -> GAAvatar | GBSAvatar | OursAvatar:
+    from ..compact.file import COMPACT_FILE
+    from ..ga.method import GAAvatar
+    from ..ga.storage import PLY_FILE
+    from ..gbs.avatar import GBSAvatar
+    from ..insta.storage import FIELD_FILE as RADIANCE_FILE
+    from ..ours.avatar import OursAvatar
+    from ..ours.storage import FIELD_FILE
+
     if (folder / PLY_FILE).exists():
         return GAAvatar.read(folder, "cpu")
     if (folder / COMPACT_FILE).exists():
@@ -88,10 +149,14 @@ def _read(folder: Path) -> GAAvatar | GBSAvatar | OursAvatar:
 
 def _tensor_names(path: Path) -> set[str]:
     """Names of a file's tensors, which show whose avatar it is; empty where there is no such file."""
+    from ..shared.tensor_files import read_safetensors
+
     return set(read_safetensors(path)[0]) if path.exists() else set()
 
 
 def _pose(settings: ExportPlySettings, head: HeadAsset, progress: Progress) -> HeadPose:
+    from ...datasets.ga.reader import read_capture
+
     if settings.capture is None:
         return neutral_pose(head)
     clip = read_capture(settings.capture, head=settings.head, progress=progress)
@@ -117,3 +182,31 @@ def neutral_pose(head: HeadAsset) -> HeadPose:
         translation=zero,
         eyelids=None if head.eyelid_basis is None else np.zeros(2, np.float32),
     )
+
+
+@writes("out")
+def import_ga(settings: ImportGASettings, progress: Progress = no_progress) -> Findings:
+    """Make an avatar of a GaussianAvatars PLY and the capture it was trained on.
+
+    Harmonics of a lower degree are filled up with zeros, and whatever other columns there are is left out. Tracking
+    that the training refined is in another file (`flame_param.npz`) and is not read: the avatar follows the capture's.
+    Raises `InputError` for a file that does not fit, and for a folder that holds something already.
+    """
+    from ...datasets.ga.reader import read_capture
+    from ..ga.storage import PLY_FILE, read_ga_splats, write_ga_splats
+    from ..shared.avatar_files import HEAD_FILE, SUBJECT_FILE, Subject, save_shared_head, write_subject
+
+    ply, out = Path(settings.ply), Path(settings.out)
+    ours = {LOCK_FILE, SUBJECT_FILE, HEAD_FILE}  # an avatar's only with its splats, which are written last
+    if out.exists() and any(path.name not in ours for path in out.iterdir()):
+        raise InputError(out, "", "a new or an empty folder", "one with files in it")
+    clip = read_capture(settings.capture, head=settings.head, progress=progress)
+    splats, binding = read_ga_splats(ply, len(clip.head.faces), "cpu")
+    write_subject(out / SUBJECT_FILE, Subject.of(clip))
+    save_shared_head(out, clip.head)
+    write_ga_splats(out / PLY_FILE, splats, binding)
+    used = len(binding.unique())
+    text = (
+        f"{out}: {len(binding)} splats on {used} of {len(clip.head.faces)} triangles, subject {clip.subject}"
+    )
+    return Findings(text, {"out": out, "splats": len(binding), "triangles": used, "subject": clip.subject})

@@ -15,8 +15,8 @@ from ...bench.contracts import Budget, Clip, Progress
 from ...datasets.head.arrays import faces_in_region
 from ...datasets.steps.expression_clusters import cluster_expressions
 from ...datasets.steps.jaw_bases import leaks
-from ..compact.encoding import Precision
 from ..compact.file import COMPACT_FILE, write_compact
+from ..compact.precision import Precision
 from ..compact.simplify import simplify, training_poses
 from ..shared.avatar_files import (
     SUBJECT_FILE,

@@ -1,23 +1,55 @@
-"""``headbench compare``: reads finished runs, prints paired differences."""
+"""``headbench compare``."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from itertools import combinations
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
 
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.protocol import TASK_TITLES
 from ...bench.runner.scoring import FULL
 from ...bench.specs import Findings, MetricSpec
-from ..runs import RunSet
-from ..statistics.comparisons import Comparison, compare
-from ..table_report import COMPARISON
-from ..tables import AVATAR_TITLE
-from ..writers import csv_text
-from .settings import CompareSettings
+
+if TYPE_CHECKING:
+    from ..runs import RunSet
+    from ..statistics.comparisons import Comparison
+
+
+@dataclass(frozen=True)
+class CompareSettings:
+    """Paired differences between methods of finished runs: size, interval, exact test, Holm's correction."""
+
+    runs: tyro.conf.Positional[tuple[str, ...]]
+    """Folders of finished runs on the same frames. Further seeds of a method join it; another setting is another
+    method."""
+
+    against: Annotated[str | None, tyro.conf.arg(metavar="METHOD")] = None
+    """Compare every method with this one alone, instead of all pairs: fewer comparisons, so fewer subjects needed."""
+
+    metrics: tuple[str, ...] = ()
+    """Metrics to compare; default: those of the comparison table."""
+
+    floors: bool = False
+    """Compare the floors (mean image, nearest camera), too."""
+
+    level: float = 0.05
+    """Level of the tests; intervals have a confidence of one minus it."""
+
+    format: Literal["text", "csv"] = "text"
+    """How to print; --json gives everything, each subject's difference included."""
+
+    def __post_init__(self) -> None:
+        if not self.runs:
+            raise ValueError("runs: at least one folder")
+        if not 0 < self.level < 1:
+            raise ValueError(f"level is {self.level}; a number between 0 and 1")
+
 
 FIELDS = (
     *("task", "metric", "first", "second", "difference", "low", "high", "effect", "p", "p_holm"),
@@ -25,8 +57,14 @@ FIELDS = (
 )
 
 
-def run(settings: CompareSettings, progress: Progress = no_progress) -> Findings:
-    """Compare methods on every metric. Raises `InputError` for runs, methods and metrics that do not fit."""
+def compare_runs(settings: CompareSettings, progress: Progress = no_progress) -> Findings:
+    """Paired differences between methods of finished runs: interval, exact test over subjects, Holm's correction.
+
+    Compare methods on every metric. Raises `InputError` for runs, methods and metrics that do not fit."""
+    from ..runs import RunSet
+    from ..statistics.comparisons import compare
+    from ..table_report import COMPARISON
+
     runs = RunSet.read([Path(folder) for folder in settings.runs])
     pairs = method_pairs(runs, settings.against, settings.floors)
     metrics = [
@@ -84,6 +122,8 @@ def _plain(comparison: Comparison) -> dict[str, object]:
 
 
 def _csv(comparisons: Sequence[Comparison]) -> str:
+    from ..writers import csv_text
+
     lines: list[list[object]] = [list(FIELDS)]
     for comparison in comparisons:
         values = _plain(comparison)
@@ -94,6 +134,8 @@ def _csv(comparisons: Sequence[Comparison]) -> str:
 
 def _text(spec: MetricSpec, comparisons: Sequence[Comparison]) -> str:
     """One metric's comparisons as a table for a terminal."""
+    from ..tables import AVATAR_TITLE
+
     first = comparisons[0]
     title = TASK_TITLES.get(first.task, first.task) if first.task else AVATAR_TITLE
     unit = f"{spec.unit}, " if spec.unit else ""

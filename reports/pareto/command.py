@@ -1,31 +1,99 @@
-"""``headbench pareto``: reads finished runs, writes a table and a plot."""
+"""``headbench pareto`` and ``headbench sweep``."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, fields
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+import tyro
 
 from ...bench.contracts import Progress, no_progress
-from ...bench.io.files import write_text
-from ...bench.runner.store import RunFolder
-from ...bench.specs import Findings
-from ..writers import csv_text
-from .plot import Panel, write_plot
-from .points import Point, pareto_front, read_points
-from .settings import ParetoSettings
-from .sweep import MARK
+from ...bench.io.files import output_inside, prepare_folder, write_text
+from ...bench.io.lock import locked
+from ...bench.runner.options import RunOptions
+from ...bench.specs import Findings, writes
+
+if TYPE_CHECKING:
+    from .points import Point
+
+
+@dataclass(frozen=True)
+class ParetoSettings:
+    """Quality against size and frame time, over finished runs of the same frames; CSV, and a plot with the front."""
+
+    runs: tyro.conf.Positional[tuple[str, ...]]
+    """Folders of finished runs: every method in each is a point, such as the settings of a sweep."""
+
+    out: str
+    """Folder to write: points.csv and pareto.png."""
+
+    task: str = "novel_view"
+    """Task whose frames tell the quality."""
+
+    metric: str = "psnr"
+    """Metric of quality."""
+
+    time: str = ""
+    """Metric of frame time, in ms: latency_p50 (default, or what frames per second give), processor_time, ..."""
+
+    def __post_init__(self) -> None:
+        if not self.runs:
+            raise ValueError("runs: at least one folder")
+
+
+@dataclass(frozen=True)
+class SweepSettings(RunOptions):
+    """Quality against size and frame time of what can be derived from a run's avatars without training."""
+
+    run: tyro.conf.Positional[str]
+    """Folder of a finished run."""
+
+    out: str | None = None
+    """Folder to write, a run folder itself; default: `sweep` in the folder of the run."""
+
+    methods: tuple[str, ...] = ()
+    """Methods to derive from; default: all that know how."""
+
+    variants: tuple[str, ...] = ()
+    """Variants to derive, by name; default: all. The trained avatar itself is always measured."""
+
+    frames: int | None = None
+    """Score at most so many frames per subject and task, evenly spaced; default: those of the run."""
+
+    task: str = "novel_view"
+    """Task whose frames tell the quality in the plot."""
+
+    metric: str = "psnr"
+    """Metric of quality in the plot."""
+
+    time: str = ""
+    """Metric of frame time in the plot, in ms: latency_p50 (default), processor_time on a machine with other work."""
+
+    def __post_init__(self) -> None:
+        if self.frames is not None and self.frames < 1:
+            raise ValueError(f"frames is {self.frames}; at least 1")
+
 
 COSTS = {"megabytes": "Size, MB", "milliseconds": "Frame time, ms"}
 
 
-def run(settings: ParetoSettings, progress: Progress = no_progress) -> Findings:
-    """Write ``points.csv`` and ``pareto.png``. Raises `InputError` for runs that cannot be compared."""
+@writes("out")
+def pareto(settings: ParetoSettings, progress: Progress = no_progress) -> Findings:
+    """Quality against size and frame time over finished runs: CSV, and a plot with the Pareto front marked.
+
+    Write ``points.csv`` and ``pareto.png``. Raises `InputError` for runs that cannot be compared."""
+    from ..writers import csv_text
+    from .plot import Panel, write_plot
+    from .points import Point, read_points
+
     out = Path(settings.out)
     points, left_out, metric = read_points(
         [Path(r) for r in settings.runs], settings.task, settings.metric, settings.time
     )
-    RunFolder(out).prepare()
+    prepare_folder(out)
     sign = 1.0 if metric.higher_is_better else -1.0
     fronts = {cost: _front(points, cost, sign, range(len(points))) for cost in COSTS}
     names = [field.name for field in fields(Point)]
@@ -64,6 +132,8 @@ def run(settings: ParetoSettings, progress: Progress = no_progress) -> Findings:
 
 def _front(points: Sequence[Point], cost: str, sign: float, among: Sequence[int]) -> list[int]:
     """Indices of the front of some points, those whose cost was measured."""
+    from .points import pareto_front
+
     known = [i for i in among if getattr(points[i], cost) is not None]
     front = pareto_front([getattr(points[i], cost) for i in known], [sign * points[i].quality for i in known])
     return [known[i] for i in front]
@@ -76,6 +146,8 @@ def _series(points: Sequence[Point]) -> list[str]:
 def _text(
     points: Sequence[Point], fronts: dict[str, list[int]], left_out: Sequence[str], label: str, digits: int
 ) -> str:
+    from .sweep import MARK
+
     wide = max([16, *(len(point.method) + 2 for point in points)])
     lines = [f"{'method':<{wide}}{label:>10}{'MB':>12}{'ms':>12}  run (* on the front of size, of time)"]
     for index, point in enumerate(points):
@@ -87,3 +159,20 @@ def _text(
     if any(point.derived_from for point in points):
         lines.append(f"METHOD{MARK}VARIANT was derived from the trained avatar, without training.")
     return "\n".join([*lines, *(f"left out: {text}" for text in left_out)])
+
+
+def sweep_run(settings: SweepSettings, progress: Progress = no_progress) -> Findings:
+    """Derive smaller and faster avatars from a run's without training: quality against size and frame time.
+
+    Writes ``points.csv`` and ``pareto.png`` as `headbench pareto` does.
+    Raises `InputError` for a folder that is no finished run, and for methods and variants that there are not.
+    """
+    from ...bench.runner.store import RunFolder
+    from .sweep import sweep
+
+    out = Path(settings.out) if settings.out else Path(settings.run) / "sweep"
+    RunFolder(Path(settings.run)).read_manifest()  # before a folder is made in what is no run
+    with nullcontext() if settings.out else output_inside(Path(settings.run)), locked(out):
+        sweep(settings, out, progress)
+        what = settings.task, settings.metric, settings.time
+        return pareto(ParetoSettings((str(out),), str(out), *what), progress)

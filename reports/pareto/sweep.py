@@ -20,7 +20,7 @@ from ...bench.runner.run import describe
 from ...bench.runner.stages import Job, measure, render
 from ...bench.runner.store import RunFolder
 from ...bench.specs import MetricSpec
-from .settings import SweepSettings
+from .command import SweepSettings
 
 log = logging.getLogger(__name__)
 NEEDED = ("storage", "fps", "latency_p50", "processor_time")

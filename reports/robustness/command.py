@@ -1,21 +1,85 @@
-"""What ``headbench extremes`` and ``headbench reenact`` have in common: avatars of a run, a folder, a sheet, limits."""
+"""``headbench extremes`` and ``headbench reenact``."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from ...bench.contracts import Progress
+import tyro
+
+from ...bench.contracts import Progress, no_progress
 from ...bench.io.files import output_inside
 from ...bench.io.lock import locked
-from ...bench.runner.avatars import trained
-from ...bench.runner.stages import Job
-from ...bench.runner.store import RunFolder
+from ...bench.runner.options import RunOptions
 from ...bench.specs import Findings
-from .settings import ExtremesSettings, ReenactSettings
-from .stability import SHEET_FILE, table
+
+if TYPE_CHECKING:
+    from ...bench.runner.stages import Job
+
+
+@dataclass(frozen=True)
+class ExtremesSettings(RunOptions):
+    """Try a run's avatars on views and expressions beyond those of training; 1 where a limit is broken."""
+
+    run: tyro.conf.Positional[str]
+    """Folder of a finished run."""
+
+    out: str | None = None
+    """Folder to write; default: `extremes` in the folder of the run."""
+
+    methods: tuple[str, ...] = ()
+    """Methods to try; default: all but the floors."""
+
+    views: int = 16
+    """Views of the turntable, in even steps."""
+
+    beyond: float = 30.0
+    """How far the turntable goes on beyond the outermost training cameras, degrees."""
+
+    dimensions: int = 8
+    """Principal components of the training expressions."""
+
+    sigmas: tuple[float, ...] = (-3.0, -2.0, -1.0, 1.0, 2.0, 3.0)
+    """How far along each component, in standard deviations."""
+
+    def __post_init__(self) -> None:
+        if self.views < 1 or self.dimensions < 1 or not self.sigmas:
+            raise ValueError("views, dimensions and sigmas: at least one of each")
+        if not 0.0 <= self.beyond < 180.0:
+            raise ValueError(f"beyond is {self.beyond}; from 0 to less than 180 degrees")
+        if len(set(self.sigmas)) != len(self.sigmas) or 0.0 in self.sigmas:
+            raise ValueError("sigmas: each once, and without 0, which is always tried")
+
+
+@dataclass(frozen=True)
+class ReenactSettings(RunOptions):
+    """Drive a run's avatars with another subject's expressions (cross-reenactment); 1 where a limit is broken."""
+
+    run: tyro.conf.Positional[str]
+    """Folder of a finished run."""
+
+    out: str | None = None
+    """Folder to write; default: `cross_reenactment` in the folder of the run."""
+
+    source: str | None = None
+    """Capture (or folder of several) that drives; default: every other subject of the run."""
+
+    methods: tuple[str, ...] = ()
+    """Methods to drive; default: all but the floors."""
+
+    camera: str | None = None
+    """Camera of the target to render; default: the first held out, or else the first of training."""
+
+    frames: int | None = None
+    """Render at most so many timesteps of each source, evenly spaced; default: all."""
+
+    def __post_init__(self) -> None:
+        if self.frames is not None and self.frames < 1:
+            raise ValueError(f"frames is {self.frames}; at least 1")
+
 
 Settings = TypeVar("Settings", ExtremesSettings, ReenactSettings)
 
@@ -28,6 +92,10 @@ def try_run(
     progress: Progress,
 ) -> Findings:
     """Try the avatars of a run, write the contact sheet; did not pass where a limit is broken."""
+    from ...bench.runner.avatars import trained
+    from ...bench.runner.store import RunFolder
+    from .stability import SHEET_FILE, table
+
     folder = Path(settings.run)
     out = Path(settings.out) if settings.out else folder / default_folder
     RunFolder(folder).read_manifest()  # before a folder is made in what is no run
@@ -38,3 +106,28 @@ def try_run(
     text = f"{table(summaries)}\n{out / SHEET_FILE}"
     passed = all(summary["frames_broken"] == 0 for summary in summaries)
     return Findings(text, {"out": out, "avatars": summaries}, passed)
+
+
+def extremes_run(settings: ExtremesSettings, progress: Progress = no_progress) -> Findings:
+    """Try a run's avatars on views and expressions beyond those of training: limits held or not, contact sheet.
+
+    Does not pass where a limit is broken. Raises `InputError` for a folder that is no finished run, and for a capture that is not the run's.
+    """
+    from .extremes import TASK as EXTREMES
+    from .extremes import try_extremes
+    from .sheets import write_extremes_sheet
+
+    return try_run(settings, EXTREMES, try_extremes, write_extremes_sheet, progress)
+
+
+def reenact_run(settings: ReenactSettings, progress: Progress = no_progress) -> Findings:
+    """Drive a run's avatars with another subject's expressions: limits held or not, frames, contact sheet.
+
+    Does not pass where a limit is broken. Raises `InputError` for a folder that is no finished run, where nobody else is there to drive, and for a source
+    tracked with another head model.
+    """
+    from .reenactment import TASK as REENACTMENT
+    from .reenactment import reenact
+    from .sheets import write_reenact_sheet
+
+    return try_run(settings, REENACTMENT, reenact, write_reenact_sheet, progress)

@@ -17,7 +17,7 @@ from ...bench.rows import Rows
 from ...bench.runner.adaptation import MethodNeeds
 from ...bench.runner.avatars import load
 from ...bench.runner.stages import Job
-from .settings import ExtremesSettings
+from .command import ExtremesSettings
 from .stability import (
     EXPRESSION_LIMITS,
     RECORD_FILE,

@@ -22,9 +22,9 @@ from ...bench.runner.captures import open_clips, run_configuration
 from ...bench.runner.run import adapt, make_jobs
 from ...bench.runner.stages import Job
 from ...bench.runner.store import RunFolder
+from .command import ReenactSettings
 from .extremes import training_poses
 from .identity import Look, identity, mean_known, of_recording
-from .settings import ReenactSettings
 from .stability import (
     RECORD_FILE,
     ROWS_FILE,

@@ -4,33 +4,37 @@ import dataclasses
 import importlib.metadata
 import json
 import subprocess
+from importlib.metadata import EntryPoint
 
 import pytest
 
 from headbench.bench import cli, commands, registry
 from headbench.bench.io.lock import locked
-from headbench.bench.registry import Plugin
-from headbench.bench.specs import CommandSpec
 
-TOY = """
+TOY = '''
 from dataclasses import dataclass
 import tyro
-from headbench.bench.specs import Findings
-from headbench.bench.errors import InputError
+from headbench import Findings, InputError, writes
 
 @dataclass(frozen=True)
 class Settings:
     path: tyro.conf.Positional[str]
-    \"\"\"What to look at.\"\"\"
+    """What to look at."""
     limit: float = 0.5
-    \"\"\"Most that may be wrong.\"\"\"
+    """Most that may be wrong."""
 
-def run(settings, progress):
+@writes("path")
+def make(settings: Settings, progress):
+    """Make it."""
+    return look(settings, progress)
+
+def look(settings: Settings, progress):
+    """Look at it."""
     if settings.limit < 0:
         raise InputError("command line", "limit", "at least 0", str(settings.limit))
     code = 3 if settings.limit == 3 else None
     return Findings(f"looked at {settings.path}", {"limit": settings.limit}, settings.limit < 1, code)
-"""
+'''
 
 
 @pytest.fixture
@@ -38,10 +42,9 @@ def offer(monkeypatch, tmp_path):
     (tmp_path / "toy_command.py").write_text(TOY)
     monkeypatch.syspath_prepend(tmp_path)
 
-    def offer(*names, settings="toy_command:Settings", writes=""):
-        specs = [CommandSpec(name, "look at it", "toy_command:run", settings, writes) for name in names]
-        found = {spec.name.replace(" ", "-"): Plugin(spec.name, "toys 1", spec) for spec in specs}
-        monkeypatch.setattr(commands, "discover", lambda group: found)
+    def offer(*names, function="toy_command:look"):
+        entries = [EntryPoint(name, function, "headbench.commands") for name in names]
+        monkeypatch.setattr(registry, "entry_points", lambda group: entries)
 
     return offer
 
@@ -141,15 +144,24 @@ def test_help_shows_the_settings_text(offer, capsys):
     assert "Most that may be wrong." in capsys.readouterr().out
 
 
-def test_a_broken_command_is_listed_and_raises_only_when_called(offer, capsys):
-    offer("look", settings="not_there:Settings")
-    assert cli.main(["list", "reports"]) == 0
+@pytest.mark.parametrize(
+    ("function", "why"),
+    [
+        ("not_there:look", "not_there"),
+        ("toy_command:not_there", "not_there"),
+        ("toy_command:Findings", "dataclass"),
+    ],
+)
+def test_a_broken_command_is_listed_and_raises_only_when_called(offer, capsys, function, why):
+    offer("look", function=function)
+    assert cli.main(["list", "commands"]) == 0
+    assert "look  broken: " in capsys.readouterr().out
     assert cli.main(["look"]) == 2
-    assert "not_there" in capsys.readouterr().err
+    assert why in capsys.readouterr().err
 
 
 def test_a_folder_that_is_written_is_locked(offer, capsys, tmp_path):
-    offer("make", writes="path")
+    offer("make", function="toy_command:make")
     with locked(tmp_path):
         assert cli.main(["make", str(tmp_path)]) == 2
     assert "no other process works in" in capsys.readouterr().err
@@ -162,5 +174,5 @@ def test_every_command_with_a_folder_to_write_locks_it():
     files = {"export ply"}  # --out is one
     for plugin in registry.discover("commands").values():
         spec = plugin.spec
-        names = {field.name for field in dataclasses.fields(registry.resolve(spec.settings))}
+        names = {field.name for field in dataclasses.fields(spec.settings)}
         assert ("out" in names) == (spec.writes == "out" or spec.name in own | files), spec.name

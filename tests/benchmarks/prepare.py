@@ -21,8 +21,7 @@ import numpy as np
 from ...bench.contracts import ByteArray, Camera, Progress, no_progress
 from ...bench.machine import processor_count
 from ...bench.specs import Findings
-from ...datasets.nersemble.command import run
-from ...datasets.nersemble.settings import PrepareSettings
+from ...datasets.nersemble.command import PrepareSettings, prepare_nersemble
 from ...datasets.nersemble.writer import RecordingWriter, video_codec
 from ...datasets.synthetic.take import cameras
 
@@ -154,7 +153,7 @@ def _prepare(root: Path, out: Path, workers: int, every: int = EVERY) -> int:
         every=every,
         workers=workers,
     )
-    written: int = run(settings).data[SUBJECT]["written"]
+    written: int = prepare_nersemble(settings).data[SUBJECT]["written"]
     return written
 
 

@@ -18,10 +18,10 @@ from ...bench.specs import Findings
 from ...datasets.clip import CaptureClip, FrameFiles
 from ...datasets.head.arrays import HeadArrays
 from ...datasets.head.procedural.model import procedural_head
+from ...datasets.head.refit.command import RefitSettings
 from ...datasets.head.refit.identity import match
 from ...datasets.head.refit.problem import FitProblem, Frame, angle_bounds, solve_frame
 from ...datasets.head.refit.refit import refit
-from ...datasets.head.refit.settings import RefitSettings
 from ...datasets.head.subject import PosedSubject, pose_in_head_frame
 from ...datasets.images import ImageStore
 from .head.sized import FLAME_SIZES, sized_head

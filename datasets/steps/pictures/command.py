@@ -1,31 +1,62 @@
-"""``headbench steps``: what the steps before training make of a capture, as pictures and numbers."""
+"""``headbench steps``."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
+import tyro
 
 from ....bench.contracts import Progress, no_progress
 from ....bench.errors import InputError
 from ....bench.io.files import write_json
-from ....bench.specs import Findings
-from ...ga.reader import read_capture
-from ...ga.writer import write_png
-from ..expression_clusters import cluster_expressions
-from .class_figure import draw_classes
-from .jaw_figure import draw_jaw_bases, find_jaw_bases
-from .settings import StepsSettings
+from ....bench.specs import Findings, writes
+
+
+@dataclass(frozen=True)
+class StepsSettings:
+    """Draw the jaw bases and the expression classes that a capture's training frames give."""
+
+    capture: tyro.conf.Positional[str]
+    """Capture in the GaussianAvatars/VHAP layout."""
+
+    out: str
+    """Folder for jaw_bases.png, expression_classes.png and steps.json."""
+
+    bases: int = 16
+    """Jaw bases at most."""
+
+    classes: int = 16
+    """Expression classes at most."""
+
+    seed: int = 0
+    """Seeds the choice of landmarks in long captures."""
+
+    variant: Literal["paper", "official"] = "paper"
+    """"official" shows what the published code makes: jaw bases from held-out poses (a leak, and said so)."""
+
+    head: str | None = None
+    """Head model for a capture that brings none: FLAME pickle or npz."""
+
 
 JAW_PICTURE, CLASS_PICTURE, NUMBERS = "jaw_bases.png", "expression_classes.png", "steps.json"
 
 
-def run(settings: StepsSettings, progress: Progress = no_progress) -> Findings:
-    """Find jaw bases and expression classes of a capture, draw them, write pictures and numbers.
+@writes("out")
+def steps(settings: StepsSettings, progress: Progress = no_progress) -> Findings:
+    """Draw the jaw bases and expression classes that a capture's training frames give, and their numbers.
 
     Raises `InputError` for a capture that the reader refuses, for counts below 1, and for a head without a face
     region.
     """
+    from ...ga.reader import read_capture
+    from ...ga.writer import write_png
+    from ..expression_clusters import cluster_expressions
+    from .class_figure import draw_classes
+    from .jaw_figure import draw_jaw_bases, find_jaw_bases
+
     for name in ("bases", "classes"):
         if getattr(settings, name) < 1:
             raise InputError(f"--{name}", "", "at least 1", str(getattr(settings, name)))

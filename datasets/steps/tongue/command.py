@@ -1,30 +1,65 @@
-"""``headbench tongue``: find the frames with the tongue out; write the decisions and pictures of them."""
+"""``headbench tongue``."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
 
 from ....bench.contracts import Progress
 from ....bench.errors import InputError
-from ....bench.specs import Findings
-from ...clip import CaptureClip
-from ...ga.reader import find_captures, read_capture
-from ..exclusion_file import KEEP, Exclusions, read_exclusions, write_exclusions
-from .atlas import mouth_atlas
-from .decide import NEAR, decide
-from .evidence import find_evidence
-from .review import write_sheet
-from .sampling import facing_cameras, frames_by_timestep, sample_clip
-from .settings import TongueSettings
+from ....bench.specs import Findings, writes
+
+if TYPE_CHECKING:
+    from ..exclusion_file import Exclusions
+
+if TYPE_CHECKING:
+    from ...clip import CaptureClip
+
+
+@dataclass(frozen=True)
+class TongueSettings:
+    """Which capture to look at, and how."""
+
+    capture: Annotated[str, tyro.conf.Positional]
+    """Capture in the GaussianAvatars/VHAP layout, or a folder of several subjects' captures."""
+
+    out: str
+    """Folder for tongue.yaml and the contact sheets. Overrides in a tongue.yaml that is there are kept."""
+
+    head: str | None = None
+    """Head model for captures that bring none: FLAME pickle or npz."""
+
+    masks: str | None = None
+    """FLAME_masks.pkl, for a head model without regions."""
+
+    cy: Literal["auto", "top", "bottom", "centre"] = "auto"
+    """How the principal point is read; auto takes the declared convention, else lets the images decide."""
+
+    threshold: float | None = None
+    """Area in mm2 from which on a frame is left out; by default chosen for each subject between 20 and 60."""
+
+    cameras: int = 4
+    """How many cameras to look through: those that the mouth faces most."""
+
+    frames: int = 60
+    """How many frames to show on a contact sheet: the highest areas."""
+
 
 DECISIONS_FILE = "tongue.yaml"
 
 
-def run(settings: TongueSettings, progress: Progress) -> Findings:
-    """Look at every subject under ``settings.capture``; see `TongueSettings`.
+@writes("out")
+def tongue(settings: TongueSettings, progress: Progress) -> Findings:
+    """Find the frames that show the tongue; scores, reasons, your overrides, and a contact sheet to review.
 
     Raises `InputError` before any image is looked at, for captures and decisions that cannot be read.
     """
+    from ...ga.reader import find_captures, read_capture
+    from ..exclusion_file import read_exclusions, write_exclusions
+
     _check(settings)
     root, out = Path(settings.capture), Path(settings.out)
     captures = find_captures(root)
@@ -57,6 +92,12 @@ def _look(
     clip: CaptureClip, settings: TongueSettings, earlier: Exclusions | None, sheet: Path, progress: Progress
 ) -> Exclusions:
     """Decide on one subject and draw its contact sheet."""
+    from .atlas import mouth_atlas
+    from .decide import decide
+    from .evidence import find_evidence
+    from .review import write_sheet
+    from .sampling import facing_cameras, frames_by_timestep, sample_clip
+
     overrides = earlier.overrides if earlier else {}
     frames = frames_by_timestep(clip)
     unknown = sorted(set(overrides) - set(frames))
@@ -85,6 +126,8 @@ def _check(settings: TongueSettings) -> None:
 
 def _summary(subject: str, decided: Exclusions) -> str:
     """Tell a person what was decided, sequence by sequence."""
+    from ..exclusion_file import KEEP
+
     reasons = decided.reasons()
     lines = [f"Subject {subject}: {len(reasons)} of {len(decided.frames)} timesteps left out"]
     lines.append(
@@ -117,6 +160,8 @@ def _data(decided: Exclusions) -> dict[str, object]:
 
 def _near(decided: Exclusions) -> list[int]:
     """Timesteps that nobody has decided and whose score is within `NEAR` of the threshold."""
+    from .decide import NEAR
+
     low, high = decided.threshold / NEAR, decided.threshold * NEAR
     return [t for t, f in decided.frames.items() if low <= f.score < high and t not in decided.overrides]
 

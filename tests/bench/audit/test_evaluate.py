@@ -8,8 +8,7 @@ import pandas as pd
 import pytest
 
 from headbench.bench import cli
-from headbench.bench.audit.evaluate import run as evaluate
-from headbench.bench.audit.settings import EvaluateSettings
+from headbench.bench.audit.command import EvaluateSettings, evaluate
 from headbench.bench.errors import InputError
 from headbench.bench.io.frames import read_png, write_png
 from headbench.bench.rows import ALL, COLUMNS

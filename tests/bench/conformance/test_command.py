@@ -10,6 +10,7 @@ import pytest
 import headbench
 from headbench.bench import cli, contracts, errors, specs
 from headbench.bench.conformance import command
+from headbench.bench.runner import captures
 
 PLUGINS = ("grey:SPEC", "outside_reader:SPEC") + tuple(
     f"outside_metric:{name}" for name in ("ERROR", "JUMP", "FILES", "HOURS")
@@ -55,10 +56,10 @@ def test_without_data_a_method_is_tried_on_a_synthetic_capture(monkeypatch):
     made, get = [], command.get
     monkeypatch.setattr(command, "get", lambda group, name: made.append((group, name)) or get(group, name))
     monkeypatch.setattr(command, "resolve", lambda reference: lambda **arguments: made.append(arguments))
-    monkeypatch.setattr(command, "open_clips", lambda config: [made.append(config.data)])
+    monkeypatch.setattr(captures, "open_clips", lambda config: [made.append(config.data)])
     monkeypatch.setattr(command, "_adapted", lambda *_: None)
     monkeypatch.setattr(command, "check_method", lambda *_, **__: [])
-    command.run(command.CheckPluginSettings("mean-image"))
+    command.check_plugin(command.CheckPluginSettings("mean-image"))
     names, arguments, data = made[-3:]
     assert names == ("datasets", "synthetic")
     assert str(arguments["out"]) == data

@@ -312,13 +312,11 @@ def test_a_device_that_is_not_there_is_refused_once_before_training(config, toy,
 
 
 def test_two_runs_in_one_folder_are_refused_before_training(config, toy):
-    folder = RunFolder(runner.Path(config.out))
-    folder.prepare()
-    with locked(folder.root), pytest.raises(InputError, match="no other process works in"):
+    with locked(runner.Path(config.out)), pytest.raises(InputError, match="no other process works in"):
         runner.run(config)
     assert toy.FITS == []
     runner.run(config)
-    assert not (folder.root / "run.lock").exists()
+    assert not (runner.Path(config.out) / "run.lock").exists()
 
 
 def test_settings_that_contradict_themselves_are_refused():

@@ -19,10 +19,9 @@ from scipy.spatial.transform import Rotation
 from headbench.bench.conformance.readers import check_clip
 from headbench.bench.contracts import no_progress
 from headbench.bench.errors import InputError
-from headbench.datasets.colmap.command import run
+from headbench.datasets.colmap.command import ExportColmapSettings, export_colmap
 from headbench.datasets.colmap.model import read_model
 from headbench.datasets.colmap.reader import model_cameras, model_lenses
-from headbench.datasets.colmap.settings import ExportColmapSettings
 from headbench.datasets.colmap.writer import export_model, export_tracking, image_name
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.model import HeadModel
@@ -306,7 +305,7 @@ def test_skew_and_empty_exports_are_refused(clip, tmp_path):
 
 def test_command_writes_the_first_training_timestep(capture, tmp_path):
     out = tmp_path / "out"
-    findings = run(ExportColmapSettings(str(capture.union), str(out)), no_progress)
+    findings = export_colmap(ExportColmapSettings(str(capture.union), str(out)), no_progress)
     clip = read_capture(capture.union)
     first = clip.timesteps("train")[0]
     assert set(model_cameras(read_model(out))) == {
@@ -314,7 +313,7 @@ def test_command_writes_the_first_training_timestep(capture, tmp_path):
     }
     assert findings.data["images"] == len(clip.cameras)
     with pytest.raises(InputError, match="--timesteps.*found 99"):
-        run(
+        export_colmap(
             ExportColmapSettings(str(capture.union), str(out), timesteps=(0, 99)),
             no_progress,
         )

@@ -12,8 +12,7 @@ from headbench.bench.runner.captures import open_clips
 from headbench.bench.runner.config import RunConfig
 from headbench.datasets.ga import content_digests
 from headbench.datasets.ga.reader import read_capture
-from headbench.datasets.lint.command import run
-from headbench.datasets.lint.settings import LintSettings
+from headbench.datasets.lint.command import LintSettings, lint
 
 from ..tiny_capture import FRONTAL, SERIALS
 
@@ -59,4 +58,4 @@ def test_what_verify_opens_has_another_fingerprint(exchanged):
 
 def test_lint_reads_the_bytes(exchanged):
     capture, _ = exchanged
-    assert "HB201" in run(LintSettings(str(capture.union))).text
+    assert "HB201" in lint(LintSettings(str(capture.union))).text

@@ -7,8 +7,7 @@ import json
 import pytest
 
 from headbench.bench.errors import InputError
-from headbench.datasets.inspect.command import NUMBERS, PICTURE, run
-from headbench.datasets.inspect.settings import InspectSettings
+from headbench.datasets.inspect.command import NUMBERS, PICTURE, InspectSettings, inspect
 
 from ..lint.good_capture import read_rgb
 
@@ -16,7 +15,7 @@ from ..lint.good_capture import read_rgb
 def test_picture_numbers_and_text(capture, clip, tmp_path):
     calls = []
     settings = InspectSettings(str(capture.union), out=str(tmp_path / "out"), timesteps=1, cameras=2)
-    findings = run(settings, lambda *arguments: calls.append(arguments))
+    findings = inspect(settings, lambda *arguments: calls.append(arguments))
     assert findings.passed
     assert calls
     picture = read_rgb(tmp_path / "out" / PICTURE)
@@ -40,11 +39,11 @@ def test_picture_numbers_and_text(capture, clip, tmp_path):
 @pytest.mark.parametrize("changes", [{"timesteps": 0}, {"cameras": 0}])
 def test_counts_below_one_are_refused(capture, tmp_path, changes):
     with pytest.raises(InputError, match="at least 1"):
-        run(InspectSettings(str(capture.union), out=str(tmp_path), **changes))
+        inspect(InspectSettings(str(capture.union), out=str(tmp_path), **changes))
     assert not any(tmp_path.iterdir())
 
 
 def test_a_capture_that_does_not_read_is_refused_before_anything_is_written(tmp_path):
     with pytest.raises(InputError):
-        run(InspectSettings(str(tmp_path / "nothing"), out=str(tmp_path / "out")))
+        inspect(InspectSettings(str(tmp_path / "nothing"), out=str(tmp_path / "out")))
     assert not (tmp_path / "out").exists()

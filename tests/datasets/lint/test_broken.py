@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 
 from headbench.bench.errors import InputError
 from headbench.datasets.ga.writer import CaptureWriter
-from headbench.datasets.lint.command import run
-from headbench.datasets.lint.settings import LintSettings
+from headbench.datasets.lint.command import LintSettings, lint
 
 from .good_capture import GoodCapture
 
@@ -63,7 +62,7 @@ def copy(pristine, tmp_path) -> GoodCapture:
 
 
 def outcome(capture: GoodCapture) -> list[str]:
-    findings = run(LintSettings(str(capture.union), views=3, duplicates=6))
+    findings = lint(LintSettings(str(capture.union), views=3, duplicates=6))
     json.dumps(findings.data)
     return [finding["code"] for finding in findings.data["findings"]]
 

@@ -14,8 +14,7 @@ from headbench.datasets.ga.layout import Declaration
 from headbench.datasets.head.arrays import read_head, save_head
 from headbench.datasets.head.procedural.model import procedural_head
 from headbench.datasets.lint.catalogue import RULES
-from headbench.datasets.lint.command import run
-from headbench.datasets.lint.settings import LintSettings
+from headbench.datasets.lint.command import LintSettings, lint
 from headbench.datasets.synthetic.capture import synthesize
 
 
@@ -27,18 +26,18 @@ def _exclude(capture, excluded):
 
 def test_clean_warning_and_strict(good):
     settings = LintSettings(str(good.union), views=4, duplicates=20)
-    assert run(settings).passed
+    assert lint(settings).passed
     _exclude(good, {3: ""})
-    findings = run(settings)
+    findings = lint(settings)
     assert findings.passed
     assert findings.data["counts"] == {"error": 0, "warning": 1, "note": 0}
-    assert not run(replace(settings, strict=True)).passed
-    assert run(replace(settings, strict=True, ignore=("HB109",))).passed
+    assert not lint(replace(settings, strict=True)).passed
+    assert lint(replace(settings, strict=True, ignore=("HB109",))).passed
 
 
 def test_an_error_does_not_pass_and_names_its_place(good):
     _exclude(good, {77: "tongue out"})
-    findings = run(LintSettings(str(good.union), views=4, duplicates=20, ignore=("HB100",)))
+    findings = lint(LintSettings(str(good.union), views=4, duplicates=20, ignore=("HB100",)))
     assert not findings.passed
     (found,) = findings.data["findings"]
     assert (found["code"], found["severity"], found["key"]) == ("HB108", "error", "excluded")
@@ -50,11 +49,11 @@ def test_an_error_does_not_pass_and_names_its_place(good):
 
 def test_the_folder_of_one_union_will_do(good):
     settings = LintSettings(str(good.writer.root), views=1, duplicates=0)
-    assert run(settings).data["capture"] == good.union.as_posix()
+    assert lint(settings).data["capture"] == good.union.as_posix()
 
 
 def test_every_rule_is_explained():
-    findings = run(LintSettings(list=True))
+    findings = lint(LintSettings(list=True))
     assert [entry["code"] for entry in findings.data["rules"]] == [rule.code for rule in RULES]
     assert all(rule.code in findings.text for rule in RULES)
 
@@ -64,7 +63,7 @@ def test_every_rule_is_explained():
 )
 def test_bad_input(settings):
     with pytest.raises(InputError):
-        run(settings)
+        lint(settings)
 
 
 def test_exit_codes_and_json_on_the_command_line(good, capsys):
@@ -88,7 +87,7 @@ def test_synthetic_captures_without_and_with_a_mix_up_of_versions(tmp_path):
         synthesize(
             root, cameras=2, timesteps=16, size=(96, 136), seed=3, tracking_noise=noise, samples_per_pixel=9
         )
-        findings = run(LintSettings(str(root))).data["findings"]
+        findings = lint(LintSettings(str(root))).data["findings"]
         assert {finding["code"] for finding in findings} <= {"HB110"}
     union = next(tmp_path.glob("0.0/UNION*"))
     head = read_head(union / "head_model.npz")
@@ -97,5 +96,5 @@ def test_synthetic_captures_without_and_with_a_mix_up_of_versions(tmp_path):
     count = min(other.shape[2], basis.shape[2])
     basis[..., :count] = other[..., :count]
     save_head(union / "head_model.npz", replace(head, expression_basis=basis))
-    findings = run(LintSettings(str(union))).data["findings"]
+    findings = lint(LintSettings(str(union))).data["findings"]
     assert {"HB615"} <= {finding["code"] for finding in findings} <= {"HB615", "HB110"}

@@ -15,9 +15,8 @@ from headbench.datasets.ga.layout import Declaration
 from headbench.datasets.ga.writer import CaptureWriter, write_png
 from headbench.datasets.head.arrays import save_head
 from headbench.datasets.lint.catalogue import GROUPS, RULES
-from headbench.datasets.lint.command import lint
+from headbench.datasets.lint.command import LintSettings, lint_capture
 from headbench.datasets.lint.rules import apply
-from headbench.datasets.lint.settings import LintSettings
 
 from ..head.toy import toy_head
 from .faults import FAULTS
@@ -42,12 +41,12 @@ def _one_thread():
 
 def codes(capture: GoodCapture, **settings) -> list[str]:
     # Fewer views than by default: one per timestep of this capture.
-    _, findings = lint(LintSettings(str(capture.union), views=24, **settings))
+    _, findings = lint_capture(LintSettings(str(capture.union), views=24, **settings))
     return [finding.code for finding in findings]
 
 
 def test_a_good_capture_has_no_findings(pristine):
-    _, findings = lint(LintSettings(str(pristine.union)))
+    _, findings = lint_capture(LintSettings(str(pristine.union)))
     assert findings == []
 
 
@@ -88,7 +87,7 @@ def test_cy_from_the_other_edge(tmp_path):
 
 
 def test_a_width_beyond_the_limit_of_gaussian_avatars(pristine):
-    evidence, _ = lint(LintSettings(str(pristine.union), views=1, duplicates=0))
+    evidence, _ = lint_capture(LintSettings(str(pristine.union), views=1, duplicates=0))
     path = next(iter(evidence.headers))
     wide = replace(evidence, headers={path: ImageInfo(1604, 2000, 3)})
     rule = next(rule for rule in RULES if rule.code == "HB115")
@@ -117,7 +116,7 @@ def detailed(tmp_path_factory) -> GoodCapture:
 
 
 def test_right_expressions_explain_the_images(detailed):
-    evidence, findings = lint(LintSettings(str(detailed.union), views=8))
+    evidence, findings = lint_capture(LintSettings(str(detailed.union), views=8))
     assert [finding.code for finding in findings] == []
     assert evidence.expression_fit is not None
     assert evidence.expression_fit.mean < 0.3
@@ -132,7 +131,7 @@ def test_coefficients_of_another_basis(detailed, tmp_path, seed):
     head = detailed.writer.plan.head
     other = toy_head(48, seed=seed).expression_basis
     save_head(mixed.union / "head_model.npz", replace(head, expression_basis=other))
-    evidence, findings = lint(LintSettings(str(mixed.union), views=8))
+    evidence, findings = lint_capture(LintSettings(str(mixed.union), views=8))
     assert [finding.code for finding in findings] == ["HB615"]
     assert evidence.expression_fit is not None
     assert min(evidence.expression_fit.mean, evidence.expression_fit.median) > 1.1

@@ -3,7 +3,7 @@
 import pytest
 
 from headbench.bench.errors import InputError
-from headbench.datasets.nersemble.command import run
+from headbench.datasets.nersemble.command import prepare_nersemble
 
 from .recordings import SUBJECT
 
@@ -11,7 +11,7 @@ from .recordings import SUBJECT
 @pytest.mark.parametrize("name", ["paper", "ablation"])
 def test_named_subjects_that_are_not_there_are_told_with_those_that_are(name, pristine_recording, tmp_path):
     with pytest.raises(InputError) as error:
-        run(pristine_recording.settings(tmp_path / "out", subjects=name))
+        prepare_nersemble(pristine_recording.settings(tmp_path / "out", subjects=name))
     assert error.value.key == "--subjects"
     assert error.value.found == SUBJECT
     assert f"--subjects {SUBJECT}" in error.value.remedy
@@ -25,7 +25,7 @@ def test_the_way_to_use_a_capture_names_its_head_model(recording, tmp_path):
         ("", "", "--head flame2023.pkl"),
         (head, "", f"--head {head}"),
     ):
-        findings = run(
+        findings = prepare_nersemble(
             recording.settings(tmp_path / f"out-{name}-{bool(given)}", head=given, head_model=name)
         )
         assert f"{expected} --out" in findings.text

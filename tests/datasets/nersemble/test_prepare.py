@@ -15,7 +15,7 @@ from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import read_head, save_head
 from headbench.datasets.nersemble import export, image_pool, sequence
 from headbench.datasets.nersemble.calibration import read_calibration
-from headbench.datasets.nersemble.command import run
+from headbench.datasets.nersemble.command import prepare_nersemble
 from headbench.datasets.nersemble.prepare import RECORD_FILE
 from headbench.datasets.nersemble.presets import UNION10_SEQUENCES, union10_held_out
 
@@ -31,7 +31,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def prepared(recording, out, **changes):
-    findings = run(recording.settings(out, **changes))
+    findings = prepare_nersemble(recording.settings(out, **changes))
     return findings.data[SUBJECT], findings
 
 
@@ -407,7 +407,7 @@ def test_union10_holds_out_by_the_seeded_rule(tmp_path):
 
 def test_progress_reaches_its_end(pristine_recording, tmp_path):
     calls = []
-    run(
+    prepare_nersemble(
         pristine_recording.settings(tmp_path / "out"),
         lambda done, total, note="": calls.append((done, total, note)),
     )
@@ -417,7 +417,7 @@ def test_progress_reaches_its_end(pristine_recording, tmp_path):
 
 
 def test_a_check_writes_nothing(pristine_recording, tmp_path):
-    findings = run(pristine_recording.settings(tmp_path / "out", check=True))
+    findings = prepare_nersemble(pristine_recording.settings(tmp_path / "out", check=True))
     assert findings.data["images"] == IMAGES
     assert not (tmp_path / "out").exists()
 
@@ -440,6 +440,6 @@ def test_a_check_writes_nothing(pristine_recording, tmp_path):
 )
 def test_bad_options_are_named(change, key, pristine_recording, tmp_path):
     with pytest.raises(InputError) as error:
-        run(pristine_recording.settings(tmp_path / "out", **change))
+        prepare_nersemble(pristine_recording.settings(tmp_path / "out", **change))
     assert error.value.key == key
     assert not (tmp_path / "out").exists()

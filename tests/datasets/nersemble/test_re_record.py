@@ -11,9 +11,13 @@ from headbench.bench.errors import InputError
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import save_head
 from headbench.datasets.head.model import HeadModel
-from headbench.datasets.nersemble.command import run as prepare
-from headbench.datasets.nersemble.re_record import re_record, run
-from headbench.datasets.nersemble.settings import PrepareSettings, RecordSettings
+from headbench.datasets.nersemble.command import (
+    PrepareSettings,
+    RecordSettings,
+    prepare_nersemble,
+    record_nersemble,
+)
+from headbench.datasets.nersemble.re_record import re_record
 
 from ..tiny_capture import make_plan, rig, write_tiny_capture
 
@@ -48,7 +52,7 @@ def test_there_and_back(release, frames, clip, tmp_path):
         mattes=frames == "images",
     )
     save_head(tmp_path / "head.npz", clip.head)
-    findings = prepare(
+    findings = prepare_nersemble(
         PrepareSettings(
             root=str(tmp_path / "raw"),
             out=str(tmp_path / "out"),
@@ -75,7 +79,7 @@ def test_there_and_back(release, frames, clip, tmp_path):
 
 def test_the_command_says_how_to_prepare(clip, tmp_path):
     source = clip.files[clip.splits["train"][0]].image.parents[2] / "UNION3_901"
-    findings = run(RecordSettings(str(source), str(tmp_path / "raw")))
+    findings = record_nersemble(RecordSettings(str(source), str(tmp_path / "raw")))
     assert "--subjects 901" in findings.text
     assert {entry.name for entry in (tmp_path / "raw").iterdir()} == {
         "recording",
@@ -94,7 +98,7 @@ def test_a_frame_missing_from_the_capture_is_named_before_anything_is_written(cl
     gone = value["frames"].pop(1)
     path.write_text(json.dumps(value))
     with pytest.raises(InputError, match="no such frame") as caught:
-        run(RecordSettings(str(union), str(tmp_path / "raw")))
+        record_nersemble(RecordSettings(str(union), str(tmp_path / "raw")))
     assert caught.value.file == str(union)
     assert caught.value.key.endswith(f"/{gone['timestep_index']:05d}/{gone['camera_id']}")
     assert not (tmp_path / "raw").exists()

@@ -8,10 +8,9 @@ import pytest
 from headbench.bench.errors import InputError
 from headbench.datasets.ga.layout import DECLARATION_FILE
 from headbench.datasets.ga.reader import read_capture
-from headbench.datasets.nersemble.command import run
+from headbench.datasets.nersemble.command import PrepareSettings, prepare_nersemble
 from headbench.datasets.nersemble.prepare import RECORD_FILE
 from headbench.datasets.nersemble.presets import UNION10_SEQUENCES, union10_held_out
-from headbench.datasets.nersemble.settings import PrepareSettings
 
 from .recordings import SUBJECT, write_recording
 
@@ -24,8 +23,8 @@ def pristine_download(tmp_path_factory):
     folder = tmp_path_factory.mktemp("download")
     recording = write_recording(folder / "raw", sequences=SEQUENCES, size=(40, 40))
     out = folder / "captures"
-    run(recording.settings(out, sequences="paper"))
-    run(recording.settings(out, sequences="paper", split="union10"))
+    prepare_nersemble(recording.settings(out, sequences="paper"))
+    prepare_nersemble(recording.settings(out, sequences="paper", split="union10"))
     shutil.rmtree(next(out.glob("UNION11_*")))
     for path in [*out.rglob(RECORD_FILE), *out.rglob(DECLARATION_FILE), *out.rglob("head_model.npz")]:
         path.unlink()
@@ -39,7 +38,7 @@ def download(pristine_download, tmp_path):
 
 
 def check(root, subjects=SUBJECT, **settings):
-    return run(PrepareSettings(union_root=str(root), subjects=subjects, **settings))
+    return prepare_nersemble(PrepareSettings(union_root=str(root), subjects=subjects, **settings))
 
 
 def test_a_whole_download_passes(download):

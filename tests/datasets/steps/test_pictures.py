@@ -16,10 +16,9 @@ from headbench.bench.io.documents import read_json
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.steps.expression_clusters import cluster_expressions
 from headbench.datasets.steps.pictures.class_figure import class_colour, draw_classes, frontal_key
-from headbench.datasets.steps.pictures.command import run
+from headbench.datasets.steps.pictures.command import StepsSettings, steps
 from headbench.datasets.steps.pictures.jaw_figure import draw_jaw_bases, find_jaw_bases
 from headbench.datasets.steps.pictures.meshes import draw_meshes, unposed_meshes
-from headbench.datasets.steps.pictures.settings import StepsSettings
 
 from .clips import make_clip, with_poses
 
@@ -103,7 +102,7 @@ def test_colours_of_sixteen_classes_differ():
 @pytest.mark.parametrize("variant", ["paper", "official"])
 def test_command_writes_pictures_and_numbers(pristine_capture, tmp_path, variant):
     settings = StepsSettings(str(pristine_capture.union), str(tmp_path), classes=2, variant=variant)
-    findings = run(settings)
+    findings = steps(settings)
     clip = read_capture(pristine_capture.union)
     stored = read_json(tmp_path / "steps.json")
     assert stored["clip"] == clip.fingerprint
@@ -126,5 +125,5 @@ def test_a_clip_with_one_timestep_still_has_figures(clip):
 
 def test_counts_below_one_are_refused(pristine_capture, tmp_path):
     with pytest.raises(InputError, match="--classes"):
-        run(StepsSettings(str(pristine_capture.union), str(tmp_path), classes=0), no_progress)
+        steps(StepsSettings(str(pristine_capture.union), str(tmp_path), classes=0), no_progress)
     assert not list(tmp_path.iterdir())

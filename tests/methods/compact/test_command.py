@@ -7,8 +7,7 @@ import pytest
 from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.errors import InputError
 from headbench.datasets.ga.reader import read_capture
-from headbench.methods.compact.command import run
-from headbench.methods.compact.settings import CompactSettings
+from headbench.methods.compact.command import CompactSettings, compact
 from headbench.methods.ours.avatar import OursAvatar
 from headbench.methods.ours.method import Ours
 from headbench.methods.shared.config import SplatTraining
@@ -39,7 +38,7 @@ def trained(tmp_path_factory):
 def test_parts_and_their_costs_are_told(trained, tmp_path):
     capture, avatar = trained
     settings = CompactSettings(str(avatar), out=str(tmp_path), compare=str(capture), frames=3)
-    findings = run(settings)
+    findings = compact(settings)
     data, quality = findings.data, findings.data["quality"]
     assert data["frames"] == 3
     assert data["whole"]["compact_bytes"] == (tmp_path / "compact.safetensors").stat().st_size
@@ -57,7 +56,7 @@ def test_parts_and_their_costs_are_told(trained, tmp_path):
 
 
 def test_without_a_capture_only_sizes_are_told(trained, tmp_path):
-    findings = run(CompactSettings(str(trained[1]), out=str(tmp_path)))
+    findings = compact(CompactSettings(str(trained[1]), out=str(tmp_path)))
     assert "quality" not in findings.data
     assert findings.data["splats_kept"] == findings.data["splats"]
     assert "dB" not in findings.text
@@ -65,15 +64,15 @@ def test_without_a_capture_only_sizes_are_told(trained, tmp_path):
 
 def test_enlarged_pictures_have_no_truth(trained, tmp_path):
     settings = CompactSettings(str(trained[1]), out=str(tmp_path), compare=str(trained[0]), frames=1, scale=2)
-    findings = run(settings)
+    findings = compact(settings)
     assert findings.data["exact"]["psnr"] is None
     assert findings.data["quality"]["all"]["psnr_exact"] > 20
 
 
 def test_what_does_not_belong_together_is_refused(trained, tmp_path):
     with pytest.raises(InputError, match="exact file"):
-        run(CompactSettings(str(tmp_path), out=str(tmp_path / "out")))
+        compact(CompactSettings(str(tmp_path), out=str(tmp_path / "out")))
     other = write_tiny_capture(tmp_path / "other", make_plan(subject="902")).union
     with pytest.raises(InputError, match="902"):
-        run(CompactSettings(str(trained[1]), out=str(tmp_path / "out"), compare=str(other)))
+        compact(CompactSettings(str(trained[1]), out=str(tmp_path / "out"), compare=str(other)))
     assert not (tmp_path / "out").exists()

@@ -10,8 +10,8 @@ from safetensors import safe_open
 from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.errors import InputError
 from headbench.methods.compact.container import Content, read_content, write_content
-from headbench.methods.compact.encoding import EXACT, Precision
 from headbench.methods.compact.file import COMPACT_FILE, encode, exact_sizes, part_sizes, write_compact
+from headbench.methods.compact.precision import EXACT, Precision
 from headbench.methods.compact.simplify import simplify, training_poses
 from headbench.methods.ours.avatar import OursAvatar
 from headbench.methods.ours.config import Lines, OursConfig, Planes

@@ -12,13 +12,12 @@ from scipy.special import sph_harm_y
 
 from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.errors import InputError
+from headbench.datasets.ga import reader
 from headbench.datasets.ga.reader import read_capture
 from headbench.methods.ga.config import GAConfig
 from headbench.methods.ga.method import GA
-from headbench.methods.gaussian_ply import command
-from headbench.methods.gaussian_ply.command import neutral_pose, run
+from headbench.methods.gaussian_ply.command import ExportPlySettings, export_ply, neutral_pose
 from headbench.methods.gaussian_ply.harmonics import BEHIND, fit_harmonics, sphere
-from headbench.methods.gaussian_ply.settings import ExportPlySettings
 from headbench.methods.gbs.config import GBSConfig
 from headbench.methods.gbs.method import GBS
 from headbench.methods.ours.avatar import OursAvatar
@@ -75,7 +74,7 @@ def soft(values):
 def test_a_viewer_shows_what_the_avatar_shows(color, clip, tmp_path):
     config = replace(SMALL, color=color, sh_degree=2)
     folder = store(clip, tmp_path / "avatar", config, (lambda _: None) if color == "sh" else soft)
-    findings = run(ExportPlySettings(str(folder), out=str(tmp_path / "x.ply"), directions=128))
+    findings = export_ply(ExportPlySettings(str(folder), out=str(tmp_path / "x.ply"), directions=128))
     table = parse(tmp_path / "x.ply")
     avatar, pose = OursAvatar.read(folder, "cpu"), neutral_pose(clip.head)
     splats = avatar.splats(pose)
@@ -98,7 +97,7 @@ def test_the_pose_of_a_capture_is_written(tmp_path):
         clip, tmp_path / "ga", Budget(iterations=3), device="cpu", seed=0, progress=no_progress
     )
     timestep = clip.timesteps("self_reenactment")[0]
-    run(
+    export_ply(
         ExportPlySettings(
             str(tmp_path / "ga"), out=str(tmp_path / "x.ply"), capture=str(capture), timestep=timestep
         )
@@ -109,9 +108,9 @@ def test_the_pose_of_a_capture_is_written(tmp_path):
     difference = viewed(table, camera).clip(0, 1) - avatar.render(camera, clip.poses[timestep]).rgb
     assert np.abs(difference).max() < 1e-4
     with pytest.raises(InputError, match="timestep"):
-        run(ExportPlySettings(str(tmp_path / "ga"), out="x", capture=str(capture), timestep=10**6))
+        export_ply(ExportPlySettings(str(tmp_path / "ga"), out="x", capture=str(capture), timestep=10**6))
     with pytest.raises(InputError, match="an avatar"):
-        run(ExportPlySettings(str(tmp_path / "capture"), out="x"))
+        export_ply(ExportPlySettings(str(tmp_path / "capture"), out="x"))
 
 
 def test_a_viewer_shows_a_blendshape_avatar_in_a_turned_pose(tmp_path):
@@ -132,8 +131,8 @@ def test_a_viewer_shows_a_blendshape_avatar_in_a_turned_pose(tmp_path):
     pose = replace(clip.poses[timestep], rotation=np.array([0.3, -0.8, 0.2]))
     fixed = {"poses": {**clip.poses, timestep: pose}}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(command, "read_capture", lambda *_, **__: replace(clip, **fixed))
-        run(
+        patch.setattr(reader, "read_capture", lambda *_, **__: replace(clip, **fixed))
+        export_ply(
             ExportPlySettings(
                 str(tmp_path / "gbs"), out=str(tmp_path / "x.ply"), capture=str(capture), timestep=timestep
             )
@@ -161,7 +160,7 @@ def test_what_cannot_be_exported_names_what_can(tmp_path, files, found):
         if tensors:
             save_file(tensors, tmp_path / name)
     with pytest.raises(InputError, match=found) as caught:
-        run(ExportPlySettings(str(tmp_path), out=str(tmp_path / "x.ply")))
+        export_ply(ExportPlySettings(str(tmp_path), out=str(tmp_path / "x.ply")))
     assert "ours, ga or gbs" in caught.value.expected
 
 

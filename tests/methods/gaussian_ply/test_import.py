@@ -8,8 +8,7 @@ import pytest
 from headbench.bench.errors import InputError
 from headbench.datasets.ga.reader import read_capture
 from headbench.methods.ga.method import GA
-from headbench.methods.gaussian_ply.import_command import run
-from headbench.methods.gaussian_ply.settings import ImportGASettings
+from headbench.methods.gaussian_ply.command import ImportGASettings, import_ga
 from headbench.methods.shared.subject_mesh import SubjectMesh
 
 from ...datasets.tiny_capture import write_tiny_capture
@@ -59,7 +58,7 @@ ROWS = [
 )
 def test_a_file_made_by_hand_becomes_an_avatar(capture, tmp_path, rest, binding):
     ply = ga_file(tmp_path / "in.ply", ROWS, rest, binding)
-    findings = run(ImportGASettings(str(ply), capture=str(capture), out=str(tmp_path / "out")))
+    findings = import_ga(ImportGASettings(str(ply), capture=str(capture), out=str(tmp_path / "out")))
     assert findings.data["splats"] == findings.data["triangles"] == 2
     clip = read_capture(capture)
     avatar = GA().load(tmp_path / "out", device="cpu")
@@ -88,18 +87,18 @@ def test_a_file_made_by_hand_becomes_an_avatar(capture, tmp_path, rest, binding)
 def test_harmonics_of_no_degree_are_refused(capture, tmp_path):
     ply = ga_file(tmp_path / "in.ply", ROWS, rest=12)
     with pytest.raises(InputError, match="f_rest"):
-        run(ImportGASettings(str(ply), capture=str(capture), out=str(tmp_path / "out")))
+        import_ga(ImportGASettings(str(ply), capture=str(capture), out=str(tmp_path / "out")))
 
 
 @pytest.mark.parametrize("triangle", [-1, 10**6])
 def test_a_triangle_that_the_head_lacks_is_refused(capture, tmp_path, triangle):
     ply = ga_file(tmp_path / "in.ply", [{**ROWS[0], "binding_0": triangle}])
     with pytest.raises(InputError, match="binding_0"):
-        run(ImportGASettings(str(ply), capture=str(capture), out=str(tmp_path / "out")))
+        import_ga(ImportGASettings(str(ply), capture=str(capture), out=str(tmp_path / "out")))
     assert not (tmp_path / "out").exists()
 
 
 def test_a_folder_in_use_is_left_alone(capture, tmp_path):
     ply = ga_file(tmp_path / "in.ply", ROWS)
     with pytest.raises(InputError, match="empty folder"):
-        run(ImportGASettings(str(ply), capture=str(capture), out=str(tmp_path)))
+        import_ga(ImportGASettings(str(ply), capture=str(capture), out=str(tmp_path)))

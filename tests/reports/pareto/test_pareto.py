@@ -20,10 +20,9 @@ from headbench.bench.io.files import plain
 from headbench.bench.rows import Row, Rows
 from headbench.bench.runner.store import RunFolder
 from headbench.bench.specs import MetricSpec
-from headbench.reports.pareto.command import run
+from headbench.reports.pareto.command import ParetoSettings, pareto
 from headbench.reports.pareto.plot import Panel, label_points, write_plot
 from headbench.reports.pareto.points import pareto_front
-from headbench.reports.pareto.settings import ParetoSettings
 
 METRICS = [
     MetricSpec("psnr", "PSNR", "dB", True, 2, "m:psnr"),
@@ -65,7 +64,7 @@ def test_points_of_several_runs_and_which_are_on_the_front(make_run, tmp_path):
     large = make_run(
         "large", ours=(30.0, 0.04, 4.0, 50.0), ga=(29.0, 0.06, 4.0, 100.0), floor=(50.0, 0, 0.1, 1e4)
     )
-    found = run(ParetoSettings((small, large), str(tmp_path / "out")))
+    found = pareto(ParetoSettings((small, large), str(tmp_path / "out")))
     rows = {(r["run"].rsplit("/", 1)[-1], r["method"]): r for r in table(tmp_path / "out")}
     assert set(rows) == {("small", "ours"), ("small", "ga"), ("large", "ours"), ("large", "ga")}
     on_size = {key for key, r in rows.items() if r["on_front_of_megabytes"] == "1"}
@@ -86,7 +85,7 @@ def test_points_of_several_runs_and_which_are_on_the_front(make_run, tmp_path):
 
 def test_the_published_result_has_its_points(tmp_path):
     gallery = Path(__file__).parents[3] / "reports" / "gallery"
-    points = run(ParetoSettings((str(gallery),), str(tmp_path / "out"))).data["points"]
+    points = pareto(ParetoSettings((str(gallery),), str(tmp_path / "out"))).data["points"]
     assert len(points) == 5  # its rows are of two regions
     assert all(point["megabytes"] and point["milliseconds"] for point in points)
 
@@ -95,7 +94,7 @@ def test_a_metric_where_less_is_better_turns_the_front_round(make_run, tmp_path)
     folder = make_run(
         "r", ours=(28.0, 0.10, 1.0, 200.0), ga=(27.0, 0.05, 2.0, 400.0), gbs=(30.0, 0.2, 3.0, 9.0)
     )
-    run(ParetoSettings((folder,), str(tmp_path / "out"), metric="lpips"))
+    pareto(ParetoSettings((folder,), str(tmp_path / "out"), metric="lpips"))
     marks = {r["method"]: r["on_front_of_megabytes"] for r in table(tmp_path / "out")}
     assert marks == {"ours": "1", "ga": "1", "gbs": "0"}
 
@@ -104,20 +103,20 @@ def test_runs_on_other_frames_are_refused(make_run, tmp_path):
     one = make_run("one", ours=(28.0, 0.1, 1.0, 200.0))
     other = make_run("other", protocol="p2", ours=(28.0, 0.1, 1.0, 200.0))
     with pytest.raises(InputError, match="protocol"):
-        run(ParetoSettings((one, other), str(tmp_path / "out")))
+        pareto(ParetoSettings((one, other), str(tmp_path / "out")))
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("changes", [{"task": "extremes"}, {"metric": "fps"}])
 def test_an_unknown_task_or_metric_is_refused(make_run, tmp_path, changes):
     with pytest.raises(InputError, match=next(iter(changes))):
-        run(ParetoSettings((make_run("r", ours=(1.0, 1.0, 1.0, 1.0)),), str(tmp_path / "out"), **changes))
+        pareto(ParetoSettings((make_run("r", ours=(1.0, 1.0, 1.0, 1.0)),), str(tmp_path / "out"), **changes))
 
 
 def test_frame_time_is_the_named_metric_or_else_the_median(make_run, tmp_path):
     folder = make_run("r", ours=(28.0, 0.1, 1.0, 200.0))
     with pytest.raises(InputError, match="metric in ms: none"):
-        run(ParetoSettings((folder,), str(tmp_path / "out"), time="processor_time"))
+        pareto(ParetoSettings((folder,), str(tmp_path / "out"), time="processor_time"))
     manifest, rows = RunFolder(tmp_path / "r").manifest, RunFolder(tmp_path / "r").rows
     record, parts = json.loads(manifest.read_text()), [pd.read_parquet(rows)]
     for name, value in (("latency_p50", 4.0), ("processor_time", 9.0)):
@@ -125,9 +124,9 @@ def test_frame_time_is_the_named_metric_or_else_the_median(make_run, tmp_path):
         parts.append(parts[0][parts[0]["metric"] == "fps"].assign(metric=name, value=value))
     manifest.write_text(json.dumps(record))
     Rows(pd.concat(parts, ignore_index=True)).write(rows)
-    run(ParetoSettings((folder,), str(tmp_path / "out")))
+    pareto(ParetoSettings((folder,), str(tmp_path / "out")))
     assert float(table(tmp_path / "out")[0]["milliseconds"]) == 4.0
-    run(ParetoSettings((folder,), str(tmp_path / "out"), time="processor_time"))
+    pareto(ParetoSettings((folder,), str(tmp_path / "out"), time="processor_time"))
     assert float(table(tmp_path / "out")[0]["milliseconds"]) == 9.0
 
 
@@ -136,7 +135,7 @@ def test_derived_avatars_are_told_from_trained_ones(make_run, tmp_path):
     manifest = json.loads((tmp_path / "r" / "run.json").read_text())
     manifest["methods"][1]["derived"] = {"from": "ga", "variant": "half", "change": "16-bit floats"}
     (tmp_path / "r" / "run.json").write_text(json.dumps(manifest))
-    text = run(ParetoSettings((folder,), str(tmp_path / "out"))).text
+    text = pareto(ParetoSettings((folder,), str(tmp_path / "out"))).text
     assert "derived from the trained avatar" in text
     trained, derived = table(tmp_path / "out")
     assert (trained["derived_from"], trained["variant"]) == ("", "")

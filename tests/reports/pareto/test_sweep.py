@@ -10,7 +10,7 @@ from headbench.bench.runner import run as runner
 from headbench.bench.runner.config import RunConfig
 from headbench.bench.runner.store import RunFolder
 from headbench.reports.pareto import sweep as module
-from headbench.reports.pareto.settings import SweepSettings
+from headbench.reports.pareto.command import SweepSettings
 from headbench.reports.pareto.sweep import sweep
 
 

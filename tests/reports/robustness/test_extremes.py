@@ -12,10 +12,9 @@ from sklearn.decomposition import PCA
 from headbench.bench.contracts import FrameKey, HeadPose
 from headbench.bench.errors import InputError
 from headbench.bench.io.lock import LOCK_FILE, locked
-from headbench.reports.robustness import command
+from headbench.bench.runner import avatars
+from headbench.reports.robustness.command import ExtremesSettings, extremes_run
 from headbench.reports.robustness.extremes import ExpressionComponents, extremes, typical_pose
-from headbench.reports.robustness.extremes_command import run
-from headbench.reports.robustness.settings import ExtremesSettings
 from headbench.reports.robustness.sheets import BROKEN, EXTRAPOLATED
 from headbench.reports.robustness.stability import RECORD_FILE, ROWS_FILE, SHEET_FILE
 
@@ -35,7 +34,7 @@ def colours(path):
 
 def test_a_stable_avatar_passes_and_every_pair_has_its_rows(ball_run):
     folder = ball_run("BALL", "FLOOR")
-    found = run(settings(folder))
+    found = extremes_run(settings(folder))
     assert found.passed
     rows = pd.read_parquet(folder / "extremes" / ROWS_FILE)
     frames = VIEWS * (1 + COMPONENTS * STEPS)  # the third coefficient never varies: no third component
@@ -60,7 +59,7 @@ def test_a_stable_avatar_passes_and_every_pair_has_its_rows(ball_run):
 
 def test_a_burst_is_found_where_it_is_and_nowhere_else(ball_run):
     folder = ball_run("BURSTING", "BALL")
-    found = run(settings(folder))
+    found = extremes_run(settings(folder))
     assert not found.passed
     rows = pd.read_parquet(folder / "extremes" / ROWS_FILE)
     failed = rows[rows["status"] == "failed"]
@@ -79,7 +78,7 @@ def test_a_burst_is_found_where_it_is_and_nowhere_else(ball_run):
 
 def test_values_that_are_no_numbers_break_a_limit(ball_run):
     folder = ball_run("BROKEN")
-    found = run(settings(folder))
+    found = extremes_run(settings(folder))
     assert not found.passed
     assert "non_finite is" in found.text
     first = folder / "extremes" / "ball-a" / "broken" / "seed-0"
@@ -89,7 +88,7 @@ def test_values_that_are_no_numbers_break_a_limit(ball_run):
 
 def test_a_splat_that_grows_is_found_in_the_splats_alone(ball_run):
     folder = ball_run("SPLATTY")
-    rows = run(settings(folder)) and pd.read_parquet(folder / "extremes" / ROWS_FILE)
+    rows = extremes_run(settings(folder)) and pd.read_parquet(folder / "extremes" / ROWS_FILE)
     failed = rows[rows["status"] == "failed"]
     assert set(failed["metric"]) == {"largest_splat"}
     assert set(failed["sequence"]) == {"pc1-3", "pc1-2", "pc1+2", "pc1+3"}
@@ -100,7 +99,7 @@ def test_a_splat_that_grows_is_found_in_the_splats_alone(ball_run):
 
 def test_extrapolated_views_are_those_beyond_the_rig(ball_run):
     folder = ball_run("BALL")
-    run(settings(folder, beyond=30.0))
+    extremes_run(settings(folder, beyond=30.0))
     (a, *_) = json.loads((folder / "extremes" / RECORD_FILE).read_text())["avatars"]
     assert [v["azimuth"] for v in a["views"]] == pytest.approx(np.linspace(-90, 90, VIEWS), abs=0.01)
     assert [v["extrapolated"] for v in a["views"]] == [True, False, False, False, False, True]
@@ -109,30 +108,30 @@ def test_extrapolated_views_are_those_beyond_the_rig(ball_run):
 def test_what_is_not_there_is_refused_before_any_work(ball_run, tmp_path):
     folder = ball_run("BALL", "FLOOR")
     with pytest.raises(InputError, match=r"run\.json"):
-        run(settings(tmp_path))
+        extremes_run(settings(tmp_path))
     with pytest.raises(InputError, match="methods"):
-        run(settings(folder, methods=("absent",)))
+        extremes_run(settings(folder, methods=("absent",)))
     (tmp_path / "moved" / "ball-other").mkdir(parents=True)
     with pytest.raises(InputError, match="the capture of the run"):
-        run(settings(folder, data=str(tmp_path / "moved")))
+        extremes_run(settings(folder, data=str(tmp_path / "moved")))
     fit = folder / "ball-a" / "ball" / "seed-0" / "fit.json"
     fit.write_text(fit.read_text().replace('"done"', '"started"'))
     with pytest.raises(InputError, match="training did not end"):
-        run(settings(folder))
+        extremes_run(settings(folder))
     fit.unlink()
     with pytest.raises(InputError, match="a trained avatar"):
-        run(settings(folder))
+        extremes_run(settings(folder))
     assert not (folder / "extremes").exists()
     with pytest.raises(InputError, match=r"run\.json"):
-        run(settings(tmp_path / "typo"))
+        extremes_run(settings(tmp_path / "typo"))
     assert not (tmp_path / "typo").exists()
 
 
 def test_a_run_of_floors_alone_has_nothing_to_try(ball_run):
     folder = ball_run("FLOOR")
     with pytest.raises(InputError, match="no floor"):
-        run(settings(folder))
-    assert run(settings(folder, methods=("floor",))).passed
+        extremes_run(settings(folder))
+    assert extremes_run(settings(folder, methods=("floor",))).passed
 
 
 @pytest.mark.parametrize("changes", [{"views": 0}, {"beyond": 180.0}, {"sigmas": (0.0, 1.0)}, {"sigmas": ()}])
@@ -148,10 +147,10 @@ def test_clips_are_adapted_in_its_folder_while_that_is_locked(ball_run, monkeypa
         seen.append((out, (out / LOCK_FILE).exists()))
         raise InputError("a", "b", "c", "d")
 
-    monkeypatch.setattr(command, "trained", trained)
+    monkeypatch.setattr(avatars, "trained", trained)
     folder = ball_run("BALL")
     with pytest.raises(InputError):
-        run(settings(folder))
+        extremes_run(settings(folder))
     assert seen == [(folder / "extremes", True)]
     assert not (folder / "extremes").exists()
 
@@ -159,12 +158,12 @@ def test_clips_are_adapted_in_its_folder_while_that_is_locked(ball_run, monkeypa
 def test_its_folder_is_locked_and_no_link_out_of_the_run(ball_run, tmp_path):
     folder = ball_run("BALL")
     with locked(folder / "extremes"), pytest.raises(InputError, match="no other process"):
-        run(settings(folder))
+        extremes_run(settings(folder))
     outside = tmp_path / "outside"
     outside.mkdir()
     (folder / "extremes").symlink_to(outside)
     with pytest.raises(InputError, match="a link to"):
-        run(settings(folder))
+        extremes_run(settings(folder))
     assert list(outside.iterdir()) == []
 
 

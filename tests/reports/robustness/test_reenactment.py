@@ -13,9 +13,8 @@ from scipy.spatial.transform import Rotation
 from headbench.bench.contracts import HeadPose
 from headbench.bench.errors import InputError
 from headbench.bench.io.frames import read_png
-from headbench.reports.robustness.reenact_command import run
+from headbench.reports.robustness.command import ReenactSettings, reenact_run
 from headbench.reports.robustness.reenactment import RigidMean, check_heads, retarget
-from headbench.reports.robustness.settings import ReenactSettings
 from headbench.reports.robustness.stability import RECORD_FILE, ROWS_FILE, SHEET_FILE
 
 
@@ -25,7 +24,7 @@ def settings(folder, **changes):
 
 def test_every_subject_is_driven_by_the_other_and_keyed_by_both(ball_run):
     folder = ball_run("BALL", "FLOOR")
-    found = run(settings(folder))
+    found = reenact_run(settings(folder))
     out = folder / "cross_reenactment"
     assert found.passed
     rows = pd.read_parquet(out / ROWS_FILE)
@@ -42,7 +41,7 @@ def test_every_subject_is_driven_by_the_other_and_keyed_by_both(ball_run):
 
 def test_the_protocol_is_recorded_and_identity_says_why_not(ball_run):
     folder = ball_run("BALL")
-    run(settings(folder))
+    reenact_run(settings(folder))
     out = folder / "cross_reenactment"
     rows = pd.read_parquet(out / ROWS_FILE)
     (protocol,) = json.loads((out / RECORD_FILE).read_text())["protocols"]
@@ -62,7 +61,7 @@ def test_another_performance_is_another_protocol(ball_run):
     folder = ball_run("BALL")
     hashes = set()
     for frames in (1, 2):
-        run(settings(folder, frames=frames))
+        reenact_run(settings(folder, frames=frames))
         hashes |= set(pd.read_parquet(folder / "cross_reenactment" / ROWS_FILE)["protocol"])
     assert len(hashes) == 2
 
@@ -70,7 +69,7 @@ def test_another_performance_is_another_protocol(ball_run):
 def test_the_target_stays_where_its_own_training_was(ball_run):
     """The subjects stand metres apart; a translation taken over as it is would leave the frame empty."""
     folder = ball_run("BALL")
-    run(settings(folder))
+    reenact_run(settings(folder))
     rows = pd.read_parquet(folder / "cross_reenactment" / ROWS_FILE)
     coverage = rows[rows["metric"] == "coverage"]["value"]
     assert np.allclose(coverage, 1.0, atol=0.05)
@@ -78,20 +77,20 @@ def test_the_target_stays_where_its_own_training_was(ball_run):
 
 def test_the_source_is_shown_in_the_same_camera(ball_run):
     folder = ball_run("BALL")
-    run(settings(folder, camera="1"))
+    reenact_run(settings(folder, camera="1"))
     out = folder / "cross_reenactment"
     (first, *_) = json.loads((out / RECORD_FILE).read_text())["avatars"]
     assert [s["source"] for s in first["shown"]] == [f"sources/ball-bee_FREE_{t:05d}_1.png" for t in (4, 5)]
     source = out / first["shown"][1]["source"]
     assert (read_png(source) == 200).all()
     source.write_bytes(b"")
-    run(settings(folder, camera="1"))
+    reenact_run(settings(folder, camera="1"))
     assert (read_png(source) == 200).all()
 
 
 def test_a_driver_beyond_what_the_avatar_bears_is_found(ball_run, monkeypatch, balls):
     folder = ball_run("BURSTING")
-    assert run(settings(folder)).passed
+    assert reenact_run(settings(folder)).passed
     original = balls.BallClip.__init__
 
     def wild(self, path, progress=None):
@@ -100,7 +99,7 @@ def test_a_driver_beyond_what_the_avatar_bears_is_found(ball_run, monkeypatch, b
             self.poses[5].expression[0] = 2.0
 
     monkeypatch.setattr(balls.BallClip, "__init__", wild)
-    assert not run(settings(folder)).passed
+    assert not reenact_run(settings(folder)).passed
     rows = pd.read_parquet(folder / "cross_reenactment" / ROWS_FILE)
     failed = rows[rows["status"] == "failed"]
     assert set(zip(failed["subject"], failed["sequence"], failed["timestep"])) == {
@@ -111,7 +110,7 @@ def test_a_driver_beyond_what_the_avatar_bears_is_found(ball_run, monkeypatch, b
 def test_a_capture_beside_the_run_can_drive(ball_run, tmp_path):
     folder = ball_run("BALL")
     (tmp_path / "others" / "ball-cool").mkdir(parents=True)
-    run(settings(folder, source=str(tmp_path / "others"), frames=1))
+    reenact_run(settings(folder, source=str(tmp_path / "others"), frames=1))
     rows = pd.read_parquet(folder / "cross_reenactment" / ROWS_FILE)
     assert set(zip(rows["subject"], rows["sequence"], rows["timestep"])) == {
         ("ball-a", "ball-cool/FREE", 5),
@@ -122,7 +121,7 @@ def test_a_capture_beside_the_run_can_drive(ball_run, tmp_path):
 def test_an_absent_camera_is_refused(ball_run):
     folder = ball_run("BALL")
     with pytest.raises(InputError, match="--camera"):
-        run(settings(folder, camera="9"))
+        reenact_run(settings(folder, camera="9"))
     with pytest.raises(ValueError, match="frames"):
         settings(folder, frames=0)
 
@@ -131,7 +130,7 @@ def test_a_run_of_one_subject_needs_a_source(ball_run, tmp_path):
     folder = ball_run("BALL")
     (tmp_path / "data" / "ball-bee").rmdir()
     with pytest.raises(InputError, match="--source"):
-        run(settings(folder))
+        reenact_run(settings(folder))
 
 
 def test_a_source_tracked_with_another_head_model_is_refused(ball_run, tmp_path, balls, monkeypatch):
@@ -146,7 +145,7 @@ def test_a_source_tracked_with_another_head_model_is_refused(ball_run, tmp_path,
 
     monkeypatch.setattr(balls.BallClip, "__init__", other_head)
     with pytest.raises(InputError, match="headbench refit"):
-        run(settings(folder, source=str(tmp_path / "others")))
+        reenact_run(settings(folder, source=str(tmp_path / "others")))
 
 
 def poses(seed, count=5, spread=0.3, timestep=0):

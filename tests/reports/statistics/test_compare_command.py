@@ -11,8 +11,7 @@ from headbench.bench.errors import InputError
 from headbench.bench.rows import Rows
 from headbench.bench.runner.store import RunFolder
 from headbench.bench.specs import MetricSpec
-from headbench.reports.comparison.command import run
-from headbench.reports.comparison.settings import CompareSettings
+from headbench.reports.comparison.command import CompareSettings, compare_runs
 
 from ..made_rows import avatar_row, row
 
@@ -53,7 +52,7 @@ def folder(tmp_path, write_manifest):
 
 
 def test_text_tells_size_interval_test_and_verdict(folder):
-    text = run(CompareSettings((str(folder),))).text
+    text = compare_runs(CompareSettings((str(folder),))).text
     novel, reenacted, size = text.split("\n\n")
     head, names, line = novel.splitlines()
     assert head == (
@@ -70,7 +69,7 @@ def test_text_tells_size_interval_test_and_verdict(folder):
 
 
 def test_json_has_every_subject(folder):
-    (first, *_) = run(CompareSettings((str(folder),), metrics=("error",))).data["comparisons"]
+    (first, *_) = compare_runs(CompareSettings((str(folder),), metrics=("error",))).data["comparisons"]
     assert first["differences"] == pytest.approx({f"s{s}": -2 * (1 + s / 10) for s in range(SUBJECTS)})
     assert first["low"] < first["difference"] < first["high"]
     assert first["seeds"] == (2, 2)
@@ -78,7 +77,7 @@ def test_json_has_every_subject(folder):
 
 
 def test_csv_reads_back(folder):
-    text = run(CompareSettings((str(folder),), floors=True, format="csv")).text
+    text = compare_runs(CompareSettings((str(folder),), floors=True, format="csv")).text
     table = pd.read_csv(io.StringIO(text), keep_default_na=False)
     assert len(table) == 3 * 3
     assert set(table["family"]) == {3}
@@ -88,13 +87,13 @@ def test_csv_reads_back(folder):
 
 
 def test_one_reference_makes_fewer_comparisons(folder):
-    found = run(CompareSettings((str(folder),), against="floor")).data["comparisons"]
+    found = compare_runs(CompareSettings((str(folder),), against="floor")).data["comparisons"]
     assert {(c["first"], c["second"]) for c in found} == {("good", "floor"), ("bad", "floor")}
     assert {c["family"] for c in found} == {2}
 
 
 def test_other_levels_are_kept(folder):
-    strict = run(CompareSettings((str(folder),), level=0.001, metrics=("error",)))
+    strict = compare_runs(CompareSettings((str(folder),), level=0.001, metrics=("error",)))
     assert "99.9 % interval" in strict.text
     assert "not testable with 7 subjects (it takes 11)" in strict.text
 
@@ -104,7 +103,7 @@ def test_other_levels_are_kept(folder):
 )
 def test_what_is_not_there_is_refused(folder, changes, message):
     with pytest.raises(InputError, match=message):
-        run(CompareSettings((str(folder),), **changes))
+        compare_runs(CompareSettings((str(folder),), **changes))
 
 
 def test_settings_are_checked():

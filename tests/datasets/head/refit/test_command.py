@@ -15,10 +15,9 @@ from headbench.bench.errors import InputError
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import save_head
 from headbench.datasets.head.refit import refit as block
-from headbench.datasets.head.refit.command import run, target_head
+from headbench.datasets.head.refit.command import RefitCommandSettings, refit_capture, target_head
 from headbench.datasets.head.refit.heat_map import colour_scale
 from headbench.datasets.head.refit.rewrite import capture_plan, link_or_copy, write_capture
-from headbench.datasets.head.refit.settings import RefitCommandSettings
 from headbench.datasets.steps.mattes import set_background
 
 from ...tiny_capture import make_plan, write_tiny_capture
@@ -32,7 +31,7 @@ def finished(tmp_path_factory):
     tiny = write_tiny_capture(root / "capture", make_plan(static_offset=offset))
     save_head(root / "other.npz", replace(tiny.writer.plan.head, version="other"))
     settings = RefitCommandSettings(str(tiny.union), str(root / "other.npz"), str(root / "out"))
-    return root, settings, run(settings)
+    return root, settings, refit_capture(settings)
 
 
 def test_the_new_capture_holds_the_same_frames_with_other_tracking(finished):
@@ -71,20 +70,20 @@ def test_report_and_picture(finished):
 def test_started_again_it_fits_nothing_anew(finished, monkeypatch):
     _, settings, findings = finished
     monkeypatch.setattr(block, "solve_frame", lambda *_: pytest.fail("fitted again"))
-    assert run(settings).data == findings.data
+    assert refit_capture(settings).data == findings.data
 
 
 def test_a_target_of_the_same_version_is_refused(finished):
     _, settings, findings = finished
     again = replace(settings, capture=findings.data["capture"], out=settings.out + "2")
     with pytest.raises(InputError, match="another head model"):
-        run(again)
+        refit_capture(again)
 
 
 def test_writing_into_the_capture_is_refused(finished):
     root, settings, _ = finished
     with pytest.raises(InputError, match="apart from the capture"):
-        run(replace(settings, out=str(root / "capture")))
+        refit_capture(replace(settings, out=str(root / "capture")))
 
 
 def test_targets_by_name():
@@ -105,7 +104,7 @@ def test_a_hole_in_the_grid_is_refused_before_the_fit(finished, tmp_path, monkey
     lost = {*read_capture(settings.capture).files} - {*read_capture(union).files}
     monkeypatch.setattr(block, "solve_frame", lambda *_: pytest.fail("fitted"))
     with pytest.raises(InputError) as caught:
-        run(replace(settings, capture=str(union), out=str(tmp_path / "out")))
+        refit_capture(replace(settings, capture=str(union), out=str(tmp_path / "out")))
     assert caught.value.file == str(union)
     assert caught.value.key == f"frame {lost.pop()}"
     assert f"/{gone['timestep_index']:05d}/{gone['camera_id']}" in caught.value.key

@@ -6,6 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from headbench.bench.errors import InputError
 from headbench.datasets.head.procedural.model import procedural_head
+from headbench.datasets.head.refit.command import RefitSettings
 from headbench.datasets.head.refit.identity import (
     fit_shape,
     fitted_vertices,
@@ -13,7 +14,6 @@ from headbench.datasets.head.refit.identity import (
     rigid_alignment,
     same_topology,
 )
-from headbench.datasets.head.refit.settings import RefitSettings
 
 from ..toy import toy_head
 from .heads import subdivided

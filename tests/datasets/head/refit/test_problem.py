@@ -10,8 +10,8 @@ from scipy.optimize import lsq_linear
 from headbench.bench.contracts import HeadPose
 from headbench.bench.errors import InputError
 from headbench.datasets.head.model import HeadModel
+from headbench.datasets.head.refit.command import RefitSettings
 from headbench.datasets.head.refit.problem import SEARCHED, FitProblem
-from headbench.datasets.head.refit.settings import RefitSettings
 from headbench.datasets.head.rotations import matrices
 
 from ..toy import toy_head

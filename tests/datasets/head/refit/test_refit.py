@@ -12,8 +12,8 @@ from headbench.bench.errors import InputError
 from headbench.datasets.head.model import HeadModel
 from headbench.datasets.head.procedural.model import procedural_head
 from headbench.datasets.head.refit import refit as block
+from headbench.datasets.head.refit.command import RefitSettings
 from headbench.datasets.head.refit.refit import BLOCK, refit, refit_clip
-from headbench.datasets.head.refit.settings import RefitSettings
 from headbench.datasets.head.subject import PosedSubject, camera_in_head_frame, pose_in_head_frame
 from headbench.datasets.head.teeth import with_teeth
 from headbench.tests.benchmarks.refit import EXACT_MEAN_MM, EXACT_P95_MM, performance

@@ -6,8 +6,8 @@ import nlopt
 import numpy as np
 import pytest
 
+from headbench.datasets.head.refit.command import RefitSettings
 from headbench.datasets.head.refit.problem import FitProblem, angle_bounds, solve_frame
-from headbench.datasets.head.refit.settings import RefitSettings
 from headbench.datasets.head.rotations import matrices
 from headbench.tests.benchmarks.refit import solve_dense
 

@@ -13,8 +13,7 @@ from headbench.bench.protocol import make_protocol
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.ga.writer import CapturePlan, CaptureWriter, SequencePlan
 from headbench.datasets.steps.exclusion_file import read_exclusions, write_exclusions
-from headbench.datasets.steps.tongue.command import DECISIONS_FILE, run
-from headbench.datasets.steps.tongue.settings import TongueSettings
+from headbench.datasets.steps.tongue.command import DECISIONS_FILE, TongueSettings, tongue
 
 from .painted import TONGUE, Moment, geometry, painted_clip
 
@@ -53,7 +52,7 @@ def capture(tmp_path_factory):
 def look(capture, out, **changes):
     seen = []
     settings = replace(TongueSettings(str(capture), str(out)), **changes)
-    findings = run(settings, lambda done, total, note="": seen.append((done, total)))
+    findings = tongue(settings, lambda done, total, note="": seen.append((done, total)))
     assert seen
     return findings
 

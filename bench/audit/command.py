@@ -1,4 +1,4 @@
-"""Settings of ``headbench verify`` and ``headbench evaluate``. Light to import."""
+"""``headbench verify`` and ``headbench evaluate``."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import tyro
 
-from ..contracts import TaskName
+from ..contracts import Progress, TaskName, no_progress
 from ..runner.options import RunOptions
+from ..specs import Findings
 
 
 @dataclass(frozen=True)
@@ -19,6 +20,13 @@ class VerifySettings(RunOptions):
 
     run: tyro.conf.Positional[str]
     """Folder of a finished run, or of `headbench evaluate`."""
+
+
+def verify(settings: VerifySettings, progress: Progress = no_progress) -> Findings:
+    """Recompute a run's hashes and metrics from its frames: exit code 1 where anything differs, 3 where it is no run."""
+    from .verify import verify_run
+
+    return verify_run(settings, progress)
 
 
 @dataclass(frozen=True)
@@ -69,3 +77,10 @@ class EvaluateSettings:
         """Refuse what leaves open what to score against."""
         if self.clip is None and self.like is None:
             raise ValueError("say what to score against: --clip CAPTURE, or --like RUN")
+
+
+def evaluate(settings: EvaluateSettings, progress: Progress = no_progress) -> Findings:
+    """Score a folder of images named by key: a method is compared without a plug-in."""
+    from .evaluate import evaluate_folder
+
+    return evaluate_folder(settings, progress)
