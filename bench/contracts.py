@@ -255,7 +255,7 @@ class Variant(NamedTuple):
     """Writes its files under a folder and returns the avatar as read back from them."""
 
 
-STAGES = ("drive", "deform", "raster", "post")
+STAGES = ("drive", "deform", "rasterize", "post")
 """Stages of a frame, in order: driving signal to mesh and features; mesh to primitives as the camera sees them;
 primitives to image; whatever changes the image afterwards (a decoder, clipping)."""
 
@@ -268,11 +268,11 @@ class StagedAvatar(Avatar, Protocol):
     """
 
     def draw(
-        self, camera: Camera, pose: HeadPose, background: Sequence[float], done: Callable[[str], None]
+        self, camera: Camera, pose: HeadPose, background: Sequence[float], end_stage: Callable[[str], None]
     ) -> Any:
         """Draw a frame where the avatar computes, without waiting for it; what comes out `read_back` understands.
 
-        Calls ``done`` with the name of a stage as soon as its work was handed over, in the order of `STAGES`; a stage
+        Calls ``end_stage`` with the name of a stage as soon as its work was handed over, in the order of `STAGES`; a stage
         that this avatar does not have is left out.
         """
 
@@ -326,7 +326,7 @@ class Metric(Protocol):
 
 @runtime_checkable
 class RegionalMetric(Metric, Protocol):
-    """A metric that can also be taken over a part of the frame (`MetricSpec.regions`)."""
+    """A metric that can also be taken over a part of the frame (`MetricSpec.kind` "regional")."""
 
     def in_regions(
         self, image: ByteArray, truth: ByteArray, masks: Mapping[str, BoolArray]
@@ -336,7 +336,7 @@ class RegionalMetric(Metric, Protocol):
 
 @runtime_checkable
 class TemporalMetric(Protocol):
-    """One number per frame and its neighbour in time, of one camera and sequence (`MetricSpec.temporal`)."""
+    """One number per frame and its neighbour in time, of one camera and sequence (`MetricSpec.kind` "temporal")."""
 
     def __call__(
         self, image: ByteArray, truth: ByteArray, other_image: ByteArray, other_truth: ByteArray

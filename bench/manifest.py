@@ -15,7 +15,7 @@ from .io.documents import checked, read_json, shown
 from .io.files import check_name, digest, write_json
 from .protocol import Protocol
 from .runner.config import RunConfig, stored_settings
-from .specs import LABEL, MetricSpec, is_label
+from .specs import LABEL, RENAMED_METRICS, MetricSpec, is_label
 
 Derived = TypedDict("Derived", {"from": str, "variant": str, "change": str})
 """From which method's avatar one was derived without training, which variant it is, and what was changed."""
@@ -86,6 +86,38 @@ class ProtocolRecord:
         return digest(record)[:12]
 
 
+def _renewed(record: dict[str, Any]) -> dict[str, Any]:
+    """A record with metrics as they are described and named today, from one that an earlier version wrote."""
+    record = dict(record)
+    if isinstance(record.get("metrics"), list):
+        record["metrics"] = [_renewed_metric(metric) for metric in record["metrics"]]
+    configuration = record.get("configuration")
+    if isinstance(configuration, dict) and isinstance(configuration.get("metrics"), list):
+        names = [
+            RENAMED_METRICS.get(name, name) if isinstance(name, str) else name
+            for name in configuration["metrics"]
+        ]
+        record["configuration"] = {**configuration, "metrics": names}
+    return record
+
+
+def _renewed_metric(metric: Any) -> Any:
+    if not isinstance(metric, dict):
+        return metric
+    metric = dict(metric)
+    if isinstance(metric.get("name"), str):
+        metric["name"] = RENAMED_METRICS.get(metric["name"], metric["name"])
+    if isinstance(metric.get("per_frame"), bool):
+        of_frame, training, regions, temporal = (
+            metric.pop(key, False) for key in ("per_frame", "training", "regions", "temporal")
+        )
+        if not of_frame:
+            metric["kind"] = "training" if training else "avatar"
+        else:
+            metric["kind"] = "temporal" if temporal else "regional" if regions else "frame"
+    return metric
+
+
 @dataclass(frozen=True)
 class Manifest:
     """Everything that made the numbers of a run.
@@ -128,7 +160,7 @@ class Manifest:
         record = read_json(path)
         if record.get("format") != 1:
             raise InputError(path, "format", "1", shown(record.get("format")))
-        manifest = checked(record, cls, path)
+        manifest = checked(_renewed(record), cls, path)
         named: dict[str, set[str]] = {
             "methods": {method.name for method in manifest.methods},
             "metrics, tables": {table for metric in manifest.metrics for table in metric.tables},

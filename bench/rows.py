@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 from .errors import InputError, shortened
 from .io.files import atomic_path
 from .io.parquet_footer import SNAPPY, UNCOMPRESSED, column_codecs
-from .specs import LABEL, is_label
+from .specs import LABEL, RENAMED_METRICS, is_label
 
 FRAME = ["subject", "sequence", "timestep", "camera"]
 """Columns that name a frame."""
@@ -102,7 +102,8 @@ class Rows:
             ) from error
         except (OSError, ValueError, pa.ArrowException) as error:
             raise InputError(path, "", "a Parquet file of rows", " ".join(str(error).split())) from error
-        return cls(_checked(table, path))
+        rows = _checked(table, path)
+        return cls(rows.assign(metric=rows["metric"].replace(RENAMED_METRICS)))
 
     def write(self, path: Path) -> None:
         """Write them as Parquet, atomically."""

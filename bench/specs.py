@@ -135,15 +135,25 @@ MAX_DIGITS = 12
 """Digits behind the point that a table shows."""
 
 
+MetricKind = Literal["frame", "regional", "temporal", "avatar", "training"]
+
+RENAMED_METRICS = {
+    "driving_rate": "driving_bitrate",
+    "latency_still": "latency_static",
+    "stage_raster": "stage_rasterize",
+}
+"""Names of metrics by what they were called before: results with those are read, settings are refused."""
+
+
 @dataclass(frozen=True)
 class MetricSpec:
     """What a table needs to know of a metric.
 
     Attributes
     ----------
-    implementation : "package.module:function" of a `Metric`, or where ``per_frame`` is False of an `AvatarMetric`; a
-        class there is made without arguments.
-    training : the implementation is a `TrainingMetric` instead (``per_frame`` is False as well).
+    implementation : "package.module:function" of what ``kind`` says; a class there is made without arguments.
+    kind : "frame", a `Metric`; "regional", a `RegionalMetric`; "temporal", a `TemporalMetric`; "avatar", an
+        `AvatarMetric`; "training", a `TrainingMetric`.
     detail : which of the measurement's details is the value, in ``unit``; "" for its value. Metrics of an avatar that
         name the same implementation are measured once, together.
     tables : names of the tables that show it.
@@ -151,8 +161,6 @@ class MetricSpec:
         machine alone, and measuring it again gives another.
     profile : the set of definitions it belongs to, see `ProfileSpec`. Other profiles than the canonical one stand in
         the metric's name, too, behind an "@": a row names its profile, ``ssim@3dgs`` is never taken for ``ssim``.
-    regions : the implementation is a `RegionalMetric`.
-    temporal : the implementation is a `TemporalMetric`.
     """
 
     name: str
@@ -162,14 +170,16 @@ class MetricSpec:
     digits: int
     implementation: str
     summary: str = ""
-    per_frame: bool = True
-    training: bool = False
+    kind: MetricKind = "frame"
     detail: str = ""
     tables: tuple[str, ...] = ("comparison",)
     machine_bound: bool = False
     profile: str = "canonical"
-    regions: bool = False
-    temporal: bool = False
+
+    @property
+    def per_frame(self) -> bool:
+        """Whether there is a value for every frame; otherwise there is one for the avatar."""
+        return self.kind in ("frame", "regional", "temporal")
 
     def __post_init__(self) -> None:
         """Refuse what no table could show, and no results could be read with."""

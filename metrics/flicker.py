@@ -7,7 +7,19 @@ import math
 import numpy as np
 
 from ..bench.contracts import ByteArray
+from ..bench.specs import MetricSpec
 from .pairs import check_pair
+
+FLICKER = MetricSpec(
+    name="flicker",
+    label="Flicker",
+    unit="levels",
+    higher_is_better=False,
+    digits=3,
+    implementation="headbench.metrics.flicker:flicker",
+    summary="Change between neighbouring frames that the ground truth does not have, root mean square, 8-bit levels.",
+    kind="temporal",
+)
 
 
 def flicker(image: ByteArray, truth: ByteArray, other_image: ByteArray, other_truth: ByteArray) -> float:

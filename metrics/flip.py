@@ -16,11 +16,22 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 
 from ..bench.contracts import ByteArray, FloatArray
+from ..bench.specs import MetricSpec
 from .pairs import Mask, check_pair, stack_masks
+
+FLIP = MetricSpec(
+    name="flip",
+    label="FLIP",
+    unit="",
+    higher_is_better=False,
+    digits=4,
+    implementation="headbench.metrics.flip:flip",
+    summary="Difference seen when flipping between the images, LDR, 67.02 pixels per degree, mean of the map.",
+    kind="regional",
+)
 
 PIXELS_PER_DEGREE = 0.7 * 3840 / 0.7 * math.pi / 180
 
@@ -47,6 +58,8 @@ class _Filter(NamedTuple):
 
     def __call__(self, channel: FloatArray) -> FloatArray:
         """Apply to an (H, W) channel; the border continues outwards."""
+        import cv2
+
         parts = [
             cv2.sepFilter2D(channel, cv2.CV_64F, across, down, borderType=cv2.BORDER_REPLICATE)
             for down, across in self.terms

@@ -8,7 +8,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 from ..bench.specs import MetricSpec, ProfileSpec
-from .specs import LPIPS, LPIPS_VGG, PSNR, SSIM
+from .lpips import LPIPS, LPIPS_VGG
+from .psnr import PSNR
+from .ssim import SSIM
 
 CANONICAL = ProfileSpec(
     name="canonical",

@@ -9,8 +9,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..bench.contracts import ByteArray, IntArray
-from .pairs import Mask, check_pair, stack_masks
-from .structural import squared_errors
+from ..bench.specs import MetricSpec
+from .pairs import Mask, check_pair, squared_errors, stack_masks
+
+PSNR = MetricSpec(
+    name="psnr",
+    label="PSNR",
+    unit="dB",
+    higher_is_better=True,
+    digits=2,
+    implementation="headbench.metrics.psnr:psnr",
+    summary="Peak signal-to-noise ratio over the 8-bit frame, or over a region of it, capped at 100 dB.",
+    kind="regional",
+)
 
 CAP = 100.0
 

@@ -1,4 +1,4 @@
-"""Speed: how fast an avatar is animated, driven and seen anew every frame.
+"""Speed: how fast an avatar is animated, driven and seen afresh every frame.
 
 One measurement, in this order: warm-up until frame times are stationary; latency, waiting for every frame; throughput,
 with several frames under way; the stages of a frame; and the same frame over and over, which shows what is kept
@@ -30,20 +30,86 @@ from ..bench.contracts import (
     no_stage,
 )
 from ..bench.errors import InputError
+from ..bench.specs import MetricSpec
+
+FPS = MetricSpec(
+    name="fps",
+    label="Speed",
+    unit="FPS",
+    higher_is_better=True,
+    digits=1,
+    implementation="headbench.metrics.speed:fps",
+    summary="Frames per second from driving signal to image in host memory, a new camera and pose every frame.",
+    kind="avatar",
+    tables=("comparison", "speed"),
+    machine_bound=True,
+)
+
+
+def _milliseconds(name: str, label: str, detail: str, summary: str) -> MetricSpec:
+    """A time of `FPS`'s measurement."""
+    return replace(
+        FPS,
+        name=name,
+        label=label,
+        unit="ms",
+        higher_is_better=False,
+        digits=2,
+        detail=detail,
+        summary=summary,
+        tables=("speed",),
+    )
+
+
+LATENCY_P50 = _milliseconds("latency_p50", "p50", "p50_ms", "Median time of a frame, each waited for.")
+LATENCY_P95 = _milliseconds("latency_p95", "p95", "p95_ms", "95 % of frames take no longer.")
+LATENCY_P99 = _milliseconds("latency_p99", "p99", "p99_ms", "99 % of frames take no longer.")
+LATENCY_STATIC = _milliseconds(
+    "latency_static",
+    "Static pose",
+    "static_ms",
+    "Median time of a frame where neither camera nor pose changes.",
+)
+PROCESSOR_TIME = _milliseconds(
+    "processor_time", "CPU", "processor_ms", "Processor time of a frame, all threads together."
+)
+STAGE_DRIVE = _milliseconds(
+    "stage_drive", "Drive", "drive_ms", "Median time from driving signal to mesh and features."
+)
+STAGE_DEFORM = _milliseconds(
+    "stage_deform", "Deform", "deform_ms", "Median time from mesh to primitives as the camera sees them."
+)
+STAGE_RASTERIZE = _milliseconds(
+    "stage_rasterize", "Rasterize", "rasterize_ms", "Median time from primitives to image."
+)
+STAGE_POST = _milliseconds(
+    "stage_post", "Post", "post_ms", "Median time of what changes the image afterwards."
+)
+STAGE_READ_BACK = _milliseconds(
+    "stage_read_back", "Read-back", "read_back_ms", "Median time to bring the image into host memory."
+)
+THROUGHPUT = replace(
+    FPS,
+    name="throughput",
+    label="Throughput",
+    detail="throughput_fps",
+    summary="Frames per second with up to 8 frames under way before the oldest is waited for.",
+    tables=("speed",),
+)
 
 WHITE = (1.0, 1.0, 1.0)
 READ_BACK = "read_back"
 NUDGE = 1e-5  # added to every expression coefficient per lap of the workload: too little to see, a new signal
 
 Clock = Callable[[], float]
-Walk = Iterator[tuple[Camera, HeadPose]]
+Stream = Iterator[tuple[Camera, HeadPose]]
 
 
 class Drawing(Protocol):
     """The part of `StagedAvatar` that is timed."""
 
     def draw(
-        self, camera: Camera, pose: HeadPose, background: Sequence[float], done: Callable[[str], None]
+        self, camera: Camera, pose: HeadPose, background: Sequence[float], end_stage: Callable[[str], None]
     ) -> Any: ...
     def read_back(self, drawn: Any) -> Any: ...
 
@@ -55,7 +121,7 @@ class WholeFrames:
         self._avatar = avatar
 
     def draw(
-        self, camera: Camera, pose: HeadPose, background: Sequence[float], done: Callable[[str], None]
+        self, camera: Camera, pose: HeadPose, background: Sequence[float], end_stage: Callable[[str], None]
     ) -> Any:
         """Render the frame, on the avatar's own background."""
         return self._avatar.render(camera, pose)
@@ -88,8 +154,8 @@ class SpeedProtocol:
     depth: int = 8
     stages: int = 60
     stages_s: float = 3.0
-    still: int = 40
-    still_s: float = 2.0
+    static: int = 40
+    static_s: float = 2.0
 
 
 def fps(avatar: Avatar, workload: Sequence[tuple[Camera, HeadPose]]) -> Measurement:
@@ -97,8 +163,8 @@ def fps(avatar: Avatar, workload: Sequence[tuple[Camera, HeadPose]]) -> Measurem
 
     The mean of per-frame rates would flatter a jittery method. Details, all of wall clock unless said: ``frames``,
     ``mean_ms``, ``p5_ms``, ``p50_ms``, ``p95_ms``, ``p99_ms``, ``iqr_ms``, ``max_ms`` and ``processor_ms`` (mean time
-    of all threads) of the latency; ``throughput_fps``; ``<stage>_ms``, the median of each stage where the avatar tells
-    stages; ``still_ms``, the median where neither camera nor pose changes; ``warm_up_frames``; ``stationary`` (1 or
+    of all threads) of the latency; ``throughput_fps``; ``<stage>_ms``, the median of each stage where the avatar reports
+    stages; ``static_ms``, the median where neither camera nor pose changes; ``warm_up_frames``; ``stationary`` (1 or
     0); ``load``, the mean number of busy processes of the last minute; ``threads``. Numbers of different machines do
     not compare.
 
@@ -118,10 +184,10 @@ def measure_speed(
     check_workload(workload)
     staged = isinstance(avatar, StagedAvatar)
     drawing: Drawing = avatar if isinstance(avatar, StagedAvatar) else WholeFrames(avatar)
-    walk = fresh_walk(workload)
-    warm_up_frames, stationary = warm_up(drawing, walk, plan, clock)
+    stream = fresh_frames(workload)
+    warm_up_frames, stationary = warm_up(drawing, stream, plan, clock)
     processor = time.process_time()
-    milliseconds = latencies(drawing, walk, plan.latency, plan.latency_s, clock)
+    milliseconds = latencies(drawing, stream, plan.latency, plan.latency_s, clock)
     processor_ms = 1000 * (time.process_time() - processor) / len(milliseconds)
     p5, p25, p50, p75, p95, p99 = map(float, np.percentile(milliseconds, [5, 25, 50, 75, 95, 99]))
     details: dict[str, float] = {
@@ -134,14 +200,14 @@ def measure_speed(
         "iqr_ms": p75 - p25,
         "max_ms": float(milliseconds.max()),
         "processor_ms": processor_ms,
-        "throughput_fps": throughput(drawing, walk, plan.throughput, plan.throughput_s, plan.depth, clock),
+        "throughput_fps": throughput(drawing, stream, plan.throughput, plan.throughput_s, plan.depth, clock),
     }
     if staged:
-        medians = stage_times(drawing, walk, plan.stages, plan.stages_s, clock)
+        medians = stage_times(drawing, stream, plan.stages, plan.stages_s, clock)
         details |= {f"{stage}_ms": value for stage, value in medians.items()}
-    still = latencies(drawing, repeat(next(walk)), plan.still, plan.still_s, clock)
+    static = latencies(drawing, repeat(next(stream)), plan.static, plan.static_s, clock)
     details |= {
-        "still_ms": float(np.median(still)),
+        "static_ms": float(np.median(static)),
         "warm_up_frames": warm_up_frames,
         "stationary": float(stationary),
         "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan"),
@@ -161,10 +227,10 @@ def check_workload(workload: Sequence[tuple[Camera, HeadPose]]) -> None:
             raise InputError("speed", "workload", "a new camera or pose every frame", found)
 
 
-def fresh_walk(workload: Sequence[tuple[Camera, HeadPose]]) -> Walk:
+def fresh_frames(workload: Sequence[tuple[Camera, HeadPose]]) -> Stream:
     """The workload over and over, without end, as a live signal: no pose comes twice.
 
-    Every lap adds `NUDGE` to the expression once more, and no pose tells subject and timestep, so that nothing kept
+    Every lap adds `NUDGE` to the expression once more, and no pose names subject and timestep, so that nothing kept
     for a known or earlier pose can be used.
     """
     for lap in count(1):
@@ -173,13 +239,13 @@ def fresh_walk(workload: Sequence[tuple[Camera, HeadPose]]) -> Walk:
             yield camera, replace(pose, expression=expression, subject="", timestep=None)
 
 
-def warm_up(drawing: Drawing, walk: Walk, plan: SpeedProtocol, clock: Clock) -> tuple[int, bool]:
+def warm_up(drawing: Drawing, stream: Stream, plan: SpeedProtocol, clock: Clock) -> tuple[int, bool]:
     """Draw until frame times are stationary; return after how many frames, and whether they were."""
     times: list[float] = []
     synchronise = synchroniser()
     begin = clock()
     while len(times) < plan.warm_up_limit:
-        times.append(_timed(drawing, next(walk), clock, synchronise))
+        times.append(_timed(drawing, next(stream), clock, synchronise))
         if len(times) >= max(plan.warm_up, 2 * plan.window):
             last = float(np.median(times[-plan.window :]))
             before = float(np.median(times[-2 * plan.window : -plan.window]))
@@ -190,26 +256,28 @@ def warm_up(drawing: Drawing, walk: Walk, plan: SpeedProtocol, clock: Clock) -> 
     return len(times), False
 
 
-def latencies(drawing: Drawing, walk: Walk, frames: int, limit_s: float, clock: Clock) -> FloatArray:
+def latencies(drawing: Drawing, stream: Stream, frames: int, limit_s: float, clock: Clock) -> FloatArray:
     """Milliseconds of each frame from driving signal to host memory, one waited for after the other."""
     times: list[float] = []
     synchronise = synchroniser()
     begin = clock()
     while len(times) < frames:
-        times.append(_timed(drawing, next(walk), clock, synchronise))
+        times.append(_timed(drawing, next(stream), clock, synchronise))
         if clock() - begin >= limit_s:
             break
     return 1000 * np.asarray(times)
 
 
-def throughput(drawing: Drawing, walk: Walk, frames: int, limit_s: float, depth: int, clock: Clock) -> float:
+def throughput(
+    drawing: Drawing, stream: Stream, frames: int, limit_s: float, depth: int, clock: Clock
+) -> float:
     """Frames per second where up to ``depth`` frames are under way before the oldest is waited for."""
     under_way: deque[Any] = deque()
     drawn = 0
     synchroniser()()
     begin = clock()
     while drawn < frames and (not drawn or clock() - begin < limit_s):
-        under_way.append(drawing.draw(*next(walk), WHITE, no_stage))
+        under_way.append(drawing.draw(*next(stream), WHITE, no_stage))
         drawn += 1
         if len(under_way) > depth:
             drawing.read_back(under_way.popleft())
@@ -218,7 +286,9 @@ def throughput(drawing: Drawing, walk: Walk, frames: int, limit_s: float, depth:
     return drawn / (clock() - begin)
 
 
-def stage_times(drawing: Drawing, walk: Walk, frames: int, limit_s: float, clock: Clock) -> dict[str, float]:
+def stage_times(
+    drawing: Drawing, stream: Stream, frames: int, limit_s: float, clock: Clock
+) -> dict[str, float]:
     """Median milliseconds of each stage and of reading back, each waited for.
 
     Waiting keeps stages from overlapping, so that together they may take longer than a frame. Raises `InputError` for
@@ -228,7 +298,7 @@ def stage_times(drawing: Drawing, walk: Walk, frames: int, limit_s: float, clock
     synchronise = synchroniser()
     begin = last = clock()
 
-    def done(stage: str) -> None:
+    def end_stage(stage: str) -> None:
         nonlocal last
         if stage not in (*STAGES, READ_BACK):
             raise InputError("avatar", "draw, stage", ", ".join(STAGES), repr(stage))
@@ -237,13 +307,13 @@ def stage_times(drawing: Drawing, walk: Walk, frames: int, limit_s: float, clock
         last = clock()
 
     for _ in range(frames):
-        camera, pose = next(walk)
+        camera, pose = next(stream)
         synchronise()
         last = clock()
-        drawn = drawing.draw(camera, pose, WHITE, done)
+        drawn = drawing.draw(camera, pose, WHITE, end_stage)
         last = clock()
         drawing.read_back(drawn)
-        done(READ_BACK)
+        end_stage(READ_BACK)
         if clock() - begin >= limit_s:
             break
     return {stage: float(np.median(values)) for stage, values in times.items()}

@@ -12,18 +12,27 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
 
-import cv2
 import numpy as np
 
 from ..bench.contracts import ByteArray, FloatArray
-from .pairs import Mask, check_pair, stack_masks
-from .structural import KERNEL
+from ..bench.specs import MetricSpec
+from .pairs import KERNEL, Mask, check_pair, stack_masks
+
+SSIM = MetricSpec(
+    name="ssim",
+    label="SSIM",
+    unit="",
+    higher_is_better=True,
+    digits=4,
+    implementation="headbench.metrics.ssim:ssim",
+    summary="Structural similarity, Gaussian window 11 x 11 of sigma 1.5, valid windows, mean over channels.",
+    kind="regional",
+)
 
 C1, C2 = (0.01 * 255.0) ** 2, (0.03 * 255.0) ** 2
 
 Border = Literal["valid", "reflect", "zero"]
 _KERNEL_BORDERS: Mapping[Border, int] = {"valid": 0, "reflect": 1, "zero": 2}
-_CV_BORDERS = {"valid": cv2.BORDER_REFLECT, "reflect": cv2.BORDER_REFLECT_101, "zero": cv2.BORDER_CONSTANT}
 
 
 @dataclass(frozen=True)
@@ -126,11 +135,14 @@ def ssim_map(image: ByteArray, truth: ByteArray, form: SsimForm = SsimForm()) ->
     For the border "valid" H' = H - 2 radius, and entry (i, j) belongs to the window centred on pixel (i + radius,
     j + radius); otherwise there is an entry for every pixel.
     """
+    import cv2
+
     check_pair(image, truth, form.smallest)
+    borders = {"valid": cv2.BORDER_REFLECT, "reflect": cv2.BORDER_REFLECT_101, "zero": cv2.BORDER_CONSTANT}
     blocks, window, inset = _blocks(form, truth), form.weights, form.inset
 
     def blur(values: FloatArray) -> FloatArray:
-        blurred = cv2.sepFilter2D(values, cv2.CV_64F, window, window, borderType=_CV_BORDERS[form.border])
+        blurred = cv2.sepFilter2D(values, cv2.CV_64F, window, window, borderType=borders[form.border])
         height, width = values.shape[:2]
         return np.asarray(blurred[inset : height - inset, inset : width - inset], dtype=np.float64)
 

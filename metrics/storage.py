@@ -4,12 +4,70 @@ from __future__ import annotations
 
 import lzma
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from ..bench.contracts import Avatar, Camera, HeadPose, Measurement, SharingAvatar
 from ..bench.errors import InputError
+from ..bench.specs import MetricSpec
+
+STORAGE = MetricSpec(
+    name="storage",
+    label="Storage",
+    unit="MB",
+    higher_is_better=False,
+    digits=2,
+    implementation="headbench.metrics.storage:storage",
+    summary="Bytes of the files needed to render the avatar, SI megabytes.",
+    kind="avatar",
+    tables=("comparison", "cost"),
+)
+
+
+def _storage_detail(name: str, label: str, unit: str, digits: int, detail: str, summary: str) -> MetricSpec:
+    """A further number of `STORAGE`'s measurement; less is better."""
+    return replace(
+        STORAGE,
+        name=name,
+        label=label,
+        unit=unit,
+        digits=digits,
+        detail=detail,
+        summary=summary,
+        tables=("cost",),
+    )
+
+
+STORAGE_PACKED = _storage_detail(
+    "storage_packed", "Packed", "MB", 2, "packed_mb", "The avatar's files packed losslessly by xz."
+)
+STORAGE_SHARED = _storage_detail(
+    "storage_shared",
+    "Shared",
+    "MB",
+    2,
+    "shared_mb",
+    "Assets that all avatars of a method share, such as the head model.",
+)
+PRIMITIVES = _storage_detail("primitives", "Primitives", "", 0, "primitives", "Number of splats.")
+PRIMITIVE_BYTES = _storage_detail(
+    "primitive_bytes",
+    "Per primitive",
+    "B",
+    1,
+    "primitive_bytes",
+    "Bytes of the avatar's files over its primitives.",
+)
+DRIVING_BITRATE = _storage_detail(
+    "driving_bitrate",
+    "Driving",
+    "kB/s",
+    2,
+    "driving_kb_s",
+    "Driving signal as float32, at 25 frames per second.",
+)
 
 MEGA, KILO = 1e6, 1e3
 DRIVING_RATE = 25.0  # frames per second at which the driving signal's bandwidth is told

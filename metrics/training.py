@@ -7,6 +7,32 @@ from typing import Any
 
 from ..bench.contracts import Measurement
 from ..bench.errors import UnavailableError
+from ..bench.specs import MetricSpec
+
+TRAINING_TIME = MetricSpec(
+    name="training_time",
+    label="Training",
+    unit="min",
+    higher_is_better=False,
+    digits=2,
+    implementation="headbench.metrics.training:training_time",
+    summary="Wall clock of the training.",
+    kind="training",
+    tables=("cost",),
+    machine_bound=True,
+)
+TRAINING_MEMORY = MetricSpec(
+    name="training_memory",
+    label="Peak memory",
+    unit="GB",
+    higher_is_better=False,
+    digits=2,
+    implementation="headbench.metrics.training:training_memory",
+    summary="Largest resident memory of the training process.",
+    kind="training",
+    tables=("cost",),
+    machine_bound=True,
+)
 
 
 def training_time(record: Mapping[str, Any]) -> Measurement:

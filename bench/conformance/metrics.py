@@ -47,18 +47,18 @@ def check_metric(spec: MetricSpec) -> list[str]:
     if not callable(metric):
         return [*breaches, f"{spec.implementation} is not callable"]
     if not spec.per_frame:
-        check = _training_breaches if spec.training else _avatar_breaches
+        check = _training_breaches if spec.kind == "training" else _avatar_breaches
         with attempt(breaches, "measuring"):
             breaches += check(metric, spec)
         return breaches
-    compare = _over_time(metric) if spec.temporal else metric
+    compare = _over_time(metric) if spec.kind == "temporal" else metric
     for part in (_value_breaches, _repeat_breaches, _input_breaches):
         with attempt(breaches, "comparing two images"):
             breaches += part(compare, spec)
     if hasattr(metric, "batched"):
         with attempt(breaches, "comparing a batch"):
             breaches += _batch_breaches(metric)
-    if spec.regions:
+    if spec.kind == "regional":
         with attempt(breaches, "comparing regions"):
             breaches += _region_breaches(metric, spec)
     return breaches

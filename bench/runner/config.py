@@ -13,16 +13,16 @@ from ..contracts import Budget, TaskName
 from ..errors import InputError
 from ..io.files import check_name
 from ..registry import discover, get, resolve, unknown
-from ..specs import MethodSpec, MetricSpec, ProfileSpec
+from ..specs import RENAMED_METRICS, MethodSpec, MetricSpec, ProfileSpec
 from .adaptation import MethodNeeds
 
 CANONICAL = "canonical"
 """The metric profile that bare metric names belong to."""
 
 COST_METRICS = (
-    *("latency_p50", "latency_p95", "latency_p99", "latency_still", "processor_time", "throughput"),
-    *("stage_drive", "stage_deform", "stage_raster", "stage_post", "stage_read_back"),
-    *("storage_packed", "storage_shared", "primitives", "primitive_bytes", "driving_rate"),
+    *("latency_p50", "latency_p95", "latency_p99", "latency_static", "processor_time", "throughput"),
+    *("stage_drive", "stage_deform", "stage_rasterize", "stage_post", "stage_read_back"),
+    *("storage_packed", "storage_shared", "primitives", "primitive_bytes", "driving_bitrate"),
     *("training_time", "training_memory"),
 )
 """Further numbers of the measurements of speed and storage, and of training: tables of their own show them."""
@@ -178,6 +178,8 @@ def resolve_metrics(config: RunConfig) -> list[MetricSpec]:
     defined = {metric.name for metric in get("profiles", CANONICAL).metrics}
     found: list[MetricSpec] = []
     for name in config.metrics:
+        if name in RENAMED_METRICS:
+            raise InputError("metrics", name, f"its new name, {RENAMED_METRICS[name]}", "the former one")
         spec: MetricSpec = get("metrics", name)
         if spec.name not in defined:
             found.append(spec)

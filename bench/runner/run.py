@@ -200,7 +200,7 @@ def _warn_of_missing_metrics(metrics: Sequence[MetricSpec], clip: Clip) -> None:
         if not spec.per_frame:
             continue
         try:
-            value = metric(image, image, image, image) if spec.temporal else metric(image, image)
+            value = metric(image, image, image, image) if spec.kind == "temporal" else metric(image, image)
         except UnavailableError as error:
             log.warning("%s will be missing: %s", spec.label, error)
         else:

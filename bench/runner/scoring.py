@@ -88,7 +88,9 @@ def score_frames(
     metrics: dict[str, Any] = {}
     for spec in specs:
         metrics[spec.name] = make_metric(spec)
-    at_once = [spec for spec in specs if not spec.temporal and not hasattr(metrics[spec.name], "batched")]
+    at_once = [
+        spec for spec in specs if spec.kind != "temporal" and not hasattr(metrics[spec.name], "batched")
+    ]
     rest = [spec for spec in specs if spec not in at_once]
     total, done = (bool(at_once) + len(rest)) * len(keys), 0
     with ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -101,7 +103,7 @@ def score_frames(
                 done += 1
                 progress(done, total, "frames")
         for spec in rest:
-            stream = _temporal if spec.temporal else _batched
+            stream = _temporal if spec.kind == "temporal" else _batched
             scored[spec.name] = []
             for score in stream(keys, frames, spec, metrics[spec.name], pool):
                 scored[spec.name].append(score)
@@ -126,14 +128,14 @@ class _FrameScorer:
     def __call__(self, key: FrameKey) -> list[Score]:
         image, truth = self.frames.render(key), self.frames.clip.image(key)
         masks: Mapping[str, Any] = {}
-        if self.regions and any(spec.regions for spec, _ in self.metrics):
+        if self.regions and any(spec.kind == "regional" for spec, _ in self.metrics):
             assert isinstance(self.frames.clip, RegionalClip)
             masks = self.frames.clip.region_masks(key, self.regions)
         scores = []
         for spec, metric in self.metrics:
             try:
                 scores.append(Score(spec.name, key, FULL, float(metric(image, truth))))
-                if spec.regions and masks:
+                if spec.kind == "regional" and masks:
                     values = metric.in_regions(image, truth, masks)
                     scores += [Score(spec.name, key, name, float(value)) for name, value in values.items()]
             except UnavailableError as error:

@@ -298,7 +298,12 @@ def _measured_before(job: Job) -> tuple[dict[str, str], dict[str, Any], Rows]:
 def _measure_fingerprint(job: Job, spec: MetricSpec, rendered: Mapping[str, str]) -> str:
     """Digest of everything a metric's values depend on."""
     protocols = sorted(protocol.hash for protocol in job.protocols.values())
-    what: list[Any] = [spec.name, spec.implementation, spec.detail, job.regions if spec.regions else ()]
+    what: list[Any] = [
+        spec.name,
+        spec.implementation,
+        spec.detail,
+        job.regions if spec.kind == "regional" else (),
+    ]
     if spec.per_frame:
         what.append({name: rendered.get(name) for name in map(job.cell.name, job.frame_paths)})
     else:
@@ -354,7 +359,7 @@ def _score(job: Job, specs: Sequence[MetricSpec], protocol: Protocol) -> dict[st
 def _measure_avatar(job: Job, spec: MetricSpec, avatar: Avatar) -> Measurement | UnavailableError:
     metric = make_metric(spec)
     try:
-        if spec.training:
+        if spec.kind == "training":
             measured: Measurement = metric(job.cell.stage("fit") or {})
         else:
             size = job.method.spec.resolution.speed_size

@@ -72,7 +72,7 @@ def draw_splats(
         transmittance_min=cutoffs.transmittance_min,
         check_values=False,
     )
-    done("raster")
+    done("rasterize")
     drawn = Drawn(rendering.image.clamp(0, 1), rendering.alpha.clamp(0, 1))
     done("post")
     return drawn

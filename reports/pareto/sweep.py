@@ -53,7 +53,7 @@ def sweep(settings: SweepSettings, out: Path, progress: Progress) -> Rows:
         task: make_protocol(task, clips, config.frames_per_task) for task in config.tasks
     }
     config = replace(config, metrics=tuple(dict.fromkeys((*config.metrics, *NEEDED))))
-    metrics = [spec for spec in resolve_metrics(config) if not spec.training]
+    metrics = [spec for spec in resolve_metrics(config) if spec.kind != "training"]
     folder = RunFolder(out)
     derived = [(job, list(_chosen(job, settings.variants))) for job in able]
     known = {variant.name for _, variants in derived for variant in variants}

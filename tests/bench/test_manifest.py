@@ -9,8 +9,9 @@ import pytest
 from headbench.bench.errors import InputError
 from headbench.bench.manifest import Manifest
 from headbench.bench.runner.store import Cell
+from headbench.bench.specs import RENAMED_METRICS
 from headbench.methods.ga.spec import GA
-from headbench.metrics.specs import PSNR
+from headbench.metrics.psnr import PSNR
 
 GALLERY = Path(__file__).parents[2] / "reports" / "gallery" / "run.json"
 
@@ -23,6 +24,21 @@ def published():
 def test_the_published_manifest_is_written_as_it_was_read(published, tmp_path):
     Manifest.read(GALLERY).write(tmp_path / "run.json")
     assert json.loads((tmp_path / "run.json").read_text()) == published
+
+
+def test_a_manifest_of_an_earlier_version_is_read(published, tmp_path):
+    old = json.loads(json.dumps(published))
+    flags = {"regional": "regions", "temporal": "temporal", "training": "training"}
+    names = {new: old_name for old_name, new in RENAMED_METRICS.items()}
+    for metric in old["metrics"]:
+        kind = metric.pop("kind")
+        metric["per_frame"] = kind not in ("avatar", "training")
+        metric |= {flag: kind == name for name, flag in flags.items()}
+        metric["name"] = names.get(metric["name"], metric["name"])
+    old["configuration"]["metrics"] = [names.get(name, name) for name in old["configuration"]["metrics"]]
+    assert old["configuration"]["metrics"] != published["configuration"]["metrics"]
+    (tmp_path / "run.json").write_text(json.dumps(old))
+    assert Manifest.read(tmp_path / "run.json") == Manifest.read(GALLERY)
 
 
 @pytest.mark.parametrize(

@@ -148,7 +148,7 @@ MEASURED = {
     "latency_p50",
     "latency_p95",
     "latency_p99",
-    "latency_still",
+    "latency_static",
     "processor_time",
     "throughput",
 }

@@ -23,7 +23,7 @@ from headbench.datasets.colmap.writer import export_model
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import save_head
 from headbench.methods.shared.checkpoint import save_checkpoint
-from headbench.metrics.weights import network_spec
+from headbench.metrics.lpips_network import network_spec
 
 from ..datasets.head.flame_files import write_flame
 from ..datasets.head.toy import toy_head

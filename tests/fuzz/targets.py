@@ -20,7 +20,7 @@ from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.loaders import load_head
 from headbench.datasets.steps.exclusion_file import read_exclusions
 from headbench.methods.shared.checkpoint import load_checkpoint
-from headbench.metrics.weights import load_backbone, network_spec
+from headbench.metrics.lpips_network import load_backbone, network_spec
 
 from .cases import ExitCode
 from .samples import AVATAR, BACKBONE, CHECKPOINT, METHODS, PREPARE, SETTINGS, SYNTH

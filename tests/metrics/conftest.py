@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from headbench.metrics import weights
+from headbench.metrics import lpips_network as weights
 from headbench.metrics.lpips import _load
 
 

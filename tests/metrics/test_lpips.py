@@ -5,9 +5,8 @@ import torch
 from torch.nn import functional
 
 from headbench.bench.errors import InputError, UnavailableError
-from headbench.metrics.lpips import Lpips, lpips
-from headbench.metrics.networks import NETWORKS
-from headbench.metrics.weights import VARIABLE
+from headbench.metrics.lpips import lpips
+from headbench.metrics.lpips_network import NETWORKS, VARIABLE, Lpips
 
 
 @pytest.fixture

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from headbench.metrics.networks import NETWORKS
+from headbench.metrics.lpips_network import NETWORKS
 
 SPECS = pytest.mark.parametrize("spec", NETWORKS.values(), ids=NETWORKS)
 

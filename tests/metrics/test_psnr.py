@@ -8,7 +8,7 @@ from hypothesis.extra import numpy as npst
 from skimage.metrics import peak_signal_noise_ratio
 
 from headbench.bench.errors import InputError
-from headbench.metrics import structural
+from headbench.metrics import pairs as structural
 from headbench.metrics.psnr import CAP, psnr, psnr_by_channel, psnr_floored
 
 PAIRS = st.tuples(st.integers(1, 12), st.integers(1, 12)).flatmap(

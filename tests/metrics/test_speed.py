@@ -14,7 +14,7 @@ from headbench.metrics.speed import (
     SpeedProtocol,
     WholeFrames,
     fps,
-    fresh_walk,
+    fresh_frames,
     latencies,
     measure_speed,
     stage_times,
@@ -26,7 +26,7 @@ ZERO = np.zeros(3)
 POSES = [
     HeadPose("toy", np.array([i, 0.5]), ZERO, ZERO, ZERO, np.zeros(6), ZERO, None, "s", i) for i in range(3)
 ]
-WALK = [("a", POSES[0]), ("b", POSES[1]), ("c", POSES[2])]
+WORKLOAD = [("a", POSES[0]), ("b", POSES[1]), ("c", POSES[2])]
 
 
 class Renderer:
@@ -48,7 +48,7 @@ class Staged(Renderer):
 
     def __init__(self):
         super().__init__([])
-        self.costs = {"drive": 0.001, "deform": 0.002, "raster": 0.004}
+        self.costs = {"drive": 0.001, "deform": 0.002, "rasterize": 0.004}
 
     def draw(self, camera, pose, background, done):
         self.seen.append((camera, pose))
@@ -74,46 +74,46 @@ def constant(seconds):
 
 def test_latencies_are_those_of_known_durations():
     renderer = Renderer([0.002, 0.002, 0.002, 0.020])
-    found = latencies(WholeFrames(renderer), fresh_walk(WALK), 4, 99.0, renderer.clock)
+    found = latencies(WholeFrames(renderer), fresh_frames(WORKLOAD), 4, 99.0, renderer.clock)
     assert found == pytest.approx([2, 2, 2, 20])
 
 
 def test_speed_is_that_of_the_mean_time_not_the_mean_of_rates():
-    quick = SpeedProtocol(warm_up=2, warm_up_limit=2, latency=4, throughput=1, stages=1, still=2)
+    quick = SpeedProtocol(warm_up=2, warm_up_limit=2, latency=4, throughput=1, stages=1, static=2)
     durations = [0.005, 0.005, 0.002, 0.002, 0.002, 0.020, 0.1, 0.001, 0.003]
     renderer = Renderer(durations)
-    measured = measure_speed(renderer, WALK, quick, renderer.clock)
+    measured = measure_speed(renderer, WORKLOAD, quick, renderer.clock)
     assert measured.value == pytest.approx(4 / 0.026)  # not 387
     details = measured.details
     expected = np.percentile([2, 2, 2, 20], [5, 50, 95, 99])
     assert [details[f"p{p}_ms"] for p in (5, 50, 95, 99)] == pytest.approx(list(expected))
     assert (details["frames"], details["max_ms"]) == (4, pytest.approx(20))
     assert details["throughput_fps"] == pytest.approx(10)
-    assert details["still_ms"] == pytest.approx(2)  # of 1 and 3
+    assert details["static_ms"] == pytest.approx(2)  # of 1 and 3
     assert "raster_ms" not in details
     assert (details["warm_up_frames"], details["stationary"]) == (2, 0)
 
 
-def test_the_still_frames_alone_repeat_and_no_pose_ever_comes_twice_before():
-    quick = SpeedProtocol(warm_up=4, warm_up_limit=4, latency=8, throughput=3, still=5)
+def test_only_static_frames_repeat_a_pose():
+    quick = SpeedProtocol(warm_up=4, warm_up_limit=4, latency=8, throughput=3, static=5)
     renderer = Renderer(constant(0.001))
-    measure_speed(renderer, WALK, quick, renderer.clock)
-    moving, still = renderer.seen[:-5], renderer.seen[-5:]
+    measure_speed(renderer, WORKLOAD, quick, renderer.clock)
+    moving, static = renderer.seen[:-5], renderer.seen[-5:]
     assert len(moving) == 4 + 8 + 3
-    assert [camera for camera, _ in moving] == [WALK[i % 3][0] for i in range(len(moving))]
+    assert [camera for camera, _ in moving] == [WORKLOAD[i % 3][0] for i in range(len(moving))]
     signals = {pose.expression.tobytes() for _, pose in moving}
     assert len(signals) == len(moving)
-    assert len({id(pose) for _, pose in still}) == 1
+    assert len({id(pose) for _, pose in static}) == 1
 
 
 @given(st.integers(2, 7), st.integers(1, 40))
 def test_a_live_signal_is_new_every_frame_and_next_to_the_recorded_one(length, frames):
-    walk = [(i, replace(POSES[0], expression=np.array([float(i), -1.0]))) for i in range(length)]
-    found = [pair for pair, _ in zip(fresh_walk(walk), range(frames))]
+    workload = [(i, replace(POSES[0], expression=np.array([float(i), -1.0]))) for i in range(length)]
+    found = [pair for pair, _ in zip(fresh_frames(workload), range(frames))]
     assert len({pose.expression.tobytes() for _, pose in found}) == frames
     for number, (camera, pose) in enumerate(found):
         assert camera == number % length
-        assert np.abs(pose.expression - walk[camera][1].expression).max() < 1e-3
+        assert np.abs(pose.expression - workload[camera][1].expression).max() < 1e-3
         assert (pose.subject, pose.timestep) == ("", None)
     assert all(a is not b for a, b in pairwise(found))
 
@@ -126,16 +126,16 @@ def test_a_live_signal_is_new_every_frame_and_next_to_the_recorded_one(length, f
         ([0.001 * 1.01**i for i in range(99)], 60, False),  # 10 % more from ten frames to the next
     ],
 )
-def test_warm_up_ends_when_times_stand_still(durations, frames, steady):
+def test_warm_up_ends_when_times_are_stationary(durations, frames, steady):
     renderer = Renderer(durations)
     plan = SpeedProtocol(warm_up_limit=60, warm_up_s=99)
-    assert warm_up(WholeFrames(renderer), fresh_walk(WALK), plan, renderer.clock) == (frames, steady)
+    assert warm_up(WholeFrames(renderer), fresh_frames(WORKLOAD), plan, renderer.clock) == (frames, steady)
 
 
 def test_a_slow_renderer_stops_at_the_limits():
     renderer = Renderer([1.0] * 100)
-    plan = SpeedProtocol(warm_up_s=1.5, latency_s=2.5, throughput_s=3.5, still_s=0.5)
-    measured = measure_speed(renderer, WALK, plan, renderer.clock)
+    plan = SpeedProtocol(warm_up_s=1.5, latency_s=2.5, throughput_s=3.5, static_s=0.5)
+    measured = measure_speed(renderer, WORKLOAD, plan, renderer.clock)
     assert len(renderer.seen) == 2 + 3 + 4 + 1
     assert (measured.details["warm_up_frames"], measured.details["frames"]) == (2, 3)
     assert measured.value == pytest.approx(1)
@@ -144,19 +144,19 @@ def test_a_slow_renderer_stops_at_the_limits():
 def test_stages_are_told_apart_and_reading_back_is_the_last():
     renderer = Staged()
     assert isinstance(renderer, StagedAvatar)
-    found = stage_times(renderer, fresh_walk(WALK), 5, 99.0, renderer.clock)
-    assert found == pytest.approx({"drive": 1, "deform": 2, "raster": 4, "read_back": 8})
-    measured = measure_speed(renderer, WALK, clock=renderer.clock)
+    found = stage_times(renderer, fresh_frames(WORKLOAD), 5, 99.0, renderer.clock)
+    assert found == pytest.approx({"drive": 1, "deform": 2, "rasterize": 4, "read_back": 8})
+    measured = measure_speed(renderer, WORKLOAD, clock=renderer.clock)
     assert measured.details["p50_ms"] == pytest.approx(15)
     assert measured.details["deform_ms"] == pytest.approx(2)
 
 
 def test_throughput_does_not_wait_for_each_frame():
     renderer = Staged()
-    found = throughput(renderer, fresh_walk(WALK), 100, 99.0, 8, renderer.clock)
+    found = throughput(renderer, fresh_frames(WORKLOAD), 100, 99.0, 8, renderer.clock)
     assert found == pytest.approx(100 / (100 * 0.007 + 0.008))  # waiting for each: 1 / 0.015
     renderer = Staged()
-    waiting = throughput(renderer, fresh_walk(WALK), 100, 99.0, 0, renderer.clock)
+    waiting = throughput(renderer, fresh_frames(WORKLOAD), 100, 99.0, 0, renderer.clock)
     assert waiting == pytest.approx(1 / 0.015)
 
 
@@ -164,16 +164,18 @@ def test_a_stage_of_another_name_is_refused():
     renderer = Staged()
     renderer.costs = {"think": 1.0}
     with pytest.raises(InputError, match=r"'think'") as error:
-        stage_times(renderer, fresh_walk(WALK), 5, 99.0, renderer.clock)
+        stage_times(renderer, fresh_frames(WORKLOAD), 5, 99.0, renderer.clock)
     assert all(stage in str(error.value) for stage in STAGES)
 
 
 @pytest.mark.parametrize(
-    "walk", [[], WALK[:1], [WALK[0], WALK[0], WALK[1]], [WALK[0], WALK[1], WALK[0]]], ids=len
+    "workload",
+    [[], WORKLOAD[:1], [WORKLOAD[0], WORKLOAD[0], WORKLOAD[1]], [WORKLOAD[0], WORKLOAD[1], WORKLOAD[0]]],
+    ids=len,
 )
-def test_a_workload_that_repeats_a_frame_is_refused(walk):
+def test_a_workload_that_repeats_a_frame_is_refused(workload):
     with pytest.raises(InputError, match="workload"):
-        fps(Renderer(constant(0.001)), walk)
+        fps(Renderer(constant(0.001)), workload)
 
 
 def test_the_metric_times_the_avatar_by_the_wall_clock():
@@ -184,9 +186,9 @@ def test_the_metric_times_the_avatar_by_the_wall_clock():
             self.calls += 1
 
     avatar = Avatar()
-    measured = fps(avatar, WALK)
+    measured = fps(avatar, WORKLOAD)
     plan = SpeedProtocol()
-    loops = plan.latency + plan.throughput + plan.still
+    loops = plan.latency + plan.throughput + plan.static
     assert avatar.calls == measured.details["warm_up_frames"] + loops
     assert measured.value == pytest.approx(1000 / measured.details["mean_ms"])
     assert all(np.isfinite(value) for value in measured.details.values())

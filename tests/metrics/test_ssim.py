@@ -7,7 +7,7 @@ from skimage.metrics import structural_similarity
 from torch.nn import functional
 
 from headbench.bench.errors import InputError
-from headbench.metrics import structural
+from headbench.metrics import pairs as structural
 from headbench.metrics.ssim import (
     Ssim,
     SsimForm,

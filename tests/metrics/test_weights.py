@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from headbench.bench.errors import InputError, UnavailableError
-from headbench.metrics import weights
-from headbench.metrics.networks import SQUEEZE
+from headbench.metrics import lpips_network as weights
+from headbench.metrics.lpips_network import SQUEEZE
 
 
 @pytest.fixture

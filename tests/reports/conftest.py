@@ -15,7 +15,7 @@ from .made_rows import avatar_row, row
 
 PSNR = MetricSpec("psnr", "PSNR", "dB", True, 2, "m:psnr")
 LPIPS = MetricSpec("lpips", "LPIPS", "", False, 3, "m:lpips")
-SIZE = MetricSpec("size", "Size", "MB", False, 1, "m:size", per_frame=False)
+SIZE = MetricSpec("size", "Size", "MB", False, 1, "m:size", kind="avatar")
 
 
 @pytest.fixture
@@ -120,7 +120,13 @@ def write_run(tmp_path, write_manifest):
         of_avatar = ("storage", "fps")
         specs = [
             MetricSpec(
-                m, m.upper(), "", m not in ("lpips", "storage"), 4, "m:m", per_frame=m not in of_avatar
+                m,
+                m.upper(),
+                "",
+                m not in ("lpips", "storage"),
+                4,
+                "m:m",
+                kind="avatar" if m in of_avatar else "frame",
             )
             for m in lines
         ]

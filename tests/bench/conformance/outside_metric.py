@@ -47,9 +47,9 @@ def hours(record):
     return Measurement(record["seconds"] / 3600, {})
 
 
-ERROR = MetricSpec("mae", "MAE", "levels", False, 2, "outside_metric:MeanError", regions=True)
-JUMP = MetricSpec("jump", "Jump", "levels", False, 2, "outside_metric:jump", temporal=True)
+ERROR = MetricSpec("mae", "MAE", "levels", False, 2, "outside_metric:MeanError", kind="regional")
+JUMP = MetricSpec("jump", "Jump", "levels", False, 2, "outside_metric:jump", kind="temporal")
 FILES = MetricSpec(
-    "files", "Files", "", False, 0, "outside_metric:file_count", per_frame=False, detail="frames"
+    "files", "Files", "", False, 0, "outside_metric:file_count", kind="avatar", detail="frames"
 )
-HOURS = MetricSpec("hours", "Hours", "h", False, 2, "outside_metric:hours", per_frame=False, training=True)
+HOURS = MetricSpec("hours", "Hours", "h", False, 2, "outside_metric:hours", kind="training")

@@ -82,7 +82,7 @@ FAULTS = {
 def test_a_fault_of_a_metric_is_found(metrics, monkeypatch, fault):
     faulty, breach = FAULTS[fault]
     monkeypatch.setattr(metrics, "MeanError", faulty)
-    found = check_metric(replace(metrics.ERROR, regions=False))
+    found = check_metric(replace(metrics.ERROR, kind="frame"))
     assert any(breach in one for one in found), found
 
 

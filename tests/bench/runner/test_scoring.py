@@ -81,7 +81,7 @@ FRAMES = Frames(render, RegionalToyClip())
 
 
 def test_whole_frames_and_regions_are_scored_in_the_order_of_the_keys(spec):
-    scored = score_frames(KEYS, FRAMES, [spec("d", "Difference", regions=True)], ["face"])["d"]
+    scored = score_frames(KEYS, FRAMES, [spec("d", "Difference", kind="regional")], ["face"])["d"]
     full = [s for s in scored if s.region == "full"]
     assert [(s.key, s.value, s.status) for s in full] == [(key, 3.0, "ok") for key in KEYS]
     face = [s for s in scored if s.region == "face"]
@@ -124,7 +124,7 @@ def test_batches_read_a_bounded_number_of_frames_ahead(spec, monkeypatch):
 
 
 def test_a_temporal_metric_sees_the_frame_before_and_at_a_start_the_one_after(spec):
-    scored = score_frames(KEYS, FRAMES, [spec("t", "change", temporal=True)])["t"]
+    scored = score_frames(KEYS, FRAMES, [spec("t", "change", kind="temporal")])["t"]
     assert [s.value for s in scored[:3]] == [-10.0, 10.0, 10.0]
     assert scored[3].status == "missing"
     assert "neighbouring" in scored[3].reason

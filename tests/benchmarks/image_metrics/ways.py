@@ -12,10 +12,9 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from ....bench.contracts import ByteArray
 from ....bench.errors import UnavailableError
-from ....metrics.lpips import Lpips
+from ....metrics.lpips_network import Lpips, find_backbone, load_backbone, network_spec
 from ....metrics.psnr import psnr
 from ....metrics.ssim import Ssim, ssim, ssim_map, ssim_reflected
-from ....metrics.weights import find_backbone, load_backbone, network_spec
 
 Ways = Mapping[str, Callable[[], float]]
 Pairs = list[tuple[ByteArray, ByteArray]]

@@ -11,7 +11,7 @@ from torchmetrics.functional.image import structural_similarity_index_measure
 
 from headbench.bench.registry import get, resolve
 from headbench.metrics.flip import flip
-from headbench.metrics.lpips import Lpips
+from headbench.metrics.lpips_network import Lpips
 from headbench.metrics.psnr import psnr, psnr_by_channel, psnr_floored
 from headbench.metrics.ssim import (
     SsimForm,

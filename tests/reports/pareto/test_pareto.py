@@ -27,8 +27,8 @@ from headbench.reports.pareto.points import pareto_front
 METRICS = [
     MetricSpec("psnr", "PSNR", "dB", True, 2, "m:psnr"),
     MetricSpec("lpips", "LPIPS", "", False, 3, "m:lpips"),
-    MetricSpec("storage", "Storage", "MB", False, 2, "m:storage", per_frame=False),
-    MetricSpec("fps", "Speed", "FPS", True, 1, "m:fps", per_frame=False),
+    MetricSpec("storage", "Storage", "MB", False, 2, "m:storage", kind="avatar"),
+    MetricSpec("fps", "Speed", "FPS", True, 1, "m:fps", kind="avatar"),
 ]
 
 

@@ -28,7 +28,7 @@ def folder(tmp_path, write_manifest):
         folder,
         [
             MetricSpec("error", "Error", "levels", False, 2, "m:e"),
-            MetricSpec("size", "Error", "levels", False, 2, "m:e", per_frame=False),
+            MetricSpec("size", "Error", "levels", False, 2, "m:e", kind="avatar"),
         ],
         dict.fromkeys(ERRORS),
         {task: f"hash-{task}" for task in tasks},

@@ -1,0 +1,381 @@
+"""The network behind LPIPS: `Lpips`, its feature networks, and where their weights come from.
+
+The feature networks are the convolutional parts of AlexNet (Krizhevsky, "One weird trick for parallelizing convolutional
+neural networks", 2014), SqueezeNet 1.1 (Iandola et al., 2016) and VGG-16 (Simonyan, Zisserman, 2015, configuration D),
+with torchvision's parameter names, so that its published weights load as they are.
+
+The linear layers (version 0.1 of Zhang et al. 2018) come with the installed torchmetrics package, whose files
+are read without importing it. The backbone is looked for, in this order:
+
+1. an explicit path, a file or a folder;
+2. the environment variable ``HEADBENCH_LPIPS_WEIGHTS``, a file or a folder;
+3. the user's caches: headbench's own, then torch hub's;
+4. PyTorch's publication, fetched once into headbench's cache and checked against the hash in its name.
+
+In a folder, the published file name or that of a file with the convolutional part alone is looked for.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import importlib.util
+import os
+import shutil
+import urllib.request
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from http.client import HTTPException
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from ..bench.contracts import ByteArray, FloatArray
+from ..bench.errors import InputError, UnavailableError
+from ..bench.io.files import atomic_path, cache_folder, digest
+from .pairs import check_pair
+from .torch_file import read_weights
+
+SHIFT = (-0.030, -0.088, -0.188)
+SCALE = (0.458, 0.448, 0.450)
+EPSILON = 1e-10
+VARIABLE = "HEADBENCH_LPIPS_WEIGHTS"
+TIMEOUT_S = 5.0
+
+
+class Lpips:
+    """LPIPS with its weights loaded, ready to compare frames.
+
+    Parameters
+    ----------
+    net : "alex" (customary for reporting), "squeeze" or "vgg".
+    weights : file with the backbone, or folder to look in; see `headbench.metrics.weights` for the default.
+    device : where the network runs; always in float32.
+    scaled : bring images to [-1, 1], as the constants expect; False feeds [0, 1].
+    cache_mb : bound of the features of truths that are kept for the next method, in 10^6 bytes.
+
+    Attributes
+    ----------
+    fingerprint : hex digest of all weights in use, the same for a full file and one of features alone.
+
+    Raises
+    ------
+    UnavailableError : no weights; says how to get them.
+    InputError : weights that are not those of the network.
+    """
+
+    def __init__(
+        self,
+        net: str = "alex",
+        *,
+        weights: Path | None = None,
+        device: str = "cpu",
+        scaled: bool = True,
+        cache_mb: float = 256.0,
+    ) -> None:
+        self.spec = network_spec(net)
+        self.scaled = scaled
+        self._cache: dict[tuple[bytes, tuple[int, ...]], list[Tensor]] = {}
+        self._cache_bytes, self._held = int(cache_mb * 1e6), 0
+        backbone = load_backbone(self.spec, find_backbone(self.spec, weights))
+        linear = load_linear(self.spec)
+        self.fingerprint = digest(*(value.numpy() for value in (*backbone.values(), *linear)))
+        self.device = torch.device(device)
+        self._network = self.spec.build()
+        self._network.load_state_dict(backbone)
+        # Pixels come channel by channel side by side; the network takes them as they lie.
+        self._network.requires_grad_(False).to(self.device)
+        for parameter in self._network.parameters():
+            if parameter.ndim == 4:
+                parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
+        self._linear = [value.to(self.device) for value in linear]
+        self._shift = torch.tensor(SHIFT, device=self.device).view(1, 3, 1, 1)
+        self._scale = torch.tensor(SCALE, device=self.device).view(1, 3, 1, 1)
+
+    def __call__(self, image: ByteArray, truth: ByteArray) -> float:
+        """Distance of two (H, W, 3) 8-bit images, 0 for identical ones."""
+        check_pair(image, truth, self.spec.smallest)
+        return float(self.distances(image[None], truth[None])[0])
+
+    def distances(self, images: ByteArray, truths: ByteArray) -> FloatArray:
+        """(N,) float64 distances of two stacks (N, H, W, 3) of 8-bit images, in one pass."""
+        if images.ndim != 4 or images.shape != truths.shape:
+            found = f"{images.shape} and {truths.shape}"
+            raise InputError("LPIPS", "images", "two stacks of one shape (N, H, W, 3)", found)
+        if not len(images):
+            return np.empty(0)
+        check_pair(images[0], truths[0], self.spec.smallest)
+        # Both stacks go through the network separately: half the peak memory, the same numbers.
+        with torch.inference_mode():
+            total = torch.zeros(len(images), dtype=torch.float64, device=self.device)
+            layers = zip(self._features(images), self._true_features(truths), self._linear)
+            for features, true_features, weight in layers:
+                difference = features.sub_(true_features).square_()
+                total += functional.conv2d(difference, weight).mean(dim=(1, 2, 3), dtype=torch.float64)
+        return np.asarray(total.cpu().numpy())
+
+    def batched(self, pairs: Iterable[tuple[ByteArray, ByteArray]], size: int = 8) -> Iterator[float]:
+        """Distances of many pairs of one size, in order, ``size`` at a time; ``pairs`` is read lazily."""
+        stream = iter(pairs)
+        while batch := list(islice(stream, size)):
+            images, truths = zip(*batch)
+            yield from map(float, self.distances(np.stack(images), np.stack(truths)))
+
+    def _true_features(self, truths: ByteArray) -> list[Tensor]:
+        """The same as `_features`, from the cache where a frame was seen before: every method has the same truths."""
+        keys = [hashlib.blake2b(np.ascontiguousarray(truth), digest_size=16).digest() for truth in truths]
+        places = [(key, truth.shape) for key, truth in zip(keys, truths)]
+        if all(place in self._cache for place in places):
+            return [torch.cat(layer) for layer in zip(*(self._cache[place] for place in places))]
+        features = self._features(truths)
+        for index, place in enumerate(places):
+            own = [layer[index : index + 1] for layer in features]
+            size = sum(layer.numel() * layer.element_size() for layer in own)
+            # What is full stays: frames come in the same order for every method, so that any frame put in the place
+            # of another would have gone before its next turn.
+            if place not in self._cache and self._held + size <= self._cache_bytes:
+                self._cache[place] = [layer.clone() for layer in own]
+                self._held += size
+        return features
+
+    def _features(self, images: ByteArray) -> list[Tensor]:
+        """Unit-length features of each tapped layer, (N, C, h, w)."""
+        # A copy: images of a clip may be read-only, or views of negative stride; tensors can be neither.
+        x = torch.from_numpy(images.copy()).to(self.device)
+        x = x.permute(0, 3, 1, 2).to(torch.float32)
+        x = x / 127.5 - 1.0 if self.scaled else x / 255.0
+        outputs = self._network(x.sub_(self._shift).div_(self._scale))
+        return [out.div_(out.square().sum(dim=1, keepdim=True).sqrt_() + EPSILON) for out in outputs]
+
+
+class Fire(nn.Module):
+    """SqueezeNet's module: a 1 x 1 squeeze, then 1 x 1 and 3 x 3 expansions side by side."""
+
+    def __init__(self, inputs: int, squeeze: int, expand: int) -> None:
+        super().__init__()
+        self.squeeze = nn.Conv2d(inputs, squeeze, 1)
+        self.expand1x1 = nn.Conv2d(squeeze, expand, 1)
+        self.expand3x3 = nn.Conv2d(squeeze, expand, 3, padding=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map (N, inputs, H, W) to (N, 2 expand, H, W)."""
+        x = torch.relu(self.squeeze(x))
+        return torch.relu(torch.cat([self.expand1x1(x), self.expand3x3(x)], dim=1))
+
+
+class TappedNetwork(nn.Module):
+    """A chain of layers that also returns what some of them put out."""
+
+    def __init__(self, layers: list[nn.Module], taps: tuple[int, ...]) -> None:
+        super().__init__()
+        self.features = nn.Sequential(*layers[: taps[-1] + 1])
+        self.taps = taps
+
+    def forward(self, x: Tensor) -> list[Tensor]:
+        """Map (N, 3, H, W) to the output of each tapped layer, shallow to deep."""
+        outputs: list[Tensor] = []
+        for index, layer in enumerate(self.features):
+            x = layer(x)
+            if index in self.taps:
+                outputs.append(x)
+        return outputs
+
+
+@dataclass(frozen=True)
+class NetworkSpec:
+    """A feature network of LPIPS and where its weights are published.
+
+    Attributes
+    ----------
+    name : as `Lpips` and the files of linear layers call it.
+    channels : of each tapped layer, shallow to deep.
+    smallest : pixels that height and width must have for the deepest layer to see anything.
+    file : published name; its last part before the suffix begins the SHA-256 of the content.
+    features_file : customary name of a file with the convolutional part alone.
+    """
+
+    name: str
+    channels: tuple[int, ...]
+    smallest: int
+    file: str
+    features_file: str
+
+    @property
+    def url(self) -> str:
+        """Where PyTorch publishes the weights."""
+        return f"https://download.pytorch.org/models/{self.file}"
+
+    @property
+    def sha256_prefix(self) -> str:
+        """The first digits of the file's SHA-256."""
+        return self.file.removesuffix(".pth").rpartition("-")[2]
+
+    def build(self) -> TappedNetwork:
+        """Make the network, weights not yet meaningful."""
+        return {"alex": _alexnet, "squeeze": _squeezenet, "vgg": _vgg16}[self.name]()
+
+
+ALEX = NetworkSpec("alex", (64, 192, 384, 256, 256), 31, "alexnet-owt-7be5be79.pth", "alexnet_features.pth")
+SQUEEZE = NetworkSpec(
+    "squeeze",
+    (64, 128, 256, 384, 384, 512, 512),
+    17,
+    "squeezenet1_1-b8a52dc0.pth",
+    "squeezenet1_1_features.pth",
+)
+VGG = NetworkSpec("vgg", (64, 128, 256, 512, 512), 16, "vgg16-397923af.pth", "vgg16_features.pth")
+NETWORKS = {spec.name: spec for spec in (ALEX, SQUEEZE, VGG)}
+
+
+def _alexnet() -> TappedNetwork:
+    layers: list[nn.Module] = [
+        nn.Conv2d(3, 64, 11, stride=4, padding=2),
+        nn.ReLU(inplace=True),
+        nn.MaxPool2d(3, 2),
+        nn.Conv2d(64, 192, 5, padding=2),
+        nn.ReLU(inplace=True),
+        nn.MaxPool2d(3, 2),
+        nn.Conv2d(192, 384, 3, padding=1),
+        nn.ReLU(inplace=True),
+        nn.Conv2d(384, 256, 3, padding=1),
+        nn.ReLU(inplace=True),
+        nn.Conv2d(256, 256, 3, padding=1),
+        nn.ReLU(inplace=True),
+    ]
+    return TappedNetwork(layers, (1, 4, 7, 9, 11))
+
+
+def _squeezenet() -> TappedNetwork:
+    layers: list[nn.Module] = [
+        nn.Conv2d(3, 64, 3, stride=2),
+        nn.ReLU(inplace=True),
+        nn.MaxPool2d(3, 2, ceil_mode=True),
+        Fire(64, 16, 64),
+        Fire(128, 16, 64),
+        nn.MaxPool2d(3, 2, ceil_mode=True),
+        Fire(128, 32, 128),
+        Fire(256, 32, 128),
+        nn.MaxPool2d(3, 2, ceil_mode=True),
+        Fire(256, 48, 192),
+        Fire(384, 48, 192),
+        Fire(384, 64, 256),
+        Fire(512, 64, 256),
+    ]
+    return TappedNetwork(layers, (1, 4, 7, 9, 10, 11, 12))
+
+
+def _vgg16() -> TappedNetwork:
+    layers: list[nn.Module] = []
+    inputs = 3
+    for block, (channels, repeats) in enumerate([(64, 2), (128, 2), (256, 3), (512, 3), (512, 3)]):
+        if block:
+            layers.append(nn.MaxPool2d(2, 2))
+        for _ in range(repeats):
+            layers += [nn.Conv2d(inputs, channels, 3, padding=1), nn.ReLU(inplace=True)]
+            inputs = channels
+    return TappedNetwork(layers, (3, 8, 15, 22, 29))
+
+
+def find_backbone(spec: NetworkSpec, path: Path | None = None) -> Path:
+    """Return the file with the weights of ``spec``, fetched if need be (see the module).
+
+    Raises
+    ------
+    InputError : ``path`` or the environment variable names something that is not there.
+    UnavailableError : not in the folder named, or not found anywhere and not to be fetched; says how to mend it.
+    """
+    if path is not None:
+        return _named(spec, path, "weights")
+    if value := os.environ.get(VARIABLE):
+        return _named(spec, Path(value), f"environment variable {VARIABLE}")
+    for folder in (cache_folder(), Path(torch.hub.get_dir()) / "checkpoints"):
+        if found := _in_folder(spec, folder):
+            return found
+    target = cache_folder() / spec.file
+    if problem := _fetch(spec.url, spec.sha256_prefix, target):
+        raise UnavailableError(
+            f"LPIPS needs the ImageNet weights of its {spec.name} network, which are not on this machine and "
+            f"could not be fetched ({problem}).",
+            f"Download {spec.url} elsewhere and put it into {cache_folder()}, or set {VARIABLE} to the file.",
+        )
+    return target
+
+
+def load_backbone(spec: NetworkSpec, path: Path) -> dict[str, Tensor]:
+    """Read the convolutional part of a weights file: a full torchvision one, or one of features alone.
+
+    Raises `InputError` for a file that is none, lacks a parameter, or has one of another shape or not finite.
+    """
+    return _read(path, {name: tuple(value.shape) for name, value in spec.build().state_dict().items()})
+
+
+def load_linear(spec: NetworkSpec, path: Path | None = None) -> list[Tensor]:
+    """Read the non-negative channel weights of each tapped layer, each (1, C, 1, 1) float32.
+
+    ``path`` defaults to the file in the installed torchmetrics package.
+    """
+    path = _torchmetrics_folder() / f"{spec.name}.pth" if path is None else path
+    shapes = {f"lin{i}.model.1.weight": (1, c, 1, 1) for i, c in enumerate(spec.channels)}
+    return list(_read(path, shapes).values())
+
+
+def network_spec(name: str) -> NetworkSpec:
+    """Look up a network by name. Raises `InputError` for an unknown one."""
+    if name not in NETWORKS:
+        raise InputError("LPIPS", "net", f"one of {', '.join(NETWORKS)}", repr(name))
+    return NETWORKS[name]
+
+
+def _named(spec: NetworkSpec, path: Path, option: str) -> Path:
+    if path.is_file():
+        return path
+    if found := _in_folder(spec, path):
+        return found
+    if path.is_dir():
+        raise UnavailableError(
+            f"LPIPS needs the ImageNet weights of its {spec.name} network; {option} names {path}, which has none.",
+            f"Download {spec.url} and put it there.",
+        )
+    raise InputError(
+        option, "", f"a file, or a folder with {spec.file} or {spec.features_file}", f"{path}, not there"
+    )
+
+
+def _in_folder(spec: NetworkSpec, folder: Path) -> Path | None:
+    candidates = (folder / name for name in (spec.file, spec.features_file))
+    return next((path for path in candidates if path.is_file()), None)
+
+
+@functools.cache
+def _fetch(url: str, sha256_prefix: str, target: Path) -> str:
+    """Fetch ``url``; return what went wrong, or "". Remembered, so that a dead network is waited for once."""
+    try:
+        with urllib.request.urlopen(url, timeout=TIMEOUT_S) as response, atomic_path(target) as temporary:
+            with temporary.open("wb") as stream:
+                shutil.copyfileobj(response, stream, 1 << 20)
+            with temporary.open("rb") as stream:
+                digest = hashlib.file_digest(stream, "sha256")
+            if not digest.hexdigest().startswith(sha256_prefix):
+                raise OSError(f"its SHA-256 is {digest.hexdigest()}, not {sha256_prefix}...")
+    except (OSError, HTTPException) as error:
+        return f"{url}: {error}"
+    return ""
+
+
+def _torchmetrics_folder() -> Path:
+    package = importlib.util.find_spec("torchmetrics")
+    if package is None or not package.submodule_search_locations:
+        raise UnavailableError(
+            "LPIPS takes its linear layers from the package torchmetrics, which is not installed.",
+            "Install it: pip install torchmetrics.",
+        )
+    return Path(package.submodule_search_locations[0]) / "functional" / "image" / "lpips_models"
+
+
+def _read(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Tensor]:
+    found = read_weights(path, shapes)
+    return {name: torch.from_numpy(values).to(torch.float32) for name, values in found.items()}
