@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
-from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -15,12 +14,11 @@ from ..bench.contracts import ByteArray, FloatArray, FrameKey
 from ..bench.errors import InputError
 from ..bench.protocol import TASK_TITLES
 from .drawing import SheetSection, Tile, TilePlace, TileRow, colour_map, write_sheet
-from .runs import RunData
+from .runs import RunData, evenly_spaced
 
 FRAMES_PER_TASK = 3
 PANEL_WIDTH = 240
 NICE_SCALES = (2, 5, 10, 20, 50, 100, 255)
-Item = TypeVar("Item")
 
 
 def write_contact_sheet(run_folder: Path, frames_per_task: int = FRAMES_PER_TASK) -> list[Path]:
@@ -45,12 +43,6 @@ def write_contact_sheet(run_folder: Path, frames_per_task: int = FRAMES_PER_TASK
         scaled_by=[method for method in data.methods if method not in data.trivial],
     )
     return [data.folder.contact_sheet]
-
-
-def evenly_spaced(items: Sequence[Item], count: int) -> list[Item]:
-    """At most ``count`` items, each in the middle of its equal share of the sequence."""
-    count = min(count, len(items))
-    return [items[(2 * i + 1) * len(items) // (2 * count)] for i in range(count)]
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from ..bench.contracts import ByteArray, Clip, FrameKey
 from ..bench.errors import InputError
@@ -19,6 +19,8 @@ from ..bench.runner.options import RunOptions
 from ..bench.runner.scoring import FULL
 from ..bench.runner.store import RunFolder
 from ..bench.specs import MetricSpec
+
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True)
@@ -306,3 +308,9 @@ def _flat(value: Any, prefix: str = "") -> dict[str, str]:
             key: text for name, part in value.items() for key, text in _flat(part, f"{prefix}.{name}").items()
         }
     return {prefix: "+".join(map(str, value)) if isinstance(value, list) else str(value)}
+
+
+def evenly_spaced(items: Sequence[Item], count: int) -> list[Item]:
+    """At most ``count`` items, each in the middle of its equal share of the sequence."""
+    count = min(count, len(items))
+    return [items[(2 * i + 1) * len(items) // (2 * count)] for i in range(count)]

@@ -1,8 +1,8 @@
-"""Expressions beyond those of training: steps along the principal components of its coefficients."""
+"""``headbench extremes``: views between and beyond the training cameras, expressions along principal components."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -10,28 +10,21 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 
-from ...bench.contracts import Camera, Clip, FloatArray, FrameKey, HeadPose, Progress
-from ...bench.io.files import digest, write_json
-from ...bench.protocol import Protocol, make_trial_protocol
-from ...bench.rows import Rows
-from ...bench.runner.adaptation import MethodNeeds
+from ...bench.contracts import Clip, FloatArray, FrameKey, HeadPose, Progress
+from ...bench.io.files import digest
 from ...bench.runner.avatars import load
 from ...bench.runner.stages import Job
 from .command import ExtremesSettings
 from .stability import (
     EXPRESSION_LIMITS,
-    RECORD_FILE,
-    ROWS_FILE,
     VIEW_LIMITS,
-    Trial,
+    JudgedFrame,
+    RobustnessCase,
     cell_folder,
-    described,
     judge,
-    needs_of,
-    shoot,
+    render_measured,
+    run_cases,
     splats_of,
-    summary,
-    to_rows,
     typical,
     write_frame,
 )
@@ -72,8 +65,8 @@ class ExpressionComponents:
 
 
 @dataclass(frozen=True, eq=False)
-class Extreme:
-    """A pose to try: ``component`` counts from 1, 0 for the mean expression, and ``sigmas`` says how far along it."""
+class ExtremePose:
+    """A pose to render: ``component`` counts from 1, 0 for the mean expression, and ``sigmas`` says how far along it."""
 
     component: int
     sigmas: float
@@ -96,7 +89,7 @@ def typical_pose(poses: Sequence[HeadPose]) -> HeadPose:
     return poses[int(np.argmin(np.linalg.norm(expressions - expressions.mean(axis=0), axis=1)))]
 
 
-def extremes(clip: Clip, dimensions: int, sigmas: Sequence[float]) -> list[Extreme]:
+def extremes(clip: Clip, dimensions: int, sigmas: Sequence[float]) -> list[ExtremePose]:
     """The mean expression, then every step along every component; the rest of the pose stays the typical one's.
 
     Taken from training timesteps alone. Poses belong to no timestep, so that no avatar answers with tracking it
@@ -110,9 +103,9 @@ def extremes(clip: Clip, dimensions: int, sigmas: Sequence[float]) -> list[Extre
     def posed(expression: FloatArray) -> HeadPose:
         return replace(base, expression=expression.astype(dtype))
 
-    found = [Extreme(0, 0.0, posed(components.mean))]
+    found = [ExtremePose(0, 0.0, posed(components.mean))]
     for index in range(len(components.deviations)):
-        found += [Extreme(index + 1, float(s), posed(components.at(index, s))) for s in sigmas if s]
+        found += [ExtremePose(index + 1, float(s), posed(components.at(index, s))) for s in sigmas if s]
     return found
 
 
@@ -120,22 +113,22 @@ TASK: Literal["extremes"] = "extremes"
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
-    """What is tried on the avatars of one clip."""
+class ExtremesPlan:
+    """Views and expressions that the avatars of one clip are rendered with."""
 
     views: Sequence[Viewpoint]
-    extremes: Sequence[Extreme]
+    extremes: Sequence[ExtremePose]
     fingerprint: str
 
 
-def plan_extremes(clip: Clip, settings: ExtremesSettings) -> Plan:
+def plan_extremes(clip: Clip, settings: ExtremesSettings) -> ExtremesPlan:
     """Choose views and expressions for a clip, from its training frames alone."""
     cameras = [clip.cameras[name] for name in sorted({key.camera for key in clip.splits["train"]})]
     views = turntable(cameras, head_center(clip), settings.views, settings.beyond)
     wanted = extremes(clip, settings.dimensions, sorted(settings.sigmas))
     asked = (settings.views, settings.beyond, settings.dimensions, sorted(settings.sigmas))
     limits = (asdict(VIEW_LIMITS), asdict(EXPRESSION_LIMITS))
-    return Plan(views, wanted, digest(TASK, 1, clip.fingerprint, asked, limits)[:12])
+    return ExtremesPlan(views, wanted, digest(TASK, 1, clip.fingerprint, asked, limits)[:12])
 
 
 def head_center(clip: Clip) -> FloatArray:
@@ -149,7 +142,7 @@ def head_center(clip: Clip) -> FloatArray:
     return np.asarray(rotation @ (middle - joint) + joint + pose.translation)
 
 
-def on_sheet(plan: Plan, view: int, extreme: Extreme) -> bool:
+def on_sheet(plan: ExtremesPlan, view: int, extreme: ExtremePose) -> bool:
     """Whether the contact sheet shows this pair: in each view every step, along one component that turns with it."""
     components = max(e.component for e in plan.extremes)
     return extreme.component == 0 or extreme.component == view % components + 1
@@ -158,88 +151,50 @@ def on_sheet(plan: Plan, view: int, extreme: Extreme) -> bool:
 def try_extremes(
     jobs: Sequence[Job], settings: ExtremesSettings, out: Path, progress: Progress
 ) -> list[dict[str, Any]]:
-    """Render and judge every pair of view and expression; return a summary for each avatar.
+    """Render and judge every pair of view and expression; return the record of each avatar.
 
     Under ``out`` it leaves the rows, a record of views, limits and findings, and the frames that the contact
     sheet shows.
     """
-    plans = [plan_extremes(job.form.clip, settings) for job in jobs]
-    protocols = _protocols(jobs, plans)
-    total = sum(len(plan.views) * len(plan.extremes) for plan in plans)
-    done, rows, summaries, views = 0, [], [], []
-    for job, plan in zip(jobs, plans):
-        trials = _try(job, plan, cell_folder(out, job), _Offset(progress, done, total, job.name))
-        done += len(trials)
-        rows += to_rows(job, TASK, trials, protocols[needs_of(job)].hash)
-        summaries.append(summary(job, trials))
-        views.append([_described(view) for view in plan.views])
-    Rows.of(rows).write(out / ROWS_FILE)
-    record = {
-        "settings": asdict(settings),
-        "limits": {"views": asdict(VIEW_LIMITS), "expressions": asdict(EXPRESSION_LIMITS)},
-        "protocols": described(protocols.values()),
-        "avatars": [
-            {
-                **s,
-                "views": v,
-                "expressions": [e.name for e in p.extremes],
-                "protocol": protocols[needs_of(job)].hash,
-            }
-            for job, s, v, p in zip(jobs, summaries, views, plans)
+    cases = [_case(job, plan_extremes(job.form.clip, settings), out) for job in jobs]
+    limits = {"views": asdict(VIEW_LIMITS), "expressions": asdict(EXPRESSION_LIMITS)}
+    return run_cases(TASK, cases, settings, limits, out, progress)
+
+
+def _case(job: Job, plan: ExtremesPlan, out: Path) -> RobustnessCase:
+    details = {
+        "views": [
+            {"id": v.camera.id, "azimuth": round(v.azimuth, 2), "extrapolated": v.extrapolated}
+            for v in plan.views
         ],
+        "expressions": [extreme.name for extreme in plan.extremes],
     }
-    write_json(out / RECORD_FILE, record)
-    return summaries
+    return RobustnessCase(
+        job,
+        job.name,
+        [job.clip],
+        [_key(job, extreme, n, view) for n, extreme in enumerate(plan.extremes) for view in plan.views],
+        [(view.camera.width, view.camera.height) for view in plan.views],
+        (f"views and expressions of {job.clip.subject}", plan.fingerprint),
+        lambda report: (_judged(job, plan, cell_folder(out, job), report), details),
+    )
 
 
-def _protocols(jobs: Sequence[Job], plans: Sequence[Plan]) -> dict[MethodNeeds, Protocol]:
-    """The protocol of each form of the clips: all subjects, every pair of view and expression."""
-    protocols = {}
-    for needs in {needs_of(job): None for job in jobs}:
-        own = [(job, plan) for job, plan in zip(jobs, plans) if needs_of(job) == needs]
-        protocols[needs] = make_trial_protocol(
-            TASK,
-            [job.clip for job, _ in own],
-            (
-                _key(job, e, n, v)
-                for job, plan in own
-                for n, e in enumerate(plan.extremes)
-                for v in plan.views
-            ),
-            ((v.camera.width, v.camera.height) for _, plan in own for v in plan.views),
-            {f"views and expressions of {job.clip.subject}": plan.fingerprint for job, plan in own},
-        )
-    return protocols
-
-
-def _key(job: Job, extreme: Extreme, number: int, view: Viewpoint) -> FrameKey:
+def _key(job: Job, extreme: ExtremePose, number: int, view: Viewpoint) -> FrameKey:
     return FrameKey(job.clip.subject, extreme.name, number, view.camera.id)
 
 
-@dataclass(frozen=True)
-class _Offset:
-    """Progress of one part of a whole."""
-
-    progress: Progress
-    done: int
-    total: int
-    note: str
-
-    def __call__(self, done: int) -> None:
-        self.progress(self.done + done, self.total, self.note)
-
-
-def _try(job: Job, plan: Plan, folder: Path, report: _Offset) -> list[Trial]:
+def _judged(job: Job, plan: ExtremesPlan, folder: Path, report: Callable[[int], None]) -> list[JudgedFrame]:
     """The mean expression first, since it is the reference of all others in its view."""
     avatar, clip = load(job), job.form.clip
     background = [float(v) for v in clip.background]
-    trials: list[Trial] = []
+    frames: list[JudgedFrame] = []
     references = []
     for number, extreme in enumerate(plan.extremes):
         splats = splats_of(avatar, extreme.pose)
         measured = []
         for index, view in enumerate(plan.views):
-            frame, found = shoot(avatar, view.camera, extreme.pose, splats, background)
+            frame, found = render_measured(avatar, view.camera, extreme.pose, background, splats)
             measured.append(found)
             if on_sheet(plan, index, extreme):
                 write_frame(folder / f"{extreme.name}_{view.camera.id}.png", frame)
@@ -248,15 +203,9 @@ def _try(job: Job, plan: Plan, folder: Path, report: _Offset) -> list[Trial]:
             references = measured
             between = [m for m, view in zip(measured, plan.views) if not view.extrapolated]
             middle = typical(between or measured)
-            verdicts = [judge(m, middle, VIEW_LIMITS) for m in measured]
+            checks = [judge(m, middle, VIEW_LIMITS) for m in measured]
         else:
-            verdicts = [judge(m, r, EXPRESSION_LIMITS) for m, r in zip(measured, references)]
-        trials += [
-            Trial(_key(job, extreme, number, view), verdict) for view, verdict in zip(plan.views, verdicts)
-        ]
-    return trials
-
-
-def _described(view: Viewpoint) -> dict[str, Any]:
-    camera: Camera = view.camera
-    return {"id": camera.id, "azimuth": round(view.azimuth, 2), "extrapolated": view.extrapolated}
+            checks = [judge(m, r, EXPRESSION_LIMITS) for m, r in zip(measured, references)]
+        keys = [_key(job, extreme, number, view) for view in plan.views]
+        frames += [JudgedFrame(key, found) for key, found in zip(keys, checks)]
+    return frames

@@ -1,16 +1,15 @@
-"""How far a driven avatar's look stays its subject's own, where there is no ground truth and no licensed network.
+"""How far the appearance of a driven avatar stays its subject's own, without ground truth or a licensed network.
 
-The parts of a head that expressions do not move (scalp and hair, ears, temples, as far as the camera sees them) have to
+The parts of a head that expressions do not move (scalp and hair, ears, temples, as far as the camera sees them) should
 look as in the subject's recordings whoever drives the avatar. The tracked mesh says where they are: the colour at
 every such vertex is compared with the median colour at the same vertex over the subject's recorded frames in the same
-camera, and the mean CIEDE2000 difference over the vertices is the number: 0 is the very look, 1 just noticeable, the
-difference of two people's hair or skin above 10.
+camera. The mean CIEDE2000 difference over the vertices is the number: 0 is equal, 1 just noticeable, the difference of
+two people's hair or skin above 10.
 
-What it does not see: the face proper, whose look changes with expression; shape, but for its outline against other
-colours; a difference of people who look alike. It contains what the avatar lacks against recordings anyway, and the
-change of shading with the turn of the head; the same number of the subject's own recorded held-out performance
-(`own`) says how much that is, that of the driver's recordings against the target's look (`source`) what a complete
-exchange of identity would give.
+It does not see the face proper, whose appearance changes with expression; nor shape, but for its outline; nor people who
+look alike. It contains what the avatar lacks against recordings anyway and the change of shading with the head's
+rotation: the same number of the subject's own held-out recordings (`own`) says how much that is, that of the driver's
+recordings (`source`) what a complete exchange of identity would give.
 """
 
 from __future__ import annotations
@@ -37,9 +36,9 @@ from ...bench.contracts import (
 )
 from ...bench.io.frames import quantise
 from .extremes import training_poses
-from .stability import Verdict
+from .stability import LimitCheck
 
-STILL_M = 0.0005
+STEADY_M = 0.0005
 """A vertex that training expressions move by less (one standard deviation of each) counts as unmoved."""
 RIGID_WEIGHT = 0.99
 FACING = 0.35
@@ -47,13 +46,13 @@ FACING = 0.35
 SMOOTHING = 0.01
 """Deviation of the Gaussian that images are smoothed by, as a share of the head's height in the image."""
 LEAST_VERTICES = 20
-NO_LOOK = "no recorded frames of that camera, or no parts that expressions leave alone, to compare with"
+NO_APPEARANCE = "no recorded frames of that camera, or no parts that expressions leave alone, to compare with"
 HIDDEN = ("teeth", "tongue", "eyeball", "lips", "mouth")
 """Regions by part of their name that lie behind others, or open and close over them."""
 
 
 @dataclass(frozen=True, eq=False)
-class SteadyParts:
+class RigidVertices:
     """The vertices of a clip's head that follow its rigid motion alone, in the rest pose.
 
     Attributes
@@ -70,13 +69,13 @@ class SteadyParts:
     neck: FloatArray
 
     @classmethod
-    def of(cls, clip: Clip) -> SteadyParts:
+    def of(cls, clip: Clip) -> RigidVertices:
         """Find them from the head model and the training expressions."""
         expressions = [pose.expression for pose in training_poses(clip)]
         return cls.at(clip, np.flatnonzero(_steady(clip.head, expressions)))
 
     @classmethod
-    def at(cls, clip: Clip, indices: IntArray) -> SteadyParts:
+    def at(cls, clip: Clip, indices: IntArray) -> RigidVertices:
         """Those at given vertices."""
         head = clip.head
         coefficients = np.asarray(clip.shape, np.float64)
@@ -95,14 +94,14 @@ class SteadyParts:
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class Appearance:
     """The colours of a subject's steady parts in one camera; Lab, (N, 3), not a number where none was seen."""
 
-    parts: SteadyParts
+    parts: RigidVertices
     colours: FloatArray
 
     @classmethod
-    def recorded(cls, clip: Clip, camera: str, count: int) -> Look | None:
+    def recorded(cls, clip: Clip, camera: str, count: int) -> Appearance | None:
         """The median over up to ``count`` recorded frames of training timesteps; None where the camera has too few."""
         keys = sorted(
             key
@@ -110,7 +109,7 @@ class Look:
             for key in clip.splits.get(split, ())
             if key.camera == camera
         )
-        parts = SteadyParts.of(clip)
+        parts = RigidVertices.of(clip)
         if not keys or len(parts.indices) < LEAST_VERTICES:
             return None
         seen = np.array([colours_of(clip, parts, key) for key in keys[:: max(1, len(keys) // count)]])
@@ -127,25 +126,25 @@ class Look:
         return float(deltaE_ciede2000(self.colours[both], colours[both]).mean())
 
 
-def identity(look: Look | None, frame: Frame, camera: Camera, pose: HeadPose) -> Verdict:
+def identity(appearance: Appearance | None, frame: Frame, camera: Camera, pose: HeadPose) -> LimitCheck:
     """The identity of a driven frame, without a limit: how much is too much depends on who drives whom."""
-    if look is None or not np.isfinite(frame.rgb).all():
-        absent = "not finite" if look is not None else NO_LOOK
-        return Verdict("identity", None, 0.0, math.inf, absent)
-    value = look.difference(sample(quantise(frame.rgb), camera, *look.parts.posed(pose)))
-    return Verdict("identity", value, 0.0, math.inf, "too little of the steady parts is seen")
+    if appearance is None or not np.isfinite(frame.rgb).all():
+        absent = "not finite" if appearance is not None else NO_APPEARANCE
+        return LimitCheck("identity", None, 0.0, math.inf, absent)
+    value = appearance.difference(sample(quantise(frame.rgb), camera, *appearance.parts.posed(pose)))
+    return LimitCheck("identity", value, 0.0, math.inf, "too little of the steady parts is seen")
 
 
-def of_recording(look: Look, clip: Clip, keys: Sequence[FrameKey], count: int) -> float | None:
+def of_recording(appearance: Appearance, clip: Clip, keys: Sequence[FrameKey], count: int) -> float | None:
     """Mean identity of recorded frames of any subject, up to ``count`` of them; None where none has it.
 
-    The vertices are the look's, where this clip's head has them.
+    The vertices are those of ``appearance``, where this clip's head has them.
     """
-    if not keys or len(clip.head.template) <= look.parts.indices.max():
+    if not keys or len(clip.head.template) <= appearance.parts.indices.max():
         return None
-    parts = SteadyParts.at(clip, look.parts.indices)
+    parts = RigidVertices.at(clip, appearance.parts.indices)
     chosen = keys[:: max(1, len(keys) // count)]
-    return mean_known([look.difference(colours_of(clip, parts, key)) for key in chosen])
+    return mean_known([appearance.difference(colours_of(clip, parts, key)) for key in chosen])
 
 
 def mean_known(values: Sequence[float | None]) -> float | None:
@@ -154,7 +153,7 @@ def mean_known(values: Sequence[float | None]) -> float | None:
     return float(np.mean(known)) if known else None
 
 
-def colours_of(clip: Clip, parts: SteadyParts, key: FrameKey) -> FloatArray:
+def colours_of(clip: Clip, parts: RigidVertices, key: FrameKey) -> FloatArray:
     """(N, 3) Lab colours of a clip's steady parts in a recorded frame."""
     return sample(clip.image(key), clip.cameras[key.camera], *parts.posed(clip.poses[key.timestep]))
 
@@ -186,7 +185,7 @@ def _steady(head: HeadAsset, expressions: Sequence[FloatArray]) -> BoolArray:
     """(V,) whether a vertex is neither moved by expressions nor by jaw and eyes, and lies open to sight."""
     deviations = np.std(np.asarray(expressions, np.float64), axis=0)
     basis = head.expression_basis[..., : len(deviations)]
-    steady: BoolArray = np.linalg.norm(basis * deviations, axis=(1, 2)) < STILL_M
+    steady: BoolArray = np.linalg.norm(basis * deviations, axis=(1, 2)) < STEADY_M
     steady &= head.skinning_weights[:, 1] >= RIGID_WEIGHT
     for name, indices in head.regions.items():
         if any(part in name for part in HIDDEN):

@@ -1,8 +1,8 @@
-"""Another subject's motion carried over to a target: expression as it is, rigid motion about the target's own mean."""
+"""``headbench reenact``: avatars of one subject driven with the held-out performance of another."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -12,33 +12,26 @@ import numpy as np
 
 from ...bench.contracts import Avatar, Camera, Clip, FloatArray, FrameKey, HeadAsset, HeadPose, Progress
 from ...bench.errors import InputError
-from ...bench.io.files import digest, write_json
+from ...bench.io.files import digest
 from ...bench.io.frames import write_png
-from ...bench.protocol import Protocol, make_trial_protocol
-from ...bench.rows import Rows
-from ...bench.runner.adaptation import MethodNeeds
 from ...bench.runner.avatars import load
 from ...bench.runner.captures import open_clips, run_configuration
 from ...bench.runner.run import adapt, make_jobs
 from ...bench.runner.stages import Job
 from ...bench.runner.store import RunFolder
+from ..runs import evenly_spaced
 from .command import ReenactSettings
 from .extremes import training_poses
-from .identity import Look, identity, mean_known, of_recording
+from .identity import Appearance, identity, mean_known, of_recording
 from .stability import (
-    RECORD_FILE,
-    ROWS_FILE,
+    JudgedFrame,
     Limits,
     Measures,
-    Trial,
+    RobustnessCase,
     cell_folder,
-    described,
     judge,
-    needs_of,
-    shoot,
-    splats_of,
-    summary,
-    to_rows,
+    render_measured,
+    run_cases,
     typical,
     write_frame,
 )
@@ -46,7 +39,7 @@ from .stability import (
 
 @dataclass(frozen=True, eq=False)
 class RigidMean:
-    """Where a subject's head rests: mean rotation and neck rotation, (3, 3) each, and mean translation, metres."""
+    """A subject's mean head pose: mean rotation and neck rotation, (3, 3) each, and mean translation, metres."""
 
     rotation: FloatArray
     neck: FloatArray
@@ -63,7 +56,7 @@ class RigidMean:
 
 
 def retarget(pose: HeadPose, source: RigidMean, target: RigidMean, subject: str) -> HeadPose:
-    """Carry a pose of the source over to the target.
+    """Retarget a pose of the source to the target.
 
     The head turns and moves, seen from its own mean pose, as the source's does from its own, so that the axes of
     the two captures need not agree. Expression, jaw, eyes and eyelids are kept. The pose belongs to no timestep.
@@ -85,7 +78,7 @@ def check_heads(source: HeadAsset, target: HeadAsset, where: str) -> None:
     """Raise `InputError` where the source's coefficients mean nothing to the target's head model."""
     ours, theirs = (f"{h.version}, {h.expression_basis.shape[2]} expressions" for h in (target, source))
     if ours != theirs:
-        remedy = "Carry the source over to the target's head model first: headbench refit."
+        remedy = "Re-fit the source to the target's head model first: headbench refit."
         raise InputError(where, "head model", ours, theirs, remedy)
 
 
@@ -109,8 +102,8 @@ LIMITS = Limits(coverage=(0.67, 1.5), translucent_rise=0.15)
 
 
 @dataclass(frozen=True, eq=False)
-class Drive:
-    """One avatar and who drives it, both in the form that the method takes; ``keys``: one frame a timestep."""
+class Driven:
+    """One avatar and the source that drives it, both in the form that the method takes; ``keys``: one frame a timestep."""
 
     job: Job
     source: Job
@@ -124,13 +117,13 @@ class Drive:
         return digest(TASK, 1, clips, self.camera.id, [str(key) for key in self.keys], asdict(LIMITS))[:12]
 
 
-def plan_reenactment(jobs: Sequence[Job], settings: ReenactSettings) -> list[Drive]:
+def plan_reenactment(jobs: Sequence[Job], settings: ReenactSettings) -> list[Driven]:
     """Pair every avatar with every other subject that can drive it.
 
     Raises `InputError` where there is no other subject, one has no held-out performance, the head models differ,
     or the camera is not there.
     """
-    drives = []
+    pairs = []
     sources = _sources(jobs, settings)
     for job in jobs:
         clip = job.form.clip
@@ -140,110 +133,87 @@ def plan_reenactment(jobs: Sequence[Job], settings: ReenactSettings) -> list[Dri
             if source.clip.subject == job.clip.subject or not same_method:
                 continue
             check_heads(source.form.clip.head, clip.head, f"source {source.clip.subject}")
-            drives.append(Drive(job, source, camera, _performance(source.clip, camera.id, settings.frames)))
-    if not drives:
+            pairs.append(Driven(job, source, camera, _performance(source.clip, camera.id, settings.frames)))
+    if not pairs:
         found = ", ".join(sorted({job.clip.subject for job in jobs}))
         remedy = "Name a capture of another subject with --source."
         raise InputError(settings.run, "subjects", "another subject to drive with", f"{found} alone", remedy)
-    return drives
+    return pairs
 
 
 def reenact(
     jobs: Sequence[Job], settings: ReenactSettings, out: Path, progress: Progress
 ) -> list[dict[str, Any]]:
-    """Render and judge every avatar driven by every other subject; return a summary for each pair.
+    """Render and judge every avatar driven by every other subject; return the record of each pair.
 
     Under ``out`` it leaves the frames, those of the source beside them, the rows, and a record.
     """
-    drives = plan_reenactment(jobs, settings)
-    protocols = _protocols(drives)
-    total = sum(len(drive.keys) for drive in drives)
-    rows, summaries, done = [], [], 0
-    for drive in drives:
-        look = Look.recorded(drive.job.form.clip, drive.camera.id, REFERENCE_FRAMES)
-        trials, frames = _drive(drive, look, out, progress, done, total)
-        done += len(trials)
-        protocol = protocols[needs_of(drive.job)].hash
-        rows += to_rows(drive.job, TASK, trials, protocol)
-        found = summary(drive.job, trials)
-        summaries.append({**found, "source": drive.source.clip.subject, "protocol": protocol})
-        summaries[-1]["identity"] = _identity(drive, look, trials)
-        summaries[-1]["shown"] = frames
-    Rows.of(rows).write(out / ROWS_FILE)
-    record = {
-        "settings": asdict(settings),
-        "limits": asdict(LIMITS),
-        "protocols": described(protocols.values()),
-        "avatars": summaries,
-    }
-    write_json(out / RECORD_FILE, record)
-    return summaries
+    cases = [_case(driven, out) for driven in plan_reenactment(jobs, settings)]
+    return run_cases(TASK, cases, settings, asdict(LIMITS), out, progress)
 
 
-def _protocols(drives: Sequence[Drive]) -> dict[MethodNeeds, Protocol]:
-    """The protocol of each form of the clips: every target with every source."""
-    protocols = {}
-    for needs in {needs_of(drive.job): None for drive in drives}:
-        own = [drive for drive in drives if needs_of(drive.job) == needs]
-        protocols[needs] = make_trial_protocol(
-            TASK,
-            [clip for drive in own for clip in (drive.job.clip, drive.source.clip)],
-            (_target(drive, key) for drive in own for key in drive.keys),
-            ((drive.camera.width, drive.camera.height) for drive in own),
-            {f"{d.source.clip.subject} drives {d.job.clip.subject}": d.fingerprint for d in own},
-        )
-    return protocols
+def _case(driven: Driven, out: Path) -> RobustnessCase:
+    target, source = driven.job.clip, driven.source.clip
+    return RobustnessCase(
+        driven.job,
+        f"{driven.job.name} driven by {source.subject}",
+        [target, source],
+        [_target(driven, key) for key in driven.keys],
+        [(driven.camera.width, driven.camera.height)],
+        (f"{source.subject} drives {target.subject}", driven.fingerprint),
+        lambda report: _judged(driven, out, report),
+    )
 
 
-def _target(drive: Drive, key: FrameKey) -> FrameKey:
-    return FrameKey(drive.job.clip.subject, f"{key.subject}/{key.sequence}", key.timestep, drive.camera.id)
+def _target(driven: Driven, key: FrameKey) -> FrameKey:
+    sequence = f"{key.subject}/{key.sequence}"
+    return FrameKey(driven.job.clip.subject, sequence, key.timestep, driven.camera.id)
 
 
-def _identity(drive: Drive, look: Look | None, trials: Sequence[Trial]) -> dict[str, float | None] | None:
-    """Mean identity of the driven frames, between that of the subject's and that of the source's own recordings."""
-    if look is None:
-        return None
-    target, source = drive.job.form.clip, drive.source.form.clip
-    own = [key for key in target.splits.get("self_reenactment", ()) if key.camera == drive.camera.id]
-    theirs = [drive.source.form.key(key) for key in drive.keys]
-    return {
-        "driven": mean_known(
-            [v.value for trial in trials for v in trial.verdicts if v.measure == "identity"]
-        ),
-        "own": of_recording(look, target, own, REFERENCE_FRAMES),
-        "source": of_recording(look, source, theirs, REFERENCE_FRAMES),
-    }
-
-
-def _drive(
-    drive: Drive, look: Look | None, out: Path, progress: Progress, done: int, total: int
-) -> tuple[list[Trial], list[dict[str, Any]]]:
-    job, source, camera = drive.job, drive.source, drive.camera
+def _judged(
+    driven: Driven, out: Path, report: Callable[[int], None]
+) -> tuple[list[JudgedFrame], dict[str, Any]]:
+    job, source, camera = driven.job, driven.source, driven.camera
+    appearance = Appearance.recorded(job.form.clip, camera.id, REFERENCE_FRAMES)
     avatar, clip = load(job), job.form.clip
     background = [float(v) for v in clip.background]
     reference = _reference(avatar, clip, camera, background)
     means = RigidMean.of(training_poses(source.form.clip)), RigidMean.of(training_poses(clip))
-    trials, frames = [], []
-    for index, key in enumerate(drive.keys):
+    frames, shown = [], []
+    for index, key in enumerate(driven.keys):
         driver = source.form.clip.poses[source.form.key(key).timestep]
         pose = retarget(driver, *means, job.clip.subject)
-        frame, found = shoot(avatar, camera, pose, splats_of(avatar, pose), background)
-        target = _target(drive, key)
+        frame, found = render_measured(avatar, camera, pose, background)
+        target = _target(driven, key)
         name = f"{key.subject}_{key.sequence}_{key.timestep:05d}"
-        driven = cell_folder(out, job) / f"{name}_{camera.id}.png"
+        rendered = cell_folder(out, job) / f"{name}_{camera.id}.png"
         original = out / "sources" / f"{name}_{key.camera}.png"
-        write_frame(driven, frame)
+        write_frame(rendered, frame)
         write_png(original, source.clip.image(key))
-        trials.append(Trial(target, [*judge(found, reference, LIMITS), identity(look, frame, camera, pose)]))
-        frames.append(
-            {
-                "key": str(target),
-                "source": original.relative_to(out).as_posix(),
-                "driven": driven.relative_to(out).as_posix(),
-            }
-        )
-        progress(done + index + 1, total, f"{job.name} driven by {key.subject}")
-    return trials, frames
+        checks = [*judge(found, reference, LIMITS), identity(appearance, frame, camera, pose)]
+        frames.append(JudgedFrame(target, checks))
+        places = {"source": original, "driven": rendered}
+        shown.append({"key": str(target), **{n: p.relative_to(out).as_posix() for n, p in places.items()}})
+        report(index + 1)
+    details = {"identity": _identity(driven, appearance, frames), "shown": shown}
+    return frames, {"source": source.clip.subject, **details}
+
+
+def _identity(
+    driven: Driven, appearance: Appearance | None, frames: Sequence[JudgedFrame]
+) -> dict[str, float | None] | None:
+    """Mean identity of the driven frames, between that of the subject's and that of the source's own recordings."""
+    if appearance is None:
+        return None
+    target, source = driven.job.form.clip, driven.source.form.clip
+    own = [key for key in target.splits.get("self_reenactment", ()) if key.camera == driven.camera.id]
+    theirs = [driven.source.form.key(key) for key in driven.keys]
+    values = [check.value for frame in frames for check in frame.checks if check.measure == "identity"]
+    return {
+        "driven": mean_known(values),
+        "own": of_recording(appearance, target, own, REFERENCE_FRAMES),
+        "source": of_recording(appearance, source, theirs, REFERENCE_FRAMES),
+    }
 
 
 def _reference(avatar: Avatar, clip: Clip, camera: Camera, background: Sequence[float]) -> Measures:
@@ -251,7 +221,7 @@ def _reference(avatar: Avatar, clip: Clip, camera: Camera, background: Sequence[
     poses = training_poses(clip)
     chosen = poses[:: max(1, len(poses) // REFERENCE_FRAMES)]
     free = [replace(pose, timestep=None) for pose in chosen]
-    return typical([shoot(avatar, camera, pose, splats_of(avatar, pose), background)[1] for pose in free])
+    return typical([render_measured(avatar, camera, pose, background)[1] for pose in free])
 
 
 def _sources(jobs: Sequence[Job], settings: ReenactSettings) -> list[Job]:
@@ -286,6 +256,4 @@ def _performance(clip: Clip, camera: str, count: int | None) -> list[FrameKey]:
     keys = [chosen[timestep] for timestep in sorted(chosen)]
     if not keys:
         raise InputError(f"clip {clip.subject}", "splits.self_reenactment", "at least one frame", "none")
-    if count is None or count >= len(keys):
-        return keys
-    return [keys[(2 * i + 1) * len(keys) // (2 * count)] for i in range(count)]
+    return keys if count is None else evenly_spaced(keys, count)

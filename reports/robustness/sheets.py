@@ -12,8 +12,8 @@ import cv2
 from ...bench.errors import InputError
 from ...bench.io.documents import read_json
 from ...bench.io.frames import read_png
-from ..contact_sheet import evenly_spaced
 from ..drawing import SheetSection, Tile, TileRow, write_sheet
+from ..runs import evenly_spaced
 from .stability import RECORD_FILE, SHEET_FILE
 
 EXTRAPOLATED, BROKEN = "#e88714", "#cd142d"

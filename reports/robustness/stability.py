@@ -1,4 +1,4 @@
-"""How steady an avatar stays where there is no ground truth: measures of one frame, and limits to them.
+"""Robustness tests without ground truth: measures of one frame, limits to them, and what a test leaves on disk.
 
 Every limit is relative to a frame of the same avatar that is not extreme, so that hair, which is translucent, or a
 low resolution, whose edges are, does not count against it.
@@ -7,17 +7,18 @@ low resolution, whose edges are, does not count against it.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ...bench.contracts import Avatar, Camera, FloatArray, Frame, FrameKey, HeadPose
+from ...bench.contracts import Avatar, Camera, Clip, FloatArray, Frame, FrameKey, HeadPose, Progress
+from ...bench.io.files import write_json
 from ...bench.io.frames import quantise, write_png
-from ...bench.protocol import Protocol
-from ...bench.rows import Row
+from ...bench.protocol import Protocol, TrialName, make_trial_protocol
+from ...bench.rows import Row, Rows
 from ...bench.runner.adaptation import MethodNeeds
 from ...bench.runner.scoring import FULL
 from ...bench.runner.stages import Job
@@ -79,7 +80,7 @@ VIEW_LIMITS = Limits(coverage=(0.5, 2.0), translucent_rise=0.2)
 
 
 @dataclass(frozen=True)
-class Verdict:
+class LimitCheck:
     """One measure of one frame and its limits. ``value`` is None where it cannot be measured, ``absent`` says why."""
 
     measure: str
@@ -151,19 +152,19 @@ def typical(measures: Sequence[Measures]) -> Measures:
     )
 
 
-def judge(found: Measures, reference: Measures, limits: Limits) -> list[Verdict]:
-    """Hold a frame to its limits; one verdict a measure, in the order of `MEASURES`.
+def judge(found: Measures, reference: Measures, limits: Limits) -> list[LimitCheck]:
+    """Compare a frame with its limits; one check a measure, in the order of `MEASURES`.
 
     Coverage and mean opacity are given as ratios to the reference. A reference that shows nothing makes the ratio
     infinite, or 1 where the frame shows nothing either.
     """
     largest = max(limits.splat_share, limits.splat_growth * (reference.largest_splat or 0.0))
     return [
-        Verdict("non_finite", found.non_finite, 0.0, 0.0),
-        Verdict("coverage", _ratio(found.coverage, reference.coverage), *limits.coverage),
-        Verdict("translucent", found.translucent, 0.0, reference.translucent + limits.translucent_rise),
-        Verdict("largest_splat", found.largest_splat, 0.0, largest),
-        Verdict("mean_opacity", _ratio(found.mean_opacity, reference.mean_opacity), *limits.opacity),
+        LimitCheck("non_finite", found.non_finite, 0.0, 0.0),
+        LimitCheck("coverage", _ratio(found.coverage, reference.coverage), *limits.coverage),
+        LimitCheck("translucent", found.translucent, 0.0, reference.translucent + limits.translucent_rise),
+        LimitCheck("largest_splat", found.largest_splat, 0.0, largest),
+        LimitCheck("mean_opacity", _ratio(found.mean_opacity, reference.mean_opacity), *limits.opacity),
     ]
 
 
@@ -184,30 +185,97 @@ ROWS_FILE, RECORD_FILE, SHEET_FILE = "rows.parquet", "record.json", "contact_she
 
 
 @dataclass(frozen=True)
-class Trial:
-    """A judged frame. ``key`` names pose and view; verdicts stand in the order of `stability.MEASURES`, further ones after."""
+class JudgedFrame:
+    """A rendered frame; ``checks`` stand in the order of `MEASURES`, further ones after."""
 
     key: FrameKey
-    verdicts: Sequence[Verdict]
+    checks: Sequence[LimitCheck]
 
     @property
-    def broken(self) -> list[Verdict]:
+    def broken(self) -> list[LimitCheck]:
         """The limits that do not hold."""
-        return [verdict for verdict in self.verdicts if not verdict.passed]
+        return [check for check in self.checks if not check.passed]
+
+
+@dataclass(frozen=True, eq=False)
+class RobustnessCase:
+    """One avatar and the frames that it is rendered for.
+
+    Attributes
+    ----------
+    job : the avatar's cell.
+    name : for the progress.
+    clips, keys, sizes : of the protocol: captures that take part, frames, sizes of images (width, height).
+    condition : of the protocol: what is rendered in words, and a fingerprint of it.
+    render : renders and judges all frames and reports how many are done; also returns entries of the record.
+    """
+
+    job: Job
+    name: str
+    clips: Sequence[Clip]
+    keys: Sequence[FrameKey]
+    sizes: Sequence[tuple[int, int]]
+    condition: tuple[str, str]
+    render: Callable[[Callable[[int], None]], tuple[list[JudgedFrame], dict[str, Any]]]
+
+
+def run_cases(
+    task: TrialName,
+    cases: Sequence[RobustnessCase],
+    settings: Any,
+    limits: Any,
+    out: Path,
+    progress: Progress,
+) -> list[dict[str, Any]]:
+    """Render and judge all cases; leave rows and a record under ``out``, and return the record of each avatar."""
+    # Avatars of methods with equal needs are shown the same frames, and so share a protocol.
+    protocols: dict[MethodNeeds, Protocol] = {}
+    for needs in {_needs(case): None for case in cases}:
+        own = [case for case in cases if _needs(case) == needs]
+        protocols[needs] = make_trial_protocol(
+            task,
+            [clip for case in own for clip in case.clips],
+            [key for case in own for key in case.keys],
+            [size for case in own for size in case.sizes],
+            dict(case.condition for case in own),
+        )
+    done, total = 0, sum(len(case.keys) for case in cases)
+    rows: list[Row] = []
+    avatars = []
+    for case in cases:
+        frames, details = case.render(lambda n, done=done, name=case.name: progress(done + n, total, name))  # type: ignore[misc]
+        done += len(frames)
+        protocol = protocols[_needs(case)].hash
+        rows += to_rows(case.job, task, frames, protocol)
+        avatars.append({**summary(case.job, frames), **details, "protocol": protocol})
+    Rows.of(rows).write(out / ROWS_FILE)
+    by_hash = sorted({protocol.hash: protocol for protocol in protocols.values()}.items())
+    record = {
+        "settings": asdict(settings),
+        "limits": limits,
+        "protocols": [{"id": p.id, "hash": name, **asdict(p)} for name, p in by_hash],
+        "avatars": avatars,
+    }
+    write_json(out / RECORD_FILE, record)
+    return avatars
+
+
+def _needs(case: RobustnessCase) -> MethodNeeds:
+    return MethodNeeds.of(case.job.method.spec)
+
+
+def render_measured(
+    avatar: Avatar, camera: Camera, pose: HeadPose, background: Sequence[float], splats: Any = None
+) -> tuple[Frame, Measures]:
+    """Render a frame and measure it, with the ``splats`` of that pose where they are known."""
+    frame = avatar.render(camera, pose, background)
+    return frame, measure(frame, camera, splats_of(avatar, pose) if splats is None else splats)
 
 
 def splats_of(avatar: Avatar, pose: HeadPose) -> Any:
     """Splats of a pose where the avatar is one of splats, else None."""
     give = getattr(avatar, "splats", None)
     return None if give is None else give(pose)
-
-
-def shoot(
-    avatar: Avatar, camera: Camera, pose: HeadPose, splats: Any, background: Sequence[float]
-) -> tuple[Frame, Measures]:
-    """Render a frame and measure it."""
-    frame = avatar.render(camera, pose, background)
-    return frame, measure(frame, camera, splats)
 
 
 def write_frame(path: Path, frame: Frame) -> None:
@@ -223,29 +291,26 @@ def cell_folder(root: Path, job: Job) -> Path:
     return root / job.clip.subject / job.method.spec.name / f"seed-{job.seed}"
 
 
-def to_rows(job: Job, task: str, trials: Sequence[Trial], protocol: str) -> list[Row]:
+def to_rows(job: Job, task: str, frames: Sequence[JudgedFrame], protocol: str) -> list[Row]:
     """Rows as every measurement leaves them; a broken limit has status "failed" and says which."""
     rows = []
-    for trial in trials:
-        for verdict in trial.verdicts:
+    for frame in frames:
+        for check in frame.checks:
             status, reason = "ok", ""
-            if verdict.value is None:
-                status, reason = "missing", verdict.absent
-            elif not verdict.passed:
-                status, reason = "failed", str(verdict)
+            if check.value is None:
+                status, reason = "missing", check.absent
+            elif not check.passed:
+                status, reason = "failed", str(check)
             rows.append(
                 Row(
                     method=job.method.spec.name,
                     version=job.method.spec.version,
                     seed=job.seed,
                     task=task,
-                    subject=trial.key.subject,
-                    sequence=trial.key.sequence,
-                    timestep=trial.key.timestep,
-                    camera=trial.key.camera,
+                    **frame.key._asdict(),
                     region=FULL,
-                    metric=verdict.measure,
-                    value=math.nan if verdict.value is None else verdict.value,
+                    metric=check.measure,
+                    value=math.nan if check.value is None else check.value,
                     protocol=protocol,
                     status=status,
                     reason=reason,
@@ -254,33 +319,19 @@ def to_rows(job: Job, task: str, trials: Sequence[Trial], protocol: str) -> list
     return rows
 
 
-def summary(job: Job, trials: Sequence[Trial]) -> dict[str, Any]:
-    """What a trial of one avatar found: frames, frames outside limits, and the extremes of every measure."""
-    broken = [trial for trial in trials if trial.broken]
-    ranges: Mapping[str, tuple[float | None, float | None]] = {
-        verdicts[0].measure: _range([v.value for v in verdicts])
-        for verdicts in zip(*(t.verdicts for t in trials))
-    }
+def summary(job: Job, frames: Sequence[JudgedFrame]) -> dict[str, Any]:
+    """How many frames of an avatar there are, which break limits, and the range of every measure."""
+    broken = [frame for frame in frames if frame.broken]
+    by_measure = zip(*(frame.checks for frame in frames))
     return {
         "subject": job.clip.subject,
         "method": job.method.spec.name,
         "seed": job.seed,
-        "frames": len(trials),
+        "frames": len(frames),
         "frames_broken": len(broken),
-        "ranges": ranges,
-        "broken": [{"key": str(t.key), "limits": [str(v) for v in t.broken]} for t in broken],
+        "ranges": {checks[0].measure: _range([check.value for check in checks]) for checks in by_measure},
+        "broken": [{"key": str(f.key), "limits": [str(check) for check in f.broken]} for f in broken],
     }
-
-
-def described(protocols: Iterable[Protocol]) -> list[dict[str, Any]]:
-    """What a record says of the protocols that its rows name, each once."""
-    by_hash = {protocol.hash: protocol for protocol in protocols}
-    return [{"id": p.id, "hash": name, **asdict(p)} for name, p in sorted(by_hash.items())]
-
-
-def needs_of(job: Job) -> MethodNeeds:
-    """Cells of equal needs are shown the same frames, and so share a protocol."""
-    return MethodNeeds.of(job.method.spec)
 
 
 def _range(values: Sequence[float | None]) -> tuple[float | None, float | None]:
@@ -307,10 +358,8 @@ def table(summaries: Sequence[Mapping[str, Any]]) -> str:
             + " ".join(f"{text:>13}" for text in shown)
         )
         if s.get("identity") is not None:
-            told = ", ".join(
-                f"{name} {value:.1f}" for name, value in s["identity"].items() if value is not None
-            )
-            lines.append(f"  colour difference from the subject's own look (CIEDE2000): {told}")
+            known = [f"{name} {value:.1f}" for name, value in s["identity"].items() if value is not None]
+            lines.append(f"  colour difference from the subject's recordings (CIEDE2000): {', '.join(known)}")
         lines += [f"  {b['key']}: {'; '.join(b['limits'])}" for b in s["broken"][:5]]
         if len(s["broken"]) > 5:
             lines.append(f"  and {len(s['broken']) - 5} more; all are in {RECORD_FILE}")

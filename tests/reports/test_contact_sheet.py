@@ -5,8 +5,9 @@ from matplotlib.colors import to_rgb
 from PIL import Image
 
 from headbench.bench.errors import InputError
-from headbench.reports.contact_sheet import ComparedFrame, contact_sheet, evenly_spaced
+from headbench.reports.contact_sheet import ComparedFrame, contact_sheet
 from headbench.reports.drawing import BOX, SheetSection, Tile, TileRow, colour_map, write_sheet
+from headbench.reports.runs import evenly_spaced
 
 
 def picture(seed, height=90, width=60):

@@ -13,8 +13,8 @@ from headbench.bench.rows import Rows
 from headbench.bench.runner.store import RunFolder
 from headbench.bench.specs import ReportSpec
 from headbench.reports import specs
-from headbench.reports.contact_sheet import evenly_spaced, write_contact_sheet
-from headbench.reports.runs import RunData, RunSet
+from headbench.reports.contact_sheet import write_contact_sheet
+from headbench.reports.runs import RunData, RunSet, evenly_spaced
 from headbench.reports.table_report import layouts, table_of, table_text, write_tables
 
 

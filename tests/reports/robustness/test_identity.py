@@ -9,7 +9,14 @@ import torch
 
 from headbench.bench.contracts import Camera, Frame, FrameKey, HeadPose
 from headbench.datasets.head.model import HeadModel
-from headbench.reports.robustness.identity import NO_LOOK, Look, SteadyParts, identity, of_recording, sample
+from headbench.reports.robustness.identity import (
+    NO_APPEARANCE,
+    Appearance,
+    RigidVertices,
+    identity,
+    of_recording,
+    sample,
+)
 from headbench.reports.robustness.viewpoints import look_at
 
 RADIUS, SIDE = 0.1, 96
@@ -124,7 +131,7 @@ def globe():
 
 @pytest.fixture(scope="module")
 def look(globe):
-    return Look.recorded(globe, "c", 12)
+    return Appearance.recorded(globe, "c", 12)
 
 
 def value(look, globe, pose):
@@ -132,7 +139,7 @@ def value(look, globe, pose):
 
 
 def test_the_parts_are_those_that_nothing_moves(globe):
-    steady = SteadyParts.of(globe).indices
+    steady = RigidVertices.of(globe).indices
     assert (sphere()[0][steady, 2] <= 0.8).all()
     assert (steady >= 30).all()  # the teeth
     assert len(steady) > 500
@@ -149,7 +156,7 @@ def test_the_own_look_stays_near_whatever_pose_and_expression(globe, look, rotat
 
 def test_another_persons_look_is_far_for_both_subjects(globe, look):
     other = Globe("dark", dark)
-    others = Look.recorded(other, "c", 12)
+    others = Appearance.recorded(other, "c", 12)
     pose = posed("fair", [0, 0.2, 0])
     own, swapped = value(look, globe, pose), value(look, other, pose)
     assert swapped > 10 > 3 * own
@@ -175,7 +182,7 @@ def test_recordings_of_the_subject_are_near_and_others_far(globe, look):
 
 
 def test_what_the_camera_does_not_see_has_no_colour(globe):
-    parts = SteadyParts.of(globe)
+    parts = RigidVertices.of(globe)
     points, normals = parts.posed(posed("fair", [0, 0, 0]))
     colours = sample(np.zeros((SIDE, SIDE, 3), np.uint8), globe.camera, points, normals)
     seen = np.isfinite(colours).all(axis=1)
@@ -191,10 +198,10 @@ def test_what_cannot_be_compared_has_no_value_and_says_why(globe, look):
     pose = posed("fair", [0, 0, 0])
     frame = globe.shown(pose)
     none = identity(None, frame, globe.camera, pose)
-    assert (none.value, none.absent) == (None, NO_LOOK)
+    assert (none.value, none.absent) == (None, NO_APPEARANCE)
     broken = Frame(np.full_like(frame.rgb, np.nan), frame.alpha)
     assert identity(look, broken, globe.camera, pose).absent == "not finite"
-    assert Look.recorded(globe, "another", 12) is None
+    assert Appearance.recorded(globe, "another", 12) is None
 
 
 def test_steady_parts_move_as_the_head_model_moves_them(globe):
@@ -208,7 +215,7 @@ def test_steady_parts_move_as_the_head_model_moves_them(globe):
     clip.head.shape_basis = rng.normal(size=(count, 3, 2)) * 0.01
     clip.head.eyelid_basis, clip.head.parents = None, np.array([-1, 0, 1, 1, 1])
     clip.shape, clip.static_offset = rng.normal(size=2), rng.normal(size=(count, 3)) * 0.001
-    parts = SteadyParts.of(clip)
+    parts = RigidVertices.of(clip)
     pose = posed("fair", rng.normal(size=3), 0.0, neck=rng.normal(size=3), translation=rng.normal(size=3))
     values = {
         "shape": clip.shape,
