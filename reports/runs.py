@@ -164,7 +164,7 @@ class RunSet:
     rows : of all, their methods named by labels.
     metrics, tasks : those of all runs, in their order.
     records : by label, in order: what the method was, as in the manifest (name, version, config, budget).
-    trivial : labels of floors.
+    trivial : labels of trivial baselines.
     """
 
     runs: tuple[RunData, ...]
@@ -217,7 +217,7 @@ class RunSet:
 
     @property
     def ranked(self) -> tuple[str, ...]:
-        """Labels of methods that are no floors, in order."""
+        """Labels of methods that are no trivial baselines, in order."""
         return tuple(label for label in self.records if label not in self.trivial)
 
     @property

@@ -61,7 +61,7 @@ class PaperLayout:
         return tuple(replace(known[metric], digits=digits) for metric, digits in self.digits.items())
 
     def labels(self, runs: RunSet, name: str) -> dict[str, str]:
-        """Rows: labels of methods and how the paper writes them, in its order; floors have no place in it."""
+        """Rows: labels of methods and how the paper writes them, in its order; without trivial baselines."""
         order = list(NAMES)
         chosen = [
             label for label in runs.ranked if not self.methods or runs.records[label].name in self.methods

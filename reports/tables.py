@@ -70,7 +70,7 @@ class TableCell:
 
 @dataclass(frozen=True)
 class TableRow:
-    """A method's cells, one per column; a trivial method is a floor and never ranked."""
+    """A method's cells, one per column; a trivial baseline is never ranked."""
 
     method: str
     version: str
@@ -138,7 +138,7 @@ def best_of_column(
 ) -> BestSet | None:
     """Find the methods that may be the best of a column; None where fewer than two have values.
 
-    Floors do not compete.
+    Trivial baselines do not compete.
     """
     competing = _competing(lines, index)
     if len(competing) < 2:
@@ -210,7 +210,7 @@ def _count(subjects: int) -> str:
 
 AVATAR_TITLE = "Avatar"
 METHODS_TITLE = "Methods"
-FLOOR_TITLE = "Floor (not ranked)"
+TRIVIAL_TITLE = "Trivial baselines (not ranked)"
 
 
 def build_table(
@@ -235,7 +235,7 @@ def build_table(
     ----------
     metrics : columns of the table, in order; those per frame appear once in each task, the others last.
     methods : in order; one without rows is shown as not measured.
-    trivial : those of ``methods`` that are floors: listed apart, not ranked.
+    trivial : those of ``methods`` that are trivial baselines: listed apart, not ranked.
     tasks : in order; by default those in ``rows``, the known ones first.
     protocol_ids : readable name of each task's protocol, for the caption.
     region : which region's rows are shown.
@@ -264,7 +264,7 @@ def build_table(
     lines = ranked(lines, columns, markings)
     groups = (
         (METHODS_TITLE, tuple(line for line in lines if not line.trivial)),
-        (FLOOR_TITLE, tuple(line for line in lines if line.trivial)),
+        (TRIVIAL_TITLE, tuple(line for line in lines if line.trivial)),
     )
     return Table(
         columns=columns,

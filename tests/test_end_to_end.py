@@ -147,14 +147,7 @@ PREPARE = "prepare nersemble --root recording/recording --tracking recording/tra
 
 # In the order in which they run: some need what an earlier one left.
 CASES = {
-    "demo": [
-        Case(
-            "demo --out mini --preset smoke --set methods=mean-image --set metrics=psnr "
-            "--set capture.cameras=2 --set capture.timesteps=4",
-            r"\| mean-image",
-            ("mini/run.json", "mini/contact_sheet.png"),
-        )
-    ],
+    "demo": [],  # the run of this module, and `test_the_result_is_there_for_machines`
     "synth": [Case(OTHERS, "others", ("others/synthesis.json",))],
     "run": [Case(PLAIN, r"\| nearest-camera", ("plain/rows.parquet", "plain/tables/comparison.md"))],
     "list": [Case(f"list {what}", r"\w") for what in (*SPEC_TYPES, "presets")],
@@ -254,7 +247,7 @@ CASES = {
         )
     ],
     "bench": [Case("bench splats --quick --tradeoffs --out bench.json", "knob", ("bench.json",))],
-    "stress": [Case("stress statistics --quick --json", "trials")],
+    "stress": [Case("stress splats --quick --json", '"verdicts"')],
 }
 
 
@@ -273,7 +266,7 @@ def test_every_listed_command_has_a_case(capsys):
     assert {name.split()[0] for name in CASES} == listed
 
 
-@pytest.mark.parametrize("command", CASES)
+@pytest.mark.parametrize("command", [name for name, cases in CASES.items() if cases])
 def test_the_command_works_from_another_directory(command, run, elsewhere, monkeypatch, capsys):
     monkeypatch.chdir(elsewhere)
     (union,) = (run.root / "capture").glob("UNION*")

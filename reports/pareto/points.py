@@ -58,7 +58,7 @@ class Point:
 def read_points(
     folders: Sequence[Path], task: str, metric: str, time: str = ""
 ) -> tuple[list[Point], list[str], MetricSpec]:
-    """Read every method of every run that is no floor; return points, what was left out and why, and the metric.
+    """Read every method of every run that is no trivial baseline; return points, what was left out and why, and the metric.
 
     ``time`` names the metric of milliseconds; "" the median latency, or what the frames per second give.
 
@@ -117,5 +117,7 @@ def read_points(
                 )
             )
     if spec is None or not points:
-        raise InputError("runs", "", "a method that is no floor, with a value", "; ".join(left_out) or "none")
+        raise InputError(
+            "runs", "", "a method, no trivial baseline, with a value", "; ".join(left_out) or "none"
+        )
     return points, left_out, spec

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ExtremesSettings(RunOptions):
-    """Try a run's avatars on views and expressions beyond those of training; 1 where a limit is broken."""
+    """Render a run's avatars in views and expressions beyond those of training; 1 where a limit is broken."""
 
     run: tyro.conf.Positional[str]
     """Folder of a finished run."""
@@ -31,7 +31,7 @@ class ExtremesSettings(RunOptions):
     """Folder to write; default: `extremes` in the folder of the run."""
 
     methods: tuple[str, ...] = ()
-    """Methods to try; default: all but the floors."""
+    """Methods to test; default: all but the trivial baselines."""
 
     views: int = 16
     """Views of the turntable, in even steps."""
@@ -51,7 +51,7 @@ class ExtremesSettings(RunOptions):
         if not 0.0 <= self.beyond < 180.0:
             raise ValueError(f"beyond is {self.beyond}; from 0 to less than 180 degrees")
         if len(set(self.sigmas)) != len(self.sigmas) or 0.0 in self.sigmas:
-            raise ValueError("sigmas: each once, and without 0, which is always tried")
+            raise ValueError("sigmas: each once, and without 0, which is always rendered")
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class ReenactSettings(RunOptions):
     """Capture (or folder of several) that drives; default: every other subject of the run."""
 
     methods: tuple[str, ...] = ()
-    """Methods to drive; default: all but the floors."""
+    """Methods to drive; default: all but the trivial baselines."""
 
     camera: str | None = None
     """Camera of the target to render; default: the first held out, or else the first of training."""
@@ -84,14 +84,14 @@ class ReenactSettings(RunOptions):
 Settings = TypeVar("Settings", ExtremesSettings, ReenactSettings)
 
 
-def try_run(
+def run_robustness_test(
     settings: Settings,
     default_folder: str,
-    attempt: Callable[[Sequence[Job], Settings, Path, Progress], list[dict[str, Any]]],
+    judge: Callable[[Sequence[Job], Settings, Path, Progress], list[dict[str, Any]]],
     write_sheet: Callable[[Path], Any],
     progress: Progress,
 ) -> Findings:
-    """Try the avatars of a run, write the contact sheet; did not pass where a limit is broken."""
+    """Judge the avatars of a run and write the contact sheet; not passed where a limit is broken."""
     from ...bench.runner.avatars import trained
     from ...bench.runner.store import RunFolder
     from .stability import SHEET_FILE, table
@@ -101,7 +101,7 @@ def try_run(
     RunFolder(folder).read_manifest()  # before a folder is made in what is no run
     with nullcontext() if settings.out else output_inside(folder), locked(out):
         _, jobs = trained(folder, settings.methods, settings, out)
-        summaries = attempt(jobs, settings, out, progress)
+        summaries = judge(jobs, settings, out, progress)
         write_sheet(out)
     text = f"{table(summaries)}\n{out / SHEET_FILE}"
     passed = all(summary["frames_broken"] == 0 for summary in summaries)
@@ -109,25 +109,25 @@ def try_run(
 
 
 def extremes_run(settings: ExtremesSettings, progress: Progress = no_progress) -> Findings:
-    """Try a run's avatars on views and expressions beyond those of training: limits held or not, contact sheet.
+    """Render a run's avatars in views and expressions beyond those of training: stability limits, contact sheet.
 
     Does not pass where a limit is broken. Raises `InputError` for a folder that is no finished run, and for a capture that is not the run's.
     """
     from .extremes import TASK as EXTREMES
-    from .extremes import try_extremes
+    from .extremes import judge_extremes
     from .sheets import write_extremes_sheet
 
-    return try_run(settings, EXTREMES, try_extremes, write_extremes_sheet, progress)
+    return run_robustness_test(settings, EXTREMES, judge_extremes, write_extremes_sheet, progress)
 
 
 def reenact_run(settings: ReenactSettings, progress: Progress = no_progress) -> Findings:
-    """Drive a run's avatars with another subject's expressions: limits held or not, frames, contact sheet.
+    """Drive a run's avatars with another subject's expressions: stability limits, frames, contact sheet.
 
     Does not pass where a limit is broken. Raises `InputError` for a folder that is no finished run, where nobody else is there to drive, and for a source
     tracked with another head model.
     """
     from .reenactment import TASK as REENACTMENT
-    from .reenactment import reenact
+    from .reenactment import judge_reenactment
     from .sheets import write_reenact_sheet
 
-    return try_run(settings, REENACTMENT, reenact, write_reenact_sheet, progress)
+    return run_robustness_test(settings, REENACTMENT, judge_reenactment, write_reenact_sheet, progress)

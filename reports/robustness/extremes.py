@@ -148,7 +148,7 @@ def on_sheet(plan: ExtremesPlan, view: int, extreme: ExtremePose) -> bool:
     return extreme.component == 0 or extreme.component == view % components + 1
 
 
-def try_extremes(
+def judge_extremes(
     jobs: Sequence[Job], settings: ExtremesSettings, out: Path, progress: Progress
 ) -> list[dict[str, Any]]:
     """Render and judge every pair of view and expression; return the record of each avatar.

@@ -141,7 +141,7 @@ def plan_reenactment(jobs: Sequence[Job], settings: ReenactSettings) -> list[Dri
     return pairs
 
 
-def reenact(
+def judge_reenactment(
     jobs: Sequence[Job], settings: ReenactSettings, out: Path, progress: Progress
 ) -> list[dict[str, Any]]:
     """Render and judge every avatar driven by every other subject; return the record of each pair.

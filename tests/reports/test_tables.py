@@ -33,13 +33,13 @@ def test_columns_are_tasks_then_the_avatar(make_rows, metrics):
     ]
 
 
-def test_a_floor_is_listed_apart_and_never_ranked(make_rows, metrics):
+def test_a_trivial_baseline_is_listed_apart_and_never_ranked(make_rows, metrics):
     values = {"floor": 99.0, "a": 1.0, "b": 2.0}
     table = build_table(Rows(make_rows(values)), metrics, list(values), trivial=["floor"])
     assert ranks(table, "novel_view", "psnr") == {"a": 2, "b": 1, "floor": None}
     assert [(title, [r.method for r in rows]) for title, rows in table.groups] == [
         ("Methods", ["a", "b"]),
-        ("Floor (not ranked)", ["floor"]),
+        ("Trivial baselines (not ranked)", ["floor"]),
     ]
 
 

@@ -68,7 +68,7 @@ def test_csv_reads_back_with_full_precision(table):
     assert (first["novel_view/psnr/rank"], second["novel_view/psnr/rank"]) == ("1", "2")
     assert (second["novel_view/lpips"], second["novel_view/lpips/status"]) == ("", "missing")
     assert second["notes"] == "No 100% weights_file."
-    assert (floor["group"], floor["novel_view/psnr/rank"]) == ("Floor (not ranked)", "")
+    assert (floor["group"], floor["novel_view/psnr/rank"]) == ("Trivial baselines (not ranked)", "")
     assert first["protocol"] == "novel_view=hash-novel_view self_reenactment=hash-self_reenactment"
 
 

@@ -127,7 +127,7 @@ def test_what_is_not_there_is_refused_before_any_work(ball_run, tmp_path):
     assert not (tmp_path / "typo").exists()
 
 
-def test_a_run_of_floors_alone_has_nothing_to_try(ball_run):
+def test_a_run_of_trivial_baselines_has_nothing_to_test(ball_run):
     folder = ball_run("FLOOR")
     with pytest.raises(InputError, match="no floor"):
         extremes_run(settings(folder))

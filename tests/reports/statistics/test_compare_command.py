@@ -11,7 +11,7 @@ from headbench.bench.errors import InputError
 from headbench.bench.rows import Rows
 from headbench.bench.runner.store import RunFolder
 from headbench.bench.specs import MetricSpec
-from headbench.reports.comparison.command import CompareSettings, compare_runs
+from headbench.reports.statistics.command import CompareSettings, compare_runs
 
 from ..made_rows import avatar_row, row
 

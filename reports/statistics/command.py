@@ -18,7 +18,7 @@ from ...bench.specs import Findings, MetricSpec
 
 if TYPE_CHECKING:
     from ..runs import RunSet
-    from ..statistics.comparisons import Comparison
+    from .comparisons import Comparison
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class CompareSettings:
     """Metrics to compare; default: those of the comparison table."""
 
     floors: bool = False
-    """Compare the floors (mean image, nearest camera), too."""
+    """Compare the trivial baselines (mean image, nearest camera), too."""
 
     level: float = 0.05
     """Level of the tests; intervals have a confidence of one minus it."""
@@ -62,8 +62,8 @@ def compare_runs(settings: CompareSettings, progress: Progress = no_progress) ->
 
     Compare methods on every metric. Raises `InputError` for runs, methods and metrics that do not fit."""
     from ..runs import RunSet
-    from ..statistics.comparisons import compare
     from ..table_report import COMPARISON
+    from .comparisons import compare
 
     runs = RunSet.read([Path(folder) for folder in settings.runs])
     pairs = method_pairs(runs, settings.against, settings.floors)
