@@ -11,17 +11,21 @@ import tyro
 from ...bench.contracts import Progress
 from ...bench.errors import InputError
 from ...bench.specs import Findings, writes
+from ..options import CaptureOptions
 
 
 @dataclass(frozen=True)
-class ExportColmapSettings:
+class ExportColmapSettings(CaptureOptions):
     """Write frames of a capture as a COLMAP dataset: images, masks and a sparse model."""
 
     capture: tyro.conf.Positional[str]
-    """Capture in the GaussianAvatars/VHAP layout."""
+    """Capture, in a layout that a reader knows."""
 
     out: str
     """Folder to write: images/, masks/ and sparse/0/."""
+
+    tracking: bool = False
+    """Write the tracked parameters and the head model beside the model, so that the reader colmap reads it all."""
 
     timesteps: tuple[int, ...] = ()
     """Timesteps to write; default: the first of training, as COLMAP's scenes do not move."""
@@ -32,19 +36,16 @@ class ExportColmapSettings:
     format: Literal["bin", "txt"] = "bin"
     """Of the sparse model."""
 
-    head: str | None = None
-    """Head model for a capture that brings none: FLAME pickle or npz."""
-
 
 @writes("out")
 def export_colmap(settings: ExportColmapSettings, progress: Progress) -> Findings:
     """Write frames of a capture as a COLMAP dataset: images, masks and a sparse model.
 
-    Export a capture; see `export_model`. Raises `InputError` for timesteps that the capture lacks."""
-    from ..ga.reader import read_capture
-    from .writer import export_model
+    See `export_model`. Raises `InputError` for timesteps that the capture lacks.
+    """
+    from .writer import export_model, export_tracking
 
-    clip = read_capture(settings.capture, head=settings.head, progress=progress)
+    clip = settings.open(settings.capture, progress)
     chosen = set(settings.timesteps) or {clip.timesteps("train")[0]}
     if settings.all_timesteps:
         chosen = set(clip.poses)
@@ -55,6 +56,8 @@ def export_colmap(settings: ExportColmapSettings, progress: Progress) -> Finding
     keys = [key for key in clip.files if key.timestep in chosen]
     out = Path(settings.out)
     written = export_model(clip, keys, out, model_format=settings.format, progress=progress)
+    if settings.tracking:
+        export_tracking(clip, chosen, out)
     text = (
         f"{out}: {written.cameras} cameras, {written.images} images, {written.points} points "
         f"with {written.observations} observations"

@@ -33,13 +33,12 @@ from ...bench.io.files import check_name, digest
 from ...bench.io.images import probe_image
 from ..clip import CaptureClip, FrameFiles
 from ..ga.content_digests import content_digests
-from ..ga.flame_parameters import read_tracking
-from ..ga.head import find_head
 from ..ga.layout import DECLARATION_FILE, Declaration, parameter_name
-from ..ga.splits import split_by_holding_out
+from ..ga.tracking import find_head, read_tracking
+from ..ga.validate import split_by_holding_out
 from ..images import ImageStore
 from ..steps.exclude import exclude_given, exclude_timesteps
-from ..steps.mattes import check_colour
+from ..steps.masks import check_colour
 from ..steps.undistort import Lens, undistort_clip
 from .model import ColmapModel, find_model, read_model
 

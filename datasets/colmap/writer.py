@@ -20,8 +20,7 @@ from ...bench.errors import InputError
 from ...bench.io.files import atomic_path, grouped_writes
 from ..clip import CaptureClip
 from ..ga import layout
-from ..ga.documents import save_npz
-from ..ga.writer import identity_parameters, pose_to_parameters
+from ..ga.writer import identity_parameters, pose_to_parameters, save_npz
 from ..head.arrays import save_head
 from ..head.model import HeadModel
 from ..mesh_pictures import rasterize_mesh

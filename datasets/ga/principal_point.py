@@ -23,8 +23,8 @@ from ...bench.errors import InputError
 from ..head.model import HeadModel
 from ..images import read_image, read_mask
 from .cameras import CaptureCameras
-from .flame_parameters import Tracking
 from .layout import CyConvention
+from .tracking import Tracking
 from .transforms import FrameEntry
 
 OUTLINE_SIGMA = 0.004

@@ -24,16 +24,23 @@ from ..foreign import describe
 from ..head.arrays import HeadArrays
 from ..images import ImageStore
 from ..steps.exclude import exclude_given, exclude_timesteps
-from ..steps.mattes import check_colour, mask_below_neck, set_background
+from ..steps.masks import check_colour, mask_below_neck, set_background
 from . import layout
 from .cameras import CaptureCameras, collect_cameras
 from .content_digests import content_digests
-from .flame_parameters import TeethPolicy, Tracking, read_tracking
-from .head import find_head
 from .principal_point import settle_cy
-from .splits import check_disjoint, sequence_names, split_by_holding_out
+from .tracking import TeethPolicy, Tracking, find_head, read_tracking
 from .transforms import FrameEntry, read_transforms
-from .validate import LeakPolicy, check_images, check_leaks, check_timesteps, find_leaks
+from .validate import (
+    LeakPolicy,
+    check_disjoint,
+    check_images,
+    check_leaks,
+    check_timesteps,
+    find_leaks,
+    sequence_names,
+    split_by_holding_out,
+)
 
 WHITE = (1.0, 1.0, 1.0)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import tyro
@@ -14,6 +14,7 @@ from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.io.files import write_json
 from ...bench.specs import Findings, writes
+from ..options import CaptureOptions
 
 if TYPE_CHECKING:
     from ..clip import CaptureClip
@@ -21,20 +22,14 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class InspectSettings:
+class InspectSettings(CaptureOptions):
     """Which capture, and how much of it to show."""
 
     clip: Annotated[str, tyro.conf.Positional]
-    """Capture in the GaussianAvatars/VHAP layout: a UNION folder, a sequence folder, or the folder of one union."""
+    """Capture, in a layout that a reader knows; of the reader ga a UNION folder, a sequence folder, or the union's."""
 
     out: str = "inspection"
     """Folder for inspection.png and inspection.json."""
-
-    head: str | None = None
-    """Head model for captures that bring none: FLAME pickle or npz."""
-
-    cy: Literal["auto", "top", "bottom", "centre"] = "auto"
-    """How the principal point is read; auto takes the declared convention, else lets the images decide."""
 
     timesteps: int = 3
     """Rows of overlays."""
@@ -53,7 +48,6 @@ def inspect(settings: InspectSettings, progress: Progress = no_progress) -> Find
     Raises `InputError` for a capture that the reader refuses (``headbench lint`` then tells all that is wrong),
     for a clip without training frames that are not excluded, and for counts below 1.
     """
-    from ..ga.reader import read_capture
     from ..ga.writer import write_png
     from .figure import draw_figure
     from .statistics import expression_space, sequence_rows, split_rows
@@ -61,7 +55,7 @@ def inspect(settings: InspectSettings, progress: Progress = no_progress) -> Find
     for name in ("timesteps", "cameras"):
         if getattr(settings, name) < 1:
             raise InputError(f"--{name}", "", "at least 1", str(getattr(settings, name)))
-    clip = read_capture(settings.clip, head=settings.head, cy=settings.cy, leaks="record", progress=progress)
+    clip = settings.open(settings.clip, progress)
     splits, sequences, space = split_rows(clip), sequence_rows(clip), expression_space(clip)
     out = Path(settings.out)
     picture = draw_figure(
@@ -84,7 +78,7 @@ def summary(
     clip: CaptureClip, splits: Sequence[SplitRow], sequences: Sequence[SequenceRow], space: ExpressionSpace
 ) -> dict[str, Any]:
     """Everything the picture shows, as plain values."""
-    record = clip.steps[0].parameters
+    record = clip.steps[0].parameters if clip.steps else {}
     held_out = {key.camera for key in clip.splits.get("novel_view", ())}
     return {
         "subject": clip.subject,
@@ -93,9 +87,9 @@ def summary(
         "vertices": len(clip.head.template),
         "expressions": clip.head.expression_basis.shape[2],
         "background": clip.background.tolist(),
-        "cy": record["cy"],
-        "leaks": record["leaks"],
-        "synthetic": bool(record["synthetic"]),
+        "cy": record.get("cy", ""),
+        "leaks": record.get("leaks", []),
+        "synthetic": bool(record.get("synthetic")),
         "splits": [asdict(row) for row in splits],
         "excluded": {
             str(t): reason for t, reason in sorted({k.timestep: r for k, r in clip.excluded.items()}.items())
@@ -125,7 +119,7 @@ def summary(
 def _text(
     clip: CaptureClip, splits: Sequence[SplitRow], sequences: Sequence[SequenceRow], space: ExpressionSpace
 ) -> str:
-    from .expression_panel import space_summary
+    from .figure import space_summary
 
     lines = [f"subject {clip.subject}, head model {clip.head.version}, {len(clip.cameras)} cameras", ""]
     lines.append(f"{'split':<18}{'images':>8}{'timesteps':>11}{'cameras':>9}{'sequences':>11}")

@@ -1,25 +1,41 @@
-"""The picture of a capture: rig, splits, overlays, motion."""
+"""The picture of a capture: camera rig, splits, tracked mesh on images, motion."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 
+import cv2
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import SubFigure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter
 
-from ...bench.contracts import ByteArray, Progress, no_progress
+from ...bench.contracts import ByteArray, Camera, FloatArray, FrameKey, IntArray, Progress, no_progress
 from ..clip import CaptureClip
-from .canvas import FINE, HELD_OUT, INK, MUTED, RULE, TRAIN, Canvas, shortened
-from .expression_panel import draw_scatter, draw_sequences, draw_space, space_summary
-from .overlay_panel import blank, frame_of, overlay, pair, pick_cameras, pick_timesteps
-from .rig_panel import draw_rig, head_frame
-from .statistics import ExpressionSpace, SequenceRow, SplitRow, posed_meshes
+from ..figures import HELD_OUT, MUTED, TRAIN, bands, hexadecimal, new_figure, pixels, shortened, show
+from ..head.geometry import rigid_alignment
+from ..mesh_pictures import draw_mesh, rasterize_mesh
+from .statistics import KEPT_VARIANCE, ExpressionSpace, SequenceRow, SplitRow, posed_meshes
 
-WIDTH, MARGIN = 1600, 36
-RIG_HEIGHT, MOTION_HEIGHT = 370, 350
-OVERLAY_HEIGHT = 280
-"""Most that an overlay is high."""
+WIDTH = 16.0
+"""Of the figure, inches."""
 
-LABEL = 128
+OVERLAY_HEIGHT = 2.8
+"""Most that an overlay is high, inches."""
+
+OVERLAY_PIXELS = 560
+MESH_OPACITY = 0.72
+FRUSTUM_M = 0.10
+"""How far a drawn frustum reaches."""
+
+SIGMA_BARS = 40
+"""Coefficients whose standard deviation is shown: the leading ones matter."""
+
+MAX_SEQUENCES = 16
+_FAR_M = 100.0  # from so far the head's picture is orthographic to a thousandth
+_HEAD_PIXELS_PER_M = 1200
 
 
 def draw_figure(
@@ -32,147 +48,340 @@ def draw_figure(
     cameras: int,
     progress: Progress = no_progress,
 ) -> ByteArray:
-    """(H, `WIDTH`, 3) picture of a clip; see `InspectSettings` for the counts."""
-    columns = pick_cameras(clip, cameras)
-    rows = pick_timesteps(clip, space, timesteps)
-    cell = (WIDTH - 2 * MARGIN - LABEL) / max(1, len(columns)) - 10
+    """(H, W, 3) picture of a clip: up to ``timesteps`` rows and ``cameras`` columns of overlays."""
+    columns, rows = pick_cameras(clip, cameras), pick_timesteps(clip, space, timesteps)
     widest = max((clip.cameras[name].width / clip.cameras[name].height for name in columns), default=1.0)
-    height = int(min(OVERLAY_HEIGHT, cell / (2 * widest)))
-    overlays_top = 104 + RIG_HEIGHT + 24
-    motion_top = overlays_top + 52 + len(rows) * (height + 10) + 26
-    canvas = Canvas(WIDTH, motion_top + MOTION_HEIGHT + 30)
-    _draw_title(canvas, clip)
-    _draw_rigs(canvas, clip)
-    _draw_splits(canvas, clip, splits)
-    _draw_overlays(canvas, clip, rows, columns, overlays_top, height, cell, progress)
-    bottom = motion_top + MOTION_HEIGHT
-    draw_sequences(canvas, (MARGIN, motion_top, 760, bottom), sequences)
-    draw_space(canvas, (800, motion_top, 1160, bottom - 26), space)
-    expressions = np.stack([clip.poses[t].expression for t in space.timesteps])
-    draw_scatter(canvas, (1200, motion_top, WIDTH - MARGIN, bottom - 26), expressions, space.held_out)
-    canvas.text((800, bottom - 4), space_summary(space), 13, MUTED, "ls")
-    return canvas.finish()
+    overlay_height = min(OVERLAY_HEIGHT, (WIDTH - 1.6) / max(1, len(columns)) / (2 * widest))
+    heights = [4.0, 0.7 + len(rows) * overlay_height, 3.8]
+    with new_figure(WIDTH, sum(heights) + 0.7) as figure:
+        figure.suptitle(_title(clip), x=0.01, ha="left", fontsize=14)
+        handles = [
+            Line2D([], [], marker="o", linestyle="", color=colour, label=name)
+            for name, colour in (("training", TRAIN), ("held out", HELD_OUT))
+        ]
+        figure.legend(handles=handles, loc="upper right", ncols=2)
+        top, middle, bottom = bands(figure, heights)
+        _draw_rigs(top, clip, splits)
+        _draw_overlays(middle, clip, rows, columns, progress)
+        _draw_motion(bottom, clip, sequences, space)
+        return pixels(figure)
 
 
-def _draw_title(canvas: Canvas, clip: CaptureClip) -> None:
-    canvas.text((MARGIN, 28), f"Subject {clip.subject}", 28)
-    sizes = sorted({(camera.width, camera.height) for camera in clip.cameras.values()})
-    pixels = ", ".join(f"{width}x{height}" for width, height in sizes[:3])
-    parts = [
-        f"{len(clip.files)} images of {pixels} pixels",
-        f"{len(clip.cameras)} cameras",
-        f"{len(clip.poses)} timesteps",
-        f"head model {clip.head.version}",
-        f"{len(clip.head.template)} vertices",
-        f"{clip.head.expression_basis.shape[2]} expressions",
-    ]
-    canvas.text((MARGIN, 66), "   ·   ".join(parts), 15, MUTED)
-    right = WIDTH - MARGIN
-    for text, colour, x in (("training", TRAIN, right - 130), ("held out", HELD_OUT, right - 40)):
-        canvas.dot((x - 52, 44), 5, colour)
-        canvas.text((x - 42, 44), text, 14, INK, "lm")
-    canvas.line([(MARGIN, 94), (right, 94)], RULE, 1)
+def _title(clip: CaptureClip) -> str:
+    sizes = sorted({f"{camera.width}x{camera.height}" for camera in clip.cameras.values()})
+    return (
+        f"Subject {clip.subject}: {len(clip.files)} images of {', '.join(sizes[:3])} pixels, "
+        f"{len(clip.cameras)} cameras, {len(clip.poses)} timesteps; head model {clip.head.version}, "
+        f"{len(clip.head.template)} vertices, {clip.head.expression_basis.shape[2]} expressions"
+    )
 
 
-def _draw_rigs(canvas: Canvas, clip: CaptureClip) -> None:
+# ------------------------------------------------------------------ rig and splits
+
+
+def _draw_rigs(figure: SubFigure, clip: CaptureClip, splits: Sequence[SplitRow]) -> None:
     timestep = min(clip.poses, key=lambda t: float(np.linalg.norm(clip.poses[t].expression)))
     vertices = posed_meshes(clip, [timestep])[0]
     members = clip.head.regions.get("face", np.arange(len(vertices)))
     frame = head_frame(vertices, clip.head.template, members)
-    held_out = {key.camera for key in clip.splits.get("novel_view", ())}
-    for left, above in ((MARGIN, True), (MARGIN + 530, False)):
-        box = (left, 110, left + 510, 104 + RIG_HEIGHT)
-        draw_rig(canvas, box, clip.cameras, held_out, vertices, clip.head.faces, frame, above=above)
+    above, side, table = figure.subplots(1, 3, width_ratios=[5, 5, 4.4])
+    for axes, from_above in ((above, True), (side, False)):
+        draw_rig(axes, clip.cameras, _held_out(clip), vertices, clip.head.faces, frame, from_above=from_above)
+    table.axis("off")
+    table.set_title("splits")
+    cells = [
+        [row.split.replace("_", " "), *map(str, (row.images, row.timesteps, row.cameras, row.sequences))]
+        for row in splits
+    ]
+    labels = ["", "images", "timesteps", "cameras", "sequences"]
+    widths = [0.3, 0.16, 0.19, 0.16, 0.19]
+    shown = table.table(cells, colLabels=labels, colWidths=widths, loc="upper left", edges="B")
+    shown.auto_set_font_size(False)
+    for (row, _), cell in shown.get_celld().items():
+        cell.set_edgecolor("white")
+        if row and splits[row - 1].split != "excluded":
+            cell.set_text_props(color=TRAIN if splits[row - 1].split == "train" else HELD_OUT)
+    facts = _facts(clip)
+    y = 0.88 - 0.075 * len(splits)
+    for number, (name, fact) in enumerate(facts):
+        table.text(0.02, y - 0.075 * number, name, color=MUTED, va="top", transform=table.transAxes)
+        table.text(0.34, y - 0.075 * number, shortened(fact, 44), va="top", transform=table.transAxes)
 
 
-def _draw_splits(canvas: Canvas, clip: CaptureClip, splits: Sequence[SplitRow]) -> None:
-    left, right, y = MARGIN + 1080, WIDTH - MARGIN, 110
-    canvas.text((left, y), "splits", 15)
-    columns = [("images", 206), ("timesteps", 286), ("cameras", 358), ("sequences", 448)]
-    for name, x in columns:
-        canvas.text((left + x, y + 46), name, 12, MUTED, "rs")
-    canvas.line([(left, y + 52), (right, y + 52)], RULE, 1)
-    for index, row in enumerate(splits):
-        middle = y + 70 + 26 * index
-        colour = {"train": TRAIN, "excluded": MUTED}.get(row.split, HELD_OUT)
-        canvas.text((left, middle), row.split.replace("_", " "), 14, colour, "lm")
-        values = (row.images, row.timesteps, row.cameras, row.sequences)
-        for (_, x), value in zip(columns, values):
-            canvas.text((left + x, middle), f"{value:,}", 14, INK, "rm")
-    y += 82 + 26 * len(splits)
-    for name, fact in _facts(clip):
-        canvas.text((left, y), name, 13, MUTED)
-        canvas.text((left + 130, y), shortened(fact, right - left - 130, 13), 13, INK)
-        y += 22
+def head_frame(vertices: FloatArray, template: FloatArray, members: IntArray) -> FloatArray:
+    """(4, 4) world to head: origin at the mean of the vertices, axes those of the template."""
+    rotation = rigid_alignment(vertices[members], template[members])[:3, :3]
+    frame = np.eye(4)
+    frame[:3, :3], frame[:3, 3] = rotation, -rotation @ vertices.mean(axis=0)
+    return frame
+
+
+def draw_rig(
+    axes: Axes,
+    cameras: Mapping[str, Camera],
+    held_out: Collection[str],
+    vertices: FloatArray,
+    faces: IntArray,
+    frame: FloatArray,
+    *,
+    from_above: bool,
+) -> None:
+    """Draw the rig to scale: from above with the face looking down, or from the head's right with it looking right."""
+    # Rows: head axes along the page's right and down, and away from the viewer.
+    view = np.array(
+        [[1, 0, 0], [0, 0, 1], [0, -1, 0]] if from_above else [[0, 0, 1], [0, -1, 0], [1, 0, 0]], float
+    )
+    to_page, shift = view @ frame[:3, :3], view @ frame[:3, 3]
+    head = vertices @ to_page.T + shift
+    low, high = head[:, :2].min(axis=0), head[:, :2].max(axis=0)
+    extent = (low[0], high[0], high[1], low[1])
+    axes.imshow(_head_picture(head, faces), extent=extent, interpolation="antialiased", zorder=2)
+    names = _short_names(list(cameras))
+    for name, camera in cameras.items():
+        centre = to_page @ camera.center + shift
+        rays = to_page @ camera.world_to_camera[:3, :3].T @ _corner_rays(camera)
+        corners = centre[:2] + FRUSTUM_M * rays.T[:, :2]
+        edges = [*zip(corners, np.roll(corners, -1, axis=0)), *((centre[:2], corner) for corner in corners)]
+        colour = HELD_OUT if name in held_out else TRAIN
+        axes.add_collection(LineCollection(edges, colors=colour, linewidths=0.9))
+        axes.plot(*centre[:2], "o", color=colour, markersize=4)
+        x, y, _ = centre.tolist()
+        away = max(float(np.hypot(x, y)), 1e-6)
+        axes.annotate(
+            names[name],
+            (x, y),
+            (12 * x / away, -10 * y / away),
+            textcoords="offset points",
+            ha="center",
+            va="center",
+            fontsize=8,
+            color=colour if name in held_out else MUTED,
+        )
+    axes.autoscale(True)
+    axes.margins(0.1)
+    if not axes.yaxis_inverted():
+        axes.invert_yaxis()
+    axes.set_aspect("equal", adjustable="datalim")
+    up = 1 if from_above else -1
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda metres, _: f"{100 * metres + 0:g}"))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda metres, _: f"{100 * up * metres + 0:g}"))
+    axes.grid()
+    axes.set_xlabel("cm")
+    axes.set_title("rig from above" if from_above else "rig from the side")
+
+
+def _corner_rays(camera: Camera) -> FloatArray:
+    """(3, 4) rays through the image's corners in the camera's axes, depth 1."""
+    width, height = camera.width, camera.height
+    corners = np.array([[0, width, width, 0], [0, 0, height, height], [1, 1, 1, 1]], dtype=np.float64)
+    return np.linalg.solve(camera.K, corners)
+
+
+def _head_picture(head: FloatArray, faces: IntArray) -> ByteArray:
+    """(H, W, 4) orthographic picture of exactly the head's bounding box, clear beside the head."""
+    low, high = head[:, :2].min(axis=0), head[:, :2].max(axis=0)
+    width, height = np.maximum(1, np.ceil(_HEAD_PIXELS_PER_M * (high - low))).astype(int).tolist()
+    scale = np.array([width, height]) / (high - low) * _FAR_M
+    intrinsics = np.array(
+        [[scale[0], 0, -scale[0] * low[0] / _FAR_M], [0, scale[1], -scale[1] * low[1] / _FAR_M], [0, 0, 1.0]]
+    )
+    away = np.eye(4)
+    away[2, 3] = _FAR_M
+    camera = Camera("panel", width, height, intrinsics, away)
+    shown = rasterize_mesh(head, faces, camera).face >= 0
+    return np.dstack([draw_mesh(head, faces, camera), np.where(shown, 255, 0).astype(np.uint8)])
+
+
+def _short_names(names: list[str]) -> dict[str, str]:
+    """The shortest ends of the names, of at least two characters, that tell them apart."""
+    longest = max(map(len, names), default=0)
+    for length in range(2, longest + 1):
+        short = {name: name[-length:] for name in names}
+        if len(set(short.values())) == len(names):
+            return short
+    return {name: name for name in names}
 
 
 def _facts(clip: CaptureClip) -> list[tuple[str, str]]:
-    record = clip.steps[0].parameters
+    record = clip.steps[0].parameters if clip.steps else {}
     background = tuple(float(c) for c in clip.background)
     named = "white" if background == (1, 1, 1) else "black" if background == (0, 0, 0) else f"{background}"
     leaks = record.get("leaks") or []
-    held_out = sorted({key.camera for key in clip.splits.get("novel_view", ())})
-    reasons = sorted(set(clip.excluded.values()))
-    masks = sum(frame.mask is not None for frame in clip.files.values())
-    return [
-        ("novel view", ", ".join(held_out) or "none"),
+    masks = sum(map(clip.has_mask, clip.files))
+    facts = [
+        ("novel view", ", ".join(sorted(_held_out(clip))) or "none"),
         ("background", named),
         ("masks", "all frames" if masks == len(clip.files) else f"{masks} of {len(clip.files)} frames"),
-        ("principal point", f"cy from the {record.get('cy')}"),
-        ("excluded for", ", ".join(reasons) or "nothing"),
-        ("leaks", f"{len(leaks)}: {leaks[0]}" if leaks else "none"),
-        ("origin", "synthetic" if record.get("synthetic") else "recorded"),
+        ("principal point", f"cy from the {record['cy']}" if "cy" in record else "as the reader gives it"),
+        ("excluded for", ", ".join(sorted(set(clip.excluded.values()))) or "nothing"),
     ]
+    if "leaks" in record:
+        facts.append(("leaks", f"{len(leaks)}: {leaks[0]}" if leaks else "none"))
+    return [*facts, ("origin", "synthetic" if record.get("synthetic") else "recorded")]
+
+
+# ------------------------------------------------------------------ overlays
+
+
+def pick_cameras(clip: CaptureClip, count: int) -> list[str]:
+    """Up to ``count`` camera ids: one held-out first, then evenly over the others in the order of the rig."""
+    held_out = _held_out(clip)
+    first = [name for name in clip.cameras if name in held_out][:1]
+    others = [name for name in clip.cameras if name not in first]
+    picks = np.unique(np.linspace(0, len(others) - 1, max(0, min(count - len(first), len(others)))).round())
+    return (first + [others[int(i)] for i in picks])[:count]
+
+
+def pick_timesteps(clip: CaptureClip, space: ExpressionSpace, count: int) -> list[tuple[int, str]]:
+    """Up to ``count`` timesteps with the reason for each: the calmest, the widest jaw, the most unusual test
+    face, then evenly spaced ones."""
+    size = np.linalg.norm(space.scores_mm - space.scores_mm.mean(axis=0), axis=1)
+    jaw = [float(np.linalg.norm(clip.poses[t].jaw)) for t in space.timesteps]
+    calm = [float(np.linalg.norm(clip.poses[t].expression)) for t in space.timesteps]
+    wanted = [
+        (space.timesteps[int(np.argmin(calm))], "calmest face"),
+        (space.timesteps[int(np.argmax(jaw))], "widest jaw"),
+    ]
+    if space.novelty_mm:
+        newest = max(space.novelty_mm, key=lambda t: space.novelty_mm[t])
+        wanted.append((newest, "test face farthest\nfrom training"))
+    wanted.append((space.timesteps[int(np.argmax(size))], "strongest expression"))
+    spread = np.linspace(0, len(space.timesteps) - 1, count + 2).round().astype(int)[1:-1]
+    wanted += [(space.timesteps[i], "evenly spaced") for i in spread]
+    chosen: dict[int, str] = {}
+    for timestep, reason in wanted:
+        chosen.setdefault(timestep, reason)
+    return list(chosen.items())[:count]
+
+
+def overlay(
+    image: ByteArray, vertices: FloatArray, faces: IntArray, camera: Camera, height: int
+) -> tuple[ByteArray, ByteArray]:
+    """The image with the mesh's outline, and under the shaded mesh, both ``height`` pixels high."""
+    width = max(1, round(camera.width * height / camera.height))
+    smaller = height < camera.height
+    scaled = cv2.resize(
+        image, (width, height), interpolation=cv2.INTER_AREA if smaller else cv2.INTER_CUBIC
+    ).astype(np.uint8, copy=False)
+    fitted = camera.resized(width, height)
+    filled = (rasterize_mesh(vertices, faces, fitted).face >= 0).astype(np.uint8)
+    contours, _ = cv2.findContours(filled, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    outlined = scaled.copy()
+    cv2.drawContours(outlined, contours, -1, hexadecimal(HELD_OUT), max(1, round(height / 300)), cv2.LINE_AA)
+    covered = draw_mesh(vertices, faces, fitted, background=scaled, opacity=MESH_OPACITY)
+    return outlined, covered
 
 
 def _draw_overlays(
-    canvas: Canvas,
+    figure: SubFigure,
     clip: CaptureClip,
     rows: Sequence[tuple[int, str]],
     columns: Sequence[str],
-    top: float,
-    height: int,
-    cell: float,
     progress: Progress,
 ) -> None:
-    canvas.text((MARGIN, top), "tracked mesh on images: its outline, and itself", 15)
-    held_out = {key.camera for key in clip.splits.get("novel_view", ())}
-    for column, name in enumerate(columns):
-        x = MARGIN + LABEL + column * (cell + 10)
-        suffix = " (held out)" if name in held_out else ""
-        colour = HELD_OUT if name in held_out else TRAIN
-        canvas.text((x, top + 42), f"camera {name}{suffix}", 13, colour, "ls")
+    figure.suptitle("tracked mesh on images: its outline, and itself", x=0.01, ha="left", fontsize=11)
+    held_out, grid = _held_out(clip), figure.subplots(len(rows), len(columns), squeeze=False)
     meshes = posed_meshes(clip, [timestep for timestep, _ in rows])
     tests = {key.timestep for key in clip.splits.get("self_reenactment", ())}
     for row, (timestep, reason) in enumerate(rows):
-        y = top + 52 + row * (height + 10)
-        sequence = next(key.sequence for key in clip.files if key.timestep == timestep)
+        frames = {key.camera: key for key in clip.files if key.timestep == timestep}
+        sequence = shortened(next(iter(frames.values())).sequence, 20)
+        label = f"timestep {timestep}\n{sequence}\n{reason}"
         colour = HELD_OUT if timestep in tests else TRAIN
-        lines = [(f"timestep {timestep}", INK), (sequence, colour), *_broken(reason)]
-        for index, (text, ink) in enumerate(lines):
-            canvas.text((MARGIN, y + 4 + 19 * index), shortened(text, LABEL - 12, 13), 13, ink)
+        grid[row, 0].set_ylabel(label, rotation=0, ha="right", va="center", color=colour)
         for column, name in enumerate(columns):
             progress(row * len(columns) + column, len(rows) * len(columns), "drawing")
-            x = MARGIN + LABEL + column * (cell + 10)
-            key = frame_of(clip, timestep, name)
-            camera = clip.cameras[name]
-            if key is None:
-                width = round(camera.width * height * FINE / camera.height)
-                canvas.image(x, y, blank(2 * width, height * FINE))
-                continue
-            pictures = overlay(clip.image(key), meshes[row], clip.head.faces, camera, height * FINE)
-            both = pair(*pictures)
-            canvas.image(x, y, both)
-            # White images need an edge on white paper: one sees what the image cuts off.
-            canvas.box(x - 1, y - 1, x + both.shape[1] / FINE, y + both.shape[0] / FINE, None, RULE)
+            show(
+                grid[row, column],
+                _cell(clip, frames.get(name), clip.cameras[name], meshes[row], OVERLAY_PIXELS),
+                frame=True,
+            )
+    for column, name in enumerate(columns):
+        suffix, colour = (" (held out)", HELD_OUT) if name in held_out else ("", TRAIN)
+        grid[0, column].set_title(f"camera {name}{suffix}", color=colour, fontsize=10)
 
 
-def _broken(text: str) -> list[tuple[str, tuple[int, int, int]]]:
-    """A short text over lines of about fifteen characters."""
-    lines: list[str] = []
-    for word in text.split():
-        if lines and len(lines[-1]) + len(word) < 15:
-            lines[-1] += f" {word}"
-        else:
-            lines.append(word)
-    return [(line, MUTED) for line in lines]
+def _cell(
+    clip: CaptureClip, key: FrameKey | None, camera: Camera, mesh: FloatArray, height: int
+) -> ByteArray:
+    """Both overlays of a frame side by side; a light grey field where the camera did not record it."""
+    if key is None:
+        width = max(1, round(camera.width * height / camera.height))
+        return np.full((height, 2 * width, 3), 238, dtype=np.uint8)
+    return np.concatenate(overlay(clip.image(key), mesh, clip.head.faces, camera, height), axis=1)
+
+
+def _held_out(clip: CaptureClip) -> set[str]:
+    return {key.camera for key in clip.splits.get("novel_view", ())}
+
+
+# ------------------------------------------------------------------ motion
+
+
+def _draw_motion(
+    figure: SubFigure, clip: CaptureClip, sequences: Sequence[SequenceRow], space: ExpressionSpace
+) -> None:
+    jaw, reach, scores, sigma = figure.subplots(1, 4, width_ratios=[2.2, 2.2, 4, 4])
+    _draw_sequences(jaw, reach, sequences)
+    points = np.pad(space.scores_mm, ((0, 0), (0, max(0, 2 - space.scores_mm.shape[1]))))[:, :2]
+    share = [*space.explained[:2], 0.0, 0.0]
+    size = 24 if len(points) < 300 else 8
+    for chosen, colour in ((~space.held_out, TRAIN), (space.held_out, HELD_OUT)):
+        scores.scatter(*points[chosen].T, s=size, color=colour, edgecolors="white", linewidths=0.4)
+    scores.set(xlabel=f"PC 1, mm ({share[0]:.0%} of variance)", ylabel=f"PC 2, mm ({share[1]:.0%})")
+    scores.set_title("space of expressions")
+    scores.grid()
+    expressions = np.stack([clip.poses[t].expression for t in space.timesteps])[:, :SIGMA_BARS]
+    groups = [
+        (c, expressions[t]) for c, t in ((TRAIN, ~space.held_out), (HELD_OUT, space.held_out)) if t.any()
+    ]
+    for number, (colour, values) in enumerate(groups):
+        width = 0.84 / len(groups)
+        places = np.arange(values.shape[1]) + 0.08 + (number + 0.5) * width
+        sigma.bar(places, values.std(axis=0), width, color=colour)
+    sigma.set_xlabel("coefficient")
+    sigma.set_title("standard deviation of coefficients")
+    sigma.grid(axis="y")
+    figure.supxlabel(space_summary(space), x=0.99, ha="right", fontsize=9, color=MUTED)
+
+
+def _draw_sequences(jaw: Axes, reach: Axes, rows: Sequence[SequenceRow]) -> None:
+    """Ranges of each sequence as bars, from least to largest, with a mark at the median."""
+    shown = rows if len(rows) <= MAX_SEQUENCES else rows[: MAX_SEQUENCES - 1]
+    for place, row in enumerate(shown):
+        colour = HELD_OUT if row.held_out else TRAIN
+        for axes, (low, typical, high) in ((jaw, row.jaw_deg), (reach, (0.0, *row.reach_mm))):
+            axes.barh(place, high - low, left=low, height=0.5, color=colour, alpha=0.5)
+            axes.plot([typical, typical], [place - 0.35, place + 0.35], color=colour, linewidth=2)
+        place_right = reach.get_yaxis_transform()
+        motion = f"{row.head_deg:.0f}° {row.head_mm:.0f} mm"
+        reach.text(1.02, place, motion, transform=place_right, va="center", fontsize=9)
+    labels = [
+        f"{shortened(row.sequence, 24)}, {row.timesteps}"
+        + (f" (+{row.excluded} excl.)" if row.excluded else "")
+        for row in shown
+    ]
+    jaw.set_yticks(range(len(shown)), labels)
+    for text, row in zip(jaw.get_yticklabels(), shown):
+        text.set_color(HELD_OUT if row.held_out else TRAIN)
+    reach.set_yticks([])
+    for axes, label in ((jaw, "jaw, degrees"), (reach, "expression, mm")):
+        axes.set_ylim(max(len(shown), 4) - 0.4, -0.6)
+        axes.set_xlim(left=0)
+        axes.set_xlabel(label)
+        axes.grid(axis="x")
+    more = f" (and {len(rows) - len(shown)} more)" if len(shown) < len(rows) else ""
+    jaw.set_title(f"motion by sequence, timesteps{more}")
+    reach.set_title("head, most", loc="right", fontsize=9, color=MUTED)
+
+
+def space_summary(space: ExpressionSpace) -> str:
+    """One sentence on how rich the training faces are and how new the test's."""
+    components = "1 component explains" if space.kept == 1 else f"{space.kept} components explain"
+    parts = [f"{components} {KEPT_VARIANCE:.0%} of the training faces"]
+    if space.novelty_mm:
+        new = np.array([*space.novelty_mm.values()])
+        parts.append(
+            f"test faces lie {np.median(new):.2f} mm (median; most {new.max():.2f}) from the nearest of them"
+        )
+    return "; ".join(parts)

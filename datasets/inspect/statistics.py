@@ -156,7 +156,7 @@ def _reach(clip: CaptureClip, expressions: FloatArray) -> FloatArray:
 
 
 def expression_space(clip: CaptureClip) -> ExpressionSpace:
-    """See `ExpressionSpace`. Exact, and done in the space of coefficients: never V x T numbers at once."""
+    """The `ExpressionSpace` of a clip. Exact, and done in the space of coefficients: never V x T numbers at once."""
     excluded = {key.timestep for key in clip.excluded}
     test = {key.timestep for key in clip.splits.get("self_reenactment", ())}
     timesteps = [t for t in sorted(clip.poses) if t not in excluded]

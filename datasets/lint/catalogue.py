@@ -2,15 +2,7 @@
 
 from __future__ import annotations
 
-from . import (
-    checks_cameras,
-    checks_colour,
-    checks_files,
-    checks_images,
-    checks_mesh,
-    checks_splits,
-    checks_tracking,
-)
+from . import checks_cameras, checks_files, checks_images, checks_tracking
 from .rules import Rule
 
 GROUPS = {
@@ -26,10 +18,7 @@ GROUPS = {
 
 RULES: tuple[Rule, ...] = (
     *checks_files.RULES,
-    *checks_splits.RULES,
     *checks_images.RULES,
-    *checks_colour.RULES,
     *checks_cameras.RULES,
     *checks_tracking.RULES,
-    *checks_mesh.RULES,
 )

@@ -283,6 +283,7 @@ RULES = (
         "a camera's matrix is no rigid motion",
         "Write camera-to-world with a right-handed rotation and no scale; put scale into the world instead.",
         _not_rigid,
+        of_layout=True,
     ),
     Rule(
         "HB502",
@@ -319,6 +320,7 @@ RULES = (
         "focal length and angle of view disagree",
         "Scale fl_x with the images; codes that read only camera_angle_x would see another camera.",
         _focal,
+        of_layout=True,
     ),
     Rule(
         "HB507",
@@ -340,6 +342,7 @@ RULES = (
         "the stated principal point is dropped",
         'Declare "top" or "bottom", unless the loss of GaussianAvatars\' centred camera is to be reproduced.',
         _centred,
+        of_layout=True,
     ),
     Rule(
         "HB510",
@@ -354,6 +357,7 @@ RULES = (
         "cy counts from the other edge",
         "Declare the other convention: VHAP counts from the bottom since November 2024, from the top before.",
         _other_edge,
+        of_layout=True,
     ),
     Rule(
         "HB512",

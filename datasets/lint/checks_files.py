@@ -1,15 +1,18 @@
-"""HB1xx: what is there and what is not."""
+"""HB1xx: what is there and what is not. HB2xx: what is held out and seen in training all the same."""
 
 from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 from ...bench.errors import InputError
 from ..ga import layout
+from ..ga.transforms import FrameEntry
+from .checks_images import unit_range
 from .evidence import Evidence, Slot
 from .rules import Hit, Rule, several, some, spans
+from .views import Thumbnail, near_duplicates
 
 GA_WIDTH = 1600
 """Wider images are rescaled by the code of GaussianAvatars, unless it is told otherwise."""
@@ -222,6 +225,86 @@ def _size_limit(evidence: Evidence) -> Iterator[Hit]:
         )
 
 
+def _same_images(evidence: Evidence) -> Iterator[Hit]:
+    """By content, hence also where one file is listed twice."""
+    contents: dict[str, dict[str, FrameEntry]] = {}
+    for split, part in evidence.splits.items():
+        held = contents.setdefault(split, {})
+        for entry in part:
+            if entry.image in evidence.digests:
+                held.setdefault(evidence.digests[entry.image], entry)
+    for one, other in combinations(contents, 2):
+        shared = sorted(contents[one].keys() & contents[other].keys())
+        if shared:
+            first, second = contents[one][shared[0]], contents[other][shared[0]]
+            yield Hit(
+                f"{several(len(shared), 'image')} in both {one} and {other}, such as {first.image.name} of "
+                f"{evidence.names[first.sequence_folder]} ({first.where} of {first.file.name})",
+                second.file,
+                second.where,
+            )
+
+
+def _near_images(evidence: Evidence) -> Iterator[Hit]:
+    if unit_range(evidence):
+        return  # levels 0 and 1 are all nearly the same
+    parts: dict[str, list[Thumbnail]] = defaultdict(list)
+    for thumbnail in evidence.thumbnails:
+        parts[thumbnail.split].append(thumbnail)
+    for one, other in combinations(parts, 2):
+        pairs = [
+            (a, b)
+            for a, b in near_duplicates(parts[one], parts[other])
+            if evidence.digests.get(a.entry.image) != evidence.digests.get(b.entry.image)
+        ]
+        if pairs:
+            a, b = (thumbnail.entry for thumbnail in pairs[0])
+            yield Hit(
+                f"{several(len({second.entry.image for _, second in pairs}), 'image')} of {other} look the same "
+                f"as one of {one}, such as {b.image.name} of {evidence.names[b.sequence_folder]} and "
+                f"{a.image.name} of {evidence.names[a.sequence_folder]}",
+                b.image,
+            )
+
+
+def _test_timesteps(evidence: Evidence) -> Iterator[Hit]:
+    train = {entry.timestep for entry in evidence.splits.get("train", ())}
+    test = {entry.timestep: entry for entry in evidence.splits.get("self_reenactment", ())}
+    shared = train & test.keys()
+    if shared:
+        entry = test[min(shared)]
+        yield Hit(
+            f"self-reenactment timesteps {spans(shared)} are training timesteps too", entry.file, entry.where
+        )
+
+
+def _test_cameras(evidence: Evidence) -> Iterator[Hit]:
+    train = {entry.camera_id for entry in evidence.splits.get("train", ())}
+    held_out = {entry.camera_id: entry for entry in evidence.splits.get("novel_view", ())}
+    shared = sorted(train & held_out.keys())
+    if shared:
+        entry = held_out[shared[0]]
+        yield Hit(f"novel-view cameras {some(shared)} are training cameras too", entry.file, entry.where)
+
+
+def _twice(evidence: Evidence) -> Iterator[Hit]:
+    for split, part in evidence.splits.items():
+        seen: set[tuple[int, str]] = set()
+        twice = []
+        for entry in part:
+            slot = (entry.timestep, entry.camera_id)
+            if slot in seen:
+                twice.append(entry)
+            seen.add(slot)
+        if twice:
+            yield Hit(
+                f"{several(len(twice), 'frame')} of {split} stand there twice, such as timestep "
+                f"{twice[0].timestep} of camera {twice[0].camera_id}",
+                twice[0].file,
+                twice[0].where,
+            )
+
+
 RULES = (
     Rule(
         "HB100",
@@ -229,6 +312,7 @@ RULES = (
         "the reader refuses the capture",
         "Mend what the other findings name; `headbench run` would stop at this one.",
         _refused,
+        of_layout=True,
     ),
     Rule(
         "HB101",
@@ -236,6 +320,7 @@ RULES = (
         "a JSON of the capture is missing or broken",
         "Export the capture again, or restore the file.",
         _broken_json,
+        of_layout=True,
     ),
     Rule(
         "HB102",
@@ -243,6 +328,7 @@ RULES = (
         "a frame's entry is incomplete or of the wrong kind",
         "Export the capture again, or mend the entry.",
         _broken_frame,
+        of_layout=True,
     ),
     Rule(
         "HB103",
@@ -257,6 +343,7 @@ RULES = (
         "an image or mask is of another size than stated",
         "Scale the intrinsics and w, h with the images, or export both at one size.",
         _wrong_size,
+        of_layout=True,
     ),
     Rule(
         "HB105",
@@ -271,6 +358,7 @@ RULES = (
         "timesteps do not count from 0 without a gap",
         "Number timesteps anew: readers of the layout index parameters by them, and a gap shifts all behind it.",
         _gap,
+        of_layout=True,
     ),
     Rule(
         "HB107",
@@ -285,6 +373,7 @@ RULES = (
         "an exclusion names a timestep that is not there",
         "Correct the timestep: probably counted within a sequence, or before the timesteps were renumbered.",
         _stray_exclusion,
+        of_layout=True,
     ),
     Rule(
         "HB109",
@@ -292,6 +381,7 @@ RULES = (
         "frames are excluded without a reason",
         "State the reason in headbench.json, so that a reader of the results can judge it.",
         _unreasoned,
+        of_layout=True,
     ),
     Rule(
         "HB110",
@@ -314,6 +404,7 @@ RULES = (
         "the capture leaves its conventions unsaid",
         "Write headbench.json beside the JSONs (see the README), so that nothing has to be guessed.",
         _undeclared,
+        of_layout=True,
     ),
     Rule(
         "HB113",
@@ -321,6 +412,7 @@ RULES = (
         "images lie there that no split names",
         "Delete them, or add them to a split, if they were to be used.",
         _orphans,
+        of_layout=True,
     ),
     Rule(
         "HB114",
@@ -335,5 +427,40 @@ RULES = (
         "images are wider than GaussianAvatars' limit",
         "Its code rescales images wider than 1,600 pixels unless given -r 1; align the size beforehand.",
         _size_limit,
+    ),
+    Rule(
+        "HB201",
+        "error",
+        "the same image is in two splits",
+        "Take it out of one: a method is measured on what it was trained on.",
+        _same_images,
+    ),
+    Rule(
+        "HB202",
+        "warning",
+        "images of two splits are nearly the same",
+        "Look at the pair; where one is the other saved anew or shifted by a frame, mend the split.",
+        _near_images,
+    ),
+    Rule(
+        "HB203",
+        "error",
+        "self-reenactment timesteps are trained on",
+        "Hold out whole sequences, in all cameras.",
+        _test_timesteps,
+    ),
+    Rule(
+        "HB204",
+        "error",
+        "novel-view cameras are trained on",
+        "Hold out the camera in every training sequence.",
+        _test_cameras,
+    ),
+    Rule(
+        "HB205",
+        "error",
+        "a frame stands twice in one split",
+        "Delete the second entry: it would be trained on or counted twice.",
+        _twice,
     ),
 )

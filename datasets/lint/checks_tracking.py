@@ -1,20 +1,22 @@
-"""HB6xx: the head model and the tracked parameters."""
+"""HB6xx: the head model and the tracked parameters. HB7xx: the tracked mesh against the images."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from ...bench.contracts import FloatArray
 from ...bench.errors import InputError
 from ..ga import layout
 from .checks_cameras import misplaced
-from .checks_mesh import mesh_misses
+from .checks_images import sound_mask
 from .evidence import Evidence
-from .motion import expression_reach, face_steps
+from .mesh import MeshFacts
 from .rules import Hit, Rule, several, some, spans
+from .views import ViewFacts
 
 STILL = 1e-4
 """Radians, or coefficients: what moves by less over a capture does not move."""
@@ -235,6 +237,68 @@ def _unexplained(evidence: Evidence) -> Iterator[Hit]:
         )
 
 
+OUTSIDE = 0.15
+"""Share of the face's vertices outside the foreground from which a frame's mesh misses it."""
+
+SMALL = 0.2
+"""Area of the mesh over that of the foreground from which the mesh is too small, or the mask shows more."""
+
+
+def _laid(evidence: Evidence) -> list[tuple[ViewFacts, MeshFacts, float]]:
+    """Frames whose mesh can be held against a sound mask, with the share of the face outside."""
+    if misplaced(evidence):
+        return []
+    return [
+        (view, view.mesh, view.mesh.face_outside)
+        for view in evidence.views
+        if view.mesh is not None and view.mesh.face_outside is not None and sound_mask(view)
+    ]
+
+
+def mesh_misses(evidence: Evidence) -> bool:
+    """Whether the face of the mesh falls outside the foreground in most frames."""
+    laid = _laid(evidence)
+    return bool(laid) and float(np.median([outside for _, _, outside in laid])) > OUTSIDE
+
+
+def _missed(evidence: Evidence) -> Iterator[Hit]:
+    if mesh_misses(evidence):
+        laid = _laid(evidence)
+        outside = float(np.median([share for _, _, share in laid]))
+        overlap = float(np.median([mesh.overlap or 0.0 for _, mesh, _ in laid]))
+        yield Hit(
+            f"{outside:.0%} of the face's vertices fall outside the foreground (median over "
+            f"{several(len(laid), 'frame')}; mesh and foreground overlap by {overlap:.2f})",
+            evidence.folder,
+        )
+
+
+def _missed_once(evidence: Evidence) -> Iterator[Hit]:
+    if mesh_misses(evidence):
+        return
+    laid = _laid(evidence)
+    lost = [(view, outside) for view, _, outside in laid if outside > OUTSIDE]
+    if lost:
+        timesteps = sorted({view.entry.timestep for view, _ in lost})
+        cameras = sorted({view.entry.camera_id for view, _ in lost})
+        where = f"camera {cameras[0]}, " if len(cameras) == 1 else ""
+        yield Hit(
+            f"the mesh misses the face in {len(lost)} of {several(len(laid), 'frame')} looked at ({where}"
+            f"timesteps {spans(timesteps)})",
+            lost[0][0].entry.image,
+        )
+
+
+def _small(evidence: Evidence) -> Iterator[Hit]:
+    sizes = [mesh.size for _, mesh, _ in _laid(evidence) if mesh.size is not None]
+    if sizes and np.median(sizes) < SMALL:
+        yield Hit(
+            f"the mesh covers {np.median(sizes):.0%} of the foreground's area (median over "
+            f"{several(len(sizes), 'frame')})",
+            evidence.folder,
+        )
+
+
 RULES = (
     Rule(
         "HB601",
@@ -243,6 +307,7 @@ RULES = (
         "Give the declared version, or refit the tracking: coefficients of FLAME 2020 and 2023 are not "
         "interchangeable, though they are as many.",
         _version,
+        of_layout=True,
     ),
     Rule(
         "HB602",
@@ -250,6 +315,7 @@ RULES = (
         "the head model is missing or broken",
         "Give its path with --head, or put it where headbench.json says.",
         _no_head,
+        of_layout=True,
     ),
     Rule(
         "HB603",
@@ -257,6 +323,7 @@ RULES = (
         "parameters do not fit the head model",
         "Give the head model the capture was tracked with.",
         _unfit,
+        of_layout=True,
     ),
     Rule(
         "HB604",
@@ -271,6 +338,7 @@ RULES = (
         "there are fewer coefficients than the head model has",
         "Make sure that the tracker used a cut basis of this very model, and not another one.",
         _short_vectors,
+        of_layout=True,
     ),
     Rule(
         "HB606",
@@ -300,6 +368,7 @@ RULES = (
         "identity changes over time",
         "Track with one identity for all sequences, or take the union apart.",
         _changing_identity,
+        of_layout=True,
     ),
     Rule(
         "HB610",
@@ -307,6 +376,7 @@ RULES = (
         "dynamic offsets are left out",
         "Nothing, if methods are to be driven by coefficients; their tracking is then a little coarser.",
         _dynamic,
+        of_layout=True,
     ),
     Rule(
         "HB611",
@@ -328,6 +398,7 @@ RULES = (
         "sequences were tracked with different head models",
         "Refit one of them, or keep them in captures of their own.",
         _sequence_versions,
+        of_layout=True,
     ),
     Rule(
         "HB614",
@@ -344,4 +415,69 @@ RULES = (
         "images are of the same timesteps; refit the tracking to the model that is to be used.",
         _unexplained,
     ),
+    Rule(
+        "HB701",
+        "error",
+        "the tracked mesh misses the subject",
+        "Look at the overlay (headbench inspect): wrong cameras, intrinsics not scaled with the images, units, "
+        "another subject's tracking, or parameters shifted by some timesteps.",
+        _missed,
+    ),
+    Rule(
+        "HB702",
+        "warning",
+        "the tracked mesh misses the subject in some frames",
+        "Track these timesteps again, or leave them out with a reason.",
+        _missed_once,
+    ),
+    Rule(
+        "HB703",
+        "warning",
+        "the mesh is small beside the foreground",
+        "Make sure of the units; where the mask shows shoulders, cut it below the neck.",
+        _small,
+    ),
 )
+
+
+_BATCH = 32
+
+
+def face_steps(evidence: Evidence) -> dict[str, tuple[list[int], FloatArray]]:
+    """By sequence folder: timesteps that have a pose, (n,), and the mean distance in metres that the face's
+    vertices move from each to the next, (n - 1,)."""
+    if evidence.subject is None:
+        return {}
+    face = evidence.subject.head.regions.get("face", np.arange(len(evidence.subject.head.template)))
+    steps = {}
+    for folder, timesteps in evidence.sequences.items():
+        posed = [t for t in timesteps if evidence.parameters[t].pose is not None]
+        steps[folder] = (posed, _steps(evidence, posed, face))
+    return steps
+
+
+def _steps(evidence: Evidence, timesteps: Sequence[int], face: np.ndarray) -> FloatArray:
+    assert evidence.subject is not None
+    found: list[float] = []
+    last: FloatArray | None = None
+    for start in range(0, len(timesteps), _BATCH):
+        poses = [evidence.parameters[t].pose for t in timesteps[start : start + _BATCH]]
+        points = evidence.subject.vertices([pose for pose in poses if pose is not None])[:, face]
+        chain = points if last is None else np.concatenate([last, points])
+        found += np.linalg.norm(np.diff(chain, axis=0), axis=2).mean(axis=1).tolist()
+        last = points[-1:]
+    return np.array(found)
+
+
+def expression_reach(evidence: Evidence) -> dict[int, float]:
+    """Farthest that a vertex moves by the expression coefficients alone, metres, by timestep."""
+    if evidence.subject is None:
+        return {}
+    basis = evidence.subject.head.expression_basis
+    matrix = np.asarray(basis, dtype=np.float64).reshape(-1, basis.shape[2])
+    poses = {t: p.pose for t, p in evidence.parameters.items() if p.pose is not None}
+    reach = {}
+    for timestep, pose in poses.items():
+        moved = (matrix @ pose.expression.astype(np.float64)).reshape(-1, 3)
+        reach[timestep] = float(np.linalg.norm(moved, axis=1).max())
+    return reach

@@ -7,13 +7,14 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.specs import Findings
+from ..options import CaptureOptions
 from .rules import SEVERITIES, Finding, apply, several
 
 if TYPE_CHECKING:
@@ -21,17 +22,11 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class LintSettings:
+class LintSettings(CaptureOptions):
     """What to look at, and how strictly."""
 
     clip: Annotated[str, tyro.conf.Positional] = ""
-    """Capture in the GaussianAvatars/VHAP layout: a UNION folder, a sequence folder, or the folder of one union."""
-
-    head: str | None = None
-    """Head model for captures that bring none: FLAME pickle or npz."""
-
-    cy: Literal["auto", "top", "bottom", "centre"] = "auto"
-    """How the principal point is read; auto takes the declared convention, else lets the images decide."""
+    """Capture, in a layout that a reader knows; of the reader ga a UNION folder, a sequence folder, or the union's."""
 
     strict: bool = False
     """Exit with 1 on warnings too."""
@@ -43,7 +38,7 @@ class LintSettings:
     """Explain every code and stop."""
 
     views: int = 48
-    """Frames to decode for the checks of colour, mattes and tracking, spread over timesteps and cameras."""
+    """Frames to decode for the checks of colour, masks and tracking, spread over timesteps and cameras."""
 
     duplicates: int = 600
     """Images to decode in the search for near-duplicates between splits. Equal files are found among all."""
@@ -82,6 +77,7 @@ def lint(settings: LintSettings, progress: Progress = no_progress) -> Findings:
         "passed": passed,
         "counts": {severity: counts[severity] for severity in SEVERITIES},
         "looked_at": _looked_at(evidence),
+        "skipped": _skipped(evidence),
         "findings": [finding.as_dict() for finding in findings],
     }
     return Findings(_report(evidence, findings, passed), data, passed)
@@ -90,10 +86,15 @@ def lint(settings: LintSettings, progress: Progress = no_progress) -> Findings:
 def lint_capture(settings: LintSettings, progress: Progress = no_progress) -> tuple[Evidence, list[Finding]]:
     """Findings for a capture, worst first, and what they rest on."""
     from ..ga.reader import find_capture
+    from ..open import find_reader
     from .catalogue import RULES
-    from .evidence import gather
+    from .evidence import gather, gather_clip
 
-    evidence = gather(find_capture(settings.clip), settings, progress)
+    if find_reader(settings.clip, settings.reader).name == "ga":
+        evidence = gather(find_capture(settings.clip), settings, progress)
+    else:
+        clip = settings.open(settings.clip, progress)
+        evidence = gather_clip(Path(settings.clip), clip, settings, progress)
     return evidence, apply(RULES, evidence, settings.ignore, base=evidence.folder.parent)
 
 
@@ -107,8 +108,15 @@ def _looked_at(evidence: Evidence) -> dict[str, Any]:
         "frames_decoded": len(evidence.views),
         "frames_compared_for_near_duplicates": len(evidence.thumbnails),
         "parameter_files": len(evidence.parameters),
-        "rules": len(RULES) - len(set(evidence.settings.ignore)),
+        "rules": len({rule.code for rule in RULES} - set(evidence.settings.ignore) - set(_skipped(evidence))),
     }
+
+
+def _skipped(evidence: Evidence) -> list[str]:
+    """Codes of checks that need files which the capture's reader does not read."""
+    from .catalogue import RULES
+
+    return [] if evidence.of_layout else [rule.code for rule in RULES if rule.of_layout]
 
 
 def _report(evidence: Evidence, findings: Sequence[Finding], passed: bool) -> str:
@@ -128,6 +136,9 @@ def _report(evidence: Evidence, findings: Sequence[Finding], passed: bool) -> st
             f"{seen['frames_decoded']}, compared {seen['frames_compared_for_near_duplicates']} for near-duplicates."
         ),
     ]
+    if skipped := _skipped(evidence):
+        text = "They look at files of the GaussianAvatars/VHAP layout, and another reader read this capture."
+        lines += _filled("", f"Skipped {several(len(skipped), 'check')}: {', '.join(skipped)}. {text}")
     if not passed:
         lines.append("Not fit for a comparison as it is.")
     return "\n".join(lines)

@@ -12,22 +12,26 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ...bench.contracts import Progress, no_progress
+import numpy as np
+
+from ...bench.contracts import FrameKey, HeadPose, Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.io.documents import read_json
+from ...bench.io.files import digest
 from ...bench.io.images import ImageInfo, probe_image
+from ..clip import CaptureClip
 from ..ga import layout
 from ..ga.content_digests import content_digests
-from ..ga.head import find_head
 from ..ga.reader import read_capture
-from ..ga.splits import sequence_names
+from ..ga.tracking import Tracking, find_head
 from ..ga.transforms import FrameEntry, parse_frame
+from ..ga.validate import sequence_names
+from ..ga.writer import pose_to_parameters
 from ..head.arrays import HeadArrays
 from .command import LintSettings
 from .expression_fit import ExpressionFit, weigh_expression
-from .parameters import Parameters, Subject, read_parameters
-from .thumbnails import Thumbnail, make_thumbnails
-from .views import ViewFacts, look, pick_views
+from .mesh import Parameters, Subject, read_parameters
+from .views import Pixels, Thumbnail, ViewFacts, look, make_thumbnails, pick_views, pixels_of_files
 
 
 class Slot(NamedTuple):
@@ -44,6 +48,8 @@ class Evidence:
     Attributes
     ----------
     folder : of the capture.
+    of_layout : whether the files of the GaussianAvatars/VHAP layout were read; else what another reader gives.
+    background : declared, else white.
     declaration : its ``headbench.json``, None where there is none or it is broken.
     splits : frames that could be read, by split.
     unread : slots of frames that a JSON lists and that could not be read.
@@ -61,6 +67,8 @@ class Evidence:
 
     folder: Path
     settings: LintSettings
+    of_layout: bool
+    background: tuple[float, ...]
     declaration: layout.Declaration | None
     splits: Mapping[str, tuple[FrameEntry, ...]]
     unread: frozenset[Slot]
@@ -87,12 +95,9 @@ class Evidence:
     @cached_property
     def names(self) -> Mapping[str, str]:
         """Sequence name by sequence folder."""
+        if not self.of_layout:
+            return {entry.sequence_folder: entry.sequence_folder for entry in self.entries}
         return sequence_names(self.entries, self.declaration.sequences if self.declaration else {})
-
-    @property
-    def background(self) -> tuple[float, ...]:
-        """Declared background, else white."""
-        return self.declaration.background if self.declaration else (1.0, 1.0, 1.0)
 
     @cached_property
     def sequences(self) -> Mapping[str, tuple[int, ...]]:
@@ -114,20 +119,12 @@ def gather(folder: Path, settings: LintSettings, progress: Progress = no_progres
     head, head_faults = _find_head(folder, declaration, settings)
     parameters, subject = read_parameters(entries, head, progress=progress)
     background = declaration.background if declaration else (1.0, 1.0, 1.0)
-    whole = [entry for entry in entries if entry.image in headers]
-    chosen = whole if settings.thorough else pick_views(whole, settings.views)
     cy = settings.cy if settings.cy != "auto" else (declaration.cy if declaration else "bottom")
-    views = look(chosen, headers, subject, parameters, background, cy, progress=progress)
-    limit = len(whole) if settings.thorough else settings.duplicates
-    thumbnails = make_thumbnails(
-        {name: [e for e in part if e.image in headers] for name, part in splits.items()},
-        background,
-        limit,
-        progress=progress,
-    )
     return Evidence(
         folder=folder,
         settings=settings,
+        of_layout=True,
+        background=background,
         declaration=declaration,
         splits=splits,
         unread=frozenset(unread),
@@ -141,11 +138,119 @@ def gather(folder: Path, settings: LintSettings, progress: Progress = no_progres
         head=head,
         parameters=parameters,
         subject=subject,
-        views=tuple(views),
-        thumbnails=tuple(thumbnails),
-        expression_fit=weigh_expression(whole, views, headers, subject, parameters, background, cy),
         refusal=_refusal(folder, settings),
+        **_looked_at(
+            splits,
+            pixels_of_files(headers, background),
+            background,
+            cy,
+            subject,
+            parameters,
+            settings,
+            progress,
+        ),
     )
+
+
+def gather_clip(
+    folder: Path, clip: CaptureClip, settings: LintSettings, progress: Progress = no_progress
+) -> Evidence:
+    """What the linter looks at in a clip of any reader; the checks of the layout's own files need more."""
+    entries = {key: _entry_of(folder, clip, key) for part in clip.splits.values() for key in part}
+    headers = {
+        path: ImageInfo(clip.cameras[key.camera].width, clip.cameras[key.camera].height, 3)
+        for key, entry in entries.items()
+        for path in (entry.image, entry.mask)
+        if path is not None
+    }
+    key_of = {entry.image: key for key, entry in entries.items()}
+    files = {files.image for files in clip.files.values() if files.image is not None and not clip.pixel_steps}
+    digests = content_digests(files & key_of.keys(), progress=progress)
+    for done, (path, key) in enumerate(key_of.items(), start=1):
+        if path not in digests:
+            digests[path] = digest(clip.image(key))
+        progress(done, len(key_of), "reading images")
+    pixels = Pixels(headers, lambda e: clip.image(key_of[e.image]), lambda e: clip.mask(key_of[e.image]))
+    subject = Subject(Tracking(clip.head, clip.poses, clip.shape, clip.static_offset))
+    parameters = {
+        timestep: Parameters(timestep, folder, *_pose_arrays(pose), 0.0, 0.0, pose, None)
+        for timestep, pose in clip.poses.items()
+    }
+    splits = {name: tuple(entries[key] for key in part) for name, part in clip.splits.items()}
+    background = tuple(clip.background.tolist())
+    return Evidence(
+        folder=folder,
+        settings=settings,
+        of_layout=False,
+        background=background,
+        declaration=None,
+        splits=splits,
+        unread=frozenset(),
+        declaration_faults=(),
+        json_faults=(),
+        frame_faults=(),
+        file_faults=(),
+        head_faults=(),
+        headers=headers,
+        digests=digests,
+        head=clip.head,
+        parameters=parameters,
+        subject=subject,
+        refusal=None,
+        **_looked_at(splits, pixels, background, "top", subject, parameters, settings, progress),
+    )
+
+
+def _looked_at(
+    splits: Mapping[str, Sequence[FrameEntry]],
+    pixels: Pixels,
+    background: tuple[float, ...],
+    cy: layout.CyConvention,
+    subject: Subject | None,
+    parameters: Mapping[int, Parameters],
+    settings: LintSettings,
+    progress: Progress,
+) -> dict[str, Any]:
+    """What decoded frames say: fields of `Evidence`."""
+    there = {name: [e for e in part if e.image in pixels.headers] for name, part in splits.items()}
+    whole = [entry for part in there.values() for entry in part]
+    chosen = whole if settings.thorough else pick_views(whole, settings.views)
+    views = look(chosen, pixels, subject, parameters, background, cy, progress=progress)
+    limit = len(whole) if settings.thorough else settings.duplicates
+    return {
+        "views": tuple(views),
+        "thumbnails": tuple(make_thumbnails(there, pixels.image, limit, progress=progress)),
+        "expression_fit": weigh_expression(whole, views, pixels, subject, parameters, cy),
+    }
+
+
+def _entry_of(folder: Path, clip: CaptureClip, key: FrameKey) -> FrameEntry:
+    """A clip's frame as the layout would state it; the key stands for paths that are not there."""
+    camera, files = clip.cameras[key.camera], clip.files[key]
+    on_disk = files.image is not None and not clip.pixel_steps
+    image = files.image if on_disk and files.image is not None else Path(str(key))
+    mask = Path(f"{key} mask") if clip.has_mask(key) else None
+    return FrameEntry(
+        file=folder,
+        where=f"frame {key}",
+        timestep=key.timestep,
+        camera_index=list(clip.cameras).index(key.camera),
+        camera_id=key.camera,
+        sequence_folder=key.sequence,
+        image=image,
+        mask=mask,
+        parameters=folder,
+        width=camera.width,
+        height=camera.height,
+        intrinsics=layout.intrinsics_to_json(camera, "top"),
+        camera_to_world=np.array(layout.extrinsics_to_json(camera.world_to_camera)),
+    )
+
+
+def _pose_arrays(pose: HeadPose) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
+    """Arrays of a pose by name, and which of them are not finite."""
+    arrays = pose_to_parameters(pose)
+    return dict(arrays), tuple(name for name, array in arrays.items() if not np.isfinite(array).all())
 
 
 def _read_declaration(folder: Path) -> tuple[layout.Declaration | None, list[InputError]]:

@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import NamedTuple
 
 import cv2
@@ -20,13 +19,11 @@ import numpy as np
 
 from ...bench.contracts import ByteArray, Camera, FloatArray
 from ...bench.errors import InputError
-from ...bench.io.images import ImageInfo
 from ..ga.layout import CyConvention
 from ..ga.transforms import FrameEntry
 from ..head.geometry import vertex_normals
-from ..images import read_image
-from .parameters import Parameters, Subject
-from .views import ViewFacts, entry_camera
+from .mesh import Parameters, Subject
+from .views import Pixels, ViewFacts, entry_camera
 
 FRAMES = 16
 """Frames to judge by."""
@@ -74,10 +71,9 @@ class _Picked:
 def weigh_expression(
     entries: Sequence[FrameEntry],
     views: Sequence[ViewFacts],
-    headers: Mapping[Path, ImageInfo],
+    pixels: Pixels,
     subject: Subject | None,
     parameters: Mapping[int, Parameters],
-    background: Sequence[float],
     cy: CyConvention,
 ) -> ExpressionFit | None:
     """Compare the expression with a face at rest; None where there is too little to compare.
@@ -103,11 +99,11 @@ def weigh_expression(
         if pose is None:
             continue
         try:
-            image = read_image(entry.image, background)
+            image = pixels.image(entry)
         except InputError:
             continue  # reported as a damaged file
         still = replace(pose, expression=np.zeros_like(pose.expression))
-        place = entry_camera(entry, headers[entry.image], cy)
+        place = entry_camera(entry, pixels.headers[entry.image], cy)
         for kept, mesh in zip((moving, resting), subject.vertices([pose, still])):
             kept.append(_pick(mesh, subject, members, place, image))
     return _compare(camera, moving, resting)

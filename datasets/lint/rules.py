@@ -35,6 +35,7 @@ class Rule:
     title : the fault in a few words.
     remedy : what to do about it.
     check : evidence to hits; no hit where what it needs could not be read.
+    of_layout : looks at files of the GaussianAvatars/VHAP layout; skipped where another reader read the capture.
     """
 
     code: str
@@ -42,6 +43,7 @@ class Rule:
     title: str
     remedy: str
     check: Callable[[Evidence], Iterable[Hit]]
+    of_layout: bool = False
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,7 @@ def apply(
     findings = [
         Finding(rule.code, rule.severity, hit.message, rule.remedy, _relative(hit.file, base), hit.key)
         for rule in rules
-        if rule.code not in ignore
+        if rule.code not in ignore and (evidence.of_layout or not rule.of_layout)
         for hit in rule.check(evidence)
     ]
     return sorted(findings, key=lambda f: (SEVERITIES.index(f.severity), f.code))

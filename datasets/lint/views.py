@@ -1,9 +1,15 @@
-"""Decoded sample frames as a few numbers each: mattes, background, colours, and how the tracked mesh lies."""
+"""Decoded sample frames as a few numbers each, and near-duplicates among images.
+
+Frames of one camera look much alike, so a perceptual hash alone accuses too many. The hash is a difference hash (signs
+of horizontal steps of brightness); a pair that it proposes counts where the thumbnails differ by less than what saving
+an image again changes.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -15,8 +21,7 @@ from ...bench.io.images import ImageInfo
 from ..ga.layout import CyConvention, extrinsics_from_json, intrinsics_from_json
 from ..ga.transforms import FrameEntry
 from ..images import read_image, read_mask
-from .mesh_views import MeshFacts, lay_mesh
-from .parameters import Parameters, Subject
+from .mesh import MeshFacts, Parameters, Subject, lay_mesh
 
 BACKGROUND_LEVELS = 12
 """A pixel is of the background's colour where no channel differs by more; JPEG changes flat areas by less."""
@@ -111,9 +116,30 @@ def entry_camera(entry: FrameEntry, info: ImageInfo, cy: CyConvention) -> Camera
     )
 
 
+@dataclass(frozen=True)
+class Pixels:
+    """Where the pixels of frames come from; both raise `InputError` for damaged files.
+
+    Attributes
+    ----------
+    headers : of the images and masks that are there, by path.
+    image : of a frame, (H, W, 3), on the background.
+    mask : of a frame, (H, W); None where it has none of its image's size.
+    """
+
+    headers: Mapping[Path, ImageInfo]
+    image: Callable[[FrameEntry], ByteArray]
+    mask: Callable[[FrameEntry], ByteArray | None]
+
+
+def pixels_of_files(headers: Mapping[Path, ImageInfo], background: Sequence[float]) -> Pixels:
+    """Pixels of the files that the entries name."""
+    return Pixels(headers, lambda entry: read_image(entry.image, background), partial(_mask, headers))
+
+
 def look(
     entries: Sequence[FrameEntry],
-    headers: Mapping[Path, ImageInfo],
+    pixels: Pixels,
     subject: Subject | None,
     parameters: Mapping[int, Parameters],
     background: Sequence[float],
@@ -125,10 +151,9 @@ def look(
     found = []
     for done, entry in enumerate(entries, start=1):
         progress(done, len(entries), "looking at frames")
-        info = headers[entry.image]
+        info = pixels.headers[entry.image]
         try:
-            image = read_image(entry.image, background)
-            mask = _mask(entry, info, headers)
+            image, mask = pixels.image(entry), pixels.mask(entry)
         except InputError as error:
             found.append(ViewFacts(entry, error=error))
             continue
@@ -137,7 +162,8 @@ def look(
     return found
 
 
-def _mask(entry: FrameEntry, info: ImageInfo, headers: Mapping[Path, ImageInfo]) -> ByteArray | None:
+def _mask(headers: Mapping[Path, ImageInfo], entry: FrameEntry) -> ByteArray | None:
+    info = headers[entry.image]
     path = entry.mask if entry.mask is not None else (entry.image if info.has_alpha else None)
     header = headers.get(path) if path is not None else None
     if path is None or header is None or (header.width, header.height) != (info.width, info.height):
@@ -210,3 +236,100 @@ def _fringe(image: ByteArray, mask: ByteArray, ground: FloatArray) -> float | No
     if telling.sum() < MIN_FRINGE_PIXELS:
         return None
     return float(np.median(added[telling] / expected[telling]))
+
+
+SIDE = 32
+"""Thumbnails are square with this many pixels a side."""
+
+HASH_DISTANCE = 0.1
+"""Largest share of hash bits in which a near-duplicate may differ."""
+
+LEVELS = 2.0
+"""Largest `difference` between two thumbnails of near-duplicates, 8-bit levels."""
+
+SUBJECT_LEVELS = 4.0
+"""A thumbnail's pixel shows the subject where it differs from the upper corners by more."""
+
+_BLOCK = 2048
+
+
+@dataclass(frozen=True, eq=False)
+class Thumbnail:
+    """A frame made small.
+
+    Attributes
+    ----------
+    grey : (SIDE, SIDE) float32 levels.
+    bits : (SIDE * (SIDE - 1),) float32, +1 where brightness grows to the right by more than a level, else -1.
+    shown : (SIDE, SIDE) bool, where it differs from the upper corners.
+    """
+
+    split: str
+    entry: FrameEntry
+    grey: FloatArray
+    bits: FloatArray
+    shown: np.ndarray
+
+
+def make_thumbnails(
+    splits: Mapping[str, Sequence[FrameEntry]],
+    image_of: Callable[[FrameEntry], ByteArray],
+    limit: int,
+    *,
+    progress: Progress = no_progress,
+) -> list[Thumbnail]:
+    """Thumbnails of up to ``limit`` frames, an equal share of every split, evenly spaced in each."""
+    filled = {name: part for name, part in splits.items() if part}
+    chosen: list[tuple[str, FrameEntry]] = []
+    for left, (name, part) in zip(range(len(filled), 0, -1), sorted(filled.items(), key=_size)):
+        count = min(len(part), max(0, limit - len(chosen)) // left)
+        chosen += [(name, part[i]) for i in np.unique(np.linspace(0, len(part) - 1, count).astype(int))]
+    found = []
+    for done, (name, entry) in enumerate(chosen, start=1):
+        progress(done, len(chosen), "comparing images")
+        try:
+            image = image_of(entry)
+        except InputError:
+            continue  # damaged inside: the decoded views and the reader report that
+        found.append(_shrink(name, entry, image))
+    return found
+
+
+def _size(item: tuple[str, Sequence[FrameEntry]]) -> int:
+    return len(item[1])
+
+
+def _shrink(split: str, entry: FrameEntry, image: np.ndarray) -> Thumbnail:
+    small = cv2.resize(image, (SIDE, SIDE), interpolation=cv2.INTER_AREA).astype(np.float32)
+    grey = small.mean(axis=2)
+    # What is declared may be wrong; what lies in the corners is what there is.
+    ground = np.median([small[0, 0], small[0, -1], small[1, 0], small[1, -1]], axis=0)
+    bits = np.where(np.diff(grey, axis=1) > 1, 1.0, -1.0).astype(np.float32).ravel()
+    return Thumbnail(split, entry, grey, bits, np.abs(small - ground).max(axis=2) > SUBJECT_LEVELS)
+
+
+def near_duplicates(
+    one: Sequence[Thumbnail], other: Sequence[Thumbnail]
+) -> Iterator[tuple[Thumbnail, Thumbnail]]:
+    """Pairs of near-duplicates, one from each list."""
+    if not one or not other:
+        return
+    bits = np.stack([thumbnail.bits for thumbnail in other])
+    for start in range(0, len(one), _BLOCK):
+        block = one[start : start + _BLOCK]
+        agreement = np.stack([thumbnail.bits for thumbnail in block]) @ bits.T / bits.shape[1]
+        for i, j in np.argwhere(agreement >= 1 - 2 * HASH_DISTANCE):
+            if difference(block[i], other[j]) <= LEVELS:
+                yield block[i], other[j]
+
+
+def difference(one: Thumbnail, other: Thumbnail) -> float:
+    """95th percentile of the absolute difference, in levels, over the pixels that show the subject in either.
+
+    A face that moves differs much in few places, an image saved anew little in all. Infinite where neither shows
+    anything, as empty frames are no evidence of anything.
+    """
+    shown = one.shown | other.shown
+    if not shown.any():
+        return float("inf")
+    return float(np.percentile(np.abs(one.grey - other.grey)[shown], 95))

@@ -13,7 +13,8 @@ from ...bench.errors import InputError
 from ...bench.specs import Findings, writes
 from ..ga.layout import HEAD_FILE
 from ..head.arrays import save_head
-from .presets import SUBJECT_NAMES, chosen_subjects
+from ..options import CaptureOptions
+from .names import SUBJECT_NAMES, chosen_subjects
 
 if TYPE_CHECKING:
     from .plan import SubjectPlan
@@ -70,7 +71,7 @@ class PrepareSettings:
 
 
 @dataclass(frozen=True)
-class RecordSettings:
+class RecordSettings(CaptureOptions):
     """What to write as a raw recording."""
 
     capture: tyro.conf.Positional[str]
@@ -89,9 +90,9 @@ def prepare_nersemble(settings: PrepareSettings, progress: Progress = no_progres
 
     Everything about every subject is checked before the first frame is decoded.
     """
+    from .export import check_unions
     from .plan import plan_subject
     from .prepare import prepare
-    from .unions import check_unions
 
     subjects = chosen_subjects(settings.subjects)
     if bool(settings.root) == bool(settings.union_root):
@@ -175,12 +176,11 @@ def _done(results: list[SubjectResult], plans: list[SubjectPlan], settings: Prep
 def record_nersemble(settings: RecordSettings, progress: Progress = no_progress) -> Findings:
     """Write a synthetic capture as a raw NeRSemble recording with VHAP's tracking, to try prepare on.
 
-    ``headbench record nersemble``: for synthetic captures, as they bring their own head model."""
-    from ..ga.reader import read_capture
-    from .re_record import re_record
-    from .writer import video_codec
+    For synthetic captures, as they bring their own head model.
+    """
+    from .re_record import re_record, video_codec
 
-    clip = read_capture(settings.capture)
+    clip = settings.open(settings.capture, progress)
     out = Path(settings.out)
     mattes = settings.frames == "images"
     sequences = re_record(

@@ -1,16 +1,30 @@
-"""Stream the frames of one camera, one at a time, however long the sequence is."""
+"""Stream the frames of many cameras side by side, each on one thread, one frame at a time, and write their images.
+
+Decoding, shrinking and encoding all happen in OpenCV with the interpreter's lock released, so threads do.
+"""
 
 from __future__ import annotations
 
+import os
+import queue
+import threading
 from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 import cv2
 
-from ...bench.contracts import ByteArray
+from ...bench.contracts import ByteArray, Progress, no_progress
 from ...bench.errors import InputError
-from ...bench.io.images import read_pixels
+from ...bench.io.files import grouped_writes
+from ...bench.io.images import probe_image, read_pixels
+from ...bench.machine import processor_count
+from ..ga.writer import write_png
+from .pixels import prepare_pixels, read_still
+from .plan import SequenceJob
 from .sequence import View, open_video
 
 
@@ -70,3 +84,107 @@ def _decode_video(path: Path, view: View, numbers: Sequence[int]) -> Iterator[By
 def _ended(path: Path, number: int, count: int) -> InputError:
     expected = f"a frame that decodes, as the index declares {count} frames"
     return InputError(path, f"frame {number}", expected, "the end of the stream", "Fetch the file again.")
+
+
+@dataclass(frozen=True, eq=False)
+class _Stream:
+    """What one camera of one sequence still lacks."""
+
+    job: SequenceJob
+    index: int
+    timesteps: tuple[int, ...]
+
+
+def write_images(
+    jobs: Sequence[SequenceJob], *, workers: int = 0, progress: Progress = no_progress
+) -> tuple[int, int]:
+    """Write what is missing; return how many images were written and how many were there already.
+
+    An image that is there and whole is kept. The first error stops all streams and is raised; what was written
+    stays, and another call continues with it.
+    """
+    streams = [_missing(job, index) for job in jobs for index in range(len(job.cameras))]
+    total = sum(job.count * len(job.cameras) for job in jobs)
+    kept = total - sum(len(stream.timesteps) for stream in streams)
+    streams = [stream for stream in streams if stream.timesteps]
+    reports: queue.SimpleQueue[Future[None] | str] = queue.SimpleQueue()
+    stop = threading.Event()
+    done = kept
+    with grouped_writes(), ThreadPoolExecutor(workers or processor_count()) as pool:
+        for stream in streams:
+            pool.submit(_run, stream, reports, stop).add_done_callback(reports.put)
+        try:
+            running = len(streams)
+            while running:
+                report = reports.get()
+                if isinstance(report, Future):
+                    report.result()  # raises what the stream raised
+                    running -= 1
+                else:
+                    done += 1
+                    progress(done, total, report)
+        finally:
+            stop.set()
+            pool.shutdown(wait=True, cancel_futures=True)
+    return done - kept, kept
+
+
+def _run(stream: _Stream, reports: queue.SimpleQueue, stop: threading.Event) -> None:
+    """Work through a stream and report each image, until the end or the sign to stop."""
+    job, index = stream.job, stream.index
+    camera = job.cameras[index]
+    correct = job.corrections.get(camera.id)
+    size = camera.width, camera.height
+    numbers = [job.recorded.numbers[timestep] for timestep in stream.timesteps]
+    view = job.recorded.views[camera.id]
+    still = read_still(job.stills[camera.id], view.size) if camera.id in job.stills else None
+    frames = read_frames(view, numbers)
+    for timestep, frame in zip(stream.timesteps, frames):
+        if stop.is_set():
+            return
+        image, mask = prepare_pixels(frame.bgr, frame.matte, size, correct, still)
+        with writing(job.image_path(timestep, index)):
+            if mask is not None:
+                write_png(job.mask_path(timestep, index), mask)
+            write_png(job.image_path(timestep, index), image)  # last: with its image a frame is whole
+        reports.put(f"{job.recorded.subject} {job.recorded.name}")
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turn an error of the system into an `InputError` that names the file, the reason and how to go on."""
+    try:
+        yield
+    except OSError as error:
+        remedy = "Make room (or let it be written) and start again: it continues where it stopped."
+        raise InputError(
+            error.filename or path, "", "a file that can be written", error.strerror or str(error), remedy
+        ) from error
+
+
+def _missing(job: SequenceJob, index: int) -> _Stream:
+    camera = job.cameras[index]
+    present = _present(job.folder / "images")
+    masks = _present(job.folder / "fg_masks") if job.recorded.has_mattes else None
+    timesteps = []
+    for timestep in range(job.count):
+        image, mask = job.image_path(timestep, index), job.mask_path(timestep, index)
+        whole = image.name in present and _is_whole(image, camera.width, camera.height)
+        if masks is not None:
+            whole = whole and mask.name in masks and _is_whole(mask, camera.width, camera.height)
+        if not whole:
+            timesteps.append(timestep)
+    return _Stream(job, index, tuple(timesteps))
+
+
+def _present(folder: Path) -> set[str]:
+    return set(os.listdir(folder)) if folder.is_dir() else set()
+
+
+def _is_whole(path: Path, width: int, height: int) -> bool:
+    """Whether an image is complete: a crash of the machine can leave a renamed file without its content."""
+    try:
+        info = probe_image(path)
+    except InputError:
+        return False
+    return (info.width, info.height) == (width, height)

@@ -1,15 +1,167 @@
-"""From a raw frame to the image of a capture: smaller, corrected, on white where there is a matte."""
+"""From a raw frame to the image of a capture: smaller, colours calibrated, on white where there is a mask.
+
+Two forms of colour calibration exist. Version 1 is an affine map on the stored values, ``SER.npy``. Version 2 is a
+polynomial on linear values, ``color_calibration.json``. Images are 8-bit sRGB before and after. VHAP's reader
+computes the version 2 correction and then returns the uncorrected image, so exports made with it carry raw colours.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property, reduce
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from ...bench.contracts import ByteArray
+from ...bench.contracts import ByteArray, FloatArray
+from ...bench.errors import InputError
+from ...bench.io.arrays import check_numbers, read_npy
 from ...bench.io.images import read_pixels
-from .colour import Correction
+from ..srgb import srgb_to_linear
+
+Correction = Callable[[ByteArray], ByteArray]
+"""From (H, W, 3) 8-bit RGB to the same."""
+
+_LARGEST = 1e6  # of a coefficient; genuine ones are below 100
+_CHANNELS = "rgb"
+_PAIRS, _SQUARES, _CUBES = ("rg", "rb", "gb"), ("rr", "gg", "bb"), ("rrr", "ggg", "bbb")
+_CYCLE, _COUNTERCYCLE = ("rrg", "ggb", "bbr"), ("rrb", "ggr", "bbg")
+_QUARTIC_MIXED = ("rrgb", "rggb", "rgbb")
+_SECOND = (*_PAIRS, *_SQUARES, "rgb")
+_THIRD = (*_SECOND, *_CYCLE, *_COUNTERCYCLE, *_CUBES)
+_FOURTH = (
+    *("rrrg", "rrrb", "gggr", "gggb", "bbbr", "bbbg"),
+    *_QUARTIC_MIXED,
+    *("rrgg", "rrbb", "ggbb"),
+    *("rrrr", "gggg", "bbbb"),
+)
+_BEYOND_LINEAR: dict[int, tuple[str, ...]] = {
+    3: (),
+    4: ("",),
+    5: ("rgb", ""),
+    7: (*_PAIRS, ""),
+    8: (*_PAIRS, "rgb", ""),
+    10: (*_PAIRS, *_SQUARES, ""),
+    11: (*_SECOND, ""),
+    14: (*_SECOND, *_CUBES, ""),
+    16: (*_SECOND, *_CYCLE, *_CUBES),
+    17: (*_SECOND, *_CYCLE, *_CUBES, ""),
+    19: _THIRD,
+    20: (*_THIRD, ""),
+    22: (*_THIRD, *_QUARTIC_MIXED),
+    35: (*_THIRD, *_FOURTH, ""),
+}
+
+POLYNOMIALS = {count: (*_CHANNELS, *beyond) for count, beyond in _BEYOND_LINEAR.items()}
+"""Terms by their number, each a product of channels ("rrg" is R R G, "" the constant 1): the augmented
+matrices of Cheung, Westland, Connah, Ripamonti (2004), in colour-science's order."""
+
+
+def linear_to_srgb(values: FloatArray) -> FloatArray:
+    """Encode linear values to sRGB, clipped to [0, 1]; float32, (H, W, C)."""
+    clipped = np.clip(values, 0, 1).astype(np.float32)
+    curved = 1.055 * cv2.pow(clipped, 1 / 2.4).reshape(clipped.shape) - 0.055
+    return np.where(clipped <= 0.0031308, 12.92 * clipped, curved)
+
+
+_LINEAR = srgb_to_linear(np.arange(256) / 255).astype(np.float32)
+_LINEAR.flags.writeable = False
+
+_STEPS = 2**16 - 1
+"""Steps of linear values in `_ENCODED`. Where sRGB is steepest a level spans 20 of them, so that results are within
+0.53 levels of the exact ones instead of 0.5."""
+
+_ENCODED = (
+    np.rint(255 * linear_to_srgb((np.arange(_STEPS + 1) / _STEPS).reshape(1, -1, 1))).astype(np.uint8).ravel()
+)
+_ENCODED.flags.writeable = False
+
+
+@dataclass(frozen=True, eq=False)
+class AffineCorrection:
+    """Version 1: ``out = rgb @ matrix[:, :3] + matrix[:, 3]`` on stored values in [0, 1], clipped.
+
+    ``rgb`` is a row on the left, so the linear part is the transpose of the usual form.
+    """
+
+    matrix: FloatArray  # (3, 4)
+
+    def __call__(self, image: ByteArray) -> ByteArray:
+        if self.is_identity:
+            return image
+        usual = np.hstack([self.matrix[:, :3].T, 255 * self.matrix[:, 3:]])
+        return _to_bytes(cv2.transform(image.astype(np.float32), usual))
+
+    @property
+    def is_identity(self) -> bool:
+        """Whether images come back as they are."""
+        return np.array_equal(self.matrix, np.eye(3, 4))
+
+
+@dataclass(frozen=True, eq=False)
+class PolynomialCorrection:
+    """Version 2: decode sRGB, ``matrix @ terms``, encode sRGB, clip; terms as in `POLYNOMIALS`."""
+
+    matrix: FloatArray  # (3, N)
+
+    def __call__(self, image: ByteArray) -> ByteArray:
+        if self.is_identity:
+            return image
+        linear = _LINEAR[image]
+        height, width, _ = image.shape
+        terms = self._expand(linear).reshape(-1, height * width)
+        planes = self.matrix.astype(np.float32) @ terms
+        steps = np.clip(planes * _STEPS + 0.5, 0, _STEPS).astype(np.uint16)
+        return cv2.merge([*_ENCODED[steps].reshape(3, height, width)]).astype(np.uint8, copy=False)
+
+    @property
+    def is_identity(self) -> bool:
+        """Whether images come back as they are."""
+        return np.array_equal(self.matrix, np.eye(*self.matrix.shape))
+
+    @cached_property
+    def _terms(self) -> tuple[str, ...]:
+        return POLYNOMIALS[self.matrix.shape[1]]
+
+    def _expand(self, linear: FloatArray) -> FloatArray:
+        """(N, H, W) terms of an (H, W, 3) image."""
+        planes = dict(zip(_CHANNELS, np.moveaxis(linear, 2, 0)))
+        terms = np.empty((len(self._terms), *linear.shape[:2]), dtype=np.float32)
+        for target, term in zip(terms, self._terms):
+            target[...] = reduce(np.multiply, (planes[c] for c in term), np.float32(1))
+        return terms
+
+
+def _to_bytes(levels: NDArray[Any]) -> ByteArray:
+    return np.clip(np.rint(levels), 0, 255).astype(np.uint8)
+
+
+def affine_correction(path: Path) -> AffineCorrection:
+    """Read version 1, ``SER.npy``. Raises `InputError` for a file that holds no such matrix."""
+    matrix = read_npy(path)
+    if matrix.dtype.kind not in "fiu" or matrix.shape not in ((3, 4), (4, 4)):
+        found = f"{matrix.dtype} {matrix.shape}"
+        raise InputError(path, "", "an affine matrix of numbers, (4, 4) or (3, 4)", found)
+    check_numbers(path, "", matrix, _LARGEST)
+    return AffineCorrection(matrix[:3].astype(np.float64))
+
+
+def polynomial_correction(path: Path, serial: str, value: Any) -> PolynomialCorrection:
+    """Check one entry of version 2's JSON: a 3 x N matrix with N out of `POLYNOMIALS`."""
+    try:
+        matrix = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        matrix = np.empty(0)
+    if matrix.ndim != 2 or matrix.shape[0] != 3 or matrix.shape[1] not in POLYNOMIALS:
+        counts = ", ".join(map(str, POLYNOMIALS))
+        found = f"shape {matrix.shape}" if matrix.size else repr(value)[:60]
+        raise InputError(path, serial, f"a 3 x N matrix of numbers, N out of {counts}", found)
+    check_numbers(path, serial, matrix, _LARGEST)
+    return PolynomialCorrection(matrix)
 
 
 def prepare_pixels(

@@ -16,13 +16,19 @@ from ..ga import layout
 from ..head.arrays import HeadArrays
 from ..head.loaders import load_head
 from ..head.procedural.model import VERSIONS
-from .calibration import read_calibration
-from .colour import Correction
 from .command import PrepareSettings
 from .export import CY, SequenceExport
-from .names import SEQUENCES, TONGUE_SEQUENCES
-from .presets import NOVEL_VIEW_CAMERA, PAPER_SEQUENCES, TEST_SEQUENCE, UNION10_SEQUENCES, union10_held_out
-from .recording import Participant, participant
+from .names import (
+    NOVEL_VIEW_CAMERA,
+    PAPER_SEQUENCES,
+    SEQUENCES,
+    TEST_SEQUENCE,
+    TONGUE_SEQUENCES,
+    UNION10_SEQUENCES,
+    union10_held_out,
+)
+from .pixels import Correction
+from .recording import Participant, participant, read_calibration
 from .sequence import RecordedSequence, read_sequence
 from .tracking import TrackedSequence, find_tracked, read_tracked
 

@@ -23,9 +23,9 @@ from ...bench.io.lock import locked
 from ..ga import layout
 from ..head.arrays import save_head
 from .export import write_union
-from .image_pool import write_images, writing
+from .frames import write_images, writing
+from .names import NOVEL_VIEW_CAMERA
 from .plan import SequenceJob, SubjectPlan, describe_pixels
-from .presets import NOVEL_VIEW_CAMERA
 
 RECORD_FILE = "headbench-prepare.json"
 RECORD_VERSION = 1

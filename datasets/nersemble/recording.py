@@ -10,20 +10,27 @@ second release                 first release, parts merged        the ten sequen
 
 The benchmark toolkit's folders read as the second release. Parts of the first release that were not merged
 (``sequence_SEQ_part-N/ID/SEQ``) are found too. Nothing is decoded here; `sequence` looks into the videos.
+
+``camera_params.json`` holds world-to-camera matrices with OpenCV axes in metres, and one intrinsic matrix for all
+cameras (raw recordings) or one per camera (the benchmark's cropped videos); no lens distortion.
 """
 
 from __future__ import annotations
 
 import csv
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+
+from ...bench.contracts import Camera, FloatArray
 from ...bench.errors import InputError
 from ...bench.io.documents import read_json
 from ...bench.io.files import check_name
-from .colour import Correction, affine_correction, polynomial_correction
-from .names import BACKGROUND, is_subject, match_sequence, serial_of
+from .names import BACKGROUND, FULL_SIZE, is_subject, match_sequence, serial_of
+from .pixels import Correction, affine_correction, polynomial_correction
 
 CAMERA_FILE = "camera_params.json"
 COLOUR_FILE = "color_calibration.json"
@@ -170,3 +177,142 @@ def _listed_sequences(root: Path) -> dict[str, tuple[str, ...]]:
         )
         for row in rows
     }
+
+
+_RIGID_TOLERANCE = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """Cameras by serial, in the file's order, which is the order of camera indices.
+
+    Attributes
+    ----------
+    file : where they come from, for error messages.
+    world_to_camera : (4, 4) by serial.
+    intrinsics : (3, 3) by serial, pixels of an image of ``size``.
+    size : (width, height) that the intrinsics refer to; None where they refer to the images as they are.
+    """
+
+    file: Path
+    world_to_camera: Mapping[str, FloatArray]
+    intrinsics: Mapping[str, FloatArray]
+    size: tuple[int, int] | None
+
+    @property
+    def serials(self) -> list[str]:
+        """Serials of all cameras."""
+        return [*self.world_to_camera]
+
+    def camera(self, serial: str, size: tuple[int, int], output: tuple[int, int]) -> Camera:
+        """Camera for images of ``output`` size made of images of ``size``, both (width, height).
+
+        Pixels scale with the edges of the image: no half-pixel term. Raises `InputError` where the images
+        have another shape than the calibration refers to.
+        """
+        width, height = self.size or size
+        if abs(size[0] * height - size[1] * width) > max(width, height):
+            raise InputError(
+                self.file,
+                "width, height",
+                f"images of the shape of {width}x{height}, which the intrinsics refer to",
+                f"images of {size[0]}x{size[1]} from camera {serial}",
+                "Give height and width in camera_params.json where the recording has another size.",
+            )
+        K = np.diag([output[0] / width, output[1] / height, 1.0]) @ self.intrinsics[serial]
+        return Camera(serial, *output, K, self.world_to_camera[serial])
+
+    def aligned(self) -> Calibration:
+        """The same cameras in a world with the mean camera looking along -z and +y up, as VHAP turns it.
+
+        The mean of all camera-to-world rotations is orthonormalised column by column (x, y, z); with its
+        second and third columns negated it is the new basis. No translation, no scale. All cameras of the
+        file count, also those that are not used.
+        """
+        to_world = {serial: np.linalg.inv(matrix) for serial, matrix in self.world_to_camera.items()}
+        basis = _gram_schmidt(np.mean([matrix[:3, :3] for matrix in to_world.values()], axis=0))
+        if basis is None:
+            found = "rotations whose mean has no direction"
+            raise InputError(self.file, "world_2_cam", "cameras that look about one way", found)
+        turn = np.eye(4)
+        turn[:3, :3] = basis * [1.0, -1.0, -1.0]
+        turned = {serial: np.linalg.inv(turn.T @ matrix) for serial, matrix in to_world.items()}
+        return replace(self, world_to_camera=turned)
+
+
+def _gram_schmidt(matrix: FloatArray) -> FloatArray | None:
+    """Orthonormal columns, each what the former ones leave of it; None where nothing is left."""
+    columns: list[FloatArray] = []
+    for column in matrix.T:
+        rest = column - sum((np.dot(column, known) * known for known in columns), np.zeros(3))
+        length = np.linalg.norm(rest)
+        if length < 1e-6:
+            return None
+        columns.append(rest / length)
+    return np.stack(columns, axis=1)
+
+
+def read_calibration(path: Path) -> Calibration:
+    """Read and check ``camera_params.json``. Raises `InputError` for the first fault."""
+    value = read_json(path)
+    matrices = value.get("world_2_cam")
+    if not isinstance(matrices, dict) or not matrices:
+        raise InputError(path, "world_2_cam", "an object from serial to 4x4 matrix", _kind(matrices))
+    world_to_camera = {}
+    for serial, entry in matrices.items():
+        check_name(serial, path, "world_2_cam")
+        world_to_camera[serial] = _rigid(path, f"world_2_cam.{serial}", entry)
+    shared = value.get("intrinsics")
+    if isinstance(shared, dict):
+        missing = [serial for serial in world_to_camera if serial not in shared]
+        if missing:
+            raise InputError(path, "intrinsics", "a matrix for every camera", f"none for {missing[0]}")
+        intrinsics = {s: _intrinsics(path, f"intrinsics.{s}", shared[s]) for s in world_to_camera}
+    else:
+        intrinsics = dict.fromkeys(world_to_camera, _intrinsics(path, "intrinsics", shared))
+    return Calibration(path, world_to_camera, intrinsics, _size(path, value, isinstance(shared, dict)))
+
+
+def _size(path: Path, value: Mapping[str, Any], per_camera: bool) -> tuple[int, int] | None:
+    if "width" not in value and "height" not in value:
+        return None if per_camera else FULL_SIZE
+    sizes = []
+    for key in ("width", "height"):
+        number = value.get(key)
+        if not isinstance(number, int) or isinstance(number, bool) or number < 1:
+            raise InputError(path, key, "a number of pixels from 1", _kind(number))
+        sizes.append(number)
+    return sizes[0], sizes[1]
+
+
+def _matrix(path: Path, key: str, value: Any, size: int) -> FloatArray:
+    try:
+        matrix = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        matrix = np.empty(0)
+    if matrix.shape != (size, size) or not np.isfinite(matrix).all():
+        raise InputError(path, key, f"a {size}x{size} matrix of finite numbers", _kind(value))
+    return matrix
+
+
+def _rigid(path: Path, key: str, value: Any) -> FloatArray:
+    matrix = _matrix(path, key, value, 4)
+    rotation = matrix[:3, :3]
+    skew = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if max(skew, np.abs(matrix[3] - [0, 0, 0, 1]).max()) > _RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
+        expected = "a rigid motion (orthonormal, right-handed, last row 0 0 0 1)"
+        raise InputError(path, key, expected, "a matrix that is none")
+    return matrix
+
+
+def _intrinsics(path: Path, key: str, value: Any) -> FloatArray:
+    K = _matrix(path, key, value, 3)
+    zeros = [K[0, 1], K[1, 0], K[2, 0], K[2, 1]]
+    if K[0, 0] <= 0 or K[1, 1] <= 0 or K[2, 2] != 1 or np.any(zeros):
+        expected = "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with positive focal lengths"
+        raise InputError(path, key, expected, _kind(value))
+    return K
+
+
+def _kind(value: Any) -> str:
+    return "no such entry" if value is None else repr(value)[:60]

@@ -12,8 +12,8 @@ import numpy as np
 from ...bench.contracts import FloatArray
 from ...bench.errors import InputError
 from ...bench.io.arrays import MAX_MAGNITUDE, check_numbers, read_npz
-from ..ga.flame_parameters import resolve_teeth
 from ..ga.layout import parse_sequence_folder
+from ..ga.tracking import resolve_teeth
 from ..ga.writer import CANONICAL_JAW
 from ..head.arrays import HeadArrays
 

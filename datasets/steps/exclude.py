@@ -1,16 +1,37 @@
-"""Leave labelled frames out of every split: FLAME has no tongue, so frames that show one are not compared."""
+"""Leave labelled frames out of every split: FLAME has no tongue, so frames that show one are not compared.
+
+Labels come as JSON ({"<timestep>": "<reason>"}), or as the YAML that ``headbench tongue`` writes, which says what a
+detector decided, why, and what people decided instead. One file serves several subjects::
+
+    format: headbench-exclusions-1
+    subjects:
+      '074':
+        overrides: {57: keep, 91: hand before the mouth}
+        threshold: 35.0
+        ...
+        frames:
+          57: {sequence: FREE, score: 61.2, excluded: true, reason: '...'}
+
+The section ``overrides`` is people's: it wins, and a detector that writes the file again keeps it. ``keep`` keeps
+a frame; any other text leaves it out and is the reason.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+from pydantic import NonNegativeInt
 
 from ...bench.contracts import FrameKey
 from ...bench.errors import InputError
-from ...bench.io.documents import read_json
+from ...bench.io.documents import checked, read_json, read_yaml
+from ...bench.io.files import check_name, write_text
 from ..clip import CaptureClip
-from .exclusion_file import read_exclusions
 
 
 def exclude_timesteps(
@@ -91,3 +112,123 @@ def read_reasons(path: Path, clip: CaptureClip) -> dict[int, str]:
                 "The file was made for a capture that numbers its timesteps otherwise.",
             )
     return decided.reasons()
+
+
+FORMAT = "headbench-exclusions-1"
+KEEP = "keep"
+UNIT = "mm2 of lip and chin that look covered"
+
+_HEADER = """\
+# Frames with the tongue out, found by `headbench tongue`. Leave them out with
+#   headbench run --set reader_settings.exclude=THIS_FILE
+# Correct a decision under `overrides` of its subject, as "timestep: keep" or "timestep: reason to exclude";
+# overrides win, and another run of the detector keeps them.
+"""
+
+
+@dataclass(frozen=True)
+class FrameDecision:
+    """What the detector says of one timestep; ``score`` is in `UNIT`."""
+
+    sequence: str
+    score: float
+    excluded: bool
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class Exclusions:
+    """Decisions on one subject.
+
+    Attributes
+    ----------
+    threshold : score from which on a frame is left out.
+    basis : how the threshold was found.
+    cameras : that were looked at.
+    frames : decision by timestep.
+    overrides : people's word by timestep: "keep", or the reason to leave the frame out.
+    """
+
+    threshold: float
+    basis: str
+    cameras: tuple[str, ...]
+    frames: Mapping[int, FrameDecision]
+    overrides: Mapping[int, str] = field(default_factory=dict)
+
+    def reasons(self) -> dict[int, str]:
+        """Reason by timestep that is left out, overrides applied."""
+        found = {t: frame.reason for t, frame in self.frames.items() if frame.excluded}
+        found |= {t: word for t, word in self.overrides.items() if word != KEEP}
+        return {t: found[t] for t in sorted(found) if self.overrides.get(t) != KEEP}
+
+
+def write_exclusions(path: Path, subjects: Mapping[str, Exclusions]) -> None:
+    """Write the file, atomically."""
+    content = {
+        "format": FORMAT,
+        "subjects": {
+            subject: {
+                "overrides": dict(sorted(decided.overrides.items())),
+                "threshold": float(decided.threshold),
+                "threshold_from": decided.basis,
+                "unit": UNIT,
+                "cameras": list(decided.cameras),
+                "frames": {t: _plain(frame) for t, frame in sorted(decided.frames.items())},
+            }
+            for subject, decided in subjects.items()
+        },
+    }
+    text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=1000, allow_unicode=True)
+    write_text(path, _HEADER + text)
+
+
+@dataclass(frozen=True)
+class _Subject:
+    """A subject's entry as the file has it."""
+
+    threshold: float
+    frames: dict[NonNegativeInt, FrameDecision]
+    overrides: dict[NonNegativeInt, str] | None = None  # as left by who deletes the last line
+    threshold_from: str = ""
+    unit: str = UNIT
+    cameras: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class _File:
+    format: Literal["headbench-exclusions-1"]
+    subjects: dict[str, _Subject]
+
+
+def read_exclusions(path: Path) -> dict[str, Exclusions]:
+    """Read the file: decisions by subject. Raises `InputError` for anything that is not one."""
+    if not path.exists():
+        remedy = "Make one with `headbench tongue`."
+        raise InputError(path, "", "a file of exclusions", "no such file", remedy)
+    content = checked(read_yaml(path), _File, path)
+    return {
+        check_name(subject, path, "subjects"): Exclusions(
+            entry.threshold,
+            entry.threshold_from,
+            entry.cameras,
+            entry.frames,
+            {t: _word(path, subject, t, word) for t, word in (entry.overrides or {}).items()},
+        )
+        for subject, entry in content.subjects.items()
+    }
+
+
+def _word(path: Path, subject: str, timestep: int, word: str) -> str:
+    if not word.strip():
+        key = f"subjects.{subject}.overrides.{timestep}"
+        raise InputError(path, key, f'"{KEEP}" or the reason to leave the frame out', "nothing")
+    return KEEP if word.strip().lower() == KEEP else word
+
+
+def _plain(frame: FrameDecision) -> dict[str, Any]:
+    return {
+        "sequence": str(frame.sequence),
+        "score": float(frame.score),
+        "excluded": bool(frame.excluded),
+        "reason": frame.reason,
+    }

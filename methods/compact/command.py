@@ -13,6 +13,7 @@ import tyro
 from ...bench.contracts import Clip, HeadAsset, Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.specs import Findings, writes
+from ...datasets.options import CaptureOptions
 from .precision import EXACT, Precision
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class CompactSettings:
+class CompactSettings(CaptureOptions):
     """Store an avatar of ours in about a fifteenth of its bytes."""
 
     avatar: tyro.conf.Positional[str]
@@ -34,9 +35,6 @@ class CompactSettings:
     compare: str | None = None
     """Capture that the avatar was trained on. Splats that none of its training poses shows are left out, and the
     quality is measured on its held-out frames."""
-
-    head: str | None = None
-    """Head model for a capture that brings none: FLAME pickle or npz."""
 
     frames: int = 8
     """Held-out frames to compare on, evenly spread over both held-out splits."""
@@ -107,11 +105,9 @@ def compact(settings: CompactSettings, progress: Progress = no_progress) -> Find
 
 
 def _clip(settings: CompactSettings, subject: str, progress: Progress) -> Clip | None:
-    from ...datasets.ga.reader import read_capture
-
     if settings.compare is None:
         return None
-    clip = read_capture(settings.compare, head=settings.head, progress=progress)
+    clip = settings.open(settings.compare, progress)
     if clip.subject != subject:
         raise InputError(settings.compare, "subject", repr(subject), repr(clip.subject))
     return clip

@@ -14,6 +14,7 @@ from ...bench.errors import InputError
 from ...bench.io.files import check_writable
 from ...bench.io.lock import LOCK_FILE
 from ...bench.specs import Findings, writes
+from ...datasets.options import CaptureOptions
 
 if TYPE_CHECKING:
     from ..ga.method import GAAvatar
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class ExportPlySettings:
+class ExportPlySettings(CaptureOptions):
     """Write an avatar in one pose as a 3D Gaussian splatting PLY that common viewers open."""
 
     avatar: tyro.conf.Positional[str]
@@ -37,9 +38,6 @@ class ExportPlySettings:
     timestep: int | None = None
     """Timestep of the capture; default: the first of its training frames."""
 
-    head: str | None = None
-    """Head model for a capture that brings none: FLAME pickle or npz."""
-
     directions: int = 96
     """Viewing directions, even over the sphere, at which colours that are not spherical harmonics are sampled."""
 
@@ -53,20 +51,17 @@ class ExportPlySettings:
 
 
 @dataclass(frozen=True)
-class ImportGASettings:
+class ImportGASettings(CaptureOptions):
     """Make an avatar of a GaussianAvatars PLY and the capture it was trained on."""
 
     ply: tyro.conf.Positional[str]
     """The PLY, with a column binding_0 (`point_cloud/iteration_<N>/point_cloud.ply`)."""
 
     capture: str
-    """Capture in the GaussianAvatars/VHAP layout: it brings the head model, the shape and the static offset."""
+    """Capture, in a layout that a reader knows: it brings the head model, the shape and the static offset."""
 
     out: str
     """Folder to write; `headbench export ply` and the method ga load it."""
-
-    head: str | None = None
-    """Head model for a capture that brings none: FLAME pickle or npz."""
 
 
 EXPORTED = "an avatar of ours, ga or gbs"
@@ -155,11 +150,9 @@ def _tensor_names(path: Path) -> set[str]:
 
 
 def _pose(settings: ExportPlySettings, head: HeadAsset, progress: Progress) -> HeadPose:
-    from ...datasets.ga.reader import read_capture
-
     if settings.capture is None:
         return neutral_pose(head)
-    clip = read_capture(settings.capture, head=settings.head, progress=progress)
+    clip = settings.open(settings.capture, progress)
     timestep = settings.timestep
     if timestep is None:
         timestep = min(key.timestep for key in clip.splits["train"])
@@ -192,7 +185,6 @@ def import_ga(settings: ImportGASettings, progress: Progress = no_progress) -> F
     that the training refined is in another file (`flame_param.npz`) and is not read: the avatar follows the capture's.
     Raises `InputError` for a file that does not fit, and for a folder that holds something already.
     """
-    from ...datasets.ga.reader import read_capture
     from ..ga.storage import PLY_FILE, read_ga_splats, write_ga_splats
     from ..shared.avatar_files import HEAD_FILE, SUBJECT_FILE, Subject, save_shared_head, write_subject
 
@@ -200,7 +192,7 @@ def import_ga(settings: ImportGASettings, progress: Progress = no_progress) -> F
     ours = {LOCK_FILE, SUBJECT_FILE, HEAD_FILE}  # an avatar's only with its splats, which are written last
     if out.exists() and any(path.name not in ours for path in out.iterdir()):
         raise InputError(out, "", "a new or an empty folder", "one with files in it")
-    clip = read_capture(settings.capture, head=settings.head, progress=progress)
+    clip = settings.open(settings.capture, progress)
     splats, binding = read_ga_splats(ply, len(clip.head.faces), "cpu")
     write_subject(out / SUBJECT_FILE, Subject.of(clip))
     save_shared_head(out, clip.head)

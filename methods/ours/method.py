@@ -13,7 +13,7 @@ import numpy as np
 
 from ...bench.contracts import Budget, Clip, Progress
 from ...datasets.head.arrays import faces_in_region
-from ...datasets.steps.expression_clusters import cluster_expressions
+from ...datasets.steps.clusters import cluster_expressions
 from ...datasets.steps.jaw_bases import leaks
 from ..compact.file import COMPACT_FILE, write_compact
 from ..compact.precision import Precision

@@ -17,15 +17,18 @@ from ...bench.machine import peak_memory_bytes
 from ...bench.specs import Findings
 from ...datasets.clip import CaptureClip
 from ...datasets.images import ImageStore
-from ...datasets.steps.expression_clusters import (
+from ...datasets.steps.clusters import (
     DEFAULT_CLASSES,
     LANDMARK_TOLERANCE,
     cluster_by_distance,
     cluster_by_landmarks,
     cluster_expressions,
+    expression_displacements,
+    farthest_meshes,
+    mean_vertex_distances,
+    nystrom_embedding,
+    similarities,
 )
-from ...datasets.steps.face_distances import expression_displacements, farthest_meshes, mean_vertex_distances
-from ...datasets.steps.spectral import nystrom_embedding, similarities
 from ...datasets.synthetic.performance import HELD_OUT, perform, share_out
 from ...datasets.synthetic.take import load_geometry
 

@@ -22,7 +22,7 @@ from ...bench.contracts import ByteArray, Camera, Progress, no_progress
 from ...bench.machine import processor_count
 from ...bench.specs import Findings
 from ...datasets.nersemble.command import PrepareSettings, prepare_nersemble
-from ...datasets.nersemble.writer import RecordingWriter, video_codec
+from ...datasets.nersemble.re_record import RecordingWriter, video_codec
 from ...datasets.synthetic.take import cameras
 
 SUBJECT = "999"

@@ -13,7 +13,7 @@ from headbench.bench.specs import ResolutionRule
 from headbench.datasets.clip import as_capture
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.open import find_reader, open_clip
-from headbench.datasets.steps.mattes import set_background
+from headbench.datasets.steps.masks import set_background
 from headbench.datasets.steps.resolution import align_clip
 
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from skimage.transform import downscale_local_mean
 
 from headbench.bench.errors import InputError
-from headbench.datasets.resampling import resize_image
+from headbench.datasets.steps.resolution import resize_image
 
 RNG = np.random.default_rng(7)
 

@@ -18,7 +18,7 @@ from headbench.datasets.colmap.model import read_model
 from headbench.datasets.colmap.reader import model_cameras
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.loaders import load_head
-from headbench.datasets.steps.exclusion_file import read_exclusions
+from headbench.datasets.steps.exclude import read_exclusions
 from headbench.methods.shared.checkpoint import load_checkpoint
 from headbench.metrics.lpips_network import load_backbone, network_spec
 

@@ -13,6 +13,7 @@ from ....bench.contracts import Progress, no_progress
 from ....bench.errors import InputError
 from ....bench.io.files import write_json
 from ....bench.specs import Findings, writes
+from ...options import CaptureOptions
 from ..arrays import HeadArrays
 
 if TYPE_CHECKING:
@@ -84,20 +85,17 @@ class RefitSettings:
 
 
 @dataclass(frozen=True)
-class RefitCommandSettings:
+class RefitCommandSettings(CaptureOptions):
     """What ``headbench refit`` takes."""
 
     capture: Annotated[str, tyro.conf.Positional]
-    """Capture in the GaussianAvatars/VHAP layout."""
+    """Capture, in a layout that a reader knows."""
 
     target: str
     """Head model to refit to: 2020 or 2023 (the embedded procedural heads), or the file of a head model."""
 
     out: str
     """Folder for the refitted capture, refit.json and heat_map.png."""
-
-    head: str | None = None
-    """Head model the capture was tracked with, where it brings none."""
 
     settings: RefitSettings = field(default_factory=RefitSettings)
     """How to fit."""
@@ -115,7 +113,6 @@ def refit_capture(settings: RefitCommandSettings, progress: Progress = no_progre
     Writes under ``settings.out`` the capture (images linked), ``refit.json`` with every timestep's residuals and
     ``heat_map.png``. Raises `InputError` before any fitting where capture and head model do not go together.
     """
-    from ...ga.reader import read_capture
     from ...ga.writer import write_png
     from .heat_map import draw_heat_map
     from .refit import refit
@@ -123,7 +120,7 @@ def refit_capture(settings: RefitCommandSettings, progress: Progress = no_progre
 
     out = Path(settings.out)
     target = target_head(settings.target)
-    clip = read_capture(settings.capture, head=settings.head, progress=progress)
+    clip = settings.open(settings.capture, progress)
     if target.version == clip.head.version:
         raise InputError(
             "command line", "--target", f"another head model than {clip.head.version}", target.version

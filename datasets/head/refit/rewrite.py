@@ -11,7 +11,7 @@ from ....bench.contracts import FrameKey, Progress, no_progress
 from ....bench.errors import InputError
 from ....bench.io.files import atomic_path, grouped_writes
 from ...clip import CaptureClip
-from ...ga.full_grid import require_full_grid
+from ...ga.validate import require_full_grid
 from ...ga.writer import CapturePlan, CaptureWriter, SequencePlan
 
 

@@ -13,14 +13,15 @@ from ....bench.contracts import Progress, no_progress
 from ....bench.errors import InputError
 from ....bench.io.files import write_json
 from ....bench.specs import Findings, writes
+from ...options import CaptureOptions
 
 
 @dataclass(frozen=True)
-class StepsSettings:
+class StepsSettings(CaptureOptions):
     """Draw the jaw bases and the expression classes that a capture's training frames give."""
 
     capture: tyro.conf.Positional[str]
-    """Capture in the GaussianAvatars/VHAP layout."""
+    """Capture, in a layout that a reader knows."""
 
     out: str
     """Folder for jaw_bases.png, expression_classes.png and steps.json."""
@@ -37,9 +38,6 @@ class StepsSettings:
     variant: Literal["paper", "official"] = "paper"
     """"official" shows what the published code makes: jaw bases from held-out poses (a leak, and said so)."""
 
-    head: str | None = None
-    """Head model for a capture that brings none: FLAME pickle or npz."""
-
 
 JAW_PICTURE, CLASS_PICTURE, NUMBERS = "jaw_bases.png", "expression_classes.png", "steps.json"
 
@@ -51,23 +49,21 @@ def steps(settings: StepsSettings, progress: Progress = no_progress) -> Findings
     Raises `InputError` for a capture that the reader refuses, for counts below 1, and for a head without a face
     region.
     """
-    from ...ga.reader import read_capture
     from ...ga.writer import write_png
-    from ..expression_clusters import cluster_expressions
-    from .class_figure import draw_classes
-    from .jaw_figure import draw_jaw_bases, find_jaw_bases
+    from ..clusters import cluster_expressions
+    from ..figures import draw_clusters, draw_jaw_bases, find_jaw_bases
 
     for name in ("bases", "classes"):
         if getattr(settings, name) < 1:
             raise InputError(f"--{name}", "", "at least 1", str(getattr(settings, name)))
-    clip = read_capture(settings.capture, head=settings.head, leaks="record", progress=progress)
+    clip = settings.open(settings.capture, progress)
     jaws = find_jaw_bases(clip, settings.bases, variant=settings.variant)
     clusters = cluster_expressions(
         clip, settings.classes, seed=settings.seed, variant=settings.variant, progress=progress
     )
     out = Path(settings.out)
     write_png(out / JAW_PICTURE, draw_jaw_bases(clip, jaws))
-    write_png(out / CLASS_PICTURE, draw_classes(clip, clusters, progress))
+    write_png(out / CLASS_PICTURE, draw_clusters(clip, clusters, progress))
     data = {
         "subject": clip.subject,
         "clip": clip.fingerprint,

@@ -4,39 +4,32 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from ....bench.contracts import Progress
 from ....bench.errors import InputError
 from ....bench.specs import Findings, writes
-
-if TYPE_CHECKING:
-    from ..exclusion_file import Exclusions
+from ...options import CaptureOptions
 
 if TYPE_CHECKING:
     from ...clip import CaptureClip
+    from ..exclude import Exclusions
 
 
 @dataclass(frozen=True)
-class TongueSettings:
+class TongueSettings(CaptureOptions):
     """Which capture to look at, and how."""
 
     capture: Annotated[str, tyro.conf.Positional]
-    """Capture in the GaussianAvatars/VHAP layout, or a folder of several subjects' captures."""
+    """Capture, in a layout that a reader knows, or a folder of several subjects' captures."""
 
     out: str
     """Folder for tongue.yaml and the contact sheets. Overrides in a tongue.yaml that is there are kept."""
 
-    head: str | None = None
-    """Head model for captures that bring none: FLAME pickle or npz."""
-
     masks: str | None = None
     """FLAME_masks.pkl, for a head model without regions."""
-
-    cy: Literal["auto", "top", "bottom", "centre"] = "auto"
-    """How the principal point is read; auto takes the declared convention, else lets the images decide."""
 
     threshold: float | None = None
     """Area in mm2 from which on a frame is left out; by default chosen for each subject between 20 and 60."""
@@ -57,25 +50,13 @@ def tongue(settings: TongueSettings, progress: Progress) -> Findings:
 
     Raises `InputError` before any image is looked at, for captures and decisions that cannot be read.
     """
-    from ...ga.reader import find_captures, read_capture
-    from ..exclusion_file import read_exclusions, write_exclusions
+    from ..exclude import read_exclusions, write_exclusions
 
     _check(settings)
-    root, out = Path(settings.capture), Path(settings.out)
-    captures = find_captures(root)
+    out = Path(settings.out)
     path = out / DECISIONS_FILE
     decided = read_exclusions(path) if path.exists() else {}
-    clips = [
-        read_capture(
-            capture,
-            head=settings.head,
-            masks=settings.masks,
-            cy=settings.cy,
-            leaks="record",
-            progress=progress,
-        )
-        for capture in captures
-    ]
+    clips = list(settings.open_all(settings.capture, progress, masks=settings.masks))
     text, data = [], {}
     for clip in clips:
         earlier = decided.get(clip.subject)
@@ -92,11 +73,9 @@ def _look(
     clip: CaptureClip, settings: TongueSettings, earlier: Exclusions | None, sheet: Path, progress: Progress
 ) -> Exclusions:
     """Decide on one subject and draw its contact sheet."""
-    from .atlas import mouth_atlas
-    from .decide import decide
-    from .evidence import find_evidence
+    from .evidence import decide, find_evidence
+    from .mouth import facing_cameras, frames_by_timestep, mouth_atlas, sample_clip
     from .review import write_sheet
-    from .sampling import facing_cameras, frames_by_timestep, sample_clip
 
     overrides = earlier.overrides if earlier else {}
     frames = frames_by_timestep(clip)
@@ -126,7 +105,7 @@ def _check(settings: TongueSettings) -> None:
 
 def _summary(subject: str, decided: Exclusions) -> str:
     """Tell a person what was decided, sequence by sequence."""
-    from ..exclusion_file import KEEP
+    from ..exclude import KEEP
 
     reasons = decided.reasons()
     lines = [f"Subject {subject}: {len(reasons)} of {len(decided.frames)} timesteps left out"]
@@ -160,7 +139,7 @@ def _data(decided: Exclusions) -> dict[str, object]:
 
 def _near(decided: Exclusions) -> list[int]:
     """Timesteps that nobody has decided and whose score is within `NEAR` of the threshold."""
-    from .decide import NEAR
+    from .evidence import NEAR
 
     low, high = decided.threshold / NEAR, decided.threshold * NEAR
     return [t for t, f in decided.frames.items() if low <= f.score < high and t not in decided.overrides]

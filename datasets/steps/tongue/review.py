@@ -11,10 +11,9 @@ from PIL import Image, ImageDraw, ImageFont
 
 from ....bench.contracts import ByteArray, Camera, Clip, FloatArray
 from ....bench.io.files import atomic_path
-from ..exclusion_file import Exclusions
-from .atlas import PITCH, MouthAtlas
+from ..exclude import Exclusions
 from .evidence import Evidence
-from .sampling import frames_by_timestep, posed_meshes
+from .mouth import PITCH, MouthAtlas, frames_by_timestep, posed_meshes
 
 Colour = tuple[int, int, int]
 OUT: Colour = (200, 40, 40)

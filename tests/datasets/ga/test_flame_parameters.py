@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from headbench.bench.errors import InputError
-from headbench.datasets.ga.flame_parameters import read_tracking, resolve_teeth
+from headbench.datasets.ga.tracking import read_tracking, resolve_teeth
 from headbench.datasets.head.teeth import with_teeth
 
 from ..head.toy import toy_head

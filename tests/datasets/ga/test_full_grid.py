@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 
 from headbench.bench.errors import InputError
-from headbench.datasets.ga.full_grid import require_full_grid
 from headbench.datasets.ga.reader import read_capture
+from headbench.datasets.ga.validate import require_full_grid
 
 from ..tiny_capture import write_tiny_capture
 

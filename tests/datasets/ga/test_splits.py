@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from headbench.bench.contracts import FrameKey
 from headbench.bench.errors import InputError
-from headbench.datasets.ga.splits import check_disjoint, sequence_names, split_by_holding_out
+from headbench.datasets.ga.validate import check_disjoint, sequence_names, split_by_holding_out
 
 KEYS = [
     FrameKey("s", sequence, t, camera)

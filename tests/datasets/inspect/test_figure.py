@@ -9,11 +9,17 @@ import numpy as np
 import pytest
 
 from headbench.bench.contracts import FrameKey
-from headbench.datasets.inspect.canvas import HELD_OUT, TRAIN, Canvas
-from headbench.datasets.inspect.expression_panel import space_summary
-from headbench.datasets.inspect.figure import WIDTH, draw_figure
-from headbench.datasets.inspect.overlay_panel import OUTLINE, overlay, pick_cameras, pick_timesteps
-from headbench.datasets.inspect.rig_panel import draw_rig, head_frame
+from headbench.datasets.figures import DPI, HELD_OUT, TRAIN, hexadecimal, new_figure, pixels
+from headbench.datasets.inspect.figure import (
+    WIDTH,
+    draw_figure,
+    draw_rig,
+    head_frame,
+    overlay,
+    pick_cameras,
+    pick_timesteps,
+    space_summary,
+)
 from headbench.datasets.inspect.statistics import (
     ExpressionSpace,
     expression_space,
@@ -26,9 +32,9 @@ from ..lint.good_capture import FRONTAL
 from ..tiny_capture import look_at
 
 
-def near(picture: np.ndarray, colour: tuple[int, int, int]) -> np.ndarray:
+def near(picture: np.ndarray, colour: str) -> np.ndarray:
     """(N, 2) x, y of pixels of about a colour."""
-    return np.argwhere(np.abs(picture.astype(int) - colour).max(axis=2) < 40)[:, ::-1]
+    return np.argwhere(np.abs(picture.astype(int) - hexadecimal(colour)).max(axis=2) < 40)[:, ::-1]
 
 
 @pytest.fixture(scope="module")
@@ -55,9 +61,11 @@ def test_cameras_stand_on_their_side_of_the_head(head, above):
         "front": look_at("front", np.array([0.0, -0.1, 1.0]), 60, 80, 30, 40),
         "aside": look_at("aside", np.array([0.8, 0.5, 0.6]), 60, 80, 30, 40),
     }
-    canvas = Canvas(400, 400)
-    draw_rig(canvas, (0, 0, 400, 400), cameras, {"aside"}, *head, above=above)
-    picture = canvas.finish()
+    with new_figure(4, 4) as figure:
+        axes = figure.subplots()
+        draw_rig(axes, cameras, {"aside"}, *head, from_above=above)
+        axes.axis("off")
+        picture = pixels(figure)
     front, aside = near(picture, TRAIN).mean(axis=0), near(picture, HELD_OUT).mean(axis=0)
     grey = (
         (np.ptp(picture.astype(int), axis=2) < 12) & (picture.max(axis=2) < 215) & (picture.min(axis=2) > 60)
@@ -79,7 +87,7 @@ def test_the_outline_lies_on_the_silhouette(clip):
     vertices = posed_meshes(clip, [key.timestep])[0]
     outlined, covered = overlay(clip.image(key), vertices, clip.head.faces, camera, height)
     assert outlined.shape == covered.shape == (height, 240, 3)
-    drawn = near(outlined, OUTLINE)
+    drawn = near(outlined, HELD_OUT)
     mask = cv2.resize(clip.mask(key), (240, height), interpolation=cv2.INTER_LINEAR) > 127
     edge = mask & ~cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
     distance = cv2.distanceTransform((~edge).astype(np.uint8), cv2.DIST_L2, 5)
@@ -116,7 +124,7 @@ def test_a_clip_with_holes_and_without_tests_is_drawn(clip):
     picture = draw_figure(
         bare, split_rows(bare), sequence_rows(bare), expression_space(bare), timesteps=22, cameras=2
     )
-    assert picture.shape[1] == WIDTH
+    assert picture.shape[1] == WIDTH * DPI
     assert len(np.argwhere((picture == 238).all(axis=2))) > 500, "the missing frame is a grey field"
 
 

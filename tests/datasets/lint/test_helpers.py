@@ -10,8 +10,13 @@ from hypothesis import strategies as st
 from headbench.datasets.ga.transforms import read_transforms
 from headbench.datasets.ga.writer import write_png
 from headbench.datasets.lint.rules import several, spans
-from headbench.datasets.lint.thumbnails import make_thumbnails, near_duplicates
-from headbench.datasets.lint.views import _fringe, pick_views
+from headbench.datasets.lint.views import (
+    _fringe,
+    make_thumbnails,
+    near_duplicates,
+    pick_views,
+    pixels_of_files,
+)
 
 from .good_capture import read_rgb
 
@@ -58,7 +63,8 @@ def test_views_cover_timesteps_and_cameras(pristine):
 def test_near_duplicates_survive_noise_and_not_motion(good, noise, shift, twins):
     """Frames saved anew with a level of noise are found, each once; louder or moved ones are not."""
     entries = [e for e in read_transforms(good.union / "transforms_test.json") if e.camera_index == 1]
-    original = make_thumbnails({"one": entries}, (1, 1, 1), 100)
+    white = pixels_of_files({}, (1, 1, 1)).image
+    original = make_thumbnails({"one": entries}, white, 100)
     rng = np.random.default_rng(0)
     for entry in entries:
         image = read_rgb(entry.image).astype(int)
@@ -67,7 +73,7 @@ def test_near_duplicates_survive_noise_and_not_motion(good, noise, shift, twins)
             + rng.integers(-1, 2, size=(20, 15, 1)).repeat(4, 0).repeat(4, 1) * noise
         )
         write_png(entry.image, np.clip(image, 0, 255).astype(np.uint8))
-    again = make_thumbnails({"other": entries}, (1, 1, 1), 100)
+    again = make_thumbnails({"other": entries}, white, 100)
     pairs = list(near_duplicates(original, again))
     assert len(pairs) == twins
     assert all(a.entry.timestep == b.entry.timestep for a, b in pairs)

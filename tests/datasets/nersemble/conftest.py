@@ -6,7 +6,7 @@ import shutil
 
 import pytest
 
-from headbench.datasets.nersemble.writer import RecordingWriter
+from headbench.datasets.nersemble.re_record import RecordingWriter
 
 from .recordings import SUBJECT, Recording, world_cameras, write_recording
 

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from headbench.bench.errors import InputError
-from headbench.datasets.nersemble.calibration import read_calibration
 from headbench.datasets.nersemble.names import FULL_SIZE
+from headbench.datasets.nersemble.recording import read_calibration
 
 from .recordings import HEIGHT, WIDTH, world_cameras
 

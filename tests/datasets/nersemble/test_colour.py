@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from headbench.bench.errors import InputError
-from headbench.datasets.nersemble.colour import (
+from headbench.datasets.nersemble.pixels import (
     POLYNOMIALS,
     AffineCorrection,
     PolynomialCorrection,

@@ -5,7 +5,7 @@ import struct
 import pytest
 
 from headbench.bench.errors import InputError
-from headbench.datasets.nersemble.mp4 import check_boxes
+from headbench.datasets.nersemble.sequence import check_boxes
 
 
 def box(kind: bytes, content: bytes) -> bytes:

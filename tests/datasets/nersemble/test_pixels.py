@@ -7,8 +7,7 @@ from hypothesis import given, settings
 from hypothesis.extra.numpy import arrays
 
 from headbench.bench.errors import InputError
-from headbench.datasets.nersemble.colour import AffineCorrection
-from headbench.datasets.nersemble.pixels import prepare_pixels, read_still
+from headbench.datasets.nersemble.pixels import AffineCorrection, prepare_pixels, read_still
 
 FRAMES = arrays(np.uint8, (8, 12, 3))
 

@@ -13,11 +13,12 @@ from headbench.bench.errors import InputError
 from headbench.bench.io.lock import locked
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import read_head, save_head
-from headbench.datasets.nersemble import export, image_pool, sequence
-from headbench.datasets.nersemble.calibration import read_calibration
+from headbench.datasets.nersemble import export, sequence
+from headbench.datasets.nersemble import frames as image_pool
 from headbench.datasets.nersemble.command import prepare_nersemble
+from headbench.datasets.nersemble.names import UNION10_SEQUENCES, union10_held_out
 from headbench.datasets.nersemble.prepare import RECORD_FILE
-from headbench.datasets.nersemble.presets import UNION10_SEQUENCES, union10_held_out
+from headbench.datasets.nersemble.recording import read_calibration
 
 from .recordings import HEIGHT, SEQUENCES, SUBJECT, WIDTH, colour_of, tone, world_cameras, write_recording
 

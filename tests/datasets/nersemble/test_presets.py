@@ -3,7 +3,7 @@
 import pytest
 
 from headbench.bench.errors import InputError
-from headbench.datasets.nersemble import presets
+from headbench.datasets.nersemble import names as presets
 from headbench.datasets.nersemble.names import SEQUENCES
 from headbench.datasets.synthetic.take import SERIALS
 

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from headbench.bench.errors import InputError
-from headbench.datasets.nersemble.calibration import read_calibration
-from headbench.datasets.nersemble.recording import participant, participants
-from headbench.datasets.nersemble.writer import RecordingWriter
+from headbench.datasets.nersemble.re_record import RecordingWriter
+from headbench.datasets.nersemble.recording import participant, participants, read_calibration
 
 from .recordings import SEQUENCES, SUBJECT, world_cameras, write_recording
 

@@ -6,11 +6,10 @@ import pytest
 
 from headbench.bench.errors import InputError
 from headbench.datasets.nersemble import sequence as sequence_module
-from headbench.datasets.nersemble.calibration import read_calibration
 from headbench.datasets.nersemble.frames import read_frames
-from headbench.datasets.nersemble.recording import participant
+from headbench.datasets.nersemble.re_record import write_video
+from headbench.datasets.nersemble.recording import participant, read_calibration
 from headbench.datasets.nersemble.sequence import probe_video, read_sequence
-from headbench.datasets.nersemble.writer import write_video
 
 from .recordings import HEIGHT, SEQUENCES, SUBJECT, WIDTH, colour_of, matte, world_cameras, write_recording
 

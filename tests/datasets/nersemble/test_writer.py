@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from headbench.bench.errors import InputError
-from headbench.datasets.nersemble.writer import RecordingWriter, video_codec, write_tracked, write_video
+from headbench.datasets.nersemble.re_record import RecordingWriter, video_codec, write_tracked, write_video
 
 from ..head.toy import toy_head
 from .recordings import HEIGHT, SUBJECT, WIDTH, tracked_arrays, world_cameras

@@ -6,8 +6,14 @@ import pytest
 
 from headbench.bench.contracts import FrameKey
 from headbench.bench.errors import InputError
-from headbench.datasets.steps.exclude import exclude_timesteps, read_labels, read_reasons
-from headbench.datasets.steps.exclusion_file import Exclusions, FrameDecision, write_exclusions
+from headbench.datasets.steps.exclude import (
+    Exclusions,
+    FrameDecision,
+    exclude_timesteps,
+    read_labels,
+    read_reasons,
+    write_exclusions,
+)
 
 from .clips import make_clip
 

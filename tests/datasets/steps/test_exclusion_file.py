@@ -6,12 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from headbench.bench.errors import InputError
-from headbench.datasets.steps.exclusion_file import (
-    Exclusions,
-    FrameDecision,
-    read_exclusions,
-    write_exclusions,
-)
+from headbench.datasets.steps.exclude import Exclusions, FrameDecision, read_exclusions, write_exclusions
 
 TEXT = st.text(st.characters(codec="utf-8", exclude_categories=("Cs", "Cc")), max_size=20)
 FRAMES = st.dictionaries(

@@ -10,10 +10,14 @@ from sklearn.cluster import SpectralClustering
 from sklearn.metrics import adjusted_rand_score
 
 from headbench.bench.errors import InputError
-from headbench.datasets.steps import expression_clusters as module
-from headbench.datasets.steps.expression_clusters import cluster_by_distance, cluster_expressions
-from headbench.datasets.steps.face_distances import expression_displacements, mean_vertex_distances
-from headbench.datasets.steps.spectral import similarities
+from headbench.datasets.steps import clusters as module
+from headbench.datasets.steps.clusters import (
+    cluster_by_distance,
+    cluster_expressions,
+    expression_displacements,
+    mean_vertex_distances,
+    similarities,
+)
 from headbench.tests.benchmarks.clusters import performed_clip
 
 from .clips import make_clip, with_poses

@@ -12,11 +12,7 @@ from hypothesis import strategies as st
 
 from headbench.bench.errors import InputError
 from headbench.datasets.head.model import HeadModel
-from headbench.datasets.steps.face_distances import (
-    expression_displacements,
-    farthest_meshes,
-    mean_vertex_distances,
-)
+from headbench.datasets.steps.clusters import expression_displacements, farthest_meshes, mean_vertex_distances
 
 from .clips import make_clip, with_poses
 

@@ -17,7 +17,7 @@ from headbench.datasets.clip import FrameFiles
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.model import HeadModel
 from headbench.datasets.images import ImageStore
-from headbench.datasets.steps.mattes import (
+from headbench.datasets.steps.masks import (
     NeckLine,
     clean_edges,
     composite,

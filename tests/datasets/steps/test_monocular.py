@@ -9,7 +9,7 @@ import torch
 from headbench.bench.specs import ResolutionRule
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.model import HeadModel
-from headbench.datasets.steps.monocular import as_single_video
+from headbench.datasets.steps.for_method import as_single_video
 from headbench.datasets.steps.resolution import align_clip
 
 from ..tiny_capture import SERIALS

@@ -13,12 +13,20 @@ from scipy.spatial.transform import Rotation
 from headbench.bench.contracts import no_progress
 from headbench.bench.errors import InputError
 from headbench.bench.io.documents import read_json
+from headbench.datasets.figures import new_figure, pixels
 from headbench.datasets.ga.reader import read_capture
-from headbench.datasets.steps.expression_clusters import cluster_expressions
-from headbench.datasets.steps.pictures.class_figure import class_colour, draw_classes, frontal_key
+from headbench.datasets.steps.clusters import cluster_expressions
+from headbench.datasets.steps.figures import (
+    cluster_colour,
+    draw_clusters,
+    draw_jaw_bases,
+    draw_meshes,
+    draw_strips,
+    find_jaw_bases,
+    frontal_key,
+    unposed_meshes,
+)
 from headbench.datasets.steps.pictures.command import StepsSettings, steps
-from headbench.datasets.steps.pictures.jaw_figure import draw_jaw_bases, find_jaw_bases
-from headbench.datasets.steps.pictures.meshes import draw_meshes, unposed_meshes
 
 from .clips import make_clip, with_poses
 
@@ -81,20 +89,22 @@ def test_the_medoids_camera_is_the_one_the_face_looks_at(clip):
         assert frontal_key(looking, timestep).camera == name
 
 
-def test_class_figure_shows_every_class_in_its_share_of_the_strips(clip):
-    clusters = cluster_expressions(clip, 2)
-    picture = draw_classes(clip, clusters)
-    sizes = sorted(Counter(clusters.labels.tolist()).values(), reverse=True)
-    lengths = Counter(key.sequence for key in {k._replace(camera="") for k in clip.splits["train"]})
-    rows = picture[-24 - 22 * len(lengths) :, 174:]  # right of the sequences' names
-    areas = [
-        (np.abs(rows.astype(int) - class_colour(rank)).max(axis=2) < 8).sum() for rank in range(len(sizes))
-    ]
-    np.testing.assert_allclose(np.array(areas) / sum(areas), np.array(sizes) / sum(sizes), atol=0.04)
+def test_strips_show_the_cluster_of_each_timestep_in_order():
+    with new_figure(6, 2) as figure:
+        axes = figure.subplots()
+        draw_strips(axes, {"EMO-1": [0, 0, 1, 2], "SEN": [1, 0]})
+        axes.axis("off")
+        axes.set_title("")
+        axes.set_position((0, 0, 1, 1))
+        picture = pixels(figure) / 255
+    for row, ranks in ((50, [0, 0, 1, 2]), (150, [1, 0])):
+        for number, rank in enumerate(ranks):
+            np.testing.assert_allclose(picture[row, 75 + 150 * number], cluster_colour(rank), atol=0.01)
+    assert (picture[150, 350:] == 1).all()
 
 
-def test_colours_of_sixteen_classes_differ():
-    colours = np.array([class_colour(rank) for rank in range(16)], dtype=float)
+def test_colours_of_sixteen_clusters_differ():
+    colours = 255 * np.array([cluster_colour(rank) for rank in range(16)])
     distances = np.linalg.norm(colours[:, None] - colours, axis=2) + 1e3 * np.eye(16)
     assert distances.min() > 20
 
@@ -119,7 +129,7 @@ def test_a_clip_with_one_timestep_still_has_figures(clip):
     first = clip.timesteps("train")[0]
     train = tuple(key for key in clip.splits["train"] if key.timestep == first)
     single = clip.derive("test", {}, splits={**clip.splits, "train": train, "self_reenactment": ()})
-    assert draw_classes(single, cluster_expressions(single)).std() > 5
+    assert draw_clusters(single, cluster_expressions(single)).std() > 5
     assert draw_jaw_bases(single, find_jaw_bases(single)).std() > 5
 
 

@@ -7,12 +7,7 @@ import pytest
 from sklearn.manifold import spectral_embedding
 from sklearn.metrics import adjusted_rand_score
 
-from headbench.datasets.steps.spectral import (
-    classes_of,
-    exact_embedding,
-    nystrom_embedding,
-    similarities,
-)
+from headbench.datasets.steps.clusters import classes_of, exact_embedding, nystrom_embedding, similarities
 
 
 def similarity_of(points):

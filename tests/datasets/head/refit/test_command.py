@@ -18,7 +18,7 @@ from headbench.datasets.head.refit import refit as block
 from headbench.datasets.head.refit.command import RefitCommandSettings, refit_capture, target_head
 from headbench.datasets.head.refit.heat_map import colour_scale
 from headbench.datasets.head.refit.rewrite import capture_plan, link_or_copy, write_capture
-from headbench.datasets.steps.mattes import set_background
+from headbench.datasets.steps.masks import set_background
 
 from ...tiny_capture import make_plan, write_tiny_capture
 
@@ -61,8 +61,8 @@ def test_report_and_picture(finished):
     assert sum(value is None for value in stored["vertices_mm"]) > 0
     picture = cv2.imread(str(root / "out" / "heat_map.png"))
     assert picture is not None
-    assert picture.shape == (484, 880, 3)
-    middle = picture[66:426, 320:560].reshape(-1, 3).astype(int)
+    assert picture.shape == (500, 880, 3)
+    middle = picture[60:400, 320:560].reshape(-1, 3).astype(int)
     coloured = np.ptp(middle, axis=1) > 60
     assert coloured.mean() > 0.05  # the face; the rest of the head is grey
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from headbench.bench.contracts import FrameKey
 from headbench.datasets.mesh_pictures import draw_mesh, portrait_camera
-from headbench.datasets.steps.tongue.sampling import posed_meshes
+from headbench.datasets.steps.tongue.mouth import posed_meshes
 from headbench.datasets.synthetic.performance import CONTROLS
 from headbench.datasets.synthetic.take import load_geometry
 

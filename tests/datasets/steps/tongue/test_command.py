@@ -12,7 +12,7 @@ from headbench.bench.errors import InputError
 from headbench.bench.protocol import make_protocol
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.ga.writer import CapturePlan, CaptureWriter, SequencePlan
-from headbench.datasets.steps.exclusion_file import read_exclusions, write_exclusions
+from headbench.datasets.steps.exclude import read_exclusions, write_exclusions
 from headbench.datasets.steps.tongue.command import DECISIONS_FILE, TongueSettings, tongue
 
 from .painted import TONGUE, Moment, geometry, painted_clip

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from headbench.datasets.steps.tongue.decide import ALWAYS, NEVER, choose_threshold, decide
-from headbench.datasets.steps.tongue.evidence import Evidence
+from headbench.datasets.steps.tongue.evidence import ALWAYS, NEVER, Evidence, choose_threshold, decide
 
 
 def evidence(areas, seen=None):

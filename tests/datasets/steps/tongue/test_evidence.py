@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 
-from headbench.datasets.steps.tongue.atlas import mouth_atlas
-from headbench.datasets.steps.tongue.decide import ALWAYS, NEVER
-from headbench.datasets.steps.tongue.evidence import find_evidence
-from headbench.datasets.steps.tongue.sampling import facing_cameras, sample_clip
+from headbench.datasets.steps.tongue.evidence import ALWAYS, NEVER, find_evidence
+from headbench.datasets.steps.tongue.mouth import facing_cameras, mouth_atlas, sample_clip
 
 from .painted import BLUSH, INSIDE, SKIN, TONGUE, Moment, painted_clip
 

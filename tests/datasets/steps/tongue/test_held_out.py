@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 
 from headbench.datasets.ga.reader import read_capture
-from headbench.datasets.steps.tongue.atlas import mouth_atlas
-from headbench.datasets.steps.tongue.decide import decide
-from headbench.datasets.steps.tongue.evidence import find_evidence
-from headbench.datasets.steps.tongue.sampling import facing_cameras, posed_meshes, sample_clip
+from headbench.datasets.steps.tongue.evidence import decide, find_evidence
+from headbench.datasets.steps.tongue.mouth import facing_cameras, mouth_atlas, posed_meshes, sample_clip
 from headbench.datasets.synthetic.capture import synthesize
 
 ERROR_MM = 1.0

@@ -1,0 +1,78 @@
+"""Figures by matplotlib, without a window: one style for the pictures of all commands on captures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure, SubFigure
+
+from ..bench.contracts import ByteArray
+
+Colour = tuple[int, int, int]
+
+TRAIN, HELD_OUT = "#0072b2", "#d55e00"
+"""Two of Okabe and Ito's colours, told apart with any colour vision."""
+MUTED, RULE, LEAK = "#737373", "#d6d6d6", "#be1e2d"
+DPI = 100
+
+_STYLE: Any = {
+    "text.parse_math": False,  # names hold dollar signs
+    "font.size": 10,
+    "axes.titlesize": 11,
+    "axes.titlelocation": "left",
+    "axes.edgecolor": RULE,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.labelsize": 9,
+    "axes.axisbelow": True,
+    "xtick.labelsize": 9,
+    "ytick.labelsize": 9,
+    "xtick.color": MUTED,
+    "ytick.color": MUTED,
+    "grid.color": RULE,
+    "grid.linewidth": 0.6,
+    "legend.frameon": False,
+}
+
+
+@contextmanager
+def new_figure(width: float, height: float) -> Iterator[Figure]:
+    """An empty figure of a size in inches; everything is drawn, and turned into pixels, within the context."""
+    with matplotlib.rc_context(_STYLE):
+        yield Figure(figsize=(width, height), dpi=DPI, layout="constrained")
+
+
+def bands(figure: Figure, heights: Sequence[float]) -> list[SubFigure]:
+    """Parts of a figure below each other, of heights in these proportions."""
+    return list(np.asarray(figure.subfigures(len(heights), 1, height_ratios=heights)))
+
+
+def pixels(figure: Figure) -> ByteArray:
+    """(H, W, 3) 8-bit sRGB."""
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def show(axes: Axes, image: ByteArray, *, frame: bool = False) -> None:
+    """Put an image on axes of its own, without ticks."""
+    axes.imshow(image)
+    axes.set(xticks=[], yticks=[])
+    axes.spines[:].set_visible(frame)
+
+
+def shortened(text: str, length: int) -> str:
+    """The text, cut with an ellipsis to so many characters."""
+    return text if len(text) <= length else f"{text[: length - 1]}…"
+
+
+def hexadecimal(colour: str) -> Colour:
+    """Levels of a colour such as `TRAIN`."""
+    red, green, blue = bytes.fromhex(colour.removeprefix("#"))
+    return red, green, blue

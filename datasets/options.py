@@ -1,0 +1,45 @@
+"""Options that every command on a capture has; light to import."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+from ..bench.contracts import Progress
+
+if TYPE_CHECKING:
+    from .clip import CaptureClip
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaptureOptions:
+    """How a capture is opened."""
+
+    reader: str = ""
+    """Reader of the capture: a name that `headbench list` shows, or "module:SPEC"; default: the one that finds it."""
+
+    head: str | None = None
+    """Head model for captures that bring none: FLAME pickle or npz."""
+
+    cy: Literal["auto", "top", "bottom", "centre"] = "auto"
+    """How the reader ga reads the principal point; auto takes the declared convention, else lets the images decide."""
+
+    def open(self, path: str, progress: Progress, **settings: Any) -> CaptureClip:
+        """Open the one capture at ``path``; see `open_clip`. Leaks between splits are recorded, if the reader can."""
+        from .open import open_clip
+
+        return open_clip(path, self.reader, progress=progress, **self._settings(), **settings)
+
+    def open_all(self, path: str, progress: Progress, **settings: Any) -> Iterator[CaptureClip]:
+        """Open every capture under ``path``, one after the other."""
+        from .open import open_clips
+
+        return open_clips(path, self.reader, progress=progress, **self._settings(), **settings)
+
+    def _settings(self) -> dict[str, Any]:
+        return {
+            "wishes": {"leaks": "record"},
+            "head": self.head,
+            "cy": None if self.cy == "auto" else self.cy,
+        }

@@ -1,0 +1,393 @@
+"""Expression clusters of a performance, so that rare expressions are trained on as often as common ones.
+
+"3D Gaussian Head Avatars with Expressive Dynamic Appearances by Compact Tensorial Representations"
+(CVPR 2025, arXiv 2504.14967), class-balanced sampling: spectral clustering of the unposed training meshes
+under the mean vertex distance of the face. The published code draws on training timesteps alone, so nothing
+leaks; it compares all pairs, and its k-means starts at random. Its behaviour is ``variant="official"``.
+
+Both embeddings, of all pairs and of a few columns of the similarity matrix (Nyström), are those of scikit-learn's
+`SpectralClustering` with a precomputed affinity: leading eigenvectors of D^-1/2 (S - I) D^-1/2, each row divided by
+the square root of its degree. Von Luxburg, "A tutorial on spectral clustering", Statistics and Computing 2007;
+Fowlkes, Belongie, Chung and Malik, "Spectral grouping using the Nyström method", PAMI 2004.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import torch
+from scipy.linalg import eigh
+from scipy.sparse.linalg import LinearOperator, eigsh
+from sklearn.cluster import AgglomerativeClustering, KMeans, SpectralClustering
+
+from ...bench.contracts import Clip, FloatArray, HeadAsset, IntArray, Progress, no_progress
+from ...bench.errors import InputError
+from ..head.model import HeadModel
+
+DEFAULT_CLASSES = 16
+LANDMARK_LIMIT = 500
+"""Timesteps up to which all pairs are compared; beyond, at most as many landmarks stand for all."""
+
+LANDMARK_TOLERANCE = 0.01
+"""Fraction of the largest distance within which every face has a landmark, if so many are allowed."""
+
+_DIGITS = 6  # distances equal to so many digits, as parts of the largest, are those of one face
+
+
+@dataclass(frozen=True, eq=False)
+class ExpressionClusters:
+    """Class of each training timestep.
+
+    Attributes
+    ----------
+    timesteps : (T,) sorted training timesteps.
+    labels : (T,) class of each, from 0; every class has a member.
+    medoids : (classes,) timestep of each class that is the nearest to its centre in the spectral embedding.
+    landmarks : timesteps that stood for all; T where all pairs were compared.
+    radius : metres within which every face has a landmark; 0 where all pairs were compared.
+    variant : "official" where the published behaviour was asked for.
+    """
+
+    timesteps: IntArray
+    labels: IntArray
+    medoids: IntArray
+    landmarks: int
+    radius: float
+    variant: str = "paper"
+
+    @property
+    def by_timestep(self) -> dict[int, int]:
+        """Class by timestep."""
+        return dict(zip(self.timesteps.tolist(), self.labels.tolist()))
+
+    def record(self) -> dict[str, Any]:
+        """What a record of the step says."""
+        return {
+            "timesteps": len(self.timesteps),
+            "class_sizes": np.bincount(self.labels).tolist(),
+            "medoids": self.medoids.tolist(),
+            "landmarks": self.landmarks,
+            "radius_mm": round(1000 * self.radius, 4),
+            "variant": self.variant,
+        }
+
+
+def cluster_expressions(
+    clip: Clip,
+    classes: int = DEFAULT_CLASSES,
+    *,
+    seed: int = 0,
+    limit: int = LANDMARK_LIMIT,
+    variant: Literal["paper", "official"] = "paper",
+    progress: Progress = no_progress,
+) -> ExpressionClusters:
+    """Cluster the training timesteps of a clip by the shape of the face.
+
+    Up to ``limit`` timesteps all pairs are compared. Beyond, farthest-point landmarks stand for all and the
+    clustering is Nyström's (see `spectral`); memory then grows with T times ``limit`` and T times the size of a
+    face, never with T squared. There are never more classes than distinct faces (landmarks, beyond ``limit``).
+
+    Parameters
+    ----------
+    seed : decides the first landmark, or the random starts of "official"; all pairs without it need none.
+    variant : "official" reproduces the published code: all pairs however many, k-means from ten random starts.
+        It sees training timesteps alone, as the default does.
+
+    Raises
+    ------
+    InputError
+        Where the head has no region "face".
+    """
+    timesteps = np.array(sorted({key.timestep for key in clip.splits["train"]}))
+    faces = expression_displacements(clip, timesteps.tolist())
+    if len(faces) <= limit or variant == "official":
+        distances = mean_vertex_distances(faces)
+        labels, embedding = cluster_by_distance(distances, classes, seed=seed, variant=variant)
+        landmarks, radius = len(faces), 0.0
+    else:
+        found = farthest_meshes(faces, limit, seed=seed, tolerance=LANDMARK_TOLERANCE, progress=progress)
+        labels, embedding = cluster_by_landmarks(found.distances, found.indices, classes)
+        landmarks, radius = len(found.indices), found.radius
+    medoids = timesteps[_medoids(labels, embedding)]
+    return ExpressionClusters(timesteps, labels, medoids, landmarks, radius, variant)
+
+
+def cluster_by_distance(
+    distances: FloatArray, classes: int, *, seed: int = 0, variant: Literal["paper", "official"] = "paper"
+) -> tuple[IntArray, FloatArray]:
+    """Spectral clustering of all pairs under the similarity 1 - d / max d.
+
+    Parameters
+    ----------
+    distances : (N, N) symmetric, zero diagonal.
+    classes : at most as many; fewer where there are fewer distinct items.
+
+    Returns
+    -------
+    (N,) labels from 0, without empty classes, and the (N, c) embedding that they part.
+    """
+    largest = float(distances.max(initial=0.0))
+    classes = min(classes, _distinct(distances, largest))
+    if classes <= 1 or classes >= len(distances):
+        return _trivial(len(distances), classes)
+    similarity = similarities(distances, largest)
+    embedding = exact_embedding(similarity, classes)
+    if variant == "official":
+        published = SpectralClustering(classes, affinity="precomputed", random_state=seed)
+        labels = np.unique(published.fit_predict(similarity), return_inverse=True)[1].astype(np.int64)
+        return labels, embedding
+    return classes_of(embedding, classes), embedding
+
+
+def cluster_by_landmarks(
+    distances: FloatArray, landmarks: IntArray, classes: int
+) -> tuple[IntArray, FloatArray]:
+    """Spectral clustering from the distances to landmarks alone; results as of `cluster_by_distance`.
+
+    Parameters
+    ----------
+    distances : (N, m) of each item to each landmark. Where the landmarks are farthest points, the largest of
+        these is the largest of all, or within the landmarks' radius of it.
+    landmarks : (m,) which items they are; distinct.
+    """
+    largest = float(distances.max(initial=0.0))
+    classes = min(classes, _distinct(distances[landmarks], largest))
+    if classes <= 1 or classes >= len(distances):
+        return _trivial(len(distances), classes)
+    embedding = nystrom_embedding(similarities(distances, largest), landmarks, classes)
+    return classes_of(embedding, classes), embedding
+
+
+def _distinct(distances: FloatArray, largest: float) -> int:
+    """Number of distinct items, by their rows of distances."""
+    return 1 if largest == 0 else len(np.unique(np.round(distances / largest, _DIGITS), axis=0))
+
+
+def _trivial(count: int, classes: int) -> tuple[IntArray, FloatArray]:
+    """All in one class, or each in its own."""
+    labels = np.zeros(count, dtype=np.int64) if classes <= 1 else np.arange(count)
+    return labels, labels[:, None].astype(np.float64)
+
+
+def _medoids(labels: IntArray, embedding: FloatArray) -> IntArray:
+    """(classes,) item of each class nearest to the mean of the class."""
+    found = []
+    for label in range(labels.max() + 1):
+        members = np.flatnonzero(labels == label)
+        points = embedding[members]
+        found.append(members[np.square(points - points.mean(axis=0)).sum(axis=1).argmin()])
+    return np.array(found)
+
+
+FACE_REGION, EYE_REGION = "face", "eye_region"
+EYE_WEIGHT = 2.0
+
+_MESH_BATCH = 64
+_BLOCK = 16
+"""Meshes compared with one at a time: few enough for their differences to stay in the processor's cache."""
+
+
+class Landmarks(NamedTuple):
+    """Meshes that stand for all."""
+
+    indices: IntArray
+    """(m,) which meshes they are, in the order of choice; distinct."""
+    distances: FloatArray
+    """(N, m) float32 distance of every mesh to each of them, metres."""
+    radius: float
+    """Distance, metres, within which every mesh has a landmark."""
+
+
+def expression_displacements(clip: Clip, timesteps: Sequence[int]) -> FloatArray:
+    """(T, 3, F) float32 displacements of the face's F vertices from the neutral face, metres.
+
+    Meshes keep jaw, eyes and expression and lose rotation, neck and translation; vertices of the eye region
+    count `EYE_WEIGHT` times. Raises `InputError` where the head has no region "face".
+    """
+    vertices, weights = _face_vertices(clip.head)
+    model = HeadModel(clip.head)
+    canonical = model.canonical(_tensor(clip.shape), _tensor(clip.static_offset))
+    neutral = canonical[:, vertices]
+    result = np.empty((len(timesteps), 3, len(vertices)), dtype=np.float32)
+    for start in range(0, len(timesteps), _MESH_BATCH):
+        part = slice(start, start + _MESH_BATCH)
+        arguments = model.pose_arguments([clip.poses[timestep] for timestep in timesteps[part]])
+        for name in ("rotation", "neck", "translation"):
+            arguments[name] = torch.zeros_like(arguments[name])
+        with torch.no_grad():
+            meshes = model(canonical=canonical, **arguments)[:, vertices]
+            result[part] = ((meshes - neutral) * weights[:, None]).transpose(1, 2).numpy()
+    return result
+
+
+def mean_vertex_distances(meshes: FloatArray) -> FloatArray:
+    """(N, N) float32 mean over vertices of the Euclidean distance among (N, 3, F) meshes, each pair once."""
+    result = np.zeros((len(meshes), len(meshes)), dtype=np.float32)
+
+    def fill(start: int) -> None:
+        # Columns in blocks: a block stays in the cache while every mesh before its end is compared with it.
+        block = meshes[start : start + _BLOCK]
+        for row in range(min(start + _BLOCK, len(meshes))):
+            result[row, start : start + _BLOCK] = _distances_to(block, meshes[row])
+
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        list(pool.map(fill, range(0, len(meshes), _BLOCK)))
+    upper = np.triu(result, 1)
+    return upper + upper.T
+
+
+def farthest_meshes(
+    meshes: FloatArray, limit: int, *, seed: int = 0, tolerance: float = 0.0, progress: Progress = no_progress
+) -> Landmarks:
+    """Greedy farthest-point sampling: from a mesh drawn at random, each time the one farthest from those chosen.
+
+    By the triangle inequality the distance of any two meshes differs from that of their landmarks by the sum of
+    their distances to these, at most twice the radius. Memory grows with N times ``limit``, never with N squared.
+
+    Parameters
+    ----------
+    meshes : (N, 3, F) float32, N at least 1.
+    limit : largest number of landmarks.
+    tolerance : stop where the radius is at most this fraction of the largest distance found.
+    """
+    count = min(limit, len(meshes))
+    columns = np.empty((count, len(meshes)), dtype=np.float32)
+    nearest = np.full(len(meshes), np.inf, dtype=np.float32)
+    chosen = [int(np.random.default_rng(seed).integers(len(meshes)))]
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        for step in range(count):
+            compare = partial(_distances_to, mesh=meshes[chosen[-1]])
+            row = columns[step]
+            row[:] = np.concatenate(list(pool.map(compare, np.array_split(meshes, torch.get_num_threads()))))
+            np.minimum(nearest, row, out=nearest)
+            progress(step + 1, count, "landmarks")
+            if step + 1 == count or nearest.max() <= tolerance * columns[: step + 1].max():
+                break
+            chosen.append(int(nearest.argmax()))
+    return Landmarks(np.array(chosen), columns[: len(chosen)].T, float(nearest.max()))
+
+
+def _distances_to(meshes: FloatArray, mesh: FloatArray) -> FloatArray:
+    """(N,) float32 mean vertex distances of (N, 3, F) meshes to one."""
+    result = np.empty(len(meshes), dtype=np.float32)
+    difference = np.empty((_BLOCK, *mesh.shape), dtype=np.float32)
+    length = np.empty((_BLOCK, mesh.shape[1]), dtype=np.float32)
+    for start in range(0, len(meshes), _BLOCK):
+        block = meshes[start : start + _BLOCK]
+        delta, norm = difference[: len(block)], length[: len(block)]
+        # Differences first: the product form |a|^2 - 2ab + |b|^2 loses what sets neighbouring frames apart.
+        np.subtract(block, mesh, out=delta)
+        np.einsum("nkf,nkf->nf", delta, delta, out=norm)
+        np.mean(np.sqrt(norm, out=norm), axis=1, out=result[start : start + _BLOCK])
+    return result
+
+
+def _face_vertices(head: HeadAsset) -> tuple[IntArray, torch.Tensor]:
+    """Face vertices and their weights."""
+    face = head.regions.get(FACE_REGION)
+    if face is None or not len(face):
+        known = ", ".join(sorted(head.regions)) or "none"
+        raise InputError(
+            f"head model {head.version}",
+            f"regions[{FACE_REGION}]",
+            "the face's vertices",
+            f"regions {known}",
+            "For FLAME, give FLAME_masks.pkl as masks=.",
+        )
+    eyes = np.isin(face, head.regions.get(EYE_REGION, np.array([], dtype=int)))
+    return face, torch.from_numpy(np.where(eyes, EYE_WEIGHT, 1.0).astype(np.float32))
+
+
+def _tensor(array: FloatArray) -> torch.Tensor:
+    return torch.from_numpy(np.asarray(array, dtype=np.float32))
+
+
+SIMILARITY_FLOOR = 1e-6
+"""The farthest pair has similarity 0; the floor keeps a graph of few distinct items connected."""
+
+START_LIMIT = 2000
+"""Items from which classes start: a hierarchy takes memory by their number squared."""
+
+_RANK_TOLERANCE = 1e-9  # eigenvalues of the landmarks' block below this part of the largest are noise
+_SMALL_FACTOR = 4  # with fewer landmarks than this times the classes, Lanczos has no room: solve densely
+
+
+def similarities(distances: FloatArray, largest: float) -> FloatArray:
+    """1 - d / largest as float64, at least `SIMILARITY_FLOOR`."""
+    return np.maximum(1 - distances.astype(np.float64) / largest, SIMILARITY_FLOOR)
+
+
+def exact_embedding(similarity: FloatArray, classes: int) -> FloatArray:
+    """(N, classes) spectral embedding of the (N, N) symmetric similarities of all pairs."""
+    links = similarity.copy()
+    np.fill_diagonal(links, 0.0)
+    scale = 1 / np.sqrt(links.sum(axis=1))
+    count = len(links)
+    _, vectors = eigh(links * scale[:, None] * scale, subset_by_index=(count - classes, count - 1))
+    return _leading_first(vectors) * scale[:, None]
+
+
+def nystrom_embedding(columns: FloatArray, landmarks: IntArray, classes: int) -> FloatArray:
+    """(N, classes) spectral embedding from the similarities to m landmarks alone.
+
+    The matrix of all pairs is replaced by C A^+ C^T, with C the columns and A their rows at the landmarks (A need
+    not be positive). Its diagonal is removed as that of the exact matrix is, and its eigenvectors are found by
+    Lanczos iterations, so that they are orthogonal and nothing of size N squared is formed.
+
+    Parameters
+    ----------
+    columns : (N, m) similarity of each item to each landmark.
+    landmarks : (m,) which items these are; m at least ``classes``.
+    """
+    block = columns[landmarks]
+    values, vectors = eigh(0.5 * (block + block.T))
+    kept = np.abs(values) > _RANK_TOLERANCE * np.abs(values).max()
+    # S = factor diag(sign) factor^T
+    factor = columns @ (vectors[:, kept] / np.sqrt(np.abs(values[kept])))
+    sign = np.sign(values[kept])
+    diagonal = np.square(factor) @ sign
+    degree = factor @ (sign * factor.sum(axis=0)) - diagonal
+    # Approximate degrees are positive in all but the strangest graphs; never below a single weakest link.
+    scale = 1 / np.sqrt(np.maximum(degree, SIMILARITY_FLOOR))
+
+    def apply(vector: FloatArray) -> FloatArray:
+        scaled = scale * vector.ravel()
+        return scale * (factor @ (sign * (factor.T @ scaled)) - diagonal * scaled)
+
+    count = len(columns)
+    operator = LinearOperator((count, count), matvec=apply, dtype=np.float64)
+    if count < _SMALL_FACTOR * classes:
+        dense = operator @ np.eye(count)
+        _, found = eigh(0.5 * (dense + dense.T), subset_by_index=(count - classes, count - 1))
+    else:
+        _, found = eigsh(operator, classes, which="LA", v0=np.ones(count))
+    return _leading_first(found) * scale[:, None]
+
+
+def classes_of(embedding: FloatArray, classes: int) -> IntArray:
+    """(N,) labels from 0 by k-means; the same for the same embedding, and nearly so for a nearly equal one.
+
+    k-means starts from the centres of Ward's hierarchy instead of from random ones: random starts end in classes
+    that differ from seed to seed, and mostly fit worse. Beyond `START_LIMIT` items the hierarchy is that of
+    items spread evenly over the order given.
+    """
+    start = np.unique(
+        np.linspace(0, len(embedding) - 1, min(START_LIMIT, len(embedding))).round().astype(int)
+    )
+    sample = embedding[start]
+    groups = AgglomerativeClustering(classes).fit_predict(sample)
+    centres = np.array([sample[groups == group].mean(axis=0) for group in range(classes)])
+    labels = KMeans(classes, init=centres, n_init=1).fit_predict(embedding)
+    return np.unique(labels, return_inverse=True)[1].astype(np.int64)
+
+
+def _leading_first(vectors: FloatArray) -> FloatArray:
+    """Eigenvectors, the leading one first, each with the sign that makes its largest entry positive."""
+    vectors = vectors[:, ::-1]
+    largest = vectors[np.abs(vectors).argmax(axis=0), np.arange(vectors.shape[1])]
+    return vectors * np.sign(largest)

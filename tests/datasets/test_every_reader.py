@@ -1,0 +1,43 @@
+"""Every command on captures works with the reader of a plug-in, whose clips have what `Clip` asks for and no more."""
+
+import pytest
+
+from headbench.bench.cli import main
+from headbench.bench.io.images import probe_image
+
+COMMANDS = {
+    "inspect": (["--timesteps", "1", "--cameras", "2"], ["inspection.png", "inspection.json"]),
+    "steps": (["--bases", "3", "--classes", "2"], ["jaw_bases.png", "expression_classes.png", "steps.json"]),
+    "tongue": (["--cameras", "1"], ["tongue.yaml", "tongue_901.png"]),
+    "export colmap": (["--tracking"], ["sparse/0/images.bin", "flame_param/00000.npz", "head_model.npz"]),
+    "record nersemble": ([], ["recording/metadata_sequences.csv", "head_model.npz"]),
+}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_commands_read_by_a_plugins_reader(plain_folder, tmp_path, command):
+    options, files = COMMANDS[command]
+    given = [
+        *command.split(),
+        str(plain_folder),
+        "--reader",
+        "plain_reader:SPEC",
+        "--out",
+        str(tmp_path / "out"),
+    ]
+    assert main([*given, *options]) == 0
+    for file in files:
+        assert (tmp_path / "out" / file).stat().st_size > 0
+        if file.endswith(".png"):
+            assert probe_image(tmp_path / "out" / file).width > 100
+
+
+def test_the_linter_says_which_checks_it_skips(plain_folder, capsys):
+    main(["lint", str(plain_folder), "--reader", "plain_reader:SPEC", "--min-test-timesteps", "1", "--json"])
+    import json
+
+    data = json.loads(capsys.readouterr().out)
+    assert {"HB101", "HB112", "HB601"} <= set(data["skipped"])
+    assert not {"HB201", "HB301", "HB503", "HB701"} & set(data["skipped"])
+    assert not {finding["code"] for finding in data["findings"]} & set(data["skipped"])
+    assert data["looked_at"]["frames_decoded"] > 0
