@@ -1,13 +1,13 @@
-"""Where the parts of the tracked head are in a frame: from the posed mesh by a z-buffer, and from the matte.
+"""Where the parts of the tracked head are in a frame: from the posed mesh by a z-buffer, and from the mask.
 
-* ``foreground``: pixels that the matte covers by half or more.
+* ``foreground``: pixels that the mask covers by half or more.
 * ``face``: the mesh's face, lips, eyes and the opening of the mouth, where nothing of the mesh is before them.
 * ``mouth``: the convex hull of the visible lips, so that teeth, tongue and the dark between them belong to it.
 * ``eyes``: eyeballs and the skin about them.
 * ``hair``: the mesh's scalp, and foreground beyond the mesh whose nearest pixel of the mesh is scalp: hair stands
   off the head that carries it. Hair that hangs down beside the neck is not told from it.
 
-Mouth and hair end where the foreground does, if there is a matte. A region is as good as the tracking.
+Mouth and hair end where the foreground does, if there is a mask. A region is as good as the tracking.
 """
 
 from __future__ import annotations
@@ -48,20 +48,20 @@ class HeadRegions:
         """The parts that the head model has the regions for."""
         return tuple(name for name in PARTS if _NEEDED[name] in self._head.regions)
 
-    def labels(self, camera: Camera, pose: HeadPose, matte: ByteArray | None) -> ByteArray:
+    def labels(self, camera: Camera, pose: HeadPose, mask: ByteArray | None) -> ByteArray:
         """(H, W) 8-bit, one bit for each region that a pixel is in; see `select`.
 
-        ``matte`` is the (H, W) 8-bit coverage, None where there is none: nothing is foreground then.
+        ``mask`` is the (H, W) 8-bit coverage, None where there is none: nothing is foreground then.
         """
         with torch.no_grad():
             vertices = self._model(canonical=self._canonical, **self._model.pose_arguments([pose]))[0].numpy()
         front = rasterize_mesh(vertices, self._head.faces, camera).face
         covered = front >= 0
         labels = np.where(covered, self._bits_of_faces[np.maximum(front, 0)], 0).astype(np.uint8)
-        foreground = np.ones(front.shape, bool) if matte is None else matte >= 128
+        foreground = np.ones(front.shape, bool) if mask is None else mask >= 128
         mouth = _hull(labels & _BITS["mouth"] != 0) & foreground
         labels[mouth] |= _BITS["mouth"] | _BITS["face"]
-        if matte is not None:
+        if mask is not None:
             labels[foreground] |= _BITS[FOREGROUND]
             labels[_beyond(covered, labels & _BITS["hair"] != 0) & foreground] |= _BITS["hair"]
         return labels

@@ -104,7 +104,7 @@ _LONGEST_NAME = 1024
 _POINT = struct.calcsize("<ddQ")  # x, y and the number of a point of the model
 
 
-class _Reader:
+class _BinaryReader:
     """Takes numbers off a file; `InputError` where it ends too early."""
 
     def __init__(self, file: Path, stream: BinaryIO) -> None:
@@ -165,7 +165,7 @@ def read_cameras_binary(file: Path) -> dict[int, ColmapCamera]:
     models = camera_models()
     cameras: dict[int, ColmapCamera] = {}
     with file.open("rb") as stream:
-        reader = _Reader(file, stream)
+        reader = _BinaryReader(file, stream)
         for _ in range(reader.count(struct.calcsize("<IiQQ"), "cameras")):
             number, model, width, height = reader.take("IiQQ", "camera")
             key = f"camera {number}"
@@ -184,7 +184,7 @@ def read_images_binary(file: Path) -> dict[int, ColmapImage]:
     """Images by number; `InputError` for whatever is wrong with the file."""
     images: dict[int, ColmapImage] = {}
     with file.open("rb") as stream:
-        reader = _Reader(file, stream)
+        reader = _BinaryReader(file, stream)
         for _ in range(reader.count(struct.calcsize("<I7dIQ") + 1, "images")):
             number, *pose, camera = reader.take("I7dI", "image")
             key = f"image {number}"

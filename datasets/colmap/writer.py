@@ -44,7 +44,7 @@ class Exported(NamedTuple):
     observations: int
 
 
-class _View(NamedTuple):
+class _Observation(NamedTuple):
     """Which vertices an image sees, where, and in what colour."""
 
     vertices: np.ndarray
@@ -91,7 +91,7 @@ def export_model(
     model = pycolmap.Reconstruction()
     for number, name in enumerate(ids, start=1):
         model.add_camera_with_trivial_rig(_pinhole(number, clip.cameras[name]))
-    views: dict[int, _View] = {}
+    views: dict[int, _Observation] = {}
     with grouped_writes():
         for number, key in enumerate(sorted(keys), start=1):
             camera, picture = clip.cameras[key.camera], clip.image(key)
@@ -144,7 +144,7 @@ def _mesh(clip: Clip, timestep: int) -> FloatArray:
         return model(canonical=canonical, **model.pose_arguments([clip.poses[timestep]]))[0].numpy()
 
 
-def _observe(vertices: FloatArray, faces: np.ndarray, camera: Camera, picture: ByteArray) -> _View:
+def _observe(vertices: FloatArray, faces: np.ndarray, camera: Camera, picture: ByteArray) -> _Observation:
     """Find the vertices in the picture that no part of the mesh hides."""
     points = vertices @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
     before = np.flatnonzero(points[:, 2] > 0)
@@ -155,10 +155,10 @@ def _observe(vertices: FloatArray, faces: np.ndarray, camera: Camera, picture: B
     before, pixels, column, row = before[inside], pixels[inside], column[inside], row[inside]
     surface = rasterize_mesh(vertices, faces, camera).depth[row, column]
     seen = points[before, 2] <= surface + _DEPTH_TOLERANCE
-    return _View(before[seen], pixels[seen], picture[row[seen], column[seen]])
+    return _Observation(before[seen], pixels[seen], picture[row[seen], column[seen]])
 
 
-def _add_points(model: pycolmap.Reconstruction, vertices: FloatArray, views: dict[int, _View]) -> None:
+def _add_points(model: pycolmap.Reconstruction, vertices: FloatArray, views: dict[int, _Observation]) -> None:
     """Add all vertices, in order, with their mean colours and the images that observe them."""
     sums, counts = np.zeros((len(vertices), 3)), np.zeros(len(vertices))
     tracks: list[list[pycolmap.TrackElement]] = [[] for _ in vertices]

@@ -65,7 +65,7 @@ class CyEvidence:
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class OutlineView:
     """A frame to judge by: the posed mesh (V, 3) in the world, the camera read from the top, the mask."""
 
     vertices: FloatArray
@@ -113,7 +113,7 @@ def _pick_views(
     poses: Mapping[int, HeadPose],
     entries: Sequence[FrameEntry],
     background: Sequence[float],
-) -> list[View]:
+) -> list[OutlineView]:
     """Up to `FRAMES` frames, spread over timesteps and, by a stride prime to most rigs, over cameras."""
     cameras = rig.resolve("top")
     ordered = sorted(entries, key=lambda e: (e.timestep, e.camera_index))
@@ -128,7 +128,7 @@ def _pick_views(
     for entry in chosen:
         arguments = model.pose_arguments([poses[entry.timestep]])
         vertices = model(canonical=canonical, **arguments)[0].numpy()
-        views.append(View(vertices, cameras[entry.camera_id], partial(_foreground, entry, background)))
+        views.append(OutlineView(vertices, cameras[entry.camera_id], partial(_foreground, entry, background)))
     return views
 
 
@@ -141,7 +141,7 @@ def _foreground(entry: FrameEntry, background: Sequence[float]) -> ByteArray:
     return (different * 255).astype(np.uint8)
 
 
-def weigh_cy(views: Sequence[View], faces: IntArray) -> CyEvidence:
+def weigh_cy(views: Sequence[OutlineView], faces: IntArray) -> CyEvidence:
     """Compare both readings of ``cy`` over some frames.
 
     For each frame: the mesh is projected and filled; agreement is the mean over its outline's pixels of

@@ -70,7 +70,7 @@ def parse_frame(path: Path, where: str, frame: Any, document: Mapping[str, Any])
     """
     if not isinstance(frame, dict):
         raise InputError(path, where, "an object", type(frame).__name__)
-    reader = _Reader(path, where, frame, document)
+    reader = _FrameReader(path, where, frame, document)
     way = frame_route(frame)
     if way:
         raise InputError(path, f"{where}.flame_param_path", "text", "no such key", way)
@@ -121,7 +121,7 @@ def _kind(container: Mapping[str, Any], key: str) -> str:
     return repr(container[key])[:60] if key in container else "no such key"
 
 
-class _Reader:
+class _FrameReader:
     """Typed access to one frame; intrinsics and size may stand at the document's top level instead."""
 
     def __init__(self, path: Path, where: str, frame: Mapping[str, Any], document: Mapping[str, Any]):

@@ -8,7 +8,7 @@ from .rules import Rule
 GROUPS = {
     "1": "files and frames",
     "2": "splits",
-    "3": "backgrounds and mattes",
+    "3": "backgrounds and masks",
     "4": "colour",
     "5": "cameras",
     "6": "head model and tracking",

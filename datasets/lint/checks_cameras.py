@@ -12,7 +12,7 @@ import numpy as np
 from ...bench.contracts import Camera, FloatArray
 from ..ga import layout
 from ..ga.cameras import FOCAL_TOLERANCE, ROTATION_TOLERANCE
-from ..ga.principal_point import View, weigh_cy
+from ..ga.principal_point import OutlineView, weigh_cy
 from ..ga.transforms import FrameEntry
 from ..images import read_mask
 from .checks_images import sound_mask
@@ -240,7 +240,7 @@ def _ignored(evidence: Evidence) -> Iterator[Hit]:
         )
 
 
-def cy_evidence_views(evidence: Evidence) -> list[View]:
+def cy_evidence_views(evidence: Evidence) -> list[OutlineView]:
     """Views whose outlines may tell where cy counts from, with their cameras read from the top."""
     views = []
     for view in evidence.views:
@@ -252,7 +252,7 @@ def cy_evidence_views(evidence: Evidence) -> list[View]:
         camera = Camera(
             mesh.camera.id, mesh.camera.width, mesh.camera.height, intrinsics, mesh.camera.world_to_camera
         )
-        views.append(View(mesh.vertices, camera, partial(read_mask, path)))
+        views.append(OutlineView(mesh.vertices, camera, partial(read_mask, path)))
     return views
 
 

@@ -439,7 +439,7 @@ RULES = (
         "HB202",
         "warning",
         "images of two splits are nearly the same",
-        "Look at the pair; where one is the other saved anew or shifted by a frame, mend the split.",
+        "Look at the pair; where one is the other saved again or shifted by a frame, mend the split.",
         _near_images,
     ),
     Rule(

@@ -13,7 +13,7 @@ import numpy as np
 
 from .evidence import Evidence
 from .rules import Hit, Rule, several, some
-from .views import BACKGROUND_LEVELS, MatteFacts, ViewFacts
+from .views import BACKGROUND_LEVELS, MaskFacts, ViewFacts
 
 MOST = 0.5
 """Share of the looked-at frames from which a fault is one of the export, not of single frames."""
@@ -22,7 +22,7 @@ DIRTY = 0.02
 """Share of pixels outside the mask that may differ from the background."""
 
 FRINGES = (0.65, 1.5)
-"""Fringes between these are a clean composite, see `MatteFacts.fringe`."""
+"""Fringes between these are a clean composite, see `MaskFacts.fringe`."""
 
 BLANK_COVERAGE = 0.001
 
@@ -36,59 +36,59 @@ def unit_range(evidence: Evidence) -> bool:
     return bool(views) and max(view.high for view in views) == 1
 
 
-def _mattes(evidence: Evidence) -> list[tuple[ViewFacts, MatteFacts]]:
-    return [(view, view.matte) for view in evidence.views if view.matte is not None]
+def _masks(evidence: Evidence) -> list[tuple[ViewFacts, MaskFacts]]:
+    return [(view, view.mask) for view in evidence.views if view.mask is not None]
 
 
-def _unit_mask(matte: MatteFacts) -> bool:
-    return matte.high == 1
+def _unit_mask(mask: MaskFacts) -> bool:
+    return mask.high == 1
 
 
-def _empty(matte: MatteFacts) -> bool:
-    return matte.coverage < BLANK_COVERAGE and not _unit_mask(matte)
+def _empty(mask: MaskFacts) -> bool:
+    return mask.coverage < BLANK_COVERAGE and not _unit_mask(mask)
 
 
-def _full(matte: MatteFacts) -> bool:
-    return matte.low > 127
+def _full(mask: MaskFacts) -> bool:
+    return mask.low > 127
 
 
-def _inverted(matte: MatteFacts) -> bool:
-    return not _full(matte) and matte.inside_empty > 0.5 and matte.outside_off > 0.3
+def _inverted(mask: MaskFacts) -> bool:
+    return not _full(mask) and mask.inside_empty > 0.5 and mask.outside_off > 0.3
 
 
-def _sound(matte: MatteFacts) -> bool:
-    return not (_unit_mask(matte) or _empty(matte) or _full(matte) or _inverted(matte))
+def _sound(mask: MaskFacts) -> bool:
+    return not (_unit_mask(mask) or _empty(mask) or _full(mask) or _inverted(mask))
 
 
 def sound_mask(view: ViewFacts) -> bool:
     """Whether a frame has a mask that the geometry can be held against."""
-    return view.matte is not None and _sound(view.matte)
+    return view.mask is not None and _sound(view.mask)
 
 
-def _masks(evidence: Evidence, faulty: Sequence[ViewFacts], what: str) -> Iterator[Hit]:
+def _faulty_masks(evidence: Evidence, faulty: Sequence[ViewFacts], what: str) -> Iterator[Hit]:
     if faulty:
         path = faulty[0].entry.mask or faulty[0].entry.image
         yield Hit(f"{what} in {len(faulty)} of {several(len(evidence.views), 'frame')} looked at", path)
 
 
 def _unit_masks(evidence: Evidence) -> Iterator[Hit]:
-    faulty = [view for view, matte in _mattes(evidence) if _unit_mask(matte)]
-    yield from _masks(evidence, faulty, "the mask holds 0 and 1 alone, out of 255,")
+    faulty = [view for view, mask in _masks(evidence) if _unit_mask(mask)]
+    yield from _faulty_masks(evidence, faulty, "the mask holds 0 and 1 alone, out of 255,")
 
 
 def _empty_masks(evidence: Evidence) -> Iterator[Hit]:
-    faulty = [view for view, matte in _mattes(evidence) if _empty(matte)]
-    yield from _masks(evidence, faulty, "the mask covers nothing")
+    faulty = [view for view, mask in _masks(evidence) if _empty(mask)]
+    yield from _faulty_masks(evidence, faulty, "the mask covers nothing")
 
 
 def _full_masks(evidence: Evidence) -> Iterator[Hit]:
-    faulty = [view for view, matte in _mattes(evidence) if _full(matte)]
-    yield from _masks(evidence, faulty, "the mask covers the whole image")
+    faulty = [view for view, mask in _masks(evidence) if _full(mask)]
+    yield from _faulty_masks(evidence, faulty, "the mask covers the whole image")
 
 
 def _inverted_masks(evidence: Evidence) -> Iterator[Hit]:
-    faulty = [view for view, matte in _mattes(evidence) if _inverted(matte)]
-    yield from _masks(evidence, faulty, "the mask covers the background and leaves out the subject")
+    faulty = [view for view, mask in _masks(evidence) if _inverted(mask)]
+    yield from _faulty_masks(evidence, faulty, "the mask covers the background and leaves out the subject")
 
 
 def _blank_images(evidence: Evidence) -> Iterator[Hit]:
@@ -108,10 +108,10 @@ def outside_colours(evidence: Evidence) -> list[tuple[ViewFacts, np.ndarray, flo
     for view in evidence.views:
         if view.error is not None or view.has_alpha or view.low == view.high:
             continue
-        if view.matte is None and view.corners is not None:
+        if view.mask is None and view.corners is not None:
             found.append((view, np.asarray(view.corners), view.corners_off))
-        elif view.matte is not None and _sound(view.matte) and view.matte.outside is not None:
-            found.append((view, np.asarray(view.matte.outside), view.matte.outside_off))
+        elif view.mask is not None and _sound(view.mask) and view.mask.outside is not None:
+            found.append((view, np.asarray(view.mask.outside), view.mask.outside_off))
     return found
 
 
@@ -139,7 +139,7 @@ def _wrong_background(evidence: Evidence) -> Iterator[Hit]:
 def _dirty_background(evidence: Evidence) -> Iterator[Hit]:
     if unit_range(evidence) or limited_range(evidence):
         return
-    seen = [entry for entry in outside_colours(evidence) if entry[0].matte is not None]
+    seen = [entry for entry in outside_colours(evidence) if entry[0].mask is not None]
     dirty = [(v, share) for v, colour, share in seen if share > DIRTY and not _foreign(evidence, colour)]
     if len(dirty) > MOST * len(seen):
         typical = float(np.median([share for _, share in dirty]))
@@ -154,9 +154,9 @@ def _fringes(evidence: Evidence) -> Iterator[Hit]:
     if unit_range(evidence) or any(_foreign(evidence, colour) for _, colour, _ in outside_colours(evidence)):
         return
     told = [
-        (view, matte.fringe)
-        for view, matte in _mattes(evidence)
-        if matte.fringe is not None and _sound(matte) and not view.has_alpha
+        (view, mask.fringe)
+        for view, mask in _masks(evidence)
+        if mask.fringe is not None and _sound(mask) and not view.has_alpha
     ]
     if len(told) < 4:
         return
@@ -165,7 +165,7 @@ def _fringes(evidence: Evidence) -> Iterator[Hit]:
         what = (
             "dark fringes, as of colours premultiplied twice"
             if typical < FRINGES[0]
-            else ("bright fringes, as of colours never multiplied by the matte")
+            else ("bright fringes, as of colours never multiplied by the mask")
         )
         yield Hit(
             f"{what}: where the mask is soft, the subject adds {typical:.2f} times the light it should (median "
@@ -305,7 +305,7 @@ RULES = (
     Rule(
         "HB303",
         "warning",
-        "fringes along the matte",
+        "fringes along the mask",
         "Composite once, straight alpha: a F + (1 - a) B with the unmultiplied colour F.",
         _fringes,
     ),

@@ -30,7 +30,7 @@ from ..ga.writer import pose_to_parameters
 from ..head.arrays import HeadArrays
 from .command import LintSettings
 from .expression_fit import ExpressionFit, weigh_expression
-from .mesh import Parameters, Subject, read_parameters
+from .mesh import Parameters, TrackedSubject, read_parameters
 from .views import Pixels, Thumbnail, ViewFacts, look, make_thumbnails, pick_views, pixels_of_files
 
 
@@ -81,7 +81,7 @@ class Evidence:
     digests: Mapping[Path, str]
     head: HeadArrays | None
     parameters: Mapping[int, Parameters]
-    subject: Subject | None
+    subject: TrackedSubject | None
     views: tuple[ViewFacts, ...]
     thumbnails: tuple[Thumbnail, ...]
     expression_fit: ExpressionFit | None
@@ -171,7 +171,7 @@ def gather_clip(
             digests[path] = digest(clip.image(key))
         progress(done, len(key_of), "reading images")
     pixels = Pixels(headers, lambda e: clip.image(key_of[e.image]), lambda e: clip.mask(key_of[e.image]))
-    subject = Subject(Tracking(clip.head, clip.poses, clip.shape, clip.static_offset))
+    subject = TrackedSubject(Tracking(clip.head, clip.poses, clip.shape, clip.static_offset))
     parameters = {
         timestep: Parameters(timestep, folder, *_pose_arrays(pose), 0.0, 0.0, pose, None)
         for timestep, pose in clip.poses.items()
@@ -206,7 +206,7 @@ def _looked_at(
     pixels: Pixels,
     background: tuple[float, ...],
     cy: layout.CyConvention,
-    subject: Subject | None,
+    subject: TrackedSubject | None,
     parameters: Mapping[int, Parameters],
     settings: LintSettings,
     progress: Progress,

@@ -22,7 +22,7 @@ from ...bench.errors import InputError
 from ..ga.layout import CyConvention
 from ..ga.transforms import FrameEntry
 from ..head.geometry import vertex_normals
-from .mesh import Parameters, Subject
+from .mesh import Parameters, TrackedSubject
 from .views import Pixels, ViewFacts, entry_camera
 
 FRAMES = 16
@@ -72,7 +72,7 @@ def weigh_expression(
     entries: Sequence[FrameEntry],
     views: Sequence[ViewFacts],
     pixels: Pixels,
-    subject: Subject | None,
+    subject: TrackedSubject | None,
     parameters: Mapping[int, Parameters],
     cy: CyConvention,
 ) -> ExpressionFit | None:
@@ -117,7 +117,7 @@ def _facing_camera(views: Sequence[ViewFacts]) -> str | None:
     return max(facing, key=lambda name: float(np.median(facing[name]))) if facing else None
 
 
-def _members(subject: Subject) -> np.ndarray:
+def _members(subject: TrackedSubject) -> np.ndarray:
     regions = subject.head.regions
     face = regions.get("face", np.arange(len(subject.head.template)))
     return np.setdiff1d(
@@ -126,7 +126,7 @@ def _members(subject: Subject) -> np.ndarray:
 
 
 def _pick(
-    vertices: FloatArray, subject: Subject, members: np.ndarray, camera: Camera, image: ByteArray
+    vertices: FloatArray, subject: TrackedSubject, members: np.ndarray, camera: Camera, image: ByteArray
 ) -> _Picked:
     points = vertices[members]
     outward = vertex_normals(vertices, subject.head.faces)[members]

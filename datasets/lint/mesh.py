@@ -51,7 +51,7 @@ class Parameters:
 
 
 @dataclass(frozen=True, eq=False)
-class Subject:
+class TrackedSubject:
     """The head with the identity of the first timestep that reads, teeth appended if its files have them."""
 
     tracking: Tracking
@@ -81,13 +81,13 @@ class Subject:
 
 def read_parameters(
     entries: Sequence[FrameEntry], head: HeadArrays | None, *, progress: Progress = no_progress
-) -> tuple[dict[int, Parameters], Subject | None]:
+) -> tuple[dict[int, Parameters], TrackedSubject | None]:
     """Parameters by timestep (of its first frame), and the head and identity that they fit."""
     files: dict[int, Path] = {}
     for entry in entries:
         files.setdefault(entry.timestep, entry.parameters)
     found: dict[int, Parameters] = {}
-    subject: Subject | None = None
+    subject: TrackedSubject | None = None
     first_offset: np.ndarray | None = None
     for done, (timestep, path) in enumerate(sorted(files.items()), start=1):
         progress(done, len(files), "reading parameters")
@@ -109,7 +109,7 @@ def read_parameters(
                     teeth="keep" if subject else "auto",
                 )
                 pose = tracking.poses[timestep]
-                subject = subject or Subject(tracking)
+                subject = subject or TrackedSubject(tracking)
             except InputError as error:
                 fault = error
         found[timestep] = Parameters(
@@ -184,7 +184,7 @@ class MeshFacts:
 
 
 def lay_mesh(
-    subject: Subject, pose: HeadPose, camera: Camera, image: ByteArray, mask: ByteArray | None
+    subject: TrackedSubject, pose: HeadPose, camera: Camera, image: ByteArray, mask: ByteArray | None
 ) -> MeshFacts:
     """Pose the subject's mesh and hold it against an image, (H, W, 3) RGB, and its mask, (H, W)."""
     vertices = subject.vertices([pose])[0]
@@ -206,19 +206,21 @@ def lay_mesh(
     return _held_against(plain, subject, image, mask)
 
 
-def head_axes(subject: Subject, vertices: FloatArray) -> FloatArray:
+def head_axes(subject: TrackedSubject, vertices: FloatArray) -> FloatArray:
     """(3, 3) rows: where the template's x, y and z axes point for the posed mesh, by the face."""
     members = _members(subject, FACE)
     return rigid_alignment(vertices[members], subject.head.template[members])[:3, :3]
 
 
-def _members(subject: Subject, names: tuple[str, ...]) -> IntArray:
+def _members(subject: TrackedSubject, names: tuple[str, ...]) -> IntArray:
     """Vertices of the regions by these names; all vertices where the head has none of them."""
     regions = [subject.head.regions[name] for name in names if name in subject.head.regions]
     return np.unique(np.concatenate(regions)) if regions else np.arange(len(subject.head.template))
 
 
-def _held_against(plain: MeshFacts, subject: Subject, image: ByteArray, mask: ByteArray | None) -> MeshFacts:
+def _held_against(
+    plain: MeshFacts, subject: TrackedSubject, image: ByteArray, mask: ByteArray | None
+) -> MeshFacts:
     camera, vertices = plain.camera, plain.vertices
     scale = min(1.0, WORKING_HEIGHT / camera.height)
     width, height = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
@@ -243,7 +245,7 @@ def _held_against(plain: MeshFacts, subject: Subject, image: ByteArray, mask: By
 
 
 def _skin(
-    subject: Subject, front: IntArray, image: ByteArray, foreground: np.ndarray | None
+    subject: TrackedSubject, front: IntArray, image: ByteArray, foreground: np.ndarray | None
 ) -> FloatArray | None:
     member = np.zeros(len(subject.head.template), dtype=bool)
     member[_members(subject, FACE)] = True
@@ -256,7 +258,7 @@ def _skin(
 
 
 def _face_outside(
-    subject: Subject, vertices: FloatArray, camera: Camera, filled: np.ndarray, foreground: np.ndarray
+    subject: TrackedSubject, vertices: FloatArray, camera: Camera, filled: np.ndarray, foreground: np.ndarray
 ) -> float:
     points = vertices[_members(subject, FACE)]
     points = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]

@@ -21,7 +21,7 @@ from ...bench.io.images import ImageInfo
 from ..ga.layout import CyConvention, extrinsics_from_json, intrinsics_from_json
 from ..ga.transforms import FrameEntry
 from ..images import read_image, read_mask
-from .mesh import MeshFacts, Parameters, Subject, lay_mesh
+from .mesh import MeshFacts, Parameters, TrackedSubject, lay_mesh
 
 BACKGROUND_LEVELS = 12
 """A pixel is of the background's colour where no channel differs by more; JPEG changes flat areas by less."""
@@ -30,13 +30,13 @@ FAR = 0.02
 """Distance from the foreground, as a share of the image's height, from which a pixel should be background."""
 
 SOFT = (0.25, 0.75)
-"""Coverage of the pixels that tell how a matte was composited."""
+"""Coverage of the pixels that tell how a mask was composited."""
 
 MIN_FRINGE_PIXELS = 12
 
 
 @dataclass(frozen=True, eq=False)
-class MatteFacts:
+class MaskFacts:
     """A frame's mask, and the image where the mask says there is none of the subject.
 
     Attributes
@@ -72,7 +72,7 @@ class ViewFacts:
     corners : median colour (3,) of the upper corners.
     corners_off : share of their pixels that are not of the declared background's colour.
     has_alpha : whether the image has an alpha channel, which then is its mask.
-    matte : None without a mask, or where the mask does not decode or is of another size.
+    mask : None without a mask, or where the mask does not decode or is of another size.
     mesh : None where the frame has no pose or no head.
     error : why the image does not decode; all else is then empty.
     """
@@ -86,7 +86,7 @@ class ViewFacts:
     corners: FloatArray | None = None
     corners_off: float = 0.0
     has_alpha: bool = False
-    matte: MatteFacts | None = None
+    mask: MaskFacts | None = None
     mesh: MeshFacts | None = None
     error: InputError | None = None
 
@@ -140,7 +140,7 @@ def pixels_of_files(headers: Mapping[Path, ImageInfo], background: Sequence[floa
 def look(
     entries: Sequence[FrameEntry],
     pixels: Pixels,
-    subject: Subject | None,
+    subject: TrackedSubject | None,
     parameters: Mapping[int, Parameters],
     background: Sequence[float],
     cy: CyConvention,
@@ -176,7 +176,7 @@ def _facts(
     info: ImageInfo,
     image: ByteArray,
     mask: ByteArray | None,
-    subject: Subject | None,
+    subject: TrackedSubject | None,
     pose: HeadPose | None,
     background: Sequence[float],
     cy: CyConvention,
@@ -201,16 +201,16 @@ def _facts(
         corners=np.median(image[corners], axis=0),
         corners_off=float(off[corners].mean()),
         has_alpha=info.has_alpha,
-        matte=None if mask is None else _matte(image, mask, off, ground),
+        mask=None if mask is None else _mask_facts(image, mask, off, ground),
         mesh=mesh,
     )
 
 
-def _matte(image: ByteArray, mask: ByteArray, off: np.ndarray, ground: FloatArray) -> MatteFacts:
+def _mask_facts(image: ByteArray, mask: ByteArray, off: np.ndarray, ground: FloatArray) -> MaskFacts:
     covered = mask > 127
     distance = cv2.distanceTransform((mask == 0).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     far = (mask == 0) & (distance > FAR * len(mask)) if (mask > 0).any() else mask == 0
-    return MatteFacts(
+    return MaskFacts(
         low=int(mask.min()),
         high=int(mask.max()),
         coverage=float(covered.mean()),
@@ -222,7 +222,7 @@ def _matte(image: ByteArray, mask: ByteArray, off: np.ndarray, ground: FloatArra
 
 
 def _fringe(image: ByteArray, mask: ByteArray, ground: FloatArray) -> float | None:
-    """See `MatteFacts.fringe`."""
+    """See `MaskFacts.fringe`."""
     alpha = mask.astype(np.float32) / 255
     inner = (alpha > 0.98).astype(np.float32)
     size = 2 * max(2, round(0.01 * len(mask))) + 1
@@ -326,7 +326,7 @@ def near_duplicates(
 def difference(one: Thumbnail, other: Thumbnail) -> float:
     """95th percentile of the absolute difference, in levels, over the pixels that show the subject in either.
 
-    A face that moves differs much in few places, an image saved anew little in all. Infinite where neither shows
+    A face that moves differs much in few places, an image saved again little in all. Infinite where neither shows
     anything, as empty frames are no evidence of anything.
     """
     shown = one.shown | other.shown

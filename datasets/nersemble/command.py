@@ -48,14 +48,14 @@ class PrepareSettings:
     downscale: int = 4
     """Width and height are divided by this, averaging areas; 4 makes 550x802 of 2200x3208."""
     source: Literal["auto", "video", "images"] = "auto"
-    """What to take where a sequence has both; "auto" takes images where they come with mattes."""
+    """What to take where a sequence has both; "auto" takes images where they come with masks."""
     every: int = 0
     """Keep every so many frames; 0 stands for 3 with the 73-per-second videos and 1 with VHAP's images."""
     colour: Literal["auto", "none"] = "auto"
     """"auto" corrects colours where the recording has a calibration for that; "none" never."""
     edges: Literal["unblend", "plain"] = "unblend"
-    """Soft edges with mattes: "unblend" takes the light of the BACKGROUND still out, where there are stills; "plain"
-    multiplies by the matte, as VHAP does, and leaves fringes."""
+    """Soft edges with masks: "unblend" takes the light of the BACKGROUND still out, where there are stills; "plain"
+    multiplies by the mask, as VHAP does, and leaves fringes."""
     cut: bool = False
     """Keep the frames that all cameras have where they differ, instead of an error; tracking of all frames is cut
     with them."""
@@ -82,7 +82,7 @@ class RecordSettings(CaptureOptions):
     release: Literal["v2", "v1", "paper2023"] = "v2"
     """Whose folders: of the second release, of the first, or of the 2023 paper."""
     frames: Literal["images", "video"] = "images"
-    """"images" with mattes, as VHAP's preprocessing leaves them, or "video" without."""
+    """"images" with masks, as VHAP's preprocessing leaves them, or "video" without."""
 
 
 def prepare_nersemble(settings: PrepareSettings, progress: Progress = no_progress) -> Findings:
@@ -126,11 +126,11 @@ def _check_named(settings: PrepareSettings, subjects: list[str]) -> None:
 
 
 def _table(plans: list[SubjectPlan]) -> list[str]:
-    lines = [f"{'subject':8} {'sequence':34} {'timesteps':>9} {'cameras':>7}  mattes  colour  tracking"]
+    lines = [f"{'subject':8} {'sequence':34} {'timesteps':>9} {'cameras':>7}  masks  colour  tracking"]
     for plan in plans:
         for job in plan.jobs:
             test = " (test)" if job.recorded.name in plan.test else ""
-            marks = (job.recorded.has_mattes, bool(job.corrections), job.tracked is not None)
+            marks = (job.recorded.has_masks, bool(job.corrections), job.tracked is not None)
             flags = "  ".join(f"{'yes' if mark else 'no':6}" for mark in marks)
             lines.append(
                 f"{plan.subject:8} {job.recorded.name + test:34} {job.count:9} {len(job.cameras):7}  {flags}"
@@ -182,18 +182,18 @@ def record_nersemble(settings: RecordSettings, progress: Progress = no_progress)
 
     clip = settings.open(settings.capture, progress)
     out = Path(settings.out)
-    mattes = settings.frames == "images"
+    masks = settings.frames == "images"
     sequences = re_record(
         clip,
         out / "recording",
         tracking=out / "tracking",
         release=settings.release,
-        mattes=mattes,
+        masks=masks,
         source=settings.capture,
         progress=progress,
     )
     save_head(out / HEAD_FILE, clip.head)
-    codec = "" if mattes or settings.release == "paper2023" else video_codec()
+    codec = "" if masks or settings.release == "paper2023" else video_codec()
     text = (
         f"Subject {clip.subject}, {len(sequences)} sequences, {len(clip.cameras)} cameras"
         f"{f', videos in {codec}' if codec else ''}.\n"

@@ -25,7 +25,7 @@ from ...bench.machine import processor_count
 from ..ga.writer import write_png
 from .pixels import prepare_pixels, read_still
 from .plan import SequenceJob
-from .sequence import View, open_video
+from .sequence import RecordedView, open_video
 
 
 class RawFrame(NamedTuple):
@@ -34,36 +34,36 @@ class RawFrame(NamedTuple):
     number: int
     bgr: ByteArray
     """(H, W, 3), channels in OpenCV's order: what follows shrinks the image first and reorders less."""
-    matte: ByteArray | None
+    mask: ByteArray | None
     """(H, W) foreground coverage."""
 
 
-def read_frames(view: View, numbers: Sequence[int]) -> Iterator[RawFrame]:
+def read_frames(view: RecordedView, numbers: Sequence[int]) -> Iterator[RawFrame]:
     """Decode the frames with these ascending numbers; memory holds one at a time.
 
     Raises `InputError` where a frame does not decode, or a video ends before the count its index declares.
     """
     if view.video is None:
         for number in numbers:
-            matte = read_pixels(view.mattes[number], cv2.IMREAD_GRAYSCALE, view.size) if view.mattes else None
+            mask = read_pixels(view.masks[number], cv2.IMREAD_GRAYSCALE, view.size) if view.masks else None
             bgr = read_pixels(view.images[number], cv2.IMREAD_COLOR, view.size)
-            yield RawFrame(number, bgr, matte)
+            yield RawFrame(number, bgr, mask)
         return
     frames = _decode_video(view.video, view, numbers)
-    if view.matte_video is None:
+    if view.mask_video is None:
         yield from (RawFrame(number, bgr, None) for number, bgr in zip(numbers, frames))
         return
-    mattes = _decode_video(view.matte_video, view, numbers)
-    for number, bgr, matte in zip(numbers, frames, mattes):
-        yield RawFrame(number, bgr, _one_channel(matte))
+    masks = _decode_video(view.mask_video, view, numbers)
+    for number, bgr, mask in zip(numbers, frames, masks):
+        yield RawFrame(number, bgr, _one_channel(mask))
 
 
-def _one_channel(matte: ByteArray) -> ByteArray:
-    """First channel: mattes are grey, and videos have it thrice."""
-    return cv2.extractChannel(matte, 0).astype("uint8", copy=False)
+def _one_channel(mask: ByteArray) -> ByteArray:
+    """First channel: masks are grey, and videos have it thrice."""
+    return cv2.extractChannel(mask, 0).astype("uint8", copy=False)
 
 
-def _decode_video(path: Path, view: View, numbers: Sequence[int]) -> Iterator[ByteArray]:
+def _decode_video(path: Path, view: RecordedView, numbers: Sequence[int]) -> Iterator[ByteArray]:
     """Frames of a video. Those in between are decoded too, as seeking is not exact, but not converted."""
     capture = open_video(path)
     try:
@@ -142,7 +142,7 @@ def _run(stream: _Stream, reports: queue.SimpleQueue, stop: threading.Event) -> 
     for timestep, frame in zip(stream.timesteps, frames):
         if stop.is_set():
             return
-        image, mask = prepare_pixels(frame.bgr, frame.matte, size, correct, still)
+        image, mask = prepare_pixels(frame.bgr, frame.mask, size, correct, still)
         with writing(job.image_path(timestep, index)):
             if mask is not None:
                 write_png(job.mask_path(timestep, index), mask)
@@ -165,7 +165,7 @@ def writing(path: Path) -> Iterator[None]:
 def _missing(job: SequenceJob, index: int) -> _Stream:
     camera = job.cameras[index]
     present = _present(job.folder / "images")
-    masks = _present(job.folder / "fg_masks") if job.recorded.has_mattes else None
+    masks = _present(job.folder / "fg_masks") if job.recorded.has_masks else None
     timesteps = []
     for timestep in range(job.count):
         image, mask = job.image_path(timestep, index), job.mask_path(timestep, index)

@@ -72,7 +72,7 @@ class SequenceJob:
             folder=self.folder,
             cameras=self.cameras,
             numbers=self.recorded.numbers,
-            masks=self.recorded.has_mattes,
+            masks=self.recorded.has_masks,
             held_out=(NOVEL_VIEW_CAMERA,),
         )
 
@@ -207,9 +207,9 @@ def wanted_sequences(settings: PrepareSettings, one: Participant) -> tuple[list[
 
 
 def _stills(settings: PrepareSettings, one: Participant, recorded: RecordedSequence) -> dict[str, Path]:
-    """Stills of all cameras in use; none where there are no mattes, or one of the stills is not there."""
+    """Stills of all cameras in use; none where there are no masks, or one of the stills is not there."""
     known = {serial: one.backgrounds[serial] for serial in recorded.views if serial in one.backgrounds}
-    wanted = settings.edges == "unblend" and recorded.has_mattes and len(known) == len(recorded.views)
+    wanted = settings.edges == "unblend" and recorded.has_masks and len(known) == len(recorded.views)
     return known if wanted else {}
 
 
@@ -230,7 +230,7 @@ def _tracked(
 
 
 def _folder_name(recorded: RecordedSequence, downscale: int) -> str:
-    background = "_whiteBg" if recorded.has_mattes else ""
+    background = "_whiteBg" if recorded.has_masks else ""
     return f"{recorded.subject}_{recorded.name}_v{len(recorded.views)}_DS{downscale}{background}"
 
 

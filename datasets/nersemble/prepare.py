@@ -138,7 +138,7 @@ def _write_state(job: SequenceJob, state: SequenceState) -> None:
         "sequence": recorded.name,
         "source": "video" if videos else "images",
         "frames": list(recorded.numbers),
-        "mattes": recorded.has_mattes,
+        "mattes": recorded.has_masks,
         **describe_pixels(job),
     }
     write_json(job.folder / RECORD_FILE, value)
@@ -148,7 +148,7 @@ def _has_all_images(job: SequenceJob, state: SequenceState) -> bool:
     if not state.images_complete:
         return False
     expected = job.count * len(job.cameras)
-    masks = len(_names(job.folder / "fg_masks")) if job.recorded.has_mattes else expected
+    masks = len(_names(job.folder / "fg_masks")) if job.recorded.has_masks else expected
     return _count_images(job) == expected == masks
 
 
@@ -221,7 +221,7 @@ def _write_union(plan: SubjectPlan) -> dict[str, int]:
 def _missing(plan: SubjectPlan) -> tuple[str, ...]:
     """What the capture lacks, one sentence each."""
     untracked = [job.recorded.name for job in plan.jobs if not _is_readable(job)]
-    unmatted = [job.recorded.name for job in plan.jobs if not job.recorded.has_mattes]
+    unmasked = [job.recorded.name for job in plan.jobs if not job.recorded.has_masks]
     plain = [job.recorded.name for job in plan.jobs if not job.corrections]
     held_out = {camera.id for job in plan.jobs for camera in job.cameras}
     lines = []
@@ -230,9 +230,9 @@ def _missing(plan: SubjectPlan) -> tuple[str, ...]:
             f"no tracked parameters for {', '.join(untracked)}: no {layout.ALL_FRAMES_FILE} and no union. Run "
             "VHAP and call again with --tracking."
         )
-    if unmatted:
+    if unmasked:
         lines.append(
-            f"no mattes for {', '.join(unmatted)}: images keep their background, and there are no masks. Make "
+            f"no masks for {', '.join(unmasked)}: images keep their background, and there are no masks. Make "
             "alpha_maps (VHAP's preprocessing) and prepare into another folder; a difference to the BACKGROUND "
             "stills is not good enough, as heads cast shadows and share the background's greys."
         )

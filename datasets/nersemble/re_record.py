@@ -34,14 +34,14 @@ def re_record(
     *,
     tracking: Path | None = None,
     release: Release = "v2",
-    mattes: bool = True,
+    masks: bool = True,
     source: str | Path = "",
     progress: Progress = no_progress,
 ) -> list[str]:
     """Write a clip's frames, cameras and parameters as a raw recording under ``root``; return its sequences.
 
     The recording shows the subject before a grey wall (`studio`), where the clip has masks. Frames become images
-    with mattes, as VHAP's preprocessing leaves them, or without ``mattes`` videos of three frames per timestep,
+    with masks, as VHAP's preprocessing leaves them, or without ``masks`` videos of three frames per timestep,
     of which a reader keeps the first. Parameters go under ``tracking``, in the world that VHAP turns the
     calibration into. Excluded frames are written like the others.
 
@@ -65,7 +65,7 @@ def re_record(
         timesteps = sorted({key.timestep for key in keys})
         for camera in clip.cameras:
             own = [FrameKey(clip.subject, sequence, timestep, camera) for timestep in timesteps]
-            if mattes or release == "paper2023":
+            if masks or release == "paper2023":
                 for number, key in enumerate(own):
                     # The 2023 frame folders count at 73 frames per second.
                     step = 3 if release == "paper2023" else 1
@@ -227,19 +227,22 @@ class RecordingWriter:
         return write_video(folder / f"cam_{serial}.mp4", frames)
 
     def write_frame(
-        self, sequence: str, serial: str, number: int, rgb: ByteArray, matte: ByteArray | None = None
+        self, sequence: str, serial: str, number: int, rgb: ByteArray, mask: ByteArray | None = None
     ) -> None:
         """Write a frame as an image file, as VHAP's preprocessing does, or the 2023 release where it is that."""
         folder = self.sequence_folder(sequence)
         if self.release == "paper2023":
             frame = folder / f"frame_{number:05d}"
-            image, mask = frame / "images-2x" / f"cam_{serial}.png", frame / "alpha_map" / f"cam_{serial}.png"
+            image, alpha = (
+                frame / "images-2x" / f"cam_{serial}.png",
+                frame / "alpha_map" / f"cam_{serial}.png",
+            )
         else:
             name = f"cam_{serial}_{number:06d}.jpg"
-            image, mask = folder / "images" / name, folder / "alpha_maps" / name
+            image, alpha = folder / "images" / name, folder / "alpha_maps" / name
         _write_image(image, rgb)
-        if matte is not None:
-            _write_image(mask, matte)
+        if mask is not None:
+            _write_image(alpha, mask)
 
     def write_metadata(self, sequences: Sequence[str]) -> None:
         """Write ``metadata_sequences.csv`` with this participant's sequences."""

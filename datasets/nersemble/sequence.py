@@ -23,19 +23,19 @@ from .names import numbered, serial_of
 from .recording import Calibration, Participant
 
 Source = Literal["auto", "video", "images"]
-"""Which frames to take: videos, or images beside them; "auto" takes images where they come with mattes."""
+"""Which frames to take: videos, or images beside them; "auto" takes images where they come with masks."""
 
 EVERY_OF_73 = 3
 """Every third frame of 73 per second makes the 24.33 per second that "24 fps" stands for."""
 
 _FRAME_FOLDER = re.compile(r"frame_(\d+)")
 _IMAGE_FOLDERS = ("images-2x", "images-2x-73fps")
-_MATTE_FOLDERS = ("alpha_map", "alpha_map-73fps")
+_MASK_FOLDERS = ("alpha_map", "alpha_map-73fps")
 _IMAGE_SUFFIXES = (".jpg", ".png")
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class RecordedView:
     """What one camera recorded.
 
     Attributes
@@ -45,7 +45,7 @@ class View:
     images : image file by frame number; empty for a video.
     count : frames there are.
     size : (width, height).
-    matte_video, mattes : foreground coverage in the same form as the frames, where there is any.
+    mask_video, masks : foreground coverage in the same form as the frames, where there is any.
     """
 
     serial: str
@@ -53,13 +53,13 @@ class View:
     images: Mapping[int, Path]
     count: int
     size: tuple[int, int]
-    matte_video: Path | None = None
-    mattes: Mapping[int, Path] | None = None
+    mask_video: Path | None = None
+    masks: Mapping[int, Path] | None = None
 
     @property
-    def has_mattes(self) -> bool:
+    def has_masks(self) -> bool:
         """Whether every frame has its foreground coverage."""
-        return self.matte_video is not None or bool(self.mattes)
+        return self.mask_video is not None or bool(self.masks)
 
     @property
     def numbers(self) -> Sequence[int]:
@@ -69,8 +69,8 @@ class View:
     @property
     def files(self) -> list[Path]:
         """Every file of this view."""
-        videos = [path for path in (self.video, self.matte_video) if path]
-        return [*videos, *self.images.values(), *(self.mattes or {}).values()]
+        videos = [path for path in (self.video, self.mask_video) if path]
+        return [*videos, *self.images.values(), *(self.masks or {}).values()]
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,14 +84,14 @@ class RecordedSequence:
     subject: str
     name: str
     folder: Path
-    views: Mapping[str, View]
+    views: Mapping[str, RecordedView]
     numbers: tuple[int, ...]
     uncut: tuple[int, ...]
 
     @property
-    def has_mattes(self) -> bool:
-        """Whether all views have mattes."""
-        return all(view.has_mattes for view in self.views.values())
+    def has_masks(self) -> bool:
+        """Whether all views have masks."""
+        return all(view.has_masks for view in self.views.values())
 
 
 def read_sequence(
@@ -118,7 +118,7 @@ def read_sequence(
     ------
     InputError
         For a camera without frames, frames without a camera, truncated videos, damaged headers, frame counts
-        that differ between cameras, mattes that are missing in part or of another size.
+        that differ between cameras, masks that are missing in part or of another size.
     """
     name = participant.match(wanted)
     folder = participant.sequences[name]
@@ -150,14 +150,14 @@ def read_sequence(
     )
 
 
-def _collect(folder: Path, serials: Sequence[str], source: Source) -> tuple[dict[str, View], int]:
+def _collect(folder: Path, serials: Sequence[str], source: Source) -> tuple[dict[str, RecordedView], int]:
     """Unchecked views by serial (sizes still unknown), and which frames to keep by default."""
     nested = _frame_folders(folder)
     if nested and source != "video":
         return nested, EVERY_OF_73
     images = _numbered_views(folder, serials)
-    with_mattes = bool(images) and all(view.mattes for view in images.values())
-    if images and (source == "images" or (source == "auto" and with_mattes)):
+    with_masks = bool(images) and all(view.masks for view in images.values())
+    if images and (source == "images" or (source == "auto" and with_masks)):
         return images, 1
     videos = _videos(folder)
     if videos and source != "images":
@@ -170,21 +170,23 @@ def _collect(folder: Path, serials: Sequence[str], source: Source) -> tuple[dict
     raise InputError(folder, "", expected, "none of them")
 
 
-def _videos(folder: Path) -> dict[str, View]:
-    views: dict[str, View] = {}
+def _videos(folder: Path) -> dict[str, RecordedView]:
+    views: dict[str, RecordedView] = {}
     for parent in (folder, folder / "images"):
         for path in sorted(parent.glob("cam_*.mp4")):
             if serial := serial_of(path.stem, "cam"):
-                matte = folder / "alpha_maps" / path.name
-                views[serial] = View(serial, path, {}, 0, (0, 0), matte if matte.exists() else None)
+                mask = folder / "alpha_maps" / path.name
+                views[serial] = RecordedView(serial, path, {}, 0, (0, 0), mask if mask.exists() else None)
     return views
 
 
-def _numbered_views(folder: Path, serials: Sequence[str]) -> dict[str, View]:
+def _numbered_views(folder: Path, serials: Sequence[str]) -> dict[str, RecordedView]:
     """Views of VHAP's preprocessing; it drops the serial where it ran on one camera."""
     images = _numbered(folder / "images", serials)
-    mattes = _numbered(folder / "alpha_maps", serials)
-    return {s: View(s, None, files, len(files), (0, 0), None, mattes.get(s)) for s, files in images.items()}
+    masks = _numbered(folder / "alpha_maps", serials)
+    return {
+        s: RecordedView(s, None, files, len(files), (0, 0), None, masks.get(s)) for s, files in images.items()
+    }
 
 
 def _numbered(folder: Path, serials: Sequence[str]) -> dict[str, dict[int, Path]]:
@@ -201,22 +203,24 @@ def _numbered(folder: Path, serials: Sequence[str]) -> dict[str, dict[int, Path]
     return found
 
 
-def _frame_folders(folder: Path) -> dict[str, View]:
+def _frame_folders(folder: Path) -> dict[str, RecordedView]:
     """Views of the 2023 release: a folder per frame."""
     images: dict[str, dict[int, Path]] = {}
-    mattes: dict[str, dict[int, Path]] = {}
+    masks: dict[str, dict[int, Path]] = {}
     for frame in sorted(folder.glob("frame_*")):
         match = _FRAME_FOLDER.fullmatch(frame.name)
         if match is None:
             continue
-        for names, target in ((_IMAGE_FOLDERS, images), (_MATTE_FOLDERS, mattes)):
+        for names, target in ((_IMAGE_FOLDERS, images), (_MASK_FOLDERS, masks)):
             for path in (path for name in names for path in sorted((frame / name).glob("cam_*.png"))):
                 if serial := serial_of(path.stem, "cam"):
                     target.setdefault(serial, {})[int(match[1])] = path
-    return {s: View(s, None, files, len(files), (0, 0), None, mattes.get(s)) for s, files in images.items()}
+    return {
+        s: RecordedView(s, None, files, len(files), (0, 0), None, masks.get(s)) for s, files in images.items()
+    }
 
 
-def _checked(folder: Path, view: View | None, serial: str, source: Source) -> View:
+def _checked(folder: Path, view: RecordedView | None, serial: str, source: Source) -> RecordedView:
     """The view with its size and count, after a look at every file's header."""
     if view is None:
         kind = "a video" if source == "video" else "frames"
@@ -226,18 +230,18 @@ def _checked(folder: Path, view: View | None, serial: str, source: Source) -> Vi
         )
     if view.video is not None:
         count, size = probe_video(view.video)
-        if view.matte_video is not None:
-            _same_matte(view.matte_video, probe_video(view.matte_video), (count, size))
+        if view.mask_video is not None:
+            _same_mask(view.mask_video, probe_video(view.mask_video), (count, size))
         return replace(view, count=count, size=size)
     size = _image_size(view.images.values())
-    if view.mattes:
-        missing = sorted(set(view.images) - set(view.mattes))
+    if view.masks:
+        missing = sorted(set(view.images) - set(view.masks))
         if missing:
             path = view.images[missing[0]]
-            raise InputError(path, "", f"a matte for each of {view.count} images", f"{len(missing)} without")
-        mattes = {number: view.mattes[number] for number in view.images}
-        _image_size(mattes.values(), size)
-        return replace(view, size=size, mattes=mattes)
+            raise InputError(path, "", f"a mask for each of {view.count} images", f"{len(missing)} without")
+        masks = {number: view.masks[number] for number in view.images}
+        _image_size(masks.values(), size)
+        return replace(view, size=size, masks=masks)
     return replace(view, size=size)
 
 
@@ -266,7 +270,7 @@ def open_video(path: Path) -> cv2.VideoCapture:
 
 
 def _image_size(files: Iterable[Path], wanted: tuple[int, int] | None = None) -> tuple[int, int]:
-    """The size that all files have. ``wanted`` is that of the images the files are mattes of; without it most
+    """The size that all files have. ``wanted`` is that of the images the files are masks of; without it most
     files decide, so that one of another size is the one to be blamed."""
     sizes = {path: (info.width, info.height) for path in files for info in (probe_image(path),)}
     size = wanted or Counter(sizes.values()).most_common(1)[0][0]
@@ -274,19 +278,21 @@ def _image_size(files: Iterable[Path], wanted: tuple[int, int] | None = None) ->
         if found != size:
             whose = "the camera's images" if wanted else "other images of this camera"
             expected = f"{size[0]}x{size[1]} pixels, as {whose}"
-            remedy = "Make mattes of the very frames." if wanted else ""
+            remedy = "Make masks of the very frames." if wanted else ""
             raise InputError(path, "size", expected, f"{found[0]}x{found[1]}", remedy)
     return size
 
 
-def _same_matte(path: Path, matte: tuple[int, tuple[int, int]], frames: tuple[int, tuple[int, int]]) -> None:
-    for key, found, expected in (("frames", matte[0], frames[0]), ("size", matte[1], frames[1])):
+def _same_mask(path: Path, mask: tuple[int, tuple[int, int]], frames: tuple[int, tuple[int, int]]) -> None:
+    for key, found, expected in (("frames", mask[0], frames[0]), ("size", mask[1], frames[1])):
         if found != expected:
-            remedy = "Make mattes of the very frames."
+            remedy = "Make masks of the very frames."
             raise InputError(path, key, f"{expected}, as the camera's frames", f"{found}", remedy)
 
 
-def _common_numbers(folder: Path, views: Mapping[str, View], cut: bool) -> tuple[list[int], list[int]]:
+def _common_numbers(
+    folder: Path, views: Mapping[str, RecordedView], cut: bool
+) -> tuple[list[int], list[int]]:
     """Frames that all cameras have, and those that any has; ascending."""
     numbers = {serial: set(view.numbers) for serial, view in views.items()}
     everything = set.union(*numbers.values())

@@ -87,7 +87,7 @@ def read_labels(path: Path) -> dict[int, str]:
 
 
 def read_reasons(path: Path, clip: CaptureClip) -> dict[int, str]:
-    """Reasons by timestep for a clip: from the YAML of `exclusion_file`, or from JSON labels by the suffix.
+    """Reasons by timestep for a clip: from the YAML of the module, or from JSON labels by the suffix.
 
     Raises
     ------

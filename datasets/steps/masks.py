@@ -1,4 +1,4 @@
-"""Mattes: compositing on any background, edges without the old background's colour, nothing below the neck.
+"""Masks: compositing on any background, edges without the old background's colour, nothing below the neck.
 
 Straight alpha throughout: a pixel of coverage a, foreground colour F and background B shows a F + (1 - a) B, in
 display-referred colours, as the field's tools composite.
@@ -99,7 +99,7 @@ def set_background(clip: CaptureClip, background: Sequence[float]) -> CaptureCli
 def clean_edges(clip: CaptureClip, recorded_on: Sequence[float] | Mapping[str, FloatArray]) -> CaptureClip:
     """Take the colour of the set out of soft edges.
 
-    A matte cut out of a recording leaves at its edges what was recorded, C = a F + (1 - a) S with S the set behind
+    A mask cut out of a recording leaves at its edges what was recorded, C = a F + (1 - a) S with S the set behind
     the subject, and composites that as if it were the foreground. With S known, F is solved for and composited
     instead. Without S there is nothing to solve: leave edges as they are.
 
@@ -270,5 +270,5 @@ def _check_masks(clip: CaptureClip, step: str) -> None:
     if bare:
         found = f"{len(bare)} without, such as {bare[0]}"
         raise InputError(
-            step, "masks", "a mask for every frame", found, "The step needs a matte to work with."
+            step, "masks", "a mask for every frame", found, "The step needs a mask to work with."
         )

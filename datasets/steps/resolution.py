@@ -31,7 +31,7 @@ class Resize:
 
 
 @dataclass(frozen=True)
-class Box:
+class PixelBox:
     """A box of an image in whole pixels; where it reaches beyond the image there is background."""
 
     left: int
@@ -51,7 +51,7 @@ class Alignment:
     """
 
     source: Size
-    moves: tuple[Resize | Box, ...]
+    moves: tuple[Resize | PixelBox, ...]
 
     @classmethod
     def of(cls, source: Size, rule: ResolutionRule) -> Alignment:
@@ -59,11 +59,11 @@ class Alignment:
 
         A side that is no multiple of the divisor is rounded down, and its pixels grow by the rest.
         """
-        moves: list[Resize | Box] = []
+        moves: list[Resize | PixelBox] = []
         width, height = source
         if rule.square and width != height:
             side = max(width, height) if rule.square == "pad" else min(width, height)
-            moves.append(Box((width - side) // 2, (height - side) // 2, side, side))
+            moves.append(PixelBox((width - side) // 2, (height - side) // 2, side, side))
             width = height = side
         if rule.divide > 1:
             width, height = width // rule.divide, height // rule.divide
@@ -111,13 +111,13 @@ class Alignment:
         `aligned_size`.
         """
         _check_size("render", self.aligned_size, (render.shape[1], render.shape[0]))
-        boxes = [move for move in self.moves if isinstance(move, Box)]
-        box = boxes[0] if boxes else Box(0, 0, *self.source)
+        boxes = [move for move in self.moves if isinstance(move, PixelBox)]
+        box = boxes[0] if boxes else PixelBox(0, 0, *self.source)
         whole = _resized(np.asarray(render, np.float32), box.width, box.height)
-        return take_box(whole, Box(-box.left, -box.top, *self.source), background)
+        return take_box(whole, PixelBox(-box.left, -box.top, *self.source), background)
 
 
-def take_box(image: FloatArray, box: Box, background: Sequence[float] | FloatArray) -> FloatArray:
+def take_box(image: FloatArray, box: PixelBox, background: Sequence[float] | FloatArray) -> FloatArray:
     """Cut a box out of an image (H, W, C); (C,) ``background`` where the box reaches beyond it."""
     height, width = image.shape[:2]
     if (box.left, box.top, box.width, box.height) == (0, 0, width, height):

@@ -1,6 +1,6 @@
 """How fast recordings are prepared, next to a plain OpenCV loop in the same run, and in how much memory.
 
-The loop does for one camera after the other what prepare does to videos without mattes: decode, average areas,
+The loop does for one camera after the other what prepare does to videos without masks: decode, average areas,
 encode as PNG. Rounds of both take turns, so that other work on the machine meets both; ratios are of the best
 rounds. Memory is the peak of a process of its own per length.
 """
@@ -58,14 +58,14 @@ def measure(quick: bool, progress: Progress = no_progress) -> Findings:
     rows: dict[str, list[_Timed]] = {}
     with tempfile.TemporaryDirectory() as folder:
         base = Path(folder)
-        videos = _record(base / "videos", size, mattes=False)
-        images = _record(base / "images", size._replace(frames=size.frames // EVERY), mattes=True)
+        videos = _record(base / "videos", size, masks=False)
+        images = _record(base / "images", size._replace(frames=size.frames // EVERY), masks=True)
         everyone = processor_count()
         ways: dict[str, Callable[[Path], int]] = {
             "video: plain OpenCV loop": lambda out: _plain_loop(videos, out, size),
             "video: prepare, 1 worker": lambda out: _prepare(videos, out, 1),
             f"video: prepare, {everyone} workers": lambda out: _prepare(videos, out, everyone),
-            f"images, mattes, stills, colours: prepare, {everyone} workers": lambda out: _prepare(
+            f"images, masks, stills, colours: prepare, {everyone} workers": lambda out: _prepare(
                 images, out, everyone, every=1
             ),
         }
@@ -78,27 +78,27 @@ def measure(quick: bool, progress: Progress = no_progress) -> Findings:
         peaks = {}
         for number, frames in enumerate(MEMORY_FRAMES):
             small = size._replace(cameras=2, frames=frames)
-            recording = _record(base / f"memory-{frames}", small, mattes=False)
+            recording = _record(base / f"memory-{frames}", small, masks=False)
             peaks[frames] = _peak_of_prepare(recording, base / f"memory-out-{frames}")
             progress(size.rounds * len(ways) + number + 1, total, f"memory of {frames} frames")
     return _findings(size, rows, peaks)
 
 
-def _record(root: Path, size: _Size, *, mattes: bool) -> Path:
+def _record(root: Path, size: _Size, *, masks: bool) -> Path:
     """A recording of smooth moving noise, which costs about what faces do to decode and to encode."""
     rig = [*cameras(size.cameras, size.width, size.height, np.zeros(3)).values()]
     writer = RecordingWriter(root, SUBJECT, rig)
     writer.write_calibration()
     pattern = _pattern(size)
     for camera in rig:
-        if mattes:
+        if masks:
             coverage = _coverage(camera)
             for number, frame in enumerate(_moving(pattern, size.frames)):
                 writer.write_frame(SEQUENCE, camera.id, number, frame, coverage)
             writer.write_background(camera.id, np.full_like(pattern, 128))
         else:
             writer.write_video(SEQUENCE, camera.id, _moving(pattern, size.frames))
-    if mattes:
+    if masks:
         rng = np.random.default_rng(1)
         matrices = {camera.id: np.eye(3, 11) + 0.01 * rng.normal(size=(3, 11)) for camera in rig}
         writer.write_colour(matrices)

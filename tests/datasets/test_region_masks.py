@@ -35,8 +35,8 @@ def pose(jaw=0.0):
     return HeadPose("toy", expression, zero, zero, np.array([jaw, 0, 0]), np.zeros(6), zero)
 
 
-def labels(view=FRONT, matte=None, head: HeadArrays = HEAD, jaw=0.0):
-    return HeadRegions(head, SHAPE, OFFSET).labels(view, pose(jaw), matte)
+def labels(view=FRONT, mask=None, head: HeadArrays = HEAD, jaw=0.0):
+    return HeadRegions(head, SHAPE, OFFSET).labels(view, pose(jaw), mask)
 
 
 def pixel(view, point):
@@ -81,23 +81,23 @@ def test_the_opening_between_the_lips_belongs_to_the_mouth():
     assert select(labels(), "mouth")[pixel(FRONT, middle)]
 
 
-def test_no_part_leaves_the_silhouette_without_a_matte():
+def test_no_part_leaves_the_silhouette_without_a_mask():
     covered = silhouette(HEAD.template, HEAD.faces, FRONT)
     found = labels()
     assert not ((found != 0) & ~covered).sum() > 5  # centres on an edge may fall either way
     assert not select(found, "foreground").any()
 
 
-def test_the_foreground_is_the_matte_from_a_half_on_and_bounds_the_hair_beyond_the_mesh():
-    matte = np.zeros((HEIGHT, WIDTH), np.uint8)
-    matte[10:, 20:76] = 255
-    matte[10:, 76:80] = 127
-    found = labels(matte=matte)
-    np.testing.assert_array_equal(select(found, "foreground"), matte >= 128)
+def test_the_foreground_is_the_mask_from_a_half_on_and_bounds_the_hair_beyond_the_mesh():
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    mask[10:, 20:76] = 255
+    mask[10:, 76:80] = 127
+    found = labels(mask=mask)
+    np.testing.assert_array_equal(select(found, "foreground"), mask >= 128)
     covered = silhouette(HEAD.template, HEAD.faces, FRONT)
     beyond = select(found, "hair") & ~covered
     assert beyond[12, 48]  # above the crown
-    assert not (beyond & (matte < 128)).any()
+    assert not (beyond & (mask < 128)).any()
     assert not beyond[HEIGHT - 4, 48]  # below the chin: nearest to the neck
 
 

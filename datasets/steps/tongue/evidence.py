@@ -49,7 +49,7 @@ _LIMIT = 6.0  # standard deviations beyond which more is no better
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class MouthEvidence:
     """What was found in T timesteps.
 
     Attributes
@@ -66,7 +66,7 @@ class Evidence:
     seen: FloatArray
 
 
-def find_evidence(colours: MouthColours, atlas: MouthAtlas) -> Evidence:
+def find_evidence(colours: MouthColours, atlas: MouthAtlas) -> MouthEvidence:
     """Look for what covers the mouth, camera by camera, and combine what the cameras see."""
     count, cameras = colours.seen.shape[:2]
     total = np.zeros((count, *atlas.shape), np.float32)
@@ -81,7 +81,7 @@ def find_evidence(colours: MouthColours, atlas: MouthAtlas) -> Evidence:
     areas = patches.sum(axis=(1, 2)) * (PITCH * 1e3) ** 2
     lip = atlas.lips & atlas.below
     seen = (looks[:, lip] > 0).mean(axis=1)
-    return Evidence(areas, patches, strength.astype(np.float16), seen)
+    return MouthEvidence(areas, patches, strength.astype(np.float16), seen)
 
 
 def mouth_patch(strength: FloatArray, atlas: MouthAtlas) -> np.ndarray:
@@ -183,7 +183,7 @@ def choose_threshold(areas: FloatArray) -> tuple[float, str]:
 
 def decide(
     timesteps: Mapping[int, str],
-    evidence: Evidence,
+    evidence: MouthEvidence,
     cameras: tuple[str, ...],
     threshold: float | None,
     overrides: Mapping[int, str],

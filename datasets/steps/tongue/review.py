@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 from ....bench.contracts import ByteArray, Camera, Clip, FloatArray
 from ....bench.io.files import atomic_path
 from ..exclude import Exclusions
-from .evidence import Evidence
+from .evidence import MouthEvidence
 from .mouth import PITCH, MouthAtlas, frames_by_timestep, posed_meshes
 
 Colour = tuple[int, int, int]
@@ -32,7 +32,7 @@ def write_sheet(
     path: Path,
     clip: Clip,
     atlas: MouthAtlas,
-    evidence: Evidence,
+    evidence: MouthEvidence,
     timesteps: Sequence[int],
     decided: Exclusions,
     count: int,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from headbench.bench.contracts import Camera
-from headbench.datasets.ga.principal_point import CyEvidence, View, weigh_cy
+from headbench.datasets.ga.principal_point import CyEvidence, OutlineView, weigh_cy
 
 from ..head.toy import toy_head
 from ..tiny_capture import look_at, silhouette
@@ -27,7 +27,7 @@ def ellipsoid_hull(camera: Camera, center, radii) -> np.ndarray:
     return filled > 0
 
 
-def make_views(offset: float, noise: float, *, seed: int = 0) -> list[View]:
+def make_views(offset: float, noise: float, *, seed: int = 0) -> list[OutlineView]:
     """Eight cameras around a head with hair and shoulders; ``noise`` in metres displaces the tracked mesh."""
     rng = np.random.default_rng(seed)
     views = []
@@ -41,16 +41,16 @@ def make_views(offset: float, noise: float, *, seed: int = 0) -> list[View]:
             HEAD.template + noise * rng.normal(size=3) + 0.3 * noise * rng.normal(size=HEAD.template.shape)
         )
         image = (mask * 255).astype(np.uint8)
-        views.append(View(tracked, camera, lambda image=image: image))
+        views.append(OutlineView(tracked, camera, lambda image=image: image))
     return views
 
 
-def flipped(view: View) -> View:
+def flipped(view: OutlineView) -> OutlineView:
     """The view of a reader that takes a cy from the bottom for one from the top."""
     K = view.camera.K.copy()
     K[1, 2] = HEIGHT - K[1, 2]
     camera = view.camera
-    return View(view.vertices, Camera(camera.id, WIDTH, HEIGHT, K, camera.world_to_camera), view.mask)
+    return OutlineView(view.vertices, Camera(camera.id, WIDTH, HEIGHT, K, camera.world_to_camera), view.mask)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.001])
@@ -69,7 +69,7 @@ def test_evidence_of_the_two_readings_swaps_with_the_reading():
 
 def test_exact_mesh_alone_agrees_wholly():
     views = [
-        View(
+        OutlineView(
             v.vertices,
             v.camera,
             lambda v=v: (silhouette(v.vertices, HEAD.faces, v.camera) * 255).astype(np.uint8),
@@ -84,7 +84,7 @@ def test_exact_mesh_alone_agrees_wholly():
 def test_empty_and_full_masks_do_not_decide():
     views = make_views(5.0, 0.0)
     for mask in (np.zeros((HEIGHT, WIDTH), np.uint8), np.full((HEIGHT, WIDTH), 255, np.uint8)):
-        blind = [View(v.vertices, v.camera, lambda mask=mask: mask) for v in views]
+        blind = [OutlineView(v.vertices, v.camera, lambda mask=mask: mask) for v in views]
         assert weigh_cy(blind, HEAD.faces).decision is None
 
 
@@ -95,9 +95,9 @@ def test_image_border_is_no_outline():
     faces = np.array([[0, 1, 2], [0, 2, 3]])
     mask = np.zeros((40, 40), np.uint8)
     mask[20:] = 255
-    assert weigh_cy([View(corners, camera, lambda: mask)], faces).top == 1
+    assert weigh_cy([OutlineView(corners, camera, lambda: mask)], faces).top == 1
     mask_without_edge = np.full((40, 40), 255, np.uint8)
-    assert weigh_cy([View(corners, camera, lambda: mask_without_edge)], faces).top == 0
+    assert weigh_cy([OutlineView(corners, camera, lambda: mask_without_edge)], faces).top == 0
 
 
 @pytest.mark.parametrize(

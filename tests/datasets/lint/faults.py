@@ -171,7 +171,7 @@ def _premultiply_again(image, mask):
 
 
 def _never_multiplied(image, mask):
-    """Colours of the subject as they are, wherever the matte is not zero."""
+    """Colours of the subject as they are, wherever the mask is not zero."""
     alpha = mask[..., None].astype(float) / 255
     colour = (image - (1 - alpha) * 255) / np.maximum(alpha, 0.02)
     grounded = 0.4 * np.clip(colour, 0, 255) + (1 - alpha) * 255  # a dark subject, which white cannot swamp

@@ -1,4 +1,4 @@
-"""A small capture without any fault: a toy head with a painted skin, moving smoothly, softly matted."""
+"""A small capture without any fault: a toy head with a painted skin, moving smoothly, softly masked."""
 
 from __future__ import annotations
 

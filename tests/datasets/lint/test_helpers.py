@@ -61,7 +61,7 @@ def test_views_cover_timesteps_and_cameras(pristine):
 
 @pytest.mark.parametrize(("noise", "shift", "twins"), [(1, 0, 10), (12, 0, 0), (0, 3, 0)])
 def test_near_duplicates_survive_noise_and_not_motion(good, noise, shift, twins):
-    """Frames saved anew with a level of noise are found, each once; louder or moved ones are not."""
+    """Frames saved again with a level of noise are found, each once; louder or moved ones are not."""
     entries = [e for e in read_transforms(good.union / "transforms_test.json") if e.camera_index == 1]
     white = pixels_of_files({}, (1, 1, 1)).image
     original = make_thumbnails({"one": entries}, white, 100)

@@ -19,7 +19,7 @@ def _copied(pristine: Recording, folder) -> Recording:
 
 @pytest.fixture(scope="session")
 def pristine_recording(tmp_path_factory) -> Recording:
-    """Frames as images with mattes, second release; tests only read it."""
+    """Frames as images with masks, second release; tests only read it."""
     return write_recording(tmp_path_factory.mktemp("images"))
 
 

@@ -46,7 +46,7 @@ def frame(camera: int, number: int, width: int = WIDTH, height: int = HEIGHT) ->
     return np.full((height, width, 3), colour_of(camera, number), np.uint8)
 
 
-def matte(width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
+def mask(width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
     """(H, W) coverage: the middle half, in blocks of 16 so that JPEG keeps it."""
     mask = np.zeros((height, width), np.uint8)
     mask[16 : height - 16, 16 : width - 16] = 255
@@ -97,7 +97,7 @@ def write_recording(
     sequences: dict[str, int] | None = None,
     size: tuple[int, int] = (WIDTH, HEIGHT),
 ) -> Recording:
-    """Write a recording with frames as images with mattes, or as videos."""
+    """Write a recording with frames as images with masks, or as videos."""
     cameras = world_cameras(*size)
     writer = RecordingWriter(folder / "recording", SUBJECT, cameras, release)
     writer.write_calibration()
@@ -108,7 +108,7 @@ def write_recording(
             frames = [frame(index, tone(name, number), *size) for number in range(count)]
             if images:
                 for number, pixels in enumerate(frames):
-                    writer.write_frame(name, camera.id, number, pixels, matte(*size))
+                    writer.write_frame(name, camera.id, number, pixels, mask(*size))
             else:
                 writer.write_video(name, camera.id, frames)
         path = folder / "tracking" / f"{SUBJECT}_{name}_v3_DS2_wBg" / "2026-01-01_00-00-00"

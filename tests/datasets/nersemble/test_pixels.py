@@ -21,24 +21,24 @@ def area_mean(image: np.ndarray, factor: int) -> np.ndarray:
 @pytest.mark.parametrize("factor", [1, 2, 4])
 @settings(max_examples=25)
 @given(frame=FRAMES)
-def test_without_a_matte_pixels_are_area_means(factor, frame):
+def test_without_a_mask_pixels_are_area_means(factor, frame):
     image, mask = prepare_pixels(frame, None, (12 // factor, 8 // factor))
     assert mask is None
     assert np.abs(image - area_mean(frame[..., ::-1], factor)).max() <= 0.5
 
 
 @settings(max_examples=25)
-@given(frame=FRAMES, matte=arrays(np.uint8, (8, 12)))
-def test_with_a_matte_the_weighted_foreground_stands_on_white(frame, matte):
-    coverage = matte[..., None] / 255
+@given(frame=FRAMES, mask=arrays(np.uint8, (8, 12)))
+def test_with_a_mask_the_weighted_foreground_stands_on_white(frame, mask):
+    coverage = mask[..., None] / 255
     expected = area_mean(frame[..., ::-1] * coverage + 255 * (1 - coverage), 4)
-    image, mask = prepare_pixels(frame, matte, (3, 2))
+    image, mask = prepare_pixels(frame, mask, (3, 2))
     # Products, means and the composite are rounded to 8 bits, one after the other.
     assert np.abs(image - expected).max() <= 2
-    assert np.abs(mask - area_mean(matte, 4)[..., 0]).max() <= 0.5
+    assert np.abs(mask - area_mean(mask, 4)[..., 0]).max() <= 0.5
 
 
-def test_full_and_empty_mattes_are_exact():
+def test_full_and_empty_masks_are_exact():
     frame = np.random.default_rng(0).integers(0, 256, (8, 12, 3), dtype=np.uint8)
     full, _ = prepare_pixels(frame, np.full((8, 12), 255, np.uint8), (12, 8))
     np.testing.assert_array_equal(full, frame[..., ::-1])
@@ -48,30 +48,30 @@ def test_full_and_empty_mattes_are_exact():
 
 
 @settings(max_examples=25)
-@given(foreground=FRAMES, wall=FRAMES, matte=arrays(np.uint8, (8, 12)))
-def test_the_still_takes_the_wall_out_of_soft_edges(foreground, wall, matte):
-    coverage = matte[..., None] / 255
+@given(foreground=FRAMES, wall=FRAMES, mask=arrays(np.uint8, (8, 12)))
+def test_the_still_takes_the_wall_out_of_soft_edges(foreground, wall, mask):
+    coverage = mask[..., None] / 255
     frame = np.rint(foreground * coverage + wall * (1 - coverage)).astype(np.uint8)
     wanted = (foreground * coverage + 255 * (1 - coverage))[..., ::-1]
-    image, _ = prepare_pixels(frame, matte, (12, 8), None, wall)
+    image, _ = prepare_pixels(frame, mask, (12, 8), None, wall)
     assert np.abs(image - wanted).max() <= 2
 
 
 def test_without_the_still_a_fringe_stays():
     frame = np.full((4, 4, 3), 100, np.uint8)  # half foreground 0, half wall 200
-    matte = np.full((4, 4), 128, np.uint8)
-    image, _ = prepare_pixels(frame, matte, (4, 4))
-    clean, _ = prepare_pixels(frame, matte, (4, 4), None, np.full((4, 4, 3), 200, np.uint8))
+    mask = np.full((4, 4), 128, np.uint8)
+    image, _ = prepare_pixels(frame, mask, (4, 4))
+    clean, _ = prepare_pixels(frame, mask, (4, 4), None, np.full((4, 4, 3), 200, np.uint8))
     assert image[0, 0, 0] - clean[0, 0, 0] == pytest.approx(200 * 0.5 * 0.5, abs=1.5)
 
 
-def test_nothing_outside_the_matte_is_averaged_in():
+def test_nothing_outside_the_mask_is_averaged_in():
     frame = np.full((2, 2, 3), 255, np.uint8)
     frame[0, 0] = 0
-    matte = np.zeros((2, 2), np.uint8)
-    matte[0, 0] = 255
+    mask = np.zeros((2, 2), np.uint8)
+    mask[0, 0] = 255
     for still in (None, np.zeros((2, 2, 3), np.uint8)):
-        image, _ = prepare_pixels(frame, matte, (1, 1), None, still)
+        image, _ = prepare_pixels(frame, mask, (1, 1), None, still)
         np.testing.assert_allclose(image, 191, atol=1)
 
 
@@ -79,9 +79,9 @@ def test_colours_are_corrected_before_the_composite():
     # Doubles the red of the foreground and lifts green; white stays white.
     correction = AffineCorrection(np.array([[2.0, 0, 0, 0], [0, 1, 0, 0.2], [0, 0, 1, 0]]))
     frame = np.full((4, 4, 3), (30, 40, 50), np.uint8)  # BGR
-    matte = np.zeros((4, 4), np.uint8)
-    matte[:, :2] = 255
-    image, mask = prepare_pixels(frame, matte, (2, 2), correction)
+    mask = np.zeros((4, 4), np.uint8)
+    mask[:, :2] = 255
+    image, mask = prepare_pixels(frame, mask, (2, 2), correction)
     np.testing.assert_array_equal(image[0], [[100, 91, 30], [255, 255, 255]])
     np.testing.assert_array_equal(mask[0], [255, 0])
     plain, _ = prepare_pixels(frame, None, (2, 2), correction)

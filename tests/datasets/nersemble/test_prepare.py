@@ -364,9 +364,9 @@ def test_tracking_of_other_frames_is_refused(recording, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_videos_without_mattes_say_so_and_write_no_masks(videos, tmp_path):
+def test_videos_without_masks_say_so_and_write_no_masks(videos, tmp_path):
     result, _ = prepared(videos, tmp_path / "out", every=1)
-    assert any("no mattes" in sentence for sentence in result["missing"])
+    assert any("no masks" in sentence for sentence in result["missing"])
     assert not [*(tmp_path / "out").rglob("fg_masks")]
     clip = read_capture(result["union"])
     assert clip.mask(clip.splits["train"][0]) is None

@@ -49,7 +49,7 @@ def test_there_and_back(release, frames, clip, tmp_path):
         tmp_path / "raw",
         tracking=tmp_path / "tracking",
         release=release,
-        mattes=frames == "images",
+        masks=frames == "images",
     )
     save_head(tmp_path / "head.npz", clip.head)
     findings = prepare_nersemble(

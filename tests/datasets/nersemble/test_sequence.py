@@ -11,7 +11,7 @@ from headbench.datasets.nersemble.re_record import write_video
 from headbench.datasets.nersemble.recording import participant, read_calibration
 from headbench.datasets.nersemble.sequence import probe_video, read_sequence
 
-from .recordings import HEIGHT, SEQUENCES, SUBJECT, WIDTH, colour_of, matte, world_cameras, write_recording
+from .recordings import HEIGHT, SEQUENCES, SUBJECT, WIDTH, colour_of, mask, world_cameras, write_recording
 
 SERIALS = [camera.id for camera in world_cameras()]
 
@@ -36,10 +36,10 @@ def check_streams(sequence, *, tolerance=4):
 def test_frames_of_images_are_those_asked_for(release, every, tmp_path):
     sequence = look(write_recording(tmp_path, release=release), every=every)
     assert sequence.numbers == tuple(range(0, SEQUENCES["FREE"], every))
-    assert sequence.has_mattes
+    assert sequence.has_masks
     check_streams(sequence)
     frame = next(iter(read_frames(sequence.views[SERIALS[0]], [0])))
-    assert np.abs(frame.matte.astype(int) - matte()).max() <= 3
+    assert np.abs(frame.mask.astype(int) - mask()).max() <= 3
 
 
 @pytest.mark.parametrize("release", ["v2", "v1"])
@@ -47,7 +47,7 @@ def test_frames_of_images_are_those_asked_for(release, every, tmp_path):
 def test_frames_of_videos_are_those_asked_for(release, every, tmp_path):
     sequence = look(write_recording(tmp_path, release=release, images=False), every=every)
     assert sequence.numbers == tuple(range(0, SEQUENCES["FREE"], every))
-    assert not sequence.has_mattes
+    assert not sequence.has_masks
     check_streams(sequence, tolerance=6)
 
 
@@ -56,19 +56,19 @@ def test_by_default_videos_give_every_third_frame_and_images_all(pristine_videos
     assert look(pristine_recording).numbers == tuple(range(6))
 
 
-def test_videos_of_mattes_are_read_with_the_frames(videos):
+def test_videos_of_masks_are_read_with_the_frames(videos):
     folder = videos.writer.sequence_folder("FREE")
     for serial in SERIALS:
-        # What OpenCV's MPEG-4 keeps best is flat, so the mattes tell their number by a flat level.
+        # What OpenCV's MPEG-4 keeps best is flat, so the masks tell their number by a flat level.
         levels = (np.full((HEIGHT, WIDTH), 40 * number, np.uint8) for number in range(6))
         write_video(folder / "alpha_maps" / f"cam_{serial}.mp4", levels)
     sequence = look(videos, every=2)
-    assert sequence.has_mattes
+    assert sequence.has_masks
     for frame in read_frames(sequence.views[SERIALS[1]], sequence.numbers):
-        assert np.abs(frame.matte.astype(int) - 40 * frame.number).max() <= 4
+        assert np.abs(frame.mask.astype(int) - 40 * frame.number).max() <= 4
 
 
-def test_images_with_mattes_go_before_videos(recording):
+def test_images_with_masks_go_before_videos(recording):
     for index, serial in enumerate(SERIALS):
         frames = (np.full((HEIGHT, WIDTH, 3), colour_of(index, n), np.uint8) for n in range(12))
         recording.writer.write_video("FREE", serial, frames)
@@ -168,7 +168,7 @@ def test_a_foreign_file_by_the_name_of_a_video_is_refused(videos):
     assert error.value.file == str(path)
 
 
-def test_mattes_of_another_size_are_named(recording):
+def test_masks_of_another_size_are_named(recording):
     folder = recording.writer.sequence_folder("FREE") / "alpha_maps"
     for path in folder.glob(f"cam_{SERIALS[0]}_*"):
         cv2.imwrite(str(path), np.zeros((HEIGHT // 2, WIDTH // 2), np.uint8))
@@ -190,7 +190,7 @@ def test_the_one_file_of_another_size_is_blamed(kind, number, recording):
     assert error.value.found == f"{WIDTH // 2}x{HEIGHT // 2}"
 
 
-def test_a_missing_matte_is_named(recording):
+def test_a_missing_mask_is_named(recording):
     folder = recording.writer.sequence_folder("FREE") / "alpha_maps"
     (folder / f"cam_{SERIALS[0]}_000003.jpg").unlink()
     with pytest.raises(InputError) as error:

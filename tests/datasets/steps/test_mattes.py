@@ -1,4 +1,4 @@
-"""Mattes on frames whose true colours are known, and the line below the neck against a filled half-plane."""
+"""Masks on frames whose true colours are known, and the line below the neck against a filled half-plane."""
 
 from dataclasses import replace
 
@@ -109,12 +109,12 @@ def clip(pristine_capture):
 
 def with_pixels(clip, folder, image, mask):
     """A clip whose frames all show one image (3 or 4 channels) with one mask."""
-    path, matte = folder / "image.png", folder / "mask.png"
+    path, mask = folder / "image.png", folder / "mask.png"
     order = [2, 1, 0, 3][: image.shape[2]]
     cv2.imwrite(str(path), image[..., order])
     if mask is not None:
-        cv2.imwrite(str(matte), mask)
-    files = {key: FrameFiles(path, path if mask is None else matte) for key in clip.files}
+        cv2.imwrite(str(mask), mask)
+    files = {key: FrameFiles(path, path if mask is None else mask) for key in clip.files}
     height, width = image.shape[:2]
     cameras = {name: camera.resized(width, height) for name, camera in clip.cameras.items()}
     return replace(clip, files=files, cameras=cameras, store=ImageStore())
@@ -172,7 +172,7 @@ def test_the_colour_of_the_set_leaves_the_edges(clip, tmp_path, by_camera):
     levels = rounded(coverage)
     shown = levels.astype(np.float32) / 255
     recorded = composite(colours, shown, GREEN)  # in front of a green screen
-    cut_out = rounded(composite(recorded, shown, WHITE))  # and cut out with its matte, as it was recorded
+    cut_out = rounded(composite(recorded, shown, WHITE))  # and cut out with its mask, as it was recorded
     spilled = with_pixels(clip, tmp_path, cut_out, levels)
     screen = np.broadcast_to(np.array(GREEN, np.float32), (SIZE, SIZE, 3))
     cleaned = clean_edges(spilled, dict.fromkeys(clip.cameras, screen) if by_camera else GREEN)
@@ -197,7 +197,7 @@ def test_another_image_of_the_set_makes_another_clip(clip):
     assert cleaned(0.2).fingerprint != cleaned(0.3).fingerprint
 
 
-def test_what_a_matte_step_needs_is_said(clip):
+def test_what_a_mask_step_needs_is_said(clip):
     bare = replace(clip, files={key: files._replace(mask=None) for key, files in clip.files.items()})
     with pytest.raises(InputError, match="a mask for every frame"):
         set_background(bare, BLUE)

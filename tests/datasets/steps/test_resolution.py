@@ -9,7 +9,7 @@ from headbench.bench.contracts import Camera
 from headbench.bench.errors import InputError
 from headbench.bench.specs import ResolutionRule
 from headbench.datasets.ga.reader import read_capture
-from headbench.datasets.steps.resolution import Alignment, Box, align_clip, scale_camera, take_box
+from headbench.datasets.steps.resolution import Alignment, PixelBox, align_clip, scale_camera, take_box
 
 WHITE = (1.0, 1.0, 1.0)
 RULES = {
@@ -113,7 +113,7 @@ def test_a_rule_that_changes_nothing_moves_nothing():
 
 
 def test_a_box_outside_the_image_is_background():
-    box = take_box(np.zeros((3, 3, 1), np.float32), Box(5, 5, 2, 2), (0.5,))
+    box = take_box(np.zeros((3, 3, 1), np.float32), PixelBox(5, 5, 2, 2), (0.5,))
     assert (box == 0.5).all()
 
 

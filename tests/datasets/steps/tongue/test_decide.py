@@ -7,13 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from headbench.datasets.steps.tongue.evidence import ALWAYS, NEVER, Evidence, choose_threshold, decide
+from headbench.datasets.steps.tongue.evidence import ALWAYS, NEVER, MouthEvidence, choose_threshold, decide
 
 
 def evidence(areas, seen=None):
     areas = np.asarray(areas, float)
     blank = np.zeros((len(areas), 2, 2))
-    return Evidence(areas, blank > 0, blank, np.ones(len(areas)) if seen is None else np.asarray(seen))
+    return MouthEvidence(areas, blank > 0, blank, np.ones(len(areas)) if seen is None else np.asarray(seen))
 
 
 @given(st.lists(st.floats(0, 500), max_size=30))
