@@ -24,7 +24,7 @@ from ...datasets.head.refit.problem import FitProblem, Frame, angle_bounds, solv
 from ...datasets.head.refit.refit import refit
 from ...datasets.head.subject import PosedSubject, pose_in_head_frame
 from ...datasets.images import ImageStore
-from .head.sized import FLAME_SIZES, sized_head
+from .head.speed import FLAME_SIZES, sized_head
 
 TIMESTEPS, QUICK_TIMESTEPS = 192, 64
 SCIPY_FRAMES, QUICK_SCIPY_FRAMES = 6, 2

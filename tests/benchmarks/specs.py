@@ -48,7 +48,7 @@ AVATAR = BenchmarkSpec(
 METRICS = BenchmarkSpec(
     name="metrics",
     summary="the image metrics: time per image next to scikit-image, torchmetrics and lpips, and equality of values",
-    speed="headbench.tests.benchmarks.image_metrics.speed:measure",
+    speed="headbench.tests.benchmarks.images:measure",
 )
 
 

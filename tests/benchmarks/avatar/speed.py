@@ -1,16 +1,327 @@
-"""``headbench bench avatar``."""
+"""Pairs of ways to the same frame, one of which leaves work out."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass
+from itertools import cycle
 from typing import Any
 
-from ....bench.contracts import Progress, no_progress
+import torch
+from torch import Tensor
+
+from ....bench.contracts import Camera, HeadAsset, HeadPose, Progress, no_progress
 from ....bench.specs import Findings
 from ....datasets.head.procedural.model import procedural_head
-from ..splats.layout import table
-from .savings import Bench
+from ....methods.ours.appearance import driving_coefficients
+from ....methods.ours.avatar import OursAvatar
+from ....methods.ours.field import (
+    Box,
+    CanonicalFrames,
+    LinePosition,
+    apply_offsets,
+    blend_lines,
+    canonical_directions,
+    line_offsets,
+    line_position,
+    normalised_weight,
+    plane_features,
+    position_part,
+    shade,
+    shade_directions,
+)
+from ....methods.shared.avatar_kernel import Carrier
+from ....methods.shared.binding import to_world
+from ....methods.shared.networks import offset_network, sum_rows
+from ....methods.shared.rendering import render_splats, view_of
+from ..timing import seconds_of, table, take_turns, torch_threads
+from .untrained import cameras_around, random_poses, untrained_avatar
+
+Run = Callable[[], Any]
+BLOCK = 1024  # splats at which every line is sampled at once; bounds the memory of the slow way
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Milliseconds of processor time, the least of runs that take turns."""
+
+    name: str
+    before: float
+    after: float
+    note: str = ""
+
+
+class Bench:
+    """One avatar with poses and cameras, taken apart."""
+
+    def __init__(
+        self, head: HeadAsset, count: int, width: int, height: int, *, budget: float, least_runs: int
+    ):
+        self.head, self.count, self.size = head, count, (width, height)
+        self._budget, self._least_runs = budget, least_runs
+        self.avatar = untrained_avatar(head, count)
+        self.poses = random_poses(head, 8)
+        self.cameras = cameras_around(head, 4, width, height)
+
+    def pairs(self) -> Iterator[Pair]:
+        """Every saving, alone, then all together, against the same frame drawn by the definition's own functions."""
+        yield self._whole()
+        yield self._pair(
+            "known poses prepared",
+            self._frames(self.avatar),
+            self._frames(self._prepared()),
+            "mesh, frames, jaw weights, offsets",
+        )
+        yield self._pair("another camera, same pose", self._frames(self.avatar), self._orbit(self.avatar))
+        yield self._pair("same camera, same pose", self._frames(self.avatar), self._still(self.avatar))
+        yield self._blended()
+        yield self._lines()
+        yield self._outside()
+        yield self._units()
+        yield self._folded()
+        yield self._network()
+        yield self._carried()
+
+    def stages(self) -> list[tuple[str, float]]:
+        """Milliseconds of the steps of one frame."""
+        parts = _Parts(self.avatar, self.poses[0], self.cameras[0])
+        runs: dict[str, Run] = {
+            "mesh": parts.mesh,
+            "triangle frames": parts.frames,
+            "line offsets": parts.offsets,
+            "splats to the world": parts.world,
+            "colours": parts.colors,
+            "rasterise, to numpy": parts.raster,
+        }
+        return list(self._least(runs).items())
+
+    def _least(self, runs: dict[str, Run]) -> dict[str, float]:
+        timed = {name: seconds_of(run, time.thread_time) for name, run in runs.items()}
+        with torch_threads(1), torch.no_grad():
+            seconds = take_turns(timed, budget=self._budget, least_runs=self._least_runs)
+        return {name: 1e3 * min(values) for name, values in seconds.items()}
+
+    def _pair(self, name: str, before: Run, after: Run, note: str = "") -> Pair:
+        least = self._least({"before": before, "after": after})
+        return Pair(name, least["before"], least["after"], note)
+
+    def _frames(self, avatar: OursAvatar) -> Run:
+        """A new pose and a new camera every frame."""
+        frames = cycle([(self.cameras[n % len(self.cameras)], pose) for n, pose in enumerate(self.poses)])
+        return lambda: avatar.render(*next(frames))
+
+    def _orbit(self, avatar: OursAvatar) -> Run:
+        frames = cycle(self.cameras)
+        # Of an avatar of its own: another run's pose between two of these would be the last one.
+        own = OursAvatar([], avatar.mesh, avatar.subject, avatar.field, "cpu")
+        return lambda: own.render(next(frames), self.poses[0])
+
+    def _still(self, avatar: OursAvatar) -> Run:
+        own = OursAvatar([], avatar.mesh, avatar.subject, avatar.field, "cpu")
+        return lambda: own.render(self.cameras[0], self.poses[0])
+
+    def _prepared(self) -> OursAvatar:
+        prepared = OursAvatar([], self.avatar.mesh, self.avatar.subject, self.avatar.field, "cpu")
+        prepared.prepare(self.poses)
+        return prepared
+
+    def _whole(self) -> Pair:
+        parts = [_Parts(self.avatar, pose, camera) for pose, camera in zip(self.poses, cycle(self.cameras))]
+        frames = cycle(parts)
+        return self._pair(
+            "all, a new pose and camera every frame", lambda: next(frames).plain(), self._frames(self.avatar)
+        )
+
+    def _blended(self) -> Pair:
+        parts = _Parts(self.avatar, self.poses[0], self.cameras[0])
+        return self._pair("lines blended once a frame", parts.offsets_by_line, parts.offsets, "not per splat")
+
+    def _lines(self) -> Pair:
+        parts = _Parts(self.avatar, self.poses[0], self.cameras[0])
+        return self._pair(
+            "first line layer on the blended lines", parts.offsets_by_splat, parts.offsets, "not per splat"
+        )
+
+    def _outside(self) -> Pair:
+        """Lines over the front half of the head, as with ``lines.bounds: face``, against the whole."""
+        field = self.avatar.field
+        low, high = field.tensors["line_box"]
+        front = torch.stack([torch.stack([low[0], low[1], 0.5 * (low[2] + high[2])]), high])
+        narrow = field._replace(tensors={**field.tensors, "line_box": front})
+        other = OursAvatar([], self.avatar.mesh, self.avatar.subject, narrow, "cpu")
+        share = len(other.line_offsets.inside) / max(self.count, 1) if other.line_offsets else 0.0
+        whole, part = (_Parts(one, self.poses[0], self.cameras[0]) for one in (self.avatar, other))
+        return self._pair(
+            "splats outside the lines' box skipped", whole.offsets, part.offsets, f"{share:.0%} inside"
+        )
+
+    def _folded(self) -> Pair:
+        parts = _Parts(self.avatar, self.poses[0], self.cameras[0])
+        return self._pair(
+            "planes folded into the first colour layer", parts.colors_by_planes, parts.colors_direct
+        )
+
+    def _units(self) -> Pair:
+        parts = _Parts(self.avatar, self.poses[0], self.cameras[0])
+        return self._pair(
+            "offset network in one pass, without units that are off",
+            parts.offsets_by_torch,
+            parts.offsets,
+            f"{parts.units_on():.0%} on",
+        )
+
+    def _network(self) -> Pair:
+        parts = _Parts(self.avatar, self.poses[0], self.cameras[0])
+        return self._pair(
+            "colour network in one pass, directions included", parts.colors_direct, parts.colors
+        )
+
+    def _carried(self) -> Pair:
+        parts = _Parts(self.avatar, self.poses[0], self.cameras[0])
+        return self._pair("splats to the world in one pass", parts.world_by_torch, parts.world)
+
+
+class _Parts:
+    """The steps of one frame by themselves; the slow twins by the functions that training uses."""
+
+    def __init__(self, avatar: OursAvatar, pose: HeadPose, camera: Camera):
+        self._avatar, self._tensors = avatar, avatar.field.tensors
+        self._mesh, self._pose = avatar.mesh, pose
+        self._view = view_of(camera, "cpu")
+        with torch.no_grad():
+            self._vertices = self.mesh()
+            self._frames = self.frames()
+            self._binding = self._tensors["splats"][:, -1].to(torch.int64)
+            self._canonical = CanonicalFrames.of(self._mesh.frames(self._mesh.canonical))
+            self._turns = self._canonical.turns(self._frames)
+            self._positions = self._canonical.positions(self._binding, avatar.neutral.means)
+            self._box = Box(*self._tensors["line_box"])
+            self._inside = self._box.contains(self._positions).nonzero().squeeze(1)
+            unit = self._box.unit(self._positions.index_select(0, self._inside))
+            self._place = line_position(unit, self._tensors["lines"].shape[2])
+            features = plane_features(self._tensors, Box(*self._tensors["plane_box"]), self._positions)
+            self._from_position = position_part(self._tensors, features)
+            splats = avatar.neutral
+            self._carrier = Carrier(self._binding, splats.log_scales, splats.quats)
+            self._coefficients = self._driving()
+            self._offsets = self.offsets()
+            self._splats = self._changed(self._offsets)
+            self._world = self.world()
+            self._shown = self.colors()
+
+    def mesh(self) -> Tensor:
+        return self._mesh.posed(self._mesh.arguments([self._pose]))
+
+    def frames(self) -> Any:
+        return self._mesh.frames(self._vertices)
+
+    def offsets(self) -> Tensor:
+        assert self._avatar.line_offsets is not None
+        return self._avatar.line_offsets(*self._coefficients)
+
+    def offsets_by_torch(self) -> Tensor:
+        """With the first layer on the blended lines, all units of all layers."""
+        assert self._avatar.line_offsets is not None
+        return self._avatar.line_offsets.by_torch(self._avatar.line_offsets.table(*self._coefficients))
+
+    def units_on(self) -> float:
+        """Part of the first layer's units that are on, over all splats inside."""
+        assert self._avatar.line_offsets is not None
+        table = self._avatar.line_offsets.table(*self._coefficients)
+        return float((sum_rows(table, *self._place) > 0).float().mean())
+
+    def offsets_by_line(self) -> Tensor:
+        """Every line sampled at each splat, and the samples blended there."""
+        expression, jaw = self._coefficients
+        lines = self._tensors["lines"]
+        features = []
+        for start in range(0, len(self._inside), BLOCK):
+            place = LinePosition(*(part[start : start + BLOCK] for part in self._place))
+            kinds = zip((expression, jaw), lines.split([len(expression), len(jaw)]))
+            features.append(torch.cat([_blend_samples(own, weights, place) for weights, own in kinds], dim=1))
+        return self._offsets_of(torch.cat(features))
+
+    def offsets_by_splat(self) -> Tensor:
+        """Blended lines sampled at each splat, 6 C features, and all layers there."""
+        blended = blend_lines(self._tensors["lines"], *self._coefficients)
+        return self._offsets_of(torch.cat([sum_rows_by_axis(kind, self._place) for kind in blended], dim=1))
+
+    def _offsets_of(self, features: Tensor) -> Tensor:
+        summed = features @ normalised_weight(self._tensors, 0).t()
+        layers = [normalised_weight(self._tensors, layer) for layer in (1, 2)]
+        biases = [self._tensors[f"line_bias_{layer}"] for layer in range(3)]
+        inside = offset_network(summed, biases[0], layers[0], biases[1], layers[1], biases[2])
+        return inside.new_zeros(len(self._binding), inside.shape[1]).index_copy(0, self._inside, inside)
+
+    def world(self) -> Any:
+        splats = self._splats
+        return self._carrier(self._frames, splats.means, splats.log_scales, splats.quats)
+
+    def world_by_torch(self) -> Any:
+        splats = self._splats
+        return to_world(self._frames, self._binding, splats.means, splats.log_scales, splats.quats)
+
+    def colors(self) -> Tensor:
+        # A copy of the means: for the same tensor the last colours would be given again.
+        means = self._world.means.view_as(self._world.means)
+        return self._avatar.colors(means, self._view.center, self._turns, self._binding)
+
+    def colors_direct(self) -> Tensor:
+        """By torch, with the part of the position known."""
+        directions = canonical_directions(self._turns, self._binding, self._world.means, self._view.center)
+        return shade_directions(self._tensors, self._from_position, directions)
+
+    def colors_by_planes(self) -> Tensor:
+        """Planes sampled and all layers at each splat."""
+        features = plane_features(self._tensors, Box(*self._tensors["plane_box"]), self._positions)
+        directions = canonical_directions(self._turns, self._binding, self._world.means, self._view.center)
+        return shade(self._tensors, features, directions)
+
+    def raster(self) -> Any:
+        opacities = torch.sigmoid(self._splats.logits)
+        return render_splats(self._world, opacities, self._shown, self._view, (1.0, 1.0, 1.0))
+
+    def plain(self) -> Any:
+        """A whole frame by training's functions, nothing known beforehand but the canonical positions."""
+        self._vertices = self.mesh()
+        self._frames = self.frames()
+        self._turns = self._canonical.turns(self._frames)
+        self._coefficients = self._driving()
+        blended = blend_lines(self._tensors["lines"], *self._coefficients)
+        inside = line_offsets(self._tensors, blended, self._place)
+        offsets = inside.new_zeros(len(self._binding), inside.shape[1]).index_copy(0, self._inside, inside)
+        self._splats = self._changed(offsets)
+        self._world = self.world()
+        self._shown = self.colors_by_planes()
+        return self.raster()
+
+    def _driving(self) -> tuple[Tensor, Tensor]:
+        bases = self._tensors["jaw_bases"].numpy().astype(float)
+        return driving_coefficients(self._pose, len(self._tensors["lines"]) - len(bases), bases, "cpu")
+
+    def _changed(self, offsets: Tensor) -> Any:
+        return apply_offsets(self._avatar.neutral, offsets, self._avatar.field.dynamic)
+
+
+def sum_rows_by_axis(lines: Tensor, place: LinePosition) -> Tensor:
+    """(N, 3 C) samples of (3, L, C) lines at each splat."""
+    axes, resolution, _ = lines.shape
+    rows, weights = place.rows.view(-1, 2, axes), place.weights.view(-1, 2, axes)
+    parts = [
+        sum_rows(lines[axis], rows[:, :, axis] - axis * resolution, weights[:, :, axis].contiguous())
+        for axis in range(axes)
+    ]
+    return torch.cat(parts, dim=1)
+
+
+def _blend_samples(lines: Tensor, weights: Tensor, place: LinePosition) -> Tensor:
+    """(n, 3 C) weighted sums of the samples of (K, 3, L, C) lines."""
+    count, _, _, channels = lines.shape
+    side_by_side = lines.permute(1, 2, 0, 3).flatten(2).contiguous()
+    samples = sum_rows_by_axis(side_by_side, place).view(len(place.rows), -1, count, channels)
+    return torch.einsum("nakc,k->nac", samples, weights).flatten(1)
+
 
 SIZES = ((20_000, 144, 208), (60_000, 550, 802))
 QUICK = ((2_000, 72, 104),)

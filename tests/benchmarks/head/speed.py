@@ -1,23 +1,148 @@
-"""``headbench bench head``: time of a forward pass, beside smplx in the same run."""
+"""The embedded head with bases of any size, for measurements: as large as a licensed model's, licensed by nobody."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from functools import partial
-from typing import Any
+import pickle
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ....bench.contracts import Progress
+from ....bench.contracts import FloatArray, Progress
 from ....bench.errors import UnavailableError
 from ....bench.specs import Findings
+from ....datasets.head.arrays import HeadArrays
 from ....datasets.head.model import HeadModel
-from .sized import FLAME_SIZES, sized_head
-from .smplx_flame import smplx_forward
+from ....datasets.head.procedural.model import procedural_head
+from ..timing import seconds_of, take_turns, torch_threads
+
+FLAME_SIZES = (300, 100)
+"""Identity and expression directions of FLAME."""
+
+_WAVES = 3
+_COARSE, _FINE = 20.0, 160.0  # radians per metre: bumps from the size of a cheek to that of a lip
+_IDENTITY, _EXPRESSION = 0.004, 0.003  # metres: root mean square of the first direction
+_CORRECTIVE = 0.002  # metres per unit entry of R - I
+
+
+def sized_head(version: str, shape_size: int, expression_size: int) -> HeadArrays:
+    """The procedural head's surface and rig with smooth random bases, dense as those of a scanned model.
+
+    Directions are sums of plane waves, later ones finer and smaller; expressions act where the procedural head's
+    do. All 36 pose correctives act. Versions differ in their bases alone.
+
+    Parameters
+    ----------
+    version : of the procedural head, "2020" or "2023"; seeds the bases too.
+    shape_size, expression_size : how many directions.
+    """
+    head = procedural_head(version)
+    rng = np.random.default_rng([int(version[-4:]), shape_size, expression_size])
+    points = np.asarray(head.template, dtype=np.float64)
+    mobility = np.linalg.norm(head.expression_basis.reshape(len(points), -1), axis=1)
+    mobility = np.sqrt(mobility / mobility.max())
+    eyeballs = np.concatenate([head.regions["left_eyeball"], head.regions["right_eyeball"]])
+    identity = _IDENTITY * _waves(points, shape_size, rng)
+    identity[eyeballs] = identity[eyeballs].mean(axis=0)
+    return replace(
+        head,
+        version=f"{head.version}-{shape_size}-{expression_size}",
+        shape_basis=identity.astype(np.float32),
+        expression_basis=(
+            _EXPRESSION * mobility[:, None, None] * _waves(points, expression_size, rng)
+        ).astype(np.float32),
+        pose_basis=(
+            _CORRECTIVE * mobility[:, None, None] * _waves(points, head.pose_basis.shape[2], rng)
+        ).astype(np.float32),
+    )
+
+
+def _waves(points: FloatArray, count: int, rng: np.random.Generator) -> FloatArray:
+    """(V, 3, count) smooth fields, the first ones of unit root mean square, falling with the index."""
+    fineness = np.geomspace(_COARSE, _FINE, count)
+    axes = rng.normal(size=(3, _WAVES * 3 * count))
+    axes /= np.linalg.norm(axes, axis=0)
+    phases = points @ axes * np.repeat(fineness, 3 * _WAVES) + rng.uniform(0, 2 * np.pi, axes.shape[1])
+    fields = np.sin(phases).reshape(len(points), count, 3, _WAVES).sum(axis=3)
+    fields /= np.sqrt(np.square(fields).mean(axis=(0, 2), keepdims=True))
+    return (fields / np.sqrt(1 + np.arange(count))[:, None]).transpose(0, 2, 1)
+
+
+Forward = Callable[[Tensor, Mapping[str, Tensor]], Tensor]
+
+
+class SmplxForward(NamedTuple):
+    """Two ways through smplx, each from identity (B, S) and pose arguments to vertices (B, V, 3)."""
+
+    model: Forward
+    """Its FLAME class, as one uses it: landmarks and bookkeeping included."""
+    skinning: Forward
+    """Its function ``lbs`` alone, with both bases joined beforehand."""
+
+
+def smplx_forward(head: HeadArrays) -> SmplxForward:
+    """Make smplx's FLAME from a head.
+
+    Raises
+    ------
+    UnavailableError
+        Where smplx is not installed.
+    """
+    try:
+        import smplx
+        from smplx.lbs import lbs
+    except ImportError as error:
+        raise UnavailableError("The package smplx is not installed.", "pip install smplx") from error
+    parents = head.parents.astype(np.int64)
+    content = {
+        "v_template": head.template,
+        "f": head.faces.astype(np.uint32),
+        "shapedirs": np.concatenate([head.shape_basis, head.expression_basis], axis=2),
+        "posedirs": head.pose_basis,
+        "J_regressor": head.joint_regressor,
+        "kintree_table": np.stack([parents, np.arange(len(parents))]),
+        "weights": head.skinning_weights,
+    }
+    landmarks = {"lmk_face_idx": np.zeros(51, np.int64), "lmk_b_coords": np.full((51, 3), 1 / 3)}
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / "FLAME_NEUTRAL.pkl").write_bytes(pickle.dumps(content))
+        (Path(folder) / "flame_static_embedding.pkl").write_bytes(pickle.dumps(landmarks))
+        sizes = {
+            "num_betas": head.shape_basis.shape[2],
+            "num_expression_coeffs": head.expression_basis.shape[2],
+        }
+        flame = smplx.FLAME(folder, **sizes, batch_size=1)
+    directions = torch.cat([flame.shapedirs, flame.expr_dirs], dim=-1)
+
+    def model(shape: Tensor, pose: Mapping[str, Tensor]) -> Tensor:
+        vertices: Tensor = flame(
+            betas=shape,
+            expression=pose["expression"],
+            global_orient=pose["rotation"],
+            neck_pose=pose["neck"],
+            jaw_pose=pose["jaw"],
+            leye_pose=pose["eyes"][:, :3],
+            reye_pose=pose["eyes"][:, 3:],
+            transl=pose["translation"],
+        ).vertices
+        return vertices
+
+    def skinning(shape: Tensor, pose: Mapping[str, Tensor]) -> Tensor:
+        angles = torch.cat([pose[name] for name in ("rotation", "neck", "jaw", "eyes")], dim=1)
+        template = flame.v_template.expand(len(shape), -1, -1)
+        arguments = (flame.posedirs, flame.J_regressor, flame.parents, flame.lbs_weights)
+        vertices: Tensor = lbs(
+            torch.cat([shape, pose["expression"]], 1), angles, template, directions, *arguments
+        )[0]
+        return vertices + pose["translation"][:, None]
+
+    return SmplxForward(model, skinning)
+
 
 BATCHES = (1, 16)
 THREADS = 2
@@ -42,13 +167,17 @@ def measure(quick: bool, progress: Progress) -> Findings:
     rows: list[dict[str, Any]] = []
     notes: list[str] = []
     passed = True
-    with torch.no_grad(), _threads(THREADS):
+    with torch.no_grad(), torch_threads(THREADS):
         for batch in BATCHES:
             shape, pose = _arguments(model, batch)
             ways = _ways(model, shape, pose, notes)
             vertices = {name: way() for name, way in ways.items()}
             difference = max(float((value - vertices[OURS]).abs().max()) for value in vertices.values())
-            seconds = _least(ways, rounds, partial(progress, total=rounds, note=f"batch {batch}"))
+            progress(BATCHES.index(batch), len(BATCHES), f"batch {batch}")
+            taken = take_turns(
+                {name: seconds_of(way) for name, way in ways.items()}, budget=0.0, least_runs=rounds
+            )
+            seconds = {name: min(each) for name, each in taken.items()}
             factor = seconds.get("smplx FLAME", np.nan) / seconds[OURS]
             passed &= difference < CLOSE and not factor < FLOORS[batch]
             for name, value in seconds.items():
@@ -91,20 +220,6 @@ def _ways(
     return ways
 
 
-def _least(
-    ways: Mapping[str, Callable[[], Tensor]], rounds: int, report: Callable[..., None]
-) -> dict[str, float]:
-    """Seconds of each way, the least over the rounds; every round runs all of them."""
-    best: dict[str, float] = dict.fromkeys(ways, np.inf)
-    for done in range(rounds):
-        for name, way in ways.items():
-            start = time.perf_counter()
-            way()
-            best[name] = min(best[name], time.perf_counter() - start)
-        report(done + 1)
-    return best
-
-
 def _arguments(model: HeadModel, batch: int) -> tuple[Tensor, dict[str, Tensor]]:
     """Identity (1, S) and a batch of poses in which every joint turns."""
     generator = torch.Generator().manual_seed(batch)
@@ -116,13 +231,3 @@ def _arguments(model: HeadModel, batch: int) -> tuple[Tensor, dict[str, Tensor]]
     pose = {name: draw(size, 0.2) for name, size in sizes}
     pose |= {"expression": draw(model.expression_size, 1.0), "translation": draw(3, 0.01)}
     return draw(model.shape_size, 1.0, 1), pose
-
-
-@contextmanager
-def _threads(count: int) -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)

@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 
 from ....methods.splats.constants import ALPHA_MIN
-from .compare import DIFFERENTIABLE, Outcome
-from .scenes import Scene, cloud
+from .scenes import DIFFERENTIABLE, Outcome, Scene, cloud
 
 TIGHT = 1e-4  # of gradients where float32 loses nothing; 2e-4 for quaternions is within
 

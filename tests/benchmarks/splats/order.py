@@ -15,10 +15,8 @@ from torch import Tensor
 
 from ....bench.contracts import HeadAsset
 from ....methods.shared.binding import to_world, triangle_frames
-from .layout import milliseconds, table
-from .passes import passes
-from .scenes import Scene
-from .timing import take_turns
+from ..timing import milliseconds, table, take_turns
+from .scenes import Scene, passes
 
 
 @dataclass(frozen=True)

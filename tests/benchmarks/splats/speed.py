@@ -1,9 +1,9 @@
-"""How fast the renderer is: scenes of a head avatar's load, every backend, a portable anchor in the same run."""
+"""What the speed bench measured, and how it is shown."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import asdict, replace
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
 
 import torch
 
@@ -14,14 +14,108 @@ from ....bench.specs import Findings
 from ....datasets.head.procedural.model import procedural_head
 from ....methods.splats import cpu
 from ....methods.splats.rasterize import available_backends
+from ..timing import Times, milliseconds, repeat, table, torch_threads
 from . import anchor
-from .accuracy import compare_with, float64_truth
-from .cells import Cell, speed_tables
 from .order import Ordering, bound_head, measure_order, order_table
-from .passes import draw, leaves, one_torch_thread, passes
-from .scenes import Scene, head_shell
+from .scenes import (
+    Accuracy,
+    Scene,
+    compare_with,
+    draw,
+    float64_truth,
+    head_shell,
+    leaves,
+    passes,
+)
 from .threads import Scaling, measure_threads, threads_table
-from .timing import repeat
+
+STAGES = ("project", "sort", "find pairs", "draw", "draw backward", "project backward")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One scene drawn by one backend on one thread. Pairs are of a splat and a pixel, of one frame."""
+
+    splats: int
+    width: int
+    height: int
+    backend: str
+    forward: Times
+    both: Times
+    tested: int | None = None
+    """Pairs whose alpha was computed."""
+    drawn: int | None = None
+    """Pairs that contributed."""
+    stages: dict[str, float] | None = None
+    """Seconds by stage, the least over the runs."""
+    peak_share: tuple[float, float] | None = None
+    """Arithmetic of the drawing stages, forward and backward, over the measured multiply-add rate."""
+    ratio_to_anchor: float | None = None
+    """The anchor's least time for both passes over this one's."""
+    accuracy: Accuracy | None = None
+    """Errors against the reference in float64, where they were measured."""
+
+
+def speed_tables(cells: Sequence[Cell], peaks: dict[str, float], missing: str) -> str:
+    """Lay out the results; ``missing`` says why there is no anchor, ``peaks`` are flops a second by backend."""
+    parts = [
+        "Processor time of one thread in ms: least and median of the runs; spread is between the quartiles. A pair is "
+        "a splat\nand a pixel it contributes to; the ratio is to the anchor's time for both passes. Errors are against "
+        "float64: the\nimage's mean, the share of pixels off by more than 1e-5, and the worst gradient's, relative.\n\n"
+        + _times(cells)
+    ]
+    if missing:
+        parts.append(f"No anchor. {missing}")
+    kernels = [cell for cell in cells if cell.stages]
+    if kernels:
+        rates = ", ".join(f"{name} {1e-9 * peak:.0f}" for name, peak in peaks.items())
+        parts.append(
+            "Stages of the kernel, ms, least of the runs. The last columns are the arithmetic of the drawing stages (by "
+            f"count in\nthe source) over the multiply-add rate measured in this run ({rates} GFlop/s).\n\n"
+            + _stages(kernels)
+        )
+    return "\n\n".join(parts)
+
+
+def _times(cells: Sequence[Cell]) -> str:
+    header = (
+        *("splats", "image", "backend", "forward", "median", "spread", "with backward", "median", "spread"),
+        *("Mpairs/s forward", "both", "x anchor", "image error", "pixels off", "gradient error"),
+    )
+    return table(header, [_times_row(cell) for cell in cells])
+
+
+def _times_row(cell: Cell) -> tuple[str, ...]:
+    both = (cell.forward, cell.both)
+    return (
+        *_scene(cell),
+        cell.backend,
+        *(milliseconds(s) for times in both for s in (times.least, times.median, times.iqr)),
+        *("-" if cell.drawn is None else f"{1e-6 * cell.drawn / times.least:.0f}" for times in both),
+        "-" if cell.ratio_to_anchor is None else f"{cell.ratio_to_anchor:.1f}",
+        *_errors(cell.accuracy),
+    )
+
+
+def _errors(accuracy: Accuracy | None) -> tuple[str, str, str]:
+    if accuracy is None:
+        return "-", "-", "-"
+    worst = max(accuracy.gradients.values())
+    return f"{accuracy.image_mean:.1e}", f"{100 * (1 - accuracy.pixels_equal):.4f} %", f"{worst:.1e}"
+
+
+def _stages(cells: Sequence[Cell]) -> str:
+    rows = []
+    for cell in cells:
+        times = [f"{1e3 * (cell.stages or {})[name]:.2f}" for name in STAGES]
+        shares = [f"{100 * share:.0f} %" for share in cell.peak_share or ()]
+        rows.append((*_scene(cell), cell.backend, *times, *shares))
+    return table(("splats", "image", "backend", *STAGES, "of peak: draw", "draw backward"), rows)
+
+
+def _scene(of: Cell) -> tuple[str, str]:
+    return str(of.splats), f"{of.width}x{of.height}"
+
 
 DIAGONAL = ((5_000, 128, 184), (20_000, 275, 401), (60_000, 550, 802))
 GRID = tuple((count, width, height) for _, width, height in DIAGONAL for count, _, _ in DIAGONAL)
@@ -48,7 +142,7 @@ def measure(quick: bool, progress: Progress) -> Findings:
     peaks = {name: cpu.peak_flops(name) for name in kernels}
     steps = len(scenes) * (len(kernels) + (anchor_passes is not None)) + (2 * len(DIAGONAL) if kernels else 0)
     cells: list[Cell] = []
-    with one_torch_thread():
+    with torch_threads(1):
         for count, width, height in scenes:
             scene = head_shell(count, width, height)
             row: list[Cell] = []

@@ -10,10 +10,9 @@ from torch import Tensor
 from ....bench.contracts import Progress
 from ....bench.specs import Findings
 from ....methods.splats.rasterize import available_backends, rasterize
-from .compare import Outcome, relative_error, render_with_gradients
+from ..timing import table
 from .extremes import CASES, Case, facing, uneven
-from .layout import table
-from .scenes import Scene, head_shell
+from .scenes import Outcome, Scene, head_shell, relative_error, render_with_gradients
 
 FLIPPED = 1e-4
 """A pixel this far off, in units of the largest colour, took another side of a threshold than float64 did. Such pixels

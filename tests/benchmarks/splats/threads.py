@@ -16,10 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 
-from .layout import milliseconds, table
-from .passes import passes
-from .scenes import Scene
-from .timing import take_turns
+from ..timing import milliseconds, table, take_turns
+from .scenes import Scene, passes
 
 # Ends with its parent, whose number is its second argument: a benchmark that is killed leaves nothing running.
 _SPIN = """

@@ -21,10 +21,8 @@ from torch import Tensor
 from ....bench.contracts import Progress
 from ....bench.specs import Findings
 from ....methods.splats.rasterize import available_backends
-from .layout import milliseconds, table
-from .passes import draw, leaves, one_torch_thread, passes
-from .scenes import Scene, head_shell
-from .timing import take_turns
+from ..timing import milliseconds, table, take_turns, torch_threads
+from .scenes import Scene, draw, head_shell, leaves, passes
 
 SCENE = (60_000, 550, 802)
 QUICK_SCENE = (5_000, 128, 184)
@@ -65,7 +63,7 @@ def measure(quick: bool, progress: Progress) -> Findings:
     scene = head_shell(*(QUICK_SCENE if quick else SCENE))
     budget, least_runs = (0.2, 3) if quick else (1.5, 9)
     backend = available_backends()[0]
-    with one_torch_thread():
+    with torch_threads(1):
         turned = list(settings(scene, backend))
         progress(0, 1, f"{len(turned)} settings in turn")
         forward, both = _time(turned, backend, budget * len(turned), least_runs)

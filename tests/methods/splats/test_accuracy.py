@@ -8,9 +8,14 @@ import pytest
 import torch
 
 from headbench.methods.splats import available_backends
-from headbench.tests.benchmarks.splats.accuracy import compare_with, float64_truth
-from headbench.tests.benchmarks.splats.compare import Outcome
-from headbench.tests.benchmarks.splats.scenes import Scene, cloud, head_shell
+from headbench.tests.benchmarks.splats.scenes import (
+    Outcome,
+    Scene,
+    cloud,
+    compare_with,
+    float64_truth,
+    head_shell,
+)
 
 KERNELS = [name for name in available_backends() if name.startswith("cpu-")]
 pytestmark = pytest.mark.skipif(

@@ -13,8 +13,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from headbench.methods.splats import available_backends, rasterize
-from headbench.tests.benchmarks.splats.compare import relative_error, render_with_gradients
-from headbench.tests.benchmarks.splats.scenes import Scene, cloud, head_shell
+from headbench.tests.benchmarks.splats.scenes import (
+    Scene,
+    cloud,
+    head_shell,
+    relative_error,
+    render_with_gradients,
+)
 
 from .dense import render_dense
 

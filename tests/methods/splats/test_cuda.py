@@ -12,8 +12,7 @@ import torch
 from headbench.bench.errors import UnavailableError
 from headbench.methods.splats import available_backends, cpu, cuda, rasterize
 from headbench.methods.splats.rasterize import make_request
-from headbench.tests.benchmarks.splats.compare import relative_error
-from headbench.tests.benchmarks.splats.scenes import cloud, head_shell
+from headbench.tests.benchmarks.splats.scenes import cloud, head_shell, relative_error
 
 slow = importlib.import_module("headbench.methods.splats.rasterize")  # the package's name is the function's
 needs_gpu = pytest.mark.skipif(not cuda.usable(), reason="needs a GPU and gsplat (extra `cuda`)")

@@ -7,8 +7,7 @@ import torch
 
 from headbench.methods.splats import available_backends, cuda, rasterize
 from headbench.methods.splats.rasterize import make_request
-from headbench.tests.benchmarks.splats.compare import relative_error, render_with_gradients
-from headbench.tests.benchmarks.splats.scenes import Scene, cloud
+from headbench.tests.benchmarks.splats.scenes import Scene, cloud, relative_error, render_with_gradients
 
 from .dense import render_dense
 

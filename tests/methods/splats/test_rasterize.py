@@ -10,8 +10,12 @@ import torch
 from headbench.bench.errors import UnavailableError
 from headbench.bench.native.loader import Kernel
 from headbench.methods.splats import available_backends, cpu, rasterize
-from headbench.tests.benchmarks.splats.compare import DIFFERENTIABLE, relative_error, render_with_gradients
-from headbench.tests.benchmarks.splats.scenes import cloud
+from headbench.tests.benchmarks.splats.scenes import (
+    DIFFERENTIABLE,
+    cloud,
+    relative_error,
+    render_with_gradients,
+)
 
 BAD = {
     "means": [

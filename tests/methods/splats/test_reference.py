@@ -12,8 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from headbench.methods.splats import rasterize
 from headbench.methods.splats.reference import rotation_matrices
-from headbench.tests.benchmarks.splats.compare import DIFFERENTIABLE, relative_error, render_with_gradients
-from headbench.tests.benchmarks.splats.scenes import Scene, cloud
+from headbench.tests.benchmarks.splats.scenes import (
+    DIFFERENTIABLE,
+    Scene,
+    cloud,
+    relative_error,
+    render_with_gradients,
+)
 
 from .dense import render_dense
 

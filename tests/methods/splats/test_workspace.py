@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from headbench.methods.splats import available_backends
-from headbench.tests.benchmarks.splats.compare import render_with_gradients
-from headbench.tests.benchmarks.splats.scenes import cloud, head_shell
+from headbench.tests.benchmarks.splats.scenes import cloud, head_shell, render_with_gradients
 
 pytestmark = pytest.mark.skipif(
     "cpu" not in available_backends(), reason="the splat kernel is not installed: no C++ compiler was found"

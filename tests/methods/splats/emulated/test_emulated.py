@@ -11,8 +11,7 @@ import pytest
 import torch
 
 from headbench.methods.splats.rasterize import rasterize
-from headbench.tests.benchmarks.splats.compare import relative_error
-from headbench.tests.benchmarks.splats.scenes import Scene, cloud, head_shell
+from headbench.tests.benchmarks.splats.scenes import Scene, cloud, head_shell, relative_error
 
 COMPILER, EMULATOR = "aarch64-linux-gnu-g++", "qemu-aarch64"
 ROOT = Path(__file__).parents[4]

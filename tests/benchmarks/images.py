@@ -1,20 +1,26 @@
-"""The ways to score frames that are compared: ours, and what the usual libraries take for the same number."""
+"""``headbench bench metrics``: our image metrics beside what the usual libraries take for the same number."""
 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Mapping
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from ....bench.contracts import ByteArray
-from ....bench.errors import UnavailableError
-from ....metrics.lpips_network import Lpips, find_backbone, load_backbone, network_spec
-from ....metrics.psnr import psnr
-from ....metrics.ssim import Ssim, ssim, ssim_map, ssim_reflected
+from ...bench.contracts import ByteArray, Progress, no_progress
+from ...bench.errors import UnavailableError
+from ...bench.specs import Findings
+from ...metrics.lpips_network import Lpips, find_backbone, load_backbone, network_spec
+from ...metrics.psnr import psnr
+from ...metrics.ssim import Ssim, ssim, ssim_map, ssim_reflected
+from .timing import take_turns
 
 Ways = Mapping[str, Callable[[], float]]
 Pairs = list[tuple[ByteArray, ByteArray]]
@@ -46,13 +52,13 @@ def structural_ways(pairs: Pairs, pool: ThreadPoolExecutor) -> dict[str, Ways]:
             total += float(functional.structural_similarity_index_measure(x, y, data_range=1.0))
         return total
 
-    def numpy_twin() -> float:
+    def reference() -> float:
         return sum(psnr(x, y) + float(ssim_map(x, y).mean()) for x, y in pairs)
 
     return {
         "PSNR + SSIM, valid windows": {
             "headbench": ours(ssim),
-            "headbench, numpy and OpenCV": numpy_twin,
+            "headbench, numpy and OpenCV": reference,
             "scikit-image": skimage,
         },
         "PSNR + SSIM, reflected border": {"headbench": ours(ssim_reflected), "torchmetrics": torchmetrics},
@@ -112,3 +118,78 @@ def noisy_pairs(count: int, height: int, width: int) -> Pairs:
         image, clean = (np.clip(a, 0, 255).round().astype(np.uint8) for a in (noisy, truth))
         pairs.append((image, clean))
     return pairs
+
+
+@dataclass(frozen=True)
+class Timed:
+    """One way: its value, and the least processor and wall time of a run, milliseconds per image."""
+
+    name: str
+    value: float
+    processor_ms: float
+    wall_ms: float
+
+
+def in_turns(ways: Ways, runs: int, images: int) -> list[Timed]:
+    """Run every way ``runs`` times, one after the other; each run scores ``images`` images."""
+    values: dict[str, float] = {}
+    processor: dict[str, list[float]] = {name: [] for name in ways}
+
+    def timed(name: str) -> Callable[[], float]:
+        def run() -> float:
+            wall, own = time.perf_counter(), time.process_time()
+            values[name] = ways[name]()
+            processor[name].append(time.process_time() - own)
+            return time.perf_counter() - wall
+
+        return run
+
+    walls = take_turns({name: timed(name) for name in ways}, budget=0.0, least_runs=runs)
+    milliseconds = 1e3 / images
+    return [
+        Timed(name, values[name], milliseconds * min(processor[name][1:]), milliseconds * min(walls[name]))
+        for name in ways
+    ]
+
+
+SIZE = (802, 550)
+QUICK_SIZE = (200, 138)
+OURS = "headbench"
+
+
+def measure(quick: bool = False, progress: Progress = no_progress) -> Findings:
+    """Milliseconds per image of PSNR + SSIM and of LPIPS, ours and by the usual libraries, and their values."""
+    height, width = QUICK_SIZE if quick else SIZE
+    pairs = noisy_pairs(4, height, width)
+    runs = 2 if quick else 4
+    threads = os.cpu_count() or 1
+    torch.set_num_threads(threads)
+    tables: dict[str, list[Timed]] = {}
+    with ThreadPoolExecutor(threads) as pool:
+        groups = structural_ways(pairs, pool)
+        learned, reason = lpips_ways_or_reason(pairs)
+        if learned:
+            groups["LPIPS, AlexNet"] = learned
+        for number, (title, ways) in enumerate(groups.items()):
+            progress(number, len(groups), title)
+            tables[title] = in_turns(ways, runs, len(pairs))
+    text = "\n\n".join(_text(title, timed, len(pairs)) for title, timed in tables.items())
+    note = (
+        f"{len(pairs)} images of {width}x{height}, {threads} threads; the least of {runs} runs that take turns. Times: the\n"
+        "first way's are 1. Values: mean over the images, PSNR and SSIM added up."
+    )
+    parts = [text, note, reason] if reason else [text, note]
+    data: dict[str, Any] = {title: [asdict(way) for way in timed] for title, timed in tables.items()}
+    return Findings("\n\n".join(parts), {"width": width, "height": height, "threads": threads, "ways": data})
+
+
+def _text(title: str, timed: Sequence[Timed], images: int) -> str:
+    first = timed[0]
+    lines = [f"{title:<34}{'wall ms':>10}{'CPU ms':>10}{'wall':>8}{'CPU':>8}{'value':>14}"]
+    for way in timed:
+        ratios = way.wall_ms / first.wall_ms, way.processor_ms / first.processor_ms
+        lines.append(
+            f"  {way.name:<32}{way.wall_ms:>10.2f}{way.processor_ms:>10.2f}{ratios[0]:>7.1f}x{ratios[1]:>7.1f}x"
+            f"{way.value / images:>14.7f}"
+        )
+    return "\n".join(lines)

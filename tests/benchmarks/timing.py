@@ -1,20 +1,22 @@
-"""Timing one frame: processor time of this thread, repeated until it is known."""
+"""Timing of benchmarks: runs repeated or in turns, torch on a number of threads, and tables of what was found."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
+import torch
 
 Key = TypeVar("Key", bound=Hashable)
 
 
 @dataclass(frozen=True)
 class Times:
-    """Seconds of repeated runs of one thing. The least is what the code costs; the rest tells of the machine."""
+    """Seconds of repeated runs of one thing. The least is what the code costs; the rest is the machine's."""
 
     least: float
     median: float
@@ -68,3 +70,47 @@ def take_turns(
             seconds[key].append(run())
         rounds += 1
     return seconds
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Align columns: text to the left, columns whose cells all begin with a digit, a sign or a dash to the right."""
+    cells = [list(header), *map(list, rows)]
+    widths = [max(len(row[k]) for row in cells) for k in range(len(header))]
+    numeric = [all(row[k][:1] in "-+.0123456789" for row in rows) for k in range(len(header))]
+    lines = [
+        "  ".join(
+            text.rjust(width) if right else text.ljust(width)
+            for text, width, right in zip(row, widths, numeric, strict=True)
+        ).rstrip()
+        for row in cells
+    ]
+    return "\n".join([lines[0], "  ".join("-" * width for width in widths), *lines[1:]])
+
+
+def milliseconds(seconds: float) -> str:
+    """Seconds as milliseconds with one decimal."""
+    return f"{1e3 * seconds:.1f}"
+
+
+def seconds_of(
+    run: Callable[[], object], clock: Callable[[], float] = time.perf_counter
+) -> Callable[[], float]:
+    """A function that runs something and returns the seconds it took."""
+
+    def timed() -> float:
+        start = clock()
+        run()
+        return clock() - start
+
+    return timed
+
+
+@contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """Torch on ``count`` threads; with one its own work counts to the thread that is timed."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -1,4 +1,4 @@
-"""Every numerical extreme on every backend, and that the bench would see a fault."""
+"""Every numerical extreme of the renderer on every backend, and of the head model; faults are found."""
 
 import math
 from dataclasses import replace
@@ -7,10 +7,16 @@ import pytest
 import torch
 
 from headbench.bench.contracts import no_progress
+from headbench.datasets.head.model import FastPosing
+from headbench.datasets.head.rotations import axis_angle_to_matrix
 from headbench.methods.splats import available_backends
+from headbench.tests.benchmarks.head import stress as head_stress
 from headbench.tests.benchmarks.splats import stress
 from headbench.tests.benchmarks.splats.extremes import CASES
 
+from ..datasets.head.toy import toy_head
+
+HEAD = toy_head(16, eyelids=True)
 BACKENDS = [name for name in available_backends() if name != "cpu"]
 
 
@@ -77,12 +83,29 @@ def test_a_fault_is_seen(monkeypatch, field, change, complaint):
     assert complaint in stress.try_case(case, "reference").complaint
 
 
-def test_the_table_and_the_verdict_tell_of_a_failure(monkeypatch):
-    monkeypatch.setattr(stress, "CASES", CASES[:2])
-    findings = stress.measure(True, no_progress)
+@pytest.mark.parametrize("case", head_stress.CASES, ids=lambda case: case.name)
+def test_extreme_of_the_head_model(case):
+    verdict = head_stress.try_case(case, HEAD)
+    assert verdict.complaint == ""
+
+
+@pytest.mark.slow
+def test_the_whole_head_command_passes():
+    findings = head_stress.measure(False, no_progress)
     assert findings.passed
-    assert "10 of 10 behave as expected" in findings.text
-    monkeypatch.setattr(stress, "render_with_gradients", _spoilt("image", lambda v: v + 1e-5))
-    findings = stress.measure(True, no_progress)
-    assert not findings.passed
-    assert findings.text.count("image error 1.0e-05 over 1e-06") == 2
+    assert len(findings.data["verdicts"]) == len(head_stress.CASES)
+
+
+def test_a_wrong_fast_path_is_found(monkeypatch):
+    right = FastPosing.forward
+    monkeypatch.setattr(FastPosing, "forward", lambda *a: right(*a) + 1e-9)
+    assert head_stress.try_case(head_stress.CASES[0], HEAD).complaint == "the paths differ"
+
+
+def test_gradients_that_are_not_finite_are_found(monkeypatch):
+    def careless(axis_angle):
+        """The right matrices; the root of the squared angle has no finite gradient at zero."""
+        return axis_angle_to_matrix(axis_angle) + 0 * axis_angle.square().sum(-1).sqrt()[..., None, None]
+
+    monkeypatch.setattr("headbench.datasets.head.model.axis_angle_to_matrix", careless)
+    assert head_stress.try_case(head_stress.CASES[0], HEAD).complaint == "not finite"
