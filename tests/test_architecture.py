@@ -1,4 +1,4 @@
-"""The walls of the house: which room may import which, and what no code may contain."""
+"""Which package may import which, and what no code may contain."""
 
 import ast
 import re
@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-ROOMS = ("bench", "datasets", "methods", "metrics", "reports")
+PACKAGES = ("bench", "datasets", "methods", "metrics", "reports")
 MAY_IMPORT = {
     "bench": set(),
     "datasets": {"bench"},
@@ -17,7 +17,7 @@ MAY_IMPORT = {
 }
 FORBIDDEN_PACKAGES = {"reports": {"torch"}, "bench": {"torch"}}
 NOWHERE = {"torchvision", "pickle5", "chumpy"}
-SOURCES = [path for room in ROOMS for path in sorted((ROOT / room).rglob("*.py"))]
+SOURCES = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
 
 
 def imports(path: Path, tree: ast.AST) -> list[str]:
@@ -35,22 +35,22 @@ def imports(path: Path, tree: ast.AST) -> list[str]:
 
 
 def violations(path: Path, source: str) -> list[str]:
-    """What a source of a room imports against the rules."""
-    room = path.relative_to(ROOT).parts[0]
+    """What a source of a package imports against the rules."""
+    package = path.relative_to(ROOT).parts[0]
     found = []
     for name in imports(path, ast.parse(source)):
         parts = name.split(".")
         if parts[0] == "headbench":
             other = parts[1] if len(parts) > 1 else ""
-            if other != room and other not in MAY_IMPORT[room]:
-                found.append(f"{room} imports {name}")
-        elif parts[0] in FORBIDDEN_PACKAGES.get(room, set()) | NOWHERE | set(ROOMS):
-            found.append(f"{room} imports {name}")
+            if other != package and other not in MAY_IMPORT[package]:
+                found.append(f"{package} imports {name}")
+        elif parts[0] in FORBIDDEN_PACKAGES.get(package, set()) | NOWHERE | set(PACKAGES):
+            found.append(f"{package} imports {name}")
     return found
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(ROOT)))
-def test_rooms_import_only_what_stands_below_them(path):
+def test_packages_import_only_what_stands_below_them(path):
     assert violations(path, path.read_text()) == []
 
 
@@ -92,9 +92,9 @@ def test_contracts_need_numpy_and_the_standard_library_only(name):
     assert roots <= {"numpy"} | set(sys.stdlib_module_names)
 
 
-def test_rooms_are_namespace_packages():
+def test_packages_are_namespace_packages():
     # A top-level datasets/__init__.py would shadow the well-known package of that name.
-    assert [room for room in (*ROOMS, "tests") if (ROOT / room / "__init__.py").exists()] == []
+    assert [package for package in (*PACKAGES, "tests") if (ROOT / package / "__init__.py").exists()] == []
 
 
 BANNED = {
