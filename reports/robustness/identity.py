@@ -94,14 +94,14 @@ class RigidVertices:
 
 
 @dataclass(frozen=True, eq=False)
-class Appearance:
+class RecordedAppearance:
     """The colours of a subject's steady parts in one camera; Lab, (N, 3), not a number where none was seen."""
 
     parts: RigidVertices
     colours: FloatArray
 
     @classmethod
-    def recorded(cls, clip: Clip, camera: str, count: int) -> Appearance | None:
+    def recorded(cls, clip: Clip, camera: str, count: int) -> RecordedAppearance | None:
         """The median over up to ``count`` recorded frames of training timesteps; None where the camera has too few."""
         keys = sorted(
             key
@@ -126,7 +126,9 @@ class Appearance:
         return float(deltaE_ciede2000(self.colours[both], colours[both]).mean())
 
 
-def identity(appearance: Appearance | None, frame: Frame, camera: Camera, pose: HeadPose) -> LimitCheck:
+def identity(
+    appearance: RecordedAppearance | None, frame: Frame, camera: Camera, pose: HeadPose
+) -> LimitCheck:
     """The identity of a driven frame, without a limit: how much is too much depends on who drives whom."""
     if appearance is None or not np.isfinite(frame.rgb).all():
         absent = "not finite" if appearance is not None else NO_APPEARANCE
@@ -135,7 +137,9 @@ def identity(appearance: Appearance | None, frame: Frame, camera: Camera, pose: 
     return LimitCheck("identity", value, 0.0, math.inf, "too little of the steady parts is seen")
 
 
-def of_recording(appearance: Appearance, clip: Clip, keys: Sequence[FrameKey], count: int) -> float | None:
+def of_recording(
+    appearance: RecordedAppearance, clip: Clip, keys: Sequence[FrameKey], count: int
+) -> float | None:
     """Mean identity of recorded frames of any subject, up to ``count`` of them; None where none has it.
 
     The vertices are those of ``appearance``, where this clip's head has them.

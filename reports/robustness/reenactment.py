@@ -22,7 +22,7 @@ from ...bench.runner.store import RunFolder
 from ..runs import evenly_spaced
 from .command import ReenactSettings
 from .extremes import training_poses
-from .identity import Appearance, identity, mean_known, of_recording
+from .identity import RecordedAppearance, identity, mean_known, of_recording
 from .stability import (
     JudgedFrame,
     Limits,
@@ -174,7 +174,7 @@ def _judged(
     driven: Driven, out: Path, report: Callable[[int], None]
 ) -> tuple[list[JudgedFrame], dict[str, Any]]:
     job, source, camera = driven.job, driven.source, driven.camera
-    appearance = Appearance.recorded(job.form.clip, camera.id, REFERENCE_FRAMES)
+    appearance = RecordedAppearance.recorded(job.form.clip, camera.id, REFERENCE_FRAMES)
     avatar, clip = load(job), job.form.clip
     background = [float(v) for v in clip.background]
     reference = _reference(avatar, clip, camera, background)
@@ -200,7 +200,7 @@ def _judged(
 
 
 def _identity(
-    driven: Driven, appearance: Appearance | None, frames: Sequence[JudgedFrame]
+    driven: Driven, appearance: RecordedAppearance | None, frames: Sequence[JudgedFrame]
 ) -> dict[str, float | None] | None:
     """Mean identity of the driven frames, between that of the subject's and that of the source's own recordings."""
     if appearance is None:

@@ -18,7 +18,7 @@ from ...bench.specs import Findings, MetricSpec
 
 if TYPE_CHECKING:
     from ..runs import RunSet
-    from .comparisons import Comparison
+    from .comparisons import PairedComparison
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ def compare_runs(settings: CompareSettings, progress: Progress = no_progress) ->
         raise InputError("command line", "--metrics", f"metrics of the runs: {names}", ", ".join(strange))
     columns = [(task, spec) for task in runs.tasks for spec in metrics if spec.per_frame]
     columns += [("", spec) for spec in metrics if not spec.per_frame]
-    found: list[tuple[MetricSpec, list[Comparison]]] = []
+    found: list[tuple[MetricSpec, list[PairedComparison]]] = []
     for index, (task, spec) in enumerate(columns):
         comparisons = compare(
             runs.rows,
@@ -110,7 +110,7 @@ def method_pairs(runs: RunSet, against: str | None, floors: bool) -> list[tuple[
     return pairs
 
 
-def _plain(comparison: Comparison) -> dict[str, object]:
+def _plain(comparison: PairedComparison) -> dict[str, object]:
     """Everything a comparison holds and says, as plain values."""
     return {
         **asdict(comparison),
@@ -121,7 +121,7 @@ def _plain(comparison: Comparison) -> dict[str, object]:
     }
 
 
-def _csv(comparisons: Sequence[Comparison]) -> str:
+def _csv(comparisons: Sequence[PairedComparison]) -> str:
     from ..writers import csv_text
 
     lines: list[list[object]] = [list(FIELDS)]
@@ -132,7 +132,7 @@ def _csv(comparisons: Sequence[Comparison]) -> str:
     return csv_text(lines).rstrip()
 
 
-def _text(spec: MetricSpec, comparisons: Sequence[Comparison]) -> str:
+def _text(spec: MetricSpec, comparisons: Sequence[PairedComparison]) -> str:
     """One metric's comparisons as a table for a terminal."""
     from ..tables import AVATAR_TITLE
 

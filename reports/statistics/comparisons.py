@@ -78,7 +78,7 @@ LEVEL = 0.05
 
 
 @dataclass(frozen=True)
-class Comparison:
+class PairedComparison:
     """First method minus second on one metric of one task; the subject is the unit.
 
     Attributes
@@ -148,7 +148,7 @@ def compare(
     region: str,
     higher_is_better: bool,
     level: float = LEVEL,
-) -> list[Comparison]:
+) -> list[PairedComparison]:
     """Compare pairs of methods on one metric of one task ("" for a metric of the avatar as a whole).
 
     The pairs are one family: their p-values are corrected together, by Holm. A method that lacks a value of any
@@ -164,7 +164,7 @@ def compare(
     """
     found = []
     for first, second in pairs:
-        comparison = Comparison(task, metric, higher_is_better, first, second, level)
+        comparison = PairedComparison(task, metric, higher_is_better, first, second, level)
         summaries = [
             summarise(rows, method=method, metric=metric, task=task, region=region)
             for method in (first, second)
@@ -182,14 +182,14 @@ def compare(
     return corrected(found)
 
 
-def corrected(comparisons: Sequence[Comparison]) -> list[Comparison]:
+def corrected(comparisons: Sequence[PairedComparison]) -> list[PairedComparison]:
     """Correct the p-values of comparisons that belong to one family."""
     tested = [c for c in comparisons if c.p is not None]
     adjusted = iter(holm([c.p for c in tested if c.p is not None]))
     return [c if c.p is None else replace(c, p_holm=next(adjusted), family=len(tested)) for c in comparisons]
 
 
-def _compared(comparison: Comparison, subjects: Sequence[SubjectPairs]) -> Comparison:
+def _compared(comparison: PairedComparison, subjects: Sequence[SubjectPairs]) -> PairedComparison:
     """Fill in what the pairs of a comparison say."""
     values = np.array([subject.difference for subject in subjects])
     bounds = interval(subjects, comparison.level)

@@ -11,7 +11,7 @@ from headbench.bench.contracts import Camera, Frame, FrameKey, HeadPose
 from headbench.datasets.head.model import HeadModel
 from headbench.reports.robustness.identity import (
     NO_APPEARANCE,
-    Appearance,
+    RecordedAppearance,
     RigidVertices,
     identity,
     of_recording,
@@ -131,7 +131,7 @@ def globe():
 
 @pytest.fixture(scope="module")
 def look(globe):
-    return Appearance.recorded(globe, "c", 12)
+    return RecordedAppearance.recorded(globe, "c", 12)
 
 
 def value(look, globe, pose):
@@ -156,7 +156,7 @@ def test_the_own_look_stays_near_whatever_pose_and_expression(globe, look, rotat
 
 def test_another_persons_look_is_far_for_both_subjects(globe, look):
     other = Globe("dark", dark)
-    others = Appearance.recorded(other, "c", 12)
+    others = RecordedAppearance.recorded(other, "c", 12)
     pose = posed("fair", [0, 0.2, 0])
     own, swapped = value(look, globe, pose), value(look, other, pose)
     assert swapped > 10 > 3 * own
@@ -201,7 +201,7 @@ def test_what_cannot_be_compared_has_no_value_and_says_why(globe, look):
     assert (none.value, none.absent) == (None, NO_APPEARANCE)
     broken = Frame(np.full_like(frame.rgb, np.nan), frame.alpha)
     assert identity(look, broken, globe.camera, pose).absent == "not finite"
-    assert Appearance.recorded(globe, "another", 12) is None
+    assert RecordedAppearance.recorded(globe, "another", 12) is None
 
 
 def test_steady_parts_move_as_the_head_model_moves_them(globe):
