@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from ..errors import ExitCode
+from ..errors import ExitCode, shortened
 from ..runner.scoring import FULL
 from .baseline import Baseline, Tolerance
 from .results import Place, Results
@@ -42,13 +42,19 @@ class Verdict:
         digits, unit = (self.tolerance.digits, self.tolerance.unit) if self.tolerance else (4, "")
         unit = f" {unit}" if unit else ""
         if self.baseline is None or self.tolerance is None:
-            return f"{what}: new: {self.found:.{digits}f}{unit}"
+            return f"{what}: new: {_shown(self.found, digits)}{unit}"
         moved = self.found - self.baseline
         allowed = self.tolerance.allowed(self.baseline)
         return (
-            f"{what}: {self.outcome}: {self.baseline:.{digits}f} to {self.found:.{digits}f}{unit}, "
-            f"{moved:+.{digits + 1}f}{unit} (tolerance {allowed:.{digits + 1}f}){self.reason and ': ' + self.reason}"
+            f"{what}: {self.outcome}: {_shown(self.baseline, digits)} to {_shown(self.found, digits)}{unit}, "
+            f"{_shown(moved, digits + 1, '+')}{unit} (tolerance {_shown(allowed, digits + 1)})"
+            f"{self.reason and ': ' + self.reason}"
         )
+
+
+def _shown(value: float, digits: int, sign: str = "") -> str:
+    """A number with so many digits behind the point; one too large for that to mean anything, in powers of ten."""
+    return f"{value:{sign}.{digits}f}" if abs(value) < 1e15 else f"{value:{sign}g}"
 
 
 def judge(results: Results, baseline: Baseline) -> list[Verdict]:
@@ -99,11 +105,15 @@ def exit_code(verdicts: Sequence[Verdict]) -> ExitCode:
     return ExitCode.NEGATIVE if "regressed" in outcomes else ExitCode.OK
 
 
+MAX_NOTE = 400
+"""Characters of a note on what differs between environments."""
+
+
 def environment_changes(baseline: Mapping[str, Any], found: Mapping[str, Any]) -> list[str]:
     """What differs between two environments, as "name: before to now"."""
     before, now = _flat(baseline), _flat(found)
     return [
-        f"{name}: {before.get(name)} to {now.get(name)}"
+        shortened(f"{name}: {before.get(name)} to {now.get(name)}", MAX_NOTE)
         for name in sorted(before.keys() | now.keys())
         if before.get(name) != now.get(name)
     ]

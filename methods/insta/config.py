@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 INSTANT_NGP_STEP = math.sqrt(3) / 1024
+SMALLEST = 1e-12
 STEP_MIN = 1e-5
 MOST = {
     "levels": 32,
@@ -144,8 +145,9 @@ class InstaConfig:
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, found {getattr(self, name)}")
         for name in ("step", "shell_outside", "shell_inside", "prior_scale", "huber", "learning_rate"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be above 0, found {getattr(self, name)}")
+            # The kernel computes in float32, where smaller numbers are 0.
+            if not getattr(self, name) >= SMALLEST:
+                raise ValueError(f"{name} must be at least {SMALLEST}, found {getattr(self, name)}")
         for name in (
             "conditions",
             "mouth_weight",

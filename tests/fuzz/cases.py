@@ -276,24 +276,23 @@ def _state(path: str) -> tuple:
 def load_everything() -> None:
     """Import what the readers import, once for all processes that are forked from this one; no threads may start."""
     import functools
+    import importlib
     import importlib.metadata
 
     import cv2
     import torch
 
     from headbench.bench import registry
-    from headbench.bench.registry import discover, resolve
 
     torch.set_num_threads(1)
     cv2.setNumThreads(0)
     # The entry points do not change while this runs, and reading them takes longer than most cases.
     registry.entry_points = functools.cache(importlib.metadata.entry_points)  # type: ignore[attr-defined]
     registry._origin = functools.cache(registry._origin)  # type: ignore[attr-defined]
-    for group in ("methods", "datasets", "metrics", "reports", "commands"):
-        for plugin in discover(group).values():  # type: ignore[arg-type]
-            resolve(plugin.spec.implementation)  # type: ignore[union-attr]
-            if group == "commands":
-                resolve(plugin.spec.settings)  # type: ignore[union-attr]
+    root = Path(__file__).parents[2]
+    for package in ("bench", "datasets", "methods", "metrics", "reports"):
+        for path in sorted((root / package).rglob("*.py")):
+            importlib.import_module(".".join(("headbench", *path.relative_to(root).with_suffix("").parts)))
     from . import targets  # noqa: F401
 
 

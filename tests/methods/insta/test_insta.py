@@ -229,6 +229,7 @@ def test_the_compatibility_options_train_as_well(clip, tmp_path):
         ("round_samples", 2**31 - 1),
         ("step", 1e-12),
         ("step", float("nan")),
+        ("prior_scale", 1e-320),
     ],
 )
 def test_settings_out_of_range_are_refused(name, wrong):
