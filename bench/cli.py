@@ -20,15 +20,21 @@ import tyro
 
 from .commands import check_known, exit_code, offered_commands, prepare_streams, show, with_groups
 from .configuration import build, merge, parse_assignments
-from .device import check_device
 from .errors import EXIT_CODES, ExitCode, HeadbenchError, InputError, Interruption
 from .io.documents import read_yaml
 from .io.files import check_writable, plain, prepare_folder, write_json
 from .io.lock import locked
+from .machine import check_device
 from .progress import log_to, progress
 from .registry import Group, discover, get, resolve
-from .runner.config import RunConfig, resolve_methods, resolve_metrics
-from .runner.demo import DemoConfig, demo_run_config, parse_size
+from .runner.config import (
+    DemoConfig,
+    RunConfig,
+    demo_run_config,
+    parse_size,
+    resolve_methods,
+    resolve_metrics,
+)
 from .specs import Findings
 
 Preset = Literal["smoke", "demo", "fast", "paper"]

@@ -125,12 +125,12 @@ def run_progress(cells: Mapping[str, Mapping[str, str]]) -> Iterator[RunProgress
 class RunProgress:
     """One line for the work on all cells of a run: which cell it is at, what it does there, the time that all takes.
 
-    How long a stage of a cell takes is told by its own steps, before it by such stages that were worked on already. As
+    How long a step of a cell takes is estimated from its own count, before it by such steps that were worked on already. As
     long as some of the work has no such basis, only a lower bound is shown.
 
     Parameters
     ----------
-    cells : by name, in order: the stages that a cell needs, each with what tells alike ones; those of one stage and one
+    cells : by name, in order: the steps that a cell needs, each with what groups those alike; those of one step and one
         kind (the method's name, say) take about as long as each other.
     show : shows a line, if it is time to.
     """
@@ -141,8 +141,8 @@ class RunProgress:
         self._took: dict[tuple[str, str], list[float]] = {}
 
     @contextmanager
-    def stage(self, cell: str, stage: str) -> Iterator[Progress]:
-        """Work on a stage of a cell; give its `Progress`. A stage that fails tells nothing of others."""
+    def step(self, cell: str, step: str) -> Iterator[Progress]:
+        """Work on a step of a cell; give its `Progress`. A step that fails says nothing of others."""
         left, started = TimeLeft(), time.monotonic()
         first: list[tuple[float, int]] = []
         steps = 0
@@ -153,34 +153,34 @@ class RunProgress:
             if not first:
                 first.append((time.monotonic(), done - 1))
             left.step(done, total)
-            self._show(lambda: self._shown(cell, stage, f" {done} of {total}", left.seconds, started, note))
+            self._show(lambda: self._shown(cell, step, f" {done} of {total}", left.seconds, started, note))
 
-        self._show(lambda: self._shown(cell, stage, "", None, started, ""))
+        self._show(lambda: self._shown(cell, step, "", None, started, ""))
         yield report
         seconds = time.monotonic() - started
         if first and steps > first[0][1]:  # steps that an earlier start did would have taken their time, too
             since, before = first[0]
             seconds += (time.monotonic() - since) * before / (steps - before)
-        if stage in self._cells[cell]:
-            self._took.setdefault((stage, self._cells[cell][stage]), []).append(seconds)
+        if step in self._cells[cell]:
+            self._took.setdefault((step, self._cells[cell][step]), []).append(seconds)
 
-    def _shown(self, cell: str, stage: str, steps: str, left: float | None, started: float, note: str) -> str:
+    def _shown(self, cell: str, step: str, count: str, left: float | None, started: float, note: str) -> str:
         index = self._names.index(cell)
-        stages = list(self._cells[cell])
-        if left is None and stage in stages:
-            took, spent = self._mean(stage, self._cells[cell][stage]), time.monotonic() - started
+        steps = list(self._cells[cell])
+        if left is None and step in steps:
+            took, spent = self._mean(step, self._cells[cell][step]), time.monotonic() - started
             left = took - spent if took is not None and took > spent else None
-        later = stages[stages.index(stage) + 1 :] if stage in stages else []
+        later = steps[steps.index(step) + 1 :] if step in steps else []
         ahead = [(name, self._cells[cell][name]) for name in later]
         ahead += [part for name in self._names[index + 1 :] for part in self._cells[name].items()]
         parts = [left, *(self._mean(*part) for part in ahead)]
         known = [part for part in parts if part is not None]
         bound = "" if len(known) == len(parts) else "more than "
-        text = f"cell {index + 1} of {len(self._names)}, {cell}: {stage}{steps}"
+        text = f"cell {index + 1} of {len(self._names)}, {cell}: {step}{count}"
         return _text(text, sum(known) if known else None, note, bound)
 
-    def _mean(self, stage: str, kind: str) -> float | None:
-        took = self._took.get((stage, kind))
+    def _mean(self, step: str, kind: str) -> float | None:
+        took = self._took.get((step, kind))
         return sum(took) / len(took) if took else None
 
 

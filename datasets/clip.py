@@ -23,7 +23,7 @@ from ..bench.contracts import (
 )
 from ..bench.errors import InputError
 from ..bench.io.files import digest
-from ..bench.io.frames import quantise
+from ..bench.io.images import quantise
 from .head.arrays import STORED, HeadArrays
 from .images import ImageStore, read_image, read_mask
 from .region_masks import FOREGROUND, HeadRegions, select

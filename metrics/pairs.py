@@ -26,7 +26,7 @@ def check_pair(image: ByteArray, truth: ByteArray, smallest: int = 1) -> None:
     for key, array in (("image", image), ("truth", truth)):
         if not isinstance(array, np.ndarray) or array.dtype != np.uint8:
             found = str(getattr(array, "dtype", type(array).__name__))
-            remedy = "Quantise renders with headbench.bench.io.frames.quantise."
+            remedy = "Quantise renders with headbench.bench.io.images.quantise."
             raise InputError("metric", key, "an array of 8-bit unsigned integers", found, remedy)
         if array.ndim != 3 or array.shape[2] != 3:
             raise InputError("metric", key, "shape (height, width, 3)", str(array.shape))

@@ -13,7 +13,7 @@ import cv2
 
 from ..bench.errors import InputError
 from ..bench.io.files import atomic_path, write_text
-from ..bench.io.frames import read_png
+from ..bench.io.images import read_png
 from ..bench.rows import ALL, Rows
 from ..bench.runner.scoring import FULL
 from ..bench.runner.store import RunFolder

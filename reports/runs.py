@@ -10,12 +10,11 @@ from typing import Any, TypeVar
 
 from ..bench.contracts import ByteArray, Clip, FrameKey
 from ..bench.errors import InputError
-from ..bench.io.frames import read_png
-from ..bench.io.images import probe_image
+from ..bench.io.images import probe_image, read_png
 from ..bench.manifest import Derived, Manifest, MethodRecord
 from ..bench.rows import ALL, Rows
 from ..bench.runner.captures import open_run_clips
-from ..bench.runner.options import RunOptions
+from ..bench.runner.config import RunOptions
 from ..bench.runner.scoring import FULL
 from ..bench.runner.store import RunFolder
 from ..bench.specs import MetricSpec

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import tyro
 
 from ..contracts import Progress, TaskName, no_progress
-from ..runner.options import RunOptions
+from ..runner.config import RunOptions
 from ..specs import Findings
 
 

@@ -13,16 +13,15 @@ import pandas as pd
 from ..contracts import Avatar, Clip, FrameKey, Progress, no_progress
 from ..errors import ExitCode, HeadbenchError, InputError
 from ..io.files import digest_file
-from ..io.frames import read_png
+from ..io.images import read_png
 from ..manifest import Manifest, ProtocolRecord
 from ..protocol import Protocol, make_protocol
 from ..rows import ALL, FRAME, Rows
-from ..runner.avatars import load
 from ..runner.captures import open_run_clips
 from ..runner.config import ResolvedMethod, RunConfig, resolve_methods, resolve_metrics
-from ..runner.run import adapt, make_jobs
+from ..runner.run import adapt, load, make_jobs
 from ..runner.scoring import check_regions
-from ..runner.stages import DIGESTS, Job, measure, recorded_frames
+from ..runner.steps import DIGESTS, Job, measure, recorded_frames
 from ..runner.store import Cell, RunFolder
 from ..specs import Findings, MetricSpec
 from .command import VerifySettings
@@ -154,7 +153,7 @@ def _verify_cell(job: Job, metrics: Sequence[MetricSpec], rows: Rows, file: Path
     if len(own) and (own["status"] == "failed").all():
         report.unverified += len(own)
         return  # recorded as failed: there is nothing it claims
-    state = job.cell.stage("fit")
+    state = job.cell.step("fit")
     digests = {**({} if state is None else state.get("files", {})), **recorded_frames(job)}
     found = list(_files(job, digests, report))
     report.mismatches += found

@@ -11,15 +11,13 @@ import tyro
 
 from ..configuration import parse_assignments
 from ..contracts import Clip, Progress, no_progress
-from ..device import check_device
 from ..errors import InputError
+from ..machine import check_device
 from ..registry import SPEC_TYPES, Group, discover, get, resolve
 from ..runner.adaptation import MethodNeeds, carry_out, plan
-from ..runner.config import ResolvedMethod, RunConfig, resolve_method
-from ..runner.demo import DemoConfig
+from ..runner.config import DemoConfig, ResolvedMethod, RunConfig, resolve_method
 from ..specs import DatasetSpec, Findings, MethodSpec, MetricSpec
-from .attempts import attempt
-from .methods import check_method
+from .methods import attempt, check_method
 from .metrics import check_metric
 from .readers import check_reader
 

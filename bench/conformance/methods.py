@@ -1,18 +1,54 @@
-"""The conformance kit: does a plug-in keep the contract? For authors of methods and for our own tests."""
+"""Does a method keep its contract? And how the kit calls a plug-in: what it raises is a breach, not an error."""
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ..contracts import Avatar, Clip, Frame, HeadPose, no_progress
-from ..errors import InputError
+from ..errors import InputError, UnavailableError
 from ..io.files import digest_file
+from ..runner.adaptation import TrainingView
 from ..runner.config import ResolvedMethod
-from ..runner.training_view import TrainingView
+
+
+@contextmanager
+def attempt(breaches: list[str], what: str) -> Iterator[None]:
+    """Note an exception of the block as a breach: ``what``, the exception and the line that raised it.
+
+    `UnavailableError` passes through: the plug-in needs something that is not installed.
+    """
+    try:
+        yield
+    except UnavailableError:
+        raise
+    except Exception as error:  # noqa: BLE001 - a plug-in may fail in any way
+        breaches.append(f"{what} raised {described(error)}")
+
+
+def described(error: Exception) -> str:
+    """The exception in one line, with the place that raised it."""
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    message = " ".join(str(error).split())
+    return f"{type(error).__name__}: {message} ({Path(last.filename).name}, line {last.lineno})"
+
+
+def refusal(call: Callable[[], Any], what: str, *, expected: type[Exception] = InputError) -> Iterator[str]:
+    """A breach unless ``call`` raises ``expected``."""
+    try:
+        call()
+    except expected:
+        return
+    except Exception as error:  # noqa: BLE001
+        yield f"{what} raised {described(error)} instead of {expected.__name__}"
+    else:
+        yield f"{what} was taken instead of refused by {expected.__name__}"
 
 
 def check_method(method: ResolvedMethod, clip: Clip, out: Path, *, device: str = "cpu") -> list[str]:

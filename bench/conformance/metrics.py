@@ -17,7 +17,7 @@ from ..errors import UnavailableError
 from ..io.files import check_name
 from ..runner.scoring import make_metric
 from ..specs import MetricSpec
-from .attempts import attempt, refusal
+from .methods import attempt, refusal
 
 SIZE = (96, 80)
 """Height and width of the images that metrics are tried on."""

@@ -17,7 +17,7 @@ from ..errors import InputError
 from ..io.files import check_name, plain
 from ..registry import resolve
 from ..specs import DatasetSpec
-from .attempts import attempt, refusal
+from .methods import attempt, refusal
 
 SPLITS = ("train", *get_args(TaskName))
 COPIED_BYTES = 256e6

@@ -69,10 +69,8 @@ def gate(settings: GateSettings, progress: Progress = no_progress) -> Findings:
 
 
 def _judge(settings: GateSettings) -> Findings:
-    from .baseline import Baseline
-    from .results import read_results
-    from .verdicts import environment_changes, exit_code, judge
-    from .writers import to_junit, to_markdown, to_text
+    from .baseline import Baseline, read_results
+    from .verdicts import environment_changes, exit_code, judge, to_junit, to_markdown, to_text
 
     baseline, results = Baseline.read(Path(settings.baseline)), read_results(Path(settings.results))
     verdicts = judge(results, baseline)
@@ -99,8 +97,7 @@ def _judge(settings: GateSettings) -> Findings:
 
 
 def _update(settings: GateSettings) -> Findings:
-    from .baseline import Baseline
-    from .results import read_results
+    from .baseline import Baseline, read_results
     from .verdicts import judge
 
     path = Path(settings.baseline)

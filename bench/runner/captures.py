@@ -17,8 +17,7 @@ from ..progress import progress
 from ..registry import get, resolve
 from ..specs import LABEL, DatasetSpec, ResolutionRule, is_label
 from .adaptation import MethodNeeds, carry_out, plan
-from .config import RunConfig
-from .options import RunOptions
+from .config import RunConfig, RunOptions
 from .store import RunFolder
 
 HARNESS = ("progress", "remembered")

@@ -12,12 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from ..contracts import Clip
-from ..device import check_device
+from ..contracts import Avatar, Clip
 from ..errors import HeadbenchError, InputError, UnavailableError
 from ..io.files import atomic_path, output_inside, prepare_folder
 from ..io.lock import locked
-from ..machine import machine_record, peak_memory_bytes
+from ..machine import check_device, machine_record, peak_memory_bytes
 from ..manifest import AdaptedRecord, ClipRecord, Manifest, MethodRecord, ProtocolRecord
 from ..progress import duration, run_progress
 from ..protocol import Protocol, make_protocol
@@ -26,10 +25,10 @@ from ..rows import Rows
 from ..specs import MetricSpec
 from . import adaptation
 from .adaptation import AdaptedClip, MethodNeeds
-from .captures import open_clips, relative_paths
-from .config import ResolvedMethod, RunConfig, resolve_methods, resolve_metrics
+from .captures import open_clips, open_run_clips, relative_paths, run_configuration
+from .config import ResolvedMethod, RunConfig, RunOptions, resolve_methods, resolve_metrics
 from .scoring import check_regions, make_metric
-from .stages import Job, failed_rows, fit, measure, render, stages_ahead
+from .steps import Job, failed_rows, fit, measure, render, steps_ahead
 from .store import RunFolder
 
 log = logging.getLogger(__name__)
@@ -80,7 +79,7 @@ def _run(
     manifest.write(folder.manifest)
     for protocol in protocols.values():
         log.info("%s, protocol %s: %d frames", protocol.task, protocol.hash, len(protocol.keys))
-    with run_progress({job.name: stages_ahead(job, metrics) for job in jobs}) as line:
+    with run_progress({job.name: steps_ahead(job, metrics) for job in jobs}) as line:
         frames = [_run_cell(replace(job, line=line), metrics) for job in jobs]
     rows = Rows.joined(frames)
     rows.write(folder.rows)
@@ -234,3 +233,44 @@ def describe(
         protocols={task: ProtocolRecord.of(protocol) for task, protocol in protocols.items()},
         machine=machine_record(),
     )
+
+
+def trained(run: Path, methods: Sequence[str], options: RunOptions, out: Path) -> tuple[RunConfig, list[Job]]:
+    """Return the settings of a run and its cells whose avatar is trained; `load` reads one.
+
+    Parameters
+    ----------
+    run : folder of the run.
+    methods : names of those wanted; empty: all but the floors, which nothing can drive to extremes.
+    options : where the run's files are now.
+    out : folder to keep clips in that methods need in another form; its lock is held. It becomes ``out`` of the settings.
+
+    Raises
+    ------
+    InputError
+        For a method that the run does not have, a capture that is not the one trained on, an avatar that is not
+        there or whose training did not end, and a run without any avatar to look at.
+    """
+    folder = RunFolder(run)
+    resolved = resolve_methods(run_configuration(run, options))
+    names = [method.spec.name for method in resolved]
+    for name in methods:
+        if name not in names:
+            raise InputError(folder.manifest, "methods", ", ".join(names), name)
+    wanted = [m for m in resolved if (m.spec.name in methods if methods else not m.spec.trivial)]
+    if not wanted:
+        raise InputError(folder.manifest, "methods", "a method that is no floor", ", ".join(names))
+    config, clips = open_run_clips(run, options, out=out)
+    jobs = make_jobs(config, wanted, clips, {}, folder, adapt(clips, wanted, config, RunFolder(out), folder))
+    for job in jobs:
+        state = job.cell.step("fit")
+        if state is None or state.get("status") != "done":
+            found = "none" if state is None else "one whose training did not end"
+            raise InputError(job.cell.folder, "fit.json", "a trained avatar", found, "Start the run again.")
+    return config, jobs
+
+
+def load(job: Job) -> Avatar:
+    """Read the avatar of a cell."""
+    avatar: Avatar = job.method.create().load(job.cell.avatar, device=job.device)
+    return avatar

@@ -36,8 +36,8 @@ from ..rows import Rows
 log = logging.getLogger(__name__)
 
 
-class Stage(TypedDict, total=False):
-    """What a stage of a cell records.
+class StepState(TypedDict, total=False):
+    """What a step of a cell records.
 
     Attributes
     ----------
@@ -84,22 +84,22 @@ class Cell:
         """Where the render of ``key`` lies."""
         return self.folder / "renders" / task / f"{key.sequence}_{key.timestep:05d}_{key.camera}.png"
 
-    def stage(self, name: str) -> Stage | None:
-        """Return what `begin` or `finish` wrote for a stage, or None. Raises `InputError` for a damaged record."""
+    def step(self, name: str) -> StepState | None:
+        """Return what `begin` or `finish` wrote for a step, or None. Raises `InputError` for a damaged record."""
         path = self.folder / f"{name}.json"
         if not path.exists():
             return None
-        stage: Stage = checked(read_json(path), Stage, path)
-        for file in map(PurePosixPath, stage.get("files", {})):
+        step: StepState = checked(read_json(path), StepState, path)
+        for file in map(PurePosixPath, step.get("files", {})):
             if file.is_absolute() or ".." in file.parts:
                 raise InputError(path, "files", f"files inside {self.folder}", str(file))
-        return stage
+        return step
 
     def drop_damaged_records(self) -> None:
-        """Remove records of stages that cannot be read, with a warning: what they record is made again."""
+        """Remove records of steps that cannot be read, with a warning: what they record is made again."""
         for name in STAGES:
             try:
-                self.stage(name)
+                self.step(name)
             except InputError as error:
                 if isinstance(error.__cause__, OSError):
                     raise  # not damaged: the disk or its permissions are at fault
@@ -128,16 +128,16 @@ class Cell:
         return {name: why for name, why in found.items() if why}
 
     def is_done(self, name: str, fingerprint: str) -> bool:
-        """Say whether the stage ended with exactly these inputs."""
-        state = self.stage(name)
+        """Say whether the step ended with exactly these inputs."""
+        state = self.step(name)
         return state is not None and state.get("fingerprint") == fingerprint and state.get("status") == "done"
 
     def begin(self, name: str, fingerprint: str, **record: Any) -> None:
-        """Record that the stage works on these inputs."""
+        """Record that the step works on these inputs."""
         write_json(self.folder / f"{name}.json", {"fingerprint": fingerprint, "status": "started", **record})
 
     def finish(self, name: str, fingerprint: str, **record: Any) -> None:
-        """Record that the stage ended, with what it measured."""
+        """Record that the step ended, with what it measured."""
         write_json(self.folder / f"{name}.json", {"fingerprint": fingerprint, "status": "done", **record})
 
 

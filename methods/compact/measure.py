@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from ...bench.contracts import ByteArray, Camera, Clip, FrameKey, HeadAsset, HeadPose
-from ...bench.io.frames import quantise
+from ...bench.io.images import quantise
 from ..ours.avatar import OursAvatar
 from ..shared.losses import mean_ssim
 from ..shared.subject_mesh import SubjectMesh

@@ -13,7 +13,7 @@ import tyro
 from ...bench.contracts import Progress, no_progress
 from ...bench.io.files import output_inside, prepare_folder, write_text
 from ...bench.io.lock import locked
-from ...bench.runner.options import RunOptions
+from ...bench.runner.config import RunOptions
 from ...bench.specs import Findings, writes
 
 if TYPE_CHECKING:

@@ -14,10 +14,9 @@ from ...bench.manifest import Derived, MethodRecord
 from ...bench.protocol import Protocol, make_protocol
 from ...bench.registry import resolve
 from ...bench.rows import Rows
-from ...bench.runner.avatars import load, trained
 from ...bench.runner.config import resolve_metrics
-from ...bench.runner.run import describe
-from ...bench.runner.stages import Job, measure, render
+from ...bench.runner.run import describe, load, trained
+from ...bench.runner.steps import Job, measure, render
 from ...bench.runner.store import RunFolder
 from ...bench.specs import MetricSpec
 from .command import SweepSettings
@@ -106,7 +105,7 @@ def _name(base: Job, variant: Variant) -> str:
 def _measured(job: Job, base: Job, variant: Variant | None, metrics: Sequence[MetricSpec]) -> Rows:
     job.check()
     avatar = load(base) if variant is None else variant.make(job.cell.avatar)
-    source = base.cell.stage("fit")
+    source = base.cell.step("fit")
     assert source is not None  # `trained` saw to it
     derived_from = digest(source["fingerprint"], source.get("files"))
     files = job.cell.digests(path for path in job.cell.avatar.rglob("*") if path.is_file())

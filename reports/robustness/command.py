@@ -13,11 +13,11 @@ import tyro
 from ...bench.contracts import Progress, no_progress
 from ...bench.io.files import output_inside
 from ...bench.io.lock import locked
-from ...bench.runner.options import RunOptions
+from ...bench.runner.config import RunOptions
 from ...bench.specs import Findings
 
 if TYPE_CHECKING:
-    from ...bench.runner.stages import Job
+    from ...bench.runner.steps import Job
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ def run_robustness_test(
     progress: Progress,
 ) -> Findings:
     """Judge the avatars of a run and write the contact sheet; not passed where a limit is broken."""
-    from ...bench.runner.avatars import trained
+    from ...bench.runner.run import trained
     from ...bench.runner.store import RunFolder
     from .stability import SHEET_FILE, table
 

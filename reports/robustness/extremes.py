@@ -12,8 +12,8 @@ import numpy as np
 
 from ...bench.contracts import Clip, FloatArray, FrameKey, HeadPose, Progress
 from ...bench.io.files import digest
-from ...bench.runner.avatars import load
-from ...bench.runner.stages import Job
+from ...bench.runner.run import load
+from ...bench.runner.steps import Job
 from .command import ExtremesSettings
 from .stability import (
     EXPRESSION_LIMITS,

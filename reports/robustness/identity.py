@@ -34,7 +34,7 @@ from ...bench.contracts import (
     HeadPose,
     IntArray,
 )
-from ...bench.io.frames import quantise
+from ...bench.io.images import quantise
 from .extremes import training_poses
 from .stability import LimitCheck
 

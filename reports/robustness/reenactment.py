@@ -13,11 +13,10 @@ import numpy as np
 from ...bench.contracts import Avatar, Camera, Clip, FloatArray, FrameKey, HeadAsset, HeadPose, Progress
 from ...bench.errors import InputError
 from ...bench.io.files import digest
-from ...bench.io.frames import write_png
-from ...bench.runner.avatars import load
+from ...bench.io.images import write_png
 from ...bench.runner.captures import open_clips, run_configuration
-from ...bench.runner.run import adapt, make_jobs
-from ...bench.runner.stages import Job
+from ...bench.runner.run import adapt, load, make_jobs
+from ...bench.runner.steps import Job
 from ...bench.runner.store import RunFolder
 from ..runs import evenly_spaced
 from .command import ReenactSettings

@@ -11,7 +11,7 @@ import cv2
 
 from ...bench.errors import InputError
 from ...bench.io.documents import read_json
-from ...bench.io.frames import read_png
+from ...bench.io.images import read_png
 from ..drawing import SheetSection, Tile, TileRow, write_sheet
 from ..runs import evenly_spaced
 from .stability import RECORD_FILE, SHEET_FILE

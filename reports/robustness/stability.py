@@ -16,12 +16,12 @@ import numpy as np
 
 from ...bench.contracts import Avatar, Camera, Clip, FloatArray, Frame, FrameKey, HeadPose, Progress
 from ...bench.io.files import write_json
-from ...bench.io.frames import quantise, write_png
+from ...bench.io.images import quantise, write_png
 from ...bench.protocol import Protocol, TrialName, make_trial_protocol
 from ...bench.rows import Row, Rows
 from ...bench.runner.adaptation import MethodNeeds
 from ...bench.runner.scoring import FULL
-from ...bench.runner.stages import Job
+from ...bench.runner.steps import Job
 
 COVERED, SOLID = 0.05, 0.95
 VISIBLE_OPACITY = 0.05

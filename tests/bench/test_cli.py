@@ -13,7 +13,7 @@ import pytest
 
 from headbench.bench import cli
 from headbench.bench.errors import HeadbenchError, InputError
-from headbench.bench.runner.demo import DemoConfig, parse_size
+from headbench.bench.runner.config import DemoConfig, parse_size
 
 GALLERY = Path(__file__).parents[2] / "reports" / "gallery"
 

@@ -3,8 +3,8 @@ import types
 import pytest
 import torch
 
-from headbench.bench.device import check_device
 from headbench.bench.errors import InputError
+from headbench.bench.machine import check_device
 
 
 def backend(available, count):

@@ -111,9 +111,9 @@ def test_a_spec_that_no_results_could_be_read_with_is_refused(spec, changes):
 def test_a_record_of_a_stage_that_is_none_is_refused_by_its_key(tmp_path, change, key):
     cell = Cell(tmp_path)
     cell.finish("fit", "f", seconds=1.5, files={"avatar/a.npz": "0"})
-    assert cell.stage("fit")["seconds"] == 1.5
+    assert cell.step("fit")["seconds"] == 1.5
     record = json.loads((tmp_path / "fit.json").read_text())
     (tmp_path / "fit.json").write_text(json.dumps({**record, **change}))
     with pytest.raises(InputError) as caught:
-        cell.stage("fit")
+        cell.step("fit")
     assert caught.value.key == key

@@ -100,7 +100,7 @@ def test_a_run_has_a_bound_until_all_of_it_has_a_basis(clock, lines):
     seconds = {"training": {"ga": 10.0, "ours": 20.0}, "rendering": {"ga": 1.0, "ours": 2.0}}
     for cell in ("s1 ga", "s1 ours", "s2 ga", "s2 ours"):
         for stage in ("training", "rendering"):
-            with run.stage(cell, stage) as report:
+            with run.step(cell, stage) as report:
                 work(clock, report, 10, seconds[stage][cell[3:]])
     told = [line for line in lines if re.search("ing 5 of", line)]
     assert told == [
@@ -119,19 +119,19 @@ def test_a_run_has_a_bound_until_all_of_it_has_a_basis(clock, lines):
 def test_alike_stages_of_any_method_tell_of_each_other(clock, lines):
     stages = {"measuring": ""}
     run = progress_of({"s ga": stages, "s ours": stages}, lines)
-    with run.stage("s ga", "measuring"):
+    with run.step("s ga", "measuring"):
         clock.passes(60)
-    with run.stage("s ours", "measuring"):
+    with run.step("s ours", "measuring"):
         pass
     assert lines[-1] == "cell 2 of 2, s ours: measuring, 1 min 00 s left"
 
 
 def test_what_an_earlier_start_did_counts_as_if_done_now(clock, lines):
     run = progress_of(cells(("s1", "ga"), ("s2", "ga"), stages=("training",)), lines)
-    with run.stage("s1 ga", "training") as report:
+    with run.step("s1 ga", "training") as report:
         clock.passes(30)
         work(clock, report, 100, 1.0, start=90)
-    with run.stage("s2 ga", "training"):
+    with run.step("s2 ga", "training"):
         pass
     assert "2 min" in lines[-1]  # 30 s to prepare and a second for each of 100 steps
 
@@ -140,15 +140,15 @@ def test_a_stage_that_fails_or_was_not_ahead_tells_nothing(clock, lines):
     run = progress_of({**cells(("s1", "ga")), "s2 ga": {}, **cells(("s3", "ga"))}, lines)
 
     def fail():
-        with run.stage("s1 ga", "training"):
+        with run.step("s1 ga", "training"):
             clock.passes(50)
             raise RuntimeError
 
     with pytest.raises(RuntimeError):
         fail()
-    with run.stage("s2 ga", "rendering") as report:
+    with run.step("s2 ga", "rendering") as report:
         work(clock, report, 10, 1.0)
-    with run.stage("s3 ga", "training"):
+    with run.step("s3 ga", "training"):
         pass
     assert lines[-1] == "cell 3 of 3, s3 ga: training"
 
@@ -160,7 +160,7 @@ def test_on_a_terminal_the_line_is_written_over(clock, monkeypatch):
 
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
-    with run_progress(cells(("s1", "ga"))) as run, run.stage("s1 ga", "training") as report:
+    with run_progress(cells(("s1", "ga"))) as run, run.step("s1 ga", "training") as report:
         work(clock, report, 10, 2.0, note="loss 1")
     shown = terminal.getvalue()
     assert "\rcell 1 of 1, s1 ga: training 9 of 10" in shown

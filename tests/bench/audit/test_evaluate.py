@@ -10,7 +10,7 @@ import pytest
 from headbench.bench import cli
 from headbench.bench.audit.command import EvaluateSettings, evaluate
 from headbench.bench.errors import InputError
-from headbench.bench.io.frames import read_png, write_png
+from headbench.bench.io.images import read_png, write_png
 from headbench.bench.rows import ALL, COLUMNS
 from headbench.bench.runner.store import RunFolder
 

@@ -10,7 +10,7 @@ import pytest
 from headbench.bench import cli
 from headbench.bench.io.documents import read_json
 from headbench.bench.io.files import digest_file, write_json
-from headbench.bench.io.frames import read_png, write_png
+from headbench.bench.io.images import read_png, write_png
 from headbench.bench.rows import Rows
 from headbench.bench.runner.store import RunFolder
 
@@ -138,7 +138,7 @@ def test_a_changed_capture_is_found(run, toy, monkeypatch, capsys):
 def test_a_run_started_again_renders_a_changed_frame_again(run, toy, capsys):
     from headbench.bench.runner import run as runner
     from headbench.bench.runner.captures import run_configuration
-    from headbench.bench.runner.options import RunOptions
+    from headbench.bench.runner.config import RunOptions
 
     frame = frame_of(run)
     before = digest_file(frame)

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from headbench.bench.io.frames import read_png, write_png
+from headbench.bench.io.images import read_png, write_png
 from headbench.bench.runner import run as runner
 from headbench.bench.runner.config import RunConfig
 from headbench.bench.runner.store import RunFolder
@@ -55,7 +55,7 @@ def remeasured(config):
         assert frames
         for path in frames:
             write_png(path, change(read_png(path)))
-        rendered = cell.stage("digests")
+        rendered = cell.step("digests")
         files = {**rendered["files"], **cell.digests(frames)}
         cell.finish("digests", rendered["fingerprint"], files=files)
         runner.run(config)

@@ -7,10 +7,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from headbench.bench.gate.baseline import Baseline, Tolerance
-from headbench.bench.gate.results import Place, Results
-from headbench.bench.gate.verdicts import Verdict, environment_changes, exit_code, judge
-from headbench.bench.gate.writers import to_junit, to_markdown
+from headbench.bench.gate.baseline import Baseline, Place, Results, Tolerance
+from headbench.bench.gate.verdicts import (
+    Verdict,
+    environment_changes,
+    exit_code,
+    judge,
+    to_junit,
+    to_markdown,
+)
 from headbench.bench.specs import MetricSpec
 
 SPEC = MetricSpec("m", "M", "dB", True, 2, "a:b")

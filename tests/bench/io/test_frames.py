@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from headbench.bench.errors import InputError
-from headbench.bench.io.frames import quantise, read_png, write_png
+from headbench.bench.io.images import quantise, read_png, write_png
 
 
 def test_every_level_survives_the_round_trip(tmp_path):

@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from headbench.bench.errors import InputError
-from headbench.bench.io.frames import read_png
-from headbench.bench.io.images import MAX_PIXELS, MAX_SCANS, ImageInfo, probe_image, read_pixels
+from headbench.bench.io.images import MAX_PIXELS, MAX_SCANS, ImageInfo, probe_image, read_pixels, read_png
 from headbench.datasets.images import read_image, read_mask
 
 MODES = {"L": 1, "RGB": 3, "RGBA": 4, "LA": 2, "P": 3}

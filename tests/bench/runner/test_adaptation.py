@@ -10,14 +10,13 @@ from headbench.bench.contracts import Camera
 from headbench.bench.errors import InputError
 from headbench.bench.io.documents import read_json
 from headbench.bench.io.files import digest, write_text
-from headbench.bench.io.frames import read_png
+from headbench.bench.io.images import read_png
 from headbench.bench.runner import adaptation
 from headbench.bench.runner import run as runner
 from headbench.bench.runner.adaptation import MethodNeeds, plan
-from headbench.bench.runner.avatars import trained
 from headbench.bench.runner.captures import open_clips
-from headbench.bench.runner.config import RunConfig
-from headbench.bench.runner.options import RunOptions
+from headbench.bench.runner.config import RunConfig, RunOptions
+from headbench.bench.runner.run import trained
 from headbench.bench.runner.store import RunFolder
 from headbench.bench.specs import ResolutionRule
 
@@ -55,7 +54,7 @@ def test_a_method_without_needs_gets_the_clip_itself(config, toy):
     method = record["methods"][0]
     expected = digest(1, method, 0, "cpu", "toy-subject1")
     cell = RunFolder(runner.Path(config.out)).cell("subject1", "mirror", 0)
-    assert cell.stage("fit")["fingerprint"] == expected
+    assert cell.step("fit")["fingerprint"] == expected
 
 
 def test_cameras_and_poses_of_the_adapted_clip_are_rendered_and_brought_back(config, toy, monkeypatch):

@@ -11,9 +11,9 @@ from headbench.bench import cli
 from headbench.bench.errors import InputError
 from headbench.bench.io.documents import read_json
 from headbench.bench.io.files import digest_file, write_json
-from headbench.bench.io.frames import read_png, write_png
+from headbench.bench.io.images import read_png, write_png
 from headbench.bench.runner import run as runner
-from headbench.bench.runner import stages
+from headbench.bench.runner import steps
 from headbench.bench.runner.config import RunConfig
 from headbench.bench.runner.store import RunFolder
 
@@ -155,13 +155,13 @@ def test_frames_without_a_record_are_rendered_again(config, toy, monkeypatch, ca
         rendered.append(1)
         return original(self, *arguments)
 
-    monkeypatch.setattr(stages, "RECORD_EVERY_S", -1.0)
+    monkeypatch.setattr(steps, "RECORD_EVERY_S", -1.0)
     with monkeypatch.context() as patch:
         patch.setattr(toy.ToyAvatar, "render", killed)
         with pytest.raises(KeyboardInterrupt):
             runner.run(config)
     cell = RunFolder(runner.Path(config.out)).cell("subject1", "toy", 0)
-    record = cell.stage("digests")
+    record = cell.step("digests")
     assert len(record["files"]) == 3
     del record["files"][FRAME]
     write_json(cell.folder / "digests.json", record)
@@ -189,7 +189,7 @@ def test_a_training_whose_checkpoint_is_damaged_starts_over(config, toy, monkeyp
     monkeypatch.setattr(toy.ToyMethod, "fit", fit)
     rows = runner.run(config)
     cell = RunFolder(runner.Path(config.out)).cell("subject1", "toy", 0)
-    state = cell.stage("fit")
+    state = cell.step("fit")
     cell.begin("fit", state["fingerprint"])
     (cell.avatar / "checkpoint").write_text("half")
     assert runner.run(config)._table.equals(rows._table)

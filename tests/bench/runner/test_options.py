@@ -12,8 +12,7 @@ from headbench.bench.io.documents import read_json
 from headbench.bench.io.files import write_json
 from headbench.bench.runner import run as runner
 from headbench.bench.runner.captures import open_run_clips, run_configuration
-from headbench.bench.runner.config import RunConfig
-from headbench.bench.runner.options import RunOptions
+from headbench.bench.runner.config import RunConfig, RunOptions
 
 TRUSTED = RunOptions(trust=True)
 

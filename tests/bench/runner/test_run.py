@@ -110,8 +110,8 @@ def test_the_record_of_training_says_how_often_it_was_interrupted(config, toy, m
                 runner.run(config)
     runner.run(config)
     folder = RunFolder(runner.Path(config.out))
-    assert folder.cell("subject1", "toy", 0).stage("fit")["interruptions"] == 2
-    assert folder.cell("subject2", "toy", 0).stage("fit")["interruptions"] == 0
+    assert folder.cell("subject1", "toy", 0).step("fit")["interruptions"] == 2
+    assert folder.cell("subject2", "toy", 0).step("fit")["interruptions"] == 0
 
 
 def test_a_method_that_looks_at_held_out_frames_fails(config):
@@ -235,8 +235,8 @@ def test_a_metric_of_training_sees_the_record_of_the_fit(config):
     rows = rows_of(changed(config, metrics=("toy_plugin:STEPS",)))
     assert rows["value"].tolist() == [2.0, 2.0]
     folder = RunFolder(runner.Path(config.out))
-    measured = folder.cell("subject1", "toy", 0).stage("measure")["details"]["steps"]
-    assert measured["peak"] >= folder.cell("subject1", "toy", 0).stage("fit")["memory_before_bytes"] > 0
+    measured = folder.cell("subject1", "toy", 0).step("measure")["details"]["steps"]
+    assert measured["peak"] >= folder.cell("subject1", "toy", 0).step("fit")["memory_before_bytes"] > 0
 
 
 def test_a_preset_and_settings_reach_the_method(config):

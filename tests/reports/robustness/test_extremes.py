@@ -12,7 +12,7 @@ from sklearn.decomposition import PCA
 from headbench.bench.contracts import FrameKey, HeadPose
 from headbench.bench.errors import InputError
 from headbench.bench.io.lock import LOCK_FILE, locked
-from headbench.bench.runner import avatars
+from headbench.bench.runner import run as runner
 from headbench.reports.robustness.command import ExtremesSettings, extremes_run
 from headbench.reports.robustness.extremes import ExpressionComponents, extremes, typical_pose
 from headbench.reports.robustness.sheets import BROKEN, EXTRAPOLATED
@@ -147,7 +147,7 @@ def test_clips_are_adapted_in_its_folder_while_that_is_locked(ball_run, monkeypa
         seen.append((out, (out / LOCK_FILE).exists()))
         raise InputError("a", "b", "c", "d")
 
-    monkeypatch.setattr(avatars, "trained", trained)
+    monkeypatch.setattr(runner, "trained", trained)
     folder = ball_run("BALL")
     with pytest.raises(InputError):
         extremes_run(settings(folder))

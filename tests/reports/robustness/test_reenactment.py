@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from headbench.bench.contracts import HeadPose
 from headbench.bench.errors import InputError
-from headbench.bench.io.frames import read_png
+from headbench.bench.io.images import read_png
 from headbench.reports.robustness.command import ReenactSettings, reenact_run
 from headbench.reports.robustness.reenactment import RigidMean, check_heads, retarget
 from headbench.reports.robustness.stability import RECORD_FILE, ROWS_FILE, SHEET_FILE

@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from headbench.bench.contracts import Budget, no_progress
-from headbench.bench.runner.training_view import TrainingView
+from headbench.bench.runner.adaptation import TrainingView
 from headbench.methods.ours.capacity import plan_capacity
 from headbench.methods.ours.config import Capacity, Lines, OursConfig, Penalty
 from headbench.methods.ours.method import Ours

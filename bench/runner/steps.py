@@ -1,4 +1,4 @@
-"""The stages of one cell (a subject, a method, a seed): fit, render, measure. Each picks up where it was."""
+"""The steps of one cell (a subject, a method, a seed): fit, render, measure. Each picks up where it was."""
 
 from __future__ import annotations
 
@@ -15,20 +15,19 @@ from typing import Any
 from ..contracts import Avatar, Camera, Clip, FrameKey, HeadPose, Measurement, Progress
 from ..errors import HeadbenchError, InputError, UnavailableError
 from ..io.files import digest, digest_file, grouped_writes, refuse_links
-from ..io.frames import quantise, read_png, write_png
+from ..io.images import quantise, read_png, write_png
 from ..machine import PeakMemory
 from ..progress import RunProgress, duration, progress
 from ..protocol import Protocol
 from ..rows import ALL, Row, Rows
 from ..specs import MetricSpec
-from .adaptation import AdaptedClip
+from .adaptation import AdaptedClip, TrainingView
 from .config import ResolvedMethod
 from .scoring import FULL, Frames, make_metric, score_frames
 from .store import Cell
-from .training_view import TrainingView
 
 log = logging.getLogger(__name__)
-RESULT_FORMAT = 1  # raise when a stage changes what it leaves behind
+RESULT_FORMAT = 1  # raise when a step changes what it leaves behind
 TRAINING, RENDERING, MEASURING_AVATAR = "training", "rendering", "measuring the avatar"
 DIGESTS = "digests"
 RECORD_EVERY_S = 10.0
@@ -53,9 +52,9 @@ class Job:
     regions: tuple[str, ...] = ()
     line: RunProgress | None = None
 
-    def progress(self, stage: str) -> AbstractContextManager[Progress]:
-        """The progress of a stage: of the run if this is a cell of one, else of its own."""
-        return self.line.stage(self.name, stage) if self.line else progress(f"{self.name}: {stage}")
+    def progress(self, step: str) -> AbstractContextManager[Progress]:
+        """The progress of a step: of the run if this is a cell of one, else of its own."""
+        return self.line.step(self.name, step) if self.line else progress(f"{self.name}: {step}")
 
     @property
     def form(self) -> AdaptedClip:
@@ -86,11 +85,11 @@ class Job:
     def check(self) -> None:
         """Refuse a folder that holds an avatar made of something else, or links out of it.
 
-        Damaged records of stages are removed, with a warning.
+        Damaged records of steps are removed, with a warning.
         """
         refuse_links(self.cell.folder)
         self.cell.drop_damaged_records()
-        state = self.cell.stage("fit")
+        state = self.cell.step("fit")
         if state is not None and state.get("fingerprint") != self.fit_fingerprint:
             raise InputError(
                 self.cell.folder / "fit.json",
@@ -101,19 +100,19 @@ class Job:
             )
 
 
-def stages_ahead(job: Job, metrics: Sequence[MetricSpec]) -> dict[str, str]:
-    """The stages of a cell that are not done, each with the kind of cells that it takes as long for."""
+def steps_ahead(job: Job, metrics: Sequence[MetricSpec]) -> dict[str, str]:
+    """The steps of a cell that are not done, each with the kind of cells that it takes as long for."""
     trained = job.cell.is_done("fit", job.fit_fingerprint)
     if trained and job.cell.is_done("measure", job.fit_fingerprint):
         return {}
     method = job.method.spec.name
-    stages = {} if trained else {TRAINING: method}
-    stages[RENDERING] = method
+    steps = {} if trained else {TRAINING: method}
+    steps[RENDERING] = method
     if any(spec.per_frame for spec in metrics):
-        stages |= {_measuring(task): "" for task in job.protocols}
+        steps |= {_measuring(task): "" for task in job.protocols}
     if not all(spec.per_frame for spec in metrics):
-        stages[MEASURING_AVATAR] = method
-    return stages
+        steps[MEASURING_AVATAR] = method
+    return steps
 
 
 def _measuring(task: str) -> str:
@@ -128,7 +127,7 @@ def fit(job: Job) -> Avatar:
     with damaged files is trained again, with a warning.
     """
     method = job.method.create()
-    earlier = job.cell.stage("fit")
+    earlier = job.cell.step("fit")
     if earlier is not None and earlier["status"] == "done":
         damaged = job.cell.damage(earlier.get("files", {}))
         if damaged:
@@ -190,7 +189,7 @@ def render(job: Job, avatar: Avatar) -> None:
     """
     cell, form = job.cell, job.form
     made_of = digest(job.fit_fingerprint, _avatar_record(job))
-    state = cell.stage(DIGESTS)
+    state = cell.step(DIGESTS)
     known = {} if state is None or state["fingerprint"] != made_of else dict(state.get("files", {}))
     wanted = {cell.name(path): frame for path, frame in job.frame_paths.items()}
     damaged = cell.damage({name: known[name] for name in wanted if name in known})
@@ -221,13 +220,13 @@ def render(job: Job, avatar: Avatar) -> None:
 
 def recorded_frames(job: Job) -> dict[str, str]:
     """SHA-256 of the frames as they were rendered, by their place in the cell's folder."""
-    state = job.cell.stage(DIGESTS)
+    state = job.cell.step(DIGESTS)
     return {} if state is None else state.get("files", {})
 
 
 def _avatar_record(job: Job) -> tuple[str, Mapping[str, str]]:
     """What tells one trained avatar from another of the same settings."""
-    state = job.cell.stage("fit")
+    state = job.cell.step("fit")
     return ("", {}) if state is None else (state.get("derived_from", ""), state.get("files", {}))
 
 
@@ -285,14 +284,14 @@ def _finite(details: Mapping[str, Any]) -> dict[str, Any]:
 
 def _measured_before(job: Job) -> tuple[dict[str, str], dict[str, Any], Rows]:
     """Fingerprints and details of the measurements that were taken, by metric, and the rows."""
-    stage = job.cell.stage("measure")
-    if stage is None or stage["status"] != "done" or "rows" not in stage:
+    step = job.cell.step("measure")
+    if step is None or step["status"] != "done" or "rows" not in step:
         return {}, {}, Rows.of([])
-    damaged = job.cell.damage({job.cell.name(job.cell.rows): stage["rows"]})
+    damaged = job.cell.damage({job.cell.name(job.cell.rows): step["rows"]})
     if damaged:
         _warn(job, damaged, "measured again")
         return {}, {}, Rows.of([])
-    return stage.get("fingerprints", {}), dict(stage.get("details", {})), Rows.read(job.cell.rows)
+    return step.get("fingerprints", {}), dict(step.get("details", {})), Rows.read(job.cell.rows)
 
 
 def _measure_fingerprint(job: Job, spec: MetricSpec, rendered: Mapping[str, str]) -> str:
@@ -360,7 +359,7 @@ def _measure_avatar(job: Job, spec: MetricSpec, avatar: Avatar) -> Measurement |
     metric = make_metric(spec)
     try:
         if spec.kind == "training":
-            measured: Measurement = metric(job.cell.stage("fit") or {})
+            measured: Measurement = metric(job.cell.step("fit") or {})
         else:
             size = job.method.spec.resolution.speed_size
             measured = metric(avatar, workload(job.form, job.protocols, size))
