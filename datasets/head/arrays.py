@@ -53,7 +53,7 @@ class HeadArrays:
 
     Attributes
     ----------
-    version : names the expression basis; poses carry it as ``HeadPose.head_model``.
+    version : names the expression basis; poses name it as ``HeadPose.head_model``.
     template : (V, 3) mean head.
     faces : (F, 3) int64 triangles, counter-clockwise seen from outside.
     shape_basis, expression_basis : (V, 3, S), (V, 3, E) metres per unit coefficient.

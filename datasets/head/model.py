@@ -139,7 +139,7 @@ class HeadModel(torch.nn.Module):
         return vertices
 
     def _pose(self, neutral: Tensor, expression: Tensor, angles: Tensor, translation: Tensor) -> Tensor:
-        """Skinned vertices (B, V, 3), differentiable: the formulae as they are written. Twin of `FastPosing`."""
+        """Skinned vertices (B, V, 3), differentiable: the formulae as they are written. The reference implementation of `FastPosing`."""
         rotations = axis_angle_to_matrix(angles)
         shaped = neutral + (expression @ self.expression_matrix).unflatten(1, (-1, 3))
         joints = self.joint_regressor @ shaped

@@ -1,7 +1,7 @@
 """Where things are on a head: the points and curves that painting, hair and wrinkles hang on.
 
 Everything is measured on the subject's own neutral shape, so that any head with the named landmarks (or the
-68 of iBUG's scheme) can be dressed. Left is the subject's left, +x; +y is up and +z is front; metres.
+68 of iBUG's scheme) can be rendered. Left is the subject's left, +x; +y is up and +z is front; metres.
 """
 
 from __future__ import annotations
@@ -129,8 +129,8 @@ def skin_triangles(head: HeadAsset) -> IntArray:
     for name in _NOT_SKIN & head.regions.keys():
         other[head.regions[name]] = True
     skin = head.faces[~other[head.faces].any(axis=1)]
-    # Light falls on fronts only, so a model whose triangles turn the other way round is turned over: the sign
-    # of the volume they enclose tells (divergence theorem).
+    # Light falls on fronts only, so a model whose triangles wind the other way is flipped: the sign
+    # of the volume that they enclose decides (divergence theorem).
     a, b, c = head.template[skin].astype(np.float64).transpose(1, 0, 2)
     return skin if np.einsum("ni,ni->", np.cross(a, b), c) > 0 else skin[:, ::-1]
 

@@ -1,4 +1,4 @@
-"""Make a synthetic capture: plan every subject, photograph what is missing, write the layout.
+"""Make a synthetic capture: plan every subject, render what is missing, write the layout.
 
 A folder belongs to one set of settings. Each image is written whole or not at all and depends on nothing but
 those settings, so a killed run continues where it stopped and ends with the same capture.
@@ -26,8 +26,8 @@ from ...bench.io.images import probe_image
 from ...bench.machine import processor_count
 from ...bench.start import end_with_parent, starting_workers
 from .performance import KINDS, Kind, share_out
-from .studio import Photographer, default_samples, sample_count
-from .take import SERIALS, Settings, Take, load_geometry, plan_take
+from .plan import SERIALS, SubjectPlan, SynthSettings, load_geometry, plan_subject
+from .renderer import CaptureRenderer, default_samples, sample_count
 
 MANIFEST = "synthesis.json"
 _VERSION = 3
@@ -36,7 +36,7 @@ _README = """This folder holds synthetic recordings made by `headbench synth`.
 
 No person was recorded. Heads, skin, hair and performances are computed; subject numbers from 900 up, camera
 serials and sequence names only follow the conventions of real recordings so that the same tools read both.
-Settings: synthesis.json.
+SynthSettings: synthesis.json.
 """
 
 
@@ -80,50 +80,52 @@ def synthesize(
     """
     samples = default_samples(*size) if samples_per_pixel is None else sample_count(samples_per_pixel)
     pixels = (size[0], size[1])
-    settings = Settings(
+    settings = SynthSettings(
         subjects, cameras, timesteps, pixels, head, seed, tracking_noise, samples, performance, dynamics
     )
     _check(settings)
     geometry = load_geometry(head)
     out = Path(out)
     _claim(out, settings, geometry.head.fingerprint())
-    takes = [plan_take(out, index, geometry, settings) for index in range(subjects)]
+    plans = [plan_subject(out, index, geometry, settings) for index in range(subjects)]
     total = subjects * timesteps * cameras
     done = 0
     progress(done, total, "planned")
-    for take in takes:
-        missing = [(s, t, _missing(take, s, t)) for s, t in take.moments()]
+    for plan in plans:
+        missing = [(s, t, _missing(plan, s, t)) for s, t in plan.moments()]
         done += timesteps * cameras - sum(len(names) for _, _, names in missing)
         work = [entry for entry in missing if entry[2]]
-        for sequence, count in _photograph(out, take, work, workers):
+        for sequence, count in _render_missing(out, plan, work, workers):
             done += count
-            progress(done, total, f"{take.person.name} {sequence}")
-    return [take.writer.write_metadata() for take in takes]
+            progress(done, total, f"{plan.person.name} {sequence}")
+    return [plan.writer.write_metadata() for plan in plans]
 
 
 Job = tuple[str, int, tuple[str, ...]]
 """A sequence, a timestep in it, and the cameras whose image is missing."""
 
 
-def _photograph(out: Path, take: Take, work: list[Job], workers: int | None) -> Iterator[tuple[str, int]]:
+def _render_missing(
+    out: Path, plan: SubjectPlan, work: list[Job], workers: int | None
+) -> Iterator[tuple[str, int]]:
     """Render the jobs; give (sequence, number of images) as each is written."""
     images = sum(len(cameras) for _, _, cameras in work)
-    small = images * take.settings.size[0] * take.settings.size[1] < _SMALL
+    small = images * plan.settings.size[0] * plan.settings.size[1] < _SMALL
     count = min(workers or (1 if small else processor_count()), len(work))
     if count <= 1:
-        photographer = Photographer(take) if work else None
+        renderer = CaptureRenderer(plan) if work else None
         for job in work:
-            assert photographer is not None
+            assert renderer is not None
             with grouped_writes():
-                photographer.shoot(*job)
+                renderer.render_frames(*job)
             yield job[0], len(job[2])
         return
     # Spawned, since neither torch nor the renderer's thread pool survives a fork.
     context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(count, context, _begin, (out, take.index, take.settings))
+    pool = ProcessPoolExecutor(count, context, _begin, (out, plan.index, plan.settings))
     try:
         with starting_workers():
-            futures = {pool.submit(_shoot, job): job for job in work}
+            futures = {pool.submit(_render, job): job for job in work}
         for future in as_completed(futures):
             future.result()
             yield futures[future][0], len(futures[future][2])
@@ -135,39 +137,39 @@ def _photograph(out: Path, take: Take, work: list[Job], workers: int | None) -> 
         pool.shutdown(cancel_futures=True)
 
 
-_photographer: list[Photographer] = []
+_renderer: list[CaptureRenderer] = []
 """This process's own, in a worker: spawned processes cannot be handed one."""
 
 
-def _begin(out: Path, index: int, settings: Settings) -> None:
+def _begin(out: Path, index: int, settings: SynthSettings) -> None:
     end_with_parent()
     torch.set_num_threads(1)  # the processes share the cores already
-    _photographer.append(Photographer(plan_take(out, index, load_geometry(settings.head), settings)))
+    _renderer.append(CaptureRenderer(plan_subject(out, index, load_geometry(settings.head), settings)))
 
 
-def _shoot(job: Job) -> None:
+def _render(job: Job) -> None:
     with grouped_writes():
-        _photographer[0].shoot(*job)
+        _renderer[0].render_frames(*job)
 
 
-def _missing(take: Take, sequence: str, timestep: int) -> tuple[str, ...]:
-    """Cameras whose image or matte is not there, or not whole."""
-    return tuple(camera for camera in take.cameras if not _is_whole(take, sequence, timestep, camera))
+def _missing(plan: SubjectPlan, sequence: str, timestep: int) -> tuple[str, ...]:
+    """Cameras whose image or mask is not there, or not whole."""
+    return tuple(camera for camera in plan.cameras if not _is_whole(plan, sequence, timestep, camera))
 
 
-def _is_whole(take: Take, sequence: str, timestep: int, camera: str) -> bool:
-    writer = take.writer
+def _is_whole(plan: SubjectPlan, sequence: str, timestep: int, camera: str) -> bool:
+    writer = plan.writer
     for path in (writer.image_path(sequence, timestep, camera), writer.mask_path(sequence, timestep, camera)):
         try:
             info = probe_image(path)
         except InputError:
             return False
-        if (info.width, info.height) != take.settings.size:
+        if (info.width, info.height) != plan.settings.size:
             return False
     return True
 
 
-def _check(settings: Settings) -> None:
+def _check(settings: SynthSettings) -> None:
     if settings.subjects < 1:
         raise InputError("--subjects", "", "at least 1", str(settings.subjects))
     if not 2 <= settings.cameras <= len(SERIALS):
@@ -185,7 +187,7 @@ def _check(settings: Settings) -> None:
         raise InputError("--tracking-noise", "", "a number from 0 up", str(settings.tracking_noise))
 
 
-def _claim(out: Path, settings: Settings, head: str) -> None:
+def _claim(out: Path, settings: SynthSettings, head: str) -> None:
     """Mark the folder as this capture's, or refuse one that is another's."""
     wanted = {
         "version": _VERSION,
@@ -216,7 +218,7 @@ def _compare(manifest: Path, wanted: dict[str, Any]) -> None:
                 key,
                 f"{value!r}, as asked for",
                 f"{found.get(key)!r}",
-                "Take another folder, or the same settings.",
+                "SubjectPlan another folder, or the same settings.",
             )
 
 

@@ -1,6 +1,6 @@
 """Hair on the head: a hairline, a thick cap under it, and combed locks over the cap.
 
-The cap is the scalp itself pushed outwards, so that no skin shows between the locks and the matte stays
+The cap is the scalp itself pushed outwards, so that no skin shows between the locks and the mask stays
 whole; the locks give strands, shine and a soft outline. Both move with the head.
 """
 
@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from ...bench.contracts import FloatArray, IntArray
 from ..head.geometry import smoothstep
 from .anatomy import SIDES, Anatomy, Eye, Person
-from .brushes import fractal_noise, value_noise
+from .fields import fractal_noise, value_noise
 from .skin import brow_color, brow_curve
 
 

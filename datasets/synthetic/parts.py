@@ -11,7 +11,7 @@ from ...bench.contracts import FloatArray, HeadAsset, IntArray
 from ..head.geometry import smoothstep
 from ..head.procedural.parts import render_parts
 from .anatomy import Anatomy, Eye, Person, front_depth
-from .brushes import value_noise
+from .fields import value_noise
 
 _IRIS_ANGLE = 0.485  # radians; an iris of 5.9 mm radius on a ball of 12 mm
 _PUPIL_SHARE = 0.40

@@ -275,7 +275,7 @@ def share_out(timesteps: int) -> dict[str, int]:
 def perform(
     name: str, timesteps: int, seed: int, tongue_shows: float = TONGUE_SHOWS, kind: Kind = "full"
 ) -> Performed:
-    """Play a sequence, sampled evenly at ``timesteps`` moments. The same seed gives the same take.
+    """Play a sequence, sampled evenly at ``timesteps`` moments. The same seed gives the same performance.
 
     ``tongue_shows`` is the share in [0, 1] by which the tongue has to be out for a timestep to be labelled. What
     ``kind`` leaves out stays at rest; everything else moves as in the full performance.
@@ -316,7 +316,7 @@ _IDLE = (
     *(("sway_x", 0.004, 4.1), ("sway_y", 0.003, 3.9), ("sway_z", 0.004, 4.7)),
     *(("gaze_left", 0.10, 1.3), ("gaze_up", 0.06, 1.7)),
 )
-"""(control, amplitude, seconds per swing) of what never stands still."""
+"""(control, amplitude, seconds per swing) of what always moves."""
 
 
 def _phrase_curves(
@@ -352,7 +352,7 @@ def _drift(time: FloatArray, period: float, rng: np.random.Generator) -> FloatAr
     )
 
 
-# ICT-FaceKit's shapes carry ARKit's names with _L and _R.
+# ICT-FaceKit's shapes have ARKit's names with _L and _R.
 _ICT_PAIRED = {
     "brow_down": "browDown",
     "brow_outer_up": "browOuterUp",

@@ -15,15 +15,7 @@ from scipy.spatial import cKDTree
 from ...bench.contracts import FloatArray
 from ..head.geometry import smoothstep
 from .anatomy import SIDES, Anatomy, Person
-from .brushes import (
-    blob,
-    fractal_noise,
-    polygon_distance,
-    polyline_distance,
-    smooth_curve,
-    spots,
-    value_noise,
-)
+from .fields import blob, fractal_noise, polygon_distance, polyline_distance, smooth_curve, spots, value_noise
 from .performance import Activations
 
 _FRONT = 0.35  # z component of the normal from which on a point counts as facing front

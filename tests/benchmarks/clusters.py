@@ -30,7 +30,7 @@ from ...datasets.steps.clusters import (
     similarities,
 )
 from ...datasets.synthetic.performance import HELD_OUT, perform, share_out
-from ...datasets.synthetic.take import load_geometry
+from ...datasets.synthetic.plan import load_geometry
 
 SIZES, QUICK_SIZES = (300, 1000, 2000, 5000), (300, 1000)
 AGREEMENT_SIZE, AGREEMENT_LANDMARKS = 300, 150

@@ -23,7 +23,7 @@ from ...bench.machine import processor_count
 from ...bench.specs import Findings
 from ...datasets.nersemble.command import PrepareSettings, prepare_nersemble
 from ...datasets.nersemble.re_record import RecordingWriter, video_codec
-from ...datasets.synthetic.take import cameras
+from ...datasets.synthetic.plan import cameras
 
 SUBJECT = "999"
 SEQUENCE = "EMO-1-shout+laugh"

@@ -20,7 +20,7 @@ from ...datasets.head.arrays import HeadArrays
 from ...datasets.head.procedural.model import procedural_head
 from ...datasets.head.refit.command import RefitSettings
 from ...datasets.head.refit.identity import match
-from ...datasets.head.refit.problem import FitProblem, Frame, angle_bounds, solve_frame
+from ...datasets.head.refit.problem import FitProblem, FrameTerms, angle_bounds, solve_frame
 from ...datasets.head.refit.refit import refit
 from ...datasets.head.subject import PosedSubject, pose_in_head_frame
 from ...datasets.images import ImageStore
@@ -173,7 +173,7 @@ def _against_scipy(
 
 def solve_dense(
     problem: FitProblem,
-    frame: Frame,
+    frame: FrameTerms,
     wanted: FloatArray,
     weights: FloatArray,
     start: Any,

@@ -19,21 +19,21 @@ from ....bench.contracts import FloatArray
 from ...rounding import COEFFICIENT_BITS, LENGTH_BITS, on_grid
 from ..geometry import mesh_edges, smoothstep
 from .anatomy import EYE_CENTER, EYE_RADIUS, MOUTH_HALF_WIDTH, eye_front, lid_curves, lip_arc
-from .surface import MIRROR, Surface, jaw_weight
+from .surface import MIRROR, SculptedHead, jaw_weight
 
 _MIXING_BITS = 25  # 2**-25 times 2**-27 m leaves two metres of room in a float64
 _SWEEPS = 12  # of Jacobi rotations; 40 x 40 matrices need 8
 
 CORNER = (MOUTH_HALF_WIDTH, -0.0520, 0.0665)
 Vector = tuple[float, float, float]
-Shape = Callable[["Clay"], FloatArray]
+Shape = Callable[["Strokes"], FloatArray]
 
 
 @dataclass(frozen=True, eq=False)
-class Clay:
+class Strokes:
     """The surface with the strokes that shapes are made of. All act on the skin only."""
 
-    surface: Surface
+    surface: SculptedHead
 
     def pull(self, center: Vector, sigma: Vector | float, millimetres: Vector) -> FloatArray:
         """Move a Gaussian neighbourhood of a point by a vector given in millimetres."""
@@ -65,7 +65,7 @@ class Clay:
         return np.column_stack([0 * x, -share * above * near, -back * 1e-3 * near])
 
 
-def _smile(c: Clay) -> FloatArray:
+def _smile(c: Strokes) -> FloatArray:
     field = c.pull(CORNER, (0.011, 0.010, 0.016), (6.5, 5.5, -4.5))
     field = field + c.pull((0.016, -0.050, 0.072), (0.007, 0.009, 0.016), (1.8, 1.2, -1.2))
     field = field + c.swell((0.042, -0.020, 0.056), (0.013, 0.012, 0.016), 4.0)
@@ -73,86 +73,86 @@ def _smile(c: Clay) -> FloatArray:
     return field - c.swell((0.029, -0.034, 0.068), (0.0035, 0.010, 0.008), 1.6)
 
 
-def _squint(c: Clay) -> FloatArray:
+def _squint(c: Strokes) -> FloatArray:
     return lid_turn(c.surface, -0.10, 0.20) + c.pull(
         (0.038, 0.004, 0.058), (0.014, 0.006, 0.012), (0, 2.2, 0.8)
     )
 
 
-def _brow_down(c: Clay) -> FloatArray:
+def _brow_down(c: Strokes) -> FloatArray:
     field = c.pull((0.017, 0.040, 0.075), (0.011, 0.008, 0.015), (-2.2, -4.2, 0.8))
     return field + c.pull((0.036, 0.040, 0.066), (0.010, 0.008, 0.015), (-0.5, -2.8, 0.3))
 
 
-def _brow_outer_up(c: Clay) -> FloatArray:
+def _brow_outer_up(c: Strokes) -> FloatArray:
     field = c.pull((0.042, 0.040, 0.060), (0.012, 0.009, 0.016), (0.2, 5.5, -0.8))
     return field + c.pull((0.040, 0.060, 0.060), (0.015, 0.014, 0.020), (0, 2.5, -0.4))
 
 
-def _cheek_raise(c: Clay) -> FloatArray:
+def _cheek_raise(c: Strokes) -> FloatArray:
     field = c.swell((0.042, -0.006, 0.056), (0.013, 0.010, 0.016), 2.5)
     return field + c.pull((0.040, -0.008, 0.058), 0.013, (0.3, 3.5, 0)) + lid_turn(c.surface, 0.0, 0.12)
 
 
-def _nose_sneer(c: Clay) -> FloatArray:
+def _nose_sneer(c: Strokes) -> FloatArray:
     field = c.pull((0.0165, -0.020, 0.078), (0.007, 0.009, 0.010), (0.8, 3.2, -0.6))
     field = field + c.pull((0.012, 0.002, 0.070), (0.007, 0.010, 0.010), (-0.3, 1.6, 0.9))
     return field + c.pull((0.016, -0.037, 0.076), (0.009, 0.007, 0.012), (0, 2.0, 0.3))
 
 
-def _puff(c: Clay) -> FloatArray:
+def _puff(c: Strokes) -> FloatArray:
     return c.swell((0.043, -0.042, 0.048), (0.016, 0.016, 0.020), 8.0) + c.pull(CORNER, 0.010, (-1.0, 0, 1.0))
 
 
-def _stretch(c: Clay) -> FloatArray:
+def _stretch(c: Strokes) -> FloatArray:
     return c.pull(CORNER, (0.011, 0.011, 0.016), (6.0, -1.5, -3.5)) + c.pull(
         (0.040, -0.075, 0.040), 0.016, (2.0, -1.5, 0)
     )
 
 
-def _frown(c: Clay) -> FloatArray:
+def _frown(c: Strokes) -> FloatArray:
     field = c.pull(CORNER, (0.010, 0.010, 0.015), (1.0, -6.0, -1.2))
     return field + c.pull((0.024, -0.068, 0.064), 0.010, (0.5, -1.8, 0.6))
 
 
-def _pucker(c: Clay) -> FloatArray:
+def _pucker(c: Strokes) -> FloatArray:
     field = c.pull(CORNER, (0.012, 0.012, 0.018), (-7.5, 0, 5.0)) + c.pull(
         (0.014, -0.051, 0.073), 0.009, (-1.8, 0, 2.2)
     )
     return field + 0.5 * c.pull((0, -0.051, 0.078), (0.012, 0.009, 0.020), (0, 0, 5.0))
 
 
-def _funnel(c: Clay) -> FloatArray:
+def _funnel(c: Strokes) -> FloatArray:
     field = c.pull(CORNER, (0.012, 0.012, 0.018), (-5.5, 0, 4.0))
     field = field + 0.5 * c.lip(True, 0, 0.015, (0, 3.4, 4.0)) + 0.5 * c.lip(False, 0, 0.015, (0, -4.0, 4.0))
     return field
 
 
-def _roll(c: Clay) -> FloatArray:
+def _roll(c: Strokes) -> FloatArray:
     return 0.5 * c.compress(0.45, 3.2)
 
 
-def _chin_raise(c: Clay) -> FloatArray:
+def _chin_raise(c: Strokes) -> FloatArray:
     field = c.pull((0, -0.080, 0.075), (0.016, 0.010, 0.020), (0, 3.4, 1.2))
     field = field + c.pull((0, -0.050, 0.078), (0.018, 0.012, 0.022), (0, 2.2, 1.0))
     return 0.5 * field
 
 
-def _wide(c: Clay) -> FloatArray:
+def _wide(c: Strokes) -> FloatArray:
     return lid_turn(c.surface, 0.16, -0.05)
 
 
-def _dimple(c: Clay) -> FloatArray:
+def _dimple(c: Strokes) -> FloatArray:
     return c.pull(CORNER, (0.008, 0.009, 0.012), (2.2, 0.3, -4.0)) + c.swell(
         (0.032, -0.050, 0.062), 0.006, -1.2
     )
 
 
-def _neck_tense(c: Clay) -> FloatArray:
+def _neck_tense(c: Strokes) -> FloatArray:
     return c.swell((0.035, -0.135, 0.005), (0.012, 0.030, 0.030), 3.0) + c.pull(CORNER, 0.012, (1.5, -2.0, 0))
 
 
-def _jaw_forward(c: Clay) -> FloatArray:
+def _jaw_forward(c: Strokes) -> FloatArray:
     return 0.5 * jaw_weight(c.surface)[:, None] * np.array([0, -0.0006, 0.0050])
 
 
@@ -203,9 +203,9 @@ SEMANTIC_NAMES: tuple[str, ...] = (
 LIDS = ("blink_left", "blink_right")
 
 
-def semantic_shapes(surface: Surface) -> dict[str, FloatArray]:
+def semantic_shapes(surface: SculptedHead) -> dict[str, FloatArray]:
     """Displacements (V, 3), metres, at activation 1 of every shape in `SEMANTIC_NAMES`."""
-    clay = Clay(surface)
+    clay = Strokes(surface)
     shapes: dict[str, FloatArray] = {}
     for name, shape in {**PAIRED, **SIDEWAYS}.items():
         field = shape(clay)
@@ -312,7 +312,7 @@ def margin_angles(x: FloatArray) -> tuple[FloatArray, FloatArray]:
     return angles[0], angles[1]
 
 
-def lid_turn(surface: Surface, upper: FloatArray | float, lower: FloatArray | float) -> FloatArray:
+def lid_turn(surface: SculptedHead, upper: FloatArray | float, lower: FloatArray | float) -> FloatArray:
     """(V, 3) displacement that turns the margins of the left eye's lids.
 
     The margins, and the lids' inner sides, turn rigidly about the eyeball; the skin around follows by the
@@ -342,7 +342,7 @@ def lid_turn(surface: Surface, upper: FloatArray | float, lower: FloatArray | fl
     return keep_off_eyes(surface, harmonic(surface, turned, free))
 
 
-def harmonic(surface: Surface, field: FloatArray, free: NDArray[np.bool_]) -> FloatArray:
+def harmonic(surface: SculptedHead, field: FloatArray, free: NDArray[np.bool_]) -> FloatArray:
     """The field with its values at ``free`` vertices made the mean of their neighbours' (uniform weights)."""
     count = len(surface.vertices)
     edges = mesh_edges(surface.faces)
@@ -356,7 +356,7 @@ def harmonic(surface: Surface, field: FloatArray, free: NDArray[np.bool_]) -> Fl
     return filled
 
 
-def blink(surface: Surface) -> FloatArray:
+def blink(surface: SculptedHead) -> FloatArray:
     """(V, 3) displacement that closes the left eye."""
     x = surface.vertices[:, 0] - EYE_CENTER[0]
     top, bottom = margin_angles(x)
@@ -369,7 +369,7 @@ def blink(surface: Surface) -> FloatArray:
     return closed + relative / distance * np.minimum(0.09 * moved, 0.0006)
 
 
-def keep_off_eyes(surface: Surface, field: FloatArray, clearance: float = 0.0003) -> FloatArray:
+def keep_off_eyes(surface: SculptedHead, field: FloatArray, clearance: float = 0.0003) -> FloatArray:
     """The displacement, pushed out wherever skin would enter an eyeball at rest by it."""
     held = field.copy()
     for ball in (EYE_CENTER, EYE_CENTER * [-1, 1, 1]):
@@ -480,7 +480,7 @@ def trait_field(name: str, points: FloatArray) -> FloatArray:
     return field
 
 
-def identity_basis(surface: Surface, seed: int) -> FloatArray:
+def identity_basis(surface: SculptedHead, seed: int) -> FloatArray:
     """(V, 3, S) orthogonal directions; coefficients drawn from N(0, 1) make plausible people."""
     fields = {name: trait_field(name, surface.vertices) for name in TRAITS}
     return principal_basis(fields, np.ones(len(fields)), seed).directions

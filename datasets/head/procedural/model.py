@@ -19,10 +19,10 @@ from .expressions import (
 )
 from .surface import (
     PARENTS,
-    Surface,
+    SculptedHead,
     joint_regressor,
     landmarks,
-    load_surface,
+    load_sculpture,
     pose_basis,
     regions,
     skinning_weights,
@@ -46,7 +46,7 @@ def procedural_head(version: str = "2023") -> HeadArrays:
         For any other version.
     """
     name = full_version(version)
-    surface = load_surface()
+    surface = load_sculpture()
     shapes = version_shapes(surface, name)
     lids = None
     if name == "procedural2020":
@@ -76,7 +76,7 @@ def semantic_to_coefficients(version: str = "2023") -> tuple[FloatArray, FloatAr
     of the eyelid bases, or None where the version has none. Coefficients of combinations add up.
     """
     name = full_version(version)
-    shapes = version_shapes(load_surface(), name)
+    shapes = version_shapes(load_sculpture(), name)
     basis = _expression_basis(shapes, name)
     matrix = np.zeros((len(SEMANTIC_NAMES), basis.directions.shape[2]))
     matrix[[SEMANTIC_NAMES.index(shape) for shape in basis.names]] = basis.from_semantic
@@ -96,7 +96,7 @@ def full_version(version: str) -> str:
     return name
 
 
-def version_shapes(surface: Surface, version: str) -> dict[str, FloatArray]:
+def version_shapes(surface: SculptedHead, version: str) -> dict[str, FloatArray]:
     """The semantic shapes (V, 3) as a version has them, metres at activation 1."""
     shapes = semantic_shapes(surface)
     if version != "procedural2020":

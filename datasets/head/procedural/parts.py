@@ -25,7 +25,7 @@ TONGUE_SECTIONS, TONGUE_SECTORS = 18, 16
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class MouthMesh:
     """A mesh that moves with the head's joints and has no expression of its own.
 
     Attributes
@@ -44,7 +44,9 @@ class Part:
     material: str
 
 
-def render_parts(head: HeadAsset, shape: FloatArray | None = None, tongue_out: float = 0.0) -> list[Part]:
+def render_parts(
+    head: HeadAsset, shape: FloatArray | None = None, tongue_out: float = 0.0
+) -> list[MouthMesh]:
     """Teeth, gums and tongue in a subject's neutral shape.
 
     Parameters
@@ -75,7 +77,7 @@ def render_parts(head: HeadAsset, shape: FloatArray | None = None, tongue_out: f
             vertices = vertices + _follow(head, shape, vertices)
         weights = np.zeros((len(vertices), len(PARENTS)))
         weights[:, joint] = 1
-        parts.append(Part(name, vertices, faces, weights, material))
+        parts.append(MouthMesh(name, vertices, faces, weights, material))
     return parts
 
 

@@ -1,4 +1,4 @@
-"""Sculpt the default head anew: ``python -m headbench.datasets.head.procedural.sculpt --out FILE``."""
+"""Sculpt the default head again: ``python -m headbench.datasets.head.procedural.sculpt --out FILE``."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ LOW, HIGH = (0.0, FLOOR, -0.13), (0.115, 0.15, 0.11)
 
 
 @dataclass(frozen=True)
-class Settings:
+class SculptSettings:
     """How finely to sculpt.
 
     Attributes
@@ -151,7 +151,7 @@ def _spaced(vertices: FloatArray, candidates: IntArray, spacing: FloatArray) -> 
     return np.array(taken)
 
 
-def main(settings: Settings) -> None:
+def main(settings: SculptSettings) -> None:
     """Sculpt and write the head."""
     vertices, faces, mirror = sculpt(settings.step, settings.detail)
     with atomic_path(settings.out) as temporary, temporary.open("wb") as stream:
@@ -165,7 +165,7 @@ def main(settings: Settings) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Settings))
+    main(tyro.cli(SculptSettings))
 
 
 BLOCK = 8  # voxels along the side of a block of the narrow band

@@ -199,7 +199,7 @@ def head_mass(points: FloatArray) -> FloatArray:
     return union(head, neck_mass(points), 0.022)
 
 
-# Clay strokes on the left half: height (metres, positive adds), centre, deviations, turn in degrees.
+# Strokes strokes on the left half: height (metres, positive adds), centre, deviations, turn in degrees.
 PLANES: tuple[tuple[float, tuple[float, ...], tuple[float, ...], tuple[float, ...] | None], ...] = (
     (0.0010, (0.000, 0.042, 0.077), (0.012, 0.009, 0.020), None),  # glabella
     (0.0022, (0.024, 0.039, 0.070), (0.013, 0.0060, 0.020), (0, 0, 6)),  # brow ridge

@@ -36,7 +36,7 @@ EYE_RINGS, EYE_SECTORS = 16, 24
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
+class SculptedHead:
     """Skin, left eyeball, right eyeball, in this order.
 
     Attributes
@@ -98,7 +98,7 @@ class Surface:
         return field[self.mirror] * MIRROR if field.ndim == 2 else field[self.mirror]
 
     def nearest(self, point: FloatArray, among: IntArray | None = None) -> int:
-        """Vertex nearest to a point, of those outside unless told otherwise."""
+        """Vertex nearest to a point, among those outside by default."""
         candidates = np.flatnonzero(self.outside) if among is None else among
         return int(candidates[np.argmin(np.linalg.norm(self.vertices[candidates] - point, axis=1))])
 
@@ -124,13 +124,13 @@ def eyeball(rings: int = EYE_RINGS, sectors: int = EYE_SECTORS) -> tuple[FloatAr
     return vertices, np.concatenate(triangles)
 
 
-def assemble(skin: FloatArray, faces: IntArray, mirror: IntArray) -> Surface:
+def assemble(skin: FloatArray, faces: IntArray, mirror: IntArray) -> SculptedHead:
     """Add the eyeballs to the skin."""
     ball, triangles = eyeball()
     left = EYE_CENTER + EYE_RADIUS * ball
     right = left * MIRROR
     start, size = len(skin), len(ball)
-    return Surface(
+    return SculptedHead(
         vertices=np.concatenate([skin, left, right]),
         faces=np.concatenate([faces, start + triangles, start + size + triangles[:, ::-1]]).astype(np.int64),
         mirror=np.concatenate([mirror, start + size + np.arange(size), start + np.arange(size)]),
@@ -138,7 +138,7 @@ def assemble(skin: FloatArray, faces: IntArray, mirror: IntArray) -> Surface:
     )
 
 
-def load_surface(path: Path = PACKAGED) -> Surface:
+def load_sculpture(path: Path = PACKAGED) -> SculptedHead:
     """The surface that `sculpt` wrote: the packaged one, or the one at ``path``.
 
     Raises
@@ -163,7 +163,7 @@ JOINTS = np.array(
 )
 
 
-def jaw_weight(surface: Surface) -> FloatArray:
+def jaw_weight(surface: SculptedHead) -> FloatArray:
     """(V,) share of the jaw: the lower lip and chin wholly, fading over cheek, throat and mouth."""
     x, y, z = surface.vertices.T
     u = np.abs(x) / MOUTH_HALF_WIDTH
@@ -181,7 +181,7 @@ def jaw_weight(surface: Surface) -> FloatArray:
     return weight * surface.skin * (1 - surface.in_socket)
 
 
-def skinning_weights(surface: Surface) -> FloatArray:
+def skinning_weights(surface: SculptedHead) -> FloatArray:
     """(V, 5) weights; rows sum to 1."""
     weights = np.zeros((len(surface.vertices), len(PARENTS)))
     head = smoothstep(surface.vertices[:, 1], FLOOR + 0.012, -0.070)
@@ -195,7 +195,7 @@ def skinning_weights(surface: Surface) -> FloatArray:
     return weights
 
 
-def joint_regressor(surface: Surface) -> FloatArray:
+def joint_regressor(surface: SculptedHead) -> FloatArray:
     """(5, V) rows of sum 1 that give `JOINTS` at rest.
 
     Each row is the evenest weighting of some vertices around its joint that reproduces it exactly; an eye's
@@ -221,7 +221,7 @@ def joint_regressor(surface: Surface) -> FloatArray:
     return regressor
 
 
-def pose_basis(surface: Surface) -> FloatArray:
+def pose_basis(surface: SculptedHead) -> FloatArray:
     """(V, 3, 36) correctives: as the jaw opens the cheeks hollow and the corners of the mouth draw in.
 
     They follow the sine of the opening angle, from the entries (2, 1) and (1, 2) of the jaw's R - I.
@@ -276,7 +276,7 @@ _CONTOUR = (
 )
 
 
-def regions(surface: Surface) -> dict[str, IntArray]:
+def regions(surface: SculptedHead) -> dict[str, IntArray]:
     """Vertex indices by region, sorted except for the rings, which run from the right corner to the left."""
     x, y, z = surface.vertices.T
     around = np.arctan2(np.abs(x), z + 0.020)  # 0 in front, pi behind
@@ -324,7 +324,7 @@ def regions(surface: Surface) -> dict[str, IntArray]:
     return named
 
 
-def lip_rings(surface: Surface) -> tuple[IntArray, IntArray]:
+def lip_rings(surface: SculptedHead) -> tuple[IntArray, IntArray]:
     """Upper and lower ring, `RING_LENGTH` vertices each from the right corner of the mouth to the left."""
     across = MOUTH_HALF_WIDTH * np.linspace(-LIP_RING_REACH, LIP_RING_REACH, RING_LENGTH)
     depth = lip_arc(across) + 0.004
@@ -336,7 +336,7 @@ def lip_rings(surface: Surface) -> tuple[IntArray, IntArray]:
     return rings[0], rings[1]
 
 
-def landmarks(surface: Surface) -> dict[str, int]:
+def landmarks(surface: SculptedHead) -> dict[str, int]:
     """Vertex by name; the lips' outer contour also by iBUG's numbers, ``ibug_48`` to ``ibug_59``."""
     vertices = surface.vertices
     facing = np.flatnonzero(surface.outside & (surface.normals[:, 2] > 0.1) & (vertices[:, 2] > 0.02))

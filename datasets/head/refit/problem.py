@@ -38,7 +38,7 @@ _PARENTS = (-1, ROOT, NECK, NECK, NECK)
 _MILLIMETRES = 1e3
 
 
-class Frame(NamedTuple):
+class FrameTerms(NamedTuple):
     """What a timestep contributes: products of its target with the bases, and the neck's rotation."""
 
     products: FloatArray  # (1 + 9 M, N), mm^2
@@ -126,7 +126,7 @@ class FitProblem:
         self._twice = np.where(self._lower[0] == self._lower[1], 1.0, 2.0)
         self._terms = self._gram_terms()
 
-    def frames(self, targets: FloatArray, necks: FloatArray) -> list[Frame]:
+    def frames(self, targets: FloatArray, necks: FloatArray) -> list[FrameTerms]:
         """Reduce the targets of T timesteps.
 
         Parameters
@@ -144,9 +144,9 @@ class FitProblem:
             products.append(block.reshape(count, 9, size))
         stacked = np.concatenate(products, axis=1)
         squares = np.einsum("tni,tni->t", weighted, wanted)
-        return [Frame(*parts) for parts in zip(stacked, squares.tolist(), necks, strict=True)]
+        return [FrameTerms(*parts) for parts in zip(stacked, squares.tolist(), necks, strict=True)]
 
-    def evaluate(self, frame: Frame, angles: FloatArray) -> Evaluation:
+    def evaluate(self, frame: FrameTerms, angles: FloatArray) -> Evaluation:
         """Find the best coefficients for ``angles``, (9,) of the joints `SEARCHED`, and the value there."""
         rotations, derivatives = matrices_and_derivatives(angles.reshape(-1, 3))
         bends, turns = rotations - np.eye(3), {ROOT: frame.neck.T - np.eye(3)}
@@ -187,12 +187,12 @@ class FitProblem:
         gradient = np.einsum("jrc,jrck->jk", stacked, derivatives).ravel()
         return Evaluation(float(value), gradient * self.searched, free)
 
-    def fitted(self, frame: Frame, angles: FloatArray, coefficients: FloatArray) -> FloatArray:
+    def fitted(self, frame: FrameTerms, angles: FloatArray, coefficients: FloatArray) -> FloatArray:
         """(n, 3) vertices in the frame of the head, metres, for angles (9,) and coefficients (E + L,)."""
         bends = matrices_and_derivatives(angles.reshape(-1, 3))[0] - np.eye(3)
         return self._skinned(frame, bends, np.concatenate([coefficients, self._fixed(frame, bends)]))
 
-    def directions(self, frame: Frame, angles: FloatArray) -> FloatArray:
+    def directions(self, frame: FrameTerms, angles: FloatArray) -> FloatArray:
         """(n, 3, E + L) how the fitted vertices move with the coefficients at angles (9,), metres.
 
         The dense matrix that `evaluate` never makes; for checks and for solvers that need it.
@@ -201,7 +201,7 @@ class FitProblem:
         size = self._plain.shape[2]
         return self._skinned(frame, bends, np.eye(size)[:, : self._free_size])
 
-    def _skinned(self, frame: Frame, bends: FloatArray, whole: FloatArray) -> FloatArray:
+    def _skinned(self, frame: FrameTerms, bends: FloatArray, whole: FloatArray) -> FloatArray:
         """Vertices of values of z, (N,) or (N, m), metres."""
         turns = {ROOT: frame.neck.T - np.eye(3)} | dict(zip(SEARCHED, bends))
         result = self._plain @ whole
@@ -239,7 +239,7 @@ class FitProblem:
                 arms[SEARCHED.index(joint)] = max(arm, 1e-6)
         return np.repeat(1 / arms, 3)
 
-    def _fixed(self, frame: Frame, bends: FloatArray) -> FloatArray:
+    def _fixed(self, frame: FrameTerms, bends: FloatArray) -> FloatArray:
         """(N - E - L,) the part of z that the angles give: correctives' entries of R - I, and 1."""
         by_joint = {NECK: frame.neck - np.eye(3)} | dict(zip(SEARCHED, bends))
         return np.array([*(by_joint[joint].flat[entry] for joint, entry in self._correctives), 1.0])
@@ -363,7 +363,7 @@ def angle_bounds(settings: RefitSettings) -> FloatArray:
 
 
 def solve_frame(
-    problem: FitProblem, frame: Frame, start: FloatArray, fixed: FloatArray, settings: RefitSettings
+    problem: FitProblem, frame: FrameTerms, start: FloatArray, fixed: FloatArray, settings: RefitSettings
 ) -> Solution:
     """Fit one timestep.
 

@@ -43,7 +43,7 @@ def refit_clip(
     folder: Path | None = None,
     progress: Progress = no_progress,
 ) -> CaptureClip:
-    """Carry a clip's tracking over to the head model ``target``; a recorded step. See `refit`."""
+    """Refit a clip's tracking to the head model ``target``; a recorded step. See `refit`."""
     return refit(clip, target, settings, folder=folder, progress=progress).clip
 
 
@@ -62,7 +62,7 @@ def refit(
 
     "3D Gaussian Head Avatars with Expressive Dynamic Appearances by Compact Tensorial Representations" (CVPR 2025,
     arXiv 2504.14967), supplement, on comparing with monocular methods: vertex distance over the facial region
-    only, identity from the neutral head. The rigid motion of the head is carried over exactly.
+    only, identity from the neutral head. The rigid motion of the head is kept exactly.
 
     Parameters
     ----------

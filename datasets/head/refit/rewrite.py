@@ -121,7 +121,7 @@ def _is_png(path: Path | None) -> TypeGuard[Path]:
 
 
 def _check_excluded(clip: CaptureClip, where: str) -> None:
-    """The layout excludes timesteps, each for one reason: whatever else would exclude frames anew, or lose a
+    """The layout excludes timesteps, each for one reason: anything else would exclude further frames, or lose a
     reason."""
     of_timestep: dict[int, FrameKey] = {}
     for key in sorted(clip.files):
@@ -129,8 +129,8 @@ def _check_excluded(clip: CaptureClip, where: str) -> None:
         found, other = clip.excluded.get(key), clip.excluded.get(first)
         if found != other:
             expected = f"timestep {key.timestep} excluded with all its cameras for one reason, or not at all"
-            told = " and ".join(
+            described = " and ".join(
                 f"{one} {f'excluded: {why}' if why is not None else 'kept'}"
                 for one, why in ((first, other), (key, found))
             )
-            raise InputError(where, "excluded", expected, told)
+            raise InputError(where, "excluded", expected, described)

@@ -121,14 +121,6 @@ def test_teeth_face_outwards(reverse):
         assert (sign * strip[:, axis] > 0).all()
 
 
-def test_diagonals_mirror_at_the_middle():
-    columns = 13
-    new = with_teeth(ringed(columns)).faces[len(HEAD.faces) :] - len(HEAD.template)
-    front = {frozenset((int(v) // columns, int(v) % columns) for v in triangle) for triangle in new[:24]}
-    mirrored = {frozenset((block, columns - 1 - column) for block, column in triangle) for triangle in front}
-    assert front == mirrored
-
-
 def test_teeth_move_with_the_jaw_and_the_identity_alone():
     columns = 13
     head = with_teeth(ringed(columns))
@@ -200,7 +192,7 @@ def test_all_of_a_short_rim_is_taken():
     np.testing.assert_array_equal(lower, HEAD.regions["lip_outside_ring_lower"][::-1])
 
 
-def test_says_what_rings_need():
+def test_missing_rings_are_explained():
     head = without_rings()
     for name in ("lips", "face"):
         rest = {key: members for key, members in head.regions.items() if key != name}

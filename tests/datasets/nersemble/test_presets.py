@@ -5,7 +5,7 @@ import pytest
 from headbench.bench.errors import InputError
 from headbench.datasets.nersemble import names as presets
 from headbench.datasets.nersemble.names import SEQUENCES
-from headbench.datasets.synthetic.take import SERIALS
+from headbench.datasets.synthetic.plan import SERIALS
 
 # Held-out sequences that VHAP's rule gives, computed apart from this code.
 HELD_OUT = {

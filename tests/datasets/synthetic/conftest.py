@@ -1,13 +1,13 @@
-"""One small take, planned once: tests render only what they look at."""
+"""One small plan, planned once: tests render only what they look at."""
 
 from pathlib import Path
 
 import pytest
 
-from headbench.datasets.synthetic.likeness import Likeness
 from headbench.datasets.synthetic.performance import CONTROLS
-from headbench.datasets.synthetic.studio import default_samples
-from headbench.datasets.synthetic.take import Settings, load_geometry, plan_take
+from headbench.datasets.synthetic.plan import SynthSettings, load_geometry, plan_subject
+from headbench.datasets.synthetic.renderer import default_samples
+from headbench.datasets.synthetic.subject import RenderedSubject
 
 
 @pytest.fixture(scope="session")
@@ -16,14 +16,14 @@ def geometry():
 
 
 @pytest.fixture(scope="session")
-def take(geometry, tmp_path_factory):
-    settings = Settings(1, 3, 8, (48, 70), "procedural", 0, 0.0, default_samples(48, 70))
-    return plan_take(Path(tmp_path_factory.mktemp("take")), 0, geometry, settings)
+def plan(geometry, tmp_path_factory):
+    settings = SynthSettings(1, 3, 8, (48, 70), "procedural", 0, 0.0, default_samples(48, 70))
+    return plan_subject(Path(tmp_path_factory.mktemp("plan")), 0, geometry, settings)
 
 
 @pytest.fixture(scope="session")
-def likeness(take):
-    return Likeness(take.person, take.geometry, take.shape)
+def subject(plan):
+    return RenderedSubject(plan.person, plan.geometry, plan.shape)
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import pytest
 from headbench.bench.errors import InputError
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.synthetic.capture import synthesize
-from headbench.datasets.synthetic.take import FRONTAL
+from headbench.datasets.synthetic.plan import FRONTAL
 
 SMALL = {"cameras": 2, "timesteps": 8, "size": (32, 46), "samples_per_pixel": 9, "workers": 1}
 
@@ -65,7 +65,7 @@ def test_other_settings_are_refused(capture):
         synthesize(capture[0], **SMALL, performance="still")
 
 
-def test_a_folder_of_part_of_the_performance_is_not_continued_with_all_of_it(capture, tmp_path):
+def test_a_folder_of_another_performance_is_refused(capture, tmp_path):
     settings = json.loads((capture[0] / "synthesis.json").read_text())
     assert "performance" not in settings  # as captures were recorded before there was a choice
     (tmp_path / "synthesis.json").write_text(json.dumps({**settings, "performance": "still"}))
@@ -84,7 +84,7 @@ def test_a_start_killed_before_the_first_image_is_resumed(capture, tmp_path, mon
     for name in left:
         there = capture[0] / name
         (tmp_path / name).write_bytes(there.read_bytes() if there.exists() else b"")
-    monkeypatch.setattr("headbench.datasets.synthetic.capture.plan_take", plan)
+    monkeypatch.setattr("headbench.datasets.synthetic.capture.plan_subject", plan)
     with pytest.raises(Planned):
         synthesize(tmp_path, **SMALL)
     for name in ("README.txt", "synthesis.json"):
@@ -124,7 +124,7 @@ def test_unknown_head_is_refused(tmp_path):
         synthesize(tmp_path / "capture", **SMALL, head="no-such-file.npz")
 
 
-def test_capture_says_that_it_is_synthetic(capture):
+def test_the_capture_is_marked_as_synthetic(capture):
     out, union, _ = capture
     assert "synthetic" in (out / "README.txt").read_text()
     assert json.loads((union / "headbench.json").read_text())["synthetic"]["seed"] == 0
@@ -158,17 +158,17 @@ import sys
 from headbench.datasets.synthetic import capture
 
 class Blank:  # writes all but the pictures of a capture
-    def __init__(self, take):
-        self.take = take
-    def shoot(self, sequence, timestep, cameras):
+    def __init__(self, plan):
+        self.plan = plan
+    def render_frames(self, sequence, timestep, cameras):
         import numpy as np
-        width, height = self.take.settings.size
+        width, height = self.plan.settings.size
         for camera in cameras:
-            self.take.writer.write_frame(sequence, timestep, camera, np.zeros((height, width, 3), np.uint8))
+            self.plan.writer.write_frame(sequence, timestep, camera, np.zeros((height, width, 3), np.uint8))
 
 if sys.argv[2] == "blank":
-    capture.Photographer = Blank
-    capture._missing = lambda take, sequence, timestep: tuple(take.cameras)
+    capture.CaptureRenderer = Blank
+    capture._missing = lambda plan, sequence, timestep: tuple(plan.cameras)
 capture.synthesize(sys.argv[1], cameras=2, timesteps=8, size=(32, 46), samples_per_pixel=9,
                    tracking_noise=0.1, workers=1)
 """

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from headbench.datasets.head.procedural.model import procedural_head
-from headbench.datasets.head.procedural.surface import load_surface
+from headbench.datasets.head.procedural.surface import load_sculpture
 
 
 @pytest.fixture(scope="session")
@@ -22,7 +22,7 @@ def head(heads):
 
 @pytest.fixture(scope="session")
 def surface():
-    return load_surface()
+    return load_sculpture()
 
 
 @pytest.fixture(scope="session")

@@ -11,14 +11,14 @@ from hypothesis import strategies as st
 import headbench.datasets.head.procedural.sculpture as fields
 from headbench.datasets.head.geometry import border_edges
 from headbench.datasets.head.procedural.sculpt import (
-    Settings,
+    SculptSettings,
     coarsen,
     main,
     mirrored,
     polygonise,
     vertex_areas,
 )
-from headbench.datasets.head.procedural.surface import load_surface
+from headbench.datasets.head.procedural.surface import load_sculpture
 
 unit = st.floats(-1, 1, allow_nan=False)
 
@@ -38,7 +38,7 @@ def test_round_ellipsoid_and_short_capsule_are_spheres(place):
 
 
 @given(unit, unit, st.floats(0.01, 0.5))
-def test_smooth_union_keeps_below_both_and_is_exact_far_from_the_seam(a, b, blend):
+def test_smooth_union_is_below_both_and_exact_far_away(a, b, blend):
     joined = fields.union(np.array([a]), np.array([b]), blend)[0]
     assert min(a, b) - blend / 4 - 1e-12 <= joined <= min(a, b) + 1e-12
     if abs(a - b) > blend:
@@ -51,7 +51,7 @@ def test_rotation_is_a_rotation():
     np.testing.assert_allclose(fields.rotation_xyz((0, 0, 90)) @ [1, 0, 0], [0, 1, 0], atol=1e-12)
 
 
-def test_marching_cubes_in_the_narrow_band_finds_the_whole_sphere():
+def test_narrow_band_marching_cubes_finds_the_whole_sphere():
     low, high = np.full(3, -0.0701), np.full(3, 0.07)
     vertices, faces = polygonise(sphere, low, high, 0.002)
     np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 0.05, atol=1e-4)
@@ -63,7 +63,7 @@ def test_marching_cubes_in_the_narrow_band_finds_the_whole_sphere():
     )
 
 
-def test_coarse_half_sphere_keeps_its_border_its_fixed_points_and_its_size():
+def test_coarsening_keeps_border_fixed_points_and_edge_length():
     vertices, faces = polygonise(sphere, np.array([0.0, -0.0701, -0.0701]), np.full(3, 0.07), 0.002)
     border = (np.abs(vertices[:, 0]) < 1e-9).astype(int)
     fixed = np.array([np.argmax(vertices[:, 0]), np.argmax(np.where(border, vertices[:, 1], -1))])
@@ -85,8 +85,8 @@ def test_coarse_half_sphere_keeps_its_border_its_fixed_points_and_its_size():
 
 @pytest.mark.slow
 def test_sculpting_again_gives_the_stored_head(tmp_path):
-    main(Settings(out=tmp_path / "again.npz"))
-    again, stored = load_surface(tmp_path / "again.npz"), load_surface()
+    main(SculptSettings(out=tmp_path / "again.npz"))
+    again, stored = load_sculpture(tmp_path / "again.npz"), load_sculpture()
     assert len(again.faces) == pytest.approx(len(stored.faces), rel=0.02)
     meshes = pymeshlab.MeshSet()
     for surface in (again, stored):

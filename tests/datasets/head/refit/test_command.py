@@ -34,7 +34,7 @@ def finished(tmp_path_factory):
     return root, settings, refit_capture(settings)
 
 
-def test_the_new_capture_holds_the_same_frames_with_other_tracking(finished):
+def test_the_new_capture_has_the_same_frames(finished):
     _, settings, findings = finished
     old, new = read_capture(settings.capture), read_capture(findings.data["capture"])
     assert new.head.version == "other"
@@ -67,7 +67,7 @@ def test_report_and_picture(finished):
     assert coloured.mean() > 0.05  # the face; the rest of the head is grey
 
 
-def test_started_again_it_fits_nothing_anew(finished, monkeypatch):
+def test_started_again_it_fits_nothing_again(finished, monkeypatch):
     _, settings, findings = finished
     monkeypatch.setattr(block, "solve_frame", lambda *_: pytest.fail("fitted again"))
     assert refit_capture(settings).data == findings.data

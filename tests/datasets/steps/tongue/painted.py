@@ -10,7 +10,7 @@ from headbench.bench.contracts import FrameKey
 from headbench.datasets.mesh_pictures import draw_mesh, portrait_camera
 from headbench.datasets.steps.tongue.mouth import posed_meshes
 from headbench.datasets.synthetic.performance import CONTROLS
-from headbench.datasets.synthetic.take import load_geometry
+from headbench.datasets.synthetic.plan import load_geometry
 
 SKIN = np.array([0.62, 0.36, 0.22])  # linear reflectance
 LIPS = SKIN * [0.86, 0.5, 0.5]

@@ -1,4 +1,6 @@
-"""The label's threshold against another rasteriser."""
+"""The separate tongue of heads that bring none: it comes out of the mouth, not through the lip."""
+
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -7,9 +9,33 @@ import torch
 from headbench.bench.contracts import Camera
 from headbench.datasets.head.model import HeadModel
 from headbench.datasets.mesh_pictures import rasterize_mesh
-from headbench.datasets.synthetic.anatomy import measure, person
+from headbench.datasets.synthetic.anatomy import front_depth, measure, person
 from headbench.datasets.synthetic.parts import HIDES, share_that_shows
-from headbench.datasets.synthetic.take import load_geometry
+from headbench.datasets.synthetic.plan import load_geometry
+
+ICT = Path(__file__).parents[3].parent / "shared/data/ict_facekit/ict_facekit_f16.npz"
+
+
+@pytest.mark.parametrize("share", [0.5, 0.75, 1.0])
+def test_tongue_slides_over_the_lower_lip(share):
+    if not ICT.exists():
+        pytest.skip("no ICT-FaceKit file beside the repository")
+    geometry = load_geometry(str(ICT))
+    head = geometry.head
+    shape = np.zeros(head.shape_basis.shape[2])
+    neutral = HeadModel(head, dtype=torch.float64).canonical(torch.from_numpy(shape))[0].numpy()
+    anatomy = measure(head, neutral)
+    (tongue,) = geometry.mouth(person("900", 0, 1), anatomy, shape)
+    step, size = 0.0005, np.array([80, 90])
+    low = anatomy["mouth"][:2] - [0.020, 0.040]
+    skin = front_depth(neutral, anatomy.skin_faces, low, step, size)
+    hidden = front_depth(tongue.at(share), tongue.faces, low, step, size) > skin
+    rim = 80  # row at the height where the lips meet
+    middle = hidden[:rim, 40]
+    assert middle.any()
+    lowest = int(np.flatnonzero(middle)[0])
+    assert middle[lowest : rim - 4].all(), "skin shows between the mouth's opening and the tongue's tip"
+
 
 FAR = 50.0
 
@@ -39,7 +65,7 @@ def hidden_area(parts, anatomy, neutral, share):
     return float((np.isfinite(skin) & (front < skin))[size // 2 :].sum()) * step**2
 
 
-def test_threshold_is_where_another_rasteriser_sees_the_area_hidden(subject):
+def test_tongue_threshold_agrees_with_another_rasterizer(subject):
     share = share_that_shows(*subject)
     assert 0.2 < share < 0.85  # a phrase puts the tongue out by 0.85 at least
     assert hidden_area(*subject, share - 0.03) < HIDES < hidden_area(*subject, share + 0.03)

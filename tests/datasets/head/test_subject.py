@@ -35,7 +35,7 @@ def make_poses(head, count, seed=0, version="toy"):
     ]
 
 
-def test_motions_carry_rigid_vertices_from_the_head_frame_to_the_world(head):
+def test_motions_take_rigid_vertices_to_world_space(head):
     """By the whole model, for more poses than one batch holds; the neck's correctives are left out of it."""
     rng = np.random.default_rng(1)
     shape, offset = rng.normal(size=6), 0.002 * rng.normal(size=head.template.shape)

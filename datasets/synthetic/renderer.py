@@ -1,4 +1,4 @@
-"""The photograph: meshes, lights and a camera handed to Mitsuba 3, an image and a matte taken back.
+"""Rendering with Mitsuba 3: meshes, lights and a camera to an image and a foreground mask.
 
 Mitsuba's own kernel (Embree rays, direct illumination) has nothing in common with the splat renderer, so an
 error of projection or blending in one cannot hide in the other.
@@ -20,9 +20,9 @@ import numpy as np
 
 from ...bench.contracts import ByteArray, Camera, FloatArray, HeadPose, IntArray
 from ...bench.errors import InputError
-from .likeness import Likeness
 from .performance import CONTROLS, Activations
-from .take import Light, Take, lights
+from .plan import Light, SubjectPlan, lights
+from .subject import RenderedSubject
 
 SAMPLE_COUNTS = (9, 25, 49, 121, 169, 289)
 """Squares of primes: what the orthogonal-array sampler takes. 25 divides evenly among five lights."""
@@ -34,7 +34,7 @@ _FILTER_REACH = 3  # pixels beyond which it gives nothing
 
 @dataclass(frozen=True)
 class Material:
-    """Surface of a mesh; its colour comes with the vertices. ``two_sided`` for strips and sheets."""
+    """PosedMesh of a mesh; its colour comes with the vertices. ``two_sided`` for strips and sheets."""
 
     roughness: float
     specular: float
@@ -71,7 +71,7 @@ def default_samples(width: int, height: int) -> int:
     return 25 if width * height >= 20_000 else 49
 
 
-class Studio:
+class PathTracer:
     """A lit scene whose meshes keep their triangles and colours may move from frame to frame.
 
     Not thread-safe; one per process. ``threads`` bounds Mitsuba's own pool.
@@ -128,7 +128,7 @@ class Studio:
 
     def _traverse(self) -> Any:
         if self._scene is None:
-            # The lamps are points of the sky: rays sampled from surfaces would never meet one.
+            # The lamps are points of the sky: rays sampled from posed_meshes would never meet one.
             sampling = {"emitter_samples": 1, "bsdf_samples": 0}
             content: dict[str, Any] = {
                 "type": "scene",
@@ -193,7 +193,7 @@ def window(camera: Camera, points: FloatArray) -> tuple[slice, slice]:
 
 
 def develop(rgb: FloatArray, alpha: FloatArray, background: FloatArray) -> tuple[ByteArray, ByteArray]:
-    """Turn linear straight colour into an 8-bit sRGB picture on ``background`` and an 8-bit matte.
+    """Turn linear straight colour into an 8-bit sRGB picture on ``background`` and an 8-bit mask.
 
     Highlights above ``knee`` roll off towards 1 instead of clipping; below it the tone is untouched.
     """
@@ -219,37 +219,32 @@ def _flat(values: FloatArray) -> Any:
     return np.ascontiguousarray(values, np.float32).ravel()
 
 
-class Photographer:
-    """One process's studio for one take. Rendering takes one thread: processes share the work better."""
+class CaptureRenderer:
+    """Renders the frames of one subject, on one thread: processes share the work better."""
 
-    def __init__(self, take: Take):
-        self._take = take
-        self._likeness = Likeness(take.person, take.geometry, take.shape)
-        self._studio = Studio(lights(), take.settings.samples_per_pixel, threads=1)
+    def __init__(self, plan: SubjectPlan):
+        self._plan = plan
+        self._subject = RenderedSubject(plan.person, plan.geometry, plan.shape)
+        self._tracer = PathTracer(lights(), plan.settings.samples_per_pixel, threads=1)
         rest = dict.fromkeys(CONTROLS, 0.0)
-        pose = take.geometry.translation.pose(rest, take.person.name, None)
-        surfaces = self._likeness.surfaces(pose, rest)
-        for name, fixture in self._likeness.fixtures().items():
-            self._studio.add(name, surfaces[name].vertices, fixture.faces, fixture.albedo, fixture.material)
+        posed = self._subject.posed_meshes(plan.geometry.translation.pose(rest, plan.person.name, None), rest)
+        for name, mesh in self._subject.rest_meshes().items():
+            self._tracer.add(name, posed[name].vertices, mesh.faces, mesh.albedo, mesh.material)
 
-    def shoot(self, sequence: str, timestep: int, cameras: Sequence[str]) -> None:
-        """Render and store one moment as the named cameras see it."""
-        self.pose(sequence, timestep)
+    def render_frames(self, sequence: str, timestep: int, cameras: Sequence[str]) -> None:
+        """Render and store one timestep as the named cameras see it."""
+        plan = self._plan
+        self.set_pose(plan.poses[sequence][timestep], plan.performed[sequence].activations[timestep])
         for camera in cameras:
-            image, matte = self.picture(camera, self._take.render_seed(sequence, timestep, camera))
-            self._take.writer.write_frame(sequence, timestep, camera, image, matte)
+            image, mask = self.render(camera, plan.render_seed(sequence, timestep, camera))
+            plan.writer.write_frame(sequence, timestep, camera, image, mask)
 
-    def pose(self, sequence: str, timestep: int) -> None:
-        """Bring the subject into a moment of its performance."""
-        take = self._take
-        self.show(take.poses[sequence][timestep], take.performed[sequence].activations[timestep])
+    def set_pose(self, pose: HeadPose, activations: Activations) -> None:
+        """Move all meshes to a pose; skin follows the ``activations``."""
+        for name, mesh in self._subject.posed_meshes(pose, activations).items():
+            self._tracer.move(name, mesh.vertices, mesh.albedo)
 
-    def show(self, pose: HeadPose, activations: Activations) -> None:
-        """Bring the subject into any pose."""
-        for name, surface in self._likeness.surfaces(pose, activations).items():
-            self._studio.move(name, surface.vertices, surface.albedo)
-
-    def picture(self, camera: str, seed: int) -> tuple[ByteArray, ByteArray]:
-        """(H, W, 3) 8-bit picture on the capture's background and (H, W) matte."""
-        rgb, alpha = self._studio.image(self._take.cameras[camera], seed)
-        return develop(rgb, alpha, np.asarray(self._take.writer.plan.background))
+    def render(self, camera: str, seed: int) -> tuple[ByteArray, ByteArray]:
+        """(H, W, 3) 8-bit image on the capture's background and (H, W) foreground mask."""
+        rgb, alpha = self._tracer.image(self._plan.cameras[camera], seed)
+        return develop(rgb, alpha, np.asarray(self._plan.writer.plan.background))

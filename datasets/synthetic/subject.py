@@ -1,4 +1,4 @@
-"""One subject, dressed: from a head pose and activations to the meshes a camera sees."""
+"""One subject with skin, hair, eyes and mouth: from a head pose and activations to the meshes to render."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from .anatomy import SIDES, Anatomy, Person, measure
 from .hair import ear_share, make_brows_and_lashes, make_hair
 from .parts import eye_mesh, tracked_parts
 from .performance import Activations
+from .plan import Geometry
 from .skin import make_folds, paint_skin
-from .take import Geometry
 
 HEAD_JOINT, EYE_JOINTS = 1, (3, 4)
 
@@ -26,15 +26,15 @@ _DETAIL = ((0.085, 0.0018), (0.13, 0.0035), (np.inf, 0.007))
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
-    """A mesh as the studio takes it: ``vertices`` (n, 3) and ``albedo`` (n, 3) of one moment."""
+class PosedMesh:
+    """A mesh to render: ``vertices`` (n, 3) and ``albedo`` (n, 3) of one moment."""
 
     vertices: FloatArray
     albedo: FloatArray | None
 
 
 @dataclass(frozen=True, eq=False)
-class Fixture:
+class RestMesh:
     """What of a mesh does not change: triangles, colours at rest, material."""
 
     faces: IntArray
@@ -42,7 +42,7 @@ class Fixture:
     material: str
 
 
-class Likeness:
+class RenderedSubject:
     """A subject's visible body over a head model; ``shape`` (S,) are the subject's identity coefficients."""
 
     def __init__(self, person: Person, geometry: Geometry, shape: FloatArray) -> None:
@@ -69,16 +69,16 @@ class Likeness:
         self._tracked_parts = tracked_parts(head)
         self._frames = self._fine.frames(self.neutral, self._rooted.root)
 
-    def fixtures(self) -> dict[str, Fixture]:
+    def rest_meshes(self) -> dict[str, RestMesh]:
         """Meshes by name."""
         fixed = {
-            "skin": Fixture(self._fine.faces, self._skin_albedo, "skin"),
-            "hair": Fixture(self._hair.faces, self._hair.albedo, "hair"),
-            "brows": Fixture(self._rooted.strands.faces, self._rooted.strands.albedo, "lash"),
+            "skin": RestMesh(self._fine.faces, self._skin_albedo, "skin"),
+            "hair": RestMesh(self._hair.faces, self._hair.albedo, "hair"),
+            "brows": RestMesh(self._rooted.strands.faces, self._rooted.strands.albedo, "lash"),
         }
-        fixed |= {f"eye_{side}": Fixture(e.faces, e.albedo, "eye") for side, e in self._eyes.items()}
-        fixed |= {p.name: Fixture(p.faces, p.albedo, p.material) for p in self._mouth}
-        return fixed | {p.name: Fixture(p.faces, p.albedo, p.material) for p in self._tracked_parts}
+        fixed |= {f"eye_{side}": RestMesh(e.faces, e.albedo, "eye") for side, e in self._eyes.items()}
+        fixed |= {p.name: RestMesh(p.faces, p.albedo, p.material) for p in self._mouth}
+        return fixed | {p.name: RestMesh(p.faces, p.albedo, p.material) for p in self._tracked_parts}
 
     def tracked(self, pose: HeadPose) -> FloatArray:
         """(V, 3) vertices of the head model in a pose: the mesh that a tracker would report."""
@@ -86,7 +86,7 @@ class Likeness:
         with torch.no_grad():
             return self._model(shape=torch.from_numpy(self.shape), **arguments)[0].numpy()
 
-    def surfaces(self, pose: HeadPose, activations: Activations) -> dict[str, Surface]:
+    def posed_meshes(self, pose: HeadPose, activations: Activations) -> dict[str, PosedMesh]:
         """All meshes in a pose; wrinkles and colour follow ``activations``."""
         tracked = self.tracked(pose)
         joints = self._joint_motions(pose)
@@ -94,18 +94,20 @@ class Likeness:
         normals = vertex_normals(points, self._fine.faces)
         lift, albedo = self._folds.apply(activations, self._skin_albedo)
         made = {
-            "skin": Surface(points + (lift + self._cap)[:, None] * normals, albedo),
-            "hair": Surface(_moved(joints[HEAD_JOINT], self._hair.vertices), None),
-            "brows": Surface(self._rooted_vertices(tracked, points + lift[:, None] * normals), None),
+            "skin": PosedMesh(points + (lift + self._cap)[:, None] * normals, albedo),
+            "hair": PosedMesh(_moved(joints[HEAD_JOINT], self._hair.vertices), None),
+            "brows": PosedMesh(self._rooted_vertices(tracked, points + lift[:, None] * normals), None),
         }
         for side, joint in zip(SIDES, EYE_JOINTS):
-            made[f"eye_{side}"] = Surface(_moved(joints[joint], self._eyes[side].vertices), None)
+            made[f"eye_{side}"] = PosedMesh(_moved(joints[joint], self._eyes[side].vertices), None)
         for inner in self._tracked_parts:
-            made[inner.name] = Surface(tracked[inner.vertices], None)
+            made[inner.name] = PosedMesh(tracked[inner.vertices], None)
         for part in self._mouth:
             rest = part.at(activations["tongue_out"])
             blended = np.einsum("nj,jab->nab", part.weights, joints)
-            made[part.name] = Surface(np.einsum("nab,nb->na", blended[..., :3], rest) + blended[..., 3], None)
+            made[part.name] = PosedMesh(
+                np.einsum("nab,nb->na", blended[..., :3], rest) + blended[..., 3], None
+            )
         return made
 
     def _rooted_vertices(self, tracked: FloatArray, points: FloatArray) -> FloatArray:
@@ -205,7 +207,7 @@ def refine(vertices: FloatArray, faces: IntArray, target: FloatArray, rounds: in
     triangles: IntArray = local.reshape(faces.shape).astype(np.int64)
     owner: IntArray = np.arange(len(faces))
     # Barycentric coordinates are with respect to the three corners of ``owner``; a point on an edge may be
-    # written by either neighbour, so points carry global parents and weights instead.
+    # written by either neighbour, so points carry global parents and weights.
     parents = np.repeat(used[:, None], 3, axis=1)
     weights = np.zeros((len(used), 3))
     weights[:, 0] = 1.0

@@ -1,4 +1,4 @@
-"""One subject's recording before it is photographed: who, which poses, which cameras, where it is written."""
+"""One subject's recording before it is rendered: traits, head model, poses, camera rig, output folder."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _LOOK_BELOW = 0.004  # metres below the middle of the head
 
 
 @dataclass(frozen=True)
-class Settings:
+class SynthSettings:
     """What decides a synthetic capture's content. ``size`` is (width, height)."""
 
     subjects: int
@@ -69,8 +69,8 @@ class Settings:
 
 
 @dataclass(frozen=True, eq=False)
-class Take:
-    """One subject's plan. ``poses`` are exact, by sequence; what is stored may carry tracking noise."""
+class SubjectPlan:
+    """One subject's plan. ``poses`` are exact, by sequence; what is stored may have tracking noise."""
 
     index: int
     person: Person
@@ -80,10 +80,10 @@ class Take:
     performed: Mapping[str, Performed]
     poses: Mapping[str, tuple[HeadPose, ...]]
     writer: CaptureWriter
-    settings: Settings
+    settings: SynthSettings
 
     def moments(self) -> Iterator[tuple[str, int]]:
-        """(sequence, timestep) of everything to photograph."""
+        """(sequence, timestep) of everything to render."""
         for name, poses in self.poses.items():
             for timestep in range(len(poses)):
                 yield name, timestep
@@ -93,7 +93,7 @@ class Take:
         return int(digest(self.settings.seed, self.person.name, sequence, timestep, camera)[:7], 16)
 
 
-def plan_take(out: Path, index: int, geometry: Geometry, settings: Settings) -> Take:
+def plan_subject(out: Path, index: int, geometry: Geometry, settings: SynthSettings) -> SubjectPlan:
     """Plan subject number ``index``: nothing is rendered or written."""
     name = f"{FIRST_SUBJECT + index}"
     who = person(name, index, settings.seed, settings.dynamics)
@@ -132,7 +132,9 @@ def plan_take(out: Path, index: int, geometry: Geometry, settings: Settings) -> 
         novel_view_cameras=[FRONTAL],
         synthetic={**settings.described(), "head": geometry.source, "style": who.style},
     )
-    return Take(index, who, geometry, shape, views, performed, poses, CaptureWriter(out, plan), settings)
+    return SubjectPlan(
+        index, who, geometry, shape, views, performed, poses, CaptureWriter(out, plan), settings
+    )
 
 
 def _middle(anatomy: Anatomy, neutral: FloatArray, style: Style) -> FloatArray:
@@ -249,7 +251,7 @@ PROCEDURAL = ("procedural", "procedural2020", "procedural2023")
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """A head model that can be performed and dressed.
+    """A head model that can be animated and rendered.
 
     ``mouth(person, anatomy, shape)`` makes the parts in the mouth that the head model lacks.
     """

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from headbench.bench.errors import InputError
-from headbench.datasets.synthetic.take import FRONTAL, SERIALS, cameras
+from headbench.datasets.synthetic.plan import FRONTAL, SERIALS, cameras
 
 TARGET = np.array([0.01, 0.02, 0.03])
 

@@ -1,0 +1,69 @@
+"""Meshes and points against answers that are known, and against scipy's."""
+
+import numpy as np
+import pytest
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
+
+from headbench.datasets.head.geometry import (
+    border_edges,
+    fit_sphere,
+    rigid_alignment,
+    smoothstep,
+    vertex_normals,
+)
+
+
+def points(count=20, seed=0):
+    return np.random.default_rng(seed).normal(size=(count, 3))
+
+
+@pytest.mark.parametrize("degrees", [0.0, 1e-4, 40.0, 180.0])
+def test_a_rigid_motion_is_found(degrees):
+    turn = Rotation.from_rotvec(degrees * np.array([0.6, 0.0, 0.8]), degrees=True).as_matrix()
+    shift = np.array([0.1, -2.0, 3.0])
+    motion = rigid_alignment(points(), points() @ turn.T + shift)
+    np.testing.assert_allclose(motion[:3, :3], turn, atol=1e-12)
+    np.testing.assert_allclose(motion[:3, 3], shift, atol=1e-12)
+    np.testing.assert_array_equal(motion[3], [0, 0, 0, 1])
+
+
+def test_weights_equal_scipys():
+    here, there = points(), points(seed=1)
+    weights = np.random.default_rng(2).random(len(here))
+    middle, there_middle = (np.average(x, axis=0, weights=weights) for x in (here, there))
+    turn, _ = Rotation.align_vectors(there - there_middle, here - middle, weights=weights)
+    motion = rigid_alignment(here, there, weights)
+    np.testing.assert_allclose(motion[:3, :3], turn.as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(motion[:3, :3] @ middle + motion[:3, 3], there_middle, atol=1e-12)
+
+
+def test_a_mirror_image_is_met_by_a_rotation():
+    motion = rigid_alignment(points(), points() * [-1, 1, 1])
+    assert np.linalg.det(motion[:3, :3]) == pytest.approx(1)
+
+
+def test_smoothstep():
+    np.testing.assert_allclose(smoothstep(np.array([-1.0, 0, 0.25, 1, 2]), 0, 1), [0, 0, 0.15625, 1, 1])
+    assert smoothstep(np.array([0.2]), 1.0, 0.0) == pytest.approx(1 - smoothstep(np.array([0.2]), 0.0, 1.0))
+
+
+def test_sphere():
+    directions = points(100) / np.linalg.norm(points(100), axis=1, keepdims=True)
+    center, radius = fit_sphere([0.3, -0.2, 0.9] + 0.012 * directions[directions[:, 2] < 0.3])
+    np.testing.assert_allclose(center, [0.3, -0.2, 0.9], atol=1e-10)
+    assert radius == pytest.approx(0.012, abs=1e-10)
+
+
+def test_normals_and_border_of_a_cap():
+    """Of a convex hull normals point outwards; without the triangles below, the border is where it was cut."""
+    sphere = points(150) / np.linalg.norm(points(150), axis=1, keepdims=True)
+    faces = ConvexHull(sphere).simplices.copy()
+    inward = np.linalg.det(sphere[faces]) < 0
+    faces[inward] = faces[inward][:, ::-1]
+    assert np.einsum("ni,ni->n", vertex_normals(sphere, faces), sphere).min() > 0.9
+    assert not len(border_edges(faces))
+    below = sphere[faces, 2].max(axis=1) < 0
+    cut = border_edges(faces[~below])
+    assert set(map(tuple, cut)) == set(map(tuple, border_edges(faces[below])[:, ::-1]))
+    assert not vertex_normals(sphere, faces[below])[sphere[:, 2].argmax()].any()

@@ -1,0 +1,181 @@
+"""The dressed head against its tracked mesh."""
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial import ConvexHull
+
+from headbench.datasets.synthetic.skin import make_folds
+from headbench.datasets.synthetic.subject import RenderedSubject, refine
+
+
+def test_tracked_vertices_lie_on_the_skin_that_is_rendered(plan, subject, rest):
+    """With hair and folds taken off, the rendered skin passes through every tracked skin vertex."""
+    pose = plan.geometry.translation.pose(
+        {**rest, "jaw_open": 0.6, "smile_left": 0.5, "head_turn": 0.2}, "900", 0
+    )
+    tracked = subject.tracked(pose)
+    fine = subject._fine
+    corners = fine.weights.max(1) == 1.0
+    own = np.take_along_axis(fine.parents, fine.weights.argmax(1)[:, None], 1)[:, 0]
+    np.testing.assert_allclose(fine.positions(tracked)[corners], tracked[own[corners]], atol=1e-12)
+    assert set(own[corners]) == set(np.unique(subject.anatomy.skin_faces))
+
+
+def test_eyeballs_follow_the_tracked_ones(plan, subject, rest):
+    pose = plan.geometry.translation.pose(
+        {**rest, "gaze_left": 1.0, "head_nod": 0.2, "sway_x": 0.01}, "900", 0
+    )
+    tracked, posed_meshes = subject.tracked(pose), subject.posed_meshes(pose, rest)
+    for side in ("left", "right"):
+        region = plan.geometry.head.regions[f"{side}_eyeball"]
+        before, after = subject.neutral[region], tracked[region]
+        # Independent rigid fit (Kabsch) of the tracked ball.
+        u, _, vt = np.linalg.svd((before - before.mean(0)).T @ (after - after.mean(0)))
+        turn = vt.T @ np.diag([1, 1, np.sign(np.linalg.det(vt.T @ u.T))]) @ u.T
+        rest_mesh = subject._eyes[side].vertices
+        expected = (rest_mesh - before.mean(0)) @ turn.T + after.mean(0)
+        np.testing.assert_allclose(posed_meshes[f"eye_{side}"].vertices, expected, atol=2e-4)
+
+
+@pytest.mark.parametrize(
+    ("face", "place"),
+    [
+        ({"brow_inner_up": 1.0, "brow_outer_up_left": 1.0, "brow_outer_up_right": 1.0}, "forehead"),
+        ({"brow_down_left": 1.0, "brow_down_right": 1.0}, "glabella"),
+        ({"smile_left": 1.0, "smile_right": 1.0}, "left_cheek"),
+        ({"nose_sneer_left": 1.0, "nose_sneer_right": 1.0}, "nose_tip"),
+        ({"pucker": 1.0}, "mouth"),
+    ],
+)
+def test_expressions_change_skin_beyond_the_tracked_mesh(plan, subject, rest, face, place):
+    """Same tracked mesh, different activations: colour changes by several 8-bit levels, and skin is displaced."""
+    pose = plan.geometry.translation.pose(rest, "900", 0)
+    calm, moved = (
+        subject.posed_meshes(pose, rest)["skin"],
+        subject.posed_meshes(pose, {**rest, **face})["skin"],
+    )
+    near = np.linalg.norm(subject._rest_points - subject.anatomy[place], axis=1) < 0.022
+
+    def display(linear):
+        return 255 * np.where(linear < 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+    change = np.abs(display(moved.albedo[near]) - display(calm.albedo[near])).max(1)
+    assert np.percentile(change, 90) > 4
+    far = np.linalg.norm(subject._rest_points - subject.anatomy["vertex_top"], axis=1) < 0.05
+    np.testing.assert_allclose(moved.albedo[far], calm.albedo[far], atol=1e-4)
+    if place != "nose_tip":
+        lift = np.linalg.norm(moved.vertices[near] - calm.vertices[near], axis=1)
+        assert 0.0002 < lift.max() < 0.005
+
+
+def test_folds_grow_continuously_with_activation(plan, subject, rest):
+    pose = plan.geometry.translation.pose(rest, "900", 0)
+    heights = [
+        subject.posed_meshes(pose, {**rest, "brow_inner_up": a})["skin"].vertices
+        for a in (0.0, 0.5, 0.55, 1.0)
+    ]
+    step = [np.abs(b - a).max() for a, b in itertools.pairwise(heights)]
+    assert step[1] < 0.3 * min(step[0], step[2])
+
+
+def test_poses_are_what_is_stored(plan):
+    for poses in plan.poses.values():
+        for pose in poses:
+            for values in (pose.expression, pose.jaw, pose.neck, pose.rotation, pose.eyes, pose.translation):
+                np.testing.assert_array_equal(values, values.astype(np.float32))
+
+
+def test_other_person_looks_different_on_the_same_head(plan, subject):
+    other = RenderedSubject(
+        replace(plan.person, seed=plan.person.seed + 1, skin=0.5 * plan.person.skin),
+        plan.geometry,
+        plan.shape,
+    )
+    assert other.rest_meshes()["skin"].albedo.mean() < 0.75 * subject.rest_meshes()["skin"].albedo.mean()
+
+
+def test_dynamics_scale_folds_and_colour_changes(plan, subject, rest):
+    """Folds and logarithms of colour factors are proportional to it; at 0 skin stays as it is."""
+    points = subject._rest_points[::50]
+    lips = np.linspace(0.0, 1.0, len(points))
+
+    def change(factor):
+        person = replace(plan.person, dynamics=factor)
+        folds = make_folds(person, subject.anatomy, points, lips, np.ones(len(points)))
+        lift, albedo = folds.apply({**rest, "brow_inner_up": 0.4}, np.full((len(points), 3), 0.1))
+        return lift, np.log(albedo / 0.1)
+
+    still, once, twice = change(0.0), change(1.0), change(2.0)
+    assert all(np.abs(part).max() < 1e-12 for part in still)
+    np.testing.assert_allclose(twice[0], 2 * once[0], atol=1e-15)
+    flushed = (once[1] > 0.02).all(1)  # paler: blood alone, no shade of folds
+    assert flushed.sum() > 20
+    np.testing.assert_allclose(twice[1][flushed], 2 * once[1][flushed], rtol=0.01)
+
+
+@pytest.fixture(scope="module")
+def sphere():
+    points = np.random.default_rng(0).standard_normal((150, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    faces = ConvexHull(points).simplices.copy()
+    corner = points[faces]
+    inward = (
+        np.einsum(
+            "ni,ni->n", np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), corner[:, 0]
+        )
+        < 0
+    )
+    faces[inward] = faces[inward][:, ::-1]
+    return points, faces
+
+
+@pytest.fixture(scope="module")
+def fine(sphere):
+    points, faces = sphere
+    # Finer on one side, so that all kinds of splits happen.
+    return refine(points, faces, np.where(points[:, 0] > 0, 0.08, 0.3), rounds=5)
+
+
+def test_closed_and_consistently_turned(sphere, fine):
+    edges = np.concatenate([fine.faces[:, [0, 1]], fine.faces[:, [1, 2]], fine.faces[:, [2, 0]]])
+    directed = {tuple(edge) for edge in edges.tolist()}
+    assert len(directed) == len(edges)
+    assert all((b, a) in directed for a, b in directed)
+
+
+def test_interpolation_is_exact_for_linear_functions(sphere, fine):
+    points, faces = sphere
+    flat = fine.interpolate(points)
+    np.testing.assert_allclose(fine.weights.sum(1), 1.0, atol=1e-12)
+    assert fine.weights.min() >= 0
+    function = np.array([0.3, -1.2, 0.7])
+    np.testing.assert_allclose(fine.interpolate(points @ function), flat @ function, atol=1e-12)
+
+    def area(v, f):
+        return np.linalg.norm(np.cross(v[f[:, 1]] - v[f[:, 0]], v[f[:, 2]] - v[f[:, 0]]), axis=1).sum() / 2
+
+    assert area(flat, fine.faces) == pytest.approx(area(points, faces), rel=1e-12)
+
+
+def test_edges_are_as_short_as_wanted_and_only_where_wanted(sphere, fine):
+    points, _ = sphere
+    flat = fine.interpolate(points)
+    wanted = fine.interpolate(np.where(points[:, 0] > 0, 0.08, 0.3))
+    for pair in ([0, 1], [1, 2], [2, 0]):
+        ends = fine.faces[:, pair]
+        length = np.linalg.norm(flat[ends[:, 0]] - flat[ends[:, 1]], axis=1)
+        assert (length <= wanted[ends].mean(1) + 1e-9).all()
+    near, far = (flat[fine.faces].mean(1)[:, 0] * sign > 0.5 for sign in (1, -1))
+    assert near.sum() > 5 * far.sum()
+
+
+def test_phong_tessellation_rounds_towards_the_sphere(sphere, fine):
+    points, _ = sphere
+    rounded = fine.positions(points)
+    corners = fine.weights.max(1) == 1.0
+    np.testing.assert_allclose(rounded[corners], fine.interpolate(points)[corners], atol=1e-12)
+    flat_error = np.abs(np.linalg.norm(fine.interpolate(points), axis=1) - 1).mean()
+    assert np.abs(np.linalg.norm(rounded, axis=1) - 1).mean() < 0.55 * flat_error
