@@ -115,7 +115,7 @@ def _read(folder: Path) -> GAAvatar | GBSAvatar | OursAvatar:
     from ..ga.method import GAAvatar
     from ..ga.storage import PLY_FILE
     from ..gbs.avatar import GBSAvatar
-    from ..insta.storage import FIELD_FILE as RADIANCE_FILE
+    from ..insta.avatar import FIELD_FILE as RADIANCE_FILE
     from ..ours.avatar import OursAvatar
     from ..ours.storage import FIELD_FILE
 

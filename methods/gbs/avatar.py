@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
+import numpy as np
 import torch
+from safetensors.torch import save
 from torch import Tensor
 
-from ...bench.contracts import Camera, Frame, HeadPose, no_stage
+from ...bench.contracts import Camera, Frame, HeadPose, IntArray, no_stage
+from ...bench.errors import InputError
+from ...bench.io.arrays import Member
+from ...bench.io.files import write_bytes
 from ..shared.avatar_files import HEAD_FILE, SUBJECT_FILE, Subject, read_shared_head, read_subject
-from ..shared.networks import sh_degree
+from ..shared.networks import coefficient_count, sh_degree
 from ..shared.rendering import Drawn, PosedSplats, draw_splats, posed_splats, read_back, view_of
 from ..shared.subject_mesh import pose_key
-from .blend import Placed, place
-from .rig import Carried, Rig
-from .storage import AVATAR_FILE, Stored, read_avatar
+from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors
+from .blendshapes import Entries, PointMotions, PosedAttributes, Rig, apply_pose, difference_widths
+from .points import SurfacePoints, full_barycentric
 
 
 class GBSAvatar:
@@ -32,7 +38,7 @@ class GBSAvatar:
     def __init__(self, folder: Path, rig: Rig, stored: Stored, device: str):
         self._folder, self._rig, self.stored, self._device = folder, rig, stored, device
         self._degree = sh_degree(stored.neutral["sh_rest"])
-        self._last: tuple[bytes, Placed] | None = None
+        self._last: tuple[bytes, PosedAttributes] | None = None
 
     @classmethod
     def read(cls, folder: Path, device: str) -> GBSAvatar:
@@ -57,10 +63,10 @@ class GBSAvatar:
         done: Callable[[str], None] = no_stage,
     ) -> Drawn:
         """Draw one frame, stage by stage; see `StagedAvatar`."""
-        placed, view = self._placed(pose, done), view_of(camera, self._device)
-        colors = placed.colors(view.center, self._degree)
+        posed, view = self._posed(pose, done), view_of(camera, self._device)
+        colors = posed.colors(view.center, self._degree)
         done("deform")
-        return draw_splats(placed.world, placed.opacities, colors, view, background, done)
+        return draw_splats(posed.world, posed.opacities, colors, view, background, done)
 
     def read_back(self, drawn: Drawn) -> Frame:
         """A drawn frame in host memory."""
@@ -69,17 +75,17 @@ class GBSAvatar:
     @torch.no_grad()
     def splats(self, pose: HeadPose, camera: Camera | None = None) -> PosedSplats:
         """Splats of a pose in the world; with colours where a camera says from where they are seen."""
-        placed = self._placed(pose)
+        posed = self._posed(pose)
         colors = None
         if camera is not None:
-            colors = placed.colors(view_of(camera, self._device).center, self._degree)
-        return posed_splats(placed.world, placed.opacities, colors)
+            colors = posed.colors(view_of(camera, self._device).center, self._degree)
+        return posed_splats(posed.world, posed.opacities, colors)
 
     @torch.no_grad()
     def harmonics(self, pose: HeadPose) -> tuple[Tensor, Tensor, Tensor]:
         """(N, 3) and (N, 3, K - 1) harmonics in a pose, along the splats' axes, and the (N, 3, 3) turn of these."""
-        placed = self._placed(pose)
-        return placed.sh_dc.cpu(), placed.sh_rest.cpu(), placed.rotation.cpu()
+        posed = self._posed(pose)
+        return posed.sh_dc.cpu(), posed.sh_rest.cpu(), posed.rotation.cpu()
 
     def files(self) -> Sequence[Path]:
         """The splats and the subject."""
@@ -89,16 +95,129 @@ class GBSAvatar:
         """The head model, with teeth."""
         return [self._folder / HEAD_FILE]
 
-    def _placed(self, pose: HeadPose, done: Callable[[str], None] = no_stage) -> Placed:
+    def _posed(self, pose: HeadPose, done: Callable[[str], None] = no_stage) -> PosedAttributes:
         """Splats of a pose; the last pose's are kept, since frames of several cameras follow one another."""
         arguments, key = self._rig.arguments([pose]), pose_key(pose)
         if self._last is not None and self._last[0] == key:
             done("drive")
             return self._last[1]
-        carried = Carried.of(self._rig.carry(arguments))
+        motions = PointMotions.of(self._rig.motions(arguments))
         done("drive")
         stored = self.stored
         differences = stored.entries.sum(stored.differences, self._rig.coefficients(arguments))
-        placed = place(stored.neutral, differences, carried)
-        self._last = key, placed
-        return placed
+        posed = apply_pose(stored.neutral, differences, motions)
+        self._last = key, posed
+        return posed
+
+
+AVATAR_FILE = "avatar.safetensors"
+EXPRESSIONS = "expressions"
+"""Key of the file's metadata: how many leading expressions there may be differences for."""
+
+GEOMETRY = {"means": 3, "log_scales": 3, "quats": 4, "opacities": 1, "sh_dc": 3}
+"""First columns of the (N, 14 + 3 R) float32 table of neutral splats; R harmonics above degree 0 by channel follow."""
+MEMBERS = {
+    "splats": Member("f", ("N", None), MAX_MAGNITUDE, "f4"),
+    "triangles": Member("i", ("N",), dtype="i4"),
+    "barycentric": Member("f", ("N", 2), MAX_MAGNITUDE, "f4"),
+    "moved_by": Member("u", ("N", "bytes"), dtype="u1"),
+    "differences": Member("f", (None, None), MAX_MAGNITUDE, "f4"),
+}
+
+
+class Stored(NamedTuple):
+    """What an avatar's file holds.
+
+    Attributes
+    ----------
+    neutral : per-splat tensors by name, see `blend.place`.
+    points : surface point that each splat was put on at the start.
+    expressions : K.
+    entries : rows of the differences; their weights are 1.
+    differences : (M, C) what is added at coefficient 1, in the columns of `blend.difference_widths`.
+    """
+
+    neutral: dict[str, Tensor]
+    points: SurfacePoints
+    expressions: int
+    entries: Entries
+    differences: Tensor
+
+
+def write_avatar(
+    path: Path,
+    neutral: Mapping[str, Tensor],
+    points: SurfacePoints,
+    expressions: int,
+    entries: Entries,
+    differences: Tensor,
+) -> None:
+    """Write an avatar as safetensors, exact.
+
+    Of each splat: 4 (14 + 3 R) bytes of neutral attributes, 12 of its surface point, a bit for each expression, and
+    4 C bytes for each expression that moves it: 12,055 bytes with all harmonics and all of 50 expressions.
+    """
+    count = len(neutral["means"])
+    columns = [neutral[name].reshape(count, -1) for name in (*GEOMETRY, "sh_rest")]
+    moved_by = torch.zeros(count, expressions, dtype=torch.bool)
+    moved_by[entries.owners.cpu(), entries.expressions.cpu()] = True
+    tensors = {
+        "splats": torch.cat([column.detach().to("cpu", torch.float32) for column in columns], dim=1),
+        "triangles": torch.from_numpy(points.triangles.astype(np.int32)),
+        "barycentric": torch.from_numpy(points.barycentric[:, 1:].astype(np.float32)),
+        "moved_by": torch.from_numpy(np.packbits(moved_by.numpy(), axis=1)),
+        "differences": differences.detach().to("cpu", torch.float32).contiguous(),
+    }
+    write_bytes(path, save(tensors, {EXPRESSIONS: str(expressions)}))
+
+
+def read_avatar(path: Path, face_count: int, expression_size: int, device: str) -> Stored:
+    """Read and check what `write_avatar` wrote. Raises `InputError` where a tensor is missing or does not fit."""
+    tensors, metadata = read_safetensors(path)
+    said = metadata.get(EXPRESSIONS, "")
+    if not said.isdecimal() or len(said) > 9 or int(said) > expression_size:
+        raise InputError(path, EXPRESSIONS, f"a number up to {expression_size}", repr(said[:20]))
+    expressions = int(said)
+    moved_by = _check(path, tensors, face_count, expressions)
+    owners, moving = np.nonzero(moved_by)
+    counts = torch.from_numpy(moved_by.sum(1)).to(device)
+    columns = tensors["splats"].to(device).split([*GEOMETRY.values(), _rest(tensors["splats"])], dim=1)
+    neutral = {name: column.contiguous() for name, column in zip((*GEOMETRY, "sh_rest"), columns)}
+    neutral["opacities"] = neutral["opacities"][:, 0]
+    neutral["sh_rest"] = neutral["sh_rest"].reshape(len(counts), 3, -1)
+    points = SurfacePoints(
+        tensors["triangles"].numpy().astype(np.int64), full_barycentric(tensors["barycentric"].numpy())
+    )
+    entries = Entries.of(counts, torch.from_numpy(moving).to(device), torch.ones(len(owners), device=device))
+    return Stored(neutral, points, expressions, entries, tensors["differences"].to(device))
+
+
+def _rest(splats: Tensor) -> int:
+    return splats.shape[1] - sum(GEOMETRY.values())
+
+
+def _check(path: Path, tensors: Mapping[str, Tensor], face_count: int, expressions: int) -> IntArray:
+    """(N, K) which expressions move which splat. Raises `InputError` at the first tensor that does not fit."""
+    bytes_of = {"bytes": -(-expressions // 8)}
+    sizes = check_tensors(path, tensors, MEMBERS, bytes_of)
+    splats, triangles = tensors["splats"], tensors["triangles"]
+
+    def require(name: str, fits: bool, expected: str) -> None:
+        if not fits:
+            raise InputError(path, name, expected, f"shape {tuple(tensors[name].shape)}, or other numbers")
+
+    rests = [3 * (coefficient_count(degree) - 1) for degree in range(4)]
+    require("splats", sizes["N"] > 0 and _rest(splats) in rests, f"(N, 14 + 3 R), 3 R one of {rests}")
+    fits = 0 <= int(triangles.min()) and int(triangles.max()) < face_count
+    require("triangles", fits, f"triangles 0 to {face_count - 1}")
+    check_sizes(path, splats[:, GEOMETRY["means"] : GEOMETRY["means"] + GEOMETRY["log_scales"]])
+    moved_by = np.unpackbits(tensors["moved_by"].numpy(), axis=1, count=expressions)
+    widths = [
+        sum(difference_widths(degree).values())
+        for degree in range(4)
+        if 3 * (coefficient_count(degree) - 1) <= _rest(splats)
+    ]
+    table = tensors["differences"]
+    fits = len(table) == int(moved_by.sum()) and table.shape[1] in widths
+    require("differences", fits, f"({int(moved_by.sum())}, C), C one of {widths}")
+    return moved_by.astype(np.int64)

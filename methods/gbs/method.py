@@ -14,11 +14,9 @@ from ..shared.avatar_files import Subject, finish_fit, is_finished, run_digest
 from ..shared.loop import check_budget, check_training_split
 from ..shared.schedule import ShuffledEpochs
 from ..shared.splat_training import run_trainer
-from .avatar import GBSAvatar
+from .avatar import AVATAR_FILE, GBSAvatar, write_avatar
 from .config import GBSConfig
-from .mouth import padded_offset, with_mouth
-from .storage import AVATAR_FILE, write_avatar
-from .surface import SurfacePoints
+from .points import SurfacePoints, padded_offset, with_mouth
 from .training import GBSTraining
 
 

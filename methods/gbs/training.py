@@ -18,12 +18,18 @@ from ..shared.optimisation import logit, rows_of_tables
 from ..shared.schedule import Sampler, Timeline, torch_generator
 from ..shared.splat_training import Initial, SplatTrainer
 from ..shared.subject_mesh import BoundedCache, SubjectMesh, pose_key
-from .blend import Entries, difference_widths, place
+from .blendshapes import (
+    PARTS,
+    Entries,
+    PointMotions,
+    Rig,
+    apply_pose,
+    consistency_mask,
+    difference_widths,
+    entries_of,
+)
 from .config import GBSConfig
-from .differences import consistency_mask, entries_of
-from .mouth import mouth_room, rows_of_teeth
-from .rig import PARTS, Carried, Rig
-from .surface import SurfacePoints, poisson_disk, spacing, surface_area
+from .points import SurfacePoints, mouth_cylinder, poisson_disk, rows_of_teeth, spacing, surface_area
 
 DIFFERENCES = "differences"
 RATE = 1e-6
@@ -31,7 +37,7 @@ RATE = 1e-6
 gradients by the table are not scaled down to where Adam's epsilon counts."""
 
 
-class Start(NamedTuple):
+class StartingPoints(NamedTuple):
     """Where splats are put at the start.
 
     Attributes
@@ -65,13 +71,13 @@ class GBSTraining(SplatTrainer):
         device: str,
         seed: int,
     ):
-        mattes = clip.mask(clip.splits["train"][0]) is not None
-        super().__init__(clip, config.splats, sampler, device, mattes=mattes)
-        self._config, self._mattes = config, mattes
+        masked = clip.mask(clip.splits["train"][0]) is not None
+        super().__init__(clip, config.splats, sampler, device, mattes=masked)
+        self._config, self._masked = config, masked
         self._recorded_on = self._background
-        if mattes:
+        if masked:
             self._background = torch.zeros_like(self._recorded_on)  # as published
-        start = start_of(clip, config, subject, head, seed)
+        start = starting_points(clip, config, subject, head, seed)
         self.points = start.points
         self.rig = Rig(head, subject.shape, subject.static_offset, start.points, config.expressions, device)
         vertices = self.rig.mesh.canonical.cpu().numpy()
@@ -88,16 +94,16 @@ class GBSTraining(SplatTrainer):
         self._weights = torch.from_numpy(weights).to(device, torch.float32)
         self._part = torch.from_numpy(start.part).to(device)
         self._rows = int(start.part[-1])
-        self._room = None
+        self._cylinder = None
         if self._rows:
-            room = mouth_room(vertices[head.regions["teeth"]])
-            self._room = room._replace(center=room.center.to(device))
+            cylinder = mouth_cylinder(vertices[head.regions["teeth"]])
+            self._cylinder = cylinder._replace(center=cylinder.center.to(device))
         poses = {pose_key(clip.poses[key.timestep]): clip.poses[key.timestep] for key in self.keys}
         row = {name: index for index, name in enumerate(poses)}
         self._pose = {key.timestep: row[pose_key(clip.poses[key.timestep])] for key in self.keys}
         self._arguments = self.rig.arguments(list(poses.values()))
         entries = config.splats.mesh_cache_mb * 2**20 // (4 * sum(PARTS.values()) * len(counts))
-        self._carried = BoundedCache(self._carry, entries)
+        self._motions = BoundedCache(self._motions_at, entries)
         splats, shared = self._initial(start, int(counts.sum()), device, seed)
         thresholds = torch.full((len(counts),), config.splats.densify_gradient, device=device)
         thresholds[self._part > 0] = config.teeth_densify_gradient
@@ -127,22 +133,22 @@ class GBSTraining(SplatTrainer):
         view = self._views[key.camera]
         image, coverage = self._on_background(self._images.get(iteration, index))
         pose = self._pose[key.timestep]
-        carried = Carried.of(self._carried(pose).index_select(0, self.binding))
+        motions = PointMotions.of(self._motions(pose).index_select(0, self.binding))
         coefficients = self._arguments["expression"][pose, : self.rig.expressions]
         differences = self.entries.sum(optimiser[DIFFERENCES], coefficients) * self._column_scales
-        placed = place({name: optimiser[name] for name in self.splat_names}, differences, carried)
+        posed = apply_pose({name: optimiser[name] for name in self.splat_names}, differences, motions)
         degree = min(config.sh_degree, iteration // self._degree_every)
-        colors = placed.colors(view.center, degree)
-        rendering, _ = self._render(placed.world, placed.opacities, colors, view, self._sizes)
+        colors = posed.colors(view.center, degree)
+        rendering, _ = self._render(posed.world, posed.opacities, colors, view, self._sizes)
         loss = photometric_loss(rendering.image, image, config.splats.ssim_weight)
         if coverage is not None and config.alpha_weight:
             loss = loss + config.alpha_weight * (rendering.alpha - coverage).square().mean()
-        if self._room is not None and config.teeth_weight:
+        if self._cylinder is not None and config.teeth_weight:
             part = self._part.index_select(0, self.binding)
             for row in range(1, self._rows + 1):
                 teeth = (part == row).nonzero().squeeze(1)
                 if len(teeth):
-                    violation = self._room.violation(optimiser["means"].index_select(0, teeth))
+                    violation = self._cylinder.violation(optimiser["means"].index_select(0, teeth))
                     loss = loss + config.teeth_weight * violation
         return loss
 
@@ -166,7 +172,7 @@ class GBSTraining(SplatTrainer):
 
         A matte takes the background that the image was recorded on out of it.
         """
-        if not self._mattes:
+        if not self._masked:
             return image, None
         colors, coverage = image[:, :, :3], image[:, :, 3:]
         return recomposited(colors, coverage, self._recorded_on, self._background), coverage[:, :, 0]
@@ -174,10 +180,12 @@ class GBSTraining(SplatTrainer):
     def _position_progress(self, iteration: int) -> float:
         return iteration / max(self._timeline.at(self._config.position_settles), 1)
 
-    def _carry(self, row: int) -> Tensor:
-        return self.rig.carry({name: values[row : row + 1] for name, values in self._arguments.items()})
+    def _motions_at(self, row: int) -> Tensor:
+        return self.rig.motions({name: values[row : row + 1] for name, values in self._arguments.items()})
 
-    def _initial(self, start: Start, entries: int, device: str, seed: int) -> tuple[Initial, Initial]:
+    def _initial(
+        self, start: StartingPoints, entries: int, device: str, seed: int
+    ) -> tuple[Initial, Initial]:
         config, settings = self._config, self._config.splats
         count = len(start.spacing)
         widths = difference_widths(config.difference_sh_degree)
@@ -208,7 +216,9 @@ class GBSTraining(SplatTrainer):
         return splats, {DIFFERENCES: (table, RATE)}
 
 
-def start_of(clip: Clip, config: GBSConfig, subject: Subject, head: HeadArrays, seed: int) -> Start:
+def starting_points(
+    clip: Clip, config: GBSConfig, subject: Subject, head: HeadArrays, seed: int
+) -> StartingPoints:
     """Poisson-disk samples of the neutral head and of each row of teeth."""
     mesh = SubjectMesh(head, subject.shape, subject.static_offset, "cpu")
     vertices, faces = mesh.canonical.numpy().astype(np.float64), np.asarray(head.faces)
@@ -222,7 +232,7 @@ def start_of(clip: Clip, config: GBSConfig, subject: Subject, head: HeadArrays, 
     points = SurfacePoints(*(np.concatenate(columns) for columns in zip(*found)))
     distances = [spacing(part.positions(vertices, faces)) for part in found]
     part = np.repeat(np.arange(len(found)), [len(points.triangles) for points in found])
-    return Start(points, np.concatenate(distances), part)
+    return StartingPoints(points, np.concatenate(distances), part)
 
 
 def sample_count(clip: Clip, config: GBSConfig, area: float, middle: np.ndarray) -> int:
@@ -232,8 +242,8 @@ def sample_count(clip: Clip, config: GBSConfig, area: float, middle: np.ndarray)
     sizes = []
     for key in clip.splits["train"]:
         camera = clip.cameras[key.camera]
-        place = middle + np.asarray(clip.poses[key.timestep].translation, np.float64)
+        head = middle + np.asarray(clip.poses[key.timestep].translation, np.float64)
         focal = 0.5 * (camera.K[0, 0] + camera.K[1, 1])
-        sizes.append(np.linalg.norm(camera.center - place) / focal)
+        sizes.append(np.linalg.norm(camera.center - head) / focal)
     required = area / (config.sample_spacing * float(np.mean(sizes))) ** 2
     return max(1, min(config.samples, round(required)))

@@ -14,13 +14,13 @@ class GHAConfig:
 
     Attributes
     ----------
-    schedule_length : iterations of the published run, both stages.
-    mesh_fraction : part of the budget that the mesh stage takes.
+    schedule_length : iterations of the published run, both phases.
+    mesh_fraction : part of the budget that the mesh phase takes.
     unit : metres of one canonical unit.
     landmarks : how many points of the tracked face say where expression rules.
     near_squared, far_squared : squared distances from the nearest landmark up to which expression alone rules, and
         from which on head pose alone does (0.1 and 0.25 units squared are 3.2 and 5 cm).
-    start : what the signed distance is fitted to before the mesh stage. "sphere" as published; "mesh", the tracked
+    start : what the signed distance is fitted to before the mesh phase. "sphere" as published; "mesh", the tracked
         mesh, saves a short run the way from the sphere to a head.
     start_steps : steps of that fit.
     grid_vertices : vertices of the tetrahedral grid about the head.
@@ -32,12 +32,12 @@ class GHAConfig:
     sr_widths : widths of the super-resolution network's blocks. The first works at the splatted size, each further
         one at twice the size before: their number decides by how much splats are drawn smaller than the image.
     residual : let super-resolution add to the splatted colours instead of making colours, as published, of nothing;
-        a short run then starts where splatting alone arrives, and splatting with the colours of the mesh stage.
+        a short run then starts where splatting alone arrives, and splatting with the colours of the mesh phase.
     neutral_jaw : radians that the jaw is open in the neutral head (about the first axis). Displacements belong to
         places, so between lips that touch they cannot part; published landmarks start at any first timestep.
     motion_steps : steps that fit the deformation by expression to the head model's own (`TrackedMotion`) before the
-        mesh stage; 0 as published.
-    motion_weight : of the same error in both stages, relative to the vertices' motion; 0 as published.
+        mesh phase; 0 as published.
+    motion_weight : of the same error in both phases, relative to the vertices' motion; 0 as published.
     appearance_margin : how far beyond its training range, in parts of that range, each driving value is followed by
         the networks of colour and attributes; None, as published, sets no end. What lies far outside of training
         otherwise tints a face.
@@ -50,16 +50,16 @@ class GHAConfig:
         unseen, in which networks then do as they like; noise keeps them from it. 0 as published.
     displacement_scale, attribute_scale : factors of the networks' outputs.
     initial_opacity : of all Gaussians.
-    mesh_views, mesh_size : views of a timestep in one iteration of the mesh stage, and the longer side of their images
+    mesh_views, mesh_size : views of a timestep in one iteration of the mesh phase, and the longer side of their images
         in pixels; smaller images stay as they are.
     landmark_weight : of the mean squared distance, in square units, between moved and tracked landmarks.
-    landmark_timesteps : timesteps whose landmarks one iteration of the mesh stage looks at; published is the one that
+    landmark_timesteps : timesteps whose landmarks one iteration of the mesh phase looks at; published is the one that
         its images show, but landmarks cost little, and a short run does not come to each timestep often.
-    mesh_lr, landmark_lr : learning rates of the mesh stage.
-    network_lr, position_lr, feature_lr, rotation_lr, scale_lr, opacity_lr, correction_lr : of the Gaussian stage, the
+    mesh_lr, landmark_lr : learning rates of the mesh phase.
+    network_lr, position_lr, feature_lr, rotation_lr, scale_lr, opacity_lr, correction_lr : of the Gaussian phase, the
         last one for the corrections of the tracked head pose, one for each training timestep.
-    final_rate : part of their learning rate that the Gaussian stage's tensors end with, log-linearly over the last
-        half of the stage; 1 keeps them constant, as published.
+    final_rate : part of their learning rate that the Gaussian phase's tensors end with, log-linearly over the last
+        half of the phase; 1 keeps them constant, as published.
     low_weight, structure_weight : weights of the L1 loss at the splatted size and of 1 - SSIM at the full one.
         The latter stands for the published 0.1 LPIPS, whose backbone is not ours to ship.
     low_truth : "mean" compares the splatted colours with area means of the image; "gha" is the compatibility option

@@ -13,7 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...bench.contracts import FloatArray, HeadAsset, HeadPose
+from ...bench.contracts import Clip, FloatArray, FrameKey, HeadAsset, HeadPose, IntArray
+from ...bench.errors import InputError
 from ...datasets.head.arrays import check_size
 from ...datasets.head.model import HeadModel
 from ...datasets.head.rotations import (
@@ -22,6 +23,9 @@ from ...datasets.head.rotations import (
     matrix_to_axis_angle,
     quaternion_to_axis_angle,
 )
+from ..shared.avatar_files import Subject
+from ..shared.rendering import View, view_of
+from .config import GHAConfig
 
 POSE_SIZE = 6
 """Axis-angle and translation."""
@@ -47,7 +51,7 @@ class Signal(NamedTuple):
     joints: Tensor
 
 
-class Motion(NamedTuple):
+class HeadMotion(NamedTuple):
     """Where the head is.
 
     Attributes
@@ -114,7 +118,7 @@ class Driver:
             signals.append(Signal(codes[t], **rigid, joints=joints[0, :2]))
         return signals
 
-    def motion(self, signal: Signal, correction: Tensor | None = None) -> Motion:
+    def motion(self, signal: Signal, correction: Tensor | None = None) -> HeadMotion:
         """Rigid motion of the head; differentiable in the (6,) correction of rotation and translation."""
         turn, shift = signal.rotation, signal.translation
         if correction is not None:
@@ -123,9 +127,9 @@ class Driver:
         base, joint = signal.joints
         rotation = root @ neck
         translation = base + shift + root @ (joint - base) + rotation @ (self.origin - joint)
-        return Motion(rotation, translation, torch.cat([matrix_to_axis_angle(rotation), translation]))
+        return HeadMotion(rotation, translation, torch.cat([matrix_to_axis_angle(rotation), translation]))
 
-    def still(self, codes: Tensor) -> dict[str, Tensor]:
+    def rest_arguments(self, codes: Tensor) -> dict[str, Tensor]:
         """Arguments of (B, E) expression codes with the head at rest: the inverse of what `signals` makes of them."""
         if self.expression_scale is not None:
             codes = codes * self.expression_scale
@@ -167,3 +171,170 @@ def code_size(head: HeadAsset) -> int:
 def _principal(axis_angle: Tensor) -> Tensor:
     """The same rotations with angles of at most pi, so that a turn too many is nothing new to a network."""
     return quaternion_to_axis_angle(axis_angle_to_quaternion(axis_angle))
+
+
+FACIAL = ("face", "lips", "eye_region", "nose", "forehead", "left_ear", "right_ear")
+"""Regions that the published landmarks and mesh points cover."""
+
+
+def landmark_vertices(head: HeadAsset, neutral: FloatArray, count: int) -> IntArray:
+    """Vertices of the face, each the farthest from those before it; as many as there are, if fewer.
+
+    The published points are 66 detected landmarks and each hundredth vertex of the tracked face; farthest points
+    cover the same surface evenly on any head model.
+
+    Parameters
+    ----------
+    neutral : (V, 3) neutral head of the subject.
+
+    Raises
+    ------
+    InputError
+        Where the head has no face region.
+    """
+    if "face" not in head.regions:
+        known = ", ".join(sorted(head.regions)) or "no regions"
+        raise InputError(f"head model {head.version!r}", "regions", "a region 'face'", known)
+    facial = np.unique(np.concatenate([head.regions[name] for name in FACIAL if name in head.regions]))
+    points = np.asarray(neutral, np.float64)[facial]
+    # Farthest from the middle first: a start that needs no choice.
+    chosen = [int(np.argmax(np.square(points - points.mean(0)).sum(1)))]
+    nearest = np.full(len(points), np.inf)
+    while len(chosen) < min(count, len(points)):
+        nearest = np.minimum(nearest, np.square(points - points[chosen[-1]]).sum(1))
+        chosen.append(int(np.argmax(nearest)))
+    return facial[chosen]
+
+
+def mouth_box(lips: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Centre and half sides, (3,) each, of the box for points inside the mouth.
+
+    Its centre is the mean of the (L, 3) lip points, but as far back as the hindmost of them; its half sides are 0.8
+    of their largest distance from that centre along each axis, as published.
+    """
+    center = lips.mean(0)
+    center[2] = lips[:, 2].min()
+    return center, 0.8 * np.abs(lips - center).max(0)
+
+
+class Influence(NamedTuple):
+    """Which points a controller acts on, (n,) int64, and its (n,) weights there in (0, 1]."""
+
+    rows: Tensor
+    weights: Tensor
+
+
+def influences(
+    points: Tensor, landmarks: Tensor, near_squared: float, far_squared: float
+) -> tuple[Influence, Influence]:
+    """Influence of expression and of head pose on (N, 3) points; their weights add up to 1.
+
+    Expression rules up to ``near_squared`` from the nearest of the (L, 3) landmarks, pose from ``far_squared`` on,
+    and in between the weights are linear in the squared distance.
+    """
+    with torch.no_grad():
+        # |a - b|^2 without |a|^2, which is the same for all landmarks of a point. `min` is three times as fast as
+        # `argmin` on the CPU.
+        nearest = torch.addmm(landmarks.square().sum(1), points, landmarks.t(), alpha=-2).min(1).indices
+    squared = (points - landmarks.index_select(0, nearest)).square().sum(1)
+    weight = ((far_squared - squared) / (far_squared - near_squared)).clamp(0, 1)
+    near, far = (weight.detach() > 0).nonzero().squeeze(1), (weight.detach() < 1).nonzero().squeeze(1)
+    return (
+        Influence(near, weight.index_select(0, near)),
+        Influence(far, 1 - weight.index_select(0, far)),
+    )
+
+
+class TrainingScene(NamedTuple):
+    """A clip made ready.
+
+    Attributes
+    ----------
+    keys : training frames.
+    timesteps : of the training frames, ascending; ``row`` gives the place of each.
+    signals : by row.
+    tracked : driving arguments by name, (T, n) each.
+    views : training cameras.
+    background : (3,).
+    rest : (V, 3) the subject's neutral head with the jaw open by the configured angle, canonical units: what the
+        neutral surface is to be.
+    landmark_rows : (L,) vertices of the head model.
+    expression_scale : (E,) that expression codes are divided by.
+    code_low, code_high : (E,) bounds of the expression code that colour and attributes follow.
+    """
+
+    clip: Clip
+    driver: Driver
+    keys: tuple[FrameKey, ...]
+    timesteps: list[int]
+    row: Mapping[int, int]
+    signals: list[Signal]
+    tracked: Mapping[str, Tensor]
+    views: Mapping[str, View]
+    background: Tensor
+    rest: Tensor
+    landmark_rows: IntArray
+    expression_scale: Tensor
+    code_low: Tensor
+    code_high: Tensor
+    device: str
+    seed: int
+
+    def frame(self) -> dict[str, Tensor]:
+        """What an avatar keeps of it: origin of the canonical frame, background and scale of the expression."""
+        return {
+            "origin": self.driver.origin,
+            "background": self.background,
+            "expression_scale": self.expression_scale,
+            "code_low": self.code_low,
+            "code_high": self.code_high,
+        }
+
+
+def training_scene(clip: Clip, config: GHAConfig, device: str, seed: int) -> TrainingScene:
+    """Make a clip ready. Raises `InputError` where its head model has no face region."""
+    subject = Subject.of(clip)
+    identity = (clip.head, subject.shape, subject.static_offset)
+    plain = Driver(*identity, np.zeros(3), 1.0, None, device)
+    neutral = plain.neutral.cpu().numpy()
+    rows = landmark_vertices(clip.head, neutral, config.landmarks)
+    timesteps = sorted({key.timestep for key in clip.splits["train"]})
+    tracked = plain.arguments([clip.poses[timestep] for timestep in timesteps])
+    scale = torch.ones(code_size(clip.head), device=device)
+    expressions = clip.head.expression_basis.shape[2]
+    scale[expressions : expressions + ANGLES] = config.angle_unit
+    driver = Driver(*identity, neutral[rows].mean(0), config.unit, scale, device)
+    opened = torch.zeros(1, len(scale), device=device)
+    opened[0, expressions] = config.neutral_jaw / config.angle_unit
+    signals = driver.signals(tracked)
+    low, high = bounds(torch.stack([signal.expression for signal in signals]), config.appearance_margin)
+    return TrainingScene(
+        clip=clip,
+        driver=driver,
+        keys=tuple(clip.splits["train"]),
+        timesteps=timesteps,
+        row={timestep: row for row, timestep in enumerate(timesteps)},
+        signals=signals,
+        tracked=tracked,
+        views={
+            name: view_of(clip.cameras[name], device) for name in {k.camera for k in clip.splits["train"]}
+        },
+        background=torch.as_tensor(np.asarray(clip.background), dtype=torch.float32, device=device),
+        rest=driver.unposed(driver.rest_arguments(opened))[0],
+        landmark_rows=rows,
+        expression_scale=scale,
+        code_low=low,
+        code_high=high,
+        device=device,
+        seed=seed,
+    )
+
+
+def bounds(codes: Tensor, margin: float | None) -> tuple[Tensor, Tensor]:
+    """(E,) lowest and highest values of (T, E) codes, each pushed out by ``margin`` of the range between them; without
+    a margin, the largest numbers there are."""
+    if margin is None:
+        largest = torch.full_like(codes[0], torch.finfo(codes.dtype).max)
+        return -largest, largest
+    low, high = codes.amin(0), codes.amax(0)
+    return low - margin * (high - low), high + margin * (high - low)

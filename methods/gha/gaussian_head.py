@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -14,11 +15,8 @@ from ...datasets.head.rotations import matrix_to_quaternion
 from ..shared.binding import WorldSplats, left_products
 from ..splats import rasterize
 from .config import GHAConfig
-from .controllers import Controllers, encode_pose
-from .driving import Motion, Signal
-from .landmarks import influences
-from .networks import Weights
-from .super_resolution import SuperResolution
+from .driving import HeadMotion, Signal, influences
+from .networks import Controllers, Weights, encode_pose, uniform
 
 POINTS = {"points": 3, "log_scales": 3, "quats": 4, "opacities": 1}
 """What a Gaussian has besides its features, with columns: canonical position and scale, rotation, opacity logit."""
@@ -33,7 +31,7 @@ COVERED = 1e-3
 """Alpha above which a pixel of the feature image counts as drawn."""
 
 
-class Splats(NamedTuple):
+class FeatureSplats(NamedTuple):
     """Splats of one pose: geometry in the world, its quaternions of any length, (N,) opacities, and (N, C) features, of
     which 3 are a colour."""
 
@@ -42,7 +40,7 @@ class Splats(NamedTuple):
     features: Tensor
 
 
-class Drawn(NamedTuple):
+class FeatureImage(NamedTuple):
     """What a camera sees: the (h, w, C) feature image and its (h, w) alpha, at the splatted size."""
 
     features: Tensor
@@ -51,7 +49,7 @@ class Drawn(NamedTuple):
 
 @dataclass(frozen=True)
 class GaussianHead:
-    """The networks of the Gaussian stage and what they do. Tensors come by name: `POINTS`, "features", "landmarks"."""
+    """The networks of the Gaussian phase and what they do. Tensors come by name: `POINTS`, "features", "landmarks"."""
 
     config: GHAConfig
     controllers: Controllers
@@ -70,7 +68,9 @@ class GaussianHead:
         }
         return {**controllers, **self.super_resolution.shapes()}
 
-    def splats(self, tensors: Weights, signal: Signal, motion: Motion, noise: Tensor | None = None) -> Splats:
+    def splats(
+        self, tensors: Weights, signal: Signal, motion: HeadMotion, noise: Tensor | None = None
+    ) -> FeatureSplats:
         """Pose all Gaussians; differentiable in every tensor but the landmarks and bounds, and in the motion.
 
         Colour and attributes see the expression code within the bounds "code_low" and "code_high", and (E,) ``noise``
@@ -92,12 +92,12 @@ class GaussianHead:
         canonical = points + c.displacement_scale * moves
         world = WorldSplats(
             c.unit * canonical @ motion.rotation.t() + motion.translation,
-            quats @ _turning(motion.rotation).t(),
+            quats @ _left_product(motion.rotation).t(),
             c.unit * log_scales.clamp_max(LARGEST_LOG_SCALE).exp(),
         )
-        return Splats(world, opacities, nets.colors(tensors, features, parts, seen, pose))
+        return FeatureSplats(world, opacities, nets.colors(tensors, features, parts, seen, pose))
 
-    def draw(self, splats: Splats, camera: Camera, background: Tensor) -> Drawn:
+    def draw(self, splats: FeatureSplats, camera: Camera, background: Tensor) -> FeatureImage:
         """Splat the features for a camera of the full size; their background is (3,) colour, then ones."""
         small = feature_camera(camera, self.config.upscale)
         world = splats.world
@@ -107,9 +107,11 @@ class GaussianHead:
             background=feature_background(background, self.config.channels),
             check_values=False,
         )
-        return Drawn(rendering.image, rendering.alpha)
+        return FeatureImage(rendering.image, rendering.alpha)
 
-    def sharpen(self, tensors: Weights, drawn: Drawn, background: Tensor, *, bounded: bool = False) -> Tensor:
+    def sharpen(
+        self, tensors: Weights, drawn: FeatureImage, background: Tensor, *, bounded: bool = False
+    ) -> Tensor:
         """(u h, u w, 3) image of a feature image; ``background`` where nothing is drawn near.
 
         ``bounded`` keeps the memory for large images small, without gradients.
@@ -145,6 +147,190 @@ def enlarged(values: Tensor, factor: int) -> Tensor:
     return values.repeat_interleave(factor, 0).repeat_interleave(factor, 1)
 
 
-def _turning(rotation: Tensor) -> Tensor:
+def _left_product(rotation: Tensor) -> Tensor:
     """(4, 4) matrix M of a (3, 3) rotation: M q is the quaternion of that rotation after q."""
     return left_products(matrix_to_quaternion(rotation)[None])[0]
+
+
+VARIANCE_FLOOR = 1e-5
+
+AT_ONCE = 2**24
+"""Numbers of the largest tensor up to which images are computed whole, and of a strip above (64 MiB of float32)."""
+
+
+@dataclass(frozen=True)
+class SuperResolution:
+    """Blocks of two 3x3 convolutions, each normalised over the image and rectified; a 1x1 convolution; a sigmoid.
+
+    The first block works at the size of the features, each further one at twice the size before it.
+
+    Attributes
+    ----------
+    channels : of the feature image.
+    widths : channels of the blocks.
+    residual : add to the splatted colours, enlarged bilinearly, as far as something is drawn, instead of making
+        colours; there is no sigmoid then, and the start is nothing to be added.
+    """
+
+    channels: int
+    widths: tuple[int, ...]
+    residual: bool = False
+
+    @property
+    def upscale(self) -> int:
+        """Size of the output over that of the input."""
+        return 2 ** (len(self.widths) - 1)
+
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shape of every tensor, by name. Convolutions have no bias but for the last one."""
+        shapes: dict[str, tuple[int, ...]] = {}
+        before = self.channels
+        for block, width in enumerate(self.widths):
+            shapes[f"sr.conv_{block}_0"] = (width, before, 3, 3)
+            shapes[f"sr.conv_{block}_1"] = (width, width, 3, 3)
+            before = width
+        return {**shapes, "sr.color": (3, before, 1, 1), "sr.color_bias": (3,)}
+
+    def initial(self, generator: torch.Generator, device: str) -> dict[str, Tensor]:
+        """Weights uniform within 1 / sqrt(fan-in), the last layer's zero for a residual."""
+        tensors = uniform(self.shapes(), generator, device)
+        if self.residual:
+            tensors |= {name: torch.zeros_like(tensors[name]) for name in ("sr.color", "sr.color_bias")}
+        return tensors
+
+    def __call__(self, weights: Weights, features: Tensor, alpha: Tensor) -> Tensor:
+        """(u H, u W, 3) colours of an (H, W, C) feature image with its (H, W) alpha; in (0, 1) without ``residual``."""
+        values = features.permute(2, 0, 1)[None]
+        for block in range(len(self.widths)):
+            if block:
+                height, width = values.shape[2:]
+                values = F.interpolate(values, (2 * height, 2 * width), mode="bilinear", align_corners=True)
+            for layer in range(2):
+                values = F.conv2d(values, weights[f"sr.conv_{block}_{layer}"], padding=1)
+                values = F.relu(_normalised(values))
+        colors = F.conv2d(values, weights["sr.color"], weights["sr.color_bias"])
+        return self._finished(colors, features, alpha)
+
+    @torch.no_grad()
+    def bounded(self, weights: Weights, features: Tensor, alpha: Tensor, at_once: int = AT_ONCE) -> Tensor:
+        """What calling gives, without gradients, in bounded memory: see `strips`.
+
+        By calling, where no tensor there has more than ``at_once`` numbers. Otherwise no more than a block's output and
+        that of the block before exist at a time, beside strips of so many numbers.
+        """
+        height, width = features.shape[:2]
+        before = (self.channels, *self.widths[:-1])
+        largest = [4**b * max(pair) * height * width for b, pair in enumerate(zip(before, self.widths))]
+        if max(largest) <= at_once:
+            return self(weights, features, alpha)
+        planes = features.permute(2, 0, 1)[None]
+
+        def given(first: int, last: int) -> Tensor:
+            return planes[:, :, first:last]
+
+        read: Reader = given
+        for block, channels in enumerate(zip(before, self.widths)):
+            if block:
+                read, height, width = doubled(read, height), 2 * height, 2 * width
+            rows = rows_at_once(width, max(channels), at_once)
+            raw = convolved(read, height, weights[f"sr.conv_{block}_0"], rows)
+            convolve_in_place(raw, weights[f"sr.conv_{block}_1"], rows, VARIANCE_FLOOR)
+            read = activated(raw, VARIANCE_FLOOR)
+        colors = features.new_empty(1, 3, height, width)
+        for first in range(0, height, rows):
+            strip = read(first, min(first + rows, height))
+            colors[:, :, first : first + rows] = F.conv2d(
+                strip, weights["sr.color"], weights["sr.color_bias"]
+            )
+        return self._finished(colors, features, alpha)
+
+    def _finished(self, colors: Tensor, features: Tensor, alpha: Tensor) -> Tensor:
+        """(u H, u W, 3) image of the last layer's (1, 3, u H, u W) output."""
+        if not self.residual:
+            return torch.sigmoid(colors)[0].permute(1, 2, 0)
+        plain = torch.cat([features[..., :3], alpha[..., None]], dim=2).permute(2, 0, 1)[None]
+        if self.upscale > 1:
+            plain = F.interpolate(plain, colors.shape[2:], mode="bilinear", align_corners=False)
+        return (plain[:, :3] + plain[:, 3:] * colors)[0].permute(1, 2, 0)
+
+
+def _normalised(values: Tensor) -> Tensor:
+    """Each channel with mean 0 and variance 1 over the image: instance normalisation.
+
+    Of one image that is what batch normalisation does, and torch's kernel for it takes an image of one pixel too
+    (which becomes 0).
+    """
+    return torch.native_batch_norm(values, None, None, None, None, True, 0.0, VARIANCE_FLOOR)[0]
+
+
+Reader = Callable[[int, int], Tensor]
+"""Rows from the first number to before the second of an image, (1, C, rows, W)."""
+
+
+def rows_at_once(width: int, channels: int, numbers: int) -> int:
+    """Rows of an image in a strip of at most so many numbers; one at least."""
+    return max(1, numbers // (width * channels))
+
+
+def convolved(read: Reader, height: int, weight: Tensor, rows: int) -> Tensor:
+    """(1, D, H, W) 3x3 convolution, padded with zeros, of the image of ``height`` rows that ``read`` gives."""
+    strips = range(0, height, rows)
+    result = None
+    for first in strips:
+        last = min(first + rows, height)
+        strip = _convolution(read(max(first - 1, 0), min(last + 1, height)), weight, first, last, height)
+        if result is None:
+            result = strip.new_empty(1, strip.shape[1], height, strip.shape[3])
+        result[:, :, first:last] = strip
+    assert result is not None
+    return result
+
+
+def convolve_in_place(raw: Tensor, weight: Tensor, rows: int, floor: float) -> None:
+    """Replace a raw output by that of the next layer, which has as many channels."""
+    read, height = activated(raw, floor), raw.shape[2]
+    above = None
+    for first in range(0, height, rows):
+        last = min(first + rows, height)
+        # The row above is overwritten already.
+        strip = read(first, min(last + 1, height))
+        joined = strip if above is None else torch.cat([above, strip], dim=2)
+        above = strip[:, :, last - first - 1 : last - first].clone()
+        raw[:, :, first:last] = _convolution(joined, weight, first, last, height)
+
+
+def activated(raw: Tensor, floor: float) -> Reader:
+    """Rows of a raw output, each channel normalised by the present image's statistics, and rectified."""
+    variances, means = zip(*(torch.var_mean(plane, correction=0) for plane in raw[0]))
+    mean = torch.stack(means)[:, None, None]
+    scale = (torch.stack(variances)[:, None, None] + floor).rsqrt()
+
+    def read(first: int, last: int) -> Tensor:
+        return (raw[:, :, first:last] - mean).mul_(scale).relu_()
+
+    return read
+
+
+def doubled(read: Reader, height: int) -> Reader:
+    """Rows of the image of ``height`` rows that ``read`` gives, at twice its size: bilinear, corners on corners."""
+
+    def read_doubled(first: int, last: int) -> Tensor:
+        step = (height - 1) / (2 * height - 1)
+        low, high = int(step * first), min(int(step * (last - 1)) + 2, height)
+        source = read(low, high)
+        places = step * torch.arange(first, last, dtype=torch.float64, device=source.device)
+        above = places.floor().long()
+        below = (above + 1).clamp_max(height - 1)
+        share = (places - above).to(source.dtype)[:, None]
+        upper, lower = (source.index_select(2, rows - low) for rows in (above, below))
+        enlarged = torch.lerp(upper, lower, share)
+        return F.interpolate(
+            enlarged, (last - first, 2 * source.shape[3]), mode="bilinear", align_corners=True
+        )
+
+    return read_doubled
+
+
+def _convolution(values: Tensor, weight: Tensor, first: int, last: int, height: int) -> Tensor:
+    """Rows ``first`` to before ``last`` of an image's convolution, of these rows and their neighbours in the image."""
+    return F.conv2d(F.pad(values, (1, 1, int(first == 0), int(last == height))), weight)

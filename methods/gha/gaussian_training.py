@@ -1,4 +1,4 @@
-"""The Gaussian stage: points, networks, super-resolution and head poses from single images."""
+"""The Gaussian phase: points, networks, super-resolution and head poses from single images."""
 
 from __future__ import annotations
 
@@ -17,13 +17,11 @@ from ..shared.losses import mean_ssim
 from ..shared.optimisation import Optimiser, logit
 from ..shared.schedule import Sampler, Timeline, log_linear, torch_generator
 from .config import GHAConfig
-from .driving import POSE_SIZE, Signal
-from .gaussian_head import Drawn, GaussianHead, feature_background
-from .landmarks import mouth_box
-from .mesh_head import MeshHead, Surface
+from .driving import POSE_SIZE, Signal, TrainingScene, mouth_box
+from .gaussian_head import FeatureImage, GaussianHead, feature_background
+from .mesh_head import MeshHead, NeutralSurface
 from .mesh_training import grid_about
 from .networks import Weights
-from .scene import Scene
 from .tracked_motion import TrackedMotion
 
 NEIGHBOURS = 3
@@ -42,11 +40,11 @@ class GaussianTraining:
 
     Parameters
     ----------
-    mesh : tensors that the mesh stage left: its networks and landmarks.
+    mesh : tensors that the mesh phase left: its networks and landmarks.
     """
 
     def __init__(
-        self, scene: Scene, head: GaussianHead, mesh_head: MeshHead, mesh: Weights, sampler: Sampler
+        self, scene: TrainingScene, head: GaussianHead, mesh_head: MeshHead, mesh: Weights, sampler: Sampler
     ):
         self._scene, self._head = scene, head
         config = self._config = head.config
@@ -94,7 +92,7 @@ class GaussianTraining:
         key = scene.keys[index]
         row = scene.row[key.timestep]
         view = scene.views[key.camera]
-        truth = self._images.get(iteration, index)
+        target = self._images.get(iteration, index)
         tensors = _With(self._optimiser, {"landmarks": self._landmarks, **self._bounds})
         signal = scene.signals[row]
         motion = scene.driver.motion(signal, self._optimiser["corrections"][row])
@@ -103,7 +101,7 @@ class GaussianTraining:
             view.camera,
             scene.background,
         )
-        padded = _padded(truth, view.camera, config.upscale, scene.background)
+        padded = _padded(target, view.camera, config.upscale, scene.background)
         small = reduced(padded, config.upscale, config.low_truth)
         loss = config.low_weight * (drawn.features[..., :3] - small).abs().mean()
         if config.augment:
@@ -165,21 +163,23 @@ class _With:
 
 
 @torch.no_grad()
-def first_points(scene: Scene, config: GHAConfig, mesh_head: MeshHead, mesh: Weights) -> dict[str, Tensor]:
-    """Gaussians on the neutral surface of the mesh stage, with its features, and some inside the mouth.
+def first_points(
+    scene: TrainingScene, config: GHAConfig, mesh_head: MeshHead, mesh: Weights
+) -> dict[str, Tensor]:
+    """Gaussians on the neutral surface of the mesh phase, with its features, and some inside the mouth.
 
     Raises
     ------
     InputError
-        Where the mesh stage ended without a surface.
+        Where the mesh phase ended without a surface.
     """
     device = scene.device
     grid = grid_about(scene.rest, config, device, finer=2 if config.subdivide else 1)
-    surface: Surface = mesh_head.surface(mesh, grid)
+    surface: NeutralSurface = mesh_head.surface(mesh, grid)
     if not len(surface.vertices):
         raise InputError(
             f"clip of {scene.clip.subject}",
-            "mesh stage",
+            "mesh phase",
             "a surface",
             "none: the signed distance has one sign all over",
             "Train longer, or start from the tracked mesh (start=mesh).",
@@ -245,16 +245,18 @@ class Zoom(NamedTuple):
         return cls(factor, size, (start[0], start[1]))
 
 
-def zoomed(drawn: Drawn, truth: Tensor, zoom: Zoom, background: Tensor) -> tuple[Drawn, Tensor]:
+def zoomed(
+    drawn: FeatureImage, target: Tensor, zoom: Zoom, background: Tensor
+) -> tuple[FeatureImage, Tensor]:
     """Feature image and ground truth rescaled alike, and cut or padded to their size before.
 
     By the nearest pixel, as published; what is padded is the (3,) ``background``, as where nothing is drawn.
     """
-    upscale = truth.shape[0] // drawn.alpha.shape[0]
+    upscale = target.shape[0] // drawn.alpha.shape[0]
     outside = feature_background(background, drawn.features.shape[2])
     features = _zoomed(drawn.features, zoom, 1, outside)
     alpha = _zoomed(drawn.alpha[..., None], zoom, 1, drawn.alpha.new_zeros(1))[..., 0]
-    return Drawn(features, alpha), _zoomed(truth, zoom, upscale, background)
+    return FeatureImage(features, alpha), _zoomed(target, zoom, upscale, background)
 
 
 def _zoomed(values: Tensor, zoom: Zoom, upscale: int, outside: Tensor) -> Tensor:

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
+from itertools import product
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from ..shared.binding import WorldSplats
 from ..shared.networks import ENCODING_SIZE, encode
 from .config import GHAConfig
-from .controllers import Controllers, encode_pose
-from .driving import Motion, Signal
-from .landmarks import influences
-from .networks import Mlp, Weights
-from .tetrahedra import TetGrid, marching_tetrahedra
+from .driving import HeadMotion, Signal, influences
+from .networks import Controllers, Mlp, Weights, encode_pose
 
 OFFSET_CELLS = 0.3
 """Reach of the grid's vertices in cells, before two tanh: published are 1/128 units in a grid of about 0.026."""
@@ -27,7 +27,7 @@ DISC_RADIUS, DISC_THICKNESS, DISC_OPACITY = 0.6, 0.1, 0.95
 """Standard deviations of a vertex's disc in roots of its area, its thickness in radii, and its opacity."""
 
 
-class Surface(NamedTuple):
+class NeutralSurface(NamedTuple):
     """The neutral head: (V, 3) canonical vertices, (V, F) features within (-1, 1), (M, 3) faces."""
 
     vertices: Tensor
@@ -37,7 +37,7 @@ class Surface(NamedTuple):
 
 @dataclass(frozen=True)
 class MeshHead:
-    """The networks of the mesh stage. ``geometry`` gives distance, offset (3) and features of a place."""
+    """The networks of the mesh phase. ``geometry`` gives distance, offset (3) and features of a place."""
 
     config: GHAConfig
     controllers: Controllers
@@ -52,14 +52,14 @@ class MeshHead:
 
     @property
     def networks(self) -> tuple[Mlp, ...]:
-        """All that the mesh stage trains."""
+        """All that the mesh phase trains."""
         return self.geometry, *self.controllers.of_mesh
 
     def distance(self, weights: Weights, places: Tensor) -> Tensor:
         """(N,) signed distance, within (-1, 1), positive outside, of (N, 3) canonical places."""
         return torch.tanh(self.geometry(weights, encode(places), outputs=1))[:, 0]
 
-    def surface(self, weights: Weights, grid: TetGrid) -> Surface:
+    def surface(self, weights: Weights, grid: TetGrid) -> NeutralSurface:
         """The neutral surface on a grid; differentiable in the geometry network.
 
         Only vertices of tetrahedra that the surface passes have an effect on it, so only they take part in what is
@@ -75,7 +75,7 @@ class MeshHead:
         reach = OFFSET_CELLS * grid.spacing
         crossings = marching_tetrahedra(values[:, 0], tets)
         vertices = crossings.interpolate(places + reach * torch.tanh(values[:, 1:4]))
-        return Surface(vertices, crossings.interpolate(values[:, 4:]), crossings.faces)
+        return NeutralSurface(vertices, crossings.interpolate(values[:, 4:]), crossings.faces)
 
     def landmark_offsets(self, weights: Weights, landmarks: Tensor, spacing: float) -> tuple[Tensor, Tensor]:
         """(L,) distance and (L, 3) offset of the geometry network at landmarks."""
@@ -88,7 +88,7 @@ class MeshHead:
         return points + self.config.displacement_scale * moves
 
     def posed(
-        self, weights: Weights, surface: Surface, landmarks: Tensor, signal: Signal, motion: Motion
+        self, weights: Weights, surface: NeutralSurface, landmarks: Tensor, signal: Signal, motion: HeadMotion
     ) -> tuple[Tensor, Tensor, Tensor]:
         """(V, 3) vertices in the world, (V, 3) colours, and the mean squared displacement.
 
@@ -115,7 +115,7 @@ class MeshHead:
 def vertex_discs(vertices: Tensor, faces: Tensor) -> WorldSplats:
     """A flat Gaussian for each vertex, in the surface and of its share of it: how the mesh is drawn.
 
-    The published mesh stage draws triangles. Discs that touch are the same surface to our renderer, give gradients for
+    The published mesh phase draws triangles. Discs that touch are the same surface to our renderer, give gradients for
     colours, silhouette and positions alike, and are what the mesh is to become. Their size and direction follow the
     mesh without gradients of their own.
 
@@ -143,3 +143,160 @@ def _turn_z_to(directions: Tensor) -> Tensor:
     unit = torch.nn.functional.normalize(directions, dim=1)
     x, y, z = torch.where(unit[:, 2:] < 0, -unit, unit).unbind(1)
     return torch.stack([1 + z, -y, x, torch.zeros_like(x)], dim=1)
+
+
+EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
+"""Edges of a tetrahedron, by its corners."""
+
+
+class TetGrid(NamedTuple):
+    """Tetrahedra that fill a box.
+
+    Attributes
+    ----------
+    vertices : (V, 3).
+    tets : (T, 4) int64, of positive volume: det[v1 - v0, v2 - v0, v3 - v0] > 0.
+    spacing : edge length of the cubic cells.
+    """
+
+    vertices: Tensor
+    tets: Tensor
+    spacing: float
+
+
+class Crossings(NamedTuple):
+    """The zero surface as places on edges; whatever the grid's vertices carry can be interpolated to it.
+
+    Attributes
+    ----------
+    ends : (K, 2) int64 vertices of the grid, one edge per surface vertex.
+    weights : (K,) of the second end, in [0, 1]; differentiable in the distances.
+    faces : (F, 3) int64, counter-clockwise seen from where the distance is positive.
+    """
+
+    ends: Tensor
+    weights: Tensor
+    faces: Tensor
+
+    def interpolate(self, values: Tensor) -> Tensor:
+        """(K, C) values at the surface of (V, C) values at the grid's vertices."""
+        first, second = values.index_select(0, self.ends[:, 0]), values.index_select(0, self.ends[:, 1])
+        return first + self.weights[:, None] * (second - first)
+
+
+def tet_grid(low: np.ndarray, high: np.ndarray, spacing: float, device: str = "cpu") -> TetGrid:
+    """Fill a box with the tetrahedra of a body-centred cubic lattice.
+
+    Inside, all are congruent, and their edges differ by a factor of 1.15 only, which makes the surface nearly as good
+    as the grid is fine. At the box's sides pyramids are cut in two.
+
+    Parameters
+    ----------
+    low, high : (3,) corners; the box grows at ``high`` to whole cells.
+    spacing : edge length of the cubic cells.
+    """
+    cells = np.maximum(np.ceil((np.asarray(high) - low) / spacing - 1e-9), 1).astype(np.int64)
+    corner_shape, total = cells + 1, int(np.prod(cells + 1))
+    corners = np.stack(np.meshgrid(*(np.arange(n) for n in corner_shape), indexing="ij"), -1).reshape(-1, 3)
+    centers = np.stack(np.meshgrid(*(np.arange(n) for n in cells), indexing="ij"), -1).reshape(-1, 3)
+    vertices = np.asarray(low) + spacing * np.concatenate([corners, centers + 0.5])
+
+    def corner_index(place: np.ndarray) -> np.ndarray:
+        return np.ravel_multi_index(place.T, tuple(corner_shape))
+
+    def center_index(place: np.ndarray) -> np.ndarray:
+        return total + np.ravel_multi_index(place.T, tuple(cells))
+
+    tets = []
+    for axis in range(3):
+        step, u, v = np.roll(np.eye(3, dtype=np.int64), axis, axis=1)
+        for side, outward in ((0, -step), (1, step)):
+            # The face of each cell towards `outward`, its corners in a cycle.
+            cycle = [
+                corner_index(centers + side * step + a * u + b * v)
+                for a, b in ((0, 0), (1, 0), (1, 1), (0, 1))
+            ]
+            own, inside = (
+                center_index(centers),
+                np.all((centers + outward >= 0) & (centers + outward < cells), 1),
+            )
+            border = ~inside
+            tets += [
+                np.stack([own, *(cycle[k] for k in corner)], 1)[border] for corner in ((0, 1, 2), (0, 2, 3))
+            ]
+            if side == 1:
+                other = center_index((centers + outward)[inside])
+                for k in range(4):
+                    pair = (own[inside], other, cycle[k][inside], cycle[(k + 1) % 4][inside])
+                    tets.append(np.stack(pair, 1))
+    joined = np.concatenate(tets)
+    edges = vertices[joined[:, 1:]] - vertices[joined[:, :1]]
+    turned = np.linalg.det(edges) < 0
+    joined[turned, 2:] = joined[turned, :1:-1]
+    return TetGrid(
+        torch.as_tensor(vertices, dtype=torch.float32, device=device),
+        torch.as_tensor(joined, device=device),
+        float(spacing),
+    )
+
+
+def spacing_for(low: np.ndarray, high: np.ndarray, count: int) -> float:
+    """Spacing at which a box holds about ``count`` vertices: two to a cell."""
+    return float((2 * np.prod(np.asarray(high, np.float64) - low) / count) ** (1 / 3))
+
+
+def marching_tetrahedra(distance: Tensor, tets: Tensor) -> Crossings:
+    """The surface where a distance given at the vertices is zero, linear between them.
+
+    Parameters
+    ----------
+    distance : (V,), positive outside.
+    tets : (T, 4) int64, of positive volume.
+
+    Returns
+    -------
+    `Crossings`; empty where nothing changes sign. A closed surface inside the grid is watertight: faces share the
+    vertices of common edges.
+    """
+    inside = distance.detach() < 0
+    codes = (inside[tets].to(torch.int64) << torch.arange(4, device=tets.device)).sum(1)
+    table, counts = (part.to(tets.device) for part in _cases())
+    crossed = counts[codes] > 0
+    tets, codes = tets[crossed], codes[crossed]
+    pairs = tets[:, torch.tensor(EDGES, device=tets.device)].sort(dim=2).values  # (T, 6, 2)
+    keys = pairs[..., 0] * len(distance) + pairs[..., 1]
+    wanted = []
+    for face in range(2):
+        rows = (counts[codes] > face).nonzero().squeeze(1)
+        wanted.append(keys[rows].gather(1, table[codes[rows], face]))
+    edges, faces = torch.unique(torch.cat(wanted), return_inverse=True)
+    ends = torch.stack([edges // len(distance), edges % len(distance)], dim=1)
+    first, second = distance.index_select(0, ends[:, 0]), distance.index_select(0, ends[:, 1])
+    return Crossings(ends, first / (first - second), faces)
+
+
+@lru_cache(maxsize=1)
+def _cases() -> tuple[Tensor, Tensor]:
+    """(16, 2, 3) edges of the triangles of each case and (16,) their number; bit k says that corner k is inside.
+
+    Each polygon is laid through the middles of its edges in a tetrahedron of positive volume and turned so that its
+    normal points away from the corners inside.
+    """
+    place = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=np.float64)
+    table, counts = np.zeros((16, 2, 3), np.int64), np.zeros(16, np.int64)
+    for case in range(1, 15):
+        inside = [k for k in range(4) if case >> k & 1]
+        outside = [k for k in range(4) if k not in inside]
+        # Around the polygon, neighbours share a face of the tetrahedron.
+        pairs = list(product(inside, outside))
+        if len(pairs) == 4:
+            pairs = [pairs[0], pairs[1], pairs[3], pairs[2]]
+        ring = [EDGES.index((min(pair), max(pair))) for pair in pairs]
+        middle = [0.5 * (place[EDGES[edge][0]] + place[EDGES[edge][1]]) for edge in ring]
+        normal = np.cross(middle[1] - middle[0], middle[2] - middle[0])
+        if normal @ (place[outside].mean(0) - place[inside].mean(0)) < 0:
+            ring.reverse()
+        counts[case] = len(ring) - 2
+        for face in range(counts[case]):
+            table[case, face] = ring[0], ring[face + 1], ring[face + 2]
+    return torch.from_numpy(table), torch.from_numpy(counts)

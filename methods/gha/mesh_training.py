@@ -1,27 +1,28 @@
-"""The mesh stage: a neutral surface, its motion and its colours from images, silhouettes and tracked landmarks."""
+"""The mesh phase: a neutral surface, its motion and its colours from images, silhouettes and tracked landmarks."""
 
 from __future__ import annotations
 
-from typing import Any
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ...bench.contracts import FrameKey
-from ..shared.loop import recomposited
+from ...bench.contracts import Budget, FrameKey, Progress
+from ..shared.checkpoint import load_checkpoint, save_checkpoint
+from ..shared.loop import CHECKPOINT, recomposited, train
 from ..shared.optimisation import Optimiser
 from ..shared.rendering import View, view_of
-from ..shared.schedule import Timeline, torch_generator
+from ..shared.schedule import ShuffledEpochs, Timeline, torch_generator
 from ..splats import rasterize
 from .config import GHAConfig
-from .mesh_head import DISC_OPACITY, MeshHead, vertex_discs
-from .scene import Scene
-from .signed_distance import TangentDistance, outer_vertices
-from .starts import fitted
-from .tetrahedra import TetGrid, spacing_for, tet_grid
-from .tracked_motion import TrackedMotion
+from .driving import TrainingScene
+from .mesh_head import DISC_OPACITY, MeshHead, TetGrid, spacing_for, tet_grid, vertex_discs
+from .tracked_motion import TangentDistance, TrackedMotion, fitted, outer_vertices
 
 COLOR, SILHOUETTE, DISPLACEMENT, DISTANCE, SMOOTHNESS = 0.1, 0.1, 0.01, 0.1, 100.0
 """Published weights of the losses, but for that of the landmarks, which is a setting."""
@@ -47,7 +48,7 @@ class MeshTraining:
     fitted : whether the start is still to be fitted to the sphere or the tracked mesh; a resumed run need not.
     """
 
-    def __init__(self, scene: Scene, head: MeshHead, *, fitted: bool):
+    def __init__(self, scene: TrainingScene, head: MeshHead, *, fitted: bool):
         self._scene, self._head, self._config = scene, head, head.config
         generator = torch_generator(scene.seed, "gha-mesh")
         initial: dict[str, Tensor] = {}
@@ -77,7 +78,7 @@ class MeshTraining:
         return self._optimiser
 
     def begin(self, timeline: Timeline) -> None:
-        """Nothing changes in the course of this stage."""
+        """Nothing changes in the course of this phase."""
 
     def loss(self, iteration: int, index: int) -> Tensor:
         """Loss of some views of the timestep that training image ``index`` belongs to."""
@@ -106,14 +107,14 @@ class MeshTraining:
         opacities = vertices.new_full((len(vertices),), DISC_OPACITY)
         chosen = self._views(iteration, key)
         for seen in chosen:
-            view, truth, mask, background = self._target(seen)
+            view, target, mask, background = self._target(seen)
             rendering = rasterize(
                 *(discs.means, discs.quats, discs.scales, opacities, colors),
                 *(view.world_to_camera, view.K, view.camera.width, view.camera.height),
                 background=background,
                 check_values=False,
             )
-            part = COLOR * (rendering.image - truth).abs().mean()
+            part = COLOR * (rendering.image - target).abs().mean()
             if mask is not None:
                 part = part + SILHOUETTE * (1 - soft_overlap(rendering.alpha, mask))
             loss = loss + part / len(chosen)
@@ -156,7 +157,7 @@ class MeshTraining:
         return [key, *(others[place] for place in order[: self._config.mesh_views - 1])]
 
     def _target(self, key: FrameKey) -> tuple[View, Tensor, Tensor | None, Tensor]:
-        """View, (H, W, 3) image and (H, W) coverage at the stage's size, and the (3,) background of the image.
+        """View, (H, W, 3) image and (H, W) coverage at the phase's size, and the (3,) background of the image.
 
         Black, as published, where a matte takes the background out of the image.
         """
@@ -230,7 +231,7 @@ def _reduced(image: np.ndarray, height: int, width: int, device: str) -> Tensor:
     return planes[0].permute(1, 2, 0).contiguous()
 
 
-def _distances(scene: Scene, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
+def _distances(scene: TrainingScene, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
     """(P, 3) places, most of them near the tracked mesh at rest, and their (P,) distances to it, up to `FAR`."""
     head, vertices = scene.clip.head, scene.rest.cpu().double().numpy()
     bounding = outer_vertices(vertices, np.asarray(head.faces), head.regions)
@@ -244,3 +245,72 @@ def _distances(scene: Scene, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]
     places = torch.cat([scene.rest[rows.to(low.device)] + NEAR * away.to(low), anywhere])
     distances = known(places.cpu().double().numpy())
     return places, torch.as_tensor(distances).to(places).clamp(-FAR, FAR)
+
+
+FOLDER, RESULT_FILE = "mesh", "mesh.safetensors"
+
+
+class MeshResult(NamedTuple):
+    """What the mesh phase leaves: its tensors by name, iterations done, and seconds spent, those of its start included."""
+
+    tensors: Mapping[str, Tensor]
+    iterations: int
+    seconds: float
+
+
+def mesh_phase(
+    scene: TrainingScene,
+    head: MeshHead,
+    budget: Budget,
+    out: Path,
+    run: str,
+    progress: Progress,
+    clock: Callable[[], float] = time.monotonic,
+) -> MeshResult:
+    """Train the mesh head, continue its training, or read what a finished one left under ``out``."""
+    folder = out / FOLDER
+    stored = load_checkpoint(folder / RESULT_FILE, run, scene.device)
+    if stored is None:
+        stored = _trained(scene, head, budget, folder, run, progress, clock)
+        save_checkpoint(folder / RESULT_FILE, run, stored)
+        (folder / CHECKPOINT).unlink(missing_ok=True)
+    return MeshResult(stored["tensors"], stored["iterations"], stored["seconds"])
+
+
+def remove_mesh_phase(out: Path) -> None:
+    """Take away what the mesh phase left; the avatar no longer needs it."""
+    folder = out / FOLDER
+    for name in (RESULT_FILE, CHECKPOINT):
+        (folder / name).unlink(missing_ok=True)
+    if folder.exists():
+        folder.rmdir()
+
+
+def _trained(
+    scene: TrainingScene,
+    head: MeshHead,
+    budget: Budget,
+    folder: Path,
+    run: str,
+    progress: Progress,
+    clock: Callable[[], float],
+) -> dict[str, Any]:
+    began = clock()
+    training = MeshTraining(scene, head, fitted=not (folder / CHECKPOINT).exists())
+    config = head.config
+    outcome = train(
+        training,
+        ShuffledEpochs(len(scene.keys), scene.seed),
+        published_length=max(1, round(config.schedule_length * config.mesh_fraction)),
+        budget=budget,
+        folder=folder,
+        run=run,
+        device=scene.device,
+        progress=progress,
+        checkpoint_every_s=config.checkpoint_every_s,
+        clock=clock,
+        began=began,
+    )
+    names = [*(name for network in head.networks for name in network.shapes()), "landmarks"]
+    tensors = {name: training.optimiser[name].detach() for name in names}
+    return {"tensors": tensors, "iterations": outcome.iterations, "seconds": outcome.seconds}

@@ -2,7 +2,7 @@
 
 Xu et al., "Gaussian Head Avatar: Ultra High-fidelity Head Avatar via Dynamic Gaussians", CVPR 2024.
 
-Two stages. A mesh head (signed distance in a tetrahedral grid, controllers for motion and colour) gives neutral points
+Two phases. A mesh head (signed distance in a tetrahedral grid, controllers for motion and colour) gives neutral points
 with features; Gaussians start there, keep the controllers, and get a super-resolution network. The budget is parted
 between them as published.
 
@@ -26,14 +26,13 @@ from ...bench.contracts import Budget, Clip, Progress
 from ..shared.avatar_files import TRACKED, RefinedTracking, Subject, finish_fit, is_finished, run_digest
 from ..shared.loop import Outcome, check_budget, check_training_split, train
 from ..shared.schedule import ShuffledEpochs
-from .avatar import DRIVING_FILE, GHAAvatar
+from .avatar import AVATAR_FILE, DRIVING_FILE, GHAAvatar, write_avatar
 from .config import GHAConfig
+from .driving import TrainingScene, training_scene
 from .gaussian_head import GaussianHead
 from .gaussian_training import GaussianTraining
 from .mesh_head import MeshHead
-from .mesh_stage import mesh_stage, remove_mesh_stage
-from .scene import Scene, scene_of
-from .storage import AVATAR_FILE, write_avatar
+from .mesh_training import mesh_phase, remove_mesh_phase
 
 
 class GHA:
@@ -59,12 +58,12 @@ class GHA:
         run = run_digest(self.name, self.version, config, clip, budget, seed)
         if is_finished(out, run):
             return self.load(out, device=device)
-        scene = scene_of(clip, config, device, seed)
+        scene = training_scene(clip, config, device, seed)
         size = len(scene.signals[0].expression)
         mesh_head, head = MeshHead.of(config, size), GaussianHead.of(config, size)
         first, second = parted(budget, config.mesh_fraction)
-        before = _Part(progress, 0, second.iterations or 0)
-        mesh = mesh_stage(scene, mesh_head, first, out, run, before, self._clock)
+        before = _PhaseProgress(progress, 0, second.iterations or 0)
+        mesh = mesh_phase(scene, mesh_head, first, out, run, before, self._clock)
         sampler = ShuffledEpochs(len(scene.keys), seed)
         began = self._clock()
         training = GaussianTraining(scene, head, mesh_head, mesh.tensors, sampler)
@@ -77,7 +76,7 @@ class GHA:
                 folder=out,
                 run=run,
                 device=device,
-                progress=_Part(progress, mesh.iterations, 0),
+                progress=_PhaseProgress(progress, mesh.iterations, 0),
                 checkpoint_every_s=config.checkpoint_every_s,
                 clock=self._clock,
                 began=began,
@@ -94,7 +93,7 @@ class GHA:
         )
         counts = {"splats": len(tensors["points"]), "mesh_iterations": mesh.iterations}
         finish_fit(out, run, whole, Subject.of(clip), clip.head, **counts)
-        remove_mesh_stage(out)
+        remove_mesh_phase(out)
         return self.load(out, device=device)
 
     def load(self, path: Path, *, device: str) -> GHAAvatar:
@@ -102,8 +101,8 @@ class GHA:
         return GHAAvatar.read(path, device)
 
 
-class _Part:
-    """Progress of one stage within that of the whole."""
+class _PhaseProgress:
+    """Progress of one phase within that of the whole."""
 
     def __init__(self, progress: Progress, before: int, after: int):
         self._progress, self._before, self._after = progress, before, after
@@ -113,7 +112,7 @@ class _Part:
 
 
 def parted(budget: Budget, fraction: float) -> tuple[Budget, Budget]:
-    """The budgets of the mesh stage and the Gaussian stage, of one iteration at least."""
+    """The budgets of the mesh phase and the Gaussian phase, of one iteration at least."""
     first, second = {}, {}
     if budget.iterations is not None:
         first["iterations"] = max(1, round(fraction * budget.iterations))
@@ -131,7 +130,7 @@ def within(part: Budget, whole: Budget, spent: float) -> Budget:
     return replace(part, seconds=min(part.seconds, max(whole.seconds - spent, 1e-3)))
 
 
-def corrected(scene: Scene, corrections: Tensor) -> RefinedTracking:
+def corrected(scene: TrainingScene, corrections: Tensor) -> RefinedTracking:
     """The tracking of the training timesteps with (T, 6) learnt corrections of rotation and translation."""
     before = {name: scene.tracked[name].cpu().numpy() for name in TRACKED}
     turn, shift = corrections.cpu().split(3, dim=1)

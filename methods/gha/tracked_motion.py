@@ -6,20 +6,22 @@ directions of the expression code; the head model that tracked it moves its face
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
+import numpy as np
 import torch
-from torch import Tensor
+from scipy.spatial import cKDTree
+from torch import Tensor, nn
 
+from ...bench.contracts import FloatArray, IntArray
+from ...datasets.head.geometry import vertex_normals
 from ..shared.networks import encode
-from ..shared.schedule import torch_generator
+from ..shared.optimisation import Optimiser
+from ..shared.schedule import log_linear, torch_generator
 from .config import GHAConfig
-from .driving import Driver
-from .landmarks import influences
+from .driving import Driver, TrainingScene, influences
 from .networks import Mlp, Weights
-from .scene import Scene
-from .starts import fitted
 
 TURNING = ("left_eyeball", "right_eyeball")
 """Regions left out: gaze turns them under the lids, where one field of displacements has no room for both."""
@@ -30,7 +32,7 @@ CODES, CODES_AT_ONCE = 512, 32
 POINTS_AT_ONCE = 64
 
 RATES = (5e-3, 5e-4)
-"""First and last learning rate of the fit before the mesh stage."""
+"""First and last learning rate of the fit before the mesh phase."""
 
 SHARE_TRACKED, AROUND_TRACKED = 0.5, 0.3
 """Share of the codes that lie about those of training timesteps, and their standard deviation there; the others are
@@ -60,7 +62,7 @@ class TrackedMotion(NamedTuple):
 
     @classmethod
     @torch.no_grad()
-    def of(cls, scene: Scene, config: GHAConfig) -> TrackedMotion:
+    def of(cls, scene: TrainingScene, config: GHAConfig) -> TrackedMotion:
         """Codes about those of the training timesteps and random ones, with what they do to the head model."""
         rows = _rows(scene, config)
         tracked = torch.stack([signal.expression for signal in scene.signals])
@@ -96,10 +98,10 @@ class TrackedMotion(NamedTuple):
 
 def _moved(driver: Driver, codes: Tensor) -> Tensor:
     """(B, V, 3) canonical vertices for (B, E) expression codes."""
-    return driver.unposed(driver.still(codes))
+    return driver.unposed(driver.rest_arguments(codes))
 
 
-def _rows(scene: Scene, config: GHAConfig) -> Tensor:
+def _rows(scene: TrainingScene, config: GHAConfig) -> Tensor:
     """Vertices within the landmarks' undivided rule."""
     near, _ = influences(scene.rest, scene.rest[scene.landmark_rows], config.near_squared, config.far_squared)
     ruled = torch.zeros(len(scene.rest), dtype=torch.bool, device=scene.rest.device)
@@ -108,3 +110,78 @@ def _rows(scene: Scene, config: GHAConfig) -> Tensor:
         if name in scene.clip.head.regions:
             ruled[torch.as_tensor(scene.clip.head.regions[name], device=ruled.device)] = False
     return ruled.nonzero().squeeze(1)
+
+
+def fitted(
+    network: Mlp,
+    initial: Mapping[str, Tensor],
+    loss: Callable[[Optimiser, int], Tensor],
+    steps: int,
+    rates: tuple[float, float],
+) -> dict[str, Tensor]:
+    """A network's tensors after so many steps of Adam.
+
+    Parameters
+    ----------
+    initial : its tensors by name, and any others.
+    loss : of the tensors and the number of the step, from 1.
+    rates : learning rate of the first half of the steps, and the one that it falls to, log-linearly, in the second.
+    """
+    names = list(network.shapes())
+    weights = Optimiser(
+        {name: nn.Parameter(initial[name].clone()) for name in names}, dict.fromkeys(names, rates[0])
+    )
+    for step in range(1, steps + 1):
+        rate = log_linear(*rates, max(0.0, 2 * step / steps - 1))
+        for name in names:
+            weights.set_learning_rate(name, rate)
+        loss(weights, step).backward()
+        weights.step()
+        weights.zero_grad()
+    return {name: weights[name].detach() for name in names}
+
+
+INNER_PARTS = ("teeth", "mouth_socket")
+"""Regions behind the skin: what lies about them says nothing of inside and outside."""
+
+FACING, FORWARD = ("left_eyeball", "right_eyeball", "eye_region"), 0.3
+"""Regions that bound the head by what faces forward of them (least component of the normals along z): eyeballs fill the
+lids' opening, but their backs, and the inner sides of lids, lie behind the skin."""
+
+
+class TangentDistance:
+    """Distance to the nearest vertex, signed by the side of its tangent plane that a point is on; positive outside.
+
+    Hoppe et al., "Surface reconstruction from unorganized points", SIGGRAPH 1992, section 3.3. Where a mesh ends (the
+    neck's lower edge) its walls continue, which is what a bust wants.
+
+    Parameters
+    ----------
+    vertices : (V, 3).
+    faces : (F, 3), counter-clockwise seen from outside.
+    keep : (K,) vertices that count.
+    """
+
+    def __init__(self, vertices: FloatArray, faces: IntArray, keep: IntArray):
+        normals = vertex_normals(np.asarray(vertices, np.float64), np.asarray(faces))
+        self._points, self._normals = np.asarray(vertices, np.float64)[keep], normals[keep]
+        self._tree = cKDTree(self._points)
+
+    def __call__(self, places: FloatArray) -> FloatArray:
+        """(N,) distances of (N, 3) places."""
+        distance, nearest = self._tree.query(places)
+        side = np.einsum("ni,ni->n", places - self._points[nearest], self._normals[nearest])
+        return np.where(side < 0, -distance, distance)
+
+
+def outer_vertices(vertices: FloatArray, faces: IntArray, regions: Mapping[str, IntArray]) -> IntArray:
+    """(K,) vertices of an unposed head that bound it: all but `INNER_PARTS` and what does not face forward of
+    `FACING`."""
+    bounding = np.ones(len(vertices), bool)
+    for name in INNER_PARTS:
+        bounding[regions.get(name, [])] = False
+    forward = vertex_normals(vertices, faces)[:, 2] > FORWARD
+    for name in FACING:
+        rows = np.asarray(regions.get(name, []), np.int64)
+        bounding[rows] = forward[rows]
+    return np.flatnonzero(bounding)

@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from torch import Tensor
 
+from ...bench.configuration import build
 from ...bench.contracts import Camera, Frame, HeadPose
-from ..shared.avatar_files import SUBJECT_FILE, Subject, read_shared_head, read_subject
+from ...bench.errors import HeadbenchError, InputError
+from ...bench.io.arrays import Member, read_arrays
+from ...bench.io.documents import read_json
+from ...bench.io.files import write_json
+from ..shared.avatar_files import SUBJECT_FILE, Subject, read_shared_head, read_subject, write_arrays
 from ..shared.subject_mesh import SubjectMesh, pose_key
-from .canonical import canonical_surface
+from . import kernel
 from .config import InstaConfig
 from .field import Architecture, Field, Parameters, Prior
-from .inference import Inference
-from .marching import PosedSurface, Space
+from .marching import PosedSurface, Space, canonical_surface
 from .occupancy import Occupancy, occupied_space
-from .parts import mouth_triangles
-from .rays import box_corners, camera_rays, pixels_of_hull
-from .rendering import Marching, Scene
-from .storage import FIELD_FILE, SETTINGS_FILE, read_field, read_settings
+from .rendering import Marching, PosedRays, box_corners, camera_rays, pixels_of_hull, render_rays
+from .warp import mouth_triangles
 
 RAYS_AT_ONCE = 1 << 15
 MIDDLE = 0.5  # of a step: where samples lie when nothing is left to chance
@@ -88,7 +94,7 @@ class InstaAvatar:
         for start in range(0, max(width, 0) * max(bottom - top, 0), RAYS_AT_ONCE):
             numbers = np.arange(start, min(start + RAYS_AT_ONCE, width * (bottom - top)))
             rows, columns = top + numbers // width, left + numbers % width
-            scene = Scene(surface, condition, camera_rays(camera, columns, rows, MIDDLE))
+            scene = PosedRays(surface, condition, camera_rays(camera, columns, rows, MIDDLE))
             seen = self._inference.render(scene)
             left_over = seen.transmittance[:, None]
             rgb[rows, columns] = seen.color + left_over * rgb[rows, columns]
@@ -106,3 +112,128 @@ class InstaAvatar:
             vertices = self._mesh.posed(self._mesh.arguments([pose]))
             self._last = key, self._surface.pose(vertices)
         return self._last[1]
+
+
+FIELD_FILE = "field.npz"
+SETTINGS_FILE = "field.json"
+OCCUPIED = "occupied"
+
+
+def write_settings(path: Path, config: InstaConfig) -> None:
+    """Write the settings that decide how the field is read and rendered."""
+    write_json(path, asdict(config))
+
+
+def read_settings(path: Path) -> InstaConfig:
+    """Read what `write_settings` wrote. Raises `InputError` for settings that are unknown or out of range."""
+    try:
+        config: InstaConfig = build(InstaConfig, read_json(path), str(path))
+    except InputError:
+        raise
+    except (HeadbenchError, TypeError, ValueError) as error:
+        raise InputError(path, "", "settings of INSTA", str(error)) from error
+    return config
+
+
+def write_field(path: Path, parameters: Mapping[str, Tensor], occupied: np.ndarray) -> None:
+    """Write parameters, and (X, Y, Z) occupancy."""
+    arrays = {name: value.detach().cpu().half().numpy() for name, value in parameters.items()}
+    bits = np.packbits(occupied.reshape(-1))
+    write_arrays(path, {**arrays, OCCUPIED: bits})
+
+
+def read_field(
+    path: Path, architecture: Architecture, size: tuple[int, ...], device: str
+) -> tuple[dict[str, Tensor], np.ndarray]:
+    """Read what `write_field` wrote: float32 parameters, and flat numbers of occupied cells.
+
+    Raises `InputError` where an array is missing, not finite or of another shape or type.
+    """
+    shapes = architecture.shapes()
+    cells = math.prod(size)
+    members = {name: Member("f", shape, dtype="f2") for name, shape in shapes.items()}
+    arrays = read_arrays(path, {**members, OCCUPIED: Member("u", (-(-cells // 8),), dtype="u1")})
+    parameters = {name: torch.from_numpy(arrays[name].astype(np.float32)).to(device) for name in shapes}
+    return parameters, np.flatnonzero(np.unpackbits(arrays[OCCUPIED], count=cells))
+
+
+class RayColors(NamedTuple):
+    """What rays see, as float32 numpy arrays."""
+
+    color: np.ndarray  # (R, 3) not yet composited on anything
+    transmittance: np.ndarray  # (R,)
+    samples: int
+
+
+class Inference:
+    """A trained field in a space, ready to be looked at.
+
+    Parameters
+    ----------
+    mouth : (F,) bool, as in `render_rays`.
+    backend : "reference" is `render_rays`; "auto" takes the kernel for parameters in float32 on the CPU. An instruction
+        set of the kernel's ``instruction_sets()`` stands for the kernel in that one.
+    """
+
+    def __init__(
+        self,
+        field: Field,
+        parameters: Parameters,
+        space: Space,
+        mouth: Tensor,
+        marching: Marching,
+        backend: str = "auto",
+    ):
+        self.field, self.parameters, self.space = field, parameters, space
+        self.mouth, self.marching = mouth, marching
+        self._isa = "" if backend == "auto" else backend
+        table = parameters["table"]
+        module = None if backend == "reference" else kernel.load()
+        fits = module is not None and table.device.type == "cpu" and table.dtype == torch.float32
+        self._trained: Any = self._prepared(module) if fits else None
+
+    @torch.no_grad()
+    def render(self, scene: PosedRays) -> RayColors:
+        """What the rays of one pose see."""
+        module = scene.surface.surface.module
+        if self._trained is None or module is None:
+            rendered = render_rays(
+                self.field, self.parameters, [scene], self.space, self.mouth, self.marching
+            )
+            return RayColors(
+                rendered.color.cpu().numpy(), rendered.transmittance.cpu().numpy(), rendered.samples
+            )
+        rays = scene.rays
+        color = np.empty((len(rays.origins), 3), np.float32)
+        transmittance = np.empty(len(color), np.float32)
+        samples = module.render(
+            *(scene.surface.guide(self.space), self._trained, self._starts(scene.condition)),
+            *(self.mouth.numpy().view(np.uint8), rays.origins, rays.directions, rays.jitter),
+            *(self.marching.step, self.marching.round_samples, self.marching.stop_transmittance),
+            *(color, transmittance, self._isa, scene.surface.surface.threads()),
+        )
+        return RayColors(color, transmittance, samples)
+
+    def _prepared(self, module: Any) -> Any:
+        architecture, box, prior = self.field.architecture, self.field.box, self.field.prior
+        arrays = {
+            name: np.ascontiguousarray(value.detach().numpy()) for name, value in self.parameters.items()
+        }
+        networks = [
+            [arrays[f"{name}_{number}"] for number in range(len(shapes))]
+            for name, shapes in (
+                ("density", architecture.density_shapes),
+                ("color", architecture.color_shapes),
+            )
+        ]
+        levels = [tuple(level) for level in architecture.levels]
+        low = box.low.numpy().astype(np.float32)
+        return module.Trained(levels, arrays["table"], low, box.side, *prior, *networks)
+
+    def _starts(self, condition: Tensor) -> np.ndarray:
+        """(2, units) that the conditions add to the first layer: outside the mouth, where all are one, and at it."""
+        weight = self.parameters["density_0"].detach().numpy()
+        width = self.field.architecture.conditions
+        conditions = np.stack([np.ones(width, np.float32), condition[:width].numpy().astype(np.float32)])
+        by_conditions = weight[:, weight.shape[1] - width :]
+        return np.ascontiguousarray(conditions @ by_conditions.T)

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import NamedTuple
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from ..shared.networks import sh_basis
 from ..shared.schedule import torch_generator
+from . import kernel
 from .config import InstaConfig
-from .hash_grid import INITIAL, Level, encode, make_levels, table_rows
-from .networks import initial_weights, layer_shapes, network
 
 SH_DEGREE = 3  # 16 basis functions; the published program calls that degree 4
 DIRECTIONS = (SH_DEGREE + 1) ** 2
@@ -21,7 +21,7 @@ LOG_DENSITY_MAX = 15.0  # of its gradient, as published; keeps a sample's thickn
 Parameters = Mapping[str, Tensor]
 
 
-class Box(NamedTuple):
+class EncodedCube(NamedTuple):
     """Cube of canonical space that the encoding covers: (3,) lower corner and side, metres."""
 
     low: Tensor
@@ -101,7 +101,7 @@ class Field:
     prior : added to the logarithm of the density per metre.
     """
 
-    def __init__(self, architecture: Architecture, box: Box, prior: Prior):
+    def __init__(self, architecture: Architecture, box: EncodedCube, prior: Prior):
         self.architecture, self.box, self.prior = architecture, box, prior
 
     def latent(self, parameters: Parameters, positions: Tensor, conditions: Tensor, rows: Tensor) -> Tensor:
@@ -140,3 +140,173 @@ class _BoundedExp(torch.autograd.Function):
     def backward(ctx, *grads: Tensor) -> Tensor:  # type: ignore[no-untyped-def]
         (result,) = ctx.saved_tensors
         return grads[0] * result
+
+
+PRIMES = (1, 2654435761, 805459861)
+INITIAL = 1e-4  # features start uniform in +-INITIAL
+
+
+class Level(NamedTuple):
+    """One level: cells per unit length, samples per side, and its rows of the table."""
+
+    scale: float
+    resolution: int
+    first: int
+    rows: int
+
+
+def make_levels(count: int, base: int, finest: int, log2_table: int) -> tuple[Level, ...]:
+    """Levels whose resolutions grow geometrically from ``base`` to ``finest``.
+
+    A level has one row per sample, rounded up to 8, as long as that is no more than ``2**log2_table``; beyond that
+    rows are shared by a hash. Sizes are those of the published program, which shifts positions by half a cell and so
+    reads the samples of the last half cell from the other side; here the first sample lies at 0.
+    """
+    growth = (math.log2(finest) - math.log2(base)) / (count - 1) if count > 1 else 0.0
+    levels, first = [], 0
+    for number in range(count):
+        scale = base * 2 ** (number * growth) - 1
+        # The last level's scale is a whole number up to rounding, which must not add a sample.
+        resolution = math.ceil(scale - 1e-6) + 1
+        rows = min(-(-(resolution**3) // 8) * 8, 2**log2_table)
+        levels.append(Level(scale, resolution, first, rows))
+        first += rows
+    return tuple(levels)
+
+
+def table_rows(levels: Sequence[Level]) -> int:
+    """Rows of the table of all levels."""
+    return levels[-1].first + levels[-1].rows
+
+
+def encode(positions: Tensor, table: Tensor, levels: Sequence[Level], backend: str = "auto") -> Tensor:
+    """(N, levels * features) values at (N, 3) positions in [0, 1]; differentiable in the (rows, features) table.
+
+    ``backend`` "reference" is the definition in torch, for any type and device; "auto" takes the kernel for float32
+    on the CPU.
+    """
+    module = kernel.load() if backend == "auto" else None
+    if module is None or table.device.type != "cpu" or table.dtype != torch.float32:
+        return encode_reference(positions, table, levels)
+    return _Encode.apply(positions.detach().contiguous(), table, tuple(levels))  # type: ignore[no-untyped-call]
+
+
+def encode_reference(positions: Tensor, table: Tensor, levels: Sequence[Level]) -> Tensor:
+    """Twin of the kernel: trilinear sums of eight rows on every level."""
+    corners = torch.tensor([[c >> axis & 1 for axis in range(3)] for c in range(8)], device=positions.device)
+    parts = []
+    for level in levels:
+        scaled = positions * level.scale
+        below = scaled.floor()
+        part = (scaled - below)[:, None]
+        at = below.long()[:, None] + corners
+        weights = torch.where(corners.bool(), part, 1 - part).prod(2)
+        rows = level.first + _rows(at, level)
+        parts.append((weights[..., None] * table[rows]).sum(1))
+    return torch.cat(parts, dim=1)
+
+
+def _rows(at: Tensor, level: Level) -> Tensor:
+    if level.resolution**3 <= level.rows:
+        flat = at[..., 0] + level.resolution * (at[..., 1] + level.resolution * at[..., 2])
+        return flat % level.rows
+    mixed = at[..., 0] * PRIMES[0] ^ at[..., 1] * PRIMES[1] ^ at[..., 2] * PRIMES[2]
+    return mixed & (level.rows - 1)
+
+
+class _Encode(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, positions: Tensor, table: Tensor, levels: tuple[Level, ...]) -> Tensor:
+        ctx.save_for_backward(positions)
+        ctx.levels, ctx.shape = levels, table.shape
+        out = table.new_empty(len(positions), len(levels) * table.shape[1])
+        module = kernel.load()
+        assert module is not None
+        arrays = positions.numpy(), table.detach().numpy()
+        module.encode(*arrays, list(levels), out.numpy(), torch.get_num_threads())
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        (positions,) = ctx.saved_tensors
+        by_table = grads[0].new_zeros(ctx.shape)
+        module = kernel.load()
+        assert module is not None
+        arrays = positions.numpy(), grads[0].contiguous().numpy()
+        module.encode_backward(*arrays, list(ctx.levels), by_table.numpy(), torch.get_num_threads())
+        return None, by_table, None
+
+
+CPU_BLOCK = 2048  # rows; their activations fit a core's second-level cache
+
+
+def layer_shapes(inputs: int, hidden: int, layers: int, outputs: int) -> list[tuple[int, int]]:
+    """(out, in) of every weight of a network with so many hidden layers."""
+    widths = [inputs, *[hidden] * layers, outputs]
+    return [(widths[i + 1], widths[i]) for i in range(len(widths) - 1)]
+
+
+def initial_weights(shapes: Sequence[tuple[int, int]], generator: torch.Generator) -> list[Tensor]:
+    """Uniform within +-sqrt(6 / (in + out)): Glorot and Bengio, as tiny-cuda-nn starts its networks."""
+    return [
+        (2 * torch.rand(shape, generator=generator) - 1) * math.sqrt(6 / (shape[0] + shape[1]))
+        for shape in shapes
+    ]
+
+
+def network(inputs: Tensor, constants: Tensor, rows: Tensor, weights: Sequence[Tensor]) -> Tensor:
+    """(N, out) of layers with ReLU between them, applied to [inputs, constants[rows]].
+
+    Parameters
+    ----------
+    inputs : (N, C).
+    constants : (M, K) that get no gradient; K may be 0.
+    rows : (N,) int64.
+    """
+    return _Network.apply(inputs, constants, rows, *weights)  # type: ignore[no-untyped-call]
+
+
+class _Network(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, inputs: Tensor, constants: Tensor, rows: Tensor, *weights: Tensor) -> Tensor:
+        keep = any(ctx.needs_input_grad)
+        outputs = inputs.new_empty(len(inputs), len(weights[-1]))
+        saved: list[Tensor] = []
+        for block in _blocks(inputs):
+            values = inputs[block]
+            if constants.shape[1]:
+                values = torch.cat([values, constants.index_select(0, rows[block])], dim=1)
+            for weight in weights[:-1]:
+                if keep:
+                    saved.append(values)
+                values = (values @ weight.t()).relu_()
+            if keep:
+                saved.append(values)
+            outputs[block] = values @ weights[-1].t()
+        ctx.width = inputs.shape[1]
+        ctx.save_for_backward(*weights, *saved)
+        return outputs
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        count = len(ctx.needs_input_grad) - 3
+        weights, saved = ctx.saved_tensors[:count], ctx.saved_tensors[count:]
+        gradient = grads[0]
+        by_weights = [torch.zeros_like(weight) for weight in weights]
+        by_inputs = gradient.new_empty(len(gradient), ctx.width)
+        for number, block in enumerate(_blocks(gradient)):
+            values = saved[number * count : (number + 1) * count]
+            by_values = gradient[block]
+            for layer in range(count - 1, -1, -1):
+                by_weights[layer].addmm_(by_values.t(), values[layer])
+                if layer:
+                    by_values = torch.ops.aten.threshold_backward(
+                        by_values @ weights[layer], values[layer], 0.0
+                    )
+            by_inputs[block] = by_values @ weights[0][:, : ctx.width]
+        return by_inputs, None, None, *by_weights
+
+
+def _blocks(rows: Tensor) -> list[slice]:
+    step = CPU_BLOCK if rows.device.type == "cpu" else max(len(rows), 1)
+    return [slice(start, start + step) for start in range(0, len(rows), step)]

@@ -12,10 +12,11 @@ import torch
 from scipy.ndimage import distance_transform_cdt
 from torch import Tensor
 
-from ...bench.contracts import HeadAsset
+from ...bench.contracts import HeadAsset, HeadPose
+from ..shared.subject_mesh import SubjectMesh
 from . import kernel
-from .triangles import Found, first_hits, nearest_triangles
-from .warp import Blend, Compatibility, blended, canonical_from_posed
+from .config import InstaConfig
+from .warp import Blend, Compatibility, Found, blended, canonical_from_posed, first_hits, nearest_triangles
 
 Backend = Literal["auto", "kernel", "reference"]
 FREE_MAX = 255
@@ -74,7 +75,7 @@ class Space:
         return self.free == 0
 
 
-class Surface:
+class CanonicalSurface:
     """The canonical mesh of a subject, and what all its poses share.
 
     Parameters
@@ -110,7 +111,7 @@ class Surface:
 class PosedSurface:
     """One pose of the surface."""
 
-    def __init__(self, surface: Surface, vertices: Tensor):
+    def __init__(self, surface: CanonicalSurface, vertices: Tensor):
         self.surface, self.vertices = surface, vertices
         self.matrices = canonical_from_posed(surface.canonical, vertices, surface.faces, surface.blend)
         self.corners = vertices[surface.faces]
@@ -258,3 +259,22 @@ def occupied_at(space: Space, positions: np.ndarray) -> np.ndarray:
 
 def _array(values: Tensor) -> np.ndarray:
     return np.ascontiguousarray(values.numpy())
+
+
+@torch.no_grad()
+def canonical_surface(
+    head: HeadAsset, mesh: SubjectMesh, config: InstaConfig, backend: Backend = "auto"
+) -> CanonicalSurface:
+    """The canonical surface of a subject; ``mesh`` lies on the CPU."""
+    still = np.zeros(3)
+    pose = HeadPose(
+        mesh.version,
+        expression=np.zeros(mesh.model.expression_size),
+        rotation=still,
+        neck=still,
+        jaw=np.array([config.jaw_opening, 0, 0]),
+        eyes=np.zeros(6),
+        translation=still,
+    )
+    vertices = mesh.posed(mesh.arguments([pose]))
+    return CanonicalSurface(head, vertices, config.warp_compatibility, backend)

@@ -9,10 +9,9 @@ from ..shared.avatar_files import Subject, finish_fit, is_finished, run_digest
 from ..shared.loop import check_budget, check_training_split, train
 from ..shared.schedule import ShuffledEpochs
 from ..shared.subject_mesh import SubjectMesh
-from .avatar import InstaAvatar
-from .canonical import canonical_surface
+from .avatar import FIELD_FILE, SETTINGS_FILE, InstaAvatar, write_field, write_settings
 from .config import InstaConfig
-from .storage import FIELD_FILE, SETTINGS_FILE, write_field, write_settings
+from .marching import canonical_surface
 from .training import InstaTraining
 
 

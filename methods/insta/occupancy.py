@@ -14,8 +14,8 @@ from torch import Tensor
 
 from ..shared.schedule import numpy_generator
 from .config import InstaConfig
-from .field import Box, Field, Parameters
-from .marching import Space, Surface
+from .field import EncodedCube, Field, Parameters
+from .marching import CanonicalSurface, Space
 
 CELLS_AT_ONCE = 1 << 16
 
@@ -26,7 +26,7 @@ class Occupancy:
     Only cells near the mesh (``candidates``) are ever occupied; at the start all of them are.
     """
 
-    def __init__(self, surface: Surface, config: InstaConfig):
+    def __init__(self, surface: CanonicalSurface, config: InstaConfig):
         self._config, self._surface = config, surface
         vertices = surface.canonical.numpy().astype(np.float64)
         low, high = vertices.min(0) - config.shell_outside, vertices.max(0) + config.shell_outside
@@ -40,9 +40,9 @@ class Occupancy:
         self._rounds = _dilation_rounds(surface, self.cell)
         self._neighbours = surface.blend.neighbours
 
-    def box(self, device: str) -> Box:
+    def box(self, device: str) -> EncodedCube:
         """The cube that the encoding covers."""
-        return Box(torch.from_numpy(self.low).to(device), float(self.cell * self.size.max()))
+        return EncodedCube(torch.from_numpy(self.low).to(device), float(self.cell * self.size.max()))
 
     @property
     def occupied(self) -> np.ndarray:
@@ -144,7 +144,7 @@ def occupied_space(occupancy: Occupancy, cells: np.ndarray) -> Space:
 
 
 def _cells_near(
-    surface: Surface, low: np.ndarray, cell: float, size: np.ndarray, config: InstaConfig
+    surface: CanonicalSurface, low: np.ndarray, cell: float, size: np.ndarray, config: InstaConfig
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Flat numbers, nearest triangles and distances of the cells within the shell, by their centres."""
     numbers = np.arange(int(np.prod(size)))
@@ -168,7 +168,7 @@ def _cells_near(
 
 
 def _probes(
-    surface: Surface, low: np.ndarray, cell: float, size: np.ndarray, candidates: np.ndarray
+    surface: CanonicalSurface, low: np.ndarray, cell: float, size: np.ndarray, candidates: np.ndarray
 ) -> list[np.ndarray]:
     """(8,) arrays: the nearest triangles of the eight corners of each candidate."""
     cells = np.stack(np.unravel_index(candidates, size), axis=1)
@@ -186,7 +186,7 @@ def _probes(
     return list(np.concatenate(parts)[inverse].reshape(8, -1).astype(np.int32))
 
 
-def _dilation_rounds(surface: Surface, cell: float) -> int:
+def _dilation_rounds(surface: CanonicalSurface, cell: float) -> int:
     """Steps across edges that cover a cell's diagonal, half an edge each."""
     corners = surface.rest.corners.numpy()
     edge = float(np.median(np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)))

@@ -10,13 +10,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .compositing import composite
+from ...bench.contracts import Camera, FloatArray
 from .field import Field, Parameters
 from .marching import PosedSurface, Rays, Space
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class PosedRays:
     """One pose of the head with rays into it.
 
     Attributes
@@ -51,7 +51,7 @@ class Marching:
 def render_rays(
     field: Field,
     parameters: Parameters,
-    scenes: Sequence[Scene],
+    scenes: Sequence[PosedRays],
     space: Space,
     mouth: Tensor,
     marching: Marching,
@@ -115,3 +115,77 @@ def render_rays(
 
 def _joined(parts: Sequence[np.ndarray], device: torch.device) -> Tensor:
     return torch.from_numpy(np.concatenate(parts)).to(device)
+
+
+class Composite(NamedTuple):
+    """What rays gather."""
+
+    color: Tensor  # (R, C) weighted sums of the samples' values
+    transmittance: Tensor  # (R,) what is left of the light behind
+    distance: Tensor  # (R,) weighted sums of the samples' distances, metres
+
+
+def composite(
+    thickness: Tensor, values: Tensor, distances: Tensor, rays: Tensor, entering: Tensor
+) -> Composite:
+    """Sums over samples of ``T (1 - exp(-thickness)) value``, T the transmittance in front of a sample.
+
+    Optical depths are summed in float64, since a ray's are differences of a sum over all rays.
+
+    Parameters
+    ----------
+    thickness : (N,) density times the length of each sample; samples ray by ray, in order of distance.
+    values, distances : (N, C) and (N,).
+    rays : (N,) int64, not descending.
+    entering : (R,) transmittance in front of the first of these samples.
+    """
+    count = len(entering)
+    depth = thickness.double()
+    total = depth.cumsum(0)
+    before = total - depth
+    firsts = torch.searchsorted(rays, torch.arange(count, device=rays.device))
+    lasts = torch.searchsorted(rays, torch.arange(count, device=rays.device), right=True)
+    bounds = torch.cat([total.new_zeros(1), total])
+    ahead = (before - bounds[firsts[rays]]).to(thickness.dtype)
+    weights = entering[rays] * torch.exp(-ahead) * -torch.expm1(-thickness)
+    leaving = entering * torch.exp(bounds[firsts] - bounds[lasts]).to(thickness.dtype)
+    rows = torch.cat([values, distances[:, None]], dim=1) * weights[:, None]
+    summed = rows.new_zeros(count, rows.shape[1]).index_add(0, rays, rows)
+    return Composite(summed[:, :-1], leaving, summed[:, -1])
+
+
+Region = tuple[int, int, int, int]  # left, top, right, bottom; the last two excluded
+
+
+def camera_rays(camera: Camera, columns: np.ndarray, rows: np.ndarray, jitter: np.ndarray | float) -> Rays:
+    """Rays through the centres of (R,) pixels, from the camera's centre; ``jitter`` as in `Rays`."""
+    K = np.asarray(camera.K, np.float64)
+    y = (rows + 0.5 - K[1, 2]) / K[1, 1]
+    x = (columns + 0.5 - K[0, 2] - K[0, 1] * y) / K[0, 0]
+    towards = np.stack([x, y, np.ones_like(x)], axis=1)
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    directions = towards @ camera.world_to_camera[:3, :3]
+    origins = np.broadcast_to(camera.center, directions.shape)
+    shift = np.broadcast_to(np.asarray(jitter, np.float32), len(directions))
+    return Rays(origins.astype(np.float32), directions.astype(np.float32), np.ascontiguousarray(shift))
+
+
+def pixels_of_hull(camera: Camera, points: FloatArray) -> Region:
+    """Pixels outside of which no ray meets the convex hull of (N, 3) points; the whole image if any is behind."""
+    transform = np.asarray(camera.world_to_camera, np.float64)
+    seen = np.asarray(points, np.float64) @ transform[:3, :3].T + transform[:3, 3]
+    if seen[:, 2].min() <= 1e-6:
+        return 0, 0, camera.width, camera.height
+    pixels = (seen @ np.asarray(camera.K, np.float64).T)[:, :2] / seen[:, 2:]
+    size = np.array([camera.width, camera.height])
+    low = np.clip(np.floor(pixels.min(0) - 1), 0, size).astype(int)
+    high = np.clip(np.ceil(pixels.max(0) + 1), 0, size).astype(int)
+    return int(low[0]), int(low[1]), int(high[0]), int(high[1])
+
+
+def box_corners(points: FloatArray, padding: float) -> FloatArray:
+    """(8, 3) corners of the box around points, grown by ``padding`` metres."""
+    low, high = points.min(0) - padding, points.max(0) + padding
+    return np.array(
+        [[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])]
+    )

@@ -11,17 +11,16 @@ from torch import Tensor, nn
 
 from ...bench.contracts import Clip, FrameKey
 from ...bench.errors import InputError
+from ..shared.loop import recomposited
 from ..shared.optimisation import Optimiser
 from ..shared.schedule import Timeline, log_linear, numpy_generator
 from ..shared.subject_mesh import BoundedCache, SubjectMesh, pose_key
 from .config import InstaConfig
 from .field import Architecture, Field, Prior
-from .losses import color_loss, depth_loss, true_colors
-from .marching import PosedSurface, Rays, Space, Surface
+from .marching import CanonicalSurface, PosedSurface, Rays, Space
 from .occupancy import Occupancy
-from .parts import bare_triangles, mouth_triangles
-from .rays import box_corners, camera_rays, pixels_of_hull
-from .rendering import Marching, Rendered, Scene, render_rays
+from .rendering import Marching, PosedRays, Rendered, box_corners, camera_rays, pixels_of_hull, render_rays
+from .warp import bare_triangles, mouth_triangles
 
 RAYS_MIN, RAYS_MAX = 64, 1 << 18
 
@@ -29,7 +28,7 @@ RAYS_MIN, RAYS_MAX = 64, 1 << 18
 class Batch(NamedTuple):
     """Rays of one iteration and what they should see."""
 
-    scenes: list[Scene]
+    scenes: list[PosedRays]
     image: Tensor  # (R, 3) in [0, 1]
     coverage: Tensor  # (R, 1)
     mouth: Tensor  # (R,) bool
@@ -40,7 +39,13 @@ class InstaTraining:
     """A `Trainable`. The loop's index names the first image of an iteration; the others are drawn beside it."""
 
     def __init__(
-        self, clip: Clip, mesh: SubjectMesh, surface: Surface, config: InstaConfig, device: str, seed: int
+        self,
+        clip: Clip,
+        mesh: SubjectMesh,
+        surface: CanonicalSurface,
+        config: InstaConfig,
+        device: str,
+        seed: int,
     ):
         self._clip, self._mesh, self._surface = clip, mesh, surface
         self._config, self._device, self._seed = config, device, seed
@@ -100,12 +105,12 @@ class InstaTraining:
         # Without a mask the recorded background is part of the picture and has to be rendered as it is.
         random = torch.from_numpy(drawn.astype(np.float32))
         background = random if self._masked else self._ground.expand_as(random)
-        truth = true_colors(batch.image, batch.coverage, self._ground, background, config)
+        target = target_colors(batch.image, batch.coverage, self._ground, background, config)
         device = rendered.color.device
         color = rendered.color + rendered.transmittance[:, None] * background.to(device)
         weighted = iteration >= self._timeline.at(config.mouth_from)
         weights = torch.where(batch.mouth & weighted, config.mouth_weight, 1.0)
-        loss = color_loss(color, truth.to(device), weights.to(device), config.huber)
+        loss = color_loss(color, target.to(device), weights.to(device), config.huber)
         if not rendered.samples:  # all rays passed the head by: nothing to learn, but no error either
             loss = loss + 0.0 * self._optimiser[self._names[-1]].sum()
         if config.fog_weight:
@@ -115,7 +120,7 @@ class InstaTraining:
         self._seen = rendered.samples
         return loss
 
-    def render(self, scenes: Sequence[Scene]) -> Rendered:
+    def render(self, scenes: Sequence[PosedRays]) -> Rendered:
         """March rays through the field as it is."""
         parameters = {name: self._optimiser[name] for name in self._names}
         return render_rays(self.field, parameters, scenes, self._space, self.mouth, self._marching)
@@ -183,7 +188,7 @@ class InstaTraining:
 
     def _rays_of(
         self, index: int, count: int, generator: np.random.Generator
-    ) -> tuple[Scene, Tensor, Tensor, Tensor, Tensor]:
+    ) -> tuple[PosedRays, Tensor, Tensor, Tensor, Tensor]:
         key = self.keys[index]
         camera, surface = self._clip.cameras[key.camera], self._surface_at(key.timestep)
         # Beyond these pixels nothing can be rendered, and no gradient comes of them.
@@ -198,7 +203,7 @@ class InstaTraining:
         coverage = torch.from_numpy(covered.astype(np.float32)[:, None] / 255)
         mouth, depth = self._guides(surface, rays, coverage[:, 0])
         expression = np.asarray(self._clip.poses[key.timestep].expression)
-        scene = Scene(surface, torch.as_tensor(expression, dtype=torch.float32), rays)
+        scene = PosedRays(surface, torch.as_tensor(expression, dtype=torch.float32), rays)
         return scene, colors, coverage, mouth, depth
 
     def _guides(self, surface: PosedSurface, rays: Rays, coverage: Tensor) -> tuple[Tensor, Tensor]:
@@ -239,3 +244,48 @@ class InstaTraining:
     @staticmethod
     def _entries(megabytes: int, size: int) -> int:
         return max(1, megabytes * 2**20 // size)
+
+
+COLOR_PART = 0.2  # the published program divides the Huber loss by 5
+
+
+def color_loss(color: Tensor, target: Tensor, weights: Tensor, huber: float) -> Tensor:
+    """Weighted mean over (R,) rays of the Huber loss of (R, 3) colours: square below ``huber``, linear above.
+
+    Channels are added up, as in the published program, which hands each its own gradient.
+    """
+    each = torch.nn.functional.huber_loss(color, target, delta=huber, reduction="none") / huber
+    return COLOR_PART * (weights * each.sum(1)).mean()
+
+
+def depth_loss(distance: Tensor, target: Tensor) -> Tensor:
+    """Mean over (R,) rays of the distance, metres, between expected and true depth; rays without have infinity."""
+    known = target.isfinite()
+    return (distance - torch.where(known, target, distance.detach())).abs().mean()
+
+
+def target_colors(
+    image: Tensor, coverage: Tensor, recorded_on: Tensor, background: Tensor, config: InstaConfig
+) -> Tensor:
+    """Colours of (R, 3) pixels on another background than the one they were recorded on.
+
+    Parameters
+    ----------
+    coverage : (R, 1) in [0, 1].
+    """
+    if config.target_compatibility == "code":
+        own = (image - (1 - coverage) * recorded_on).clamp(0, 1) / coverage.clamp_min(1 / 255)
+        mixed = coverage * to_linear(own.clamp(0, 1)) + (1 - coverage) * to_linear(background)
+        return to_srgb(mixed)
+    return recomposited(image, coverage, recorded_on, background)
+
+
+def to_linear(srgb: Tensor) -> Tensor:
+    """Linear light of display-referred sRGB (IEC 61966-2-1)."""
+    return torch.where(srgb <= 0.04045, srgb / 12.92, ((srgb.clamp_min(0.04045) + 0.055) / 1.055) ** 2.4)
+
+
+def to_srgb(linear: Tensor) -> Tensor:
+    """Inverse of `to_linear`."""
+    bright = 1.055 * linear.clamp_min(0.0031308) ** (1 / 2.4) - 0.055
+    return torch.where(linear <= 0.0031308, 12.92 * linear, bright)

@@ -8,11 +8,10 @@ import torch
 from skimage.metrics import structural_similarity
 
 from headbench.bench.contracts import Budget, no_progress
-from headbench.methods.gbs.blend import difference_widths, place
+from headbench.methods.gbs.blendshapes import PointMotions, apply_pose, difference_widths
 from headbench.methods.gbs.config import BlendshapeTraining, GBSConfig
 from headbench.methods.gbs.method import GBS
-from headbench.methods.gbs.mouth import mouth_room, padded_offset, with_mouth
-from headbench.methods.gbs.rig import Carried
+from headbench.methods.gbs.points import mouth_cylinder, padded_offset, with_mouth
 from headbench.methods.gbs.training import DIFFERENCES, GBSTraining, sample_count
 from headbench.methods.shared.avatar_files import Subject
 from headbench.methods.shared.schedule import Timeline
@@ -71,11 +70,11 @@ def test_the_loss_is_the_papers_sum(training, clip):
     dense[entries.owners, entries.expressions] = table
     blended = torch.from_numpy(np.einsum("k,nkc->nc", pose.expression, dense)).float()
     assert blended.abs().max() > 1e-4
-    placed = place(neutral, blended, Carried.of(training.rig.carry(arguments)))
-    colors = placed.colors(torch.from_numpy(camera.center).float(), 0)
+    posed = apply_pose(neutral, blended, PointMotions.of(training.rig.motions(arguments)))
+    colors = posed.colors(torch.from_numpy(camera.center).float(), 0)
     rendering = rasterize(
-        *placed.world,
-        placed.opacities,
+        *posed.world,
+        posed.opacities,
         colors,
         camera.world_to_camera,
         camera.K,
@@ -92,20 +91,20 @@ def test_the_loss_is_the_papers_sum(training, clip):
     expected = 0.8 * np.abs(image - truth).mean() + 0.2 * (1 - similarity[10:-10, 10:-10].mean())
     expected += 10 * np.mean((rendering.alpha.double().numpy() - coverage) ** 2)
     vertices = training.rig.mesh.canonical.numpy()
-    room = mouth_room(vertices[head.regions["teeth"]])
+    cylinder = mouth_cylinder(vertices[head.regions["teeth"]])
     for row in ("teeth_upper", "teeth_lower"):
         of_row = np.flatnonzero(np.isin(head.faces, head.regions[row]).any(1))
         on_row = np.isin(training.points.triangles, of_row)
-        x, y, z = (neutral["means"].double().numpy()[on_row] - room.center.double().numpy()).T
-        outward = np.maximum(np.hypot(x, z) - room.radius, 0)
-        upward = np.maximum(np.abs(y) - room.half_height, 0)
+        x, y, z = (neutral["means"].double().numpy()[on_row] - cylinder.center.double().numpy()).T
+        outward = np.maximum(np.hypot(x, z) - cylinder.radius, 0)
+        upward = np.maximum(np.abs(y) - cylinder.half_height, 0)
         violation = np.mean(outward**2 + upward**2)
         assert violation > 0
         expected += 100 * violation
     assert found == pytest.approx(expected, rel=1e-4)
 
 
-def test_without_mattes_alpha_and_background_are_left_alone(clip):
+def test_without_masks_alpha_and_background_are_unused(clip):
     bare = replace(clip, masks=dict.fromkeys(clip.masks))
     opaque = {key: np.full_like(mask, 255) for key, mask in clip.masks.items()}
     covered = replace(clip, masks=opaque, background=np.zeros(3))
@@ -122,7 +121,7 @@ def test_without_mattes_alpha_and_background_are_left_alone(clip):
     assert found[2] != pytest.approx(found[1], rel=1e-2), "on the background that the clip has"
 
 
-def test_differences_step_at_the_rates_of_their_columns_times_the_mask(training):
+def test_differences_step_at_their_rates_times_the_mask(training):
     """Adam's first step is the learning rate wherever there is a gradient; round splats have none by rotation."""
     training, _ = training
     training.optimiser["log_scales"].data += torch.tensor([0.3, 0.0, -0.3])
@@ -153,7 +152,7 @@ def test_positions_settle_after_three_quarters(training):
     assert rate(30_000) == rate(39_999) == pytest.approx(1.6e-6)
 
 
-def test_teeth_and_still_triangles_have_no_differences(training):
+def test_teeth_and_unmoved_triangles_have_no_differences(training):
     training, head = training
     counts = torch.bincount(training.entries.owners, minlength=len(training.binding)).numpy()
     corners = head.faces[training.points.triangles]
@@ -162,7 +161,7 @@ def test_teeth_and_still_triangles_have_no_differences(training):
     assert 0 < counts[~still].mean() < training.rig.expressions
 
 
-def test_a_run_starts_with_as_many_splats_as_images_tell_apart(clip):
+def test_initial_splats_are_limited_by_image_resolution(clip):
     camera = look_at(np.array([0, 0, 0.5]), np.zeros(3), "a", 100, 100)
     key = clip.splits["train"][0]._replace(camera="a")
     poses = {key.timestep: replace(clip.poses[key.timestep], translation=np.array([0, 0, 0.1]))}

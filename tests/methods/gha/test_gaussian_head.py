@@ -1,4 +1,4 @@
-"""The Gaussian stage: gradients of the whole model, its images, and what it prepares of them."""
+"""The Gaussian phase: gradients of the whole model, its images, and what it prepares of them."""
 
 import numpy as np
 import pytest
@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from headbench.methods.gha.driving import Motion, Signal
-from headbench.methods.gha.gaussian_head import Drawn, GaussianHead, enlarged, near_drawn
+from headbench.methods.gha.driving import HeadMotion, Signal
+from headbench.methods.gha.gaussian_head import FeatureImage, GaussianHead, enlarged, near_drawn
 from headbench.methods.gha.gaussian_training import Zoom, reduced, zoomed
 
 from ..toy_clip import look_at
@@ -38,7 +38,7 @@ def model(**more):
         "code_high": torch.full((CODE,), 9.0, dtype=torch.float64),
     }
     turn = torch.tensor(Rotation.from_rotvec([0.2, -0.1, 0.3]).as_matrix())
-    motion = Motion(turn, random(3, scale=0.01), random(6))
+    motion = HeadMotion(turn, random(3, scale=0.01), random(6))
     empty = torch.zeros(3, dtype=torch.float64)
     signal = Signal(random(CODE), empty, empty, empty, torch.zeros(2, 3, dtype=torch.float64))
     camera = look_at(np.array([0.0, 0.05, 0.4]), np.zeros(3), "c", 10, 12)
@@ -46,7 +46,7 @@ def model(**more):
 
 
 @pytest.mark.parametrize("residual", [False, True])
-def test_gradients_of_the_whole_model_agree_with_finite_differences(residual):
+def test_gradients_of_the_whole_model(residual):
     """Every tensor and the motion, through networks, splatting and super-resolution, along random directions."""
     head, tensors, signal, motion, camera = model(residual=residual)
     ground = torch.tensor([1.0, 0.5, 0.25], dtype=torch.float64)
@@ -64,10 +64,10 @@ def test_gradients_of_the_whole_model_agree_with_finite_differences(residual):
         if name not in ("landmarks", "code_low", "code_high")
     }
     parts = [value.clone().requires_grad_() for value in motion]
-    loss({**tensors, **variables}, Motion(*parts)).backward()
+    loss({**tensors, **variables}, HeadMotion(*parts)).backward()
     step = 1e-6
-    for name in [*variables, *Motion._fields]:
-        variable = variables[name] if name in variables else parts[Motion._fields.index(name)]
+    for name in [*variables, *HeadMotion._fields]:
+        variable = variables[name] if name in variables else parts[HeadMotion._fields.index(name)]
         direction = torch.randn(variable.shape, generator=generator, dtype=torch.float64)
 
         def moved(amount, name=name, direction=direction):
@@ -135,23 +135,23 @@ def a_picture():
     planes = [rows, columns, rows * 0 + 1, rows + columns]
     features = torch.tensor(np.stack(planes, -1), dtype=torch.float64)
     generator = torch.Generator().manual_seed(0)
-    truth = torch.rand(24, 32, 3, generator=generator, dtype=torch.float64)
-    return Drawn(features, torch.ones(12, 16)), truth
+    target = torch.rand(24, 32, 3, generator=generator, dtype=torch.float64)
+    return FeatureImage(features, torch.ones(12, 16)), target
 
 
 @pytest.mark.parametrize("draws", [(0.0, 0.0, 0.0), (0.1, 0.7, 0.4), (0.3, 0.99, 0.99)])
 def test_a_smaller_picture_is_put_somewhere_on_the_background(draws):
-    drawn, truth = a_picture()
+    drawn, target = a_picture()
     ground = torch.tensor([0.25, 0.5, 0.75], dtype=torch.float64)
     zoom = Zoom.of((12, 16), draws)
     (height, width), (top, left) = zoom.size, (-start for start in zoom.start)
     assert height < 12
     assert 0 <= top <= 12 - height
     assert 0 <= left <= 16 - width
-    smaller, small_truth = zoomed(drawn, truth, zoom, ground)
+    smaller, small_truth = zoomed(drawn, target, zoom, ground)
     for found, whole, many, around in (
         (smaller.features, drawn.features, 1, torch.tensor([*ground, 1.0])),
-        (small_truth, truth, 2, ground),
+        (small_truth, target, 2, ground),
     ):
         expected = around.double().expand(found.shape).clone()
         inside = interpolated(whole, zoom.factor)[: many * height, : many * width]
@@ -162,13 +162,13 @@ def test_a_smaller_picture_is_put_somewhere_on_the_background(draws):
 
 @pytest.mark.parametrize("draws", [(0.99, 0.0, 0.0), (0.9, 0.3, 0.8), (0.7, 0.99, 0.99), (0.45, 0.5, 0.5)])
 def test_of_a_larger_picture_some_part_is_cut_out(draws):
-    drawn, truth = a_picture()
+    drawn, target = a_picture()
     zoom = Zoom.of((12, 16), draws)
     (height, width), (top, left) = zoom.size, zoom.start
     assert 0 <= top <= height - 12
     assert 0 <= left <= width - 16
-    larger, large_truth = zoomed(drawn, truth, zoom, torch.zeros(3, dtype=torch.float64))
-    for found, whole, many in ((larger.features, drawn.features, 1), (large_truth, truth, 2)):
+    larger, large_truth = zoomed(drawn, target, zoom, torch.zeros(3, dtype=torch.float64))
+    for found, whole, many in ((larger.features, drawn.features, 1), (large_truth, target, 2)):
         cut = interpolated(whole, zoom.factor)[many * top :, many * left :]
         assert torch.equal(found, cut[: many * 12, : many * 16])
     assert larger.alpha.all()
@@ -181,7 +181,7 @@ def test_zooms_cover_all_factors_and_places():
     assert {zoom.start[1] for zoom in zooms if zoom.size[0] == 24} == set(range(4))
 
 
-def test_beyond_its_bounds_the_code_moves_points_but_changes_nothing_else():
+def test_beyond_its_bounds_the_code_only_moves_points():
     head, tensors, signal, motion, _ = model()
     high = torch.full((CODE,), 0.5, dtype=torch.float64)
     tensors["code_high"] = high

@@ -1,21 +1,31 @@
-"""The mesh stage: its start, its drawing, its losses, and that it learns a head."""
+"""The mesh phase: its start, its drawing, its losses, and that it learns a head."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from scipy.integrate import dblquad
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from headbench.bench.contracts import Budget, no_progress
 from headbench.datasets.head.geometry import vertex_normals
-from headbench.methods.gha.mesh_head import DISC_RADIUS, DISC_THICKNESS, MeshHead, vertex_discs
-from headbench.methods.gha.mesh_stage import mesh_stage
-from headbench.methods.gha.mesh_training import MeshTraining, roughness, soft_overlap
-from headbench.methods.gha.scene import scene_of
-from headbench.methods.gha.signed_distance import TangentDistance, outer_vertices
-from headbench.methods.gha.tetrahedra import marching_tetrahedra, tet_grid
+from headbench.methods.gha.driving import training_scene
+from headbench.methods.gha.mesh_head import (
+    DISC_RADIUS,
+    DISC_THICKNESS,
+    MeshHead,
+    TetGrid,
+    marching_tetrahedra,
+    spacing_for,
+    tet_grid,
+    vertex_discs,
+)
+from headbench.methods.gha.mesh_training import MeshTraining, mesh_phase, roughness, soft_overlap
+from headbench.methods.gha.tracked_motion import TangentDistance, outer_vertices
 from headbench.methods.shared.networks import encode
 
 from .small import small_config
@@ -76,7 +86,7 @@ def test_soft_overlap_of_binary_masks_is_intersection_over_union():
 
 def test_the_surface_is_that_of_the_whole_grid(clip):
     """Evaluating only what the surface passes gives what evaluating everything gives."""
-    scene = scene_of(clip, small_config(), "cpu", 0)
+    scene = training_scene(clip, small_config(), "cpu", 0)
     head = MeshHead.of(small_config(), len(scene.expression_scale))
     training = MeshTraining(scene, head, fitted=True)
     weights = {name: training.optimiser[name].detach() for mlp in head.networks for name in mlp.shapes()}
@@ -94,7 +104,7 @@ def test_the_surface_is_that_of_the_whole_grid(clip):
 @pytest.mark.parametrize("start", ["mesh", "sphere"])
 def test_the_start_is_what_it_was_asked_to_be(clip, start):
     config = small_config(start=start, start_steps=80, geometry_hidden=(32, 32))
-    scene = scene_of(clip, config, "cpu", 0)
+    scene = training_scene(clip, config, "cpu", 0)
     head = MeshHead.of(config, len(scene.expression_scale))
     training = MeshTraining(scene, head, fitted=True)
     with torch.no_grad():
@@ -108,7 +118,7 @@ def test_the_start_is_what_it_was_asked_to_be(clip, start):
 
 
 @pytest.mark.parametrize("masked", [True, False])
-def test_images_are_masked_on_black_where_there_are_mattes(clip, masked):
+def test_images_are_masked_on_black_where_there_are_masks(clip, masked):
     """As published; on another background than the clip's, for that to show."""
     key = clip.splits["train"][0]
     coverage, ground = clip.mask(key)[:, :, None] / 255, np.array([0.2, 0.6, 0.4])
@@ -117,7 +127,7 @@ def test_images_are_masked_on_black_where_there_are_mattes(clip, masked):
     if not masked:
         other = replace(other, masks=dict.fromkeys(clip.masks))
     config = small_config()
-    scene = scene_of(other, config, "cpu", 0)
+    scene = training_scene(other, config, "cpu", 0)
     training = MeshTraining(scene, MeshHead.of(config, len(scene.expression_scale)), fitted=False)
     _, found, mask, background = training._target(key)
     assert (mask is not None) == masked
@@ -126,10 +136,10 @@ def test_images_are_masked_on_black_where_there_are_mattes(clip, masked):
     np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
-def test_the_mesh_stage_learns_shape_motion_and_colour(clip, tmp_path):
+def test_the_mesh_phase_learns_shape_motion_and_colour(clip, tmp_path):
     """Its loss falls, landmarks follow the tracked mesh, and the image resembles the truth."""
     config = small_config(geometry_hidden=(32, 32), mesh_lr=6e-3, landmark_weight=300.0, at_rest=True)
-    scene = scene_of(clip, config, "cpu", 0)
+    scene = training_scene(clip, config, "cpu", 0)
     head = MeshHead.of(config, len(scene.expression_scale))
     losses = []
 
@@ -137,9 +147,9 @@ def test_the_mesh_stage_learns_shape_motion_and_colour(clip, tmp_path):
         if note:
             losses.append(float(note.split("loss ")[1].split(";")[0]))
 
-    result = mesh_stage(scene, head, Budget(iterations=60), tmp_path, "run", record)
+    result = mesh_phase(scene, head, Budget(iterations=60), tmp_path, "run", record)
     assert losses[-1] < 0.5 * losses[0]
-    again = mesh_stage(scene, head, Budget(iterations=60), tmp_path, "run", no_progress)
+    again = mesh_phase(scene, head, Budget(iterations=60), tmp_path, "run", no_progress)
     assert all(torch.equal(result.tensors[name], again.tensors[name]) for name in result.tensors)
     rows = torch.as_tensor(scene.landmark_rows)
     tracked = scene.driver.unposed(scene.tracked)[0, rows]
@@ -164,3 +174,115 @@ def test_what_lies_behind_the_skin_does_not_bound_the_head(head):
     for name in ("mouth_socket", "teeth"):
         assert not kept & set(np.asarray(head.regions.get(name, [])).tolist())
     assert kept >= set(np.asarray(head.regions["nose"]).tolist())
+
+
+def box(half=1.3, spacing=0.1):
+    return tet_grid(np.full(3, -half), np.full(3, half), spacing)
+
+
+def surface(grid: TetGrid, distance: torch.Tensor):
+    crossings = marching_tetrahedra(distance, grid.tets)
+    return crossings.interpolate(grid.vertices.to(distance.dtype)), crossings.faces
+
+
+def area_and_volume(vertices, faces):
+    corners = vertices.double()[faces]
+    across = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return across.norm(dim=1).sum().item() / 2, (corners[:, 0] * across).sum().item() / 6
+
+
+def ellipsoid_area(a, b, c):
+    """Integral of |dx/du x dx/dv| over the unit sphere's angles."""
+
+    def density(v, u):
+        s, k = np.sin(u), np.cos(u)
+        across = np.array([b * c * s * s * np.cos(v), a * c * s * s * np.sin(v), a * b * s * k])
+        return np.linalg.norm(across)
+
+    return dblquad(density, 0, np.pi, 0, 2 * np.pi, epsabs=1e-4)[0]
+
+
+def test_the_tetrahedra_fill_the_box_without_overlap():
+    grid = tet_grid(np.zeros(3), np.array([0.5, 0.7, 0.3]), 0.1)
+    corners = grid.vertices.double()[grid.tets]
+    volumes = torch.linalg.det(corners[:, 1:] - corners[:, :1]) / 6
+    assert volumes.min() > 0
+    assert volumes.sum().item() == pytest.approx(0.5 * 0.7 * 0.3, rel=1e-6)
+    # Within the box each triangle belongs to two tetrahedra, on its sides to one: no gaps, nothing twice.
+    triangles = torch.cat([grid.tets[:, [i for i in range(4) if i != k]] for k in range(4)]).sort(1).values
+    places, counts = torch.unique(triangles, dim=0, return_counts=True)
+    assert set(counts.tolist()) == {1, 2}
+    single = grid.vertices[places[counts == 1]]
+    high = torch.tensor([0.5, 0.7, 0.3])
+    on_side = ((single == 0) | ((single - high).abs() < 1e-6)).all(1).any(1)
+    assert on_side.all()
+
+
+def test_spacing_gives_about_the_number_asked_for():
+    low, high = np.array([-1.0, -2.0, -1.5]), np.array([1.0, 1.8, 1.2])
+    grid = tet_grid(low, high, spacing_for(low, high, 20_000))
+    assert len(grid.vertices) == pytest.approx(20_000, rel=0.15)
+
+
+@settings(max_examples=4, deadline=None)
+@given(st.tuples(*[st.floats(0.5, 1.2)] * 3), st.tuples(*[st.floats(-0.05, 0.05)] * 3))
+def test_ellipsoids_have_their_area_and_volume(axes, center):
+    grid = box(spacing=0.08)
+    scaled = (grid.vertices.double() - torch.tensor(center)) / torch.tensor(axes)
+    area, volume = area_and_volume(*surface(grid, scaled.norm(dim=1) - 1))
+    assert volume == pytest.approx(4 / 3 * np.pi * np.prod(axes), rel=0.015)
+    assert area == pytest.approx(ellipsoid_area(*axes), rel=0.015)
+
+
+def test_a_closed_surface_is_watertight_and_turned_outwards():
+    grid = box()
+    generator = torch.Generator().manual_seed(0)
+    rough = grid.vertices.norm(dim=1) - 0.9 + 0.1 * torch.randn(len(grid.vertices), generator=generator)
+    rough[(grid.vertices.abs() > 1.25).any(1)] = 1
+    vertices, faces = surface(grid, rough)
+    edges = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    forward = set(map(tuple, edges.tolist()))
+    assert len(forward) == len(edges)  # no directed edge twice
+    assert forward == {(b, a) for a, b in forward}  # each has its opposite
+    assert area_and_volume(vertices, faces)[1] > 0
+    assert torch.equal(faces.unique(), torch.arange(len(vertices)))
+
+
+@given(st.tuples(*[st.floats(-1, 1)] * 3), st.floats(-0.5, 0.5))
+@settings(max_examples=20, deadline=None)
+def test_a_plane_is_exact(normal, shift):
+    direction = torch.tensor(normal, dtype=torch.float64)
+    assume(direction.norm() >= 0.1)
+    direction = direction / direction.norm()
+    grid = box(1.0, 0.25)
+    vertices, _ = surface(grid, grid.vertices.double() @ direction - shift)
+    assert (vertices @ direction - shift).abs().max() < 1e-9
+
+
+def test_values_are_interpolated_along_with_the_surface():
+    grid = box()
+    crossings = marching_tetrahedra(grid.vertices.norm(dim=1) - 1, grid.tets)
+    linear = grid.vertices @ torch.tensor([[1.0, 2.0], [0.5, -1.0], [3.0, 0.0]]) + 0.25
+    expected = (
+        crossings.interpolate(grid.vertices) @ torch.tensor([[1.0, 2.0], [0.5, -1.0], [3.0, 0.0]]) + 0.25
+    )
+    assert torch.allclose(crossings.interpolate(linear), expected, atol=1e-5)
+
+
+def test_gradients_by_the_signed_distances():
+    grid = tet_grid(np.full(3, -1.0), np.full(3, 1.0), 0.5)
+    places = grid.vertices.double()
+    distance = (places * torch.tensor([1.0, 1.1, 0.9])).norm(dim=1) - 0.71
+
+    def vertices(values):
+        return marching_tetrahedra(values, grid.tets).interpolate(places)
+
+    assert torch.autograd.gradcheck(vertices, distance.requires_grad_(), eps=1e-6)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_nothing_where_nothing_changes_sign(sign):
+    grid = box(1.0, 0.5)
+    crossings = marching_tetrahedra(torch.full((len(grid.vertices),), sign), grid.tets)
+    assert crossings.faces.shape == (0, 3)
+    assert crossings.interpolate(grid.vertices).shape == (0, 3)

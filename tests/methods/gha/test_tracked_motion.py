@@ -4,8 +4,8 @@ import numpy as np
 import torch
 
 from headbench.datasets.head.model import HeadModel
-from headbench.methods.gha.controllers import Controllers
-from headbench.methods.gha.scene import bounds, scene_of
+from headbench.methods.gha.driving import bounds, training_scene
+from headbench.methods.gha.networks import Controllers
 from headbench.methods.gha.tracked_motion import TrackedMotion
 from headbench.methods.shared.networks import encode
 
@@ -29,9 +29,9 @@ def vertices(scene, code):
     return (posed - scene.driver.origin) / scene.driver.unit
 
 
-def test_moves_are_those_of_the_head_model_where_expression_rules(clip):
+def test_moves_are_the_head_models_near_landmarks(clip):
     config = small_config(neutral_jaw=0.1, angle_unit=0.2)
-    scene = scene_of(clip, config, "cpu", 0)
+    scene = training_scene(clip, config, "cpu", 0)
     motion = TrackedMotion.of(scene, config)
     opened = torch.zeros_like(scene.code_low)
     opened[clip.head.expression_basis.shape[2]] = 0.1 / 0.2
@@ -50,7 +50,7 @@ def test_moves_are_those_of_the_head_model_where_expression_rules(clip):
 def test_a_network_learns_to_move_like_the_head_model(clip):
     """Also by expressions that no timestep shows."""
     config = small_config(at_rest=True, expression_deform_hidden=(32, 32), angle_unit=0.2)
-    scene = scene_of(clip, config, "cpu", 0)
+    scene = training_scene(clip, config, "cpu", 0)
     motion = TrackedMotion.of(scene, config)
     network = Controllers.of(config, len(scene.code_low)).expression_deform
     initial = network.initial(torch.Generator().manual_seed(0))
@@ -69,7 +69,7 @@ def test_a_network_learns_to_move_like_the_head_model(clip):
 def test_errors_count_relative_to_a_vertexs_motion(clip):
     """A network at rest errs by all the motion there is: 1, but for what hardly moves."""
     config = small_config(at_rest=True)
-    scene = scene_of(clip, config, "cpu", 0)
+    scene = training_scene(clip, config, "cpu", 0)
     motion = TrackedMotion.of(scene, config)
     network = Controllers.of(config, len(scene.code_low)).expression_deform
     weights = network.initial(torch.Generator().manual_seed(0))
@@ -89,7 +89,7 @@ def test_bounds_widen_the_range_of_training():
 
 
 def test_a_margin_bounds_the_avatar_by_its_training_expressions(clip):
-    margin = scene_of(clip, small_config(appearance_margin=0.5), "cpu", 0)
+    margin = training_scene(clip, small_config(appearance_margin=0.5), "cpu", 0)
     count = clip.head.expression_basis.shape[2]
     seen = np.array([clip.poses[t].expression for t in margin.timesteps])
     span = seen.max(0) - seen.min(0)

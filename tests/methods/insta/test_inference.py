@@ -7,15 +7,13 @@ import pytest
 import torch
 
 from headbench.methods.insta import kernel
-from headbench.methods.insta.canonical import canonical_surface
+from headbench.methods.insta.avatar import Inference
 from headbench.methods.insta.config import InstaConfig
 from headbench.methods.insta.field import Architecture, Field, Prior
-from headbench.methods.insta.inference import Inference
-from headbench.methods.insta.marching import Space
+from headbench.methods.insta.marching import Space, canonical_surface
 from headbench.methods.insta.occupancy import Occupancy
-from headbench.methods.insta.parts import mouth_triangles
-from headbench.methods.insta.rays import camera_rays
-from headbench.methods.insta.rendering import Marching, Scene
+from headbench.methods.insta.rendering import Marching, PosedRays, camera_rays
+from headbench.methods.insta.warp import mouth_triangles
 from headbench.methods.shared.subject_mesh import SubjectMesh
 
 from ..toy_clip import look_at
@@ -54,7 +52,7 @@ class Stage(NamedTuple):
     parameters: dict[str, torch.Tensor]
     space: Space
     mouth: torch.Tensor
-    scene: Scene
+    scene: PosedRays
     step: float
 
     def seen(self, backend, *, stop=0.0, most=4):
@@ -78,7 +76,7 @@ def make(head, **more):
     rows, columns = np.divmod(np.arange(19 * 23), 19)
     condition = torch.randn(16, generator=torch.Generator().manual_seed(3))
     moved = surface.canonical + 0.004 * torch.sin(25 * surface.canonical)
-    scene = Scene(surface.pose(moved), condition, camera_rays(camera, columns, rows, 0.5))
+    scene = PosedRays(surface.pose(moved), condition, camera_rays(camera, columns, rows, 0.5))
     return Stage(field, parameters, occupancy.space(), mouth_triangles(head), scene, config.step)
 
 
@@ -109,7 +107,7 @@ def test_rays_stop_where_the_definition_stops_them(head, most):
 
 def test_the_comparison_would_notice_another_expression(head):
     stage = make(head)
-    other = stage._replace(scene=Scene(stage.scene.surface, -stage.scene.condition, stage.scene.rays))
+    other = stage._replace(scene=PosedRays(stage.scene.surface, -stage.scene.condition, stage.scene.rays))
     assert np.abs(stage.seen("auto").color - other.seen("reference").color).max() > 1e-3
 
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from headbench.methods.insta import kernel
-from headbench.methods.insta.marching import Rays, Space, Surface, occupied_at
-from headbench.methods.insta.rays import camera_rays
+from headbench.methods.insta.marching import CanonicalSurface, Rays, Space, occupied_at
+from headbench.methods.insta.rendering import camera_rays
 
 from ...datasets.head.toy import toy_head
 from ..toy_clip import look_at
@@ -23,7 +23,7 @@ STEP = 0.004
 def make(backend, roughness=0.003):
     head = toy_head(16)
     canonical = torch.from_numpy(head.template).float()
-    surface = Surface(head, canonical, backend=backend)
+    surface = CanonicalSurface(head, canonical, backend=backend)
     rng = np.random.default_rng(0)
     moved = (head.template * 1.05 + roughness * rng.standard_normal(head.template.shape)).astype(np.float32)
     return surface.pose(torch.from_numpy(moved))

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from headbench.methods.insta.canonical import canonical_surface
 from headbench.methods.insta.config import InstaConfig
 from headbench.methods.insta.field import Architecture, Field, Prior
+from headbench.methods.insta.marching import canonical_surface
 from headbench.methods.insta.occupancy import Occupancy, occupied_space
-from headbench.methods.insta.parts import mouth_triangles
+from headbench.methods.insta.warp import mouth_triangles
 from headbench.methods.shared.subject_mesh import SubjectMesh
 
 from .small import SMALL
@@ -20,7 +20,7 @@ def surface(head):
     return canonical_surface(head, mesh, InstaConfig(**SMALL))
 
 
-def test_every_point_of_an_occupied_cell_is_within_the_reach_of_its_triangle(surface):
+def test_occupied_cells_are_within_their_triangles_reach(surface):
     occupancy = Occupancy(surface, InstaConfig(**SMALL))
     rng = np.random.default_rng(0)
     chosen = rng.choice(occupancy.candidates, size=60, replace=False)
@@ -57,7 +57,7 @@ def refreshed(head, surface, prior, rounds=1, whole=True):
     return occupancy
 
 
-def test_an_empty_field_leaves_nothing_and_a_dense_one_everything(head, surface):
+def test_empty_and_dense_fields_occupy_nothing_and_everything(head, surface):
     empty = refreshed(head, surface, Prior(-200, 0, 1))
     assert not empty.occupied.any()
     assert (empty.space().reach < 0).all()
@@ -82,7 +82,7 @@ def test_values_decay_where_the_field_empties(head, surface):
     np.testing.assert_allclose(occupancy.values, config.occupancy_decay * before, rtol=1e-6)
 
 
-def test_partial_refreshes_reach_every_cell_and_repeat_themselves(head, surface):
+def test_partial_refreshes_reach_every_cell(head, surface):
     one, other = (refreshed(head, surface, Prior(3, 0, 1), rounds=40, whole=False) for _ in range(2))
     assert np.isfinite(one.values).mean() > 0.99
     np.testing.assert_array_equal(one.values, other.values)

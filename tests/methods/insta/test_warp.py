@@ -5,13 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from headbench.datasets.head.rotations import axis_angle_to_matrix
+from headbench.methods.insta import kernel
+from headbench.methods.insta.marching import CanonicalSurface, Rays
 from headbench.methods.insta.warp import (
     Blend,
     blended,
     canonical_from_posed,
     edge_neighbours,
+    first_hits,
+    nearest_triangles,
+    squared_distances,
     touching,
     triangle_bases,
 )
@@ -57,7 +64,7 @@ def test_a_grown_head_is_shrunk(head):
     torch.testing.assert_close(back, points / 1.3, atol=1e-10, rtol=0)
 
 
-def test_the_code_scales_the_eye_region_alone_and_by_the_ratio_of_areas(head):
+def test_the_official_warp_scales_the_eye_region_alone(head):
     vertices, faces = pieces(head)
     matrices = canonical_from_posed(vertices, 1.3 * vertices, faces, Blend.of(head, "code"))
     scales = torch.linalg.det(matrices[:, :, :3]).pow(1 / 3)
@@ -118,3 +125,136 @@ def test_collapsed_triangles_stay_finite(head):
     for blend in (Blend.of(head, ""), replace(Blend.of(head, ""), root=False)):
         matrices = canonical_from_posed(vertices, torch.zeros_like(vertices), faces, blend)
         assert torch.isfinite(matrices).all()
+
+
+needs_kernel = pytest.mark.skipif(
+    kernel.load() is None, reason="INSTA's kernel is not installed: no C++ compiler was found"
+)
+SIDE = 60
+
+
+def barycentric_grid():
+    i, j = np.meshgrid(np.arange(SIDE + 1), np.arange(SIDE + 1), indexing="ij")
+    keep = i + j <= SIDE
+    u, v = i[keep] / SIDE, j[keep] / SIDE
+    return np.stack([1 - u - v, u, v], axis=1)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_squared_distances_agree_with_dense_sampling(seed):
+    rng = np.random.default_rng(seed)
+    corners, points = rng.normal(size=(1, 3, 3)), rng.normal(size=(20, 3)) * 2
+    surface = barycentric_grid() @ corners[0]
+    dense = np.linalg.norm(points[:, None] - surface, axis=2).min(1)
+    exact = squared_distances(torch.from_numpy(points), torch.from_numpy(corners))[:, 0].sqrt().numpy()
+    spacing = np.linalg.norm(corners[0] - np.roll(corners[0], 1, axis=0), axis=1).max() / SIDE
+    assert (exact <= dense + 1e-9).all()
+    assert (dense <= exact + spacing).all()
+
+
+def test_closed_forms_over_face_edge_and_corner():
+    corners = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]], dtype=torch.float64)
+    points = torch.tensor(
+        [[0.2, 0.3, 2], [0.5, -3, 4], [-3, -4, 0], [1, 1, 0], [2, 0, 1]], dtype=torch.float64
+    )
+    expected = torch.tensor([4.0, 25.0, 25.0, 0.5, 2.0], dtype=torch.float64)
+    torch.testing.assert_close(squared_distances(points, corners)[:, 0], expected)
+
+
+def test_space_around_a_convex_edge_is_parted_along_the_bisector():
+    # Two walls of a roof with its ridge along x; above the ridge all points are equally far from both.
+    roof = torch.tensor(
+        [[[0.0, 0, 0], [1, 0, 0], [0.5, 1, -1]], [[0.0, 0, 0], [1, 0, 0], [0.5, -1, -1]]], dtype=torch.float64
+    )
+    points = torch.tensor([[0.5, 0.1, 1.0], [0.5, -0.1, 1.0]], dtype=torch.float64)
+    assert nearest_triangles(points, roof).triangles.tolist() == [0, 1]
+
+
+@pytest.fixture(scope="module")
+def surface():
+    head = toy_head(16)
+    return CanonicalSurface(head, torch.from_numpy(head.template).float(), backend="kernel")
+
+
+@pytest.fixture(scope="module")
+def posed(surface):
+    rng = np.random.default_rng(3)
+    moved = surface.canonical.numpy() * 1.1 + 0.004 * rng.standard_normal(surface.canonical.shape)
+    return surface.pose(torch.from_numpy(moved).float())
+
+
+@needs_kernel
+@pytest.mark.parametrize("spread", [0.002, 0.02, 0.3])
+def test_the_kernel_finds_the_nearest_triangle_of_all(posed, spread):
+    rng = np.random.default_rng(1)
+    base = posed.vertices.numpy()[rng.integers(0, len(posed.vertices), 1500)]
+    points = (base + spread * rng.standard_normal(base.shape)).astype(np.float32)
+    found = posed.nearest(points)
+    all_of_them = squared_distances(torch.from_numpy(points).double(), posed.corners.double()).sqrt()
+    least = all_of_them.min(1).values
+    chosen = all_of_them.gather(1, found.triangles[:, None])[:, 0]
+    assert float((chosen - least).abs().max()) < 1e-6
+    assert float((found.values.double().sqrt() - least).abs().max()) < 1e-6
+    reference = nearest_triangles(torch.from_numpy(points).double(), posed.corners.double())
+    assert float((reference.triangles == found.triangles).double().mean()) > 0.995  # but for rounding
+
+
+@needs_kernel
+def test_every_instruction_set_finds_the_same_triangles(posed):
+    rng = np.random.default_rng(6)
+    base = posed.vertices.numpy()[rng.integers(0, len(posed.vertices), 600)]
+    points = (base + 0.02 * rng.standard_normal(base.shape)).astype(np.float32)
+    expected = nearest_triangles(torch.from_numpy(points).double(), posed.corners.double())
+    module = kernel.load()
+    for name in module.instruction_sets():
+        mesh = module.posed(posed.surface.tree, posed.vertices.numpy(), name)
+        triangles, squared = np.empty(len(points), np.int32), np.empty(len(points), np.float32)
+        module.nearest(mesh, points, triangles, squared, 1)
+        np.testing.assert_allclose(np.sqrt(squared), expected.values.sqrt(), atol=1e-6)
+        assert (triangles == expected.triangles.numpy()).mean() > 0.995  # but for rounding
+
+
+@needs_kernel
+def test_far_away_and_degenerate_meshes_are_searched_as_well():
+    head = toy_head(16)
+    flat = torch.from_numpy(head.template).float()
+    flat[:, 2] = 0.01
+    flat[head.faces[5]] = flat[head.faces[5][0]].clone()  # a triangle without area
+    surface = CanonicalSurface(head, flat, backend="kernel")
+    points = np.array([[0, 0, 0], [5, 5, 5], [0, 0.05, 0.01], [-100, 3, 2]], np.float32)
+    least = squared_distances(torch.from_numpy(points).double(), surface.rest.corners.double()).min(1).values
+    np.testing.assert_allclose(surface.rest.nearest(points).values, least, rtol=1e-5, atol=1e-12)
+
+
+@needs_kernel
+def test_first_hits_are_those_of_the_reference_and_of_a_plane(posed):
+    rng = np.random.default_rng(2)
+    origins = np.tile(np.array([[0.05, 0.02, 0.6]], np.float32), (800, 1))
+    towards = 0.12 * rng.standard_normal((800, 3)) - origins
+    directions = (towards / np.linalg.norm(towards, axis=1, keepdims=True)).astype(np.float32)
+    found = posed.first_hit(Rays(origins, directions, np.zeros(800, np.float32)))
+    exact = first_hits(
+        torch.from_numpy(origins).double(), torch.from_numpy(directions).double(), posed.corners.double()
+    )
+    agree = (found.triangles >= 0) == (exact.triangles >= 0)
+    assert float(agree.double().mean()) > 0.997  # rays along the silhouette may go either way
+    both = agree & (exact.triangles >= 0)
+    assert 100 < int(both.sum()) < 800
+    torch.testing.assert_close(found.values[both].double(), exact.values[both], atol=2e-6, rtol=0)
+    # At the distance told the ray is on the plane of the triangle told.
+    at = torch.from_numpy(
+        origins + directions * np.where(found.values < 9, found.values, 0)[:, None]
+    ).double()
+    corners = posed.corners[found.triangles.clamp_min(0)].double()
+    normal = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal = torch.nn.functional.normalize(normal, dim=1)
+    assert float(((at - corners[:, 0]) * normal).sum(1)[both].abs().max()) < 1e-5
+
+
+@needs_kernel
+def test_a_ray_that_starts_on_the_other_side_sees_nothing(posed):
+    away = Rays(np.array([[0, 0, 1]], np.float32), np.array([[0, 0, 1]], np.float32), np.zeros(1, np.float32))
+    found = posed.first_hit(away)
+    assert found.triangles.tolist() == [-1]
+    assert found.values.isinf().all()

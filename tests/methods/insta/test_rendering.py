@@ -1,12 +1,59 @@
-"""Volume rendering against densities whose integrals are known."""
+"""Rays against the projection of points on them."""
 
 import math
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from headbench.methods.insta.compositing import composite
+from headbench.bench.contracts import Camera
+from headbench.methods.insta.rendering import box_corners, camera_rays, composite, pixels_of_hull
+
+
+def some_camera(seed, width=40, height=30):
+    rng = np.random.default_rng(seed)
+    turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    turn *= np.linalg.det(turn)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = turn, [0.05, -0.02, 1.0]
+    K = np.array([[50.0, 0.4, 18.0], [0, 60.0, 17.0], [0, 0, 1]])
+    return Camera("c", width, height, K, pose)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 10_000))
+def test_points_on_a_ray_project_to_the_centre_of_its_pixel(seed):
+    camera = some_camera(seed)
+    rows, columns = np.divmod(np.arange(40 * 30), 40)
+    rays = camera_rays(camera, columns, rows, 0.5)
+    np.testing.assert_allclose(np.linalg.norm(rays.directions, axis=1), 1, atol=1e-6)
+    points = rays.origins.astype(np.float64) + 0.8 * rays.directions
+    seen = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    pixels = seen @ camera.K.T
+    np.testing.assert_allclose(pixels[:, :2] / pixels[:, 2:], np.stack([columns, rows], 1) + 0.5, atol=1e-3)
+    assert (seen[:, 2] > 0).all()
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 10_000))
+def test_no_point_of_the_hull_projects_outside_its_pixels(seed):
+    camera = some_camera(seed)
+    rng = np.random.default_rng(seed)
+    corners = box_corners(rng.normal(size=(10, 3)) * 0.1, 0.02)
+    weights = rng.dirichlet(np.ones(8), 200)
+    seen = (weights @ corners) @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    pixels = (seen @ camera.K.T)[:, :2] / seen[:, 2:]
+    left, top, right, bottom = pixels_of_hull(camera, corners)
+    inside = ((pixels >= 0) & (pixels < [40, 30])).all(1)
+    assert ((pixels >= [left, top]) & (pixels < [right, bottom])).all(1)[inside].all()
+
+
+def test_a_hull_around_the_camera_takes_the_whole_image():
+    camera = some_camera(1)
+    assert pixels_of_hull(camera, box_corners(np.stack([camera.center] * 2), 0.1)) == (0, 0, 40, 30)
+
 
 STEP = 0.001
 
@@ -28,14 +75,6 @@ def test_a_slab_of_constant_density_absorbs_by_beer_and_lambert(density):
     # Mean of t under density exp(-density (t - 0.5)) on [0.5, 0.9].
     mean = 0.5 * (1 - left) + (1 - left) / density - 0.4 * left
     assert result.distance.item() == pytest.approx(mean, rel=2e-3)
-
-
-@pytest.mark.parametrize("peak", [1.0, 60.0])
-def test_a_gaussian_density_absorbs_by_the_error_function(peak):
-    center, width = 0.7, 0.03
-    result = along(lambda t: peak * torch.exp(-0.5 * ((t - center) / width) ** 2))
-    thickness = peak * width * math.sqrt(2 * math.pi) * math.erf(0.2 / width / math.sqrt(2))
-    assert result.transmittance.item() == pytest.approx(math.exp(-thickness), rel=1e-6)
 
 
 def test_emission_follows_the_integral():

@@ -4,15 +4,29 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.linalg
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from headbench.datasets.head.model import HeadModel
-from headbench.methods.gbs.blend import LARGEST_SCALE, Entries, difference_widths, place
-from headbench.methods.gbs.rig import PARTS, Carried, Rig
-from headbench.methods.gbs.surface import SurfacePoints, full_barycentric
+from headbench.datasets.head.rotations import quaternion_to_matrix
+from headbench.methods.gbs.blendshapes import (
+    LARGEST_SCALE,
+    PARTS,
+    Entries,
+    PointMotions,
+    Rig,
+    apply_pose,
+    consistency_mask,
+    deformation_gradients,
+    difference_widths,
+    entries_of,
+    initial_rotations,
+    nearest_rotation,
+)
+from headbench.methods.gbs.points import SurfacePoints, full_barycentric
 
 from ...datasets.head.toy import toy_head
 from ..toy_clip import toy_pose
@@ -71,7 +85,7 @@ def no_differences(count, degree=0):
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("eyelids", [False, True])
-def test_before_training_splats_ride_on_the_mesh_of_the_head_model(seed, eyelids):
+def test_untrained_splats_follow_the_head_models_mesh(seed, eyelids):
     """Positions: initial differences, correctives, joints, eyelids and translation, whatever the pose."""
     head = toy_head(16, eyelids=eyelids)
     rng = np.random.default_rng(seed)
@@ -84,7 +98,7 @@ def test_before_training_splats_ride_on_the_mesh_of_the_head_model(seed, eyelids
     pose = toy_pose(head, rng, 0, "toy")
     pose = replace(pose, eyelids=np.array([0.7, -0.4])) if eyelids else pose
     arguments = rig.arguments([pose])
-    placed = place(neutral_of(rig), no_differences(200), Carried.of(rig.carry(arguments)))
+    posed = apply_pose(neutral_of(rig), no_differences(200), PointMotions.of(rig.motions(arguments)))
     model = HeadModel(head, dtype=torch.float64)
     mesh = model(
         shape=torch.from_numpy(shape), static_offset=torch.from_numpy(offset), **model.pose_arguments([pose])
@@ -95,8 +109,8 @@ def test_before_training_splats_ride_on_the_mesh_of_the_head_model(seed, eyelids
     alike = np.ptp(weights, axis=1).max(1) < 1e-9
     assert alike.sum() > 20
     assert (~alike).sum() > 20
-    np.testing.assert_allclose(placed.world.means[alike], expected[alike], atol=2e-6)
-    np.testing.assert_allclose(placed.world.means, expected, atol=1e-3)
+    np.testing.assert_allclose(posed.world.means[alike], expected[alike], atol=2e-6)
+    np.testing.assert_allclose(posed.world.means, expected, atol=1e-3)
 
 
 def test_splats_turn_with_the_head_and_their_colours_with_them(head):
@@ -109,8 +123,8 @@ def test_splats_turn_with_the_head_and_their_colours_with_them(head):
     center = torch.tensor([0.1, 0.2, 0.6])
     found = []
     for one in (still, turned):
-        carried = Carried.of(rig.carry(rig.arguments([one])))
-        found.append((place(neutral, no_differences(100), carried), one))
+        motions = PointMotions.of(rig.motions(rig.arguments([one])))
+        found.append((apply_pose(neutral, no_differences(100), motions), one))
     (before, _), (after, _) = found
     turn = Rotation.from_rotvec(turned.rotation)
     model = HeadModel(head, dtype=torch.float64)
@@ -141,18 +155,18 @@ def test_every_attribute_is_the_sum_that_the_paper_gives(head):
     columns["linear"] = columns["rotation"] = torch.eye(3).flatten().repeat(60, 1)
     columns["product"] = torch.eye(4).flatten().repeat(60, 1)
     columns["shift"], columns["turn"] = torch.full((60, 3), 0.01), torch.full((60, 4), 0.02)
-    placed = place(neutral, table, Carried(**columns))
-    torch.testing.assert_close(placed.world.means, neutral["means"] + 0.01 + parts["means"])
+    posed = apply_pose(neutral, table, PointMotions(**columns))
+    torch.testing.assert_close(posed.world.means, neutral["means"] + 0.01 + parts["means"])
     raw = neutral["quats"] + 0.02 + parts["quats"]
-    torch.testing.assert_close(placed.world.quats, raw / raw.norm(dim=1, keepdim=True))
+    torch.testing.assert_close(posed.world.quats, raw / raw.norm(dim=1, keepdim=True))
     scales = torch.exp(neutral["log_scales"] + parts["log_scales"]).clamp_max(LARGEST_SCALE)
-    torch.testing.assert_close(placed.world.scales, scales)
+    torch.testing.assert_close(posed.world.scales, scales)
     logits = neutral["opacities"] + parts["opacities"][:, 0]
-    torch.testing.assert_close(placed.opacities, 1 / (1 + torch.exp(-logits)))
-    torch.testing.assert_close(placed.sh_dc, neutral["sh_dc"] + parts["sh_dc"])
+    torch.testing.assert_close(posed.opacities, 1 / (1 + torch.exp(-logits)))
+    torch.testing.assert_close(posed.sh_dc, neutral["sh_dc"] + parts["sh_dc"])
     rest = neutral["sh_rest"].clone()
     rest[:, :, :3] += parts["sh_rest"].view(60, 3, 3)
-    torch.testing.assert_close(placed.sh_rest, rest)
+    torch.testing.assert_close(posed.sh_rest, rest)
 
 
 def test_an_expression_beyond_those_kept_moves_joints_alone(head):
@@ -163,10 +177,133 @@ def test_an_expression_beyond_those_kept_moves_joints_alone(head):
     rest = replace(pose, rotation=np.zeros(3), neck=np.zeros(3), jaw=np.zeros(3), eyes=np.zeros(6))
     kept, other = rest.expression.copy(), rest.expression.copy()
     kept[3:] = 0
-    one, same = (Carried.of(rig.carry(rig.arguments([replace(rest, expression=e)]))) for e in (kept, other))
+    one, same = (
+        PointMotions.of(rig.motions(rig.arguments([replace(rest, expression=e)]))) for e in (kept, other)
+    )
     torch.testing.assert_close(one.shift, same.shift)
     # At rest joints turn nothing, so where they are does not matter.
     torch.testing.assert_close(one.offset, same.offset, atol=1e-6, rtol=0)
     turned = replace(rest, jaw=np.array([0.3, 0, 0]))
-    opened = [Carried.of(rig.carry(rig.arguments([replace(turned, expression=e)]))) for e in (kept, other)]
+    opened = [
+        PointMotions.of(rig.motions(rig.arguments([replace(turned, expression=e)]))) for e in (kept, other)
+    ]
     assert (opened[0].offset - opened[1].offset).abs().max() > 1e-5
+
+
+MILLIMETRE = 1e-3
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_triangles_go_where_their_gradient_says(seed):
+    rng = np.random.default_rng(seed)
+    rest, moved = (torch.from_numpy(rng.normal(size=(4, 3, 3))) for _ in range(2))
+    found = deformation_gradients(rest, moved)
+    inside = torch.tensor([0.2, 0.3, 0.5], dtype=torch.float64)
+    at, to = inside @ rest, inside @ moved
+    expected = (found @ (at - rest[:, 0])[..., None])[..., 0] + moved[:, 0]
+    torch.testing.assert_close(to, expected, rtol=1e-6, atol=1e-6)
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_rotations_are_those_of_the_polar_decomposition(seed):
+    rng = np.random.default_rng(seed)
+    matrices = np.eye(3) + 0.4 * rng.normal(size=(6, 3, 3))
+    matrices[np.linalg.det(matrices) < 0.05] = np.diag([1, 2, 3])
+    found = nearest_rotation(torch.from_numpy(matrices), 20).numpy()
+    for one, expected in zip(found, matrices):
+        np.testing.assert_allclose(one, scipy.linalg.polar(expected)[0], atol=1e-6)
+
+
+def test_matrices_that_are_no_rotations_stay_finite():
+    wild = torch.stack(
+        [torch.zeros(3, 3), torch.diag(torch.tensor([1.0, 1.0, 0.0])), torch.full((3, 3), 1e6)]
+    )
+    assert torch.isfinite(nearest_rotation(wild, 3)).all()
+
+
+def frame(corners):
+    """Two edges of a triangle, and its normal as long as the root of their cross product."""
+    a, b, c = corners
+    normal = np.cross(b - a, c - a)
+    return np.column_stack([b - a, c - a, normal / np.sqrt(np.linalg.norm(normal))])
+
+
+def test_turns_are_those_of_the_mesh_that_the_head_model_makes(head):
+    """Against the polar factor of the change of edges and normal between two meshes of `HeadModel`."""
+    model = HeadModel(head, dtype=torch.float64)
+    zero, six = torch.zeros(1, 3, dtype=torch.float64), torch.zeros(1, 6, dtype=torch.float64)
+    still = {"rotation": zero, "neck": zero, "jaw": zero, "eyes": six, "translation": zero}
+    size = model.expression_size
+
+    def mesh(expression):
+        shape = torch.zeros(1, model.shape_size, dtype=torch.float64)
+        return model(shape=shape, expression=expression[None], **still)[0].numpy()
+
+    neutral = mesh(torch.zeros(size, dtype=torch.float64))
+    basis = torch.from_numpy(np.asarray(head.expression_basis, np.float64))
+    turns = initial_rotations(torch.from_numpy(neutral), basis, model.faces).numpy()
+    rng = np.random.default_rng(0)
+    for k in range(size):
+        moved = mesh(torch.eye(size, dtype=torch.float64)[k])
+        for face in rng.choice(len(head.faces), 20, replace=False):
+            corners = head.faces[face]
+            gradient = frame(moved[corners]) @ np.linalg.inv(frame(neutral[corners]))
+            expected = scipy.linalg.polar(gradient)[0]
+            quaternion = turns[face, :, k] + np.array([1.0, 0, 0, 0])
+            np.testing.assert_allclose(
+                quaternion_to_matrix(torch.from_numpy(quaternion)), expected, atol=1e-7
+            )
+    assert np.abs(turns).max() > 0.01
+
+
+def with_expressions(head, *fields):
+    return replace(head, expression_basis=np.stack(fields, axis=2), regions={"neck": head.regions["neck"]})
+
+
+def test_the_mask_is_the_papers_function_of_displacement(head):
+    """Whole-head shifts of known length; nothing is held in place in a head without a scalp."""
+    up = np.zeros_like(head.template)
+    up[:, 1] = MILLIMETRE
+    shifted = with_expressions(head, 0.01 * up, 0.1 * up, 2.1 * up, 10.1 * up)
+    found = consistency_mask(shifted, head.template, 4, 0.1 * MILLIMETRE, 2.1 * MILLIMETRE)
+    neck = np.isin(head.faces, head.regions["neck"])
+    whole, none = ~neck.any(1), neck.all(1)
+    assert whole.any()
+    assert none.any()
+    np.testing.assert_allclose(found[whole], np.tile([0, 0, 1, 5], (whole.sum(), 1)), atol=1e-12)
+    assert (found[none] == 0).all()
+
+
+def test_a_rigid_motion_in_an_expression_is_none_of_its_own(head):
+    turn = Rotation.from_rotvec([0.05, 0.02, -0.03]).as_matrix()
+    rigid = head.template @ turn.T + [0.001, 0.002, 0.0] - head.template
+    moving = replace(head, expression_basis=rigid[:, :, None])
+    found = consistency_mask(moving, head.template, 1, 0.02 * MILLIMETRE, 5 * MILLIMETRE)
+    neck = np.isin(head.faces, head.regions["neck"]).any(1)
+    assert found[~neck].max() == 0
+    apart = replace(moving, regions={"neck": head.regions["neck"]})
+    assert consistency_mask(apart, head.template, 1, 0.02 * MILLIMETRE, 5 * MILLIMETRE).max() > 0
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_entries_are_the_mask_without_its_zeros(seed):
+    rng = np.random.default_rng(seed)
+    mask = np.maximum(0, rng.normal(size=(6, 5)))
+    triangles = rng.integers(0, 6, 9)
+    counts, expressions, weights = entries_of(mask, triangles)
+    dense = np.zeros((9, 5))
+    dense[np.repeat(np.arange(9), counts), expressions] = weights
+    np.testing.assert_array_equal(dense, mask[triangles])
+    assert (weights > 0).all()
+
+
+def test_a_triangle_without_area_is_not_turned():
+    rest = torch.zeros(3, 3, 3, dtype=torch.float64)
+    rest[2] = torch.eye(3)
+    moved = rest + torch.randn(3, 3, 3, dtype=torch.float64)
+    found = deformation_gradients(rest, moved)
+    assert torch.equal(found[:2], torch.eye(3, dtype=torch.float64).expand(2, 3, 3))
+    assert torch.isfinite(found).all()

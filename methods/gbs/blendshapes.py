@@ -1,0 +1,345 @@
+"""Neutral splats plus differences, weighted by expression coefficients, carried by a pose."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import embedding_bag, normalize
+
+from ...bench.contracts import FloatArray, HeadAsset, HeadPose, IntArray
+from ...datasets.head.arrays import HeadArrays
+from ...datasets.head.geometry import rigid_alignment
+from ...datasets.head.model import chain_transforms
+from ...datasets.head.rotations import axis_angle_to_matrix, matrix_to_quaternion, quaternion_to_matrix
+from ..shared.binding import WorldSplats, apply_matrices, left_products
+from ..shared.networks import coefficient_count, sh_to_rgb
+from ..shared.subject_mesh import SubjectMesh
+from .points import SurfacePoints
+
+LARGEST_SCALE = 0.1
+"""Metres; training removes neutral splats that are larger, and no expression makes one so."""
+SMALLEST_SCALE = 1e-7
+
+
+def difference_widths(degree: int) -> dict[str, int]:
+    """Columns of the differences by attribute; harmonics above degree 0 up to ``degree``."""
+    rest = 3 * (coefficient_count(degree) - 1)
+    return {"means": 3, "log_scales": 3, "quats": 4, "opacities": 1, "sh_dc": 3, "sh_rest": rest}
+
+
+class Entries(NamedTuple):
+    """Which rows of the differences belong to which splat, and to which expression.
+
+    Attributes
+    ----------
+    starts : (N + 1,) int64, the first row of each splat, and the number of all.
+    owners : (M,) int64, splat of each row, ascending.
+    expressions : (M,) int64.
+    weights : (M,) with which a row counts; 1 where it holds what is added at coefficient 1.
+    """
+
+    starts: Tensor
+    owners: Tensor
+    expressions: Tensor
+    weights: Tensor
+
+    @classmethod
+    def of(cls, counts: Tensor, expressions: Tensor, weights: Tensor) -> Entries:
+        """From the (N,) numbers of rows."""
+        starts = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+        owners = torch.arange(len(counts), device=counts.device).repeat_interleave(counts)
+        return cls(starts, owners, expressions, weights)
+
+    def sum(self, differences: Tensor, coefficients: Tensor) -> Tensor:
+        """(N, C) differences of each splat, blended by the (K,) coefficients of a pose."""
+        weights = self.weights * coefficients.index_select(0, self.expressions)
+        return _SumEntries.apply(differences, weights, self.starts, self.owners)  # type: ignore[no-untyped-call]
+
+
+class _SumEntries(torch.autograd.Function):
+    """Sums of weighted rows of a table, run by run. The adjoint is one gather: torch's own scatters."""
+
+    @staticmethod
+    def forward(ctx: Any, table: Tensor, weights: Tensor, starts: Tensor, owners: Tensor) -> Tensor:
+        ctx.save_for_backward(weights, owners)
+        rows = torch.arange(len(table), device=table.device)
+        return embedding_bag(
+            rows, table, starts, per_sample_weights=weights, mode="sum", include_last_offset=True
+        )
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        weights, owners = ctx.saved_tensors
+        return grads[0].index_select(0, owners).mul_(weights[:, None]), None, None, None
+
+
+class PosedAttributes(NamedTuple):
+    """Splats of a pose in the world: geometry, (N,) opacities, harmonics, and the (N, 3, 3) turn of their axes."""
+
+    world: WorldSplats
+    opacities: Tensor
+    sh_dc: Tensor
+    sh_rest: Tensor
+    rotation: Tensor
+
+    def colors(self, center: Tensor, degree: int) -> Tensor:
+        """(N, 3) as seen from a camera at ``center`` (3,); the harmonics turn with the surface."""
+        directions = normalize(self.world.means - center, dim=1)
+        own = torch.bmm(directions[:, None], self.rotation)[:, 0]
+        return sh_to_rgb(self.sh_dc, self.sh_rest, own, degree)
+
+
+def apply_pose(neutral: Mapping[str, Tensor], differences: Tensor, motions: PointMotions) -> PosedAttributes:
+    """Splats of a pose.
+
+    Each attribute is the neutral one plus its differences, initial and learnt (section 3.2 of the paper); positions
+    and rotations then follow the joints (section 3.4).
+
+    Parameters
+    ----------
+    neutral : means (N, 3) metres, log_scales (N, 3), quats (N, 4), opacities (N,) logits, sh_dc (N, 3) and sh_rest
+        (N, 3, R).
+    differences : (N, C), learnt and blended, in the columns of `difference_widths`.
+    """
+    rest = neutral["sh_rest"]
+    by_rest = differences.shape[1] - sum(difference_widths(0).values())
+    moved, scaled, turned, opaque, coloured, rest_change = differences.split([3, 3, 4, 1, 3, by_rest], dim=1)
+    means = (
+        apply_matrices(motions.linear.contiguous(), neutral["means"] + motions.shift + moved) + motions.offset
+    )
+    quats = normalize(neutral["quats"] + motions.turn + turned, dim=1)
+    scales = (neutral["log_scales"] + scaled).exp().clamp(SMALLEST_SCALE, LARGEST_SCALE)
+    if by_rest:
+        changed = by_rest // 3
+        rest = torch.cat(
+            [rest[:, :, :changed] + rest_change.view(-1, 3, changed), rest[:, :, changed:]], dim=2
+        )
+    return PosedAttributes(
+        WorldSplats(means, apply_matrices(motions.product.contiguous(), quats), scales),
+        torch.sigmoid(neutral["opacities"] + opaque[:, 0]),
+        neutral["sh_dc"] + coloured,
+        rest,
+        motions.rotation.reshape(-1, 3, 3),
+    )
+
+
+PARTS = {"linear": 9, "offset": 3, "rotation": 9, "product": 16, "turn": 4, "shift": 3}
+"""Columns of what a pose says of each point."""
+
+
+class PointMotions(NamedTuple):
+    """What a pose does to splats.
+
+    Attributes
+    ----------
+    linear, offset : (N, 9) and (N, 3), blended transforms of the joints with eyelids and translation; x -> A x + b.
+    rotation : (N, 9), the rotation in ``linear``.
+    product : (N, 16), the matrix that multiplies by its quaternion from the left.
+    turn : (N, 4) initial differences of rotation, blended: times the quaternion at the start.
+    shift : (N, 3) initial differences of position, blended, and pose correctives; before the transform, metres.
+    """
+
+    linear: Tensor
+    offset: Tensor
+    rotation: Tensor
+    product: Tensor
+    turn: Tensor
+    shift: Tensor
+
+    @classmethod
+    def of(cls, rows: Tensor) -> PointMotions:
+        """Part the columns of `PARTS`."""
+        return cls(*rows.split(list(PARTS.values()), dim=1))
+
+
+class Rig:
+    """Points on the surface of a subject, moved as FLAME moves it but for expressions beyond the first K.
+
+    Parameters
+    ----------
+    head, shape, static_offset : of the subject, as those of `SubjectMesh`.
+    points : on its neutral mesh.
+    expressions : K, leading expressions that splats follow; the joints follow all.
+    """
+
+    def __init__(
+        self,
+        head: HeadAsset,
+        shape: FloatArray,
+        static_offset: FloatArray,
+        points: SurfacePoints,
+        expressions: int,
+        device: str,
+    ):
+        self.mesh = SubjectMesh(head, shape, static_offset, device)
+        model = self.mesh.model
+        self.expressions = min(expressions, model.expression_size)
+        like = model.template
+        self._triangles = torch.from_numpy(points.triangles).to(device)
+        self._corners = self.mesh.faces[self._triangles].t().reshape(-1)
+        self._barycentric = torch.from_numpy(points.barycentric).to(like).t()[:, :, None]
+        self._weights = self._at_points(model.skinning_weights)
+        self.rest = self._at_points(self.mesh.canonical)
+        directions = model.expression_matrix.unflatten(1, (-1, 3))
+        self._joints = (model.joint_regressor @ self.mesh.canonical)[None]
+        self._joint_directions = torch.einsum("jv,evc->ejc", model.joint_regressor, directions).flatten(1)
+        self._basis = torch.cat([model.expression_matrix[: self.expressions], model.pose_matrix])
+        basis = model.expression_matrix[: self.expressions].t().unflatten(0, (-1, 3))
+        used = torch.unique(self._triangles)
+        turns = initial_rotations(self.mesh.canonical, basis, self.mesh.faces[used])
+        self._turned = torch.searchsorted(used, self._triangles)
+        self._turns = turns.flatten(0, 1)
+
+    def arguments(self, poses: Sequence[HeadPose]) -> dict[str, Tensor]:
+        """Driving signal as tensors. Raises `InputError` for another head model's pose."""
+        return self.mesh.arguments(poses)
+
+    def coefficients(self, arguments: Mapping[str, Tensor]) -> Tensor:
+        """(K,) expression coefficients that drive differences."""
+        return arguments["expression"][0, : self.expressions]
+
+    @torch.no_grad()
+    def motions(self, arguments: Mapping[str, Tensor]) -> Tensor:
+        """What one pose does to each point, (P, 44) in the columns of `PARTS`."""
+        model, expression = self.mesh.model, arguments["expression"]
+        coefficients = self.coefficients(arguments)
+        angles = torch.cat([arguments[name] for name in ("rotation", "neck", "jaw", "eyes")], dim=1)
+        rotations = axis_angle_to_matrix(angles.unflatten(1, (-1, 3)))
+        joints = self._joints + (expression @ self._joint_directions).unflatten(1, (-1, 3))
+        world = chain_transforms(rotations, joints, model.parents)[0]
+        turns, places = world[:, :, :3], world[:, :, 3]
+        offsets = places - (turns @ joints[0, :, :, None])[:, :, 0]
+        relative = torch.cat([turns.flatten(1), offsets], dim=1)
+        linear, offset = (self._weights @ relative).split([9, 3], dim=1)
+        feature = (rotations[0, 1:] - torch.eye(3).to(rotations)).flatten()
+        shift = self._at_points((torch.cat([coefficients, feature]) @ self._basis).view(-1, 3))
+        offset = offset + arguments["translation"]
+        if "eyelids" in arguments and model.eyelid_matrix is not None:
+            lids = (arguments["eyelids"][0] @ model.eyelid_matrix).view(-1, 3)
+            offset = offset + self._at_points(lids) @ (rotations[0, 0] @ rotations[0, 1]).t()
+        # By way of the quaternion it is a rotation to rounding, however far the blended transforms were from one.
+        quaternion = matrix_to_quaternion(nearest_rotation(linear.view(-1, 3, 3), SKINNING_STEPS))
+        rotation, product = quaternion_to_matrix(quaternion).flatten(1), left_products(quaternion).flatten(1)
+        turn = (self._turns @ coefficients).view(-1, 4)[self._turned]
+        return torch.cat([linear, offset, rotation, product, turn, shift], dim=1)
+
+    def _at_points(self, values: Tensor) -> Tensor:
+        """(P, C) of (V, C) vertex values."""
+        corners = values.index_select(0, self._corners).view(3, -1, values.shape[1])
+        return (corners * self._barycentric).sum(0)
+
+
+POLAR_STEPS = 8
+"""Steps of `nearest_rotation` for gradients of deformation; an error of 1 becomes 1e-12 in six."""
+SKINNING_STEPS = 3
+"""Steps for blended joint transforms, which are nearly rotations; as published."""
+SMALLEST = 1e-12
+
+
+def deformation_gradients(rest: Tensor, moved: Tensor) -> Tensor:
+    """(..., 3, 3) linear maps that take each triangle, with its normal, to where it has moved.
+
+    A fourth vertex off the triangle at n / sqrt(|n|), n being the cross product of its edges, makes the map unique
+    (Sumner and Popovic, eq. 1 to 3). It takes a point x of the rest triangle's plane to ``Q (x - v0) + v0'``. A
+    triangle without area has no such map and gets the identity.
+
+    Parameters
+    ----------
+    rest : (F, 3, 3) corners, metres.
+    moved : (..., F, 3, 3) corners.
+    """
+    inverse, singular = torch.linalg.inv_ex(_edges(rest))
+    maps = _edges(moved) @ inverse
+    return torch.where(singular[:, None, None] == 0, maps, torch.eye(3, dtype=maps.dtype, device=maps.device))
+
+
+def _edges(corners: Tensor) -> Tensor:
+    """(..., 3, 3) matrices whose columns are two edges and the direction of the fourth vertex."""
+    one, other = corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :]
+    normal = torch.linalg.cross(one, other)
+    length = torch.linalg.vector_norm(normal, dim=-1, keepdim=True).clamp_min(SMALLEST)
+    return torch.stack([one, other, normal / length.sqrt()], dim=-1)
+
+
+def nearest_rotation(matrices: Tensor, steps: int) -> Tensor:
+    """Rotation part of (..., 3, 3) matrices of positive determinant: the orthogonal factor of the polar decomposition.
+
+    Newton's iteration R <- (R + R^-T) / 2 (Higham, "Computing the polar decomposition - with applications", SIAM J.
+    Sci. Stat. Comput. 1986). Matrices that are singular in working precision stay finite and are not rotations.
+    """
+    for _ in range(steps):
+        a, b, c = matrices.unbind(-2)
+        cofactors = torch.stack(
+            [torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], -2
+        )
+        determinant = (a * cofactors[..., 0, :]).sum(-1)[..., None, None]
+        safe = torch.where(determinant.abs() < 1e-6, torch.full_like(determinant, 1e-6), determinant)
+        matrices = 0.5 * (matrices + cofactors / safe)
+    return matrices
+
+
+def initial_rotations(vertices: Tensor, basis: Tensor, faces: Tensor) -> Tensor:
+    """(F, 4, K) quaternions, less the one of no rotation: how each expression at coefficient 1 turns each triangle.
+
+    Times the quaternion of a splat at its start they are the published initial differences of rotation; differences
+    add up over expressions, and the sum is normalised.
+
+    Parameters
+    ----------
+    vertices : (V, 3) neutral mesh, metres.
+    basis : (V, 3, K) metres per unit coefficient.
+    faces : (F, 3) int64.
+    """
+    rest = vertices.to(torch.float64)[faces]
+    turns = torch.zeros(len(faces), 4, basis.shape[2], dtype=torch.float64, device=vertices.device)
+    for k in range(basis.shape[2]):
+        moved = rest + basis[:, :, k].to(torch.float64)[faces]
+        turns[:, :, k] = matrix_to_quaternion(
+            nearest_rotation(deformation_gradients(rest, moved), POLAR_STEPS)
+        )
+    turns[:, 0] -= 1
+    return turns.to(vertices.dtype)
+
+
+def consistency_mask(
+    head: HeadArrays, vertices: FloatArray, expressions: int, floor: float, full: float
+) -> FloatArray:
+    """(F, K) weight, not negative, with which an expression may change the splats of a triangle.
+
+    max(0, (D - floor) / (full - floor)), not bounded above, where D is how far an expression at coefficient 1 moves
+    the triangle's centroid. The back of the head is held in place first (a rigid motion in an expression is none of
+    its own), and the neck never moves.
+
+    Parameters
+    ----------
+    vertices : (V, 3) neutral mesh.
+    expressions : K, how many of the leading expressions.
+    floor, full : metres.
+    """
+    still = head.regions.get("scalp", np.empty(0, np.int64))
+    neck = head.regions.get("neck", np.empty(0, np.int64))
+    # Teeth have no expressions of their own; held in place with the scalp they would seem to have.
+    teeth = head.regions.get("teeth", np.empty(0, np.int64))
+    vertices = np.asarray(vertices, np.float64)
+    mask = np.empty((len(head.faces), expressions))
+    for k in range(expressions):
+        moved = vertices + head.expression_basis[:, :, k]
+        if len(still) >= 3:
+            motion = rigid_alignment(moved[still], vertices[still])
+            moved = moved @ motion[:3, :3].T + motion[:3, 3]
+        displacement = moved - vertices
+        displacement[np.concatenate([neck, teeth])] = 0
+        distance = np.linalg.norm(displacement[head.faces].mean(1), axis=1)
+        mask[:, k] = np.maximum(0.0, (distance - floor) / (full - floor))
+    return mask
+
+
+def entries_of(mask: FloatArray, triangles: IntArray) -> tuple[IntArray, IntArray, FloatArray]:
+    """The mask at points of the surface without its zeros: (P,) counts, and (M,) expressions and weights in order."""
+    at_points = mask[triangles]
+    _, columns = np.nonzero(at_points)
+    return (at_points > 0).sum(1), columns, at_points[at_points > 0]

@@ -1,0 +1,130 @@
+"""Points on a surface: where they are, how many, how far apart."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial import ConvexHull, cKDTree
+
+from headbench.methods.gbs.points import (
+    RADIUS,
+    MouthCylinder,
+    mouth_cylinder,
+    padded_offset,
+    poisson_disk,
+    rows_of_teeth,
+    spacing,
+    surface_area,
+    with_mouth,
+)
+
+COUNT = 1500
+
+
+@pytest.fixture(scope="module")
+def ball():
+    """Vertices and outward triangles of a sphere of 0.1 m."""
+    index = np.arange(600) + 0.5
+    polar, around = np.arccos(1 - 2 * index / 600), np.pi * (1 + 5**0.5) * index
+    points = 0.1 * np.stack(
+        [np.cos(around) * np.sin(polar), np.sin(around) * np.sin(polar), np.cos(polar)], axis=1
+    )
+    return points, ConvexHull(points).simplices.astype(np.int64)
+
+
+def test_samples_are_blue_noise_on_the_triangles_asked_for(ball):
+    vertices, faces = ball
+    upper = np.flatnonzero((vertices[faces][:, :, 2] > 0).all(1))
+    found = poisson_disk(vertices, faces, upper, COUNT, 0)
+    assert set(found.triangles) <= set(upper)
+    assert len(found.triangles) == pytest.approx(COUNT, rel=0.05)
+    assert found.barycentric.min() >= -1e-7
+    np.testing.assert_allclose(found.barycentric.sum(1), 1, atol=1e-12)
+    positions = found.positions(vertices, faces)
+    area = surface_area(vertices, faces[upper])
+    nearest = cKDTree(positions).query(positions, k=2)[0][:, 1]
+    assert nearest.min() >= RADIUS * np.sqrt(area / COUNT) * 0.999
+    # No hole: every point of the surface has a sample at hand; as candidates are few, a little beyond the disk's radius.
+    corners = vertices[faces[upper]]
+    assert cKDTree(positions).query(corners.mean(1))[0].max() <= 1.3 * RADIUS * np.sqrt(area / COUNT)
+
+
+def test_equal_seeds_give_equal_points_and_others_others(ball):
+    one, same, other = (poisson_disk(*ball, np.arange(len(ball[1])), 200, seed) for seed in (0, 0, 1))
+    np.testing.assert_array_equal(one.barycentric, same.barycentric)
+    assert not np.array_equal(one.barycentric[:50], other.barycentric[:50])
+
+
+def test_area_of_a_box():
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 2) for z in (0, 3)], float)
+    hull = ConvexHull(corners)
+    assert surface_area(corners, hull.simplices) == pytest.approx(2 * (2 + 3 + 6))
+
+
+def test_spacing_is_the_root_mean_square_of_three_neighbours():
+    points = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3], [9, 9, 9]], float)
+    assert spacing(points)[0] == pytest.approx(np.sqrt((1 + 4 + 9) / 3))
+    assert spacing(np.zeros((4, 3)))[0] == pytest.approx(np.sqrt(1e-7))
+    assert spacing(np.zeros((1, 3)))[0] == pytest.approx(np.sqrt(1e-7))
+
+
+def test_distances_to_the_cylinder_are_those_of_its_sides():
+    cylinder = MouthCylinder(torch.tensor([0.0, 1.0, 0.0]), 2.0, 3.0)
+    inside = torch.tensor([[1.0, 0.5, -1.0], [0, 1, 0]])
+    assert cylinder.violation(inside) == 0
+    sideways = torch.tensor([[3.0, 1.0, 4.0]])  # 5 from the axis
+    assert cylinder.violation(sideways) == pytest.approx(9.0)
+    upwards = torch.tensor([[0.0, 6.0, 0.0]])
+    assert cylinder.violation(upwards) == pytest.approx(4.0)
+    both = torch.cat([sideways + torch.tensor([0, 5.0, 0]), inside])
+    assert cylinder.violation(both) == pytest.approx((9 + 4) / 3)
+    on_axis = torch.zeros(1, 3, requires_grad=True)
+    cylinder.violation(on_axis).backward()
+    assert torch.isfinite(on_axis.grad).all()
+
+
+def test_teeth_at_rest_fit_their_cylinder(head):
+    mouth = with_mouth(head, ())
+    teeth = torch.from_numpy(mouth.template[mouth.regions["teeth"]]).float()
+    cylinder = mouth_cylinder(teeth.numpy())
+    assert cylinder.violation(teeth) == 0
+    assert cylinder.violation(teeth + torch.tensor([0, 0, cylinder.radius])) > 0
+    assert cylinder.violation(teeth + torch.tensor([0, 2 * cylinder.half_height, 0])) > 0
+
+
+def test_teeth_hang_on_neck_and_jaw_and_know_no_expression(head):
+    mouth = with_mouth(head, ())
+    upper, lower = rows_of_teeth(mouth)
+    assert len(upper) == len(lower) > 0
+    for row, joint in ((upper, 1), (lower, 2)):
+        corners = np.unique(mouth.faces[row])
+        assert (mouth.skinning_weights[corners, joint] == 1).all()
+        assert not mouth.expression_basis[corners].any()
+    again = with_mouth(mouth, ())
+    assert len(again.template) == len(mouth.template)
+
+
+def test_a_head_without_lips_stays_without_teeth(head, caplog):
+    bald = replace(head, regions={}, landmarks={})
+    mouth = with_mouth(bald, ("blended_lower_teeth",))
+    assert rows_of_teeth(mouth) == []
+    assert len(mouth.template) == len(head.template)
+    assert "no teeth" in caplog.text
+
+
+def test_the_published_codes_departures(head):
+    plain, odd = with_mouth(head, ()), with_mouth(head, ("blended_lower_teeth", "triple_correctives"))
+    lower = odd.regions["teeth_lower"]
+    np.testing.assert_allclose(odd.skinning_weights[lower[0]], [0.0131, 0.0426, 0.9443, 0, 0])
+    np.testing.assert_allclose(odd.skinning_weights.sum(1), 1, atol=1e-3)
+    others = np.setdiff1d(np.arange(len(odd.template)), lower)
+    np.testing.assert_array_equal(odd.skinning_weights[others], plain.skinning_weights[others])
+    np.testing.assert_allclose(odd.pose_basis, 3 * plain.pose_basis)
+
+
+def test_offsets_are_zero_for_added_teeth():
+    offset = np.ones((4, 3), np.float32)
+    padded = padded_offset(offset, 6)
+    assert padded.dtype == np.float32
+    np.testing.assert_array_equal(padded, [[1, 1, 1]] * 4 + [[0, 0, 0]] * 2)
