@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...bench.contracts import Budget, Camera, Clip, Frame, HeadPose, Progress, no_stage
+from ...bench.contracts import Camera, Clip, Frame, HeadPose, no_stage
 from ..shared.avatar_files import (
     HEAD_FILE,
     SUBJECT_FILE,
@@ -20,14 +20,13 @@ from ..shared.avatar_files import (
     RefinedTracking,
     Subject,
     finish_fit,
-    is_finished,
     read_shared_head,
     read_subject,
-    run_digest,
 )
 from ..shared.avatar_kernel import Carrier, HarmonicColors
 from ..shared.binding import Frames, WorldSplats, to_world
-from ..shared.loop import check_budget, check_training_split
+from ..shared.loop import Fit
+from ..shared.method import TrainedMethod
 from ..shared.networks import coefficient_count, initial_coefficients, occupied_degree, sh_to_rgb
 from ..shared.optimisation import Optimiser
 from ..shared.rendering import (
@@ -42,9 +41,10 @@ from ..shared.rendering import (
     view_of,
 )
 from ..shared.schedule import ShuffledEpochs, Timeline, torch_generator
-from ..shared.splat_training import Placed, run_bound_training
+from ..shared.splat_training import BoundTraining, Placed
 from ..shared.subject_mesh import BoundedCache, SubjectMesh
 from .config import GAConfig
+from .spec import GA as SPEC
 from .storage import PLY_FILE, read_ga_splats, write_ga_splats
 
 DRIVING_FILE = "driving.npz"
@@ -227,50 +227,25 @@ class GAAvatar:
         return self._shade(world.means, view.center)
 
 
-class GA:
+class GA(TrainedMethod[GAConfig, GAAvatar]):
     """The method: see the module."""
 
-    name, version = "ga", "2"
+    name, version = SPEC.name, SPEC.version
+    config_class, avatar_class = GAConfig, GAAvatar
 
-    def __init__(self, config: GAConfig | None = None):
-        self.config = config or GAConfig()
-
-    def fit(
-        self, clip: Clip, out: Path, budget: Budget, *, device: str, seed: int, progress: Progress
-    ) -> GAAvatar:
-        """Train on the training split and write the avatar under ``out``; continues a killed run."""
-        check_budget(budget)
-        check_training_split(clip)
-        run = run_digest(self.name, self.version, self.config, clip, budget, seed)
-        if is_finished(out, run):
-            return self.load(out, device=device)
-        subject = Subject.of(clip)
-        mesh = SubjectMesh(clip.head, subject.shape, subject.static_offset, device)
-        appearance = GAAppearance(mesh, clip, self.config, device, seed)
-        sampler = ShuffledEpochs(len(clip.splits["train"]), seed)
-        training, outcome = run_bound_training(
-            clip,
-            self.config.splats,
-            appearance,
-            sampler,
-            len(mesh.faces),
-            budget=budget,
-            folder=out,
-            run=run,
-            device=device,
-            seed=seed,
-            progress=progress,
+    def _train(self, fit: Fit, config: GAConfig) -> None:
+        clip, subject = fit.clip, Subject.of(fit.clip)
+        mesh = SubjectMesh(clip.head, subject.shape, subject.static_offset, fit.device)
+        appearance = GAAppearance(mesh, clip, config, fit.device, fit.seed)
+        sampler = ShuffledEpochs(len(clip.splits["train"]), fit.seed)
+        training = BoundTraining(
+            clip, config.splats, appearance, sampler, len(mesh.faces), fit.device, fit.seed
         )
+        outcome = training.run(fit)
         optimiser = training.optimiser
-        write_ga_splats(
-            out / PLY_FILE, {name: optimiser[name] for name in training.splat_names}, training.binding
-        )
+        splats: dict[str, Tensor] = {name: optimiser[name] for name in training.splat_names}
+        write_ga_splats(fit.out / PLY_FILE, splats, training.binding)
         refined = appearance.refined(clip.subject, optimiser)
         if refined is not None:
-            refined.save(out / DRIVING_FILE)
-        finish_fit(out, run, outcome, subject, clip.head, splats=len(training.binding))
-        return self.load(out, device=device)
-
-    def load(self, path: Path, *, device: str) -> GAAvatar:
-        """Read an avatar that `fit` wrote."""
-        return GAAvatar.read(path, device)
+            refined.save(fit.out / DRIVING_FILE)
+        finish_fit(fit, outcome, subject, clip.head, splats=len(training.binding))

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,9 +12,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ...bench.contracts import Budget, FrameKey, Progress
+from ...bench.contracts import FrameKey
 from ..shared.checkpoint import load_checkpoint, save_checkpoint
-from ..shared.loop import CHECKPOINT, recomposited, train
+from ..shared.loop import CHECKPOINT, Fit, recomposited, train
 from ..shared.optimisation import Optimiser
 from ..shared.rendering import View, view_of
 from ..shared.schedule import ShuffledEpochs, Timeline, torch_generator
@@ -258,21 +258,13 @@ class MeshResult(NamedTuple):
     seconds: float
 
 
-def mesh_phase(
-    scene: TrainingScene,
-    head: MeshHead,
-    budget: Budget,
-    out: Path,
-    run: str,
-    progress: Progress,
-    clock: Callable[[], float] = time.monotonic,
-) -> MeshResult:
-    """Train the mesh head, continue its training, or read what a finished one left under ``out``."""
-    folder = out / FOLDER
-    stored = load_checkpoint(folder / RESULT_FILE, run, scene.device)
+def mesh_phase(scene: TrainingScene, head: MeshHead, fit: Fit) -> MeshResult:
+    """Train the mesh head, continue its training, or read what a finished one left under ``fit.out``."""
+    folder = fit.out / FOLDER
+    stored = load_checkpoint(folder / RESULT_FILE, fit.run, scene.device)
     if stored is None:
-        stored = _trained(scene, head, budget, folder, run, progress, clock)
-        save_checkpoint(folder / RESULT_FILE, run, stored)
+        stored = _trained(scene, head, replace(fit, out=folder))
+        save_checkpoint(folder / RESULT_FILE, fit.run, stored)
         (folder / CHECKPOINT).unlink(missing_ok=True)
     return MeshResult(stored["tensors"], stored["iterations"], stored["seconds"])
 
@@ -286,29 +278,16 @@ def remove_mesh_phase(out: Path) -> None:
         folder.rmdir()
 
 
-def _trained(
-    scene: TrainingScene,
-    head: MeshHead,
-    budget: Budget,
-    folder: Path,
-    run: str,
-    progress: Progress,
-    clock: Callable[[], float],
-) -> dict[str, Any]:
-    began = clock()
-    training = MeshTraining(scene, head, fitted=not (folder / CHECKPOINT).exists())
+def _trained(scene: TrainingScene, head: MeshHead, fit: Fit) -> dict[str, Any]:
+    began = fit.clock()
+    training = MeshTraining(scene, head, fitted=not (fit.out / CHECKPOINT).exists())
     config = head.config
     outcome = train(
         training,
         ShuffledEpochs(len(scene.keys), scene.seed),
+        fit,
         published_length=max(1, round(config.schedule_length * config.mesh_fraction)),
-        budget=budget,
-        folder=folder,
-        run=run,
-        device=scene.device,
-        progress=progress,
         checkpoint_every_s=config.checkpoint_every_s,
-        clock=clock,
         began=began,
     )
     names = [*(name for network in head.networks for name in network.shapes()), "landmarks"]

@@ -17,14 +17,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from torch import Tensor
 
-from ...bench.contracts import Budget, Clip, Progress
-from ..shared.avatar_files import TRACKED, RefinedTracking, Subject, finish_fit, is_finished, run_digest
-from ..shared.loop import Outcome, check_budget, check_training_split, train
+from ...bench.contracts import Budget, Progress
+from ..shared.avatar_files import TRACKED, RefinedTracking, Subject, finish_fit
+from ..shared.loop import Fit, Outcome, train
+from ..shared.method import TrainedMethod
 from ..shared.schedule import ShuffledEpochs
 from .avatar import AVATAR_FILE, DRIVING_FILE, GHAAvatar, write_avatar
 from .config import GHAConfig
@@ -33,9 +33,10 @@ from .gaussian_head import GaussianHead
 from .gaussian_training import GaussianTraining
 from .mesh_head import MeshHead
 from .mesh_training import mesh_phase, remove_mesh_phase
+from .spec import GHA as SPEC
 
 
-class GHA:
+class GHA(TrainedMethod[GHAConfig, GHAAvatar]):
     """The method: see the module.
 
     Parameters
@@ -43,42 +44,32 @@ class GHA:
     clock : seconds, from any start; what budgets in seconds are measured by.
     """
 
-    name, version = "gha", "3"
+    name, version = SPEC.name, SPEC.version
+    config_class, avatar_class = GHAConfig, GHAAvatar
 
     def __init__(self, config: GHAConfig | None = None, clock: Callable[[], float] = time.monotonic):
-        self.config, self._clock = config or GHAConfig(), clock
+        super().__init__(config)
+        self._clock = clock
 
-    def fit(
-        self, clip: Clip, out: Path, budget: Budget, *, device: str, seed: int, progress: Progress
-    ) -> GHAAvatar:
-        """Train on the training split and write the avatar under ``out``; continues a killed run."""
-        check_budget(budget)
-        check_training_split(clip)
-        config = self.config
-        run = run_digest(self.name, self.version, config, clip, budget, seed)
-        if is_finished(out, run):
-            return self.load(out, device=device)
-        scene = training_scene(clip, config, device, seed)
+    def _train(self, fit: Fit, config: GHAConfig) -> None:
+        clip, out = fit.clip, fit.out
+        scene = training_scene(clip, config, fit.device, fit.seed)
         size = len(scene.signals[0].expression)
         mesh_head, head = MeshHead.of(config, size), GaussianHead.of(config, size)
-        first, second = parted(budget, config.mesh_fraction)
-        before = _PhaseProgress(progress, 0, second.iterations or 0)
-        mesh = mesh_phase(scene, mesh_head, first, out, run, before, self._clock)
-        sampler = ShuffledEpochs(len(scene.keys), seed)
-        began = self._clock()
+        first, second = parted(fit.budget, config.mesh_fraction)
+        before = _PhaseProgress(fit.progress, 0, second.iterations or 0)
+        mesh = mesh_phase(scene, mesh_head, replace(fit, budget=first, progress=before))
+        sampler = ShuffledEpochs(len(scene.keys), fit.seed)
+        began = fit.clock()
         training = GaussianTraining(scene, head, mesh_head, mesh.tensors, sampler)
+        budget = within(second, fit.budget, mesh.seconds)
         try:
             outcome = train(
                 training,
                 sampler,
+                replace(fit, budget=budget, progress=_PhaseProgress(fit.progress, mesh.iterations, 0)),
                 published_length=round(config.schedule_length * (1 - config.mesh_fraction)),
-                budget=within(second, budget, mesh.seconds),
-                folder=out,
-                run=run,
-                device=device,
-                progress=_PhaseProgress(progress, mesh.iterations, 0),
                 checkpoint_every_s=config.checkpoint_every_s,
-                clock=self._clock,
                 began=began,
             )
         finally:
@@ -92,13 +83,8 @@ class GHA:
             mesh.seconds + outcome.seconds,
         )
         counts = {"splats": len(tensors["points"]), "mesh_iterations": mesh.iterations}
-        finish_fit(out, run, whole, Subject.of(clip), clip.head, **counts)
+        finish_fit(fit, whole, Subject.of(clip), clip.head, **counts)
         remove_mesh_phase(out)
-        return self.load(out, device=device)
-
-    def load(self, path: Path, *, device: str) -> GHAAvatar:
-        """Read an avatar that `fit` wrote."""
-        return GHAAvatar.read(path, device)
 
 
 class _PhaseProgress:

@@ -217,10 +217,10 @@ def _line_box(mesh: SubjectMesh, clip: Clip, config: OursConfig) -> Box:
     return line_box(mesh.canonical[mesh.faces[triangles].reshape(-1)])
 
 
-def shell_start(mesh: SubjectMesh, clip: Clip, config: OursConfig, device: str) -> Start:
+def outer_layers_start(mesh: SubjectMesh, clip: Clip, config: OursConfig, device: str) -> Start:
     """One splat per triangle, and ``config.outer_layers.count`` more outwards over each of `expressive_triangles`.
 
-    Without lines there is no opacity to change, hence no shells.
+    Without lines there is no opacity to change, hence no outer layers.
     """
     start = one_per_triangle(len(mesh.faces), config.splats.initial_opacity, device)
     if not config.lines.enabled or not config.outer_layers.count:
@@ -228,9 +228,9 @@ def shell_start(mesh: SubjectMesh, clip: Clip, config: OursConfig, device: str) 
     chosen = expressive_triangles(mesh, clip, config.penalty.face_mm, device)
     size = mesh.frames(mesh.canonical).size.index_select(0, chosen)
     parts = [start]
-    for shell in range(1, config.outer_layers.count + 1):
+    for layer in range(1, config.outer_layers.count + 1):
         means = torch.zeros(len(chosen), 3, device=device)
-        means[:, NORMAL] = shell * config.outer_layers.gap / size
+        means[:, NORMAL] = layer * config.outer_layers.gap / size
         parts.append(
             Start(chosen, means, torch.full((len(chosen),), config.outer_layers.opacity, device=device))
         )
@@ -241,7 +241,7 @@ def shell_start(mesh: SubjectMesh, clip: Clip, config: OursConfig, device: str) 
 def expressive_triangles(mesh: SubjectMesh, clip: Clip, millimetres: float, device: str) -> Tensor:
     """Indices of face triangles whose centroid a training expression moves by ``millimetres`` or more, ascending.
 
-    There, at some time, the penalty lets opacity change (`ours_appearance.penalty_weights`).
+    There, at some time, the penalty lets opacity change (`penalty_weights`).
     """
     face = torch.from_numpy(faces_in_region(clip.head, "face")).to(device)
     moved = torch.zeros(len(face), dtype=torch.bool, device=device)

@@ -16,7 +16,7 @@ from ...bench.io.arrays import MAX_MAGNITUDE, TEXT, Member, read_arrays
 from ...bench.io.documents import read_json
 from ...bench.io.files import atomic_path, digest, write_json
 from ...datasets.head.arrays import HeadArrays, read_head, save_head
-from .loop import CHECKPOINT, Outcome
+from .loop import CHECKPOINT, Fit, Outcome
 
 HEAD_FILE = "head_model.npz"
 SUBJECT_FILE = "subject.npz"
@@ -188,23 +188,21 @@ def is_finished(folder: Path, run: str) -> bool:
     return True
 
 
-def write_record(folder: Path, run: str, outcome: Outcome, **more: Any) -> None:
+def write_record(fit: Fit, outcome: Outcome, **more: Any) -> None:
     """Write how the run went. The last file of a fit: its presence says that the avatar is whole."""
     record = {
-        "run": run,
+        "run": fit.run,
         "iterations": outcome.iterations,
         "planned_iterations": outcome.planned,
         "seconds": round(outcome.seconds, 3),
         **more,
     }
-    write_json(folder / RECORD_FILE, record)
+    write_json(fit.out / RECORD_FILE, record)
 
 
-def finish_fit(
-    folder: Path, run: str, outcome: Outcome, subject: Subject, head: HeadAsset, **more: Any
-) -> None:
+def finish_fit(fit: Fit, outcome: Outcome, subject: Subject, head: HeadAsset, **more: Any) -> None:
     """Write what every trained avatar has beside its own files, the record last; the checkpoint is done with."""
-    write_subject(folder / SUBJECT_FILE, subject)
-    save_shared_head(folder, head)
-    write_record(folder, run, outcome, **more)
-    (folder / CHECKPOINT).unlink(missing_ok=True)
+    write_subject(fit.out / SUBJECT_FILE, subject)
+    save_shared_head(fit.out, head)
+    write_record(fit, outcome, **more)
+    (fit.out / CHECKPOINT).unlink(missing_ok=True)

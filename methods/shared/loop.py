@@ -27,7 +27,7 @@ REPORT_EVERY = 10  # iterations between looks at the loss, each of which waits f
 
 
 class Trainable(Protocol):
-    """What the loop trains. It draws random numbers by iteration (`methods.seeds`), never from a global state."""
+    """What the loop trains. It draws random numbers by iteration (`schedule`), never from a global state."""
 
     @property
     def optimiser(self) -> Optimiser: ...
@@ -50,6 +50,27 @@ class Trainable(Protocol):
         """A few words on the state of training, for progress."""
 
 
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """What a method is asked to train.
+
+    Attributes
+    ----------
+    out : folder of the avatar, its checkpoint and its record.
+    run : digest of everything that decides how training goes; another run's checkpoint is refused.
+    clock : seconds, from any start; what budgets in seconds are measured by.
+    """
+
+    clip: Clip
+    out: Path
+    budget: Budget
+    device: str
+    seed: int
+    progress: Progress
+    run: str
+    clock: Callable[[], float] = time.monotonic
+
+
 @dataclass(frozen=True)
 class Outcome:
     """How a run went: iterations done of those planned, and seconds over all its parts."""
@@ -62,18 +83,13 @@ class Outcome:
 def train(
     trainable: Trainable,
     sampler: Sampler,
+    fit: Fit,
     *,
     published_length: int,
-    budget: Budget,
-    folder: Path,
-    run: str,
-    device: str,
-    progress: Progress,
     checkpoint_every_s: float,
-    clock: Callable[[], float] = time.monotonic,
     began: float | None = None,
 ) -> Outcome:
-    """Train until the budget is spent; continue from ``folder``'s checkpoint if it is of the same run.
+    """Train until the budget is spent; continue from the checkpoint in ``fit.out`` if it is of the same run.
 
     One iteration is: loss of one image, gradients, `after_backward` (densification), Adam step; the last
     iteration has no Adam step, as published. A run that was killed and continued ends bit for bit like an
@@ -82,7 +98,6 @@ def train(
     Parameters
     ----------
     published_length : iterations of the published run (`Timeline`).
-    run : digest of what the run was started with; another run's checkpoint is refused.
     began : what the clock said before the preparation of ``trainable``, whose seconds then count like those of
         iterations; by default counting begins here.
 
@@ -91,9 +106,10 @@ def train(
     InputError
         For a budget without iterations and seconds, and for a checkpoint that is damaged or of another run.
     """
+    budget, clock = fit.budget, fit.clock
     check_budget(budget)
-    path = folder / CHECKPOINT
-    saved = load_checkpoint(path, run, device)
+    path = fit.out / CHECKPOINT
+    saved = load_checkpoint(path, fit.run, fit.device)
     started = clock() if began is None else began
     if saved is None:
         iteration, spent = 0, 0.0
@@ -122,7 +138,7 @@ def train(
         loss = trainable.loss(iteration, sampler(iteration))
         loss.backward()
         if iteration % REPORT_EVERY == 0 or iteration == 1:
-            _check_finite(loss, iteration, folder)
+            _check_finite(loss, iteration, fit.out)
         trainable.after_backward(iteration)
         if iteration < total:
             trainable.optimiser.step()
@@ -134,12 +150,12 @@ def train(
                 "seconds": seconds(),
                 "trainable": trainable.state(),
             }
-            save_checkpoint(path, run, state)
+            save_checkpoint(path, fit.run, state)
             last_save = clock()
         note = ""
         if iteration % REPORT_EVERY == 0 or iteration == total:
             note = f"{estimated}loss {loss.item():.4f}; {trainable.note()}"
-        progress(iteration, total, note)
+        fit.progress(iteration, total, note)
     return Outcome(iteration, total, seconds())
 
 

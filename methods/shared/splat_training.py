@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ...bench.contracts import Budget, Camera, Clip, FrameKey, Progress
+from ...bench.contracts import Camera, Clip, FrameKey
 from ..splats import rasterize
 from ..splats.request import Rendering
 from .binding import Frames, WorldSplats
 from .config import DensifiedTraining, SplatTraining
-from .loop import Outcome, TrainingImages, train
+from .loop import Fit, Outcome, TrainingImages, train
 from .losses import photometric_loss, position_penalty, scale_penalty
 from .optimisation import Densifier, Optimiser
 from .rendering import View, scene_extent, view_of
@@ -34,7 +33,7 @@ class SplatTrainer:
     def __init__(
         self, clip: Clip, settings: DensifiedTraining, sampler: Sampler, device: str, *, mattes: bool = False
     ):
-        self._settings = settings
+        self._settings, self._sampler = settings, sampler
         self.keys: Sequence[FrameKey] = clip.splits["train"]
         self._images = TrainingImages(clip, self.keys, sampler, device, mattes=mattes)
         self.cameras = {key.camera: clip.cameras[key.camera] for key in self.keys}
@@ -121,6 +120,20 @@ class SplatTrainer:
         """Number of splats."""
         return f"{len(self.binding)} splats"
 
+    def run(self, fit: Fit) -> Outcome:
+        """Train to the end of the budget; see `train`."""
+        settings = self._settings
+        try:
+            return train(
+                self,
+                self._sampler,
+                fit,
+                published_length=settings.schedule_length,
+                checkpoint_every_s=settings.checkpoint_every_s,
+            )
+        finally:
+            self.close()
+
     def close(self) -> None:
         """Stop background work."""
         self._images.close()
@@ -149,34 +162,6 @@ class SplatTrainer:
         visible = rendering.radii > 0  # whatever their opacity, as published
         self._seen: tuple[Tensor, Tensor, Camera, Tensor] = (offset, visible, view.camera, face_sizes)
         return rendering, visible
-
-
-def run_trainer(
-    trainer: SplatTrainer,
-    settings: DensifiedTraining,
-    sampler: Sampler,
-    *,
-    budget: Budget,
-    folder: Path,
-    run: str,
-    device: str,
-    progress: Progress,
-) -> Outcome:
-    """Train to the end of the budget and stop the background work; arguments as those of `training.loop.train`."""
-    try:
-        return train(
-            trainer,
-            sampler,
-            published_length=settings.schedule_length,
-            budget=budget,
-            folder=folder,
-            run=run,
-            device=device,
-            progress=progress,
-            checkpoint_every_s=settings.checkpoint_every_s,
-        )
-    finally:
-        trainer.close()
 
 
 GEOMETRY = ("means", "log_scales", "quats", "opacities")
@@ -293,36 +278,6 @@ class BoundTraining(SplatTrainer):
         loss = loss + settings.position_weight * position_penalty(means, visible, settings.position_threshold)
         loss = loss + settings.scale_weight * scale_penalty(log_scales, visible, settings.scale_threshold)
         return loss if placed.penalty is None else loss + placed.penalty
-
-
-def run_bound_training(
-    clip: Clip,
-    settings: SplatTraining,
-    appearance: Appearance,
-    sampler: Sampler,
-    face_count: int,
-    *,
-    start: Start | None = None,
-    budget: Budget,
-    folder: Path,
-    run: str,
-    device: str,
-    seed: int,
-    progress: Progress,
-) -> tuple[BoundTraining, Outcome]:
-    """Train splats bound to a mesh of ``face_count`` triangles; arguments as those of `training.loop.train`."""
-    training = BoundTraining(clip, settings, appearance, sampler, face_count, device, seed, start=start)
-    outcome = run_trainer(
-        training,
-        settings,
-        sampler,
-        budget=budget,
-        folder=folder,
-        run=run,
-        device=device,
-        progress=progress,
-    )
-    return training, outcome
 
 
 def _initial_geometry(

@@ -12,14 +12,15 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ...bench.contracts import Budget, Camera, Clip, FloatArray, Frame, HeadPose, Progress
+from ...bench.contracts import Camera, Clip, FloatArray, Frame, HeadPose
 from ...bench.errors import InputError
 from ...bench.io.arrays import MAX_MAGNITUDE, TEXT, Member, read_arrays
 from ...bench.io.files import atomic_path
 from ...bench.io.images import read_pixels
-from ..shared.avatar_files import TRACKED, is_finished, run_digest, write_arrays, write_record
-from ..shared.loop import Outcome, check_training_split
-from .spec import NearestCameraConfig
+from ..shared.avatar_files import TRACKED, write_arrays, write_record
+from ..shared.loop import Fit, Outcome
+from ..shared.method import TrainedMethod
+from .spec import MEAN_IMAGE, NEAREST_CAMERA, NearestCameraConfig
 
 MEAN_FILE = "mean.npz"
 INDEX_FILE = "index.npz"
@@ -86,37 +87,31 @@ class MeanImageAvatar:
         return [self._path]
 
 
-class MeanImage:
-    """Mean of all training images, at the size of the largest."""
+class MeanImage(TrainedMethod[None, MeanImageAvatar]):
+    """Mean of all training images, at the size of the largest; the budget and the seed decide nothing."""
 
-    name, version = "mean-image", "1"
-
-    def fit(
-        self, clip: Clip, out: Path, budget: Budget, *, device: str, seed: int, progress: Progress
-    ) -> MeanImageAvatar:
-        """Average the training images; the budget and the seed decide nothing."""
-        check_training_split(clip)
-        run = run_digest(self.name, self.version, None, clip, budget, seed)
-        if not is_finished(out, run):
-            keys = clip.splits["train"]
-            cameras = [clip.cameras[key.camera] for key in keys]
-            largest = max(cameras, key=lambda camera: camera.width * camera.height)
-            total = np.zeros((largest.height, largest.width, 4))
-            for done, key in enumerate(keys, 1):
-                total += resize(_rgba(clip, key), largest.width, largest.height)
-                progress(done, len(keys))
-            arrays = {
-                "rgba": (total / len(keys)).astype(np.float32),
-                "background": np.asarray(clip.background, np.float32),
-                "head_model": np.array(clip.head.version),
-            }
-            write_arrays(out / MEAN_FILE, arrays)
-            write_record(out, run, Outcome(len(keys), len(keys), 0.0))
-        return self.load(out, device=device)
+    name, version = MEAN_IMAGE.name, MEAN_IMAGE.version
+    config_class = type(None)
 
     def load(self, path: Path, *, device: str) -> MeanImageAvatar:
         """Read the avatar `fit` wrote."""
         return MeanImageAvatar(path)
+
+    def _train(self, fit: Fit, config: None) -> None:
+        clip, keys = fit.clip, fit.clip.splits["train"]
+        cameras = [clip.cameras[key.camera] for key in keys]
+        largest = max(cameras, key=lambda camera: camera.width * camera.height)
+        total = np.zeros((largest.height, largest.width, 4))
+        for done, key in enumerate(keys, 1):
+            total += resize(_rgba(clip, key), largest.width, largest.height)
+            fit.progress(done, len(keys))
+        arrays = {
+            "rgba": (total / len(keys)).astype(np.float32),
+            "background": np.asarray(clip.background, np.float32),
+            "head_model": np.array(clip.head.version),
+        }
+        write_arrays(fit.out / MEAN_FILE, arrays)
+        write_record(fit, Outcome(len(keys), len(keys), 0.0))
 
 
 class NearestCameraAvatar:
@@ -181,49 +176,40 @@ class NearestCameraAvatar:
         return pixels[..., [2, 1, 0, 3]].astype(np.float32) / 255
 
 
-class NearestCamera:
-    """Keeps the training images and an index of their driving signals and cameras."""
+class NearestCamera(TrainedMethod[NearestCameraConfig, NearestCameraAvatar]):
+    """Keeps the training images and an index of their driving signals and cameras; budget and seed decide nothing."""
 
-    name, version = "nearest-camera", "1"
-
-    def __init__(self, config: NearestCameraConfig | None = None):
-        self.config = config or NearestCameraConfig()
-
-    def fit(
-        self, clip: Clip, out: Path, budget: Budget, *, device: str, seed: int, progress: Progress
-    ) -> NearestCameraAvatar:
-        """Copy the training images; the budget and the seed decide nothing."""
-        check_training_split(clip)
-        run = run_digest(self.name, self.version, self.config, clip, budget, seed)
-        if not is_finished(out, run):
-            timesteps = self._timesteps(clip)
-            row = {timestep: number for number, timestep in enumerate(timesteps)}
-            keys = [key for key in clip.splits["train"] if key.timestep in row]
-            column = {name: number for number, name in enumerate(sorted({key.camera for key in keys}))}
-            images = np.full((len(row), len(column)), -1, dtype=np.int64)
-            for number, key in enumerate(keys):
-                _write_image(image_path(out, number), clip, key)
-                images[row[key.timestep], column[key.camera]] = number
-                progress(number + 1, len(keys))
-            signals = np.stack([driving_signal(clip.poses[timestep]) for timestep in timesteps])
-            spread = signals.std(0)
-            arrays = {
-                "head_model": np.array(clip.head.version),
-                "background": np.asarray(clip.background, np.float32),
-                "timesteps": np.array(timesteps),
-                "signals": signals,
-                # A parameter that never moved in training must not outweigh all others when it does.
-                "scales": np.where(spread > 1e-8, spread, 1.0),
-                "centers": np.stack([clip.cameras[name].center for name in column]),
-                "images": images,
-            }
-            write_arrays(out / INDEX_FILE, arrays)
-            write_record(out, run, Outcome(len(keys), len(keys), 0.0))
-        return self.load(out, device=device)
+    name, version = NEAREST_CAMERA.name, NEAREST_CAMERA.version
+    config_class = NearestCameraConfig
 
     def load(self, path: Path, *, device: str) -> NearestCameraAvatar:
         """Read the avatar `fit` wrote."""
         return NearestCameraAvatar(path)
+
+    def _train(self, fit: Fit, config: NearestCameraConfig) -> None:
+        clip, timesteps = fit.clip, self._timesteps(fit.clip)
+        row = {timestep: number for number, timestep in enumerate(timesteps)}
+        keys = [key for key in clip.splits["train"] if key.timestep in row]
+        column = {name: number for number, name in enumerate(sorted({key.camera for key in keys}))}
+        images = np.full((len(row), len(column)), -1, dtype=np.int64)
+        for number, key in enumerate(keys):
+            _write_image(image_path(fit.out, number), clip, key)
+            images[row[key.timestep], column[key.camera]] = number
+            fit.progress(number + 1, len(keys))
+        signals = np.stack([driving_signal(clip.poses[timestep]) for timestep in timesteps])
+        spread = signals.std(0)
+        arrays = {
+            "head_model": np.array(clip.head.version),
+            "background": np.asarray(clip.background, np.float32),
+            "timesteps": np.array(timesteps),
+            "signals": signals,
+            # A parameter that never moved in training must not outweigh all others when it does.
+            "scales": np.where(spread > 1e-8, spread, 1.0),
+            "centers": np.stack([clip.cameras[name].center for name in column]),
+            "images": images,
+        }
+        write_arrays(fit.out / INDEX_FILE, arrays)
+        write_record(fit, Outcome(len(keys), len(keys), 0.0))
 
     def _timesteps(self, clip: Clip) -> list[int]:
         timesteps = sorted({key.timestep for key in clip.splits["train"]})

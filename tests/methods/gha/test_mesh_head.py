@@ -26,6 +26,7 @@ from headbench.methods.gha.mesh_head import (
 )
 from headbench.methods.gha.mesh_training import MeshTraining, mesh_phase, roughness, soft_overlap
 from headbench.methods.gha.tracked_motion import TangentDistance, outer_vertices
+from headbench.methods.shared.loop import Fit
 from headbench.methods.shared.networks import encode
 
 from .small import small_config
@@ -147,9 +148,10 @@ def test_the_mesh_phase_learns_shape_motion_and_colour(clip, tmp_path):
         if note:
             losses.append(float(note.split("loss ")[1].split(";")[0]))
 
-    result = mesh_phase(scene, head, Budget(iterations=60), tmp_path, "run", record)
+    fit = Fit(clip, tmp_path, Budget(iterations=60), "cpu", 0, record, "run")
+    result = mesh_phase(scene, head, fit)
     assert losses[-1] < 0.5 * losses[0]
-    again = mesh_phase(scene, head, Budget(iterations=60), tmp_path, "run", no_progress)
+    again = mesh_phase(scene, head, replace(fit, progress=no_progress))
     assert all(torch.equal(result.tensors[name], again.tensors[name]) for name in result.tensors)
     rows = torch.as_tensor(scene.landmark_rows)
     tracked = scene.driver.unposed(scene.tracked)[0, rows]

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from headbench.datasets.head.arrays import faces_in_region
-from headbench.methods.ours.appearance import expressive_triangles, shell_start
+from headbench.methods.ours.appearance import expressive_triangles, outer_layers_start
 from headbench.methods.ours.config import Lines, OursConfig, OuterLayers, Penalty
 from headbench.methods.shared.subject_mesh import SubjectMesh
 
@@ -17,7 +17,7 @@ def mesh(clip):
 
 def test_the_published_start_is_one_splat_at_each_centroid(clip, mesh):
     for config in (OursConfig(), OursConfig(outer_layers=OuterLayers(count=2), lines=Lines(enabled=False))):
-        start = shell_start(mesh, clip, config, "cpu")
+        start = outer_layers_start(mesh, clip, config, "cpu")
         np.testing.assert_array_equal(start.binding, np.arange(len(mesh.faces)))
         assert not start.means.any()
 
@@ -26,7 +26,7 @@ def test_shells_lie_a_gap_apart_along_the_normal_of_the_canonical_mesh(clip, mes
     config = OursConfig(
         outer_layers=OuterLayers(count=2, gap=0.002, opacity=0.2), penalty=Penalty(face_mm=0.01)
     )
-    start = shell_start(mesh, clip, config, "cpu")
+    start = outer_layers_start(mesh, clip, config, "cpu")
     frames, count = mesh.frames(mesh.canonical), len(mesh.faces)
     more = len(start.binding) - count
     assert more > 0
@@ -57,7 +57,7 @@ def test_only_face_triangles_that_a_training_expression_moves_are_expressive(cli
 
 def test_a_face_at_rest_has_no_shells(clip, mesh):
     assert len(expressive_triangles(mesh, clip, 1e6, "cpu")) == 0
-    start = shell_start(
+    start = outer_layers_start(
         mesh, clip, OursConfig(outer_layers=OuterLayers(count=1), penalty=Penalty(face_mm=1e6)), "cpu"
     )
     assert len(start.binding) == len(mesh.faces)

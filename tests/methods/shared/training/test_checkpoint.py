@@ -8,7 +8,7 @@ import torch
 from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.errors import InputError
 from headbench.methods.shared.checkpoint import load_checkpoint, save_checkpoint
-from headbench.methods.shared.loop import CHECKPOINT, train
+from headbench.methods.shared.loop import CHECKPOINT, Fit, train
 
 
 def test_what_was_saved_comes_back(tmp_path):
@@ -100,18 +100,9 @@ def test_a_state_that_is_none_of_the_method_is_refused(tmp_path, state):
             state["means"]
 
     save_checkpoint(tmp_path / CHECKPOINT, "run", state)
+    fit = Fit(None, tmp_path, Budget(iterations=2), "cpu", 0, no_progress, "run")
     with pytest.raises(InputError, match="the state of this method"):
-        train(
-            Method(),
-            lambda iteration: 0,
-            published_length=1,
-            budget=Budget(iterations=2),
-            folder=tmp_path,
-            run="run",
-            device="cpu",
-            progress=no_progress,
-            checkpoint_every_s=1.0,
-        )
+        train(Method(), lambda iteration: 0, fit, published_length=1, checkpoint_every_s=1.0)
 
 
 def test_a_failed_write_leaves_the_old_checkpoint(tmp_path):

@@ -6,7 +6,7 @@ from torch import nn
 
 from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.errors import InputError
-from headbench.methods.shared.loop import CHECKPOINT, train
+from headbench.methods.shared.loop import CHECKPOINT, Fit, train
 from headbench.methods.shared.optimisation import Optimiser
 
 
@@ -48,19 +48,9 @@ class Clock:
 
 
 def run(model, folder, budget, progress=no_progress, clock=None, every=1e9, name="run", began=None):
-    return train(
-        model,
-        lambda iteration: iteration % 3,
-        published_length=100,
-        budget=budget,
-        folder=folder,
-        run=name,
-        device="cpu",
-        progress=progress,
-        checkpoint_every_s=every,
-        clock=clock or Clock(),
-        began=began,
-    )
+    fit = Fit(None, folder, budget, "cpu", 0, progress, name, clock or Clock())
+    sampler = lambda iteration: iteration % 3
+    return train(model, sampler, fit, published_length=100, checkpoint_every_s=every, began=began)
 
 
 def test_iterations_are_counted_from_one_and_the_last_makes_no_step(tmp_path):

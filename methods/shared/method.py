@@ -1,0 +1,59 @@
+"""What a trained method does around its training: checks, resuming, reading back."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any, ClassVar, Generic, TypeVar
+
+from ...bench.contracts import Budget, Clip, Progress
+from .avatar_files import is_finished, run_digest
+from .loop import Fit, check_budget, check_training_split
+
+Config = TypeVar("Config")
+Avatar = TypeVar("Avatar")
+
+
+class TrainedMethod(Generic[Config, Avatar]):
+    """A `Method` but for its training, `_train`, which writes the avatar under ``fit.out``.
+
+    A derived class names its settings' class, its avatar's (with ``read(folder, device)``), and the name and version
+    of its spec.
+    """
+
+    name: ClassVar[str]
+    version: ClassVar[str]
+    config_class: ClassVar[Any]
+    avatar_class: ClassVar[Any]
+
+    def __init__(self, config: Config | None = None):
+        self.config: Config = config or self.config_class()
+        self._clock = time.monotonic
+
+    def fit(
+        self, clip: Clip, out: Path, budget: Budget, *, device: str, seed: int, progress: Progress
+    ) -> Avatar:
+        """Train on the training split and write the avatar under ``out``; continues a killed run.
+
+        Raises `InputError` for a budget without bound, a clip without training frames, and an output folder that holds
+        the avatar of another run.
+        """
+        check_budget(budget)
+        check_training_split(clip)
+        config, settings = self._resolved(clip, device)
+        run = run_digest(self.name, self.version, settings, clip, budget, seed)
+        if not is_finished(out, run):
+            self._train(Fit(clip, out, budget, device, seed, progress, run, self._clock), config)
+        return self.load(out, device=device)
+
+    def load(self, path: Path, *, device: str) -> Avatar:
+        """Read an avatar that `fit` wrote."""
+        avatar: Avatar = self.avatar_class.read(path, device)
+        return avatar
+
+    def _resolved(self, clip: Clip, device: str) -> tuple[Any, Any]:
+        """The configuration to train with, and what of it tells one run from another."""
+        return self.config, self.config
+
+    def _train(self, fit: Fit, config: Any) -> None:
+        raise NotImplementedError
