@@ -5,13 +5,12 @@ The defaults are the published values; times are on the scale of the published r
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import ClassVar, Literal
 
+from ...bench.specs import Renamed
 from ..shared.config import DensifiedTraining
-
-Departure = Literal["triple_correctives", "blended_lower_teeth"]
-"""What the published code does otherwise than the paper says."""
 
 
 @dataclass(frozen=True)
@@ -57,9 +56,10 @@ class GBSConfig:
         largest displacement by FLAME's 50th expression, and the largest by its first.
     alpha_weight : of the mean squared difference of alpha and matte; needs mattes, else it is left out.
     teeth_weight : of the penalty on teeth that leave the mouth (`mouth.Cylinder`), the mean over each row, added up.
-    departures : what to do as the published code does. "triple_correctives" adds the pose correctives of a
-        triangle's corners instead of interpolating them, which makes them three times too strong;
-        "blended_lower_teeth" lets the lower teeth follow root and neck by 5.6 % instead of the jaw alone.
+    correctives_variant : "paper" interpolates the pose correctives of a triangle's corners. "official" adds them up as
+        the authors' program does, which makes them three times too strong.
+    lower_teeth_variant : "paper" lets the lower teeth follow the jaw alone. "official" lets them follow root and neck by
+        5.6 % as the authors' program does.
     """
 
     splats: BlendshapeTraining = field(default_factory=BlendshapeTraining)
@@ -84,7 +84,13 @@ class GBSConfig:
     mask_full_mm: float = 5.7035
     alpha_weight: float = 10.0
     teeth_weight: float = 100.0
-    departures: tuple[Departure, ...] = ()
+    correctives_variant: Literal["paper", "official"] = "paper"
+    lower_teeth_variant: Literal["paper", "official"] = "paper"
+
+    renamed: ClassVar[Mapping[str, Renamed]] = {
+        "departures:triple_correctives": Renamed("correctives_variant"),
+        "departures:blended_lower_teeth": Renamed("lower_teeth_variant"),
+    }
 
     def __post_init__(self) -> None:
         if self.samples < 1 or self.teeth_samples < 0:
@@ -95,5 +101,3 @@ class GBSConfig:
             raise ValueError("sh_degree must be 0 to 3, and difference_sh_degree not above it")
         if not 0 <= self.mask_floor_mm < self.mask_full_mm:
             raise ValueError("mask_floor_mm must be at least 0 and below mask_full_mm")
-        if len(set(self.departures)) != len(self.departures):
-            raise ValueError(f"departures must name each thing once, found {self.departures}")

@@ -28,7 +28,7 @@ class GBS(TrainedMethod[GBSConfig, GBSAvatar]):
 
     def _train(self, fit: Fit, config: GBSConfig) -> None:
         clip, seed = fit.clip, fit.seed
-        head = with_mouth(clip.head, config.departures)
+        head = with_mouth(clip.head, config)
         offset = padded_offset(np.asarray(clip.static_offset, np.float32), len(head.template))
         subject = Subject(clip.subject, head.version, np.asarray(clip.shape, np.float32), offset)
         sampler = ShuffledEpochs(len(clip.splits["train"]), seed)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -17,7 +16,7 @@ from ...datasets.head.arrays import HeadArrays, faces_in_region
 from ...datasets.head.teeth import with_teeth_where_possible
 from ..shared.avatar_files import head_arrays
 from ..shared.schedule import numpy_generator
-from .config import Departure
+from .config import GBSConfig
 
 CANDIDATES = 20
 """Random points drawn for each that is kept."""
@@ -122,18 +121,18 @@ class MouthCylinder(NamedTuple):
         return (torch.relu(outward).square() + torch.relu(upward).square()).mean()
 
 
-def with_mouth(head: HeadAsset, departures: Sequence[Departure]) -> HeadArrays:
+def with_mouth(head: HeadAsset, config: GBSConfig) -> HeadArrays:
     """The head with teeth (regions `ROWS`), and with what the published code does otherwise than the paper.
 
     Clips bring the same teeth for all methods; a head without gets them here. The paper's teeth are two billboards of
     fixed size in FLAME's mouth; these plates follow the lips of any head.
     """
     arrays = with_teeth_where_possible(head_arrays(head))
-    if "blended_lower_teeth" in departures and "teeth_lower" in arrays.regions:
+    if config.lower_teeth_variant == "official" and "teeth_lower" in arrays.regions:
         weights = arrays.skinning_weights.copy()
         weights[arrays.regions["teeth_lower"]] = (*LOWER_TEETH_WEIGHTS, 0, 0)
         arrays = replace(arrays, skinning_weights=weights)
-    if "triple_correctives" in departures:
+    if config.correctives_variant == "official":
         arrays = replace(arrays, pose_basis=3 * arrays.pose_basis)
     return arrays
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
+
+from ...bench.specs import Renamed
 
 
 @dataclass(frozen=True)
@@ -41,7 +44,7 @@ class GHAConfig:
     appearance_margin : how far beyond its training range, in parts of that range, each driving value is followed by
         the networks of colour and attributes; None, as published, sets no end. What lies far outside of training
         otherwise tints a face.
-    at_rest : start all controllers without an effect of expression and pose, deformation and attributes with outputs
+    zero_initialised : start all controllers without an effect of expression and pose, deformation and attributes with outputs
         of zero, instead of small random ones: what a short capture never shows then stays without effect.
     angle_unit : radians of jaw and eye angles that count as 1 in the expression code. Expression coefficients are of
         the order of 1, and beside them a short run hardly notices a jaw's tenths of a radian.
@@ -62,8 +65,8 @@ class GHAConfig:
         half of the phase; 1 keeps them constant, as published.
     low_weight, structure_weight : weights of the L1 loss at the splatted size and of 1 - SSIM at the full one.
         The latter stands for the published 0.1 LPIPS, whose backbone is not ours to ship.
-    low_truth : "mean" compares the splatted colours with area means of the image; "gha" is the compatibility option
-        for the published code, which takes every fourth pixel.
+    low_image_variant : "paper" compares the splatted colours with area means of the image; "official" with every fourth
+        pixel, as the authors' program does.
     augment : rescale the feature image by 0.8 to 1.25 before super-resolution, and cut out of it or put it at random,
         as published.
     checkpoint_every_s : seconds between checkpoints.
@@ -96,7 +99,7 @@ class GHAConfig:
     motion_steps: int = 0
     motion_weight: float = 0.0
     appearance_margin: float | None = None
-    at_rest: bool = False
+    zero_initialised: bool = False
     angle_unit: float = 1.0
     expression_noise: float = 0.0
     displacement_scale: float = 0.3
@@ -118,9 +121,14 @@ class GHAConfig:
     final_rate: float = 1.0
     low_weight: float = 1.0
     structure_weight: float = 0.1
-    low_truth: Literal["mean", "gha"] = "mean"
+    low_image_variant: Literal["paper", "official"] = "paper"
     augment: bool = True
     checkpoint_every_s: float = 120.0
+
+    renamed: ClassVar[Mapping[str, Renamed]] = {
+        "low_truth": Renamed("low_image_variant", {"mean": "paper", "gha": "official"}),
+        "at_rest": Renamed("zero_initialised"),
+    }
 
     def __post_init__(self) -> None:
         counts = (

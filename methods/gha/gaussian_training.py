@@ -102,7 +102,7 @@ class GaussianTraining:
             scene.background,
         )
         padded = _padded(target, view.camera, config.upscale, scene.background)
-        small = reduced(padded, config.upscale, config.low_truth)
+        small = reduced(padded, config.upscale, config.low_image_variant)
         loss = config.low_weight * (drawn.features[..., :3] - small).abs().mean()
         if config.augment:
             zoom = Zoom.of(drawn.alpha.shape, _draws(scene.seed, iteration))
@@ -210,9 +210,9 @@ def first_points(
     }
 
 
-def reduced(image: Tensor, factor: int, how: str) -> Tensor:
-    """(h, w, 3) of a (u h, u w, 3) image: area means, or for "gha" the first pixel of each block."""
-    if how == "gha":
+def reduced(image: Tensor, factor: int, variant: str) -> Tensor:
+    """(h, w, 3) of a (u h, u w, 3) image: area means, or for "official" the first pixel of each block."""
+    if variant == "official":
         return image[::factor, ::factor]
     height, width = image.shape[0] // factor, image.shape[1] // factor
     return image.view(height, factor, width, factor, 3).mean((1, 3))

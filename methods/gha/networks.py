@@ -40,7 +40,7 @@ class Mlp:
     hidden, outputs : widths of the layers.
     deaf : start without an effect of the condition, by weights of zero for it. What training never shows then has
         none in the end, instead of a random one.
-    at_rest : start with outputs of zero, by a last layer of zero.
+    zero_initialised : start with outputs of zero, by a last layer of zero.
     """
 
     name: str
@@ -49,7 +49,7 @@ class Mlp:
     hidden: tuple[int, ...]
     outputs: int
     deaf: bool = False
-    at_rest: bool = False
+    zero_initialised: bool = False
 
     @property
     def widths(self) -> tuple[int, ...]:
@@ -77,7 +77,7 @@ class Mlp:
         if self.deaf and self.condition_inputs:
             for layer in {0, self._again}:
                 tensors[f"{self.name}.weight_{layer}"][:, -self.condition_inputs :] = 0
-        if self.at_rest:
+        if self.zero_initialised:
             last = len(self.hidden)
             tensors |= {
                 name: torch.zeros_like(tensors[name])
@@ -158,7 +158,7 @@ class Controllers:
         def pair(
             kind: str, inputs: int, hidden: tuple[tuple[int, ...], ...], outputs: int
         ) -> tuple[Mlp, Mlp]:
-            starts = (config.at_rest, config.at_rest and kind != "color")
+            starts = (config.zero_initialised, config.zero_initialised and kind != "color")
             return (
                 Mlp(f"expression_{kind}", inputs, expression_size, hidden[0], outputs, *starts),
                 Mlp(f"pose_{kind}", inputs, pose, hidden[1], outputs, *starts),

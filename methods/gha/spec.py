@@ -30,7 +30,7 @@ SHORT: dict[str, Any] = {
     "motion_steps": 1_500,
     "motion_weight": 0.1,
     "appearance_margin": 0.25,
-    "at_rest": True,
+    "zero_initialised": True,
     "angle_unit": 0.2,
     "expression_noise": 0.1,
     "mesh_views": 2,

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
+
+from ...bench.specs import Renamed
 
 INSTANT_NGP_STEP = math.sqrt(3) / 1024
 SMALLEST = 1e-12
@@ -53,9 +56,9 @@ class InstaConfig:
     step : metres between samples of a ray.
     shell_outside, shell_inside : metres from the surface within which there may be density, on both of its sides.
     jaw_opening : radians that the jaw of the canonical mesh is opened, so that lips are apart.
-    warp_compatibility : "" carries points by the mean of the transforms of the nearest triangle and of those across
+    warp_variant : "paper" carries points by the mean of the transforms of the nearest triangle and of those across
         its edges, weighted by exp(-4 d) in metres, each with the root of the ratio of areas as its scale (paper,
-        section 3.2). "code" is the authors' program: means in the face region alone, exp(-d) for the own
+        section 3.2). "official" is the authors' program: means in the face region alone, exp(-d) for the own
         triangle, and a scale only in the eye region, by the ratio itself.
     occupancy_resolution, occupancy_every, occupancy_decay, occupancy_threshold : cells along the longest side of the
         canonical box; iterations between refreshes; how much of an old value stays; optical thickness per ``step``
@@ -69,9 +72,9 @@ class InstaConfig:
     huber : where the colour loss turns from square to linear.
     mouth_weight, mouth_from : weight of pixels that show lips or teeth, from then on.
     depth_weight : of the distance between the expected depth and the mesh, metres, outside hair and neck. 0 for none.
-    fog_weight : of the mean opacity of a ray's samples, summed. Not published (0 there): with it short runs clear
+    opacity_weight : of the mean opacity of a ray's samples, summed. Not published (0 there): with it short runs clear
         the air in front of the surface, which nothing else asks for, and have less to march through.
-    target_compatibility : "" composites the truth over the random background as the prediction is, in sRGB. "code"
+    target_variant : "paper" composites the truth over the random background as the prediction is, in sRGB. "official"
         does it in linear light, which differs where masks are soft.
     learning_rate, final_rate, betas, weight_decay, ema : Adam; part of the rate that is left at the end, log-linearly
         over the last half; decay of the networks' weights; of the running mean of parameters that is kept as the
@@ -98,7 +101,7 @@ class InstaConfig:
     shell_outside: float = 0.05
     shell_inside: float = 0.02
     jaw_opening: float = 0.2094
-    warp_compatibility: Literal["", "code"] = ""
+    warp_variant: Literal["paper", "official"] = "paper"
     occupancy_resolution: int = 128
     occupancy_every: int = 16
     occupancy_decay: float = 0.95
@@ -113,8 +116,8 @@ class InstaConfig:
     mouth_weight: float = 40.0
     mouth_from: int = 500
     depth_weight: float = 1.25
-    fog_weight: float = 0.0
-    target_compatibility: Literal["", "code"] = ""
+    opacity_weight: float = 0.0
+    target_variant: Literal["paper", "official"] = "paper"
     learning_rate: float = 1.75e-3
     final_rate: float = 1.0
     betas: tuple[float, float] = (0.9, 0.99)
@@ -123,6 +126,12 @@ class InstaConfig:
     mesh_cache_mb: int = 512
     image_cache_mb: int = 512
     checkpoint_every_s: float = 120.0
+
+    renamed: ClassVar[Mapping[str, Renamed]] = {
+        "warp_compatibility": Renamed("warp_variant", {"": "paper", "code": "official"}),
+        "target_compatibility": Renamed("target_variant", {"": "paper", "code": "official"}),
+        "fog_weight": Renamed("opacity_weight"),
+    }
 
     def __post_init__(self) -> None:
         if self.level_features not in (1, 2, 4, 8):
@@ -154,7 +163,7 @@ class InstaConfig:
             "depth_weight",
             "weight_decay",
             "prior_depth",
-            "fog_weight",
+            "opacity_weight",
         ):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must not be negative, found {getattr(self, name)}")

@@ -16,7 +16,7 @@ from ...bench.contracts import HeadAsset, HeadPose
 from ..shared.subject_mesh import SubjectMesh
 from . import kernel
 from .config import InstaConfig
-from .warp import Blend, Compatibility, Found, blended, canonical_from_posed, first_hits, nearest_triangles
+from .warp import Blend, Found, Variant, blended, canonical_from_posed, first_hits, nearest_triangles
 
 Backend = Literal["auto", "kernel", "reference"]
 FREE_MAX = 255
@@ -85,11 +85,11 @@ class CanonicalSurface:
     """
 
     def __init__(
-        self, head: HeadAsset, canonical: Tensor, compatibility: Compatibility = "", backend: Backend = "auto"
+        self, head: HeadAsset, canonical: Tensor, variant: Variant = "paper", backend: Backend = "auto"
     ):
         self.canonical = canonical.detach().cpu()
         self.faces = torch.from_numpy(np.asarray(head.faces, dtype=np.int64))
-        self.blend = Blend.of(head, compatibility)
+        self.blend = Blend.of(head, variant)
         self.module = None if backend == "reference" else kernel.load()
         if backend == "kernel" and self.module is None:
             raise ValueError("backend 'kernel': not installed; 'reference' is")
@@ -277,4 +277,4 @@ def canonical_surface(
         translation=still,
     )
     vertices = mesh.posed(mesh.arguments([pose]))
-    return CanonicalSurface(head, vertices, config.warp_compatibility, backend)
+    return CanonicalSurface(head, vertices, config.warp_variant, backend)

@@ -16,7 +16,7 @@ SHORT: dict[str, Any] = {
     "color_layers": 2,
     "density_bias": 4.5,
     "prior_depth": 4.0,
-    "fog_weight": 9e-4,
+    "opacity_weight": 9e-4,
     "depth_weight": 3.75,
     "step": 0.004,
     "shell_outside": 0.04,

@@ -113,8 +113,8 @@ class InstaTraining:
         loss = color_loss(color, target.to(device), weights.to(device), config.huber)
         if not rendered.samples:  # all rays passed the head by: nothing to learn, but no error either
             loss = loss + 0.0 * self._optimiser[self._names[-1]].sum()
-        if config.fog_weight:
-            loss = loss + config.fog_weight * rendered.fog / len(batch.image)
+        if config.opacity_weight:
+            loss = loss + config.opacity_weight * rendered.fog / len(batch.image)
         if config.depth_weight:
             loss = loss + config.depth_weight * depth_loss(rendered.distance, batch.depth.to(device))
         self._seen = rendered.samples
@@ -273,7 +273,7 @@ def target_colors(
     ----------
     coverage : (R, 1) in [0, 1].
     """
-    if config.target_compatibility == "code":
+    if config.target_variant == "official":
         own = (image - (1 - coverage) * recorded_on).clamp(0, 1) / coverage.clamp_min(1 / 255)
         mixed = coverage * to_linear(own.clamp(0, 1)) + (1 - coverage) * to_linear(background)
         return to_srgb(mixed)

@@ -12,11 +12,11 @@ from torch import Tensor
 from ...bench.contracts import HeadAsset, IntArray
 
 FALLOFF = 4.0  # per metre
-OWN_FALLOFF_OF_CODE = 1.0
+OFFICIAL_OWN_FALLOFF = 1.0
 SCALE_LIMIT = 4.0  # a triangle that an extreme pose collapses must not throw its points out of the box
 ALONE = -1.0
 
-Compatibility = Literal["", "code"]
+Variant = Literal["paper", "official"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,18 +39,18 @@ class Blend:
     root: bool
 
     @classmethod
-    def of(cls, head: HeadAsset, compatibility: Compatibility) -> Blend:
+    def of(cls, head: HeadAsset, variant: Variant) -> Blend:
         """The blend of a head, as the paper or as the authors' code has it."""
         faces = np.asarray(head.faces)
         count = len(faces)
         neighbours = edge_neighbours(faces)
         falloff = np.full(count, FALLOFF, np.float32)
-        if not compatibility:
+        if variant == "paper":
             return cls(neighbours, falloff, falloff, np.ones(count, bool), True)
         apart = touching(head, "lips") | touching(head, "left_ear") | touching(head, "right_ear")
         eyes = touching(head, "eye_region") & ~apart
         face = touching(head, "face") & ~apart & ~eyes
-        own = np.where(face, OWN_FALLOFF_OF_CODE, ALONE).astype(np.float32)
+        own = np.where(face, OFFICIAL_OWN_FALLOFF, ALONE).astype(np.float32)
         return cls(neighbours, own, falloff, eyes, False)
 
 

@@ -138,7 +138,6 @@ def test_the_paper_preset_of_gbs_is_the_paper():
         (GBSConfig, {"expressions": -1}),
         (GBSConfig, {"difference_sh_degree": 4}),
         (GBSConfig, {"mask_floor_mm": 6.0}),
-        (GBSConfig, {"departures": ("triple_correctives",) * 2}),
         (Planes, {"resolution": 1}),
         (Lines, {"expressions": -1}),
         (Capacity, {"tolerance": 0.0}),

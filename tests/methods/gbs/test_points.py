@@ -7,6 +7,7 @@ import pytest
 import torch
 from scipy.spatial import ConvexHull, cKDTree
 
+from headbench.methods.gbs.config import GBSConfig
 from headbench.methods.gbs.points import (
     RADIUS,
     MouthCylinder,
@@ -85,7 +86,7 @@ def test_distances_to_the_cylinder_are_those_of_its_sides():
 
 
 def test_teeth_at_rest_fit_their_cylinder(head):
-    mouth = with_mouth(head, ())
+    mouth = with_mouth(head, GBSConfig())
     teeth = torch.from_numpy(mouth.template[mouth.regions["teeth"]]).float()
     cylinder = mouth_cylinder(teeth.numpy())
     assert cylinder.violation(teeth) == 0
@@ -94,27 +95,30 @@ def test_teeth_at_rest_fit_their_cylinder(head):
 
 
 def test_teeth_hang_on_neck_and_jaw_and_know_no_expression(head):
-    mouth = with_mouth(head, ())
+    mouth = with_mouth(head, GBSConfig())
     upper, lower = rows_of_teeth(mouth)
     assert len(upper) == len(lower) > 0
     for row, joint in ((upper, 1), (lower, 2)):
         corners = np.unique(mouth.faces[row])
         assert (mouth.skinning_weights[corners, joint] == 1).all()
         assert not mouth.expression_basis[corners].any()
-    again = with_mouth(mouth, ())
+    again = with_mouth(mouth, GBSConfig())
     assert len(again.template) == len(mouth.template)
 
 
 def test_a_head_without_lips_stays_without_teeth(head, caplog):
     bald = replace(head, regions={}, landmarks={})
-    mouth = with_mouth(bald, ("blended_lower_teeth",))
+    mouth = with_mouth(bald, GBSConfig(lower_teeth_variant="official"))
     assert rows_of_teeth(mouth) == []
     assert len(mouth.template) == len(head.template)
     assert "no teeth" in caplog.text
 
 
-def test_the_published_codes_departures(head):
-    plain, odd = with_mouth(head, ()), with_mouth(head, ("blended_lower_teeth", "triple_correctives"))
+def test_the_official_variants_of_the_mouth(head):
+    plain, odd = (
+        with_mouth(head, GBSConfig()),
+        with_mouth(head, GBSConfig(correctives_variant="official", lower_teeth_variant="official")),
+    )
     lower = odd.regions["teeth_lower"]
     np.testing.assert_allclose(odd.skinning_weights[lower[0]], [0.0131, 0.0426, 0.9443, 0, 0])
     np.testing.assert_allclose(odd.skinning_weights.sum(1), 1, atol=1e-3)

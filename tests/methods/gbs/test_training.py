@@ -30,7 +30,7 @@ SMALL = GBSConfig(
 
 
 def make(clip, config=SMALL):
-    head = with_mouth(clip.head, config.departures)
+    head = with_mouth(clip.head, config)
     offset = padded_offset(clip.static_offset.astype(np.float32), len(head.template))
     subject = Subject("toy", head.version, clip.shape.astype(np.float32), offset)
     training = GBSTraining(clip, config, subject, head, lambda iteration: 0, "cpu", 0)

@@ -120,8 +120,8 @@ def test_only_drawn_surroundings_are_coloured():
 def test_reduction_takes_means_or_as_published_every_nth_pixel(height, width, factor):
     image = torch.rand(height * factor, width * factor, 3, dtype=torch.float64)
     blocks = image.reshape(height, factor, width, factor, 3)
-    np.testing.assert_allclose(reduced(image, factor, "mean"), blocks.mean((1, 3)))
-    np.testing.assert_array_equal(reduced(image, factor, "gha"), blocks[:, 0, :, 0])
+    np.testing.assert_allclose(reduced(image, factor, "paper"), blocks.mean((1, 3)))
+    np.testing.assert_array_equal(reduced(image, factor, "official"), blocks[:, 0, :, 0])
 
 
 def interpolated(values, factor):

@@ -139,7 +139,9 @@ def test_images_are_masked_on_black_where_there_are_masks(clip, masked):
 
 def test_the_mesh_phase_learns_shape_motion_and_colour(clip, tmp_path):
     """Its loss falls, landmarks follow the tracked mesh, and the image resembles the truth."""
-    config = small_config(geometry_hidden=(32, 32), mesh_lr=6e-3, landmark_weight=300.0, at_rest=True)
+    config = small_config(
+        geometry_hidden=(32, 32), mesh_lr=6e-3, landmark_weight=300.0, zero_initialised=True
+    )
     scene = training_scene(clip, config, "cpu", 0)
     head = MeshHead.of(config, len(scene.expression_scale))
     losses = []

@@ -215,6 +215,6 @@ def test_zero_initialised_networks_ignore_the_condition():
         assert torch.equal(deaf(weights, points, one), deaf(weights, points, other))
         weights = hearing.initial(torch.Generator().manual_seed(6))
         assert not torch.equal(hearing(weights, points, one), hearing(weights, points, other))
-        resting = Mlp("m", 3, 4, hidden, 2, at_rest=True)
+        resting = Mlp("m", 3, 4, hidden, 2, zero_initialised=True)
         weights = resting.initial(torch.Generator().manual_seed(6))
         assert torch.equal(resting(weights, points, one), torch.zeros(6, 2))

@@ -49,7 +49,7 @@ def test_moves_are_the_head_models_near_landmarks(clip):
 
 def test_a_network_learns_to_move_like_the_head_model(clip):
     """Also by expressions that no timestep shows."""
-    config = small_config(at_rest=True, expression_deform_hidden=(32, 32), angle_unit=0.2)
+    config = small_config(zero_initialised=True, expression_deform_hidden=(32, 32), angle_unit=0.2)
     scene = training_scene(clip, config, "cpu", 0)
     motion = TrackedMotion.of(scene, config)
     network = Controllers.of(config, len(scene.code_low)).expression_deform
@@ -68,7 +68,7 @@ def test_a_network_learns_to_move_like_the_head_model(clip):
 
 def test_errors_count_relative_to_a_vertexs_motion(clip):
     """A network at rest errs by all the motion there is: 1, but for what hardly moves."""
-    config = small_config(at_rest=True)
+    config = small_config(zero_initialised=True)
     scene = training_scene(clip, config, "cpu", 0)
     motion = TrackedMotion.of(scene, config)
     network = Controllers.of(config, len(scene.code_low)).expression_deform

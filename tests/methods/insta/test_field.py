@@ -207,7 +207,7 @@ def test_values_and_gradients_are_those_of_autograd(constants, layers, monkeypat
     weights = [w.double() for w in initial_weights(layer_shapes(5 + constants, 7, layers, 2), generator)]
     gradient = torch.randn(53, 2, generator=generator, dtype=torch.float64)
     results = []
-    for function in network:
+    for function in (network, network_reference):
         leaves = [value.clone().requires_grad_() for value in (inputs, *weights)]
         output = function(leaves[0], others, rows, leaves[1:])
         output.backward(gradient)

@@ -31,7 +31,7 @@ SHAPES = {
     "eight features": {"level_features": 8, "density_layers": 2, "color_layers": 3},
     "no conditions": {"conditions": 0},
     "coarse": {"base_resolution": 2, "finest_resolution": 2, "levels": 1},
-    "the authors' warp": {"warp_compatibility": "code"},
+    "the authors' warp": {"warp_variant": "official"},
     "published shapes": {
         "levels": 16,
         "level_features": 8,

@@ -195,9 +195,9 @@ def test_no_regions_and_no_masks_are_trained(clip, tmp_path):
     check_frame(avatar.render(clip.cameras[key.camera], clip.poses[key.timestep]), clip.cameras[key.camera])
 
 
-def test_the_compatibility_options_train_as_well(clip, tmp_path):
-    one = fit(clip, tmp_path / "a", warp_compatibility="code")
-    other = fit(clip, tmp_path / "b", target_compatibility="code")
+def test_the_official_variants_train_as_well(clip, tmp_path):
+    one = fit(clip, tmp_path / "a", warp_variant="official")
+    other = fit(clip, tmp_path / "b", target_variant="official")
     assert content(one) != content(other)
 
 
@@ -227,7 +227,7 @@ def test_the_paper_preset_has_the_published_values():
     settings = dict(INSTA.presets["paper"])
     assert settings.pop("budget") == {"iterations": 20_000}
     config = build(InstaConfig, settings, "preset")
-    assert (config.warp_compatibility, config.target_compatibility) == ("", "")
+    assert (config.warp_variant, config.target_variant) == ("paper", "paper")
     assert (config.levels, config.level_features, config.log2_table) == (16, 8, 18)
     assert (config.learning_rate, config.betas, config.weight_decay, config.ema) == (
         1.75e-3,

@@ -35,9 +35,9 @@ def test_linear_light_agrees_and_comes_back():
     torch.testing.assert_close(to_srgb(to_linear(values)), values, atol=1e-6, rtol=0)
 
 
-@pytest.mark.parametrize("compatibility", ["", "code"])
-def test_backgrounds_are_exchanged(compatibility):
-    config = InstaConfig(target_compatibility=compatibility)
+@pytest.mark.parametrize("variant", ["paper", "official"])
+def test_backgrounds_are_exchanged(variant):
+    config = InstaConfig(target_variant=variant)
     own = torch.tensor([[0.8, 0.3, 0.1]])
     was, new = torch.tensor([1.0, 1.0, 1.0]), torch.tensor([[0.1, 0.9, 0.4]])
     for coverage, expected in ((1.0, own), (0.0, new)):
@@ -47,6 +47,6 @@ def test_backgrounds_are_exchanged(compatibility):
     alpha = torch.tensor([[0.25]])
     mixed = target_colors(alpha * own + (1 - alpha) * was, alpha, was, new, config)
     straight = alpha * own + (1 - alpha) * new
-    if compatibility:
+    if variant == "official":
         straight = to_srgb(alpha * to_linear(own) + (1 - alpha) * to_linear(new))
     torch.testing.assert_close(mixed, straight, atol=1e-5, rtol=0)

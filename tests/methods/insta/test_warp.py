@@ -40,13 +40,13 @@ def carried(points, triangles, matrices, vertices, faces, blend):
     return (transform[:, :, :3] @ points[..., None])[..., 0] + transform[:, :, 3]
 
 
-@pytest.mark.parametrize("compatibility", ["", "code"])
-def test_a_rigid_motion_is_undone_everywhere(head, compatibility):
+@pytest.mark.parametrize("variant", ["paper", "official"])
+def test_a_rigid_motion_is_undone_everywhere(head, variant):
     vertices, faces = pieces(head)
     turn = axis_angle_to_matrix(torch.tensor([0.4, -1.0, 0.3], dtype=torch.float64))
     shift = torch.tensor([0.1, 0.2, -0.3], dtype=torch.float64)
     posed = vertices @ turn.T + shift
-    blend = Blend.of(head, compatibility)
+    blend = Blend.of(head, variant)
     matrices = canonical_from_posed(vertices, posed, faces, blend)
     generator = torch.Generator().manual_seed(0)
     canonical = torch.randn(300, 3, generator=generator, dtype=torch.float64) * 0.1
@@ -57,7 +57,7 @@ def test_a_rigid_motion_is_undone_everywhere(head, compatibility):
 
 def test_a_grown_head_is_shrunk(head):
     vertices, faces = pieces(head)
-    blend = Blend.of(head, "")
+    blend = Blend.of(head, "paper")
     matrices = canonical_from_posed(vertices, 1.3 * vertices, faces, blend)
     points = vertices[faces].mean(1) * 1.7
     back = carried(points, torch.arange(len(faces)), matrices, 1.3 * vertices, faces, blend)
@@ -66,7 +66,7 @@ def test_a_grown_head_is_shrunk(head):
 
 def test_the_official_warp_scales_the_eye_region_alone(head):
     vertices, faces = pieces(head)
-    matrices = canonical_from_posed(vertices, 1.3 * vertices, faces, Blend.of(head, "code"))
+    matrices = canonical_from_posed(vertices, 1.3 * vertices, faces, Blend.of(head, "official"))
     scales = torch.linalg.det(matrices[:, :, :3]).pow(1 / 3)
     apart = touching(head, "lips") | touching(head, "left_ear") | touching(head, "right_ear")
     eyes = torch.from_numpy(touching(head, "eye_region") & ~apart)
@@ -107,7 +107,7 @@ def test_a_border_and_a_fan_of_three():
 
 def test_the_mean_of_transforms_is_weighted_by_distance(head):
     vertices, faces = pieces(head)
-    blend = Blend.of(head, "")
+    blend = Blend.of(head, "paper")
     rng = np.random.default_rng(0)
     matrices = torch.from_numpy(rng.normal(size=(len(faces), 3, 4)))
     centroids = vertices[faces].mean(1)
@@ -122,7 +122,7 @@ def test_the_mean_of_transforms_is_weighted_by_distance(head):
 
 def test_collapsed_triangles_stay_finite(head):
     vertices, faces = pieces(head)
-    for blend in (Blend.of(head, ""), replace(Blend.of(head, ""), root=False)):
+    for blend in (Blend.of(head, "paper"), replace(Blend.of(head, "paper"), root=False)):
         matrices = canonical_from_posed(vertices, torch.zeros_like(vertices), faces, blend)
         assert torch.isfinite(matrices).all()
 
