@@ -1,4 +1,4 @@
-"""Flicker: how much the image changes over time in other ways than the truth does."""
+"""Flicker: how much the image changes over time in other ways than the ground truth does."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def flicker(image: ByteArray, truth: ByteArray, other_image: ByteArray, other_tr
 
     ``other`` is a neighbour in time, from the same camera; which of the two comes first does not matter. What an
     avatar gets wrong alike in both frames (a wrong colour, a blur that moves along) cancels; what appears in one of
-    them does not. 0 for a render that changes as the truth does. All are (H, W, 3) 8-bit images of one size.
+    them does not. 0 for a render that changes as the ground truth does. All are (H, W, 3) 8-bit images of one size.
     """
     check_pair(image, truth)
     check_pair(other_image, other_truth)

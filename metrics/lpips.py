@@ -3,7 +3,7 @@
 Zhang, Isola, Efros, Shechtman, Wang, "The unreasonable effectiveness of deep features as a perceptual metric",
 CVPR 2018, equation 1, version 0.1 (with the scaling layer). Inputs are brought to [-1, 1], as the scaling
 layer's constants expect. Feeding [0, 1] instead, as some published avatar code does, gives lower numbers; the
-two do not compare. `Lpips` can do both, under names that tell them apart.
+two do not compare. `Lpips` can do both, under different names.
 """
 
 from __future__ import annotations

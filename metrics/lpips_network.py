@@ -56,7 +56,7 @@ class Lpips:
     weights : file with the backbone, or folder to look in; see `headbench.metrics.weights` for the default.
     device : where the network runs; always in float32.
     scaled : bring images to [-1, 1], as the constants expect; False feeds [0, 1].
-    cache_mb : bound of the features of truths that are kept for the next method, in 10^6 bytes.
+    cache_mb : bound of the features of ground-truth images that are kept for the next method, in 10^6 bytes.
 
     Attributes
     ----------
@@ -126,7 +126,7 @@ class Lpips:
             yield from map(float, self.distances(np.stack(images), np.stack(truths)))
 
     def _true_features(self, truths: ByteArray) -> list[Tensor]:
-        """The same as `_features`, from the cache where a frame was seen before: every method has the same truths."""
+        """The same as `_features`, from the cache where a frame was seen before: every method has the same ground truth."""
         keys = [hashlib.blake2b(np.ascontiguousarray(truth), digest_size=16).digest() for truth in truths]
         places = [(key, truth.shape) for key, truth in zip(keys, truths)]
         if all(place in self._cache for place in places):
@@ -286,7 +286,7 @@ def find_backbone(spec: NetworkSpec, path: Path | None = None) -> Path:
     Raises
     ------
     InputError : ``path`` or the environment variable names something that is not there.
-    UnavailableError : not in the folder named, or not found anywhere and not to be fetched; says how to mend it.
+    UnavailableError : not in the folder named, or not found anywhere and not to be fetched; names the remedy.
     """
     if path is not None:
         return _named(spec, path, "weights")

@@ -2,7 +2,7 @@
 
 One measurement, in this order: warm-up until frame times are stationary; latency, waiting for every frame; throughput,
 with several frames under way; the stages of a frame; and the same frame over and over, which shows what is kept
-between frames. Latency and throughput are told apart as in MLPerf's single-stream and offline scenarios (Reddi et al.,
+between frames. Latency and throughput are separate, as in MLPerf's single-stream and offline scenarios (Reddi et al.,
 "MLPerf Inference Benchmark", ISCA 2020).
 """
 

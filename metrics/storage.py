@@ -70,7 +70,7 @@ DRIVING_BITRATE = _storage_detail(
 )
 
 MEGA, KILO = 1e6, 1e3
-DRIVING_RATE = 25.0  # frames per second at which the driving signal's bandwidth is told
+DRIVING_RATE = 25.0  # frames per second at which the driving signal's bitrate is given
 PACKING = 6  # xz's own default; higher ones take more memory than most avatars
 CHUNK = 1 << 20
 
@@ -82,7 +82,7 @@ def storage(avatar: Avatar, workload: Sequence[tuple[Camera, HeadPose]] = ()) ->
     it names twice counts once.
 
     Details: ``bytes``; ``files``; ``packed_mb``, the files packed losslessly by xz one after the other;
-    ``shared_mb``, where the avatar tells its shared assets; ``primitives`` and ``primitive_bytes`` (bytes of all
+    ``shared_mb``, where the avatar names its shared assets; ``primitives`` and ``primitive_bytes`` (bytes of all
     files over primitives), where it has splats and ``workload`` a pose; ``driving_bytes`` of one pose as float32 and
     ``driving_kb_s``, kilobytes per second at 25 frames per second, where ``workload`` has a pose.
 

@@ -1,6 +1,6 @@
 """State dictionaries that ``torch.save`` wrote, read without its loader and only as far as they are asked for.
 
-``torch.load`` takes the sizes that a file declares for granted, also with ``weights_only``: a damaged file can make it
+Why not ``torch.load``: it takes the sizes that a file declares for granted, also with ``weights_only``: a damaged file can make it
 take any memory. Both layouts are read: the archive of PyTorch 1.6 and later, and the stream of pickles before it.
 """
 

@@ -26,7 +26,7 @@ def instruction_sets() -> dict[str, str]:
 
 
 def supports(request: Request) -> bool:
-    """Tell whether the kernel takes this request's dtype and device."""
+    """Whether the kernel takes this request's dtype and device."""
     return request.means.dtype == torch.float32 and request.means.device.type == "cpu"
 
 

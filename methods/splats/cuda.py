@@ -29,12 +29,12 @@ REMEDY = "pip install 'headbench[cuda]', on a machine with an NVIDIA GPU and the
 
 @functools.cache
 def usable() -> bool:
-    """Tell whether there is a GPU and gsplat is installed, without importing it."""
+    """Whether there is a GPU and gsplat is installed, without importing it."""
     return torch.cuda.is_available() and importlib.util.find_spec("gsplat") is not None
 
 
 def usable_or_warn(request: Request) -> bool:
-    """Tell whether gsplat is there and draws this request; if a GPU is left without it, log why and what helps.
+    """Whether gsplat is there and draws this request; if a GPU is left without it, log why and what helps.
 
     It is logged once per process and reason.
     """
@@ -74,7 +74,7 @@ def load() -> ModuleType:
 
 
 def supports(request: Request) -> bool:
-    """Tell whether gsplat takes this request's dtype and device."""
+    """Whether gsplat takes this request's dtype and device."""
     return request.means.dtype == torch.float32 and request.means.device.type == "cuda"
 
 

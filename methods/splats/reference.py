@@ -1,4 +1,4 @@
-"""The renderer in plain torch: the readable twin every faster backend is tested against.
+"""The renderer in plain torch: the reference implementation that every faster backend is tested against.
 
 Elliptical weighted average splatting (Zwicker et al., "EWA Splatting", TVCG 2002) of 3D Gaussians (Kerbl
 et al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering", SIGGRAPH 2023), with gsplat's

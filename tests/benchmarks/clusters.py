@@ -36,7 +36,7 @@ SIZES, QUICK_SIZES = (300, 1000, 2000, 5000), (300, 1000)
 AGREEMENT_SIZE, AGREEMENT_LANDMARKS = 300, 150
 PERFORMANCES, QUICK_PERFORMANCES = 5, 2
 SEEDS = 4
-_TAKE = 1000  # timesteps after which the subject performs everything anew, a little differently
+_TAKE = 1000  # timesteps after which the subject performs everything again, a little differently
 _WOBBLE = 0.02  # of a coefficient's standard deviation: tracked performances are not smooth
 
 

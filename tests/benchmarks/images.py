@@ -70,7 +70,7 @@ def lpips_ways(pairs: Pairs) -> Ways:
     spec = network_spec("alex")
     weights = find_backbone(spec)
     fresh, cached = Lpips(weights=weights, cache_mb=0), Lpips(weights=weights, cache_mb=1e4)
-    sum(cached.batched(pairs))  # another method's turn: the truths are known from then on
+    sum(cached.batched(pairs))  # another method's turn: the ground truth is known from then on
     ways: dict[str, Callable[[], float]] = {
         "headbench, first method": lambda: sum(fresh.batched(pairs)),
         "headbench, further methods": lambda: sum(cached.batched(pairs)),

@@ -1,4 +1,4 @@
-"""Benchmarks of this room. Light to import: implementations are named, not loaded."""
+"""The benchmarks that ``headbench bench`` and ``headbench stress`` run. Light to import: implementations are named, not loaded."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from ...bench.specs import BenchmarkSpec
 
 CLUSTERS = BenchmarkSpec(
     name="clusters",
-    summary="expression classes: time and memory by timesteps; landmarks against all pairs",
+    summary="expression clusters: time and memory by timesteps; landmarks against all pairs",
     speed="headbench.tests.benchmarks.clusters:measure",
 )
 
@@ -54,6 +54,6 @@ METRICS = BenchmarkSpec(
 
 STATISTICS = BenchmarkSpec(
     name="statistics",
-    summary="Tests and intervals on simulated comparisons: do they reject and cover as often as they say?",
+    summary="Tests and intervals on simulated comparisons: do they reject and cover as often as stated?",
     stress="headbench.tests.benchmarks.statistics:run",
 )

@@ -1,4 +1,4 @@
-"""The measurement of speed against renderers that last as long as they are told, on a clock of their own."""
+"""The measurement of speed against renderers of a given duration, on a clock of their own."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -30,7 +30,7 @@ WORKLOAD = [("a", POSES[0]), ("b", POSES[1]), ("c", POSES[2])]
 
 
 class Renderer:
-    """An avatar whose frames last as long as it is told."""
+    """An avatar whose frames have a given duration."""
 
     def __init__(self, durations):
         self.now, self.seen, self.durations = 0.0, [], iter(durations)

@@ -75,7 +75,7 @@ class Frame {
   std::array<double, kStageCount> seconds_{};
 };
 
-// Processor time of the calling thread, seconds; wall time where the system does not tell.
+// Processor time of the calling thread, seconds; wall time where the system has no such clock.
 double thread_seconds();
 
 }  // namespace headbench

@@ -68,7 +68,7 @@ void give(void* block, std::size_t bytes) {
         store.bytes += rounded;
         return;
       } catch (const std::bad_alloc&) {
-        // No room to remember it: let it go.
+        // No memory to remember it: release it.
       }
     }
   }

@@ -183,7 +183,7 @@ class Bench:
 
 
 class _Parts:
-    """The steps of one frame by themselves; the slow twins by the functions that training uses."""
+    """The steps of one frame by themselves; the slow ways by the functions that training uses."""
 
     def __init__(self, avatar: OursAvatar, pose: HeadPose, camera: Camera):
         self._avatar, self._tensors = avatar, avatar.field.tensors

@@ -1,4 +1,7 @@
-"""The kernel, in every instruction set this machine runs, against the float64 reference."""
+"""The kernel, in every instruction set this machine runs, against the float64 reference.
+
+Numerical extremes and numbers of threads are in tests/benchmarks/test_extremes.py.
+"""
 
 from __future__ import annotations
 
@@ -117,109 +120,6 @@ def test_empty_scenes_show_the_background(kernel):
             assert bool(gradient.any()) == (name == "background"), name
         truth = render_with_gradients(scene, torch.float64, backend="reference")
         assert relative_error(result.gradients["background"], truth.gradients["background"]) < 1e-6
-
-
-@kernels
-def test_extreme_splats_stay_finite_and_near_the_reference(kernel):
-    """Needles, giants and splats just beyond the near plane: float32 loses digits, but never its head."""
-    scene = replaced(
-        cloud(60, 40, 30, seed=20),
-        scales=[
-            [5.0, 1e-6, 1e-6],
-            [1e4, 1e-3, 1e-3],
-            [1e4, 1e4, 1e4],
-            [50.0, 1e-5, 10.0],
-            [1e12] * 3,
-            [1e-30] * 3,
-        ],
-        means=[
-            [0.1, 0, 2],
-            [0, 0, 2],
-            [0, 0, 3],
-            [0, 0.2, 2],
-            [0, 0, 2],
-            [0, 0, 2],
-            [0, 0, 0.0101],
-            [1e6, 0, 2],
-            [1e10, 1e10, 0.02],
-        ],
-        viewmat=torch.eye(4).tolist(),
-    )
-    scene.opacities[:10] = 0.3
-    truth = render_with_gradients(scene, torch.float64, backend="reference")
-    result = render_with_gradients(scene, torch.float32, backend=kernel)
-    assert result.rendering.radii[4] == 0, "beyond float32: culled"
-    assert result.rendering.radii[2] > 10_000
-    error = (result.rendering.image - truth.rendering.image).abs()
-    assert error.mean() < 1e-4
-    for name, gradient in result.gradients.items():
-        assert torch.isfinite(gradient).all(), name
-    assert relative_error(result.gradients["colors"], truth.gradients["colors"]) < 1e-3
-    assert relative_error(result.gradients["opacities"], truth.gradients["opacities"]) < 1e-3
-
-
-@kernels
-def test_needles_keep_their_determinant(kernel):
-    """A needle 2000 px long and 0.55 px thin: with ac - b² in float32 its width would be lost."""
-    count = 40
-    scene = cloud(count, 64, 48, seed=21)
-    scene = scene._replace(
-        means=torch.tensor([0.1, 0.05, 2.0])
-        + 0.1 * torch.randn(count, 3, generator=torch.Generator().manual_seed(0)),
-        scales=torch.tensor([60.0, 1e-4, 1e-4]).repeat(count, 1),
-        opacities=torch.full((count,), 0.5),
-        viewmat=torch.eye(4),
-    )
-    truth = render_with_gradients(scene, torch.float64, backend="reference")
-    result = render_with_gradients(scene, torch.float32, backend=kernel)
-    assert truth.rendering.radii.max() > 1000
-    assert (result.rendering.image - truth.rendering.image).abs().mean() < 1e-3
-    assert relative_error(result.gradients["colors"], truth.gradients["colors"]) < 1e-2
-
-
-@kernels
-def test_quaternion_gradients_at_any_length(kernel):
-    # Splat by splat: the shorter a quaternion the larger its gradient, and one norm over all would see only those. The
-    # lengths below 1e-12 are the ones that are not divided by themselves.
-    lengths = [1.0, 1e20, 1e-6, 1e-11, 3e-13, 1e-14, 0.0]
-    quats = torch.tensor([0.5, -0.3, 0.7, 0.4]) * torch.tensor(lengths)[:, None]
-    count = len(lengths)
-    scene = cloud(count, 30, 30, seed=22)._replace(
-        means=torch.tensor([0.0, 0.0, 2.0])
-        + 0.2 * torch.randn(count, 3, generator=torch.Generator().manual_seed(0)),
-        scales=torch.tensor([0.2, 0.05, 0.1]).repeat(count, 1),
-        quats=quats,
-        opacities=torch.full((count,), 0.4),
-        viewmat=torch.eye(4),
-    )
-    truth = render_with_gradients(scene, torch.float64, backend="reference").gradients["quats"]
-    result = render_with_gradients(scene, torch.float32, backend=kernel).gradients["quats"]
-    assert (truth[:-1].norm(dim=1) > 0).all(), "only at zero itself the gradient vanishes"
-    for length, row, true_row in zip(lengths, result, truth, strict=True):
-        assert relative_error(row, true_row) < 2e-3, length
-
-
-@kernels
-def test_equal_depths_keep_the_order_of_indices(kernel):
-    scene = cloud(100, 24, 24, seed=23, size=0.3, opacity=-1.0)
-    means = scene.means.clone()
-    means[:, 2] = 2.0
-    scene = scene._replace(means=means, viewmat=torch.eye(4))
-    truth = render_dense(scene)
-    result = rasterize(*scene[:9], background=scene.background, backend=kernel)
-    assert (result.image - truth.image).abs()[truth.safe].max() < 2e-5
-
-
-@kernels
-def test_any_number_of_threads_gives_the_same_bits(kernel):
-    scene = head_shell(4000, 90, 70)
-    outcomes = [render_with_gradients(scene, torch.float32, backend=kernel, threads=n) for n in (1, 2, 3, 4)]
-    first = outcomes[0]
-    for other in outcomes[1:]:
-        for field in ("image", "alpha", "radii"):
-            assert torch.equal(getattr(first.rendering, field), getattr(other.rendering, field))
-        for name, gradient in first.gradients.items():
-            assert torch.equal(gradient, other.gradients[name]), name
 
 
 def test_arrays_need_not_be_contiguous():
