@@ -35,5 +35,5 @@ def test_the_largest_change_does_not_overflow():
 
 def test_frames_of_different_size_are_refused():
     image, truth, other, other_truth = frames(1)
-    with pytest.raises(InputError, match="shape of the truth"):
+    with pytest.raises(InputError, match="shape of the ground truth"):
         flicker(image, truth, other[1:], other_truth[1:])

@@ -68,7 +68,7 @@ def test_the_order_of_pixels_does_not_matter(pair, random):
     ("image", "truth", "expected"),
     [
         (np.zeros((4, 4, 3), np.float32), np.zeros((4, 4, 3), np.uint8), "8-bit unsigned"),
-        (np.zeros((4, 4, 3), np.uint8), np.zeros((4, 5, 3), np.uint8), "shape of the truth"),
+        (np.zeros((4, 4, 3), np.uint8), np.zeros((4, 5, 3), np.uint8), "shape of the ground truth"),
         (np.zeros((4, 4, 4), np.uint8), np.zeros((4, 4, 4), np.uint8), "height, width, 3"),
         (np.zeros((4, 4), np.uint8), np.zeros((4, 4), np.uint8), "height, width, 3"),
         (np.zeros((0, 4, 3), np.uint8), np.zeros((0, 4, 3), np.uint8), "at least 1 pixels"),
