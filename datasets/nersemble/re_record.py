@@ -81,10 +81,7 @@ def re_record(
         if tracking is not None:
             poses = [turned_pose(clip, clip.poses[timestep], turn) for timestep in timesteps]
             folder = tracking / f"{clip.subject}_{sequence}" / "2000-01-01_00-00-00"
-            arrays = _stacked(poses) | {
-                "shape": clip.shape,
-                "static_offset": clip.static_offset[None],
-            }
+            arrays = _stacked(poses) | {"shape": clip.shape, "static_offset": clip.static_offset[None]}
             write_tracked(folder / "tracked_flame_params_30.npz", arrays, range(len(poses)))
     writer.write_metadata([*by_sequence])
     return [*by_sequence]

@@ -107,10 +107,7 @@ def draw_jaw_bases(clip: CaptureClip, found: JawFindings) -> ByteArray:
 def _scatter(axes: Axes, found: JawFindings) -> None:
     """Opening against sideways angle: training poses, held-out poses, bases by number."""
     near = found.bases[:, 0] > np.cos(np.pi / 4)  # a half turn would leave no room for anything else
-    for angles, colour, name in (
-        (found.held_out, HELD_OUT, "held-out"),
-        (found.train, TRAIN, "training"),
-    ):
+    for angles, colour, name in ((found.held_out, HELD_OUT, "held-out"), (found.train, TRAIN, "training")):
         axes.scatter(angles[:, 0], angles[:, 1], s=14, color=colour, label=f"{len(angles)} {name} poses")
     axes.scatter(
         found.angles[near, 0],

@@ -313,10 +313,7 @@ def test_command_writes_the_first_training_timestep(capture, tmp_path):
     }
     assert findings.data["images"] == len(clip.cameras)
     with pytest.raises(InputError, match="--timesteps.*found 99"):
-        export_colmap(
-            ExportColmapSettings(str(capture.union), str(out), timesteps=(0, 99)),
-            no_progress,
-        )
+        export_colmap(ExportColmapSettings(str(capture.union), str(out), timesteps=(0, 99)), no_progress)
 
 
 @pytest.fixture

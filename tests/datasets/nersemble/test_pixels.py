@@ -32,10 +32,10 @@ def test_without_a_mask_pixels_are_area_means(factor, frame):
 def test_with_a_mask_the_weighted_foreground_stands_on_white(frame, mask):
     coverage = mask[..., None] / 255
     expected = area_mean(frame[..., ::-1] * coverage + 255 * (1 - coverage), 4)
-    image, mask = prepare_pixels(frame, mask, (3, 2))
+    image, reduced = prepare_pixels(frame, mask, (3, 2))
     # Products, means and the composite are rounded to 8 bits, one after the other.
     assert np.abs(image - expected).max() <= 2
-    assert np.abs(mask - area_mean(mask, 4)[..., 0]).max() <= 0.5
+    assert np.abs(reduced - area_mean(mask, 4)[..., 0]).max() <= 0.5
 
 
 def test_full_and_empty_masks_are_exact():
@@ -81,9 +81,9 @@ def test_colours_are_corrected_before_the_composite():
     frame = np.full((4, 4, 3), (30, 40, 50), np.uint8)  # BGR
     mask = np.zeros((4, 4), np.uint8)
     mask[:, :2] = 255
-    image, mask = prepare_pixels(frame, mask, (2, 2), correction)
+    image, reduced = prepare_pixels(frame, mask, (2, 2), correction)
     np.testing.assert_array_equal(image[0], [[100, 91, 30], [255, 255, 255]])
-    np.testing.assert_array_equal(mask[0], [255, 0])
+    np.testing.assert_array_equal(reduced[0], [255, 0])
     plain, _ = prepare_pixels(frame, None, (2, 2), correction)
     np.testing.assert_array_equal(plain[0, 0], [100, 91, 30])
 

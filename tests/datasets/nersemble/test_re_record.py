@@ -45,11 +45,7 @@ def projected(clip, timestep, camera):
 @pytest.mark.parametrize(("release", "frames"), [("v2", "images"), ("v1", "video"), ("paper2023", "images")])
 def test_there_and_back(release, frames, clip, tmp_path):
     re_record(
-        clip,
-        tmp_path / "raw",
-        tracking=tmp_path / "tracking",
-        release=release,
-        masks=frames == "images",
+        clip, tmp_path / "raw", tracking=tmp_path / "tracking", release=release, masks=frames == "images"
     )
     save_head(tmp_path / "head.npz", clip.head)
     findings = prepare_nersemble(

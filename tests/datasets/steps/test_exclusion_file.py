@@ -10,9 +10,7 @@ from headbench.datasets.steps.exclude import Exclusions, FrameDecision, read_exc
 
 TEXT = st.text(st.characters(codec="utf-8", exclude_categories=("Cs", "Cc")), max_size=20)
 FRAMES = st.dictionaries(
-    st.integers(0, 10**6),
-    st.builds(FrameDecision, TEXT, st.floats(0, 1e6), st.booleans(), TEXT),
-    max_size=5,
+    st.integers(0, 10**6), st.builds(FrameDecision, TEXT, st.floats(0, 1e6), st.booleans(), TEXT), max_size=5
 )
 WORDS = st.dictionaries(
     st.integers(0, 10**6), TEXT.filter(lambda word: word.strip().lower() not in ("", "keep")), max_size=3

@@ -109,12 +109,12 @@ def clip(pristine_capture):
 
 def with_pixels(clip, folder, image, mask):
     """A clip whose frames all show one image (3 or 4 channels) with one mask."""
-    path, mask = folder / "image.png", folder / "mask.png"
+    path, mask_path = folder / "image.png", folder / "mask.png"
     order = [2, 1, 0, 3][: image.shape[2]]
     cv2.imwrite(str(path), image[..., order])
     if mask is not None:
-        cv2.imwrite(str(mask), mask)
-    files = {key: FrameFiles(path, path if mask is None else mask) for key in clip.files}
+        cv2.imwrite(str(mask_path), mask)
+    files = {key: FrameFiles(path, path if mask is None else mask_path) for key in clip.files}
     height, width = image.shape[:2]
     cameras = {name: camera.resized(width, height) for name, camera in clip.cameras.items()}
     return replace(clip, files=files, cameras=cameras, store=ImageStore())
