@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ...bench.contracts import FloatArray
 from ...bench.errors import InputError
-from ..ours.field import Box, normalised_weight, plane_features
+from ..ours.field import Bounds, normalised_weight, plane_features
 from ..ours.storage import SPLAT_WIDTHS
 from ..shared.networks import C0, PAIRS
 from .container import Arrays, coded, dequantise, from_smallest_three, narrow, smallest_three
@@ -125,7 +125,7 @@ def negligible_lines(tensors: Mapping[str, Tensor], step: float) -> np.ndarray:
 def _used_samples(tensors: Mapping[str, Tensor], positions: Tensor) -> list[np.ndarray]:
     """(S,) for each plane: whether some splat reads a sample. Whatever has a gradient is read."""
     ones = {name: torch.ones(len(tensors[name]), 1, requires_grad=True) for name in PLANES}
-    box = Box(*tensors["plane_box"].cpu())
+    box = Bounds(*tensors["plane_box"].cpu())
     with torch.enable_grad():
         total = torch.stack([part.sum() for part in plane_features(ones, box, positions.cpu())]).sum()
     gradients = torch.autograd.grad(total, [ones[name] for name in PLANES])

@@ -23,7 +23,7 @@ from ..shared.avatar_files import (
     read_shared_head,
     read_subject,
 )
-from ..shared.avatar_kernel import Carrier, HarmonicColors
+from ..shared.avatar_kernel import HarmonicColors, WorldTransform
 from ..shared.binding import Frames, WorldSplats, to_world
 from ..shared.loop import Fit
 from ..shared.method import TrainedMethod
@@ -41,7 +41,7 @@ from ..shared.rendering import (
     view_of,
 )
 from ..shared.schedule import ShuffledEpochs, Timeline, torch_generator
-from ..shared.splat_training import BoundTraining, Placed
+from ..shared.splat_training import BoundTraining, ShadedSplats
 from ..shared.subject_mesh import BoundedCache, SubjectMesh
 from .config import GAConfig
 from .spec import GA as SPEC
@@ -101,13 +101,13 @@ class GAAppearance:
         timestep: int,
         optimiser: Optimiser,
         iteration: int,
-    ) -> Placed:
+    ) -> ShadedSplats:
         """Colour by direction from the camera; opacity as it is."""
         world = to_world(frames, binding, optimiser["means"], optimiser["log_scales"], optimiser["quats"])
         degree = min(self._config.sh_degree, iteration // self._degree_every)
         directions = torch.nn.functional.normalize(world.means - view.center, dim=1)
         colors = sh_to_rgb(optimiser["sh_dc"], optimiser["sh_rest"], directions, degree)
-        return Placed(world, colors, torch.sigmoid(optimiser["opacities"]), None)
+        return ShadedSplats(world, colors, torch.sigmoid(optimiser["opacities"]), None)
 
     def refined(self, subject: str, optimiser: Optimiser) -> RefinedTracking | None:
         """Tracking before and after, or None where it was left alone."""
@@ -151,7 +151,7 @@ class GAAvatar:
         self.mesh, self.subject, self.refined = mesh, subject, refined
         self.splat_tensors, self.binding = splats, binding
         self._stored, self._device, self._cutoffs = stored, device, cutoffs
-        self._carry = Carrier(binding, splats["log_scales"], splats["quats"])
+        self._to_world = WorldTransform(binding, splats["log_scales"], splats["quats"])
         occupied = coefficient_count(occupied_degree(splats["sh_rest"])) - 1
         self._shade = HarmonicColors(splats["sh_dc"], splats["sh_rest"][:, :, :occupied].contiguous())
 
@@ -177,16 +177,16 @@ class GAAvatar:
         camera: Camera,
         pose: HeadPose,
         background: Sequence[float],
-        done: Callable[[str], None] = no_stage,
+        end_stage: Callable[[str], None] = no_stage,
     ) -> Drawn:
         """Draw one frame, stage by stage; see `StagedAvatar`."""
         frames = self._frames(pose)
-        done("drive")
+        end_stage("drive")
         world = self._world(frames)
         view = view_of(camera, self._device)
         opacities, colors = self._opacities(), self._colors(world, view)
-        done("deform")
-        return draw_splats(world, opacities, colors, view, background, done, self._cutoffs)
+        end_stage("deform")
+        return draw_splats(world, opacities, colors, view, background, end_stage, self._cutoffs)
 
     def read_back(self, drawn: Drawn) -> Frame:
         """A drawn frame in host memory."""
@@ -218,7 +218,7 @@ class GAAvatar:
 
     def _world(self, frames: Frames) -> WorldSplats:
         s = self.splat_tensors
-        return self._carry(frames, s["means"], s["log_scales"], s["quats"])
+        return self._to_world(frames, s["means"], s["log_scales"], s["quats"])
 
     def _opacities(self) -> Tensor:
         return torch.sigmoid(self.splat_tensors["opacities"])

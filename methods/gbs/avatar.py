@@ -60,13 +60,13 @@ class GBSAvatar:
         camera: Camera,
         pose: HeadPose,
         background: Sequence[float],
-        done: Callable[[str], None] = no_stage,
+        end_stage: Callable[[str], None] = no_stage,
     ) -> Drawn:
         """Draw one frame, stage by stage; see `StagedAvatar`."""
-        posed, view = self._posed(pose, done), view_of(camera, self._device)
+        posed, view = self._posed(pose, end_stage), view_of(camera, self._device)
         colors = posed.colors(view.center, self._degree)
-        done("deform")
-        return draw_splats(posed.world, posed.opacities, colors, view, background, done)
+        end_stage("deform")
+        return draw_splats(posed.world, posed.opacities, colors, view, background, end_stage)
 
     def read_back(self, drawn: Drawn) -> Frame:
         """A drawn frame in host memory."""
@@ -95,14 +95,14 @@ class GBSAvatar:
         """The head model, with teeth."""
         return [self._folder / HEAD_FILE]
 
-    def _posed(self, pose: HeadPose, done: Callable[[str], None] = no_stage) -> PosedAttributes:
+    def _posed(self, pose: HeadPose, end_stage: Callable[[str], None] = no_stage) -> PosedAttributes:
         """Splats of a pose; the last pose's are kept, since frames of several cameras follow one another."""
         arguments, key = self._rig.arguments([pose]), pose_key(pose)
         if self._last is not None and self._last[0] == key:
-            done("drive")
+            end_stage("drive")
             return self._last[1]
         motions = PointMotions.of(self._rig.motions(arguments))
-        done("drive")
+        end_stage("drive")
         stored = self.stored
         differences = stored.entries.sum(stored.differences, self._rig.coefficients(arguments))
         posed = apply_pose(stored.neutral, differences, motions)

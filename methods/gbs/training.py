@@ -72,7 +72,7 @@ class GBSTraining(SplatTrainer):
         seed: int,
     ):
         masked = clip.mask(clip.splits["train"][0]) is not None
-        super().__init__(clip, config.splats, sampler, device, mattes=masked)
+        super().__init__(clip, config.splats, sampler, device, masks=masked)
         self._config, self._masked = config, masked
         self._recorded_on = self._background
         if masked:

@@ -17,11 +17,11 @@ from ..shared.networks import initial_coefficients, sh_to_rgb
 from ..shared.optimisation import Optimiser
 from ..shared.rendering import View
 from ..shared.schedule import Timeline, torch_generator
-from ..shared.splat_training import Placed, Start, one_per_triangle
+from ..shared.splat_training import ShadedSplats, Start, one_per_triangle
 from ..shared.subject_mesh import BoundedCache, SubjectMesh, centroid_displacements
 from .config import OursConfig
 from .field import (
-    Box,
+    Bounds,
     CanonicalFrames,
     LocalSplats,
     apply_offsets,
@@ -65,7 +65,7 @@ class OursAppearance:
         device: str,
         seed: int,
         *,
-        lines_within: Box | None = None,
+        lines_within: Bounds | None = None,
     ):
         self._mesh, self._clip, self._config, self._device, self._seed = mesh, clip, config, device, seed
         self.canonical = CanonicalFrames.of(mesh.frames(mesh.canonical))
@@ -114,7 +114,7 @@ class OursAppearance:
         timestep: int,
         optimiser: Optimiser,
         iteration: int,
-    ) -> Placed:
+    ) -> ShadedSplats:
         """Colour by canonical position and direction; what the lines change, once they are on."""
         prepared = self._prepared(timestep)
         positions = self.canonical.positions(binding, optimiser["means"])
@@ -132,7 +132,7 @@ class OursAppearance:
         if self._config.direction_jitter:
             directions = directions @ self._turn(iteration).t()
         colors = self._colors(optimiser, positions, directions, iteration)
-        return Placed(world, changed_colors(colors, splats), torch.sigmoid(splats.logits), penalty)
+        return ShadedSplats(world, changed_colors(colors, splats), torch.sigmoid(splats.logits), penalty)
 
     def offsets(self, optimiser: Optimiser, positions: Tensor, expression: Tensor, jaw: Tensor) -> Tensor:
         """(N, D) offsets; zero, and not computed, outside the lines' box."""
@@ -210,7 +210,7 @@ def penalty_weights(
     return torch.where(is_face, still_face, still_other)
 
 
-def _line_box(mesh: SubjectMesh, clip: Clip, config: OursConfig) -> Box:
+def _line_box(mesh: SubjectMesh, clip: Clip, config: OursConfig) -> Bounds:
     if config.lines.bounds == "head":
         return line_box(mesh.canonical)
     triangles = torch.from_numpy(faces_in_region(clip.head, "face")).to(mesh.faces.device)

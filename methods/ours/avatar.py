@@ -13,7 +13,7 @@ from torch import Tensor
 from ...bench.contracts import Camera, Frame, HeadPose, no_stage
 from ..compact.file import COMPACT_FILE, read_compact
 from ..shared.avatar_files import HEAD_FILE, SUBJECT_FILE, Subject, read_shared_head, read_subject
-from ..shared.avatar_kernel import Carrier, HarmonicColors
+from ..shared.avatar_kernel import HarmonicColors, WorldTransform
 from ..shared.binding import NORMAL, WorldSplats
 from ..shared.rendering import (
     USUAL,
@@ -28,7 +28,7 @@ from ..shared.rendering import (
 from ..shared.subject_mesh import KnownPoses, SubjectMesh, pose_key
 from .appearance import driving_coefficients
 from .field import (
-    Box,
+    Bounds,
     CanonicalFrames,
     LocalSplats,
     apply_offsets,
@@ -36,7 +36,7 @@ from .field import (
     plane_features,
     position_part,
 )
-from .inference import LineOffsets, Placed, PlaneColors, Posed
+from .inference import DrivenPose, LineOffsets, PlaneColors, WorldPose
 from .storage import FIELD_FILE, SPLAT_WIDTHS, Field, read_field
 
 
@@ -85,11 +85,11 @@ class OursAvatar:
         self._binding = columns["binding"][:, 0].to(torch.int64)
         self._canonical = CanonicalFrames.of(mesh.frames(mesh.canonical))
         positions = self._canonical.positions(self._binding, self.neutral.means)
-        self._carry = Carrier(self._binding, self.neutral.log_scales, self.neutral.quats)
+        self._to_world = WorldTransform(self._binding, self.neutral.log_scales, self.neutral.quats)
         self.colors: PlaneColors | HarmonicColors
         self.line_offsets: LineOffsets | None = None
         if "sh_dc" not in tensors:
-            features = plane_features(tensors, Box(*tensors["plane_box"]), positions)
+            features = plane_features(tensors, Bounds(*tensors["plane_box"]), positions)
             weights = tensors["color_weight_0"], tensors["color_weight_1"]
             self.colors = PlaneColors(*weights, position_part(tensors, features))
         else:
@@ -98,7 +98,7 @@ class OursAvatar:
             self.line_offsets = LineOffsets(tensors, positions)
         self._jaw_bases = tensors["jaw_bases"].cpu().numpy().astype(np.float64)
         self._known = KnownPoses(self._posed, 0)
-        self._last: tuple[bytes, Placed] | None = None
+        self._last: tuple[bytes, WorldPose] | None = None
 
     @classmethod
     def read(cls, folder: Path, device: str, *, exact: bool = False) -> OursAvatar:
@@ -137,15 +137,15 @@ class OursAvatar:
         camera: Camera,
         pose: HeadPose,
         background: Sequence[float],
-        done: Callable[[str], None] = no_stage,
+        end_stage: Callable[[str], None] = no_stage,
     ) -> Drawn:
         """Draw one frame, stage by stage; see `StagedAvatar`. The lines' offsets belong to the first."""
-        splats, world, turns = self._placed(pose, done)
+        splats, world, turns = self._placed(pose, end_stage)
         view = view_of(camera, self._device)
         colors = self._colors(splats, world, turns, view.center)
         opacities = torch.sigmoid(splats.logits)
-        done("deform")
-        return draw_splats(world, opacities, colors, view, background, done, self._cutoffs)
+        end_stage("deform")
+        return draw_splats(world, opacities, colors, view, background, end_stage, self._cutoffs)
 
     def read_back(self, drawn: Drawn) -> Frame:
         """A drawn frame in host memory."""
@@ -191,27 +191,27 @@ class OursAvatar:
         """The head model."""
         return [path.parent / HEAD_FILE for path in self._stored[:1]]
 
-    def _posed(self, pose: HeadPose) -> Posed:
+    def _posed(self, pose: HeadPose) -> DrivenPose:
         frames = self.mesh.frames(self.mesh.posed(self.mesh.arguments([pose])))
         offsets = None
         if self.line_offsets is not None:
             expressions = len(self.field.tensors["lines"]) - len(self._jaw_bases)
             coefficients = driving_coefficients(pose, expressions, self._jaw_bases, self._device)
             offsets = self.line_offsets(*coefficients)
-        return Posed(frames, self._canonical.turns(frames), offsets)
+        return DrivenPose(frames, self._canonical.turns(frames), offsets)
 
-    def _placed(self, pose: HeadPose, driven: Callable[[str], None] = no_stage) -> Placed:
+    def _placed(self, pose: HeadPose, end_stage: Callable[[str], None] = no_stage) -> WorldPose:
         """Splats of a pose in the world; those of the last pose are kept, as several cameras often look at one."""
         key = pose_key(pose)
         if self._last is None or self._last[0] != key:
             posed = self._known(pose)
-            driven("drive")
+            end_stage("drive")
             splats = self._changed(posed)
-            world = self._carry(posed.frames, splats.means, splats.log_scales, splats.quats)
-            self._last = key, Placed(splats, world, posed.turns)
+            world = self._to_world(posed.frames, splats.means, splats.log_scales, splats.quats)
+            self._last = key, WorldPose(splats, world, posed.turns)
         return self._last[1]
 
-    def _changed(self, posed: Posed) -> LocalSplats:
+    def _changed(self, posed: DrivenPose) -> LocalSplats:
         if posed.offsets is None:
             return self.neutral
         return apply_offsets(self.neutral, posed.offsets, self.field.dynamic)

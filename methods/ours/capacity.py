@@ -21,7 +21,7 @@ from ...datasets.steps.jaw_bases import IDENTITY, farthest_quaternions, jaw_quat
 from ..compact.simplify import training_poses
 from ..shared.subject_mesh import SubjectMesh, centroid_displacements
 from .config import OursConfig, Planned
-from .field import PLANE_MARGIN, Box, line_box, plane_box
+from .field import PLANE_MARGIN, Bounds, line_box, plane_box
 
 LINE_SAMPLES_PER_PIXEL = 0.5
 SPLATS_PER_PIXEL = 0.5
@@ -70,12 +70,12 @@ class CapacityPlan:
         groups = {name: replace(getattr(config, name), **chosen) for name, chosen in sizes.items()}
         return replace(config, **groups)
 
-    def box(self, device: str) -> Box | None:
-        """Box of the lines as tensors, or None where the configured one holds."""
+    def box(self, device: str) -> Bounds | None:
+        """Bounds of the lines as tensors, or None where the configured one holds."""
         if self.lines_within is None:
             return None
         low, high = (torch.tensor(corner, device=device) for corner in self.lines_within)
-        return Box(low, high)
+        return Bounds(low, high)
 
     def record(self) -> dict[str, Any]:
         """The plan as plain values, for JSON."""
@@ -197,7 +197,7 @@ class _Planner:
             displaced &= inside
         return displaced
 
-    def _configured_line_box(self) -> Box:
+    def _configured_line_box(self) -> Bounds:
         vertices: FloatArray = self._canonical
         if self._config.lines.bounds == "face":
             faces = np.asarray(self._clip.head.faces)[faces_in_region(self._clip.head, "face")]

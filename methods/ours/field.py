@@ -171,7 +171,7 @@ PLANE_MARGIN_BELOW = 0.025  # metres more at the bottom: splats of the neck hang
 PAPER_HALF_WIDTH = 0.25  # metres
 
 
-class Box(NamedTuple):
+class Bounds(NamedTuple):
     """Axis-aligned box: (3,) corners, metres."""
 
     low: Tensor
@@ -186,19 +186,19 @@ class Box(NamedTuple):
         return ((points >= self.low) & (points <= self.high)).all(1)
 
 
-def plane_box(canonical: Tensor, variant: str) -> Box:
+def plane_box(canonical: Tensor, variant: str) -> Bounds:
     """Bounds of the planes around (V, 3) canonical vertices; ``variant`` is ``planes.bounds_variant``."""
     low = canonical.amin(0) - PLANE_MARGIN
     high = canonical.amax(0) + PLANE_MARGIN
     low[1] -= PLANE_MARGIN_BELOW
     if variant == "paper":
         low[0], high[0] = -PAPER_HALF_WIDTH, PAPER_HALF_WIDTH
-    return Box(low, high)
+    return Bounds(low, high)
 
 
-def line_box(vertices: Tensor) -> Box:
+def line_box(vertices: Tensor) -> Bounds:
     """Bounds of the lines: exactly the vertices given."""
-    return Box(vertices.amin(0), vertices.amax(0))
+    return Bounds(vertices.amin(0), vertices.amax(0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,7 +239,7 @@ def canonical_directions(turns: Tensor, binding: Tensor, means: Tensor, center: 
     return torch.nn.functional.normalize(apply_matrices(rows, directions), dim=1)
 
 
-def plane_features(parameters: Parameters, box: Box, positions: Tensor) -> tuple[Tensor, ...]:
+def plane_features(parameters: Parameters, box: Bounds, positions: Tensor) -> tuple[Tensor, ...]:
     """Features (N, C_k) of the three planes at canonical positions."""
     planes = {name: parameters[f"plane_{name}"] for name, _, _ in PAIRS}
     resolution = round(len(planes["xy"]) ** 0.5)

@@ -1,6 +1,6 @@
 """What a stored avatar of "ours" computes per frame, prepared as far as it does not depend on the frame.
 
-Each of these is the fast twin of what `ours_appearance` trains with; `tests/methods/ours/test_formula.py` compares
+Each of these is the fast form of what `appearance` trains with; `tests/methods/ours/test_formula.py` compares
 both with the definition in float64. README.md lists what was measured and left out.
 """
 
@@ -17,7 +17,7 @@ from ..shared.binding import Frames, WorldSplats
 from ..shared.networks import C0, CPU_BLOCK, ENCODING_SIZE, FREQUENCIES, sum_rows
 from .field import (
     AXES,
-    Box,
+    Bounds,
     LinePosition,
     LocalSplats,
     blend_lines,
@@ -28,7 +28,7 @@ from .field import (
 )
 
 
-class Posed(NamedTuple):
+class DrivenPose(NamedTuple):
     """What a pose decides, as far as it is worth keeping for known poses."""
 
     frames: Frames
@@ -44,7 +44,7 @@ class Posed(NamedTuple):
         return sum(value.nbytes for value in tensors)
 
 
-class Placed(NamedTuple):
+class WorldPose(NamedTuple):
     """Splats of a pose in the world, before a camera looks at them."""
 
     splats: LocalSplats
@@ -64,7 +64,7 @@ class LineOffsets:
 
     def __init__(self, tensors: Mapping[str, Tensor], positions: Tensor):
         self._lines, self._count = tensors["lines"], len(positions)
-        box = Box(*tensors["line_box"])
+        box = Bounds(*tensors["line_box"])
         inside = box.contains(positions).nonzero().squeeze(1)
         unit = box.unit(positions.index_select(0, inside))
         position = line_position(unit, self._lines.shape[2])
@@ -153,7 +153,7 @@ class PlaneColors:
     Parameters
     ----------
     first, last : (H, C + 27) and (3, H) weights of the colour network.
-    from_position : (N, H), what the planes add to the hidden layer: `ours_field.position_part`.
+    from_position : (N, H), what the planes add to the hidden layer: `field.position_part`.
     """
 
     def __init__(self, first: Tensor, last: Tensor, from_position: Tensor):

@@ -18,7 +18,7 @@ from ...bench.io.files import write_bytes
 from ..shared.networks import ENCODING_SIZE, PAIRS, coefficient_count
 from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors
 from .config import Dynamic
-from .field import WIDTHS, Box, offset_width
+from .field import WIDTHS, Bounds, offset_width
 
 FIELD_FILE = "avatar.safetensors"
 DYNAMIC = "dynamic"
@@ -33,8 +33,8 @@ def write_field(
     splats: Mapping[str, Tensor],
     binding: Tensor,
     shared: Mapping[str, Tensor],
-    plane_box: Box,
-    line_box: Box,
+    plane_box: Bounds,
+    line_box: Bounds,
     jaw_bases: np.ndarray,
     dynamic: Sequence[Dynamic],
 ) -> None:

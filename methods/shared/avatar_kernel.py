@@ -1,6 +1,6 @@
 """What avatars compute of a frame before its splats are drawn, by the compiled kernel.
 
-Each function has a twin in torch, which is the definition and is used where the kernel is not: other devices, other
+Each function has a reference implementation in torch, which is the definition and is used where the kernel is not: other devices, other
 dtypes, gradients, or no compiler at installation. The kernel's results do not depend on the number of threads.
 """
 
@@ -33,7 +33,7 @@ def usable(like: Tensor) -> bool:
 
 
 def triangles(vertices: Tensor, faces: Tensor, backend: str = "cpu") -> Frames:
-    """Frames of the triangles of a mesh: the twin of `binding.triangle_frames`.
+    """Frames of the triangles of a mesh: the compiled form of `binding.triangle_frames`.
 
     Parameters
     ----------
@@ -45,10 +45,10 @@ def triangles(vertices: Tensor, faces: Tensor, backend: str = "cpu") -> Frames:
     return frames
 
 
-def carry(
+def splats_to_world(
     frames: Frames, binding: Tensor, means: Tensor, quats: Tensor, scales: Tensor, backend: str = "cpu"
 ) -> WorldSplats:
-    """Carry local splats to the world: the twin of `binding.to_world` for unit quaternions and scales.
+    """Transform local splats to world space: the compiled form of `binding.to_world` for unit quaternions and scales.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ def shade(
     binding: Tensor | None = None,
     backend: str = "cpu",
 ) -> Tensor:
-    """Colours (N, 3) >= 0 as a camera sees them: the twin of `sh.sh_to_rgb` along the ways from the camera.
+    """Colours (N, 3) >= 0 as a camera sees them: the compiled form of `sh.sh_to_rgb` along the ways from the camera.
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ def shade_network(
     binding: Tensor,
     backend: str = "cpu",
 ) -> Tensor:
-    """Colours (N, 3) >= 0 as a camera sees them: the twin of `ours_field.shade_directions`.
+    """Colours (N, 3) >= 0 as a camera sees them: the compiled form of `ours_field.shade_directions`.
 
     Parameters
     ----------
@@ -144,7 +144,7 @@ def offsets_into(
     last_bias: Tensor,
     backend: str = "cpu",
 ) -> None:
-    """Write offsets into the rows ``splats`` of (N, D) ``out``: the twin of `feature_lines.line_offsets`.
+    """Write offsets into the rows ``splats`` of (N, D) ``out``: the compiled form of `feature_lines.line_offsets`.
 
     Units of the first layer that no place on the lines turns on are left out of the whole frame, those that none of a
     few neighbours turns on are left out of their second layer.
@@ -173,8 +173,8 @@ def _call(name: str, *arrays: Tensor, backend: str) -> Any:
     return function(*plain, instruction_sets()[backend], torch.get_num_threads())
 
 
-class Carrier:
-    """Carries splats to the world: `binding.to_world`, with what no frame changes computed beforehand.
+class WorldTransform:
+    """Transforms splats to world space: `binding.to_world`, with what no frame changes computed beforehand.
 
     Parameters
     ----------
@@ -197,7 +197,7 @@ class Carrier:
             units = _unit(quats)
         if log_scales is not self._log_scales:
             scales = log_scales.exp()
-        return carry(frames, self._binding, means, units, scales)
+        return splats_to_world(frames, self._binding, means, units, scales)
 
 
 class HarmonicColors:

@@ -71,7 +71,7 @@ def triangle_frames(vertices: Tensor, faces: Tensor) -> Frames:
 def to_world(
     frames: Frames, binding: Tensor, means: Tensor, log_scales: Tensor, quats: Tensor
 ) -> WorldSplats:
-    """Carry local splats to the world: mean' = k R mean + T, scale' = k exp(s), q' = q(R) q/|q|.
+    """Transform local splats to world space: mean' = k R mean + T, scale' = k exp(s), q' = q(R) q/|q|.
 
     Parameters
     ----------

@@ -21,7 +21,7 @@ from .optimisation import Optimiser
 from .schedule import Sampler, Timeline
 
 CHECKPOINT = "checkpoint.safetensors"
-TRIAL_STEPS = 5  # steps timed to turn seconds into iterations
+TIMED_STEPS = 5  # steps timed to turn seconds into iterations
 COST_GROWTH = 1.6  # a step late in training costs about so much more than one at its start: more splats
 REPORT_EVERY = 10  # iterations between looks at the loss, each of which waits for the device
 
@@ -176,16 +176,16 @@ def _estimate(
     published_length: int,
     clock: Callable[[], float],
 ) -> int:
-    """How many iterations fit into so many seconds, one at least, from a few trial steps that change nothing."""
+    """How many iterations fit into so many seconds, one at least, from a few steps that change nothing."""
     trainable.begin(Timeline(published_length, published_length))
     durations = []
-    for trial in range(1, TRIAL_STEPS + 2):
+    for step in range(1, TIMED_STEPS + 2):
         before = clock()
-        trainable.loss(1, sampler(trial)).backward()
+        trainable.loss(1, sampler(step)).backward()
         trainable.optimiser.zero_grad()
         durations.append(clock() - before)
-    # The first step pays for lazy initialisation; the median of the rest shrugs off a hiccup.
-    typical = sorted(durations[1:])[TRIAL_STEPS // 2]
+    # The first step pays for lazy initialisation; the median of the rest is robust to an outlier.
+    typical = sorted(durations[1:])[TIMED_STEPS // 2]
     return max(1, int(seconds / max(typical * COST_GROWTH, 1e-6)))
 
 
@@ -208,14 +208,14 @@ class TrainingImages:
 
     Parameters
     ----------
-    mattes : whether images come with a fourth channel, the foreground's coverage.
+    masks : whether images come with a fourth channel, the foreground's coverage.
     """
 
     def __init__(
-        self, clip: Clip, keys: Sequence[FrameKey], sampler: Sampler, device: str, *, mattes: bool = False
+        self, clip: Clip, keys: Sequence[FrameKey], sampler: Sampler, device: str, *, masks: bool = False
     ):
         self._clip, self._keys, self._sampler, self._device = clip, keys, sampler, device
-        self._mattes = mattes
+        self._masks = masks
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="decode")
         self._ahead: tuple[int, Future[Tensor]] | None = None
 
@@ -241,17 +241,17 @@ class TrainingImages:
             raise InputError(
                 str(key), "image", f"uint8 of shape {expected}", f"{image.dtype} of shape {image.shape}"
             )
-        if self._mattes:
-            image = np.dstack([image, self._matte(key, expected[:2])])
+        if self._masks:
+            image = np.dstack([image, self._mask(key, expected[:2])])
         # A clip's images may be read-only and shared; torch wants an array it may write to.
         return torch.from_numpy(np.array(image, copy=True))
 
-    def _matte(self, key: FrameKey, expected: tuple[int, int]) -> ByteArray:
-        matte = self._clip.mask(key)
-        if matte is None or matte.shape != expected or matte.dtype != np.uint8:
-            found = "none" if matte is None else f"{matte.dtype} of shape {matte.shape}"
+    def _mask(self, key: FrameKey, expected: tuple[int, int]) -> ByteArray:
+        mask = self._clip.mask(key)
+        if mask is None or mask.shape != expected or mask.dtype != np.uint8:
+            found = "none" if mask is None else f"{mask.dtype} of shape {mask.shape}"
             raise InputError(str(key), "mask", f"uint8 of shape {expected}", found)
-        return matte
+        return mask
 
 
 def recomposited(image: Tensor, coverage: Tensor, recorded_on: Tensor, background: Tensor) -> Tensor:

@@ -1,6 +1,6 @@
 """The two small networks of "ours", evaluated in blocks of rows that stay in cache, with adjoints in closed form.
 
-Autograd over the same layers is the slow twin the tests compare with; it takes about twice the time, most of it
+Autograd over the same layers is the reference that the tests compare with; it takes about twice the time, most of it
 in moving activations of all splats to memory and back.
 """
 

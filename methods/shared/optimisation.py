@@ -17,8 +17,7 @@ from .schedule import DensifySchedule, torch_generator
 class Optimiser:
     """One Adam (eps 1e-15, dense) over named parameters.
 
-    Densification replaces per-splat parameters by longer or shorter ones; `select` and `append` carry the moments
-    along, with zeros for new rows. A replaced parameter has no gradient, so it sits out the step that follows,
+    Densification replaces per-splat parameters by longer or shorter ones; `select` and `append` keep the moments, with zeros for new rows. A replaced parameter has no gradient, so it sits out the step that follows,
     as in the published code.
 
     Parameters

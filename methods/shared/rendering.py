@@ -60,10 +60,10 @@ def draw_splats(
     colors: Tensor,
     view: View,
     background: Sequence[float],
-    done: Callable[[str], None] = no_stage,
+    end_stage: Callable[[str], None] = no_stage,
     cutoffs: Cutoffs = USUAL,
 ) -> Drawn:
-    """Rasterise and clip to [0, 1]: the last two stages of `StagedAvatar.draw`."""
+    """Rasterize and clip to [0, 1]: the last two stages of `StagedAvatar.draw`."""
     rendering = rasterize(
         *(world.means, world.quats, world.scales, opacities, colors),
         *(view.world_to_camera, view.K, view.camera.width, view.camera.height),
@@ -72,9 +72,9 @@ def draw_splats(
         transmittance_min=cutoffs.transmittance_min,
         check_values=False,
     )
-    done("rasterize")
+    end_stage("rasterize")
     drawn = Drawn(rendering.image.clamp(0, 1), rendering.alpha.clamp(0, 1))
-    done("post")
+    end_stage("post")
     return drawn
 
 
@@ -86,7 +86,7 @@ def read_back(drawn: Drawn) -> Frame:
 def render_splats(
     world: WorldSplats, opacities: Tensor, colors: Tensor, view: View, background: Sequence[float]
 ) -> Frame:
-    """Rasterise to a numpy frame, clipped to [0, 1]."""
+    """Rasterize to a numpy frame, clipped to [0, 1]."""
     return read_back(draw_splats(world, opacities, colors, view, background))
 
 

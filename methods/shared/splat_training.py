@@ -31,11 +31,11 @@ class SplatTrainer:
     """
 
     def __init__(
-        self, clip: Clip, settings: DensifiedTraining, sampler: Sampler, device: str, *, mattes: bool = False
+        self, clip: Clip, settings: DensifiedTraining, sampler: Sampler, device: str, *, masks: bool = False
     ):
         self._settings, self._sampler = settings, sampler
         self.keys: Sequence[FrameKey] = clip.splits["train"]
-        self._images = TrainingImages(clip, self.keys, sampler, device, mattes=mattes)
+        self._images = TrainingImages(clip, self.keys, sampler, device, masks=masks)
         self.cameras = {key.camera: clip.cameras[key.camera] for key in self.keys}
         self._views = {name: view_of(camera, device) for name, camera in self.cameras.items()}
         self._background = torch.as_tensor(np.asarray(clip.background), dtype=torch.float32, device=device)
@@ -145,7 +145,7 @@ class SplatTrainer:
     def _render(
         self, world: WorldSplats, opacities: Tensor, colors: Tensor, view: View, face_sizes: Tensor
     ) -> tuple[Rendering, Tensor]:
-        """Rasterise and remember what densification needs; also (N,) which splats are seen.
+        """Rasterize and remember what densification needs; also (N,) which splats are seen.
 
         Parameters
         ----------
@@ -167,7 +167,7 @@ class SplatTrainer:
 GEOMETRY = ("means", "log_scales", "quats", "opacities")
 
 
-class Placed(NamedTuple):
+class ShadedSplats(NamedTuple):
     """Splats as one camera sees them at one timestep."""
 
     world: WorldSplats
@@ -202,7 +202,7 @@ class Appearance(Protocol):
         timestep: int,
         optimiser: Optimiser,
         iteration: int,
-    ) -> Placed:
+    ) -> ShadedSplats:
         """Splats in the world with their colours and opacities as this camera sees them."""
 
 

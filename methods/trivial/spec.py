@@ -18,7 +18,7 @@ PRESETS = {name: {"budget": {"iterations": 1}} for name in ("smoke", "demo", "fa
 
 MEAN_IMAGE = MethodSpec(
     name="mean-image",
-    summary="The mean of all training images, whatever is asked for: the floor of every table.",
+    summary="The mean of all training images, whatever is asked for: the trivial baseline of every table.",
     implementation="headbench.methods.trivial.method:MeanImage",
     trivial=True,
     presets=PRESETS,

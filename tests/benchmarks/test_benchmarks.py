@@ -141,7 +141,7 @@ def test_scipy_finds_the_meshes_of_the_refit():
 
 
 def test_a_plain_opencv_loop_makes_the_pixels_of_prepare(tmp_path):
-    recording = prepare._record(tmp_path / "recording", TINY_RECORDING, mattes=False)
+    recording = prepare._record(tmp_path / "recording", TINY_RECORDING, masks=False)
     loop, ours = tmp_path / "loop", tmp_path / "ours"
     assert prepare._plain_loop(recording, loop, TINY_RECORDING) == prepare._prepare(recording, ours, 2) == 6
     images = {path.name: path for path in ours.rglob("images/*.png")}

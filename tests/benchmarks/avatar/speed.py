@@ -17,7 +17,7 @@ from ....datasets.head.procedural.model import procedural_head
 from ....methods.ours.appearance import driving_coefficients
 from ....methods.ours.avatar import OursAvatar
 from ....methods.ours.field import (
-    Box,
+    Bounds,
     CanonicalFrames,
     LinePosition,
     apply_offsets,
@@ -31,7 +31,7 @@ from ....methods.ours.field import (
     shade,
     shade_directions,
 )
-from ....methods.shared.avatar_kernel import Carrier
+from ....methods.shared.avatar_kernel import WorldTransform
 from ....methods.shared.binding import to_world
 from ....methods.shared.networks import offset_network, sum_rows
 from ....methods.shared.rendering import render_splats, view_of
@@ -196,14 +196,14 @@ class _Parts:
             self._canonical = CanonicalFrames.of(self._mesh.frames(self._mesh.canonical))
             self._turns = self._canonical.turns(self._frames)
             self._positions = self._canonical.positions(self._binding, avatar.neutral.means)
-            self._box = Box(*self._tensors["line_box"])
+            self._box = Bounds(*self._tensors["line_box"])
             self._inside = self._box.contains(self._positions).nonzero().squeeze(1)
             unit = self._box.unit(self._positions.index_select(0, self._inside))
             self._place = line_position(unit, self._tensors["lines"].shape[2])
-            features = plane_features(self._tensors, Box(*self._tensors["plane_box"]), self._positions)
+            features = plane_features(self._tensors, Bounds(*self._tensors["plane_box"]), self._positions)
             self._from_position = position_part(self._tensors, features)
             splats = avatar.neutral
-            self._carrier = Carrier(self._binding, splats.log_scales, splats.quats)
+            self._carrier = WorldTransform(self._binding, splats.log_scales, splats.quats)
             self._coefficients = self._driving()
             self._offsets = self.offsets()
             self._splats = self._changed(self._offsets)
@@ -274,7 +274,7 @@ class _Parts:
 
     def colors_by_planes(self) -> Tensor:
         """Planes sampled and all layers at each splat."""
-        features = plane_features(self._tensors, Box(*self._tensors["plane_box"]), self._positions)
+        features = plane_features(self._tensors, Bounds(*self._tensors["plane_box"]), self._positions)
         directions = canonical_directions(self._turns, self._binding, self._world.means, self._view.center)
         return shade(self._tensors, features, directions)
 

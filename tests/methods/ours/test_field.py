@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from headbench.methods.ours.config import Lines, OursConfig, Planes
 from headbench.methods.ours.field import (
-    Box,
+    Bounds,
     CanonicalFrames,
     canonical_directions,
     initial_parameters,
@@ -92,7 +92,7 @@ def test_initial_values():
 def test_colour_is_the_network_on_concatenated_features_and_encoding():
     config = OursConfig(hidden=5, planes=Planes(resolution=6, channels=(3, 2, 2)), lines=Lines(enabled=False))
     parameters = {k: v.double() for k, (v, _) in initial_parameters(config, 0, 0, GENERATOR).items()}
-    box = Box(*(torch.tensor(v, dtype=torch.float64) for v in ([-1.0, -2, -1], [1.0, 1, 3])))
+    box = Bounds(*(torch.tensor(v, dtype=torch.float64) for v in ([-1.0, -2, -1], [1.0, 1, 3])))
     positions = torch.rand(8, 3, dtype=torch.float64, generator=GENERATOR)
     directions = torch.nn.functional.normalize(torch.randn(8, 3, dtype=torch.float64), dim=1)
     features = plane_features(parameters, box, positions)

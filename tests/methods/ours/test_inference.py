@@ -8,7 +8,7 @@ import torch
 
 from headbench.bench.errors import InputError
 from headbench.methods.ours.avatar import OursAvatar
-from headbench.methods.ours.field import Box, blend_lines, line_offsets, line_position, shade
+from headbench.methods.ours.field import Bounds, blend_lines, line_offsets, line_position, shade
 from headbench.methods.ours.inference import LineOffsets, PlaneColors, encode_columns
 from headbench.methods.shared.networks import CPU_BLOCK, encode_directions
 from headbench.methods.shared.subject_mesh import KnownPoses, pose_key
@@ -69,7 +69,7 @@ def test_offsets_are_those_of_training(clip, tmp_path):
     jaw = torch.rand(2, generator=generator)
     expression = torch.randn(len(tensors["lines"]) - 2, generator=generator)
     found = LineOffsets(tensors, points)(expression, jaw)
-    box = Box(low, high)
+    box = Bounds(low, high)
     inside = box.contains(points)
     assert 2 * CPU_BLOCK < inside.sum() < 15000  # several blocks, the last one short
     blended = blend_lines(tensors["lines"], expression, jaw)

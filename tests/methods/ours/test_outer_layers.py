@@ -22,7 +22,7 @@ def test_the_published_start_is_one_splat_at_each_centroid(clip, mesh):
         assert not start.means.any()
 
 
-def test_shells_lie_a_gap_apart_along_the_normal_of_the_canonical_mesh(clip, mesh):
+def test_outer_layers_lie_a_gap_apart_along_the_normal(clip, mesh):
     config = OursConfig(
         outer_layers=OuterLayers(count=2, gap=0.002, opacity=0.2), penalty=Penalty(face_mm=0.01)
     )
@@ -55,7 +55,7 @@ def test_only_face_triangles_that_a_training_expression_moves_are_expressive(cli
     assert 0 < len(found) < len(face)
 
 
-def test_a_face_at_rest_has_no_shells(clip, mesh):
+def test_a_static_face_has_no_outer_layers(clip, mesh):
     assert len(expressive_triangles(mesh, clip, 1e6, "cpu")) == 0
     start = outer_layers_start(
         mesh, clip, OursConfig(outer_layers=OuterLayers(count=1), penalty=Penalty(face_mm=1e6)), "cpu"

@@ -78,12 +78,12 @@ def test_a_triangle_without_area_has_a_finite_frame(backend):
 
 @settings(max_examples=20, deadline=None)
 @given(count=COUNTS, seed=st.integers(0, 1000))
-def test_splats_are_carried_as_defined(backend, count, seed):
+def test_splats_are_transformed_as_defined(backend, count, seed):
     normal = numbers(seed)
     frames = mesh(normal, 40)
     binding = torch.randint(40, (count,), generator=torch.Generator().manual_seed(seed))
     means, log_scales, quats = normal(count, 3), normal(count, 3), normal(count, 4)
-    found = avatar_kernel.carry(frames, binding, means, unit(quats), log_scales.exp(), backend)
+    found = avatar_kernel.splats_to_world(frames, binding, means, unit(quats), log_scales.exp(), backend)
     expected = to_world(double(frames), binding, means.double(), log_scales.double(), quats.double())
     for one, other in zip(found, expected):
         np.testing.assert_allclose(one, other, rtol=1e-5, atol=2e-5)
@@ -168,7 +168,7 @@ def test_results_do_not_depend_on_the_number_of_threads(backend):
     try:
         for threads in (1, 3):
             torch.set_num_threads(threads)
-            world = avatar_kernel.carry(frames, binding, means, quats, scales, backend)
+            world = avatar_kernel.splats_to_world(frames, binding, means, quats, scales, backend)
             network = known, first, last, world.means, normal(3) * 0 + 2, frames.rotation, binding
             results.append((*world, avatar_kernel.shade_network(*network, backend)))
     finally:
@@ -182,7 +182,7 @@ def test_what_would_read_beyond_an_array_is_refused(backend):
     frames = mesh(normal, 4)
     for triangle in (-1, 4):
         with pytest.raises(ValueError, match="fit"):
-            avatar_kernel.carry(
+            avatar_kernel.splats_to_world(
                 *(frames, torch.tensor([triangle]), normal(1, 3), normal(1, 4), normal(1, 3)), backend
             )
     arguments = normal(1, 1).new_zeros(2, 1), torch.tensor([0]), normal(6, 16)

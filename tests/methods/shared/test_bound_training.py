@@ -14,7 +14,7 @@ from headbench.methods.shared.config import SplatTraining
 from headbench.methods.shared.loop import check_training_split
 from headbench.methods.shared.rendering import scene_extent
 from headbench.methods.shared.schedule import Timeline
-from headbench.methods.shared.splat_training import BoundTraining, Placed
+from headbench.methods.shared.splat_training import BoundTraining, ShadedSplats
 from headbench.methods.shared.subject_mesh import SubjectMesh
 from headbench.methods.splats import rasterize
 
@@ -42,7 +42,7 @@ class Grey:
     def place(self, frames, binding, view, timestep, optimiser, iteration):
         world = to_world(frames, binding, *(optimiser[name] for name in ("means", "log_scales", "quats")))
         colors = torch.full((len(binding), 3), 0.5)
-        return Placed(world, colors, torch.sigmoid(optimiser["opacities"]), torch.tensor(PENALTY))
+        return ShadedSplats(world, colors, torch.sigmoid(optimiser["opacities"]), torch.tensor(PENALTY))
 
 
 @pytest.fixture

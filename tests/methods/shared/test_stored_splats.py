@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from headbench.methods.shared.avatar_kernel import Carrier, HarmonicColors
+from headbench.methods.shared.avatar_kernel import HarmonicColors, WorldTransform
 from headbench.methods.shared.binding import to_world, triangle_frames
 
 
@@ -17,11 +17,11 @@ def frames_of(dtype):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_known_shapes_and_others_are_carried_as_defined(dtype):
+def test_known_shapes_and_others_are_transformed_as_defined(dtype):
     """The kernel takes float32; float64 goes the way of torch."""
     binding = torch.arange(50) % 10
     means, log_scales, quats = (normal(50, n, seed=n).to(dtype) for n in (3, 3, 4))
-    carrier, frames = Carrier(binding, log_scales, quats), frames_of(dtype)
+    carrier, frames = WorldTransform(binding, log_scales, quats), frames_of(dtype)
     for shape in ((log_scales, quats), (log_scales + 1, quats), (log_scales, 2 * quats.flip(1))):
         expected = to_world(frames, binding, means, *shape)
         for found, other in zip(carrier(frames, means, *shape), expected):

@@ -57,7 +57,7 @@ def test_an_image_of_another_size_than_its_camera_is_an_input_error(clip):
 
 def test_mattes_come_as_a_fourth_channel(clip):
     keys = clip.splits["train"]
-    images = TrainingImages(clip, keys, ShuffledEpochs(len(keys), 0), "cpu", mattes=True)
+    images = TrainingImages(clip, keys, ShuffledEpochs(len(keys), 0), "cpu", masks=True)
     image = images.get(1, 2)
     images.close()
     np.testing.assert_allclose(image[:, :, :3], clip.image(keys[2]) / np.float32(255), atol=1e-7)
@@ -68,7 +68,7 @@ def test_mattes_come_as_a_fourth_channel(clip):
 def test_a_matte_that_is_missing_or_does_not_fit_is_an_input_error(clip, matte):
     keys = clip.splits["train"]
     faulty = replace(clip, masks=dict.fromkeys(clip.masks, matte))
-    images = TrainingImages(faulty, keys, ShuffledEpochs(len(keys), 0), "cpu", mattes=True)
+    images = TrainingImages(faulty, keys, ShuffledEpochs(len(keys), 0), "cpu", masks=True)
     with pytest.raises(InputError, match="mask"):
         images.get(1, 0)
     images.close()
