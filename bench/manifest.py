@@ -215,6 +215,8 @@ class Manifest:
             for name in ("needs", "derived"):
                 if method[name] is None:
                     del method[name]
+        for metric in record["metrics"]:
+            del metric["default"]
         write_json(path, record)
 
     def check_done(self, path: Path) -> None:

@@ -102,6 +102,8 @@ class MethodSpec:
     native : runs on our own implementation; False for an adapter to an official repository.
     source : the paper.
     trivial : a floor that every real method should beat; shown in tables, never ranked.
+    default : a run that names no methods takes it.
+    demo : ``headbench demo`` takes it.
     variants : "package.module:function" of ``(avatar folder, clip, device) -> Iterator[Variant]``: what can be derived
         from a trained avatar without training (``headbench sweep``); "" for nothing.
     """
@@ -117,6 +119,8 @@ class MethodSpec:
     version: str = "1"
     source: str = ""
     trivial: bool = False
+    default: bool = False
+    demo: bool = False
     variants: str = ""
     resolution: ResolutionRule = ResolutionRule()
     preset_resolutions: Mapping[str, ResolutionRule] = field(default_factory=dict)
@@ -161,6 +165,7 @@ class MetricSpec:
         machine alone, and measuring it again gives another.
     profile : the set of definitions it belongs to, see `ProfileSpec`. Other profiles than the canonical one stand in
         the metric's name, too, behind an "@": a row names its profile, ``ssim@3dgs`` is never taken for ``ssim``.
+    default : a run that names no metrics takes it. Not recorded in runs.
     """
 
     name: str
@@ -175,6 +180,7 @@ class MetricSpec:
     tables: tuple[str, ...] = ("comparison",)
     machine_bound: bool = False
     profile: str = "canonical"
+    default: bool = field(default=False, compare=False)
 
     @property
     def per_frame(self) -> bool:

@@ -28,11 +28,13 @@ LPIPS = MetricSpec(
     digits=4,
     implementation="headbench.metrics.lpips:lpips",
     summary="Learned perceptual distance v0.1, AlexNet, inputs scaled to [-1, 1].",
+    default=True,
 )
 
 LPIPS_VGG = replace(
     LPIPS,
     name="lpips-vgg",
+    default=False,
     label="LPIPS VGG",
     implementation="headbench.metrics.lpips:lpips_vgg",
     summary="Learned perceptual distance v0.1, VGG-16, inputs scaled to [-1, 1].",

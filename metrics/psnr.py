@@ -21,6 +21,7 @@ PSNR = MetricSpec(
     implementation="headbench.metrics.psnr:psnr",
     summary="Peak signal-to-noise ratio over the 8-bit frame, or over a region of it, capped at 100 dB.",
     kind="regional",
+    default=True,
 )
 
 CAP = 100.0

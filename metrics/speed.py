@@ -43,6 +43,7 @@ FPS = MetricSpec(
     kind="avatar",
     tables=("comparison", "speed"),
     machine_bound=True,
+    default=True,
 )
 
 

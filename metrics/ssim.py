@@ -27,6 +27,7 @@ SSIM = MetricSpec(
     implementation="headbench.metrics.ssim:ssim",
     summary="Structural similarity, Gaussian window 11 x 11 of sigma 1.5, valid windows, mean over channels.",
     kind="regional",
+    default=True,
 )
 
 C1, C2 = (0.01 * 255.0) ** 2, (0.03 * 255.0) ** 2

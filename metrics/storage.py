@@ -23,6 +23,7 @@ STORAGE = MetricSpec(
     summary="Bytes of the files needed to render the avatar, SI megabytes.",
     kind="avatar",
     tables=("comparison", "cost"),
+    default=True,
 )
 
 

@@ -20,6 +20,7 @@ TRAINING_TIME = MetricSpec(
     kind="training",
     tables=("cost",),
     machine_bound=True,
+    default=True,
 )
 TRAINING_MEMORY = MetricSpec(
     name="training_memory",
@@ -32,6 +33,7 @@ TRAINING_MEMORY = MetricSpec(
     kind="training",
     tables=("cost",),
     machine_bound=True,
+    default=True,
 )
 
 

@@ -57,8 +57,8 @@ class EvaluateSettings:
     tasks: tuple[TaskName, ...] = ("novel_view", "self_reenactment")
     """What to score; with --like the run's."""
 
-    metrics: tuple[str, ...] = ("psnr", "ssim", "lpips")
-    """By which metrics; with --like the run's."""
+    metrics: tuple[str, ...] = ()
+    """By which metrics of frames; default: those of `headbench run`; with --like the run's."""
 
     reader: str = "ga"
     """Which dataset reader opens the capture; with --like the run's."""

@@ -18,7 +18,7 @@ from ..protocol import Protocol, make_protocol
 from ..registry import discover, get, resolve
 from ..rows import Rows
 from ..runner.captures import open_clips, open_run_clips
-from ..runner.config import ResolvedMethod, RunConfig, RunOptions, resolve_metrics
+from ..runner.config import ResolvedMethod, RunConfig, RunOptions, default_names, resolve_metrics
 from ..runner.run import describe, make_jobs, write_reports
 from ..runner.scoring import check_regions
 from ..runner.steps import DIGESTS, Job, measure
@@ -105,7 +105,7 @@ def _opened(settings: EvaluateSettings) -> tuple[RunConfig, list[Clip]]:
             data=str(settings.clip),
             out=settings.out,
             tasks=settings.tasks,
-            metrics=settings.metrics,
+            metrics=settings.metrics or _default_metrics(),
             reader=settings.reader,
             reader_settings={} if settings.head is None else {"head": settings.head},
             frames_per_task=settings.frames_per_task,
@@ -115,6 +115,10 @@ def _opened(settings: EvaluateSettings) -> tuple[RunConfig, list[Clip]]:
         config, out=settings.out, methods=(label,), seeds=(0,), settings={}, heads={}, device="cpu"
     )
     return config, clips
+
+
+def _default_metrics() -> tuple[str, ...]:
+    return tuple(name for name in default_names("metrics") if get("metrics", name).per_frame)
 
 
 def _copy(images: Mapping[tuple[str, FrameKey], Path], job: Job) -> None:

@@ -6,8 +6,9 @@ import re
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from ..configuration import build, merge, with_first_names, with_new_names
 from ..contracts import Budget, TaskName
@@ -20,13 +21,10 @@ from .adaptation import MethodNeeds
 CANONICAL = "canonical"
 """The metric profile that bare metric names belong to."""
 
-COST_METRICS = (
-    *("latency_p50", "latency_p95", "latency_p99", "latency_static", "processor_time", "throughput"),
-    *("stage_drive", "stage_deform", "stage_rasterize", "stage_post", "stage_read_back"),
-    *("storage_packed", "storage_shared", "primitives", "primitive_bytes", "driving_bitrate"),
-    *("training_time", "training_memory"),
-)
-"""Further numbers of the measurements of speed and storage, and of training: tables of their own show them."""
+
+def default_names(group: Literal["methods", "metrics"]) -> tuple[str, ...]:
+    """Names of the registered methods or metrics that a run takes which names none, in the registry's order."""
+    return tuple(name for name, plugin in discover(group).items() if plugin.spec and plugin.spec.default)
 
 
 @dataclass(frozen=True)
@@ -57,11 +55,11 @@ class RunConfig:
 
     data: str
     out: str
-    methods: tuple[str, ...] = ("mean-image", "nearest-camera", "ga", "ours")
+    methods: tuple[str, ...] = field(default_factory=partial(default_names, "methods"))
     preset: str = "fast"
     seeds: tuple[int, ...] = (0,)
     tasks: tuple[TaskName, ...] = ("novel_view", "self_reenactment")
-    metrics: tuple[str, ...] = ("psnr", "ssim", "lpips", "storage", "fps", *COST_METRICS)
+    metrics: tuple[str, ...] = field(default_factory=partial(default_names, "metrics"))
     metric_profiles: tuple[str, ...] = ("canonical",)
     regions: tuple[str, ...] | None = None
     reader: str = "ga"
@@ -252,16 +250,14 @@ class DemoConfig:
         return Path(self.out) / "capture"
 
 
-DEMO_METHODS = ("mean-image", "nearest-camera", "ga", "gbs", "gha", "insta", "ours")
-"""Both floors and every native method: the demonstration's head model suits them all."""
-
-
 def demo_run_config(config: DemoConfig) -> dict[str, Any]:
     """Settings of the comparison, as `RunConfig` fields."""
     return {
         "data": str(config.capture_folder),
         "out": config.out,
-        "methods": DEMO_METHODS,
+        "methods": tuple(
+            name for name, plugin in discover("methods").items() if plugin.spec and plugin.spec.demo
+        ),
         "preset": config.preset,
         "seeds": (config.seed,),
     }

@@ -12,6 +12,8 @@ SHORT: dict[str, Any] = {"sh_dc_lr": 0.01, "sh_rest_lr": 5e-4}
 
 GA = MethodSpec(
     name="ga",
+    default=True,
+    demo=True,
     version="2",
     summary="GaussianAvatars: splats with spherical harmonics rigged to the triangles of the tracked mesh.",
     implementation="headbench.methods.ga.method:GA",

@@ -53,6 +53,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 
 GBS = MethodSpec(
     name="gbs",
+    demo=True,
     version="3",
     summary="GaussianBlendshapes: splats of a neutral head plus linear differences for each expression, skinned.",
     implementation="headbench.methods.gbs.method:GBS",

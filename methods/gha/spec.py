@@ -64,6 +64,7 @@ SHORT_PRESETS: dict[str, dict[str, Any]] = {
 
 GHA = MethodSpec(
     name="gha",
+    demo=True,
     version="3",
     summary="Gaussian Head Avatar: splats driven by networks, drawn as features, sharpened by another network.",
     implementation="headbench.methods.gha.method:GHA",

@@ -37,6 +37,7 @@ SHORT: dict[str, Any] = {
 
 INSTA = MethodSpec(
     name="insta",
+    demo=True,
     version="2",
     summary="INSTA: a canonical hash-grid radiance field, warped by the nearest triangle of the tracked mesh.",
     implementation="headbench.methods.insta.method:Insta",

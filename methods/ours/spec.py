@@ -19,6 +19,8 @@ SHORT: dict[str, Any] = {
 
 OURS = MethodSpec(
     name="ours",
+    default=True,
+    demo=True,
     version="2",
     summary="Mesh-bound splats with tri-plane colour and expression-driven opacity along feature lines.",
     implementation="headbench.methods.ours.method:Ours",

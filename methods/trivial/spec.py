@@ -18,6 +18,8 @@ PRESETS = {name: {"budget": {"iterations": 1}} for name in ("smoke", "demo", "fa
 
 MEAN_IMAGE = MethodSpec(
     name="mean-image",
+    default=True,
+    demo=True,
     summary="The mean of all training images, whatever is asked for: the trivial baseline of every table.",
     implementation="headbench.methods.trivial.method:MeanImage",
     trivial=True,
@@ -26,6 +28,8 @@ MEAN_IMAGE = MethodSpec(
 
 NEAREST_CAMERA = MethodSpec(
     name="nearest-camera",
+    default=True,
+    demo=True,
     summary="The training image of the nearest pose and camera, as it is: what memorising alone achieves.",
     implementation="headbench.methods.trivial.method:NearestCamera",
     trivial=True,

@@ -33,8 +33,8 @@ class ParetoSettings:
     task: str = "novel_view"
     """Task whose frames tell the quality."""
 
-    metric: str = "psnr"
-    """Metric of quality."""
+    metric: str = ""
+    """Metric of quality; default: the first of frames that the runs have."""
 
     time: str = ""
     """Metric of frame time, in ms: latency_p50 (default, or what frames per second give), processor_time, ..."""
@@ -66,8 +66,8 @@ class SweepSettings(RunOptions):
     task: str = "novel_view"
     """Task whose frames tell the quality in the plot."""
 
-    metric: str = "psnr"
-    """Metric of quality in the plot."""
+    metric: str = ""
+    """Metric of quality in the plot; default: the first of frames that the run has."""
 
     time: str = ""
     """Metric of frame time in the plot, in ms: latency_p50 (default), processor_time on a machine with other work."""

@@ -60,7 +60,7 @@ def read_points(
 ) -> tuple[list[Point], list[str], MetricSpec]:
     """Read every method of every run that is no trivial baseline; return points, what was left out and why, and the metric.
 
-    ``time`` names the metric of milliseconds; "" the median latency, or what the frames per second give.
+    ``metric`` "" is the first of frames that the runs have; ``time`` names the metric of milliseconds; "" the median latency, or what the frames per second give.
 
     Raises `InputError` where runs were not scored on the same frames by the same protocol, where one lacks the
     task or the metric, and where nothing is left to show.
@@ -74,10 +74,11 @@ def read_points(
         data.rows.check()
         if task not in data.tasks:
             raise InputError(folder, "task", ", ".join(data.tasks), task)
-        found = next((m for m in data.metrics if m.name == metric and m.per_frame), None)
+        found = next((m for m in data.metrics if m.per_frame and metric in ("", m.name)), None)
         if found is None:
             names = ", ".join(m.name for m in data.metrics if m.per_frame)
             raise InputError(folder, "metric", f"a metric of frames: {names}", metric)
+        metric = found.name
         units = {m.name: m.unit for m in data.metrics}
         if time and units.get(time) != "ms":
             names = ", ".join(name for name, unit in units.items() if unit == "ms") or "none"

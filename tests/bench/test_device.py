@@ -30,8 +30,10 @@ def test_a_number_beyond_the_devices_is_refused(monkeypatch):
         check_device("cuda:2")
 
 
-def test_every_kind_that_settings_allow_can_be_asked_for():
-    for kind in ("cuda", "mps", "xpu"):
-        if not getattr(torch, kind).is_available():
-            with pytest.raises(InputError, match=kind):
-                check_device(kind)
+@pytest.mark.parametrize("kind", ["cuda", "mps", "xpu"])
+def test_every_kind_that_settings_allow_is_looked_for(monkeypatch, kind):
+    monkeypatch.setattr(torch, kind, backend(False, 0))
+    with pytest.raises(InputError, match=kind):
+        check_device(kind)
+    monkeypatch.setattr(torch, kind, backend(True, 1))
+    check_device(kind)

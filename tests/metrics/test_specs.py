@@ -9,7 +9,7 @@ import pytest
 from headbench.bench.contracts import STAGES, HeadPose
 from headbench.bench.errors import InputError
 from headbench.bench.registry import discover, resolve
-from headbench.bench.runner.config import COST_METRICS, RunConfig, resolve_metrics
+from headbench.bench.runner.config import RunConfig, default_names, resolve_metrics
 from headbench.bench.specs import RENAMED_METRICS
 
 SPECS = [
@@ -30,7 +30,9 @@ def test_more_is_better_of_rates_alone_among_what_avatars_cost():
 
 
 def test_a_run_measures_every_cost_unless_told_otherwise():
-    assert set(COST_METRICS) | {"storage", "fps"} == {s.name for s in SPECS if not s.per_frame}
+    assert {"psnr", "ssim", "lpips"} | {s.name for s in SPECS if not s.per_frame} == set(
+        default_names("metrics")
+    )
 
 
 def test_details_are_among_those_that_the_measurement_gives(tmp_path):
