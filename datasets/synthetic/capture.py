@@ -4,7 +4,7 @@ A folder belongs to one set of settings. Each image is written whole or not at a
 those settings, so a killed run continues where it stopped and ends with the same capture.
 
 Everything but the pictures has the same bytes on every x86-64 machine (see `rounding`). Pictures have them with any
-number of threads and whatever numpy, BLAS, torch and libm use, but not on every kind of processor: see `scene`.
+number of threads and whatever numpy, BLAS, torch and libm use, but not on every kind of processor: see `renderer`.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def synthesize(
     timesteps : per subject, shared out over the sequences; FREE is held out for self-reenactment, and its
         frames with the tongue out are labelled as excluded.
     size : (width, height) of the images, pixels.
-    head : see `geometry.load_geometry`.
+    head : see `plan.load_geometry`.
     tracking_noise : standard deviation of the error of each stored parameter, as a fraction of that
         parameter's own standard deviation over the subject's timesteps. Images show the exact poses.
     samples_per_pixel : rounded up to a count that the sampler takes; by default enough for 40 dB between two

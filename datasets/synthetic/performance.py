@@ -98,7 +98,7 @@ TONGUE = "tongue out"
 """Why a frame is left out of a comparison: no head model of FLAME's layout has a tongue."""
 
 TONGUE_SHOWS = 0.6
-"""`Performed.excluded` begins here unless the subject says better: see `tongue_labels`."""
+"""`Performed.excluded` begins here for a subject without its own: see `parts.share_that_shows`."""
 
 _PHRASE_SECONDS = 0.9
 

@@ -229,7 +229,7 @@ def _look_at(azimuth: float, elevation: float, target: FloatArray) -> FloatArray
 def lights() -> tuple[Light, ...]:
     """Five lamps: key, fill, one from the camera's side, and two from behind that draw the outline.
 
-    Five because the default 25 samples per pixel fall evenly on them (see `scene.SAMPLE_COUNTS`).
+    Five because the default 25 samples per pixel fall evenly on them (see `renderer.SAMPLE_COUNTS`).
     """
     placed = (
         ((-38.0, 38.0), 1.9, (1.0, 0.97, 0.93)),

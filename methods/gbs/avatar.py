@@ -25,7 +25,7 @@ from .points import SurfacePoints, full_barycentric
 
 
 class GBSAvatar:
-    """A trained head: neutral splats, differences for expressions, and the joints that carry them.
+    """A trained head: neutral splats, differences for expressions, and the joints that move them.
 
     Files: ``avatar.safetensors`` and ``subject.npz`` count as storage; beside them lies the shared head model, with
     teeth. What the mesh says of the splats is computed from these when loaded.
@@ -130,11 +130,11 @@ class Stored(NamedTuple):
 
     Attributes
     ----------
-    neutral : per-splat tensors by name, see `blend.place`.
+    neutral : per-splat tensors by name, see `blendshapes.apply_pose`.
     points : surface point that each splat was put on at the start.
     expressions : K.
     entries : rows of the differences; their weights are 1.
-    differences : (M, C) what is added at coefficient 1, in the columns of `blend.difference_widths`.
+    differences : (M, C) what is added at coefficient 1, in the columns of `blendshapes.difference_widths`.
     """
 
     neutral: dict[str, Tensor]

@@ -128,7 +128,7 @@ class GBSTraining(SplatTrainer):
         self._degree_every = timeline.every(self._config.sh_every, self._config.min_sh_every)
 
     def loss(self, iteration: int, index: int) -> Tensor:
-        """Photometric loss of one image, alpha against the matte, and teeth that leave the mouth."""
+        """Photometric loss of one image, alpha against the mask, and teeth that leave the mouth."""
         key, config, optimiser = self.keys[index], self._config, self._optimiser
         view = self._views[key.camera]
         image, coverage = self._on_background(self._images.get(iteration, index))
@@ -168,9 +168,9 @@ class GBSTraining(SplatTrainer):
         return table * self.entries.weights[:, None]
 
     def _on_background(self, image: Tensor) -> tuple[Tensor, Tensor | None]:
-        """(H, W, 3) colours on the background of training, and (H, W) coverage where there are mattes.
+        """(H, W, 3) colours on the background of training, and (H, W) coverage where there are masks.
 
-        A matte takes the background that the image was recorded on out of it.
+        A mask takes the background that the image was recorded on out of it.
         """
         if not self._masked:
             return image, None

@@ -213,7 +213,7 @@ class SuperResolution:
 
     @torch.no_grad()
     def bounded(self, weights: Weights, features: Tensor, alpha: Tensor, at_once: int = AT_ONCE) -> Tensor:
-        """What calling gives, without gradients, in bounded memory: see `strips`.
+        """What calling gives, without gradients, in bounded memory, in strips of rows.
 
         By calling, where no tensor there has more than ``at_once`` numbers. Otherwise no more than a block's output and
         that of the block before exist at a time, beside strips of so many numbers.

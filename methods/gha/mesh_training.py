@@ -159,7 +159,7 @@ class MeshTraining:
     def _target(self, key: FrameKey) -> tuple[View, Tensor, Tensor | None, Tensor]:
         """View, (H, W, 3) image and (H, W) coverage at the phase's size, and the (3,) background of the image.
 
-        Black, as published, where a matte takes the background out of the image.
+        Black, as published, where a mask takes the background out of the image.
         """
         scene = self._scene
         camera = scene.clip.cameras[key.camera]

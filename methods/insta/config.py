@@ -52,7 +52,7 @@ class InstaConfig:
         mouth. Elsewhere it sees ones.
     density_bias, prior_depth, prior_scale : added to the logarithm of the density per metre is ``density_bias -
         min(distance / prior_scale, prior_depth)``, with the distance from the mesh in metres. Not published (0 there):
-        a short run has not the time to find the surface, and so starts with a fog that is thickest at the mesh.
+        a short run has not the time to find the surface, and so starts with a density that is highest at the mesh.
     step : metres between samples of a ray.
     shell_outside, shell_inside : metres from the surface within which there may be density, on both of its sides.
     jaw_opening : radians that the jaw of the canonical mesh is opened, so that lips are apart.

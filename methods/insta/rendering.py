@@ -35,7 +35,7 @@ class Rendered(NamedTuple):
     color: Tensor  # (R, 3) not yet composited on anything
     transmittance: Tensor  # (R,)
     distance: Tensor  # (R,) metres, weighted by opacity
-    fog: Tensor  # scalar, opacities of all samples added up
+    opacity_sum: Tensor  # scalar, opacities of all samples added up
     samples: int
 
 
@@ -70,7 +70,7 @@ def render_rays(
     conditions = torch.ones(len(scenes) + 1, width, device=device, dtype=parameters["table"].dtype)
     for number, scene in enumerate(scenes):
         conditions[number] = scene.condition[:width].to(conditions)
-    color, fog = conditions.new_zeros(total, 3), conditions.new_zeros(())
+    color, opacity_sum = conditions.new_zeros(total, 3), conditions.new_zeros(())
     transmittance, distance = conditions.new_ones(total), conditions.new_zeros(total)
     first = [np.zeros(count, np.int32) for count in counts]
     evaluated = 0
@@ -103,14 +103,14 @@ def render_rays(
         part = composite(thickness, values, lengths.to(thickness), rays, transmittance)
         color, distance = color + part.color, distance + part.distance
         transmittance = part.transmittance
-        fog = fog - torch.expm1(-thickness).sum()
+        opacity_sum = opacity_sum - torch.expm1(-thickness).sum()
         evaluated += len(rays)
         finished = (transmittance.detach() < marching.stop_transmittance).cpu().numpy()
         offset = 0
         for number, count in enumerate(counts):
             first[number] = np.where(finished[offset : offset + count], np.int32(-1), first[number])
             offset += count
-    return Rendered(color, transmittance, distance, fog, evaluated)
+    return Rendered(color, transmittance, distance, opacity_sum, evaluated)
 
 
 def _joined(parts: Sequence[np.ndarray], device: torch.device) -> Tensor:

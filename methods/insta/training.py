@@ -114,7 +114,7 @@ class InstaTraining:
         if not rendered.samples:  # all rays passed the head by: nothing to learn, but no error either
             loss = loss + 0.0 * self._optimiser[self._names[-1]].sum()
         if config.opacity_weight:
-            loss = loss + config.opacity_weight * rendered.fog / len(batch.image)
+            loss = loss + config.opacity_weight * rendered.opacity_sum / len(batch.image)
         if config.depth_weight:
             loss = loss + config.depth_weight * depth_loss(rendered.distance, batch.depth.to(device))
         self._seen = rendered.samples
@@ -229,7 +229,7 @@ class InstaTraining:
             found = f"{image.dtype} of shape {image.shape}"
             raise InputError(str(key), "image", f"uint8 of shape {(*size, 3)}", found)
         if (mask is not None) != self._masked:
-            names = ("none", "a matte")
+            names = ("none", "a mask")
             expected, found = names[self._masked], names[not self._masked]
             raise InputError(str(key), "mask", f"{expected}, as the first training frame has", found)
         if mask is not None and (mask.shape != size or mask.dtype != np.uint8):
