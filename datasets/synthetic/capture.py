@@ -36,7 +36,7 @@ _README = """This folder holds synthetic recordings made by `headbench synth`.
 
 No person was recorded. Heads, skin, hair and performances are computed; subject numbers from 900 up, camera
 serials and sequence names only follow the conventions of real recordings so that the same tools read both.
-SynthSettings: synthesis.json.
+Settings: synthesis.json.
 """
 
 

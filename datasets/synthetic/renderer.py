@@ -34,7 +34,7 @@ _FILTER_REACH = 3  # pixels beyond which it gives nothing
 
 @dataclass(frozen=True)
 class Material:
-    """PosedMesh of a mesh; its colour comes with the vertices. ``two_sided`` for strips and sheets."""
+    """Surface of a mesh; its colour comes with the vertices. ``two_sided`` for strips and sheets."""
 
     roughness: float
     specular: float
