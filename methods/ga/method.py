@@ -12,9 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...bench.contracts import Camera, Clip, Frame, HeadPose, no_stage
+from ...bench.contracts import Camera, Clip, HeadPose, no_stage
 from ..shared.avatar_files import (
-    HEAD_FILE,
     SUBJECT_FILE,
     TRACKED,
     RefinedTracking,
@@ -34,10 +33,10 @@ from ..shared.rendering import (
     Cutoffs,
     Drawn,
     PosedSplats,
+    StoredSplatAvatar,
     View,
     draw_splats,
     posed_splats,
-    read_back,
     view_of,
 )
 from ..shared.schedule import ShuffledEpochs, Timeline, torch_generator
@@ -124,7 +123,7 @@ class GAAppearance:
             )
 
 
-class GAAvatar:
+class GAAvatar(StoredSplatAvatar):
     """A trained GaussianAvatars head.
 
     Files: ``point_cloud.ply`` in GaussianAvatars' layout and ``subject.npz`` count as storage; beside them lie
@@ -167,10 +166,6 @@ class GAAvatar:
         stored = [folder / PLY_FILE, folder / SUBJECT_FILE]
         return cls(stored, mesh, subject, splats, binding, refined, device)
 
-    def render(self, camera: Camera, pose: HeadPose, background: Sequence[float] = (1.0, 1.0, 1.0)) -> Frame:
-        """Render one frame. Raises `InputError` where the pose is of another head model."""
-        return self.read_back(self.draw(camera, pose, background))
-
     @torch.no_grad()
     def draw(
         self,
@@ -188,10 +183,6 @@ class GAAvatar:
         end_stage("deform")
         return draw_splats(world, opacities, colors, view, background, end_stage, self._cutoffs)
 
-    def read_back(self, drawn: Drawn) -> Frame:
-        """A drawn frame in host memory."""
-        return read_back(drawn)
-
     @torch.no_grad()
     def splats(self, pose: HeadPose, camera: Camera | None = None) -> PosedSplats:
         """Splats of a pose in the world; with colours where a camera says from where they are seen."""
@@ -202,14 +193,6 @@ class GAAvatar:
     def harmonics(self) -> tuple[Tensor, Tensor]:
         """(N, 3) and (N, 3, 15) spherical harmonics along world directions; the pose does not change them."""
         return self.splat_tensors["sh_dc"], self.splat_tensors["sh_rest"]
-
-    def files(self) -> Sequence[Path]:
-        """The PLY and the subject."""
-        return self._stored
-
-    def shared_files(self) -> Sequence[Path]:
-        """The head model."""
-        return [path.parent / HEAD_FILE for path in self._stored[:1]]
 
     def _frames(self, pose: HeadPose) -> Frames:
         if self.refined is not None:

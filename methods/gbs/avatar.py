@@ -11,20 +11,27 @@ import torch
 from safetensors.torch import save
 from torch import Tensor
 
-from ...bench.contracts import Camera, Frame, HeadPose, IntArray, no_stage
+from ...bench.contracts import Camera, HeadPose, IntArray, no_stage
 from ...bench.errors import InputError
 from ...bench.io.arrays import Member
 from ...bench.io.files import write_bytes
-from ..shared.avatar_files import HEAD_FILE, SUBJECT_FILE, Subject, read_shared_head, read_subject
+from ..shared.avatar_files import SUBJECT_FILE, Subject, read_shared_head, read_subject
 from ..shared.networks import coefficient_count, sh_degree
-from ..shared.rendering import Drawn, PosedSplats, draw_splats, posed_splats, read_back, view_of
+from ..shared.rendering import (
+    Drawn,
+    PosedSplats,
+    StoredSplatAvatar,
+    draw_splats,
+    posed_splats,
+    view_of,
+)
 from ..shared.subject_mesh import pose_key
 from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors
 from .blendshapes import Entries, PointMotions, PosedAttributes, Rig, apply_pose, difference_widths
 from .points import SurfacePoints, full_barycentric
 
 
-class GBSAvatar:
+class GBSAvatar(StoredSplatAvatar):
     """A trained head: neutral splats, differences for expressions, and the joints that move them.
 
     Files: ``avatar.safetensors`` and ``subject.npz`` count as storage; beside them lies the shared head model, with
@@ -36,7 +43,8 @@ class GBSAvatar:
     """
 
     def __init__(self, folder: Path, rig: Rig, stored: Stored, device: str):
-        self._folder, self._rig, self.stored, self._device = folder, rig, stored, device
+        self._stored = [folder / AVATAR_FILE, folder / SUBJECT_FILE]
+        self._rig, self.stored, self._device = rig, stored, device
         self._degree = sh_degree(stored.neutral["sh_rest"])
         self._last: tuple[bytes, PosedAttributes] | None = None
 
@@ -50,10 +58,6 @@ class GBSAvatar:
         return cls(folder, rig, stored, device)
 
     @torch.no_grad()
-    def render(self, camera: Camera, pose: HeadPose, background: Sequence[float] = (1.0, 1.0, 1.0)) -> Frame:
-        """Render one frame. Raises `InputError` where the pose is of another head model."""
-        return self.read_back(self.draw(camera, pose, background))
-
     @torch.no_grad()
     def draw(
         self,
@@ -67,10 +71,6 @@ class GBSAvatar:
         colors = posed.colors(view.center, self._degree)
         end_stage("deform")
         return draw_splats(posed.world, posed.opacities, colors, view, background, end_stage)
-
-    def read_back(self, drawn: Drawn) -> Frame:
-        """A drawn frame in host memory."""
-        return read_back(drawn)
 
     @torch.no_grad()
     def splats(self, pose: HeadPose, camera: Camera | None = None) -> PosedSplats:
@@ -86,14 +86,6 @@ class GBSAvatar:
         """(N, 3) and (N, 3, K - 1) harmonics in a pose, along the splats' axes, and the (N, 3, 3) turn of these."""
         posed = self._posed(pose)
         return posed.sh_dc.cpu(), posed.sh_rest.cpu(), posed.rotation.cpu()
-
-    def files(self) -> Sequence[Path]:
-        """The splats and the subject."""
-        return [self._folder / AVATAR_FILE, self._folder / SUBJECT_FILE]
-
-    def shared_files(self) -> Sequence[Path]:
-        """The head model, with teeth."""
-        return [self._folder / HEAD_FILE]
 
     def _posed(self, pose: HeadPose, end_stage: Callable[[str], None] = no_stage) -> PosedAttributes:
         """Splats of a pose; the last pose's are kept, since frames of several cameras follow one another."""

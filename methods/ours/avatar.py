@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...bench.contracts import Camera, Frame, HeadPose, no_stage
+from ...bench.contracts import Camera, HeadPose, no_stage
 from ..compact.file import COMPACT_FILE, read_compact
-from ..shared.avatar_files import HEAD_FILE, SUBJECT_FILE, Subject, read_shared_head, read_subject
+from ..shared.avatar_files import SUBJECT_FILE, Subject, read_shared_head, read_subject
 from ..shared.avatar_kernel import HarmonicColors, WorldTransform
 from ..shared.binding import NORMAL, WorldSplats
 from ..shared.rendering import (
@@ -20,9 +20,9 @@ from ..shared.rendering import (
     Cutoffs,
     Drawn,
     PosedSplats,
+    StoredSplatAvatar,
     draw_splats,
     posed_splats,
-    read_back,
     view_of,
 )
 from ..shared.subject_mesh import KnownPoses, SubjectMesh, pose_key
@@ -49,7 +49,7 @@ class SeenFrom(NamedTuple):
     """Maps a unit vector (3,) from the splats to the camera, in the world, to colours (N, 3) >= 0."""
 
 
-class OursAvatar:
+class OursAvatar(StoredSplatAvatar):
     """A trained head: splats without colour, planes, lines and two small networks.
 
     What depends on canonical position alone (plane features, places on the lines) is computed once when loaded.
@@ -127,10 +127,6 @@ class OursAvatar:
         self._known = KnownPoses(self._posed, int(megabytes * 2**20))
         return self._known.prepare(poses)
 
-    def render(self, camera: Camera, pose: HeadPose, background: Sequence[float] = (1.0, 1.0, 1.0)) -> Frame:
-        """Render one frame. Raises `InputError` where the pose is of another head model."""
-        return self.read_back(self.draw(camera, pose, background))
-
     @torch.no_grad()
     def draw(
         self,
@@ -146,10 +142,6 @@ class OursAvatar:
         opacities = torch.sigmoid(splats.logits)
         end_stage("deform")
         return draw_splats(world, opacities, colors, view, background, end_stage, self._cutoffs)
-
-    def read_back(self, drawn: Drawn) -> Frame:
-        """A drawn frame in host memory."""
-        return read_back(drawn)
 
     @torch.no_grad()
     def splats(self, pose: HeadPose, camera: Camera | None = None) -> PosedSplats:
@@ -182,14 +174,6 @@ class OursAvatar:
         expressions = len(self.field.tensors["lines"]) - len(self._jaw_bases)
         offsets = self.line_offsets(still(expressions), still(len(self._jaw_bases)))
         return apply_offsets(self.neutral, offsets, self.field.dynamic).logits
-
-    def files(self) -> Sequence[Path]:
-        """The file read, and the subject's where that file does not hold it."""
-        return self._stored
-
-    def shared_files(self) -> Sequence[Path]:
-        """The head model."""
-        return [path.parent / HEAD_FILE for path in self._stored[:1]]
 
     def _posed(self, pose: HeadPose) -> DrivenPose:
         frames = self.mesh.frames(self.mesh.posed(self.mesh.arguments([pose])))

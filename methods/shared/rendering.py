@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ...bench.contracts import Camera, FloatArray, Frame, no_stage
+from ...bench.contracts import Camera, FloatArray, Frame, HeadPose, no_stage
 from ..splats import rasterize
 from ..splats.constants import ALPHA_MIN, TRANSMITTANCE_MIN
+from .avatar_files import HEAD_FILE
 from .binding import WorldSplats
 
 
@@ -135,3 +137,40 @@ def scene_extent(cameras: Mapping[str, Camera]) -> float:
     if radius < 1e-6:
         radius = 0.5 * float(np.linalg.norm(centers[0]))
     return 1.1 * max(radius, 1e-3)
+
+
+class StoredSplatAvatar:
+    """What avatars of splats share around their `draw`.
+
+    Attributes
+    ----------
+    _stored : files that count as storage, in the avatar's folder.
+    """
+
+    _stored: Sequence[Path]
+
+    def draw(
+        self,
+        camera: Camera,
+        pose: HeadPose,
+        background: Sequence[float],
+        end_stage: Callable[[str], None] = no_stage,
+    ) -> Drawn:
+        """Draw one frame, stage by stage; see `StagedAvatar`."""
+        raise NotImplementedError
+
+    def render(self, camera: Camera, pose: HeadPose, background: Sequence[float] = (1.0, 1.0, 1.0)) -> Frame:
+        """Render one frame. Raises `InputError` where the pose is of another head model."""
+        return self.read_back(self.draw(camera, pose, background))
+
+    def read_back(self, drawn: Drawn) -> Frame:
+        """A drawn frame in host memory."""
+        return read_back(drawn)
+
+    def files(self) -> Sequence[Path]:
+        """The files that hold the avatar."""
+        return self._stored
+
+    def shared_files(self) -> Sequence[Path]:
+        """The head model."""
+        return [path.parent / HEAD_FILE for path in self._stored[:1]]
