@@ -59,16 +59,15 @@ def offered_commands() -> dict[str, Command | dict[str, Command]]:
     """
     found: dict[str, Command | dict[str, Command]] = {}
     for name, plugin in sorted(discover("commands").items()):
-        if plugin.spec is None:
-            found[name] = _broken(name, f"{plugin.origin}: {plugin.error}")
-            continue
-        first, _, second = plugin.spec.name.partition(" ")
+        spec = plugin.spec
+        command = _broken(name, f"{plugin.origin}: {plugin.error}") if spec is None else _command(spec)
+        first, _, second = name.partition(" ")
         if not second:
-            found[first] = _command(plugin.spec)
+            found[first] = command
             continue
         group = found.setdefault(first, {})
         if isinstance(group, dict):
-            group[second] = _command(plugin.spec)
+            group[second] = command
     return found
 
 
@@ -163,7 +162,7 @@ def _broken(name: str, why: str) -> Command:
     def command() -> int:
         raise HeadbenchError(f"command {name!r} is broken: {why}")
 
-    command.__doc__ = "Broken; calling it tells why."
+    command.__doc__ = "Broken; calling it shows why."
     return command
 
 

@@ -106,6 +106,8 @@ class MethodSpec:
     demo : ``headbench demo`` takes it.
     variants : "package.module:function" of ``(avatar folder, clip, device) -> Iterator[Variant]``: what can be derived
         from a trained avatar without training (``headbench sweep``); "" for nothing.
+    first_implementation : what ``implementation`` was when the first runs were made, "" for the same: digests of what an
+        avatar was made of outlive a move of the class.
     """
 
     name: str
@@ -122,6 +124,7 @@ class MethodSpec:
     default: bool = False
     demo: bool = False
     variants: str = ""
+    first_implementation: str = ""
     resolution: ResolutionRule = ResolutionRule()
     preset_resolutions: Mapping[str, ResolutionRule] = field(default_factory=dict)
 

@@ -113,8 +113,9 @@ class ResolvedMethod:
         }
 
     def identity(self) -> dict[str, Any]:
-        """The same for fingerprints, which do not change with the names of settings."""
-        return {**self.record(), "config": with_first_names(self.config)}
+        """The same for fingerprints, which change neither with names of settings nor with where the class is."""
+        implementation = self.spec.first_implementation or self.spec.implementation
+        return {**self.record(), "implementation": implementation, "config": with_first_names(self.config)}
 
 
 def stored_settings(method: str, settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -17,6 +17,7 @@ GA = MethodSpec(
     version="2",
     summary="GaussianAvatars: splats with spherical harmonics rigged to the triangles of the tracked mesh.",
     implementation="headbench.methods.ga.method:GA",
+    first_implementation="headbench.methods.ga:GA",
     config="headbench.methods.ga.config:GAConfig",
     variants="headbench.methods.derived.ga_variants:variants",
     presets=splat_presets(SHORT, {}),

@@ -24,6 +24,7 @@ OURS = MethodSpec(
     version="2",
     summary="Mesh-bound splats with tri-plane colour and expression-driven opacity along feature lines.",
     implementation="headbench.methods.ours.method:Ours",
+    first_implementation="headbench.methods.ours:Ours",
     config="headbench.methods.ours.config:OursConfig",
     variants="headbench.methods.derived.ours_variants:variants",
     presets=splat_presets(SHORT, {"planes": {"bounds_variant": "paper"}}),

@@ -1,4 +1,4 @@
-"""Commands that rooms offer: their settings become options, their findings output and exit code."""
+"""Commands that packages offer: their settings become options, their findings output and exit code."""
 
 import dataclasses
 import importlib.metadata
@@ -152,11 +152,12 @@ def test_help_shows_the_settings_text(offer, capsys):
         ("toy_command:Findings", "dataclass"),
     ],
 )
-def test_a_broken_command_is_listed_and_raises_only_when_called(offer, capsys, function, why):
-    offer("look", function=function)
+@pytest.mark.parametrize("name", ["look", "look twice"])
+def test_a_broken_command_is_listed_and_raises_only_when_called(offer, capsys, function, why, name):
+    offer(name, function=function)
     assert cli.main(["list", "commands"]) == 0
-    assert "look  broken: " in capsys.readouterr().out
-    assert cli.main(["look"]) == 2
+    assert f"{name}  broken: " in capsys.readouterr().out
+    assert cli.main(name.split()) == 2
     assert why in capsys.readouterr().err
 
 

@@ -4,6 +4,7 @@ import pytest
 
 from headbench.bench.configuration import build
 from headbench.bench.contracts import Budget
+from headbench.bench.io.files import digest
 from headbench.bench.registry import resolve
 from headbench.bench.runner.config import resolve_method
 from headbench.methods.ga.config import GAConfig
@@ -43,6 +44,23 @@ def test_presets_resolve(name, preset):
 def test_a_run_records_the_version_of_the_method_that_it_runs(name):
     spec = SPECS[name]
     assert resolve_method(spec, "demo", {}).record()["version"] == resolve(spec.implementation).version
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    {
+        "ours": "d55d7f92e73b",
+        "ga": "616f46ce6b19",
+        "gbs": "67bc23562190",
+        "gha": "ba0fa3f936a0",
+        "insta": "aa3d4245fc40",
+        "mean-image": "872346b1a896",
+        "nearest-camera": "8cb115f71ccc",
+    }.items(),
+)
+def test_runs_stored_before_a_move_or_new_name_keep_their_identity(name, expected):
+    """Of version 0.1.0 before its modules moved and settings were grouped: fingerprints in run folders hold them."""
+    assert digest(resolve_method(SPECS[name], "paper", {}).identity())[:12] == expected
 
 
 def test_paper_presets_are_the_published_values():

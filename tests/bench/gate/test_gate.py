@@ -15,6 +15,7 @@ from headbench.bench.io.files import write_json
 from headbench.bench.rows import Rows
 from headbench.bench.runner import run as runner
 from headbench.bench.runner.store import RunFolder
+from headbench.bench.specs import RENAMED_METRICS
 
 
 @pytest.fixture
@@ -221,6 +222,13 @@ def test_a_number_unavailable_in_the_baseline_too_is_no_loss(run, tmp_path, caps
     assert "missing: no gold" in capsys.readouterr().out
     assert gate(run, path, "--update") == 3
     assert "no gold" in capsys.readouterr().out
+
+
+def test_a_baseline_with_a_metric_by_its_former_name_is_read(run, baseline, monkeypatch, capsys):
+    monkeypatch.setitem(RENAMED_METRICS, "former", "psnr")
+    baseline.write_text(baseline.read_text().replace("psnr", "former"))
+    assert gate(run, baseline) == 0
+    assert "nothing got worse (6 pass)" in capsys.readouterr().out
 
 
 def test_a_new_number_is_told_and_passes(run, baseline, capsys):
