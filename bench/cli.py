@@ -1,4 +1,4 @@
-"""The command line. It composes the rooms through the registry; commands themselves hold no logic of a room."""
+"""The command line. It composes the packages through the registry; commands hold no logic of theirs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The contracts between the rooms: what a capture, a method, an avatar and a metric are.
+"""The contracts between the packages: what a capture, a method, an avatar and a metric are.
 
 What the registry lists of them is in `specs`.
 
@@ -369,7 +369,7 @@ class TrainingMetric(Protocol):
     def __call__(self, record: Mapping[str, Any]) -> Measurement:
         """Take it from the record of the fit: ``seconds``, ``interruptions``, ``peak_memory_bytes``.
 
-        Raises `UnavailableError` where the record does not tell it.
+        Raises `UnavailableError` where the record does not have it.
         """
 
 

@@ -68,7 +68,7 @@ def accelerators() -> list[dict[str, str]]:
 class PeakMemory:
     """Context that finds the largest resident memory of this process while it lasts.
 
-    Linux keeps that maximum, and lets a process begin it anew; elsewhere a thread looks every 20 ms, which can miss a
+    Linux keeps that maximum, and lets a process reset it; elsewhere a thread looks every 20 ms, which can miss a
     short spike. A child that ended meanwhile counts singly, if it was the largest so far: no other is told apart.
 
     Attributes
@@ -121,7 +121,7 @@ def _children_peak() -> int:
 
 
 def _resident_peak() -> int:
-    """Largest resident memory of this process since it was last begun anew (Linux)."""
+    """Largest resident memory of this process since it was last reset (Linux)."""
     for line in STATUS.read_text(encoding="ascii", errors="replace").splitlines():
         if line.startswith("VmHWM:"):
             return int(line.split()[1]) * 1024
@@ -147,7 +147,7 @@ def _version(name: str) -> str | None:
 def check_device(device: str) -> None:
     """Raise `InputError` unless torch can use ``device`` ("cpu", "cuda", "cuda:1", "mps", "xpu").
 
-    The CPU needs no question; for others torch is asked by name, as this room knows it no more than it knows methods.
+    The CPU needs no question; for others torch is asked by name, as this package knows it no more than it knows methods.
     """
     kind, _, index = device.partition(":")
     if kind == "cpu":

@@ -1,6 +1,6 @@
 """Finds methods, readers, metrics and reports by entry points; imports an implementation when it is used.
 
-This is how the command line reaches rooms it may not import: an entry point names a light spec, the spec
+This is how the command line reaches packages it may not import: an entry point names a light spec, the spec
 names its implementation as ``"package.module:attribute"``.
 """
 

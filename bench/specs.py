@@ -101,7 +101,7 @@ class MethodSpec:
     preset_resolutions : the same by preset name, for presets that work at another size; see `at_preset`.
     native : runs on our own implementation; False for an adapter to an official repository.
     source : the paper.
-    trivial : a floor that every real method should beat; shown in tables, never ranked.
+    trivial : a trivial baseline, which every real method should beat; shown in tables, never ranked.
     default : a run that names no methods takes it.
     demo : ``headbench demo`` takes it.
     variants : "package.module:function" of ``(avatar folder, clip, device) -> Iterator[Variant]``: what can be derived

@@ -19,6 +19,6 @@ TABLE_TEXT = ReportSpec(
 
 CONTACT_SHEET = ReportSpec(
     name="contact-sheet",
-    summary="Some frames of each task side by side: truth, renders and error maps of all methods, as PNG.",
+    summary="Some frames of each task side by side: ground truth, renders and error maps of all methods, as PNG.",
     implementation="headbench.reports.contact_sheet:write_contact_sheet",
 )

@@ -34,7 +34,7 @@ class EvaluateSettings:
     """Score a folder of images named by key, so that a method needs no plug-in to be compared.
 
     An image is SEQUENCE_TIMESTEP_CAMERA.png (timestep of five digits), as `headbench run` names its renders: 8-bit RGB
-    PNG of the truth's size, composited on the capture's background. It lies in FOLDER itself, in a folder named after
+    PNG of the ground truth's size, composited on the capture's background. It lies in FOLDER itself, in a folder named after
     the task, or in renders/TASK; with several subjects, in a folder named after the subject. A cell of a run
     (SUBJECT/METHOD/seed-N) has this layout, too.
     """

@@ -58,7 +58,7 @@ class ProtocolIdentity:
 class Results:
     """What was measured, and of what it lacks a number, with the reason.
 
-    ``frames`` tells how many frames of each seed a number is the mean of; 1 for a number of the avatar.
+    ``frames`` says how many frames of each seed a number is the mean of; 1 for a number of the avatar.
     ``unavailable`` numbers are those that no seed could have: an avatar that offers no stage times, a metric whose
     weights are not installed. ``problems`` are all others.
     """

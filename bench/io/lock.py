@@ -90,7 +90,7 @@ def _described(text: str) -> str:
         owner = json.loads(text)
         return f"process {int(owner['process'])} on {owner['host']}, since {owner['since']}"
     except (ValueError, KeyError, TypeError):
-        return "another process, which does not tell its number"
+        return "another process of unknown number"
 
 
 def _now() -> str:

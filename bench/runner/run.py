@@ -241,7 +241,7 @@ def trained(run: Path, methods: Sequence[str], options: RunOptions, out: Path) -
     Parameters
     ----------
     run : folder of the run.
-    methods : names of those wanted; empty: all but the floors, which nothing can drive to extremes.
+    methods : names of those wanted; empty: all but the trivial baselines, which nothing can drive to extremes.
     options : where the run's files are now.
     out : folder to keep clips in that methods need in another form; its lock is held. It becomes ``out`` of the settings.
 
@@ -259,7 +259,7 @@ def trained(run: Path, methods: Sequence[str], options: RunOptions, out: Path) -
             raise InputError(folder.manifest, "methods", ", ".join(names), name)
     wanted = [m for m in resolved if (m.spec.name in methods if methods else not m.spec.trivial)]
     if not wanted:
-        raise InputError(folder.manifest, "methods", "a method that is no floor", ", ".join(names))
+        raise InputError(folder.manifest, "methods", "a method that is no trivial baseline", ", ".join(names))
     config, clips = open_run_clips(run, options, out=out)
     jobs = make_jobs(config, wanted, clips, {}, folder, adapt(clips, wanted, config, RunFolder(out), folder))
     for job in jobs:

@@ -38,7 +38,7 @@ RECORD_EVERY_S = 10.0
 class Job:
     """One cell with all it needs.
 
-    ``clip`` is what is compared: the truth of every metric. ``adapted`` is its form for this method, None where
+    ``clip`` is what is compared: the ground truth of every metric. ``adapted`` is its form for this method, None where
     that is the clip itself. ``regions`` are measured beside the whole frame. ``line`` shows the progress of the run.
     """
 
@@ -225,7 +225,7 @@ def recorded_frames(job: Job) -> dict[str, str]:
 
 
 def _avatar_record(job: Job) -> tuple[str, Mapping[str, str]]:
-    """What tells one trained avatar from another of the same settings."""
+    """What distinguishes trained avatars of the same settings."""
     state = job.cell.step("fit")
     return ("", {}) if state is None else (state.get("derived_from", ""), state.get("files", {}))
 
@@ -233,7 +233,7 @@ def _avatar_record(job: Job) -> tuple[str, Mapping[str, str]]:
 def measure(job: Job, avatar: Avatar, metrics: Sequence[MetricSpec]) -> Rows:
     """Score the stored frames and the avatar as a whole; what was measured already is read back.
 
-    Metrics of one implementation are one measurement: they are read back, or taken anew, together. A measurement that
+    Metrics of one implementation are one measurement: they are read back, or taken again, together. A measurement that
     gave any number is read back; one that could not be had is tried again. Damaged rows are measured again, with a
     warning.
     """
@@ -374,7 +374,7 @@ def _avatar_row(job: Job, spec: MetricSpec, outcome: Measurement | UnavailableEr
     if not spec.detail:
         return _row(job, spec, None, None, outcome.value, "ok", "")
     if spec.detail not in outcome.details:
-        return _row(job, spec, None, None, math.nan, "missing", "This avatar does not tell it.")
+        return _row(job, spec, None, None, math.nan, "missing", "The avatar does not report it.")
     return _row(job, spec, None, None, float(outcome.details[spec.detail]), "ok", "")
 
 

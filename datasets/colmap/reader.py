@@ -208,7 +208,7 @@ def _frame_key(root: Path, name: str) -> FrameKey:
     if match and len(parts) == 1:
         return FrameKey("", "capture", int(match["timestep"]), match["camera"])
     expected = (
-        "<subject>/<sequence>/<timestep>/<camera> or <timestep>_<camera>, which tell timestep and camera"
+        "<subject>/<sequence>/<timestep>/<camera> or <timestep>_<camera>, which name timestep and camera"
     )
     raise InputError(root, f"image {name}", expected, name)
 

@@ -9,8 +9,8 @@ A capture is a *union* folder beside its *sequence* folders::
                                         transforms.json, transforms_{train,val,test}.json
 
 Two files of ours may stand beside the JSONs: ``headbench.json`` (a `Declaration`: what the layout itself
-leaves unsaid) and ``head_model.npz``. Tools of the field ignore them. `ga_writer` writes the layout,
-`ga_reader` reads it.
+leaves unsaid) and ``head_model.npz``. Tools of the field ignore them. `writer` writes the layout,
+`reader` reads it.
 
 Conventions: ``transform_matrix`` is camera-to-world with OpenGL axes (x right, y up, looking along -z);
 VHAP measures ``cy`` from the bottom edge since its commit 34afb35 (November 2024), from the top before.

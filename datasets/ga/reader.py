@@ -81,7 +81,7 @@ def read_capture(
     background : (r, g, b) in [0, 1]; None takes the declared one, else white. For images without alpha it is
         exchanged by their masks, see `set_background`.
     below_neck : keep what lies below the tracked neck; False turns it into background, see `mask_below_neck`.
-    held_out_sequences, held_out_cameras : make the splits anew instead of taking the JSONs': all frames of
+    held_out_sequences, held_out_cameras : make new splits instead of taking the JSONs': all frames of
         these sequences (full names or unique prefixes) are self-reenactment, these cameras' other frames
         novel view, the rest training.
     exclude : frames to leave out, added to what ``headbench.json`` declares: reason by timestep, or a file for

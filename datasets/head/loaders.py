@@ -75,7 +75,7 @@ def flame_version(path: Path) -> str:
     Raises
     ------
     InputError
-        Where the name does not tell: the two files have the same layout, and confusing them goes unnoticed.
+        Where the name leaves it open: the two files have the same layout, and confusing them goes unnoticed.
     """
     name = path.stem.lower().replace("-", "_")
     if "2023" in name:
@@ -85,7 +85,7 @@ def flame_version(path: Path) -> str:
     raise InputError(
         path,
         "version",
-        "a file name that tells FLAME's version (generic_model.pkl, flame2020.pkl, flame2023.pkl)",
+        "a file name with FLAME's version (generic_model.pkl, flame2020.pkl, flame2023.pkl)",
         repr(path.name),
         "Say which it is: version='flame2020' or 'flame2023'. Their coefficients are not interchangeable.",
     )

@@ -348,7 +348,7 @@ RULES = (
         "HB510",
         "note",
         "official code would centre the principal point",
-        "GaussianAvatars and its heirs ignore cx, cy: their renders are shifted by as much against the images.",
+        "GaussianAvatars and what is derived from it ignore cx, cy: their renders are shifted by as much against the images.",
         _ignored,
     ),
     Rule(

@@ -356,7 +356,7 @@ RULES = (
         "HB106",
         "error",
         "timesteps do not count from 0 without a gap",
-        "Number timesteps anew: readers of the layout index parameters by them, and a gap shifts all behind it.",
+        "Renumber timesteps: readers of the layout index parameters by them, and a gap shifts all behind it.",
         _gap,
         of_layout=True,
     ),

@@ -116,7 +116,7 @@ def union10_held_out(subject: str, sequences: Sequence[str] = UNION10_SEQUENCES)
 def chosen_subjects(text: str, key: str = "--subjects") -> list[str]:
     """Subject ids of an option: ids separated by commas, ``paper`` (the nine) or ``ablation``.
 
-    Numbers are padded to three digits, so 74 is 074. Raises `InputError` for anything else and for twins.
+    Numbers are padded to three digits, so 74 is 074. Raises `InputError` for anything else and for subjects named twice.
     """
     if text in SUBJECT_NAMES:
         return [*SUBJECT_NAMES[text]]

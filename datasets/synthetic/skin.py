@@ -1,7 +1,7 @@
 """The skin's colour at rest, painted once per subject on the fine mesh.
 
 Painting is a function of the neutral shape and the subject's traits alone; what expressions add is in
-`wrinkles`. Colours are linear-light reflectances.
+`Folds`. Colours are linear-light reflectances.
 """
 
 from __future__ import annotations

@@ -40,7 +40,8 @@ class CompactSettings(CaptureOptions):
     """Held-out frames to compare on, evenly spread over both held-out splits."""
 
     scale: int = 1
-    """Enlarge the compared images so many times. Above 1 there is no truth to compare with, only the exact avatar."""
+    """Enlarge the compared images so many times. Above 1 there is no ground truth to compare with, only the exact
+    avatar."""
 
     precision: Precision = field(default_factory=Precision)
     """How finely each part is stored."""

@@ -54,7 +54,7 @@ class GBSConfig:
     mask_floor_mm, mask_full_mm : displacement of the surface by one expression, at coefficient 1, up to which its
         differences are zero and not stored, and at which they count in full. The published values: a tenth of the
         largest displacement by FLAME's 50th expression, and the largest by its first.
-    alpha_weight : of the mean squared difference of alpha and matte; needs masks, else it is left out.
+    alpha_weight : of the mean squared difference of alpha and mask; needs masks, else it is left out.
     teeth_weight : of the penalty on teeth that leave the mouth (`points.MouthCylinder`), the mean over each row, added up.
     correctives_variant : "paper" interpolates the pose correctives of a triangle's corners. "official" adds them up as
         the authors' program does, which makes them three times too strong.

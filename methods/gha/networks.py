@@ -229,7 +229,7 @@ class Controllers:
 
 
 def encoded_size(size: int) -> int:
-    """Numbers that `triplane.encode` makes of ``size``."""
+    """Numbers that `encode` makes of ``size``."""
     return size * ENCODING_SIZE // 3
 
 

@@ -192,7 +192,7 @@ def encode(positions: Tensor, table: Tensor, levels: Sequence[Level], backend: s
 
 
 def encode_reference(positions: Tensor, table: Tensor, levels: Sequence[Level]) -> Tensor:
-    """Twin of the kernel: trilinear sums of eight rows on every level."""
+    """Reference implementation of the kernel: trilinear sums of eight rows on every level."""
     corners = torch.tensor([[c >> axis & 1 for axis in range(3)] for c in range(8)], device=positions.device)
     parts = []
     for level in levels:

@@ -200,7 +200,7 @@ class PosedSurface:
     def _march_reference(
         self, rays: Rays, first: np.ndarray, step: float, samples_max: int, space: Space
     ) -> Samples:
-        """Twin of the kernel: every sample that is not behind the mesh, its nearest triangle of all."""
+        """Reference implementation of the kernel: every sample that is not behind the mesh, its nearest triangle of all."""
         low, high = self.vertices.min(0).values.numpy(), self.vertices.max(0).values.numpy()
         reach = self.reach(space)
         padding = max(float(reach.max()), 0.0)

@@ -194,7 +194,7 @@ class PlaneColors:
 
 
 def encode_columns(directions: Tensor) -> Tensor:
-    """(27, N), the transpose of `triplane.encode_directions`, from one sine and one cosine per coordinate.
+    """(27, N), the transpose of `encode_directions`, from one sine and one cosine per coordinate.
 
     The frequencies double, so the other waves follow by sin 2a = 2 sin a cos a and cos 2a = 1 - 2 sin^2 a; each step
     doubles the rounding error, to 1e-6 at frequency 8 in float32.

@@ -1,7 +1,7 @@
 """Compact tensorial Gaussian avatars: static colour from planes, dynamic opacity from feature lines.
 
 "3D Gaussian Head Avatars with Expressive Dynamic Appearances by Compact Tensorial Representations", CVPR 2025,
-arXiv 2504.14967. What the paper does not change is as in GaussianAvatars (`bound_training`).
+arXiv 2504.14967. What the paper does not change is as in GaussianAvatars (`shared.splat_training`).
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ The defaults are the published values (600,000 iterations). Where the authors' p
 ``<what>_variant`` chooses between "paper" and "official".
 
 Moments in training are written on the published scale and mapped to the budget at hand as fractions
-(`training.Timeline`); the ``min_...`` fields are the iterations that a thing needs in any run to do more good than harm.
+(`schedule.Timeline`); the ``min_...`` fields are the iterations that a thing needs in any run to do more good than harm.
 """
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ MARK = "+"
 def sweep(settings: SweepSettings, out: Path, progress: Progress) -> Rows:
     """Derive, render and measure; return the rows of the run folder that it writes to ``out``.
 
-    The trained avatars are measured anew beside their variants, so that frame times were taken in one go. Started
+    The trained avatars are measured again beside their variants, so that frame times were taken in one go. Started
     again, it keeps what is measured.
 
     Raises

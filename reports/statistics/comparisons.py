@@ -211,7 +211,7 @@ class BestSet:
 
     Attributes
     ----------
-    methods : those that no other one is told to be better than; None where so few subjects can tell nothing.
+    methods : those that no other one is found better than; None where so few subjects can tell nothing.
     subjects : how many there are.
     needed : subjects that it takes for this many methods.
     """

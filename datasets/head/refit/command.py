@@ -25,7 +25,7 @@ Algorithm = Literal["slsqp", "lbfgs", "mma"]
 
 @dataclass(frozen=True)
 class RefitSettings:
-    """How tracking is carried over to another head model.
+    """How tracking is re-fitted to another head model.
 
     The defaults follow published practice for monocular methods: vertex distances over the facial region decide,
     identity comes from the neutral head, neither static offset nor neck rotation is kept.

@@ -1,6 +1,6 @@
 // The field at canonical points, one sample to a lane.
 //
-// The formulas are those of field.py, the encoding's those of hash_grid.py.
+// The formulas are those of field.py.
 #pragma once
 
 #include "bench/native/spherical_harmonics.h"

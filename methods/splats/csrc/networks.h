@@ -138,7 +138,7 @@ HEADBENCH_INLINE void sine_cosine(Real x, Real& sine, Real& cosine) {
   cosine = fma(square, cosine, 1.0f);
 }
 
-// The encoding of ours_inference.py, `encode_columns`, for the W splats in one column of `out`.
+// The encoding of methods/ours/inference.py, `encode_columns`, for the W splats in one column of `out`.
 HEADBENCH_INLINE void encode(const Real* direction, float* out) {
   constexpr int kFrequencies = (kEncoding - 3) / 6;
   for (int k = 0; k < 3; ++k) {

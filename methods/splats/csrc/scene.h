@@ -153,7 +153,8 @@ struct ToWorld {
 constexpr int kHarmonicsBlock = 16;
 constexpr int kDegreeMax = 3;
 
-// Colours of spherical harmonics along the directions from the camera to the splats; the formulas of sh.py, `sh_to_rgb`.
+// Colours of spherical harmonics along the directions from the camera to the splats; the formulas of `sh_to_rgb` in
+// methods/shared/networks.py.
 struct Harmonics {
   int degree;
   const float* coefficients;    // (ceil(N / 16), 3, (degree + 1)^2, 16)
@@ -167,8 +168,8 @@ struct Harmonics {
 // Both networks' layers are this wide, or multiples of it.
 constexpr int kUnitsStep = 16;
 
-// The colour network of ours_field.py, `shade_directions`: what is known of the position, plus the encoded direction from
-// the splat to the camera by its weights, ReLU, a layer.
+// The colour network, `shade_directions` in methods/ours/field.py: what is known of the position, plus the encoded
+// direction from the splat to the camera by its weights, ReLU, a layer.
 constexpr int kEncoding = 27;
 
 struct ColorNetwork {
@@ -183,8 +184,8 @@ struct ColorNetwork {
   float* colors;                // (N, 3)
 };
 
-// The offset network of feature_lines.py for M splats: rows of a table interpolated on three axes and added, ReLU, a
-// layer, ReLU, a layer.
+// The offset network, `offset_network` in methods/shared/networks.py, for M splats: rows of a table interpolated on three
+// axes and added, ReLU, a layer, ReLU, a layer.
 struct OffsetNetwork {
   int units, hidden, outputs;
   const float* table;         // (T, units), T > rows + 1

@@ -70,7 +70,7 @@ def test_a_lock_file_of_nonsense_is_no_obstacle_and_tells_nothing(tmp_path):
     (tmp_path / LOCK_FILE).write_text("[1, 2")
     with locked(tmp_path):
         (tmp_path / LOCK_FILE).write_text("[1, 2")
-        with pytest.raises(InputError, match="does not tell its number"), locked(tmp_path):
+        with pytest.raises(InputError, match="of unknown number"), locked(tmp_path):
             pytest.fail("entered twice")
 
 

@@ -129,7 +129,7 @@ def test_what_is_not_there_is_refused_before_any_work(ball_run, tmp_path):
 
 def test_a_run_of_trivial_baselines_has_nothing_to_test(ball_run):
     folder = ball_run("FLOOR")
-    with pytest.raises(InputError, match="no floor"):
+    with pytest.raises(InputError, match="no trivial baseline"):
         extremes_run(settings(folder))
     assert extremes_run(settings(folder, methods=("floor",))).passed
 
