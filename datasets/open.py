@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import logging
 from collections.abc import Iterator, Mapping
 from os import PathLike
 from pathlib import Path
@@ -15,6 +16,8 @@ from ..bench.runner.captures import found_captures
 from ..bench.specs import DatasetSpec
 from .clip import CaptureClip, as_capture
 from .foreign import describe
+
+log = logging.getLogger(__name__)
 
 
 def find_reader(path: str | PathLike[str], name: str = "") -> DatasetSpec:
@@ -87,5 +90,8 @@ def _finds(spec: DatasetSpec, root: Path) -> bool:
     """Whether a reader finds captures; one that cannot be imported or that looks at nothing finds none."""
     try:
         return bool(spec.find and resolve(spec.find)(root))
-    except (HeadbenchError, InputError):
+    except HeadbenchError:
+        return False
+    except Exception as error:  # noqa: BLE001 - a plug-in may fail in any way; the others must still be asked
+        log.warning("reader %s cannot look at %s: %s: %s", spec.name, root, type(error).__name__, error)
         return False

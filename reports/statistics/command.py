@@ -35,7 +35,7 @@ class CompareSettings:
     metrics: tuple[str, ...] = ()
     """Metrics to compare; default: those of the comparison table."""
 
-    floors: bool = False
+    trivial: bool = False
     """Compare the trivial baselines (mean image, nearest camera), too."""
 
     level: float = 0.05
@@ -66,7 +66,7 @@ def compare_runs(settings: CompareSettings, progress: Progress = no_progress) ->
     from .comparisons import compare
 
     runs = RunSet.read([Path(folder) for folder in settings.runs])
-    pairs = method_pairs(runs, settings.against, settings.floors)
+    pairs = method_pairs(runs, settings.against, settings.trivial)
     metrics = [
         spec
         for spec in runs.metrics
@@ -96,9 +96,9 @@ def compare_runs(settings: CompareSettings, progress: Progress = no_progress) ->
     return Findings(text, {"level": settings.level, "comparisons": [_plain(c) for c in every]})
 
 
-def method_pairs(runs: RunSet, against: str | None, floors: bool) -> list[tuple[str, str]]:
+def method_pairs(runs: RunSet, against: str | None, trivial: bool) -> list[tuple[str, str]]:
     """Return the pairs to compare: all, or every method with one."""
-    methods = runs.methods if floors else runs.ranked
+    methods = runs.methods if trivial else runs.ranked
     if against is None:
         pairs = list(combinations(methods, 2))
     elif against in runs.methods:

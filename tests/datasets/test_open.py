@@ -53,6 +53,21 @@ def test_of_several_fitting_readers_one_has_to_be_named(pristine_capture, monkey
     assert open_clip(pristine_capture.union, "ga").poses
 
 
+def fails(root):
+    raise KeyError(root)
+
+
+def test_a_reader_that_fails_to_look_leaves_a_capture_to_the_others(pristine_capture, monkeypatch, caplog):
+    known = registry.discover("datasets")
+    spec = replace(known["ga"].spec, name="other", find=f"{__name__}:fails")
+    monkeypatch.setattr(
+        "headbench.datasets.open.discover",
+        lambda group: {**known, "other": replace(known["ga"], name="other", spec=spec)},
+    )
+    assert find_reader(pristine_capture.union).name == "ga"
+    assert "reader other cannot look at" in caplog.text
+
+
 def test_a_clip_of_another_reader_passes_through_steps(plain_folder, pristine_capture):
     clip, same = open_clip(plain_folder, "plain_reader:SPEC"), read_capture(pristine_capture.union)
     assert as_capture(clip) is clip

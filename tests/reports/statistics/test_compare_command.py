@@ -77,7 +77,7 @@ def test_json_has_every_subject(folder):
 
 
 def test_csv_reads_back(folder):
-    text = compare_runs(CompareSettings((str(folder),), floors=True, format="csv")).text
+    text = compare_runs(CompareSettings((str(folder),), trivial=True, format="csv")).text
     table = pd.read_csv(io.StringIO(text), keep_default_na=False)
     assert len(table) == 3 * 3
     assert set(table["family"]) == {3}
