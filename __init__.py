@@ -46,6 +46,7 @@ if _TYPE_CHECKING:
         MethodSpec,
         MetricSpec,
         ProfileSpec,
+        Renamed,
         ReportSpec,
         ResolutionRule,
         writes,
@@ -78,6 +79,7 @@ __all__ = [
     "Progress",
     "RegionalClip",
     "RegionalMetric",
+    "Renamed",
     "ReportSpec",
     "ResolutionRule",
     "SharingAvatar",
@@ -103,7 +105,7 @@ _HOMES = {
     "errors": ("HeadbenchError", "InputError", "UnavailableError"),
     "runner.config": ("resolve_method",),
     "specs": tuple(name for name in __all__ if name.endswith("Spec"))
-    + ("Findings", "ResolutionRule", "writes"),
+    + ("Findings", "Renamed", "ResolutionRule", "writes"),
 }
 _HOME = {name: module for module, names in _HOMES.items() for name in names}
 

@@ -7,7 +7,7 @@ import inspect
 import math
 import types
 import typing
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -98,7 +98,8 @@ def with_new_names(cls: type, values: Mapping[str, Any]) -> dict[str, Any]:
             element = old.partition(":")[2]
             renamed = _exchanged(value, entry.values)
             if element:
-                renamed = "official" if element in value else "paper"
+                listed = isinstance(value, (list, tuple)) and element in value
+                renamed = "official" if listed else "paper"
             for name in reversed(entry.new.split(".")):
                 renamed = {name: renamed}
             result = merge(result, renamed)
@@ -142,7 +143,7 @@ def _new_names(cls: type, key: str, value: Any) -> dict[str, Renamed]:
 def _exchanged(value: Any, values: Mapping[Any, Any]) -> Any:
     if isinstance(value, (list, tuple)):
         return type(value)(_exchanged(each, values) for each in value)
-    return values.get(value, value)
+    return values.get(value, value) if isinstance(value, Hashable) else value
 
 
 def build_arguments(

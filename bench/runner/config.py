@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 from ..configuration import build, merge, with_first_names, with_new_names
 from ..contracts import Budget, TaskName
-from ..errors import InputError
+from ..errors import HeadbenchError, InputError
 from ..io.files import check_name
 from ..registry import discover, get, resolve, unknown
 from ..specs import RENAMED_METRICS, MethodSpec, MetricSpec, ProfileSpec
@@ -119,15 +119,22 @@ class ResolvedMethod:
 
 
 def stored_settings(method: str, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings of a method as an earlier version stored them, by their names now; as they are for a method unknown here."""
+    """Settings of a method as an earlier version stored them, by their names now.
+
+    As they are for a method that is unknown here, or whose settings' class cannot be imported: tables need neither.
+    """
     plugin = next(
         (found for found in discover("methods").values() if getattr(found.spec, "name", "") == method), None
     )
     if plugin is None or plugin.spec is None or not plugin.spec.config:
         return dict(settings)
+    try:
+        known = resolve(plugin.spec.config)
+    except HeadbenchError:
+        return dict(settings)
     budget = {key: value for key, value in settings.items() if key == "budget"}
     own = {key: value for key, value in settings.items() if key != "budget"}
-    return {**budget, **with_new_names(resolve(plugin.spec.config), own)}
+    return {**budget, **with_new_names(known, own)}
 
 
 def resolve_methods(config: RunConfig) -> list[ResolvedMethod]:

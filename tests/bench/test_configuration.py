@@ -120,6 +120,11 @@ def test_an_old_name_is_refused_with_the_new_one(values, new):
         build(Now, values, "file", "a.")
 
 
+@pytest.mark.parametrize("stored", [{"odd": 5}, {"odd": None}, {"how": [{}]}, {"how": [["code"], 1.5]}])
+def test_stored_settings_of_wrong_types_are_left_to_those_who_build_them(stored):
+    assert with_new_names(Now, stored).keys() <= {"odd_variant", "group"}
+
+
 def test_settings_stored_by_old_names_are_read_and_digested_alike():
     stored = {"inner": {"rate": 0.5, "steps": 3}, "group": False, "how": "code", "odd": ["teeth"]}
     now = Now(Inner(0.5), Group(on=False, variant="official"), odd_variant="official")

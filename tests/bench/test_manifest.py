@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from headbench.bench import registry
 from headbench.bench.errors import InputError
 from headbench.bench.manifest import Manifest
 from headbench.bench.runner.store import Cell
@@ -39,6 +40,16 @@ def test_a_manifest_of_an_earlier_version_is_read(published, tmp_path):
     assert old["configuration"]["metrics"] != published["configuration"]["metrics"]
     (tmp_path / "run.json").write_text(json.dumps(old))
     assert Manifest.read(tmp_path / "run.json") == Manifest.read(GALLERY)
+
+
+def test_a_method_whose_settings_cannot_be_imported_is_read(published, tmp_path, monkeypatch):
+    known = registry.discover("methods")
+    broken = {
+        name: dataclasses.replace(plugin, spec=dataclasses.replace(plugin.spec, config="not_there:Config"))
+        for name, plugin in known.items()
+    }
+    monkeypatch.setattr("headbench.bench.runner.config.discover", lambda group: broken)
+    assert Manifest.read(GALLERY).configuration.settings == published["configuration"]["settings"]
 
 
 @pytest.mark.parametrize(

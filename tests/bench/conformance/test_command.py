@@ -107,4 +107,4 @@ def test_every_specification_and_protocol_is_exported():
         if isinstance(value, type) and value.__module__ == module.__name__
     }
     # A `CommandSpec` is read from a plug-in's function, not written by it.
-    assert public - set(headbench.__all__) <= {"CommandSpec", "ExitCode", "Interruption", "Renamed"}
+    assert public - set(headbench.__all__) <= {"CommandSpec", "ExitCode", "Interruption"}
