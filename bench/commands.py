@@ -51,6 +51,12 @@ WORDS_OF_OTHERS = {
 }
 """What other toolkits call their commands, and which of ours does it."""
 
+RENAMED_OPTIONS = {
+    "compare": {"--floors": "--trivial"},
+    "steps": {"--classes": "--clusters", "--compatibility": "--variant"},
+}
+"""Options by command and by what they were called before."""
+
 
 def offered_commands() -> dict[str, Command | dict[str, Command]]:
     """Commands by name; a word that several share ("prepare nersemble") leads to a table of its own.
@@ -79,8 +85,11 @@ def with_groups(commands: Mapping[str, Command | dict[str, Command]]) -> dict[st
 
 
 def check_known(words: Sequence[str], commands: Mapping[str, Command | dict[str, Command]]) -> None:
-    """Raise `InputError` where the words of a command line name none of ``commands``, with the nearest one."""
+    """Raise `InputError` where a command line names none of ``commands``, or an option as it was called before."""
     word = next(iter(words), "-")
+    for option, new in RENAMED_OPTIONS.get(word, {}).items():
+        if any(each.partition("=")[0] == option for each in words[1:]):
+            raise InputError("command line", option, f"its new name, {new}", "the old one")
     table = commands.get(word)
     if isinstance(table, dict) and words[1:]:
         if words[1].startswith("-") or words[1] in table:

@@ -7,7 +7,10 @@ from headbench.bench.io.images import probe_image
 
 COMMANDS = {
     "inspect": (["--timesteps", "1", "--cameras", "2"], ["inspection.png", "inspection.json"]),
-    "steps": (["--bases", "3", "--classes", "2"], ["jaw_bases.png", "expression_classes.png", "steps.json"]),
+    "steps": (
+        ["--bases", "3", "--clusters", "2"],
+        ["jaw_bases.png", "expression_clusters.png", "steps.json"],
+    ),
     "tongue": (["--cameras", "1"], ["tongue.yaml", "tongue_901.png"]),
     "export colmap": (["--tracking"], ["sparse/0/images.bin", "flame_param/00000.npz", "head_model.npz"]),
     "record nersemble": ([], ["recording/metadata_sequences.csv", "head_model.npz"]),

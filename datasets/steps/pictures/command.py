@@ -18,19 +18,19 @@ from ...options import CaptureOptions
 
 @dataclass(frozen=True)
 class StepsSettings(CaptureOptions):
-    """Draw the jaw bases and the expression classes that a capture's training frames give."""
+    """Draw the jaw bases and the expression clusters that a capture's training frames give."""
 
     capture: tyro.conf.Positional[str]
     """Capture, in a layout that a reader knows."""
 
     out: str
-    """Folder for jaw_bases.png, expression_classes.png and steps.json."""
+    """Folder for jaw_bases.png, expression_clusters.png and steps.json."""
 
     bases: int = 16
     """Jaw bases at most."""
 
-    classes: int = 16
-    """Expression classes at most."""
+    clusters: int = 16
+    """Expression clusters at most."""
 
     seed: int = 0
     """Seeds the choice of landmarks in long captures."""
@@ -39,12 +39,12 @@ class StepsSettings(CaptureOptions):
     """"official" shows what the published code makes: jaw bases from held-out poses (a leak, and said so)."""
 
 
-JAW_PICTURE, CLASS_PICTURE, NUMBERS = "jaw_bases.png", "expression_classes.png", "steps.json"
+JAW_PICTURE, CLUSTER_PICTURE, NUMBERS = "jaw_bases.png", "expression_clusters.png", "steps.json"
 
 
 @writes("out")
 def steps(settings: StepsSettings, progress: Progress = no_progress) -> Findings:
-    """Draw the jaw bases and expression classes that a capture's training frames give, and their numbers.
+    """Draw the jaw bases and expression clusters that a capture's training frames give, and their numbers.
 
     Raises `InputError` for a capture that the reader refuses, for counts below 1, and for a head without a face
     region.
@@ -53,22 +53,22 @@ def steps(settings: StepsSettings, progress: Progress = no_progress) -> Findings
     from ..clusters import cluster_expressions
     from ..figures import draw_clusters, draw_jaw_bases, find_jaw_bases
 
-    for name in ("bases", "classes"):
+    for name in ("bases", "clusters"):
         if getattr(settings, name) < 1:
             raise InputError(f"--{name}", "", "at least 1", str(getattr(settings, name)))
     clip = settings.open(settings.capture, progress)
     jaws = find_jaw_bases(clip, settings.bases, variant=settings.variant)
     clusters = cluster_expressions(
-        clip, settings.classes, seed=settings.seed, variant=settings.variant, progress=progress
+        clip, settings.clusters, seed=settings.seed, variant=settings.variant, progress=progress
     )
     out = Path(settings.out)
     write_png(out / JAW_PICTURE, draw_jaw_bases(clip, jaws))
-    write_png(out / CLASS_PICTURE, draw_clusters(clip, clusters, progress))
+    write_png(out / CLUSTER_PICTURE, draw_clusters(clip, clusters, progress))
     data = {
         "subject": clip.subject,
         "clip": clip.fingerprint,
         "jaw_bases": jaws.record(),
-        "expression_classes": clusters.record(),
+        "expression_clusters": clusters.record(),
     }
     write_json(out / NUMBERS, data)
     sizes = np.sort(np.bincount(clusters.labels))[::-1]
@@ -78,8 +78,8 @@ def steps(settings: StepsSettings, progress: Progress = no_progress) -> Findings
             f"{len(jaws.bases)} jaw bases, opening up to {jaws.angles[:, 0].max():.1f}°; "
             f"every training pose has one within {jaws.largest_gap:.1f}°"
         ),
-        f"{len(sizes)} expression classes of {', '.join(map(str, sizes))} timesteps",
+        f"{len(sizes)} expression clusters of {', '.join(map(str, sizes))} timesteps",
         *(f"Leak: {note}" for note in jaws.record()["leaks"]),
-        f"Pictures: {out / JAW_PICTURE}, {out / CLASS_PICTURE}",
+        f"Pictures: {out / JAW_PICTURE}, {out / CLUSTER_PICTURE}",
     ]
     return Findings("\n".join(lines), data)

@@ -111,15 +111,15 @@ def test_colours_of_sixteen_clusters_differ():
 
 @pytest.mark.parametrize("variant", ["paper", "official"])
 def test_command_writes_pictures_and_numbers(pristine_capture, tmp_path, variant):
-    settings = StepsSettings(str(pristine_capture.union), str(tmp_path), classes=2, variant=variant)
+    settings = StepsSettings(str(pristine_capture.union), str(tmp_path), clusters=2, variant=variant)
     findings = steps(settings)
     clip = read_capture(pristine_capture.union)
     stored = read_json(tmp_path / "steps.json")
     assert stored["clip"] == clip.fingerprint
     assert stored["jaw_bases"]["leaks"] == list(findings.data["jaw_bases"]["leaks"])
     assert bool(stored["jaw_bases"]["leaks"]) == (variant == "official") == ("Leak" in findings.text)
-    assert sum(stored["expression_classes"]["class_sizes"]) == len(clip.timesteps("train"))
-    for name in ("jaw_bases.png", "expression_classes.png"):
+    assert sum(stored["expression_clusters"]["class_sizes"]) == len(clip.timesteps("train"))
+    for name in ("jaw_bases.png", "expression_clusters.png"):
         picture = cv2.imread(str(tmp_path / name))
         assert picture is not None
         assert picture.std() > 10
@@ -134,6 +134,6 @@ def test_a_clip_with_one_timestep_still_has_figures(clip):
 
 
 def test_counts_below_one_are_refused(pristine_capture, tmp_path):
-    with pytest.raises(InputError, match="--classes"):
-        steps(StepsSettings(str(pristine_capture.union), str(tmp_path), classes=0), no_progress)
+    with pytest.raises(InputError, match="--clusters"):
+        steps(StepsSettings(str(pristine_capture.union), str(tmp_path), clusters=0), no_progress)
     assert not list(tmp_path.iterdir())
