@@ -153,7 +153,7 @@ def _cameras_only(path: Path, names: list[str]) -> Foreign | None:
     models = {"cameras.bin", "cameras.txt", "database.db"}
     if not models & set(names) and "sparse" not in names and not (path / "colmap").is_dir():
         return None
-    remedy = f"COLMAP gives cameras and no tracked head; with tracked parameters beside the model, choose the reader colmap. {TRACK}"
+    remedy = f"COLMAP gives cameras and no tracked head; with tracked parameters beside the model, choose the reader colmap (`headbench run`: --set reader=colmap). {TRACK}"
     return Foreign("a COLMAP dataset", remedy)
 
 

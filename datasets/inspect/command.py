@@ -45,7 +45,7 @@ PICTURE, NUMBERS = "inspection.png", "inspection.json"
 def inspect(settings: InspectSettings, progress: Progress = no_progress) -> Findings:
     """Draw what a capture holds: camera rig, splits, tracked mesh on images, motion by sequence.
 
-    Raises `InputError` for a capture that the reader refuses (``headbench lint`` then tells all that is wrong),
+    Raises `InputError` for a capture that the reader refuses (``headbench lint`` then reports all that is wrong),
     for a clip without training frames that are not excluded, and for counts below 1.
     """
     from ..ga.writer import write_png

@@ -111,7 +111,8 @@ def run_robustness_test(
 def extremes_run(settings: ExtremesSettings, progress: Progress = no_progress) -> Findings:
     """Render a run's avatars in views and expressions beyond those of training: stability limits, contact sheet.
 
-    Does not pass where a limit is broken. Raises `InputError` for a folder that is no finished run, and for a capture that is not the run's.
+    Does not pass where a limit is broken. Raises `InputError` for a folder that is no finished run, and for a capture
+    that is not the run's.
     """
     from .extremes import TASK as EXTREMES
     from .extremes import judge_extremes
@@ -123,8 +124,8 @@ def extremes_run(settings: ExtremesSettings, progress: Progress = no_progress) -
 def reenact_run(settings: ReenactSettings, progress: Progress = no_progress) -> Findings:
     """Drive a run's avatars with another subject's expressions: stability limits, frames, contact sheet.
 
-    Does not pass where a limit is broken. Raises `InputError` for a folder that is no finished run, where nobody else is there to drive, and for a source
-    tracked with another head model.
+    Does not pass where a limit is broken. Raises `InputError` for a folder that is no finished run, where nobody else
+    is there to drive, and for a source tracked with another head model.
     """
     from .reenactment import TASK as REENACTMENT
     from .reenactment import judge_reenactment

@@ -60,7 +60,8 @@ FIELDS = (
 def compare_runs(settings: CompareSettings, progress: Progress = no_progress) -> Findings:
     """Paired differences between methods of finished runs: interval, exact test over subjects, Holm's correction.
 
-    Compare methods on every metric. Raises `InputError` for runs, methods and metrics that do not fit."""
+    Raises `InputError` for runs, methods and metrics that do not fit.
+    """
     from ..runs import RunSet
     from ..table_report import COMPARISON
     from .comparisons import compare
