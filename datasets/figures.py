@@ -6,8 +6,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-import matplotlib
 import numpy as np
+from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure, SubFigure
@@ -44,7 +44,7 @@ _STYLE: Any = {
 @contextmanager
 def new_figure(width: float, height: float) -> Iterator[Figure]:
     """An empty figure of a size in inches; everything is drawn, and turned into pixels, within the context."""
-    with matplotlib.rc_context(_STYLE):
+    with style.context(["default", _STYLE]):  # whatever the user's matplotlibrc says, such as text.usetex
         yield Figure(figsize=(width, height), dpi=DPI, layout="constrained")
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import matplotlib
 import numpy as np
+from matplotlib import style
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
@@ -131,6 +132,7 @@ class _Paper:
             Image.fromarray(pixels).save(temporary, optimize=True)
 
 
+@style.context("default")  # whatever the user's matplotlibrc says, such as text.usetex
 def write_sheet(
     path: Path,
     sections: Sequence[SheetSection],

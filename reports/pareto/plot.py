@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import matplotlib
+from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -52,7 +52,7 @@ def write_plot(path: Path, panels: Sequence[Panel], quality: str, machines: str)
     derived = any(variant for panel in panels for variant in panel.variants)
     shapes = " Squares: trained; circles: derived from them without training." if derived else ""
     note = f"Lines: Pareto front of each method; filled: of all.{shapes} Measured on {machines}."
-    with matplotlib.rc_context({"text.parse_math": False, "font.size": 10}):
+    with style.context(["default", {"text.parse_math": False, "font.size": 10}]):
         figure = Figure(figsize=(6.2 * len(panels), 4.9), dpi=200, layout="constrained")
         figure.supxlabel(note, x=0.01, ha="left", fontsize=SMALL, color=MUTED)
         names = dict.fromkeys(name for panel in panels for name in panel.series)

@@ -1,6 +1,7 @@
 import cv2
 import numpy as np
 import pytest
+from matplotlib import rc_context
 from matplotlib.colors import to_rgb
 from PIL import Image
 
@@ -103,6 +104,14 @@ def test_the_same_frames_make_the_same_file(tmp_path):
     for name in ("one.png", "two.png"):
         contact_sheet([frame], ["a"], tmp_path / name)
     assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
+
+
+def test_a_matplotlibrc_changes_no_sheet(tmp_path):
+    draw(tmp_path, picture(0), {})
+    first = (tmp_path / "sheet.png").read_bytes()
+    with rc_context({"text.usetex": True, "font.size": 30, "figure.facecolor": "red"}):
+        draw(tmp_path, picture(0), {})
+    assert (tmp_path / "sheet.png").read_bytes() == first
 
 
 def test_faulty_input_is_refused_and_leaves_no_file(tmp_path):

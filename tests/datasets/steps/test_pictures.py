@@ -8,6 +8,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from matplotlib import rc_context
 from scipy.spatial.transform import Rotation
 
 from headbench.bench.contracts import no_progress
@@ -87,6 +88,17 @@ def test_the_medoids_camera_is_the_one_the_face_looks_at(clip):
             clip, rotation=lambda t, turn=turn: turn.as_rotvec(), translation=lambda t: np.zeros(3)
         )
         assert frontal_key(looking, timestep).camera == name
+
+
+def test_a_matplotlibrc_changes_no_figure():
+    def drawn():
+        with new_figure(2, 1) as figure:
+            figure.suptitle("title")
+            return pixels(figure)
+
+    expected = drawn()
+    with rc_context({"text.usetex": True, "font.size": 30, "figure.facecolor": "red"}):
+        np.testing.assert_array_equal(drawn(), expected)
 
 
 def test_strips_show_the_cluster_of_each_timestep_in_order():

@@ -11,6 +11,7 @@ import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 from PIL import Image
@@ -162,6 +163,14 @@ def test_a_plot_without_measured_costs_is_drawn(tmp_path):
     write_plot(tmp_path / "plot.png", [measured, panel], "PSNR", "here")
     width, height = Image.open(tmp_path / "plot.png").size
     assert width > 2 * height
+
+
+def test_a_matplotlibrc_changes_no_plot(tmp_path):
+    panel = Panel("MB", [1.0, 2.0], [20.0, 21.0], [0, 1], ["ga"] * 2, ["half", ""], {"ga": [0, 1]})
+    write_plot(tmp_path / "a.png", [panel], "PSNR", "here")
+    with rc_context({"text.usetex": True, "savefig.dpi": 30, "axes.facecolor": "red"}):
+        write_plot(tmp_path / "b.png", [panel], "PSNR", "here")
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
 
 SMALL = st.integers(0, 6)  # many ties
