@@ -366,7 +366,7 @@ def test_images_named_as_vhap_does_are_read(clip, dataset):
         (lambda d: shutil.rmtree(d / "flame_param"), "no tracked head.*export colmap --tracking"),
         (lambda d: (d / "flame_param" / "00001.npz").unlink(), "00001.npz"),
         (lambda d: (d / "head_model.npz").unlink(), "head model the capture was tracked with"),
-        (lambda d: renamed(d, lambda name: name.replace("/", "-")), "tell timestep and camera"),
+        (lambda d: renamed(d, lambda name: name.replace("/", "-")), "name timestep and camera"),
         (lambda d: shutil.rmtree(d / "images" / "901"), "no such file"),
     ],
 )
