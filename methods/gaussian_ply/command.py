@@ -189,11 +189,18 @@ def import_ga(settings: ImportGASettings, progress: Progress = no_progress) -> F
     from ..shared.avatar_files import HEAD_FILE, SUBJECT_FILE, Subject, save_shared_head, write_subject
 
     ply, out = Path(settings.ply), Path(settings.out)
-    ours = {LOCK_FILE, SUBJECT_FILE, HEAD_FILE}  # an avatar's only with its splats, which are written last
+    ours = {LOCK_FILE, SUBJECT_FILE, HEAD_FILE, PLY_FILE}
+    other = InputError(out, "", "a new or an empty folder", "one with files in it")
     if out.exists() and any(path.name not in ours for path in out.iterdir()):
-        raise InputError(out, "", "a new or an empty folder", "one with files in it")
+        raise other
     clip = settings.open(settings.capture, progress)
     splats, binding = read_ga_splats(ply, len(clip.head.faces), "cpu")
+    if (
+        out / PLY_FILE
+    ).exists():  # the splats are written last: those of this import, killed at its end, or others
+        there, triangles = read_ga_splats(out / PLY_FILE, len(clip.head.faces), "cpu")
+        if not (binding.equal(triangles) and all(splats[name].equal(there[name]) for name in splats)):
+            raise other
     write_subject(out / SUBJECT_FILE, Subject.of(clip))
     save_shared_head(out, clip.head)
     write_ga_splats(out / PLY_FILE, splats, binding)

@@ -17,6 +17,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from torch import Tensor
@@ -84,6 +85,9 @@ class GHA(TrainedMethod[GHAConfig, GHAAvatar]):
         )
         counts = {"splats": len(tensors["points"]), "mesh_iterations": mesh.iterations}
         finish_fit(fit, whole, Subject.of(clip), clip.head, **counts)
+
+    def _remove_training_files(self, out: Path) -> None:
+        super()._remove_training_files(out)
         remove_mesh_phase(out)
 
 

@@ -16,7 +16,7 @@ from ...bench.io.arrays import MAX_MAGNITUDE, TEXT, Member, read_arrays
 from ...bench.io.documents import read_json
 from ...bench.io.files import atomic_path, digest, write_json
 from ...datasets.head.arrays import HeadArrays, read_head, save_head
-from .loop import CHECKPOINT, Fit, Outcome
+from .loop import Fit, Outcome
 
 HEAD_FILE = "head_model.npz"
 SUBJECT_FILE = "subject.npz"
@@ -201,8 +201,7 @@ def write_record(fit: Fit, outcome: Outcome, **more: Any) -> None:
 
 
 def finish_fit(fit: Fit, outcome: Outcome, subject: Subject, head: HeadAsset, **more: Any) -> None:
-    """Write what every trained avatar has beside its own files, the record last; the checkpoint is done with."""
+    """Write what every trained avatar has beside its own files, the record last."""
     write_subject(fit.out / SUBJECT_FILE, subject)
     save_shared_head(fit.out, head)
     write_record(fit, outcome, **more)
-    (fit.out / CHECKPOINT).unlink(missing_ok=True)

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 
 from ...bench.contracts import Budget, Clip, Progress
 from .avatar_files import is_finished, run_digest
-from .loop import Fit, check_budget, check_training_split
+from .loop import CHECKPOINT, Fit, check_budget, check_training_split
 
 Config = TypeVar("Config")
 Avatar = TypeVar("Avatar")
@@ -44,6 +44,7 @@ class TrainedMethod(Generic[Config, Avatar]):
         run = run_digest(self.name, self.version, settings, clip, budget, seed)
         if not is_finished(out, run):
             self._train(Fit(clip, out, budget, device, seed, progress, run, self._clock), config)
+        self._remove_training_files(out)
         return self.load(out, device=device)
 
     def load(self, path: Path, *, device: str) -> Avatar:
@@ -54,6 +55,10 @@ class TrainedMethod(Generic[Config, Avatar]):
     def _resolved(self, clip: Clip, device: str) -> tuple[Any, Any]:
         """The configuration to train with, and what of it tells one run from another."""
         return self.config, self.config
+
+    def _remove_training_files(self, out: Path) -> None:
+        """Remove what a finished avatar no longer needs, that of a run killed just before it did so included."""
+        (out / CHECKPOINT).unlink(missing_ok=True)
 
     def _train(self, fit: Fit, config: Any) -> None:
         raise NotImplementedError

@@ -104,6 +104,9 @@ def test_interrupted_and_continued_is_the_same_bit_for_bit(unbroken, clip, tmp_p
     assert first_seen[0] == kills[-1] + 1
     assert content(avatar) == expected
     assert not (tmp_path / CHECKPOINT).exists()
+    (tmp_path / CHECKPOINT).write_bytes(b"")  # of a process killed before it removed it
+    assert content(fit(name, clip, tmp_path)) == expected
+    assert not (tmp_path / CHECKPOINT).exists()
 
 
 def test_the_comparison_would_notice_a_lost_moment(unbroken, clip, tmp_path, monkeypatch):

@@ -102,3 +102,13 @@ def test_a_folder_in_use_is_left_alone(capture, tmp_path):
     ply = ga_file(tmp_path / "in.ply", ROWS)
     with pytest.raises(InputError, match="empty folder"):
         import_ga(ImportGASettings(str(ply), capture=str(capture), out=str(tmp_path)))
+
+
+def test_an_import_goes_on_in_its_own_folder_alone(capture, tmp_path):
+    def imported(rows, name):
+        ply = ga_file(tmp_path / name, rows)
+        return import_ga(ImportGASettings(str(ply), capture=str(capture), out=str(tmp_path / "out")))
+
+    assert imported(ROWS, "one.ply") == imported(ROWS, "one.ply")  # as after a kill behind the last file
+    with pytest.raises(InputError, match="empty folder"):
+        imported([{**ROWS[0], "x": 0.5}, ROWS[1]], "other.ply")
