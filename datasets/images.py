@@ -1,4 +1,4 @@
-"""Decoded images under a memory bound: least recently used goes first."""
+"""Images and masks read and written; decoded ones held under a memory bound, least recently used goes first."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from ..bench.contracts import ByteArray
 from ..bench.errors import InputError
+from ..bench.io.files import write_bytes
 from ..bench.io.images import read_pixels
 
 _ROWS = 64
@@ -102,3 +103,14 @@ def read_mask(path: Path) -> ByteArray:
         return pixels
     channel = 3 if pixels.shape[2] == 4 else 0
     return np.ascontiguousarray(pixels[..., channel])
+
+
+def write_image(path: Path, image: ByteArray, *options: int) -> None:
+    """Write (H, W) grey, (H, W, 3) RGB or (H, W, 4) RGBA, 8-bit, atomically; ``options`` are OpenCV's.
+
+    The suffix decides the format.
+    """
+    if image.ndim == 3:  # OpenCV encodes BGR(A)
+        order = cv2.COLOR_RGB2BGR if image.shape[2] == 3 else cv2.COLOR_RGBA2BGRA
+        image = cv2.cvtColor(image, order).astype(np.uint8, copy=False)
+    write_bytes(path, cv2.imencode(path.suffix, image, options)[1].tobytes())

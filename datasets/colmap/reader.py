@@ -4,7 +4,7 @@ COLMAP gives cameras and images. What methods need besides is the tracked head: 
 model, one for each timestep, and the head model they belong to. `export colmap --tracking` writes such a dataset::
 
     images/<subject>/<sequence>/<timestep>/<camera>.png     or images/<timestep>_<camera>.png
-    masks/<the image's name>.png                            optional; 255 is the subject
+    masks/<the image's name>.png                            optional, 255 is the subject; else the image's alpha
     sparse/0/{cameras,images}.{bin,txt}
     flame_param/<timestep as %05d>.npz                      as in the GaussianAvatars/VHAP layout
     head_model.npz                                          unless given as head=
@@ -215,10 +215,10 @@ def _frame_key(root: Path, name: str) -> FrameKey:
 
 def _frame_files(root: Path, name: str) -> FrameFiles:
     image = root / "images" / name
-    probe_image(image)
+    own_alpha = image if probe_image(image).has_alpha else None
     # COLMAP's own convention: the image's whole name and one more suffix.
     mask = root / "masks" / f"{name}.png"
-    return FrameFiles(image, mask if mask.exists() else None)
+    return FrameFiles(image, mask if mask.exists() else own_alpha)
 
 
 def _rig(model: ColmapModel, keys: Mapping[str, FrameKey]) -> tuple[dict[str, Camera], dict[str, Lens]]:

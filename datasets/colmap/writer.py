@@ -11,7 +11,6 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-import cv2
 import numpy as np
 import torch
 
@@ -23,6 +22,7 @@ from ..ga import layout
 from ..ga.writer import identity_parameters, pose_to_parameters, save_npz
 from ..head.arrays import save_head
 from ..head.model import HeadModel
+from ..images import write_image
 from ..mesh_pictures import rasterize_mesh
 from .model import pycolmap
 from .reader import TRACKING_FOLDER
@@ -100,11 +100,11 @@ def export_model(
             pixels = views[number].pixels if number in views else np.zeros((0, 2))
             image = pycolmap.Image(image_name(key), pixels, ids.index(key.camera) + 1, number)
             model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(camera.world_to_camera[:3]))
-            _write_picture(out / "images" / image_name(key), picture[..., ::-1])
+            write_image(out / "images" / image_name(key), picture)
             mask = clip.mask(key)
             if mask is not None:
                 # COLMAP's own convention: the image's whole name and one more suffix, 0 for what to leave out.
-                _write_picture(out / "masks" / f"{image_name(key)}.png", mask)
+                write_image(out / "masks" / f"{image_name(key)}.png", mask)
             progress(number, len(keys), str(key))
     _add_points(model, vertices, views)
     _write_model(model, out / "sparse" / "0", model_format)
@@ -192,12 +192,6 @@ def _write_model(model: pycolmap.Reconstruction, folder: Path, model_format: Mod
         for file in files:
             with atomic_path(folder / file.name) as copy:
                 shutil.copyfile(file, copy)
-
-
-def _write_picture(path: Path, picture: ByteArray) -> None:
-    _, data = cv2.imencode(path.suffix, picture)
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(data.tobytes())  # tells why where it cannot, unlike OpenCV
 
 
 def _tensor(array: FloatArray) -> torch.Tensor:

@@ -150,7 +150,7 @@ def check_leaks(folder: Path, leaks: Iterable[str], policy: LeakPolicy) -> list[
             "splits",
             "splits that share nothing",
             "; ".join(leaks),
-            'Mend the split, or read with leaks="record" to have this noted in every result.',
+            'Fix the split, or read with leaks="record" to have this noted in every result.',
         )
     return leaks
 

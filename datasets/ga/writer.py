@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from ...bench.contracts import ByteArray, Camera, FloatArray, HeadPose
@@ -20,6 +19,7 @@ from ...bench.errors import InputError
 from ...bench.io.files import atomic_path, grouped_writes, write_json, write_text
 from ...bench.io.images import probe_image
 from ..head.arrays import HeadArrays, save_head
+from ..images import write_image
 from . import layout
 
 
@@ -196,8 +196,8 @@ class CaptureWriter:
         Each is written atomically and the image last: a frame whose image exists is whole.
         """
         if mask is not None:
-            write_png(self.mask_path(sequence, timestep, camera), mask)
-        write_png(self.image_path(sequence, timestep, camera), image)
+            write_image(self.mask_path(sequence, timestep, camera), mask)
+        write_image(self.image_path(sequence, timestep, camera), image)
 
     def write_metadata(self) -> Path:
         """Write parameters, JSONs and the head model; return the union folder.
@@ -309,17 +309,6 @@ class CaptureWriter:
             },
             synthetic=self.plan.synthetic,
         )
-
-
-def write_png(path: Path, image: ByteArray) -> None:
-    """Write (H, W), (H, W, 3) RGB or (H, W, 4) RGBA, 8-bit, as PNG, atomically."""
-    if image.ndim == 3:
-        # OpenCV encodes BGR(A).
-        order = cv2.COLOR_RGB2BGR if image.shape[2] == 3 else cv2.COLOR_RGBA2BGRA
-        image = cv2.cvtColor(image, order).astype(np.uint8, copy=False)
-    _, data = cv2.imencode(".png", image)
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(data.tobytes())
 
 
 def pose_to_parameters(pose: HeadPose) -> dict[str, FloatArray]:

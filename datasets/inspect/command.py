@@ -48,7 +48,7 @@ def inspect(settings: InspectSettings, progress: Progress = no_progress) -> Find
     Raises `InputError` for a capture that the reader refuses (``headbench lint`` then reports all that is wrong),
     for a clip without training frames that are not excluded, and for counts below 1.
     """
-    from ..ga.writer import write_png
+    from ..images import write_image
     from .figure import draw_figure
     from .statistics import expression_space, sequence_rows, split_rows
 
@@ -67,7 +67,7 @@ def inspect(settings: InspectSettings, progress: Progress = no_progress) -> Find
         cameras=settings.cameras,
         progress=progress,
     )
-    write_png(out / PICTURE, picture)
+    write_image(out / PICTURE, picture)
     data = summary(clip, splits, sequences, space)
     write_json(out / NUMBERS, data)
     text = _text(clip, splits, sequences, space)

@@ -22,7 +22,7 @@ from ...bench.errors import InputError
 from ...bench.io.files import grouped_writes
 from ...bench.io.images import probe_image, read_pixels
 from ...bench.machine import processor_count
-from ..ga.writer import write_png
+from ..images import write_image
 from .pixels import prepare_pixels, read_still
 from .plan import SequenceJob
 from .sequence import RecordedView, open_video
@@ -145,8 +145,8 @@ def _run(stream: _Stream, reports: queue.SimpleQueue, stop: threading.Event) -> 
         image, mask = prepare_pixels(frame.bgr, frame.mask, size, correct, still)
         with writing(job.image_path(timestep, index)):
             if mask is not None:
-                write_png(job.mask_path(timestep, index), mask)
-            write_png(job.image_path(timestep, index), image)  # last: with its image a frame is whole
+                write_image(job.mask_path(timestep, index), mask)
+            write_image(job.image_path(timestep, index), image)  # last: with its image a frame is whole
         reports.put(f"{job.recorded.subject} {job.recorded.name}")
 
 

@@ -24,6 +24,7 @@ from ...bench.io.files import atomic_path, write_json, write_text
 from ..clip import CaptureClip
 from ..ga.validate import require_full_grid
 from ..ga.writer import pose_to_parameters, save_npz
+from ..images import write_image
 from .names import BACKGROUND, FPS, FULL_SIZE, is_subject
 from .recording import CAMERA_FILE, COLOUR_FILE, SEQUENCES_FILE, read_calibration
 
@@ -142,7 +143,7 @@ SYNTHETIC_IDS = 900
 MARKER_FILE = "SYNTHETIC.txt"
 _MARKER = "Synthetic recordings in NeRSemble's layout, written by headbench. No person was recorded.\n"
 
-JPEG_QUALITY = 97
+_JPEG = (cv2.IMWRITE_JPEG_QUALITY, 97)
 _H264, _MPEG4 = "avc1", "mp4v"
 
 
@@ -215,7 +216,7 @@ class RecordingWriter:
     def write_background(self, serial: str, rgb: ByteArray) -> None:
         """Write the still of the empty set."""
         folder = self.sequence_folder(BACKGROUND)
-        _write_image(folder / f"image_{serial}.jpg", rgb)
+        write_image(folder / f"image_{serial}.jpg", rgb, *_JPEG)
 
     def write_video(self, sequence: str, serial: str, frames: Iterable[ByteArray]) -> str:
         """Write a camera's video of RGB frames; return the codec, see `video_codec`."""
@@ -229,17 +230,17 @@ class RecordingWriter:
         """Write a frame as an image file, as VHAP's preprocessing does, or the 2023 release where it is that."""
         folder = self.sequence_folder(sequence)
         if self.release == "paper2023":
-            frame = folder / f"frame_{number:05d}"
-            image, alpha = (
-                frame / "images-2x" / f"cam_{serial}.png",
-                frame / "alpha_map" / f"cam_{serial}.png",
+            frame, name, kinds = (
+                folder / f"frame_{number:05d}",
+                f"cam_{serial}.png",
+                ("images-2x", "alpha_map"),
             )
         else:
-            name = f"cam_{serial}_{number:06d}.jpg"
-            image, alpha = folder / "images" / name, folder / "alpha_maps" / name
-        _write_image(image, rgb)
-        if mask is not None:
-            _write_image(alpha, mask)
+            frame, name, kinds = folder, f"cam_{serial}_{number:06d}.jpg", ("images", "alpha_maps")
+        options = _JPEG if name.endswith(".jpg") else ()
+        for kind, pixels in zip(kinds, (rgb, mask)):
+            if pixels is not None:
+                write_image(frame / kind / name, pixels, *options)
 
     def write_metadata(self, sequences: Sequence[str]) -> None:
         """Write ``metadata_sequences.csv`` with this participant's sequences."""
@@ -300,11 +301,3 @@ def write_video(path: Path, frames: Iterable[ByteArray]) -> str:
             raise InputError(path, "", "at least one frame", "none")
         writer.release()
     return codec
-
-
-def _write_image(path: Path, pixels: ByteArray) -> None:
-    order = pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
-    settings = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY] if path.suffix == ".jpg" else []
-    _, data = cv2.imencode(path.suffix, order, settings)
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(data.tobytes())

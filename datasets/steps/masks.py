@@ -1,4 +1,4 @@
-"""Masks: compositing on any background, edges without the old background's colour, nothing below the neck.
+"""Masks: compositing on any background, nothing below the neck.
 
 Straight alpha throughout: a pixel of coverage a, foreground colour F and background B shows a F + (1 - a) B, in
 display-referred colours, as the field's tools composite.
@@ -6,28 +6,20 @@ display-referred colours, as the field's tools composite.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import torch
 from scipy.special import ndtr
 
 from ...bench.contracts import Camera, FloatArray, FrameKey, HeadAsset, IntArray
 from ...bench.errors import InputError
-from ...bench.io.files import digest
 from ..clip import CaptureClip, FramePixels
 from ..head.model import HeadModel
 
 Ground = Sequence[float] | FloatArray
 """A colour (3,) in [0, 1], or an image (H, W, 3) of the empty set."""
-
-LEAST_COVERAGE = 0.1
-"""Below it a pixel's own foreground colour drowns in rounding and is taken from its neighbours instead."""
-
-NEIGHBOURS = 9
-"""Side of the window that colours are taken from, pixels."""
 
 SOFTNESS = 0.005
 """Standard deviation of the edge below the neck, in image widths: VHAP blurs with a Gaussian kernel 3 % wide,
@@ -54,27 +46,6 @@ def recomposite(image: FloatArray, coverage: FloatArray, old: Ground, new: Groun
     return contribution + (1 - share) * np.asarray(new, dtype=image.dtype)
 
 
-def foreground_colours(image: FloatArray, coverage: FloatArray, background: Ground) -> FloatArray:
-    """(H, W, 3) foreground of an image that was recorded or composited over a known background.
-
-    Solves image = a F + (1 - a) background for F and clamps to [0, 1]. Where a is below `LEAST_COVERAGE` F is the
-    mean of the solved colours around, weighted by coverage; where there are none, the image's own colour.
-    """
-    share = coverage[..., None]
-    solved = image - (1 - share) * np.asarray(background, dtype=image.dtype)
-    reliable = coverage >= LEAST_COVERAGE
-    colours = np.where(reliable[..., None], solved / np.maximum(share, LEAST_COVERAGE), image)
-    colours = np.clip(colours, 0, 1).astype(np.float32)
-    if reliable.all():
-        return colours
-    weight = np.where(reliable, coverage, 0).astype(np.float32)
-    window = (NEIGHBOURS, NEIGHBOURS)
-    total = cv2.blur(weight, window)
-    around = cv2.blur(colours * weight[..., None], window) / np.maximum(total, 1e-6)[..., None]
-    near = ~reliable & (total > 1e-6)
-    return np.where(near[..., None], around, colours)
-
-
 def set_background(clip: CaptureClip, background: Sequence[float]) -> CaptureClip:
     """The clip on another background. Raises `InputError` where a frame has no mask."""
     colour = check_colour(background)
@@ -94,43 +65,6 @@ def set_background(clip: CaptureClip, background: Sequence[float]) -> CaptureCli
         return FramePixels(image, pixels.coverage)
 
     return clip.derive_pixels("set_background", parameters, change, background=colour)
-
-
-def clean_edges(clip: CaptureClip, recorded_on: Sequence[float] | Mapping[str, FloatArray]) -> CaptureClip:
-    """Take the colour of the set out of soft edges.
-
-    A mask cut out of a recording leaves at its edges what was recorded, C = a F + (1 - a) S with S the set behind
-    the subject, and composites that as if it were the foreground. With S known, F is solved for and composited
-    instead. Without S there is nothing to solve: leave edges as they are.
-
-    Parameters
-    ----------
-    recorded_on : the set's colour, or an image (H, W, 3) float32 in [0, 1] of it by camera, of the size that images
-        have at this point.
-
-    Raises
-    ------
-    InputError
-        Where a frame has no mask, or a camera no image of its size.
-    """
-    _check_masks(clip, "clean_edges")
-    if isinstance(recorded_on, Mapping):
-        sets = {name: _set_image(camera, recorded_on) for name, camera in clip.cameras.items()}
-        by_recorded: dict[str, Ground] = {clip.recorded(key).camera: sets[key.camera] for key in clip.files}
-        said: object = {name: digest(image) for name, image in sorted(sets.items())}
-    else:
-        colour = check_colour(recorded_on).astype(np.float32)
-        by_recorded = {clip.recorded(key).camera: colour for key in clip.files}
-        said = colour.tolist()
-    ground = np.asarray(clip.background, dtype=np.float32)
-
-    def clean(key: FrameKey, pixels: FramePixels) -> FramePixels:
-        assert pixels.coverage is not None
-        cut_out = foreground_colours(pixels.image, pixels.coverage, ground)
-        colours = foreground_colours(cut_out, pixels.coverage, by_recorded[key.camera])
-        return FramePixels(composite(colours, pixels.coverage, ground), pixels.coverage)
-
-    return clip.derive_pixels("clean_edges", {"recorded_on": said}, clean)
 
 
 # ------------------------------------------------------------------ below the neck
@@ -255,14 +189,6 @@ def check_colour(values: Sequence[float] | FloatArray) -> FloatArray:
     if colour.shape != (3,) or not ((colour >= 0) & (colour <= 1)).all():
         raise InputError("colour", "background", "three numbers in [0, 1]", str(values))
     return colour
-
-
-def _set_image(camera: Camera, images: Mapping[str, FloatArray]) -> FloatArray:
-    found = np.shape(images[camera.id]) if camera.id in images else "none"
-    if found != (camera.height, camera.width, 3):
-        expected = f"an image of shape {(camera.height, camera.width, 3)}"
-        raise InputError("clean_edges", f"recorded_on[{camera.id}]", expected, str(found))
-    return np.asarray(images[camera.id], dtype=np.float32)
 
 
 def _check_masks(clip: CaptureClip, step: str) -> None:

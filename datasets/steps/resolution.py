@@ -132,13 +132,6 @@ def take_box(image: FloatArray, box: PixelBox, background: Sequence[float] | Flo
     return result
 
 
-def scale_camera(camera: Camera, factor: float) -> Camera:
-    """The same view at the nearest whole size to ``factor`` times the camera's; see `Camera.resized`."""
-    if not factor > 0:
-        raise InputError(f"camera {camera.id}", "factor", "a positive number", str(factor))
-    return camera.resized(max(1, round(camera.width * factor)), max(1, round(camera.height * factor)))
-
-
 def alignments(cameras: Mapping[str, Camera], rule: ResolutionRule) -> dict[str, Alignment]:
     """How each camera's images are aligned, by camera id."""
     return {name: Alignment.of((c.width, c.height), rule) for name, c in cameras.items()}

@@ -136,11 +136,7 @@ def skin_triangles(head: HeadAsset) -> IntArray:
 
 
 def _opening(
-    vertices: FloatArray,
-    skin: IntArray,
-    ball: IntArray,
-    corners: tuple[FloatArray, FloatArray],
-    scale: float,
+    vertices: FloatArray, skin: IntArray, ball: IntArray, corners: tuple[FloatArray, FloatArray], scale: float
 ) -> tuple[FloatArray, FloatArray]:
     """Upper and lower lid line: the outline of the visible eyeball in an orthographic front view."""
     step = 0.0003 * scale

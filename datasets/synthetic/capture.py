@@ -218,7 +218,7 @@ def _compare(manifest: Path, wanted: dict[str, Any]) -> None:
                 key,
                 f"{value!r}, as asked for",
                 f"{found.get(key)!r}",
-                "SubjectPlan another folder, or the same settings.",
+                "Give another folder, or the same settings.",
             )
 
 

@@ -128,7 +128,7 @@ class PathTracer:
 
     def _traverse(self) -> Any:
         if self._scene is None:
-            # The lamps are points of the sky: rays sampled from posed_meshes would never meet one.
+            # The lamps are points of the sky: rays sampled from surfaces would never meet one.
             sampling = {"emitter_samples": 1, "bsdf_samples": 0}
             content: dict[str, Any] = {
                 "type": "scene",

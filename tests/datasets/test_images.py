@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 
 from headbench.bench.errors import InputError
 from headbench.datasets import images
-from headbench.datasets.ga.writer import write_png
-from headbench.datasets.images import ImageStore, read_image
+from headbench.datasets.images import ImageStore, read_image, write_image
 
 WHITE = (1.0, 1.0, 1.0)
 BYTES = 10 * 10 * 3
@@ -24,7 +23,7 @@ def paths(tmp_path_factory):
     folder = tmp_path_factory.mktemp("images")
     result = [folder / f"{i}.png" for i in range(6)]
     for i, path in enumerate(result):
-        write_png(path, np.full((10, 10, 3), i, np.uint8))
+        write_image(path, np.full((10, 10, 3), i, np.uint8))
     return result
 
 
@@ -87,7 +86,7 @@ def test_many_threads_read_right_pixels_within_the_bound(paths):
 
 def test_grey_and_palette_files_become_rgb(tmp_path):
     grey = np.arange(100, dtype=np.uint8).reshape(10, 10)
-    write_png(tmp_path / "grey.png", grey)
+    write_image(tmp_path / "grey.png", grey)
     np.testing.assert_array_equal(
         read_image(tmp_path / "grey.png", WHITE), np.repeat(grey[..., None], 3, axis=2)
     )

@@ -12,12 +12,7 @@ from headbench.bench.contracts import Camera
 from headbench.bench.errors import InputError
 from headbench.datasets import mesh_pictures
 from headbench.datasets.head.procedural.model import procedural_head
-from headbench.datasets.mesh_pictures import (
-    draw_mesh,
-    portrait_camera,
-    rasterize_mesh,
-    vertex_normals,
-)
+from headbench.datasets.mesh_pictures import draw_mesh, portrait_camera, rasterize_mesh, vertex_normals
 
 CUBE = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
 QUADS = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]

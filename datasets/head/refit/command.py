@@ -113,7 +113,7 @@ def refit_capture(settings: RefitCommandSettings, progress: Progress = no_progre
     Writes under ``settings.out`` the capture (images linked), ``refit.json`` with every timestep's residuals and
     ``heat_map.png``. Raises `InputError` before any fitting where capture and head model do not go together.
     """
-    from ...ga.writer import write_png
+    from ...images import write_image
     from .heat_map import draw_heat_map
     from .refit import refit
     from .rewrite import capture_plan, write_capture
@@ -130,7 +130,7 @@ def refit_capture(settings: RefitCommandSettings, progress: Progress = no_progre
     if any(out.resolve() in image.resolve().parents for image in images):
         raise InputError("command line", "--out", "a folder apart from the capture", str(out))
     refitted = refit(clip, target, settings.settings, folder=out / BLOCKS_FOLDER, progress=progress)
-    write_png(out / "heat_map.png", draw_heat_map(refitted))
+    write_image(out / "heat_map.png", draw_heat_map(refitted))
     union = write_capture(refitted.clip, out, progress)
     report = refitted.report
     data = {

@@ -49,7 +49,7 @@ def steps(settings: StepsSettings, progress: Progress = no_progress) -> Findings
     Raises `InputError` for a capture that the reader refuses, for counts below 1, and for a head without a face
     region.
     """
-    from ...ga.writer import write_png
+    from ...images import write_image
     from ..clusters import cluster_expressions
     from ..figures import draw_clusters, draw_jaw_bases, find_jaw_bases
 
@@ -62,8 +62,8 @@ def steps(settings: StepsSettings, progress: Progress = no_progress) -> Findings
         clip, settings.clusters, seed=settings.seed, variant=settings.variant, progress=progress
     )
     out = Path(settings.out)
-    write_png(out / JAW_PICTURE, draw_jaw_bases(clip, jaws))
-    write_png(out / CLUSTER_PICTURE, draw_clusters(clip, clusters, progress))
+    write_image(out / JAW_PICTURE, draw_jaw_bases(clip, jaws))
+    write_image(out / CLUSTER_PICTURE, draw_clusters(clip, clusters, progress))
     data = {
         "subject": clip.subject,
         "clip": clip.fingerprint,

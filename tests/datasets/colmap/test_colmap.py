@@ -25,6 +25,7 @@ from headbench.datasets.colmap.reader import model_cameras, model_lenses
 from headbench.datasets.colmap.writer import export_model, export_tracking, image_name
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.model import HeadModel
+from headbench.datasets.images import write_image
 from headbench.datasets.open import open_clip
 
 FILES = ("cameras", "images")
@@ -358,6 +359,17 @@ def test_images_named_as_vhap_does_are_read(clip, dataset):
     assert {(key.timestep, key.camera) for key in found.files} == {
         (key.timestep, key.camera) for key in clip.files
     }
+
+
+def test_an_alpha_channel_serves_as_the_mask(clip, dataset):
+    for key in clip.files:
+        path = dataset / "images" / image_name(key)
+        write_image(path, np.dstack([clip.image(key), clip.mask(key)]))
+    shutil.rmtree(dataset / "masks")
+    found = open_clip(dataset)
+    for key in clip.files:
+        np.testing.assert_array_equal(found.mask(key), clip.mask(key))
+        np.testing.assert_array_equal(found.image(key), clip.image(key))
 
 
 @pytest.mark.parametrize(

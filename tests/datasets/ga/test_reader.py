@@ -13,9 +13,10 @@ import pytest
 from headbench.bench.contracts import Clip, FrameKey
 from headbench.bench.errors import InputError
 from headbench.datasets.ga.reader import find_captures, read_capture
-from headbench.datasets.ga.writer import CaptureWriter, write_png
+from headbench.datasets.ga.writer import CaptureWriter
 from headbench.datasets.head.arrays import with_derived_regions
 from headbench.datasets.head.teeth import with_teeth
+from headbench.datasets.images import write_image
 
 from ..head.toy import toy_head
 from ..tiny_capture import FRONTAL, SERIALS, make_plan, posed_vertices, rig, write_tiny_capture
@@ -139,7 +140,7 @@ def write_ga_style(root: Path, plan, *, shifts=(0.0, 0.0), offset_rows: int | No
             )
             for index, camera in enumerate(plan.cameras):
                 image = np.full((camera.height, camera.width, 3), 40 * number + 10 * local + index, np.uint8)
-                write_png(root / name / "images" / f"{local:05d}_{index:02d}.png", image)
+                write_image(root / name / "images" / f"{local:05d}_{index:02d}.png", image)
                 matrix = np.linalg.inv(camera.world_to_camera) @ np.diag([1, -1, -1, 1])
                 matrix[0, 3] += shift
                 frame = {
@@ -249,7 +250,7 @@ def test_cy_is_told_without_masks_too(tmp_path):
 def test_undecidable_cy_asks_for_a_declaration(capture):
     (capture.union / "headbench.json").unlink()
     for path in capture.writer.root.rglob("fg_masks/*.png"):
-        write_png(path, np.full((64, 48), 255, np.uint8))
+        write_image(path, np.full((64, 48), 255, np.uint8))
     with pytest.raises(InputError, match='State the convention: cy="bottom"'):
         read_capture(capture.union)
     assert read_capture(capture.union, cy="bottom").cameras[FRONTAL].K[1, 2] == pytest.approx(29.3)
@@ -358,7 +359,7 @@ def test_fingerprint_follows_content_and_not_place(capture, pristine_capture):
     assert read_capture(capture.union, cy="centre").fingerprint != original.fingerprint
     assert read_capture(capture.union, exclude={0: "blur"}).fingerprint != original.fingerprint
     path = capture.writer.image_path("FREE", 0, FRONTAL)
-    write_png(path, 255 - np.asarray(original.image(FrameKey("901", "FREE", 4, FRONTAL))))
+    write_image(path, 255 - np.asarray(original.image(FrameKey("901", "FREE", 4, FRONTAL))))
     assert read_capture(capture.union).fingerprint != original.fingerprint
 
 

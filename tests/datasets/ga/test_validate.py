@@ -13,7 +13,7 @@ from headbench.bench.contracts import FrameKey
 from headbench.bench.errors import InputError
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.ga.validate import find_leaks
-from headbench.datasets.ga.writer import write_png
+from headbench.datasets.images import write_image
 
 from ..tiny_capture import FRONTAL, SERIALS
 
@@ -79,14 +79,14 @@ def test_image_that_is_none(capture):
 
 
 def test_image_of_another_size_than_declared(capture):
-    write_png(capture.writer.image_path("FREE", 0, FRONTAL), np.zeros((32, 24, 3), np.uint8))
+    write_image(capture.writer.image_path("FREE", 0, FRONTAL), np.zeros((32, 24, 3), np.uint8))
     error = fault(capture)
     assert "48x64 pixels" in error.expected
     assert error.found == "24x32"
 
 
 def test_mask_of_another_size_than_its_image(capture):
-    write_png(capture.writer.mask_path("FREE", 0, FRONTAL), np.zeros((32, 24), np.uint8))
+    write_image(capture.writer.mask_path("FREE", 0, FRONTAL), np.zeros((32, 24), np.uint8))
     assert fault(capture).file.endswith("fg_masks/00000_01.png")
 
 

@@ -14,10 +14,11 @@ import numpy as np
 import torch
 
 from headbench.bench.contracts import Camera, HeadPose
-from headbench.datasets.ga.writer import CapturePlan, CaptureWriter, SequencePlan, write_png
+from headbench.datasets.ga.writer import CapturePlan, CaptureWriter, SequencePlan
 from headbench.datasets.head.arrays import HeadArrays
 from headbench.datasets.head.model import HeadModel
 from headbench.datasets.head.teeth import with_teeth
+from headbench.datasets.images import write_image
 from headbench.datasets.mesh_pictures import rasterize_mesh
 
 from ..head.toy import toy_head
@@ -164,7 +165,7 @@ class GoodCapture:
         for path in self.files("images"):
             mask_path = path.parent.parent / "fg_masks" / path.name
             image, mask = read_rgb(path), read_grey(mask_path)
-            write_png(mask_path if masks else path, change(image, mask))
+            write_image(mask_path if masks else path, change(image, mask))
 
     def each_parameters(self, change: Callable[[dict[str, np.ndarray], int], None]) -> None:
         """Apply ``change`` to the arrays of every parameter file, given its position in the order of files."""

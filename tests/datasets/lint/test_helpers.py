@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from headbench.datasets.ga.transforms import read_transforms
-from headbench.datasets.ga.writer import write_png
+from headbench.datasets.images import write_image
 from headbench.datasets.lint.rules import several, spans
 from headbench.datasets.lint.views import (
     _fringe,
@@ -72,7 +72,7 @@ def test_near_duplicates_survive_noise_and_not_motion(good, noise, shift, twins)
             np.roll(image, shift, axis=1)
             + rng.integers(-1, 2, size=(20, 15, 1)).repeat(4, 0).repeat(4, 1) * noise
         )
-        write_png(entry.image, np.clip(image, 0, 255).astype(np.uint8))
+        write_image(entry.image, np.clip(image, 0, 255).astype(np.uint8))
     again = make_thumbnails({"other": entries}, white, 100)
     pairs = list(near_duplicates(original, again))
     assert len(pairs) == twins

@@ -12,8 +12,9 @@ import torch
 
 from headbench.bench.io.images import ImageInfo
 from headbench.datasets.ga.layout import Declaration
-from headbench.datasets.ga.writer import CaptureWriter, write_png
+from headbench.datasets.ga.writer import CaptureWriter
 from headbench.datasets.head.arrays import save_head
+from headbench.datasets.images import write_image
 from headbench.datasets.lint.catalogue import GROUPS, RULES
 from headbench.datasets.lint.command import LintSettings, lint_capture
 from headbench.datasets.lint.rules import apply
@@ -102,7 +103,7 @@ def test_alpha_in_the_image_is_a_mask_and_has_no_background(good):
         image = read_rgb(path).astype(float)
         alpha = mask[..., None] / 255
         colour = np.where(alpha > 0, (image - (1 - alpha) * 255) / np.maximum(alpha, 1e-3), 0)
-        write_png(path, np.dstack([np.clip(colour, 0, 255).round(), mask]).astype(np.uint8))
+        write_image(path, np.dstack([np.clip(colour, 0, 255).round(), mask]).astype(np.uint8))
     good.each_frame(lambda frame: frame.pop("fg_mask_path") and None)
     assert codes(good) == []
 

@@ -144,14 +144,14 @@ def test_a_broken_run_continues_and_ends_the_same(whole, pristine_recording, tmp
     out = tmp_path / "out"
     calls = []
 
-    def write_png(path, image, _write=image_pool.write_png):
+    def write_image(path, image, _write=image_pool.write_image):
         calls.append(path)
         if len(calls) > 20:
             raise OSError(errno.ENOSPC, "No space left on device")
         _write(path, image)
 
     with monkeypatch.context() as patch:
-        patch.setattr(image_pool, "write_png", write_png)
+        patch.setattr(image_pool, "write_image", write_image)
         with pytest.raises(InputError) as error:
             prepared(pristine_recording, out)
     assert "No space left" in error.value.found

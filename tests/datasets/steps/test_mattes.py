@@ -19,9 +19,7 @@ from headbench.datasets.head.model import HeadModel
 from headbench.datasets.images import ImageStore
 from headbench.datasets.steps.masks import (
     NeckLine,
-    clean_edges,
     composite,
-    foreground_colours,
     mask_below_neck,
     neck_anchors,
     neck_line,
@@ -31,7 +29,7 @@ from headbench.datasets.steps.masks import (
 from headbench.datasets.steps.resolution import align_clip
 
 SIZE = 64
-GREEN, WHITE, BLUE = (0.1, 0.7, 0.2), (1.0, 1.0, 1.0), (0.0, 0.2, 0.9)
+WHITE, BLUE = (1.0, 1.0, 1.0), (0.0, 0.2, 0.9)
 
 
 def subject(size=SIZE):
@@ -73,30 +71,6 @@ def test_a_background_that_was_not_quite_so_cannot_shine_through():
     coverage = np.zeros((4, 4), np.float32)
     nearly_white = np.full((4, 4, 3), 0.97, np.float32)
     assert (recomposite(nearly_white, coverage, WHITE, (0.0, 0.0, 0.0)) == 0).all()
-
-
-def test_the_foreground_behind_a_known_background_is_found():
-    """From 8 bits, at soft edges, over one colour and over an image of the set."""
-    colours, coverage = subject()
-    stage = np.random.default_rng(0).random((SIZE, SIZE, 3)).astype(np.float32)
-    for ground in (GREEN, stage):
-        recorded = rounded(composite(colours, coverage, ground)).astype(np.float32) / 255
-        found = foreground_colours(recorded, coverage, ground)
-        reliable = coverage >= 0.1
-        allowed = 0.5 / 255 / coverage[reliable] + 1e-4
-        assert (np.abs(found - colours)[reliable] <= allowed[:, None]).all()
-        assert found.min() >= 0
-        assert found.max() <= 1
-        thin = (coverage > 0) & ~reliable
-        assert thin.sum() > 20
-        # From the neighbours: what remains of the error once composited is within two levels.
-        assert (np.abs(found - colours) * coverage[..., None])[thin].max() < 2 / 255
-
-
-def test_no_coverage_at_all_leaves_the_image_and_full_coverage_too():
-    image = np.random.default_rng(1).random((9, 9, 3)).astype(np.float32)
-    assert np.array_equal(foreground_colours(image, np.zeros((9, 9), np.float32), WHITE), image)
-    assert np.allclose(foreground_colours(image, np.ones((9, 9), np.float32), WHITE), image)
 
 
 # ------------------------------------------------------------------ clips
@@ -166,47 +140,12 @@ def test_the_same_background_is_the_same_clip(clip):
     assert set_background(clip, WHITE) is clip
 
 
-@pytest.mark.parametrize("by_camera", [False, True])
-def test_the_colour_of_the_set_leaves_the_edges(clip, tmp_path, by_camera):
-    colours, coverage = subject()
-    levels = rounded(coverage)
-    shown = levels.astype(np.float32) / 255
-    recorded = composite(colours, shown, GREEN)  # in front of a green screen
-    cut_out = rounded(composite(recorded, shown, WHITE))  # and cut out with its mask, as it was recorded
-    spilled = with_pixels(clip, tmp_path, cut_out, levels)
-    screen = np.broadcast_to(np.array(GREEN, np.float32), (SIZE, SIZE, 3))
-    cleaned = clean_edges(spilled, dict.fromkeys(clip.cameras, screen) if by_camera else GREEN)
-    key = clip.splits["train"][0]
-    truth = 255 * composite(colours, shown, WHITE)
-    edge = (shown > 0.02) & (shown < 0.98)
-    before = np.abs(cut_out - truth)[edge]
-    after = np.abs(cleaned.image(key) - truth)[edge]
-    assert before.max() > 25
-    assert after.max() < 6
-    assert before.mean() > 10
-    assert after.mean() < 1  # levels; two roundings on file, amplified where it is soft
-    assert np.abs(cleaned.image(key).astype(int) - cut_out)[shown == 1].max() <= 1
-    assert np.array_equal(cleaned.mask(key), levels)
-
-
-def test_another_image_of_the_set_makes_another_clip(clip):
-    def cleaned(level):
-        return clean_edges(clip, {n: np.full((64, 48, 3), level, np.float32) for n in clip.cameras})
-
-    assert cleaned(0.2).fingerprint == cleaned(0.2).fingerprint
-    assert cleaned(0.2).fingerprint != cleaned(0.3).fingerprint
-
-
 def test_what_a_mask_step_needs_is_said(clip):
     bare = replace(clip, files={key: files._replace(mask=None) for key, files in clip.files.items()})
     with pytest.raises(InputError, match="a mask for every frame"):
         set_background(bare, BLUE)
-    with pytest.raises(InputError, match="a mask for every frame"):
-        clean_edges(bare, GREEN)
     with pytest.raises(InputError, match=r"three numbers in \[0, 1\]"):
         set_background(clip, (1.0, 2.0, 0.0))
-    with pytest.raises(InputError, match=r"recorded_on\[222200037\]|recorded_on\[222200042\]"):
-        clean_edges(clip, {})
     with pytest.raises(InputError, match="softness"):
         mask_below_neck(clip, softness=0.0)
 

@@ -9,7 +9,7 @@ from headbench.bench.contracts import Camera
 from headbench.bench.errors import InputError
 from headbench.bench.specs import ResolutionRule
 from headbench.datasets.ga.reader import read_capture
-from headbench.datasets.steps.resolution import Alignment, PixelBox, align_clip, scale_camera, take_box
+from headbench.datasets.steps.resolution import Alignment, PixelBox, align_clip, take_box
 
 WHITE = (1.0, 1.0, 1.0)
 RULES = {
@@ -125,14 +125,6 @@ def test_wrong_sizes_are_refused():
         plan.camera(view())
     with pytest.raises(InputError, match="at least 50 pixels"):
         Alignment.of((30, 60), ResolutionRule(divide=50))
-    with pytest.raises(InputError, match="factor"):
-        scale_camera(view(), 0.0)
-
-
-def test_scaling_a_camera_goes_to_whole_pixels():
-    scaled = scale_camera(view(241, 344), 0.25)
-    assert (scaled.width, scaled.height) == (60, 86)
-    assert scaled.K[0, 0] == pytest.approx(700 * 60 / 241)
 
 
 # ------------------------------------------------------------------ clips
