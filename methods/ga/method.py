@@ -23,10 +23,10 @@ from ..shared.avatar_files import (
     read_subject,
 )
 from ..shared.avatar_kernel import HarmonicColors, WorldTransform
-from ..shared.binding import Frames, WorldSplats, to_world
+from ..shared.binding import Frames, WorldSplats
 from ..shared.loop import Fit
 from ..shared.method import TrainedMethod
-from ..shared.networks import coefficient_count, initial_coefficients, occupied_degree, sh_to_rgb
+from ..shared.networks import coefficient_count, initial_coefficients, occupied_degree
 from ..shared.optimisation import Optimiser
 from ..shared.rendering import (
     USUAL,
@@ -42,6 +42,7 @@ from ..shared.rendering import (
 from ..shared.schedule import ShuffledEpochs, Timeline, torch_generator
 from ..shared.splat_training import BoundTraining, ShadedSplats
 from ..shared.subject_mesh import BoundedCache, SubjectMesh
+from ..shared.training_kernel import harmonic_colors, to_world
 from .config import GAConfig
 from .spec import GA as SPEC
 from .storage import PLY_FILE, read_ga_splats, write_ga_splats
@@ -104,8 +105,8 @@ class GAAppearance:
         """Colour by direction from the camera; opacity as it is."""
         world = to_world(frames, binding, optimiser["means"], optimiser["log_scales"], optimiser["quats"])
         degree = min(self._config.sh_degree, iteration // self._degree_every)
-        directions = torch.nn.functional.normalize(world.means - view.center, dim=1)
-        colors = sh_to_rgb(optimiser["sh_dc"], optimiser["sh_rest"], directions, degree)
+        vectors = world.means - view.center
+        colors = harmonic_colors(optimiser["sh_dc"], optimiser["sh_rest"], vectors, degree)
         return ShadedSplats(world, colors, torch.sigmoid(optimiser["opacities"]), None)
 
     def refined(self, subject: str, optimiser: Optimiser) -> RefinedTracking | None:

@@ -12,13 +12,14 @@ from ...bench.contracts import Clip, FloatArray, HeadPose
 from ...datasets.head.arrays import faces_in_region
 from ...datasets.head.rotations import axis_angle_to_matrix
 from ...datasets.steps.jaw_bases import jaw_bases, jaw_quaternions, jaw_weights
-from ..shared.binding import NORMAL, Frames, to_world
-from ..shared.networks import initial_coefficients, sh_to_rgb
+from ..shared.binding import NORMAL, Frames
+from ..shared.networks import initial_coefficients
 from ..shared.optimisation import Optimiser
 from ..shared.rendering import View
 from ..shared.schedule import Timeline, torch_generator
 from ..shared.splat_training import ShadedSplats, Start, one_per_triangle
 from ..shared.subject_mesh import BoundedCache, SubjectMesh, centroid_displacements
+from ..shared.training_kernel import harmonic_colors, to_world
 from .config import OursConfig
 from .field import (
     Bounds,
@@ -152,7 +153,7 @@ class OursAppearance:
     def _colors(self, optimiser: Optimiser, positions: Tensor, directions: Tensor, iteration: int) -> Tensor:
         if self._config.color == "sh":
             degree = min(self._config.sh_degree, iteration // self._degree_every)
-            return sh_to_rgb(optimiser["sh_dc"], optimiser["sh_rest"], -directions, degree)
+            return harmonic_colors(optimiser["sh_dc"], optimiser["sh_rest"], -directions, degree)
         return shade(optimiser, plane_features(optimiser, self.plane_box, positions), directions)
 
     @torch.no_grad()

@@ -41,7 +41,7 @@ def triangles(vertices: Tensor, faces: Tensor, backend: str = "cpu") -> Frames:
     """
     count, empty = len(faces), vertices.new_empty
     frames = Frames(empty(count, 3, 3), empty(count, 3), empty(count), empty(count, 4))
-    _call("triangles", vertices, faces, *frames, backend=backend)
+    call("triangles", vertices, faces, *frames, backend=backend)
     return frames
 
 
@@ -56,7 +56,7 @@ def splats_to_world(
     means, quats, scales : (N, 3) and (N, 3) in units of the triangle's size, (N, 4) unit quaternions wxyz.
     """
     world = WorldSplats(torch.empty_like(means), torch.empty_like(quats), torch.empty_like(scales))
-    _call(
+    call(
         "to_world",
         *(binding, frames.rotation, frames.center, frames.size, frames.quaternion, means, quats, scales),
         *world,
@@ -92,7 +92,7 @@ def shade(
     colors = torch.empty_like(means)
     turns = means.new_empty(0, 3, 3) if turns is None else turns
     binding = torch.empty(0, dtype=torch.int64) if binding is None else binding
-    _call("shade", packed, means, turns, binding, center, colors, backend=backend)
+    call("shade", packed, means, turns, binding, center, colors, backend=backend)
     return colors
 
 
@@ -124,7 +124,7 @@ def shade_network(
     from_position, of_direction, last : (N, H), (27, H) and (3, H), each padded by `pad_units` along H.
     """
     colors = torch.empty_like(means)
-    _call(
+    call(
         "color_network",
         *(from_position, of_direction, last, means, turns, binding, center, colors),
         backend=backend,
@@ -160,17 +160,19 @@ def offsets_into(
     # What is interpolated on an axis is no more than its largest sample.
     alive = table.view(3, -1, table.shape[1]).amax(1).sum(0) > 0
     used = pad_units(table[:, alive], 1), pad_units(second[alive], 0)
-    _call(
+    call(
         "offset_network",
         *(used[0], rows, fractions, used[1], second_bias, last, last_bias, splats, out),
         backend=backend,
     )
 
 
-def _call(name: str, *arrays: Tensor, backend: str) -> Any:
-    function = getattr(KERNEL.load(), name)
-    plain = [array.detach().contiguous().numpy() for array in arrays]
-    return function(*plain, instruction_sets()[backend], torch.get_num_threads())
+def call(name: str, *arguments: Any, backend: str) -> Any:
+    """Call a function of the kernel with tensors as arrays, and other arguments as they are."""
+    plain = [
+        value.detach().contiguous().numpy() if isinstance(value, Tensor) else value for value in arguments
+    ]
+    return getattr(KERNEL.load(), name)(*plain, instruction_sets()[backend], torch.get_num_threads())
 
 
 class WorldTransform:

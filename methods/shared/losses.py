@@ -14,10 +14,16 @@ C1, C2 = 0.01**2, 0.03**2
 
 
 @lru_cache(maxsize=16)
-def _window(channels: int, dtype: torch.dtype, device: str) -> tuple[Tensor, Tensor]:
+def window_weights(dtype: torch.dtype = torch.float32, device: str = "cpu") -> Tensor:
+    """(11,) weights of SSIM's window along one axis, of sum 1."""
     offset = torch.arange(WINDOW, dtype=torch.float64) - WINDOW // 2
     weights = torch.exp(-(offset**2) / (2 * SIGMA**2))
-    weights = (weights / weights.sum()).to(device=device, dtype=dtype)
+    return (weights / weights.sum()).to(device=device, dtype=dtype)
+
+
+@lru_cache(maxsize=16)
+def _window(channels: int, dtype: torch.dtype, device: str) -> tuple[Tensor, Tensor]:
+    weights = window_weights(dtype, device)
     column = weights.view(1, 1, WINDOW, 1).repeat(channels, 1, 1, 1)
     row = weights.view(1, 1, 1, WINDOW).repeat(channels, 1, 1, 1)
     return column, row

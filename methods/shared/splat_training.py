@@ -15,10 +15,10 @@ from ..splats.request import Rendering
 from .binding import Frames, WorldSplats
 from .config import DensifiedTraining, SplatTraining
 from .loop import Fit, Outcome, TrainingImages, train
-from .losses import photometric_loss, position_penalty, scale_penalty
 from .optimisation import Densifier, Optimiser
 from .rendering import View, scene_extent, view_of
 from .schedule import DensifySchedule, Sampler, Timeline, log_linear
+from .training_kernel import photometric_loss, splat_penalties
 
 Initial = Mapping[str, tuple[Tensor, float]]
 """Initial tensors with their learning rates, by name."""
@@ -274,9 +274,11 @@ class BoundTraining(SplatTrainer):
             placed.world, placed.opacities, placed.colors, view, frames.size.detach()
         )
         means, log_scales = optimiser["means"], optimiser["log_scales"]
-        loss = photometric_loss(rendering.image, truth, settings.ssim_weight)
-        loss = loss + settings.position_weight * position_penalty(means, visible, settings.position_threshold)
-        loss = loss + settings.scale_weight * scale_penalty(log_scales, visible, settings.scale_threshold)
+        loss = photometric_loss(rendering.image, truth, settings.ssim_weight) + splat_penalties(
+            *(means, log_scales, visible),
+            position=(settings.position_weight, settings.position_threshold),
+            scale=(settings.scale_weight, settings.scale_threshold),
+        )
         return loss if placed.penalty is None else loss + placed.penalty
 
 

@@ -13,8 +13,8 @@ from torch import Tensor
 from ...bench.contracts import FloatArray, HeadAsset, HeadPose
 from ...datasets.head.arrays import check_size
 from ...datasets.head.model import HeadModel
-from . import avatar_kernel
-from .binding import Frames, triangle_frames
+from .binding import Frames
+from .training_kernel import triangle_frames
 
 Value = TypeVar("Value")
 
@@ -69,8 +69,6 @@ class SubjectMesh:
 
     def frames(self, vertices: Tensor) -> Frames:
         """Triangle frames of a mesh; differentiable in its vertices."""
-        if avatar_kernel.usable(vertices) and not (vertices.requires_grad and torch.is_grad_enabled()):
-            return avatar_kernel.triangles(vertices, self.faces)
         return triangle_frames(vertices, self.faces)
 
 

@@ -19,7 +19,8 @@ using namespace nb::literals;
 
 namespace headbench {
 
-void bind_avatar(nb::module_& m);  // avatar.cpp
+void bind_avatar(nb::module_& m);    // avatar.cpp
+void bind_training(nb::module_& m);  // training.cpp
 
 namespace {
 
@@ -201,5 +202,6 @@ NB_MODULE(_kernel, m) {
         "grad_absolute"_a, "threads"_a,
         "Add the gradients of drawn splats; write those of background and camera. An empty grad_absolute asks for none.");
   bind_avatar(m);
+  bind_training(m);
   m.def("instruction_sets", [] { return names_of(runnable_kernels()); }, "Variants this machine can run, the fastest first.");
 }

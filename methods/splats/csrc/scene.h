@@ -199,6 +199,77 @@ struct OffsetNetwork {
   float* offsets;             // (N, outputs)
 };
 
+// What training computes of splats beside the rasteriser; gradients are named by what they are taken by.
+
+struct TrianglesBackward {
+  const float* vertices;        // (V, 3)
+  const std::int64_t* faces;    // (F, 3)
+  const float* by_rotations;    // (F, 3, 3)
+  const float* by_centers;      // (F, 3)
+  const float* by_sizes;        // (F,)
+  const float* by_quaternions;  // (F, 4)
+  float* by_corners;            // (F, 3, 3)
+};
+
+struct Activation {
+  const float* log_scales;  // (N, 3)
+  const float* quats;       // (N, 4) of any length
+  float* scales;            // (N, 3)
+  float* unit_quats;        // (N, 4)
+};
+
+// Gradients of a triangle's frame: rotation, centre, size, quaternion.
+constexpr int kFrameNumbers = 9 + 3 + 1 + 4;
+
+struct ToWorldBackward {
+  ToWorld splats;          // what `to_world` read
+  const float* raw_quats;  // (N, 4) of any length
+  const float* by_means;   // (N, 3) in the world
+  const float* by_quats;   // (N, 4)
+  const float* by_scales;  // (N, 3)
+  float* by_local_means;   // (N, 3)
+  float* by_raw_quats;     // (N, 4)
+  float* by_log_scales;    // (N, 3)
+  float* by_frames;        // (N, kFrameNumbers) or null
+};
+
+// Means over visible splats of how far local means and scales exceed a threshold, as in methods/shared/losses.py.
+struct Penalties {
+  const float* means;       // (N, 3)
+  const float* log_scales;  // (N, 3)
+  const bool* visible;      // (N,)
+  float position_threshold, scale_threshold;
+  float by_position, by_scale;  // weights over the number of visible splats
+  float* by_means;          // (N, 3)
+  float* by_log_scales;     // (N, 3)
+};
+
+// As `Harmonics`, with coefficients as training holds them.
+struct TrainedHarmonics {
+  int degree;
+  std::int64_t stride;     // coefficients a channel in `rest`
+  const float* dc;         // (N, 3)
+  const float* rest;       // (N, 3, stride)
+  const float* vectors;    // (N, 3) from the camera to the splats, of any length
+  float* colors;           // (N, 3)
+  const float* by_colors;  // (N, 3)
+  float* by_dc;            // (N, 3)
+  float* by_rest;          // (N, 3, stride)
+  float* by_vectors;       // (N, 3)
+};
+
+// (1 - w) mean|image - truth| + w (1 - mean SSIM) of methods/shared/losses.py, and its gradient by the image.
+struct Photometric {
+  int height, width;
+  const float* image;   // (H, W, 3)
+  const float* truth;   // (H, W, 3)
+  const float* window;  // (11,)
+  float ssim_weight;
+  float* gradient;   // (H, W, 3)
+  double* row_l1;    // (H,) sums
+  double* row_ssim;  // (H,)
+};
+
 // The functions compiled for one instruction set.
 struct Kernels {
   const char* name;
@@ -227,6 +298,15 @@ struct Kernels {
   void (*color_network)(const ColorNetwork&, std::int64_t begin, std::int64_t end, float* scratch);
   std::size_t (*offset_scratch)(int units, int hidden);
   void (*offset_network)(const OffsetNetwork&, std::int64_t begin, std::int64_t end, float* scratch);
+  // Of training, for triangles, splats or rows [begin, end).
+  void (*triangles_backward)(const TrianglesBackward&, std::int64_t begin, std::int64_t end);
+  void (*activate)(const Activation&, std::int64_t begin, std::int64_t end);
+  void (*to_world_backward)(const ToWorldBackward&, std::int64_t begin, std::int64_t end);
+  void (*penalties)(const Penalties&, std::int64_t begin, std::int64_t end, double* sums);
+  void (*harmonics)(const TrainedHarmonics&, std::int64_t begin, std::int64_t end);
+  void (*harmonics_backward)(const TrainedHarmonics&, std::int64_t begin, std::int64_t end);
+  std::size_t (*photometric_scratch)(int width);
+  void (*photometric)(const Photometric&, int begin, int end, float* scratch);
 };
 
 }  // namespace headbench

@@ -6,6 +6,7 @@
 #include "forward.h"
 #include "networks.h"
 #include "projection_backward.h"
+#include "training.h"
 
 namespace headbench::HEADBENCH_ISA {
 
@@ -63,6 +64,8 @@ inline std::size_t scratch_floats(int channels) {
 extern const Kernels kernels;
 const Kernels kernels = {HEADBENCH_ISA_NAME, W, project, find_entries, scratch_floats, draw_tile, draw_tile_backward,
                          project_backward, count_work, multiply_add, kChains, triangles, to_world, shade, color_scratch,
-                         color_network, offset_scratch, offset_network};
+                         color_network, offset_scratch, offset_network,
+                         triangles_backward, activate, to_world_backward, penalties, harmonics, harmonics_backward,
+                         photometric_scratch, photometric};
 
 }  // namespace headbench::HEADBENCH_ISA
