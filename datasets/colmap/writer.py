@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
-import torch
 
 from ...bench.contracts import ByteArray, Camera, Clip, FloatArray, FrameKey, Progress, no_progress
 from ...bench.errors import InputError
@@ -21,7 +20,7 @@ from ..clip import CaptureClip
 from ..ga import layout
 from ..ga.writer import identity_parameters, pose_to_parameters, save_npz
 from ..head.arrays import save_head
-from ..head.model import HeadModel
+from ..head.subject import PosedSubject
 from ..images import write_image
 from ..mesh_pictures import rasterize_mesh
 from .model import pycolmap
@@ -87,7 +86,7 @@ def export_model(
         if abs(clip.cameras[name].K[0, 1]) > _SKEW_TOLERANCE:
             raise InputError("clip", f"camera {name}, K", "no skew", f"{clip.cameras[name].K[0, 1]:g} pixels")
     first = min(key.timestep for key in keys)
-    vertices = _mesh(clip, first)
+    vertices = PosedSubject.of(clip).meshes([clip.poses[first]])[0]
     model = pycolmap.Reconstruction()
     for number, name in enumerate(ids, start=1):
         model.add_camera_with_trivial_rig(_pinhole(number, clip.cameras[name]))
@@ -134,14 +133,6 @@ def _pinhole(number: int, camera: Camera) -> pycolmap.Camera:
     return pycolmap.Camera(
         camera_id=number, model="PINHOLE", width=camera.width, height=camera.height, params=params
     )
-
-
-def _mesh(clip: Clip, timestep: int) -> FloatArray:
-    """(V, 3) float64 tracked mesh in the world, metres."""
-    model = HeadModel(clip.head, dtype=torch.float64)
-    canonical = model.canonical(_tensor(clip.shape), _tensor(clip.static_offset))
-    with torch.no_grad():
-        return model(canonical=canonical, **model.pose_arguments([clip.poses[timestep]]))[0].numpy()
 
 
 def _observe(vertices: FloatArray, faces: np.ndarray, camera: Camera, picture: ByteArray) -> _Observation:
@@ -192,7 +183,3 @@ def _write_model(model: pycolmap.Reconstruction, folder: Path, model_format: Mod
         for file in files:
             with atomic_path(folder / file.name) as copy:
                 shutil.copyfile(file, copy)
-
-
-def _tensor(array: FloatArray) -> torch.Tensor:
-    return torch.from_numpy(np.asarray(array, dtype=np.float64))

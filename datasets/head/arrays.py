@@ -13,6 +13,7 @@ from ...bench.contracts import FloatArray, HeadAsset, IntArray
 from ...bench.errors import InputError
 from ...bench.io.arrays import MAX_MAGNITUDE, TEXT, Member, check_arrays, read_arrays
 from ...bench.io.files import atomic_path, digest
+from .geometry import triangle_areas
 
 JOINT_NAMES = ("root", "neck", "jaw", "left_eye", "right_eye")
 """Joint order of the layout; every pose argument of the model refers to it."""
@@ -94,10 +95,24 @@ class HeadArrays:
             indices out of range, a joint tree that is none, skinning weights that do not sum to 1, or a mesh
             that cannot be a head's by its size.
         """
-        self._validate_arrays(file)
-        self._validate_weights(file)
+        arrays = {name: np.asarray(getattr(self, name)) for name in STORED}
+        if self.eyelid_basis is not None:
+            arrays["eyelid_basis"] = self.eyelid_basis
+        sizes = {"J": len(JOINT_NAMES), "9 (J - 1)": 9 * (len(JOINT_NAMES) - 1)}
+        sizes = check_arrays(file, arrays, _MEMBERS, sizes)
+        if sizes["V"] == 0 or sizes["F"] == 0:
+            raise InputError(file, "template", "at least one vertex and one triangle", "an empty mesh")
+        sums = self.skinning_weights.sum(axis=1, dtype=np.float64)
+        worst = int(np.argmax(np.abs(sums - 1)))
+        if abs(sums[worst] - 1) > WEIGHT_TOLERANCE:
+            expected = f"rows that sum to 1 within {WEIGHT_TOLERANCE:g}"
+            found = f"a sum of {sums[worst]:.6g} at vertex {worst}"
+            raise InputError(file, "skinning_weights", expected, found)
         self._validate_indices(file)
-        self._validate_skeleton(file)
+        parents = [int(parent) for parent in self.parents]
+        if parents[0] != -1 or not all(0 <= p < joint for joint, p in enumerate(parents[1:], start=1)):
+            expected = "a tree: -1 for joint 0, then a parent that comes before its joint"
+            raise InputError(file, "parents", expected, str(parents))
         check_size(file, "template", self.template, self.faces)
         self._validate_motion(file)
         return self
@@ -110,15 +125,6 @@ class HeadArrays:
         regions = [part for name in sorted(self.regions) for part in (name, self.regions[name])]
         return digest(self.version, *arrays, *regions, dict(sorted(self.landmarks.items())))
 
-    def _validate_arrays(self, file: str | PathLike[str]) -> None:
-        arrays = {name: np.asarray(getattr(self, name)) for name in STORED}
-        if self.eyelid_basis is not None:
-            arrays["eyelid_basis"] = self.eyelid_basis
-        sizes = {"J": len(JOINT_NAMES), "9 (J - 1)": 9 * (len(JOINT_NAMES) - 1)}
-        sizes = check_arrays(file, arrays, _MEMBERS, sizes)
-        if sizes["V"] == 0 or sizes["F"] == 0:
-            raise InputError(file, "template", "at least one vertex and one triangle", "an empty mesh")
-
     def _validate_motion(self, file: str | PathLike[str]) -> None:
         joints = float(np.abs(self.joint_regressor.astype(np.float64) @ self.template).max())
         if joints > MAX_EXTENT:
@@ -129,17 +135,6 @@ class HeadArrays:
         if corrected > MAX_CORRECTION:
             expected = f"correctives that move no vertex further than {MAX_CORRECTION:g} m together"
             raise InputError(file, "pose_basis", expected, f"up to {corrected:g} m")
-
-    def _validate_weights(self, file: str | PathLike[str]) -> None:
-        sums = self.skinning_weights.sum(axis=1, dtype=np.float64)
-        worst = int(np.argmax(np.abs(sums - 1)))
-        if abs(sums[worst] - 1) > WEIGHT_TOLERANCE:
-            raise InputError(
-                file,
-                "skinning_weights",
-                f"rows that sum to 1 within {WEIGHT_TOLERANCE:g}",
-                f"a sum of {sums[worst]:.6g} at vertex {worst}",
-            )
 
     def _validate_indices(self, file: str | PathLike[str]) -> None:
         vertices = self.template.shape[0]
@@ -157,19 +152,6 @@ class HeadArrays:
             if not 0 <= vertex < vertices:
                 raise InputError(file, f"landmarks[{name}]", f"a vertex below {vertices}", str(vertex))
 
-    def _validate_skeleton(self, file: str | PathLike[str]) -> None:
-        parents = [int(parent) for parent in self.parents]
-        is_tree = parents[0] == -1 and all(
-            0 <= parent < joint for joint, parent in enumerate(parents) if joint
-        )
-        if not is_tree:
-            raise InputError(
-                file,
-                "parents",
-                "a tree: -1 for joint 0, then a parent that comes before its joint",
-                str(parents),
-            )
-
 
 def check_size(file: str | PathLike[str], key: str, vertices: FloatArray, faces: IntArray) -> None:
     """Raise `InputError` unless a mesh, (V, 3) metres, has an area, and extents and area within their bounds."""
@@ -177,12 +159,10 @@ def check_size(file: str | PathLike[str], key: str, vertices: FloatArray, faces:
     extent = float(np.abs(vertices).max())
     if not extent <= MAX_EXTENT:
         raise InputError(file, key, f"a head within {MAX_EXTENT:g} m of its origin", f"{extent:g} m")
-    one, other = (vertices[faces[:, corner]] - vertices[faces[:, 0]] for corner in (1, 2))
-    area = 0.5 * float(np.linalg.norm(np.cross(one, other), axis=1).sum())
+    area = float(triangle_areas(vertices, faces).sum())
     if not 0 < area <= MAX_AREA:
-        raise InputError(
-            file, key, f"a surface of at most {MAX_AREA:g} square metres, not of none", f"{area:g}"
-        )
+        expected = f"a surface of at most {MAX_AREA:g} square metres, not of none"
+        raise InputError(file, key, expected, f"{area:g}")
 
 
 def _check_indices(file: str | PathLike[str], key: str, indices: IntArray, count: int) -> None:
@@ -280,6 +260,16 @@ def with_derived_regions(arrays: HeadArrays) -> HeadArrays:
     """The same head with `derived_regions` added."""
     derived = derived_regions(arrays.regions, arrays.template.shape[0])
     return replace(arrays, regions={**arrays.regions, **derived})
+
+
+def region(head: HeadAsset, name: str) -> IntArray:
+    """Vertices of a region. Raises `InputError` where the head has none of that name, or an empty one."""
+    if not len(head.regions.get(name, ())):
+        known = ", ".join(sorted(head.regions)) or "none"
+        remedy = "For a FLAME pickle, give FLAME_masks.pkl as masks=."
+        where = f"head model {head.version!r}"
+        raise InputError(where, f"regions[{name}]", "the vertices of that region", f"regions {known}", remedy)
+    return np.asarray(head.regions[name])
 
 
 def faces_in_region(asset: HeadAsset, name: str) -> IntArray:

@@ -25,6 +25,13 @@ def border_edges(faces: IntArray) -> IntArray:
     return edges[count[inverse.ravel()] == 1]
 
 
+def triangle_areas(vertices: FloatArray, faces: IntArray) -> FloatArray:
+    """(F,) in the square of the vertices' unit."""
+    corners = np.asarray(vertices, np.float64)[faces]
+    one, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    return np.asarray(0.5 * np.linalg.norm(np.cross(one, other), axis=1))
+
+
 def vertex_normals(vertices: FloatArray, faces: IntArray) -> FloatArray:
     """(V, 3) unit normals, area-weighted means of the triangles around; 0 at vertices without any area."""
     edges = vertices[faces[:, 1:]] - vertices[faces[:, :1]]
@@ -33,6 +40,21 @@ def vertex_normals(vertices: FloatArray, faces: IntArray) -> FloatArray:
         [np.bincount(faces.ravel(), np.repeat(areas[:, i], 3), len(vertices)) for i in range(3)], axis=1
     )
     return sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+
+
+def even_weights(points: FloatArray, target: FloatArray) -> FloatArray:
+    """(n,) weights of points (n, 3) that sum to 1 and reproduce the target, as even as possible.
+
+    The target then moves with the points in every translation, rotation and scaling. Raises `ValueError` where
+    the points do not span it.
+    """
+    constraints = np.vstack([points.T, np.ones(len(points))])
+    even = np.full(len(points), 1 / len(points))
+    wanted = np.array([*target, 1.0])
+    weights: FloatArray = even + np.linalg.lstsq(constraints, wanted - constraints @ even, rcond=None)[0]
+    if not np.allclose(constraints @ weights, wanted, atol=1e-6):
+        raise ValueError("the points do not span the target")
+    return weights
 
 
 def fit_sphere(points: FloatArray) -> tuple[FloatArray, float]:

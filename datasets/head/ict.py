@@ -19,13 +19,14 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
+from skimage.measure import points_in_poly
 
 from ...bench.contracts import FloatArray, IntArray
 from ...bench.errors import InputError
 from ...bench.io.arrays import MAX_MAGNITUDE, Member, check_arrays
 from ..rounding import LENGTH_BITS, REGRESSOR_BITS, SHARE_BITS, on_grid
 from .arrays import HeadArrays
-from .geometry import border_edges, fit_sphere, mesh_edges, smoothstep
+from .geometry import border_edges, even_weights, fit_sphere, mesh_edges, smoothstep
 
 VERSION = "ict-facekit"
 LANDMARKS = tuple(f"ibug_{index:02d}" for index in range(68))
@@ -101,7 +102,9 @@ def _rigged(file: str | PathLike[str], content: Mapping[str, np.ndarray]) -> Hea
     parts = mesh_parts(file, template, faces, materials, jaw_open)
     profile = Profile.of(template, landmarks)
 
-    hinge = fit_hinge(template[parts.teeth_lower], template[parts.teeth_lower] + jaw_open[parts.teeth_lower])
+    hinge = fit_hinge(
+        template[parts["teeth_lower"]], template[parts["teeth_lower"]] + jaw_open[parts["teeth_lower"]]
+    )
     weights = on_grid(_weights(template, jaw_open, hinge, parts, profile), SHARE_BITS)
     correctives = np.zeros((len(template), 3, 36))
     # The second joint's block: the root has none, the neck has the first.
@@ -148,37 +151,38 @@ def _basis(deltas: FloatArray) -> FloatArray:
 
 
 def _weights(
-    template: FloatArray, jaw_open: FloatArray, hinge: Hinge, parts: MeshParts, profile: Profile
+    template: FloatArray, jaw_open: FloatArray, hinge: Hinge, parts: Parts, profile: Profile
 ) -> FloatArray:
     """(V, 5) skinning weights, rows sum to 1."""
     jaw = hinge_weights(hinge, template, jaw_open, _SOFTNESS)
-    jaw[parts.teeth_lower], jaw[parts.teeth_upper] = 1, 0
+    jaw[parts["teeth_lower"]], jaw[parts["teeth_upper"]] = 1, 0
     on_neck = smoothstep(profile.height(template), profile.neck_base, profile.neck_top)
-    inside = np.concatenate([parts.teeth, parts.gums_and_tongue, parts.mouth_socket])
+    inside = np.concatenate([parts["teeth"], parts["gums_and_tongue"], parts["mouth_socket"]])
     on_neck[inside] = 1  # what is in the mouth hangs on the head, however low it reaches
     still = np.zeros_like(jaw)
     weights = np.stack([1 - on_neck, on_neck * (1 - jaw), on_neck * jaw, still, still], axis=1)
-    weights[parts.left_eyeball] = [0, 0, 0, 1, 0]
-    weights[parts.right_eyeball] = [0, 0, 0, 0, 1]
+    weights[parts["left_eyeball"]] = [0, 0, 0, 1, 0]
+    weights[parts["right_eyeball"]] = [0, 0, 0, 0, 1]
     return weights
 
 
-def _regressor(template: FloatArray, hinge: Hinge, parts: MeshParts, profile: Profile) -> FloatArray:
+def _regressor(template: FloatArray, hinge: Hinge, parts: Parts, profile: Profile) -> FloatArray:
     """(5, V) joint regressor: each joint from the vertices around it."""
-    skin = np.concatenate([parts.face_material, parts.outer_back])
+    skin = np.concatenate([parts["face_material"], parts["outer_back"]])
     height = profile.height(template[skin])
-    rows = []
+    joints: list[tuple[IntArray, FloatArray]] = []  # vertices around each, and where it is
     for level in (profile.neck_base, 0.5 * (profile.neck_base + profile.neck_top)):
         ring = np.unique(skin[np.abs(height - level) < 0.05 * profile.length])
-        spread = template[ring]
-        rows.append(regressor_row(template, ring, 0.5 * (spread.min(0) + spread.max(0))))
-    rows.append(regressor_row(template, _around_axis(template, skin, hinge), hinge.center))
-    for eyeball in (parts.left_sclera, parts.right_sclera):
+        joints.append((ring, 0.5 * (template[ring].min(0) + template[ring].max(0))))
+    joints.append((_around_axis(template, skin, hinge), hinge.center))
+    for eyeball in (parts["left_sclera"], parts["right_sclera"]):
         center, _ = fit_sphere(template[eyeball])
         back = eyeball[template[eyeball, 2] < center[2]]  # without the bulge of the cornea
-        center, _ = fit_sphere(template[back])
-        rows.append(regressor_row(template, back, center))
-    return np.stack(rows)
+        joints.append((back, fit_sphere(template[back])[0]))
+    regressor = np.zeros((len(joints), len(template)))
+    for row, (support, center) in zip(regressor, joints):
+        row[support] = even_weights(template[support], center)
+    return regressor
 
 
 def _around_axis(template: FloatArray, skin: IntArray, hinge: Hinge, each_side: int = 60) -> IntArray:
@@ -197,28 +201,7 @@ _MATERIALS = (
     *("M_EyeOcclusion", "M_EyeBlend", "M_ScleraLeft", "M_ScleraRight", "M_IrisLeft", "M_IrisRight"),
 )
 _EYES = {"right": range(36, 42), "left": range(42, 48)}
-
-
-@dataclass(frozen=True, eq=False)
-class MeshParts:
-    """Sorted vertex indices of what the kit is put together from."""
-
-    face_material: IntArray
-    outer_back: IntArray  # scalp, back of the neck, shoulders
-    mouth_socket: IntArray
-    eye_sockets: IntArray
-    gums_and_tongue: IntArray
-    teeth: IntArray
-    teeth_upper: IntArray
-    teeth_lower: IntArray
-    left_eyeball: IntArray
-    right_eyeball: IntArray
-    left_sclera: IntArray
-    right_sclera: IntArray
-    eyelashes: IntArray
-    lacrimal_fluid: IntArray
-    eye_occlusion: IntArray
-    eye_blend: IntArray
+Parts = Mapping[str, IntArray]
 
 
 @dataclass(frozen=True)
@@ -256,8 +239,8 @@ def mesh_parts(
     faces: IntArray,
     materials: Mapping[str, IntArray],
     jaw_open: FloatArray,
-) -> MeshParts:
-    """Take the mesh apart.
+) -> Parts:
+    """Take the mesh apart: sorted vertex indices by what they belong to.
 
     Parameters
     ----------
@@ -269,41 +252,40 @@ def mesh_parts(
             raise InputError(file, "material_names", f"triangles of {name}", ", ".join(sorted(materials)))
     # Behind the face material lie the outer head and, each a piece of its own, the mouth and eye sockets.
     back = np.setdiff1d(materials["M_BackHead"], materials["M_Face"])
-    pieces = sorted(_pieces(back, faces), key=lambda piece: -template[piece, 1].max())
-    outer, inner = pieces[0], pieces[1:]
-    sockets = [piece for piece in inner if len(np.unique(template[piece, 0] > 0)) == 1]
-    mouth = [piece for piece in inner if len(np.unique(template[piece, 0] > 0)) == 2]
-    motion = np.linalg.norm(jaw_open[materials["M_Teeth"]], axis=1)
+    outer, *inner = sorted(_pieces(back, faces), key=lambda piece: -template[piece, 1].max())
+    sides = [len(np.unique(template[piece, 0] > 0)) for piece in inner]
+    teeth = materials["M_Teeth"]
+    motion = np.linalg.norm(jaw_open[teeth], axis=1)
     lower = motion > 0.25 * motion.max()
-    return MeshParts(
-        face_material=materials["M_Face"],
-        outer_back=outer,
-        mouth_socket=_together(mouth),
-        eye_sockets=_together(sockets),
-        gums_and_tongue=materials["M_GumsTongue"],
-        teeth=materials["M_Teeth"],
-        teeth_upper=materials["M_Teeth"][~lower],
-        teeth_lower=materials["M_Teeth"][lower],
-        left_eyeball=np.union1d(materials["M_ScleraLeft"], materials["M_IrisLeft"]),
-        right_eyeball=np.union1d(materials["M_ScleraRight"], materials["M_IrisRight"]),
-        left_sclera=materials["M_ScleraLeft"],
-        right_sclera=materials["M_ScleraRight"],
-        eyelashes=materials["M_EyeLashes"],
-        lacrimal_fluid=materials["M_LacrimalFluid"],
-        eye_occlusion=materials["M_EyeOcclusion"],
-        eye_blend=materials["M_EyeBlend"],
-    )
+    return {
+        "face_material": materials["M_Face"],
+        "outer_back": outer,  # scalp, back of the neck, shoulders
+        "mouth_socket": _together([piece for piece, count in zip(inner, sides) if count == 2]),
+        "eye_sockets": _together([piece for piece, count in zip(inner, sides) if count == 1]),
+        "gums_and_tongue": materials["M_GumsTongue"],
+        "teeth": teeth,
+        "teeth_upper": teeth[~lower],
+        "teeth_lower": teeth[lower],
+        "left_eyeball": np.union1d(materials["M_ScleraLeft"], materials["M_IrisLeft"]),
+        "right_eyeball": np.union1d(materials["M_ScleraRight"], materials["M_IrisRight"]),
+        "left_sclera": materials["M_ScleraLeft"],
+        "right_sclera": materials["M_ScleraRight"],
+        "eyelashes": materials["M_EyeLashes"],
+        "lacrimal_fluid": materials["M_LacrimalFluid"],
+        "eye_occlusion": materials["M_EyeOcclusion"],
+        "eye_blend": materials["M_EyeBlend"],
+    }
 
 
 def regions_of(
-    template: FloatArray, faces: IntArray, parts: MeshParts, profile: Profile, landmarks: IntArray
+    template: FloatArray, faces: IntArray, parts: Parts, profile: Profile, landmarks: IntArray
 ) -> dict[str, IntArray]:
     """Regions by name: FLAME's, and the kit's own pieces."""
     points = template[landmarks]
     length = profile.length
     everything = np.arange(len(template))
     skin = np.zeros(len(template), dtype=bool)
-    skin[parts.face_material] = True
+    skin[parts["face_material"]] = True
     x, y, z = template.T
 
     # From the side the contour runs from the ear down to the chin; the face lies in front of it. The
@@ -320,7 +302,7 @@ def regions_of(
     ear &= np.abs(x) > 0.93 * np.abs(points[0, 0])
     height = profile.height(template)
     outer = np.zeros_like(skin)
-    outer[parts.outer_back] = True
+    outer[parts["outer_back"]] = True
     neck = (skin | outer) & ~face & ~ear & (height < profile.neck_top) & (height > profile.neck_base)
 
     brow = points[list(_BROWS), 1].max()
@@ -330,7 +312,7 @@ def regions_of(
         "forehead": face & (y > brow),
         "nose": face & _near(template, nose, 0.12 * length) & (y > nose[:, 1].min() - 0.02 * length),
         "lips": skin
-        & _inside(template[:, :2], points[list(_OUTER_LIPS), :2], 0.02 * length)
+        & points_in_poly(template[:, :2], _widened(points[list(_OUTER_LIPS), :2], 0.02 * length))
         & (z > points[list(_OUTER_LIPS), 2].min() - 0.06 * length),
         "left_ear": ear & (x > 0),
         "right_ear": ear & (x < 0),
@@ -344,8 +326,7 @@ def regions_of(
         masks[f"{side}_eye_region"] = face & (np.linalg.norm(template - eye.mean(0), axis=1) < 0.85 * width)
     masks["eye_region"] = masks["left_eye_region"] | masks["right_eye_region"]
     regions = {name: everything[mask] for name, mask in masks.items()}
-    pieces = {name: getattr(parts, name) for name in MeshParts.__dataclass_fields__}
-    del pieces["face_material"], pieces["outer_back"]
+    pieces = {name: piece for name, piece in parts.items() if name not in ("face_material", "outer_back")}
     return regions | pieces | {"boundary": np.intersect1d(border_edges(faces), everything[skin | outer])}
 
 
@@ -370,17 +351,10 @@ def _near(template: FloatArray, points: FloatArray, radius: float) -> np.ndarray
     return distance.min(1) < radius
 
 
-def _inside(points: FloatArray, polygon: FloatArray, margin: float) -> np.ndarray:
-    """Whether each 2D point is inside the polygon widened from its middle by about the margin (even-odd rule)."""
-    middle = polygon.mean(0)
-    away = polygon - middle
-    polygon = polygon + margin * away / np.linalg.norm(away, axis=1, keepdims=True)
-    inside = np.zeros(len(points), dtype=bool)
-    for start, end in zip(polygon, np.roll(polygon, -1, axis=0)):
-        crosses = (start[1] > points[:, 1]) != (end[1] > points[:, 1])
-        slope = (end[0] - start[0]) / (end[1] - start[1]) if end[1] != start[1] else 0.0
-        inside ^= crosses & (points[:, 0] < start[0] + slope * (points[:, 1] - start[1]))
-    return inside
+def _widened(polygon: FloatArray, margin: float) -> FloatArray:
+    """The polygon (n, 2) with its corners moved away from its middle."""
+    away = polygon - polygon.mean(0)
+    return polygon + margin * away / np.linalg.norm(away, axis=1, keepdims=True)
 
 
 class Hinge(NamedTuple):
@@ -449,24 +423,3 @@ def hinge_correctives(
     basis[:, :, 7] = wanted / (2 * np.sin(hinge.angle))  # element (2, 1), +sine
     basis[:, :, 5] = -basis[:, :, 7]  # element (1, 2), -sine
     return basis
-
-
-def regressor_row(vertices: FloatArray, support: IntArray, target: FloatArray) -> FloatArray:
-    """(V,) weights on the support that sum to 1 and reproduce the target, as even as possible.
-
-    The target then moves with the support in every translation, rotation and scaling of the mesh.
-
-    Raises
-    ------
-    ValueError
-        Where the support does not span the target.
-    """
-    constraints = np.vstack([vertices[support].T, np.ones(len(support))])
-    even = np.full(len(support), 1 / len(support))
-    wanted = np.array([*target, 1.0])
-    weights = even + np.linalg.lstsq(constraints, wanted - constraints @ even, rcond=None)[0]
-    if not np.allclose(constraints @ weights, wanted, atol=1e-6):
-        raise ValueError("the support does not span the target")
-    row = np.zeros(len(vertices))
-    row[support] = weights
-    return row

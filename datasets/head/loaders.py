@@ -82,13 +82,11 @@ def flame_version(path: Path) -> str:
         return "flame2023_no_jaw" if "no_jaw" in name else "flame2023"
     if "2020" in name or name == "generic_model":
         return "flame2020"
-    raise InputError(
-        path,
-        "version",
-        "a file name with FLAME's version (generic_model.pkl, flame2020.pkl, flame2023.pkl)",
-        repr(path.name),
-        "Say which it is: version='flame2020' or 'flame2023'. Their coefficients are not interchangeable.",
+    expected = "a file name with FLAME's version (generic_model.pkl, flame2020.pkl, flame2023.pkl)"
+    remedy = (
+        "Say which it is: version='flame2020' or 'flame2023'. Their coefficients are not interchangeable."
     )
+    raise InputError(path, "version", expected, repr(path.name), remedy)
 
 
 def read_masks(path: str | PathLike[str]) -> dict[str, IntArray]:
@@ -100,10 +98,7 @@ def read_regions(path: str | PathLike[str]) -> dict[str, IntArray]:
     """Regions of a JSON file ``{name: [vertex, ...]}``. Lip rings keep their order, others are sorted."""
     result = {}
     for name, members in read_json(Path(path)).items():
-        is_list = isinstance(members, list) and all(
-            type(member) is int and 0 <= member < 2**31 for member in members
-        )
-        if not is_list:
+        if not isinstance(members, list) or not all(type(m) is int and 0 <= m < 2**31 for m in members):
             raise InputError(path, name, "a list of vertex indices", reprlib.repr(members))
         result[name] = _members(path, name, np.array(members, dtype=np.int64))
     return result
@@ -122,9 +117,8 @@ def _flame(path: Path, version: str) -> HeadArrays:
     def array(name: str, kinds: str, ndim: int) -> np.ndarray:
         values = content.get(name)
         if not isinstance(values, np.ndarray):
-            raise InputError(
-                path, name, "an array of that name", f"only {', '.join(sorted(content)) or 'nothing'}"
-            )
+            found = f"only {', '.join(sorted(content)) or 'nothing'}"
+            raise InputError(path, name, "an array of that name", found)
         if values.dtype.kind not in kinds or values.ndim != ndim:
             expected = f"{ndim} dimensions of {'integers' if 'i' in kinds else 'floats'}"
             raise InputError(path, name, expected, f"{values.ndim} of {values.dtype}")

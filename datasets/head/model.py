@@ -72,11 +72,6 @@ class HeadModel(torch.nn.Module):
         self.register_buffer("faces", faces, persistent=False)
 
     @property
-    def vertex_count(self) -> int:
-        """V."""
-        return self.template.shape[0]
-
-    @property
     def shape_size(self) -> int:
         """S, the number of identity coefficients."""
         return self.shape_matrix.shape[0]
@@ -139,7 +134,7 @@ class HeadModel(torch.nn.Module):
         return vertices
 
     def _pose(self, neutral: Tensor, expression: Tensor, angles: Tensor, translation: Tensor) -> Tensor:
-        """Skinned vertices (B, V, 3), differentiable: the formulae as they are written. The reference implementation of `FastPosing`."""
+        """Skinned vertices (B, V, 3), differentiable: the formulae as they are written, and what `FastPosing` is tested by."""
         rotations = axis_angle_to_matrix(angles)
         shaped = neutral + (expression @ self.expression_matrix).unflatten(1, (-1, 3))
         joints = self.joint_regressor @ shaped
@@ -158,7 +153,12 @@ class HeadModel(torch.nn.Module):
         """Neutral, unposed head of an identity: (B, V, 3), metres."""
         blend = _rows(shape, self.shape_size, "shape") @ self.shape_matrix
         vertices = self.template + blend.unflatten(1, (-1, 3))
-        return vertices if static_offset is None else vertices + self._offset(static_offset)
+        if static_offset is None:
+            return vertices
+        if static_offset.shape[-2:] != self.template.shape:
+            found = tuple(static_offset.shape)
+            raise ValueError(f"static_offset: expected (..., {len(self.template)}, 3), found {found}")
+        return vertices + static_offset
 
     def joints(self, shape: Tensor, expression: Tensor, static_offset: Tensor | None = None) -> Tensor:
         """Joint positions of the shaped, unposed head: (B, J, 3), metres."""
@@ -192,7 +192,7 @@ class HeadModel(torch.nn.Module):
         return torch.cat([torch.cat([turn.expand(batch, 3, 3), shift[..., None]], dim=-1), last], dim=-2)
 
     def pose_arguments(self, poses: Sequence[HeadPose]) -> dict[str, Tensor]:
-        """Stack poses into arguments of `forward`, in this model's dtype and on its device.
+        """Poses as arguments of `forward`, in this model's dtype and on its device.
 
         ``eyelids`` is among them only where the model has eyelid bases (zeros for poses that lack them).
 
@@ -209,27 +209,18 @@ class HeadModel(torch.nn.Module):
             self._check_pose(pose, sizes)
         columns = {name: np.stack([getattr(pose, name) for pose in poses]) for name in sizes}
         if self.eyelid_matrix is not None:
-            columns["eyelids"] = np.stack(
-                [np.zeros(2) if pose.eyelids is None else pose.eyelids for pose in poses]
-            )
-        like = self.template
-        return {
-            name: torch.from_numpy(np.asarray(values, dtype=np.float64)).to(like)
-            for name, values in columns.items()
-        }
+            lids = [np.zeros(2) if pose.eyelids is None else pose.eyelids for pose in poses]
+            columns["eyelids"] = np.stack(lids)
+        doubles = {name: torch.from_numpy(np.asarray(values, np.float64)) for name, values in columns.items()}
+        return {name: values.to(self.template) for name, values in doubles.items()}
 
     def _check_pose(self, pose: HeadPose, sizes: dict[str, int]) -> None:
         where = f"pose of {pose.subject or 'unnamed subject'}"
         if pose.timestep is not None:
             where += f", timestep {pose.timestep}"
         if pose.head_model != self.version:
-            raise InputError(
-                where,
-                "head_model",
-                repr(self.version),
-                repr(pose.head_model),
-                "Coefficients of one head model mean nothing to another; refit the tracking first.",
-            )
+            remedy = "Coefficients of one head model mean nothing to another; refit the tracking first."
+            raise InputError(where, "head_model", repr(self.version), repr(pose.head_model), remedy)
         for name, size in sizes.items():
             found = np.shape(getattr(pose, name))
             if found != (size,):
@@ -250,16 +241,10 @@ class HeadModel(torch.nn.Module):
 
     def _angles(self, rotation: Tensor, neck: Tensor, jaw: Tensor, eyes: Tensor) -> Tensor:
         """Axis-angle vectors in joint order, (B, J, 3)."""
-        parts = [_rows(rotation, 3, "rotation"), _rows(neck, 3, "neck"), _rows(jaw, 3, "jaw")]
-        parts.append(_rows(eyes, 6, "eyes"))
+        given = (rotation, 3, "rotation"), (neck, 3, "neck"), (jaw, 3, "jaw"), (eyes, 6, "eyes")
+        parts = [_rows(*part) for part in given]
         batch = max(part.shape[0] for part in parts)
         return torch.cat([part.expand(batch, -1) for part in parts], dim=1).unflatten(1, (-1, 3))
-
-    def _offset(self, static_offset: Tensor) -> Tensor:
-        if static_offset.shape[-2:] != self.template.shape:
-            expected, found = tuple(self.template.shape), tuple(static_offset.shape)
-            raise ValueError(f"static_offset: expected (..., {expected[0]}, 3), found {found}")
-        return static_offset
 
 
 def chain_transforms(rotations: Tensor, joints: Tensor, parents: Sequence[int]) -> Tensor:
@@ -297,13 +282,7 @@ def _rows(values: Tensor, size: int, name: str) -> Tensor:
 
 
 class FastPosing(torch.nn.Module):
-    """Posed vertices of a head from its neutral ones. On the CPU, without gradients.
-
-    Parameters
-    ----------
-    asset : a head in FLAME's layout.
-    dtype : of the buffers.
-    """
+    """Posed vertices of a head from its neutral ones. On the CPU, without gradients; sizes as in `HeadModel`."""
 
     directions: Tensor
     joint_directions: Tensor
@@ -344,15 +323,7 @@ class FastPosing(torch.nn.Module):
     def forward(
         self, canonical: Tensor, expression: Tensor, axis_angles: Tensor, translation: Tensor
     ) -> Tensor:
-        """(B, V, 3) skinned vertices, metres. Arguments of batch size 1 stand for all.
-
-        Parameters
-        ----------
-        canonical : (B, V, 3) neutral head, metres.
-        expression : (B, E).
-        axis_angles : (B, J, 3) of the joints relative to their parents.
-        translation : (B, 3) metres.
-        """
+        """(B, V, 3) skinned vertices, metres; ``axis_angles`` (B, J, 3) are relative to the joints' parents."""
         joints = self.joints(canonical, expression).numpy().astype(np.float64)
         local = Rotation.from_rotvec(axis_angles.reshape(-1, 3).numpy()).as_matrix()
         local = local.reshape(-1, len(self.parents), 3, 3)

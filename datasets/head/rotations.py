@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -139,11 +138,6 @@ _GENERATORS = np.array(
 _DERIVATIVE_SERIES_BELOW = 1e-2  # squared angle under which the third coefficient's closed form cancels
 
 
-def matrices(axis_angles: FloatArray) -> FloatArray:
-    """(n, 3, 3) rotation matrices of (n, 3) axis-angle vectors, radians."""
-    return np.asarray(Rotation.from_rotvec(axis_angles).as_matrix())
-
-
 def matrices_and_derivatives(axis_angles: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Rotation matrices (n, 3, 3) and their derivatives (n, 3, 3, 3), the last axis being the vector's component.
 
@@ -164,8 +158,3 @@ def matrices_and_derivatives(axis_angles: FloatArray) -> tuple[FloatArray, Float
     jacobian = identity - b * cross + c * square
     # skew(J e_k) = sum_i J_ik G_i
     return rotation, np.einsum("nrs,isc,nik->nrck", rotation, _GENERATORS, jacobian, optimize=False)
-
-
-def axis_angles(rotations: FloatArray) -> FloatArray:
-    """(n, 3) axis-angle vectors of rotation matrices (n, 3, 3), of length at most pi."""
-    return np.asarray(Rotation.from_matrix(rotations).as_rotvec())

@@ -1,4 +1,4 @@
-"""A head with one identity: its neutral mesh, and its meshes and rigid motions over poses, in float64.
+"""A head with one identity: its neutral mesh, and its meshes and rigid motions over poses.
 
 A tracker of single videos keeps the head still and lets the camera move around it. With M the rigid motion of the
 head (global rotation about the root joint, neck rotation about the neck joint, translation) a camera W in the
@@ -9,14 +9,14 @@ root (lower neck, shoulders) move with the head, as they do in such methods.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from ...bench.contracts import Camera, FloatArray, HeadAsset, HeadPose
+from ...bench.contracts import Camera, Clip, FloatArray, HeadAsset, HeadPose
 from .model import HeadModel
 
 BATCH = 64
@@ -24,34 +24,54 @@ BATCH = 64
 
 
 class PosedSubject:
-    """One identity of a head model, float64.
+    """One identity of a head model.
 
     Parameters
     ----------
     head : the model.
     shape : (S,) identity coefficients.
     static_offset : (V, 3) metres.
+    dtype : that everything is computed in.
     """
 
-    def __init__(self, head: HeadAsset, shape: FloatArray, static_offset: FloatArray):
-        self._model = HeadModel(head, dtype=torch.float64)
-        shape, offset = np.asarray(shape, dtype=np.float64), np.asarray(static_offset, dtype=np.float64)
-        self._identity = {"shape": torch.from_numpy(shape), "static_offset": torch.from_numpy(offset)}
+    def __init__(
+        self,
+        head: HeadAsset,
+        shape: FloatArray,
+        static_offset: FloatArray,
+        dtype: torch.dtype = torch.float64,
+    ):
+        self._model = HeadModel(head, dtype=dtype)
+        identity = {"shape": shape, "static_offset": static_offset}
+        self._identity = {
+            name: torch.tensor(np.asarray(values), dtype=dtype) for name, values in identity.items()
+        }
         self._canonical = self._model.canonical(**self._identity)
-
-    @property
-    def version(self) -> str:
-        """Of the head model."""
-        return self._model.version
-
-    @property
-    def neutral(self) -> FloatArray:
+        self.version = head.version
+        self.neutral: FloatArray = self._canonical[0].numpy()
         """(V, 3) unposed head, metres."""
-        return np.asarray(self._canonical[0].numpy())
+
+    @classmethod
+    def of(cls, clip: Clip, dtype: torch.dtype = torch.float64) -> PosedSubject:
+        """The subject of a clip."""
+        return cls(clip.head, clip.shape, clip.static_offset, dtype)
 
     def meshes(self, poses: Sequence[HeadPose]) -> FloatArray:
         """(T, V, 3) vertices in the world, metres. Raises `InputError` for poses of another model."""
-        return self._batched(poses, lambda arguments: self._model(canonical=self._canonical, **arguments))
+        return np.concatenate([*self.batches(poses)])
+
+    def batches(self, poses: Sequence[HeadPose], size: int = BATCH) -> Iterator[FloatArray]:
+        """`meshes` of up to ``size`` poses at a time."""
+        for arguments in self._arguments(poses, size):
+            with torch.no_grad():
+                yield self._model(canonical=self._canonical, **arguments).numpy()
+
+    def each(
+        self, clip: Clip, timesteps: Sequence[int], size: int = BATCH
+    ) -> Iterator[tuple[int, FloatArray]]:
+        """(timestep, (V, 3) mesh) of a clip's poses, ``size`` of them in memory."""
+        poses = [clip.poses[timestep] for timestep in timesteps]
+        return zip(timesteps, chain.from_iterable(self.batches(poses, size)))
 
     def motions(self, poses: Sequence[HeadPose]) -> FloatArray:
         """(T, 4, 4) rigid motion of the head, from the frame with the neck joint at rest to the world, metres.
@@ -59,18 +79,19 @@ class PosedSubject:
         Raises `InputError` for poses of another model.
         """
 
-        def motion(arguments: dict[str, Tensor]) -> Tensor:
-            moving = {name: arguments[name] for name in ("expression", "rotation", "neck", "translation")}
-            return self._model.head_transform(**self._identity, **moving)
+        moving = ("expression", "rotation", "neck", "translation")
+        return np.concatenate(
+            [
+                self._model.head_transform(
+                    **self._identity, **{name: arguments[name] for name in moving}
+                ).numpy()
+                for arguments in self._arguments(poses, BATCH)
+            ]
+        )
 
-        return self._batched(poses, motion)
-
-    def _batched(
-        self, poses: Sequence[HeadPose], evaluate: Callable[[dict[str, Tensor]], Tensor]
-    ) -> FloatArray:
-        batches = [poses[start : start + BATCH] for start in range(0, len(poses), BATCH)] or [poses]
-        with torch.no_grad():
-            return np.concatenate([evaluate(self._model.pose_arguments(batch)).numpy() for batch in batches])
+    def _arguments(self, poses: Sequence[HeadPose], size: int) -> Iterator[dict[str, torch.Tensor]]:
+        for start in range(0, max(len(poses), 1), size):  # no pose is an error, which the model raises
+            yield self._model.pose_arguments(poses[start : start + size])
 
 
 def camera_in_head_frame(camera: Camera, motion: FloatArray) -> Camera:

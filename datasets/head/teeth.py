@@ -50,12 +50,11 @@ def with_teeth(arrays: HeadArrays) -> HeadArrays:
     vertices, columns = arrays.template.shape[0], len(upper)
     positions = _positions(arrays.template[upper], arrays.template[lower])
     follow = 0.5 * (arrays.shape_basis[upper] + arrays.shape_basis[lower])
-    joints = ["jaw" if row.startswith("lower") else "neck" for row in ROWS]
-    weights = np.zeros((len(ROWS) * columns, len(JOINT_NAMES)))
-    weights[np.arange(len(weights)), np.repeat([JOINT_NAMES.index(name) for name in joints], columns)] = 1
+    on_jaw = np.repeat([row.startswith("lower") for row in ROWS], columns)
+    joints = np.where(on_jaw, JOINT_NAMES.index("jaw"), JOINT_NAMES.index("neck"))
+    weights = np.eye(len(JOINT_NAMES))[joints]
     towards_left = float(arrays.template[upper[-1], 0] - arrays.template[upper[0], 0]) > 0
     triangles = vertices + _triangles(columns, towards_left)
-    on_jaw = np.repeat([name == "jaw" for name in joints], columns)
     teeth = vertices + np.arange(len(weights))
     return replace(
         arrays,
@@ -112,18 +111,18 @@ def _triangles(columns: int, towards_left: bool) -> IntArray:
     In the order of GaussianAvatars, whose splats are bound to triangles by number and turn with their first edge.
     """
     block = {name: index * columns + np.arange(columns) for index, name in enumerate(ROWS)}
-    upper_back = _strip(block["upper_root_back"], block["upper_edge_back"], falling=True)
-    upper_edge = _strip(block["upper_edge_back"], block["upper_edge"], falling=False)
-    strips = [
-        _strip(block["upper_root"], block["upper_edge"], falling=True),
-        _turned(upper_back),
-        _turned(upper_edge),
-        _strip(block["lower_edge"], block["lower_root"], falling=False),
-        _strip(block["lower_root_back"], block["lower_edge_back"], falling=True),
-        _strip(block["lower_edge_back"], block["lower_edge"], falling=False),
-    ]
-    triangles = np.concatenate(strips)
-    return _turned(triangles) if towards_left else triangles
+    strips = []
+    for first, second, falling, turned in (
+        ("upper_root", "upper_edge", True, False),
+        ("upper_root_back", "upper_edge_back", True, True),
+        ("upper_edge_back", "upper_edge", False, True),
+        ("lower_edge", "lower_root", False, False),
+        ("lower_root_back", "lower_edge_back", True, False),
+        ("lower_edge_back", "lower_edge", False, False),
+    ):
+        strip = _strip(block[first], block[second], falling=falling)
+        strips.append(strip[:, [0, 2, 1]] if turned != towards_left else strip)
+    return np.concatenate(strips)
 
 
 def _strip(first: IntArray, second: IntArray, *, falling: bool) -> IntArray:
@@ -137,11 +136,6 @@ def _strip(first: IntArray, second: IntArray, *, falling: bool) -> IntArray:
     up = np.stack([a, next_a, b, next_a, next_b, b], axis=1).reshape(-1, 2, 3)
     first_half = np.arange(len(a)) < len(a) / 2
     return np.where((first_half == falling)[:, None, None], down, up).reshape(-1, 3)
-
-
-def _turned(triangles: IntArray) -> IntArray:
-    """The same triangles seen from behind."""
-    return triangles[:, [0, 2, 1]]
 
 
 def _append(array: FloatArray, rows: FloatArray) -> FloatArray:
@@ -204,10 +198,7 @@ def _rim(asset: HeadAsset, where: str) -> IntArray:
     missing = [name for name in ("lips", "face") if name not in asset.regions]
     if missing:
         raise InputError(where, "regions", f"{' and '.join(missing)}", "none of that name", _REMEDY)
-    lips = np.zeros(asset.template.shape[0], dtype=bool)
-    lips[asset.regions["lips"]] = True
-    face = np.zeros_like(lips)
-    face[asset.regions["face"]] = True
+    lips, face = (np.isin(np.arange(len(asset.template)), asset.regions[name]) for name in ("lips", "face"))
     outer, inner = lips & face, lips & ~face
     edges = mesh_edges(asset.faces)
     edges = np.concatenate([edges, edges[:, ::-1]])

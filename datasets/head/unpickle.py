@@ -28,7 +28,7 @@ MAX_BYTES = 2**30
 """Of a file; the largest of FLAME has 0.1 GB."""
 MAX_DIMENSIONS = 8
 
-_KINDS = {"f", "i", "u", "b"}
+_KINDS = "fiub"
 _DATA = (np.ndarray, str, bytes, int, float, complex, type(None), list, tuple, dict)
 _ByteOrder = Literal["<", ">", "|", "="]
 
@@ -69,7 +69,7 @@ class _DType:
 
     def resolve(self) -> np.dtype[Any]:
         """The numpy dtype: booleans, integers and floats only."""
-        known = len(self.name) <= 3 and self.name[:1] in _KINDS and self.name[1:].isdecimal()
+        known = len(self.name) <= 3 and self.name[:1] in {*_KINDS} and self.name[1:].isdecimal()
         if not known:
             raise Malformed(f"an array of dtype {self.name[:20]!r}")
         try:
@@ -120,19 +120,34 @@ class _Array:
         return self._values
 
 
-class _Sparse:
-    """A scipy.sparse matrix: its instance dictionary, made dense once everything is read."""
+class _Instance:
+    """An object of a class that is not there: its instance dictionary, made an array once everything is read."""
 
     __slots__ = ("state",)
-    layout = ""
 
     def __new__(cls, *arguments: Any) -> Self:
         return super().__new__(cls)
 
     def __setstate__(self, state: Any) -> None:
-        self.state = _dictionary(state)
+        # Python may wrap the dictionary in a pair with the slots' state.
+        if isinstance(state, tuple) and len(state) == 2 and not state[1]:
+            state = state[0]
+        if not isinstance(state, dict):
+            raise Malformed("an object whose state is no dictionary")
+        self.state: dict[Any, Any] = state
 
-    def dense(self, budget: _Budget) -> np.ndarray:
+    def array(self, budget: _Budget) -> np.ndarray:
+        """The values."""
+        raise NotImplementedError
+
+
+class _Sparse(_Instance):
+    """A scipy.sparse matrix."""
+
+    __slots__ = ()
+    layout = ""
+
+    def array(self, budget: _Budget) -> np.ndarray:
         """(rows, columns) array; entries at the same place add up, as in scipy."""
         shape = _shape(self.state.get("_shape"))
         if len(shape) != 2 or math.prod(shape) > MAX_DENSE_ELEMENTS:
@@ -152,16 +167,11 @@ class _Sparse:
     def _coordinates(self, shape: tuple[int, ...], budget: _Budget) -> tuple[np.ndarray, np.ndarray]:
         if self.layout == "coo":
             coords = self.state.get("coords")
-            if isinstance(coords, tuple) and len(coords) == 2:
-                row, column = (_plain(part, budget) for part in coords)
-                if not all(
-                    isinstance(part, np.ndarray) and part.dtype.kind in "iu" for part in (row, column)
-                ):
-                    raise Malformed("a sparse matrix without coordinates")
-                return row.ravel(), column.ravel()
-            return self._part("row", {"i", "u"}, budget), self._part("col", {"i", "u"}, budget)
-        minor = self._part("indices", {"i", "u"}, budget)
-        pointers = self._part("indptr", {"i", "u"}, budget).astype(np.int64)
+            if isinstance(coords, tuple) and len(coords) == 2:  # as scipy keeps them since 1.11
+                self.state |= dict(zip(("row", "col"), coords))
+            return self._part("row", "iu", budget), self._part("col", "iu", budget)
+        minor = self._part("indices", "iu", budget)
+        pointers = self._part("indptr", "iu", budget).astype(np.int64)
         lines = shape[1] if self.layout == "csc" else shape[0]
         counts = np.diff(pointers)
         if len(pointers) != lines + 1 or pointers[0] != 0 or (counts < 0).any() or pointers[-1] != len(minor):
@@ -169,54 +179,29 @@ class _Sparse:
         major = np.repeat(np.arange(lines), counts)
         return (minor, major) if self.layout == "csc" else (major, minor)
 
-    def _part(self, name: str, kinds: set[str], budget: _Budget) -> np.ndarray:
+    def _part(self, name: str, kinds: str, budget: _Budget) -> np.ndarray:
         values = _plain(self.state.get(name), budget)
         if not isinstance(values, np.ndarray) or values.dtype.kind not in kinds:
             raise Malformed(f"a sparse matrix without {name}")
         return values.ravel()
 
 
-class _SparseColumns(_Sparse):
+_SPARSE = {
+    layout: type(f"_{layout}_matrix", (_Sparse,), {"__slots__": (), "layout": layout})
+    for layout in ("csc", "csr", "coo")
+}
+
+
+class _Chumpy(_Instance):
+    """``chumpy.ch.Ch``: a plain array under the key x."""
+
     __slots__ = ()
-    layout = "csc"
-
-
-class _SparseRows(_Sparse):
-    __slots__ = ()
-    layout = "csr"
-
-
-class _SparseCoordinates(_Sparse):
-    __slots__ = ()
-    layout = "coo"
-
-
-class _Chumpy:
-    """``chumpy.ch.Ch``: a plain array under the key x of its instance dictionary."""
-
-    __slots__ = ("state",)
-
-    def __new__(cls, *arguments: Any) -> Self:
-        return super().__new__(cls)
-
-    def __setstate__(self, state: Any) -> None:
-        self.state = _dictionary(state)
 
     def array(self, budget: _Budget) -> np.ndarray:
-        """The wrapped values."""
         values = self.state.get("x")
         if not isinstance(values, _Array):
             raise Malformed("a chumpy object without plain values")
         return values.values(budget)
-
-
-def _dictionary(state: Any) -> dict[Any, Any]:
-    """Instance dictionary of a pickled object; Python may wrap it in a pair with the slots' state."""
-    if isinstance(state, tuple) and len(state) == 2 and not state[1]:
-        state = state[0]
-    if not isinstance(state, dict):
-        raise Malformed("an object whose state is no dictionary")
-    return state
 
 
 def _shape(shape: Any) -> tuple[int, ...]:
@@ -275,12 +260,9 @@ def _set(items: Any = ()) -> list[Any]:
 
 def _object_of(kind: Any, base: Any, state: Any) -> Any:
     """``copyreg._reconstructor``: how protocols 0 and 1 make instances of new-style classes."""
-    if kind not in _CLASSES:
+    if kind is not _Chumpy and kind not in _SPARSE.values():
         raise Malformed("an instance of an unexpected class")
     return kind.__new__(kind)
-
-
-_CLASSES: tuple[type, ...] = (_Chumpy, _SparseColumns, _SparseRows, _SparseCoordinates)
 
 
 def _table() -> dict[tuple[str, str], Any]:
@@ -300,8 +282,7 @@ def _table() -> dict[tuple[str, str], Any]:
         table[builtins, "object"] = Function(_not_to_be_called)
     for registry in ("copy_reg", "copyreg"):
         table[registry, "_reconstructor"] = Function(_object_of)
-    for kind in _CLASSES[1:]:
-        layout = kind.layout  # type: ignore[attr-defined]
+    for layout, kind in _SPARSE.items():
         for module in (f"scipy.sparse.{layout}", f"scipy.sparse._{layout}"):
             table[module, f"{layout}_matrix"] = kind
             table[module, f"{layout}_array"] = kind
@@ -316,10 +297,10 @@ def _plain(value: Any, budget: _Budget) -> Any:
     """The array behind a stand-in; anything else as it is."""
     if isinstance(value, _Array):
         return value.values(budget)
-    if isinstance(value, (_Sparse, _Chumpy)):
+    if isinstance(value, _Instance):
         if getattr(value, "state", None) is None:
             raise Malformed("an object without state")
-        return value.dense(budget) if isinstance(value, _Sparse) else value.array(budget)
+        return value.array(budget)
     return value
 
 
@@ -345,19 +326,13 @@ def read_pickle(path: str | PathLike[str]) -> dict[str, Any]:
     try:
         return _arrays(content)
     except Refused as error:
-        raise InputError(
-            path,
-            f"global {error}",
-            expected,
-            "a name that could run code",
-            "The file was not read. Get the model from its official source.",
-        ) from error
+        remedy = "The file was not read. Get the model from its official source."
+        raise InputError(path, f"global {error}", expected, "a name that could run code", remedy) from error
     except Malformed as error:
         raise InputError(path, "", expected, str(error)) from error
     except Exception as error:  # a damaged stream makes the unpickler raise almost anything
-        raise InputError(
-            path, "", expected, f"unreadable content ({type(error).__name__}: {error})"
-        ) from error
+        found = f"unreadable content ({type(error).__name__}: {error})"
+        raise InputError(path, "", expected, found) from error
 
 
 def _arrays(stream: bytes) -> dict[str, Any]:

@@ -16,8 +16,9 @@ from ...bench.contracts import ByteArray, Camera, FloatArray, FrameKey, IntArray
 from ..clip import CaptureClip
 from ..figures import HELD_OUT, MUTED, TRAIN, bands, hexadecimal, new_figure, pixels, shortened, show
 from ..head.geometry import rigid_alignment
+from ..head.subject import PosedSubject
 from ..mesh_pictures import draw_mesh, rasterize_mesh
-from .statistics import KEPT_VARIANCE, ExpressionSpace, SequenceRow, SplitRow, posed_meshes
+from .statistics import KEPT_VARIANCE, ExpressionSpace, SequenceRow, SplitRow
 
 WIDTH = 16.0
 """Of the figure, inches."""
@@ -81,7 +82,7 @@ def _title(clip: CaptureClip) -> str:
 
 def _draw_rigs(figure: SubFigure, clip: CaptureClip, splits: Sequence[SplitRow]) -> None:
     timestep = min(clip.poses, key=lambda t: float(np.linalg.norm(clip.poses[t].expression)))
-    vertices = posed_meshes(clip, [timestep])[0]
+    vertices = PosedSubject.of(clip).meshes([clip.poses[timestep]])[0]
     members = clip.head.regions.get("face", np.arange(len(vertices)))
     frame = head_frame(vertices, clip.head.template, members)
     above, side, table = figure.subplots(1, 3, width_ratios=[5, 5, 4.4])
@@ -281,7 +282,7 @@ def _draw_overlays(
 ) -> None:
     figure.suptitle("tracked mesh on images: its outline, and itself", x=0.01, ha="left", fontsize=11)
     held_out, grid = _held_out(clip), figure.subplots(len(rows), len(columns), squeeze=False)
-    meshes = posed_meshes(clip, [timestep for timestep, _ in rows])
+    meshes = PosedSubject.of(clip).meshes([clip.poses[timestep] for timestep, _ in rows])
     tests = {key.timestep for key in clip.splits.get("self_reenactment", ())}
     for row, (timestep, reason) in enumerate(rows):
         frames = {key.camera: key for key in clip.files if key.timestep == timestep}

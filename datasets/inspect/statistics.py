@@ -11,7 +11,6 @@ import torch
 
 from ...bench.contracts import FloatArray, FrameKey, HeadPose
 from ..clip import CaptureClip
-from ..head.model import HeadModel
 from ..head.rotations import axis_angle_to_matrix
 
 KEPT_VARIANCE = 0.95
@@ -184,15 +183,3 @@ def expression_space(clip: CaptureClip) -> ExpressionSpace:
     return ExpressionSpace(
         timesteps, held_out, scores, variance / total if total > 0 else variance[:0], novelty
     )
-
-
-def posed_meshes(clip: CaptureClip, timesteps: Sequence[int]) -> FloatArray:
-    """(T, V, 3) tracked meshes in the clip's world, metres."""
-    model = HeadModel(clip.head, dtype=torch.float64)
-    canonical = model.canonical(
-        torch.from_numpy(clip.shape.astype(np.float64)),
-        torch.from_numpy(clip.static_offset.astype(np.float64)),
-    )
-    arguments = model.pose_arguments([clip.poses[t] for t in timesteps])
-    meshes: FloatArray = model(canonical=canonical, **arguments).numpy()
-    return meshes

@@ -26,8 +26,8 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 from sklearn.cluster import AgglomerativeClustering, KMeans, SpectralClustering
 
 from ...bench.contracts import Clip, FloatArray, HeadAsset, IntArray, Progress, no_progress
-from ...bench.errors import InputError
-from ..head.model import HeadModel
+from ..head.arrays import region
+from ..head.subject import PosedSubject, pose_in_head_frame
 
 DEFAULT_CLASSES = 16
 LANDMARK_LIMIT = 500
@@ -111,67 +111,50 @@ def cluster_expressions(
         landmarks, radius = len(faces), 0.0
     else:
         found = farthest_meshes(faces, limit, seed=seed, tolerance=LANDMARK_TOLERANCE, progress=progress)
-        labels, embedding = cluster_by_landmarks(found.distances, found.indices, classes)
+        labels, embedding = cluster_by_distance(found.distances, classes, found.indices)
         landmarks, radius = len(found.indices), found.radius
     medoids = timesteps[_medoids(labels, embedding)]
     return ExpressionClusters(timesteps, labels, medoids, landmarks, radius, variant)
 
 
 def cluster_by_distance(
-    distances: FloatArray, classes: int, *, seed: int = 0, variant: Literal["paper", "official"] = "paper"
+    distances: FloatArray,
+    classes: int,
+    landmarks: IntArray | None = None,
+    *,
+    seed: int = 0,
+    variant: Literal["paper", "official"] = "paper",
 ) -> tuple[IntArray, FloatArray]:
-    """Spectral clustering of all pairs under the similarity 1 - d / max d.
+    """Spectral clustering under the similarity 1 - d / max d, of all pairs or from the distances to landmarks alone.
 
     Parameters
     ----------
-    distances : (N, N) symmetric, zero diagonal.
+    distances : (N, N) symmetric, zero diagonal; or (N, m) of each item to each landmark. Where the landmarks are
+        farthest points, the largest of these is the largest of all, or within the landmarks' radius of it.
     classes : at most as many; fewer where there are fewer distinct items.
+    landmarks : (m,) which items they are; distinct.
 
     Returns
     -------
     (N,) labels from 0, without empty classes, and the (N, c) embedding that they part.
     """
-    largest = float(distances.max(initial=0.0))
-    classes = min(classes, _distinct(distances, largest))
-    if classes <= 1 or classes >= len(distances):
-        return _trivial(len(distances), classes)
+    count, largest = len(distances), float(distances.max(initial=0.0))
+    rows = distances if landmarks is None else distances[landmarks]
+    distinct = len(np.unique(np.round(rows / largest, _DIGITS), axis=0)) if largest > 0 else 1
+    classes = min(classes, distinct)
+    if classes <= 1 or classes >= count:  # all in one class, or each in its own
+        labels = np.zeros(count, dtype=np.int64) if classes <= 1 else np.arange(count)
+        return labels, labels[:, None].astype(np.float64)
     similarity = similarities(distances, largest)
-    embedding = exact_embedding(similarity, classes)
-    if variant == "official":
-        published = SpectralClustering(classes, affinity="precomputed", random_state=seed)
-        labels = np.unique(published.fit_predict(similarity), return_inverse=True)[1].astype(np.int64)
-        return labels, embedding
+    if landmarks is not None:
+        embedding = nystrom_embedding(similarity, landmarks, classes)
+    else:
+        embedding = exact_embedding(similarity, classes)
+        if variant == "official":
+            published = SpectralClustering(classes, affinity="precomputed", random_state=seed)
+            labels = np.unique(published.fit_predict(similarity), return_inverse=True)[1].astype(np.int64)
+            return labels, embedding
     return classes_of(embedding, classes), embedding
-
-
-def cluster_by_landmarks(
-    distances: FloatArray, landmarks: IntArray, classes: int
-) -> tuple[IntArray, FloatArray]:
-    """Spectral clustering from the distances to landmarks alone; results as of `cluster_by_distance`.
-
-    Parameters
-    ----------
-    distances : (N, m) of each item to each landmark. Where the landmarks are farthest points, the largest of
-        these is the largest of all, or within the landmarks' radius of it.
-    landmarks : (m,) which items they are; distinct.
-    """
-    largest = float(distances.max(initial=0.0))
-    classes = min(classes, _distinct(distances[landmarks], largest))
-    if classes <= 1 or classes >= len(distances):
-        return _trivial(len(distances), classes)
-    embedding = nystrom_embedding(similarities(distances, largest), landmarks, classes)
-    return classes_of(embedding, classes), embedding
-
-
-def _distinct(distances: FloatArray, largest: float) -> int:
-    """Number of distinct items, by their rows of distances."""
-    return 1 if largest == 0 else len(np.unique(np.round(distances / largest, _DIGITS), axis=0))
-
-
-def _trivial(count: int, classes: int) -> tuple[IntArray, FloatArray]:
-    """All in one class, or each in its own."""
-    labels = np.zeros(count, dtype=np.int64) if classes <= 1 else np.arange(count)
-    return labels, labels[:, None].astype(np.float64)
 
 
 def _medoids(labels: IntArray, embedding: FloatArray) -> IntArray:
@@ -187,7 +170,6 @@ def _medoids(labels: IntArray, embedding: FloatArray) -> IntArray:
 FACE_REGION, EYE_REGION = "face", "eye_region"
 EYE_WEIGHT = 2.0
 
-_MESH_BATCH = 64
 _BLOCK = 16
 """Meshes compared with one at a time: few enough for their differences to stay in the processor's cache."""
 
@@ -210,18 +192,14 @@ def expression_displacements(clip: Clip, timesteps: Sequence[int]) -> FloatArray
     count `EYE_WEIGHT` times. Raises `InputError` where the head has no region "face".
     """
     vertices, weights = _face_vertices(clip.head)
-    model = HeadModel(clip.head)
-    canonical = model.canonical(_tensor(clip.shape), _tensor(clip.static_offset))
-    neutral = canonical[:, vertices]
+    subject = PosedSubject.of(clip, torch.float32)
+    poses = [pose_in_head_frame(clip.poses[timestep]) for timestep in timesteps]
     result = np.empty((len(timesteps), 3, len(vertices)), dtype=np.float32)
-    for start in range(0, len(timesteps), _MESH_BATCH):
-        part = slice(start, start + _MESH_BATCH)
-        arguments = model.pose_arguments([clip.poses[timestep] for timestep in timesteps[part]])
-        for name in ("rotation", "neck", "translation"):
-            arguments[name] = torch.zeros_like(arguments[name])
-        with torch.no_grad():
-            meshes = model(canonical=canonical, **arguments)[:, vertices]
-            result[part] = ((meshes - neutral) * weights[:, None]).transpose(1, 2).numpy()
+    start = 0
+    for meshes in subject.batches(poses):
+        moved = (meshes[:, vertices] - subject.neutral[vertices]) * weights[:, None]
+        result[start : start + len(meshes)] = moved.transpose(0, 2, 1)
+        start += len(meshes)
     return result
 
 
@@ -287,24 +265,11 @@ def _distances_to(meshes: FloatArray, mesh: FloatArray) -> FloatArray:
     return result
 
 
-def _face_vertices(head: HeadAsset) -> tuple[IntArray, torch.Tensor]:
+def _face_vertices(head: HeadAsset) -> tuple[IntArray, FloatArray]:
     """Face vertices and their weights."""
-    face = head.regions.get(FACE_REGION)
-    if face is None or not len(face):
-        known = ", ".join(sorted(head.regions)) or "none"
-        raise InputError(
-            f"head model {head.version}",
-            f"regions[{FACE_REGION}]",
-            "the face's vertices",
-            f"regions {known}",
-            "For FLAME, give FLAME_masks.pkl as masks=.",
-        )
+    face = region(head, FACE_REGION)
     eyes = np.isin(face, head.regions.get(EYE_REGION, np.array([], dtype=int)))
-    return face, torch.from_numpy(np.where(eyes, EYE_WEIGHT, 1.0).astype(np.float32))
-
-
-def _tensor(array: FloatArray) -> torch.Tensor:
-    return torch.from_numpy(np.asarray(array, dtype=np.float32))
+    return face, np.where(eyes, EYE_WEIGHT, 1.0).astype(np.float32)
 
 
 SIMILARITY_FLOOR = 1e-6

@@ -18,11 +18,11 @@ a frame; any other text leaves it out and is the reason.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 from os import PathLike
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import yaml
 from pydantic import NonNegativeInt
@@ -38,7 +38,6 @@ def exclude_timesteps(
     clip: CaptureClip,
     reasons: Mapping[int, str],
     *,
-    only: Collection[str] = (),
     source: str | PathLike[str] = "excluded frames",
 ) -> CaptureClip:
     """Move the labelled timesteps of a clip from its splits to `excluded`, with their reasons.
@@ -46,7 +45,6 @@ def exclude_timesteps(
     Parameters
     ----------
     reasons : label by timestep, such as {57: "tongue out"}.
-    only : labels to act on; empty means all.
     source : where the reasons come from; named in the error.
 
     Raises
@@ -58,12 +56,11 @@ def exclude_timesteps(
     if unknown:
         expected = f"timesteps of the clip, 0 to {max(clip.poses)}"
         raise InputError(source, "timestep", expected, ", ".join(map(str, unknown)))
-    chosen = {t: reason for t, reason in reasons.items() if not only or reason in only}
-    gone = {key: chosen[key.timestep] for key in clip.files if key.timestep in chosen}
+    gone = {key: reasons[key.timestep] for key in clip.files if key.timestep in reasons}
     splits = {name: tuple(key for key in keys if key not in gone) for name, keys in clip.splits.items()}
     if not splits["train"]:
         raise InputError(source, "timestep", "training frames left", "none left")
-    parameters = {"reasons": {str(t): reason for t, reason in sorted(chosen.items())}}
+    parameters = {"reasons": {str(t): reason for t, reason in sorted(reasons.items())}}
     excluded: dict[FrameKey, str] = {**clip.excluded, **gone}
     return clip.derive("exclude_timesteps", parameters, splits=splits, excluded=excluded)
 
@@ -173,7 +170,7 @@ def write_exclusions(path: Path, subjects: Mapping[str, Exclusions]) -> None:
                 "threshold_from": decided.basis,
                 "unit": UNIT,
                 "cameras": list(decided.cameras),
-                "frames": {t: _plain(frame) for t, frame in sorted(decided.frames.items())},
+                "frames": {t: asdict(frame) for t, frame in sorted(decided.frames.items())},
             }
             for subject, decided in subjects.items()
         },
@@ -223,12 +220,3 @@ def _word(path: Path, subject: str, timestep: int, word: str) -> str:
         key = f"subjects.{subject}.overrides.{timestep}"
         raise InputError(path, key, f'"{KEEP}" or the reason to leave the frame out', "nothing")
     return KEEP if word.strip().lower() == KEEP else word
-
-
-def _plain(frame: FrameDecision) -> dict[str, Any]:
-    return {
-        "sequence": str(frame.sequence),
-        "score": float(frame.score),
-        "excluded": bool(frame.excluded),
-        "reason": frame.reason,
-    }

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from ...bench.contracts import ByteArray, Clip, FloatArray, FrameKey, HeadPose, Progress, no_progress
 from ..clip import CaptureClip
 from ..figures import HELD_OUT, LEAK, MUTED, TRAIN, bands, new_figure, pixels, shortened, show
-from ..head.model import HeadModel
+from ..head.subject import PosedSubject, pose_in_head_frame
 from ..mesh_pictures import draw_mesh, portrait_camera
 from .clusters import ExpressionClusters
 from .jaw_bases import DEFAULT_COUNT, jaw_bases, jaw_quaternions, jaw_weights, leaks
@@ -191,13 +191,7 @@ def cluster_colour(rank: int) -> tuple[float, float, float]:
 
 def unposed_meshes(clip: Clip, poses: Sequence[HeadPose]) -> FloatArray:
     """(N, V, 3) meshes that keep expression, jaw, eyes and eyelids and lose rotation, neck and translation."""
-    model = HeadModel(clip.head)
-    shape, offset = (torch.from_numpy(np.asarray(a, np.float32)) for a in (clip.shape, clip.static_offset))
-    unposed = [
-        replace(pose, rotation=np.zeros(3), neck=np.zeros(3), translation=np.zeros(3)) for pose in poses
-    ]
-    with torch.no_grad():
-        return model(canonical=model.canonical(shape, offset), **model.pose_arguments(unposed)).numpy()
+    return PosedSubject.of(clip, torch.float32).meshes([pose_in_head_frame(pose) for pose in poses])
 
 
 def draw_meshes(clip: Clip, meshes: FloatArray, width: int, height: int) -> list[ByteArray]:

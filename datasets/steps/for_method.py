@@ -6,20 +6,21 @@ Found by the harness as the entry point of `headbench.adaptation`, see `headbenc
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from ...bench.contracts import Camera, Clip, FloatArray, FrameKey, HeadPose, Progress
+from ...bench.contracts import Clip, FloatArray, FrameKey, Progress
 from ...bench.errors import InputError
 from ...bench.runner.adaptation import Adaptation, AdaptedClip, MethodNeeds
-from ..clip import CaptureClip, FrameFiles, as_capture
+from ..clip import CaptureClip, as_capture
 from ..ga.tracking import find_head
 from ..head.arrays import HeadArrays
 from ..head.procedural.model import VERSIONS, procedural_head
-from ..head.refit.refit import refit_clip
+from ..head.refit.refit import refit
 from ..head.subject import PosedSubject, camera_in_head_frame, pose_in_head_frame
 from .resolution import align_clip, alignments
 
@@ -51,7 +52,7 @@ def clip_for_method(source: Clip, needs: MethodNeeds, heads: Mapping[str, str]) 
 def _adapt(
     clip: CaptureClip, needs: MethodNeeds, target: HeadArrays | None, folder: Path, progress: Progress
 ) -> AdaptedClip:
-    tracked = clip if target is None else refit_clip(clip, target, folder=folder, progress=progress)
+    tracked = clip if target is None else refit(clip, target, folder=folder, progress=progress).clip
     aligned = align_clip(tracked, needs.resolution)
     plans = alignments(tracked.cameras, needs.resolution)
     ground = np.asarray(clip.background, np.float32)
@@ -84,63 +85,43 @@ def _target(clip: CaptureClip, accepted: tuple[str, ...], heads: Mapping[str, st
     )
 
 
-@dataclass(frozen=True, eq=False)
-class SingleVideo:
-    """A clip as one video, and which frame of the source each of its frames is.
-
-    Attributes
-    ----------
-    clip : the video. Its timesteps are frame numbers: first all training frames, then those of the other splits,
-        then those left out. No two frames share a timestep or, with the head's motion in the cameras, a camera.
-    keys : key in the video by key in the source.
-    """
+class SingleVideo(NamedTuple):
+    """A clip as one video, and which frame of the source each of its frames is."""
 
     clip: CaptureClip
+    """The video. Its timesteps are frame numbers: first all training frames, then those of the other splits, then
+    those left out. No two frames share a timestep or a camera."""
     keys: Mapping[FrameKey, FrameKey]
-
-    @property
-    def sources(self) -> dict[FrameKey, FrameKey]:
-        """Key in the source by key in the video."""
-        return {video: source for source, video in self.keys.items()}
+    """Key in the video by key in the source."""
 
 
-def as_single_video(clip: CaptureClip, *, head_frame: bool = True) -> SingleVideo:
+def as_single_video(clip: CaptureClip) -> SingleVideo:
     """Concatenate the views of a clip into one video: all of the first camera, then all of the next.
 
     This is how the paper gave multi-view captures to GaussianBlendshapes. Training frames come first and are
     numbered without a gap; frames of other splits have later numbers and are in no way part of the video, they keep
-    their pose and camera so that they can be rendered.
-
-    Parameters
-    ----------
-    head_frame : move the head's rigid motion into the cameras (see `head_frame`): then every frame has a camera of
-        its own, named after the one that recorded it, and poses without rotation, neck and translation. Otherwise
-        cameras and poses stay and only timesteps are renumbered.
+    their pose and camera so that they can be rendered. The head's rigid motion moves into the cameras (see
+    `head.subject`): every frame has a camera of its own, named after the one that recorded it, and a pose without
+    rotation, neck and translation.
     """
     order = _order(clip)
     width = len(str(len(order) - 1))
     keys = {
-        key: key._replace(
-            timestep=number, camera=f"{key.camera}-{number:0{width}d}" if head_frame else key.camera
-        )
+        key: key._replace(timestep=number, camera=f"{key.camera}-{number:0{width}d}")
         for number, key in enumerate(order)
     }
-    poses = {keys[key].timestep: _numbered(clip.poses[key.timestep], keys[key]) for key in order}
-    cameras: dict[str, Camera] = dict(clip.cameras)
-    if head_frame:
-        timesteps = sorted({key.timestep for key in order})
-        motions = PosedSubject(clip.head, clip.shape, clip.static_offset).motions(
-            [clip.poses[timestep] for timestep in timesteps]
-        )
-        motion = dict(zip(timesteps, motions))
-        poses = {timestep: pose_in_head_frame(pose) for timestep, pose in poses.items()}
-        cameras = {}
-        for key in order:
-            camera = camera_in_head_frame(clip.cameras[key.camera], motion[key.timestep])
-            cameras[keys[key].camera] = replace(camera, id=keys[key].camera)
+    timesteps = sorted({key.timestep for key in order})
+    poses, cameras = {}, {}
+    motions = dict(zip(timesteps, PosedSubject.of(clip).motions([clip.poses[t] for t in timesteps])))
+    for key, new in keys.items():
+        # A pose of its own, so that what a method refines belongs to this frame alone.
+        still = pose_in_head_frame(clip.poses[key.timestep])
+        poses[new.timestep] = replace(still, timestep=new.timestep)
+        camera = camera_in_head_frame(clip.cameras[key.camera], motions[key.timestep])
+        cameras[new.camera] = replace(camera, id=new.camera)
     video = clip.derive(
         "as_single_video",
-        {"order": "camera, then timestep; training frames first", "head_frame": head_frame},
+        {"order": "camera, then timestep; training frames first", "head_frame": True},
         cameras=cameras,
         poses=poses,
         splits={
@@ -148,7 +129,7 @@ def as_single_video(clip: CaptureClip, *, head_frame: bool = True) -> SingleVide
             for name, part in clip.splits.items()
         },
         excluded={keys[key]: reason for key, reason in clip.excluded.items()},
-        files={keys[key]: _recorded(clip, key) for key in order},
+        files={keys[key]: clip.files[key]._replace(recorded=clip.recorded(key)) for key in order},
     )
     return SingleVideo(video, keys)
 
@@ -159,12 +140,3 @@ def _order(clip: CaptureClip) -> list[FrameKey]:
     ordered = [key for part in parts for key in sorted(part, key=lambda key: (key.camera, key.timestep))]
     rest = sorted(set(clip.files) - set(ordered), key=lambda key: (key.camera, key.timestep))
     return [*dict.fromkeys([*ordered, *rest])]
-
-
-def _numbered(pose: HeadPose, key: FrameKey) -> HeadPose:
-    """The pose as one of the video's own, so that what a method refines belongs to this frame alone."""
-    return replace(pose, timestep=key.timestep)
-
-
-def _recorded(clip: CaptureClip, key: FrameKey) -> FrameFiles:
-    return clip.files[key]._replace(recorded=clip.recorded(key))

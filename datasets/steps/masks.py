@@ -16,7 +16,7 @@ from scipy.special import ndtr
 from ...bench.contracts import Camera, FloatArray, FrameKey, HeadAsset, IntArray
 from ...bench.errors import InputError
 from ..clip import CaptureClip, FramePixels
-from ..head.model import HeadModel
+from ..head.subject import PosedSubject
 
 Ground = Sequence[float] | FloatArray
 """A colour (3,) in [0, 1], or an image (H, W, 3) of the empty set."""
@@ -25,7 +25,6 @@ SOFTNESS = 0.005
 """Standard deviation of the edge below the neck, in image widths: VHAP blurs with a Gaussian kernel 3 % wide,
 which reaches about three deviations to either side."""
 
-_BATCH = 64
 _SIDEWAYS = 0.3  # foreshortening of the neck, against that of the head, beyond which its sides give no line
 
 
@@ -104,7 +103,9 @@ def mask_below_neck(clip: CaptureClip, *, softness: float = SOFTNESS) -> Capture
             "mask_below_neck", "softness", "a positive share of the image's width", str(softness)
         )
     anchors = neck_anchors(clip.head)
-    places = _posed(clip, anchors)
+    timesteps = sorted({key.timestep for key in clip.files})
+    meshes = PosedSubject.of(clip, torch.float32).each(clip, timesteps)
+    places = {timestep: mesh[anchors].astype(np.float64) for timestep, mesh in meshes}
     lines = {
         clip.recorded(key): neck_line(clip.cameras[key.camera], places[key.timestep]) for key in clip.files
     }
@@ -163,24 +164,6 @@ def neck_line(camera: Camera, anchors: FloatArray) -> NeckLine | None:
     return NeckLine(
         (float(front[0]), float(front[1])), (float(normal[0] / length), float(normal[1] / length))
     )
-
-
-def _posed(clip: CaptureClip, vertices: IntArray) -> dict[int, FloatArray]:
-    """World positions (n, 3) of some vertices at each timestep."""
-    model = HeadModel(clip.head)
-    canonical = model.canonical(
-        torch.from_numpy(np.asarray(clip.shape, np.float32)),
-        torch.from_numpy(np.asarray(clip.static_offset, np.float32)),
-    )
-    timesteps = sorted({key.timestep for key in clip.files})
-    places: dict[int, FloatArray] = {}
-    with torch.no_grad():
-        for start in range(0, len(timesteps), _BATCH):
-            part = timesteps[start : start + _BATCH]
-            arguments = model.pose_arguments([clip.poses[timestep] for timestep in part])
-            posed = model(canonical=canonical, **arguments)[:, vertices].numpy().astype(np.float64)
-            places.update(zip(part, posed))
-    return places
 
 
 def check_colour(values: Sequence[float] | FloatArray) -> FloatArray:

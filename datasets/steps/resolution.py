@@ -158,14 +158,10 @@ def align_clip(clip: CaptureClip, rule: ResolutionRule) -> CaptureClip:
             coverage = plan.image(coverage[..., None], (0.0,))[..., 0]
         return FramePixels(plan.image(pixels.image, ground), coverage)
 
-    parameters = {"rule": asdict(rule), "sizes": _sizes(plans)}
+    pairs = sorted({(plan.source, plan.aligned_size) for plan in plans.values()})
+    sizes = [f"{a[0]}x{a[1]} to {b[0]}x{b[1]}" for a, b in pairs]
+    parameters = {"rule": asdict(rule), "sizes": sizes}
     return clip.derive_pixels("align_resolution", parameters, align, cameras=cameras)
-
-
-def _sizes(plans: Mapping[str, Alignment]) -> list[str]:
-    """What became of which size, for the record."""
-    pairs = {(plan.source, plan.aligned_size) for plan in plans.values()}
-    return [f"{a[0]}x{a[1]} to {b[0]}x{b[1]}" for a, b in sorted(pairs)]
 
 
 def _resized(image: FloatArray, width: int, height: int) -> FloatArray:
@@ -206,18 +202,11 @@ def resize_image(image: FloatArray, width: int, height: int) -> FloatArray:
     if (rows, columns) == (height, width):
         return image
     if rows % height == 0 and columns % width == 0:
-        return block_means(image, columns // width, rows // height)
+        means = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+        return np.asarray(means, dtype=np.float32).reshape(height, width, *image.shape[2:])
     planes = image[..., None] if image.ndim == 2 else image
     resized = [_cubic(planes[..., channel], width, height) for channel in range(planes.shape[2])]
     return resized[0] if image.ndim == 2 else np.stack(resized, axis=-1)
-
-
-def block_means(image: FloatArray, across: int, down: int) -> FloatArray:
-    """Means over blocks of ``across`` by ``down`` pixels, which have to tile the image."""
-    size = (image.shape[1] // across, image.shape[0] // down)
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.float32).reshape(
-        size[1], size[0], *image.shape[2:]
-    )
 
 
 def _cubic(plane: FloatArray, width: int, height: int) -> FloatArray:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from ...bench.contracts import Camera, FloatArray, FrameKey
+from ...bench.contracts import FloatArray, FrameKey
 from ...bench.errors import InputError
 from ..clip import CaptureClip, FramePixels
 
@@ -27,9 +27,6 @@ _PARAMETERS = {
     "RADIAL_FISHEYE": "f cx cy k1 k2",
     "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
 }
-MODELS = tuple(_PARAMETERS)
-"""Names of the lens models that can be undone."""
-
 _OUTSIDE = -1e4
 
 
@@ -39,7 +36,7 @@ class Lens:
 
     Attributes
     ----------
-    model : one of `MODELS`.
+    model : as COLMAP names it: a pinhole, or one that can be undone.
     parameters : in COLMAP's order; lengths in pixels.
     width, height : image size, pixels.
 
@@ -54,7 +51,7 @@ class Lens:
     def __post_init__(self) -> None:
         """Refuse what describes no lens."""
         if self.model not in _PARAMETERS:
-            raise InputError("lens", "model", f"one of {', '.join(MODELS)}", repr(self.model))
+            raise InputError("lens", "model", f"one of {', '.join(_PARAMETERS)}", repr(self.model))
         names = _PARAMETERS[self.model].split()
         if len(self.parameters) != len(names) or not np.isfinite(self.parameters).all():
             expected = f"{len(names)} finite numbers: {', '.join(names)}"
@@ -131,14 +128,6 @@ def undistort_image(image: FloatArray, places: FloatArray, background: FloatArra
     return np.clip(moved, 0, 1).astype(np.float32, copy=False)
 
 
-def undistort_camera(camera: Camera, lens: Lens) -> Camera:
-    """The pinhole camera of the undistorted images: size, focal lengths and principal point of the lens stay."""
-    if (camera.width, camera.height) != (lens.width, lens.height):
-        expected, found = f"{camera.width}x{camera.height}", f"{lens.width}x{lens.height}"
-        raise InputError(f"lens of camera {camera.id}", "size", f"{expected}, that of the images", found)
-    return replace(camera, K=lens.K)
-
-
 def undistort_clip(clip: CaptureClip, lenses: Mapping[str, Lens]) -> CaptureClip:
     """The clip with distortion taken out of images and masks; pixels that no lens saw are background.
 
@@ -159,10 +148,13 @@ def undistort_clip(clip: CaptureClip, lenses: Mapping[str, Lens]) -> CaptureClip
     bent = {name: lens for name, lens in lenses.items() if lens.distorts}
     if not bent:
         return clip
-    cameras = {
-        name: undistort_camera(camera, bent[name]) if name in bent else camera
-        for name, camera in clip.cameras.items()
-    }
+    cameras = dict(clip.cameras)
+    for name, lens in bent.items():
+        camera = clip.cameras[name]
+        if (camera.width, camera.height) != (lens.width, lens.height):
+            expected, found = f"{camera.width}x{camera.height}", f"{lens.width}x{lens.height}"
+            raise InputError(f"lens of camera {name}", "size", f"{expected}, that of the images", found)
+        cameras[name] = replace(camera, K=lens.K)
     lens_of = {clip.recorded(key).camera: bent[key.camera] for key in clip.files if key.camera in bent}
     maps = {lens: lens.map_from(lens.K, lens.width, lens.height) for lens in set(lens_of.values())}
     ground = np.asarray(clip.background, dtype=np.float32)

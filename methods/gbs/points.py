@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ...bench.contracts import FloatArray, HeadAsset, IntArray
 from ...datasets.head.arrays import HeadArrays, faces_in_region
+from ...datasets.head.geometry import triangle_areas
 from ...datasets.head.teeth import with_teeth_where_possible
 from ..shared.avatar_files import head_arrays
 from ..shared.schedule import numpy_generator
@@ -58,7 +59,7 @@ def poisson_disk(
     seed : of the run.
     """
     corners = np.asarray(vertices, np.float64)[faces[triangles]]
-    areas = _areas(corners)
+    areas = triangle_areas(vertices, faces[triangles])
     random = numpy_generator(seed, "surface", count)
     chosen = random.choice(len(areas), size=CANDIDATES * count, p=areas / areas.sum())
     root, along = np.sqrt(random.random(len(chosen))), random.random(len(chosen))
@@ -78,17 +79,6 @@ def full_barycentric(last_two: FloatArray) -> FloatArray:
     """(P, 3) float64 barycentric coordinates from the last two of them."""
     last_two = last_two.astype(np.float64)
     return np.column_stack([1 - last_two.sum(1), last_two])
-
-
-def surface_area(vertices: FloatArray, faces: IntArray) -> float:
-    """Area of a mesh, square metres."""
-    return float(_areas(np.asarray(vertices, np.float64)[faces]).sum())
-
-
-def _areas(corners: FloatArray) -> FloatArray:
-    one, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    areas: FloatArray = 0.5 * np.linalg.norm(np.cross(one, other), axis=1)
-    return areas
 
 
 def spacing(points: FloatArray) -> FloatArray:

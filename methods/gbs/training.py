@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ...bench.contracts import Clip
 from ...datasets.head.arrays import HeadArrays
+from ...datasets.head.geometry import triangle_areas
 from ..shared.avatar_files import Subject
 from ..shared.loop import recomposited
 from ..shared.networks import initial_coefficients
@@ -29,7 +30,7 @@ from .blendshapes import (
     entries_of,
 )
 from .config import GBSConfig
-from .points import SurfacePoints, mouth_cylinder, poisson_disk, rows_of_teeth, spacing, surface_area
+from .points import SurfacePoints, mouth_cylinder, poisson_disk, rows_of_teeth, spacing
 
 DIFFERENCES = "differences"
 RATE = 1e-6
@@ -226,7 +227,9 @@ def starting_points(
     on_teeth = np.concatenate([*rows, np.empty(0, np.int64)])
     on_head = np.setdiff1d(np.arange(len(faces)), on_teeth)
     share = config.teeth_samples / config.samples
-    count = sample_count(clip, config, surface_area(vertices, faces[on_head]), vertices.mean(0))
+    count = sample_count(
+        clip, config, float(triangle_areas(vertices, faces[on_head]).sum()), vertices.mean(0)
+    )
     parts = [(on_head, count), *((row, round(share * count)) for row in rows)]
     found = [poisson_disk(vertices, faces, *part, seed) for part in parts if part[1] > 0]
     points = SurfacePoints(*(np.concatenate(columns) for columns in zip(*found)))

@@ -17,6 +17,7 @@ import torch
 
 from ...bench.contracts import Clip, FloatArray, HeadPose
 from ...datasets.head.arrays import JOINT_NAMES, faces_in_region
+from ...datasets.head.geometry import triangle_areas
 from ...datasets.steps.jaw_bases import IDENTITY, farthest_quaternions, jaw_quaternions
 from ..compact.simplify import training_poses
 from ..shared.subject_mesh import SubjectMesh, centroid_displacements
@@ -236,7 +237,7 @@ class _Planner:
         """Bound on the number of splats; training starts with one on each triangle, so never fewer."""
         if self._kept("splats.max_splats"):
             return None
-        area = surface_area(self._canonical, np.asarray(self._clip.head.faces)) / self.pixel**2
+        area = float(triangle_areas(self._canonical, np.asarray(self._clip.head.faces)).sum()) / self.pixel**2
         needed = max(ceil(SPLATS_PER_PIXEL * area), len(self._mesh.faces))
         configured = self._config.splats.max_splats
         chosen = needed if configured is None else min(needed, configured)
@@ -368,9 +369,3 @@ def _residual(quaternions: FloatArray, bases: FloatArray) -> float:
     _, sizes, rows = np.linalg.svd(bases, full_matrices=False)
     rows = rows[sizes > 1e-9 * sizes[0]]
     return float(np.linalg.norm(quaternions - quaternions @ rows.T @ rows, axis=1).max())
-
-
-def surface_area(vertices: FloatArray, faces: FloatArray) -> float:
-    """Square metres of a mesh."""
-    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
-    return float(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())

@@ -21,7 +21,6 @@ from ...datasets.steps.clusters import (
     DEFAULT_CLASSES,
     LANDMARK_TOLERANCE,
     cluster_by_distance,
-    cluster_by_landmarks,
     cluster_expressions,
     expression_displacements,
     farthest_meshes,
@@ -144,7 +143,7 @@ def _agreement(seed: int) -> dict[str, float]:
     approximate, by_landmarks = [], []
     for start in range(SEEDS):
         found = farthest_meshes(faces, AGREEMENT_LANDMARKS, seed=start, tolerance=LANDMARK_TOLERANCE)
-        approximate.append(cluster_by_landmarks(found.distances, found.indices, DEFAULT_CLASSES)[0])
+        approximate.append(cluster_by_distance(found.distances, DEFAULT_CLASSES, found.indices)[0])
         columns = similarities(found.distances, float(found.distances.max()))
         embedding = nystrom_embedding(columns, found.indices, DEFAULT_CLASSES)
         by_landmarks.append(_published_labels(embedding, SEEDS + start))

@@ -7,7 +7,7 @@ by name, as FLAME's do. `semantic_to_coefficients` leads from names to coefficie
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +29,11 @@ Vector = tuple[float, float, float]
 Shape = Callable[["Strokes"], FloatArray]
 
 
+def _gaussian(points: FloatArray, center: Vector | FloatArray, sigma: Vector | float) -> FloatArray:
+    """(N,) weights, 1 at the centre."""
+    return np.exp(-0.5 * (((points - center) / np.broadcast_to(sigma, 3)) ** 2).sum(axis=1))
+
+
 @dataclass(frozen=True, eq=False)
 class Strokes:
     """The surface with the strokes that shapes are made of. All act on the skin only."""
@@ -37,8 +42,7 @@ class Strokes:
 
     def pull(self, center: Vector, sigma: Vector | float, millimetres: Vector) -> FloatArray:
         """Move a Gaussian neighbourhood of a point by a vector given in millimetres."""
-        scaled = (self.surface.vertices - center) / np.broadcast_to(sigma, 3)
-        weight = np.exp(-0.5 * (scaled**2).sum(axis=1)) * self.surface.skin
+        weight = _gaussian(self.surface.vertices, center, sigma) * self.surface.skin
         return weight[:, None] * np.array(millimetres) * 1e-3
 
     def swell(self, center: Vector, sigma: Vector | float, millimetres: float) -> FloatArray:
@@ -65,128 +69,85 @@ class Strokes:
         return np.column_stack([0 * x, -share * above * near, -back * 1e-3 * near])
 
 
-def _smile(c: Strokes) -> FloatArray:
-    field = c.pull(CORNER, (0.011, 0.010, 0.016), (6.5, 5.5, -4.5))
-    field = field + c.pull((0.016, -0.050, 0.072), (0.007, 0.009, 0.016), (1.8, 1.2, -1.2))
-    field = field + c.swell((0.042, -0.020, 0.056), (0.013, 0.012, 0.016), 4.0)
-    field = field + c.pull((0.040, -0.016, 0.058), 0.013, (0.5, 2.5, 0))
-    return field - c.swell((0.029, -0.034, 0.068), (0.0035, 0.010, 0.008), 1.6)
-
-
-def _squint(c: Strokes) -> FloatArray:
-    return lid_turn(c.surface, -0.10, 0.20) + c.pull(
-        (0.038, 0.004, 0.058), (0.014, 0.006, 0.012), (0, 2.2, 0.8)
-    )
-
-
-def _brow_down(c: Strokes) -> FloatArray:
-    field = c.pull((0.017, 0.040, 0.075), (0.011, 0.008, 0.015), (-2.2, -4.2, 0.8))
-    return field + c.pull((0.036, 0.040, 0.066), (0.010, 0.008, 0.015), (-0.5, -2.8, 0.3))
-
-
-def _brow_outer_up(c: Strokes) -> FloatArray:
-    field = c.pull((0.042, 0.040, 0.060), (0.012, 0.009, 0.016), (0.2, 5.5, -0.8))
-    return field + c.pull((0.040, 0.060, 0.060), (0.015, 0.014, 0.020), (0, 2.5, -0.4))
-
-
-def _cheek_raise(c: Strokes) -> FloatArray:
-    field = c.swell((0.042, -0.006, 0.056), (0.013, 0.010, 0.016), 2.5)
-    return field + c.pull((0.040, -0.008, 0.058), 0.013, (0.3, 3.5, 0)) + lid_turn(c.surface, 0.0, 0.12)
-
-
-def _nose_sneer(c: Strokes) -> FloatArray:
-    field = c.pull((0.0165, -0.020, 0.078), (0.007, 0.009, 0.010), (0.8, 3.2, -0.6))
-    field = field + c.pull((0.012, 0.002, 0.070), (0.007, 0.010, 0.010), (-0.3, 1.6, 0.9))
-    return field + c.pull((0.016, -0.037, 0.076), (0.009, 0.007, 0.012), (0, 2.0, 0.3))
-
-
-def _puff(c: Strokes) -> FloatArray:
-    return c.swell((0.043, -0.042, 0.048), (0.016, 0.016, 0.020), 8.0) + c.pull(CORNER, 0.010, (-1.0, 0, 1.0))
-
-
-def _stretch(c: Strokes) -> FloatArray:
-    return c.pull(CORNER, (0.011, 0.011, 0.016), (6.0, -1.5, -3.5)) + c.pull(
-        (0.040, -0.075, 0.040), 0.016, (2.0, -1.5, 0)
-    )
-
-
-def _frown(c: Strokes) -> FloatArray:
-    field = c.pull(CORNER, (0.010, 0.010, 0.015), (1.0, -6.0, -1.2))
-    return field + c.pull((0.024, -0.068, 0.064), 0.010, (0.5, -1.8, 0.6))
-
-
-def _pucker(c: Strokes) -> FloatArray:
-    field = c.pull(CORNER, (0.012, 0.012, 0.018), (-7.5, 0, 5.0)) + c.pull(
-        (0.014, -0.051, 0.073), 0.009, (-1.8, 0, 2.2)
-    )
-    return field + 0.5 * c.pull((0, -0.051, 0.078), (0.012, 0.009, 0.020), (0, 0, 5.0))
-
-
-def _funnel(c: Strokes) -> FloatArray:
-    field = c.pull(CORNER, (0.012, 0.012, 0.018), (-5.5, 0, 4.0))
-    field = field + 0.5 * c.lip(True, 0, 0.015, (0, 3.4, 4.0)) + 0.5 * c.lip(False, 0, 0.015, (0, -4.0, 4.0))
-    return field
-
-
-def _roll(c: Strokes) -> FloatArray:
-    return 0.5 * c.compress(0.45, 3.2)
-
-
-def _chin_raise(c: Strokes) -> FloatArray:
-    field = c.pull((0, -0.080, 0.075), (0.016, 0.010, 0.020), (0, 3.4, 1.2))
-    field = field + c.pull((0, -0.050, 0.078), (0.018, 0.012, 0.022), (0, 2.2, 1.0))
-    return 0.5 * field
-
-
-def _wide(c: Strokes) -> FloatArray:
-    return lid_turn(c.surface, 0.16, -0.05)
-
-
-def _dimple(c: Strokes) -> FloatArray:
-    return c.pull(CORNER, (0.008, 0.009, 0.012), (2.2, 0.3, -4.0)) + c.swell(
-        (0.032, -0.050, 0.062), 0.006, -1.2
-    )
-
-
-def _neck_tense(c: Strokes) -> FloatArray:
-    return c.swell((0.035, -0.135, 0.005), (0.012, 0.030, 0.030), 3.0) + c.pull(CORNER, 0.012, (1.5, -2.0, 0))
-
-
-def _jaw_forward(c: Strokes) -> FloatArray:
-    return 0.5 * jaw_weight(c.surface)[:, None] * np.array([0, -0.0006, 0.0050])
-
-
 # Shapes of the left side; each has its mirror image on the right.
 PAIRED: dict[str, Shape] = {
-    "brow_down": _brow_down,
-    "brow_outer_up": _brow_outer_up,
+    "brow_down": lambda c: (
+        c.pull((0.017, 0.040, 0.075), (0.011, 0.008, 0.015), (-2.2, -4.2, 0.8))
+        + c.pull((0.036, 0.040, 0.066), (0.010, 0.008, 0.015), (-0.5, -2.8, 0.3))
+    ),
+    "brow_outer_up": lambda c: (
+        c.pull((0.042, 0.040, 0.060), (0.012, 0.009, 0.016), (0.2, 5.5, -0.8))
+        + c.pull((0.040, 0.060, 0.060), (0.015, 0.014, 0.020), (0, 2.5, -0.4))
+    ),
     "blink": lambda c: blink(c.surface),
-    "squint": _squint,
-    "eye_wide": _wide,
-    "cheek_raise": _cheek_raise,
-    "nose_sneer": _nose_sneer,
-    "smile": _smile,
-    "mouth_stretch": _stretch,
+    "squint": lambda c: (
+        lid_turn(c.surface, -0.10, 0.20) + c.pull((0.038, 0.004, 0.058), (0.014, 0.006, 0.012), (0, 2.2, 0.8))
+    ),
+    "eye_wide": lambda c: lid_turn(c.surface, 0.16, -0.05),
+    "cheek_raise": lambda c: (
+        c.swell((0.042, -0.006, 0.056), (0.013, 0.010, 0.016), 2.5)
+        + c.pull((0.040, -0.008, 0.058), 0.013, (0.3, 3.5, 0))
+        + lid_turn(c.surface, 0.0, 0.12)
+    ),
+    "nose_sneer": lambda c: (
+        c.pull((0.0165, -0.020, 0.078), (0.007, 0.009, 0.010), (0.8, 3.2, -0.6))
+        + c.pull((0.012, 0.002, 0.070), (0.007, 0.010, 0.010), (-0.3, 1.6, 0.9))
+        + c.pull((0.016, -0.037, 0.076), (0.009, 0.007, 0.012), (0, 2.0, 0.3))
+    ),
+    "smile": lambda c: (
+        c.pull(CORNER, (0.011, 0.010, 0.016), (6.5, 5.5, -4.5))
+        + c.pull((0.016, -0.050, 0.072), (0.007, 0.009, 0.016), (1.8, 1.2, -1.2))
+        + c.swell((0.042, -0.020, 0.056), (0.013, 0.012, 0.016), 4.0)
+        + c.pull((0.040, -0.016, 0.058), 0.013, (0.5, 2.5, 0))
+        - c.swell((0.029, -0.034, 0.068), (0.0035, 0.010, 0.008), 1.6)
+    ),
+    "mouth_stretch": lambda c: (
+        c.pull(CORNER, (0.011, 0.011, 0.016), (6.0, -1.5, -3.5))
+        + c.pull((0.040, -0.075, 0.040), 0.016, (2.0, -1.5, 0))
+    ),
     "upper_lip_up": lambda c: c.lip(True, 0.011, 0.009, (0.3, 4.6, 0.8)),
     "lower_lip_down": lambda c: c.lip(False, 0.011, 0.009, (0.3, -4.8, 0.6)),
-    "dimple": _dimple,
+    "dimple": lambda c: (
+        c.pull(CORNER, (0.008, 0.009, 0.012), (2.2, 0.3, -4.0)) + c.swell((0.032, -0.050, 0.062), 0.006, -1.2)
+    ),
     "nostril_flare": lambda c: c.pull((0.0170, -0.0235, 0.0775), (0.005, 0.007, 0.009), (2.2, 0.6, 0)),
 }
 # Halves of symmetric shapes: left half plus its mirror image.
 SINGLE: dict[str, Shape] = {
     "brow_inner_up": lambda c: c.pull((0.012, 0.041, 0.076), (0.011, 0.011, 0.018), (0.3, 5.0, -0.5)),
-    "cheek_puff": _puff,
-    "mouth_frown": _frown,
-    "pucker": _pucker,
-    "funnel": _funnel,
+    "cheek_puff": lambda c: (
+        c.swell((0.043, -0.042, 0.048), (0.016, 0.016, 0.020), 8.0) + c.pull(CORNER, 0.010, (-1.0, 0, 1.0))
+    ),
+    "mouth_frown": lambda c: (
+        c.pull(CORNER, (0.010, 0.010, 0.015), (1.0, -6.0, -1.2))
+        + c.pull((0.024, -0.068, 0.064), 0.010, (0.5, -1.8, 0.6))
+    ),
+    "pucker": lambda c: (
+        c.pull(CORNER, (0.012, 0.012, 0.018), (-7.5, 0, 5.0))
+        + c.pull((0.014, -0.051, 0.073), 0.009, (-1.8, 0, 2.2))
+        + 0.5 * c.pull((0, -0.051, 0.078), (0.012, 0.009, 0.020), (0, 0, 5.0))
+    ),
+    "funnel": lambda c: (
+        c.pull(CORNER, (0.012, 0.012, 0.018), (-5.5, 0, 4.0))
+        + 0.5 * c.lip(True, 0, 0.015, (0, 3.4, 4.0))
+        + 0.5 * c.lip(False, 0, 0.015, (0, -4.0, 4.0))
+    ),
     "lip_press": lambda c: 0.5 * c.compress(0.30, 0.6),
-    "lip_roll": _roll,
-    "chin_raise": _chin_raise,
+    "lip_roll": lambda c: 0.5 * c.compress(0.45, 3.2),
+    "chin_raise": lambda c: (
+        0.5
+        * (
+            c.pull((0, -0.080, 0.075), (0.016, 0.010, 0.020), (0, 3.4, 1.2))
+            + c.pull((0, -0.050, 0.078), (0.018, 0.012, 0.022), (0, 2.2, 1.0))
+        )
+    ),
     "lips_part": lambda c: (
         0.5 * c.lip(True, 0, 0.016, (0, 2.5, 0.3)) + 0.5 * c.lip(False, 0, 0.016, (0, -3.5, 0))
     ),
-    "neck_tense": _neck_tense,
-    "jaw_forward": _jaw_forward,
+    "neck_tense": lambda c: (
+        c.swell((0.035, -0.135, 0.005), (0.012, 0.030, 0.030), 3.0) + c.pull(CORNER, 0.012, (1.5, -2.0, 0))
+    ),
+    "jaw_forward": lambda c: 0.5 * jaw_weight(c.surface)[:, None] * np.array([0, -0.0006, 0.0050]),
 }
 # Shapes with a direction, to the subject's left; the right one is the mirror image.
 SIDEWAYS: dict[str, Shape] = {
@@ -382,50 +343,36 @@ def keep_off_eyes(surface: SculptedHead, field: FloatArray, clearance: float = 0
     return held
 
 
-Field = Callable[[FloatArray], FloatArray]
+Displacement = Callable[[FloatArray], FloatArray]
 
 
-def _along(axis: int, profile: Callable[[FloatArray], FloatArray]) -> Field:
+def _along(axis: int, profile: Callable[[FloatArray], FloatArray]) -> Displacement:
     """Displacement along an axis, its size given by a profile of position (N, 3) -> (N,) metres."""
-
-    def field(points: FloatArray) -> FloatArray:
-        out = np.zeros_like(points)
-        out[:, axis] = profile(points)
-        return out
-
-    return field
+    return lambda points: profile(points)[:, None] * np.eye(3)[axis]
 
 
-def _pair(
-    center: tuple[float, ...], sigma: tuple[float, ...] | float, millimetres: tuple[float, ...]
-) -> Field:
+def _pull(
+    center: Vector,
+    sigma: Vector | float,
+    millimetres: Vector,
+    sides: Sequence[FloatArray] = (np.ones(3), MIRROR),
+) -> Displacement:
     """Gaussian pull around a point and its mirror image; the x component is outward on either side."""
 
-    def field(points: FloatArray) -> FloatArray:
+    def displacement(points: FloatArray) -> FloatArray:
         out = np.zeros_like(points)
-        for side in (np.ones(3), MIRROR):
-            scaled = (points - side * center) / np.broadcast_to(sigma, 3)
-            weight = np.exp(-0.5 * (scaled**2).sum(axis=1))
-            out += weight[:, None] * side * np.array(millimetres) * (1e-3 if center[0] else 0.5e-3)
+        for side in sides:
+            weight = _gaussian(points, side * center, sigma)
+            out += weight[:, None] * side * np.array(millimetres) * (1e-3 if center[0] else 1e-3 / len(sides))
         return out
 
-    return field
+    return displacement
 
 
-def _single(
-    center: tuple[float, ...], sigma: tuple[float, ...] | float, millimetres: tuple[float, ...]
-) -> Field:
-    """Gaussian pull around one point: where faces are not symmetric."""
-
-    def field(points: FloatArray) -> FloatArray:
-        weight = np.exp(-0.5 * (((points - center) / np.broadcast_to(sigma, 3)) ** 2).sum(axis=1))
-        return weight[:, None] * np.array(millimetres) * 1e-3
-
-    return field
-
+_LEFT_ALONE = (np.ones(3),)  # where faces are not symmetric
 
 # One standard deviation of each trait; Farkas (1994) gives about 4-5 % for the large measures.
-TRAITS: dict[str, Field] = {
+TRAITS: dict[str, Displacement] = {
     "size": lambda p: 0.030 * p,
     "breadth": _along(0, lambda p: 0.040 * p[:, 0]),
     "depth": _along(2, lambda p: 0.035 * p[:, 2]),
@@ -433,40 +380,37 @@ TRAITS: dict[str, Field] = {
         1, lambda p: 0.060 * np.minimum(p[:, 1] - 0.02, 0) * smoothstep(p[:, 1], -0.22, -0.09)
     ),
     "skull_height": _along(1, lambda p: 0.060 * np.maximum(p[:, 1] - 0.04, 0)),
-    "jaw_width": _pair((0.050, -0.060, 0.015), (0.022, 0.025, 0.030), (3.2, 0, 0)),
-    "chin_forward": _pair((0, -0.086, 0.072), (0.022, 0.015, 0.024), (0, -0.5, 3.0)),
-    "chin_height": _pair((0, -0.092, 0.066), (0.030, 0.014, 0.035), (0, -3.0, 0)),
-    "chin_width": _pair((0.018, -0.086, 0.066), 0.012, (2.2, 0, 0)),
-    "cheekbones": _pair((0.054, 0.000, 0.045), (0.016, 0.014, 0.022), (2.2, 0.3, 1.0)),
-    "cheek_fullness": _pair((0.046, -0.036, 0.046), (0.018, 0.020, 0.022), (3.0, 0, 1.6)),
-    "brow_ridge": _pair((0.020, 0.040, 0.073), (0.018, 0.009, 0.016), (0, 0, 1.8)),
-    "brow_height": _pair((0.026, 0.040, 0.070), (0.020, 0.009, 0.018), (0, 1.8, 0)),
-    "forehead_slope": _pair((0, 0.085, 0.060), (0.050, 0.026, 0.040), (0, 0, 3.2)),
-    "temple": _pair((0.066, 0.040, 0.030), (0.020, 0.025, 0.028), (2.2, 0, 0)),
-    "eye_spacing": _pair((0.0315, 0.020, 0.055), (0.014, 0.014, 0.025), (1.5, 0, 0)),
-    "eye_depth": _pair((0.0315, 0.020, 0.055), (0.016, 0.014, 0.025), (0, 0, -1.3)),
-    "nose_length": _pair((0, -0.022, 0.088), (0.016, 0.011, 0.018), (0, -2.2, 0.3)),
-    "nose_projection": _pair((0, -0.017, 0.094), (0.014, 0.014, 0.018), (0, 0.3, 2.0)),
-    "nose_width": _pair((0.0155, -0.021, 0.080), (0.008, 0.010, 0.012), (1.5, 0, 0)),
-    "nose_bridge": _pair((0, 0.004, 0.076), (0.009, 0.011, 0.012), (0, 0, 1.6)),
-    "nose_tip": _pair((0, -0.020, 0.096), 0.008, (0, 1.6, 0.3)),
-    "mouth_width": _pair((0.0258, -0.052, 0.067), (0.012, 0.010, 0.016), (2.0, 0, -0.9)),
-    "mouth_height": _pair((0, -0.051, 0.076), (0.030, 0.012, 0.025), (0, 1.6, 0)),
-    "mouth_forward": _pair((0, -0.051, 0.078), (0.024, 0.016, 0.022), (0, 0, 1.6)),
-    "lip_fullness": lambda p: _lip_fullness(p),
-    "ear_flare": _pair((0.083, 0.014, -0.034), (0.013, 0.028, 0.014), (3.0, 0, 0.8)),
-    "ear_size": _pair((0.078, 0.038, -0.028), (0.014, 0.016, 0.018), (0, 2.6, -0.5)),
+    "jaw_width": _pull((0.050, -0.060, 0.015), (0.022, 0.025, 0.030), (3.2, 0, 0)),
+    "chin_forward": _pull((0, -0.086, 0.072), (0.022, 0.015, 0.024), (0, -0.5, 3.0)),
+    "chin_height": _pull((0, -0.092, 0.066), (0.030, 0.014, 0.035), (0, -3.0, 0)),
+    "chin_width": _pull((0.018, -0.086, 0.066), 0.012, (2.2, 0, 0)),
+    "cheekbones": _pull((0.054, 0.000, 0.045), (0.016, 0.014, 0.022), (2.2, 0.3, 1.0)),
+    "cheek_fullness": _pull((0.046, -0.036, 0.046), (0.018, 0.020, 0.022), (3.0, 0, 1.6)),
+    "brow_ridge": _pull((0.020, 0.040, 0.073), (0.018, 0.009, 0.016), (0, 0, 1.8)),
+    "brow_height": _pull((0.026, 0.040, 0.070), (0.020, 0.009, 0.018), (0, 1.8, 0)),
+    "forehead_slope": _pull((0, 0.085, 0.060), (0.050, 0.026, 0.040), (0, 0, 3.2)),
+    "temple": _pull((0.066, 0.040, 0.030), (0.020, 0.025, 0.028), (2.2, 0, 0)),
+    "eye_spacing": _pull((0.0315, 0.020, 0.055), (0.014, 0.014, 0.025), (1.5, 0, 0)),
+    "eye_depth": _pull((0.0315, 0.020, 0.055), (0.016, 0.014, 0.025), (0, 0, -1.3)),
+    "nose_length": _pull((0, -0.022, 0.088), (0.016, 0.011, 0.018), (0, -2.2, 0.3)),
+    "nose_projection": _pull((0, -0.017, 0.094), (0.014, 0.014, 0.018), (0, 0.3, 2.0)),
+    "nose_width": _pull((0.0155, -0.021, 0.080), (0.008, 0.010, 0.012), (1.5, 0, 0)),
+    "nose_bridge": _pull((0, 0.004, 0.076), (0.009, 0.011, 0.012), (0, 0, 1.6)),
+    "nose_tip": _pull((0, -0.020, 0.096), 0.008, (0, 1.6, 0.3)),
+    "mouth_width": _pull((0.0258, -0.052, 0.067), (0.012, 0.010, 0.016), (2.0, 0, -0.9)),
+    "mouth_height": _pull((0, -0.051, 0.076), (0.030, 0.012, 0.025), (0, 1.6, 0)),
+    "mouth_forward": _pull((0, -0.051, 0.078), (0.024, 0.016, 0.022), (0, 0, 1.6)),
+    "lip_fullness": lambda p: (
+        _pull((0, -0.0455, 0.080), (0.014, 0.0042, 0.010), (0, 0.8, 1.0))(p)
+        + _pull((0, -0.0580, 0.078), (0.013, 0.0045, 0.010), (0, -0.9, 1.1))(p)
+    ),
+    "ear_flare": _pull((0.083, 0.014, -0.034), (0.013, 0.028, 0.014), (3.0, 0, 0.8)),
+    "ear_size": _pull((0.078, 0.038, -0.028), (0.014, 0.016, 0.018), (0, 2.6, -0.5)),
     "neck_girth": lambda p: p * [0.07, 0, 0.07] * smoothstep(-p[:, 1], 0.070, 0.125)[:, None],
-    "nose_aside": _single((0, -0.014, 0.090), (0.012, 0.016, 0.016), (1.0, 0, 0)),
-    "jaw_aside": _single((0, -0.080, 0.060), (0.040, 0.024, 0.040), (1.6, 0, 0)),
-    "brow_uneven": _single((0.028, 0.040, 0.070), (0.018, 0.010, 0.018), (0, 1.0, 0)),
+    "nose_aside": _pull((0, -0.014, 0.090), (0.012, 0.016, 0.016), (1.0, 0, 0), _LEFT_ALONE),
+    "jaw_aside": _pull((0, -0.080, 0.060), (0.040, 0.024, 0.040), (1.6, 0, 0), _LEFT_ALONE),
+    "brow_uneven": _pull((0.028, 0.040, 0.070), (0.018, 0.010, 0.018), (0, 1.0, 0), _LEFT_ALONE),
 }
-
-
-def _lip_fullness(points: FloatArray) -> FloatArray:
-    upper = _pair((0, -0.0455, 0.080), (0.014, 0.0042, 0.010), (0, 0.8, 1.0))(points)
-    lower = _pair((0, -0.0580, 0.078), (0.013, 0.0045, 0.010), (0, -0.9, 1.1))(points)
-    return upper + lower
 
 
 def trait_field(name: str, points: FloatArray) -> FloatArray:

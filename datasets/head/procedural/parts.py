@@ -114,9 +114,8 @@ def _teeth(
     share = np.linspace(0, 1, COLUMNS, endpoint=False)  # where a tooth ends the next one begins
     length = (starts[:, None] + every[:, None] * share).ravel()
     across = np.tile(2 * share - 1, len(every))
-    order = np.abs(
-        np.repeat(np.arange(len(every)) - len(half) + 0.5, COLUMNS)
-    )  # 0.5, 1.5 ... from the midline
+    # 0.5, 1.5 ... from the midline
+    order = np.abs(np.repeat(np.arange(len(every)) - len(half) + 0.5, COLUMNS))
     place, normal = dental_arch(length, front)
     bulge = 0.0009 * (1 - np.abs(across) ** 3)
     shorter = np.where((order > 1) & (order < 2), 0.0007, 0.0) + 0.0005 * np.abs(across) ** 4
@@ -136,14 +135,8 @@ def _gums(front: float, *, near: float, far: float) -> tuple[FloatArray, IntArra
     end = arch_length()
     place, normal = dental_arch(np.linspace(-end, end, 81), front)
     rows = []
-    for height, out in (
-        (1.0, -0.0010),
-        (0.6, 0.0010),
-        (0.2, 0.0014),
-        (0.0, 0.0002),
-        (0.0, -0.0046),
-        (1.0, -0.0075),
-    ):
+    profile = ((1.0, -0.0010), (0.6, 0.0010), (0.2, 0.0014), (0.0, 0.0002), (0.0, -0.0046), (1.0, -0.0075))
+    for height, out in profile:
         y = np.full(len(place), near + height * (far - near))
         rows.append(place + out * normal + np.column_stack([0 * y, y, 0 * y]))
     return _strip(rows, flip=far < near)
@@ -153,12 +146,8 @@ def _strip(rows: list[FloatArray], *, flip: bool) -> tuple[FloatArray, IntArray]
     """Quads between rows of equal length, as triangles."""
     count = len(rows[0])
     base = (np.arange(len(rows) - 1)[:, None] * count + np.arange(count - 1)).ravel()
-    faces = np.concatenate(
-        [
-            np.column_stack([base, base + count, base + 1]),
-            np.column_stack([base + 1, base + count, base + count + 1]),
-        ]
-    )
+    first = np.column_stack([base, base + count, base + 1])
+    faces = np.concatenate([first, np.column_stack([base + 1, base + count, base + count + 1])])
     return np.concatenate(rows), faces[:, ::-1] if flip else faces
 
 

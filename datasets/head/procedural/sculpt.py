@@ -16,7 +16,7 @@ from skimage.measure import marching_cubes
 
 from ....bench.contracts import FloatArray, IntArray
 from ....bench.io.files import atomic_path
-from ..geometry import border_edges, mesh_edges
+from ..geometry import border_edges, mesh_edges, triangle_areas
 from .anatomy import (
     CLOSED_LIP_GAP,
     EYE_CENTER,
@@ -197,9 +197,8 @@ def polygonise(
 
 def vertex_areas(vertices: FloatArray, faces: IntArray) -> FloatArray:
     """(V,) a third of the area of the triangles around each vertex, square metres."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
-    return np.bincount(faces.ravel(), np.repeat(area, 3), len(vertices)).astype(float)
+    share = triangle_areas(vertices, faces) / 3
+    return np.bincount(faces.ravel(), np.repeat(share, 3), len(vertices)).astype(float)
 
 
 def surface_graph(vertices: FloatArray, faces: IntArray, size: FloatArray, *, diagonals: bool) -> csr_matrix:

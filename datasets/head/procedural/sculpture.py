@@ -199,7 +199,7 @@ def head_mass(points: FloatArray) -> FloatArray:
     return union(head, neck_mass(points), 0.022)
 
 
-# Strokes strokes on the left half: height (metres, positive adds), centre, deviations, turn in degrees.
+# Strokes on the left half: height (metres, positive adds), centre, deviations, turn in degrees.
 PLANES: tuple[tuple[float, tuple[float, ...], tuple[float, ...], tuple[float, ...] | None], ...] = (
     (0.0010, (0.000, 0.042, 0.077), (0.012, 0.009, 0.020), None),  # glabella
     (0.0022, (0.024, 0.039, 0.070), (0.013, 0.0060, 0.020), (0, 0, 6)),  # brow ridge
@@ -375,8 +375,8 @@ def add_ears(head: FloatArray, points: FloatArray) -> FloatArray:
     ear = union(ear, antihelix, 0.002)
     ear = union(ear, ellipsoid(points, at(-2, 0, 2.5), (0.0026, 0.0050, 0.0032), turn), 0.003)
     head = union(head, ear, 0.004)
-    shell = ellipsoid(points, at(8, 2, -2.0), (0.0060, 0.0130, 0.0100), turn)
-    head = union(head, shell, 0.003)
+    back = ellipsoid(points, at(8, 2, -2.0), (0.0060, 0.0130, 0.0100), turn)
+    head = union(head, back, 0.003)
     concha = ellipsoid(points, at(8, 0.5, 5.0), (0.0058, 0.0095, 0.0066), turn)
     cymba = ellipsoid(points, at(9, 10, 5.0), (0.0045, 0.0050, 0.0060), turn)
     return subtraction(head, union(concha, cymba, 0.002), 0.0022)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ....bench.contracts import FloatArray, IntArray
 from ....bench.io.arrays import Member, read_arrays
-from ..geometry import border_edges, smoothstep, vertex_normals
+from ..geometry import border_edges, even_weights, smoothstep, vertex_normals
 from .anatomy import (
     EYE_CENTER,
     EYE_RADIUS,
@@ -214,10 +214,7 @@ def joint_regressor(surface: SculptedHead) -> FloatArray:
     }
     regressor = np.zeros((len(PARENTS), len(vertices)))
     for joint, support in supports.items():
-        rows = np.vstack([np.ones(len(support)), vertices[support].T])
-        even = np.full(len(support), 1 / len(support))
-        missing = np.concatenate([[1], JOINTS[joint]]) - rows @ even
-        regressor[joint, support] = even + np.linalg.pinv(rows) @ missing
+        regressor[joint, support] = even_weights(vertices[support], JOINTS[joint])
     return regressor
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 
-from ....bench.contracts import ByteArray, FloatArray
+from ....bench.contracts import ByteArray
 from ...figures import new_figure, pixels, show
 from ...mesh_pictures import CLAY, draw_mesh, portrait_camera
 from ..subject import PosedSubject
@@ -21,11 +21,11 @@ _SHOWN = 99  # percentile of the residuals at the upper end of the scale
 def draw_heat_map(refitted: Refitted) -> ByteArray:
     """(H, W, 3) picture of the head from three sides with a scale; vertices that were not fitted are grey."""
     clip, report = refitted.clip, refitted.report
-    neutral = PosedSubject(clip.head, clip.shape, clip.static_offset).neutral
+    neutral = PosedSubject.of(clip).neutral
     fitted = np.isfinite(report.vertex_mm)
     top = max(float(np.percentile(report.vertex_mm[fitted], _SHOWN)), 1e-3)
     colours = np.tile(np.array(CLAY), (len(neutral), 1))
-    colours[fitted] = colour_scale(report.vertex_mm[fitted] / top)
+    colours[fitted] = matplotlib.colormaps["viridis"](np.clip(report.vertex_mm[fitted] / top, 0, 1))[:, :3]
     summary = report.summary()
     with new_figure(8.8, 5) as figure:
         figure.suptitle(
@@ -41,8 +41,3 @@ def draw_heat_map(refitted: Refitted) -> ByteArray:
         scale = ScalarMappable(Normalize(0, top), "viridis")
         figure.colorbar(scale, ax=grid, location="bottom", shrink=0.5, aspect=40, label="mm")
         return pixels(figure)
-
-
-def colour_scale(values: FloatArray) -> FloatArray:
-    """(n, 3) colours in [0, 1] of values from 0 (dark blue) to 1 (yellow): the perceptually even viridis."""
-    return np.asarray(matplotlib.colormaps["viridis"](np.clip(values, 0, 1)))[:, :3]

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from ....bench.contracts import FloatArray, HeadAsset, IntArray
 from ....bench.errors import InputError
-from ..arrays import faces_in_region
+from ..arrays import faces_in_region, region
 from ..geometry import rigid_alignment, vertex_normals
 from .command import RefitSettings
 from .problem import solve_bounded
@@ -61,11 +61,7 @@ def fitted_vertices(head: HeadAsset, settings: RefitSettings) -> tuple[IntArray,
     Raises `InputError` where the head has no face region.
     """
     weights = np.zeros(len(head.template))
-    if not len(head.regions.get(FACE, ())):
-        known = ", ".join(sorted(head.regions)) or "no regions"
-        remedy = "For a FLAME pickle, give FLAME_masks.pkl beside it."
-        raise InputError(f"head model {head.version!r}", "regions", f"a region {FACE!r}", known, remedy)
-    weights[head.regions[FACE]] = 1.0
+    weights[region(head, FACE)] = 1.0
     for name, factor in (("lips", settings.lips), ("eye_region", settings.eye_region)):
         weights[head.regions.get(name, np.zeros(0, dtype=np.int64))] *= factor
     for name in EYEBALLS:

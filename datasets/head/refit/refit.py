@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 from threadpoolctl import threadpool_limits
 
 from ....bench.contracts import FloatArray, HeadPose, Progress, no_progress
@@ -17,7 +18,6 @@ from ....bench.io.arrays import MAX_MAGNITUDE, TEXT, Member, read_arrays
 from ....bench.io.files import atomic_path, digest
 from ...clip import CaptureClip
 from ..arrays import HeadArrays
-from ..rotations import axis_angles, matrices
 from ..subject import PosedSubject
 from ..teeth import with_teeth
 from .command import RefitSettings
@@ -35,18 +35,6 @@ class Refitted(NamedTuple):
     report: RefitReport
 
 
-def refit_clip(
-    clip: CaptureClip,
-    target: HeadArrays,
-    settings: RefitSettings | None = None,
-    *,
-    folder: Path | None = None,
-    progress: Progress = no_progress,
-) -> CaptureClip:
-    """Refit a clip's tracking to the head model ``target``; a recorded step. See `refit`."""
-    return refit(clip, target, settings, folder=folder, progress=progress).clip
-
-
 # The number of threads decides how sums are rounded, and by that whether blocks kept earlier fit and what the
 # refitted clip's fingerprint is: a run that continues with another number would find another clip.
 @threadpool_limits.wrap(limits=1)
@@ -58,7 +46,7 @@ def refit(
     folder: Path | None = None,
     progress: Progress = no_progress,
 ) -> Refitted:
-    """Fit identity, then every timestep's expression, jaw, eyes and eyelids, to the clip's own meshes.
+    """Fit identity, then every timestep's expression, jaw, eyes and eyelids, to the clip's own meshes; recorded as a step.
 
     "3D Gaussian Head Avatars with Expressive Dynamic Appearances by Compact Tensorial Representations" (CVPR 2025,
     arXiv 2504.14967), supplement, on comparing with monocular methods: vertex distance over the facial region
@@ -84,9 +72,11 @@ def refit(
         expected = "two head models over one topology, to keep a residual as static offset"
         remedy = "Set static_offset to zero."
         raise InputError(f"head model {target.version!r}", "faces", expected, "different ones", remedy)
-    neutral = PosedSubject(clip.head, clip.shape, clip.static_offset).neutral
+    neutral = PosedSubject.of(clip).neutral
     matching = match(clip.head, neutral, target, settings)
-    offset = _static_offset(neutral, target, matching, settings)
+    offset = np.zeros(target.template.shape, dtype=np.float32)
+    if settings.static_offset == "residual":
+        offset = (neutral - PosedSubject(target, matching.shape, offset).neutral).astype(np.float32)
     fitter = BlockFitter(clip, target, matching, offset, settings)
 
     blocks: list[dict[str, FloatArray]] = []
@@ -127,9 +117,8 @@ def _check_tracking(clip: CaptureClip) -> None:
         for name in ("expression", "rotation", "neck", "jaw", "eyes", "translation", "eyelids"):
             values = getattr(pose, name)
             if values is not None and not np.isfinite(values).all():
-                raise InputError(
-                    where, f"{name}, timestep {timestep}", "finite numbers", "NaN or infinite ones"
-                )
+                key = f"{name}, timestep {timestep}"
+                raise InputError(where, key, "finite numbers", "NaN or infinite ones")
 
 
 def _with_same_teeth(source: HeadArrays, target: HeadArrays) -> HeadArrays:
@@ -138,19 +127,6 @@ def _with_same_teeth(source: HeadArrays, target: HeadArrays) -> HeadArrays:
     if teeth and "teeth" not in target.regions and len(source.template) == len(target.template) + teeth:
         return with_teeth(target)
     return target
-
-
-def _static_offset(
-    neutral: FloatArray,
-    target: HeadArrays,
-    matching: Matching,
-    settings: RefitSettings,
-) -> FloatArray:
-    """(V, 3) float32, what the identity leaves of the neutral head, or zeros."""
-    zero = np.zeros(target.template.shape, dtype=np.float32)
-    if settings.static_offset == "zero":
-        return zero
-    return (neutral - PosedSubject(target, matching.shape, zero).neutral).astype(np.float32)
 
 
 _FORMAT = 1  # of the blocks on disk; counts up when the fit changes
@@ -186,7 +162,7 @@ class BlockFitter:
         settings: RefitSettings,
     ):
         self.target, self.matching, self.settings = target, matching, settings
-        self._source = PosedSubject(clip.head, clip.shape, clip.static_offset)
+        self._source = PosedSubject.of(clip)
         self._subject = PosedSubject(target, matching.shape, offset)
         self._problem = FitProblem(
             target, self._subject.neutral, matching.vertices, matching.weights, settings
@@ -205,8 +181,12 @@ class BlockFitter:
         counterparts = self._on_surface(self._source.meshes(poses))
         motions = self._source.motions(poses) @ self._to_source
         local = np.einsum("tni,tij->tnj", counterparts - motions[:, None, :3, 3], motions[:, :3, :3])
-        necks = self._necks(poses)
-        frames = self._problem.frames(local, matrices(necks))
+        necks = np.zeros((len(poses), 3))
+        if self.settings.neck == "keep":
+            given_necks = np.array([pose.neck for pose in poses], dtype=np.float64)
+            necks = given_necks @ self.matching.alignment[:3, :3].T
+        turns = Rotation.from_rotvec(necks).as_matrix()
+        frames = self._problem.frames(local, turns)
         given = np.array([[*pose.jaw, *pose.eyes] for pose in poses], dtype=np.float64)
         solutions, start = [], given[0]
         for frame, own in zip(frames, given):
@@ -217,7 +197,7 @@ class BlockFitter:
             "angles": np.stack([solution.angles for solution in solutions]),
             "evaluations": np.array([solution.evaluations for solution in solutions]),
             "neck": necks,
-            "rotation": axis_angles(motions[:, :3, :3] @ matrices(necks).transpose(0, 2, 1)),
+            "rotation": Rotation.from_matrix(motions[:, :3, :3] @ turns.transpose(0, 2, 1)).as_rotvec(),
             "translation": np.zeros((len(poses), 3)),
         }
         turned = [self.pose(pose, None, columns, row) for row, pose in enumerate(poses)]
@@ -279,10 +259,9 @@ class BlockFitter:
         frames = [
             FrameResidual(
                 timestep,
-                mean_mm=float(columns["mean_mm"][row]),
-                p95_mm=float(columns["p95_mm"][row]),
-                max_mm=float(columns["max_mm"][row]),
-                eyeballs_mm=float(columns["eyeballs_mm"][row]),
+                **{
+                    name: float(columns[name][row]) for name in ("mean_mm", "p95_mm", "max_mm", "eyeballs_mm")
+                },
                 at_bound=tuple(names[i] for i in np.flatnonzero(bounded[row])),
                 evaluations=int(columns["evaluations"][row]),
             )
@@ -308,13 +287,6 @@ class BlockFitter:
         count, vertices = meshes.shape[:2]
         by_vertex = np.ascontiguousarray(meshes.transpose(1, 0, 2)).reshape(vertices, -1)
         return (self.matching.counterparts @ by_vertex).reshape(-1, count, 3).transpose(1, 0, 2)
-
-    def _necks(self, poses: Sequence[HeadPose]) -> FloatArray:
-        """(T, 3) neck rotations of the refitted poses."""
-        if self.settings.neck == "fold":
-            return np.zeros((len(poses), 3))
-        given = np.array([pose.neck for pose in poses], dtype=np.float64)
-        return given @ self.matching.alignment[:3, :3].T
 
     def _residuals(
         self, poses: Sequence[HeadPose], columns: dict[str, FloatArray], counterparts: FloatArray
@@ -375,24 +347,22 @@ class RefitReport:
     def summary(self) -> dict[str, Any]:
         """Means over the timesteps and the worst of them, as plain values."""
         worst = max(self.frames, key=lambda frame: frame.mean_mm)
-        bounded = sum(bool(frame.at_bound) for frame in self.frames)
+        means = ("mean_mm", "p95_mm", "eyeballs_mm")
         return {
             "source": self.source,
             "target": self.target,
             "timesteps": len(self.frames),
             "neutral_mm": self.neutral_mm,
-            "mean_mm": float(np.mean([frame.mean_mm for frame in self.frames])),
-            "p95_mm": float(np.mean([frame.p95_mm for frame in self.frames])),
-            "eyeballs_mm": float(np.mean([frame.eyeballs_mm for frame in self.frames])),
+            **{name: float(np.mean([getattr(frame, name) for frame in self.frames])) for name in means},
             "worst_timestep": worst.timestep,
             "worst_mean_mm": worst.mean_mm,
             "worst_p95_mm": max(frame.p95_mm for frame in self.frames),
-            "timesteps_at_bound": bounded,
+            "timesteps_at_bound": sum(bool(frame.at_bound) for frame in self.frames),
             "shape_at_bound": list(self.shape_at_bound),
         }
 
     def to_json(self) -> Mapping[str, Any]:
-        """Summary, settings-free, and every timestep."""
+        """Summary and every timestep."""
         return {**self.summary(), "frames": [asdict(frame) for frame in self.frames]}
 
     def text(self) -> str:

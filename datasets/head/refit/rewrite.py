@@ -37,8 +37,7 @@ def write_capture(clip: CaptureClip, out: Path, progress: Progress = no_progress
                 or not _is_png(files.image)
                 or not (files.mask is None or _is_png(files.mask))
             ):
-                sequence, timestep, camera = place
-                writer.write_frame(sequence, timestep, camera, clip.image(key), clip.mask(key))
+                writer.write_frame(*place, clip.image(key), clip.mask(key))
                 continue
             if files.mask is not None:
                 link_or_copy(files.mask, writer.mask_path(*place))
@@ -75,11 +74,7 @@ def capture_plan(clip: CaptureClip, source: str | Path = "") -> tuple[CapturePla
         SequencePlan(
             name,
             [clip.poses[timestep] for timestep in sorted({*timesteps[name]})],
-            {
-                key.timestep - first[name]: reason
-                for key, reason in clip.excluded.items()
-                if key.sequence == name
-            },
+            {k.timestep - first[name]: why for k, why in clip.excluded.items() if k.sequence == name},
         )
         for name in names
     ]
@@ -129,8 +124,6 @@ def _check_excluded(clip: CaptureClip, where: str) -> None:
         found, other = clip.excluded.get(key), clip.excluded.get(first)
         if found != other:
             expected = f"timestep {key.timestep} excluded with all its cameras for one reason, or not at all"
-            described = " and ".join(
-                f"{one} {f'excluded: {why}' if why is not None else 'kept'}"
-                for one, why in ((first, other), (key, found))
-            )
-            raise InputError(where, "excluded", expected, described)
+            said = {first: other, key: found}
+            parts = [f"{one} {'kept' if why is None else f'excluded: {why}'}" for one, why in said.items()]
+            raise InputError(where, "excluded", expected, " and ".join(parts))

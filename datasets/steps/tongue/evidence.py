@@ -39,10 +39,7 @@ has to go: flushed, shaded lips go up to a quarter of it, a tongue more than hal
 
 _LEAST_PIGMENT = 0.1  # log units; of paler skin than that, noise would be taken for a share
 _DARK = 0.001  # linear light added to every channel: below it ratios are noise
-_DARKER, _PALER = (
-    1.0,
-    0.25,
-)  # log units that a tongue may be darker, or less red, than the darkest and palest nearby
+_DARKER, _PALER = 1.0, 0.25  # log units that a tongue may be darker, or less red, than what is nearby
 _FLOORS = {"pink": 0.02, "red": 0.05, "light": 0.10}  # least spread, log units: quantisation and image noise
 _LEAST_SEEN = 0.2  # share of the timesteps that must show a pixel for it to have a canonical colour
 _LIMIT = 6.0  # standard deviations beyond which more is no better
@@ -144,14 +141,8 @@ def _features(colours: ByteArray, seen: np.ndarray) -> dict[str, FloatArray]:
     linear = srgb_to_linear(np.arange(256) / 255).astype(np.float32)
     weight = seen.astype(np.float32)
     total = ndimage.uniform_filter(weight, (0, 3, 3))
-    channels = [
-        np.log(
-            ndimage.uniform_filter(linear[colours[..., i]] * weight, (0, 3, 3)) / np.maximum(total, 0.1)
-            + _DARK
-        )
-        for i in range(3)
-    ]
-    red, green, blue = channels
+    sums = [ndimage.uniform_filter(linear[colours[..., i]] * weight, (0, 3, 3)) for i in range(3)]
+    red, green, blue = (np.log(channel / np.maximum(total, 0.1) + _DARK) for channel in sums)
     return {"pink": green - blue, "red": red - green, "light": np.logaddexp(red, green)}
 
 
@@ -202,9 +193,8 @@ def decide(
     frames = {}
     for (timestep, sequence), area, seen in zip(timesteps.items(), evidence.areas.tolist(), evidence.seen):
         excluded = area >= threshold
-        frames[timestep] = FrameDecision(
-            sequence, round(area, 1), excluded, _reason(area, threshold, float(seen))
-        )
+        reason = _reason(area, threshold, float(seen))
+        frames[timestep] = FrameDecision(sequence, round(area, 1), excluded, reason)
     return Exclusions(threshold, basis, cameras, frames, dict(overrides))
 
 

@@ -27,9 +27,9 @@ from ....bench.contracts import (
 )
 from ....bench.errors import InputError
 from ....bench.machine import processor_count
-from ...head.arrays import JOINT_NAMES
+from ...head.arrays import JOINT_NAMES, region
 from ...head.geometry import vertex_normals
-from ...head.model import HeadModel
+from ...head.subject import PosedSubject
 from ...mesh_pictures import rasterize_mesh
 
 PITCH = 0.0015
@@ -88,21 +88,16 @@ def mouth_atlas(clip: Clip) -> MouthAtlas:
     """
     head = clip.head
     where = f"head model {head.version!r}"
-    for name in ("lips", "face"):
-        if not len(head.regions.get(name, ())):
-            known = ", ".join(sorted(head.regions)) or "none"
-            remedy = "For FLAME, give FLAME_masks.pkl as masks=."
-            raise InputError(where, f"regions[{name}]", "the vertices of that region", known, remedy)
-    neutral = _neutral(clip)
-    lips = np.intersect1d(head.regions["lips"], head.regions["face"])
-    lips = lips if len(lips) else np.asarray(head.regions["lips"])
+    lip_region, face = (region(head, name) for name in ("lips", "face"))
+    neutral = PosedSubject.of(clip).neutral
+    lips = np.intersect1d(lip_region, face)
+    lips = lips if len(lips) else lip_region
     on_jaw = head.skinning_weights[:, JOINT_NAMES.index("jaw")]
     span = on_jaw[lips]
     if np.ptp(span) < 0.2:
+        expected = "a lower lip that follows the jaw and an upper that does not"
         found = f"jaw weights from {span.min():.2f} to {span.max():.2f}"
-        raise InputError(
-            where, "skinning_weights", "a lower lip that follows the jaw and an upper that does not", found
-        )
+        raise InputError(where, "skinning_weights", expected, found)
     middle = 0.5 * float(span.min() + span.max())
     width = float(np.ptp(neutral[lips, 0]))
     upper, lower = lips[span < middle], lips[span >= middle]
@@ -125,7 +120,7 @@ def mouth_atlas(clip: Clip) -> MouthAtlas:
         return picture
 
     on_lips = np.zeros(len(neutral))
-    on_lips[head.regions["lips"]] = 1.0
+    on_lips[lip_region] = 1.0
     lip_map = inside & (spread(on_lips) > 0.5)
     row_line = _lip_line(lip_map, spread(on_jaw) >= middle, camera)
     rows = np.arange(camera.height)[:, None] + 0.5
@@ -135,14 +130,6 @@ def mouth_atlas(clip: Clip) -> MouthAtlas:
     return MouthAtlas(
         inside, corners, weights, lip_map, inside & (height < 0), height, head.faces[np.flatnonzero(close)]
     )
-
-
-def _neutral(clip: Clip) -> FloatArray:
-    """(V, 3) the subject's mesh without expression or pose."""
-    model = HeadModel(clip.head, dtype=torch.float64)
-    shape, offset = (torch.from_numpy(np.asarray(a, np.float64)) for a in (clip.shape, clip.static_offset))
-    neutral: FloatArray = model.canonical(shape, offset)[0].numpy()
-    return neutral
 
 
 def _map_camera(centre: FloatArray, mouth: float) -> Camera:
@@ -238,22 +225,15 @@ def facing_cameras(clip: Clip, atlas: MouthAtlas, count: int) -> list[str]:
     chosen = sorted((name for name in typical if typical[name] > _MOUTH_FACING), key=lambda n: -typical[n])
     if not chosen:
         best = np.degrees(np.arccos(max(typical.values())))
-        raise InputError(
-            "clip", "cameras", "a camera that sees the mouth within 55 degrees", f"{best:.0f} degrees"
-        )
+        expected = "a camera that sees the mouth within 55 degrees"
+        raise InputError("clip", "cameras", expected, f"{best:.0f} degrees")
     return chosen[:count]
 
 
 def posed_meshes(clip: Clip, timesteps: Sequence[int]) -> Iterator[tuple[int, FloatArray]]:
     """(timestep, (V, 3) tracked mesh in metres), a few posed at a time."""
-    model = HeadModel(clip.head)
-    shape, offset = (torch.from_numpy(np.asarray(a, np.float32)) for a in (clip.shape, clip.static_offset))
-    canonical = model.canonical(shape, offset)
-    for start in range(0, len(timesteps), _MESHES):
-        part = timesteps[start : start + _MESHES]
-        with torch.no_grad():
-            meshes = model(canonical=canonical, **model.pose_arguments([clip.poses[t] for t in part])).numpy()
-        yield from zip(part, meshes.astype(np.float64))
+    for timestep, mesh in PosedSubject.of(clip, torch.float32).each(clip, timesteps, _MESHES):
+        yield timestep, mesh.astype(np.float64)
 
 
 def sample_clip(
@@ -276,16 +256,16 @@ def sample_clip(
                 picture, visible = sample_image(clip.image(keys[name]), clip.cameras[name], atlas, vertices)
                 colours[row, column], seen[row, column] = picture, visible
 
-    done = 0
+    subject = PosedSubject.of(clip, torch.float32)
     with ThreadPoolExecutor(min(processor_count(), 8)) as pool:
-        batch: list[tuple[int, FloatArray]] = []
-        for row, (_, vertices) in enumerate(posed_meshes(clip, timesteps)):
-            batch.append((row, vertices))
-            if len(batch) == _MESHES or row == len(timesteps) - 1:
-                for _ in pool.map(lambda job: sample(*job), batch):
-                    done += 1
-                    progress(done, len(timesteps), "mouths")
-                batch = []
+        for start in range(
+            0, len(timesteps), _MESHES
+        ):  # a pool takes all of its jobs, and their meshes, at once
+            part = timesteps[start : start + _MESHES]
+            meshes = subject.meshes([clip.poses[t] for t in part]).astype(np.float64)
+            rows = range(start, start + len(part))
+            for row, _ in zip(rows, pool.map(sample, rows, meshes)):
+                progress(row + 1, len(timesteps), "mouths")
     return MouthColours(timesteps, list(cameras), colours, seen)
 
 

@@ -186,7 +186,7 @@ def measure(quick: bool, progress: Progress) -> Findings:
                     {"batch": batch, "way": name, "ms_per_frame": 1e3 * value / batch, "ratio": share}
                 )
             rows[-1]["largest_difference_m"] = difference
-    sizes = f"{model.vertex_count} vertices, {FLAME_SIZES[0]} + {FLAME_SIZES[1]} directions"
+    sizes = f"{len(model.template)} vertices, {FLAME_SIZES[0]} + {FLAME_SIZES[1]} directions"
     lines = [
         f"Forward pass without gradients, {sizes}, float32, {THREADS} threads; least of {rounds} runs by the clock.",
         f"{'batch':>5}  {'way':36}  {'ms per frame':>12}  {'times ours':>10}",

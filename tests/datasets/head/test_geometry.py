@@ -7,9 +7,11 @@ from scipy.spatial.transform import Rotation
 
 from headbench.datasets.head.geometry import (
     border_edges,
+    even_weights,
     fit_sphere,
     rigid_alignment,
     smoothstep,
+    triangle_areas,
     vertex_normals,
 )
 
@@ -58,7 +60,9 @@ def test_sphere():
 def test_normals_and_border_of_a_cap():
     """Of a convex hull normals point outwards; without the triangles below, the border is where it was cut."""
     sphere = points(150) / np.linalg.norm(points(150), axis=1, keepdims=True)
-    faces = ConvexHull(sphere).simplices.copy()
+    hull = ConvexHull(sphere)
+    faces = hull.simplices.copy()
+    np.testing.assert_allclose(triangle_areas(sphere, faces).sum(), hull.area, rtol=1e-12)
     inward = np.linalg.det(sphere[faces]) < 0
     faces[inward] = faces[inward][:, ::-1]
     assert np.einsum("ni,ni->n", vertex_normals(sphere, faces), sphere).min() > 0.9
@@ -67,3 +71,14 @@ def test_normals_and_border_of_a_cap():
     cut = border_edges(faces[~below])
     assert set(map(tuple, cut)) == set(map(tuple, border_edges(faces[below])[:, ::-1]))
     assert not vertex_normals(sphere, faces[below])[sphere[:, 2].argmax()].any()
+
+
+def test_even_weights_move_with_the_points():
+    target = np.array([0.2, -0.1, 0.3])
+    weights = even_weights(points(30), target)
+    np.testing.assert_allclose(weights.sum(), 1)
+    turn = Rotation.random(random_state=0)
+    for moved, wanted in ((points(30), target), (3 * turn.apply(points(30)) + 1, 3 * turn.apply(target) + 1)):
+        np.testing.assert_allclose(weights @ moved, wanted, atol=1e-13)
+    with pytest.raises(ValueError, match="span"):
+        even_weights(points(30) * [1, 1, 0], target)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from headbench.datasets.head import rotations
-from headbench.datasets.head.rotations import axis_angles, matrices, matrices_and_derivatives
+from headbench.datasets.head.rotations import matrices_and_derivatives
 
 AXES = np.concatenate([np.eye(3), -np.eye(3), Rotation.random(20, random_state=0).apply([0.0, 0.0, 1.0])])
 ANGLES = (
@@ -23,9 +23,7 @@ ANGLES = (
     0.21,
     1.0,
     2.5,
-    np.pi - 1e-3,
-    np.pi - 1e-7,
-    np.pi - 1e-12,
+    *(np.pi - np.array([1e-3, 1e-7, 1e-12])),
 )
 VECTORS = np.concatenate([AXES * angle for angle in ANGLES])
 
@@ -131,14 +129,10 @@ SPECIAL_VECTORS = [
 def test_matrices_and_derivatives(vector):
     rotation, derivative = matrices_and_derivatives(vector[None])
     np.testing.assert_allclose(rotation[0], Rotation.from_rotvec(vector).as_matrix(), atol=1e-15)
-    np.testing.assert_allclose(matrices(vector[None]), rotation, atol=1e-15)
     step = 1e-6
     for axis in range(3):
-        either = [matrices(vector[None] + side * step * np.eye(3)[axis])[0] for side in (1, -1)]
+        either = [
+            Rotation.from_rotvec(vector + side * step * np.eye(3)[axis]).as_matrix() for side in (1, -1)
+        ]
         numeric = (either[0] - either[1]) / (2 * step)
         np.testing.assert_allclose(derivative[0, :, :, axis], numeric, atol=1e-9)
-
-
-def test_the_way_back():
-    vectors = np.random.default_rng(0).normal(size=(50, 3))
-    np.testing.assert_allclose(axis_angles(matrices(vectors)), vectors, atol=1e-12)

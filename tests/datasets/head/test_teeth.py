@@ -52,38 +52,18 @@ def ringed(columns, reverse=False):
     return replace(HEAD, regions=HEAD.regions | rings)
 
 
-def rows_of(head, columns):
-    return head.template[len(HEAD.template) :].reshape(8, columns, 3)
-
-
-def test_counts_of_the_flame_layout():
-    head, toothed = ringed(13), with_teeth(ringed(13))
-    toothed.validate("toothed")
-    assert len(head.regions["lip_outside_ring_upper"]) == 13
-    assert len(toothed.template) - len(head.template) == 8 * 13
-    assert len(toothed.faces) - len(head.faces) == 12 * 12
-    big = toy_head(96)
-    assert len(big.regions["lip_outside_ring_upper"]) == 17
-    rings = {name: big.regions[name][1:-1] for name in RING_REGIONS}
-    toothed = with_teeth(replace(big, regions=big.regions | rings))
-    assert len(toothed.template) - len(big.template) == 120
-    assert len(toothed.faces) - len(big.faces) == 168
-    new = toothed.faces[len(big.faces) :] - len(big.template)
-    assert new.min() == 0
-    assert new.max() == 119
-    upper = {*range(15), *range(30, 45), *range(60, 90)}
-    assert set(toothed.regions["teeth_upper"] - len(big.template)) == upper
-    assert set(toothed.regions["teeth_lower"] - len(big.template)) == set(range(120)) - upper
-
-
 def test_triangles_stand_in_the_published_order():
+    """With rings of 15, from the left to the right, as published: 120 vertices and 168 triangles are added."""
     big = toy_head(96)
-    rings = {
-        name: big.regions[name][-2:0:-1] for name in RING_REGIONS
-    }  # from the left to the right, as published
-    new = with_teeth(replace(big, regions=big.regions | rings)).faces[len(big.faces) :] - len(big.template)
+    rings = {name: big.regions[name][-2:0:-1] for name in RING_REGIONS}
+    toothed = with_teeth(replace(big, regions=big.regions | rings)).validate("toothed")
+    first = len(big.template)
+    assert len(toothed.template) - first == 120
     published = [[int(vertex) for vertex in row.split()] for row in PUBLISHED.split(",") if row.strip()]
-    np.testing.assert_array_equal(new, published)
+    np.testing.assert_array_equal(toothed.faces[len(big.faces) :] - first, published)
+    upper = {*range(15), *range(30, 45), *range(60, 90)}
+    assert set(toothed.regions["teeth_upper"] - first) == upper
+    assert set(toothed.regions["teeth_lower"] - first) == set(range(120)) - upper
 
 
 def test_positions_follow_the_recipe():
@@ -91,7 +71,7 @@ def test_positions_follow_the_recipe():
     head = ringed(columns)
     upper, lower = (head.template[head.regions[name]] for name in RING_REGIONS)
     distance = np.mean([np.linalg.norm(a - b) for a, b in zip(upper, lower)])
-    rows = rows_of(with_teeth(head), columns)
+    rows = with_teeth(head).template[len(HEAD.template) :].reshape(8, columns, 3)
     level = np.mean([(a[1] + b[1]) / 2 for a, b in zip(upper, lower)])
     for column in range(columns):
         x = (upper[column, 0] + lower[column, 0]) / 2

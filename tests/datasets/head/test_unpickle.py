@@ -129,19 +129,15 @@ ATTACKS = {
     "nested call": Call(np.dtype, Call(os.getcwd)),
     "call in a state": Call(np.dtype, "f8", state=(3, Call(os.getcwd), None, None, None, -1, -1, 0)),
     "call in a list": [1, [2, (3, Call(os.getcwd))]],
-    "call in chumpy": None,  # made in the test
 }
 
 
 @pytest.mark.parametrize("protocol", [0, 2, 4, 5])
 @pytest.mark.parametrize("name", ATTACKS)
 def test_refuses(tmp_path, name, protocol):
-    if name == "call in chumpy":
-        with chumpy_stand_in() as ch:
-            stream = pickle.dumps({"x": ch(Call(os.getcwd))}, protocol=protocol)
-    else:
-        stream = pickle.dumps({"x": ATTACKS[name]}, protocol=protocol)
-    refusal(tmp_path / "attack.pkl", stream)
+    refusal(tmp_path / "attack.pkl", pickle.dumps({"x": ATTACKS[name]}, protocol=protocol))
+    with chumpy_stand_in() as ch:
+        refusal(tmp_path / "attack.pkl", pickle.dumps({"x": ch(ATTACKS[name])}, protocol=protocol))
 
 
 def test_names_the_global(tmp_path):
@@ -186,18 +182,6 @@ def test_refuses_crafted_streams(tmp_path, name):
     np.testing.assert_array_equal(read_pickle(tmp_path / "good.pkl")["double"], ARRAYS["double"])  # unharmed
 
 
-@pytest.mark.parametrize(
-    "bomb", [b"\x80\x02Nr\xff\xff\xff\x0f.", b"\x80\x04\x8e\x00\x00\x00\x00\x04\0\0\0abc."]
-)
-def test_a_few_bytes_cannot_ask_for_gigabytes(tmp_path, bomb):
-    tracemalloc.start()
-    try:
-        refusal(tmp_path / "bomb.pkl", bomb)
-        assert tracemalloc.get_traced_memory()[1] < 10_000_000
-    finally:
-        tracemalloc.stop()
-
-
 def amplified(count: int, size: int, what: str) -> bytes:
     """A dictionary with ``count`` arrays, each made anew of the same ``size`` bytes, in a few operations each."""
     raw = {"bytes": b"\x8e" + size.to_bytes(8, "little") + bytes(size)}
@@ -211,15 +195,11 @@ def amplified(count: int, size: int, what: str) -> bytes:
     return whole + b"".join(name + array + b"h\x01bs" for name in names) + b"."
 
 
-def test_one_such_array_is_read(tmp_path):
-    for what in ("bytes", "text", "encoded"):
-        (tmp_path / "x.pkl").write_bytes(amplified(0, 100, what))
-        assert read_pickle(tmp_path / "x.pkl")["first"].shape == (100,)
-
-
 TUPLES = b"(K\x01t" + b"2\x86" * 60  # a pair of a pair ..., 2^60 numbers
 LONG = b"\x8b\x40\x42\x0f\0" + b"\x01" * 1_000_000
 BOMBS = {
+    "a huge memo": b"\x80\x02Nr\xff\xff\xff\x0f.",
+    "huge bytes": b"\x80\x04\x8e\x00\x00\x00\x00\x04\0\0\0abc.",
     "many arrays of the same bytes": amplified(500, 2**20, "bytes"),
     "many arrays of the same text": amplified(500, 2**20, "text"),
     "many arrays of the same encoded text": amplified(500, 2**20, "encoded"),
@@ -238,12 +218,19 @@ BOMBS = {
 }
 
 
+@pytest.mark.parametrize("what", ["bytes", "text", "encoded"])
+def test_one_array_of_the_bombs_below_is_read(tmp_path, what):
+    (tmp_path / "x.pkl").write_bytes(amplified(0, 100, what))
+    assert read_pickle(tmp_path / "x.pkl")["first"].shape == (100,)
+
+
 @pytest.mark.parametrize("name", BOMBS)
 def test_memory_and_message_are_bounded_by_the_file(tmp_path, name):
     tracemalloc.start()
     try:
         error = refusal(tmp_path / "bomb.pkl", BOMBS[name])
-        assert tracemalloc.get_traced_memory()[1] < 4 * len(BOMBS[name]) + 150_000_000
+        allowed = 150_000_000 if len(BOMBS[name]) > 100 else 10_000_000
+        assert tracemalloc.get_traced_memory()[1] < 4 * len(BOMBS[name]) + allowed
     finally:
         tracemalloc.stop()
     assert len(str(error)) < 3000
@@ -307,9 +294,8 @@ def test_arrays_have_the_bytes_they_declare(tmp_path):
     good = pickle.dumps({"x": np.arange(3.0)}, protocol=2)
     shape = b"K\x03\x85"
     assert good.count(shape) == 1
-    refusal(tmp_path / "more.pkl", good.replace(shape, b"K\x04\x85"))
-    refusal(tmp_path / "negative.pkl", good.replace(shape, b"J\xff\xff\xff\xff\x85"))
-    refusal(tmp_path / "huge.pkl", good.replace(shape, b"J\xff\xff\xff\x7f\x85"))
+    for other in (b"K\x04\x85", b"J\xff\xff\xff\xff\x85", b"J\xff\xff\xff\x7f\x85"):  # 4, -1, 2^31 - 1
+        refusal(tmp_path / "x.pkl", good.replace(shape, other))
 
 
 def test_refuses_truncated_files(tmp_path):
@@ -317,11 +303,6 @@ def test_refuses_truncated_files(tmp_path):
         stream = legacy_pickle({"x": ch(np.arange(4.0)), "y": MATRICES["csc"], "z": "text"})
     for length in range(0, len(stream), 7):
         refusal(tmp_path / "cut.pkl", stream[:length])
-
-
-def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(InputError, match=r"none\.pkl"):
-        read_pickle(tmp_path / "none.pkl")
 
 
 FUZZ = legacy_pickle({"a": np.arange(4.0), "b": MATRICES["csc"], "c": np.arange(3, dtype=np.int32)})

@@ -43,7 +43,7 @@ def test_counts_below_one_are_refused(capture, tmp_path, changes):
     assert not any(tmp_path.iterdir())
 
 
-def test_a_capture_that_does_not_read_is_refused_before_anything_is_written(tmp_path):
+def test_an_unreadable_capture_is_refused_before_any_writing(tmp_path):
     with pytest.raises(InputError):
         inspect(InspectSettings(str(tmp_path / "nothing"), out=str(tmp_path / "out")))
     assert not (tmp_path / "out").exists()

@@ -10,6 +10,7 @@ import pytest
 
 from headbench.bench.contracts import FrameKey
 from headbench.datasets.figures import DPI, HELD_OUT, TRAIN, hexadecimal, new_figure, pixels
+from headbench.datasets.head.subject import PosedSubject
 from headbench.datasets.inspect.figure import (
     WIDTH,
     draw_figure,
@@ -23,7 +24,6 @@ from headbench.datasets.inspect.figure import (
 from headbench.datasets.inspect.statistics import (
     ExpressionSpace,
     expression_space,
-    posed_meshes,
     sequence_rows,
     split_rows,
 )
@@ -84,7 +84,7 @@ def test_cameras_stand_on_their_side_of_the_head(head, above):
 def test_the_outline_lies_on_the_silhouette(clip):
     key = clip.splits["train"][0]
     camera, height = clip.cameras[key.camera], 320
-    vertices = posed_meshes(clip, [key.timestep])[0]
+    vertices = PosedSubject.of(clip).meshes([clip.poses[key.timestep]])[0]
     outlined, covered = overlay(clip.image(key), vertices, clip.head.faces, camera, height)
     assert outlined.shape == covered.shape == (height, 240, 3)
     drawn = near(outlined, HELD_OUT)
@@ -132,6 +132,6 @@ def test_a_clip_with_holes_and_without_tests_is_drawn(clip):
     ("explained", "begins"),
     [((0.97, 0.03), "1 component explains 95%"), ((0.8, 0.2), "2 components explain 95%")],
 )
-def test_the_summary_of_expressions_counts_in_singular_and_plural(explained, begins):
+def test_the_summary_counts_in_singular_and_plural(explained, begins):
     space = ExpressionSpace([0], np.zeros(1, bool), np.zeros((1, 2)), np.array(explained), {})
     assert space_summary(space).startswith(begins)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from headbench.datasets.inspect.statistics import expression_space, posed_meshes, sequence_rows, split_rows
+from headbench.datasets.inspect.statistics import expression_space, sequence_rows, split_rows
 from headbench.datasets.steps.exclude import exclude_timesteps
 
 from ..lint.good_capture import LENGTHS
@@ -90,22 +92,8 @@ def test_novelty_is_the_distance_to_the_nearest_training_face(clip, space):
 
 
 def test_a_test_face_that_was_trained_on_is_not_new(clip):
-    from dataclasses import replace
-
     twin = dict(clip.poses)
     twin[15] = replace(clip.poses[15], expression=clip.poses[3].expression)
     novelty = expression_space(replace(clip, poses=twin)).novelty_mm
     assert novelty[15] < 1e-6
     assert min(value for t, value in novelty.items() if t != 15) > 0.01
-
-
-def test_posed_meshes_are_where_the_images_show_them(clip):
-    key = clip.splits["train"][0]
-    camera = clip.cameras[key.camera]
-    points = posed_meshes(clip, [key.timestep])[0]
-    points = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-    pixels = (points @ camera.K.T)[:, :2] / points[:, 2:]
-    mask = clip.mask(key)
-    rows, columns = np.nonzero(mask > 0)
-    assert pixels[:, 0].min() == pytest.approx(columns.min() + 0.5, abs=1.0)
-    assert pixels[:, 1].max() == pytest.approx(rows.max() + 0.5, abs=1.0)

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,6 @@ from headbench.bench.contracts import no_progress
 from headbench.bench.errors import InputError
 from headbench.bench.runner.adaptation import MethodNeeds, plan
 from headbench.bench.specs import ResolutionRule
-from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import save_head
 from headbench.datasets.head.refit.refit import BlockFitter
 from headbench.datasets.steps import for_method
@@ -21,11 +21,6 @@ from ..head.toy import toy_head
 OTHER = toy_head(16, version="other", expression_size=5, shape_size=4, eyelids=True)
 
 
-@pytest.fixture(scope="module")
-def clip(pristine_capture):
-    return read_capture(pristine_capture.union)
-
-
 @pytest.fixture
 def heads(tmp_path):
     save_head(tmp_path / "other.npz", OTHER)
@@ -34,23 +29,16 @@ def heads(tmp_path):
 
 def pretend_refit(clip, target, *, folder, progress):
     """Stands in for the optimiser: coefficients that tell timesteps apart."""
+    size = target.expression_basis.shape[2]
     poses = {
         t: replace(
-            pose,
-            head_model=target.version,
-            expression=np.full(target.expression_basis.shape[2], t / 7),
-            eyelids=np.array([0.1, t / 3]),
+            pose, head_model=target.version, expression=np.full(size, t / 7), eyelids=np.array([0.1, t / 3])
         )
         for t, pose in clip.poses.items()
     }
-    return clip.derive(
-        "pretend_refit",
-        {"target": target.version, "worst_mm": 0.1},
-        head=target,
-        shape=np.arange(target.shape_basis.shape[2]) / 3,
-        static_offset=np.zeros_like(target.template),
-        poses=poses,
-    )
+    shape, offset = np.arange(target.shape_basis.shape[2]) / 3, np.zeros_like(target.template)
+    identity = {"head": target, "shape": shape, "static_offset": offset}
+    return SimpleNamespace(clip=clip.derive("pretend_refit", {}, poses=poses, **identity))
 
 
 def adapted(clip, folder, heads=None, **needs):
@@ -73,7 +61,7 @@ def test_needs_that_change_nothing_give_the_clip_itself(clip, tmp_path):
 
 
 def test_all_steps_in_their_order(clip, tmp_path, heads, monkeypatch):
-    monkeypatch.setattr(for_method, "refit_clip", pretend_refit)
+    monkeypatch.setattr(for_method, "refit", pretend_refit)
     form = adapted(
         clip,
         tmp_path / "kept",
@@ -94,9 +82,8 @@ def test_all_steps_in_their_order(clip, tmp_path, heads, monkeypatch):
         assert image.shape == (128, 128, 3)
         # Twice as large and back: what a perfect method would be scored with.
         back = form.restore(key, image.astype(np.float32) / 255)
-        assert (
-            np.abs(255 * back - clip.image(key)).mean() < 12
-        )  # noise of 52 levels, cubic and means soften it
+        # Noise of 52 levels, which cubic and means soften.
+        assert np.abs(255 * back - clip.image(key)).mean() < 12
         assert back.shape == (64, 48, 3)
 
 
@@ -115,24 +102,23 @@ def test_a_refit_goes_on_where_it_was(clip, tmp_path, heads, monkeypatch):
 
 
 def test_what_cannot_be_done_is_said_before_any_work(clip, heads, tmp_path):
-    with pytest.raises(InputError, match=r"--set heads.flame2020=PATH"):
-        clip_for_method(clip, MethodNeeds(head_models=("flame2020",)), heads)
-    with pytest.raises(InputError, match="expected 'flame2020', found 'other'"):
-        clip_for_method(clip, MethodNeeds(head_models=("flame2020",)), {"flame2020": heads["other"]})
-    with pytest.raises(InputError, match="no such file"):
-        clip_for_method(clip, MethodNeeds(head_models=("x",)), {"x": str(Path(tmp_path) / "none.npz")})
-    with pytest.raises(InputError, match="at least 60 pixels"):
-        clip_for_method(clip, MethodNeeds(resolution=ResolutionRule(divide=60)), {})
+    for needs, at_hand, said in (
+        ({"head_models": ("flame2020",)}, heads, r"--set heads.flame2020=PATH"),
+        (
+            {"head_models": ("flame2020",)},
+            {"flame2020": heads["other"]},
+            "expected 'flame2020', found 'other'",
+        ),
+        ({"head_models": ("x",)}, {"x": str(Path(tmp_path) / "none.npz")}, "no such file"),
+        ({"resolution": ResolutionRule(divide=60)}, {}, "at least 60 pixels"),
+    ):
+        with pytest.raises(InputError, match=said):
+            clip_for_method(clip, MethodNeeds(**needs), at_hand)
 
 
 def test_the_procedural_heads_need_no_file(clip, monkeypatch):
-    made = []
-
-    def make(version):
-        made.append(version)
-        return OTHER
-
-    monkeypatch.setattr(for_method, "procedural_head", make)
+    made: list[str] = []
+    monkeypatch.setattr(for_method, "procedural_head", lambda version: made.append(version) or OTHER)
     procedural = replace(clip, head=replace(clip.head, version="procedural2023"))
     needs = MethodNeeds(head_models=("flame2020", "procedural2020"))
     clip_for_method(procedural, needs, {})

@@ -52,7 +52,7 @@ def test_quaternion_of_a_jaw_opening_in_closed_form(angle):
     np.testing.assert_allclose(jaw_quaternions([clip.poses[0]]), expected, atol=1e-15)
 
 
-def test_bases_start_with_identity_and_come_from_training_poses_alone():
+def test_bases_are_identity_and_training_poses_alone():
     clip = make_clip(30, test=10)
     bases = jaw_bases(clip, 8)
     np.testing.assert_array_equal(bases[0], IDENTITY)
@@ -72,7 +72,7 @@ def test_no_more_bases_than_distinct_rotations():
     np.testing.assert_array_equal(jaw_bases(still, 16), [IDENTITY])
 
 
-def test_published_behaviour_draws_on_held_out_poses_and_a_half_turn():
+def test_published_bases_are_held_out_poses_and_a_half_turn():
     clip = make_clip(10, test=0)
     cameras = [f"{i:02d}" for i in range(8)]  # every 16th frame is then every second timestep
     test = tuple(FrameKey("s", "q", t, c) for t in range(10, 14) for c in cameras)

@@ -5,7 +5,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
@@ -14,8 +13,7 @@ from headbench.bench.contracts import Camera
 from headbench.bench.errors import InputError
 from headbench.bench.specs import ResolutionRule
 from headbench.datasets.clip import FrameFiles
-from headbench.datasets.ga.reader import read_capture
-from headbench.datasets.head.model import HeadModel
+from headbench.datasets.head.subject import PosedSubject
 from headbench.datasets.images import ImageStore
 from headbench.datasets.steps.masks import (
     NeckLine,
@@ -49,22 +47,12 @@ def rounded(image):
 
 @settings(max_examples=50, deadline=None)
 @given(*[st.tuples(*[st.floats(0, 1)] * 3)] * 2)
-def test_exchanging_the_background_equals_compositing_on_the_new_one(old, new):
+def test_exchanging_equals_compositing_on_the_new_background(old, new):
     colours, coverage = subject(24)
+    expected = coverage[5, 6] * colours[5, 6] + (1 - coverage[5, 6]) * np.array(old)
+    assert np.abs(composite(colours, coverage, old)[5, 6] - expected).max() < 1e-6
     exchanged = recomposite(composite(colours, coverage, old), coverage, old, new)
     assert np.abs(exchanged - composite(colours, coverage, new)).max() < 1e-5
-
-
-def test_the_composite_is_the_formula():
-    colours, coverage = subject(8)
-    expected = [
-        [
-            [coverage[y, x] * colours[y, x, c] + (1 - coverage[y, x]) * BLUE[c] for c in range(3)]
-            for x in range(8)
-        ]
-        for y in range(8)
-    ]
-    assert np.abs(composite(colours, coverage, BLUE) - np.array(expected)).max() < 1e-6
 
 
 def test_a_background_that_was_not_quite_so_cannot_shine_through():
@@ -74,11 +62,6 @@ def test_a_background_that_was_not_quite_so_cannot_shine_through():
 
 
 # ------------------------------------------------------------------ clips
-
-
-@pytest.fixture(scope="module")
-def clip(pristine_capture):
-    return read_capture(pristine_capture.union)
 
 
 def with_pixels(clip, folder, image, mask):
@@ -111,43 +94,33 @@ def test_a_clip_on_another_background(clip, tmp_path):
     assert [step.name for step in again.steps[-2:]] == ["set_background", "set_background"]
 
 
-def test_straight_colours_on_file_are_composited_without_rounding_twice(clip, tmp_path):
+def test_straight_colours_on_file_are_rounded_once(clip, tmp_path):
     colours, coverage = subject()
     rgba = np.dstack([rounded(colours), rounded(coverage)])
     straight = with_pixels(clip, tmp_path, rgba, None)
     changed = set_background(straight, BLUE)
     assert changed.pixel_steps == ()
+    assert set_background(straight, WHITE) is straight
     key = clip.splits["train"][0]
     expected = 255 * composite(rgba[..., :3] / 255, rgba[..., 3] / 255, np.array(BLUE))
     assert np.abs(changed.image(key) - expected).max() <= 0.5 + 1e-3
-
-
-def test_straight_colours_that_went_through_another_step_are_composited_on_what_they_were_read_on(
-    clip, tmp_path
-):
-    colours, coverage = subject()
-    straight = with_pixels(clip, tmp_path, np.dstack([rounded(colours), rounded(coverage)]), None)
-    halved = align_clip(straight, ResolutionRule(divide=2))
-    key = clip.splits["train"][0]
-    found = set_background(halved, BLUE).image(key).astype(int)
-    assert (
-        np.abs(found - align_clip(set_background(straight, BLUE), ResolutionRule(divide=2)).image(key)).max()
-        <= 1
-    )
-
-
-def test_the_same_background_is_the_same_clip(clip):
-    assert set_background(clip, WHITE) is clip
+    # After another step they are composited on what they were read on.
+    rule = ResolutionRule(divide=2)
+    found = set_background(align_clip(straight, rule), BLUE).image(key).astype(int)
+    assert np.abs(found - align_clip(changed, rule).image(key)).max() <= 1
 
 
 def test_what_a_mask_step_needs_is_said(clip):
     bare = replace(clip, files={key: files._replace(mask=None) for key, files in clip.files.items()})
-    with pytest.raises(InputError, match="a mask for every frame"):
-        set_background(bare, BLUE)
-    with pytest.raises(InputError, match=r"three numbers in \[0, 1\]"):
-        set_background(clip, (1.0, 2.0, 0.0))
-    with pytest.raises(InputError, match="softness"):
-        mask_below_neck(clip, softness=0.0)
+    faceless = replace(clip, head=replace(clip.head, regions={"face": np.arange(3)}))
+    for step, said in (
+        (lambda: set_background(bare, BLUE), "a mask for every frame"),
+        (lambda: set_background(clip, (1.0, 2.0, 0.0)), r"three numbers in \[0, 1\]"),
+        (lambda: mask_below_neck(clip, softness=0.0), "softness"),
+        (lambda: mask_below_neck(faceless), "a region 'boundary' or 'neck'"),
+    ):
+        with pytest.raises(InputError, match=said):
+            step()
 
 
 # ------------------------------------------------------------------ below the neck
@@ -163,6 +136,19 @@ def test_the_edge_is_a_half_plane_blurred_by_a_gaussian():
     assert np.abs(found - soft)[inner].max() < 0.01
     assert found[5, 30] > 0.999
     assert found[60, 30] < 0.001
+
+
+UPRIGHT = np.array([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 1], [0, 0, 0, 1]])
+ROLLED = np.diag([-1.0, -1, 1, 1]) @ UPRIGHT
+SIDE = np.array([[0.0, 0, -1, 0], [0, -1, 0, 0], [-1, 0, 0, 1], [0, 0, 0, 1]])
+
+
+@pytest.mark.parametrize(("view", "normal"), [(UPRIGHT, (0, -1)), (ROLLED, (0, 1)), (SIDE, (0, -1))])
+def test_the_neck_line_follows_the_head_in_every_view(view, normal):
+    anchors = np.array([[0.0, -0.1, 0.08], [0.06, -0.1, 0.0], [-0.06, -0.1, 0.0], [0.0, 0.12, 0.08]])
+    camera = Camera("c", 100, 100, np.array([[500.0, 0, 50], [0, 500, 50], [0, 0, 1]]), view)
+    assert neck_line(camera, anchors).normal == pytest.approx(normal, abs=1e-9)
+    assert neck_line(camera, anchors - 9 * view[2, :3]) is None  # behind the camera
 
 
 def project(camera, point):
@@ -185,15 +171,11 @@ def test_images_and_masks_end_below_the_line_through_the_neck(clip, tmp_path):
     noise = np.random.default_rng(0).integers(0, 200, (64, 48, 3)).astype(np.uint8)
     clip = with_pixels(clip, tmp_path, noise, np.full((64, 48), 255, np.uint8))
     cut = mask_below_neck(clip)
-    model = HeadModel(clip.head, dtype=torch.float64)
-    canonical = model.canonical(
-        torch.tensor(np.asarray(clip.shape, float)), torch.tensor(np.asarray(clip.static_offset, float))
-    )
-    anchors = neck_anchors(clip.head)
+    posed, anchors = PosedSubject.of(clip), neck_anchors(clip.head)
     changed, tilts = 0, set()
     for key in clip.splits["train"]:
         camera, pose = clip.cameras[key.camera], clip.poses[key.timestep]
-        vertices = model(canonical=canonical, **model.pose_arguments([pose]))[0].numpy()[anchors]
+        vertices = posed.meshes([pose])[0, anchors]
         front, left, right, _ = (project(camera, vertex) for vertex in vertices)
         y, x = np.mgrid[:64, :48] + 0.5
         slope = (left[1] - right[1]) / (left[0] - right[0])
@@ -209,33 +191,3 @@ def test_images_and_masks_end_below_the_line_through_the_neck(clip, tmp_path):
     assert changed > 50  # there was something to cut
     assert max(tilts) - min(tilts) > 0.05
     assert cut.steps[-1].name == "mask_below_neck"
-
-
-def test_a_head_upside_down_is_cut_on_its_own_neck():
-    anchors = np.array([[0.0, -0.1, 0.08], [0.06, -0.1, 0.0], [-0.06, -0.1, 0.0], [0.0, 0.12, 0.0]])
-    K = np.array([[500.0, 0, 50], [0, 500, 50], [0, 0, 1]])
-    upright = np.diag([1.0, -1, -1, 1])
-    upright[2, 3] = 1.0
-    rolled = np.diag([-1.0, -1, 1, 1]) @ upright
-    for matrix, sign in ((upright, -1), (rolled, 1)):
-        line = neck_line(Camera("c", 100, 100, K, matrix), anchors)
-        assert np.sign(line.normal[1]) == sign
-        assert abs(line.normal[0]) < 0.05
-
-
-def test_from_the_side_the_line_is_perpendicular_to_the_head():
-    anchors = np.array([[0.0, -0.1, 0.08], [0.06, -0.1, 0.0], [-0.06, -0.1, 0.0], [0.0, 0.12, 0.08]])
-    K = np.array([[500.0, 0, 50], [0, 500, 50], [0, 0, 1]])
-    side = np.array([[0.0, 0, -1, 0], [0, -1, 0, 0], [-1, 0, 0, 1], [0, 0, 0, 1]])
-    line = neck_line(Camera("c", 100, 100, K, side), anchors)
-    assert line.normal == pytest.approx((0, -1), abs=1e-9)
-
-
-def test_a_neck_behind_the_camera_gives_no_line():
-    camera = Camera("c", 100, 100, np.eye(3), np.eye(4))
-    assert neck_line(camera, np.array([[0.0, 0, -1]] * 4)) is None
-
-
-def test_a_head_without_a_neck_is_refused(clip):
-    with pytest.raises(InputError, match="a region 'boundary' or 'neck'"):
-        neck_anchors(replace(clip.head, regions={"face": np.arange(3)}))

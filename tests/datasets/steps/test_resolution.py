@@ -51,7 +51,7 @@ def centroid(image):
 
 
 @pytest.mark.parametrize("name", RULES)
-def test_a_disc_lands_where_the_aligned_camera_projects_its_centre(name):
+def test_a_disc_lands_where_the_aligned_camera_projects_it(name):
     point = (0.0137, -0.0211, 1.0)
     camera = view()
     image = disc(camera, point, 21.3)
@@ -108,8 +108,10 @@ def test_values_stay_in_range_where_the_cubic_overshoots():
     assert aligned.max() <= 1
 
 
-def test_a_rule_that_changes_nothing_moves_nothing():
+def test_a_rule_that_changes_nothing_moves_nothing(clip):
     assert Alignment.of((64, 64), ResolutionRule(square="pad", size=(64, 64))).moves == ()
+    for rule in (ResolutionRule(), ResolutionRule(size=(48, 64), speed_size=(9, 9))):
+        assert align_clip(clip, rule) is clip
 
 
 def test_a_box_outside_the_image_is_background():
@@ -130,11 +132,6 @@ def test_wrong_sizes_are_refused():
 # ------------------------------------------------------------------ clips
 
 
-@pytest.fixture(scope="module")
-def clip(pristine_capture):
-    return read_capture(pristine_capture.union)
-
-
 def test_a_clip_is_resized_when_read(clip):
     aligned = align_clip(clip, ResolutionRule(divide=2))
     key = clip.splits["train"][3]
@@ -148,21 +145,11 @@ def test_a_clip_is_resized_when_read(clip):
     assert camera.K[:2] == pytest.approx(before.K[:2] / 2)
     assert not image.flags.writeable
     assert aligned.image(key) is image
-
-
-def test_the_step_is_on_record_and_changes_the_fingerprint(clip):
-    half, third = (align_clip(clip, ResolutionRule(divide=n)) for n in (2, 3))
-    assert len({clip.fingerprint, half.fingerprint, third.fingerprint}) == 3
-    step = half.steps[-1]
-    assert step.name == "align_resolution"
-    assert step.input_fingerprint == clip.fingerprint
-    assert step.parameters["rule"]["divide"] == 2
-    assert step.parameters["sizes"] == ["48x64 to 24x32"]
-
-
-def test_a_rule_without_effect_gives_the_clip_itself(clip):
-    assert align_clip(clip, ResolutionRule()) is clip
-    assert align_clip(clip, ResolutionRule(size=(48, 64), speed_size=(9, 9))) is clip
+    step = aligned.steps[-1]
+    assert (step.name, step.input_fingerprint) == ("align_resolution", clip.fingerprint)
+    assert (step.parameters["rule"]["divide"], step.parameters["sizes"]) == (2, ["48x64 to 24x32"])
+    third = align_clip(clip, ResolutionRule(divide=3))
+    assert len({clip.fingerprint, aligned.fingerprint, third.fingerprint}) == 3
 
 
 def test_two_alignments_round_once(clip):

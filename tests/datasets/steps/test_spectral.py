@@ -59,7 +59,7 @@ def test_nystrom_is_exact_for_copies_of_the_landmarks():
     )
 
 
-def test_nystrom_nears_the_exact_embedding_as_landmarks_are_added():
+def test_more_landmarks_bring_nystrom_nearer_the_exact_embedding():
     points = np.random.default_rng(3).normal(size=(200, 3))
     similarity = similarity_of(points)
     exact = projector(exact_embedding(similarity, 4), similarity)

@@ -7,6 +7,7 @@ import pytest
 import torch
 from scipy.spatial import ConvexHull, cKDTree
 
+from headbench.datasets.head.geometry import triangle_areas
 from headbench.methods.gbs.config import GBSConfig
 from headbench.methods.gbs.points import (
     RADIUS,
@@ -16,7 +17,6 @@ from headbench.methods.gbs.points import (
     poisson_disk,
     rows_of_teeth,
     spacing,
-    surface_area,
     with_mouth,
 )
 
@@ -43,7 +43,7 @@ def test_samples_are_blue_noise_on_the_triangles_asked_for(ball):
     assert found.barycentric.min() >= -1e-7
     np.testing.assert_allclose(found.barycentric.sum(1), 1, atol=1e-12)
     positions = found.positions(vertices, faces)
-    area = surface_area(vertices, faces[upper])
+    area = triangle_areas(vertices, faces[upper]).sum()
     nearest = cKDTree(positions).query(positions, k=2)[0][:, 1]
     assert nearest.min() >= RADIUS * np.sqrt(area / COUNT) * 0.999
     # No hole: every point of the surface has a sample at hand; as candidates are few, a little beyond the disk's radius.
@@ -55,12 +55,6 @@ def test_equal_seeds_give_equal_points_and_others_others(ball):
     one, same, other = (poisson_disk(*ball, np.arange(len(ball[1])), 200, seed) for seed in (0, 0, 1))
     np.testing.assert_array_equal(one.barycentric, same.barycentric)
     assert not np.array_equal(one.barycentric[:50], other.barycentric[:50])
-
-
-def test_area_of_a_box():
-    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 2) for z in (0, 3)], float)
-    hull = ConvexHull(corners)
-    assert surface_area(corners, hull.simplices) == pytest.approx(2 * (2 + 3 + 6))
 
 
 def test_spacing_is_the_root_mean_square_of_three_neighbours():

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import headbench.datasets.head.procedural.sculpture as fields
-from headbench.datasets.head.geometry import border_edges
+from headbench.datasets.head.geometry import border_edges, mesh_edges
 from headbench.datasets.head.procedural.sculpt import (
     SculptSettings,
     coarsen,
@@ -58,9 +58,8 @@ def test_narrow_band_marching_cubes_finds_the_whole_sphere():
     assert vertex_areas(vertices, faces).sum() == pytest.approx(4 * np.pi * 0.05**2, rel=0.01)
     assert len(border_edges(faces)) == 0
     a, b, c = (vertices[faces[:, k]] for k in range(3))
-    assert np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6 == pytest.approx(
-        4 / 3 * np.pi * 0.05**3, rel=0.01
-    )
+    volume = np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6
+    assert volume == pytest.approx(4 / 3 * np.pi * 0.05**3, rel=0.01)
 
 
 def test_coarsening_keeps_border_fixed_points_and_edge_length():
@@ -72,9 +71,7 @@ def test_coarsening_keeps_border_fixed_points_and_edge_length():
     np.testing.assert_array_equal(coarse[:2], vertices[fixed])
     rim = np.unique(border_edges(triangles))
     np.testing.assert_allclose(coarse[rim, 0], 0, atol=1e-9)
-    edges = np.unique(
-        np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), 1), axis=0
-    )
+    edges = np.unique(np.sort(mesh_edges(triangles), axis=1), axis=0)
     assert len(coarse) - len(edges) + len(triangles) == 1  # a disk
     length = np.linalg.norm(coarse[edges[:, 0]] - coarse[edges[:, 1]], axis=1)
     assert np.median(length) == pytest.approx(0.010, rel=0.2)

@@ -79,13 +79,6 @@ def aligned_surface(points, other):
     return other @ motion[:3, :3].T + motion[:3, 3]
 
 
-def test_heads_without_a_face_are_refused():
-    head = toy_head(16)
-    faceless = type(head)(**{**vars(head), "regions": {k: v for k, v in head.regions.items() if k != "face"}})
-    with pytest.raises(InputError, match="face"):
-        fitted_vertices(faceless, SETTINGS)
-
-
 def test_heads_far_from_each_other_are_refused():
     head = toy_head(16)
     other = subdivided(head)

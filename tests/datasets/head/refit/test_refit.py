@@ -4,15 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from threadpoolctl import threadpool_limits
 
 from headbench.bench.errors import InputError
-from headbench.datasets.head.model import HeadModel
 from headbench.datasets.head.procedural.model import procedural_head
 from headbench.datasets.head.refit import refit as block
 from headbench.datasets.head.refit.command import RefitSettings
-from headbench.datasets.head.refit.refit import BLOCK, refit, refit_clip
+from headbench.datasets.head.refit.refit import BLOCK, refit
 from headbench.datasets.head.subject import PosedSubject
 from headbench.datasets.head.teeth import with_teeth
 from headbench.tests.benchmarks.refit import EXACT_MEAN_MM, EXACT_P95_MM, performance
@@ -20,14 +18,6 @@ from headbench.tests.benchmarks.refit import EXACT_MEAN_MM, EXACT_P95_MM, perfor
 from .heads import subdivided, toy_pair
 
 SOURCE, TARGET = toy_pair()
-
-
-def vertices(clip, timesteps):
-    """(T, V, 3) meshes of a clip in the world."""
-    model = HeadModel(clip.head, dtype=torch.float64)
-    shape = torch.from_numpy(np.asarray(clip.shape, float))
-    canonical = model.canonical(shape, torch.from_numpy(np.asarray(clip.static_offset, float)))
-    return model(canonical=canonical, **model.pose_arguments([clip.poses[t] for t in timesteps])).numpy()
 
 
 @pytest.fixture(scope="module")
@@ -43,10 +33,10 @@ def test_an_exact_solution_is_found(exact):
     assert summary["mean_mm"] < EXACT_MEAN_MM / 10
     assert summary["p95_mm"] < EXACT_P95_MM / 10
     face = target.regions["face"]
-    timesteps = sorted(clip.poses)
-    gaps = (
-        1e3 * np.linalg.norm(vertices(refitted.clip, timesteps) - vertices(clip, timesteps), axis=2)[:, face]
-    )
+    meshes = [
+        PosedSubject.of(c).meshes([c.poses[t] for t in sorted(clip.poses)]) for c in (refitted.clip, clip)
+    ]
+    gaps = 1e3 * np.linalg.norm(meshes[0] - meshes[1], axis=2)[:, face]
     np.testing.assert_allclose([f.mean_mm for f in refitted.report.frames], gaps.mean(axis=1))
     np.testing.assert_allclose([f.p95_mm for f in refitted.report.frames], np.percentile(gaps, 95, axis=1))
     assert np.nanmean(refitted.report.vertex_mm[face]) == pytest.approx(gaps.mean())
@@ -55,7 +45,7 @@ def test_an_exact_solution_is_found(exact):
 def test_another_basis_is_fitted_and_the_step_recorded():
     clip = performance(procedural_head("2023"), 12)
     target = procedural_head("2020")
-    derived = refit_clip(clip, target)
+    derived = refit(clip, target).clip
     step = derived.steps[-1]
     assert (step.name, step.input_fingerprint) == ("refit_head", clip.fingerprint)
     assert step.parameters["target_fingerprint"] == target.fingerprint()
@@ -71,13 +61,9 @@ def test_another_basis_is_fitted_and_the_step_recorded():
 @pytest.mark.parametrize("neck", ["fold", "keep"])
 def test_the_rigid_motion_of_the_head_stays(neck):
     clip = performance(SOURCE, 6)
-    derived = refit_clip(clip, TARGET, RefitSettings(neck=neck))
-    timesteps = sorted(clip.poses)
-    motions = [
-        PosedSubject(c.head, c.shape, c.static_offset).motions([c.poses[t] for t in timesteps])
-        for c in (clip, derived)
-    ]
-    np.testing.assert_allclose(motions[1], motions[0], atol=1e-12)
+    derived = refit(clip, TARGET, RefitSettings(neck=neck)).clip
+    before, after = (PosedSubject.of(c).motions([c.poses[t] for t in range(6)]) for c in (clip, derived))
+    np.testing.assert_allclose(after, before, atol=1e-12)
     turned = np.abs([pose.neck for pose in derived.poses.values()]).max()
     assert turned == (0 if neck == "fold" else np.abs([p.neck for p in clip.poses.values()]).max())
 
@@ -98,7 +84,7 @@ def test_a_residual_offset_makes_the_neutral_head_exact():
 
 def test_teeth_are_given_to_the_target_where_the_source_has_them():
     clip = performance(with_teeth(SOURCE), 2)
-    derived = refit_clip(clip, TARGET)
+    derived = refit(clip, TARGET).clip
     assert len(derived.head.template) == len(clip.head.template)
     assert derived.steps[-1].parameters["residual"]["mean_mm"] < 0.1
 
@@ -128,17 +114,12 @@ def test_a_target_out_of_reach_ends_at_bounds_that_are_reported():
     assert report.summary()["timesteps_at_bound"] == 3
 
 
-def test_no_timestep_is_refused():
-    with pytest.raises(InputError, match="timestep"):
-        refit_clip(replace(performance(SOURCE, 1), poses={}), TARGET)
-
-
 def test_the_number_of_threads_does_not_change_the_clip():
     clip, target = performance(procedural_head("2023"), 3), procedural_head("2020")
     found = set()
     for threads in (1, 2):
         with threadpool_limits(threads):
-            found.add(refit_clip(clip, target).fingerprint)
+            found.add(refit(clip, target).clip.fingerprint)
     assert len(found) == 1
 
 
@@ -149,13 +130,15 @@ def test_numbers_that_are_not_finite_are_refused(field):
     values[0] = np.nan
     broken = {**clip.poses, 1: replace(clip.poses[1], **{field: values})}
     with pytest.raises(InputError, match=f"{field}, timestep 1"):
-        refit_clip(replace(clip, poses=broken), TARGET)
+        refit(replace(clip, poses=broken), TARGET)
 
 
-def test_an_identity_that_is_not_finite_is_refused():
-    clip = performance(SOURCE, 1)
-    with pytest.raises(InputError, match="shape"):
-        refit_clip(replace(clip, shape=np.full_like(clip.shape, np.inf)), TARGET)
+@pytest.mark.parametrize(
+    ("change", "said"), [({"poses": {}}, "timestep"), ({"shape": np.full(6, np.inf)}, "shape")]
+)
+def test_tracking_that_cannot_be_fitted_is_refused(change, said):
+    with pytest.raises(InputError, match=said):
+        refit(replace(performance(SOURCE, 1), **change), TARGET)
 
 
 def test_half_a_turn_of_head_and_jaw(exact):
@@ -176,7 +159,9 @@ def test_settings_out_of_range_are_refused(name, value):
 
 def test_a_second_call_continues_at_the_first_missing_block(tmp_path, monkeypatch):
     clip = performance(SOURCE, 2 * BLOCK + 5)
-    whole = refit_clip(clip, TARGET, folder=tmp_path)
+    told: list[object] = []
+    whole = refit(clip, TARGET, folder=tmp_path, progress=lambda *a: told.append(a[:2])).clip
+    assert (told[0], told[-1]) == ((0, len(clip.poses)), (len(clip.poses), len(clip.poses)))
     assert len(list(tmp_path.iterdir())) == 3
     (tmp_path / "refit-00001.npz").unlink()
     solved: list[object] = []
@@ -187,7 +172,7 @@ def test_a_second_call_continues_at_the_first_missing_block(tmp_path, monkeypatc
         return solve(problem, frame, *rest)
 
     monkeypatch.setattr(block, "solve_frame", counted)
-    again = refit_clip(clip, TARGET, folder=tmp_path)
+    again = refit(clip, TARGET, folder=tmp_path).clip
     assert len(solved) == BLOCK
     for t, pose in whole.poses.items():
         np.testing.assert_array_equal(again.poses[t].expression, pose.expression)
@@ -197,15 +182,8 @@ def test_a_second_call_continues_at_the_first_missing_block(tmp_path, monkeypatc
 
 def test_blocks_of_other_input_are_not_taken(tmp_path):
     clip = performance(SOURCE, 4)
-    refit_clip(clip, TARGET, folder=tmp_path)
+    refit(clip, TARGET, folder=tmp_path)
     other = {t: replace(pose, jaw=pose.jaw * 0.5) for t, pose in clip.poses.items()}
-    again = refit_clip(replace(clip, poses=other), TARGET, folder=tmp_path)
-    fresh = refit_clip(replace(clip, poses=other), TARGET)
+    again = refit(replace(clip, poses=other), TARGET, folder=tmp_path).clip
+    fresh = refit(replace(clip, poses=other), TARGET).clip
     np.testing.assert_array_equal(again.poses[2].jaw, fresh.poses[2].jaw)
-
-
-def test_progress_is_reported():
-    told = []
-    refit_clip(performance(SOURCE, 3), TARGET, progress=lambda *a: told.append(a[:2]))
-    assert told[0] == (0, 3)
-    assert told[-1] == (3, 3)

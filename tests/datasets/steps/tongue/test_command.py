@@ -88,7 +88,7 @@ def test_decisions_overrides_and_exclusion(capture, tmp_path):
     assert {key.timestep: reason for key, reason in protocol.excluded}[6].startswith("tongue out")
 
 
-def test_what_people_leave_out_need_not_be_in_the_cameras_looked_at(capture, tmp_path):
+def test_people_may_leave_out_what_no_chosen_camera_recorded(capture, tmp_path):
     """The camera that the mouth faces most has no frame of timestep 3, which somebody left out."""
     copy = tmp_path / "captures"
     shutil.copytree(capture.parent, copy)
@@ -117,22 +117,16 @@ def test_given_threshold_is_used(capture, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("changes", "where"),
-    [
-        ({"threshold": -1.0}, "--threshold"),
-        ({"threshold": np.inf}, "--threshold"),
-        ({"cameras": 0}, "--cameras"),
-        ({"frames": 0}, "--frames"),
-    ],
+    ("name", "value"), [("threshold", -1.0), ("threshold", np.inf), ("cameras", 0), ("frames", 0)]
 )
-def test_settings_out_of_range_are_refused(capture, tmp_path, changes, where):
+def test_settings_out_of_range_are_refused(capture, tmp_path, name, value):
     with pytest.raises(InputError) as caught:
-        look(capture, tmp_path, **changes)
-    assert caught.value.file == where
+        look(capture, tmp_path, **{name: value})
+    assert caught.value.file == f"--{name}"
     assert not any(tmp_path.iterdir())
 
 
-def test_a_folder_without_captures_and_stray_overrides_are_refused(capture, tmp_path):
+def test_no_captures_and_stray_overrides_are_refused(capture, tmp_path):
     with pytest.raises(InputError):
         look(tmp_path, tmp_path / "out")
     look(capture, tmp_path)

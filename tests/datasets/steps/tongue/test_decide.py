@@ -17,7 +17,7 @@ def evidence(areas, seen=None):
 
 
 @given(st.lists(st.floats(0, 500), max_size=30))
-def test_threshold_stays_between_its_bounds_and_in_the_widest_gap(areas):
+def test_threshold_lies_in_the_widest_gap_between_its_bounds(areas):
     threshold, _ = choose_threshold(np.array(areas))
     assert NEVER <= threshold <= ALWAYS
     edges = sorted([NEVER, ALWAYS, *(a for a in areas if NEVER < a < ALWAYS)])

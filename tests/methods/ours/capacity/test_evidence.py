@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from headbench.datasets.steps.jaw_bases import IDENTITY, farthest_quaternions, jaw_quaternions, jaw_weights
@@ -19,7 +18,6 @@ from headbench.methods.ours.capacity import (
     leading_directions,
     pixel_footprint,
     spanning_jaw_bases,
-    surface_area,
 )
 from headbench.methods.shared.subject_mesh import SubjectMesh
 
@@ -151,8 +149,3 @@ def test_footprint_is_depth_over_focal_length(head):
     clip = toy_clip(head, timesteps=2, cameras=3, width=20, height=24)
     focal = 0.5 * 24 / np.tan(np.radians(20))
     np.testing.assert_allclose(pixel_footprint(clip, np.zeros(3)), 0.5 / focal, rtol=0.02)
-
-
-def test_area_is_that_of_a_convex_hull():
-    hull = ConvexHull(np.random.default_rng(0).normal(size=(50, 3)))
-    np.testing.assert_allclose(surface_area(hull.points, hull.simplices), hull.area, rtol=1e-12)
