@@ -45,6 +45,12 @@ AVATAR = BenchmarkSpec(
 )
 
 
+TRAINING = BenchmarkSpec(
+    name="training",
+    summary="an iteration of training by stage, and its ratio to the rasteriser, for methods that train splats",
+    speed="headbench.tests.benchmarks.training:measure",
+)
+
 METRICS = BenchmarkSpec(
     name="metrics",
     summary="the image metrics: time per image next to scikit-image, torchmetrics and lpips, and equality of values",

@@ -14,7 +14,7 @@ from headbench.bench.registry import resolve
 from headbench.datasets.head.model import HeadModel
 from headbench.datasets.head.procedural.model import procedural_head
 from headbench.methods.splats import available_backends, rasterize
-from headbench.tests.benchmarks import clusters, images, prepare, refit, statistics
+from headbench.tests.benchmarks import clusters, images, prepare, refit, statistics, training
 from headbench.tests.benchmarks.avatar import speed as avatar
 from headbench.tests.benchmarks.head import speed as head_speed
 from headbench.tests.benchmarks.specs import CLUSTERS
@@ -30,6 +30,11 @@ SMALLEST = {
     "splats": (speed, {"DIAGONAL": SIZES}, ["Threads.", "Order in memory", *KERNELS, *("300", "500")]),
     "splats, tradeoffs": (tradeoffs, {"QUICK_SCENE": (600, 48, 40)}, ["exact", "float16", "8/255", "0.05"]),
     "avatar": (avatar, {"QUICK": ((700, 40, 32),)}, ["step of a frame", "saving", "700 splats"]),
+    "training": (
+        training,
+        {"SIZE": (40, 32), "QUICK_SPLATS": 13_000},
+        ["ga", "ours", "gbs", "rasterize, backward"],
+    ),
     "head": (head_speed, {"FLAME_SIZES": (12, 8), "_QUICK_ROUNDS": 2}, [head_speed.OURS, "readable path"]),
     "metrics": (
         images,

@@ -201,6 +201,24 @@ struct OffsetNetwork {
 
 // What training computes of splats beside the rasteriser; gradients are named by what they are taken by.
 
+// A posed head, datasets/head/model.py: V vertices of J joints, K rows of expressions and pose correctives.
+constexpr int kMotion = 12;  // of a joint: 3 rows of a rotation and an offset
+
+struct Posing {
+  std::int64_t vertices;
+  int joints, rows;
+  const float* neutral;       // (V, 3)
+  const float* basis;         // (K, V, 3)
+  const float* coefficients;  // (K,)
+  const float* weights;       // (V, J)
+  const float* motions;       // (J, 3, 4)
+  const float* lids;          // (V, 3) added after they are rotated, or null
+  float lid_rotation[9];
+  float translation[3];
+  float* unposed;  // (V, 3)
+  float* posed;    // (V, 3)
+};
+
 struct TrianglesBackward {
   const float* vertices;        // (V, 3)
   const std::int64_t* faces;    // (F, 3)
@@ -298,7 +316,10 @@ struct Kernels {
   void (*color_network)(const ColorNetwork&, std::int64_t begin, std::int64_t end, float* scratch);
   std::size_t (*offset_scratch)(int units, int hidden);
   void (*offset_network)(const OffsetNetwork&, std::int64_t begin, std::int64_t end, float* scratch);
-  // Of training, for triangles, splats or rows [begin, end).
+  // Of training, for vertices, triangles, splats or rows [begin, end).
+  void (*pose_vertices)(const Posing&, std::int64_t begin, std::int64_t end);
+  void (*pose_backward)(const Posing&, const float* by_posed, std::int64_t begin, std::int64_t end, float* scratch,
+                        float* sums);
   void (*triangles_backward)(const TrianglesBackward&, std::int64_t begin, std::int64_t end);
   void (*activate)(const Activation&, std::int64_t begin, std::int64_t end);
   void (*to_world_backward)(const ToWorldBackward&, std::int64_t begin, std::int64_t end);

@@ -125,6 +125,88 @@ inline void triangles_backward(const TrianglesBackward& in, std::int64_t begin, 
   }
 }
 
+// A posed head.
+
+// Sum of `count` products.
+HEADBENCH_INLINE float dot(const float* a, const float* b, int count) {
+  Real sum = 0.0f;
+  int i = 0;
+  for (; i + W <= count; i += W) sum = fma(load(a + i), load(b + i), sum);
+  alignas(64) float lanes[W];
+  store(lanes, sum);
+  float total = 0.0f;
+  for (int lane = 0; lane < W; ++lane) total += lanes[lane];
+  for (; i < count; ++i) total += a[i] * b[i];
+  return total;
+}
+
+// Blend the joints' motions at one vertex.
+HEADBENCH_INLINE void blend_joints(const Posing& in, std::int64_t vertex, float* out) {
+  for (int k = 0; k < kMotion; ++k) out[k] = 0.0f;
+  const float* weights = in.weights + vertex * in.joints;
+  for (int joint = 0; joint < in.joints; ++joint)
+    for (int k = 0; k < kMotion; ++k) out[k] += weights[joint] * in.motions[kMotion * joint + k];
+}
+
+// Vertices [begin, end): unposed ones with expression and pose correctives, and posed ones.
+inline void pose_vertices(const Posing& in, std::int64_t begin, std::int64_t end) {
+  const std::int64_t first = 3 * begin, count = 3 * (end - begin), all = 3 * in.vertices;
+  float* unposed = in.unposed + first;
+  for (std::int64_t i = 0; i < count; ++i) unposed[i] = in.neutral[first + i];
+  for (int row = 0; row < in.rows; ++row) {
+    const float coefficient = in.coefficients[row];
+    if (coefficient == 0.0f) continue;
+    const float* basis = in.basis + row * all + first;
+    std::int64_t i = 0;
+    for (; i + W <= count; i += W) store(unposed + i, fma(Real(coefficient), load(basis + i), load(unposed + i)));
+    for (; i < count; ++i) unposed[i] += coefficient * basis[i];
+  }
+  float motion[kMotion];
+  for (std::int64_t vertex = begin; vertex < end; ++vertex) {
+    blend_joints(in, vertex, motion);
+    const float* x = in.unposed + 3 * vertex;
+    for (int row = 0; row < 3; ++row) {
+      const float* m = motion + 4 * row;
+      float sum = m[0] * x[0] + m[1] * x[1] + m[2] * x[2] + m[3] + in.translation[row];
+      if (in.lids)
+        for (int k = 0; k < 3; ++k) sum += in.lid_rotation[3 * row + k] * in.lids[3 * vertex + k];
+      in.posed[3 * vertex + row] = sum;
+    }
+  }
+}
+
+// What vertices [begin, end) add to the gradients by coefficients, motions, lids' rotation and translation, in that order.
+// `scratch` has 3 (end - begin) floats.
+inline void pose_backward(const Posing& in, const float* by_posed, std::int64_t begin, std::int64_t end, float* scratch,
+                          float* sums) {
+  const int count = static_cast<int>(3 * (end - begin));
+  float* by_motions = sums + in.rows;
+  float* by_lids = by_motions + kMotion * in.joints;
+  float* by_translation = by_lids + 9;
+  for (int i = 0; i < kMotion * in.joints + 9 + 3; ++i) by_motions[i] = 0.0f;
+  float motion[kMotion];
+  for (std::int64_t vertex = begin; vertex < end; ++vertex) {
+    blend_joints(in, vertex, motion);
+    const float *g = by_posed + 3 * vertex, *x = in.unposed + 3 * vertex;
+    float* out = scratch + 3 * (vertex - begin);
+    float outer[kMotion];
+    for (int row = 0; row < 3; ++row) {
+      for (int k = 0; k < 3; ++k) outer[4 * row + k] = g[row] * x[k];
+      outer[4 * row + 3] = g[row];
+      by_translation[row] += g[row];
+    }
+    for (int k = 0; k < 3; ++k) out[k] = motion[k] * g[0] + motion[4 + k] * g[1] + motion[8 + k] * g[2];
+    const float* weights = in.weights + vertex * in.joints;
+    for (int joint = 0; joint < in.joints; ++joint)
+      for (int k = 0; k < kMotion; ++k) by_motions[kMotion * joint + k] += weights[joint] * outer[k];
+    if (in.lids)
+      for (int row = 0; row < 3; ++row)
+        for (int k = 0; k < 3; ++k) by_lids[3 * row + k] += g[row] * in.lids[3 * vertex + k];
+  }
+  for (int row = 0; row < in.rows; ++row)
+    sums[row] = dot(in.basis + row * 3 * in.vertices + 3 * begin, scratch, count);
+}
+
 HEADBENCH_INLINE Real exponential(Real x) { return exp2(max(min(x * Real(kLog2e), Real(127.0f)), Real(-126.0f))); }
 
 // Local splats [begin, end) as training holds them, prepared for `to_world`.

@@ -9,6 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from headbench.datasets.head.model import HeadModel
+from headbench.datasets.head.procedural.model import procedural_head
 from headbench.methods.shared import binding, losses, training_kernel
 from headbench.methods.shared.networks import sh_to_rgb
 from headbench.methods.splats.cpu import instruction_sets
@@ -89,7 +91,28 @@ def _penalties() -> Case:
     )
 
 
+def _pose(lids: bool) -> Case:
+    head = procedural_head("2020" if lids else "2023")
+    asset = HeadModel(head)
+    exact = HeadModel(head, dtype=torch.float64)
+    canonical = asset.canonical(0.5 * _random(asset.shape_size).float())
+    mesh = training_kernel.PosedMesh(asset, canonical)
+    names = ("expression", "rotation", "neck", "jaw", "eyes", "translation")
+    sizes = (asset.expression_size, 3, 3, 3, 6, 3)
+    inputs = [0.3 * _random(1, size, seed=seed) for seed, size in enumerate(sizes)]
+    inputs[2].zero_()  # the series of small angles
+    still = {"eyelids": torch.tensor([[0.4, -0.2]])} if lids else {}
+
+    def slow(*values: Tensor) -> Tensor:
+        arguments = dict(zip(names, values)) | {name: value.double() for name, value in still.items()}
+        return exact(canonical=canonical.double(), **arguments)
+
+    return Case(lambda *x: mesh(dict(zip(names, x[:-1])) | still, x[-1]), slow, inputs)
+
+
 CASES = {
+    "pose": _pose(False),
+    "pose with eyelids": _pose(True),
     "photometric": _photometric(131, 70, 0.2),
     "photometric, SSIM alone, smaller than the window": _photometric(5, 7, 1.0),
     "photometric, L1 alone, one column": _photometric(100, 1, 0.0),
@@ -121,9 +144,10 @@ def test_equals_the_reference_in_values_and_gradients(name: str, backend: str) -
     expected = _run(case.slow, case.inputs)
     found = _run(case.fast, [value.float() for value in case.inputs], backend)
     for one, other in zip(found, expected, strict=True):
-        torch.testing.assert_close(
-            one.double(), other, rtol=0, atol=2e-6 * max(1e-6, float(other.abs().max()))
-        )
+        # What turns an eye is a small difference of large sums; float32 autograd is as far from float64.
+        share = 5e-5 if name.startswith("pose") else 2e-6
+        bound = share * max(1e-6, float(other.abs().max()))
+        torch.testing.assert_close(one.double(), other, rtol=0, atol=bound)
 
 
 @needs_kernel

@@ -1,0 +1,317 @@
+"""Processor time of a training iteration by stage, forward and backward, against the rasteriser's in the same run.
+
+Splats lie at random on the procedural head, as training leaves them, and the images are drawn from an untrained avatar: what an
+iteration costs does not depend on what it learns.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...bench.configuration import build
+from ...bench.contracts import (
+    ByteArray,
+    Camera,
+    FloatArray,
+    FrameKey,
+    HeadAsset,
+    HeadPose,
+    Progress,
+    StepRecord,
+)
+from ...bench.specs import Findings, MethodSpec
+from ...datasets.head.procedural.model import procedural_head
+from ...methods.ga import method as ga
+from ...methods.ga.config import GAConfig
+from ...methods.ga.spec import GA
+from ...methods.gbs import training as gbs
+from ...methods.gbs.config import GBSConfig
+from ...methods.gbs.spec import GBS
+from ...methods.ours import appearance as ours
+from ...methods.ours.config import OursConfig
+from ...methods.ours.spec import OURS
+from ...methods.shared import splat_training
+from ...methods.shared.avatar_files import Subject
+from ...methods.shared.loop import TrainingImages
+from ...methods.shared.optimisation import Densifier, Optimiser
+from ...methods.shared.schedule import ShuffledEpochs, Timeline
+from ...methods.shared.splat_training import BoundTraining, SplatTrainer, Start
+from ...methods.shared.subject_mesh import SubjectMesh
+from ...methods.splats.request import Rendering
+from .avatar.untrained import cameras_around, random_poses, untrained_avatar
+from .timing import table, torch_threads
+
+SIZE = (144, 208)  # of the demo's images
+SPLATS = 20_000  # the most that the demo's preset allows
+QUICK_SPLATS = 13_000  # above one a triangle
+CAMERAS, TIMESTEPS = 4, 8
+WARM_UP = 4
+FIRST_ITERATION, LENGTH = 1_200, 2_000  # lines and harmonics of every degree are on
+RASTERISER = "rasterize"
+
+
+@dataclass(frozen=True, eq=False)
+class _Clip:
+    """A `Clip` in memory."""
+
+    head: HeadAsset
+    shape: FloatArray
+    static_offset: FloatArray
+    cameras: Mapping[str, Camera]
+    poses: Mapping[int, HeadPose]
+    splits: Mapping[str, tuple[FrameKey, ...]]
+    images: Mapping[FrameKey, ByteArray]
+    background: FloatArray
+    subject: str = "untrained"
+    fingerprint: str = ""
+    excluded: Mapping[FrameKey, str] = ()  # type: ignore[assignment]
+    steps: Sequence[StepRecord] = ()
+
+    def image(self, key: FrameKey) -> ByteArray:
+        return self.images[key]
+
+    def mask(self, key: FrameKey) -> None:
+        return None
+
+
+def _clip(head: HeadAsset, width: int, height: int) -> _Clip:
+    avatar = untrained_avatar(head, len(head.faces))
+    cameras = {camera.id: camera for camera in cameras_around(head, CAMERAS, width, height)}
+    poses = {
+        number: replace(pose, timestep=number, subject="untrained")
+        for number, pose in enumerate(random_poses(head, TIMESTEPS))
+    }
+    keys = [FrameKey("untrained", "TRAIN", timestep, camera) for timestep in poses for camera in cameras]
+    images = {
+        key: np.rint(255 * avatar.render(cameras[key.camera], poses[key.timestep]).rgb).astype(np.uint8)
+        for key in keys
+    }
+    shape, offset = np.zeros(head.shape_basis.shape[2], np.float32), np.zeros(head.template.shape, np.float32)
+    return _Clip(head, shape, offset, cameras, poses, {"train": tuple(keys)}, images, np.ones(3))
+
+
+def _config(kind: type, spec: MethodSpec) -> Any:
+    preset = {name: value for name, value in spec.presets["demo"].items() if name != "budget"}
+    return build(kind, preset, f"preset demo of {spec.name}")
+
+
+def _bound(clip: _Clip, count: int, name: str) -> SplatTrainer:
+    mesh = SubjectMesh(clip.head, clip.shape, clip.static_offset, "cpu")
+    faces, generator = len(mesh.faces), torch.Generator().manual_seed(0)
+    appearance: splat_training.Appearance
+    if name == "ga":
+        config = _config(GAConfig, GA)
+        appearance = ga.GAAppearance(mesh, clip, config, "cpu", 0)
+    else:
+        config = _config(OursConfig, OURS)
+        appearance = ours.OursAppearance(mesh, clip, config, "cpu", 0)
+    means = torch.randn(count, 3, generator=generator) * torch.tensor([0.25, 0.02, 0.25])
+    start = Start(torch.arange(count) * faces // count, means, torch.full((count,), 0.5))
+    sampler = ShuffledEpochs(len(clip.splits["train"]), 0)
+    training = BoundTraining(clip, config.splats, appearance, sampler, faces, "cpu", 0, start=start)
+    size = 0.4 * (faces / count) ** 0.5
+    with torch.no_grad():
+        training.optimiser["log_scales"].copy_(torch.tensor([size, 0.2 * size, size]).log().expand(count, 3))
+    return training
+
+
+def _blendshapes(clip: _Clip, count: int) -> SplatTrainer:
+    config = replace(_config(GBSConfig, GBS), samples=count, sample_spacing=0.0)
+    sampler = ShuffledEpochs(len(clip.splits["train"]), 0)
+    return gbs.GBSTraining(clip, config, Subject.of(clip), clip.head, sampler, "cpu", 0)  # type: ignore[arg-type]
+
+
+METHODS: Mapping[str, Callable[[_Clip, int], SplatTrainer]] = {
+    "ga": lambda clip, count: _bound(clip, count, "ga"),
+    "ours": lambda clip, count: _bound(clip, count, "ours"),
+    "gbs": _blendshapes,
+}
+
+
+class _Stages:
+    """Seconds of the calling thread by stage, and by the backward pass of each."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = defaultdict(float)
+        self._open: list[tuple[str, float]] = []
+
+    def begin(self, name: str) -> None:
+        self._open.append((name, time.thread_time()))
+
+    def end(self, name: str) -> None:
+        if self._open and self._open[-1][0] == name:
+            self.seconds[name] += time.thread_time() - self._open.pop()[1]
+
+    def timed(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        """The function, its time taken, and, by marks on what goes in and comes out, that of its backward pass."""
+
+        def run(*arguments: Any, **named: Any) -> Any:
+            backward = f"{name}, backward"
+            arguments = self._marked(arguments, lambda: self.end(backward))
+            self.begin(name)
+            found = function(*arguments, **named)
+            self.end(name)
+            if isinstance(found, Rendering):
+                image, alpha = self._marked((found.image, found.alpha), lambda: self.begin(backward))
+                return replace(found, image=image, alpha=alpha)
+            parts = (found,) if isinstance(found, Tensor) else tuple(found)
+            marked = self._marked(parts, lambda: self.begin(backward))
+            return marked[0] if isinstance(found, Tensor) else type(found)(*marked)
+
+        return run
+
+    def _marked(self, values: Sequence[Any], event: Callable[[], None]) -> tuple[Any, ...]:
+        chosen = [n for n, value in enumerate(values) if isinstance(value, Tensor) and value.requires_grad]
+        result = list(values)
+        if chosen:
+            for place, value in zip(chosen, _Mark.apply(event, *(values[n] for n in chosen))):  # type: ignore[no-untyped-call]
+                result[place] = value
+        return tuple(result)
+
+
+class _Mark(torch.autograd.Function):
+    """Identity that calls a function when the gradients pass."""
+
+    @staticmethod
+    def forward(ctx: Any, event: Callable[[], None], *values: Tensor) -> tuple[Tensor, ...]:
+        ctx.event = event
+        return tuple(value.view_as(value) for value in values)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        ctx.event()
+        return None, *grads
+
+
+@contextmanager
+def _timed_stages(stages: _Stages) -> Iterator[None]:
+    functions = [
+        (splat_training, "rasterize", RASTERISER),
+        (splat_training, "photometric_loss", "L1 and SSIM"),
+        (gbs, "photometric_loss", "L1 and SSIM"),
+        (splat_training, "splat_penalties", "penalties"),
+        (ga, "to_world", "to world space"),
+        (ours, "to_world", "to world space"),
+        (ga, "harmonic_colors", "colours"),
+        (ours, "shade", "colours"),
+        (ours, "line_offsets", "lines"),
+        (gbs, "apply_pose", "to world space"),
+    ]
+    plain = [(Optimiser, "step"), (Densifier, "observe"), (TrainingImages, "get")]
+    with ExitStack() as entered:
+        for owner, name, stage in functions:
+            entered.enter_context(patch.object(owner, name, stages.timed(stage, getattr(owner, name))))
+        for kind, name in plain:
+            entered.enter_context(patch.object(kind, name, _method(stages, kind, name)))
+        yield
+
+
+def _method(stages: _Stages, kind: type, name: str) -> Callable[..., Any]:
+    original, stage = getattr(kind, name), {"step": "Adam", "observe": "densification", "get": "images"}[name]
+
+    def run(*arguments: Any) -> Any:
+        stages.begin(stage)
+        found = original(*arguments)
+        stages.end(stage)
+        return found
+
+    return run
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """Milliseconds of one thread, the least of the iterations; ``stages`` are medians."""
+
+    method: str
+    splats: int
+    whole: float
+    rasteriser: float
+    stages: Mapping[str, float]
+
+
+def measure_iteration(name: str, clip: _Clip, count: int, repeats: int) -> Iteration:
+    """Time iterations of one method."""
+    training = METHODS[name](clip, count)
+    training.begin(Timeline(LENGTH, 600_000))
+    whole, by_stage = [], defaultdict(list)
+    try:
+        for number in range(WARM_UP + repeats):
+            stages = _Stages()
+            start = time.thread_time()
+            with _timed_stages(stages):
+                _iterate(training, FIRST_ITERATION + number)
+            if number >= WARM_UP:
+                whole.append(time.thread_time() - start)
+                for stage, seconds in stages.seconds.items():
+                    by_stage[stage].append(seconds)
+    finally:
+        training.close()
+    medians = {stage: 1e3 * float(np.median(seconds)) for stage, seconds in by_stage.items()}
+    medians["rest"] = 1e3 * float(np.median(whole)) - sum(medians.values())
+    rasteriser = [
+        a + b for a, b in zip(by_stage[RASTERISER], by_stage[f"{RASTERISER}, backward"], strict=True)
+    ]
+    return Iteration(name, len(training.binding), 1e3 * min(whole), 1e3 * min(rasteriser), medians)
+
+
+def _iterate(training: SplatTrainer, iteration: int) -> None:
+    # Rounds of densification, at every hundredth iteration, would change the number of splats.
+    training.loss(iteration, iteration % len(training.keys)).backward()
+    offset, visible, camera, _ = training._seen
+    assert offset.grad is not None
+    training._densifier.observe(offset.grad, visible, camera.width, camera.height)
+    training.optimiser.step()
+    training.optimiser.zero_grad()
+
+
+def measure(quick: bool, progress: Progress) -> Findings:
+    """An iteration of each method that trains splats on a mesh, at the demo's size."""
+    clip = _clip(procedural_head("2020"), *SIZE)
+    count, repeats = (QUICK_SPLATS, 6) if quick else (SPLATS, 30)
+    found = []
+    with torch_threads(1):
+        for number, name in enumerate(METHODS):
+            found.append(measure_iteration(name, clip, count, repeats))
+            progress(number + 1, len(METHODS), name)
+    rows = [
+        (
+            one.method,
+            str(one.splats),
+            f"{one.whole:.1f}",
+            f"{one.rasteriser:.1f}",
+            f"{one.whole / one.rasteriser:.1f}",
+        )
+        for one in found
+    ]
+    names = sorted({stage for one in found for stage in one.stages}, key=lambda name: (name == "rest", name))
+    stages = [
+        (name, *(f"{one.stages[name]:.2f}" if name in one.stages else "-" for one in found)) for name in names
+    ]
+    width, height = SIZE
+    text = (
+        f"Training at {width}x{height}, processor ms of one thread: an iteration, the least of {repeats}, and the "
+        "rasteriser's two passes.\n\n"
+        + table(("method", "splats", "iteration", "rasteriser", "ratio"), rows)
+        + "\n\nStages, medians.\n\n"
+        + table(("stage", *(one.method for one in found)), stages)
+    )
+    data = {
+        one.method: {
+            "splats": one.splats,
+            "iteration_ms": one.whole,
+            "rasteriser_ms": one.rasteriser,
+            "stages_ms": dict(one.stages),
+        }
+        for one in found
+    }
+    return Findings(text, data)
