@@ -16,7 +16,6 @@ from ...bench.contracts import FloatArray, FrameKey, HeadPose, IntArray, Progres
 from ...bench.machine import peak_memory_bytes
 from ...bench.specs import Findings
 from ...datasets.clip import CaptureClip
-from ...datasets.images import ImageStore
 from ...datasets.steps.clusters import (
     DEFAULT_CLASSES,
     LANDMARK_TOLERANCE,
@@ -30,6 +29,7 @@ from ...datasets.steps.clusters import (
 )
 from ...datasets.synthetic.performance import HELD_OUT, perform, share_out
 from ...datasets.synthetic.plan import load_geometry
+from .refit import without_images
 
 SIZES, QUICK_SIZES = (300, 1000, 2000, 5000), (300, 1000)
 AGREEMENT_SIZE, AGREEMENT_LANDMARKS = 300, 150
@@ -105,18 +105,10 @@ def performed_clip(timesteps: int, seed: int) -> CaptureClip:
     head = geometry.head
     return CaptureClip(
         subject="s",
-        head=head,
         shape=np.zeros(head.shape_basis.shape[2]),
-        static_offset=np.zeros(head.template.shape),
-        cameras={},
-        poses=noisy,
         splits={"train": tuple(FrameKey("s", "performed", t, "a") for t in noisy)},
-        excluded={},
-        background=np.ones(3),
-        steps=(),
         files={},
-        source_fingerprint="",
-        store=ImageStore(),
+        **without_images(head, noisy),
     )
 
 

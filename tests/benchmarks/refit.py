@@ -13,7 +13,7 @@ import torch
 from scipy.optimize import least_squares
 from threadpoolctl import threadpool_limits
 
-from ...bench.contracts import FloatArray, FrameKey, HeadPose, Progress
+from ...bench.contracts import FloatArray, FrameKey, HeadAsset, HeadPose, Progress
 from ...bench.specs import Findings
 from ...datasets.clip import CaptureClip, FrameFiles
 from ...datasets.head.arrays import HeadArrays
@@ -122,19 +122,26 @@ def performance(head: HeadArrays, timesteps: int, *, seed: int = 0, strength: fl
     keys = tuple(FrameKey("subject", "EMO", t, "camera") for t in range(timesteps))
     return CaptureClip(
         subject="subject",
-        head=head,
         shape=np.asarray(0.8 * rng.normal(size=head.shape_basis.shape[2])),
-        static_offset=np.zeros(head.template.shape),
-        cameras={},
-        poses=poses,
         splits={"train": keys, "novel_view": (), "self_reenactment": ()},
-        excluded={},
-        background=np.ones(3),
-        steps=(),
         files={key: FrameFiles(Path("none"), None) for key in keys},
-        source_fingerprint="",
-        store=ImageStore(),
+        **without_images(head, poses),
     )
+
+
+def without_images(head: HeadAsset, poses: dict[int, HeadPose]) -> dict[str, Any]:
+    """What is the same of every clip of poses alone."""
+    return {
+        "head": head,
+        "static_offset": np.zeros(head.template.shape),
+        "poses": poses,
+        "cameras": {},
+        "excluded": {},
+        "background": np.ones(3),
+        "steps": (),
+        "source_fingerprint": "",
+        "store": ImageStore(),
+    }
 
 
 def _against_scipy(

@@ -36,22 +36,14 @@ SMALLEST = {
         ["ga", "ours", "gbs", "rasterize, backward"],
     ),
     "head": (head_speed, {"FLAME_SIZES": (12, 8), "_QUICK_ROUNDS": 2}, [head_speed.OURS, "readable path"]),
-    "metrics": (
-        images,
-        {"QUICK_SIZE": (40, 31)},
-        ["scikit-image", "torchmetrics", "numpy", "weights"],
-    ),
+    "metrics": (images, {"QUICK_SIZE": (40, 31)}, ["scikit-image", "torchmetrics", "numpy", "weights"]),
     "prepare": (prepare, {"_QUICK": TINY_RECORDING, "MEMORY_FRAMES": (6, 60)}, ["plain OpenCV loop"]),
     "refit": (
         refit,
         {"QUICK_TIMESTEPS": 3, "QUICK_SCIPY_FRAMES": 1, "FLAME_SIZES": (12, 8)},
         ["procedural 2023 to 2020", "300 + 100, other random bases"],
     ),
-    "statistics": (
-        statistics,
-        {"QUICK_TRIALS": 3, "REPLICATES": 20},
-        list(statistics.CASES),
-    ),
+    "statistics": (statistics, {"QUICK_TRIALS": 3, "REPLICATES": 20}, list(statistics.CASES)),
 }
 
 

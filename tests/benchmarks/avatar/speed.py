@@ -66,22 +66,31 @@ class Bench:
 
     def pairs(self) -> Iterator[Pair]:
         """Every saving, alone, then all together, against the same frame drawn by the definition's own functions."""
-        yield self._whole()
-        yield self._pair(
-            "known poses prepared",
-            self._frames(self.avatar),
-            self._frames(self._prepared()),
-            "mesh, frames, jaw weights, offsets",
-        )
-        yield self._pair("another camera, same pose", self._frames(self.avatar), self._orbit(self.avatar))
-        yield self._pair("same camera, same pose", self._frames(self.avatar), self._still(self.avatar))
-        yield self._blended()
-        yield self._lines()
-        yield self._outside()
-        yield self._units()
-        yield self._folded()
-        yield self._network()
-        yield self._carried()
+        parts = _Parts(self.avatar, self.poses[0], self.cameras[0])
+        frames = cycle([_Parts(self.avatar, p, c) for p, c in zip(self.poses, cycle(self.cameras))])
+        prepared = self._again()
+        prepared.prepare(self.poses)
+        every = self._frames(self.avatar)
+        whole, narrow, inside = self._narrow()
+        by_name: dict[str, tuple[Run, Run] | tuple[Run, Run, str]] = {
+            "all, a new pose and camera every frame": (lambda: next(frames).plain(), every),
+            "known poses prepared": (every, self._frames(prepared), "mesh, frames, jaw weights, offsets"),
+            "another camera, same pose": (every, self._same_pose(cycle(self.cameras))),
+            "same camera, same pose": (every, self._same_pose(cycle(self.cameras[:1]))),
+            "lines blended once a frame": (parts.offsets_by_line, parts.offsets, "not per splat"),
+            "first line layer on the blended lines": (parts.offsets_by_splat, parts.offsets, "not per splat"),
+            "splats outside the lines' box skipped": (whole.offsets, narrow.offsets, f"{inside:.0%} inside"),
+            "offset network in one pass, without units that are off": (
+                *(parts.offsets_by_torch, parts.offsets),
+                f"{parts.units_on():.0%} on",
+            ),
+            "planes folded into the first colour layer": (parts.colors_by_planes, parts.colors_direct),
+            "colour network in one pass, directions included": (parts.colors_direct, parts.colors),
+            "splats to the world in one pass": (parts.world_by_torch, parts.world),
+        }
+        for name, (before, after, *note) in by_name.items():
+            least = self._least({"before": before, "after": after})
+            yield Pair(name, least["before"], least["after"], *note)
 
     def stages(self) -> list[tuple[str, float]]:
         """Milliseconds of the steps of one frame."""
@@ -102,49 +111,20 @@ class Bench:
             seconds = take_turns(timed, budget=self._budget, least_runs=self._least_runs)
         return {name: 1e3 * min(values) for name, values in seconds.items()}
 
-    def _pair(self, name: str, before: Run, after: Run, note: str = "") -> Pair:
-        least = self._least({"before": before, "after": after})
-        return Pair(name, least["before"], least["after"], note)
-
     def _frames(self, avatar: OursAvatar) -> Run:
         """A new pose and a new camera every frame."""
         frames = cycle([(self.cameras[n % len(self.cameras)], pose) for n, pose in enumerate(self.poses)])
         return lambda: avatar.render(*next(frames))
 
-    def _orbit(self, avatar: OursAvatar) -> Run:
-        frames = cycle(self.cameras)
-        # Of an avatar of its own: another run's pose between two of these would be the last one.
-        own = OursAvatar([], avatar.mesh, avatar.subject, avatar.field, "cpu")
-        return lambda: own.render(next(frames), self.poses[0])
+    def _same_pose(self, cameras: Iterator[Camera]) -> Run:
+        own = self._again()  # another run's pose between two of these would be the last one
+        return lambda: own.render(next(cameras), self.poses[0])
 
-    def _still(self, avatar: OursAvatar) -> Run:
-        own = OursAvatar([], avatar.mesh, avatar.subject, avatar.field, "cpu")
-        return lambda: own.render(self.cameras[0], self.poses[0])
+    def _again(self) -> OursAvatar:
+        return OursAvatar([], self.avatar.mesh, self.avatar.subject, self.avatar.field, "cpu")
 
-    def _prepared(self) -> OursAvatar:
-        prepared = OursAvatar([], self.avatar.mesh, self.avatar.subject, self.avatar.field, "cpu")
-        prepared.prepare(self.poses)
-        return prepared
-
-    def _whole(self) -> Pair:
-        parts = [_Parts(self.avatar, pose, camera) for pose, camera in zip(self.poses, cycle(self.cameras))]
-        frames = cycle(parts)
-        return self._pair(
-            "all, a new pose and camera every frame", lambda: next(frames).plain(), self._frames(self.avatar)
-        )
-
-    def _blended(self) -> Pair:
-        parts = _Parts(self.avatar, self.poses[0], self.cameras[0])
-        return self._pair("lines blended once a frame", parts.offsets_by_line, parts.offsets, "not per splat")
-
-    def _lines(self) -> Pair:
-        parts = _Parts(self.avatar, self.poses[0], self.cameras[0])
-        return self._pair(
-            "first line layer on the blended lines", parts.offsets_by_splat, parts.offsets, "not per splat"
-        )
-
-    def _outside(self) -> Pair:
-        """Lines over the front half of the head, as with ``lines.bounds: face``, against the whole."""
+    def _narrow(self) -> tuple[_Parts, _Parts, float]:
+        """The avatar, one with lines over the front half of the head (``lines.bounds: face``), the share inside."""
         field = self.avatar.field
         low, high = field.tensors["line_box"]
         front = torch.stack([torch.stack([low[0], low[1], 0.5 * (low[2] + high[2])]), high])
@@ -152,34 +132,7 @@ class Bench:
         other = OursAvatar([], self.avatar.mesh, self.avatar.subject, narrow, "cpu")
         share = len(other.line_offsets.inside) / max(self.count, 1) if other.line_offsets else 0.0
         whole, part = (_Parts(one, self.poses[0], self.cameras[0]) for one in (self.avatar, other))
-        return self._pair(
-            "splats outside the lines' box skipped", whole.offsets, part.offsets, f"{share:.0%} inside"
-        )
-
-    def _folded(self) -> Pair:
-        parts = _Parts(self.avatar, self.poses[0], self.cameras[0])
-        return self._pair(
-            "planes folded into the first colour layer", parts.colors_by_planes, parts.colors_direct
-        )
-
-    def _units(self) -> Pair:
-        parts = _Parts(self.avatar, self.poses[0], self.cameras[0])
-        return self._pair(
-            "offset network in one pass, without units that are off",
-            parts.offsets_by_torch,
-            parts.offsets,
-            f"{parts.units_on():.0%} on",
-        )
-
-    def _network(self) -> Pair:
-        parts = _Parts(self.avatar, self.poses[0], self.cameras[0])
-        return self._pair(
-            "colour network in one pass, directions included", parts.colors_direct, parts.colors
-        )
-
-    def _carried(self) -> Pair:
-        parts = _Parts(self.avatar, self.poses[0], self.cameras[0])
-        return self._pair("splats to the world in one pass", parts.world_by_torch, parts.world)
+        return whole, part, share
 
 
 class _Parts:
@@ -357,19 +310,17 @@ def _text(result: Mapping[str, Any]) -> str:
     stages = [(name, f"{ms:.2f}") for name, ms in result["stages_ms"].items()]
     savings = [
         (
-            pair["name"],
-            f"{pair['before']:.2f}",
-            f"{pair['after']:.2f}",
-            f"{pair['before'] / max(pair['after'], 1e-9):.1f}",
-            pair["note"] or "-",
+            pair.name,
+            f"{pair.before:.2f}",
+            f"{pair.after:.2f}",
+            f"{pair.before / max(pair.after, 1e-9):.1f}",
+            pair.note or "-",
         )
-        for pair in result["savings"]
+        for pair in (Pair(**values) for values in result["savings"])
     ]
     head = f"{result['splats']} splats, {result['width']}x{result['height']}"
-    return "\n\n".join(
-        [
-            head,
-            table(("step of a frame", "ms"), stages),
-            table(("saving", "before", "after", "times", "note"), savings),
-        ]
+    tables = (
+        table(("step of a frame", "ms"), stages),
+        table(("saving", "before", "after", "times", "note"), savings),
     )
+    return "\n\n".join([head, *tables])

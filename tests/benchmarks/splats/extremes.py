@@ -268,12 +268,7 @@ CASES = (
         lambda: facing(20, scales=uneven(20, 0.03), opacities=[0.9] * 20),
         options={"eps2d": 0.0},
     ),
-    Case(
-        "needles 100 px long, 0.55 px thin",
-        "the thin side survives",
-        lambda: _needles(1.5),
-        gradient=1e-3,
-    ),
+    Case("needles 100 px long, 0.55 px thin", "the thin side survives", lambda: _needles(1.5), gradient=1e-3),
     Case(
         "needles 4000 px long, 0.55 px thin",
         "drawn as exactly; gradients along the needle lose digits",
@@ -354,11 +349,7 @@ CASES = (
         lambda: _layers(150, 0.05),
         gradient=2e-4,
     ),
-    Case(
-        "40 layers of alpha 0.98",
-        "stops where transmittance would reach 1e-4",
-        lambda: _layers(40, 0.98),
-    ),
+    Case("40 layers of alpha 0.98", "stops where transmittance would reach 1e-4", lambda: _layers(40, 0.98)),
     Case(
         "1500 splats of opacity 1/200 in a tile",
         "long lists, thresholds everywhere",
@@ -366,22 +357,9 @@ CASES = (
         image=2e-6,
         gradient=5e-4,
     ),
-    Case(
-        "66 000 splats in a tile",
-        "more than 16 bits count",
-        lambda: _crowd(66_000),
-        gradient=5e-4,
-    ),
-    Case(
-        "equal depths",
-        "in the order of their indices",
-        lambda: _same_depth(60),
-    ),
-    Case(
-        "depths one unit in the last place apart",
-        "in the order of depth",
-        lambda: _one_ulp_apart(60),
-    ),
+    Case("66 000 splats in a tile", "more than 16 bits count", lambda: _crowd(66_000), gradient=5e-4),
+    Case("equal depths", "in the order of their indices", lambda: _same_depth(60)),
+    Case("depths one unit in the last place apart", "in the order of depth", lambda: _one_ulp_apart(60)),
     Case(
         "depths from 0.02 m to 1e9 m",
         "in the order of depth, finite",

@@ -17,16 +17,7 @@ from ....methods.splats.rasterize import available_backends
 from ..timing import Times, milliseconds, repeat, table, torch_threads
 from . import anchor
 from .order import Ordering, bound_head, measure_order, order_table
-from .scenes import (
-    Accuracy,
-    Scene,
-    compare_with,
-    draw,
-    float64_truth,
-    head_shell,
-    leaves,
-    passes,
-)
+from .scenes import Accuracy, Scene, compare_with, draw, float64_truth, head_shell, leaves, passes
 from .threads import Scaling, measure_threads, threads_table
 
 STAGES = ("project", "sort", "find pairs", "draw", "draw backward", "project backward")

@@ -80,8 +80,7 @@ def one_core_busy() -> Iterator[bool]:
     try:
         _confine(cores[:2])
         spinner = subprocess.Popen(
-            [sys.executable, "-S", "-c", _SPIN, str(cores[0]), str(os.getpid())],
-            stdout=subprocess.PIPE,
+            [sys.executable, "-S", "-c", _SPIN, str(cores[0]), str(os.getpid())], stdout=subprocess.PIPE
         )
         assert spinner.stdout is not None
         yield spinner.stdout.readline() == b"spinning\n"
