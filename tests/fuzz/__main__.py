@@ -23,21 +23,14 @@ from .samples import prepare_samples
 def describe(tallies: dict[str, Tally], findings: list[tuple[str, dict[str, Any]]], seed: int) -> str:
     """The table of outcomes, then each kind of finding with the command that shows the first of it."""
     columns = ("accepted", "exit 1", "refused", "finding")
-    lines = [
-        f"{'reader':<20}{'cases':>7}"
-        + "".join(f"{name:>10}" for name in columns)
-        + f"{'longest s':>11}{'most MB':>9}"
-    ]
-    total: Counter = Counter()
-    for name, tally in tallies.items():
-        total += tally.outcomes
+    titles = "".join(f"{name:>10}" for name in columns)
+    lines = [f"{'reader':<20}{'cases':>7}{titles}{'longest s':>11}{'most MB':>9}"]
+    every = Tally(sum((tally.outcomes for tally in tallies.values()), Counter()))
+    every.took, every.memory = (max(getattr(t, key) for t in tallies.values()) for key in ("took", "memory"))
+    for name, tally in [*tallies.items(), ("all", every)]:
         counts = "".join(f"{tally.outcomes[column]:>10}" for column in columns)
-        lines.append(
-            f"{name:<20}{tally.outcomes.total():>7}{counts}{tally.took:>11.2f}{tally.memory / 1e6:>9.0f}"
-        )
-    counts = "".join(f"{total[column]:>10}" for column in columns)
-    longest, most = (max(getattr(t, key) for t in tallies.values()) for key in ("took", "memory"))
-    lines.append(f"{'all':<20}{total.total():>7}{counts}{longest:>11.2f}{most / 1e6:>9.0f}")
+        cost = f"{tally.took:>11.2f}{tally.memory / 1e6:>9.0f}"
+        lines.append(f"{name:<20}{tally.outcomes.total():>7}{counts}{cost}")
     kinds = defaultdict(list)
     for name, result in findings:
         detail = re.sub(r"\d{3,}|'[^']*'|0x\w+", "#", result["detail"].splitlines()[0])[:90]

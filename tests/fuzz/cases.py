@@ -26,7 +26,8 @@ import traceback
 import zlib
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +57,19 @@ class Tally:
     seconds: float = 0.0
     memory: int = 0
     took: float = 0.0
+
+
+@dataclass
+class Result:
+    """What became of a case: ``took`` in seconds, ``memory`` in bytes, ``text`` is what it printed."""
+
+    case: int
+    outcome: str
+    detail: str = ""
+    how: list[str] = field(default_factory=list)
+    took: float = 0.0
+    memory: int = 0
+    text: str = ""
 
 
 class ExitCode(Exception):
@@ -93,7 +107,9 @@ def run_case(target: Any, place: Place, seed: int, case: int) -> dict[str, Any]:
     os.chdir(place.work)
     place.output.seek(0)
     place.output.truncate()
-    _return_free_memory()  # what is free would be used again without being counted
+    getattr(ctypes.CDLL(None), "malloc_trim", int)(
+        0
+    )  # what is free would be used again without being counted
     Path("/proc/self/clear_refs").write_text("5")  # start the peak of memory afresh
     before, start = _status("VmRSS"), time.process_time()
     outcome, detail, code = "accepted", "", 0
@@ -133,49 +149,24 @@ def run_case(target: Any, place: Place, seed: int, case: int) -> dict[str, Any]:
     if detail:
         outcome = "finding"
     place.wrote = ""
-    return {
-        "case": case,
-        "outcome": outcome,
-        "detail": detail,
-        "how": how,
-        "took": took,
-        "memory": memory,
-        "text": text,
-    }
-
-
-def _return_free_memory() -> None:
-    """Give memory that was freed back to the system, where the C library can."""
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    if trim:
-        trim(0)
+    return asdict(Result(case, outcome, detail, how, took, memory, text))
 
 
 def _where(error: BaseException) -> str:
     """The innermost place of ours that an exception passed."""
-    frames = [
-        frame for frame in traceback.extract_tb(error.__traceback__) if "/tests/fuzz/" not in frame.filename
-    ]
-    ours = [
-        frame
-        for frame in frames
-        if "site-packages" not in frame.filename and "/lib/python" not in frame.filename
-    ]
-    if not ours:
-        return ""
-    return f"{Path(ours[-1].filename).parent.name}/{Path(ours[-1].filename).name}:{ours[-1].lineno}"
+    others = ("/tests/fuzz/", "site-packages", "/lib/python")
+    frames = traceback.extract_tb(error.__traceback__)
+    ours = [frame for frame in frames if not any(part in frame.filename for part in others)]
+    return f"{'/'.join(Path(ours[-1].filename).parts[-2:])}:{ours[-1].lineno}" if ours else ""
 
 
 def _last_error(text: str) -> str:
     """Place and message at the end of the last traceback in what was printed."""
     lines = text[text.rindex("Traceback (most recent call last)") :].splitlines()[1:]
     stack = list(itertools.takewhile(lambda line: line.startswith(" "), lines))
-    places = re.findall(
-        r'(\w+/\w+\.py)", line (\d+)', "\n".join(line for line in stack if "/lib/python" not in line)
-    )
-    return f"{':'.join(places[-1]) if places else ''} {lines[len(stack)] if len(stack) < len(lines) else ''}"[
-        :300
-    ]
+    ours = "\n".join(line for line in stack if "/lib/python" not in line)
+    place = (["", *map(":".join, re.findall(r'(\w+/\w+\.py)", line (\d+)', ours))])[-1]
+    return f"{place} {''.join(lines[len(stack) : len(stack) + 1])}"[:300]
 
 
 def _status(name: str) -> int:
@@ -340,10 +331,8 @@ class Batch:
 
     def stop(self, why: str) -> dict[str, Any] | None:
         """End the process; the outcome of the case that it was in, if it was in one."""
-        try:
+        with suppress(ProcessLookupError):
             os.kill(self.process, signal.SIGKILL)
-        except ProcessLookupError:
-            pass
         status = os.waitpid(self.process, 0)[1]
         os.close(self.pipe)
         text = (self.place.root / "output").read_text(errors="replace")
@@ -354,16 +343,7 @@ class Batch:
         if not why:
             ended = f"ended by signal {os.WTERMSIG(status)}" if os.WIFSIGNALED(status) else "ended"
             why = f"{ended}: {_last_error(text)}" if "Traceback (most" in text else ended
-        case = self.cases.pop(0)
-        return {
-            "case": case,
-            "outcome": "finding",
-            "detail": why,
-            "how": [],
-            "took": 0.0,
-            "memory": 0,
-            "text": text,
-        }
+        return asdict(Result(self.cases.pop(0), "finding", why, text=text))
 
 
 def _too_slow(*_: Any) -> None:

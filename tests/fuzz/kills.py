@@ -139,16 +139,11 @@ def _count(work: Path, pipe: int, kill_at: int | None) -> Iterator[None]:
 # What a command leaves.
 
 
-TIMES = re.compile(
-    r"seconds|interruptions|memory|since|started|finished|time|fingerprint|training.json", re.IGNORECASE
-)
+TIMES = re.compile("(?i)seconds|interruptions|memory|since|started|finished|time|fingerprint|training.json")
 """Keys of what depends on the clock and on the machine, and of digests of that."""
 MEASURED = {
     "fps",
-    "latency_p50",
-    "latency_p95",
-    "latency_p99",
-    "latency_static",
+    *(f"latency_{what}" for what in ("p50", "p95", "p99", "static")),
     "processor_time",
     "throughput",
 }
@@ -195,7 +190,7 @@ def differences(expected: dict[str, Any], found: dict[str, Any]) -> list[str]:
     lines = [f"left behind: {name}" for name in found if name not in expected]
     lines += [f"missing: {name}" for name in expected if name not in found]
     return lines + [
-        f"differs: {name}" for name in expected if name in found and expected[name] != found[name]
+        f"differs: {name}" for name in expected if found.get(name, expected[name]) != expected[name]
     ]
 
 
@@ -217,8 +212,9 @@ class Kills:
         faults = differences(self.expected, tree(self.place, writer))
         if code not in (0, 1) or code != self.code or faults:
             self.findings.append((0, f"two unbroken runs: {self.code} and {code}; {'; '.join(faults[:3])}"))
-        edges = [*range(1, self.changes + 1)][:10] + [*range(1, self.changes + 1)][-10:]
-        rest = [n for n in range(1, self.changes + 1) if n not in edges]
+        every = [*range(1, self.changes + 1)]
+        edges = every[:10] + every[-10:]
+        rest = [n for n in every if n not in edges]
         self.waiting = [*dict.fromkeys(edges), *np.random.default_rng(seed).permutation(rest).tolist()]
 
     def kill(self, number: int) -> None:
@@ -277,13 +273,9 @@ def kill_all(
 def describe(outcomes: Sequence[Outcome], left_out: Sequence[str]) -> str:
     """How many changes of how many were tried, then each kind of finding."""
     lines = [f"{'command':<16}{'changes':>9}{'killed':>8}{'findings':>10}"]
-    lines += [f"{o.name:<16}{o.changes:>9}{o.done:>8}{len(o.findings):>10}" for o in outcomes]
-    total = (
-        sum(o.changes for o in outcomes),
-        sum(o.done for o in outcomes),
-        sum(len(o.findings) for o in outcomes),
-    )
-    lines.append(f"{'all':<16}{total[0]:>9}{total[1]:>8}{total[2]:>10}")
+    counts = [(o.name, o.changes, o.done, len(o.findings)) for o in outcomes]
+    counts.append(("all", *(sum(column) for column in zip(*(count[1:] for count in counts)))))
+    lines += [f"{name:<16}{changes:>9}{done:>8}{findings:>10}" for name, changes, done, findings in counts]
     if left_out:
         lines.append(f"no time for: {', '.join(left_out)}")
     for outcome in outcomes:
@@ -292,10 +284,8 @@ def describe(outcomes: Sequence[Outcome], left_out: Sequence[str]) -> str:
             kinds.setdefault(re.sub(r"-\w{8}\b", "-*", text), []).append(number)
         for text, numbers in kinds.items():
             shown = ", ".join(map(str, numbers[:10])) + (", ..." if len(numbers) > 10 else "")
-            lines.append(f"\n{outcome.name}, killed before {shown}: {text}")
-            lines.append(
-                f"  python -m headbench.tests.fuzz.kills --command '{outcome.name}' --at {numbers[0]}"
-            )
+            command = f"python -m headbench.tests.fuzz.kills --command '{outcome.name}' --at {numbers[0]}"
+            lines.append(f"\n{outcome.name}, killed before {shown}: {text}\n  {command}")
     return "\n".join(lines)
 
 

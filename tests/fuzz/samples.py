@@ -5,6 +5,7 @@ Each builder writes one sample into the folder it is given, and may take files f
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import pickle
@@ -16,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+import yaml
 
 from headbench.bench import cli
 from headbench.bench.io.files import digest
@@ -71,6 +73,12 @@ def configuration(methods: tuple[str, ...], metrics: tuple[str, ...] = ("psnr", 
     }
 
 
+def with_capture(folder: Path, samples: Path) -> Path:
+    """Copy the capture into a sample; return the folder of the finished run's avatars of it."""
+    shutil.copytree(samples / "capture" / "capture", folder / "capture")
+    return samples / "run" / "run" / "901"
+
+
 def capture(folder: Path, samples: Path, subject: str = "901") -> None:
     """A capture with a head model beside it: five timesteps, two cameras."""
     lengths = {"FREE": 2, "EMO-1-shout+laugh": 2, "SEN-01-cramp_small_danger": 1}
@@ -83,7 +91,7 @@ def capture(folder: Path, samples: Path, subject: str = "901") -> None:
 
 def heads(folder: Path, samples: Path) -> None:
     """Head models of every kind, files with their regions, and a capture of another head model."""
-    shutil.copytree(samples / "capture" / "capture", folder / "capture")
+    with_capture(folder, samples)
     head = toy_head(16)
     save_head(folder / "head.npz", head)
     save_head(folder / "eyelids.npz", toy_head(16, eyelids=True))
@@ -113,7 +121,7 @@ def run(folder: Path, samples: Path) -> None:
 
 def unfinished(folder: Path, samples: Path) -> None:
     """A run that has not begun, with a checkpoint after every iteration."""
-    shutil.copytree(samples / "capture" / "capture", folder / "capture")
+    with_capture(folder, samples)
     values = configuration(METHODS)
     for name, settings in values["settings"].items():
         often = {"checkpoint_every_s": 0.0}
@@ -140,16 +148,14 @@ def checkpoint(folder: Path, samples: Path) -> None:
 
 def compact(folder: Path, samples: Path) -> None:
     """A compact avatar of ours, with the capture it is of."""
-    shutil.copytree(samples / "capture" / "capture", folder / "capture")
-    avatar = samples / "run" / "run" / "901" / "ours" / "seed-0" / "avatar"
-    _main("compact", str(avatar), "--out", str(folder / "avatar"))
+    avatars = with_capture(folder, samples)
+    _main("compact", str(avatars / "ours" / "seed-0" / "avatar"), "--out", str(folder / "avatar"))
 
 
 def ply(folder: Path, samples: Path) -> None:
     """A PLY of GaussianAvatars, with the capture it is of."""
-    shutil.copytree(samples / "capture" / "capture", folder / "capture")
-    avatar = samples / "run" / "run" / "901" / "ga" / "seed-0" / "avatar"
-    shutil.copyfile(avatar / "point_cloud.ply", folder / "point_cloud.ply")
+    avatars = with_capture(folder, samples)
+    shutil.copyfile(avatars / "ga" / "seed-0" / "avatar" / "point_cloud.ply", folder / "point_cloud.ply")
 
 
 def colmap(folder: Path, samples: Path) -> None:
@@ -161,7 +167,7 @@ def colmap(folder: Path, samples: Path) -> None:
 
 def exclusions(folder: Path, samples: Path) -> None:
     """A file of frames to leave out, with the capture it is of."""
-    shutil.copytree(samples / "capture" / "capture", folder / "capture")
+    with_capture(folder, samples)
     _main("tongue", str(folder / "capture"), "--out", str(folder / "reviewed"))
 
 
@@ -173,12 +179,9 @@ def baseline(folder: Path, samples: Path) -> None:
 
 def settings(folder: Path, samples: Path) -> None:
     """A file of settings."""
-    import yaml
-
     values = {**configuration(METHODS), "data": "nowhere", "seeds": [0, 1], "regions": ["face"]}
-    (folder / "config.yaml").write_text(
-        yaml.safe_dump({**values, "reader_settings": {"background": [0, 0, 0]}})
-    )
+    values["reader_settings"] = {"background": [0, 0, 0]}
+    (folder / "config.yaml").write_text(yaml.safe_dump(values))
 
 
 def weights(folder: Path, samples: Path) -> None:
@@ -249,14 +252,10 @@ def _sources() -> str:
 
 def _run(folder: Path, samples: Path, methods: tuple[str, ...]) -> None:
     if not (folder / "capture").exists():
-        shutil.copytree(samples / "capture" / "capture", folder / "capture")
+        with_capture(folder, samples)
     (folder / "config.json").write_text(json.dumps(configuration(methods)))
-    before = os.getcwd()
-    os.chdir(folder)
-    try:
+    with contextlib.chdir(folder):
         _main("run", "--config", "config.json")
-    finally:
-        os.chdir(before)
 
 
 def _main(*words: str) -> None:
