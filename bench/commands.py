@@ -1,4 +1,4 @@
-"""Commands of the command line that are found in the registry, described by their settings."""
+"""Commands of the command line, as the registry lists them: described by their settings."""
 
 # Without `from __future__ import annotations`: the parser reads annotations that are made when a command is found.
 
@@ -18,9 +18,9 @@ import tyro
 from .errors import ExitCode, HeadbenchError, InputError
 from .io.files import plain
 from .io.lock import locked
-from .progress import log_to, progress
+from .progress import log_to_terminal, progress
 from .registry import discover
-from .specs import CommandSpec, Findings
+from .specs import CommandSpec
 
 Command = Callable[..., int]
 
@@ -61,19 +61,18 @@ RENAMED_OPTIONS = {
 def offered_commands() -> dict[str, Command | dict[str, Command]]:
     """Commands by name; a word that several share ("prepare nersemble") leads to a table of its own.
 
-    A command that cannot be loaded is listed; it raises when it is called.
+    A command that cannot be loaded is offered where its name is free; it raises when it is called.
     """
     found: dict[str, Command | dict[str, Command]] = {}
-    for name, plugin in sorted(discover("commands").items()):
+    for name, plugin in sorted(
+        discover("commands").items(), key=lambda item: (item[1].spec is None, item[0])
+    ):
         spec = plugin.spec
         command = _broken(name, f"{plugin.origin}: {plugin.error}") if spec is None else _command(spec)
         first, _, second = name.partition(" ")
-        if not second:
-            found[first] = command
-            continue
-        group = found.setdefault(first, {})
-        if isinstance(group, dict):
-            group[second] = command
+        place = found.setdefault(first, {} if second else command)
+        if second and isinstance(place, dict):
+            place[second] = command
     return found
 
 
@@ -145,23 +144,18 @@ def show(text: str = "", end: str = "\n") -> None:
             raise
 
 
-def exit_code(findings: Findings) -> int:
-    """Exit code of the command that found this."""
-    if findings.code is not None:
-        return findings.code
-    return ExitCode.OK if findings.passed else ExitCode.NEGATIVE
-
-
 def _command(spec: CommandSpec) -> Command:
     settings_type: Any = Annotated[spec.settings, tyro.conf.OmitArgPrefixes]
 
     def command(settings: settings_type, json: bool = False) -> int:
         folder = getattr(settings, spec.writes) if spec.writes else None
         lock = locked(Path(folder)) if folder else nullcontext()
-        with log_to(None), lock, progress(spec.name) as report:
+        with log_to_terminal(), lock, progress(spec.name) as report:
             findings = spec.function(settings, report)
         show(json_module.dumps(findings.data, indent=1, default=plain) if json else findings.text)
-        return exit_code(findings)
+        if findings.code is not None:
+            return findings.code
+        return ExitCode.OK if findings.passed else ExitCode.NEGATIVE
 
     command.__doc__ = f"{spec.summary}\n\nArgs:\n    json: Print the result as JSON."
     return command

@@ -359,7 +359,7 @@ class AvatarMetric(Protocol):
     """One number per avatar (storage, speed), not per frame."""
 
     def __call__(self, avatar: Avatar, workload: Sequence[tuple[Camera, HeadPose]]) -> Measurement:
-        """Measure an avatar; ``workload`` is a walk over cameras and poses, neighbours always different."""
+        """Measure an avatar; ``workload`` are pairs in which camera and pose always differ from the last."""
 
 
 @runtime_checkable

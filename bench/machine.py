@@ -19,14 +19,8 @@ import psutil
 from .errors import HeadbenchError, InputError
 from .registry import resolve
 
-RECORDED_PACKAGES = (
-    "headbench",
-    "torch",
-    "numpy",
-    "opencv-contrib-python-headless",
-    "scikit-image",
-    "mitsuba",
-)
+OPENCV = "opencv-contrib-python-headless"
+RECORDED_PACKAGES = ("headbench", "torch", "numpy", OPENCV, "scikit-image", "mitsuba")
 ACCELERATOR_FIELDS = ("name", "driver_version", "memory.total", "power.limit", "clocks.sm", "clocks.max.sm")
 RUSAGE_UNIT = 1 if sys.platform == "darwin" else 1024
 STATUS, RESET_PEAK = Path("/proc/self/status"), Path("/proc/self/clear_refs")
@@ -52,16 +46,16 @@ def machine_record() -> dict[str, Any]:
 
 
 def accelerators() -> list[dict[str, str]]:
-    """NVIDIA devices with driver, memory, power limit and clocks, as their driver tells; none without it."""
+    """NVIDIA devices with driver, memory, power limit and clocks, as their driver reports; none without it."""
     program = shutil.which("nvidia-smi")
     if program is None:
         return []
     command = [program, f"--query-gpu={','.join(ACCELERATOR_FIELDS)}", "--format=csv,noheader"]
     try:
-        told = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout
+        reported = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout
     except (OSError, subprocess.SubprocessError):
         return []
-    rows = csv.reader(told.splitlines(), skipinitialspace=True)
+    rows = csv.reader(reported.splitlines(), skipinitialspace=True)
     return [dict(zip(ACCELERATOR_FIELDS, row)) for row in rows]
 
 
@@ -69,7 +63,7 @@ class PeakMemory:
     """Context that finds the largest resident memory of this process while it lasts.
 
     Linux keeps that maximum, and lets a process reset it; elsewhere a thread looks every 20 ms, which can miss a
-    short spike. A child that ended meanwhile counts singly, if it was the largest so far: no other is told apart.
+    short spike. A child that ended meanwhile counts singly, if it was the largest so far: others are not known.
 
     Attributes
     ----------
@@ -122,19 +116,17 @@ def _children_peak() -> int:
 
 def _resident_peak() -> int:
     """Largest resident memory of this process since it was last reset (Linux)."""
-    for line in STATUS.read_text(encoding="ascii", errors="replace").splitlines():
-        if line.startswith("VmHWM:"):
-            return int(line.split()[1]) * 1024
-    return 0
+    return int(_entry(STATUS, "VmHWM").removesuffix("kB") or 0) * 1024
 
 
 def _processor() -> str:
-    info = Path("/proc/cpuinfo")
-    if info.exists():
-        for line in info.read_text(encoding="utf-8", errors="replace").splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
+    return _entry(Path("/proc/cpuinfo"), "model name") or platform.processor() or platform.machine()
+
+
+def _entry(path: Path, name: str) -> str:
+    """What a file of the kernel says of ``name`` first; "" where it is not there."""
+    lines = path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith(name)), "")
 
 
 def _version(name: str) -> str | None:

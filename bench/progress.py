@@ -7,7 +7,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 
@@ -20,39 +20,36 @@ from .io.files import no_link
 LOG_EVERY_S, SHOW_EVERY_S = 15.0, 0.2
 """Seconds between lines of a log, and between changes of the line on a terminal."""
 BASIS_S, SAMPLES, SAMPLE_EVERY_S = 5.0, 60, 1.0
-"""Seconds of steps from which on their speed is told, how many samples of it are kept, how far apart."""
+"""Seconds of steps from which on their speed is known, how many samples of it are kept, how far apart."""
 Show = Callable[[Callable[[], str]], None]
 """Shows a line that a function makes, if it is time to."""
 log = logging.getLogger("headbench")
 
 
+def log_to_terminal() -> AbstractContextManager[None]:
+    """Send the messages of headbench's log to the terminal while the block runs."""
+    return _logging(logging.StreamHandler(sys.stderr), "%(message)s")
+
+
+def log_to_file(path: Path) -> AbstractContextManager[None]:
+    """Append headbench's log, with times, to a file while the block runs."""
+    return _logging(_LogFile(path), "%(asctime)s %(levelname)s %(name)s: %(message)s")
+
+
 @contextmanager
-def log_to(path: Path | None, *, quiet: bool = False) -> Iterator[None]:
-    """Send headbench's log to the terminal (messages) and to a file (with times) while the block runs."""
-    root = logging.getLogger("headbench")
-    level, propagate = root.level, root.propagate
-    handlers: list[logging.Handler] = []
-    console = logging.StreamHandler(sys.stderr)
-    console.setFormatter(logging.Formatter("%(message)s"))
-    console.setLevel(logging.WARNING if quiet else logging.INFO)
-    handlers.append(console)
-    if path is not None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        file = _LogFile(path)
-        file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
-        handlers.append(file)
-    root.setLevel(logging.INFO)
-    root.propagate = False
-    for handler in handlers:
-        root.addHandler(handler)
+def _logging(handler: logging.Handler, form: str) -> Iterator[None]:
+    handler.setFormatter(logging.Formatter(form))
+    level, propagate = log.level, log.propagate
+    log.setLevel(logging.INFO)
+    log.propagate = False
+    log.addHandler(handler)
     try:
         yield
     finally:
-        for handler in handlers:
-            root.removeHandler(handler)
-            handler.close()
-        root.setLevel(level)
-        root.propagate = propagate
+        log.removeHandler(handler)
+        handler.close()
+        log.setLevel(level)
+        log.propagate = propagate
 
 
 class _LogFile(logging.StreamHandler):
@@ -203,11 +200,16 @@ def _line() -> Iterator[Show]:
             last = now
             write(text())
 
-    if not on_terminal:
-        yield partial(show, partial(log.info, "%s"))
-        return
-    with logging_redirect_tqdm([log]), tqdm(bar_format="{desc}", leave=False, dynamic_ncols=True) as bar:
-        yield partial(show, bar.set_description_str)
+    with ExitStack() as stack:
+        bars: list[tqdm] = []
+
+        def write_over(text: str) -> None:
+            if not bars:  # a line in which nothing is shown takes none of the terminal
+                stack.enter_context(logging_redirect_tqdm([log]))
+                bars.append(stack.enter_context(tqdm(bar_format="{desc}", leave=False, dynamic_ncols=True)))
+            bars[0].set_description_str(text)
+
+        yield partial(show, write_over if on_terminal else partial(log.info, "%s"))
 
 
 def duration(seconds: float) -> str:

@@ -21,7 +21,7 @@ TASK_TITLES: Mapping[str, str] = {
     "extremes": "Extremes",
 }
 
-TrialName = Literal["cross_reenactment", "extremes"]
+TaskWithoutTruth = Literal["cross_reenactment", "extremes"]
 """Tasks without ground truth: what is measured is how steady an avatar stays, and whose look it keeps."""
 
 
@@ -43,7 +43,7 @@ class Protocol:
         held to, for tasks without ground truth.
     """
 
-    task: TaskName | TrialName
+    task: TaskName | TaskWithoutTruth
     keys: tuple[FrameKey, ...]
     excluded: tuple[tuple[FrameKey, str], ...]
     clips: tuple[tuple[str, str], ...]
@@ -107,8 +107,15 @@ def make_protocol(task: TaskName, clips: Sequence[Clip], max_frames: int | None 
     )
 
 
-def make_trial_protocol(
-    task: TrialName,
+def make_protocols(
+    tasks: Sequence[TaskName], clips: Sequence[Clip], max_frames: int | None
+) -> dict[str, Protocol]:
+    """The protocol of each task, see `make_protocol`."""
+    return {task: make_protocol(task, clips, max_frames) for task in tasks}
+
+
+def make_protocol_without_truth(
+    task: TaskWithoutTruth,
     clips: Sequence[Clip],
     keys: Iterable[FrameKey],
     sizes: Iterable[tuple[int, int]],

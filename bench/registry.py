@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import difflib
 import importlib
+import itertools
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Literal
 
@@ -26,7 +27,13 @@ SPEC_TYPES: dict[str, type] = {
     "benchmarks": BenchmarkSpec,
     "commands": CommandSpec,
 }
+BUILT_IN = {
+    **{name: name for name in ("demo", "run", "table", "synth", "bench", "stress")},
+    "list": "list_installed",
+}
+"""The commands of this package's module `builtin`, and their functions."""
 log = logging.getLogger(__name__)
+_OWN = "headbench"
 
 
 @dataclass(frozen=True)
@@ -42,23 +49,27 @@ class Plugin:
 def discover(group: Group) -> dict[str, Plugin]:
     """All plug-ins of a group by name. A broken one is listed with its error, never fatal.
 
-    Where two distributions claim a name, headbench's own wins and the clash is logged.
+    Where two distributions claim a name, headbench's own wins and the clash is logged. Of two commands of which one is
+    the other's first word the later is broken.
     """
     found: dict[str, Plugin] = {}
-    entries = sorted(entry_points(group=f"headbench.{group}"), key=lambda e: _origin(e) != _OWN)
-    for entry in entries:
-        plugin = _load(entry, group)
-        if entry.name in found:
-            if found[entry.name].origin != plugin.origin:
-                log.warning(
-                    "%s %r of %s is hidden by that of %s",
-                    group,
-                    entry.name,
-                    plugin.origin,
-                    found[entry.name].origin,
-                )
-            continue
-        found[entry.name] = plugin
+    entries: list[EntryPoint] = [*entry_points(group=f"headbench.{group}")]
+    if group == "commands":
+        entries += [EntryPoint(name, f"{_OWN}.bench.builtin:{f}", "") for name, f in BUILT_IN.items()]
+    for entry in sorted(entries, key=lambda e: _origin(e) != _OWN):
+        plugin, known = _load(entry, group), found.get(entry.name)
+        if known is None:
+            found[entry.name] = plugin
+        elif known.origin != plugin.origin:
+            log.warning("%s %r of %s is hidden by that of %s", group, entry.name, plugin.origin, known.origin)
+    if group == "commands":
+        for name, plugin in found.items():
+            before = itertools.takewhile(lambda other, name=name: other != name, found)  # type: ignore[misc]
+            first = name.partition(" ")[0]
+            rival = next((n for n in before if n == first or (n.partition(" ")[0] == name)), None)
+            if rival is not None:
+                why = f"{rival!r} of {found[rival].origin} is a command, too"
+                found[name] = replace(plugin, spec=None, error=why)
     return found
 
 
@@ -99,10 +110,9 @@ def unknown(file: str, key: str, name: str, known: Any) -> InputError:
     return InputError(file, key, f"one of {', '.join(names)}", repr(name), hint)
 
 
-_OWN = "headbench"
-
-
 def _origin(entry: EntryPoint) -> str:
+    if entry.value.startswith(f"{_OWN}.bench.builtin:"):
+        return _OWN
     return entry.dist.name if entry.dist is not None else "unknown"
 
 

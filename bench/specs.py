@@ -252,12 +252,12 @@ class Findings(NamedTuple):
 
     text: str
     """Tables for a terminal."""
-    data: Mapping[str, Any]
+    data: Any
     """The same as plain values, for JSON."""
     passed: bool = True
     """False where something did not behave as expected."""
     code: int | None = None
-    """Exit code of a command that tells more than passed (0) from not passed (1) apart; None for those two."""
+    """Exit code of a command that has others than 0 (passed) and 1 (did not pass); None for those two."""
 
 
 @dataclass(frozen=True)

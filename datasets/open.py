@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import inspect
-import logging
 from collections.abc import Iterator, Mapping
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
 from ..bench.contracts import Progress, no_progress
-from ..bench.errors import HeadbenchError, InputError
-from ..bench.registry import discover, get, resolve
-from ..bench.runner.captures import found_captures
+from ..bench.errors import InputError
+from ..bench.registry import get, resolve
+from ..bench.runner.captures import finds, found_captures, readers
 from ..bench.specs import DatasetSpec
 from .clip import CaptureClip, as_capture
 from .foreign import describe
-
-log = logging.getLogger(__name__)
 
 
 def find_reader(path: str | PathLike[str], name: str = "") -> DatasetSpec:
@@ -32,11 +29,11 @@ def find_reader(path: str | PathLike[str], name: str = "") -> DatasetSpec:
         spec: DatasetSpec = get("datasets", name)
         return spec
     root = Path(path)
-    readers = {n: p.spec for n, p in discover("datasets").items() if p.spec is not None and p.spec.reads}
-    expected = f"a capture that a reader knows ({', '.join(readers)})"
+    known = readers()
+    expected = f"a capture that a reader knows ({', '.join(known)})"
     if not root.exists():
         raise InputError(root, "", expected, "no such file or folder")
-    fitting = [spec for spec in readers.values() if _finds(spec, root)]
+    fitting = [spec for spec in known.values() if finds(spec, root)]
     if not fitting:
         raise InputError(root, "", expected, *describe(root))
     if len(fitting) > 1:
@@ -84,14 +81,3 @@ def open_clip(path: str | PathLike[str], reader: str = "", **options: Any) -> Ca
         names = ", ".join(Path(one).name for one in found)
         raise InputError(path, "", "one capture", names, "Name one capture.")
     return next(open_clips(path, reader, **options))
-
-
-def _finds(spec: DatasetSpec, root: Path) -> bool:
-    """Whether a reader finds captures; one that cannot be imported or that looks at nothing finds none."""
-    try:
-        return bool(spec.find and resolve(spec.find)(root))
-    except HeadbenchError:
-        return False
-    except Exception as error:  # noqa: BLE001 - a plug-in may fail in any way; the others must still be asked
-        log.warning("reader %s cannot look at %s: %s: %s", spec.name, root, type(error).__name__, error)
-        return False

@@ -60,8 +60,8 @@ class EvaluateSettings:
     metrics: tuple[str, ...] = ()
     """By which metrics of frames; default: those of `headbench run`; with --like the run's."""
 
-    reader: str = "ga"
-    """Which dataset reader opens the capture; with --like the run's."""
+    reader: str = ""
+    """Which dataset reader opens the capture; default: the one that finds it; with --like the run's."""
 
     head: str | None = None
     """Head model for captures that bring none: FLAME pickle or npz."""

@@ -9,18 +9,17 @@ from pathlib import Path
 
 from PIL import Image, UnidentifiedImageError
 
-from ..contracts import Avatar, Budget, Camera, Clip, Frame, FrameKey, HeadPose, Progress, no_progress
+from ..contracts import Budget, Camera, Clip, Frame, FrameKey, HeadPose, Progress, no_progress
 from ..errors import HeadbenchError, InputError
 from ..io.files import atomic_path, check_name, digest, digest_file, grouped_writes, prepare_folder
 from ..io.images import probe_image
 from ..io.lock import locked
-from ..protocol import Protocol, make_protocol
+from ..protocol import Protocol, make_protocols
 from ..registry import discover, get, resolve
 from ..rows import Rows
-from ..runner.captures import open_clips, open_run_clips
+from ..runner.captures import open_clips, open_run_clips, reader_of
 from ..runner.config import ResolvedMethod, RunConfig, RunOptions, default_names, resolve_metrics
 from ..runner.run import describe, make_jobs, write_reports
-from ..runner.scoring import check_regions
 from ..runner.steps import DIGESTS, Job, measure
 from ..runner.store import Cell, RunFolder
 from ..specs import Findings, MethodSpec
@@ -51,31 +50,27 @@ def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress
 
     Raises `InputError` for whatever is wrong with settings, capture or images, before anything is written.
     """
-    config, clips = _opened(settings)
+    config, clips = _open(settings)
     metrics = [metric for metric in resolve_metrics(config) if metric.per_frame]
     if not metrics:
         raise InputError("metrics", "", "at least one metric of frames", ", ".join(config.metrics))
-    protocols: dict[str, Protocol] = {
-        task: make_protocol(task, clips, config.frames_per_task) for task in config.tasks
-    }
+    protocols = make_protocols(config.tasks, clips, config.frames_per_task)
     images = find_images(Path(settings.folder), clips, protocols)
     digests = [[task, str(key), digest_file(path)] for (task, key), path in sorted(images.items())]
     method = images_method(config.methods[0], digest(digests)[:12])
     folder = RunFolder(Path(config.out))
     prepare_folder(folder.root)
     with locked(folder.root):
-        regions = {clip.subject: check_regions(clip, config.regions) for clip in clips}
-        jobs = make_jobs(config, [method], clips, protocols, folder, {}, regions)
+        jobs = make_jobs(config, [method], clips, protocols, folder)
         manifest = describe(config, [method], metrics, clips, protocols)
         manifest = replace(manifest, evaluated=str(Path(settings.folder)))
         manifest.write(folder.manifest)
         parts = []
-        avatar: Avatar = NoAvatar()
         for index, job in enumerate(jobs):
             job.check()
             _copy(images, job)
             job.cell.finish(DIGESTS, job.fit_fingerprint, files=job.cell.digests(job.frame_paths))
-            parts.append(measure(job, avatar, metrics))
+            parts.append(measure(job, NoAvatar(), metrics))
             progress(index + 1, len(jobs), job.name)
         rows = Rows.joined(parts)
         rows.write(folder.rows)
@@ -87,7 +82,7 @@ def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress
     return Findings(f"{text}\n{folder.root}", data)
 
 
-def _opened(settings: EvaluateSettings) -> tuple[RunConfig, list[Clip]]:
+def _open(settings: EvaluateSettings) -> tuple[RunConfig, list[Clip]]:
     """The settings to score by, and the captures to score against."""
     label = check_name(settings.label, "command line", "--label")
     if label in discover("methods"):
@@ -105,8 +100,9 @@ def _opened(settings: EvaluateSettings) -> tuple[RunConfig, list[Clip]]:
             data=str(settings.clip),
             out=settings.out,
             tasks=settings.tasks,
-            metrics=settings.metrics or _default_metrics(),
-            reader=settings.reader,
+            metrics=settings.metrics
+            or tuple(name for name in default_names("metrics") if get("metrics", name).per_frame),
+            reader=settings.reader or reader_of(str(settings.clip)),
             reader_settings={} if settings.head is None else {"head": settings.head},
             frames_per_task=settings.frames_per_task,
         )
@@ -115,10 +111,6 @@ def _opened(settings: EvaluateSettings) -> tuple[RunConfig, list[Clip]]:
         config, out=settings.out, methods=(label,), seeds=(0,), settings={}, heads={}, device="cpu"
     )
     return config, clips
-
-
-def _default_metrics() -> tuple[str, ...]:
-    return tuple(name for name in default_names("metrics") if get("metrics", name).per_frame)
 
 
 def _copy(images: Mapping[tuple[str, FrameKey], Path], job: Job) -> None:

@@ -15,12 +15,11 @@ from ..errors import ExitCode, HeadbenchError, InputError
 from ..io.files import digest_file
 from ..io.images import read_png
 from ..manifest import Manifest, ProtocolRecord
-from ..protocol import Protocol, make_protocol
+from ..protocol import Protocol, make_protocols
 from ..rows import ALL, FRAME, Rows
 from ..runner.captures import open_run_clips
-from ..runner.config import ResolvedMethod, RunConfig, resolve_methods, resolve_metrics
-from ..runner.run import adapt, load, make_jobs
-from ..runner.scoring import check_regions
+from ..runner.config import resolve_methods, resolve_metrics
+from ..runner.run import load, make_jobs
 from ..runner.steps import DIGESTS, Job, measure, recorded_frames
 from ..runner.store import Cell, RunFolder
 from ..specs import Findings, MetricSpec
@@ -78,23 +77,22 @@ def _verify(settings: VerifySettings, scratch: Path, progress: Progress) -> Find
     manifest.check_done(folder.manifest)
     config, clips = open_run_clips(folder.root, settings, out=scratch, altered=True, remembered=False)
     rows = folder.read_rows(manifest)
-    methods = _methods(config, manifest)
-    metrics = resolve_metrics(config) if _has_avatars(methods) else _of_frames(resolve_metrics(config))
-    protocols: dict[str, Protocol] = {
-        task: make_protocol(task, clips, config.frames_per_task) for task in config.tasks
-    }
+    avatars = any(method.implementation for method in manifest.methods)  # else images that `evaluate` scored
+    methods = (
+        resolve_methods(config) if avatars else [images_method(m.name, m.version) for m in manifest.methods]
+    )
+    metrics = [metric for metric in resolve_metrics(config) if metric.per_frame or avatars]
+    protocols = make_protocols(config.tasks, clips, config.frames_per_task)
     report = _Report([*_clips(folder, manifest, clips), *_protocols(folder, manifest, protocols)])
     if not report.mismatches:
         rows.check_protocols(folder.rows, {task: protocol.hash for task, protocol in protocols.items()})
-        regions = {clip.subject: check_regions(clip, config.regions) for clip in clips}
-        adapted = adapt(clips, methods, config, RunFolder(scratch), folder) if _has_avatars(methods) else {}
-        jobs = make_jobs(config, methods, clips, protocols, folder, adapted, regions)
+        jobs = make_jobs(config, methods, clips, protocols, folder, scratch)
         for index, job in enumerate(jobs):
             _verify_cell(job, metrics, rows, folder.rows, report)
             progress(index + 1, len(jobs), job.name)
-    told = [f"  {mismatch}" for mismatch in report.mismatches[:SHOWN]]
+    lines = [f"  {mismatch}" for mismatch in report.mismatches[:SHOWN]]
     if len(report.mismatches) > SHOWN:
-        told.append(f"  and {len(report.mismatches) - SHOWN} more")
+        lines.append(f"  and {len(report.mismatches) - SHOWN} more")
     verdict = f"{len(report.mismatches)} mismatches" if report.mismatches else "as recorded"
     looked = f"{report.files} files and {report.values} values recomputed"
     left = f"; {report.unverified} values bound to a machine or absent are not recomputed" * bool(
@@ -106,22 +104,8 @@ def _verify(settings: VerifySettings, scratch: Path, progress: Progress) -> Find
         "values": report.values,
         "unverified": report.unverified,
     }
-    text = "\n".join([f"{folder.root}: {verdict}: {looked}{left}.", *told])
+    text = "\n".join([f"{folder.root}: {verdict}: {looked}{left}.", *lines])
     return Findings(text, data, not report.mismatches)
-
-
-def _methods(config: RunConfig, manifest: Manifest) -> list[ResolvedMethod]:
-    if any(method.implementation for method in manifest.methods):
-        return resolve_methods(config)
-    return [images_method(method.name, method.version) for method in manifest.methods]
-
-
-def _has_avatars(methods: Sequence[ResolvedMethod]) -> bool:
-    return any(method.spec.implementation for method in methods)
-
-
-def _of_frames(metrics: Sequence[MetricSpec]) -> list[MetricSpec]:
-    return [metric for metric in metrics if metric.per_frame]
 
 
 def _clips(folder: RunFolder, manifest: Manifest, clips: Sequence[Clip]) -> Iterator[Mismatch]:
@@ -174,8 +158,8 @@ def _verify_cell(job: Job, metrics: Sequence[MetricSpec], rows: Rows, file: Path
     for path, (_, key) in job.frame_paths.items():
         suspect = path in changed or job.cell.name(path) not in digests
         if suspect and not _can_be_scored(job, path, key):
-            return  # told above
-    report.mismatches += _values(_measured_anew(job, avatar, metrics), own, metrics, file, report)
+            return  # reported above
+    report.mismatches += _values(_measure_again(job, avatar, metrics), own, metrics, file, report)
 
 
 def _files(job: Job, digests: Mapping[str, str], report: _Report) -> Iterator[Mismatch]:
@@ -203,7 +187,7 @@ def _can_be_scored(job: Job, path: Path, key: FrameKey) -> bool:
         return False
 
 
-def _measured_anew(job: Job, avatar: Avatar, metrics: Sequence[MetricSpec]) -> pd.DataFrame:
+def _measure_again(job: Job, avatar: Avatar, metrics: Sequence[MetricSpec]) -> pd.DataFrame:
     """Measure the stored frames as if for the first time, beside the run."""
     stable = [metric for metric in metrics if not metric.machine_bound]
     with tempfile.TemporaryDirectory() as name:
@@ -214,9 +198,9 @@ def _measured_anew(job: Job, avatar: Avatar, metrics: Sequence[MetricSpec]) -> p
 
 
 def _values(
-    anew: pd.DataFrame, own: pd.DataFrame, metrics: Sequence[MetricSpec], file: Path, report: _Report
+    again: pd.DataFrame, own: pd.DataFrame, metrics: Sequence[MetricSpec], file: Path, report: _Report
 ) -> Iterator[Mismatch]:
-    recorded, found = _by_place(own), _by_place(anew)
+    recorded, found = _by_place(own), _by_place(again)
     if len(recorded) != len(own):
         twice = own[own.duplicated(KEY)][KEY].iloc[0].tolist()
         yield Mismatch(file, _place(twice), "one row", "several")
@@ -225,17 +209,17 @@ def _values(
     bound = {metric.name for metric in metrics if metric.machine_bound}
     for place, (status, value, _) in recorded.items():
         metric = str(place[-1])
-        again = found.pop(place, None)
+        new = found.pop(place, None)
         if metric in bound or status == "missing":
             report.unverified += 1
-        elif again is None:
+        elif new is None:
             yield Mismatch(file, _place(place), "no row: nothing asks for it", f"{value:.9g}")
-        elif again[0] != "ok":
-            raise HeadbenchError(f"{_place(place)} was measured, and cannot be now: {again[2]}")
+        elif new[0] != "ok":
+            raise HeadbenchError(f"{_place(place)} was measured, and cannot be now: {new[2]}")
         else:
             report.values += 1
-            if not abs(again[1] - value) <= tolerances[metric]:
-                yield Mismatch(file, _place(place), f"{again[1]:.9g}", f"{value:.9g}")
+            if not abs(new[1] - value) <= tolerances[metric]:
+                yield Mismatch(file, _place(place), f"{new[1]:.9g}", f"{value:.9g}")
     for place, (status, value, _) in found.items():
         if status == "ok":
             yield Mismatch(file, _place(place), f"a row with {value:.9g}", "none")

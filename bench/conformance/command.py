@@ -19,7 +19,6 @@ from ..runner.config import DemoConfig, ResolvedMethod, RunConfig, resolve_metho
 from ..specs import DatasetSpec, Findings, MethodSpec, MetricSpec
 from .methods import attempt, check_method
 from .metrics import check_metric
-from .readers import check_reader
 
 
 @dataclass(frozen=True)
@@ -39,8 +38,8 @@ class CheckPluginSettings:
     """Capture: for a reader one in its layout (required); for a method default: a tiny synthetic one, made on the
     spot."""
 
-    reader: str = "ga"
-    """Which reader opens --data for a method."""
+    reader: str = ""
+    """Which reader opens --data for a method; default: the one that finds it."""
 
     preset: str | None = None
     """Preset of the method; default: smoke if it has that, else its first."""
@@ -69,6 +68,8 @@ def check_plugin(settings: CheckPluginSettings, progress: Progress = no_progress
     elif isinstance(spec, DatasetSpec):
         if settings.data is None:
             raise InputError("command line", "--data", "a capture in the layout of the reader", "none")
+        from .readers import check_reader  # which takes long to import
+
         breaches = check_reader(spec, Path(settings.data), values)
     else:
         if values:
@@ -78,9 +79,8 @@ def check_plugin(settings: CheckPluginSettings, progress: Progress = no_progress
     verdict = f"{spec.name}: a {kind} that keeps its contract"
     if breaches:
         count = "1 breach" if len(breaches) == 1 else f"{len(breaches)} breaches"
-        verdict = "\n".join(
-            [f"{spec.name}: {count} of the contract of a {kind}", *(f"- {b}" for b in breaches)]
-        )
+        title = f"{spec.name}: {count} of the contract of a {kind}"
+        verdict = "\n".join([title, *(f"- {breach}" for breach in breaches)])
     return Findings(verdict, {"name": spec.name, "kind": kind, "breaches": breaches}, not breaches)
 
 
@@ -120,15 +120,15 @@ def _check_method(
 
 
 def _clip(settings: CheckPluginSettings, folder: Path, progress: Progress) -> Clip:
-    from ..runner.captures import open_clips
+    from ..runner import captures  # which takes long to import
 
     data = settings.data
     if data is None:
         tiny = DemoConfig(out=str(folder), preset="smoke", timesteps=TIMESTEPS)
         resolve(get("datasets", "synthetic").implementation)(**tiny.capture_arguments(), progress=progress)
         data = str(tiny.capture_folder)
-    clips = open_clips(RunConfig(data, str(folder / "run"), reader=settings.reader))
-    return clips[0]
+    reader = settings.reader or captures.reader_of(data)
+    return captures.open_clips(RunConfig(data, str(folder / "run"), reader=reader))[0]
 
 
 def _adapted(clip: Clip, method: ResolvedMethod, folder: Path) -> Clip:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, get_args
@@ -12,10 +12,11 @@ from typing import Any, get_args
 import numpy as np
 
 from ..configuration import build_arguments
-from ..contracts import Camera, Clip, FrameKey, HeadAsset, HeadPose, TaskName
+from ..contracts import Camera, Clip, FrameKey, HeadAsset, HeadPose, TaskName, no_progress
 from ..errors import InputError
 from ..io.files import check_name, plain
 from ..registry import resolve
+from ..runner.captures import HARNESS, found_captures
 from ..specs import DatasetSpec
 from .methods import attempt, refusal
 
@@ -23,6 +24,7 @@ SPLITS = ("train", *get_args(TaskName))
 COPIED_BYTES = 256e6
 """Largest capture that is copied, to see that its fingerprint does not depend on where it lies."""
 RIGID = 1e-4
+Read = Callable[[Path], list[Clip]]
 FRAMES = 4
 """Frames of each split that are read, evenly spaced."""
 
@@ -42,24 +44,28 @@ def check_reader(spec: DatasetSpec, path: Path, settings: Mapping[str, Any] | No
     """
     if not spec.reads:
         raise InputError("check-plugin", spec.name, "a reader", "one that makes captures")
-    opener = _Opener(spec, dict(settings or {}))
     if not path.exists():
         raise InputError(path, "--data", "a capture in the reader's layout", "no such file or folder")
+    build_arguments(resolve(spec.implementation), settings or {}, "reader_settings", harness=HARNESS)
+
+    def read(root: Path) -> list[Clip]:
+        return [read_one(no_progress) for _, read_one in found_captures(spec, root, settings or {})]
+
     breaches: list[str] = []
     clips: list[Clip] = []
     with attempt(breaches, "reading the capture"):
-        found = opener.find(path)
+        found = resolve(spec.find)(path) if spec.find else [path]
         if not found:
             return [f"find lists nothing under {path}"]
         breaches += [f"find lists {one}, which is not there" for one in found if not Path(one).exists()]
-        clips = [opener.read(one) for one in found]
+        clips = read(path)
     for clip in clips:
         with attempt(breaches, f"checking the clip {getattr(clip, 'subject', '?')!r}"):
             breaches += check_clip(clip)
     if clips and not breaches:
         with attempt(breaches, "reading the capture again"):
-            breaches += _repeated(opener, path, clips)
-    breaches += _refusals(opener)
+            breaches += _repeated(read, path, clips)
+    breaches += _refusals(read)
     return breaches
 
 
@@ -73,29 +79,6 @@ def check_clip(clip: Clip) -> list[str]:
         with attempt(breaches, f"checking the clip's {check.__name__.strip('_')}"):
             breaches += check(clip)
     return breaches
-
-
-class _Opener:
-    """A reader as `captures.open_clips` calls it."""
-
-    def __init__(self, spec: DatasetSpec, settings: Mapping[str, Any]):
-        self._spec, self._read = spec, resolve(spec.implementation)
-        self._settings = build_arguments(self._read, settings, "reader_settings", harness=("progress",))
-
-    def find(self, root: Path) -> Sequence[Path]:
-        return [Path(one) for one in resolve(self._spec.find)(root)] if self._spec.find else [root]
-
-    def read(self, path: Path) -> Clip:
-        clip: Clip = self._read(path, **self._settings)
-        return clip
-
-    def open(self, root: Path) -> None:
-        """Find and read; finding nothing is refused by the harness."""
-        found = self.find(root)
-        if not found:
-            raise InputError(root, "", "a capture", "none")
-        for path in found:
-            self.read(path)
 
 
 def _shaped(name: str, array: Any, shape: tuple[int | None, ...], kind: type = np.floating) -> Iterator[str]:
@@ -272,10 +255,10 @@ def _spread(count: int) -> list[int]:
     return sorted({*np.linspace(0, count - 1, FRAMES).astype(int).tolist()}) if count else []
 
 
-def _repeated(opener: _Opener, path: Path, clips: Sequence[Clip]) -> Iterator[str]:
+def _repeated(read: Read, path: Path, clips: Sequence[Clip]) -> Iterator[str]:
     """Breaches of what has to be the same when the capture is read again, here and elsewhere."""
     before = [clip.fingerprint for clip in clips]
-    if [opener.read(one).fingerprint for one in opener.find(path)] != before:
+    if [clip.fingerprint for clip in read(path)] != before:
         yield "the fingerprint differs when the capture is read again"
         return
     files = [file for file in path.rglob("*") if file.is_file()] if path.is_dir() else [path]
@@ -285,11 +268,11 @@ def _repeated(opener: _Opener, path: Path, clips: Sequence[Clip]) -> Iterator[st
         elsewhere = Path(folder) / path.resolve().name
         copy = shutil.copytree if path.is_dir() else shutil.copyfile
         copy(path, elsewhere)
-        if [opener.read(one).fingerprint for one in opener.find(elsewhere)] != before:
+        if [clip.fingerprint for clip in read(elsewhere)] != before:
             yield "the fingerprint differs when the capture lies in another folder"
 
 
-def _refusals(opener: _Opener) -> Iterator[str]:
+def _refusals(read: Read) -> Iterator[str]:
     with TemporaryDirectory() as folder:
         root = Path(folder)
         (root / "empty").mkdir()
@@ -300,4 +283,4 @@ def _refusals(opener: _Opener) -> Iterator[str]:
             "text.txt": "a text file",
         }
         for name, what in cases.items():
-            yield from refusal(lambda name=name: opener.open(root / name), what)  # type: ignore[misc]
+            yield from refusal(lambda name=name: read(root / name), what)  # type: ignore[misc]

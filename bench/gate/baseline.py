@@ -35,11 +35,10 @@ class Place(NamedTuple):
     def __str__(self) -> str:
         return "/".join(self)
 
-    @classmethod
-    def parse(cls, text: str) -> Place | None:
-        """Read what `str` wrote; None for anything else."""
-        parts = text.split("/")
-        return cls(*parts) if len(parts) == len(cls._fields) and all(parts) else None
+    @property
+    def measured(self) -> str:
+        """The metric, and the region if that is not the whole frame."""
+        return self.metric if self.region == FULL else f"{self.metric} ({self.region})"
 
 
 @dataclass(frozen=True)
@@ -96,9 +95,8 @@ def read_results(root: Path) -> Results:
     frames: dict[Place, int] = {}
     problems: dict[Place, str] = {}
     unavailable: dict[Place, str] = {}
-    columns = ["task", "method", "subject", "region", "metric"]
     every = rows.select(method=ALL, metric=ALL, task=ALL, region=ALL, seeds=ALL)
-    for parts, own in every.groupby(columns, sort=True):
+    for parts, own in every.groupby([*Place._fields], sort=True):
         task, *rest = map(str, parts)
         place = Place(task or AVATAR, *rest)
         wanted = expected[task][place.subject] if task else 1
@@ -122,11 +120,9 @@ def _lacking(own: pd.DataFrame, frames: int, seeds: set[int]) -> str:
         return f"{first['status']}: {' '.join(str(first['reason']).split())}"
     if not own["value"].map(lambda value: abs(value) < float("inf")).all():
         return "a value that is not finite"
-    regional = (own["region"] != FULL).all()  # seen in some frames only, which ones is the truth's matter
-    if regional:
+    if (own["region"] != FULL).all():  # seen in some frames only, which ones is the truth's matter
         frames = own.groupby(FRAME).ngroups
-    measured = own.drop_duplicates(["seed", *FRAME])
-    if len(measured) != len(own):
+    if own.duplicated(["seed", *FRAME]).any():
         return "frames measured twice"
     if set(own["seed"]) != seeds or len(own) != frames * len(seeds):
         return f"{len(own)} values, {frames * len(seeds)} expected ({frames} frames, {len(seeds)} seeds)"
@@ -143,6 +139,7 @@ LAST_DIGITS = 10
 MACHINE_SHARE = 0.3
 KEPT_DIGITS = 3
 MACHINE = ("processor", "cores", "device")
+"""Entries of the environment in which two machines differ whose speeds do not compare."""
 
 
 @dataclass(frozen=True)
@@ -172,9 +169,8 @@ class Tolerance:
     @classmethod
     def default(cls, spec: MetricSpec) -> Tolerance:
         """Ten units of the last digit that tables show (0.1 dB of PSNR); for speed and memory 30 % as well."""
-        share = MACHINE_SHARE if spec.machine_bound else 0.0
-        absolute = round(LAST_DIGITS * 10.0**-spec.digits, spec.digits)
-        bound = spec.machine_bound
+        absolute, bound = round(LAST_DIGITS * 10.0**-spec.digits, spec.digits), spec.machine_bound
+        share = MACHINE_SHARE if bound else 0.0
         return cls(spec.higher_is_better, absolute, share, bound, spec.unit, spec.digits)
 
     def allowed(self, value: float) -> float:
@@ -292,10 +288,6 @@ class Baseline:
         }
         write_json(path, record)
 
-    def same_machine(self, environment: Mapping[str, Any]) -> bool:
-        """Whether speed measured in an environment compares with the baseline's."""
-        return all(self.environment.get(name) == environment.get(name) for name in MACHINE)
-
 
 def _with_new_names(record: Mapping[str, Any]) -> dict[str, Any]:
     """The record of a file with metrics, the last part of keys, by the names that they have now."""
@@ -314,9 +306,7 @@ def _with_new_names(record: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _place(key: str, path: Path, group: str) -> Place:
-    place = Place.parse(key)
-    if place is None:
+    parts = key.split("/")
+    if len(parts) != len(Place._fields) or not all(parts):
         raise InputError(path, f"{group}, {key}", "task/method/subject/region/metric", repr(key))
-    for name in place:
-        check_name(name, path, f"{group}, {key}")
-    return place
+    return Place(*(check_name(name, path, f"{group}, {key}") for name in parts))

@@ -9,8 +9,7 @@ from typing import Any, Literal
 from xml.etree import ElementTree
 
 from ..errors import ExitCode, shortened
-from ..runner.scoring import FULL
-from .baseline import Baseline, Place, Results, Tolerance
+from .baseline import MACHINE, Baseline, Place, Results, Tolerance
 
 Outcome = Literal["pass", "regressed", "improved", "missing", "new", "unjudged"]
 ORDER: tuple[Outcome, ...] = ("missing", "regressed", "improved", "new", "unjudged", "pass")
@@ -36,8 +35,7 @@ class Verdict:
 
     def __str__(self) -> str:
         place = self.place
-        region = "" if place.region == FULL else f" ({place.region})"
-        what = f"{place.metric}{region} of {place.method}, subject {place.subject}, {place.task}"
+        what = f"{place.measured} of {place.method}, subject {place.subject}, {place.task}"
         if self.outcome == "missing" or self.found is None:
             return f"{what}: missing: {self.reason}"
         digits, unit = (self.tolerance.digits, self.tolerance.unit) if self.tolerance else (4, "")
@@ -64,30 +62,27 @@ def judge(results: Results, baseline: Baseline) -> list[Verdict]:
     Numbers of a task whose protocol is not the baseline's are missing: they were measured, but of something else.
     """
     other = _other_protocols(results, baseline)
-    same_machine = baseline.same_machine(results.environment)
+    same_machine = all(baseline.environment.get(name) == results.environment.get(name) for name in MACHINE)
     verdicts = []
     for place, expected in baseline.values.items():
         tolerance = baseline.tolerances[place.metric]
         found = results.values.get(place)
-        if place.task in other:
-            verdicts.append(Verdict(place, "missing", None, expected, tolerance, other[place.task]))
+        outcome: Outcome = "missing"
+        reason = other.get(place.task, "")
+        if reason:
+            found = None
         elif found is None:
-            reason = (
-                results.problems.get(place) or results.unavailable.get(place) or "no rows; was it measured?"
-            )
-            verdicts.append(Verdict(place, "missing", None, expected, tolerance, reason))
+            known = results.problems.get(place) or results.unavailable.get(place)
+            reason = known or "no rows; was it measured?"
         elif results.frames[place] < baseline.frames[place]:
-            reason = f"{results.frames[place]} frames, {baseline.frames[place]} in the baseline"
-            verdicts.append(Verdict(place, "missing", None, expected, tolerance, reason))
+            found, reason = None, f"{results.frames[place]} frames, {baseline.frames[place]} in the baseline"
         elif tolerance.machine_bound and not same_machine:
-            reason = "measured on another machine"
-            verdicts.append(Verdict(place, "unjudged", found, expected, tolerance, reason))
+            outcome, reason = "unjudged", "measured on another machine"
         else:
-            verdicts.append(Verdict(place, _outcome(found, expected, tolerance), found, expected, tolerance))
-    lacking = {
-        **results.problems,
-        **{p: r for p, r in results.unavailable.items() if p not in baseline.unavailable},
-    }
+            outcome = _outcome(found, expected, tolerance)
+        verdicts.append(Verdict(place, outcome, found, expected, tolerance, reason))
+    unavailable = {p: r for p, r in results.unavailable.items() if p not in baseline.unavailable}
+    lacking = {**results.problems, **unavailable}
     for place in {**results.values, **lacking}.keys() - baseline.values.keys():
         tolerance = Tolerance.default(results.metrics[place.metric])
         if place in lacking:
@@ -167,20 +162,20 @@ def headline(verdicts: Sequence[Verdict], code: int) -> str:
 
 def to_text(verdicts: Sequence[Verdict], code: int, notes: Sequence[str]) -> str:
     """Headline, everything that did not simply pass (the gravest first), notes."""
-    told = [verdict for verdict in verdicts if verdict.outcome != "pass"]
-    lines = [headline(verdicts, code), *(f"  {verdict}" for verdict in told[:SHOWN])]
-    if len(told) > SHOWN:
-        lines.append(f"  and {len(told) - SHOWN} more")
+    others = [verdict for verdict in verdicts if verdict.outcome != "pass"]
+    lines = [headline(verdicts, code), *(f"  {verdict}" for verdict in others[:SHOWN])]
+    if len(others) > SHOWN:
+        lines.append(f"  and {len(others) - SHOWN} more")
     return "\n".join([*lines, *notes])
 
 
 def to_markdown(verdicts: Sequence[Verdict], code: int, notes: Sequence[str]) -> str:
     """A summary: what did not pass in a table, the rest folded below."""
     lines = [f"### {headline(verdicts, code)}", ""]
-    told = [verdict for verdict in verdicts if verdict.outcome != "pass"]
+    others = [verdict for verdict in verdicts if verdict.outcome != "pass"]
     rest = [verdict for verdict in verdicts if verdict.outcome == "pass"]
-    if told:
-        lines += [*_table(told), ""]
+    if others:
+        lines += [*_table(others), ""]
     if rest:
         lines += [f"<details><summary>{len(rest)} passed</summary>", "", *_table(rest), "", "</details>", ""]
     lines += [f"- {_escaped(note)}" for note in notes]
@@ -193,20 +188,15 @@ def to_junit(verdicts: Sequence[Verdict], notes: Sequence[str]) -> str:
     for task in dict.fromkeys(verdict.place.task for verdict in verdicts):
         own = [verdict for verdict in verdicts if verdict.place.task == task]
         counts = Counter(verdict.outcome for verdict in own)
-        suite = ElementTree.SubElement(
-            root,
-            "testsuite",
-            name=_xml(task),
-            tests=str(len(own)),
-            failures=str(counts["regressed"]),
-            errors=str(counts["missing"]),
-            skipped=str(counts["unjudged"]),
-        )
+        numbers = {"tests": len(own), "failures": counts["regressed"]}
+        numbers |= {"errors": counts["missing"], "skipped": counts["unjudged"]}
+        attributes = {"name": _xml(task), **{name: str(number) for name, number in numbers.items()}}
+        suite = ElementTree.SubElement(root, "testsuite", attributes)
         for verdict in own:
             place = verdict.place
-            name = f"{place.metric} {place.region} subject {place.subject}"
+            name = _xml(f"{place.metric} {place.region} subject {place.subject}")
             case = ElementTree.SubElement(
-                suite, "testcase", classname=_xml(f"{task}.{place.method}"), name=_xml(name)
+                suite, "testcase", classname=_xml(f"{task}.{place.method}"), name=name
             )
             kind = {"regressed": "failure", "missing": "error", "unjudged": "skipped"}.get(verdict.outcome)
             if kind:
@@ -226,24 +216,17 @@ def _table(verdicts: Sequence[Verdict]) -> list[str]:
     for verdict in verdicts:
         place, tolerance = verdict.place, verdict.tolerance
         digits = tolerance.digits if tolerance else 4
-        metric = place.metric if place.region == FULL else f"{place.metric} ({place.region})"
         unit = f" ({tolerance.unit})" if tolerance and tolerance.unit else ""
         allowed = None
         if tolerance is not None and verdict.baseline is not None:
             allowed = tolerance.allowed(verdict.baseline)
-        numbers = [
-            _number(verdict.baseline, f".{digits}f"),
-            _number(verdict.found, f".{digits}f") or verdict.reason,
-            _number(verdict.change, f"+.{digits + 1}f"),
-            _number(allowed, f".{digits + 1}f"),
-        ]
-        named = [verdict.outcome, place.task, place.method, place.subject, f"{metric}{unit}"]
+        values = (verdict.baseline, verdict.found, verdict.change, allowed)
+        forms = (f".{digits}f", f".{digits}f", f"+.{digits + 1}f", f".{digits + 1}f")
+        numbers = ["" if value is None else format(value, form) for value, form in zip(values, forms)]
+        numbers[1] = numbers[1] or verdict.reason
+        named = [verdict.outcome, place.task, place.method, place.subject, f"{place.measured}{unit}"]
         lines.append("| " + " | ".join(_escaped(cell) for cell in [*named, *numbers]) + " |")
     return lines
-
-
-def _number(value: float | None, form: str) -> str:
-    return "" if value is None else format(value, form)
 
 
 def _escaped(text: str) -> str:

@@ -85,11 +85,6 @@ def parse_setting(text: str, source: Source, key: str) -> Any:
     return _parse_yaml(text, source, key, literal=True)
 
 
-def read_document(path: Path, kind: type[T], *, foreign: bool = False) -> T:
-    """Read a JSON file into a dataclass; see `read_json` and `checked`."""
-    return checked(read_json(path), kind, path, foreign=foreign)
-
-
 def checked(value: Any, kind: type[T], source: Source, prefix: str = "", *, foreign: bool = False) -> T:
     """Build a dataclass from a value that was read, nested ones included.
 

@@ -64,14 +64,6 @@ class MethodNeeds:
         return cls(spec.head_models, spec.monocular, spec.resolution)
 
 
-def _same_key(key: FrameKey) -> FrameKey:
-    return key
-
-
-def _same_image(key: FrameKey, rgb: FloatArray) -> FloatArray:
-    return rgb
-
-
 @dataclass(frozen=True, eq=False)
 class AdaptedClip:
     """A clip in the form that a method needs, and the way back to the frames of the protocol.
@@ -85,13 +77,11 @@ class AdaptedClip:
     """
 
     clip: Clip
-    key: Callable[[FrameKey], FrameKey] = _same_key
-    restore: Callable[[FrameKey, FloatArray], FloatArray] = _same_image
+    key: Callable[[FrameKey], FrameKey] = lambda key: key
+    restore: Callable[[FrameKey, FloatArray], FloatArray] = lambda key, rgb: rgb
 
 
 Adaptation = Callable[[Path, Progress], AdaptedClip]
-
-
 Adapter = Callable[[Clip, MethodNeeds, Mapping[str, str]], Adaptation]
 
 
@@ -135,7 +125,8 @@ def check(clip: Clip, needs: MethodNeeds) -> None:
     if needs.head_models and clip.head.version not in needs.head_models:
         expected = f"a capture tracked with {' or '.join(needs.head_models)}"
         raise InputError(where, "head_models", expected, clip.head.version)
-    views = _further_views(clip)
+    train = clip.splits["train"]
+    views = len(train) - len({key.timestep for key in train})
     if needs.monocular and views:
         expected = "a single video, one training frame at a timestep"
         raise InputError(where, "monocular", expected, f"{views} further views")
@@ -150,8 +141,3 @@ def record(clip: Clip, adapted: AdaptedClip, method: str) -> dict[str, Any]:
         "fingerprint": adapted.clip.fingerprint,
         "steps": [asdict(step) for step in added],
     }
-
-
-def _further_views(clip: Clip) -> int:
-    train = clip.splits["train"]
-    return len(train) - len({key.timestep for key in train})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import logging
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -11,15 +12,16 @@ from typing import Any, get_args, get_type_hints
 
 from ..configuration import build_arguments
 from ..contracts import Clip, Progress
-from ..errors import InputError
+from ..errors import HeadbenchError, InputError
 from ..io.files import check_name
 from ..progress import progress
-from ..registry import get, resolve
+from ..registry import discover, get, resolve
 from ..specs import LABEL, DatasetSpec, ResolutionRule, is_label
 from .adaptation import MethodNeeds, carry_out, plan
 from .config import RunConfig, RunOptions
 from .store import RunFolder
 
+log = logging.getLogger(__name__)
 HARNESS = ("progress", "remembered")
 """Keywords of a reader that are no settings: the harness gives them, see `DatasetSpec`."""
 
@@ -71,6 +73,38 @@ def found_captures(
         return one
 
     return [(Path(path), reads(path)) for path in paths]
+
+
+def readers() -> dict[str, DatasetSpec]:
+    """The readers that are installed, by name."""
+    found = {name: plugin.spec for name, plugin in discover("datasets").items()}
+    return {name: spec for name, spec in found.items() if spec is not None and spec.reads}
+
+
+def finds(spec: DatasetSpec, root: Path) -> bool:
+    """Whether a reader finds captures; one that cannot be imported or that looks at nothing finds none."""
+    try:
+        return bool(spec.find and resolve(spec.find)(root))
+    except HeadbenchError:
+        return False
+    except Exception as error:  # noqa: BLE001 - a plug-in may fail in any way; the others must still be asked
+        log.warning("reader %s cannot look at %s: %s: %s", spec.name, root, type(error).__name__, error)
+        return False
+
+
+def reader_of(root: str) -> str:
+    """Name of the reader for a run's capture: ga, unless it finds none there and another does.
+
+    Raises `InputError` where several others do.
+    """
+    there = Path(root).exists()
+    found = [name for name, spec in readers().items() if there and finds(spec, Path(root))]
+    if "ga" in found or not found:
+        return "ga"
+    if len(found) > 1:
+        expected = "a capture that one reader knows"
+        raise InputError(root, "", expected, f"one for {', '.join(found)}", "Choose with the setting reader.")
+    return found[0]
 
 
 def relative_paths(config: RunConfig) -> dict[str, str]:

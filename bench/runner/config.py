@@ -123,14 +123,13 @@ def stored_settings(method: str, settings: Mapping[str, Any]) -> dict[str, Any]:
 
     As they are for a method that is unknown here, or whose settings' class cannot be imported: tables need neither.
     """
-    plugin = next(
-        (found for found in discover("methods").values() if getattr(found.spec, "name", "") == method), None
-    )
-    if plugin is None or plugin.spec is None or not plugin.spec.config:
-        return dict(settings)
+    specs = (plugin.spec for plugin in discover("methods").values())
+    spec = next((spec for spec in specs if spec is not None and spec.name == method), None)
     try:
-        known = resolve(plugin.spec.config)
+        known = resolve(spec.config) if spec is not None and spec.config else None
     except HeadbenchError:
+        known = None
+    if known is None:
         return dict(settings)
     budget = {key: value for key, value in settings.items() if key == "budget"}
     own = {key: value for key, value in settings.items() if key != "budget"}
@@ -263,9 +262,7 @@ def demo_run_config(config: DemoConfig) -> dict[str, Any]:
     return {
         "data": str(config.capture_folder),
         "out": config.out,
-        "methods": tuple(
-            name for name, plugin in discover("methods").items() if plugin.spec and plugin.spec.demo
-        ),
+        "methods": tuple(n for n, plugin in discover("methods").items() if plugin.spec and plugin.spec.demo),
         "preset": config.preset,
         "seeds": (config.seed,),
     }

@@ -19,7 +19,7 @@ from ..io.lock import locked
 from ..machine import check_device, machine_record, peak_memory_bytes
 from ..manifest import AdaptedRecord, ClipRecord, Manifest, MethodRecord, ProtocolRecord
 from ..progress import duration, run_progress
-from ..protocol import Protocol, make_protocol
+from ..protocol import Protocol, make_protocols
 from ..registry import discover, resolve
 from ..rows import Rows
 from ..specs import MetricSpec
@@ -60,12 +60,8 @@ def _run(
     for method in methods:
         method.create()  # an implementation that cannot be imported or made is not to be found out hours later
     clips = open_clips(config)
-    protocols: dict[str, Protocol] = {
-        task: make_protocol(task, clips, config.frames_per_task) for task in config.tasks
-    }
-    regions = {clip.subject: check_regions(clip, config.regions) for clip in clips}
-    adapted = adapt(clips, methods, config, folder)
-    jobs = make_jobs(config, methods, clips, protocols, folder, adapted, regions)
+    protocols = make_protocols(config.tasks, clips, config.frames_per_task)
+    jobs = make_jobs(config, methods, clips, protocols, folder)
     for job in jobs:
         job.check()
     _warn_of_missing_metrics(metrics, clips[0])
@@ -107,35 +103,61 @@ def write_reports(run_folder: Path) -> list[Path]:
     return written
 
 
-Adapted = Mapping[tuple[str, MethodNeeds], AdaptedClip]
+def make_jobs(
+    config: RunConfig,
+    methods: Sequence[ResolvedMethod],
+    clips: Sequence[Clip],
+    protocols: Mapping[str, Protocol],
+    folder: RunFolder,
+    out: Path | None = None,
+) -> list[Job]:
+    """Make the cells of a comparison, each clip in the form that its method needs; first make sure that all can be had.
+
+    Parameters
+    ----------
+    folder : run folder of the cells.
+    out : where to keep what took long in adapting clips, its lock is held; what ``folder`` kept is copied there first,
+        since nothing is written in a run by what looks at it. None: ``folder`` itself.
+    """
+    regions = {clip.subject: check_regions(clip, config.regions) if protocols else () for clip in clips}
+    adapted = _adapt(clips, methods, config, folder, RunFolder(out or folder.root))
+    return [
+        Job(
+            clip,
+            method,
+            seed,
+            config.device,
+            folder.cell(clip.subject, method.spec.name, seed),
+            protocols,
+            adapted.get((clip.subject, MethodNeeds.of(method.spec))),
+            regions[clip.subject],
+        )
+        for clip in clips
+        for method in methods
+        for seed in config.seeds
+    ]
 
 
-def adapt(
+def _adapt(
     clips: Sequence[Clip],
     methods: Sequence[ResolvedMethod],
     config: RunConfig,
-    folder: RunFolder,
-    finished: RunFolder | None = None,
-) -> Adapted:
-    """Bring every clip into every form that a method needs, once each; first make sure that all can be had.
-
-    What takes long is kept in ``folder``, whose lock the caller holds. What the run ``finished`` kept is copied there
-    first: nothing is written in a run by what looks at it.
-    """
+    run: RunFolder,
+    out: RunFolder,
+) -> dict[tuple[str, MethodNeeds], AdaptedClip]:
+    """Bring every clip into every form that a method needs, once each."""
     planned = {}
     for clip in clips:
         for needs in {MethodNeeds.of(method.spec): None for method in methods}:
             step = adaptation.plan(clip, needs, config.heads)
             if step is not None:
                 planned[clip.subject, needs] = step
-    with output_inside(folder.root):
-        if finished is not None:
+    with output_inside(out.root):
+        if out.root != run.root:
             for subject in {subject for subject, _ in planned}:
-                _copy_kept(finished.adapted / subject, folder.adapted / subject)
+                _copy_kept(run.adapted / subject, out.adapted / subject)
         return {
-            (subject, needs): adaptation.carry_out(
-                step, needs, folder.adapted / subject, f"adapting {subject}"
-            )
+            (subject, needs): adaptation.carry_out(step, needs, out.adapted / subject, f"adapting {subject}")
             for (subject, needs), step in planned.items()
         }
 
@@ -149,32 +171,6 @@ def _copy_kept(source: Path, folder: Path) -> None:
         if path.is_file() and not path.is_symlink() and not target.exists():
             with atomic_path(target) as temporary:
                 shutil.copyfile(path, temporary)
-
-
-def make_jobs(
-    config: RunConfig,
-    methods: Sequence[ResolvedMethod],
-    clips: Sequence[Clip],
-    protocols: Mapping[str, Protocol],
-    folder: RunFolder,
-    adapted: Adapted,
-    regions: Mapping[str, tuple[str, ...]] | None = None,
-) -> list[Job]:
-    return [
-        Job(
-            clip,
-            method,
-            seed,
-            config.device,
-            folder.cell(clip.subject, method.spec.name, seed),
-            protocols,
-            adapted.get((clip.subject, MethodNeeds.of(method.spec))),
-            (regions or {}).get(clip.subject, ()),
-        )
-        for clip in clips
-        for method in methods
-        for seed in config.seeds
-    ]
 
 
 def _run_cell(job: Job, metrics: Sequence[MetricSpec]) -> Rows:
@@ -261,7 +257,7 @@ def trained(run: Path, methods: Sequence[str], options: RunOptions, out: Path) -
     if not wanted:
         raise InputError(folder.manifest, "methods", "a method that is no trivial baseline", ", ".join(names))
     config, clips = open_run_clips(run, options, out=out)
-    jobs = make_jobs(config, wanted, clips, {}, folder, adapt(clips, wanted, config, RunFolder(out), folder))
+    jobs = make_jobs(config, wanted, clips, {}, folder, out)
     for job in jobs:
         state = job.cell.step("fit")
         if state is None or state.get("status") != "done":

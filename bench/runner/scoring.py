@@ -85,9 +85,7 @@ def score_frames(
     HeadbenchError : a value that is not finite.
     """
     scored: dict[str, list[Score]] = {}
-    metrics: dict[str, Any] = {}
-    for spec in specs:
-        metrics[spec.name] = make_metric(spec)
+    metrics = {spec.name: make_metric(spec) for spec in specs}
     at_once = [
         spec for spec in specs if spec.kind != "temporal" and not hasattr(metrics[spec.name], "batched")
     ]

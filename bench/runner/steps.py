@@ -109,14 +109,10 @@ def steps_ahead(job: Job, metrics: Sequence[MetricSpec]) -> dict[str, str]:
     steps = {} if trained else {TRAINING: method}
     steps[RENDERING] = method
     if any(spec.per_frame for spec in metrics):
-        steps |= {_measuring(task): "" for task in job.protocols}
+        steps |= {f"measuring {task}": "" for task in job.protocols}
     if not all(spec.per_frame for spec in metrics):
         steps[MEASURING_AVATAR] = method
     return steps
-
-
-def _measuring(task: str) -> str:
-    return f"measuring {task}"
 
 
 def fit(job: Job) -> Avatar:
@@ -255,7 +251,9 @@ def measure(job: Job, avatar: Avatar, metrics: Sequence[MetricSpec]) -> Rows:
         for spec in of_avatar:
             if spec.implementation not in measured:
                 measured[spec.implementation] = outcome = _measure_avatar(job, spec, avatar)
-                details[spec.name] = _finite(outcome.details) if isinstance(outcome, Measurement) else {}
+                found = outcome.details.items() if isinstance(outcome, Measurement) else ()
+                # JSON has no others; a metric of one of them has a row of its own.
+                details[spec.name] = {k: v for k, v in found if not isinstance(v, float) or math.isfinite(v)}
     parts: list[Rows] = []
     for spec in metrics:
         if spec not in wanted:
@@ -277,11 +275,6 @@ def measure(job: Job, avatar: Avatar, metrics: Sequence[MetricSpec]) -> Rows:
     return result
 
 
-def _finite(details: Mapping[str, Any]) -> dict[str, Any]:
-    """The details without numbers that JSON does not have; a metric of one of them has a row of its own."""
-    return {k: v for k, v in details.items() if not isinstance(v, float) or math.isfinite(v)}
-
-
 def _measured_before(job: Job) -> tuple[dict[str, str], dict[str, Any], Rows]:
     """Fingerprints and details of the measurements that were taken, by metric, and the rows."""
     step = job.cell.step("measure")
@@ -297,24 +290,19 @@ def _measured_before(job: Job) -> tuple[dict[str, str], dict[str, Any], Rows]:
 def _measure_fingerprint(job: Job, spec: MetricSpec, rendered: Mapping[str, str]) -> str:
     """Digest of everything a metric's values depend on."""
     protocols = sorted(protocol.hash for protocol in job.protocols.values())
-    what: list[Any] = [
-        spec.name,
-        spec.implementation,
-        spec.detail,
-        job.regions if spec.kind == "regional" else (),
-    ]
+    regions = job.regions if spec.kind == "regional" else ()
+    what: Any = _avatar_record(job)
     if spec.per_frame:
-        what.append({name: rendered.get(name) for name in map(job.cell.name, job.frame_paths)})
-    else:
-        what.append(_avatar_record(job))
-    return digest(RESULT_FORMAT, job.fit_fingerprint, protocols, *what)
+        what = {name: rendered.get(name) for name in map(job.cell.name, job.frame_paths)}
+    metric = (spec.name, spec.implementation, spec.detail)
+    return digest(RESULT_FORMAT, job.fit_fingerprint, protocols, *metric, regions, what)
 
 
 def failed_rows(job: Job, metrics: Sequence[MetricSpec], error: Exception) -> Rows:
     """Rows that show a failed cell as failed, with its error."""
     reason = f"{type(error).__name__}: {error}"
     rows = [
-        _row(job, spec, protocol, None, math.nan, "failed", reason)
+        _row(job, spec, protocol, status="failed", reason=reason)
         for spec in metrics
         for protocol in (job.protocols.values() if spec.per_frame else [None])
     ]
@@ -324,7 +312,7 @@ def failed_rows(job: Job, metrics: Sequence[MetricSpec], error: Exception) -> Ro
 def workload(
     form: AdaptedClip, protocols: Mapping[str, Protocol], size: tuple[int, int] | None = None
 ) -> list[tuple[Camera, HeadPose]]:
-    """Return a walk over the cameras and poses of the scored frames, a new camera and pose at every step.
+    """Cameras and poses of the scored frames in pairs, a new camera and pose in every pair.
 
     ``size`` is the (width, height) that the cameras are brought to, None for their own.
     """
@@ -335,9 +323,9 @@ def workload(
         camera if size is None else camera.resized(*size) for _, camera in sorted(clip.cameras.items())
     ]
     steps = max(len(timesteps), len(cameras), 2)
-    walk = [(cameras[i % len(cameras)], clip.poses[timesteps[i % len(timesteps)]]) for i in range(steps)]
-    first, last = walk[0], walk[-1]
-    return walk[:-1] if len(walk) > 2 and first[0] is last[0] and first[1] is last[1] else walk
+    pairs = [(cameras[i % len(cameras)], clip.poses[timesteps[i % len(timesteps)]]) for i in range(steps)]
+    first, last = pairs[0], pairs[-1]
+    return pairs[:-1] if len(pairs) > 2 and first[0] is last[0] and first[1] is last[1] else pairs
 
 
 def _score(job: Job, specs: Sequence[MetricSpec], protocol: Protocol) -> dict[str, list[Row]]:
@@ -345,7 +333,7 @@ def _score(job: Job, specs: Sequence[MetricSpec], protocol: Protocol) -> dict[st
     keys = [key for key in protocol.keys if key.subject == job.clip.subject]
     frames = Frames(lambda key: read_png(job.cell.render(protocol.task, key)), job.clip)
     by_name = {spec.name: spec for spec in specs}
-    with job.progress(_measuring(protocol.task)) as report:
+    with job.progress(f"measuring {protocol.task}") as report:
         scored = score_frames(keys, frames, specs, job.regions, report)
     return {
         name: [
@@ -359,33 +347,31 @@ def _measure_avatar(job: Job, spec: MetricSpec, avatar: Avatar) -> Measurement |
     metric = make_metric(spec)
     try:
         if spec.kind == "training":
-            measured: Measurement = metric(job.cell.step("fit") or {})
-        else:
-            size = job.method.spec.resolution.speed_size
-            measured = metric(avatar, workload(job.form, job.protocols, size))
+            return metric(job.cell.step("fit") or {})  # type: ignore[no-any-return]
+        size = job.method.spec.resolution.speed_size
+        return metric(avatar, workload(job.form, job.protocols, size))  # type: ignore[no-any-return]
     except UnavailableError as error:
         return error
-    return measured
 
 
 def _avatar_row(job: Job, spec: MetricSpec, outcome: Measurement | UnavailableError) -> Row:
     if isinstance(outcome, UnavailableError):
-        return _row(job, spec, None, None, math.nan, "missing", str(outcome))
+        return _row(job, spec, reason=str(outcome))
     if not spec.detail:
-        return _row(job, spec, None, None, outcome.value, "ok", "")
+        return _row(job, spec, value=outcome.value, status="ok")
     if spec.detail not in outcome.details:
-        return _row(job, spec, None, None, math.nan, "missing", "The avatar does not report it.")
-    return _row(job, spec, None, None, float(outcome.details[spec.detail]), "ok", "")
+        return _row(job, spec, reason="The avatar does not report it.")
+    return _row(job, spec, value=float(outcome.details[spec.detail]), status="ok")
 
 
 def _row(
     job: Job,
     spec: MetricSpec,
-    protocol: Protocol | None,
-    key: FrameKey | None,
-    value: float,
-    status: str,
-    reason: str,
+    protocol: Protocol | None = None,
+    key: FrameKey | None = None,
+    value: float = math.nan,
+    status: str = "missing",
+    reason: str = "",
     region: str = FULL,
 ) -> Row:
     if status == "ok" and not math.isfinite(value):

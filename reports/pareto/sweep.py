@@ -11,7 +11,7 @@ from ...bench.contracts import Progress, Variant
 from ...bench.errors import InputError
 from ...bench.io.files import check_name, digest
 from ...bench.manifest import Derived, MethodRecord
-from ...bench.protocol import Protocol, make_protocol
+from ...bench.protocol import Protocol, make_protocols
 from ...bench.registry import resolve
 from ...bench.rows import Rows
 from ...bench.runner.config import resolve_metrics
@@ -48,9 +48,7 @@ def sweep(settings: SweepSettings, out: Path, progress: Progress) -> Rows:
     if settings.frames is not None:
         config = replace(config, frames_per_task=settings.frames)
     clips = list({job.clip.subject: job.clip for job in able}.values())
-    protocols: dict[str, Protocol] = {
-        task: make_protocol(task, clips, config.frames_per_task) for task in config.tasks
-    }
+    protocols = make_protocols(config.tasks, clips, config.frames_per_task)
     config = replace(config, metrics=tuple(dict.fromkeys((*config.metrics, *NEEDED))))
     metrics = [spec for spec in resolve_metrics(config) if spec.kind != "training"]
     folder = RunFolder(out)

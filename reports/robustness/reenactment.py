@@ -15,7 +15,7 @@ from ...bench.errors import InputError
 from ...bench.io.files import digest
 from ...bench.io.images import write_png
 from ...bench.runner.captures import open_clips, run_configuration
-from ...bench.runner.run import adapt, load, make_jobs
+from ...bench.runner.run import load, make_jobs
 from ...bench.runner.steps import Job
 from ...bench.runner.store import RunFolder
 from ..runs import evenly_spaced
@@ -232,9 +232,7 @@ def _sources(jobs: Sequence[Job], settings: ReenactSettings) -> list[Job]:
     config = run_configuration(Path(settings.run), replace(settings, data=settings.source))
     config = replace(config, out=str(folder.root))
     methods = list({job.method.spec.name: job.method for job in jobs}.values())
-    clips = open_clips(config)
-    adapted = adapt(clips, methods, config, folder)
-    return make_jobs(replace(config, seeds=(0,)), methods, clips, {}, folder, adapted)
+    return make_jobs(replace(config, seeds=(0,)), methods, open_clips(config), {}, folder)
 
 
 def _camera(clip: Clip, wanted: str | None) -> Camera:

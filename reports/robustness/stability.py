@@ -17,7 +17,7 @@ import numpy as np
 from ...bench.contracts import Avatar, Camera, Clip, FloatArray, Frame, FrameKey, HeadPose, Progress
 from ...bench.io.files import write_json
 from ...bench.io.images import quantise, write_png
-from ...bench.protocol import Protocol, TrialName, make_trial_protocol
+from ...bench.protocol import Protocol, TaskWithoutTruth, make_protocol_without_truth
 from ...bench.rows import Row, Rows
 from ...bench.runner.adaptation import MethodNeeds
 from ...bench.runner.scoring import FULL
@@ -220,7 +220,7 @@ class RobustnessCase:
 
 
 def run_cases(
-    task: TrialName,
+    task: TaskWithoutTruth,
     cases: Sequence[RobustnessCase],
     settings: Any,
     limits: Any,
@@ -232,7 +232,7 @@ def run_cases(
     protocols: dict[MethodNeeds, Protocol] = {}
     for needs in {_needs(case): None for case in cases}:
         own = [case for case in cases if _needs(case) == needs]
-        protocols[needs] = make_trial_protocol(
+        protocols[needs] = make_protocol_without_truth(
             task,
             [clip for case in own for clip in case.clips],
             [key for case in own for key in case.keys],

@@ -1,6 +1,12 @@
+"""A run on toy plug-ins, small enough to see through."""
+
 from pathlib import Path
 
 import pytest
+
+from headbench.bench.runner import run as runner
+from headbench.bench.runner.config import RunConfig
+from headbench.bench.runner.store import RunFolder
 
 
 @pytest.fixture
@@ -13,3 +19,39 @@ def toy(monkeypatch):
     toy_plugin.ADAPTED.clear()
     toy_plugin.WORKLOAD_SIZES.clear()
     return toy_plugin
+
+
+@pytest.fixture
+def subjects():
+    """Whose captures there are."""
+    return ("subject1",)
+
+
+@pytest.fixture
+def config(toy, tmp_path, monkeypatch, subjects):
+    """Settings of a run that writes no reports."""
+    monkeypatch.setattr(runner, "write_reports", lambda folder: [])
+    for name in subjects:
+        (tmp_path / "data" / name).mkdir(parents=True)
+    return RunConfig(
+        data=str(tmp_path / "data"),
+        out=str(tmp_path / "run"),
+        methods=("toy_plugin:METHOD",),
+        preset="smoke",
+        metrics=("psnr", "toy_plugin:FILES"),
+        reader="toy_plugin:READER",
+    )
+
+
+@pytest.fixture
+def run(config, toy):
+    """The folder of a finished run."""
+    runner.run(config)
+    toy.FITS.clear()
+    return Path(config.out)
+
+
+@pytest.fixture
+def cell(config):
+    """The first subject's cell of the run."""
+    return RunFolder(Path(config.out)).cell("subject1", "toy", 0)

@@ -10,7 +10,6 @@ import pytest
 from headbench.bench import progress as module
 from headbench.bench.progress import RunProgress, TimeLeft, duration, progress, run_progress
 from headbench.bench.runner import run as runner
-from headbench.bench.runner.config import RunConfig
 
 
 class Clock:
@@ -67,7 +66,7 @@ def work(clock, report, total, seconds, start=0, note=""):
         ([*[1.0] * 100, *[5.0] * 100], 1000, 800 * 5.0),  # the last while counts
     ],
 )
-def test_time_left_is_told_by_steps_alone(clock, waits, steps, left):
+def test_time_left_follows_from_steps_alone(clock, waits, steps, left):
     found = TimeLeft()
     for done, wait in enumerate(waits, start=1):
         clock.passes(wait)
@@ -75,7 +74,7 @@ def test_time_left_is_told_by_steps_alone(clock, waits, steps, left):
     assert found.seconds == (None if left is None else pytest.approx(left))
 
 
-def test_steps_that_start_over_are_timed_anew(clock):
+def test_steps_that_start_over_are_timed_again(clock):
     found = TimeLeft()
     work(clock, lambda done, total, _: found.step(done, total), 20, 1.0)
     found.step(1, 50)
@@ -84,7 +83,7 @@ def test_steps_that_start_over_are_timed_anew(clock):
     assert found.seconds == 41 * 3.0
 
 
-def test_a_line_tells_steps_time_left_and_note(clock, lines):
+def test_a_line_has_steps_time_left_and_note(clock, lines):
     with progress("measuring") as report:
         work(clock, report, 10, 4.0, note="psnr")
     assert lines[0] == "measuring: 1 of 10 (psnr)"
@@ -102,8 +101,7 @@ def test_a_run_has_a_bound_until_all_of_it_has_a_basis(clock, lines):
         for stage in ("training", "rendering"):
             with run.step(cell, stage) as report:
                 work(clock, report, 10, seconds[stage][cell[3:]])
-    told = [line for line in lines if re.search("ing 5 of", line)]
-    assert told == [
+    assert [line for line in lines if re.search("ing 5 of", line)] == [
         "cell 1 of 4, s1 ga: training 5 of 10, more than 50 s left",
         "cell 1 of 4, s1 ga: rendering 5 of 10, more than 1 min 40 s left",
         "cell 2 of 4, s1 ours: training 5 of 10, more than 3 min 30 s left",
@@ -116,7 +114,7 @@ def test_a_run_has_a_bound_until_all_of_it_has_a_basis(clock, lines):
     assert lines[0] == "cell 1 of 4, s1 ga: training"
 
 
-def test_alike_stages_of_any_method_tell_of_each_other(clock, lines):
+def test_alike_stages_of_any_method_are_a_basis(clock, lines):
     stages = {"measuring": ""}
     run = progress_of({"s ga": stages, "s ours": stages}, lines)
     with run.step("s ga", "measuring"):
@@ -136,7 +134,7 @@ def test_what_an_earlier_start_did_counts_as_if_done_now(clock, lines):
     assert "2 min" in lines[-1]  # 30 s to prepare and a second for each of 100 steps
 
 
-def test_a_stage_that_fails_or_was_not_ahead_tells_nothing(clock, lines):
+def test_a_stage_that_fails_or_was_not_ahead_is_no_basis(clock, lines):
     run = progress_of({**cells(("s1", "ga")), "s2 ga": {}, **cells(("s3", "ga"))}, lines)
 
     def fail():
@@ -167,28 +165,12 @@ def test_on_a_terminal_the_line_is_written_over(clock, monkeypatch):
     assert "\n" not in shown
 
 
-def test_a_run_names_its_cells_in_order(toy, tmp_path, monkeypatch, lines):
-    monkeypatch.setattr(runner, "write_reports", lambda folder: [])
-    for name in ("subject1", "subject2"):
-        (tmp_path / "data" / name).mkdir(parents=True)
-    config = RunConfig(
-        data=str(tmp_path / "data"),
-        out=str(tmp_path / "out"),
-        methods=("toy_plugin:METHOD",),
-        preset="smoke",
-        metrics=("psnr", "toy_plugin:FILES"),
-        reader="toy_plugin:READER",
-    )
+@pytest.mark.parametrize("subjects", [("subject1", "subject2")])
+def test_a_run_names_its_cells_in_order(config, lines):
     runner.run(config)
-    told = [line for line in lines if line.startswith("cell")]
-    cell = "cell 2 of 2, subject2 toy seed 0: "
-    for step in (
-        "training 2 of 2",
-        "rendering 5 of 5",
-        "measuring novel_view 3 of 3",
-        "measuring the avatar",
-    ):
-        assert any(line.startswith(cell + step) for line in told), step
+    steps = ("training 2 of 2", "rendering 5 of 5", "measuring novel_view 3 of 3", "measuring the avatar")
+    for step in steps:
+        assert any(line.startswith(f"cell 2 of 2, subject2 toy seed 0: {step}") for line in lines), step
     lines.clear()
     runner.run(config)
     assert not [line for line in lines if line.startswith("cell")]

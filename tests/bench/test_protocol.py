@@ -6,7 +6,7 @@ import pytest
 from headbench.bench.contracts import FrameKey
 from headbench.bench.errors import InputError
 from headbench.bench.io.files import digest
-from headbench.bench.protocol import make_protocol, make_trial_protocol
+from headbench.bench.protocol import make_protocol, make_protocol_without_truth
 
 SIZE = (8, 6)
 
@@ -42,10 +42,10 @@ def test_a_protocol_without_conditions_keeps_the_hash_it_had_before_there_were_a
 
 def test_trials_are_keyed_whatever_the_order_they_are_made_in(clip):
     keys = [FrameKey("subject1", "pc1+2", t, "view") for t in range(3)]
-    made = make_trial_protocol(
+    made = make_protocol_without_truth(
         "extremes", [clip, clip], [*keys[::-1], keys[0]], [SIZE, SIZE], {"b": "2", "a": "1"}
     )
-    again = make_trial_protocol("extremes", [clip], keys, [SIZE], {"a": "1", "b": "2"})
+    again = make_protocol_without_truth("extremes", [clip], keys, [SIZE], {"a": "1", "b": "2"})
     assert made == again
     assert made.resolution == "8x6"
     assert made.id == "extremes/canonical/1"

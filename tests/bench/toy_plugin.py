@@ -223,14 +223,7 @@ def training_steps(record):
 
 
 STEPS = MetricSpec(
-    "steps",
-    "Steps",
-    "",
-    False,
-    0,
-    "toy_plugin:training_steps",
-    kind="training",
-    tables=("cost",),
+    "steps", "Steps", "", False, 0, "toy_plugin:training_steps", kind="training", tables=("cost",)
 )
 
 

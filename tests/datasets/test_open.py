@@ -47,7 +47,7 @@ def test_what_is_no_capture_is_described(tmp_path, fill, found):
 def test_of_several_fitting_readers_one_has_to_be_named(pristine_capture, monkeypatch):
     known = registry.discover("datasets")
     twin = replace(known["ga"], name="other", spec=replace(known["ga"].spec, name="other"))
-    monkeypatch.setattr("headbench.datasets.open.discover", lambda group: {**known, "other": twin})
+    monkeypatch.setattr("headbench.bench.runner.captures.discover", lambda group: {**known, "other": twin})
     with pytest.raises(InputError, match=r"one for ga, other. Choose with --reader"):
         open_clip(pristine_capture.union)
     assert open_clip(pristine_capture.union, "ga").poses
@@ -61,7 +61,7 @@ def test_a_reader_that_fails_to_look_leaves_a_capture_to_the_others(pristine_cap
     known = registry.discover("datasets")
     spec = replace(known["ga"].spec, name="other", find=f"{__name__}:fails")
     monkeypatch.setattr(
-        "headbench.datasets.open.discover",
+        "headbench.bench.runner.captures.discover",
         lambda group: {**known, "other": replace(known["ga"], name="other", spec=spec)},
     )
     assert find_reader(pristine_capture.union).name == "ga"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from headbench.bench.configuration import merge
-from headbench.bench.conformance import check_method
+from headbench.bench.conformance.methods import check_method
 from headbench.bench.contracts import no_progress
 from headbench.bench.io.documents import read_json
 from headbench.bench.io.files import digest_file

@@ -1,4 +1,4 @@
-"""Folders of images by key: scored as a run scores its own, in every layout; what is wrong is told before work."""
+"""Folders of images by key: scored as a run scores its own, in every layout; what is wrong is said before work."""
 
 import shutil
 
@@ -16,9 +16,9 @@ from headbench.bench.runner.store import RunFolder
 
 
 @pytest.fixture
-def renders(run):
+def renders(run, cell):
     """Renders of the run's one cell, by task."""
-    return RunFolder(run).cell("subject1", "toy", 0).folder / "renders"
+    return cell.folder / "renders"
 
 
 @pytest.fixture
@@ -46,18 +46,11 @@ def test_images_of_a_run_score_as_in_the_run_under_their_own_label(run, images, 
     assert theirs[same].equals(own[same])
 
 
-@pytest.mark.parametrize("layout", ["{task}/{name}", "renders/{task}/{name}", "subject1/{task}/{name}"])
+@pytest.mark.parametrize("layout", [".", "renders", "subject1"])
 def test_every_layout_gives_the_same_rows(run, renders, images, tmp_path, layout):
-    other = tmp_path / "other"
-    for path in renders.glob("*/*.png"):
-        target = other / layout.format(task=path.parent.name, name=path.name)
-        target.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(path, target)
-    assert scored(other, run, tmp_path / "a").equals(scored(images, run, tmp_path / "b"))
-
-
-def test_a_cell_of_a_run_is_a_folder_of_images(run, renders, images, tmp_path):
-    assert scored(renders.parent, run, tmp_path / "a").equals(scored(images, run, tmp_path / "b"))
+    """Among them that of a run's cell."""
+    shutil.copytree(renders, tmp_path / "other" / layout, dirs_exist_ok=True)
+    assert scored(tmp_path / "other", run, tmp_path / "a").equals(scored(images, run, tmp_path / "b"))
 
 
 def test_the_table_shown_holds_the_run_and_the_images(run, images, tmp_path):
@@ -89,7 +82,7 @@ def test_the_rows_stand_in_one_table_with_the_runs_and_verify(run, images, tmp_p
     assert cli.main(["verify", str(tmp_path / "out"), "--trust"]) == 1
 
 
-def test_changed_images_are_scored_anew_in_the_same_folder(run, images, tmp_path):
+def test_changed_images_are_scored_again_in_the_same_folder(run, images, tmp_path):
     before = scored(images, run, tmp_path / "out")
     for path in images.iterdir():
         write_png(path, read_png(path) + 9)
@@ -109,27 +102,23 @@ def test_missing_images_are_counted_before_anything_is_written(run, images, tmp_
     assert not (tmp_path / "out").exists()
 
 
-def jpeg(path, image):
-    path.write_bytes(cv2.imencode(".jpg", image)[1].tobytes())
-
-
-def png(path, image):
-    path.write_bytes(cv2.imencode(".png", image)[1].tobytes())
+def encoded(shape, suffix=".png"):
+    return cv2.imencode(suffix, np.zeros(shape, np.uint8))[1].tobytes()
 
 
 @pytest.mark.parametrize(
-    ("spoil", "match"),
+    ("content", "match"),
     [
-        (lambda p: png(p, np.zeros((7, 8, 3), np.uint8)), "8 x 6 pixels, as the ground truth, found 8 x 7"),
-        (lambda p: png(p, np.zeros((6, 8, 4), np.uint8)), "Composite it on the background"),
-        (lambda p: png(p, np.zeros((6, 8), np.uint8)), "8-bit RGB"),
-        (lambda p: jpeg(p, np.zeros((6, 8, 3), np.uint8)), "lossless"),
-        (lambda p: p.write_bytes(b"no image"), "PNG or JPEG"),
+        (encoded((7, 8, 3)), "8 x 6 pixels, as the ground truth, found 8 x 7"),
+        (encoded((6, 8, 4)), "Composite it on the background"),
+        (encoded((6, 8)), "8-bit RGB"),
+        (encoded((6, 8, 3), ".jpg"), "lossless"),
+        (b"no image", "PNG or JPEG"),
     ],
 )
-def test_images_that_would_mislead_are_refused_by_name(run, images, tmp_path, spoil, match):
+def test_images_that_would_mislead_are_refused_by_name(run, images, tmp_path, content, match):
     path = sorted(images.iterdir())[3]
-    spoil(path)
+    path.write_bytes(content)
     with pytest.raises(InputError, match=match) as refused:
         scored(images, run, tmp_path / "out")
     assert path.name in str(refused.value)

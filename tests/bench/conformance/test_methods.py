@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from headbench.bench.conformance import check_method
+from headbench.bench.conformance.methods import check_method
 from headbench.bench.contracts import Frame
 from headbench.bench.errors import HeadbenchError
 from headbench.bench.runner.config import resolve_method

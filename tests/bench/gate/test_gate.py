@@ -51,70 +51,72 @@ def worse_by(decibels):
 TRUTH_LEVEL = 40 + 30  # of the toy's self-reenactment frames, camera a
 
 
-def psnr_of(rows, subject, task):
-    own = rows[(rows["subject"] == subject) & (rows["task"] == task) & (rows["metric"] == "psnr")]
+def psnr_of(rows):
+    """Mean of what `worse_by` is applied to."""
+    own = rows.query("subject == 'subject2' and task == 'self_reenactment' and metric == 'psnr'")
     return own.groupby("sequence")["value"].mean().mean()
 
 
-def test_an_unchanged_run_passes(run, baseline, capsys):
-    assert gate(run, baseline) == 0
-    assert "nothing got worse (6 pass)" in capsys.readouterr().out
+@pytest.fixture
+def stored(run):
+    """Rows of the run, and what writes others in their place."""
+    path = RunFolder(run).rows
+    return pd.read_parquet(path), lambda rows: Rows(rows).write(path)
 
 
-def test_a_run_worse_by_0_3_db_fails_naming_metric_subject_and_size(run, baseline, remeasured, capsys):
-    before = psnr_of(pd.read_parquet(RunFolder(run).rows), "subject2", "self_reenactment")
-    rows = remeasured("subject2", "self_reenactment", worse_by(0.3))
-    loss = before - psnr_of(rows, "subject2", "self_reenactment")
+@pytest.fixture
+def judged(run, baseline, capsys):
+    """The gate's exit code and what it prints."""
+
+    def judged(*options, run=run, baseline=baseline):
+        code = gate(run, baseline, *options)
+        return code, capsys.readouterr().out
+
+    return judged
+
+
+def test_a_run_worse_by_0_3_db_fails_naming_metric_subject_and_size(stored, remeasured, judged):
+    code, out = judged()
+    assert code == 0
+    assert "nothing got worse (6 pass)" in out
+    loss = psnr_of(stored[0]) - psnr_of(remeasured("subject2", "self_reenactment", worse_by(0.3)))
     assert 0.3 <= loss < 0.5  # by whole pixels of a tiny image
-    assert gate(run, baseline) == 1
-    out = capsys.readouterr().out
+    code, out = judged()
+    assert code == 1
     assert "1 regressed, 5 pass" in out
     assert "psnr of toy, subject subject2, self_reenactment: regressed" in out
     assert f"{-loss:.3f} dB" in out
 
 
-def test_a_noise_level_change_passes(run, baseline, remeasured, capsys):
-    before = pd.read_parquet(RunFolder(run).rows)
-
+def test_a_noise_level_change_passes(stored, remeasured, judged):
     def change(image):
         image[0, 0, 0] += 1  # one channel of one pixel by one level
         return image
 
-    rows = remeasured("subject2", "self_reenactment", change)
-    assert not rows.equals(before)
-    assert gate(run, baseline) == 0
-    assert "6 pass" in capsys.readouterr().out
+    assert not remeasured("subject2", "self_reenactment", change).equals(stored[0])
+    code, out = judged()
+    assert code == 0
+    assert "6 pass" in out
 
 
-def test_an_improvement_passes_and_says_how_to_keep_it(run, baseline, remeasured, capsys):
+def test_an_improvement_passes_and_says_how_to_keep_it(remeasured, judged):
     remeasured("subject1", "novel_view", lambda image: np.full_like(image, 50))
-    assert gate(run, baseline) == 0
-    out = capsys.readouterr().out
+    code, out = judged()
+    assert code == 0
     assert "1 improved, 5 pass" in out
     assert "--update" in out
-    assert gate(run, baseline, "--update") == 0
-    capsys.readouterr()
-    assert gate(run, baseline) == 0
-    assert "6 pass" in capsys.readouterr().out
+    assert judged("--update")[0] == 0
+    assert "6 pass" in judged()[1]
 
 
-def test_a_missing_subject_is_code_3(run, baseline, capsys):
-    folder = RunFolder(run)
-    rows = pd.read_parquet(folder.rows)
-    Rows(rows[rows["subject"] != "subject2"]).write(folder.rows)
-    assert gate(run, baseline) == 3
-    out = capsys.readouterr().out
-    assert "3 missing, 3 pass" in out
+def test_a_missing_subject_is_code_3_also_beside_a_regression(stored, remeasured, judged):
+    _, write = stored
+    rows = remeasured("subject1", "novel_view", lambda image: image + 20)
+    write(rows[rows["subject"] != "subject2"])
+    code, out = judged()
+    assert code == 3
+    assert "3 missing, 1 regressed" in out
     assert "subject subject2" in out
-
-
-def test_a_regression_beside_something_missing_is_code_3_and_both_are_told(run, baseline, remeasured, capsys):
-    remeasured("subject1", "novel_view", lambda image: image + 20)
-    folder = RunFolder(run)
-    rows = pd.read_parquet(folder.rows)
-    Rows(rows[rows["subject"] != "subject2"]).write(folder.rows)
-    assert gate(run, baseline) == 3
-    assert "3 missing, 1 regressed" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -129,45 +131,45 @@ def test_a_regression_beside_something_missing_is_code_3_and_both_are_told(run, 
         (lambda rows: pd.concat([rows, rows.iloc[:1]]), "measured twice"),
     ],
 )
-def test_rows_with_holes_give_no_number(run, baseline, spoil, why, capsys):
-    folder = RunFolder(run)
-    Rows(spoil(pd.read_parquet(folder.rows))).write(folder.rows)
-    assert gate(run, baseline) == 3
-    assert why in capsys.readouterr().out
-    assert gate(run, baseline, "--update") == 3  # a baseline with holes would hide them
+def test_rows_with_holes_give_no_number(stored, judged, spoil, why):
+    rows, write = stored
+    write(spoil(rows))
+    code, out = judged()
+    assert code == 3
+    assert why in out
+    assert judged("--update")[0] == 3  # a baseline with holes would hide them
 
 
-def test_a_region_of_fewer_frames_is_code_3(run, tmp_path, capsys):
-    """Which frames a region is seen in is not in the protocol: only the baseline tells how many there were."""
-    folder, path = RunFolder(run), tmp_path / "baseline.json"
-    rows = pd.read_parquet(folder.rows)
+def test_a_region_of_fewer_frames_is_code_3(stored, judged, baseline):
+    """Which frames a region is seen in is not in the protocol: only the baseline has how many there were."""
+    rows, write = stored
     rows = pd.concat([rows, rows[rows["task"] != ""].assign(region="face")])
-    Rows(rows).write(folder.rows)
-    assert gate(run, path, "--update") == 0
+    write(rows)
+    assert judged("--update")[0] == 0
     place = "novel_view/toy/subject2/face/psnr"
-    frames = read_json(path)["frames"]
+    frames = read_json(baseline)["frames"]
     assert (frames[place], frames["avatar/toy/subject2/full/files"]) == (3, 1)
-    assert gate(run, path) == 0
-    dropped = (rows["region"] == "face") & (rows["subject"] == "subject2") & (rows["timestep"] == 1)
-    Rows(rows[~dropped]).write(folder.rows)
-    capsys.readouterr()
-    assert gate(run, path) == 3
-    told = capsys.readouterr().out
-    assert "psnr (face) of toy, subject subject2, novel_view: missing: 2 frames, 3 in the baseline" in told
-    assert "1 missing, 9 pass" in told
-    assert gate(run, path, "--update") == 0
-    assert f"frames: {place}: 3 to 2" in capsys.readouterr().out
-    Rows(rows).write(folder.rows)
-    assert gate(run, path) == 0
+    assert judged()[0] == 0
+    write(rows.query("not (region == 'face' and subject == 'subject2' and timestep == 1)"))
+    code, out = judged()
+    assert code == 3
+    assert "psnr (face) of toy, subject subject2, novel_view: missing: 2 frames, 3 in the baseline" in out
+    assert "1 missing, 9 pass" in out
+    code, out = judged("--update")
+    assert code == 0
+    assert f"frames: {place}: 3 to 2" in out
+    write(rows)
+    assert judged()[0] == 0
 
 
-def test_another_protocol_is_code_3_not_a_comparison(run, baseline, config, capsys):
+def test_another_protocol_is_code_3_not_a_comparison(config, judged):
     runner.run(dataclasses.replace(config, frames_per_task=1))
-    assert gate(run, baseline) == 3
-    assert "other frames or settings" in capsys.readouterr().out
+    code, out = judged()
+    assert code == 3
+    assert "other frames or settings" in out
 
 
-def test_remade_captures_compare_where_the_baseline_says_so(run, baseline, config, toy, monkeypatch, capsys):
+def test_remade_captures_compare_where_the_baseline_says_so(config, toy, monkeypatch, judged):
     remade = toy.ToyClip
 
     def read(path):
@@ -178,70 +180,70 @@ def test_remade_captures_compare_where_the_baseline_says_so(run, baseline, confi
     monkeypatch.setattr(toy, "read", read)
     other = dataclasses.replace(config, out=config.out + "-other")
     runner.run(other)
-    assert gate(other.out, baseline) == 3
-    assert "other captures" in capsys.readouterr().out
-    assert gate(run, baseline, "--update", "--captures", "remade") == 0
-    assert gate(other.out, baseline) == 0
-    assert "made again" in capsys.readouterr().out
+    code, out = judged(run=other.out)
+    assert code == 3
+    assert "other captures" in out
+    assert judged("--update", "--captures", "remade")[0] == 0
+    code, out = judged(run=other.out)
+    assert code == 0
+    assert "made again" in out
 
 
-def test_speed_is_judged_on_its_own_machine_alone(run, baseline, capsys):
+def test_speed_is_judged_on_its_own_machine_alone(baseline, judged):
     record = read_json(baseline)
     record["tolerances"]["files"]["machine_bound"] = True
     record["values"] = {k: v - 100 if k.endswith("files") else v for k, v in record["values"].items()}
     write_json(baseline, record)
-    assert gate(run, baseline) == 1  # more files than before, on this machine
+    assert judged()[0] == 1  # more files than before, on this machine
     record["environment"]["processor"] = "abacus"
     write_json(baseline, record)
-    assert gate(run, baseline) == 0
-    out = capsys.readouterr().out
+    code, out = judged()
+    assert code == 0
     assert "2 unjudged, 4 pass" in out
     assert "Environment changed: processor: abacus to" in out
 
 
-def test_a_number_unavailable_in_the_baseline_too_is_no_loss(run, tmp_path, capsys):
-    folder, path = RunFolder(run), tmp_path / "baseline.json"
-    whole = pd.read_parquet(folder.rows)
+def test_a_number_unavailable_in_the_baseline_too_is_no_loss(stored, judged, tmp_path):
+    whole, write = stored
+    path = tmp_path / "new.json"
     lacking = (whole["subject"] == "subject2") & (whole["metric"] == "psnr")
     without = whole.assign(
         value=whole["value"].mask(lacking),
         status=whole["status"].mask(lacking, "missing"),
         reason=whole["reason"].mask(lacking, "no gold"),
     )
-    Rows(without).write(folder.rows)
-    assert gate(run, path, "--update") == 0
-    assert "no gold" in capsys.readouterr().out
-    assert gate(run, path) == 0
-    assert "Unavailable here as in the baseline" in capsys.readouterr().out
-    Rows(whole).write(folder.rows)
-    assert gate(run, path) == 0
-    assert "new" in capsys.readouterr().out
-    assert gate(run, path, "--update") == 0
-    Rows(without).write(folder.rows)
-    assert gate(run, path) == 3  # it was there before
-    assert "missing: no gold" in capsys.readouterr().out
-    assert gate(run, path, "--update") == 3
-    assert "no gold" in capsys.readouterr().out
+    for rows, options, expected, words in (
+        (without, ["--update"], 0, "no gold"),
+        (without, [], 0, "Unavailable here as in the baseline"),
+        (whole, [], 0, "new"),
+        (whole, ["--update"], 0, ""),
+        (without, [], 3, "missing: no gold"),  # it was there before
+        (without, ["--update"], 3, "no gold"),
+    ):
+        write(rows)
+        code, out = judged(*options, baseline=path)
+        assert code == expected
+        assert words in out
 
 
-def test_a_baseline_with_a_metric_by_its_former_name_is_read(run, baseline, monkeypatch, capsys):
+def test_a_baseline_with_a_metric_by_its_former_name_is_read(baseline, judged, monkeypatch):
     monkeypatch.setitem(RENAMED_METRICS, "former", "psnr")
     baseline.write_text(baseline.read_text().replace("psnr", "former"))
-    assert gate(run, baseline) == 0
-    assert "nothing got worse (6 pass)" in capsys.readouterr().out
+    assert "nothing got worse (6 pass)" in judged()[1]
 
 
-def test_a_new_number_is_told_and_passes(run, baseline, capsys):
+def test_a_new_number_passes(baseline, judged):
     record = read_json(baseline)
-    record["values"] = {k: v for k, v in record["values"].items() if "/subject1/" in k}
-    record["frames"] = {k: v for k, v in record["frames"].items() if "/subject1/" in k}
+    for group in ("values", "frames"):
+        record[group] = {k: v for k, v in record[group].items() if "/subject1/" in k}
     record["count"] = len(record["values"])
     write_json(baseline, record)
-    assert gate(run, baseline) == 0
-    assert "3 new, 3 pass" in capsys.readouterr().out
+    code, out = judged()
+    assert code == 0
+    assert "3 new, 3 pass" in out
 
 
-def test_junit_and_markdown_say_the_same(run, baseline, remeasured, tmp_path, capsys):
+def test_junit_and_markdown_say_the_same(run, baseline, remeasured, tmp_path):
     remeasured("subject2", "self_reenactment", lambda image: image + 20)
     junit, markdown = tmp_path / "gate.xml", tmp_path / "gate.md"
     assert gate(run, baseline, "--junit", str(junit), "--markdown", str(markdown)) == 1
@@ -260,7 +262,7 @@ def test_junit_and_markdown_say_the_same(run, baseline, remeasured, tmp_path, ca
     assert "<details><summary>5 passed</summary>" in text
 
 
-def test_results_that_are_none_are_code_3_and_leave_no_stale_report(run, baseline, tmp_path, capsys):
+def test_invalid_results_are_code_3_and_leave_no_stale_report(run, baseline, tmp_path, capsys):
     junit = tmp_path / "gate.xml"
     assert gate(run, baseline, "--junit", str(junit)) == 0
     assert gate(tmp_path / "nowhere", baseline, "--junit", str(junit)) == 3

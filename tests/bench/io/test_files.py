@@ -46,8 +46,9 @@ def test_a_failed_write_leaves_the_old_file_and_no_rubbish(tmp_path):
 
 def test_results_are_readable_whatever_their_writer_makes_of_the_file(tmp_path):
     """safetensors writes beside the file it is given and renames, which leaves the mode of a private file."""
-    path = tmp_path / "a.txt"
+    path = tmp_path / "new" / "a.txt"
     with atomic_path(path) as temporary:
+        assert temporary.suffix == ".txt"
         private = temporary.with_name("private")
         private.write_text("new")
         private.chmod(0o600)
@@ -57,22 +58,9 @@ def test_results_are_readable_whatever_their_writer_makes_of_the_file(tmp_path):
     assert path.stat().st_mode == usual.stat().st_mode
 
 
-def test_the_temporary_name_keeps_the_suffix(tmp_path):
-    with atomic_path(tmp_path / "new" / "a.png") as temporary:
-        assert temporary.suffix == ".png"
-
-
 def test_digests_tell_values_types_shapes_and_order_apart():
-    values = [
-        (np.zeros(4),),
-        (np.zeros((2, 2)),),
-        (np.zeros(4, np.float32),),
-        (np.ones(4),),
-        ("ab", "c"),
-        ("a", "bc"),
-        ({"a": 1},),
-        ({"a": 2},),
-    ]
+    arrays = [np.zeros(4), np.zeros((2, 2)), np.zeros(4, np.float32), np.ones(4)]
+    values = [*((array,) for array in arrays), ("ab", "c"), ("a", "bc"), ({"a": 1},), ({"a": 2},)]
     assert len({digest(*value) for value in values}) == len(values)
     assert digest({"a": 1, "b": 2}) == digest({"b": 2, "a": 1})
 
@@ -88,23 +76,23 @@ def test_json_takes_numpy(tmp_path):
     assert '"x": 0.5' in (tmp_path / "a.json").read_text()
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "",
-        ".",
-        "..",
-        ".hidden",
-        "../up",
-        "/root",
-        "a/b",
-        "a\\b",
-        "C:",
-        "a\0",
-        "a\n",
-        "x" * (MAX_NAME_BYTES + 1),
-    ],
+UNFIT = (
+    "",
+    ".",
+    "..",
+    ".hidden",
+    "../up",
+    "/root",
+    "a/b",
+    "a\\b",
+    "C:",
+    "a\0",
+    "a\n",
+    "x" * (MAX_NAME_BYTES + 1),
 )
+
+
+@pytest.mark.parametrize("name", UNFIT)
 def test_a_name_that_could_leave_its_folder_is_refused(name):
     with pytest.raises(InputError) as caught:
         check_name(name, "capture.json", "subject")
@@ -126,16 +114,13 @@ def test_names_of_the_field_are_accepted(name):
     assert check_name(name, "", "") == name
 
 
-def test_a_disk_that_fills_up_is_told_with_the_file_meant(tmp_path):
+def test_an_error_of_the_system_names_the_file_meant_and_no_other_does(tmp_path):
     with pytest.raises(OSError, match="a.png") as caught, atomic_path(tmp_path / "a.png"):
         raise OSError(errno.ENOSPC, "No space left on device")
     assert caught.value.filename == str(tmp_path / "a.png")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_an_error_of_ones_own_keeps_its_words(tmp_path):
     with pytest.raises(OSError, match="^nothing of the system$"), atomic_path(tmp_path / "a.png"):
         raise OSError("nothing of the system")
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.fixture
@@ -195,31 +180,37 @@ def test_a_group_that_fails_keeps_what_was_written_before(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["a"]
 
 
-def test_a_flush_that_fails_leaves_the_old_file_and_names_it(tmp_path, monkeypatch):
-    def fail(path):
-        raise OSError(errno.EIO, "Input/output error")
+@pytest.fixture
+def failing(monkeypatch):
+    """Let flushes fail, all or those of one name."""
+    flush = files._flush
 
+    def failing(name=""):
+        def fail(path):
+            if name in ("", Path(path).name):
+                raise OSError(errno.EIO, "Input/output error")
+            flush(path)
+
+        monkeypatch.setattr(files, "_flush", fail)
+
+    return failing
+
+
+def test_a_flush_that_fails_leaves_the_old_file_and_names_it(tmp_path, failing):
     (tmp_path / "a").write_text("old")
-    monkeypatch.setattr(files, "_flush", fail)
+    failing()
     with pytest.raises(OSError, match="Input/output") as caught:
         write_text(tmp_path / "a", "new")
     assert caught.value.filename == str(tmp_path / "a")
     assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"a": "old"}
 
 
-def test_a_folder_that_cannot_be_flushed_fails_one_write_and_not_those_after_it(tmp_path, monkeypatch):
+def test_a_folder_that_cannot_be_flushed_fails_one_write_alone(tmp_path, failing):
     for name in ("bad", "good"):
         (tmp_path / name).mkdir()
     flush_renames()
     write_text(tmp_path / "bad" / "a", "a")  # its rename waits for the next flush
-    flush = files._flush
-
-    def fail(path):
-        if Path(path).name == "bad":
-            raise OSError(errno.EIO, "Input/output error")
-        flush(path)
-
-    monkeypatch.setattr(files, "_flush", fail)
+    failing("bad")
     with pytest.raises(OSError, match="Input/output") as caught:
         write_text(tmp_path / "good" / "b", "b")
     assert caught.value.filename == str(tmp_path / "bad")

@@ -1,4 +1,4 @@
-"""Headers and end markers against files made by an independent encoder."""
+"""Images against files made by an independent encoder; frames are rounded to levels and come back as they were."""
 
 from __future__ import annotations
 
@@ -14,7 +14,16 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from headbench.bench.errors import InputError
-from headbench.bench.io.images import MAX_PIXELS, MAX_SCANS, ImageInfo, probe_image, read_pixels, read_png
+from headbench.bench.io.images import (
+    MAX_PIXELS,
+    MAX_SCANS,
+    ImageInfo,
+    probe_image,
+    quantise,
+    read_pixels,
+    read_png,
+    write_png,
+)
 from headbench.datasets.images import read_image, read_mask
 
 MODES = {"L": 1, "RGB": 3, "RGBA": 4, "LA": 2, "P": 3}
@@ -29,18 +38,17 @@ def encode(mode: str, size: tuple[int, int], format: str, **options) -> bytes:
     return stream.getvalue()
 
 
-@pytest.mark.parametrize("mode", MODES)
-def test_png_header(tmp_path, mode):
-    path = tmp_path / "image.png"
-    path.write_bytes(encode(mode, (17, 31), "PNG"))
-    assert probe_image(path, decode=True) == ImageInfo(17, 31, MODES[mode])
+JPEG_OPTIONS = ({}, {"progressive": True}, {"exif": b"Exif\0\0" + bytes(200)})
 
 
-@pytest.mark.parametrize("options", [{}, {"progressive": True}, {"exif": b"Exif\0\0" + bytes(200)}])
-@pytest.mark.parametrize("mode", ["L", "RGB"])
-def test_jpeg_header(tmp_path, mode, options):
-    path = tmp_path / "image.jpg"
-    path.write_bytes(encode(mode, (17, 31), "JPEG", **options))
+@pytest.mark.parametrize(
+    ("mode", "format", "options"),
+    [(mode, "PNG", {}) for mode in MODES]
+    + [(mode, "JPEG", options) for mode in ("L", "RGB") for options in JPEG_OPTIONS],
+)
+def test_a_header_is_read(tmp_path, mode, format, options):
+    path = tmp_path / "image"
+    path.write_bytes(encode(mode, (17, 31), format, **options))
     assert probe_image(path, decode=True) == ImageInfo(17, 31, MODES[mode])
 
 
@@ -55,22 +63,25 @@ def test_every_truncation_is_found(tmp_path_factory, data, format):
         probe_image(path)
 
 
-def test_jpeg_that_ends_within_its_frame_header(tmp_path):
-    path = tmp_path / "image.jpg"
-    path.write_bytes(b"\xff\xd8" + b"\xff\xc0\x00\x11" + b"\x08\xff\xd9")
-    with pytest.raises(InputError, match="frame header"):
-        probe_image(path)
-
-
-def test_missing_and_foreign_files(tmp_path):
-    with pytest.raises(InputError, match="no such file"):
-        probe_image(tmp_path / "none.png")
-    with pytest.raises(InputError, match="a folder"):
-        probe_image(tmp_path)
-    path = tmp_path / "image.bmp"
-    path.write_bytes(encode("RGB", (4, 4), "BMP"))
-    with pytest.raises(InputError, match="PNG or JPEG"):
-        probe_image(path)
+@pytest.mark.parametrize(
+    ("content", "match"),
+    [
+        (None, "no such file"),
+        (b"", "an empty file"),
+        (encode("RGB", (4, 4), "BMP"), "PNG or JPEG"),
+        (b"\x89PNG\r\n\x1a\n truncated", "a whole PNG"),
+        (b"\xff\xd8\xff\xc0\x00\x11\x08\xff\xd9", "frame header"),
+    ],
+)
+def test_a_missing_damaged_or_foreign_file_is_refused(tmp_path, content, match):
+    path = tmp_path / "image"
+    if content is not None:
+        path.write_bytes(content)
+    for read in (probe_image, read_png):
+        with pytest.raises(InputError, match=match):
+            read(path)
+        with pytest.raises(InputError, match="a folder"):
+            read(tmp_path)
 
 
 def declared(width: int, height: int, depth: int = 8, colour: int = 2, data: bytes = b"") -> bytes:
@@ -137,3 +148,24 @@ def test_images_of_any_kind_and_of_the_largest_size_are_read(tmp_path):
         assert read_pixels(path, size=(17, 31)).shape[:2] == (31, 17)
     with pytest.raises(InputError, match="18x31 pixels, found 17x31"):
         read_pixels(path, size=(18, 31))
+
+
+def test_every_level_survives_the_round_trip(tmp_path):
+    image = np.arange(256, dtype=np.uint8).reshape(16, 16, 1) * np.array([1, 3, 7], np.uint8)
+    write_png(tmp_path / "a.png", image)
+    assert np.array_equal(read_png(tmp_path / "a.png"), image)
+    assert np.array_equal(quantise(image.astype(np.float32) / 255), image)
+
+
+def test_rounding_goes_to_the_nearest_level_and_clamps():
+    rgb = np.array([[[-0.5, 0.49 / 255, 0.51 / 255], [254.4 / 255, 254.6 / 255, 2.0]]])
+    assert quantise(rgb).tolist() == [[[0, 0, 1], [254, 255, 255]]]
+
+
+@pytest.mark.parametrize(
+    ("rgb", "match"),
+    [([[[np.nan, np.inf, 0.0]]], "2 of 3"), (np.zeros((1, 1, 3), np.uint8), "floating-point")],
+)
+def test_what_is_no_colour_is_refused(rgb, match):
+    with pytest.raises(InputError, match=match):
+        quantise(np.asarray(rgb))

@@ -11,7 +11,7 @@ import pytest
 from headbench.bench.errors import InputError
 from headbench.bench.io.files import TEMPORARY
 from headbench.bench.io.lock import LOCK_FILE, locked
-from headbench.bench.progress import log_to
+from headbench.bench.progress import log_to_file
 
 HOLDER = """
 import sys, time
@@ -82,7 +82,7 @@ def test_lock_and_log_are_never_links(tmp_path, name):
     (folder / name).symlink_to(victim)
     with (
         pytest.raises(InputError, match="expected a file, found a link"),
-        log_to(folder / "run.log"),
+        log_to_file(folder / "run.log"),
         locked(folder),
     ):
         pytest.fail("went on")

@@ -1,6 +1,7 @@
 """The harness brings clips into the form a method declares, and its renders back; other methods see no change."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,60 +25,54 @@ TWICE = ResolutionRule(size=(16, 12), speed_size=(32, 24))
 
 
 @pytest.fixture
-def config(toy, tmp_path, monkeypatch):
-    (tmp_path / "data" / "subject1").mkdir(parents=True)
-    monkeypatch.setattr(runner, "write_reports", lambda folder: [])
+def config(toy, config, monkeypatch):
     monkeypatch.setattr(adaptation, "adapter", lambda: toy.adapt)
-    return RunConfig(
-        data=str(tmp_path / "data"),
-        out=str(tmp_path / "out"),
-        methods=("toy_plugin:MIRROR",),
-        preset="smoke",
-        metrics=("toy_plugin:ERROR", "toy_plugin:FILES"),
-        reader="toy_plugin:READER",
-    )
+    metrics = ("toy_plugin:ERROR", "toy_plugin:FILES")
+    return dataclasses.replace(config, methods=("toy_plugin:MIRROR",), metrics=metrics)
+
+
+@pytest.fixture
+def cell(config):
+    return RunFolder(Path(config.out)).cell("subject1", "mirror", 0)
+
+
+def manifest_of(config):
+    return read_json(Path(config.out) / "run.json")
 
 
 def declare(monkeypatch, toy, name="MIRROR", **needs):
     monkeypatch.setattr(toy, name, dataclasses.replace(getattr(toy, name), **needs))
 
 
-def test_a_method_without_needs_gets_the_clip_itself(config, toy):
+def test_a_method_without_needs_gets_the_clip_itself(config, toy, cell):
     clip = toy.ToyClip("subject1")
     assert plan(clip, MethodNeeds(), {}) is None
     runner.run(config)
     assert toy.ADAPTED == []
-    record = read_json(RunFolder(runner.Path(config.out)).manifest)
+    record = manifest_of(config)
     assert record["adapted"] == []
     assert "needs" not in record["methods"][0]
     # The formula before methods had needs: avatars trained then stay valid.
     method = record["methods"][0]
     expected = digest(1, method, 0, "cpu", "toy-subject1")
-    cell = RunFolder(runner.Path(config.out)).cell("subject1", "mirror", 0)
     assert cell.step("fit")["fingerprint"] == expected
 
 
-def test_cameras_and_poses_of_the_adapted_clip_are_rendered_and_brought_back(config, toy, monkeypatch):
+def test_renders_of_the_adapted_clip_are_brought_back(config, toy, monkeypatch, cell):
     declare(monkeypatch, toy, resolution=TWICE)
     assert runner.run(config).failed == []
     assert toy.ADAPTED == ["subject1"]
-    cell = RunFolder(runner.Path(config.out)).cell("subject1", "mirror", 0)
+    assert toy.WORKLOAD_SIZES == {(32, 24)}  # at which speed is measured
     for key in toy.ToyClip("subject1").splits["novel_view"]:
         image = read_png(cell.render("novel_view", key))
         assert image.shape == (6, 8, 3)  # the protocol's size, not the method's 16x12
         assert (image == round(255 * (0.5 + key.timestep / 10))).all()  # the adapted pose of the same frame
 
 
-def test_speed_is_measured_at_the_declared_size(config, toy, monkeypatch):
-    declare(monkeypatch, toy, resolution=TWICE)
-    runner.run(config)
-    assert toy.WORKLOAD_SIZES == {(32, 24)}
-
-
-def test_the_manifest_tells_the_steps_and_the_needs(config, toy, monkeypatch):
+def test_the_manifest_has_the_steps_and_the_needs(config, toy, monkeypatch):
     declare(monkeypatch, toy, resolution=TWICE)
     runner.run(dataclasses.replace(config, heads={"flame2020": "somewhere"}, seeds=(0, 1)))
-    record = read_json(RunFolder(runner.Path(config.out)).manifest)
+    record = manifest_of(config)
     (adapted,) = record["adapted"]
     assert (adapted["subject"], adapted["method"]) == ("subject1", "mirror")
     assert adapted["fingerprint"] == "toy-subject1-adapted"
@@ -94,9 +89,7 @@ def test_the_manifest_tells_the_steps_and_the_needs(config, toy, monkeypatch):
     ],
     ids=["verify", "sweep, extremes, reenact"],
 )
-def test_what_looks_at_a_run_takes_what_it_kept_and_writes_nothing_there(
-    config, toy, tmp_path, monkeypatch, look
-):
+def test_looking_at_a_run_writes_nothing_there(config, toy, tmp_path, monkeypatch, look):
     declare(monkeypatch, toy, resolution=TWICE)
     adapt, found = toy.adapt, []
 
@@ -111,7 +104,7 @@ def test_what_looks_at_a_run_takes_what_it_kept_and_writes_nothing_there(
     monkeypatch.setattr(toy, "adapt", keeping)
     config = dataclasses.replace(config, divide=2)
     runner.run(config)
-    run, out = runner.Path(config.out), tmp_path / "looked"
+    run, out = Path(config.out), tmp_path / "looked"
     # Reduction needs a folder, too: that of the run itself, where it is made.
     kept = [run / "adapted" / "subject1" / "kept", run / "kept"]
     assert found == [False, False]
@@ -165,9 +158,9 @@ def test_a_reduced_comparison_has_another_size_and_another_hash(config, toy):
     for divide in (1, 2):
         chosen = dataclasses.replace(config, divide=divide, out=f"{config.out}{divide}")
         assert runner.run(chosen).failed == []
-        manifest = read_json(RunFolder(runner.Path(chosen.out)).manifest)
+        manifest = manifest_of(chosen)
         record[divide] = manifest["protocols"]["novel_view"]
-        # Whoever opens the captures of a run anew, as reports do, sees what was measured.
+        # Whoever opens the captures of a run again, as reports do, sees what was measured.
         (clip,) = open_clips(chosen)
         assert clip.fingerprint == manifest["clips"][0]["fingerprint"]
     assert record[1]["resolution"] == "8x6"

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import logging
 
 import cv2
 import pytest
@@ -12,37 +11,18 @@ from headbench.bench.errors import InputError
 from headbench.bench.io.documents import read_json
 from headbench.bench.io.files import digest_file, write_json
 from headbench.bench.io.images import read_png, write_png
+from headbench.bench.rows import Rows
 from headbench.bench.runner import run as runner
 from headbench.bench.runner import steps
-from headbench.bench.runner.config import RunConfig
-from headbench.bench.runner.store import RunFolder
 
 FRAME = "renders/novel_view/EMO_00001_b.png"
 AVATAR = "avatar/level.txt"
 
 
 @pytest.fixture
-def config(toy, tmp_path, monkeypatch):
-    monkeypatch.setattr(runner, "write_reports", lambda folder: [])
-    monkeypatch.setattr(logging.getLogger("headbench"), "propagate", True)
-    (tmp_path / "data" / "subject1").mkdir(parents=True)
-    return RunConfig(
-        data=str(tmp_path / "data"),
-        out=str(tmp_path / "run"),
-        methods=("toy_plugin:METHOD",),
-        preset="smoke",
-        metrics=("psnr", "toy_plugin:FILES"),
-        reader="toy_plugin:READER",
-    )
-
-
-@pytest.fixture
-def run(config, toy):
+def run(run, cell):
     """A finished run: its folder, its cell's folder, its rows."""
-    rows = runner.run(config)
-    toy.FITS.clear()
-    folder = RunFolder(runner.Path(config.out))
-    return folder.root, folder.cell("subject1", "toy", 0).folder, rows
+    return run, cell.folder, Rows.read(run / "rows.parquet")
 
 
 def warnings(caplog):
@@ -84,9 +64,9 @@ def test_a_damaged_file_is_made_again_and_named(run, config, toy, caplog, name, 
     frame = digest_file(cell / FRAME)
     DAMAGE[how](cell / name)
     again = runner.run(config)
-    (told,) = warnings(caplog)
-    assert str(cell / name) in told
-    assert remedy in told
+    (message,) = warnings(caplog)
+    assert str(cell / name) in message
+    assert remedy in message
     assert again._table.equals(rows._table)
     assert digest_file(cell / FRAME) == frame
     assert toy.FITS == ["subject1"] * trains
@@ -106,13 +86,12 @@ def test_damaged_files_of_the_whole_run_are_written_over(run, config, name, how)
     assert cli.main(["verify", str(root), "--trust"]) == 0
 
 
-def test_many_damaged_frames_are_told_in_one_line(run, config, caplog):
+def test_many_damaged_frames_are_named_in_one_line(run, config, caplog):
     _, cell, _ = run
     for path in cell.glob("renders/*/*.png"):
         path.write_bytes(b"")
     runner.run(config)
-    (told,) = warnings(caplog)
-    assert "is empty, 4 more are damaged; rendered again" in told
+    assert "is empty, 4 more are damaged; rendered again" in warnings(caplog)[0]
 
 
 def test_what_depends_on_a_remade_file_is_made_again(run, config, toy, monkeypatch):
@@ -144,7 +123,7 @@ def test_a_renderer_that_renders_otherwise_is_measured_again(run, config, toy, m
     assert cli.main(["verify", str(root), "--trust"]) == 0
 
 
-def test_frames_without_a_record_are_rendered_again(config, toy, monkeypatch, caplog):
+def test_frames_without_a_record_are_rendered_again(config, cell, toy, monkeypatch, caplog):
     whole = runner.run(dataclasses.replace(config, out=config.out + "-whole"))
     original = toy.ToyAvatar.render
     rendered = []
@@ -160,7 +139,6 @@ def test_frames_without_a_record_are_rendered_again(config, toy, monkeypatch, ca
         patch.setattr(toy.ToyAvatar, "render", killed)
         with pytest.raises(KeyboardInterrupt):
             runner.run(config)
-    cell = RunFolder(runner.Path(config.out)).cell("subject1", "toy", 0)
     record = cell.step("digests")
     assert len(record["files"]) == 3
     del record["files"][FRAME]
@@ -173,7 +151,7 @@ def test_frames_without_a_record_are_rendered_again(config, toy, monkeypatch, ca
     assert warnings(caplog) == []
 
 
-def test_a_training_whose_checkpoint_is_damaged_starts_over(config, toy, monkeypatch, caplog):
+def test_a_training_with_a_damaged_checkpoint_starts_over(config, cell, toy, monkeypatch, caplog):
     original = toy.ToyMethod.fit
 
     def fit(self, clip, out, budget, **settings):
@@ -188,14 +166,13 @@ def test_a_training_whose_checkpoint_is_damaged_starts_over(config, toy, monkeyp
 
     monkeypatch.setattr(toy.ToyMethod, "fit", fit)
     rows = runner.run(config)
-    cell = RunFolder(runner.Path(config.out)).cell("subject1", "toy", 0)
     state = cell.step("fit")
     cell.begin("fit", state["fingerprint"])
     (cell.avatar / "checkpoint").write_text("half")
     assert runner.run(config)._table.equals(rows._table)
-    (told,) = warnings(caplog)
-    assert f"{cell.avatar / 'checkpoint'}: expected a checkpoint, found noise" in told
-    assert "trained from the start" in told
+    (message,) = warnings(caplog)
+    assert f"{cell.avatar / 'checkpoint'}: expected a checkpoint, found noise" in message
+    assert "trained from the start" in message
 
 
 def test_verify_names_frames_that_cannot_be_scored(run, capsys):

@@ -2,6 +2,7 @@
 
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,55 +13,37 @@ from headbench.bench.io.documents import read_json
 from headbench.bench.io.files import write_json
 from headbench.bench.runner import run as runner
 from headbench.bench.runner.captures import open_run_clips, run_configuration
-from headbench.bench.runner.config import RunConfig, RunOptions
+from headbench.bench.runner.config import RunOptions
 
 TRUSTED = RunOptions(trust=True)
 
 
 @pytest.fixture
-def run(toy, tmp_path, monkeypatch):
+def run(toy, config, tmp_path, monkeypatch):
     """A run made in a folder of its own: run, capture and head model by relative paths."""
-    monkeypatch.setattr(runner, "write_reports", lambda folder: [])
-    monkeypatch.setattr(toy, "read", with_head(toy.ToyClip))
-    home = tmp_path / "home"
-    (home / "data" / "subject1").mkdir(parents=True)
-    for name in ("head.npz", "other.npz"):
-        (home / name).write_text(name)
-    with monkeypatch.context() as patch:
-        patch.chdir(home)
-        runner.run(
-            RunConfig(
-                data="data",
-                out="run",
-                methods=("toy_plugin:METHOD",),
-                preset="smoke",
-                metrics=("psnr",),
-                reader="toy_plugin:READER",
-                reader_settings={"head": "head.npz"},
-                heads={"other": "other.npz"},
-            )
-        )
-    return home / "run"
-
-
-def with_head(clip_type):
-    """A reader whose fingerprint depends on what the capture and the head model hold."""
 
     def read(path, head: str | Path | None = None):
-        clip = clip_type(path)
+        """Give a clip whose fingerprint depends on what the capture and the head model hold."""
+        clip = toy.ToyClip(path)
         clip.fingerprint += Path(head).read_text() + ",".join(sorted(os.listdir(path)))
         return clip
 
-    return read
+    monkeypatch.setattr(toy, "read", read)
+    home = tmp_path / "home"
+    home.mkdir()
+    (tmp_path / "data").rename(home / "data")
+    for name in ("head.npz", "other.npz"):
+        (home / name).write_text(name)
+    files = {"reader_settings": {"head": "head.npz"}, "heads": {"other": "other.npz"}}
+    with monkeypatch.context() as patch:
+        patch.chdir(home)
+        runner.run(replace(config, data="data", out="run", metrics=("psnr",), **files))
+    return home / "run"
 
 
 def test_a_run_records_where_its_files_lie_from_its_folder(run):
-    paths = read_json(run / "run.json")["paths"]
-    assert paths == {
-        "data": "../data",
-        "reader_settings.head": "../head.npz",
-        "heads.other": "../other.npz",
-    }
+    expected = {"data": "../data", "reader_settings.head": "../head.npz", "heads.other": "../other.npz"}
+    assert read_json(run / "run.json")["paths"] == expected
 
 
 def test_a_run_works_from_any_directory_and_after_a_move(run, tmp_path, monkeypatch):
@@ -92,13 +75,13 @@ def test_of_two_captures_that_of_the_run_is_taken(run, tmp_path, monkeypatch):
     ("gone", "key", "option"),
     [("data", "data", "--data"), ("head.npz", "reader_settings.head", "--head"), ("other.npz", "heads", "")],
 )
-def test_what_is_gone_is_told_with_places_and_option(run, tmp_path, capsys, gone, key, option):
+def test_what_is_gone_is_named_with_places_and_option(run, tmp_path, capsys, gone, key, option):
     (run.parent / gone).rename(tmp_path / gone)
     assert cli.main(["verify", str(run), "--trust"]) == 3
-    told = capsys.readouterr().out
-    assert f"configuration.{key}" in told
-    assert f"expected {run.parent / gone} or {gone}, found neither" in told
-    assert option in told
+    out = capsys.readouterr().out
+    assert f"configuration.{key}" in out
+    assert f"expected {run.parent / gone} or {gone}, found neither" in out
+    assert option in out
     if option:
         assert cli.main(["verify", str(run), "--trust", option, str(tmp_path / gone)]) == 0
 
@@ -129,10 +112,9 @@ def test_a_module_that_a_run_names_is_not_imported(run, monkeypatch, tmp_path, c
         (["evaluate", str(run), "--out", str(tmp_path / "out"), "--like"], 2),
     ):
         assert cli.main([*command, str(run)]) == code
-        told = "".join(capsys.readouterr())
-        assert f"configuration.{next(iter(change))}" in told
-        assert "--trust" in told
-        assert "'stranger:SPEC'" in told
+        shown = "".join(capsys.readouterr())
+        for words in (f"configuration.{next(iter(change))}", "--trust", "'stranger:SPEC'"):
+            assert words in shown
     assert cli.main(["table", str(run)]) in (0, 2)
     assert "stranger" not in sys.modules
 

@@ -1,9 +1,10 @@
 """The harness on toy plug-ins: what a run leaves, resumes, refuses and records."""
 
-import dataclasses
 import json
 import math
 import types
+from dataclasses import replace
+from pathlib import Path
 
 import pandas as pd
 import pytest
@@ -21,42 +22,48 @@ from headbench.bench.specs import ReportSpec
 
 
 @pytest.fixture
-def capture(tmp_path):
-    for name in ("subject1", "subject2"):
-        (tmp_path / "data" / name).mkdir(parents=True)
-    return tmp_path / "data"
+def subjects():
+    return ("subject1", "subject2")
 
 
 @pytest.fixture
-def config(toy, capture, tmp_path, monkeypatch):
-    monkeypatch.setattr(runner, "write_reports", lambda folder: [])
-    return RunConfig(
-        data=str(capture),
-        out=str(tmp_path / "out"),
-        methods=("toy_plugin:METHOD",),
-        preset="smoke",
-        metrics=("toy_plugin:ERROR", "toy_plugin:FILES"),
-        reader="toy_plugin:READER",
-    )
+def config(config):
+    return replace(config, metrics=("toy_plugin:ERROR", "toy_plugin:FILES"))
 
 
-def rows_of(config):
+@pytest.fixture
+def refuses(toy):
+    """Run with some changes, which are refused before any training."""
+
+    def refuses(config, match, error=InputError, **changes):
+        toy.FITS.clear()
+        with pytest.raises(error, match=match):
+            runner.run(replace(config, **changes))
+        assert toy.FITS == []
+
+    return refuses
+
+
+def rows_of(config, **changes):
     """Table of the rows of a run."""
+    config = replace(config, **changes)
     runner.run(config)
-    return pd.read_parquet(RunFolder(runner.Path(config.out)).rows)
+    return pd.read_parquet(RunFolder(Path(config.out)).rows)
 
 
-def changed(config, **changes):
-    return dataclasses.replace(config, **changes)
+def manifest_of(config):
+    return read_json(Path(config.out) / "run.json")
+
+
+def killed(self, *args, **kwargs):
+    raise KeyboardInterrupt
 
 
 def test_rows_hold_every_frame_of_every_task_keyed(config):
     rows = rows_of(config)
     errors = rows[rows["metric"] == "error"]
     assert len(errors) == 2 * (3 + 2)  # subjects x (novel-view + self-reenactment frames)
-    row = errors[
-        (errors["subject"] == "subject2") & (errors["task"] == "novel_view") & (errors["timestep"] == 2)
-    ]
+    row = errors.query("subject == 'subject2' and task == 'novel_view' and timestep == 2")
     # rendered level round(0.5 * 255) = 128 against 40 + 20 + 1
     assert row["value"].tolist() == [128 - 61]
     assert row["protocol"].nunique() == 1
@@ -67,7 +74,7 @@ def test_rows_hold_every_frame_of_every_task_keyed(config):
 
 def test_the_manifest_names_everything_that_made_the_numbers(config):
     runner.run(config)
-    record = read_json(RunFolder(runner.Path(config.out)).manifest)
+    record = manifest_of(config)
     assert record["status"] == "done"
     assert record["methods"][0]["config"] == {"level": 0.5, "fail": False}
     assert record["methods"][0]["budget"] == {"iterations": 2, "seconds": None}
@@ -85,11 +92,7 @@ def test_a_second_run_trains_nothing_again_and_gives_the_same_rows(config, toy):
 
 
 def test_a_run_killed_in_training_continues(config, toy, monkeypatch):
-    whole = rows_of(changed(config, out=config.out + "-whole"))
-
-    def killed(self, *args, **kwargs):
-        raise KeyboardInterrupt
-
+    whole = rows_of(config, out=config.out + "-whole")
     with monkeypatch.context() as patch:
         patch.setattr(toy.ToyAvatar, "render", killed)
         with pytest.raises(KeyboardInterrupt):
@@ -99,31 +102,26 @@ def test_a_run_killed_in_training_continues(config, toy, monkeypatch):
     assert toy.FITS == ["subject2"]  # the first had been trained
 
 
-def test_the_record_of_training_says_how_often_it_was_interrupted(config, toy, monkeypatch):
-    def killed(self, *args, **kwargs):
-        raise KeyboardInterrupt
-
+def test_the_record_of_training_says_how_often_it_was_interrupted(config, toy, monkeypatch, cell):
     with monkeypatch.context() as patch:
         patch.setattr(toy.ToyMethod, "fit", killed)
         for _ in range(2):
             with pytest.raises(KeyboardInterrupt):
                 runner.run(config)
     runner.run(config)
-    folder = RunFolder(runner.Path(config.out))
-    assert folder.cell("subject1", "toy", 0).step("fit")["interruptions"] == 2
-    assert folder.cell("subject2", "toy", 0).step("fit")["interruptions"] == 0
+    assert cell.step("fit")["interruptions"] == 2
+    assert RunFolder(Path(config.out)).cell("subject2", "toy", 0).step("fit")["interruptions"] == 0
 
 
 def test_a_method_that_looks_at_held_out_frames_fails(config):
-    rows = rows_of(changed(config, methods=("toy_plugin:PEEKING",)))
+    rows = rows_of(config, methods=("toy_plugin:PEEKING",))
     assert set(rows["status"]) == {"failed"}
     assert rows["reason"].str.contains("not a training frame").all()
 
 
 def test_an_adapter_is_given_the_whole_capture(config, toy, monkeypatch):
-    monkeypatch.setattr(toy, "PEEKING", dataclasses.replace(toy.PEEKING, native=False))
-    rows = rows_of(changed(config, methods=("toy_plugin:PEEKING",)))
-    assert set(rows["status"]) == {"ok"}
+    monkeypatch.setattr(toy, "PEEKING", replace(toy.PEEKING, native=False))
+    assert set(rows_of(config, methods=("toy_plugin:PEEKING",))["status"]) == {"ok"}
 
 
 @pytest.mark.parametrize(
@@ -135,51 +133,44 @@ def test_an_adapter_is_given_the_whole_capture(config, toy, monkeypatch):
         ({"implementation": "toy_plugin:NoSuchClass"}, False),
     ],
 )
-def test_what_a_method_needs_is_looked_for_before_training(config, toy, monkeypatch, needs, fits):
+def test_needs_are_checked_before_training(config, toy, monkeypatch, refuses, needs, fits):
     monkeypatch.setattr(toy.ToyClip, "head", types.SimpleNamespace(version="toy"))
-    monkeypatch.setattr(toy, "SAME_NAME", dataclasses.replace(toy.METHOD, name="needy", **needs))
-    both = changed(config, methods=("toy_plugin:METHOD", "toy_plugin:SAME_NAME"))
+    monkeypatch.setattr(toy, "SAME_NAME", replace(toy.METHOD, name="needy", **needs))
+    both = ("toy_plugin:METHOD", "toy_plugin:SAME_NAME")
     if fits:
-        assert set(rows_of(both)["status"]) == {"ok"}
-        return
-    with pytest.raises(HeadbenchError):
-        runner.run(both)
-    assert toy.FITS == []
+        assert set(rows_of(config, methods=both)["status"]) == {"ok"}
+    else:
+        refuses(config, "", HeadbenchError, methods=both)
 
 
-def test_several_views_after_adaptation_to_a_monocular_method_are_refused(config, toy, monkeypatch):
+def test_several_views_for_a_monocular_method_are_refused(config, toy, monkeypatch, refuses):
     class TwoViews(toy.ToyClip):
         def __init__(self, path):
             super().__init__(path)
             self.splits["train"] += tuple(key._replace(camera="c") for key in self.splits["train"])
 
     monkeypatch.setattr(toy, "read", lambda path: TwoViews(path))
-    monkeypatch.setattr(toy, "METHOD", dataclasses.replace(toy.METHOD, monocular=True))
+    monkeypatch.setattr(toy, "METHOD", replace(toy.METHOD, monocular=True))
     unchanged = lambda clip, needs, heads: lambda folder, progress: adaptation.AdaptedClip(clip)
     monkeypatch.setattr(adaptation, "adapter", lambda: unchanged)
-    with pytest.raises(InputError, match="3 further views"):
-        runner.run(config)
-    assert toy.FITS == []
+    refuses(config, "3 further views")
 
 
-def test_another_setting_in_the_same_folder_is_refused_before_work(config, toy):
+def test_other_settings_in_the_same_folder_are_refused(config, refuses):
     runner.run(config)
-    toy.FITS.clear()
-    with pytest.raises(InputError, match="Choose another --out"):
-        runner.run(changed(config, settings={"toy": {"level": 0.75}}))
-    assert toy.FITS == []
+    refuses(config, "Choose another --out", settings={"toy": {"level": 0.75}})
 
 
 def test_measuring_something_else_trains_nothing_again(config, toy):
     runner.run(config)
     toy.FITS.clear()
-    rows = rows_of(changed(config, metrics=("toy_plugin:ERROR",), tasks=("novel_view",)))
+    rows = rows_of(config, metrics=("toy_plugin:ERROR",), tasks=("novel_view",))
     assert set(rows["task"]) == {"novel_view"}
     assert toy.FITS == []
 
 
 def test_a_failing_method_is_recorded_and_the_others_go_on(config):
-    rows = rows_of(changed(config, methods=("toy_plugin:FAILING", "toy_plugin:METHOD")))
+    rows = rows_of(config, methods=("toy_plugin:FAILING", "toy_plugin:METHOD"))
     failed = rows[rows["method"] == "failing"]
     assert set(failed["status"]) == {"failed"}
     assert failed["reason"].str.contains("the training diverged").all()
@@ -187,11 +178,8 @@ def test_a_failing_method_is_recorded_and_the_others_go_on(config):
     assert (rows[rows["method"] == "toy"]["status"] == "ok").all()
 
 
-def test_a_metric_that_cannot_be_had_is_missing_with_reason_and_said_before_training(config, toy, caplog):
-    import logging
-
-    logging.getLogger("headbench").propagate = True
-    rows = rows_of(changed(config, metrics=("toy_plugin:NOT_HERE", "toy_plugin:ERROR")))
+def test_a_missing_metric_has_its_reason_and_is_warned_of_first(config, caplog):
+    rows = rows_of(config, metrics=("toy_plugin:NOT_HERE", "toy_plugin:ERROR"))
     missing = rows[rows["metric"] == "not_here"]
     assert set(missing["status"]) == {"missing"}
     assert missing["reason"].str.contains("Put them there").all()
@@ -199,11 +187,11 @@ def test_a_metric_that_cannot_be_had_is_missing_with_reason_and_said_before_trai
     assert "Absent will be missing" in caplog.records[0].getMessage()
 
 
-def test_what_was_missing_is_measured_once_it_is_there_and_nothing_else_again(config, toy, monkeypatch):
+def test_what_was_missing_is_measured_once_it_is_there(config, toy, monkeypatch):
     counted = []
     original = toy.mean_error
     monkeypatch.setattr(toy, "mean_error", lambda *pair: counted.append(1) or original(*pair))
-    both = changed(config, metrics=("toy_plugin:NOT_HERE", "toy_plugin:ERROR"))
+    both = replace(config, metrics=("toy_plugin:NOT_HERE", "toy_plugin:ERROR"))
     runner.run(both)
     counted.clear()
     monkeypatch.setattr(toy, "not_here", lambda image, truth: 1.0)
@@ -217,33 +205,29 @@ def test_metrics_of_one_measurement_are_taken_together_and_once(config, toy, mon
     original = toy.files_in_avatar
     monkeypatch.setattr(toy, "files_in_avatar", lambda *arguments: counted.append(1) or original(*arguments))
     group = ("toy_plugin:FILES_NONE", "toy_plugin:FILES", "toy_plugin:FILES_LOAD")
-    rows = rows_of(changed(config, metrics=group)).set_index(["subject", "metric"])
+    rows = rows_of(config, metrics=group).set_index(["subject", "metric"])
     assert len(counted) == 2  # subjects
     assert rows.loc[("subject1", "files"), "value"] == 1.0
     assert rows.loc[("subject1", "files_load"), "value"] == 4.0  # frames of the workload
     assert rows.loc[("subject1", "files_none"), "status"] == "missing"
-    again = rows_of(changed(config, metrics=group)).set_index(["subject", "metric"])
-    assert again.equals(rows)
+    assert rows_of(config, metrics=group).set_index(["subject", "metric"]).equals(rows)
     assert len(counted) == 2
-    runner.run(changed(config, out=config.out + "-less", metrics=group[1:2]))
+    runner.run(replace(config, out=config.out + "-less", metrics=group[1:2]))
     assert len(counted) == 4
-    runner.run(changed(config, out=config.out + "-less", metrics=group))
-    assert len(counted) == 6  # another number of it: all of it anew
+    runner.run(replace(config, out=config.out + "-less", metrics=group))
+    assert len(counted) == 6  # another number of it: all of it again
 
 
-def test_a_metric_of_training_sees_the_record_of_the_fit(config):
-    rows = rows_of(changed(config, metrics=("toy_plugin:STEPS",)))
-    assert rows["value"].tolist() == [2.0, 2.0]
-    folder = RunFolder(runner.Path(config.out))
-    measured = folder.cell("subject1", "toy", 0).step("measure")["details"]["steps"]
-    assert measured["peak"] >= folder.cell("subject1", "toy", 0).step("fit")["memory_before_bytes"] > 0
+def test_a_metric_of_training_sees_the_record_of_the_fit(config, cell):
+    assert rows_of(config, metrics=("toy_plugin:STEPS",))["value"].tolist() == [2.0, 2.0]
+    measured = cell.step("measure")["details"]["steps"]
+    assert measured["peak"] >= cell.step("fit")["memory_before_bytes"] > 0
 
 
 def test_a_preset_and_settings_reach_the_method(config):
-    runner.run(changed(config, preset="fast", settings={"toy": {"budget": {"iterations": 3}}}))
-    record = read_json(RunFolder(runner.Path(config.out)).manifest)
-    assert record["methods"][0]["config"]["level"] == 0.25
-    assert record["methods"][0]["budget"]["iterations"] == 3
+    runner.run(replace(config, preset="fast", settings={"toy": {"budget": {"iterations": 3}}}))
+    (method,) = manifest_of(config)["methods"]
+    assert (method["config"]["level"], method["budget"]["iterations"]) == (0.25, 3)
 
 
 @pytest.mark.parametrize(
@@ -259,12 +243,13 @@ def test_a_preset_and_settings_reach_the_method(config):
         ({"data": "nowhere"}, "no such folder"),
         ({"reader_settings": {"shfit": 1}}, "shfit"),
         ({"methods": ("ors",)}, "Did you mean 'ours'"),
+        ({"out": f"{__file__}/out"}, "can be written"),
+        ({"device": "cuda:0"}, "cuda"),
     ],
 )
-def test_bad_settings_are_refused_before_training(config, toy, changes, match):
-    with pytest.raises(InputError, match=match):
-        runner.run(changed(config, **changes))
-    assert toy.FITS == []
+def test_bad_settings_are_refused_before_training(config, refuses, monkeypatch, changes, match):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    refuses(config, match, **changes)
 
 
 @pytest.mark.parametrize(
@@ -276,12 +261,10 @@ def test_bad_settings_are_refused_before_training(config, toy, changes, match):
         ({"region_names": ("a/b",)}, "region: expected a name"),
     ],
 )
-def test_what_results_could_not_be_read_with_is_refused_before_training(
-    config, toy, monkeypatch, part, match
-):
+def test_what_no_results_can_be_read_with_is_refused(config, toy, monkeypatch, refuses, part, match):
     key = next(iter(part))
     if hasattr(toy.ERROR, key):
-        monkeypatch.setattr(toy, "ERROR", dataclasses.replace(toy.ERROR, **part))
+        monkeypatch.setattr(toy, "ERROR", replace(toy.ERROR, **part))
     else:
 
         def read(path):
@@ -291,32 +274,14 @@ def test_what_results_could_not_be_read_with_is_refused_before_training(
             return clip
 
         monkeypatch.setattr(toy, "read", read)
-    with pytest.raises(InputError, match=match):
-        runner.run(changed(config, metrics=("toy_plugin:ERROR",), regions=part.get("region_names")))
-    assert toy.FITS == []
+    refuses(config, match, metrics=("toy_plugin:ERROR",), regions=part.get("region_names"))
 
 
-def test_an_unwritable_output_is_refused_before_training(config, toy, tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="can be written"):
-        runner.run(changed(config, out=str(tmp_path / "file" / "out")))
-    assert toy.FITS == []
-
-
-def test_a_device_that_is_not_there_is_refused_once_before_training(config, toy, monkeypatch):
-    torch = pytest.importorskip("torch")
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with pytest.raises(InputError, match="cuda"):
-        runner.run(changed(config, device="cuda:0"))
-    assert toy.FITS == []
-
-
-def test_two_runs_in_one_folder_are_refused_before_training(config, toy):
-    with locked(runner.Path(config.out)), pytest.raises(InputError, match="no other process works in"):
-        runner.run(config)
-    assert toy.FITS == []
+def test_two_runs_in_one_folder_are_refused_before_training(config, refuses):
+    with locked(Path(config.out)):
+        refuses(config, "no other process works in")
     runner.run(config)
-    assert not (runner.Path(config.out) / "run.lock").exists()
+    assert not (Path(config.out) / "run.lock").exists()
 
 
 def test_settings_that_contradict_themselves_are_refused():
@@ -335,9 +300,7 @@ def test_a_damaged_manifest_is_refused(tmp_path):
         folder.read_manifest()
 
 
-def test_every_registered_report_is_written_and_a_failing_one_stops_no_other(
-    monkeypatch, toy, tmp_path, caplog
-):
+def test_a_report_that_fails_stops_no_other(monkeypatch, toy, tmp_path, caplog):
     caplog.set_level("WARNING", logger="headbench")
     plugins = [
         Plugin("broken", "other 1", None, "ImportError: no"),
@@ -354,23 +317,21 @@ def test_every_registered_report_is_written_and_a_failing_one_stops_no_other(
     assert "'failing' of other 1 failed" in messages[1]
 
 
+CELL = ("avatar", "avatar/level.txt", "fit.json", "renders", "renders/novel_view", "rows.parquet")
 LINKED = (
-    *("run.json", "rows.parquet", "contact_sheet.png", "tables", "subject1"),
-    *(f"subject1/toy{below}" for below in ("", "/seed-0", "/seed-0/avatar", "/seed-0/avatar/level.txt")),
-    *(
-        f"subject1/toy/seed-0/{name}"
-        for name in ("fit.json", "renders", "renders/novel_view", "rows.parquet")
-    ),
+    *("run.json", "rows.parquet", "contact_sheet.png", "tables", "subject1", "subject1/toy"),
+    *("subject1/toy/seed-0", *(f"subject1/toy/seed-0/{name}" for name in CELL)),
 )
 
 
 @pytest.mark.parametrize("place", LINKED)
-def test_a_received_run_is_not_written_through_its_links(toy, capture, tmp_path, place, capsys):
-    run = RunFolder(tmp_path / "out")
-    words = ["run", "--data", str(capture), "--out", str(run.root), "--methods", "toy_plugin:METHOD"]
+def test_a_received_run_is_not_written_through_its_links(config, monkeypatch, tmp_path, place, capsys):
+    monkeypatch.undo()
+    monkeypatch.syspath_prepend(Path(__file__).parents[1])
+    words = ["run", "--data", config.data, "--out", config.out, "--methods", "toy_plugin:METHOD"]
     words += ["--set", "reader=toy_plugin:READER", "--set", "metrics=psnr"]
     outside = tmp_path / "outside"
-    link = run.root / place
+    link = Path(config.out) / place
     link.parent.mkdir(parents=True)
     if link.suffix:
         outside.write_text("victim")

@@ -1,0 +1,310 @@
+"""The commands that every other package's work is composed by: demo, synth, run, table, list, bench, stress."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from .configuration import build, merge, parse_assignments
+from .contracts import Progress
+from .errors import InputError
+from .io.documents import read_yaml
+from .io.files import check_writable, prepare_folder, write_json
+from .io.lock import locked
+from .machine import check_device
+from .progress import log_to_file
+from .progress import progress as show_progress
+from .registry import Group, discover, get, resolve
+from .runner.config import (
+    DemoConfig,
+    RunConfig,
+    demo_run_config,
+    parse_size,
+    resolve_methods,
+    resolve_metrics,
+)
+from .specs import Findings
+
+Preset = Literal["smoke", "demo", "fast", "paper"]
+Assignments = Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="KEY=VALUE")]
+
+
+@dataclass(frozen=True)
+class DemoSettings:
+    """Needs no data, no accelerator and no network. Everything lands in OUT: the capture, the avatars, the renders,
+    tables (Markdown, CSV, LaTeX) and contact_sheet.png. Started again after a kill it continues.
+    """
+
+    out: str = "demo-output"
+    """Folder for everything the demo makes."""
+    preset: Preset = "demo"
+    """How much effort: smoke takes seconds and proves nothing about quality; demo takes minutes."""
+    seed: int = 0
+    """Seeds the training."""
+    set: Assignments = ()
+    """Change a setting of the run, as for `headbench run`; repeatable. `capture.size=96x136`, `capture.subject_seed=3`
+    and the like change the capture."""
+
+
+def demo(settings: DemoSettings, progress: Progress) -> Findings:
+    """Compare methods from nothing: make a capture, train, render, measure, print the table."""
+    values = parse_assignments(settings.set)
+    capture = {"preset": settings.preset, "seed": settings.seed, "out": settings.out}
+    given = merge({"capture": capture}, {"capture": values.pop("capture", {})})
+    config = build(DemoConfig, given["capture"], "--set", "capture.")
+    comparison = build(RunConfig, merge(demo_run_config(config), values), "--set")
+    # Errors before the capture is made, which takes minutes.
+    resolve_methods(comparison)
+    resolve_metrics(comparison)
+    check_device(comparison.device)
+    out = Path(settings.out)
+    prepare_folder(out)
+    with _log_file(out):
+        start = time.perf_counter()
+        with locked(out):
+            _synthesise(config.capture_arguments())
+        return _run(comparison, capture_seconds=round(time.perf_counter() - start, 3))
+
+
+@dataclass(frozen=True)
+class SynthSettings:
+    """Path-traced heads with expression-dependent wrinkles and blush, on NeRSemble's camera rig, with sequences
+    named as there. Frames already rendered with the same settings are kept.
+    """
+
+    out: str
+    """Folder to write."""
+    subjects: int = 1
+    """How many heads; each differs in shape, skin, hair."""
+    cameras: int = 16
+    """2 to 16 views; the frontal one is always there and is held out as the novel view."""
+    timesteps: int = 60
+    """Frames per camera, shared out over the sequences; FREE is held out for self-reenactment."""
+    size: str = "275x401"
+    """Width x height of the images in pixels, for example 550x802 (NeRSemble at a quarter)."""
+    head: str = "procedural"
+    """`procedural`, or the path of a head model (ICT-FaceKit npz)."""
+    seed: int = 0
+    """Decides subjects and performances."""
+    tracking_noise: float = 0.0
+    """Noise on the tracked parameters, as a fraction of their standard deviation."""
+    performance: Literal["full", "expressions", "still"] = "full"
+    """`expressions` leaves out jaw and tongue, `still` moves only head, neck and eyes."""
+    dynamics: float = 1.0
+    """Scales what expressions do to skin beyond moving it (wrinkles, blush), 0 to 3."""
+
+
+def synth(settings: SynthSettings, progress: Progress) -> Findings:
+    """Render a synthetic multi-view capture in the GaussianAvatars/VHAP layout."""
+    out = Path(settings.out)
+    prepare_folder(out)
+    with locked(out, beside=True):  # a capture is made in an empty folder
+        _synthesise({**asdict(settings), "out": out, "size": parse_size(settings.size)})
+    return Findings(settings.out, {"out": out})
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """Settings come from --config, then from the options here, then from --set. A run that was killed continues
+    when started again. Exit code 0: all done; 1: some method failed (the table shows which and why); 2: bad input,
+    found before any training.
+    """
+
+    data: str | None = None
+    """Capture, such as one in the GaussianAvatars/VHAP layout: a UNION folder, a sequence folder, or a folder of them."""
+    out: str | None = None
+    """Folder for everything the run makes."""
+    methods: str | None = None
+    """Names, separated by commas; see `headbench list methods`. Default: all that compare fairly here:
+    mean-image,nearest-camera,ga,ours."""
+    preset: Preset | None = None
+    """How much training: smoke (seconds), demo (minutes), fast, paper (the published schedule)."""
+    config: str | None = None
+    """YAML file with any settings of a run."""
+    head: str | None = None
+    """Head model for captures that bring none: FLAME pickle or npz."""
+    seeds: str | None = None
+    """Seeds of the training, separated by commas: an avatar is trained for each. Default: 0."""
+    set: Assignments = ()
+    """Any setting, for example `frames_per_task=50`, `settings.ga.budget.iterations=5000`; repeatable."""
+
+
+def run(settings: RunSettings, progress: Progress) -> Findings:
+    """Train methods on a capture, render, measure, and write tables and pictures."""
+    values: dict[str, Any] = read_yaml(Path(settings.config)) if settings.config else {}
+    given = {name: getattr(settings, name) for name in ("data", "out", "methods", "preset", "seeds")}
+    values = merge(values, {key: value for key, value in given.items() if value is not None})
+    if settings.head is not None:
+        values = merge(values, {"reader_settings": {"head": settings.head}})
+    source = settings.config or "command line"
+    for key in ("data", "out"):
+        if key not in values:
+            raise InputError(source, key, f"--{key} or the key {key} in --config", "neither")
+    values = merge(values, parse_assignments(settings.set))
+    if "reader" not in values and isinstance(values["data"], str):
+        from .runner.captures import reader_of  # which takes long to import
+
+        values["reader"] = reader_of(values["data"])
+    config = build(RunConfig, values, source)
+    with _log_file(Path(config.out)):
+        return _run(config)
+
+
+@dataclass(frozen=True)
+class TableSettings:
+    """Several runs make one table: other seeds of the same settings join, other settings are rows of their own."""
+
+    runs: tyro.conf.Positional[tuple[str, ...]]
+    """Folders of the runs."""
+    format: Literal["md", "csv", "latex", "html", "json"] = "md"
+    """Markdown, CSV, LaTeX (booktabs), a page of HTML, or JSON."""
+    layout: str = "comparison"
+    """Which table: comparison, speed (latency, throughput, stages), cost (storage, training), or the paper's: paper-1
+    (all methods), paper-3 (INSTA and ours), paper-4 (what an expression may change: a run each)."""
+    published: bool = False
+    """Add columns with the figures that papers printed, where a layout has some."""
+
+
+def table(settings: TableSettings, progress: Progress) -> Findings:
+    """Print a table of finished runs on the same frames."""
+    text = _table(settings.runs, settings.format, settings.layout, settings.published)
+    return Findings(text, {"format": settings.format, "table": text})
+
+
+@dataclass(frozen=True)
+class ListSettings:
+    """With --json everything that is known of each."""
+
+    what: tyro.conf.Positional[
+        Literal["methods", "presets", "metrics", "profiles", "datasets", "reports", "benchmarks", "commands"]
+    ]
+    """What to list."""
+
+
+def list_installed(settings: ListSettings, progress: Progress) -> Findings:
+    """List what is installed: methods, presets, metrics, their profiles, readers, reports, benchmarks, commands."""
+    group: Group = "methods" if settings.what == "presets" else settings.what
+    entries = []
+    for name, plugin in discover(group).items():
+        known = {} if plugin.spec is None else {k: _reference(v) for k, v in asdict(plugin.spec).items()}
+        entries.append({"origin": plugin.origin, "error": plugin.error, **known, "name": name})
+    if settings.what == "presets":
+        entries = [
+            {
+                "name": f"{entry['name']} {preset}",
+                "summary": ", ".join(f"{key}={value}" for key, value in values.items()),
+                "settings": values,
+                "error": "",
+            }
+            for entry in entries
+            for preset, values in entry.get("presets", {}).items()
+        ]
+    width = max((len(entry["name"]) for entry in entries), default=0)
+    shown = [f"broken: {entry['error']}" if entry["error"] else entry["summary"] for entry in entries]
+    lines = [f"{entry['name']:<{width}}  {text}" for entry, text in zip(entries, shown)]
+    return Findings("\n".join(lines), entries)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StressSettings:
+    """Exit code 1 where a case does not behave as expected."""
+
+    part: tyro.conf.Positional[str]
+    """What to measure: splats, or what `headbench list benchmarks` shows."""
+    quick: bool = False
+    """Less where there is much: fewer sizes, runs, cases."""
+    out: str | None = None
+    """Also write the results to this JSON file."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchSettings(StressSettings):
+    """Times are the least of many runs, beside an anchor timed in the same run, and each table says whether they are
+    processor times or by the clock, and of how many threads; compare ratios, not milliseconds, between machines.
+    """
+
+    tradeoffs: bool = False
+    """Instead of speed alone, what settings that give up accuracy for speed buy."""
+
+
+def bench(settings: BenchSettings, progress: Progress) -> Findings:
+    """Measure the speed of a part of headbench itself on this machine."""
+    return _measure(settings, "tradeoffs" if settings.tradeoffs else "speed", progress)
+
+
+def stress(settings: StressSettings, progress: Progress) -> Findings:
+    """Try a part of headbench at numerical extremes and print each case, what is expected and what came out."""
+    return _measure(settings, "stress", progress)
+
+
+def _synthesise(arguments: dict[str, Any]) -> None:
+    with show_progress("capture") as report:
+        resolve(get("datasets", "synthetic").implementation)(**arguments, progress=report)
+
+
+def _run(config: RunConfig, **record: Any) -> Findings:
+    from .runner.run import run as run_comparison
+
+    rows = run_comparison(config, **record)
+    text = f"{_table([config.out])}\n\nPictures, tables and everything else: {config.out}"
+    return Findings(
+        text, {"out": config.out, "failed": rows.failed, "means": means(config.out)}, not rows.failed
+    )
+
+
+def _table(
+    runs: tuple[str, ...] | list[str], form: str = "md", layout: str = "comparison", published: bool = False
+) -> str:
+    text: str = resolve(get("reports", "table-text").implementation)(
+        list(map(Path, runs)), form, layout, published
+    )
+    return text
+
+
+def means(run_folder: str) -> list[dict[str, Any]]:
+    """Numbers of the comparison table, so that a machine reads what a person does; None where there is none."""
+    table = json.loads(_table([run_folder], "json"))
+    return [
+        {
+            **{name: column[name] for name in ("task", "metric")},
+            "method": row["method"],
+            **{name: cell[name] for name in ("value", "status")},
+        }
+        for _, rows in table["groups"]
+        for row in rows
+        for column, cell in zip(table["columns"], row["cells"])
+    ]
+
+
+def _measure(settings: StressSettings, kind: str, progress: Progress) -> Findings:
+    function = getattr(get("benchmarks", settings.part), kind)
+    if not function:
+        found = f"{settings.part}, which has none"
+        raise InputError("command line", "part", f"a benchmark with {kind}", found)
+    if settings.out is not None:
+        check_writable(Path(settings.out), "--out")
+    findings: Findings = resolve(function)(settings.quick, progress)
+    if settings.out is not None:
+        write_json(Path(settings.out), findings.data)
+    return findings
+
+
+def _log_file(out: Path) -> AbstractContextManager[None]:
+    """Log to a run's file; not where the folder cannot be made, which the run then reports properly."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except (OSError, ValueError):
+        return nullcontext()
+    return log_to_file(out / "run.log") if os.access(out, os.W_OK) else nullcontext()
+
+
+def _reference(value: Any) -> Any:
+    """Functions and classes as "package.module:name"."""
+    return f"{value.__module__}:{value.__qualname__}" if callable(value) else value
