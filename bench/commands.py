@@ -24,31 +24,19 @@ from .specs import CommandSpec
 
 Command = Callable[..., int]
 
-WORDS_OF_OTHERS = {
-    "analyze": "compare",
-    "benchmark": "run",
-    "check": "lint",
-    "eval": "evaluate",
-    "evaluation": "evaluate",
-    "fit": "run",
-    "generate": "synth",
-    "metrics": "evaluate",
-    "preprocess": "prepare nersemble",
-    "process-data": "prepare nersemble",
-    "process": "prepare nersemble",
-    "prune": "sweep",
-    "render": "run",
-    "report": "table",
-    "results": "table",
-    "show": "table",
-    "synthesize": "synth",
-    "test": "evaluate",
-    "train": "run",
-    "validate": "lint",
-    "view": "export ply",
-    "viewer": "export ply",
-    "visualize": "inspect",
+_OF_OTHERS = {
+    "compare": "analyze",
+    "evaluate": "eval evaluation metrics test",
+    "export ply": "view viewer",
+    "inspect": "visualize",
+    "lint": "check validate",
+    "prepare nersemble": "preprocess process-data process",
+    "run": "benchmark fit render train",
+    "sweep": "prune",
+    "synth": "generate synthesize",
+    "table": "report results show",
 }
+WORDS_OF_OTHERS = {word: name for name, words in _OF_OTHERS.items() for word in words.split()}
 """What other toolkits call their commands, and which of ours does it."""
 
 RENAMED_OPTIONS = {

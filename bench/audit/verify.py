@@ -78,9 +78,8 @@ def _verify(settings: VerifySettings, scratch: Path, progress: Progress) -> Find
     config, clips = open_run_clips(folder.root, settings, out=scratch, altered=True, remembered=False)
     rows = folder.read_rows(manifest)
     avatars = any(method.implementation for method in manifest.methods)  # else images that `evaluate` scored
-    methods = (
-        resolve_methods(config) if avatars else [images_method(m.name, m.version) for m in manifest.methods]
-    )
+    images = [images_method(method.name, method.version) for method in manifest.methods]
+    methods = resolve_methods(config) if avatars else images
     metrics = [metric for metric in resolve_metrics(config) if metric.per_frame or avatars]
     protocols = make_protocols(config.tasks, clips, config.frames_per_task)
     report = _Report([*_clips(folder, manifest, clips), *_protocols(folder, manifest, protocols)])
@@ -95,17 +94,10 @@ def _verify(settings: VerifySettings, scratch: Path, progress: Progress) -> Find
         lines.append(f"  and {len(report.mismatches) - SHOWN} more")
     verdict = f"{len(report.mismatches)} mismatches" if report.mismatches else "as recorded"
     looked = f"{report.files} files and {report.values} values recomputed"
-    left = f"; {report.unverified} values bound to a machine or absent are not recomputed" * bool(
-        report.unverified
-    )
-    data = {
-        "mismatches": [asdict(mismatch) for mismatch in report.mismatches],
-        "files": report.files,
-        "values": report.values,
-        "unverified": report.unverified,
-    }
+    left = f"; {report.unverified} values bound to a machine or absent are not recomputed"
+    left = left if report.unverified else ""
     text = "\n".join([f"{folder.root}: {verdict}: {looked}{left}.", *lines])
-    return Findings(text, data, not report.mismatches)
+    return Findings(text, asdict(report), not report.mismatches)
 
 
 def _clips(folder: RunFolder, manifest: Manifest, clips: Sequence[Clip]) -> Iterator[Mismatch]:

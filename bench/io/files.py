@@ -173,9 +173,8 @@ def _flush_file(write: _Write) -> None:
 def _flush_folder(folder: Path) -> None:
     try:
         _flush(folder)
-    except (
-        OSError
-    ) as error:  # a file system that flushes no folders, one that may not be listed, one removed since
+    except OSError as error:
+        # A file system that flushes no folders, a folder that may not be listed, one removed since.
         if error.errno not in (errno.EINVAL, errno.ENOTSUP, errno.EACCES, errno.ENOENT):
             error.filename = str(folder)
             raise
@@ -322,26 +321,31 @@ def check_writable(path: Path, option: str) -> None:
 
     Raises `InputError`, naming the ``option`` that asked for the file.
     """
-    try:
+    with _writable(path, option, "a file"):
         _check_target(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=path.parent):
-            pass
-    except (OSError, ValueError) as error:  # ValueError: a name that no file can have
-        found = getattr(error, "strerror", None) or str(error)
-        raise InputError(path, option, "a file that can be written", found) from error
+        _try_to_write(path.parent)
 
 
 def prepare_folder(folder: Path) -> None:
     """Make the folder of ``--out`` and prove that it can be written, before any work. Raises `InputError`."""
+    with _writable(folder, "--out", "a folder"):
+        _try_to_write(folder)
+
+
+@contextmanager
+def _writable(path: Path, option: str, what: str) -> Iterator[None]:
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        # Such a file has no name where the system can do without.
-        with tempfile.TemporaryFile(dir=folder, prefix=TEMPORARY):
-            pass
+        yield
     except (OSError, ValueError) as error:  # ValueError: a name that no file can have
         found = getattr(error, "strerror", None) or str(error)
-        raise InputError(folder, "--out", "a folder that can be written", found) from error
+        raise InputError(path, option, f"{what} that can be written", found) from error
+
+
+def _try_to_write(folder: Path) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    # Such a file has no name where the system can do without.
+    with tempfile.TemporaryFile(dir=folder, prefix=TEMPORARY):
+        pass
 
 
 def _check_target(path: Path) -> None:

@@ -7,7 +7,7 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 from ..contracts import ByteArray, Clip, FrameKey, Progress, RegionalClip, no_progress
@@ -93,7 +93,7 @@ def score_frames(
     total, done = (bool(at_once) + len(rest)) * len(keys), 0
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         if at_once:
-            scorer = _FrameScorer(frames, [(spec, metrics[spec.name]) for spec in at_once], tuple(regions))
+            scorer = partial(_score_frame, frames, [(spec, metrics[spec.name]) for spec in at_once], regions)
             scored.update({spec.name: [] for spec in at_once})
             for scores in pool.map(scorer, keys):
                 for score in scores:
@@ -115,30 +115,25 @@ def score_frames(
     return scored
 
 
-@dataclass(frozen=True)
-class _FrameScorer:
+def _score_frame(
+    frames: Frames, metrics: Sequence[tuple[MetricSpec, Any]], regions: Sequence[str], key: FrameKey
+) -> list[Score]:
     """All metrics that look at one frame at a time, so that it is decoded once."""
-
-    frames: Frames
-    metrics: Sequence[tuple[MetricSpec, Any]]
-    regions: tuple[str, ...]
-
-    def __call__(self, key: FrameKey) -> list[Score]:
-        image, truth = self.frames.render(key), self.frames.clip.image(key)
-        masks: Mapping[str, Any] = {}
-        if self.regions and any(spec.kind == "regional" for spec, _ in self.metrics):
-            assert isinstance(self.frames.clip, RegionalClip)
-            masks = self.frames.clip.region_masks(key, self.regions)
-        scores = []
-        for spec, metric in self.metrics:
-            try:
-                scores.append(Score(spec.name, key, FULL, float(metric(image, truth))))
-                if spec.kind == "regional" and masks:
-                    values = metric.in_regions(image, truth, masks)
-                    scores += [Score(spec.name, key, name, float(value)) for name, value in values.items()]
-            except UnavailableError as error:
-                scores.append(_missing(spec, key, str(error)))
-        return scores
+    image, truth = frames.render(key), frames.clip.image(key)
+    masks: Mapping[str, Any] = {}
+    if regions and any(spec.kind == "regional" for spec, _ in metrics):
+        assert isinstance(frames.clip, RegionalClip)
+        masks = frames.clip.region_masks(key, regions)
+    scores = []
+    for spec, metric in metrics:
+        try:
+            scores.append(Score(spec.name, key, FULL, float(metric(image, truth))))
+            if spec.kind == "regional" and masks:
+                values = metric.in_regions(image, truth, masks)
+                scores += [Score(spec.name, key, name, float(value)) for name, value in values.items()]
+        except UnavailableError as error:
+            scores.append(_missing(spec, key, str(error)))
+    return scores
 
 
 def _batched(

@@ -132,13 +132,13 @@ class Cell:
         state = self.step(name)
         return state is not None and state.get("fingerprint") == fingerprint and state.get("status") == "done"
 
-    def begin(self, name: str, fingerprint: str, **record: Any) -> None:
+    def begin(self, name: str, fingerprint: str, *, status: str = "started", **record: Any) -> None:
         """Record that the step works on these inputs."""
-        write_json(self.folder / f"{name}.json", {"fingerprint": fingerprint, "status": "started", **record})
+        write_json(self.folder / f"{name}.json", {"fingerprint": fingerprint, "status": status, **record})
 
     def finish(self, name: str, fingerprint: str, **record: Any) -> None:
         """Record that the step ended, with what it measured."""
-        write_json(self.folder / f"{name}.json", {"fingerprint": fingerprint, "status": "done", **record})
+        self.begin(name, fingerprint, status="done", **record)
 
 
 def _damage(path: Path, known: str) -> str:

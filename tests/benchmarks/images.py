@@ -100,10 +100,8 @@ def lpips_ways_or_reason(pairs: Pairs) -> tuple[Ways, str]:
         ways = lpips_ways(pairs)
     except UnavailableError as error:
         return {}, str(error)
-    return (
-        ways,
-        "" if "lpips" in ways else "The package lpips is not installed: pip install headbench[peers].",
-    )
+    missing = "The package lpips is not installed: pip install headbench[peers]."
+    return ways, "" if "lpips" in ways else missing
 
 
 def noisy_pairs(count: int, height: int, width: int) -> Pairs:

@@ -180,12 +180,7 @@ def _prepare_and_report(root: Path, out: Path) -> int:
 
 
 def _findings(size: _Size, rows: dict[str, list[_Timed]], peaks: dict[int, int]) -> Findings:
-    best = {
-        name: _Timed(
-            min(run.seconds for run in runs), min(run.processor_seconds for run in runs), runs[0].images
-        )
-        for name, runs in rows.items()
-    }
+    best = {name: _Timed(*(min(column) for column in zip(*runs))) for name, runs in rows.items()}
     plain = next(iter(best.values()))
     lines = [
         f"{size.cameras} videos of {size.width}x{size.height}, {size.frames} frames, {video_codec()}; "
@@ -194,10 +189,8 @@ def _findings(size: _Size, rows: dict[str, list[_Timed]], peaks: dict[int, int])
     ]
     data: dict[str, Any] = {"codec": video_codec(), "cores": processor_count(), "rows": {}, "peaks": peaks}
     for name, timed in best.items():
-        rate, ratio = (
-            timed.images / timed.seconds,
-            plain.seconds / plain.images * timed.images / timed.seconds,
-        )
+        rate = timed.images / timed.seconds
+        ratio = plain.seconds / plain.images * rate
         cost = 1000 * timed.processor_seconds / timed.images
         lines.append(f"{name:62} {rate:8.1f} {ratio:16.2f}x {cost:19.1f}")
         data["rows"][name] = {"images_per_s": rate, "ratio": ratio, "processor_ms": cost}

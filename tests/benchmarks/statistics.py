@@ -43,26 +43,19 @@ class Population:
     def draw(self, generator: np.random.Generator) -> tuple[SubjectPairs, ...]:
         """Draw subjects; the second method's values are its seeds' deviations alone."""
         shape = (self.subjects, self.sequences, self.timesteps)
-        levels = (
-            generator.standard_exponential(shape[:1]) - 1
-            if self.skewed
-            else generator.standard_normal(shape[:1])
-        )
+        draw = generator.standard_exponential if self.skewed else generator.standard_normal
+        levels = draw(shape[:1]) - (1 if self.skewed else 0)
         values = self.frame_sd * self._series(shape, generator)
         values += self.mean + self.subject_sd * levels[:, None, None]
         values += self.sequence_sd * generator.standard_normal(shape[:2])[:, :, None]
         first, second = self.seed_sd * generator.standard_normal((2, self.subjects, self.seeds))
         cameras = np.ones(self.timesteps)
-        return tuple(
-            SubjectPairs(
-                f"{index}",
-                tuple(
-                    SequencePairs(frames + first[index][:, None], cameras * second[index][:, None], cameras)
-                    for frames in values[index]
-                ),
-            )
-            for index in range(self.subjects)
-        )
+
+        def pairs(index: int) -> tuple[SequencePairs, ...]:
+            one, other = first[index][:, None], cameras * second[index][:, None]
+            return tuple(SequencePairs(frames + one, other, cameras) for frames in values[index])
+
+        return tuple(SubjectPairs(f"{index}", pairs(index)) for index in range(self.subjects))
 
     def _series(self, shape: tuple[int, ...], generator: np.random.Generator) -> FloatArray:
         """Return autoregressive series of unit variance along the last axis."""
@@ -148,14 +141,9 @@ def calibrate(case: str, population: Population, trials: int, seed: int = 0) -> 
 
 def frame_t_test_p(subjects: tuple[SubjectPairs, ...]) -> float:
     """P-value of a paired t-test that takes frames for independent: here only to show what it does."""
-    frames = np.concatenate(
-        [
-            (sequence.first.mean(axis=0) - sequence.second.mean(axis=0)) / sequence.cameras
-            for subject in subjects
-            for sequence in subject.sequences
-        ]
-    )
-    return float(stats.ttest_1samp(frames, 0.0).pvalue)
+    sequences = [sequence for subject in subjects for sequence in subject.sequences]
+    frames = [(each.first.mean(axis=0) - each.second.mean(axis=0)) / each.cameras for each in sequences]
+    return float(stats.ttest_1samp(np.concatenate(frames), 0.0).pvalue)
 
 
 def best_set_errors(

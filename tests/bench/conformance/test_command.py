@@ -33,22 +33,24 @@ def test_plugins_written_outside_import_the_root_alone(outside):
         assert {name for name in names if name.startswith("headbench")} <= {"headbench"}
 
 
-def test_breaches_are_listed_and_the_exit_code_is_one(outside, npz_capture, capsys, monkeypatch):
-    import grey
+@pytest.fixture
+def grey(npz_capture):
+    """The words that check the README's method."""
+    return ["check-plugin", "grey:SPEC", "--reader", "outside_reader:SPEC", "--data", str(npz_capture)]
 
-    monkeypatch.setattr(grey.GreyAvatar, "files", lambda self: [])
-    given = ["check-plugin", "grey:SPEC", "--reader", "outside_reader:SPEC", "--data", str(npz_capture)]
-    assert cli.main(given) == 1
+
+def test_breaches_are_listed_and_the_exit_code_is_one(outside, grey, capsys, monkeypatch):
+    monkeypatch.setattr("grey.GreyAvatar.files", lambda self: [])
+    assert cli.main(grey) == 1
     assert "1 breach of the contract of a method\n- files() names no file" in capsys.readouterr().out
-    assert cli.main([*given, "--json"]) == 1
+    assert cli.main([*grey, "--json"]) == 1
     assert json.loads(capsys.readouterr().out)["breaches"] == ["files() names no file"]
 
 
-def test_what_a_plugin_raises_is_a_breach_with_its_line(outside, npz_capture, capsys):
-    given = ["check-plugin", "grey:SPEC", "--reader", "outside_reader:SPEC", "--data", str(npz_capture)]
+def test_what_a_plugin_raises_is_a_breach_with_its_line(outside, grey, capsys):
     (outside / "grey.py").write_text((outside / "grey.py").read_text().replace("progress(1, 1)", "1 / 0"))
-    assert cli.main([*given, "--set", "level=high"]) == 2  # not of its type
-    assert cli.main(given) == 1
+    assert cli.main([*grey, "--set", "level=high"]) == 2  # not of its type
+    assert cli.main(grey) == 1
     assert "ZeroDivisionError: division by zero (grey.py, line" in capsys.readouterr().out
 
 

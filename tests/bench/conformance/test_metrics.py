@@ -88,18 +88,12 @@ def test_a_fault_of_a_metric_is_found(metrics, monkeypatch, fault):
 
 REGIONS = {
     "empty masks": (lambda values: {**values, "nothing": 0.0}, "in_regions names"),
-    "a diluted error": (
-        lambda values: {name: value / 9 for name, value in values.items()},
-        "far from the value",
-    ),
+    "a diluted error": (lambda values: {n: value / 9 for n, value in values.items()}, "far from the value"),
     "the frame's value": (
         lambda values: dict.fromkeys(values, values["everything"]),
         "a fault inside a region",
     ),
-    "not a number": (
-        lambda values: {name: float("nan") for name in values},
-        "a region's value is not finite",
-    ),
+    "not a number": (lambda values: dict.fromkeys(values, float("nan")), "a region's value is not finite"),
 }
 
 

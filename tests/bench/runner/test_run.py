@@ -84,13 +84,6 @@ def test_the_manifest_names_everything_that_made_the_numbers(config):
     assert record["machine"]["packages"]["numpy"]
 
 
-def test_a_second_run_trains_nothing_again_and_gives_the_same_rows(config, toy):
-    first = rows_of(config)
-    toy.FITS.clear()
-    assert rows_of(config).equals(first)
-    assert toy.FITS == []
-
-
 def test_a_run_killed_in_training_continues(config, toy, monkeypatch):
     whole = rows_of(config, out=config.out + "-whole")
     with monkeypatch.context() as patch:
