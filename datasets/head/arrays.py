@@ -224,8 +224,8 @@ def read_head(path: Path) -> HeadArrays:
     ).validate(path)
 
 
-def derived_regions(regions: Mapping[str, IntArray], vertex_count: int) -> dict[str, IntArray]:
-    """Regions that follow from those given, as VHAP derives them from ``FLAME_masks.pkl``.
+def with_derived_regions(head: HeadArrays) -> HeadArrays:
+    """The head with regions that follow from those it has, as VHAP derives them from ``FLAME_masks.pkl``.
 
     * ``hair`` = scalp - (face and neck), where scalp, face and neck are known;
     * ``ears``, ``eyeballs`` = left and right together;
@@ -235,31 +235,26 @@ def derived_regions(regions: Mapping[str, IntArray], vertex_count: int) -> dict[
     Only regions whose inputs are all there are derived, and none that is given already; the ones that VHAP
     writes out as vertex lists (irises, lip rings, ...) cannot be derived this way.
     """
-    known = {name: np.asarray(members, dtype=np.int64) for name, members in regions.items()}
-    derived: dict[str, IntArray] = {}
+    known = dict(head.regions)
 
     def add(name: str, inputs: tuple[str, ...], members: IntArray) -> None:
-        if name not in regions and all(source in known for source in inputs):
-            derived[name] = known[name] = np.unique(members)
+        if name not in known and all(source in known for source in inputs):
+            known[name] = np.unique(members)
 
     def union(*names: str) -> IntArray:
-        return np.concatenate([known.get(name, np.empty(0, np.int64)) for name in names])
+        return np.concatenate([np.empty(0, np.int64), *(known[name] for name in names if name in known)])
 
-    add("ears", ("left_ear", "right_ear"), union("left_ear", "right_ear"))
-    add("eyeballs", ("left_eyeball", "right_eyeball"), union("left_eyeball", "right_eyeball"))
-    for side in ("left", "right"):
-        parts = (f"{side}_eye_region", f"{side}_eyeball")
-        add(f"{side}_eye", parts, union(*parts))
+    for name, parts in (
+        ("ears", ("left_ear", "right_ear")),
+        ("eyeballs", ("left_eyeball", "right_eyeball")),
+        ("left_eye", ("left_eye_region", "left_eyeball")),
+        ("right_eye", ("right_eye_region", "right_eyeball")),
+    ):
+        add(name, parts, union(*parts))
     add("hair", ("scalp", "face", "neck"), np.setdiff1d(union("scalp"), union("face", "neck")))
     bare = union("eyeballs", "hair", "lips", "teeth", "boundary")
-    add("skin", ("eyeballs", "hair", "lips"), np.setdiff1d(np.arange(vertex_count), bare))
-    return derived
-
-
-def with_derived_regions(arrays: HeadArrays) -> HeadArrays:
-    """The same head with `derived_regions` added."""
-    derived = derived_regions(arrays.regions, arrays.template.shape[0])
-    return replace(arrays, regions={**arrays.regions, **derived})
+    add("skin", ("eyeballs", "hair", "lips"), np.setdiff1d(np.arange(len(head.template)), bare))
+    return replace(head, regions=known)
 
 
 def region(head: HeadAsset, name: str) -> IntArray:

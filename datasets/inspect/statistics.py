@@ -91,9 +91,7 @@ def split_rows(clip: CaptureClip) -> list[SplitRow]:
         SplitRow(
             name,
             len(keys),
-            len({key.timestep for key in keys}),
-            len({key.camera for key in keys}),
-            len({key.sequence for key in keys}),
+            *(len({getattr(k, of) for k in keys}) for of in ("timestep", "camera", "sequence")),
         )
         for name, keys in parts.items()
     ]

@@ -39,15 +39,10 @@ def jaw_quaternions(poses: Sequence[HeadPose]) -> FloatArray:
     return rotations.as_quat()[:, [3, 0, 1, 2]]
 
 
-def quaternion_distances(one: FloatArray, other: FloatArray) -> FloatArray:
-    """(N, M) distances 1 - |<p, q>| of (N, 4) and (M, 4) unit quaternions; in [0, 1], blind to sign."""
-    return 1 - np.abs(one @ other.T)
-
-
 def farthest_quaternions(
     candidates: FloatArray, seed: Sequence[float], count: int, *, tolerance: float = 0.0
 ) -> FloatArray:
-    """Greedy farthest-point sampling: ``seed``, then each time the candidate farthest from those chosen.
+    """Greedy farthest-point sampling by 1 - |<p, q>|: ``seed``, then each time the candidate farthest from all chosen.
 
     Parameters
     ----------
@@ -60,10 +55,10 @@ def farthest_quaternions(
     (n, 4), n at most ``count``: fewer where the candidates are not that many distinct ones.
     """
     chosen = [np.asarray(seed, dtype=np.float64)]
-    nearest = quaternion_distances(candidates, chosen[0][None])[:, 0]
+    nearest = 1 - np.abs(candidates @ chosen[0][:, None])[:, 0]
     while len(chosen) < count and nearest.size and nearest.max() > tolerance:
         chosen.append(candidates[nearest.argmax()])
-        nearest = np.minimum(nearest, quaternion_distances(candidates, chosen[-1][None])[:, 0])
+        nearest = np.minimum(nearest, 1 - np.abs(candidates @ chosen[-1][:, None])[:, 0])
     return np.array(chosen)
 
 

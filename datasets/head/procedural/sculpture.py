@@ -1,4 +1,4 @@
-"""Implicit-surface vocabulary of the sculpture: primitives, smooth booleans and clay strokes.
+"""The head as an implicit surface: primitives, smooth booleans, strokes, and what is made of them.
 
 Every function works on points ``(N, 3)`` in metres and returns ``(N,)`` approximate signed distances,
 negative inside. The bounds are those of I. Quilez, "Distance functions" and "Smooth minimum".
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
-from functools import wraps
 
 import numpy as np
 from scipy.interpolate import CubicSpline, PchipInterpolator
@@ -103,27 +102,6 @@ def ridge(points: FloatArray, knots: Sequence[Point], width: float, samples: int
     """Weight in [0, 1] of a stroke along a spline: Gaussian of its distance, of deviation ``width``."""
     distance = tube(points, knots, [0.0] * len(knots), samples)
     return np.exp(-0.5 * (distance / width) ** 2)
-
-
-Feature = Callable[[FloatArray, FloatArray], FloatArray]
-
-
-def within(low: Point, high: Point) -> Callable[[Feature], Feature]:
-    """Decorate ``feature(head, points) -> head`` to touch only a box, which must hold all it changes."""
-
-    def decorate(feature: Feature) -> Feature:
-        @wraps(feature)
-        def bounded(head: FloatArray, points: FloatArray) -> FloatArray:
-            inside = np.all((points > np.asarray(low)) & (points < np.asarray(high)), axis=1)
-            if not inside.any():
-                return head
-            changed = head.copy()
-            changed[inside] = feature(head[inside], points[inside])
-            return changed
-
-        return bounded
-
-    return decorate
 
 
 # One row per height, metres: midline depth of the face without nose and lips, half width, depth of the widest
@@ -232,7 +210,6 @@ def planes(points: FloatArray) -> FloatArray:
     return total + 0.0008 * ridge(points, column, 0.0016)
 
 
-@within((-0.01, -0.01, 0.02), (0.065, 0.055, 0.10))
 def add_eyes(head: FloatArray, points: FloatArray) -> FloatArray:
     """Lids over the eyeball, crease, aperture and the cavity the eyeball sits in."""
     radius = EYE_RADIUS + LID_CLEARANCE
@@ -263,7 +240,6 @@ def _crease(points: FloatArray, x: FloatArray, y: FloatArray, width: float) -> F
     return weight * np.clip((points[:, 2] - center[2]) / 0.004, 0, 1)
 
 
-@within((-0.01, -0.05, 0.04), (0.04, 0.045, 0.13))
 def add_nose(head: FloatArray, points: FloatArray) -> FloatArray:
     """Bridge, tip, alae, columella and nostrils."""
     bridge = tube(
@@ -292,7 +268,6 @@ def add_nose(head: FloatArray, points: FloatArray) -> FloatArray:
     return subtraction(head, nostril, 0.0016)
 
 
-@within((-0.01, -0.085, -0.01), (0.045, -0.02, 0.12))
 def add_mouth(head: FloatArray, points: FloatArray) -> FloatArray:
     """Lips, the slit between them and the cavity behind."""
     upper = tube(
@@ -333,7 +308,6 @@ EAR_ORIGIN = (0.0690, 0.0060, -0.0130)
 EAR_TURN = (-14.0, -24.0, -3.0)  # leaning back, flaring out
 
 
-@within((0.045, -0.045, -0.075), (0.13, 0.065, 0.02))
 def add_ears(head: FloatArray, points: FloatArray) -> FloatArray:
     """Auricle in its own frame: x out, y up, z front (so the rim is at negative z)."""
     turn = EAR_TURN
@@ -382,10 +356,20 @@ def add_ears(head: FloatArray, points: FloatArray) -> FloatArray:
     return subtraction(head, union(concha, cymba, 0.002), 0.0022)
 
 
+# Feature, and the box that holds all it changes: its lower and its upper corner.
+FEATURES: tuple[tuple[Callable[[FloatArray, FloatArray], FloatArray], Point, Point], ...] = (
+    (add_eyes, (-0.01, -0.01, 0.02), (0.065, 0.055, 0.10)),
+    (add_nose, (-0.01, -0.05, 0.04), (0.04, 0.045, 0.13)),
+    (add_mouth, (-0.01, -0.085, -0.01), (0.045, -0.02, 0.12)),
+    (add_ears, (0.045, -0.045, -0.075), (0.13, 0.065, 0.02)),
+)
+
+
 def sculpture(points: FloatArray) -> FloatArray:
     """Signed distance, about, of the head to ``points`` (N, 3) with x >= 0; mirror for the other half."""
     head: FloatArray = head_mass(points) - planes(points)
-    head = add_eyes(head, points)
-    head = add_nose(head, points)
-    head = add_mouth(head, points)
-    return add_ears(head, points)
+    for add, low, high in FEATURES:
+        inside = np.all((points > np.asarray(low)) & (points < np.asarray(high)), axis=1)
+        if inside.any():
+            head[inside] = add(head[inside], points[inside])
+    return head

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 import tyro
@@ -79,10 +79,6 @@ class RefitSettings:
             if not lowest <= value < float("inf"):
                 raise InputError("refit settings", name, f"a number of at least {lowest:g}", str(value))
 
-    def record(self) -> dict[str, Any]:
-        """The settings as plain values, for a step's record."""
-        return asdict(self)
-
 
 @dataclass(frozen=True)
 class RefitCommandSettings(CaptureOptions):
@@ -135,7 +131,7 @@ def refit_capture(settings: RefitCommandSettings, progress: Progress = no_progre
     report = refitted.report
     data = {
         "capture": union.as_posix(),
-        "settings": settings.settings.record(),
+        "settings": asdict(settings.settings),
         **report.to_json(),
         "vertices_mm": [None if np.isnan(value) else round(float(value), 6) for value in report.vertex_mm],
     }

@@ -90,7 +90,7 @@ def refit(
     poses = {t: fitter.pose(clip.poses[t], t, columns, row) for row, t in enumerate(timesteps)}
     report = fitter.report(timesteps, columns, np.sum([block["vertex_sums"] for block in blocks], axis=0))
     parameters = {
-        "settings": settings.record(),
+        "settings": asdict(settings),
         "target": target.version,
         "target_fingerprint": target.fingerprint(),
         "residual": report.summary(),
@@ -173,7 +173,7 @@ class BlockFitter:
         self._face = np.isin(matching.vertices, target.regions[FACE])
         self._input = digest(
             *(clip.head.fingerprint(), target.fingerprint(), self._source.neutral, offset),
-            *(matching.shape, settings.record(), _FORMAT),
+            *(matching.shape, asdict(settings), _FORMAT),
         )
 
     def fit(self, poses: Sequence[HeadPose]) -> dict[str, FloatArray]:

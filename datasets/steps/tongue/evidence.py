@@ -66,8 +66,8 @@ class MouthEvidence:
 def find_evidence(colours: MouthColours, atlas: MouthAtlas) -> MouthEvidence:
     """Look for what covers the mouth, camera by camera, and combine what the cameras see."""
     count, cameras = colours.seen.shape[:2]
-    total = np.zeros((count, *atlas.shape), np.float32)
-    looks = np.zeros((count, *atlas.shape), np.uint8)
+    total = np.zeros((count, *atlas.inside.shape), np.float32)
+    looks = np.zeros((count, *atlas.inside.shape), np.uint8)
     for camera in range(cameras):
         strength, known = _camera_strength(colours.colours[:, camera], colours.seen[:, camera], atlas)
         total += strength
@@ -92,7 +92,7 @@ def mouth_patch(strength: FloatArray, atlas: MouthAtlas) -> np.ndarray:
     sizes[~np.isin(np.arange(count + 1), labels[opening])] = 0
     sizes[0] = 0
     if not sizes.any():
-        return np.zeros(atlas.shape, bool)
+        return np.zeros(atlas.inside.shape, bool)
     patch = labels == sizes.argmax()
     above = np.cumsum(patch[::-1], axis=0)[::-1] > 0  # at or above the patch's lowest pixel in its column
     return atlas.below & above

@@ -65,11 +65,6 @@ class MouthAtlas:
     height: FloatArray
     occluders: IntArray
 
-    @property
-    def shape(self) -> tuple[int, int]:
-        """(H, W)."""
-        return self.inside.shape[0], self.inside.shape[1]
-
     def points(self, vertices: FloatArray) -> FloatArray:
         """(N, 3) places of the map's pixels on a posed mesh (V, 3), metres."""
         return np.einsum("nk,nkd->nd", self.weights, vertices[self.corners])
@@ -245,7 +240,7 @@ def sample_clip(
     """
     frames = frames_by_timestep(clip)
     timesteps = [t for t, keys in frames.items() if any(camera in keys for camera in cameras)]
-    height, width = atlas.shape
+    height, width = atlas.inside.shape
     colours = np.zeros((len(timesteps), len(cameras), height, width, 3), np.uint8)
     seen = np.zeros(colours.shape[:4], bool)
 
@@ -277,8 +272,8 @@ def sample_image(
     A point is seen where it faces the camera within 62 degrees, lies in the picture and no triangle of the
     tracked mesh is in front of it.
     """
-    colours = np.zeros((*atlas.shape, 3), np.uint8)
-    seen = np.zeros(atlas.shape, bool)
+    colours = np.zeros((*atlas.inside.shape, 3), np.uint8)
+    seen = np.zeros(atlas.inside.shape, bool)
     points = atlas.points(vertices)
     sight = camera.center - points
     cosine = np.einsum("nd,nd->n", atlas.normals(vertices), sight) / np.linalg.norm(sight, axis=1)

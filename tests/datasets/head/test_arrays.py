@@ -8,7 +8,6 @@ import pytest
 from headbench.bench.contracts import HeadAsset
 from headbench.bench.errors import InputError
 from headbench.datasets.head.arrays import (
-    derived_regions,
     faces_in_region,
     read_head,
     region,
@@ -154,11 +153,13 @@ def test_derived_regions_are_the_sets_they_name():
 
 
 def test_only_what_follows_is_derived():
-    assert derived_regions({}, 10) == {}
-    some = {"left_ear": np.array([1]), "scalp": np.array([2]), "face": np.array([3])}
-    assert derived_regions(some, 10) == {}
-    given = {"left_ear": np.array([1]), "right_ear": np.array([2]), "ears": np.array([7])}
-    assert "ears" not in derived_regions(given, 10)
+    def derived(**regions):
+        given = {name: np.array(members) for name, members in regions.items()}
+        return {*with_derived_regions(replace(HEAD, regions=given)).regions} - {*given}
+
+    assert derived() == derived(left_ear=[1], scalp=[2], face=[3]) == set()
+    assert derived(left_ear=[1], right_ear=[2]) == {"ears"}
+    assert derived(left_ear=[1], right_ear=[2], ears=[7]) == set()
 
 
 def test_faces_have_all_three_vertices_inside():
