@@ -13,7 +13,7 @@ import numpy as np
 from ..bench.contracts import ByteArray
 from ..bench.errors import InputError
 from ..bench.io.files import write_bytes
-from ..bench.io.images import read_pixels
+from ..bench.io.images import probe_image, read_pixels
 
 _ROWS = 64
 
@@ -103,6 +103,15 @@ def read_mask(path: Path) -> ByteArray:
         return pixels
     channel = 3 if pixels.shape[2] == 4 else 0
     return np.ascontiguousarray(pixels[..., channel])
+
+
+def is_whole(path: Path, width: int, height: int) -> bool:
+    """Whether an image of that size is there, and complete: a crash can leave a renamed file without its content."""
+    try:
+        info = probe_image(path)
+    except InputError:
+        return False
+    return (info.width, info.height) == (width, height)
 
 
 def write_image(path: Path, image: ByteArray, *options: int) -> None:

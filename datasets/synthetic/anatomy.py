@@ -114,13 +114,10 @@ def landmark_index(landmarks: Mapping[str, int], name: str) -> int:
     for key in (name, f"ibug_{_IBUG[name]:02d}"):
         if key in landmarks:
             return landmarks[key]
-    raise InputError(
-        "head model",
-        f"landmarks[{name!r}]",
-        f"the vertex, under this name or as ibug_{_IBUG[name]:02d}",
-        f"{len(landmarks)} other landmarks",
-        "Use the procedural head or an ICT-FaceKit file, or add landmarks to the head model.",
-    )
+    expected = f"the vertex, under this name or as ibug_{_IBUG[name]:02d}"
+    found = f"{len(landmarks)} other landmarks"
+    remedy = "Use the procedural head or an ICT-FaceKit file, or add landmarks to the head model."
+    raise InputError("head model", f"landmarks[{name!r}]", expected, found, remedy)
 
 
 def skin_triangles(head: HeadAsset) -> IntArray:
@@ -235,9 +232,8 @@ def _lip_outline(head: HeadAsset, landmarks: Mapping[str, int], vertices: FloatA
         return vertices[[landmarks[key] for key in keys]]
     rings = [head.regions.get(f"lip_outside_ring_{part}") for part in ("upper", "lower")]
     if rings[0] is None or rings[1] is None:
-        raise InputError(
-            head.version, "regions", "lip_outside_ring_upper and _lower, or iBUG's lip landmarks", "neither"
-        )
+        expected = "lip_outside_ring_upper and _lower, or iBUG's lip landmarks"
+        raise InputError(head.version, "regions", expected, "neither")
     ring = vertices[np.unique(np.concatenate([rings[0], rings[1]]))]
     middle, extent = 0.5 * (ring.max(axis=0) + ring.min(axis=0)), np.ptp(ring, axis=0)
     # The outline is star-shaped once its height is stretched to its width: sort it by angle.

@@ -13,7 +13,6 @@ import multiprocessing
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -22,9 +21,9 @@ from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.io.documents import read_json
 from ...bench.io.files import TEMPORARY, grouped_writes, write_json, write_text
-from ...bench.io.images import probe_image
 from ...bench.machine import processor_count
 from ...bench.start import end_with_parent, starting_workers
+from ..images import is_whole
 from .performance import KINDS, Kind, share_out
 from .plan import SERIALS, SubjectPlan, SynthSettings, load_geometry, plan_subject
 from .renderer import CaptureRenderer, default_samples, sample_count
@@ -154,37 +153,31 @@ def _render(job: Job) -> None:
 
 def _missing(plan: SubjectPlan, sequence: str, timestep: int) -> tuple[str, ...]:
     """Cameras whose image or mask is not there, or not whole."""
-    return tuple(camera for camera in plan.cameras if not _is_whole(plan, sequence, timestep, camera))
 
+    def whole(camera: str) -> bool:
+        place, writer = (sequence, timestep, camera), plan.writer
+        return all(
+            is_whole(p, *plan.settings.size) for p in (writer.image_path(*place), writer.mask_path(*place))
+        )
 
-def _is_whole(plan: SubjectPlan, sequence: str, timestep: int, camera: str) -> bool:
-    writer = plan.writer
-    for path in (writer.image_path(sequence, timestep, camera), writer.mask_path(sequence, timestep, camera)):
-        try:
-            info = probe_image(path)
-        except InputError:
-            return False
-        if (info.width, info.height) != plan.settings.size:
-            return False
-    return True
+    return tuple(camera for camera in plan.cameras if not whole(camera))
 
 
 def _check(settings: SynthSettings) -> None:
-    if settings.subjects < 1:
-        raise InputError("--subjects", "", "at least 1", str(settings.subjects))
-    if not 2 <= settings.cameras <= len(SERIALS):
-        raise InputError(
-            "--cameras", "", f"2 to {len(SERIALS)}, as the frontal one is held out", str(settings.cameras)
-        )
-    if settings.performance not in KINDS:
-        raise InputError("--performance", "", f"one of {', '.join(KINDS)}", repr(settings.performance))
-    if not 0.0 <= settings.dynamics <= 3.0:
-        raise InputError("--dynamics", "", "0 to 3", str(settings.dynamics))
+    size, noise, most = settings.size, settings.tracking_noise, len(SERIALS)
+    count, kinds = settings.cameras, ", ".join(KINDS)
+    checks = (
+        ("--subjects", settings.subjects >= 1, "at least 1", settings.subjects),
+        ("--cameras", 2 <= count <= most, f"2 to {most}, as the frontal one is held out", count),
+        ("--performance", settings.performance in KINDS, f"one of {kinds}", repr(settings.performance)),
+        ("--dynamics", 0.0 <= settings.dynamics <= 3.0, "0 to 3", settings.dynamics),
+        ("--size", min(size) >= 16, "at least 16 pixels each way", "x".join(map(str, size))),
+        ("--tracking-noise", np.isfinite(noise) and noise >= 0.0, "a number from 0 up", noise),
+    )
+    for option, fits, expected, found in checks:
+        if not fits:
+            raise InputError(option, "", expected, str(found))
     share_out(settings.timesteps)
-    if min(settings.size) < 16:
-        raise InputError("--size", "", "at least 16 pixels each way", "x".join(map(str, settings.size)))
-    if not (np.isfinite(settings.tracking_noise) and settings.tracking_noise >= 0.0):
-        raise InputError("--tracking-noise", "", "a number from 0 up", str(settings.tracking_noise))
 
 
 def _claim(out: Path, settings: SynthSettings, head: str) -> None:
@@ -192,34 +185,26 @@ def _claim(out: Path, settings: SynthSettings, head: str) -> None:
     wanted = {
         "version": _VERSION,
         **settings.described(),
+        "head": Path(settings.head).name,  # the same file may lie elsewhere: its content counts, not its path
         "size": list(settings.size),
         "head_fingerprint": head,
     }
-    # The same file may lie elsewhere: its content counts, not its path.
-    wanted["head"] = Path(settings.head).name
     manifest, readme = out / MANIFEST, out / "README.txt"
     if manifest.exists():
-        _compare(manifest, wanted)
+        found = read_json(manifest)
+        for key in {**wanted, **found}:
+            if found.get(key) != wanted.get(key):
+                expected, remedy = (
+                    f"{wanted.get(key)!r}, as asked for",
+                    "Give another folder, or the same settings.",
+                )
+                raise InputError(manifest, key, expected, f"{found.get(key)!r}", remedy)
     else:
         if out.exists() and any(_is_foreign(path) for path in out.iterdir()):
             raise InputError(out, "", "an empty folder or an earlier synthetic capture", "other files")
         write_json(manifest, wanted)
     if not readme.exists():
         write_text(readme, _README)
-
-
-def _compare(manifest: Path, wanted: dict[str, Any]) -> None:
-    found = read_json(manifest)
-    for key in {**wanted, **found}:
-        value = wanted.get(key)
-        if found.get(key) != value:
-            raise InputError(
-                manifest,
-                key,
-                f"{value!r}, as asked for",
-                f"{found.get(key)!r}",
-                "Give another folder, or the same settings.",
-            )
 
 
 def _is_foreign(path: Path) -> bool:

@@ -103,45 +103,21 @@ TONGUE_SHOWS = 0.6
 _PHRASE_SECONDS = 0.9
 
 
-def _both(name: str, value: float) -> dict[str, float]:
-    return {f"{name}_left": value, f"{name}_right": value}
+def _both(**values: float) -> dict[str, float]:
+    """Controls of both sides."""
+    return {f"{name}_{side}": value for name, value in values.items() for side in SIDES}
 
 
 _REST: Face = {}
-_SHOUT: Face = {
-    "jaw_open": 0.95,
-    **_both("upper_lip_up", 0.5),
-    **_both("lower_lip_down", 0.5),
-    **_both("brow_down", 0.5),
-}
-_LAUGH: Face = {**_both("smile", 1.0), **_both("cheek_raise", 0.8), "jaw_open": 0.45, **_both("squint", 0.5)}
-_SURPRISE: Face = {
-    "brow_inner_up": 1.0,
-    **_both("brow_outer_up", 1.0),
-    **_both("eye_wide", 0.8),
-    "jaw_open": 0.55,
-}
-_FEAR: Face = {
-    "brow_inner_up": 0.9,
-    **_both("brow_down", 0.3),
-    **_both("eye_wide", 0.9),
-    **_both("mouth_stretch", 0.8),
-}
-_ANGRY: Face = {
-    **_both("brow_down", 1.0),
-    **_both("squint", 0.4),
-    "lip_press": 0.9,
-    **_both("nose_sneer", 0.25),
-}
+_SHOUT: Face = {"jaw_open": 0.95, **_both(upper_lip_up=0.5, lower_lip_down=0.5, brow_down=0.5)}
+_LAUGH: Face = {"jaw_open": 0.45, **_both(smile=1.0, cheek_raise=0.8, squint=0.5)}
+_SURPRISE: Face = {"brow_inner_up": 1.0, "jaw_open": 0.55, **_both(brow_outer_up=1.0, eye_wide=0.8)}
+_FEAR: Face = {"brow_inner_up": 0.9, **_both(brow_down=0.3, eye_wide=0.9, mouth_stretch=0.8)}
+_ANGRY: Face = {"lip_press": 0.9, **_both(brow_down=1.0, squint=0.4, nose_sneer=0.25)}
 _SAD: Face = {"brow_inner_up": 0.85, "mouth_frown": 0.9, "chin_raise": 0.5, "gaze_up": -0.4}
-_DISGUST: Face = {
-    **_both("nose_sneer", 1.0),
-    **_both("upper_lip_up", 0.6),
-    **_both("brow_down", 0.5),
-    **_both("squint", 0.4),
-}
-_HAPPY: Face = {**_both("smile", 1.0), **_both("cheek_raise", 0.5)}
-_TONGUE: Face = {"jaw_open": 0.55, "tongue_out": 1.0, **_both("lower_lip_down", 0.2)}
+_DISGUST: Face = _both(nose_sneer=1.0, upper_lip_up=0.6, brow_down=0.5, squint=0.4)
+_HAPPY: Face = _both(smile=1.0, cheek_raise=0.5)
+_TONGUE: Face = {"jaw_open": 0.55, "tongue_out": 1.0, **_both(lower_lip_down=0.2)}
 
 SEQUENCES: Mapping[str, tuple[Face, ...]] = {
     "EMO-1-shout+laugh": (_REST, _SHOUT, _SHOUT, _REST, _LAUGH, {**_LAUGH, "jaw_open": 0.2}, _LAUGH, _REST),
@@ -175,37 +151,37 @@ SEQUENCES: Mapping[str, tuple[Face, ...]] = {
     "EXP-2-eyes": (
         {"gaze_left": 0.9},
         {"gaze_left": -0.9},
-        {"gaze_up": 0.9, "brow_inner_up": 0.4, **_both("brow_outer_up", 0.4)},
-        {"gaze_up": -0.9, **_both("blink", 0.3)},
-        {**_both("squint", 1.0), **_both("blink", 0.5), **_both("cheek_raise", 0.6)},
-        _both("blink", 1.0),
+        {"gaze_up": 0.9, "brow_inner_up": 0.4, **_both(brow_outer_up=0.4)},
+        {"gaze_up": -0.9, **_both(blink=0.3)},
+        _both(squint=1.0, blink=0.5, cheek_raise=0.6),
+        _both(blink=1.0),
         {"blink_left": 1.0, "squint_left": 0.6},
         {"blink_right": 1.0, "squint_right": 0.6},
-        _both("eye_wide", 1.0),
+        _both(eye_wide=1.0),
     ),
     "EXP-3-cheeks+nose": (
         {"cheek_puff": 1.0},
         _REST,
-        _both("nose_sneer", 1.0),
+        _both(nose_sneer=1.0),
         {"nose_sneer_left": 1.0, "smile_left": 0.4},
         {"nose_sneer_right": 1.0, "smile_right": 0.4},
         {"cheek_puff": 0.8, "lip_press": 0.6},
-        _both("cheek_raise", 1.0),
+        _both(cheek_raise=1.0),
     ),
     "EXP-4-lips": (
         {"pucker": 1.0},
         {"funnel": 1.0, "jaw_open": 0.15},
         {"lip_press": 1.0},
         {"lip_roll": 1.0},
-        _both("mouth_stretch", 1.0),
+        _both(mouth_stretch=1.0),
         {"mouth_left": 1.0},
         {"mouth_right": 1.0},
-        _both("smile", 0.8),
+        _both(smile=0.8),
     ),
     "EXP-5-mouth": (
-        {**_both("upper_lip_up", 1.0), **_both("smile", 0.3)},
-        {**_both("lower_lip_down", 1.0)},
-        {**_both("smile", 1.0), **_both("upper_lip_up", 0.5), **_both("lower_lip_down", 0.4)},
+        _both(upper_lip_up=1.0, smile=0.3),
+        _both(lower_lip_down=1.0),
+        _both(smile=1.0, upper_lip_up=0.5, lower_lip_down=0.4),
         {"mouth_frown": 1.0, "chin_raise": 0.6},
         {"chin_raise": 1.0},
         {"smile_left": 1.0},
@@ -227,16 +203,16 @@ SEQUENCES: Mapping[str, tuple[Face, ...]] = {
     ),
     # Nothing here is new on its own; the combinations are.
     "FREE": (
-        {**_both("smile", 0.6), "gaze_left": 0.4},
+        {**_both(smile=0.6), "gaze_left": 0.4},
         {"brow_inner_up": 0.7, "brow_outer_up_left": 1.0, "smile_right": 0.7},
-        {**_both("brow_down", 0.6), "pucker": 0.7},
-        {"jaw_open": 0.6, **_both("smile", 0.7), **_both("brow_outer_up", 0.7), "brow_inner_up": 0.7},
+        {**_both(brow_down=0.6), "pucker": 0.7},
+        {"jaw_open": 0.6, **_both(smile=0.7, brow_outer_up=0.7), "brow_inner_up": 0.7},
         _TONGUE,
-        {**_both("nose_sneer", 0.6), "mouth_left": 0.5, "blink_left": 0.9},
-        {"jaw_open": 0.3, "jaw_side": 0.5, **_both("brow_down", 0.5)},
+        {**_both(nose_sneer=0.6), "mouth_left": 0.5, "blink_left": 0.9},
+        {"jaw_open": 0.3, "jaw_side": 0.5, **_both(brow_down=0.5)},
         {"mouth_frown": 0.7, "brow_inner_up": 0.6, "gaze_left": -0.7},
-        {"jaw_open": 0.75, **_both("eye_wide", 0.6), **_both("lower_lip_down", 0.5)},
-        {**_both("cheek_raise", 0.8), "lip_press": 0.5},
+        {"jaw_open": 0.75, **_both(eye_wide=0.6, lower_lip_down=0.5)},
+        {**_both(cheek_raise=0.8), "lip_press": 0.5},
     ),
 }
 """Phrases by sequence, in NeRSemble's order."""
@@ -366,7 +342,8 @@ _ICT_PAIRED = {
     "upper_lip_up": "mouthUpperUp",
     "lower_lip_down": "mouthLowerDown",
 }
-_ICT_SINGLE = {
+ICT_TARGETS: Mapping[str, tuple[str, ...]] = {
+    **{f"{name}_{s}": (f"{shape}_{s[0].upper()}",) for name, shape in _ICT_PAIRED.items() for s in SIDES},
     "brow_inner_up": ("browInnerUp_L", "browInnerUp_R"),
     "cheek_puff": ("cheekPuff_L", "cheekPuff_R"),
     "mouth_frown": ("mouthFrown_L", "mouthFrown_R"),
@@ -378,29 +355,19 @@ _ICT_SINGLE = {
     "mouth_left": ("mouthLeft",),
     "mouth_right": ("mouthRight",),
 }
-
-
-def ict_targets(control: str) -> tuple[str, ...]:
-    """ICT-FaceKit shapes that play an expression control."""
-    if control in _ICT_SINGLE:
-        return _ICT_SINGLE[control]
-    name, _, side = control.rpartition("_")
-    return (f"{_ICT_PAIRED[name]}_{side[0].upper()}",)
+"""ICT-FaceKit shapes that play each expression control."""
 
 
 def named_translation(
-    head: HeadAsset, names: Sequence[str], targets: Mapping[str, Mapping[str, float]]
+    head: HeadAsset, names: Sequence[str], targets: Mapping[str, Sequence[str]]
 ) -> Translation:
-    """Translation for a head whose expression directions have names.
-
-    ``targets`` gives, for each control, the weights of named directions.
-    """
+    """Translation for a head whose expression directions have names; ``targets`` are those of each control."""
     matrix = np.zeros((len(EXPRESSION_CONTROLS), head.expression_basis.shape[2]))
     for row, control in enumerate(EXPRESSION_CONTROLS):
-        for name, weight in targets.get(control, {}).items():
+        for name in targets.get(control, ()):
             if name not in names:
                 raise InputError(head.version, "expression names", name, f"{len(names)} others")
-            matrix[row, list(names).index(name)] = weight
+            matrix[row, names.index(name)] = 1.0
     return Translation(head.version, matrix, None)
 
 

@@ -24,12 +24,11 @@ from .anatomy import Anatomy, Person, measure, person
 from .hair import STYLES, Style
 from .parts import MouthPart, procedural_parts, share_that_shows, tongue
 from .performance import (
-    EXPRESSION_CONTROLS,
     HELD_OUT,
+    ICT_TARGETS,
     Kind,
     Performed,
     Translation,
-    ict_targets,
     named_translation,
     perform,
     procedural_translation,
@@ -156,14 +155,8 @@ SERIALS = (
     *(FRONTAL, "222200038", "222200047", "222200043", "222200049", "222200039", "222200045", "221501007"),
 )
 _LOWER = {
-    "222200044",
-    "222200040",
-    "222200048",
-    "222200041",
-    "222200038",
-    "222200043",
-    "222200039",
-    "222200045",
+    *("222200044", "222200040", "222200048", "222200041"),
+    *("222200038", "222200043", "222200039", "222200045"),
 }
 _ARC = np.radians(93.0)
 _RISE = np.radians(32.0)
@@ -277,12 +270,10 @@ def load_geometry(name: str) -> Geometry:
         raise InputError("--head", "", f"{', '.join(PROCEDURAL)} or an existing file", name)
     content = read_npz(path)
     if not is_ict(content):
-        raise InputError(
-            path, "", "an ICT-FaceKit npz", f"{', '.join(sorted(content))}", "Or take the procedural head."
-        )
+        expected = "an ICT-FaceKit npz"
+        raise InputError(path, "", expected, f"{', '.join(sorted(content))}", "Or take the procedural head.")
     head = ict_head(path, content)
-    targets = {control: dict.fromkeys(ict_targets(control), 1.0) for control in EXPRESSION_CONTROLS}
-    translation = named_translation(head, expression_names(content), targets)
+    translation = named_translation(head, expression_names(content), ICT_TARGETS)
 
     def mouth(person: Person, anatomy: Anatomy, shape: FloatArray) -> Sequence[MouthPart]:
         return (tongue(person, anatomy, len(head.parents)),)

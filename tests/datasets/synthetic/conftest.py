@@ -1,8 +1,10 @@
-"""One small plan, planned once: tests render only what they look at."""
+"""One small plan, planned once: tests render only what they look at. And convex meshes."""
 
 from pathlib import Path
 
+import numpy as np
 import pytest
+from scipy.spatial import ConvexHull
 
 from headbench.datasets.synthetic.performance import CONTROLS
 from headbench.datasets.synthetic.plan import SynthSettings, load_geometry, plan_subject
@@ -29,3 +31,12 @@ def subject(plan):
 @pytest.fixture
 def rest():
     return dict.fromkeys(CONTROLS, 0.0)
+
+
+def hull_faces(points):
+    """(F, 3) triangles of the hull of points (n, 3) about the origin, turned outwards."""
+    faces = ConvexHull(points).simplices.copy()
+    a, b, c = points[faces].transpose(1, 0, 2)
+    inward = np.einsum("ni,ni->n", np.cross(b - a, c - a), a) < 0
+    faces[inward] = faces[inward][:, ::-1]
+    return faces

@@ -59,14 +59,11 @@ def test_killed_run_continues_to_the_same_images(capture):
     assert all(os.stat(out / path).st_mtime_ns == untouched[path] for path in same)
 
 
-def test_other_settings_are_refused(capture):
+def test_other_settings_are_refused(capture, tmp_path):
     with pytest.raises(InputError, match="seed"):
         synthesize(capture[0], **SMALL, seed=5)
     with pytest.raises(InputError, match="performance"):
         synthesize(capture[0], **SMALL, performance="still")
-
-
-def test_a_folder_of_another_performance_is_refused(capture, tmp_path):
     settings = json.loads((capture[0] / "synthesis.json").read_text())
     assert "performance" not in settings  # as captures were recorded before there was a choice
     (tmp_path / "synthesis.json").write_text(json.dumps({**settings, "performance": "still"}))
@@ -111,6 +108,7 @@ def test_foreign_folder_is_refused(tmp_path, name):
         {"performance": "asleep"},
         {"dynamics": -0.5},
         {"dynamics": float("nan")},
+        {"head": "no-such-file.npz"},
     ],
 )
 def test_bad_settings_are_refused_before_anything_is_written(tmp_path, change):
@@ -118,11 +116,6 @@ def test_bad_settings_are_refused_before_anything_is_written(tmp_path, change):
     with pytest.raises(InputError):
         synthesize(out, **{**SMALL, **change})
     assert not out.exists()
-
-
-def test_unknown_head_is_refused(tmp_path):
-    with pytest.raises(InputError, match="--head"):
-        synthesize(tmp_path / "capture", **SMALL, head="no-such-file.npz")
 
 
 def test_the_capture_is_marked_as_synthetic(capture):

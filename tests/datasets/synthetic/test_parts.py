@@ -4,10 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from headbench.bench.contracts import Camera
-from headbench.datasets.head.model import HeadModel
+from headbench.datasets.head.subject import PosedSubject
 from headbench.datasets.mesh_pictures import rasterize_mesh
 from headbench.datasets.synthetic.anatomy import front_depth, measure, person
 from headbench.datasets.synthetic.parts import HIDES, share_that_shows
@@ -16,16 +15,19 @@ from headbench.datasets.synthetic.plan import load_geometry
 ICT = Path(__file__).parents[3].parent / "shared/data/ict_facekit/ict_facekit_f16.npz"
 
 
+def mouth_of(geometry, seed, shape):
+    """Parts in the mouth, anatomy and neutral mesh of a subject."""
+    neutral = PosedSubject(geometry.head, shape, np.zeros_like(geometry.head.template)).neutral
+    anatomy = measure(geometry.head, neutral)
+    return geometry.mouth(person("900", 0, seed), anatomy, shape), anatomy, neutral
+
+
 @pytest.mark.parametrize("share", [0.5, 0.75, 1.0])
 def test_tongue_slides_over_the_lower_lip(share):
     if not ICT.exists():
         pytest.skip("no ICT-FaceKit file beside the repository")
     geometry = load_geometry(str(ICT))
-    head = geometry.head
-    shape = np.zeros(head.shape_basis.shape[2])
-    neutral = HeadModel(head, dtype=torch.float64).canonical(torch.from_numpy(shape))[0].numpy()
-    anatomy = measure(head, neutral)
-    (tongue,) = geometry.mouth(person("900", 0, 1), anatomy, shape)
+    (tongue,), anatomy, neutral = mouth_of(geometry, 1, np.zeros(geometry.head.shape_basis.shape[2]))
     step, size = 0.0005, np.array([80, 90])
     low = anatomy["mouth"][:2] - [0.020, 0.040]
     skin = front_depth(neutral, anatomy.skin_faces, low, step, size)
@@ -45,10 +47,7 @@ def subject(request):
     geometry = load_geometry("procedural")
     rng = np.random.default_rng(request.param)
     shape = 0.6 * rng.standard_normal(geometry.head.shape_basis.shape[2])
-    neutral = HeadModel(geometry.head, dtype=torch.float64).canonical(torch.from_numpy(shape))[0].numpy()
-    anatomy = measure(geometry.head, neutral)
-    parts = geometry.mouth(person("900", 0, request.param), anatomy, shape)
-    return parts, anatomy, neutral
+    return mouth_of(geometry, request.param, shape)
 
 
 def hidden_area(parts, anatomy, neutral, share):

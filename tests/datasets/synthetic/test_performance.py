@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 
 from headbench.bench.contracts import HeadPose
-from headbench.bench.errors import InputError
 from headbench.datasets.synthetic.performance import (
     CONTROLS,
     EXPRESSION_CONTROLS,
@@ -21,15 +20,7 @@ def test_timesteps_are_shared_out_exactly(timesteps):
     assert HELD_OUT in shares
     assert len(shares) >= 2
     assert min(shares.values()) >= 2
-
-
-def test_many_timesteps_make_all_sequences():
-    assert list(share_out(300)) == list(SEQUENCES)
-
-
-def test_too_few_are_refused():
-    with pytest.raises(InputError, match="timesteps"):
-        share_out(3)
+    assert timesteps < 300 or list(shares) == list(SEQUENCES)
 
 
 @pytest.mark.parametrize("name", SEQUENCES)

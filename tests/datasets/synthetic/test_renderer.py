@@ -15,6 +15,8 @@ from headbench.bench.errors import InputError
 from headbench.datasets.synthetic.plan import FRONTAL, SynthSettings, lights, plan_subject
 from headbench.datasets.synthetic.renderer import CaptureRenderer, PathTracer, develop, sample_count, window
 
+from .conftest import hull_faces
+
 
 @pytest.fixture(scope="module")
 def renderer(plan):
@@ -62,9 +64,8 @@ def test_every_camera_holds_the_whole_head_with_a_margin(geometry, rest, size):
         _, mask = renderer.render(camera, 1)
         assert mask[: size[1] // 20].max() == 0, camera
         assert max(mask[:, :2].max(), mask[:, -2:].max()) == 0, camera
-        assert (mask[-1] > 200).sum() > size[0] // 8, (
-            camera
-        )  # the bust is cut by the frame, not by its own end
+        # The bust is cut by the frame, not by its own end.
+        assert (mask[-1] > 200).sum() > size[0] // 8, camera
 
 
 def test_tracked_skin_projects_into_the_mask(plan, subject, renderer):
@@ -132,22 +133,24 @@ def test_a_detector_finds_the_face(geometry):
 
 def ball(center, radius, steps=24):
     """A convex mesh, so that its silhouette is the hull of its projected vertices."""
-    theta, phi = np.meshgrid(
-        np.linspace(0.1, np.pi - 0.1, steps), np.linspace(0, 2 * np.pi, steps, endpoint=False), indexing="ij"
-    )
-    unit = np.stack([np.sin(theta) * np.cos(phi), np.cos(theta), np.sin(theta) * np.sin(phi)], -1).reshape(
-        -1, 3
-    )
-    hull = ConvexHull(unit)
-    faces = hull.simplices.copy()
-    inward = (
-        np.einsum(
-            "ni,ni->n", np.cross(*(unit[faces[:, k]] - unit[faces[:, 0]] for k in (1, 2))), unit[faces[:, 0]]
-        )
-        < 0
-    )
-    faces[inward] = faces[inward][:, ::-1]
-    return center + radius * unit, faces
+    polar, around = np.linspace(0.1, np.pi - 0.1, steps), np.linspace(0, 2 * np.pi, steps, endpoint=False)
+    theta, phi = (grid.ravel() for grid in np.meshgrid(polar, around, indexing="ij"))
+    unit = np.stack([np.sin(theta) * np.cos(phi), np.cos(theta), np.sin(theta) * np.sin(phi)], -1)
+    return np.asarray(center) + radius * unit, hull_faces(unit)
+
+
+def front_camera(width, height, focal, cx, cy):
+    """At one metre before the origin."""
+    world_to_camera = np.diag([1.0, -1.0, -1.0, 1.0])
+    world_to_camera[2, 3] = 1.0
+    K = np.array([[focal, 0, cx], [0, focal, cy], [0, 0, 1.0]])
+    return Camera("a", width, height, K, world_to_camera)
+
+
+def lit(vertices, faces, samples=9):
+    tracer = PathTracer(lights(), samples)
+    tracer.add("ball", vertices, faces, np.full((len(vertices), 3), 0.5), "skin")
+    return tracer
 
 
 @pytest.mark.parametrize("principal", [(40.0, 30.0), (47.5, 22.0), (33.0, 37.5)])
@@ -161,9 +164,7 @@ def test_silhouette_lies_where_the_pinhole_camera_puts_it(principal):
     K = np.array([[200.0, 0, principal[0]], [0, 200.0, principal[1]], [0, 0, 1]])
     camera = Camera("a", 80, 60, K, world_to_camera)
     vertices, faces = ball(np.array([0.01, 0.03, 0.02]), 0.08)
-    tracer = PathTracer(lights(), 25)
-    tracer.add("ball", vertices, faces, np.full((len(vertices), 3), 0.5), "skin")
-    _, alpha = tracer.image(camera, 0)
+    _, alpha = lit(vertices, faces, 25).image(camera, 0)
 
     in_camera = vertices @ rotation.T + world_to_camera[:3, 3]
     pixels = in_camera @ K.T
@@ -182,14 +183,9 @@ def test_silhouette_lies_where_the_pinhole_camera_puts_it(principal):
 
 
 def test_moved_mesh_is_rendered_where_it_went():
-    world_to_camera = np.diag([1.0, -1.0, -1.0, 1.0])
-    world_to_camera[2, 3] = 1.0
-    K = np.array([[100.0, 0, 32], [0, 100.0, 24], [0, 0, 1]])
-    camera = Camera("a", 64, 48, K, world_to_camera)
+    camera = front_camera(64, 48, 100.0, 32, 24)
     vertices, faces = ball(np.zeros(3), 0.05)
-    tracer = PathTracer(lights(), 9)
-    tracer.add("ball", vertices, faces, np.full((len(vertices), 3), 0.5), "skin")
-    columns = np.arange(64) + 0.5
+    tracer, columns = lit(vertices, faces), np.arange(64) + 0.5
     _, before = tracer.image(camera, 0)
     tracer.move("ball", vertices + [0.1, 0, 0])
     _, after = tracer.image(camera, 0)
@@ -199,22 +195,14 @@ def test_moved_mesh_is_rendered_where_it_went():
 
 def test_the_rendered_window_lacks_nothing():
     """The window is tight, and a far speck that widens it to the whole image leaves coverage where it was."""
-    world_to_camera = np.diag([1.0, -1.0, -1.0, 1.0])
-    world_to_camera[2, 3] = 1.0
-    K = np.array([[100.0, 0, 30.5], [0, 100.0, 26]], float)
-    camera = Camera("a", 64, 48, np.vstack([K, [0, 0, 1]]), world_to_camera)
-    vertices, faces = ball(np.array([0.08, 0.03, 0.0]), 0.05)
+    camera = front_camera(64, 48, 100.0, 30.5, 26)
+    vertices, faces = ball([0.08, 0.03, 0.0], 0.05)
     rows, columns = window(camera, vertices)
-    assert columns.start == pytest.approx(33.5, abs=4)
-    assert (columns.stop, rows.start, rows.stop) == (
-        pytest.approx(43.5 + 4, abs=4),
-        pytest.approx(16, abs=4),
-        pytest.approx(32, abs=4),
-    )
+    found = (columns.start, columns.stop, rows.start, rows.stop)
+    np.testing.assert_allclose(found, [33.5, 47.5, 16, 32], atol=4)
     alphas = []
     for corners in ((), ((-0.30, 0.26), (0.34, -0.22))):
-        tracer = PathTracer(lights(), 289)
-        tracer.add("ball", vertices, faces, np.full((len(vertices), 3), 0.5), "skin")
+        tracer = lit(vertices, faces, 289)
         for index, (x, y) in enumerate(corners):
             speck = np.array([[x, y, 0.0], [x + 1e-4, y, 0.0], [x, y + 1e-4, 0.0]])
             tracer.add(f"speck{index}", speck, np.array([[0, 1, 2]]), np.full((3, 3), 0.5), "cloth")
@@ -222,17 +210,12 @@ def test_the_rendered_window_lacks_nothing():
     inside = np.zeros(alphas[0].shape, bool)
     inside[rows, columns] = True
     assert alphas[0][~inside].max() == 0
-    difference = np.abs(alphas[0] - alphas[1])[2:-2, 2:-2]
-    assert difference.max() < 0.06
+    assert np.abs(alphas[0] - alphas[1])[2:-2, 2:-2].max() < 0.06
     assert alphas[0].max() == 1
 
 
 def test_nothing_in_view_gives_an_empty_picture_and_no_error():
-    camera = Camera("a", 32, 24, np.array([[50.0, 0, 16], [0, 50.0, 12], [0, 0, 1]]), np.eye(4))
-    vertices, faces = ball(np.array([5.0, 0.0, 1.0]), 0.05)
-    tracer = PathTracer(lights(), 9)
-    tracer.add("ball", vertices, faces, np.full((len(vertices), 3), 0.5), "skin")
-    rgb, alpha = tracer.image(camera, 0)
+    rgb, alpha = lit(*ball([5.0, 0.0, 0.0], 0.05)).image(front_camera(32, 24, 50.0, 16, 12), 0)
     assert rgb.shape == (24, 32, 3)
     assert not rgb.any()
     assert not alpha.any()

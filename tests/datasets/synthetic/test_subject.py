@@ -5,10 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial import ConvexHull
 
 from headbench.datasets.synthetic.skin import make_folds
 from headbench.datasets.synthetic.subject import RenderedSubject, refine
+
+from .conftest import hull_faces
 
 
 def test_tracked_vertices_lie_on_the_skin_that_is_rendered(plan, subject, rest):
@@ -120,16 +121,7 @@ def test_dynamics_scale_folds_and_colour_changes(plan, subject, rest):
 def sphere():
     points = np.random.default_rng(0).standard_normal((150, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
-    faces = ConvexHull(points).simplices.copy()
-    corner = points[faces]
-    inward = (
-        np.einsum(
-            "ni,ni->n", np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), corner[:, 0]
-        )
-        < 0
-    )
-    faces[inward] = faces[inward][:, ::-1]
-    return points, faces
+    return points, hull_faces(points)
 
 
 @pytest.fixture(scope="module")
