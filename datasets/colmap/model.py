@@ -11,12 +11,12 @@ import os
 import signal
 import struct
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache, partial
 from os import PathLike
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
 import pycolmap as pycolmap  # noqa: PLC0414 - the writer imports it from here
@@ -27,6 +27,8 @@ from ...bench.io.files import check_name
 # Its import replaces the handler of SIGTERM by one that prints a stack, behind the interpreter's back.
 if threading.current_thread() is threading.main_thread():
     signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)
+
+T = TypeVar("T")
 
 _MAX_PIXELS = 1 << 20  # along one side: far beyond any sensor
 _UNIT_TOLERANCE = 1e-3  # of a quaternion's length; COLMAP itself normalises what it reads
@@ -77,19 +79,14 @@ def camera_models() -> dict[int, tuple[str, int]]:
     return models
 
 
-def checked_camera(file: Path, number: int, camera: ColmapCamera) -> ColmapCamera:
-    """Return the camera, or raise `InputError` where its size or a parameter makes no sense."""
-    key = f"camera {number}"
+def _check_camera(file: Path, key: str, camera: ColmapCamera) -> None:
     if not (0 < camera.width <= _MAX_PIXELS and 0 < camera.height <= _MAX_PIXELS):
         raise InputError(file, key, "an image size in pixels", f"{camera.width}x{camera.height}")
     if not np.isfinite(camera.params).all():
         raise InputError(file, key, "finite parameters", str(camera.params))
-    return camera
 
 
-def checked_image(file: Path, number: int, image: ColmapImage) -> ColmapImage:
-    """Return the image, or raise `InputError` for an unfit name or a pose that is no rigid motion."""
-    key = f"image {number}"
+def _check_image(file: Path, key: str, image: ColmapImage) -> None:
     for part in image.name.split("/"):
         check_name(part, file, f"{key}, name")
     if not np.isfinite([*image.quaternion, *image.translation]).all():
@@ -97,7 +94,20 @@ def checked_image(file: Path, number: int, image: ColmapImage) -> ColmapImage:
     length = math.hypot(*image.quaternion)
     if abs(length - 1) > _UNIT_TOLERANCE:
         raise InputError(file, key, "a unit quaternion", f"one of length {length:.4g}")
-    return image
+
+
+def _by_number(
+    file: Path, kind: str, entries: Iterable[tuple[int, T]], check: Callable[[Path, str, T], None]
+) -> dict[int, T]:
+    """Cameras or images by number, each checked and there once."""
+    found: dict[int, T] = {}
+    for number, entry in entries:
+        key = f"{kind} {number}"
+        if number in found:
+            raise InputError(file, key, f"each {kind} once", "a second one")
+        check(file, key, entry)
+        found[number] = entry
+    return found
 
 
 _LONGEST_NAME = 1024
@@ -148,22 +158,18 @@ class _BinaryReader:
     def _need(self, size: int, key: str) -> None:
         if size > self.left:
             expected = f"{size} more bytes at byte {self._stream.tell()}"
-            raise InputError(
-                self.file, key, expected, f"{self.left}", "The file was cut short or is damaged."
-            )
+            found = f"{self.left}"
+            raise InputError(self.file, key, expected, found, "The file was cut short or is damaged.")
 
     def finish(self) -> None:
         """Check that nothing is left over."""
         if self.left:
-            raise InputError(
-                self.file, "", "the end of the file after the last entry", f"{self.left} more bytes"
-            )
+            expected = "the end of the file after the last entry"
+            raise InputError(self.file, "", expected, f"{self.left} more bytes")
 
 
-def read_cameras_binary(file: Path) -> dict[int, ColmapCamera]:
-    """Cameras by number; `InputError` for whatever is wrong with the file."""
+def _cameras_binary(file: Path) -> Iterator[tuple[int, ColmapCamera]]:
     models = camera_models()
-    cameras: dict[int, ColmapCamera] = {}
     with file.open("rb") as stream:
         reader = _BinaryReader(file, stream)
         for _ in range(reader.count(struct.calcsize("<IiQQ"), "cameras")):
@@ -172,17 +178,11 @@ def read_cameras_binary(file: Path) -> dict[int, ColmapCamera]:
             if model not in models:
                 raise InputError(file, key, "a camera model pycolmap knows", f"number {model}")
             name, length = models[model]
-            params = reader.take(f"{length}d", key)
-            if number in cameras:
-                raise InputError(file, key, "each camera once", "a second one")
-            cameras[number] = checked_camera(file, number, ColmapCamera(name, width, height, params))
+            yield number, ColmapCamera(name, width, height, reader.take(f"{length}d", key))
         reader.finish()
-    return cameras
 
 
-def read_images_binary(file: Path) -> dict[int, ColmapImage]:
-    """Images by number; `InputError` for whatever is wrong with the file."""
-    images: dict[int, ColmapImage] = {}
+def _images_binary(file: Path) -> Iterator[tuple[int, ColmapImage]]:
     with file.open("rb") as stream:
         reader = _BinaryReader(file, stream)
         for _ in range(reader.count(struct.calcsize("<I7dIQ") + 1, "images")):
@@ -191,44 +191,31 @@ def read_images_binary(file: Path) -> dict[int, ColmapImage]:
             name = reader.name(key)
             points = reader.count(_POINT, f"{key}, points")
             reader.skip(points * _POINT, key)
-            if number in images:
-                raise InputError(file, key, "each image once", "a second one")
-            image = ColmapImage(name, camera, tuple(pose[:4]), tuple(pose[4:]))
-            images[number] = checked_image(file, number, image)
+            yield number, ColmapImage(name, camera, tuple(pose[:4]), tuple(pose[4:]))
         reader.finish()
-    return images
 
 
 _LONGEST_LINE = 2**23  # 300,000 points of an image; words take ten times the memory of their line
 _IMAGE_WORDS = 10  # number, quaternion, translation, camera, name
 
 
-def read_cameras_text(file: Path) -> dict[int, ColmapCamera]:
-    """Cameras by number; `InputError` for whatever is wrong with the file."""
+def _cameras_text(file: Path) -> Iterator[tuple[int, ColmapCamera]]:
     lengths = dict(camera_models().values())
-    cameras: dict[int, ColmapCamera] = {}
     for line, words in _lines(file):
         if not words:
             continue
         key = f"line {line}"
         if len(words) < 4 or words[1] not in lengths:
-            raise InputError(
-                file, key, "a number, a camera model pycolmap knows and a size", " ".join(words)[:80]
-            )
+            expected = "a number, a camera model pycolmap knows and a size"
+            raise InputError(file, key, expected, " ".join(words)[:80])
         if len(words) != 4 + lengths[words[1]]:
             expected = f"{lengths[words[1]]} parameters of {words[1]}"
             raise InputError(file, key, expected, f"{len(words) - 4}")
         number, width, height = _whole(file, key, [words[0], words[2], words[3]])
-        if number in cameras:
-            raise InputError(file, key, "each camera once", f"camera {number} again")
-        camera = ColmapCamera(words[1], width, height, _real(file, key, words[4:]))
-        cameras[number] = checked_camera(file, number, camera)
-    return cameras
+        yield number, ColmapCamera(words[1], width, height, _real(file, key, words[4:]))
 
 
-def read_images_text(file: Path) -> dict[int, ColmapImage]:
-    """Images by number; `InputError` for whatever is wrong with the file."""
-    images: dict[int, ColmapImage] = {}
+def _images_text(file: Path) -> Iterator[tuple[int, ColmapImage]]:
     lines = _lines(file)
     for line, words in lines:
         if not words:
@@ -237,17 +224,12 @@ def read_images_text(file: Path) -> dict[int, ColmapImage]:
         if len(words) != _IMAGE_WORDS:
             raise InputError(file, key, f"{_IMAGE_WORDS} words of an image", f"{len(words)}")
         number, camera = _whole(file, key, [words[0], words[8]])
-        if number in images:
-            raise InputError(file, key, "each image once", f"image {number} again")
         pose = _real(file, key, words[1:8])
-        image = ColmapImage(words[9], camera, pose[:4], pose[4:])
-        images[number] = checked_image(file, number, image)
+        yield number, ColmapImage(words[9], camera, pose[:4], pose[4:])
         _, points = next(lines, (0, ["missing"]))
         if len(points) % 3:
-            raise InputError(
-                file, f"line {line + 1}", "the image's points, three numbers each", "another line"
-            )
-    return images
+            expected = "the image's points, three numbers each"
+            raise InputError(file, f"line {line + 1}", expected, "another line")
 
 
 def _lines(file: Path) -> Iterator[tuple[int, list[str]]]:
@@ -303,8 +285,12 @@ def read_model(path: str | PathLike[str]) -> ColmapModel:
         expected = "a COLMAP model: cameras.bin and images.bin, or cameras.txt and images.txt"
         raise InputError(path, "", expected, "none in it, in sparse/0 or in sparse")
     binary = files[0].suffix == ".bin"
-    cameras = (read_cameras_binary if binary else read_cameras_text)(files[0])
-    images = (read_images_binary if binary else read_images_text)(files[1])
+    cameras = _by_number(
+        files[0], "camera", (_cameras_binary if binary else _cameras_text)(files[0]), _check_camera
+    )
+    images = _by_number(
+        files[1], "image", (_images_binary if binary else _images_text)(files[1]), _check_image
+    )
     for number, image in images.items():
         if image.camera not in cameras:
             expected = "one of the model's cameras"

@@ -77,9 +77,8 @@ def model_cameras(
                 "Undistort images and model together (`colmap image_undistorter`), or the clip by undistort_clip.",
             )
         if image.name in found:
-            raise InputError(
-                model.folder, f"image {number}", "image names that differ", f"{image.name!r} again"
-            )
+            expected = "image names that differ"
+            raise InputError(model.folder, f"image {number}", expected, f"{image.name!r} again")
         world_to_camera = np.eye(4)
         w, x, y, z = image.quaternion
         world_to_camera[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
@@ -98,9 +97,8 @@ def _lens(model: ColmapModel, number: int) -> Lens:
     try:
         return Lens(camera.model, camera.params, camera.width, camera.height)
     except InputError as error:
-        raise InputError(
-            model.folder, f"camera {number}", error.expected, error.found, error.remedy
-        ) from error
+        key = f"camera {number}"
+        raise InputError(model.folder, key, error.expected, error.found, error.remedy) from error
 
 
 def find_datasets(root: Path) -> list[Path]:

@@ -89,7 +89,13 @@ def export_model(
     vertices = PosedSubject.of(clip).meshes([clip.poses[first]])[0]
     model = pycolmap.Reconstruction()
     for number, name in enumerate(ids, start=1):
-        model.add_camera_with_trivial_rig(_pinhole(number, clip.cameras[name]))
+        camera = clip.cameras[name]
+        params = [camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]]
+        model.add_camera_with_trivial_rig(
+            pycolmap.Camera(
+                camera_id=number, model="PINHOLE", width=camera.width, height=camera.height, params=params
+            )
+        )
     views: dict[int, _Observation] = {}
     with grouped_writes():
         for number, key in enumerate(sorted(keys), start=1):
@@ -125,14 +131,6 @@ def export_tracking(clip: CaptureClip, timesteps: Collection[int], out: Path) ->
     layout.Declaration(
         clip.subject, clip.head.version, background=(red, green, blue), cy="top", excluded=excluded
     ).write(out)
-
-
-def _pinhole(number: int, camera: Camera) -> pycolmap.Camera:
-    intrinsics = camera.K
-    params = [intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]]
-    return pycolmap.Camera(
-        camera_id=number, model="PINHOLE", width=camera.width, height=camera.height, params=params
-    )
 
 
 def _observe(vertices: FloatArray, faces: np.ndarray, camera: Camera, picture: ByteArray) -> _Observation:
