@@ -17,11 +17,10 @@ from functools import cached_property
 
 import cv2
 import numpy as np
-import torch
 
 from ..bench.contracts import BoolArray, ByteArray, Camera, FloatArray, HeadPose, IntArray
 from .head.arrays import HeadArrays
-from .head.model import HeadModel
+from .head.subject import PosedSubject
 from .mesh_pictures import rasterize_mesh
 
 FOREGROUND = "foreground"
@@ -53,9 +52,7 @@ class HeadRegions:
 
         ``mask`` is the (H, W) 8-bit coverage, None where there is none: nothing is foreground then.
         """
-        with torch.no_grad():
-            vertices = self._model(canonical=self._canonical, **self._model.pose_arguments([pose]))[0].numpy()
-        front = rasterize_mesh(vertices, self._head.faces, camera).face
+        front = rasterize_mesh(self._subject.meshes([pose])[0], self._head.faces, camera).face
         covered = front >= 0
         labels = np.where(covered, self._bits_of_faces[np.maximum(front, 0)], 0).astype(np.uint8)
         foreground = np.ones(front.shape, bool) if mask is None else mask >= 128
@@ -67,15 +64,8 @@ class HeadRegions:
         return labels
 
     @cached_property
-    def _model(self) -> HeadModel:
-        return HeadModel(self._head, dtype=torch.float64)
-
-    @cached_property
-    def _canonical(self) -> torch.Tensor:
-        shape, offset = (
-            torch.from_numpy(np.asarray(a, dtype=np.float64)) for a in (self._shape, self._offset)
-        )
-        return self._model.canonical(shape, offset)
+    def _subject(self) -> PosedSubject:
+        return PosedSubject(self._head, self._shape, self._offset)
 
     @cached_property
     def _bits_of_faces(self) -> IntArray:

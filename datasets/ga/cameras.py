@@ -69,126 +69,101 @@ def collect_cameras(entries: Sequence[FrameEntry], infos: Mapping[Path, ImageInf
     a translation, or where ``camera_index`` and ``camera_id`` do not go together.
     """
     _check_ids(entries)
+    sizes = {entry.image: (infos[entry.image].width, infos[entry.image].height) for entry in entries}
     groups: dict[str, dict[str, FrameEntry]] = {}
     for entry in sorted(entries, key=lambda e: (e.timestep, e.camera_index)):
         first = groups.setdefault(entry.sequence_folder, {}).setdefault(entry.camera_id, entry)
-        _check_same_optics(first, entry, infos)
-        _check_same_place(first, entry)
+        _check_same_optics(first, entry, sizes)
+        moved = np.abs(first.camera_to_world - entry.camera_to_world).max()
+        if moved > ROTATION_TOLERANCE:
+            expected = f"camera {entry.camera_id} where {first.where} has it, as cameras stand still"
+            key = f"{entry.where}.transform_matrix"
+            raise InputError(entry.file, key, expected, f"entries that differ by {moved:.3g}")
     views: dict[str, FrameEntry] = {}
     shifts: dict[str, FloatArray] = {}
     for folder, group in groups.items():
-        shifts[folder] = _shift(views, group, infos) if views else np.zeros(3)
+        shifts[folder] = _shift(views, group, sizes) if views else np.zeros(3)
         for name, entry in group.items():
-            views.setdefault(name, _moved(entry, shifts[folder]))
+            matrix = entry.camera_to_world.copy()
+            matrix[:3, 3] += shifts[folder]
+            views.setdefault(name, replace(entry, camera_to_world=matrix))
     for entry in views.values():
-        _check_focal(entry, infos)
+        _check_focal(entry, sizes[entry.image][0])
     ordered = dict(sorted(views.items(), key=lambda item: item[1].camera_index))
-    return CaptureCameras(ordered, {name: _size(entry, infos) for name, entry in ordered.items()}, shifts)
-
-
-def _size(entry: FrameEntry, infos: Mapping[Path, ImageInfo]) -> tuple[int, int]:
-    info = infos[entry.image]
-    return info.width, info.height
+    return CaptureCameras(ordered, {name: sizes[entry.image] for name, entry in ordered.items()}, shifts)
 
 
 def _check_ids(entries: Sequence[FrameEntry]) -> None:
     by_index: dict[int, FrameEntry] = {}
     by_id: dict[str, FrameEntry] = {}
     for entry in entries:
-        for other in (
-            by_index.setdefault(entry.camera_index, entry),
-            by_id.setdefault(entry.camera_id, entry),
-        ):
-            if (other.camera_id, other.camera_index) != (entry.camera_id, entry.camera_index):
-                raise InputError(
-                    entry.file,
-                    f"{entry.where}.camera_id",
-                    f"one camera_id per camera_index, as {other.where} with index {other.camera_index} has "
-                    f"{other.camera_id}",
-                    f"index {entry.camera_index} with {entry.camera_id}",
+        pair = (entry.camera_id, entry.camera_index)
+        same = by_index.setdefault(entry.camera_index, entry), by_id.setdefault(entry.camera_id, entry)
+        for other in same:
+            if (other.camera_id, other.camera_index) != pair:
+                known = f"{other.where} with index {other.camera_index} has {other.camera_id}"
+                expected, found = (
+                    f"one camera_id per camera_index, as {known}",
+                    f"index {pair[1]} with {pair[0]}",
                 )
+                raise InputError(entry.file, f"{entry.where}.camera_id", expected, found)
 
 
-def _check_same_optics(first: FrameEntry, entry: FrameEntry, infos: Mapping[Path, ImageInfo]) -> None:
-    same_keys = first.intrinsics.keys() == entry.intrinsics.keys()
-    if not same_keys or not all(
-        math.isclose(entry.intrinsics[key], value, rel_tol=1e-6, abs_tol=1e-9)
-        for key, value in first.intrinsics.items()
-    ):
-        raise InputError(
-            entry.file,
-            f"{entry.where}.{'/'.join(entry.intrinsics)}",
-            f"intrinsics of camera {entry.camera_id} as in {first.where}, {dict(first.intrinsics)}",
-            f"{dict(entry.intrinsics)}",
-        )
-    if _size(first, infos) != _size(entry, infos):
-        width, height = _size(first, infos)
-        found_width, found_height = _size(entry, infos)
-        raise InputError(
-            entry.image,
-            "",
-            f"{width}x{height} pixels, as other images of camera {entry.camera_id}",
-            f"{found_width}x{found_height}",
-        )
+def _check_same_optics(first: FrameEntry, entry: FrameEntry, sizes: Mapping[Path, tuple[int, int]]) -> None:
+    if not same_intrinsics(first, entry):
+        key = f"{entry.where}.{'/'.join(entry.intrinsics)}"
+        expected = f"intrinsics of camera {entry.camera_id} as in {first.where}, {dict(first.intrinsics)}"
+        raise InputError(entry.file, key, expected, f"{dict(entry.intrinsics)}")
+    (width, height), found = sizes[first.image], sizes[entry.image]
+    if (width, height) != found:
+        expected = f"{width}x{height} pixels, as other images of camera {entry.camera_id}"
+        raise InputError(entry.image, "", expected, f"{found[0]}x{found[1]}")
 
 
-def _check_same_place(first: FrameEntry, entry: FrameEntry) -> None:
-    moved = np.abs(first.camera_to_world - entry.camera_to_world).max()
-    if moved > ROTATION_TOLERANCE:
-        raise InputError(
-            entry.file,
-            f"{entry.where}.transform_matrix",
-            f"camera {entry.camera_id} where {first.where} has it, as cameras stand still",
-            f"entries that differ by {moved:.3g}",
-        )
+def same_intrinsics(one: FrameEntry, other: FrameEntry) -> bool:
+    """Whether two frames state the same intrinsics, to rounding."""
+    return one.intrinsics.keys() == other.intrinsics.keys() and all(
+        math.isclose(value, other.intrinsics[key], rel_tol=1e-6, abs_tol=1e-9)
+        for key, value in one.intrinsics.items()
+    )
 
 
 def _shift(
-    views: Mapping[str, FrameEntry], group: Mapping[str, FrameEntry], infos: Mapping[Path, ImageInfo]
+    views: Mapping[str, FrameEntry], group: Mapping[str, FrameEntry], sizes: Mapping[Path, tuple[int, int]]
 ) -> FloatArray:
     """Translation from a sequence's world to the first's, from the cameras they share."""
     shared = [name for name in group if name in views]
     any_entry = next(iter(group.values()))
     if not shared:
-        raise InputError(
-            any_entry.file,
-            any_entry.where,
-            "a camera that the first sequence has too, to bring both to one world",
-            f"cameras {', '.join(group)} only",
-        )
+        expected = "a camera that the first sequence has too, to bring both to one world"
+        raise InputError(any_entry.file, any_entry.where, expected, f"cameras {', '.join(group)} only")
     for name in shared:
-        _check_same_optics(views[name], group[name], infos)
+        _check_same_optics(views[name], group[name], sizes)
     differences = np.array([views[n].camera_to_world - group[n].camera_to_world for n in shared])
     shift = differences[:, :3, 3].mean(axis=0)
     turn = np.abs(differences[:, :3, :3]).max()
     spread = np.abs(differences[:, :3, 3] - shift).max()
     if turn > ROTATION_TOLERANCE or spread > POSITION_TOLERANCE:
-        raise InputError(
-            any_entry.file,
-            f"{any_entry.where}.transform_matrix",
-            f"cameras of {any_entry.sequence_folder} that equal those of the first sequence but for one shift",
-            f"rotations that differ by {turn:.3g} and shifts by {spread:.3g} m",
-        )
+        folder = any_entry.sequence_folder
+        expected = f"cameras of {folder} that equal those of the first sequence but for one shift"
+        found = f"rotations that differ by {turn:.3g} and shifts by {spread:.3g} m"
+        raise InputError(any_entry.file, f"{any_entry.where}.transform_matrix", expected, found)
     # A difference at the level of the stored digits is none: the cameras then stay exactly as written.
     return shift if np.abs(shift).max() > 1e-9 else np.zeros(3)
 
 
-def _moved(entry: FrameEntry, shift: FloatArray) -> FrameEntry:
-    matrix = entry.camera_to_world.copy()
-    matrix[:3, 3] += shift
-    return replace(entry, camera_to_world=matrix)
+def contradicted_focal(entry: FrameEntry, width: int) -> float | None:
+    """Focal length that ``camera_angle_x`` implies, pixels, where ``fl_x`` is another."""
+    if not {"fl_x", "camera_angle_x"} <= entry.intrinsics.keys():
+        return None
+    implied = width / (2 * math.tan(entry.intrinsics["camera_angle_x"] / 2))
+    return implied if abs(entry.intrinsics["fl_x"] / implied - 1) > FOCAL_TOLERANCE else None
 
 
-def _check_focal(entry: FrameEntry, infos: Mapping[Path, ImageInfo]) -> None:
-    if {"fl_x", "camera_angle_x"} <= entry.intrinsics.keys():
-        width = _size(entry, infos)[0]
-        stated = entry.intrinsics["fl_x"]
-        implied = width / (2 * np.tan(entry.intrinsics["camera_angle_x"] / 2))
-        if abs(stated / implied - 1) > FOCAL_TOLERANCE:
-            raise InputError(
-                entry.file,
-                f"{entry.where}.fl_x",
-                f"{implied:.6g} px, which camera_angle_x and a width of {width} px imply",
-                f"{stated:.6g}",
-                "The intrinsics were probably not scaled with the images.",
-            )
+def _check_focal(entry: FrameEntry, width: int) -> None:
+    implied = contradicted_focal(entry, width)
+    if implied is not None:
+        expected = f"{implied:.6g} px, which camera_angle_x and a width of {width} px imply"
+        remedy = "The intrinsics were probably not scaled with the images."
+        found = f"{entry.intrinsics['fl_x']:.6g}"
+        raise InputError(entry.file, f"{entry.where}.fl_x", expected, found, remedy)

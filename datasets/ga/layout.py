@@ -67,11 +67,6 @@ def parameter_name(timestep: int) -> str:
     return f"{timestep:05d}.npz"
 
 
-def sequence_folder_name(subject: str, sequence: str, cameras: int) -> str:
-    """Name of a sequence's folder in VHAP's manner: ``074_EMO-1-shout+laugh_v16_whiteBg_staticOffset``."""
-    return f"{subject}_{sequence}_v{cameras}_whiteBg_staticOffset"
-
-
 def parse_sequence_folder(name: str) -> tuple[str, str]:
     """Subject and sequence that a sequence folder is named after; ("", name) where it follows no pattern."""
     match = _SEQUENCE_FOLDER.fullmatch(name)
@@ -164,17 +159,8 @@ class Declaration:
 
     def write(self, folder: Path) -> None:
         """Write ``headbench.json`` into ``folder``."""
-        value = {
-            "format_version": FORMAT_VERSION,
-            "subject": self.subject,
-            "head_model": self.head_model,
-            "head_file": self.head_file,
-            "background": list(self.background),
-            "cy": self.cy,
-            "sequences": dict(self.sequences),
-            "excluded": [{"timestep": t, "reason": reason} for t, reason in sorted(self.excluded.items())],
-            "synthetic": dict(self.synthetic),
-        }
+        excluded = [{"timestep": t, "reason": reason} for t, reason in sorted(self.excluded.items())]
+        value = {"format_version": FORMAT_VERSION, **vars(self), "excluded": excluded}
         write_json(folder / DECLARATION_FILE, value)
 
     @classmethod
@@ -194,9 +180,9 @@ class Declaration:
             check_name(name, path, f"sequences.{part}")
         if not all(0 <= channel <= 1 for channel in file.background):
             raise InputError(path, "background", "three numbers in [0, 1]", str(file.background))
-        excluded = {entry.timestep: entry.reason for entry in file.excluded}
-        members = {name: getattr(file, name) for name in _PLAIN_MEMBERS}
-        return cls(**members, excluded=excluded)
+        values = {**vars(file), "excluded": {entry.timestep: entry.reason for entry in file.excluded}}
+        del values["format_version"]
+        return cls(**values)
 
 
 @dataclass(frozen=True)
@@ -218,6 +204,3 @@ class _DeclarationFile:
     sequences: dict[str, str]
     excluded: tuple[_Exclusion, ...]
     synthetic: dict[str, Any]
-
-
-_PLAIN_MEMBERS = ("subject", "head_model", "head_file", "background", "cy", "sequences", "synthetic")

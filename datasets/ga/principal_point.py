@@ -16,11 +16,10 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
-import torch
 
 from ...bench.contracts import ByteArray, Camera, FloatArray, HeadPose, IntArray
 from ...bench.errors import InputError
-from ..head.model import HeadModel
+from ..head.subject import PosedSubject
 from ..images import read_image, read_mask
 from .cameras import CaptureCameras
 from .layout import CyConvention
@@ -96,14 +95,13 @@ def settle_cy(
         return "top", {"source": "immaterial, within 0.5 px of the centre"}
     evidence = weigh_cy(_pick_views(rig, tracking, poses, entries, background), tracking.head.faces)
     if evidence.decision is None:
-        raise InputError(
-            folder,
-            "cy",
-            "outlines of the tracked mesh and the foreground that agree better under one reading of cy",
-            f"agreement {evidence.top:.3f} with cy from the top, {evidence.bottom:.3f} from the bottom",
+        expected = "outlines of the tracked mesh and the foreground that agree better under one reading of cy"
+        found = f"agreement {evidence.top:.3f} with cy from the top, {evidence.bottom:.3f} from the bottom"
+        remedy = (
             'State the convention: cy="bottom" for VHAP exports since November 2024, "top" for older ones, '
-            '"centre" to ignore the principal point as GaussianAvatars does.',
+            '"centre" to ignore the principal point as GaussianAvatars does.'
         )
+        raise InputError(folder, "cy", expected, found, remedy)
     return evidence.decision, {"source": "outlines", **asdict(evidence)}
 
 
@@ -117,19 +115,13 @@ def _pick_views(
     """Up to `FRAMES` frames, spread over timesteps and, by a stride prime to most rigs, over cameras."""
     cameras = rig.resolve("top")
     ordered = sorted(entries, key=lambda e: (e.timestep, e.camera_index))
-    picks = np.unique(np.linspace(0, len(ordered) - 1, min(FRAMES, len(ordered))).round().astype(int))
-    chosen = [ordered[i] for i in picks]
-    model = HeadModel(tracking.head, dtype=torch.float64)
-    canonical = model.canonical(
-        torch.from_numpy(tracking.shape.astype(np.float64)),
-        torch.from_numpy(tracking.static_offset.astype(np.float64)),
-    )
-    views = []
-    for entry in chosen:
-        arguments = model.pose_arguments([poses[entry.timestep]])
-        vertices = model(canonical=canonical, **arguments)[0].numpy()
-        views.append(OutlineView(vertices, cameras[entry.camera_id], partial(_foreground, entry, background)))
-    return views
+    picks = np.linspace(0, len(ordered) - 1, min(FRAMES, len(ordered))).round().astype(int)
+    chosen = [ordered[i] for i in np.unique(picks)]
+    subject = PosedSubject(tracking.head, tracking.shape, tracking.static_offset)
+    return [
+        OutlineView(mesh, cameras[entry.camera_id], partial(_foreground, entry, background))
+        for entry, mesh in zip(chosen, subject.meshes([poses[entry.timestep] for entry in chosen]))
+    ]
 
 
 def _foreground(entry: FrameEntry, background: Sequence[float]) -> ByteArray:

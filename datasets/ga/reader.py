@@ -106,7 +106,9 @@ def read_capture(
     rig = collect_cameras(everything, infos)
     ground, wanted = _backgrounds(folder, declaration, background, everything, infos)
     asset = find_head(folder, declaration, head, masks=masks, regions=regions)
-    subject = check_name(subject or _subject(folder, declaration, everything), folder, "subject")
+    sequence_subject, _ = layout.parse_sequence_folder(everything[0].sequence_folder)
+    named = layout.parse_union_folder(folder.name) or sequence_subject or folder.name
+    subject = check_name(subject or (declaration.subject if declaration else named), folder, "subject")
     files = {entry.timestep: entry.parameters for entry in everything}
     tracking = read_tracking(files, asset, subject, teeth=teeth)
     poses = _shift_poses(tracking, rig, everything)
@@ -117,7 +119,9 @@ def read_capture(
     splits, frames = _index_frames(folder, subject, names, entries, infos)
     if held_out_sequences or held_out_cameras:
         splits = split_by_holding_out(folder, frames, held_out_sequences, held_out_cameras)
-    used = _used_files(folder, everything)
+    # Every file the clip depends on, but the head model, which may lie elsewhere and has its own digest.
+    used = {file for e in everything for file in (e.file, e.image, e.mask, e.parameters) if file is not None}
+    used |= {folder / layout.DECLARATION_FILE} if declaration else set()
     images = {
         FrameKey(subject, names[e.sequence_folder], e.timestep, e.camera_id): e.image for e in everything
     }
@@ -180,9 +184,8 @@ def find_capture(path: str | Path) -> Path:
     captures = find_captures(folder)
     if len(captures) != 1:
         found = ", ".join(capture.name for capture in captures)
-        raise InputError(
-            path, "", "one capture in the GaussianAvatars/VHAP layout", found, "Name one capture."
-        )
+        expected = "one capture in the GaussianAvatars/VHAP layout"
+        raise InputError(path, "", expected, found, "Name one capture.")
     return captures[0]
 
 
@@ -194,22 +197,12 @@ def _read_splits(folder: Path, resplit: bool) -> dict[str, list[FrameEntry]]:
         if resplit:
             return entries
         remedy = "Splits are made by reader_settings.held_out_sequences and .held_out_cameras."
-        raise InputError(
-            paths["train"], "", "a file for each split", f"{layout.ALL_FRAMES_FILE} alone", remedy
-        )
+        expected = "a file for each split"
+        raise InputError(paths["train"], "", expected, f"{layout.ALL_FRAMES_FILE} alone", remedy)
     entries = {name: read_transforms(path) for name, path in paths.items()}
     if not entries["train"]:
         raise InputError(paths["train"], "frames", "at least one training frame", "an empty list")
     return entries
-
-
-def _subject(folder: Path, declaration: layout.Declaration | None, entries: Sequence[FrameEntry]) -> str:
-    if declaration:
-        return declaration.subject
-    named = (
-        layout.parse_union_folder(folder.name) or layout.parse_sequence_folder(entries[0].sequence_folder)[0]
-    )
-    return named or folder.name
 
 
 def _backgrounds(
@@ -263,11 +256,3 @@ def _index_frames(
             frames[key] = FrameFiles(entry.image, entry.mask or own_alpha)
     check_disjoint(folder, splits)
     return splits, frames
-
-
-def _used_files(folder: Path, entries: Iterable[FrameEntry]) -> set[Path]:
-    """Every file the clip depends on, but the head model, which may lie elsewhere and has its own digest."""
-    files = {folder / layout.DECLARATION_FILE} if (folder / layout.DECLARATION_FILE).exists() else set()
-    for entry in entries:
-        files |= {entry.file, entry.image, entry.parameters} | ({entry.mask} if entry.mask else set())
-    return files

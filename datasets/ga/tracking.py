@@ -48,26 +48,19 @@ def find_head(
         path = Path(head) if head else folder / (declaration.head_file if declaration else HEAD_FILE)
         asset = _load(path, masks, regions)
     if declaration and asset.version != declaration.head_model:
-        raise InputError(
-            folder / DECLARATION_FILE,
-            "head_model",
-            f"{asset.version}, the version of the head model given",
-            declaration.head_model,
-            "Coefficients of one head model mean nothing to another.",
-        )
+        expected = f"{asset.version}, the version of the head model given"
+        remedy = "Coefficients of one head model mean nothing to another."
+        raise InputError(folder / DECLARATION_FILE, "head_model", expected, declaration.head_model, remedy)
     return asset
 
 
 def _load(path: Path, masks: str | Path | None, regions: str | Path | None) -> HeadArrays:
     if not path.exists():
-        raise InputError(
-            path,
-            "",
-            "the head model the capture was tracked with",
-            "no such file",
+        remedy = (
             "Captures of NeRSemble subjects need flame2023.pkl (FLAME 2023, versions with jaw rotation) from "
-            "https://flame.is.tue.mpg.de; give its path as head=. Synthetic captures hold their own.",
+            "https://flame.is.tue.mpg.de; give its path as head=. Synthetic captures hold their own."
         )
+        raise InputError(path, "", "the head model the capture was tracked with", "no such file", remedy)
     beside = path.with_name(FLAME_MASKS_FILE)
     if masks is None and path.suffix != ".npz" and beside.exists():
         masks = beside
@@ -78,7 +71,8 @@ TeethPolicy = Literal["auto", "add", "keep"]
 
 MAX_MOTION = 100.0  # metres; a wide open mouth takes 0.05
 
-_POSE_SIZES = {"translation": 3, "rotation": 3, "neck_pose": 3, "jaw_pose": 3, "eyes_pose": 6}
+POSE_SIZES = {"translation": 3, "rotation": 3, "neck_pose": 3, "jaw_pose": 3, "eyes_pose": 6}
+"""Arrays of a parameter file and their numbers per timestep, in the order of VHAP's export."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,9 +162,8 @@ def resolve_teeth(
         return head, rows
     expected = f"(1, {total}, 3) for head model {head.version}"
     found = f"{rows} rows"
-    raise InputError(
-        file, "static_offset", expected, found, "Give the head model the capture was tracked with."
-    )
+    remedy = "Give the head model the capture was tracked with."
+    raise InputError(file, "static_offset", expected, found, remedy)
 
 
 def _check_motion(
@@ -194,7 +187,7 @@ def _check_motion(
 def _pose(
     path: Path, arrays: Mapping[str, np.ndarray], head: HeadArrays, subject: str, timestep: int
 ) -> HeadPose:
-    parts = {key: _row(path, arrays, key, size) for key, size in _POSE_SIZES.items()}
+    parts = {key: _row(path, arrays, key, size) for key, size in POSE_SIZES.items()}
     eyelids = None
     if head.eyelid_basis is not None and "eyelids" in arrays:
         eyelids = _row(path, arrays, "eyelids", head.eyelid_basis.shape[2])

@@ -56,7 +56,7 @@ def read_transforms(path: Path) -> list[FrameEntry]:
     document = read_json(path)
     frames = document.get("frames")
     if not isinstance(frames, list):
-        raise InputError(path, "frames", "a list of frames", _kind(document, "frames"))
+        raise InputError(path, "frames", "a list of frames", found_entry(frames))
     return [parse_frame(path, f"frames[{i}]", frame, document) for i, frame in enumerate(frames)]
 
 
@@ -94,7 +94,7 @@ def parse_frame(path: Path, where: str, frame: Any, document: Mapping[str, Any])
         width=reader.integer("w") if reader.has("w") else None,
         height=reader.integer("h") if reader.has("h") else None,
         intrinsics=intrinsics,
-        camera_to_world=reader.rigid("transform_matrix"),
+        camera_to_world=read_rigid(path, f"{where}.transform_matrix", frame.get("transform_matrix")),
     )
 
 
@@ -103,9 +103,8 @@ def _check_intrinsics(path: Path, where: str, intrinsics: Mapping[str, float]) -
         raise InputError(path, where, "fl_x or camera_angle_x", "neither")
     for key in ("fl_x", "fl_y"):
         if intrinsics.get(key, 1.0) <= 0:
-            raise InputError(
-                path, f"{where}.{key}", "a positive focal length in pixels", f"{intrinsics[key]}"
-            )
+            expected = "a positive focal length in pixels"
+            raise InputError(path, f"{where}.{key}", expected, f"{intrinsics[key]}")
     angle = intrinsics.get("camera_angle_x", 1.0)
     if not 0 < angle < np.pi:
         raise InputError(path, f"{where}.camera_angle_x", "an angle in (0, pi) radians", f"{angle}")
@@ -115,10 +114,6 @@ def _sequence_folder(folder: Path, image: str) -> str:
     """Folder that holds ``images/``: the sequence's own, also when a union refers to it."""
     parts = Path(image).parts
     return parts[1] if len(parts) > 2 and parts[0] == ".." else folder.name
-
-
-def _kind(container: Mapping[str, Any], key: str) -> str:
-    return repr(container[key])[:60] if key in container else "no such key"
 
 
 class _FrameReader:
@@ -131,8 +126,7 @@ class _FrameReader:
         return key in self._frame or key in self._document
 
     def _fail(self, key: str, expected: str) -> InputError:
-        source = self._frame if key in self._frame else self._document
-        return InputError(self._path, f"{self._where}.{key}", expected, _kind(source, key))
+        return InputError(self._path, f"{self._where}.{key}", expected, found_entry(self._get(key)))
 
     def _get(self, key: str) -> Any:
         return self._frame.get(key, self._document.get(key))
@@ -163,19 +157,33 @@ class _FrameReader:
             raise self._fail(key, "a finite number")
         return number
 
-    def rigid(self, key: str) -> FloatArray:
-        try:
-            matrix = np.array(self._frame.get(key), dtype=np.float64)
-        except (TypeError, ValueError, OverflowError):
-            raise self._fail(key, "a 4x4 matrix of numbers") from None
-        if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-            raise self._fail(key, "a 4x4 matrix of finite numbers")
-        rotation = matrix[:3, :3]
-        skew = np.abs(rotation @ rotation.T - _IDENTITY).max()
-        projective = np.abs(matrix[3] - _LAST_ROW).max()
-        if max(skew, projective) > RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
-            raise self._fail(key, "a rigid motion (orthonormal, right-handed, last row 0 0 0 1)")
-        return matrix
+
+def read_matrix(file: Path, key: str, value: Any, size: int) -> FloatArray:
+    """(size, size) matrix of a JSON. Raises `InputError` for anything but finite numbers of that shape."""
+    try:
+        matrix = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        matrix = np.empty(0)
+    if matrix.shape != (size, size) or not np.isfinite(matrix).all():
+        raise InputError(file, key, f"a {size}x{size} matrix of finite numbers", found_entry(value))
+    return matrix
+
+
+def read_rigid(file: Path, key: str, value: Any) -> FloatArray:
+    """(4, 4) rigid motion of a JSON. Raises `InputError` for another matrix."""
+    matrix = read_matrix(file, key, value, 4)
+    rotation = matrix[:3, :3]
+    skew = np.abs(rotation @ rotation.T - _IDENTITY).max()
+    projective = np.abs(matrix[3] - _LAST_ROW).max()
+    if max(skew, projective) > RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
+        expected = "a rigid motion (orthonormal, right-handed, last row 0 0 0 1)"
+        raise InputError(file, key, expected, found_entry(value))
+    return matrix
+
+
+def found_entry(value: Any) -> str:
+    """An entry of a JSON for an error; None stands for one that is missing."""
+    return "no such key" if value is None else repr(value)[:60]
 
 
 def timesteps_of(entries: Sequence[FrameEntry]) -> list[int]:

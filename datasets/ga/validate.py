@@ -6,7 +6,7 @@ Each fault is one `InputError` that names the file, the entry, what was expected
 from __future__ import annotations
 
 import os
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
@@ -98,11 +98,17 @@ def find_leaks(
     training timesteps, and for novel-view cameras among the training cameras. Contents are read from the files
     at each call, but only of images that have their size in common with one of another split.
     """
-    contents = _contents(splits, images, progress)
+    sizes = {images[key]: images[key].stat().st_size for keys in splits.values() for key in keys}
+    split_of_size: dict[int, set[str]] = defaultdict(set)
+    for split, keys in splits.items():
+        for key in keys:
+            split_of_size[sizes[images[key]]].add(split)
+    alike = [path for path, size in sizes.items() if len(split_of_size[size]) > 1]
+    contents = content_digests(alike, progress=progress)
     found = []
     for one, other in combinations(splits, 2):
         names = f"{one} and {other}"
-        shared = _common({images[key] for key in splits[one]}, {images[key] for key in splits[other]})
+        shared = sorted({images[key] for key in splits[one]} & {images[key] for key in splits[other]})
         if shared:
             found.append(f"{len(shared)} image files are in both {names}, such as {shared[0]}")
             continue
@@ -114,44 +120,20 @@ def find_leaks(
                 f"{len(equal)} images have the same content in {names}, such as {first} and {equal[0]}"
             )
     train = splits.get("train", ())
-    timesteps = _common({k.timestep for k in train}, {k.timestep for k in splits.get("self_reenactment", ())})
+    timesteps = sorted({k.timestep for k in train} & {k.timestep for k in splits.get("self_reenactment", ())})
     if timesteps:
         found.append(f"{len(timesteps)} self-reenactment timesteps are trained on, such as {timesteps[0]}")
-    cameras = _common({k.camera for k in train}, {k.camera for k in splits.get("novel_view", ())})
+    cameras = sorted({k.camera for k in train} & {k.camera for k in splits.get("novel_view", ())})
     if cameras:
-        found.append(f"novel-view cameras are trained on: {', '.join(map(str, cameras))}")
+        found.append(f"novel-view cameras are trained on: {', '.join(cameras)}")
     return found
 
 
-def _contents(
-    splits: Mapping[str, Sequence[FrameKey]], images: Mapping[FrameKey, Path], progress: Progress
-) -> dict[Path, str]:
-    """Digest of each image that may have the content of one in another split, having its size."""
-    split_of_size: dict[int, set[str]] = {}
-    sizes: dict[Path, int] = {}
-    for split, keys in splits.items():
-        for path in {images[key] for key in keys}:
-            sizes[path] = path.stat().st_size
-            split_of_size.setdefault(sizes[path], set()).add(split)
-    candidates = [path for path, size in sizes.items() if len(split_of_size[size]) > 1]
-    return content_digests(candidates, progress=progress)
-
-
-def _common(one: set, other: set) -> list:
-    return sorted(one & other)
-
-
-def check_leaks(folder: Path, leaks: Iterable[str], policy: LeakPolicy) -> list[str]:
+def check_leaks(folder: Path, leaks: list[str], policy: LeakPolicy) -> list[str]:
     """Raise `InputError` for the leaks `find_leaks` found, or under ``"record"`` return them."""
-    leaks = list(leaks)
     if leaks and policy == "error":
-        raise InputError(
-            folder,
-            "splits",
-            "splits that share nothing",
-            "; ".join(leaks),
-            'Fix the split, or read with leaks="record" to have this noted in every result.',
-        )
+        remedy = 'Fix the split, or read with leaks="record" to have this noted in every result.'
+        raise InputError(folder, "splits", "splits that share nothing", "; ".join(leaks), remedy)
     return leaks
 
 
@@ -242,6 +224,5 @@ def require_full_grid(clip: CaptureClip, source: str | Path = "") -> None:
             "List the frame in a transforms JSON of the capture, or leave its timestep or camera out of all."
         )
         found = f"no such frame{more}"
-        raise InputError(
-            where, f"frame {missing[0]}", "a frame of every camera at every timestep", found, remedy
-        )
+        expected = "a frame of every camera at every timestep"
+        raise InputError(where, f"frame {missing[0]}", expected, found, remedy)

@@ -16,11 +16,13 @@ import numpy as np
 
 from ...bench.contracts import ByteArray, Camera, FloatArray, HeadPose
 from ...bench.errors import InputError
-from ...bench.io.files import atomic_path, grouped_writes, write_json, write_text
+from ...bench.io.documents import read_json
+from ...bench.io.files import atomic_path, grouped_writes, write_bytes, write_json, write_text
 from ...bench.io.images import probe_image
 from ..head.arrays import HeadArrays, save_head
 from ..images import write_image
 from . import layout
+from .transforms import read_transforms
 
 
 def camera_record(camera: Camera, index: int, cy: layout.CyConvention) -> dict[str, Any]:
@@ -33,15 +35,12 @@ def camera_record(camera: Camera, index: int, cy: layout.CyConvention) -> dict[s
     }
 
 
-def file_record(timestep: int, camera_index: int, prefix: str, *, mask: bool) -> dict[str, str]:
-    """Paths of a frame's files, relative to the JSON; ``prefix`` leads to the sequence's folder."""
+def file_record(timestep: int, camera_index: int, *, mask: bool) -> dict[str, str]:
+    """Paths of a frame's files, relative to the sequence's folder."""
     name = layout.frame_name(timestep, camera_index)
-    masks = {"fg_mask_path": f"{prefix}fg_masks/{name}.png"} if mask else {}
-    return {
-        "file_path": f"{prefix}images/{name}.png",
-        **masks,
-        "flame_param_path": f"{prefix}flame_param/{timestep:05d}.npz",
-    }
+    masks = {"fg_mask_path": f"fg_masks/{name}.png"} if mask else {}
+    parameters = f"flame_param/{layout.parameter_name(timestep)}"
+    return {"file_path": f"images/{name}.png", **masks, "flame_param_path": parameters}
 
 
 def transforms_document(
@@ -56,11 +55,78 @@ def transforms_document(
     }
 
 
-def split_of(*, test: bool, held_out_camera: bool) -> str:
-    """Name of the split a frame belongs to."""
-    if test:
-        return "self_reenactment"
-    return "novel_view" if held_out_camera else "train"
+def write_sequence(
+    folder: Path,
+    frames: Sequence[dict[str, Any]],
+    shared: Mapping[str, float | int],
+    held_out: Sequence[str],
+    declaration: layout.Declaration,
+) -> None:
+    """Write a sequence's declaration and its four JSONs.
+
+    The splits within the sequence are VHAP's: the first 70 % of the timesteps are training and, of the ``held_out``
+    cameras, novel views; the rest is test.
+    """
+    declaration.write(folder)
+    boundary = math.ceil(TRAIN_FRACTION * (1 + max(frame["timestep_index"] for frame in frames)))
+    placed = (
+        (frame, frame["timestep_index"] >= boundary, frame["camera_id"] in held_out) for frame in frames
+    )
+    _write_splits(folder, placed, shared)
+    write_json(folder / layout.ALL_FRAMES_FILE, transforms_document(frames, shared))
+
+
+def write_union(
+    union: Path,
+    train: Sequence[Path],
+    test: Sequence[Path],
+    held_out: Sequence[str],
+    declaration: layout.Declaration | None,
+) -> dict[str, int]:
+    """Join sequence folders, ours or VHAP's, into a union beside them; return the frames per split.
+
+    Timesteps are renumbered, training sequences first; nothing is copied. Frames of ``test`` are for
+    self-reenactment, with all cameras; of ``train``, the ``held_out`` cameras are for novel views.
+    """
+    placed: list[tuple[dict[str, Any], bool, bool]] = []
+    start = 0
+    shared: dict[str, Any] = {}
+    for folder in (*train, *test):
+        path = folder / layout.ALL_FRAMES_FILE
+        document = read_json(path)
+        shared = {
+            k: v for k, v in document.items() if k not in ("frames", "timestep_indices", "camera_indices")
+        }
+        for entry, frame in zip(read_transforms(path), document["frames"], strict=True):
+            record = {key: value for key, value in frame.items() if key not in _SINGLE_SEQUENCE_KEYS}
+            record["timestep_index"] += start
+            for key in _PATH_KEYS & record.keys():
+                record[key] = f"../{folder.name}/{record[key]}"
+            placed.append((record, folder in test, entry.camera_id in held_out))
+        start += 1 + max((frame["timestep_index"] for frame in document["frames"]), default=-1)
+    for file, group in ((layout.TRAIN_SEQUENCES_FILE, train), (layout.TEST_SEQUENCES_FILE, test)):
+        write_text(union / file, "".join(f"{folder.name}\n" for folder in group))
+    write_bytes(union / layout.CANONICAL_FILE, (train[0] / layout.CANONICAL_FILE).read_bytes())
+    if declaration is not None:
+        declaration.write(union)
+    return _write_splits(union, placed, shared)
+
+
+_PATH_KEYS = {"file_path", "fg_mask_path", "flame_param_path"}
+_SINGLE_SEQUENCE_KEYS = ("timestep_index_original", "timestep_id")
+
+
+def _write_splits(
+    folder: Path, frames: Iterable[tuple[dict[str, Any], bool, bool]], shared: Mapping[str, float | int]
+) -> dict[str, int]:
+    """Write the JSON of each split from (frame, whether it is test, whether of a held-out camera)."""
+    parts: dict[str, list[dict[str, Any]]] = {name: [] for name in layout.SPLIT_FILES}
+    for frame, test, held_out in frames:
+        parts["self_reenactment" if test else "novel_view" if held_out else "train"].append(frame)
+    # Training last: it is the file that readers recognise a capture by.
+    for name, file in reversed(layout.SPLIT_FILES.items()):
+        write_json(folder / file, transforms_document(parts[name], shared))
+    return {name: len(part) for name, part in parts.items()}
 
 
 def save_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
@@ -123,40 +189,35 @@ class CapturePlan:
         names = [sequence.name for sequence in self.sequences]
         ids = [camera.id for camera in self.cameras]
         vertices, _, identities = self.head.shape_basis.shape
-        _require(len(set(names)) == len(names) > 0, "sequences", "distinct names, at least one", f"{names}")
-        _require(len(set(ids)) == len(ids) > 0, "cameras", "distinct ids, at least one", f"{ids}")
-        _require(bool(self.subject), "subject", "a name", "none")
-        _require("_" not in self.subject, "subject", "a name without underscores", repr(self.subject))
-        _require(self.shape.shape == (identities,), "shape", f"({identities},)", f"{self.shape.shape}")
-        _require(
-            self.static_offset.shape == (vertices, 3),
-            "static_offset",
-            f"({vertices}, 3)",
-            f"{self.static_offset.shape}",
-        )
-        unknown = sorted({*self.test_sequences} - {*names})
-        _require(not unknown, "test_sequences", f"names out of {names}", f"{unknown}")
+        strays = sorted({*self.test_sequences} - {*names})
         unknown = sorted({*self.novel_view_cameras} - {*ids})
-        _require(not unknown, "novel_view_cameras", f"ids out of {ids}", f"{unknown}")
-        _require(
-            {*self.test_sequences} != {*names}, "test_sequences", "a training sequence left", "none left"
+        versions = sorted({pose.head_model for sequence in self.sequences for pose in sequence.poses})
+        version = self.head.version
+        shapes = (identities,), (vertices, 3)
+        checks = (
+            (len({*names}) == len(names) > 0, "sequences", "distinct names, at least one", names),
+            (len({*ids}) == len(ids) > 0, "cameras", "distinct ids, at least one", ids),
+            (bool(self.subject), "subject", "a name", "none"),
+            ("_" not in self.subject, "subject", "a name without underscores", repr(self.subject)),
+            (self.shape.shape == shapes[0], "shape", str(shapes[0]), self.shape.shape),
+            (
+                self.static_offset.shape == shapes[1],
+                "static_offset",
+                str(shapes[1]),
+                self.static_offset.shape,
+            ),
+            (not strays, "test_sequences", f"names out of {names}", strays),
+            (not unknown, "novel_view_cameras", f"ids out of {ids}", unknown),
+            ({*self.test_sequences} != {*names}, "test_sequences", "a training sequence left", "none left"),
+            (versions == [version], "sequences", f"poses of head model {version}", versions),
         )
-        versions = {pose.head_model for sequence in self.sequences for pose in sequence.poses}
-        _require(
-            versions == {self.head.version},
-            "sequences",
-            f"poses of head model {self.head.version}",
-            f"{sorted(versions)}",
-        )
+        for fits, key, expected, found in checks:
+            if not fits:
+                raise InputError("capture plan", key, expected, str(found))
 
     def sequence(self, name: str) -> SequencePlan:
         """The sequence of that name."""
         return next(sequence for sequence in self.sequences if sequence.name == name)
-
-
-def _require(condition: bool, key: str, expected: str, found: str) -> None:
-    if not condition:
-        raise InputError("capture plan", key, expected, found)
 
 
 class CaptureWriter:
@@ -172,9 +233,8 @@ class CaptureWriter:
         return self.root / f"UNION{len(self.plan.sequences)}_{self.plan.subject}"
 
     def sequence_folder(self, sequence: str) -> Path:
-        """Folder of a sequence."""
-        name = layout.sequence_folder_name(self.plan.subject, sequence, len(self.plan.cameras))
-        return self.root / name
+        """Folder of a sequence, named in VHAP's manner: ``074_EMO-1-shout+laugh_v16_whiteBg_staticOffset``."""
+        return self.root / f"{self.plan.subject}_{sequence}_v{len(self.plan.cameras)}_whiteBg_staticOffset"
 
     def image_path(self, sequence: str, timestep: int, camera: str) -> Path:
         """File of an image; ``timestep`` counts from 0 within the sequence."""
@@ -204,97 +264,58 @@ class CaptureWriter:
 
         Raises `InputError` naming the first image that is missing, broken or of the wrong size.
         """
-        self._check_images()
-        for sequence in self.plan.sequences:
-            self._write_sequence(sequence)
-        self._write_union()
-        return self.union
-
-    def _check_images(self) -> None:
-        for sequence in self.plan.sequences:
+        plan = self.plan
+        for sequence in plan.sequences:
             for timestep in range(len(sequence.poses)):
-                for camera in self.plan.cameras:
+                for camera in plan.cameras:
                     path = self.image_path(sequence.name, timestep, camera.id)
                     info = probe_image(path)
                     if (info.width, info.height) != (camera.width, camera.height):
                         size = f"{camera.width}x{camera.height} pixels, the size of camera {camera.id}"
                         raise InputError(path, "", size, f"{info.width}x{info.height}")
+        for sequence in plan.sequences:
+            self._write_sequence(sequence)
+        save_head(self.union / layout.HEAD_FILE, plan.head)
+        train = [s for s in plan.sequences if s.name not in plan.test_sequences]
+        test = [s for s in plan.sequences if s.name in plan.test_sequences]
+        write_union(
+            self.union,
+            [self.sequence_folder(sequence.name) for sequence in train],
+            [self.sequence_folder(sequence.name) for sequence in test],
+            plan.novel_view_cameras,
+            self._declaration([*train, *test], layout.HEAD_FILE),
+        )
+        return self.union
 
     def _write_sequence(self, sequence: SequencePlan) -> None:
-        folder = self.sequence_folder(sequence.name)
-        constant = identity_parameters(self.plan.shape, self.plan.static_offset)
+        plan, folder = self.plan, self.sequence_folder(sequence.name)
+        identity = identity_parameters(plan.shape, plan.static_offset)
         with grouped_writes():
             for timestep, pose in enumerate(sequence.poses):
-                save_npz(
-                    folder / "flame_param" / layout.parameter_name(timestep),
-                    pose_to_parameters(pose) | constant,
-                )
-        self._write_canonical(folder)
-        boundary = math.ceil(TRAIN_FRACTION * len(sequence.poses))
-        frames = list(self._frames(sequence, 0, ""))
-        for record in frames:
-            timestep = record["timestep_index"]
-            record["timestep_index_original"] = timestep
-            record["timestep_id"] = f"{timestep:06d}"
-        held_out = {self._camera_index[camera] for camera in self.plan.novel_view_cameras}
-        parts: dict[str, list[dict[str, Any]]] = {name: [] for name in layout.SPLIT_FILES}
-        for record in frames:
-            split = split_of(
-                test=record["timestep_index"] >= boundary, held_out_camera=record["camera_index"] in held_out
-            )
-            parts[split].append(record)
-        self._declaration([sequence], f"../{self.union.name}/{layout.HEAD_FILE}").write(folder)
-        for name, file in layout.SPLIT_FILES.items():
-            self._write_transforms(folder / file, parts[name])
-        self._write_transforms(folder / layout.ALL_FRAMES_FILE, frames)
-
-    def _write_union(self) -> None:
-        test = [s for s in self.plan.sequences if s.name in self.plan.test_sequences]
-        train = [s for s in self.plan.sequences if s.name not in self.plan.test_sequences]
-        held_out = {self._camera_index[camera] for camera in self.plan.novel_view_cameras}
-        parts: dict[str, list[dict[str, Any]]] = {name: [] for name in layout.SPLIT_FILES}
-        start = 0
-        for sequence in [*train, *test]:
-            for record in self._frames(sequence, start, f"../{self.sequence_folder(sequence.name).name}/"):
-                split = split_of(test=sequence in test, held_out_camera=record["camera_index"] in held_out)
-                parts[split].append(record)
-            start += len(sequence.poses)
-        for file, group in ((layout.TRAIN_SEQUENCES_FILE, train), (layout.TEST_SEQUENCES_FILE, test)):
-            names = (self.sequence_folder(sequence.name).name for sequence in group)
-            write_text(self.union / file, "".join(f"{name}\n" for name in names))
-        self._write_canonical(self.union)
-        save_head(self.union / layout.HEAD_FILE, self.plan.head)
-        self._declaration([*train, *test], layout.HEAD_FILE).write(self.union)
-        # Training last: it is the file that readers recognise a capture by.
-        for name, file in reversed(layout.SPLIT_FILES.items()):
-            self._write_transforms(self.union / file, parts[name])
-
-    def _frames(self, sequence: SequencePlan, start: int, prefix: str) -> Iterable[dict[str, Any]]:
-        """Frame records, timestep outer, camera inner, with the key order of VHAP's union export."""
-        for timestep in range(len(sequence.poses)):
-            for index, camera in enumerate(self.plan.cameras):
-                mask = self.mask_path(sequence.name, timestep, camera.id).exists()
-                yield {
-                    "timestep_index": start + timestep,
-                    **camera_record(camera, index, self.plan.cy),
-                    **file_record(timestep, index, prefix, mask=mask),
-                }
-
-    def _write_transforms(self, path: Path, frames: Sequence[Mapping[str, Any]]) -> None:
-        shared = layout.intrinsics_to_json(self.plan.cameras[-1], self.plan.cy)
-        write_json(path, transforms_document(frames, shared))
-
-    def _write_canonical(self, folder: Path) -> None:
-        pose = self.plan.sequences[0].poses[0]
-        zeros = {key: np.zeros_like(value) for key, value in pose_to_parameters(pose).items()}
+                path = folder / "flame_param" / layout.parameter_name(timestep)
+                save_npz(path, pose_to_parameters(pose) | identity)
+        zeros = {k: np.zeros_like(v) for k, v in pose_to_parameters(plan.sequences[0].poses[0]).items()}
         zeros["jaw_pose"] = np.array([CANONICAL_JAW], dtype=np.float64)
-        save_npz(
-            folder / layout.CANONICAL_FILE,
-            zeros | identity_parameters(self.plan.shape, self.plan.static_offset),
-        )
+        save_npz(folder / layout.CANONICAL_FILE, zeros | identity)
+        frames = [  # timestep outer, camera inner, keys in the order of VHAP's union export
+            {
+                "timestep_index": timestep,
+                **camera_record(camera, index, plan.cy),
+                **file_record(
+                    timestep, index, mask=self.mask_path(sequence.name, timestep, camera.id).exists()
+                ),
+                "timestep_index_original": timestep,
+                "timestep_id": f"{timestep:06d}",
+            }
+            for timestep in range(len(sequence.poses))
+            for index, camera in enumerate(plan.cameras)
+        ]
+        shared = layout.intrinsics_to_json(plan.cameras[-1], plan.cy)
+        declaration = self._declaration([sequence], f"../{self.union.name}/{layout.HEAD_FILE}")
+        write_sequence(folder, frames, shared, plan.novel_view_cameras, declaration)
 
     def _declaration(self, sequences: Sequence[SequencePlan], head_file: str) -> layout.Declaration:
-        starts = np.cumsum([0, *(len(sequence.poses) for sequence in sequences)])
+        starts = np.cumsum([0, *(len(sequence.poses) for sequence in sequences)]).tolist()
         return layout.Declaration(
             subject=self.plan.subject,
             head_model=self.plan.head.version,
@@ -303,8 +324,8 @@ class CaptureWriter:
             cy=self.plan.cy,
             sequences={self.sequence_folder(s.name).name: s.name for s in sequences},
             excluded={
-                int(start) + timestep: reason
-                for start, sequence in zip(starts, sequences, strict=False)
+                start + timestep: reason
+                for start, sequence in zip(starts, sequences)
                 for timestep, reason in sequence.excluded.items()
             },
             synthetic=self.plan.synthetic,

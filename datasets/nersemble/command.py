@@ -158,16 +158,10 @@ def _done(results: list[SubjectResult], plans: list[SubjectPlan], settings: Prep
                 f"  Frames: {splits}.",
                 f"  Use it: headbench run --data {result.union}{head} --out runs/{result.subject}",
             ]
-    data = {
-        result.subject: {
-            "written": result.written,
-            "kept": result.kept,
-            "frames": result.frames,
-            "union": result.union,
-            "missing": list(result.missing),
-        }
-        for result in results
-    }
+    data = {}
+    for result in results:
+        data[result.subject] = {**vars(result), "missing": list(result.missing)}
+        del data[result.subject]["subject"]
     passed = not settings.tracking or all(result.union is not None for result in results)
     return Findings("\n".join(lines), data, passed)
 

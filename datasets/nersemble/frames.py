@@ -20,9 +20,9 @@ import cv2
 from ...bench.contracts import ByteArray, Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.io.files import grouped_writes
-from ...bench.io.images import probe_image, read_pixels
+from ...bench.io.images import read_pixels
 from ...bench.machine import processor_count
-from ..images import write_image
+from ..images import is_whole, write_image
 from .pixels import prepare_pixels, read_still
 from .plan import SequenceJob
 from .sequence import RecordedView, open_video
@@ -55,12 +55,8 @@ def read_frames(view: RecordedView, numbers: Sequence[int]) -> Iterator[RawFrame
         return
     masks = _decode_video(view.mask_video, view, numbers)
     for number, bgr, mask in zip(numbers, frames, masks):
-        yield RawFrame(number, bgr, _one_channel(mask))
-
-
-def _one_channel(mask: ByteArray) -> ByteArray:
-    """First channel: masks are grey, and videos have it thrice."""
-    return cv2.extractChannel(mask, 0).astype("uint8", copy=False)
+        # Masks are grey, and videos have that thrice.
+        yield RawFrame(number, bgr, cv2.extractChannel(mask, 0).astype("uint8", copy=False))
 
 
 def _decode_video(path: Path, view: RecordedView, numbers: Sequence[int]) -> Iterator[ByteArray]:
@@ -157,9 +153,8 @@ def writing(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         remedy = "Make room (or let it be written) and start again: it continues where it stopped."
-        raise InputError(
-            error.filename or path, "", "a file that can be written", error.strerror or str(error), remedy
-        ) from error
+        found = error.strerror or str(error)
+        raise InputError(error.filename or path, "", "a file that can be written", found, remedy) from error
 
 
 def _missing(job: SequenceJob, index: int) -> _Stream:
@@ -169,9 +164,9 @@ def _missing(job: SequenceJob, index: int) -> _Stream:
     timesteps = []
     for timestep in range(job.count):
         image, mask = job.image_path(timestep, index), job.mask_path(timestep, index)
-        whole = image.name in present and _is_whole(image, camera.width, camera.height)
+        whole = image.name in present and is_whole(image, camera.width, camera.height)
         if masks is not None:
-            whole = whole and mask.name in masks and _is_whole(mask, camera.width, camera.height)
+            whole = whole and mask.name in masks and is_whole(mask, camera.width, camera.height)
         if not whole:
             timesteps.append(timestep)
     return _Stream(job, index, tuple(timesteps))
@@ -179,12 +174,3 @@ def _missing(job: SequenceJob, index: int) -> _Stream:
 
 def _present(folder: Path) -> set[str]:
     return set(os.listdir(folder)) if folder.is_dir() else set()
-
-
-def _is_whole(path: Path, width: int, height: int) -> bool:
-    """Whether an image is complete: a crash of the machine can leave a renamed file without its content."""
-    try:
-        info = probe_image(path)
-    except InputError:
-        return False
-    return (info.width, info.height) == (width, height)

@@ -122,9 +122,8 @@ def chosen_subjects(text: str, key: str = "--subjects") -> list[str]:
         return [*SUBJECT_NAMES[text]]
     ids = [part.strip() for part in text.split(",") if part.strip()]
     if not ids or not all(part.isascii() and part.isdigit() for part in ids):
-        raise InputError(
-            "command line", key, 'numbers separated by commas, "paper" or "ablation"', repr(text)
-        )
+        expected = 'numbers separated by commas, "paper" or "ablation"'
+        raise InputError("command line", key, expected, repr(text))
     padded = [part.zfill(3) for part in ids]
     if len(set(padded)) != len(padded):
         raise InputError("command line", key, "every subject once", repr(text))

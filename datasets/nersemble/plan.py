@@ -17,9 +17,7 @@ from ..head.arrays import HeadArrays
 from ..head.loaders import load_head
 from ..head.procedural.model import VERSIONS
 from .command import PrepareSettings
-from .export import CY, SequenceExport
 from .names import (
-    NOVEL_VIEW_CAMERA,
     PAPER_SEQUENCES,
     SEQUENCES,
     TEST_SEQUENCE,
@@ -31,6 +29,9 @@ from .pixels import Correction
 from .recording import Participant, participant, read_calibration
 from .sequence import RecordedSequence, read_sequence
 from .tracking import TrackedSequence, find_tracked, read_tracked
+
+CY: layout.CyConvention = "bottom"
+"""Where VHAP's exports measure the principal point from."""
 
 IMAGES_VERSION = 1
 """Counted up when the same recording and settings make other images than before."""
@@ -64,17 +65,6 @@ class SequenceJob:
     def count(self) -> int:
         """Number of timesteps."""
         return len(self.recorded.numbers)
-
-    @property
-    def export(self) -> SequenceExport:
-        """The metadata to write."""
-        return SequenceExport(
-            folder=self.folder,
-            cameras=self.cameras,
-            numbers=self.recorded.numbers,
-            masks=self.recorded.has_masks,
-            held_out=(NOVEL_VIEW_CAMERA,),
-        )
 
     def image_path(self, timestep: int, index: int) -> Path:
         """File of an image."""

@@ -15,20 +15,26 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from ...bench.contracts import Progress, no_progress
+import numpy as np
+
+from ...bench.contracts import Camera, FloatArray, Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.io.documents import checked, read_json
-from ...bench.io.files import digest, remove_dead_temporaries, write_json
+from ...bench.io.files import digest, grouped_writes, remove_dead_temporaries, write_json
 from ...bench.io.lock import locked
 from ..ga import layout
+from ..ga.writer import camera_record, file_record, save_npz, transforms_document, write_sequence, write_union
 from ..head.arrays import save_head
-from .export import write_union
 from .frames import write_images, writing
 from .names import NOVEL_VIEW_CAMERA
-from .plan import SequenceJob, SubjectPlan, describe_pixels
+from .plan import CY, SequenceJob, SubjectPlan, describe_pixels
+from .tracking import TrackedSequence
 
 RECORD_FILE = "headbench-prepare.json"
 RECORD_VERSION = 1
+
+BACKUP_FILE = "transforms_backup.json"
+"""Frames and cameras before tracking: no parameters, no shift."""
 
 _READABLE = (*layout.SPLIT_FILES.values(), layout.ALL_FRAMES_FILE)
 """Files a folder is read as a capture by."""
@@ -182,10 +188,48 @@ def _write_metadata(plan: SubjectPlan, job: SequenceJob, state: SequenceState) -
         for name in _READABLE:
             (folder / name).unlink(missing_ok=True)
     _write_state(job, replace(state, images_complete=True, metadata=""))
-    job.export.write_backup()
+    bare = [{k: v for k, v in f.items() if k != "flame_param_path"} for f in _frames(job, np.zeros(3))]
+    write_json(job.folder / BACKUP_FILE, transforms_document(bare, _intrinsics(job.cameras[-1])))
     if job.tracked is not None:
-        job.export.write_tracked(job.tracked, declaration)
+        _write_tracked(job, job.tracked, declaration)
     _write_state(job, replace(state, images_complete=True, metadata=fingerprint))
+
+
+def _intrinsics(camera: Camera) -> dict[str, float | int]:
+    return layout.intrinsics_to_json(camera, CY)
+
+
+def _frames(job: SequenceJob, shift: FloatArray) -> list[dict[str, Any]]:
+    """Frame records in the world whose origin is at ``shift``: timestep outer, camera inner, VHAP's order of keys."""
+    records = [camera_record(_moved(camera, shift), index, CY) for index, camera in enumerate(job.cameras)]
+    return [
+        {
+            "timestep_index": timestep,
+            "timestep_index_original": timestep,
+            "timestep_id": f"{number:06d}",
+            **record,
+            **file_record(timestep, index, mask=job.recorded.has_masks),
+        }
+        for timestep, number in enumerate(job.recorded.numbers)
+        for index, record in enumerate(records)
+    ]
+
+
+def _moved(camera: Camera, shift: FloatArray) -> Camera:
+    matrix = camera.world_to_camera.copy()
+    matrix[:3, 3] += matrix[:3, :3] @ shift
+    return replace(camera, world_to_camera=matrix)
+
+
+def _write_tracked(job: SequenceJob, tracked: TrackedSequence, declaration: layout.Declaration) -> None:
+    """Write parameters and JSONs in the world whose mean translation is zero."""
+    with grouped_writes():
+        for timestep in range(tracked.count):
+            path = job.folder / "flame_param" / layout.parameter_name(timestep)
+            save_npz(path, tracked.parameters(timestep))
+    save_npz(job.folder / layout.CANONICAL_FILE, tracked.canonical())
+    frames = _frames(job, tracked.shift)
+    write_sequence(job.folder, frames, _intrinsics(job.cameras[-1]), (NOVEL_VIEW_CAMERA,), declaration)
 
 
 def _is_readable(job: SequenceJob) -> bool:

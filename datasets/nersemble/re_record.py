@@ -288,9 +288,8 @@ def write_video(path: Path, frames: Iterable[ByteArray]) -> str:
             height, width = frame.shape[:2]
             if writer is None:
                 if width % 2 or height % 2:
-                    raise InputError(
-                        path, "size", "even width and height, as the codec asks", f"{width}x{height}"
-                    )
+                    expected = "even width and height, as the codec asks"
+                    raise InputError(path, "size", expected, f"{width}x{height}")
                 code = cv2.VideoWriter.fourcc(*codec)
                 writer = cv2.VideoWriter(str(temporary), cv2.CAP_FFMPEG, code, FPS, (width, height))
                 if not writer.isOpened():

@@ -29,6 +29,7 @@ from ...bench.contracts import Camera, FloatArray
 from ...bench.errors import InputError
 from ...bench.io.documents import read_json
 from ...bench.io.files import check_name
+from ..ga.transforms import found_entry, read_matrix, read_rigid
 from .names import BACKGROUND, FULL_SIZE, is_subject, match_sequence, serial_of
 from .pixels import Correction, affine_correction, polynomial_correction
 
@@ -111,13 +112,8 @@ def participant(root: Path, subject: str) -> Participant:
         raise InputError(root, "subject", f"one out of {', '.join(known)}", subject)
     one = known[subject]
     if not one.calibration_file.exists():
-        raise InputError(
-            one.calibration_file,
-            "",
-            "the calibration of the cameras",
-            "no such file",
-            "Download calibrations.",
-        )
+        expected = "the calibration of the cameras"
+        raise InputError(one.calibration_file, "", expected, "no such file", "Download calibrations.")
     return one
 
 
@@ -164,9 +160,8 @@ def _listed_sequences(root: Path) -> dict[str, tuple[str, ...]]:
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(path, "", "a CSV file in UTF-8", f"content that does not parse ({error})") from error
     if rows and "ID" not in rows[0]:
-        raise InputError(
-            path, "ID", "a column of participants", f"columns {', '.join(map(str, rows[0]))[:80]}"
-        )
+        expected = "a column of participants"
+        raise InputError(path, "ID", expected, f"columns {', '.join(map(str, rows[0]))[:80]}")
     return {
         str(row["ID"]).strip().zfill(3): tuple(
             name
@@ -177,9 +172,6 @@ def _listed_sequences(root: Path) -> dict[str, tuple[str, ...]]:
         )
         for row in rows
     }
-
-
-_RIGID_TOLERANCE = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,13 +204,10 @@ class Calibration:
         """
         width, height = self.size or size
         if abs(size[0] * height - size[1] * width) > max(width, height):
-            raise InputError(
-                self.file,
-                "width, height",
-                f"images of the shape of {width}x{height}, which the intrinsics refer to",
-                f"images of {size[0]}x{size[1]} from camera {serial}",
-                "Give height and width in camera_params.json where the recording has another size.",
-            )
+            expected = f"images of the shape of {width}x{height}, which the intrinsics refer to"
+            found = f"images of {size[0]}x{size[1]} from camera {serial}"
+            remedy = "Give height and width in camera_params.json where the recording has another size."
+            raise InputError(self.file, "width, height", expected, found, remedy)
         K = np.diag([output[0] / width, output[1] / height, 1.0]) @ self.intrinsics[serial]
         return Camera(serial, *output, K, self.world_to_camera[serial])
 
@@ -257,11 +246,11 @@ def read_calibration(path: Path) -> Calibration:
     value = read_json(path)
     matrices = value.get("world_2_cam")
     if not isinstance(matrices, dict) or not matrices:
-        raise InputError(path, "world_2_cam", "an object from serial to 4x4 matrix", _kind(matrices))
+        raise InputError(path, "world_2_cam", "an object from serial to 4x4 matrix", found_entry(matrices))
     world_to_camera = {}
     for serial, entry in matrices.items():
         check_name(serial, path, "world_2_cam")
-        world_to_camera[serial] = _rigid(path, f"world_2_cam.{serial}", entry)
+        world_to_camera[serial] = read_rigid(path, f"world_2_cam.{serial}", entry)
     shared = value.get("intrinsics")
     if isinstance(shared, dict):
         missing = [serial for serial in world_to_camera if serial not in shared]
@@ -280,39 +269,15 @@ def _size(path: Path, value: Mapping[str, Any], per_camera: bool) -> tuple[int, 
     for key in ("width", "height"):
         number = value.get(key)
         if not isinstance(number, int) or isinstance(number, bool) or number < 1:
-            raise InputError(path, key, "a number of pixels from 1", _kind(number))
+            raise InputError(path, key, "a number of pixels from 1", found_entry(number))
         sizes.append(number)
     return sizes[0], sizes[1]
 
 
-def _matrix(path: Path, key: str, value: Any, size: int) -> FloatArray:
-    try:
-        matrix = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        matrix = np.empty(0)
-    if matrix.shape != (size, size) or not np.isfinite(matrix).all():
-        raise InputError(path, key, f"a {size}x{size} matrix of finite numbers", _kind(value))
-    return matrix
-
-
-def _rigid(path: Path, key: str, value: Any) -> FloatArray:
-    matrix = _matrix(path, key, value, 4)
-    rotation = matrix[:3, :3]
-    skew = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if max(skew, np.abs(matrix[3] - [0, 0, 0, 1]).max()) > _RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
-        expected = "a rigid motion (orthonormal, right-handed, last row 0 0 0 1)"
-        raise InputError(path, key, expected, "a matrix that is none")
-    return matrix
-
-
 def _intrinsics(path: Path, key: str, value: Any) -> FloatArray:
-    K = _matrix(path, key, value, 3)
+    K = read_matrix(path, key, value, 3)
     zeros = [K[0, 1], K[1, 0], K[2, 0], K[2, 1]]
     if K[0, 0] <= 0 or K[1, 1] <= 0 or K[2, 2] != 1 or np.any(zeros):
         expected = "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with positive focal lengths"
-        raise InputError(path, key, expected, _kind(value))
+        raise InputError(path, key, expected, found_entry(value))
     return K
-
-
-def _kind(value: Any) -> str:
-    return "no such entry" if value is None else repr(value)[:60]

@@ -11,7 +11,7 @@ import re
 import struct
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import BinaryIO, Literal
 
@@ -28,6 +28,7 @@ Source = Literal["auto", "video", "images"]
 EVERY_OF_73 = 3
 """Every third frame of 73 per second makes the 24.33 per second that "24 fps" stands for."""
 
+_TRUNCATED = "Fetch the file again."
 _FRAME_FOLDER = re.compile(r"frame_(\d+)")
 _IMAGE_FOLDERS = ("images-2x", "images-2x-73fps")
 _MASK_FOLDERS = ("alpha_map", "alpha_map-73fps")
@@ -49,10 +50,10 @@ class RecordedView:
     """
 
     serial: str
-    video: Path | None
-    images: Mapping[int, Path]
-    count: int
-    size: tuple[int, int]
+    video: Path | None = None
+    images: Mapping[int, Path] = field(default_factory=dict)
+    count: int = 0
+    size: tuple[int, int] = (0, 0)
     mask_video: Path | None = None
     masks: Mapping[int, Path] | None = None
 
@@ -132,9 +133,8 @@ def read_sequence(
     if stray:
         remedy = "Name the cameras to use."
         expected = f"cameras that {calibration.file.name} knows"
-        raise InputError(
-            folder, stray[0], expected, "a recording of another camera", "" if cameras else remedy
-        )
+        found = "a recording of another camera"
+        raise InputError(folder, stray[0], expected, found, "" if cameras else remedy)
     views = {serial: _checked(folder, views.get(serial), serial, source) for serial in serials}
     common, everything = _common_numbers(folder, views, cut)
     step = every or rate
@@ -155,7 +155,7 @@ def _collect(folder: Path, serials: Sequence[str], source: Source) -> tuple[dict
     nested = _frame_folders(folder)
     if nested and source != "video":
         return nested, EVERY_OF_73
-    images = _numbered_views(folder, serials)
+    images = _image_views(*(_numbered(folder / kind, serials) for kind in ("images", "alpha_maps")))
     with_masks = bool(images) and all(view.masks for view in images.values())
     if images and (source == "images" or (source == "auto" and with_masks)):
         return images, 1
@@ -176,20 +176,21 @@ def _videos(folder: Path) -> dict[str, RecordedView]:
         for path in sorted(parent.glob("cam_*.mp4")):
             if serial := serial_of(path.stem, "cam"):
                 mask = folder / "alpha_maps" / path.name
-                views[serial] = RecordedView(serial, path, {}, 0, (0, 0), mask if mask.exists() else None)
+                views[serial] = RecordedView(serial, path, mask_video=mask if mask.exists() else None)
     return views
 
 
-def _numbered_views(folder: Path, serials: Sequence[str]) -> dict[str, RecordedView]:
-    """Views of VHAP's preprocessing; it drops the serial where it ran on one camera."""
-    images = _numbered(folder / "images", serials)
-    masks = _numbered(folder / "alpha_maps", serials)
+def _image_views(
+    images: Mapping[str, dict[int, Path]], masks: Mapping[str, dict[int, Path]]
+) -> dict[str, RecordedView]:
     return {
-        s: RecordedView(s, None, files, len(files), (0, 0), None, masks.get(s)) for s, files in images.items()
+        serial: RecordedView(serial, images=files, count=len(files), masks=masks.get(serial))
+        for serial, files in images.items()
     }
 
 
 def _numbered(folder: Path, serials: Sequence[str]) -> dict[str, dict[int, Path]]:
+    """Files of VHAP's preprocessing, which drops the serial where it ran on one camera."""
     found: dict[str, dict[int, Path]] = {}
     for path in sorted(folder.iterdir()) if folder.is_dir() else ():
         parsed = numbered(path.stem) if path.suffix.lower() in _IMAGE_SUFFIXES else None
@@ -215,9 +216,7 @@ def _frame_folders(folder: Path) -> dict[str, RecordedView]:
             for path in (path for name in names for path in sorted((frame / name).glob("cam_*.png"))):
                 if serial := serial_of(path.stem, "cam"):
                     target.setdefault(serial, {})[int(match[1])] = path
-    return {
-        s: RecordedView(s, None, files, len(files), (0, 0), None, masks.get(s)) for s, files in images.items()
-    }
+    return _image_views(images, masks)
 
 
 def _checked(folder: Path, view: RecordedView | None, serial: str, source: Source) -> RecordedView:
@@ -225,9 +224,8 @@ def _checked(folder: Path, view: RecordedView | None, serial: str, source: Sourc
     if view is None:
         kind = "a video" if source == "video" else "frames"
         remedy = "Fetch them, or name the cameras to use."
-        raise InputError(
-            folder, f"camera {serial}", f"{kind}, as the calibration has this camera", "none", remedy
-        )
+        expected = f"{kind}, as the calibration has this camera"
+        raise InputError(folder, f"camera {serial}", expected, "none", remedy)
     if view.video is not None:
         count, size = probe_video(view.video)
         if view.mask_video is not None:
@@ -298,13 +296,10 @@ def _common_numbers(
     everything = set.union(*numbers.values())
     common = set.intersection(*numbers.values())
     if len(common) < len(everything) and not cut:
-        raise InputError(
-            folder,
-            "frames",
-            f"the same frames for all cameras, {len(everything)} as they have together",
-            _lacking({serial: everything - own for serial, own in numbers.items()}),
-            "Fetch the file again, or keep what all cameras have with --cut.",
-        )
+        expected = f"the same frames for all cameras, {len(everything)} as they have together"
+        found = _lacking({serial: everything - own for serial, own in numbers.items()})
+        remedy = "Fetch the file again, or keep what all cameras have with --cut."
+        raise InputError(folder, "frames", expected, found, remedy)
     if not common:
         raise InputError(folder, "frames", "frames that all cameras have", "none")
     return sorted(common), sorted(everything)
@@ -333,9 +328,6 @@ def _ranges(numbers: Sequence[int], most: int = 8) -> str:
     listed = ", ".join(f"{run[0]}-{run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs[:most])
     rest = sum(len(run) for run in runs[most:])
     return f"{listed} and {rest} more" if rest else listed
-
-
-_TRUNCATED = "Fetch the file again."
 
 
 def check_boxes(path: Path) -> None:

@@ -13,12 +13,9 @@ from ...bench.contracts import FloatArray
 from ...bench.errors import InputError
 from ...bench.io.arrays import MAX_MAGNITUDE, check_numbers, read_npz
 from ..ga.layout import parse_sequence_folder
-from ..ga.tracking import resolve_teeth
+from ..ga.tracking import POSE_SIZES, resolve_teeth
 from ..ga.writer import CANONICAL_JAW
 from ..head.arrays import HeadArrays
-
-PER_TIMESTEP = {"translation": 3, "rotation": 3, "neck_pose": 3, "jaw_pose": 3, "eyes_pose": 6}
-"""Arrays of shape (T, n) that every tracking has, in the order of an export; ``expr`` is (T, E)."""
 
 _RESULT = re.compile(r"tracked_flame_params_(\d+)\.npz")
 
@@ -30,7 +27,7 @@ class TrackedSequence:
     Attributes
     ----------
     file : where they come from.
-    frames : arrays with T rows: those of `PER_TIMESTEP`, ``expr``, and ``dynamic_offset`` and ``eyelids`` where
+    frames : arrays with T rows: those of `POSE_SIZES`, ``expr``, and ``dynamic_offset`` and ``eyelids`` where
         there are any.
     constant : ``shape`` (S,) and ``static_offset`` (1, V, 3), zeros where the tracker wrote none.
     """
@@ -83,7 +80,7 @@ def read_tracked(
         raise InputError(path, "rotation_matrices", "VHAP's arrays", "the benchmark's tracking", remedy)
     if len(kept) > timesteps:
         arrays = _cut(path, arrays, timesteps, np.asarray(kept, dtype=bool))
-    frames = {key: _floats(path, arrays, key, (timesteps, size)) for key, size in PER_TIMESTEP.items()}
+    frames = {key: _floats(path, arrays, key, (timesteps, size)) for key, size in POSE_SIZES.items()}
     frames["expr"] = _floats(path, arrays, "expr", (timesteps, None))
     for key, shape in (("dynamic_offset", (timesteps, None, 3)), ("eyelids", (timesteps, 2))):
         if key in arrays:
@@ -128,7 +125,7 @@ def _cut(
     """The arrays with the rows of the frames that were kept, where they have rows for all frames."""
     rows = arrays["translation"].shape[:1] if "translation" in arrays else ()
     if rows == (len(kept),):
-        moving = {*PER_TIMESTEP, "expr", "dynamic_offset", "eyelids"}
+        moving = {*POSE_SIZES, "expr", "dynamic_offset", "eyelids"}
         return {
             key: array[kept] if key in moving and array.shape[:1] == rows else array
             for key, array in arrays.items()
@@ -150,9 +147,8 @@ def _floats(
 ) -> FloatArray:
     """An array as float32; None in ``shape`` fits any size."""
     if key not in arrays:
-        raise InputError(
-            path, key, "an array", f"only {', '.join(sorted(arrays))}", "Give VHAP's own output."
-        )
+        expected = "an array"
+        raise InputError(path, key, expected, f"only {', '.join(sorted(arrays))}", "Give VHAP's own output.")
     array = arrays[key]
     if key == "shape" and array.ndim == 2 and len(array) == 1:
         array = array[0]

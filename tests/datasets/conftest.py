@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import pytest
@@ -19,9 +18,7 @@ def pristine_capture(tmp_path_factory) -> TinyCapture:
 @pytest.fixture
 def capture(pristine_capture, tmp_path) -> TinyCapture:
     """A copy of the capture that a test may damage."""
-    root = tmp_path / "capture"
-    shutil.copytree(pristine_capture.writer.root, root)
-    return pristine_capture.moved(root)
+    return pristine_capture.copied(tmp_path / "capture")
 
 
 @pytest.fixture

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import json
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Self
 
-import cv2
 import numpy as np
-import torch
 
 from headbench.bench.contracts import Camera, HeadPose
 from headbench.datasets.ga.writer import CapturePlan, CaptureWriter, SequencePlan
 from headbench.datasets.head.arrays import HeadArrays
-from headbench.datasets.head.model import HeadModel
+from headbench.datasets.head.subject import PosedSubject
 from headbench.datasets.head.teeth import with_teeth
 
 from .head.toy import toy_head
@@ -92,11 +93,7 @@ def make_plan(
 
 def posed_vertices(plan: CapturePlan, pose: HeadPose) -> np.ndarray:
     """(V, 3) mesh of a pose, metres."""
-    model = HeadModel(plan.head, dtype=torch.float64)
-    canonical = model.canonical(
-        torch.tensor(plan.shape.astype(float)), torch.tensor(plan.static_offset.astype(float))
-    )
-    return model(canonical=canonical, **model.pose_arguments([pose]))[0].numpy()
+    return PosedSubject(plan.head, plan.shape, plan.static_offset).meshes([pose])[0]
 
 
 def silhouette(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> np.ndarray:
@@ -126,30 +123,39 @@ def paint(plan: CapturePlan, pose: HeadPose, camera: Camera, seed: int) -> tuple
     return image, (covered * 255).astype(np.uint8)
 
 
-class TinyCapture(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class TinyCapture:
     """A written capture: its writer, and (image, mask) by (sequence, timestep in it, camera)."""
 
     writer: CaptureWriter
-    frames: dict[tuple[str, int, str], tuple[np.ndarray, np.ndarray]]
-
-    def __repr__(self) -> str:  # hypothesis prints its arguments
-        return f"TinyCapture({self.union})"
+    frames: dict[tuple[str, int, str], tuple[np.ndarray, np.ndarray]] = field(
+        default_factory=dict, repr=False
+    )
 
     @property
     def union(self) -> Path:
         return self.writer.union
 
-    def moved(self, root: Path) -> TinyCapture:
-        """The same capture in another place."""
-        return TinyCapture(CaptureWriter(root, self.writer.plan), self.frames)
+    def copied(self, root: Path) -> Self:
+        """The same capture in another place, which a test may damage."""
+        shutil.copytree(self.writer.root, root)
+        return type(self)(CaptureWriter(root, self.writer.plan), self.frames)
 
-    def edit(self, file: str, change) -> Path:
+    def edit(self, file: str, change: Callable[[dict], object]) -> None:
         """Apply ``change`` to a JSON of the union folder."""
         path = self.union / file
         value = json.loads(path.read_text())
         change(value)
         path.write_text(json.dumps(value))
-        return path
+
+    def each_frame(self, change: Callable[[dict], object]) -> None:
+        """Apply ``change`` to every frame of every split."""
+        for split in ("train", "val", "test"):
+            self.edit(f"transforms_{split}.json", lambda value: [change(frame) for frame in value["frames"]])
+
+    def without_masks(self) -> None:
+        """No frame names a mask."""
+        self.each_frame(lambda frame: frame.pop("fg_mask_path"))
 
 
 def write_tiny_capture(root: Path, plan: CapturePlan | None = None) -> TinyCapture:
@@ -165,8 +171,3 @@ def write_tiny_capture(root: Path, plan: CapturePlan | None = None) -> TinyCaptu
                 writer.write_frame(*key, *frames[key])
     writer.write_metadata()
     return TinyCapture(writer, frames)
-
-
-def decode_png(path: Path) -> np.ndarray:
-    """(H, W, 3) RGB."""
-    return cv2.imread(str(path), cv2.IMREAD_COLOR)[..., ::-1]

@@ -55,7 +55,7 @@ def flipped(view: OutlineView) -> OutlineView:
 
 @pytest.mark.parametrize("noise", [0.0, 0.001])
 @pytest.mark.parametrize("offset", [-6.0, -2.0, 2.0, 6.0])
-def test_outlines_decide_in_spite_of_hair_shoulders_and_tracking_noise(offset, noise):
+def test_outlines_decide_in_spite_of_hair_shoulders_and_noise(offset, noise):
     views = make_views(offset, noise)
     assert weigh_cy(views, HEAD.faces).decision == "top"
     assert weigh_cy([flipped(view) for view in views], HEAD.faces).decision == "bottom"

@@ -1,7 +1,8 @@
-"""Sequence names and splits."""
+"""Sequence names, splits, and grids of frames with holes."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -10,7 +11,13 @@ from hypothesis import strategies as st
 
 from headbench.bench.contracts import FrameKey
 from headbench.bench.errors import InputError
-from headbench.datasets.ga.validate import check_disjoint, sequence_names, split_by_holding_out
+from headbench.datasets.ga.reader import read_capture
+from headbench.datasets.ga.validate import (
+    check_disjoint,
+    require_full_grid,
+    sequence_names,
+    split_by_holding_out,
+)
 
 KEYS = [
     FrameKey("s", sequence, t, camera)
@@ -33,7 +40,7 @@ def test_names_are_declared_or_parsed_and_never_shared():
 @given(
     cameras=st.sets(st.sampled_from("abc")), sequences=st.sets(st.sampled_from(["EMO-1", "EMO-2", "FREE"]))
 )
-def test_every_frame_is_in_exactly_one_split_and_held_out_data_is_held_out(cameras, sequences):
+def test_every_frame_is_in_one_split_and_held_out_where_asked(cameras, sequences):
     splits = split_by_holding_out("x", KEYS, sorted(sequences), sorted(cameras))
     assert sorted(key for keys in splits.values() for key in keys) == sorted(KEYS)
     check_disjoint("x", splits)
@@ -61,3 +68,23 @@ def test_repeated_and_shared_keys_are_refused():
         check_disjoint("x", {"train": (KEYS[0], KEYS[1], KEYS[0])})
     with pytest.raises(InputError, match="2 frames in both"):
         check_disjoint("x", {"train": tuple(KEYS[:3]), "novel_view": tuple(KEYS[1:4])})
+
+
+def test_whole_grids_pass_and_so_do_those_without_a_timestep(pristine_capture):
+    clip = read_capture(pristine_capture.union)
+    require_full_grid(clip)
+    first = min(key.timestep for key in clip.files)
+    rest = {key: files for key, files in clip.files.items() if key.timestep != first}
+    require_full_grid(replace(clip, files=rest))
+
+
+@pytest.mark.parametrize("holes", [1, 2])
+def test_the_first_hole_is_named_and_the_others_counted(holes, pristine_capture):
+    clip = read_capture(pristine_capture.union)
+    camera = [*clip.cameras][1]
+    gone = sorted((key for key in clip.files if key.camera == camera), key=lambda key: key[:3])[:holes]
+    files = {key: value for key, value in clip.files.items() if key not in gone}
+    with pytest.raises(InputError) as caught:
+        require_full_grid(replace(clip, files=files), "a/capture")
+    assert (caught.value.file, caught.value.key) == ("a/capture", f"frame {gone[0]}")
+    assert ("1 more missing" in caught.value.found) == (holes == 2)

@@ -53,13 +53,7 @@ def test_any_value_of_a_frame_is_read_or_refused(capture, key, value):
 @pytest.mark.parametrize("name", ["x" * 5000, "a\0b", "."])
 @pytest.mark.parametrize("key", ["file_path", "fg_mask_path", "flame_param_path"])
 def test_paths_no_file_can_have_are_refused(capture, key, name):
-    def change(document):
-        for frame in document["frames"]:
-            folder = frame[key].rsplit("/", 2)[0]
-            frame[key] = f"{folder}/{name}"
-
-    for part in ("train", "val", "test"):
-        capture.edit(f"transforms_{part}.json", change)
+    capture.each_frame(lambda frame: frame.update({key: f"{frame[key].rsplit('/', 2)[0]}/{name}"}))
     with pytest.raises(InputError):
         read_capture(capture.union)
 
@@ -68,12 +62,8 @@ def test_entries_carry_what_the_frame_says(pristine_capture):
     entries = read_transforms(pristine_capture.union / "transforms_train.json")
     camera = pristine_capture.writer.plan.cameras[2]
     entry = entries[1]
-    assert (entry.where, entry.timestep, entry.camera_index, entry.camera_id) == (
-        "frames[1]",
-        0,
-        2,
-        SERIALS[2],
-    )
+    place = (entry.where, entry.timestep, entry.camera_index, entry.camera_id)
+    assert place == ("frames[1]", 0, 2, SERIALS[2])
     assert (entry.width, entry.height) == (48, 64)
     assert entry.intrinsics["fl_x"] == camera.K[0, 0]
     assert entry.sequence_folder == "901_EMO-1-shout+laugh_v3_whiteBg_staticOffset"

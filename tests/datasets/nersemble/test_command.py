@@ -9,7 +9,7 @@ from .recordings import SUBJECT
 
 
 @pytest.mark.parametrize("name", ["paper", "ablation"])
-def test_named_subjects_that_are_not_there_are_told_with_those_that_are(name, pristine_recording, tmp_path):
+def test_missing_subjects_are_named_with_those_there_are(name, pristine_recording, tmp_path):
     with pytest.raises(InputError) as error:
         prepare_nersemble(pristine_recording.settings(tmp_path / "out", subjects=name))
     assert error.value.key == "--subjects"

@@ -3,6 +3,7 @@
 import errno
 import json
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 
 import cv2
@@ -11,10 +12,12 @@ import pytest
 
 from headbench.bench.errors import InputError
 from headbench.bench.io.lock import locked
+from headbench.datasets.ga import writer
+from headbench.datasets.ga.layout import SPLIT_FILES
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import read_head, save_head
-from headbench.datasets.nersemble import export, sequence
 from headbench.datasets.nersemble import frames as image_pool
+from headbench.datasets.nersemble import prepare, sequence
 from headbench.datasets.nersemble.command import prepare_nersemble
 from headbench.datasets.nersemble.names import UNION10_SEQUENCES, union10_held_out
 from headbench.datasets.nersemble.prepare import RECORD_FILE
@@ -36,11 +39,30 @@ def prepared(recording, out, **changes):
     return findings.data[SUBJECT], findings
 
 
+def error_of_a_full_disk(module, function, fails, *preparation) -> InputError:
+    """Prepare with no room for the files that ``fails`` says."""
+    original = getattr(module, function)
+
+    def write(path, *content):
+        if fails(path):
+            raise OSError(errno.ENOSPC, "No space left on device")
+        original(path, *content)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, function, write)
+        with pytest.raises(InputError, match="No space left") as error:
+            prepared(*preparation)
+    return error.value
+
+
 @pytest.fixture(scope="session")
 def whole(pristine_recording, tmp_path_factory):
     """A prepared capture that tests only read: folder and findings."""
-    out = tmp_path_factory.mktemp("whole")
-    return out, prepared(pristine_recording, out)[1]
+    out, calls = tmp_path_factory.mktemp("whole"), []
+    findings = prepare_nersemble(pristine_recording.settings(out), lambda *call: calls.append(call))
+    assert [(done, total) for done, total, _ in calls] == [(n, IMAGES) for n in range(1, IMAGES + 1)]
+    assert {note for _, _, note in calls} == {f"{SUBJECT} {name}" for name in SEQUENCES}
+    return out, findings
 
 
 @pytest.fixture(scope="session")
@@ -73,31 +95,22 @@ def test_images_are_the_frames_on_white(clip):
         assert (mask[:6] <= 5).all()
 
 
-def test_cameras_and_poses_stand_to_each_other_as_in_the_tracked_world(clip, pristine_recording):
+def test_cameras_and_poses_stand_to_each_other_as_tracked(clip, pristine_recording):
+    """In one world: each sequence was shifted by a mean of its own, and the reader brings them together again."""
     aligned = read_calibration(pristine_recording.writer.calibration_file).aligned()
-    files = pristine_recording.tracking.rglob("*EMO-1*/**/*.npz")
-    tracked = np.load(next(files), allow_pickle=False)
-    for timestep in range(SEQUENCES["EMO-1-shout+laugh"]):
-        pose = clip.poses[timestep]
-        for serial, camera in clip.cameras.items():
-            # The tracked origin of the head, seen by each camera, before and after.
-            expected = aligned.world_to_camera[serial] @ [*tracked["translation"][timestep], 1.0]
-            found = camera.world_to_camera @ [*pose.translation, 1.0]
-            np.testing.assert_allclose(found, expected, atol=1e-6)
-        np.testing.assert_array_equal(pose.expression, tracked["expr"][timestep])
-
-
-def test_sequences_of_one_camera_set_meet_in_one_world(clip, pristine_recording):
-    # Each sequence was shifted by a mean of its own; the reader brings them together again.
-    emo, free = (
-        np.load(next(pristine_recording.tracking.rglob(f"*{name}*/**/*.npz")), allow_pickle=False)[
-            "translation"
-        ]
-        for name in ("EMO-1", "FREE")
-    )
-    first = SEQUENCES["EMO-1-shout+laugh"]
-    found = clip.poses[first].translation - clip.poses[0].translation
-    np.testing.assert_allclose(found, free[0] - emo[0], atol=1e-6)
+    first = 0
+    for name, length in SEQUENCES.items():
+        path = next(pristine_recording.tracking.rglob(f"*{name}*/**/*.npz"))
+        tracked = np.load(path, allow_pickle=False)
+        for local in range(length):
+            pose = clip.poses[first + local]
+            for serial, camera in clip.cameras.items():
+                # The tracked origin of the head, seen by each camera, before and after.
+                expected = aligned.world_to_camera[serial] @ [*tracked["translation"][local], 1.0]
+                found = camera.world_to_camera @ [*pose.translation, 1.0]
+                np.testing.assert_allclose(found, expected, atol=1e-6)
+            np.testing.assert_array_equal(pose.expression, tracked["expr"][local])
+        first += length
 
 
 def test_keys_of_the_jsons_are_those_of_vhap(whole):
@@ -140,26 +153,14 @@ def test_the_same_bytes_come_out_however_it_runs(workers, whole, pristine_record
     assert contents(tmp_path / "again") == contents(whole[0])
 
 
-def test_a_broken_run_continues_and_ends_the_same(whole, pristine_recording, tmp_path, monkeypatch):
-    out = tmp_path / "out"
-    calls = []
-
-    def write_image(path, image, _write=image_pool.write_image):
-        calls.append(path)
-        if len(calls) > 20:
-            raise OSError(errno.ENOSPC, "No space left on device")
-        _write(path, image)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(image_pool, "write_image", write_image)
-        with pytest.raises(InputError) as error:
-            prepared(pristine_recording, out)
-    assert "No space left" in error.value.found
-    assert error.value.file.endswith(".png")
-    assert "start again" in str(error.value)
+def test_a_broken_run_continues_and_ends_the_same(whole, pristine_recording, tmp_path):
+    out, calls = tmp_path / "out", count()
+    late = error_of_a_full_disk(
+        image_pool, "write_image", lambda path: next(calls) >= 20, pristine_recording, out
+    )
+    assert late.file.endswith(".png")
+    assert "start again" in str(late)
     assert not [*out.rglob("transforms*.json")], "nothing half done reads as a capture"
-    with pytest.raises(InputError):
-        read_capture(next(out.glob(f"{SUBJECT}_EMO*")))
     there = len([*out.rglob("images/*.png")])
     again, _ = prepared(pristine_recording, out)
     assert 0 < there < IMAGES
@@ -167,20 +168,10 @@ def test_a_broken_run_continues_and_ends_the_same(whole, pristine_recording, tmp
     assert contents(out) == contents(whole[0])
 
 
-def test_a_full_disk_while_metadata_are_written_leaves_no_capture(
-    pristine_recording, whole, tmp_path, monkeypatch
-):
-    def full(path, value):
-        if path.name == "transforms_val.json":
-            raise OSError(errno.ENOSPC, "No space left on device")
-        original(path, value)
-
-    original = export.write_json
+def test_a_full_disk_at_the_metadata_leaves_no_capture(pristine_recording, whole, tmp_path):
     out = tmp_path / "out"
-    with monkeypatch.context() as patch:
-        patch.setattr(export, "write_json", full)
-        with pytest.raises(InputError, match="No space left"):
-            prepared(pristine_recording, out)
+    val = SPLIT_FILES["novel_view"]
+    error_of_a_full_disk(writer, "write_json", lambda path: path.name == val, pristine_recording, out)
     assert not [*out.glob("UNION*/transforms*.json")]
     with pytest.raises(InputError):
         read_capture(next(out.glob(f"{SUBJECT}_EMO*")))
@@ -194,6 +185,7 @@ def test_broken_and_missing_images_are_made_again(whole, pristine_recording, tmp
     folder = next(out.glob(f"{SUBJECT}_FREE_*"))
     (folder / "images" / "00001_01.png").unlink()
     (folder / "fg_masks" / "00002_01.png").unlink()
+    (folder / "images" / ".tmp-headbench-abc.png").write_bytes(b"half")  # left by a killed call
     again, _ = prepared(pristine_recording, out)
     assert again["written"] >= 1
     assert contents(out) == contents(whole[0])
@@ -203,16 +195,6 @@ def test_broken_and_missing_images_are_made_again(whole, pristine_recording, tmp
     record.write_text(json.dumps(value | {"images_complete": False}))
     (folder / "images" / "00003_02.png").write_bytes(b"")
     cv2.imwrite(str(folder / "images" / "00004_00.png"), np.zeros((4, 4, 3), np.uint8))
-    prepared(pristine_recording, out)
-    assert contents(out) == contents(whole[0])
-
-
-def test_leftovers_of_a_killed_call_are_removed(whole, pristine_recording, tmp_path):
-    out = tmp_path / "out"
-    folder = out / next(whole[0].glob(f"{SUBJECT}_FREE_*")).name
-    prepared(pristine_recording, out)
-    (folder / "images" / ".tmp-headbench-abc.png").write_bytes(b"half")
-    (folder / "images" / "00001_01.png").unlink()
     prepared(pristine_recording, out)
     assert contents(out) == contents(whole[0])
 
@@ -279,10 +261,15 @@ def test_tracking_of_some_sequences_only_does_not_pass(recording, tmp_path):
 
 def test_new_tracking_replaces_the_old_and_keeps_the_images(recording, whole, tmp_path):
     out = tmp_path / "out"
-    prepared(recording, out)
+    union = prepared(recording, out)[0]["union"]
     file = next(recording.tracking.rglob("*FREE*/**/*.npz"))
     arrays = dict(np.load(file, allow_pickle=False))
     np.savez(file, **(arrays | {"translation": arrays["translation"] + np.array([0, 0.5, 0], np.float32)}))
+    # Broken off on the way: no capture of old and new.
+    error_of_a_full_disk(prepare, "save_npz", lambda path: path.name == "00003.npz", recording, out)
+    for folder in (union, next(out.glob(f"{SUBJECT}_FREE_*"))):
+        with pytest.raises(InputError):
+            read_capture(folder)
     result, _ = prepared(recording, out)
     assert result["written"] == 0
     moved, still = (read_capture(next(folder.glob("UNION*"))) for folder in (out, whole[0]))
@@ -290,33 +277,6 @@ def test_new_tracking_replaces_the_old_and_keeps_the_images(recording, whole, tm
     shift = moved.poses[first].translation - still.poses[first].translation
     np.testing.assert_allclose(shift, [0, 0.5, 0], atol=1e-6)
     np.testing.assert_array_equal(moved.poses[0].translation, still.poses[0].translation)
-
-
-def test_new_tracking_that_breaks_off_leaves_no_capture_of_old_and_new(recording, tmp_path, monkeypatch):
-    out = tmp_path / "out"
-    union = prepared(recording, out)[0]["union"]
-    file = next(recording.tracking.rglob("*FREE*/**/*.npz"))
-    arrays = dict(np.load(file, allow_pickle=False))
-    np.savez(file, **(arrays | {"expr": arrays["expr"] + np.float32(1)}))
-
-    def full(path, values):
-        if path.name == "00003.npz":
-            raise OSError(errno.ENOSPC, "No space left on device")
-        original(path, values)
-
-    original = export.save_npz
-    with monkeypatch.context() as patch:
-        patch.setattr(export, "save_npz", full)
-        with pytest.raises(InputError, match="No space left"):
-            prepared(recording, out)
-    for folder in (union, next(out.glob(f"{SUBJECT}_FREE_*"))):
-        with pytest.raises(InputError):
-            read_capture(folder)
-    prepared(recording, out)
-    first = SEQUENCES["EMO-1-shout+laugh"]
-    np.testing.assert_array_equal(
-        read_capture(union).poses[first].expression, arrays["expr"][0] + np.float32(1)
-    )
 
 
 def test_images_are_never_enlarged(recording, tmp_path):
@@ -329,22 +289,16 @@ def test_images_are_never_enlarged(recording, tmp_path):
     assert prepared(recording, tmp_path / "out", downscale=2)[0]["written"] == IMAGES
 
 
-def test_the_wrong_head_model_is_refused_before_any_work(recording, tmp_path):
+def test_other_heads_and_frames_are_refused_before_any_work(recording, tmp_path):
+    with pytest.raises(InputError, match="very frames") as error:
+        prepared(recording, tmp_path / "out", every=2)
+    assert error.value.key == "translation"
     head = read_head(recording.head)
-    smaller = replace(head, expression_basis=head.expression_basis[..., :3])
-    save_head(recording.head, smaller)
-    with pytest.raises(InputError) as error:
+    save_head(recording.head, replace(head, expression_basis=head.expression_basis[..., :3]))
+    with pytest.raises(InputError, match="the head model the sequence was tracked with") as error:
         prepared(recording, tmp_path / "out")
     assert error.value.key == "expr"
-    assert "the head model the sequence was tracked with" in str(error.value)
     assert not (tmp_path / "out").exists()
-
-
-def test_a_capture_declared_for_another_head_model_is_refused_by_the_reader(recording, tmp_path):
-    result, _ = prepared(recording, tmp_path / "out", head="", head_model="flame2023")
-    with pytest.raises(InputError) as error:
-        read_capture(result["union"], head=recording.head)
-    assert error.value.key == "head_model"
 
 
 def test_flame_itself_is_never_copied(recording, tmp_path):
@@ -356,14 +310,6 @@ def test_flame_itself_is_never_copied(recording, tmp_path):
     assert read_capture(result["union"], head=recording.head).head.version == "flame2023"
 
 
-def test_tracking_of_other_frames_is_refused(recording, tmp_path):
-    with pytest.raises(InputError) as error:
-        prepared(recording, tmp_path / "out", every=2)
-    assert error.value.key == "translation"
-    assert "very frames" in str(error.value)
-    assert not (tmp_path / "out").exists()
-
-
 def test_videos_without_masks_say_so_and_write_no_masks(videos, tmp_path):
     result, _ = prepared(videos, tmp_path / "out", every=1)
     assert any("no masks" in sentence for sentence in result["missing"])
@@ -372,7 +318,7 @@ def test_videos_without_masks_say_so_and_write_no_masks(videos, tmp_path):
     assert clip.mask(clip.splits["train"][0]) is None
 
 
-def test_a_video_that_ends_early_stops_the_run_and_the_next_continues(videos, tmp_path, monkeypatch):
+def test_a_video_that_ends_early_stops_the_run(videos, tmp_path, monkeypatch):
     true_probe = sequence.probe_video
 
     def lying_index(path):
@@ -404,17 +350,6 @@ def test_union10_holds_out_by_the_seeded_rule(tmp_path):
     assert result["union"].name.startswith(f"UNION10_{SUBJECT}_")
     clip = read_capture(result["union"], leaks="record")  # images so small are all white
     assert {key.sequence for key in clip.splits["self_reenactment"]} == {union10_held_out(SUBJECT)}
-
-
-def test_progress_reaches_its_end(pristine_recording, tmp_path):
-    calls = []
-    prepare_nersemble(
-        pristine_recording.settings(tmp_path / "out"),
-        lambda done, total, note="": calls.append((done, total, note)),
-    )
-    assert [done for done, _, _ in calls] == [*range(1, IMAGES + 1)]
-    assert {total for _, total, _ in calls} == {IMAGES}
-    assert {note for _, _, note in calls} == {f"{SUBJECT} {name}" for name in SEQUENCES}
 
 
 def test_a_check_writes_nothing(pristine_recording, tmp_path):

@@ -5,12 +5,11 @@ import shutil
 
 import numpy as np
 import pytest
-import torch
 
 from headbench.bench.errors import InputError
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import save_head
-from headbench.datasets.head.model import HeadModel
+from headbench.datasets.head.subject import PosedSubject
 from headbench.datasets.nersemble.command import (
     PrepareSettings,
     RecordSettings,
@@ -33,11 +32,9 @@ def clip(tmp_path_factory):
 
 def projected(clip, timestep, camera):
     """(V, 2) pixels of the posed mesh."""
-    model = HeadModel(clip.head, dtype=torch.float64)
-    identity = torch.tensor(clip.shape.astype(float)), torch.tensor(clip.static_offset.astype(float))
-    vertices = model(canonical=model.canonical(*identity), **model.pose_arguments([clip.poses[timestep]]))[0]
+    (vertices,) = PosedSubject(clip.head, clip.shape, clip.static_offset).meshes([clip.poses[timestep]])
     view = clip.cameras[camera]
-    points = vertices.numpy() @ view.world_to_camera[:3, :3].T + view.world_to_camera[:3, 3]
+    points = vertices @ view.world_to_camera[:3, :3].T + view.world_to_camera[:3, 3]
     pixels = points @ view.K.T
     return pixels[:, :2] / pixels[:, 2:]
 
@@ -77,15 +74,12 @@ def test_the_command_says_how_to_prepare(clip, tmp_path):
     source = clip.files[clip.splits["train"][0]].image.parents[2] / "UNION3_901"
     findings = record_nersemble(RecordSettings(str(source), str(tmp_path / "raw")))
     assert "--subjects 901" in findings.text
-    assert {entry.name for entry in (tmp_path / "raw").iterdir()} == {
-        "recording",
-        "tracking",
-        "head_model.npz",
-    }
+    names = {entry.name for entry in (tmp_path / "raw").iterdir()}
+    assert names == {"recording", "tracking", "head_model.npz"}
     assert (tmp_path / "raw" / "recording" / "901" / "sequences" / "BACKGROUND").is_dir()
 
 
-def test_a_frame_missing_from_the_capture_is_named_before_anything_is_written(clip, tmp_path):
+def test_a_missing_frame_is_named_before_anything_is_written(clip, tmp_path):
     source = clip.files[clip.splits["train"][0]].image.parents[2]
     shutil.copytree(source, tmp_path / "capture")
     union = tmp_path / "capture" / "UNION3_901"

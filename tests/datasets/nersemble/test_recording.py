@@ -43,7 +43,7 @@ def test_colour_files_are_found_where_each_release_has_them(release, tmp_path):
     np.testing.assert_allclose(corrections[cameras[0].id].matrix, matrix)
 
 
-def test_a_colour_calibration_without_one_of_the_cameras_is_an_error(tmp_path):
+def test_a_colour_calibration_without_a_camera_is_an_error(tmp_path):
     for release in ("v1", "v2"):
         cameras = world_cameras()
         writer = RecordingWriter(tmp_path / release, SUBJECT, cameras, release)

@@ -1,5 +1,7 @@
 """A sequence's frames: which are chosen, how they stream, and every fault found before or while decoding."""
 
+import struct
+
 import cv2
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ from headbench.datasets.nersemble import sequence as sequence_module
 from headbench.datasets.nersemble.frames import read_frames
 from headbench.datasets.nersemble.re_record import write_video
 from headbench.datasets.nersemble.recording import participant, read_calibration
-from headbench.datasets.nersemble.sequence import probe_video, read_sequence
+from headbench.datasets.nersemble.sequence import check_boxes, probe_video, read_sequence
 
 from .recordings import HEIGHT, SEQUENCES, SUBJECT, WIDTH, colour_of, mask, world_cameras, write_recording
 
@@ -19,6 +21,12 @@ SERIALS = [camera.id for camera in world_cameras()]
 def look(recording, name="FREE", **settings):
     one = participant(recording.root, SUBJECT)
     return read_sequence(one, read_calibration(one.calibration_file), name, **settings)
+
+
+def fault(recording, **settings) -> InputError:
+    with pytest.raises(InputError) as error:
+        look(recording, **settings)
+    return error.value
 
 
 def check_streams(sequence, *, tolerance=4):
@@ -31,24 +39,19 @@ def check_streams(sequence, *, tolerance=4):
             assert np.abs(middle - colour_of(index, frame.number)).max() <= tolerance
 
 
-@pytest.mark.parametrize("release", ["v2", "v1", "paper2023"])
-@pytest.mark.parametrize("every", [1, 2, 3])
-def test_frames_of_images_are_those_asked_for(release, every, tmp_path):
-    sequence = look(write_recording(tmp_path, release=release), every=every)
-    assert sequence.numbers == tuple(range(0, SEQUENCES["FREE"], every))
-    assert sequence.has_masks
-    check_streams(sequence)
-    frame = next(iter(read_frames(sequence.views[SERIALS[0]], [0])))
-    assert np.abs(frame.mask.astype(int) - mask()).max() <= 3
-
-
-@pytest.mark.parametrize("release", ["v2", "v1"])
-@pytest.mark.parametrize("every", [1, 2, 3])
-def test_frames_of_videos_are_those_asked_for(release, every, tmp_path):
-    sequence = look(write_recording(tmp_path, release=release, images=False), every=every)
-    assert sequence.numbers == tuple(range(0, SEQUENCES["FREE"], every))
-    assert not sequence.has_masks
-    check_streams(sequence, tolerance=6)
+@pytest.mark.parametrize(
+    ("release", "images"), [("v2", True), ("v1", True), ("paper2023", True), ("v2", False), ("v1", False)]
+)
+def test_frames_are_those_asked_for(release, images, tmp_path):
+    recording = write_recording(tmp_path, release=release, images=images)
+    for every in (1, 2, 3):
+        sequence = look(recording, every=every)
+        assert sequence.numbers == tuple(range(0, SEQUENCES["FREE"], every))
+        assert sequence.has_masks == images
+        check_streams(sequence, tolerance=4 if images else 6)
+    if images:
+        frame = next(iter(read_frames(sequence.views[SERIALS[0]], [0])))
+        assert np.abs(frame.mask.astype(int) - mask()).max() <= 3
 
 
 def test_by_default_videos_give_every_third_frame_and_images_all(pristine_videos, pristine_recording):
@@ -91,65 +94,46 @@ def test_a_lone_camera_has_no_serial_in_its_files(recording):
         look(recording)
 
 
-def test_a_missing_camera_is_named(videos):
-    path = videos.writer.sequence_folder("FREE") / "images" / f"cam_{SERIALS[2]}.mp4"
-    path.unlink()
-    with pytest.raises(InputError) as error:
-        look(videos)
-    assert error.value.key == f"camera {SERIALS[2]}"
-    assert [*look(videos, cameras=SERIALS[:2]).views] == SERIALS[:2]
-
-
-def test_an_unknown_camera_is_named(videos):
+def test_missing_and_unknown_cameras_are_named(videos):
     with pytest.raises(InputError, match="camera 123"):
         look(videos, cameras=["123"])
-    folder = videos.writer.sequence_folder("FREE") / "images"
-    (folder / f"cam_{SERIALS[2]}.mp4").rename(folder / "cam_123.mp4")
-    with pytest.raises(InputError) as error:
-        look(videos)
-    assert error.value.key == "123"
+    path = videos.writer.sequence_folder("FREE") / "images" / f"cam_{SERIALS[2]}.mp4"
+    path.rename(path.with_name("cam_123.mp4"))
+    assert fault(videos).key == "123"
+    path.with_name("cam_123.mp4").unlink()
+    assert fault(videos).key == f"camera {SERIALS[2]}"
+    assert [*look(videos, cameras=SERIALS[:2]).views] == SERIALS[:2]
 
 
 def test_frame_counts_that_differ_are_an_error_or_cut(videos):
     frames = (np.zeros((HEIGHT, WIDTH, 3), np.uint8) for _ in range(4))
     videos.writer.write_video("FREE", SERIALS[1], frames)
-    with pytest.raises(InputError) as error:
-        look(videos)
-    assert error.value.key == "frames"
-    assert error.value.found == f"camera {SERIALS[1]} without 4-5"
+    error = fault(videos)
+    assert (error.key, error.found) == ("frames", f"camera {SERIALS[1]} without 4-5")
     assert look(videos, cut=True, every=1).numbers == (0, 1, 2, 3)
-
-
-def test_a_missing_image_is_a_count_that_differs(recording):
-    folder = recording.writer.sequence_folder("FREE")
-    (folder / "images" / f"cam_{SERIALS[0]}_000002.jpg").unlink()
-    with pytest.raises(InputError, match="same frames"):
-        look(recording)
-    assert look(recording, cut=True).numbers == (0, 1, 3, 4, 5)
 
 
 def test_cameras_that_lack_other_frames_are_told_by_their_frames(recording):
     folder = recording.writer.sequence_folder("FREE") / "images"
     for serial, number in zip(SERIALS, (2, 4, 4), strict=True):
         (folder / f"cam_{serial}_{number:06d}.jpg").unlink()
-    with pytest.raises(InputError) as error:
-        look(recording)
-    assert error.value.found == f"camera {SERIALS[0]} without 2; cameras {SERIALS[1]}, {SERIALS[2]} without 4"
-    (folder / f"cam_{SERIALS[2]}_000005.jpg").unlink()
-    with pytest.raises(InputError) as error:
-        look(recording)
-    assert error.value.found == "; ".join(
-        f"camera {serial} without {lacks}" for serial, lacks in zip(SERIALS, ("2", "4", "4-5"), strict=True)
-    )
+    first, second, third = SERIALS
+    assert fault(recording).found == f"camera {first} without 2; cameras {second}, {third} without 4"
+    assert look(recording, cut=True).numbers == (0, 1, 3, 5)
+    (folder / f"cam_{third}_000005.jpg").unlink()
+    lacking = zip(SERIALS, ("2", "4", "4-5"), strict=True)
+    assert fault(recording).found == "; ".join(f"camera {one} without {lacks}" for one, lacks in lacking)
 
 
 def test_truncated_videos_are_found_before_decoding(videos, monkeypatch):
     path = videos.writer.sequence_folder("FREE") / "images" / f"cam_{SERIALS[1]}.mp4"
-    path.write_bytes(path.read_bytes()[:-40])
+    content = path.read_bytes()
     monkeypatch.setattr(sequence_module, "open_video", None)  # so that opening it would be seen
-    with pytest.raises(InputError) as error:
-        probe_video(path)
-    assert error.value.file == str(path)
+    for damaged in (content[:-40], b"<html>not found</html>"):
+        path.write_bytes(damaged)
+        with pytest.raises(InputError) as error:
+            probe_video(path)
+        assert error.value.file == str(path)
 
 
 def test_a_video_that_ends_early_is_found_when_decoding(videos):
@@ -160,50 +144,28 @@ def test_a_video_that_ends_early_is_found_when_decoding(videos):
     assert (error.value.file, error.value.key) == (str(view.video), "frame 6")
 
 
-def test_a_foreign_file_by_the_name_of_a_video_is_refused(videos):
-    path = videos.writer.sequence_folder("FREE") / "images" / f"cam_{SERIALS[1]}.mp4"
-    path.write_bytes(b"<html>not found</html>")
-    with pytest.raises(InputError) as error:
-        look(videos)
-    assert error.value.file == str(path)
-
-
 def test_masks_of_another_size_are_named(recording):
     folder = recording.writer.sequence_folder("FREE") / "alpha_maps"
     for path in folder.glob(f"cam_{SERIALS[0]}_*"):
         cv2.imwrite(str(path), np.zeros((HEIGHT // 2, WIDTH // 2), np.uint8))
-    with pytest.raises(InputError) as error:
-        look(recording)
-    assert error.value.key == "size"
-    assert error.value.file.startswith(str(folder))
+    error = fault(recording)
+    assert error.key == "size"
+    assert error.file.startswith(str(folder))
 
 
 @pytest.mark.parametrize("kind", ["alpha_maps", "images"])
 @pytest.mark.parametrize("number", [0, 3])
-def test_the_one_file_of_another_size_is_blamed(kind, number, recording):
+def test_the_one_file_at_fault_is_blamed(kind, number, recording):
     path = recording.writer.sequence_folder("FREE") / kind / f"cam_{SERIALS[0]}_{number:06d}.jpg"
-    cv2.imwrite(str(path), np.zeros((HEIGHT // 2, WIDTH // 2), np.uint8))
-    with pytest.raises(InputError) as error:
-        look(recording)
-    assert error.value.file == str(path)
-    assert f"{WIDTH}x{HEIGHT}" in error.value.expected
-    assert error.value.found == f"{WIDTH // 2}x{HEIGHT // 2}"
-
-
-def test_a_missing_mask_is_named(recording):
-    folder = recording.writer.sequence_folder("FREE") / "alpha_maps"
-    (folder / f"cam_{SERIALS[0]}_000003.jpg").unlink()
-    with pytest.raises(InputError) as error:
-        look(recording)
-    assert error.value.file.endswith(f"cam_{SERIALS[0]}_000003.jpg")
-
-
-def test_a_truncated_image_is_named(recording):
-    path = recording.writer.sequence_folder("FREE") / "images" / f"cam_{SERIALS[0]}_000003.jpg"
     path.write_bytes(path.read_bytes()[:100])
-    with pytest.raises(InputError) as error:
-        look(recording)
-    assert error.value.file == str(path)
+    assert fault(recording).file == str(path)
+    cv2.imwrite(str(path), np.zeros((HEIGHT // 2, WIDTH // 2), np.uint8))
+    error = fault(recording)
+    assert (error.file, error.found) == (str(path), f"{WIDTH // 2}x{HEIGHT // 2}")
+    assert f"{WIDTH}x{HEIGHT}" in error.expected
+    path.unlink()
+    if kind == "alpha_maps":
+        assert fault(recording).file == str(path.parents[1] / "images" / path.name)
 
 
 def test_an_image_damaged_in_the_middle_is_found_when_decoding(recording):
@@ -224,3 +186,57 @@ def test_an_empty_sequence_is_refused(recording):
         look(recording, "HAIR")
     with pytest.raises(InputError, match="source=video"):
         look(recording, source="video")
+
+
+def box(kind: bytes, content: bytes) -> bytes:
+    return struct.pack(">I4s", 8 + len(content), kind) + content
+
+
+FTYP, MOOV, MDAT = box(b"ftyp", b"isom"), box(b"moov", bytes(40)), box(b"mdat", bytes(100))
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        FTYP + MDAT + MOOV,
+        FTYP + MOOV + struct.pack(">I4sQ", 1, b"mdat", 25) + bytes(9),
+        FTYP + MOOV + struct.pack(">I4s", 0, b"mdat") + b"x",
+    ],
+)
+def test_whole_files_pass(content, tmp_path):
+    path = tmp_path / "video.mp4"
+    path.write_bytes(content)
+    check_boxes(path)
+
+
+@pytest.mark.parametrize("order", [FTYP + MDAT + MOOV, FTYP + MOOV + MDAT])
+def test_every_truncation_is_found(order, tmp_path):
+    path = tmp_path / "video.mp4"
+    for length in range(len(order)):
+        path.write_bytes(order[:length])
+        with pytest.raises(InputError):
+            check_boxes(path)
+
+
+@pytest.mark.parametrize(
+    "content", [b"\xff\xd8\xff\xe0 a JPEG of some kind", box(b"\x00\x01\x02\x03", b""), b"<html>"]
+)
+def test_other_files_are_refused(content, tmp_path):
+    path = tmp_path / "video.mp4"
+    path.write_bytes(content)
+    with pytest.raises(InputError) as error:
+        check_boxes(path)
+    assert error.value.file == str(path)
+    with pytest.raises(InputError, match="No such file"):
+        check_boxes(tmp_path / "none.mp4")
+
+
+def test_a_real_video_and_its_truncations(pristine_videos, tmp_path):
+    video = next(pristine_videos.root.rglob("cam_*.mp4"))
+    check_boxes(video)
+    content = video.read_bytes()
+    path = tmp_path / "video.mp4"
+    for fraction in (0.1, 0.5, 0.9, 0.999):
+        path.write_bytes(content[: int(fraction * len(content))])
+        with pytest.raises(InputError):
+            check_boxes(path)

@@ -25,7 +25,7 @@ def written(path, head, **changes):
     return path
 
 
-def test_an_export_keeps_every_vertex_where_it_was_but_for_one_shift(head, tmp_path):
+def test_an_export_keeps_every_vertex_but_for_one_shift(head, tmp_path):
     tracked = read_tracked(written(tmp_path / "t.npz", head), timesteps=COUNT, head=head)
     arrays = tracked_arrays(head, COUNT)
     exported = [tracked.parameters(timestep) for timestep in range(COUNT)]
@@ -52,7 +52,7 @@ def test_the_canonical_file_is_zero_but_for_identity_and_jaw(head, tmp_path):
     assert zero == {"translation", "rotation", "neck_pose", "eyes_pose", "expr"}
 
 
-def test_without_a_static_offset_zeros_are_written_as_tools_need_one(head, tmp_path):
+def test_without_a_static_offset_zeros_are_written(head, tmp_path):
     path = written(tmp_path / "t.npz", head, static_offset=None)
     tracked = read_tracked(path, timesteps=COUNT, head=head)
     assert tracked.constant["static_offset"].shape == (1, len(with_teeth(head).template), 3)

@@ -69,7 +69,7 @@ def test_the_papers_split_is_joined_from_the_same_files(download, pristine_downl
 
 
 @pytest.mark.parametrize("named", [None, "08"], ids=["no id", "id by index"])
-def test_a_held_out_camera_that_is_named_by_its_index_is_not_trained_on(named, download, pristine_download):
+def test_a_held_out_camera_named_by_its_index_is_not_trained_on(named, download, pristine_download):
     """Older exports lack serials: there the frontal camera is the one of index 8."""
     for path in download.glob("*/transforms*.json"):
         document = json.loads(path.read_text())
