@@ -16,9 +16,12 @@ GROUPS = {
 }
 """Subject by the code's first digit."""
 
-RULES: tuple[Rule, ...] = (
-    *checks_files.RULES,
-    *checks_images.RULES,
-    *checks_cameras.RULES,
-    *checks_tracking.RULES,
+RULES = sorted(
+    (
+        found
+        for checks in (checks_cameras, checks_files, checks_images, checks_tracking)
+        for found in vars(checks).values()
+        if isinstance(found, Rule)
+    ),
+    key=lambda found: found.code,
 )

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from functools import partial
 from itertools import combinations
 
 import numpy as np
 
-from ...bench.contracts import Camera, FloatArray
+from ...bench.contracts import FloatArray
 from ..ga import layout
-from ..ga.cameras import FOCAL_TOLERANCE, ROTATION_TOLERANCE
+from ..ga.cameras import ROTATION_TOLERANCE, contradicted_focal, same_intrinsics
 from ..ga.principal_point import OutlineView, weigh_cy
 from ..ga.transforms import FrameEntry
 from ..images import read_mask
 from .checks_images import sound_mask
 from .evidence import Evidence, by_camera
-from .rules import Hit, Rule, several, some
+from .rules import Hit, at, rule, several, some
 
 SAME_PLACE_M = 1e-3
 SAME_TURN = 2e-3
@@ -36,15 +36,19 @@ EXACT = 1e-4
 """Pixels; a principal point this close to (w - 1) / 2 was computed as that."""
 
 
+@rule("HB501", "error", of_layout=True)
 def _not_rigid(evidence: Evidence) -> Iterator[Hit]:
+    """A camera's matrix is no rigid motion.
+
+    Write camera-to-world with a right-handed rotation and no scale; put scale into the world instead.
+    """
     broken = [error for error in evidence.frame_faults if error.key.endswith(".transform_matrix")]
     if broken:
-        yield Hit(
+        text = (
             f"{several(len(broken), 'frame')} with a transform_matrix that is no rigid motion: "
-            f"{broken[0].found}",
-            broken[0].file,
-            broken[0].key,
+            f"{broken[0].found}"
         )
+        yield Hit(text, broken[0].file, broken[0].key)
 
 
 def first_entries(evidence: Evidence) -> dict[str, FrameEntry]:
@@ -52,7 +56,12 @@ def first_entries(evidence: Evidence) -> dict[str, FrameEntry]:
     return {camera: frames[0] for camera, frames in by_camera(evidence.entries).items()}
 
 
+@rule("HB502", "error")
 def _same_camera(evidence: Evidence) -> Iterator[Hit]:
+    """Two cameras are one.
+
+    Correct the calibration, or drop one: with one held out, a novel view is a training view.
+    """
     groups: dict[str, dict[str, FrameEntry]] = {}
     for entry in evidence.entries:
         groups.setdefault(entry.sequence_folder, {}).setdefault(entry.camera_id, entry)
@@ -63,14 +72,16 @@ def _same_camera(evidence: Evidence) -> Iterator[Hit]:
             same = difference[:3, 3].max() < SAME_PLACE_M and difference[:3, :3].max() < SAME_TURN
             if same and (one, other) not in seen:
                 seen.add((one, other))
-                yield Hit(
-                    f"cameras {one} and {other} stand at the same place and look the same way",
-                    views[other].file,
-                    f"{views[other].where}.transform_matrix",
-                )
+                text = f"cameras {one} and {other} stand at the same place and look the same way"
+                yield Hit(text, *at(views[other], "transform_matrix"))
 
 
+@rule("HB512", "error")
 def _moving(evidence: Evidence) -> Iterator[Hit]:
+    """A camera moves within a sequence.
+
+    Cameras of the layout stand still; for a moving camera move the head instead.
+    """
     first: dict[tuple[str, str], FrameEntry] = {}
     moved: dict[str, FrameEntry] = {}
     changed: dict[str, FrameEntry] = {}
@@ -78,18 +89,12 @@ def _moving(evidence: Evidence) -> Iterator[Hit]:
         other = first.setdefault((entry.sequence_folder, entry.camera_id), entry)
         if np.abs(entry.camera_to_world - other.camera_to_world).max() > ROTATION_TOLERANCE:
             moved.setdefault(entry.camera_id, entry)
-        if not _same_numbers(entry.intrinsics, other.intrinsics):
+        if not same_intrinsics(entry, other):
             changed.setdefault(entry.camera_id, entry)
     for found, what in ((moved, "moves"), (changed, "changes its intrinsics")):
         for camera, entry in list(found.items())[:1]:
             others = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
             yield Hit(f"camera {camera}{others} {what} within a sequence", entry.file, entry.where)
-
-
-def _same_numbers(one: Mapping[str, float], other: Mapping[str, float]) -> bool:
-    return one.keys() == other.keys() and all(
-        math.isclose(one[key], other[key], rel_tol=1e-6, abs_tol=1e-9) for key in one
-    )
 
 
 def behind(evidence: Evidence) -> list[str]:
@@ -106,11 +111,22 @@ def upside_down(evidence: Evidence) -> list[str]:
     return sorted(camera for camera, values in seen.items() if np.median(values) < -0.3)
 
 
+@rule("HB503", "error")
 def _behind(evidence: Evidence) -> Iterator[Hit]:
+    """The head is behind a camera.
+
+    Write camera-to-world with OpenGL axes (looking along -z); OpenCV's matrix needs its columns 2 and 3
+    negated, world-to-camera needs inverting.
+    """
     yield from _cameras(evidence, behind(evidence), "have the head behind them")
 
 
+@rule("HB504", "error")
 def _upside_down(evidence: Evidence) -> Iterator[Hit]:
+    """A camera sees the head upside down.
+
+    Negate the y axis once, not twice: the layout's cameras have y up, OpenCV's y down.
+    """
     yield from _cameras(evidence, upside_down(evidence), "see the head upside down")
 
 
@@ -134,15 +150,16 @@ def misplaced(evidence: Evidence) -> bool:
     return bool(behind(evidence) or upside_down(evidence) or implausible_distance(evidence) is not None)
 
 
+@rule("HB505", "error")
 def _distance(evidence: Evidence) -> Iterator[Hit]:
+    """The head's distance is not in metres.
+
+    Bring translations of cameras and tracking to metres; recordings are often in millimetres.
+    """
     median = implausible_distance(evidence)
     if median is not None:
         entry = evidence.entries[0]
-        yield Hit(
-            f"the head is {median:.3g} m from the cameras (median)",
-            entry.file,
-            f"{entry.where}.transform_matrix",
-        )
+        yield Hit(f"the head is {median:.3g} m from the cameras (median)", *at(entry, "transform_matrix"))
 
 
 def _size(evidence: Evidence, entry: FrameEntry) -> tuple[int, int] | None:
@@ -150,22 +167,24 @@ def _size(evidence: Evidence, entry: FrameEntry) -> tuple[int, int] | None:
     return (info.width, info.height) if info else None
 
 
+@rule("HB506", "error", of_layout=True)
 def _focal(evidence: Evidence) -> Iterator[Hit]:
+    """Focal length and angle of view disagree.
+
+    Scale fl_x with the images; codes that read only camera_angle_x would see another camera.
+    """
     wrong = []
     for camera, entry in first_entries(evidence).items():
         size = _size(evidence, entry)
-        if size is None or not {"fl_x", "camera_angle_x"} <= entry.intrinsics.keys():
-            continue
-        implied = size[0] / (2 * math.tan(entry.intrinsics["camera_angle_x"] / 2))
-        if abs(entry.intrinsics["fl_x"] / implied - 1) > FOCAL_TOLERANCE:
+        implied = contradicted_focal(entry, size[0]) if size else None
+        if implied is not None:
             wrong.append((camera, entry, implied))
     if wrong:
         camera, entry, implied = wrong[0]
         yield Hit(
             f"in {several(len(wrong), 'camera')} fl_x and camera_angle_x disagree: {camera} has fl_x "
             f"{entry.intrinsics['fl_x']:.6g} px where its angle and the image's width imply {implied:.6g}",
-            entry.file,
-            f"{entry.where}.fl_x",
+            *at(entry, "fl_x"),
         )
 
 
@@ -183,7 +202,12 @@ def principal_offsets(evidence: Evidence) -> dict[str, FloatArray]:
     return offsets
 
 
+@rule("HB507", "warning")
 def _far_principal_point(evidence: Evidence) -> Iterator[Hit]:
+    """A principal point lies far from the centre.
+
+    Scale and crop cx, cy with the images, or make sure that the crop is meant.
+    """
     entries = first_entries(evidence)
     for camera, offset in principal_offsets(evidence).items():
         size = _size(evidence, entries[camera])
@@ -192,21 +216,21 @@ def _far_principal_point(evidence: Evidence) -> Iterator[Hit]:
             yield Hit(
                 f"the principal point of camera {camera} is ({entry.intrinsics['cx']:.6g}, "
                 f"{entry.intrinsics['cy']:.6g}) in an image of {size[0]}x{size[1]}",
-                entry.file,
-                f"{entry.where}.cx",
+                *at(entry, "cx"),
             )
             return
 
 
+@rule("HB508", "warning")
 def _half_pixel(evidence: Evidence) -> Iterator[Hit]:
+    """Principal points are off by half a pixel.
+
+    Use w / 2, h / 2 for a centred camera: here the centre of the first pixel is at 0.5, not at 0.
+    """
     offsets = principal_offsets(evidence)
     if offsets and all(np.abs(np.abs(offset) - 0.5).max() < EXACT for offset in offsets.values()):
         entry = next(iter(first_entries(evidence).values()))
-        yield Hit(
-            "every principal point is exactly half a pixel from the image's centre",
-            entry.file,
-            f"{entry.where}.cx",
-        )
+        yield Hit("every principal point is exactly half a pixel from the image's centre", *at(entry, "cx"))
 
 
 def _convention(evidence: Evidence) -> str | None:
@@ -216,7 +240,12 @@ def _convention(evidence: Evidence) -> str | None:
     return evidence.declaration.cy if evidence.declaration else None
 
 
+@rule("HB509", "warning", of_layout=True)
 def _centred(evidence: Evidence) -> Iterator[Hit]:
+    """The stated principal point is dropped.
+
+    Declare "top" or "bottom", unless the loss of GaussianAvatars' centred camera is to be reproduced.
+    """
     offsets = principal_offsets(evidence)
     worst = max((float(np.linalg.norm(o)) for o in offsets.values()), default=0.0)
     if _convention(evidence) == "centre" and worst > 0.5:
@@ -227,16 +256,20 @@ def _centred(evidence: Evidence) -> Iterator[Hit]:
         )
 
 
+@rule("HB510", "note")
 def _ignored(evidence: Evidence) -> Iterator[Hit]:
+    """Official code would centre the principal point.
+
+    GaussianAvatars and what is derived from it ignore cx, cy: their renders are shifted by as much against
+    the images.
+    """
     offsets = principal_offsets(evidence)
     worst = max((float(np.linalg.norm(o)) for o in offsets.values()), default=0.0)
     if _convention(evidence) != "centre" and worst > 1.0:
         camera = max(offsets, key=lambda name: float(np.linalg.norm(offsets[name])))
         entry = first_entries(evidence)[camera]
         yield Hit(
-            f"the principal point is up to {worst:.1f} px off the centre (camera {camera})",
-            entry.file,
-            f"{entry.where}.cx",
+            f"the principal point is up to {worst:.1f} px off the centre (camera {camera})", *at(entry, "cx")
         )
 
 
@@ -247,16 +280,18 @@ def cy_evidence_views(evidence: Evidence) -> list[OutlineView]:
         mesh, path = view.mesh, view.entry.mask or view.entry.image
         if mesh is None or mesh.depth <= 0 or not sound_mask(view) or "cy" not in view.entry.intrinsics:
             continue
-        intrinsics = mesh.camera.K.copy()
-        intrinsics[0, 2], intrinsics[1, 2] = view.entry.intrinsics.get("cx", 0), view.entry.intrinsics["cy"]
-        camera = Camera(
-            mesh.camera.id, mesh.camera.width, mesh.camera.height, intrinsics, mesh.camera.world_to_camera
-        )
-        views.append(OutlineView(mesh.vertices, camera, partial(read_mask, path)))
+        K = mesh.camera.K.copy()
+        K[:2, 2] = view.entry.intrinsics.get("cx", 0), view.entry.intrinsics["cy"]
+        views.append(OutlineView(mesh.vertices, replace(mesh.camera, K=K), partial(read_mask, path)))
     return views
 
 
+@rule("HB511", "error", of_layout=True)
 def _other_edge(evidence: Evidence) -> Iterator[Hit]:
+    """Cy counts from the other edge.
+
+    Declare the other convention: VHAP counts from the bottom since November 2024, from the top before.
+    """
     convention = _convention(evidence)
     matters = any(abs(offset[1]) > TELLING_PX for offset in principal_offsets(evidence).values())
     if convention not in ("top", "bottom") or not matters or evidence.subject is None:
@@ -268,102 +303,8 @@ def _other_edge(evidence: Evidence) -> Iterator[Hit]:
         return
     found = weigh_cy(views, evidence.subject.head.faces)
     if found.decision is not None and found.decision != convention:
-        yield Hit(
+        text = (
             f"cy is read from the {convention}; outlines of mesh and foreground agree better with the "
-            f"{found.decision} ({found.top:.2f} with the top, {found.bottom:.2f} with the bottom)",
-            evidence.folder / layout.DECLARATION_FILE,
-            "cy",
+            f"{found.decision} ({found.top:.2f} with the top, {found.bottom:.2f} with the bottom)"
         )
-
-
-RULES = (
-    Rule(
-        "HB501",
-        "error",
-        "a camera's matrix is no rigid motion",
-        "Write camera-to-world with a right-handed rotation and no scale; put scale into the world instead.",
-        _not_rigid,
-        of_layout=True,
-    ),
-    Rule(
-        "HB502",
-        "error",
-        "two cameras are one",
-        "Correct the calibration, or drop one: with one held out, a novel view is a training view.",
-        _same_camera,
-    ),
-    Rule(
-        "HB503",
-        "error",
-        "the head is behind a camera",
-        "Write camera-to-world with OpenGL axes (looking along -z); OpenCV's matrix needs its columns 2 and 3 "
-        "negated, world-to-camera needs inverting.",
-        _behind,
-    ),
-    Rule(
-        "HB504",
-        "error",
-        "a camera sees the head upside down",
-        "Negate the y axis once, not twice: the layout's cameras have y up, OpenCV's y down.",
-        _upside_down,
-    ),
-    Rule(
-        "HB505",
-        "error",
-        "the head's distance is not in metres",
-        "Bring translations of cameras and tracking to metres; recordings are often in millimetres.",
-        _distance,
-    ),
-    Rule(
-        "HB506",
-        "error",
-        "focal length and angle of view disagree",
-        "Scale fl_x with the images; codes that read only camera_angle_x would see another camera.",
-        _focal,
-        of_layout=True,
-    ),
-    Rule(
-        "HB507",
-        "warning",
-        "a principal point lies far from the centre",
-        "Scale and crop cx, cy with the images, or make sure that the crop is meant.",
-        _far_principal_point,
-    ),
-    Rule(
-        "HB508",
-        "warning",
-        "principal points are off by half a pixel",
-        "Use w / 2, h / 2 for a centred camera: here the centre of the first pixel is at 0.5, not at 0.",
-        _half_pixel,
-    ),
-    Rule(
-        "HB509",
-        "warning",
-        "the stated principal point is dropped",
-        'Declare "top" or "bottom", unless the loss of GaussianAvatars\' centred camera is to be reproduced.',
-        _centred,
-        of_layout=True,
-    ),
-    Rule(
-        "HB510",
-        "note",
-        "official code would centre the principal point",
-        "GaussianAvatars and what is derived from it ignore cx, cy: their renders are shifted by as much against the images.",
-        _ignored,
-    ),
-    Rule(
-        "HB511",
-        "error",
-        "cy counts from the other edge",
-        "Declare the other convention: VHAP counts from the bottom since November 2024, from the top before.",
-        _other_edge,
-        of_layout=True,
-    ),
-    Rule(
-        "HB512",
-        "error",
-        "a camera moves within a sequence",
-        "Cameras of the layout stand still; for a moving camera move the head instead.",
-        _moving,
-    ),
-)
+        yield Hit(text, evidence.folder / layout.DECLARATION_FILE, "cy")

@@ -11,7 +11,7 @@ from ..ga import layout
 from ..ga.transforms import FrameEntry
 from .checks_images import unit_range
 from .evidence import Evidence, Slot
-from .rules import Hit, Rule, several, some, spans
+from .rules import Hit, at, rule, several, some, spans
 from .views import Thumbnail, near_duplicates
 
 GA_WIDTH = 1600
@@ -29,23 +29,43 @@ def _faults(errors: Iterable[InputError], noun: str) -> Iterator[Hit]:
         yield Hit(f"expected {expected}, found {first.found}{more}", first.file, first.key)
 
 
+@rule("HB100", "error", of_layout=True)
 def _refused(evidence: Evidence) -> Iterator[Hit]:
+    """The reader refuses the capture.
+
+    Fix what the other findings name; `headbench run` would stop at this one.
+    """
     if evidence.refusal is not None:
         error = evidence.refusal
         text = f"expected {error.expected}, found {error.found}"
         yield Hit(f"{text}. {error.remedy}" if error.remedy else text, error.file, error.key)
 
 
+@rule("HB101", "error", of_layout=True)
 def _broken_json(evidence: Evidence) -> Iterator[Hit]:
+    """A JSON of the capture is missing or broken.
+
+    Export the capture again, or restore the file.
+    """
     yield from _faults((*evidence.json_faults, *evidence.declaration_faults), "file")
 
 
+@rule("HB102", "error", of_layout=True)
 def _broken_frame(evidence: Evidence) -> Iterator[Hit]:
+    """A frame's entry is incomplete or of the wrong kind.
+
+    Export the capture again, or fix the entry.
+    """
     others = [error for error in evidence.frame_faults if not error.key.endswith(".transform_matrix")]
     yield from _faults(others, "frame")
 
 
+@rule("HB103", "error")
 def _missing_file(evidence: Evidence) -> Iterator[Hit]:
+    """A file is missing, cut off or damaged.
+
+    Copy or export the file again; a copy that was broken off leaves such files.
+    """
     groups: dict[tuple[str, str], list[InputError]] = defaultdict(list)
     for error in evidence.file_faults:
         groups[(error.expected, error.found)].append(error)
@@ -62,7 +82,12 @@ def _missing_file(evidence: Evidence) -> Iterator[Hit]:
         )
 
 
+@rule("HB104", "error", of_layout=True)
 def _wrong_size(evidence: Evidence) -> Iterator[Hit]:
+    """An image or mask is of another size than stated.
+
+    Scale the intrinsics and w, h with the images, or export both at one size.
+    """
     wrong = []
     for entry in evidence.entries:
         image = evidence.headers.get(entry.image)
@@ -82,7 +107,12 @@ def _wrong_size(evidence: Evidence) -> Iterator[Hit]:
         )
 
 
+@rule("HB105", "warning")
 def _holes(evidence: Evidence) -> Iterator[Hit]:
+    """Frames are missing from the grid of timesteps and cameras.
+
+    Export the missing frames, or leave the timestep out altogether and say why.
+    """
     slots = {Slot(e.timestep, e.camera_index) for e in evidence.entries} | evidence.unread
     for folder, timesteps in evidence.sequences.items():
         cameras = {e.camera_index for e in evidence.entries if e.sequence_folder == folder}
@@ -90,15 +120,19 @@ def _holes(evidence: Evidence) -> Iterator[Hit]:
         if missing:
             worst = Counter(camera for _, camera in missing).most_common(1)[0][0]
             where = spans(t for t, camera in missing if camera == worst)
-            yield Hit(
+            text = (
                 f"{several(len(missing), 'frame')} of sequence {evidence.names[folder]} missing from the grid of "
-                f"{len(timesteps)} timesteps and {len(cameras)} cameras, such as camera {worst} at {where}",
-                evidence.folder,
-                "frames",
+                f"{len(timesteps)} timesteps and {len(cameras)} cameras, such as camera {worst} at {where}"
             )
+            yield Hit(text, evidence.folder, "frames")
 
 
+@rule("HB106", "error", of_layout=True)
 def _gap(evidence: Evidence) -> Iterator[Hit]:
+    """Timesteps do not count from 0 without a gap.
+
+    Renumber timesteps: readers of the layout index parameters by them, and a gap shifts all behind it.
+    """
     present = {e.timestep for e in evidence.entries} | {slot.timestep for slot in evidence.unread}
     gaps = [
         f"{before + 1}-{after - 1}" if after - before > 2 else f"{before + 1}"
@@ -109,27 +143,30 @@ def _gap(evidence: Evidence) -> Iterator[Hit]:
         yield Hit(f"no frame of timesteps {some(gaps)}", evidence.folder, "timestep_index")
 
 
+@rule("HB107", "warning")
 def _frozen(evidence: Evidence) -> Iterator[Hit]:
-    """Consecutive timesteps whose images are the same files' content in every camera that has both."""
-    images: dict[int, dict[str, str]] = defaultdict(dict)
-    for entry in evidence.entries:
-        if entry.image in evidence.digests:
-            images[entry.timestep][entry.camera_id] = evidence.digests[entry.image]
-    frozen = []
+    """Timesteps repeat the images of the one before.
+
+    Drop the repeated timesteps: frozen video counts one moment many times.
+    """
+    # Consecutive timesteps whose images are the same files' content in every camera that has both.
+    images, frozen = evidence.contents, []
     for timesteps in evidence.sequences.values():
         for before, after in pairwise(timesteps):
             shared = images[before].keys() & images[after].keys()
             if shared and all(images[before][camera] == images[after][camera] for camera in shared):
                 frozen.append(after)
     if frozen:
-        yield Hit(
-            f"{several(len(frozen), 'timestep')} with the images of the timestep before: {spans(frozen)}",
-            evidence.folder,
-            "timestep_index",
-        )
+        text = f"{several(len(frozen), 'timestep')} with the images of the timestep before: {spans(frozen)}"
+        yield Hit(text, evidence.folder, "timestep_index")
 
 
+@rule("HB108", "error", of_layout=True)
 def _stray_exclusion(evidence: Evidence) -> Iterator[Hit]:
+    """An exclusion names a timestep that is not there.
+
+    Correct the timestep: probably counted within a sequence, or before the timesteps were renumbered.
+    """
     if evidence.declaration is None:
         return
     known = {e.timestep for e in evidence.entries} | {slot.timestep for slot in evidence.unread}
@@ -139,7 +176,12 @@ def _stray_exclusion(evidence: Evidence) -> Iterator[Hit]:
         yield Hit(f"timesteps {spans(stray)} are excluded and not in the capture", file, "excluded")
 
 
+@rule("HB109", "warning", of_layout=True)
 def _unreasoned(evidence: Evidence) -> Iterator[Hit]:
+    """Frames are excluded without a reason.
+
+    State the reason in headbench.json, so that a reader of the results can judge it.
+    """
     if evidence.declaration is None:
         return
     bare = [t for t, reason in evidence.declaration.excluded.items() if not reason.strip()]
@@ -148,7 +190,13 @@ def _unreasoned(evidence: Evidence) -> Iterator[Hit]:
         yield Hit(f"timesteps {spans(bare)} are excluded without a reason", file, "excluded")
 
 
+@rule("HB110", "warning")
 def _short_test(evidence: Evidence) -> Iterator[Hit]:
+    """A test sequence is short.
+
+    Hold out a longer sequence: a mean over a few timesteps says little, and official code of GaussianAvatars
+    fails with fewer than 10 test frames.
+    """
     excluded = set(evidence.declaration.excluded) if evidence.declaration else set()
     least = evidence.settings.min_test_timesteps
     timesteps: dict[str, set[int]] = defaultdict(set)
@@ -165,8 +213,13 @@ def _short_test(evidence: Evidence) -> Iterator[Hit]:
             )
 
 
+@rule("HB111", "warning")
 def _empty_split(evidence: Evidence) -> Iterator[Hit]:
     # A file that does not read, or whose frames do not, is another fault.
+    """A split is empty.
+
+    Hold out a camera for novel views and a sequence for self-reenactment.
+    """
     faulty = {error.file for error in (*evidence.json_faults, *evidence.frame_faults)}
     files = {name: evidence.folder / file for name, file in layout.SPLIT_FILES.items()}
     empty = [
@@ -176,7 +229,12 @@ def _empty_split(evidence: Evidence) -> Iterator[Hit]:
         yield Hit(f"no frames in {some(empty)}", files[empty[0]], "frames")
 
 
+@rule("HB112", "note", of_layout=True)
 def _undeclared(evidence: Evidence) -> Iterator[Hit]:
+    """The capture leaves its conventions unsaid.
+
+    Write headbench.json beside the JSONs (see the README), so that nothing has to be guessed.
+    """
     if evidence.declaration is None and not evidence.declaration_faults:
         yield Hit(
             "no declaration of background, head model, principal point and sequence names: white, the given "
@@ -185,7 +243,12 @@ def _undeclared(evidence: Evidence) -> Iterator[Hit]:
         )
 
 
+@rule("HB113", "note", of_layout=True)
 def _orphans(evidence: Evidence) -> Iterator[Hit]:
+    """Images lie there that no split names.
+
+    Delete them, or add them to a split, if they were to be used.
+    """
     named = {entry.image for entry in evidence.entries}
     folders = {entry.image.parent for entry in evidence.entries}
     # Frames that do not parse name images too, and which is not known.
@@ -204,18 +267,25 @@ def _orphans(evidence: Evidence) -> Iterator[Hit]:
         yield Hit(f"{several(len(orphans), 'image')} that no split names", orphans[0])
 
 
+@rule("HB114", "warning")
 def _uneven_masks(evidence: Evidence) -> Iterator[Hit]:
+    """Some frames have a mask and some have none.
+
+    Export all masks: regions and masked metrics would cover a part of the frames only.
+    """
     bare = [entry for entry in evidence.entries if entry.mask is None]
     share = len(bare) / max(1, len(evidence.entries))
     if 0 < share < 1:
-        yield Hit(
-            f"{several(len(bare), 'frame')} of {len(evidence.entries)} name no mask, the others do",
-            bare[0].file,
-            f"{bare[0].where}.fg_mask_path",
-        )
+        text = f"{several(len(bare), 'frame')} of {len(evidence.entries)} name no mask, the others do"
+        yield Hit(text, *at(bare[0], "fg_mask_path"))
 
 
+@rule("HB115", "note")
 def _size_limit(evidence: Evidence) -> Iterator[Hit]:
+    """Images are wider than GaussianAvatars' limit.
+
+    Its code rescales images wider than 1,600 pixels unless given -r 1; align the size beforehand.
+    """
     wide = [path for path, info in evidence.headers.items() if info.width > GA_WIDTH]
     if wide:
         info = evidence.headers[wide[0]]
@@ -225,8 +295,13 @@ def _size_limit(evidence: Evidence) -> Iterator[Hit]:
         )
 
 
+@rule("HB201", "error")
 def _same_images(evidence: Evidence) -> Iterator[Hit]:
-    """By content, hence also where one file is listed twice."""
+    """The same image is in two splits.
+
+    Take it out of one: a method is measured on what it was trained on.
+    """
+    # By content, hence also where one file is listed twice.
     contents: dict[str, dict[str, FrameEntry]] = {}
     for split, part in evidence.splits.items():
         held = contents.setdefault(split, {})
@@ -237,15 +312,19 @@ def _same_images(evidence: Evidence) -> Iterator[Hit]:
         shared = sorted(contents[one].keys() & contents[other].keys())
         if shared:
             first, second = contents[one][shared[0]], contents[other][shared[0]]
-            yield Hit(
+            text = (
                 f"{several(len(shared), 'image')} in both {one} and {other}, such as {first.image.name} of "
-                f"{evidence.names[first.sequence_folder]} ({first.where} of {first.file.name})",
-                second.file,
-                second.where,
+                f"{evidence.names[first.sequence_folder]} ({first.where} of {first.file.name})"
             )
+            yield Hit(text, second.file, second.where)
 
 
+@rule("HB202", "warning")
 def _near_images(evidence: Evidence) -> Iterator[Hit]:
+    """Images of two splits are nearly the same.
+
+    Look at the pair; where one is the other saved again or shifted by a frame, fix the split.
+    """
     if unit_range(evidence):
         return  # levels 0 and 1 are all nearly the same
     parts: dict[str, list[Thumbnail]] = defaultdict(list)
@@ -267,7 +346,12 @@ def _near_images(evidence: Evidence) -> Iterator[Hit]:
             )
 
 
+@rule("HB203", "error")
 def _test_timesteps(evidence: Evidence) -> Iterator[Hit]:
+    """Self-reenactment timesteps are trained on.
+
+    Hold out whole sequences, in all cameras.
+    """
     train = {entry.timestep for entry in evidence.splits.get("train", ())}
     test = {entry.timestep: entry for entry in evidence.splits.get("self_reenactment", ())}
     shared = train & test.keys()
@@ -278,7 +362,12 @@ def _test_timesteps(evidence: Evidence) -> Iterator[Hit]:
         )
 
 
+@rule("HB204", "error")
 def _test_cameras(evidence: Evidence) -> Iterator[Hit]:
+    """Novel-view cameras are trained on.
+
+    Hold out the camera in every training sequence.
+    """
     train = {entry.camera_id for entry in evidence.splits.get("train", ())}
     held_out = {entry.camera_id: entry for entry in evidence.splits.get("novel_view", ())}
     shared = sorted(train & held_out.keys())
@@ -287,7 +376,12 @@ def _test_cameras(evidence: Evidence) -> Iterator[Hit]:
         yield Hit(f"novel-view cameras {some(shared)} are training cameras too", entry.file, entry.where)
 
 
+@rule("HB205", "error")
 def _twice(evidence: Evidence) -> Iterator[Hit]:
+    """A frame stands twice in one split.
+
+    Delete the second entry: it would be trained on or counted twice.
+    """
     for split, part in evidence.splits.items():
         seen: set[tuple[int, str]] = set()
         twice = []
@@ -297,170 +391,8 @@ def _twice(evidence: Evidence) -> Iterator[Hit]:
                 twice.append(entry)
             seen.add(slot)
         if twice:
-            yield Hit(
+            text = (
                 f"{several(len(twice), 'frame')} of {split} stand there twice, such as timestep "
-                f"{twice[0].timestep} of camera {twice[0].camera_id}",
-                twice[0].file,
-                twice[0].where,
+                f"{twice[0].timestep} of camera {twice[0].camera_id}"
             )
-
-
-RULES = (
-    Rule(
-        "HB100",
-        "error",
-        "the reader refuses the capture",
-        "Fix what the other findings name; `headbench run` would stop at this one.",
-        _refused,
-        of_layout=True,
-    ),
-    Rule(
-        "HB101",
-        "error",
-        "a JSON of the capture is missing or broken",
-        "Export the capture again, or restore the file.",
-        _broken_json,
-        of_layout=True,
-    ),
-    Rule(
-        "HB102",
-        "error",
-        "a frame's entry is incomplete or of the wrong kind",
-        "Export the capture again, or fix the entry.",
-        _broken_frame,
-        of_layout=True,
-    ),
-    Rule(
-        "HB103",
-        "error",
-        "a file is missing, cut off or damaged",
-        "Copy or export the file again; a copy that was broken off leaves such files.",
-        _missing_file,
-    ),
-    Rule(
-        "HB104",
-        "error",
-        "an image or mask is of another size than stated",
-        "Scale the intrinsics and w, h with the images, or export both at one size.",
-        _wrong_size,
-        of_layout=True,
-    ),
-    Rule(
-        "HB105",
-        "warning",
-        "frames are missing from the grid of timesteps and cameras",
-        "Export the missing frames, or leave the timestep out altogether and say why.",
-        _holes,
-    ),
-    Rule(
-        "HB106",
-        "error",
-        "timesteps do not count from 0 without a gap",
-        "Renumber timesteps: readers of the layout index parameters by them, and a gap shifts all behind it.",
-        _gap,
-        of_layout=True,
-    ),
-    Rule(
-        "HB107",
-        "warning",
-        "timesteps repeat the images of the one before",
-        "Drop the repeated timesteps: frozen video counts one moment many times.",
-        _frozen,
-    ),
-    Rule(
-        "HB108",
-        "error",
-        "an exclusion names a timestep that is not there",
-        "Correct the timestep: probably counted within a sequence, or before the timesteps were renumbered.",
-        _stray_exclusion,
-        of_layout=True,
-    ),
-    Rule(
-        "HB109",
-        "warning",
-        "frames are excluded without a reason",
-        "State the reason in headbench.json, so that a reader of the results can judge it.",
-        _unreasoned,
-        of_layout=True,
-    ),
-    Rule(
-        "HB110",
-        "warning",
-        "a test sequence is short",
-        "Hold out a longer sequence: a mean over a few timesteps says little, and official code of "
-        "GaussianAvatars fails with fewer than 10 test frames.",
-        _short_test,
-    ),
-    Rule(
-        "HB111",
-        "warning",
-        "a split is empty",
-        "Hold out a camera for novel views and a sequence for self-reenactment.",
-        _empty_split,
-    ),
-    Rule(
-        "HB112",
-        "note",
-        "the capture leaves its conventions unsaid",
-        "Write headbench.json beside the JSONs (see the README), so that nothing has to be guessed.",
-        _undeclared,
-        of_layout=True,
-    ),
-    Rule(
-        "HB113",
-        "note",
-        "images lie there that no split names",
-        "Delete them, or add them to a split, if they were to be used.",
-        _orphans,
-        of_layout=True,
-    ),
-    Rule(
-        "HB114",
-        "warning",
-        "some frames have a mask and some have none",
-        "Export all masks: regions and masked metrics would cover a part of the frames only.",
-        _uneven_masks,
-    ),
-    Rule(
-        "HB115",
-        "note",
-        "images are wider than GaussianAvatars' limit",
-        "Its code rescales images wider than 1,600 pixels unless given -r 1; align the size beforehand.",
-        _size_limit,
-    ),
-    Rule(
-        "HB201",
-        "error",
-        "the same image is in two splits",
-        "Take it out of one: a method is measured on what it was trained on.",
-        _same_images,
-    ),
-    Rule(
-        "HB202",
-        "warning",
-        "images of two splits are nearly the same",
-        "Look at the pair; where one is the other saved again or shifted by a frame, fix the split.",
-        _near_images,
-    ),
-    Rule(
-        "HB203",
-        "error",
-        "self-reenactment timesteps are trained on",
-        "Hold out whole sequences, in all cameras.",
-        _test_timesteps,
-    ),
-    Rule(
-        "HB204",
-        "error",
-        "novel-view cameras are trained on",
-        "Hold out the camera in every training sequence.",
-        _test_cameras,
-    ),
-    Rule(
-        "HB205",
-        "error",
-        "a frame stands twice in one split",
-        "Delete the second entry: it would be trained on or counted twice.",
-        _twice,
-    ),
-)
+            yield Hit(text, twice[0].file, twice[0].where)

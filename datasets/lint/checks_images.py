@@ -7,12 +7,12 @@ mask is not reported as a wrong background too.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
 from .evidence import Evidence
-from .rules import Hit, Rule, several, some
+from .rules import Hit, rule, several, some
 from .views import BACKGROUND_LEVELS, MaskFacts, ViewFacts
 
 MOST = 0.5
@@ -65,33 +65,55 @@ def sound_mask(view: ViewFacts) -> bool:
     return view.mask is not None and _sound(view.mask)
 
 
-def _faulty_masks(evidence: Evidence, faulty: Sequence[ViewFacts], what: str) -> Iterator[Hit]:
+def _faulty_masks(evidence: Evidence, is_faulty: Callable[[MaskFacts], bool], what: str) -> Iterator[Hit]:
+    faulty = [view for view, mask in _masks(evidence) if is_faulty(mask)]
     if faulty:
         path = faulty[0].entry.mask or faulty[0].entry.image
         yield Hit(f"{what} in {len(faulty)} of {several(len(evidence.views), 'frame')} looked at", path)
 
 
+@rule("HB307", "error")
 def _unit_masks(evidence: Evidence) -> Iterator[Hit]:
-    faulty = [view for view, mask in _masks(evidence) if _unit_mask(mask)]
-    yield from _faulty_masks(evidence, faulty, "the mask holds 0 and 1 alone, out of 255,")
+    """A mask holds 0 and 1 out of 255.
+
+    Multiply it by 255 before saving.
+    """
+    yield from _faulty_masks(evidence, _unit_mask, "the mask holds 0 and 1 alone, out of 255,")
 
 
+@rule("HB304", "error")
 def _empty_masks(evidence: Evidence) -> Iterator[Hit]:
-    faulty = [view for view, mask in _masks(evidence) if _empty(mask)]
-    yield from _faulty_masks(evidence, faulty, "the mask covers nothing")
+    """A mask is empty.
+
+    Run the matting again for these frames, or exclude them with a reason.
+    """
+    yield from _faulty_masks(evidence, _empty, "the mask covers nothing")
 
 
+@rule("HB305", "error")
 def _full_masks(evidence: Evidence) -> Iterator[Hit]:
-    faulty = [view for view, mask in _masks(evidence) if _full(mask)]
-    yield from _faulty_masks(evidence, faulty, "the mask covers the whole image")
+    """A mask is full.
+
+    Run the matting again; a mask of 255 everywhere is what a failed matting leaves.
+    """
+    yield from _faulty_masks(evidence, _full, "the mask covers the whole image")
 
 
+@rule("HB306", "error")
 def _inverted_masks(evidence: Evidence) -> Iterator[Hit]:
-    faulty = [view for view, mask in _masks(evidence) if _inverted(mask)]
-    yield from _faulty_masks(evidence, faulty, "the mask covers the background and leaves out the subject")
+    """A mask is inverted.
+
+    Invert it: 255 is the subject.
+    """
+    yield from _faulty_masks(evidence, _inverted, "the mask covers the background and leaves out the subject")
 
 
+@rule("HB308", "error")
 def _blank_images(evidence: Evidence) -> Iterator[Hit]:
+    """An image is of one colour.
+
+    Export the frame again, or exclude it with a reason.
+    """
     faulty = [view for view in evidence.views if view.error is None and view.low == view.high > 1]
     if faulty:
         yield Hit(
@@ -119,7 +141,12 @@ def _foreign(evidence: Evidence, colour: np.ndarray) -> bool:
     return bool(np.abs(colour - np.asarray(evidence.background) * 255).max() > BACKGROUND_LEVELS)
 
 
+@rule("HB301", "error")
 def _wrong_background(evidence: Evidence) -> Iterator[Hit]:
+    """Images are not on the declared background.
+
+    Declare the background they are on, or composite them on the declared one.
+    """
     if unit_range(evidence) or limited_range(evidence):
         return
     seen = outside_colours(evidence)
@@ -136,7 +163,13 @@ def _wrong_background(evidence: Evidence) -> Iterator[Hit]:
         )
 
 
+@rule("HB302", "warning")
 def _dirty_background(evidence: Evidence) -> Iterator[Hit]:
+    """The background is not clean outside the mask.
+
+    Composite with the mask that is stored, or store the one that was used: masked metrics and alpha losses
+    see what the mask denies.
+    """
     if unit_range(evidence) or limited_range(evidence):
         return
     seen = [entry for entry in outside_colours(evidence) if entry[0].mask is not None]
@@ -150,7 +183,12 @@ def _dirty_background(evidence: Evidence) -> Iterator[Hit]:
         )
 
 
+@rule("HB303", "warning")
 def _fringes(evidence: Evidence) -> Iterator[Hit]:
+    """Fringes along the mask.
+
+    Composite once, straight alpha: a F + (1 - a) B with the unmultiplied colour F.
+    """
     if unit_range(evidence) or any(_foreign(evidence, colour) for _, colour, _ in outside_colours(evidence)):
         return
     told = [
@@ -210,22 +248,35 @@ APART_LEVELS = 30
 """Difference between a camera's skin colour and the others' from which they are not calibrated to each other."""
 
 
+@rule("HB401", "error")
 def _limited(evidence: Evidence) -> Iterator[Hit]:
+    """Colours are in video's limited range.
+
+    Decode the video again with full range (for ffmpeg -vf scale=in_range=tv:out_range=pc): white is 255.
+    """
     if limited_range(evidence):
         views = [view for view in evidence.views if view.error is None and view.low != view.high]
         low, high = min(view.subject_low for view in views), max(view.subject_high for view in views)
-        yield Hit(
-            f"the subject's levels lie from {low} to {high}, within the limited range of video, 16 to 235",
-            views[0].entry.image,
-        )
+        text = f"the subject's levels lie from {low} to {high}, within the limited range of video, 16 to 235"
+        yield Hit(text, views[0].entry.image)
 
 
+@rule("HB402", "error")
 def _unit(evidence: Evidence) -> Iterator[Hit]:
+    """Images hold levels 0 and 1 alone.
+
+    Multiply by 255 and round before saving as 8 bits.
+    """
     if unit_range(evidence):
         yield Hit("no level is above 1 of 255", evidence.views[0].entry.image)
 
 
+@rule("HB403", "warning")
 def _grey(evidence: Evidence) -> Iterator[Hit]:
+    """Images have no colour.
+
+    Export the colour images, if there are any.
+    """
     views = [
         view for view in evidence.views if view.error is None and view.low != view.high and view.high > 1
     ]
@@ -251,7 +302,12 @@ def _swapped_cameras(evidence: Evidence) -> list[str]:
     return [camera for camera, colour in skin.items() if colour[2] - colour[0] > SWAPPED_LEVELS]
 
 
+@rule("HB404", "warning")
 def _swapped(evidence: Evidence) -> Iterator[Hit]:
+    """Red and blue seem swapped.
+
+    Convert between OpenCV's BGR and RGB once, where images are read or written.
+    """
     cameras = _swapped_cameras(evidence)
     if cameras:
         red, _, blue = skin_by_camera(evidence)[cameras[0]].round().astype(int)
@@ -262,8 +318,13 @@ def _swapped(evidence: Evidence) -> Iterator[Hit]:
         )
 
 
+@rule("HB405", "warning")
 def _uncalibrated(evidence: Evidence) -> Iterator[Hit]:
-    """Brightness differs with the light's direction, so only the balance between channels is compared."""
+    """Cameras are not calibrated to each other in colour.
+
+    Apply the recording's colour calibration; some loaders compute it and return the uncorrected image.
+    """
+    # Brightness differs with the light's direction, so only the balance between channels is compared.
     skin = skin_by_camera(evidence)
     swapped = _swapped_cameras(evidence)
     balance = {c: v - v.mean() for c, v in skin.items() if c not in swapped}
@@ -280,94 +341,12 @@ def _uncalibrated(evidence: Evidence) -> Iterator[Hit]:
         )
 
 
+@rule("HB406", "note")
 def _lossy(evidence: Evidence) -> Iterator[Hit]:
+    """Ground truth is lossy.
+
+    Export PNG: metrics against JPEG reward its artefacts.
+    """
     lossy = [path for path in evidence.digests if path.suffix.lower() in (".jpg", ".jpeg")]
     if lossy:
         yield Hit(f"{len(lossy)} of {several(len(evidence.digests), 'image')} are JPEG", lossy[0])
-
-
-RULES = (
-    Rule(
-        "HB301",
-        "error",
-        "images are not on the declared background",
-        "Declare the background they are on, or composite them on the declared one.",
-        _wrong_background,
-    ),
-    Rule(
-        "HB302",
-        "warning",
-        "the background is not clean outside the mask",
-        "Composite with the mask that is stored, or store the one that was used: masked metrics and alpha losses "
-        "see what the mask denies.",
-        _dirty_background,
-    ),
-    Rule(
-        "HB303",
-        "warning",
-        "fringes along the mask",
-        "Composite once, straight alpha: a F + (1 - a) B with the unmultiplied colour F.",
-        _fringes,
-    ),
-    Rule(
-        "HB304",
-        "error",
-        "a mask is empty",
-        "Run the matting again for these frames, or exclude them with a reason.",
-        _empty_masks,
-    ),
-    Rule(
-        "HB305",
-        "error",
-        "a mask is full",
-        "Run the matting again; a mask of 255 everywhere is what a failed matting leaves.",
-        _full_masks,
-    ),
-    Rule("HB306", "error", "a mask is inverted", "Invert it: 255 is the subject.", _inverted_masks),
-    Rule(
-        "HB307", "error", "a mask holds 0 and 1 out of 255", "Multiply it by 255 before saving.", _unit_masks
-    ),
-    Rule(
-        "HB308",
-        "error",
-        "an image is of one colour",
-        "Export the frame again, or exclude it with a reason.",
-        _blank_images,
-    ),
-    Rule(
-        "HB401",
-        "error",
-        "colours are in video's limited range",
-        "Decode the video again with full range (for ffmpeg -vf scale=in_range=tv:out_range=pc): white is 255.",
-        _limited,
-    ),
-    Rule(
-        "HB402",
-        "error",
-        "images hold levels 0 and 1 alone",
-        "Multiply by 255 and round before saving as 8 bits.",
-        _unit,
-    ),
-    Rule("HB403", "warning", "images have no colour", "Export the colour images, if there are any.", _grey),
-    Rule(
-        "HB404",
-        "warning",
-        "red and blue seem swapped",
-        "Convert between OpenCV's BGR and RGB once, where images are read or written.",
-        _swapped,
-    ),
-    Rule(
-        "HB405",
-        "warning",
-        "cameras are not calibrated to each other in colour",
-        "Apply the recording's colour calibration; some loaders compute it and return the uncorrected image.",
-        _uncalibrated,
-    ),
-    Rule(
-        "HB406",
-        "note",
-        "ground truth is lossy",
-        "Export PNG: metrics against JPEG reward its artefacts.",
-        _lossy,
-    ),
-)

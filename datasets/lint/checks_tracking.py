@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ from .checks_cameras import misplaced
 from .checks_images import sound_mask
 from .evidence import Evidence
 from .mesh import MeshFacts
-from .rules import Hit, Rule, several, some, spans
+from .rules import Hit, rule, several, some, spans
 from .views import ViewFacts
 
 STILL = 1e-4
@@ -36,18 +36,28 @@ WORSE = 1.05
 CHANGE = 1e-4
 
 
+@rule("HB601", "error", of_layout=True)
 def _version(evidence: Evidence) -> Iterator[Hit]:
+    """The head model is not the one the capture was tracked with.
+
+    Give the declared version, or refit the tracking: coefficients of FLAME 2020 and 2023 are not
+    interchangeable, though they are as many.
+    """
     for error in evidence.head_faults:
         if error.key == "head_model":
-            yield Hit(
+            text = (
                 f"the head model given is {error.expected.split(',')[0]}, the capture was tracked with "
-                f"{error.found}",
-                error.file,
-                error.key,
+                f"{error.found}"
             )
+            yield Hit(text, error.file, error.key)
 
 
+@rule("HB613", "error", of_layout=True)
 def _sequence_versions(evidence: Evidence) -> Iterator[Hit]:
+    """Sequences were tracked with different head models.
+
+    Refit one of them, or keep them in captures of their own.
+    """
     if evidence.declaration is None:
         return
     others: dict[str, Path] = {}
@@ -60,111 +70,144 @@ def _sequence_versions(evidence: Evidence) -> Iterator[Hit]:
             others[other.head_model] = folder
     if others:
         folder = next(iter(others.values()))
-        yield Hit(
+        text = (
             f"sequence {folder.name} was tracked with {some(others)}, the union says "
-            f"{evidence.declaration.head_model}",
-            folder / layout.DECLARATION_FILE,
-            "head_model",
+            f"{evidence.declaration.head_model}"
         )
+        yield Hit(text, folder / layout.DECLARATION_FILE, "head_model")
 
 
+@rule("HB602", "error", of_layout=True)
 def _no_head(evidence: Evidence) -> Iterator[Hit]:
+    """The head model is missing or broken.
+
+    Give its path with --head, or put it where headbench.json says.
+    """
     for error in evidence.head_faults:
         if error.key != "head_model":
             yield Hit(f"expected {error.expected}, found {error.found}", error.file, error.key)
 
 
+@rule("HB603", "error", of_layout=True)
 def _unfit(evidence: Evidence) -> Iterator[Hit]:
+    """Parameters do not fit the head model.
+
+    Give the head model the capture was tracked with.
+    """
     wrong = [p for p in evidence.parameters.values() if p.error is not None and p.arrays and not p.not_finite]
     if wrong and wrong[0].error is not None:
         error = wrong[0].error
-        yield Hit(
+        text = (
             f"{several(len(wrong), 'parameter file')} do not fit the head model: expected {error.expected}, found "
-            f"{error.found}",
-            error.file,
-            error.key,
+            f"{error.found}"
         )
+        yield Hit(text, error.file, error.key)
 
 
+@rule("HB604", "error")
 def _not_finite(evidence: Evidence) -> Iterator[Hit]:
+    """Parameters are not finite.
+
+    Track these timesteps again, or leave them out with a reason.
+    """
     wrong = [p for p in evidence.parameters.values() if p.not_finite]
     if wrong:
-        yield Hit(
+        text = (
             f"{some(wrong[0].not_finite)} not finite in {several(len(wrong), 'parameter file')}, timesteps "
-            f"{spans(p.timestep for p in wrong)}",
-            wrong[0].path,
-            wrong[0].not_finite[0],
+            f"{spans(p.timestep for p in wrong)}"
         )
+        yield Hit(text, wrong[0].path, wrong[0].not_finite[0])
 
 
+@rule("HB605", "warning", of_layout=True)
 def _short_vectors(evidence: Evidence) -> Iterator[Hit]:
+    """There are fewer coefficients than the head model has.
+
+    Make sure that the tracker used a cut basis of this very model, and not another one.
+    """
     if evidence.subject is None:
         return
     head = evidence.subject.head
     for key, basis in (("expr", head.expression_basis), ("shape", head.shape_basis)):
-        short = [
-            p
-            for p in evidence.parameters.values()
-            if p.pose is not None and p.arrays[key].size < basis.shape[2]
-        ]
+        short = [p for p in evidence.posed if p.arrays[key].size < basis.shape[2]]
         if short:
-            yield Hit(
+            text = (
                 f"{key} has {short[0].arrays[key].size} coefficients, head model {head.version} has "
-                f"{basis.shape[2]}; the rest is taken as zero",
-                short[0].path,
-                key,
+                f"{basis.shape[2]}; the rest is taken as zero"
             )
+            yield Hit(text, short[0].path, key)
 
 
+@rule("HB606", "warning")
 def _eyelids(evidence: Evidence) -> Iterator[Hit]:
+    """Eyelids are tracked that the head model lacks.
+
+    Give the model the tracker used (FLAME 2020 with eyelids, in MICA's tracker), or refit.
+    """
     if evidence.subject is None or evidence.subject.head.eyelid_basis is not None:
         return
     used = [p for p in evidence.parameters.values() if np.any(p.arrays.get("eyelids", 0))]
     if used:
-        yield Hit(
+        text = (
             f"eyelids are tracked in {several(len(used), 'timestep')}, head model "
-            f"{evidence.subject.head.version} has no eyelid basis",
-            used[0].path,
-            "eyelids",
+            f"{evidence.subject.head.version} has no eyelid basis"
         )
+        yield Hit(text, used[0].path, "eyelids")
 
 
+@rule("HB607", "warning")
 def _still_jaw(evidence: Evidence) -> Iterator[Hit]:
+    """The jaw never moves.
+
+    Make sure of the version: in FLAME 2023 without jaw rotation the mouth opens by expression, and its
+    coefficients are those of no other model.
+    """
     if evidence.subject is None or evidence.subject.head.skinning_weights[:, 2].max() < 0.5:
         return
-    poses = [p for p in evidence.parameters.values() if p.pose is not None]
-    jaws = np.array([p.pose.jaw for p in poses if p.pose is not None])
+    poses = evidence.posed
+    jaws = np.array([p.pose.jaw for p in poses if p.pose])
     if len(poses) >= FEW and np.ptp(jaws, axis=0).max() < STILL:
         yield Hit(
             f"the jaw never turns over {several(len(poses), 'timestep')}", poses[0].path.parent, "jaw_pose"
         )
 
 
+@rule("HB614", "warning")
 def _still_expression(evidence: Evidence) -> Iterator[Hit]:
-    poses = [p for p in evidence.parameters.values() if p.pose is not None]
-    expressions = np.array([p.pose.expression for p in poses if p.pose is not None])
+    """The expression never changes.
+
+    Make sure that expressions were tracked and exported.
+    """
+    poses = evidence.posed
+    expressions = np.array([p.pose.expression for p in poses if p.pose])
     if len(poses) >= FEW and np.ptp(expressions, axis=0).max(initial=0.0) < STILL:
-        yield Hit(
-            f"the expression never changes over {several(len(poses), 'timestep')}",
-            poses[0].path.parent,
-            "expr",
-        )
+        text = f"the expression never changes over {several(len(poses), 'timestep')}"
+        yield Hit(text, poses[0].path.parent, "expr")
 
 
+@rule("HB608", "warning")
 def _far_expression(evidence: Evidence) -> Iterator[Hit]:
+    """Expressions are larger than faces allow.
+
+    Make sure of the version and of the coefficients' scale (standard deviations, metres).
+    """
     far = {t: reach for t, reach in expression_reach(evidence).items() if reach > REACH_M}
     if far:
         worst = max(far, key=lambda t: far[t])
-        yield Hit(
+        text = (
             f"the expression moves vertices by up to {1000 * far[worst]:.0f} mm (timestep {worst}; more than "
-            f"{1000 * REACH_M:.0f} mm in {several(len(far), 'timestep')})",
-            evidence.parameters[worst].path,
-            "expr",
+            f"{1000 * REACH_M:.0f} mm in {several(len(far), 'timestep')})"
         )
+        yield Hit(text, evidence.parameters[worst].path, "expr")
 
 
+@rule("HB609", "warning", of_layout=True)
 def _changing_identity(evidence: Evidence) -> Iterator[Hit]:
-    posed = [p for p in evidence.parameters.values() if p.pose is not None]
+    """Identity changes over time.
+
+    Track with one identity for all sequences, or take the union apart.
+    """
+    posed = evidence.posed
     if not posed:
         return
     first = posed[0].arrays["shape"].ravel()
@@ -172,30 +215,33 @@ def _changing_identity(evidence: Evidence) -> Iterator[Hit]:
     change = max(float(np.abs(s - first).max(initial=0.0)) for s in shapes if s.shape == first.shape)
     offset = max(p.offset_change_m for p in posed)
     if change > CHANGE or offset > 1e-6:
-        yield Hit(
+        text = (
             f"identity changes over time (shape by up to {change:.3g}, static offset by {1000 * offset:.3g} mm); "
-            "the first timestep's is taken for all",
-            posed[0].path.parent,
-            "shape",
+            "the first timestep's is taken for all"
         )
+        yield Hit(text, posed[0].path.parent, "shape")
 
 
+@rule("HB610", "note", of_layout=True)
 def _dynamic(evidence: Evidence) -> Iterator[Hit]:
+    """Dynamic offsets are left out.
+
+    Nothing, if methods are to be driven by coefficients; their tracking is then a little coarser.
+    """
     largest = max((p.dynamic_m for p in evidence.parameters.values()), default=0.0)
     if largest > 0:
         path = next(p.path for p in evidence.parameters.values() if p.dynamic_m > 0)
-        yield Hit(
-            f"dynamic_offset moves vertices by up to {1000 * largest:.3g} mm and is not used",
-            path,
-            "dynamic_offset",
-        )
+        text = f"dynamic_offset moves vertices by up to {1000 * largest:.3g} mm and is not used"
+        yield Hit(text, path, "dynamic_offset")
 
 
+@rule("HB611", "warning")
 def _repeated(evidence: Evidence) -> Iterator[Hit]:
-    images: dict[int, dict[str, str]] = {}
-    for entry in evidence.entries:
-        images.setdefault(entry.timestep, {})[entry.camera_id] = evidence.digests.get(entry.image, "")
-    repeated = []
+    """Tracking stands still while images go on.
+
+    Track these timesteps again, or leave them out with a reason.
+    """
+    images, repeated = evidence.contents, []
     for timesteps in evidence.sequences.values():
         for before, after in itertools.pairwise(timesteps):
             one, other = evidence.parameters[before].arrays, evidence.parameters[after].arrays
@@ -210,7 +256,12 @@ def _repeated(evidence: Evidence) -> Iterator[Hit]:
         )
 
 
+@rule("HB612", "warning")
 def _jumps(evidence: Evidence) -> Iterator[Hit]:
+    """Tracking jumps.
+
+    Look at the overlay (headbench inspect); track these timesteps again, or leave them out with a reason.
+    """
     for folder, (timesteps, steps) in face_steps(evidence).items():
         if len(steps) < FEW:
             continue
@@ -224,17 +275,22 @@ def _jumps(evidence: Evidence) -> Iterator[Hit]:
             )
 
 
+@rule("HB615", "warning")
 def _unexplained(evidence: Evidence) -> Iterator[Hit]:
+    """Expressions fit the images worse than a face at rest.
+
+    Make sure of the head model's version (FLAME 2020 and 2023 are not interchangeable), and that parameters
+    and images are of the same timesteps; refit the tracking to the model that is to be used.
+    """
     fit = evidence.expression_fit
     if fit is None or misplaced(evidence) or mesh_misses(evidence):
         return
     if fit.ratio > WORSE:
-        yield Hit(
+        text = (
             f"the skin's colours at the mesh's vertices vary {fit.ratio:.2f} times as much over time as with a face at "
-            f"rest ({fit.vertices} vertices, {several(fit.frames, 'frame')} of camera {fit.camera})",
-            evidence.folder,
-            "expr",
+            f"rest ({fit.vertices} vertices, {several(fit.frames, 'frame')} of camera {fit.camera})"
         )
+        yield Hit(text, evidence.folder, "expr")
 
 
 OUTSIDE = 0.15
@@ -261,7 +317,13 @@ def mesh_misses(evidence: Evidence) -> bool:
     return bool(laid) and float(np.median([outside for _, _, outside in laid])) > OUTSIDE
 
 
+@rule("HB701", "error")
 def _missed(evidence: Evidence) -> Iterator[Hit]:
+    """The tracked mesh misses the subject.
+
+    Look at the overlay (headbench inspect): wrong cameras, intrinsics not scaled with the images, units,
+    another subject's tracking, or parameters shifted by some timesteps.
+    """
     if mesh_misses(evidence):
         laid = _laid(evidence)
         outside = float(np.median([share for _, _, share in laid]))
@@ -273,7 +335,12 @@ def _missed(evidence: Evidence) -> Iterator[Hit]:
         )
 
 
+@rule("HB702", "warning")
 def _missed_once(evidence: Evidence) -> Iterator[Hit]:
+    """The tracked mesh misses the subject in some frames.
+
+    Track these timesteps again, or leave them out with a reason.
+    """
     if mesh_misses(evidence):
         return
     laid = _laid(evidence)
@@ -289,7 +356,12 @@ def _missed_once(evidence: Evidence) -> Iterator[Hit]:
         )
 
 
+@rule("HB703", "warning")
 def _small(evidence: Evidence) -> Iterator[Hit]:
+    """The mesh is small beside the foreground.
+
+    Make sure of the units; where the mask shows shoulders, cut it below the neck.
+    """
     sizes = [mesh.size for _, mesh, _ in _laid(evidence) if mesh.size is not None]
     if sizes and np.median(sizes) < SMALL:
         yield Hit(
@@ -297,147 +369,6 @@ def _small(evidence: Evidence) -> Iterator[Hit]:
             f"{several(len(sizes), 'frame')})",
             evidence.folder,
         )
-
-
-RULES = (
-    Rule(
-        "HB601",
-        "error",
-        "the head model is not the one the capture was tracked with",
-        "Give the declared version, or refit the tracking: coefficients of FLAME 2020 and 2023 are not "
-        "interchangeable, though they are as many.",
-        _version,
-        of_layout=True,
-    ),
-    Rule(
-        "HB602",
-        "error",
-        "the head model is missing or broken",
-        "Give its path with --head, or put it where headbench.json says.",
-        _no_head,
-        of_layout=True,
-    ),
-    Rule(
-        "HB603",
-        "error",
-        "parameters do not fit the head model",
-        "Give the head model the capture was tracked with.",
-        _unfit,
-        of_layout=True,
-    ),
-    Rule(
-        "HB604",
-        "error",
-        "parameters are not finite",
-        "Track these timesteps again, or leave them out with a reason.",
-        _not_finite,
-    ),
-    Rule(
-        "HB605",
-        "warning",
-        "there are fewer coefficients than the head model has",
-        "Make sure that the tracker used a cut basis of this very model, and not another one.",
-        _short_vectors,
-        of_layout=True,
-    ),
-    Rule(
-        "HB606",
-        "warning",
-        "eyelids are tracked that the head model lacks",
-        "Give the model the tracker used (FLAME 2020 with eyelids, in MICA's tracker), or refit.",
-        _eyelids,
-    ),
-    Rule(
-        "HB607",
-        "warning",
-        "the jaw never moves",
-        "Make sure of the version: in FLAME 2023 without jaw rotation the mouth opens by expression, and its "
-        "coefficients are those of no other model.",
-        _still_jaw,
-    ),
-    Rule(
-        "HB608",
-        "warning",
-        "expressions are larger than faces allow",
-        "Make sure of the version and of the coefficients' scale (standard deviations, metres).",
-        _far_expression,
-    ),
-    Rule(
-        "HB609",
-        "warning",
-        "identity changes over time",
-        "Track with one identity for all sequences, or take the union apart.",
-        _changing_identity,
-        of_layout=True,
-    ),
-    Rule(
-        "HB610",
-        "note",
-        "dynamic offsets are left out",
-        "Nothing, if methods are to be driven by coefficients; their tracking is then a little coarser.",
-        _dynamic,
-        of_layout=True,
-    ),
-    Rule(
-        "HB611",
-        "warning",
-        "tracking stands still while images go on",
-        "Track these timesteps again, or leave them out with a reason.",
-        _repeated,
-    ),
-    Rule(
-        "HB612",
-        "warning",
-        "tracking jumps",
-        "Look at the overlay (headbench inspect); track these timesteps again, or leave them out with a reason.",
-        _jumps,
-    ),
-    Rule(
-        "HB613",
-        "error",
-        "sequences were tracked with different head models",
-        "Refit one of them, or keep them in captures of their own.",
-        _sequence_versions,
-        of_layout=True,
-    ),
-    Rule(
-        "HB614",
-        "warning",
-        "the expression never changes",
-        "Make sure that expressions were tracked and exported.",
-        _still_expression,
-    ),
-    Rule(
-        "HB615",
-        "warning",
-        "expressions fit the images worse than a face at rest",
-        "Make sure of the head model's version (FLAME 2020 and 2023 are not interchangeable), and that parameters and "
-        "images are of the same timesteps; refit the tracking to the model that is to be used.",
-        _unexplained,
-    ),
-    Rule(
-        "HB701",
-        "error",
-        "the tracked mesh misses the subject",
-        "Look at the overlay (headbench inspect): wrong cameras, intrinsics not scaled with the images, units, "
-        "another subject's tracking, or parameters shifted by some timesteps.",
-        _missed,
-    ),
-    Rule(
-        "HB702",
-        "warning",
-        "the tracked mesh misses the subject in some frames",
-        "Track these timesteps again, or leave them out with a reason.",
-        _missed_once,
-    ),
-    Rule(
-        "HB703",
-        "warning",
-        "the mesh is small beside the foreground",
-        "Make sure of the units; where the mask shows shoulders, cut it below the neck.",
-        _small,
-    ),
-)
 
 
 _BATCH = 32
@@ -451,33 +382,20 @@ def face_steps(evidence: Evidence) -> dict[str, tuple[list[int], FloatArray]]:
     face = evidence.subject.head.regions.get("face", np.arange(len(evidence.subject.head.template)))
     steps = {}
     for folder, timesteps in evidence.sequences.items():
-        posed = [t for t in timesteps if evidence.parameters[t].pose is not None]
-        steps[folder] = (posed, _steps(evidence, posed, face))
+        posed = [t for t in timesteps if evidence.parameters[t].pose]
+        lengths: list[float] = []
+        for start in range(0, len(posed) - 1, _BATCH):
+            poses = [evidence.parameters[t].pose for t in posed[start : start + _BATCH + 1]]
+            points = evidence.subject.meshes([pose for pose in poses if pose])[:, face]
+            lengths += np.linalg.norm(np.diff(points, axis=0), axis=2).mean(axis=1).tolist()
+        steps[folder] = (posed, np.array(lengths))
     return steps
-
-
-def _steps(evidence: Evidence, timesteps: Sequence[int], face: np.ndarray) -> FloatArray:
-    assert evidence.subject is not None
-    found: list[float] = []
-    last: FloatArray | None = None
-    for start in range(0, len(timesteps), _BATCH):
-        poses = [evidence.parameters[t].pose for t in timesteps[start : start + _BATCH]]
-        points = evidence.subject.vertices([pose for pose in poses if pose is not None])[:, face]
-        chain = points if last is None else np.concatenate([last, points])
-        found += np.linalg.norm(np.diff(chain, axis=0), axis=2).mean(axis=1).tolist()
-        last = points[-1:]
-    return np.array(found)
 
 
 def expression_reach(evidence: Evidence) -> dict[int, float]:
     """Farthest that a vertex moves by the expression coefficients alone, metres, by timestep."""
     if evidence.subject is None:
         return {}
-    basis = evidence.subject.head.expression_basis
-    matrix = np.asarray(basis, dtype=np.float64).reshape(-1, basis.shape[2])
-    poses = {t: p.pose for t, p in evidence.parameters.items() if p.pose is not None}
-    reach = {}
-    for timestep, pose in poses.items():
-        moved = (matrix @ pose.expression.astype(np.float64)).reshape(-1, 3)
-        reach[timestep] = float(np.linalg.norm(moved, axis=1).max())
-    return reach
+    basis = np.asarray(evidence.subject.head.expression_basis, dtype=np.float64)
+    moved = {p.timestep: basis @ p.pose.expression.astype(np.float64) for p in evidence.posed if p.pose}
+    return {timestep: float(np.linalg.norm(by, axis=1).max()) for timestep, by in moved.items()}

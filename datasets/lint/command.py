@@ -5,7 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -78,7 +78,7 @@ def lint(settings: LintSettings, progress: Progress = no_progress) -> Findings:
         "counts": {severity: counts[severity] for severity in SEVERITIES},
         "looked_at": _looked_at(evidence),
         "skipped": _skipped(evidence),
-        "findings": [finding.as_dict() for finding in findings],
+        "findings": [asdict(finding) for finding in findings],
     }
     return Findings(_report(evidence, findings, passed), data, passed)
 

@@ -6,6 +6,7 @@ behind each fault, so that one broken frame does not hide what else is wrong.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...bench.contracts import FrameKey, HeadPose, Progress, no_progress
+from ...bench.contracts import FrameKey, Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.io.documents import read_json
 from ...bench.io.files import digest
@@ -30,7 +31,7 @@ from ..ga.writer import pose_to_parameters
 from ..head.arrays import HeadArrays
 from .command import LintSettings
 from .expression_fit import ExpressionFit, weigh_expression
-from .mesh import Parameters, TrackedSubject, read_parameters
+from .mesh import Parameters, TrackedSubject, not_finite, read_parameters
 from .views import Pixels, Thumbnail, ViewFacts, look, make_thumbnails, pick_views, pixels_of_files
 
 
@@ -56,7 +57,6 @@ class Evidence:
     declaration_faults, json_faults, frame_faults, file_faults, head_faults : why things could not be read.
     headers : of the images and masks that are there, by path.
     digests : of the content of every image that is there.
-    head : None where it could not be found or read.
     parameters : by timestep.
     subject : head and identity that fit the parameters; None where no file does.
     views : decoded sample frames.
@@ -69,23 +69,22 @@ class Evidence:
     settings: LintSettings
     of_layout: bool
     background: tuple[float, ...]
-    declaration: layout.Declaration | None
     splits: Mapping[str, tuple[FrameEntry, ...]]
-    unread: frozenset[Slot]
-    declaration_faults: tuple[InputError, ...]
-    json_faults: tuple[InputError, ...]
-    frame_faults: tuple[InputError, ...]
-    file_faults: tuple[InputError, ...]
-    head_faults: tuple[InputError, ...]
     headers: Mapping[Path, ImageInfo]
     digests: Mapping[Path, str]
-    head: HeadArrays | None
     parameters: Mapping[int, Parameters]
     subject: TrackedSubject | None
-    views: tuple[ViewFacts, ...]
-    thumbnails: tuple[Thumbnail, ...]
+    views: Sequence[ViewFacts]
+    thumbnails: Sequence[Thumbnail]
     expression_fit: ExpressionFit | None
-    refusal: InputError | None
+    declaration: layout.Declaration | None = None
+    unread: frozenset[Slot] = frozenset()
+    declaration_faults: Sequence[InputError] = ()
+    json_faults: Sequence[InputError] = ()
+    frame_faults: Sequence[InputError] = ()
+    file_faults: Sequence[InputError] = ()
+    head_faults: Sequence[InputError] = ()
+    refusal: InputError | None = None
 
     @cached_property
     def entries(self) -> tuple[FrameEntry, ...]:
@@ -107,6 +106,20 @@ class Evidence:
             found.setdefault(entry.sequence_folder, set()).add(entry.timestep)
         return {folder: tuple(sorted(timesteps)) for folder, timesteps in found.items()}
 
+    @cached_property
+    def posed(self) -> Sequence[Parameters]:
+        """Parameters that give a pose."""
+        return [parameters for parameters in self.parameters.values() if parameters.pose is not None]
+
+    @cached_property
+    def contents(self) -> Mapping[int, Mapping[str, str]]:
+        """Digest of each image by timestep and camera id; of those that are there."""
+        found: dict[int, dict[str, str]] = defaultdict(dict)
+        for entry in self.entries:
+            if entry.image in self.digests:
+                found[entry.timestep][entry.camera_id] = self.digests[entry.image]
+        return found
+
 
 def gather(folder: Path, settings: LintSettings, progress: Progress = no_progress) -> Evidence:
     """Read all that can be read of a capture."""
@@ -120,6 +133,7 @@ def gather(folder: Path, settings: LintSettings, progress: Progress = no_progres
     parameters, subject = read_parameters(entries, head, progress=progress)
     background = declaration.background if declaration else (1.0, 1.0, 1.0)
     cy = settings.cy if settings.cy != "auto" else (declaration.cy if declaration else "bottom")
+    pixels = pixels_of_files(headers, background)
     return Evidence(
         folder=folder,
         settings=settings,
@@ -128,27 +142,17 @@ def gather(folder: Path, settings: LintSettings, progress: Progress = no_progres
         declaration=declaration,
         splits=splits,
         unread=frozenset(unread),
-        declaration_faults=tuple(declaration_faults),
-        json_faults=tuple(json_faults),
-        frame_faults=tuple(frame_faults),
-        file_faults=tuple(file_faults),
-        head_faults=tuple(head_faults),
+        declaration_faults=declaration_faults,
+        json_faults=json_faults,
+        frame_faults=frame_faults,
+        file_faults=file_faults,
+        head_faults=head_faults,
         headers=headers,
         digests=digests,
-        head=head,
         parameters=parameters,
         subject=subject,
         refusal=_refusal(folder, settings),
-        **_looked_at(
-            splits,
-            pixels_of_files(headers, background),
-            background,
-            cy,
-            subject,
-            parameters,
-            settings,
-            progress,
-        ),
+        **_looked_at(splits, pixels, background, cy, subject, parameters, settings, progress),
     )
 
 
@@ -172,10 +176,10 @@ def gather_clip(
         progress(done, len(key_of), "reading images")
     pixels = Pixels(headers, lambda e: clip.image(key_of[e.image]), lambda e: clip.mask(key_of[e.image]))
     subject = TrackedSubject(Tracking(clip.head, clip.poses, clip.shape, clip.static_offset))
-    parameters = {
-        timestep: Parameters(timestep, folder, *_pose_arrays(pose), 0.0, 0.0, pose, None)
-        for timestep, pose in clip.poses.items()
-    }
+    parameters = {}
+    for timestep, pose in clip.poses.items():
+        arrays = pose_to_parameters(pose)
+        parameters[timestep] = Parameters(timestep, folder, arrays, not_finite(arrays), pose=pose)
     splits = {name: tuple(entries[key] for key in part) for name, part in clip.splits.items()}
     background = tuple(clip.background.tolist())
     return Evidence(
@@ -183,20 +187,11 @@ def gather_clip(
         settings=settings,
         of_layout=False,
         background=background,
-        declaration=None,
         splits=splits,
-        unread=frozenset(),
-        declaration_faults=(),
-        json_faults=(),
-        frame_faults=(),
-        file_faults=(),
-        head_faults=(),
         headers=headers,
         digests=digests,
-        head=clip.head,
         parameters=parameters,
         subject=subject,
-        refusal=None,
         **_looked_at(splits, pixels, background, "top", subject, parameters, settings, progress),
     )
 
@@ -218,8 +213,8 @@ def _looked_at(
     views = look(chosen, pixels, subject, parameters, background, cy, progress=progress)
     limit = len(whole) if settings.thorough else settings.duplicates
     return {
-        "views": tuple(views),
-        "thumbnails": tuple(make_thumbnails(there, pixels.image, limit, progress=progress)),
+        "views": views,
+        "thumbnails": make_thumbnails(there, pixels.image, limit, progress=progress),
         "expression_fit": weigh_expression(whole, views, pixels, subject, parameters, cy),
     }
 
@@ -245,12 +240,6 @@ def _entry_of(folder: Path, clip: CaptureClip, key: FrameKey) -> FrameEntry:
         intrinsics=layout.intrinsics_to_json(camera, "top"),
         camera_to_world=np.array(layout.extrinsics_to_json(camera.world_to_camera)),
     )
-
-
-def _pose_arrays(pose: HeadPose) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
-    """Arrays of a pose by name, and which of them are not finite."""
-    arrays = pose_to_parameters(pose)
-    return dict(arrays), tuple(name for name, array in arrays.items() if not np.isfinite(array).all())
 
 
 def _read_declaration(folder: Path) -> tuple[layout.Declaration | None, list[InputError]]:

@@ -104,7 +104,7 @@ def weigh_expression(
             continue  # reported as a damaged file
         still = replace(pose, expression=np.zeros_like(pose.expression))
         place = entry_camera(entry, pixels.headers[entry.image], cy)
-        for kept, mesh in zip((moving, resting), subject.vertices([pose, still])):
+        for kept, mesh in zip((moving, resting), subject.meshes([pose, still])):
             kept.append(_pick(mesh, subject, members, place, image))
     return _compare(camera, moving, resting)
 

@@ -5,12 +5,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 
 import cv2
 import numpy as np
-import torch
 
 from ...bench.contracts import ByteArray, Camera, FloatArray, HeadPose, IntArray, Progress, no_progress
 from ...bench.errors import InputError
@@ -19,7 +17,7 @@ from ..ga.tracking import Tracking, read_tracking
 from ..ga.transforms import FrameEntry
 from ..head.arrays import HeadArrays
 from ..head.geometry import rigid_alignment
-from ..head.model import HeadModel
+from ..head.subject import PosedSubject
 from ..mesh_pictures import rasterize_mesh
 
 OFFSETS = ("static_offset", "dynamic_offset")
@@ -43,40 +41,19 @@ class Parameters:
     timestep: int
     path: Path
     arrays: Mapping[str, np.ndarray]
-    not_finite: tuple[str, ...]
-    offset_change_m: float
-    dynamic_m: float
-    pose: HeadPose | None
-    error: InputError | None
+    not_finite: tuple[str, ...] = ()
+    offset_change_m: float = 0.0
+    dynamic_m: float = 0.0
+    pose: HeadPose | None = None
+    error: InputError | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class TrackedSubject:
+class TrackedSubject(PosedSubject):
     """The head with the identity of the first timestep that reads, teeth appended if its files have them."""
 
-    tracking: Tracking
-
-    @property
-    def head(self) -> HeadArrays:
-        """Head model that the parameters fit."""
-        return self.tracking.head
-
-    @cached_property
-    def _model(self) -> HeadModel:
-        return HeadModel(self.head, dtype=torch.float64)
-
-    @cached_property
-    def _canonical(self) -> torch.Tensor:
-        return self._model.canonical(
-            torch.from_numpy(self.tracking.shape.astype(np.float64)),
-            torch.from_numpy(self.tracking.static_offset.astype(np.float64)),
-        )
-
-    def vertices(self, poses: Sequence[HeadPose]) -> FloatArray:
-        """(B, V, 3) metres, in the world of the poses' own sequence."""
-        arguments = self._model.pose_arguments(poses)
-        posed: FloatArray = self._model(canonical=self._canonical, **arguments).numpy()
-        return posed
+    def __init__(self, tracking: Tracking) -> None:
+        super().__init__(tracking.head, tracking.shape, tracking.static_offset)
+        self.head = tracking.head
 
 
 def read_parameters(
@@ -94,7 +71,7 @@ def read_parameters(
         try:
             arrays = read_npz(path)
         except InputError as error:
-            found[timestep] = Parameters(timestep, path, {}, (), 0.0, 0.0, None, error)
+            found[timestep] = Parameters(timestep, path, {}, error=error)
             continue
         offset = _numbers(arrays.get("static_offset"))
         if first_offset is None:
@@ -116,13 +93,18 @@ def read_parameters(
             timestep=timestep,
             path=path,
             arrays={name: array for name, array in arrays.items() if name not in OFFSETS},
-            not_finite=tuple(name for name, array in arrays.items() if not _is_finite(array)),
-            offset_change_m=_largest_difference(offset, first_offset),
-            dynamic_m=float(np.abs(_numbers(arrays.get("dynamic_offset"))).max(initial=0.0)),
+            not_finite=not_finite(arrays),
+            offset_change_m=_largest(offset - first_offset) if offset.shape == first_offset.shape else 0.0,
+            dynamic_m=_largest(_numbers(arrays.get("dynamic_offset"))),
             pose=pose,
             error=fault,
         )
     return found, subject
+
+
+def not_finite(arrays: Mapping[str, np.ndarray]) -> tuple[str, ...]:
+    """Names of the arrays that hold NaN or infinite numbers."""
+    return tuple(name for name, array in arrays.items() if not _is_finite(array))
 
 
 def _numbers(array: np.ndarray | None) -> np.ndarray:
@@ -135,8 +117,8 @@ def _is_finite(array: np.ndarray) -> bool:
     return array.dtype.kind not in "f" or bool(np.isfinite(array).all())
 
 
-def _largest_difference(one: np.ndarray, other: np.ndarray) -> float:
-    return float(np.abs(one - other).max(initial=0.0)) if one.shape == other.shape else 0.0
+def _largest(array: np.ndarray) -> float:
+    return float(np.abs(array).max(initial=0.0))
 
 
 FACE = ("face", "forehead", "nose")
@@ -187,11 +169,13 @@ def lay_mesh(
     subject: TrackedSubject, pose: HeadPose, camera: Camera, image: ByteArray, mask: ByteArray | None
 ) -> MeshFacts:
     """Pose the subject's mesh and hold it against an image, (H, W, 3) RGB, and its mask, (H, W)."""
-    vertices = subject.vertices([pose])[0]
+    vertices = subject.meshes([pose])[0]
     turn = camera.world_to_camera[:3, :3]
     centre = vertices.mean(axis=0)
     towards = camera.center - centre
-    head = head_axes(subject, vertices)
+    # Where the template's axes point for the posed mesh, by the face, in rows.
+    face = _members(subject, FACE)
+    head = rigid_alignment(vertices[face], subject.head.template[face])[:3, :3]
     distance = float(np.linalg.norm(towards))
     plain = MeshFacts(
         vertices=vertices,
@@ -204,12 +188,6 @@ def lay_mesh(
     if plain.depth <= 0:
         return plain
     return _held_against(plain, subject, image, mask)
-
-
-def head_axes(subject: TrackedSubject, vertices: FloatArray) -> FloatArray:
-    """(3, 3) rows: where the template's x, y and z axes point for the posed mesh, by the face."""
-    members = _members(subject, FACE)
-    return rigid_alignment(vertices[members], subject.head.template[members])[:3, :3]
 
 
 def _members(subject: TrackedSubject, names: tuple[str, ...]) -> IntArray:

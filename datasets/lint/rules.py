@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 if TYPE_CHECKING:
+    from ..ga.transforms import FrameEntry
     from .evidence import Evidence
 
 Severity = Literal["error", "warning", "note"]
@@ -23,6 +25,11 @@ class Hit(NamedTuple):
     message: str
     file: Path | str = ""
     key: str = ""
+
+
+def at(entry: FrameEntry, key: str) -> tuple[Path, str]:
+    """File and key of a hit in a frame's entry."""
+    return entry.file, f"{entry.where}.{key}"
 
 
 @dataclass(frozen=True)
@@ -57,9 +64,18 @@ class Finding:
     file: str
     key: str
 
-    def as_dict(self) -> dict[str, Any]:
-        """Plain values."""
-        return asdict(self)
+
+def rule(
+    code: str, severity: Severity, *, of_layout: bool = False
+) -> Callable[[Callable[[Evidence], Iterable[Hit]]], Rule]:
+    """Make a rule of a check. The check's docstring gives the title in its first line, and the remedy below."""
+
+    def make(check: Callable[[Evidence], Iterable[Hit]]) -> Rule:
+        title, _, remedy = inspect.cleandoc(check.__doc__ or "").partition("\n\n")
+        title = title[:1].lower() + title[1:].removesuffix(".")
+        return Rule(code, severity, title, " ".join(remedy.split()), check, of_layout)
+
+    return make
 
 
 def apply(

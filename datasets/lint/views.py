@@ -15,7 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ...bench.contracts import ByteArray, Camera, FloatArray, HeadPose, Progress, no_progress
+from ...bench.contracts import ByteArray, Camera, FloatArray, Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.io.images import ImageInfo
 from ..ga.layout import CyConvention, extrinsics_from_json, intrinsics_from_json
@@ -100,12 +100,9 @@ def pick_views(entries: Sequence[FrameEntry], count: int) -> list[FrameEntry]:
         return []
     timesteps = sorted(groups)
     where = np.linspace(0, len(timesteps) - 1, count).round().astype(int)
-    chosen = {id(e): e for i, t in enumerate(where) for e in [_turn(groups[timesteps[t]], i)]}
-    return list(chosen.values())
-
-
-def _turn(group: Sequence[FrameEntry], i: int) -> FrameEntry:
-    return group[i % len(group)]
+    spread = (groups[timesteps[t]] for t in where)
+    chosen = [group[i % len(group)] for i, group in enumerate(spread)]
+    return list({id(entry): entry for entry in chosen}.values())
 
 
 def entry_camera(entry: FrameEntry, info: ImageInfo, cy: CyConvention) -> Camera:
@@ -151,14 +148,17 @@ def look(
     found = []
     for done, entry in enumerate(entries, start=1):
         progress(done, len(entries), "looking at frames")
-        info = pixels.headers[entry.image]
         try:
             image, mask = pixels.image(entry), pixels.mask(entry)
         except InputError as error:
             found.append(ViewFacts(entry, error=error))
             continue
+        info = pixels.headers[entry.image]
         pose = parameters[entry.timestep].pose if entry.timestep in parameters else None
-        found.append(_facts(entry, info, image, mask, subject, pose, background, cy))
+        mesh = None
+        if subject is not None and pose is not None:
+            mesh = lay_mesh(subject, pose, entry_camera(entry, info, cy), image, mask)
+        found.append(_facts(entry, info, image, mask, mesh, background))
     return found
 
 
@@ -176,10 +176,8 @@ def _facts(
     info: ImageInfo,
     image: ByteArray,
     mask: ByteArray | None,
-    subject: TrackedSubject | None,
-    pose: HeadPose | None,
+    mesh: MeshFacts | None,
     background: Sequence[float],
-    cy: CyConvention,
 ) -> ViewFacts:
     ground = np.round(np.asarray(background) * 255)
     off = np.abs(image.astype(np.int16) - ground).max(axis=2) > BACKGROUND_LEVELS
@@ -188,9 +186,6 @@ def _facts(
     width = max(1, info.width // 10)
     corners = np.zeros(off.shape, dtype=bool)
     corners[:width, :width] = corners[:width, -width:] = True
-    mesh = None
-    if subject is not None and pose is not None:
-        mesh = lay_mesh(subject, pose, entry_camera(entry, info, cy), image, mask)
     return ViewFacts(
         entry=entry,
         low=int(image.min()),
@@ -281,7 +276,8 @@ def make_thumbnails(
     """Thumbnails of up to ``limit`` frames, an equal share of every split, evenly spaced in each."""
     filled = {name: part for name, part in splits.items() if part}
     chosen: list[tuple[str, FrameEntry]] = []
-    for left, (name, part) in zip(range(len(filled), 0, -1), sorted(filled.items(), key=_size)):
+    for left, name in zip(range(len(filled), 0, -1), sorted(filled, key=lambda name: len(filled[name]))):
+        part = filled[name]
         count = min(len(part), max(0, limit - len(chosen)) // left)
         chosen += [(name, part[i]) for i in np.unique(np.linspace(0, len(part) - 1, count).astype(int))]
     found = []
@@ -293,10 +289,6 @@ def make_thumbnails(
             continue  # damaged inside: the decoded views and the reader report that
         found.append(_shrink(name, entry, image))
     return found
-
-
-def _size(item: tuple[str, Sequence[FrameEntry]]) -> int:
-    return len(item[1])
 
 
 def _shrink(split: str, entry: FrameEntry, image: np.ndarray) -> Thumbnail:

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
-
 import pytest
-
-from headbench.datasets.ga.writer import CaptureWriter
 
 from .good_capture import GoodCapture, write_good_capture
 
@@ -20,6 +16,4 @@ def pristine(tmp_path_factory) -> GoodCapture:
 @pytest.fixture
 def good(pristine, tmp_path) -> GoodCapture:
     """A copy that a test may damage."""
-    root = tmp_path / "good"
-    shutil.copytree(pristine.writer.root, root)
-    return GoodCapture(CaptureWriter(root, pristine.writer.plan))
+    return pristine.copied(tmp_path / "good")

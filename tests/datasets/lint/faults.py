@@ -31,14 +31,16 @@ REFUSED = ("HB100",)
 TRAIN, VAL, TEST = "transforms_train.json", "transforms_val.json", "transforms_test.json"
 
 
-def _declare(good: GoodCapture, **changes) -> None:
-    declaration = Declaration.read(good.union)
-    assert declaration is not None
-    replace(declaration, **changes).write(good.union)
+def _declare(**changes) -> Plant:
+    return lambda good: replace(Declaration.read(good.union), **changes).write(good.union)
 
 
-def _frame(good: GoodCapture, file: str, index: int, **changes) -> None:
-    good.edit(file, lambda value: value["frames"][index].update(changes))
+def _each(change: Callable[[dict], object]) -> Plant:
+    return lambda good: good.each_frame(change)
+
+
+def _edit(file: str, change: Callable[[dict], object]) -> Plant:
+    return lambda good: good.edit(file, change)
 
 
 def _matrix(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[dict], None]:
@@ -55,21 +57,9 @@ def _test_images(good: GoodCapture, timestep: int) -> list:
 # ------------------------------------------------------------------ files
 
 
-def _rename_camera(good):
-    _frame(good, TRAIN, 4, camera_id="elsewhere")
-
-
 def _cut_json(good):
     path = good.union / VAL
     path.write_text(path.read_text()[:-20])
-
-
-def _drop_key(good):
-    good.edit(TRAIN, lambda value: value["frames"][3].pop("file_path"))
-
-
-def _delete_image(good):
-    _test_images(good, 2)[1].unlink()
 
 
 def _cut_image(good):
@@ -77,56 +67,14 @@ def _cut_image(good):
     path.write_bytes(path.read_bytes()[:-30])
 
 
-def _damage_parameters(good):
-    good.files("flame_param")[4].write_bytes(b"PK\x03\x04 no archive")
-
-
-def _shrink_mask(good):
-    write_image(good.files("fg_masks")[7], np.full((HEIGHT // 2, WIDTH // 2), 255, np.uint8))
-
-
-def _drop_frame(good):
-    good.edit(TRAIN, lambda value: value["frames"].pop(5))
-
-
-def _shift_timesteps(good):
-    good.edit(
-        TEST, lambda v: [f.update(timestep_index=f["timestep_index"] + 1) for f in v["frames"]] and None
-    )
-
-
 def _freeze(good):
     for source, target in zip(_test_images(good, 3), _test_images(good, 4)):
         target.write_bytes(source.read_bytes())
 
 
-def _stray_exclusion(good):
-    _declare(good, excluded={99: "tongue out"})
-
-
-def _bare_exclusion(good):
-    _declare(good, excluded={3: " "})
-
-
-def _short_test(good):
-    _declare(good, excluded={12: "tongue out", 13: "tongue out"})
-
-
-def _empty_split(good):
-    good.edit(VAL, lambda value: value.update(frames=[]))
-
-
-def _no_declaration(good):
-    (good.union / "headbench.json").unlink()
-
-
 def _orphan(good):
     path = good.files("images")[0]
     path.with_name("00777_00.png").write_bytes(path.read_bytes())
-
-
-def _one_mask_less(good):
-    good.edit(TRAIN, lambda value: value["frames"][2].pop("fg_mask_path") and None)
 
 
 # ------------------------------------------------------------------ splits
@@ -146,14 +94,10 @@ def _nearly_copy_to_test(good):
 def _move(source: str, index: int) -> Plant:
     def plant(good):
         moved = []
-        good.edit(source, lambda value: moved.append(value["frames"].pop(index)))
-        good.edit(TRAIN, lambda value: value["frames"].append(moved[0]))
+        good.edit(source, lambda v: moved.append(v["frames"].pop(index)))
+        good.edit(TRAIN, lambda v: v["frames"].append(moved[0]))
 
     return plant
-
-
-def _repeat_entry(good):
-    good.edit(TRAIN, lambda value: value["frames"].append(value["frames"][0]))
 
 
 # ------------------------------------------------------------------ images
@@ -236,10 +180,6 @@ def _jpeg(good):
 # ------------------------------------------------------------------ cameras
 
 
-def _stretch_rotation(good):
-    good.edit(TRAIN, lambda v: _matrix(lambda m: m * np.array([2.0, 2, 2, 1]))(v["frames"][4]))
-
-
 def _same_camera(good):
     matrices: dict[int, list] = {}
     good.each_frame(lambda f: matrices.setdefault(f["camera_index"], f["transform_matrix"]) and None)
@@ -247,7 +187,7 @@ def _same_camera(good):
 
 
 def _matrices(change: Callable[[np.ndarray], np.ndarray]) -> Plant:
-    return lambda good: good.each_frame(_matrix(change))
+    return _each(_matrix(change))
 
 
 def _millimetres(matrix):
@@ -255,11 +195,7 @@ def _millimetres(matrix):
 
 
 def _set_all(**values) -> Plant:
-    return lambda good: good.each_frame(lambda frame: frame.update(values))
-
-
-def _double_focal(good):
-    good.each_frame(lambda f: f.update(fl_x=2 * f["fl_x"], fl_y=2 * f["fl_y"]))
+    return _each(lambda frame: frame.update(values))
 
 
 def _nudge_one_frame(good):
@@ -311,29 +247,58 @@ def _shrink(good):
 
 
 FAULTS = (
-    Fault("camera id changes", "HB100", _rename_camera, ("HB502",)),
+    Fault(
+        "camera id changes",
+        "HB100",
+        _edit(TRAIN, lambda v: v["frames"][4].update(camera_id="elsewhere")),
+        ("HB502",),
+    ),
     Fault("JSON cut off", "HB101", _cut_json, REFUSED),
-    Fault("frame without its image's name", "HB102", _drop_key, REFUSED),
-    Fault("image deleted", "HB103", _delete_image, REFUSED),
+    Fault(
+        "frame without its image's name",
+        "HB102",
+        _edit(TRAIN, lambda v: v["frames"][3].pop("file_path")),
+        REFUSED,
+    ),
+    Fault("image deleted", "HB103", lambda good: _test_images(good, 2)[1].unlink(), REFUSED),
     Fault("image cut off", "HB103", _cut_image, REFUSED),
-    Fault("parameters damaged", "HB103", _damage_parameters, REFUSED),
-    Fault("mask of another size", "HB104", _shrink_mask, REFUSED),
-    Fault("frame left out", "HB105", _drop_frame, ("HB113",)),
-    Fault("gap in timesteps", "HB106", _shift_timesteps, REFUSED),
+    Fault(
+        "parameters damaged",
+        "HB103",
+        lambda good: good.files("flame_param")[4].write_bytes(b"PK\x03\x04 no archive"),
+        REFUSED,
+    ),
+    Fault(
+        "mask of another size",
+        "HB104",
+        lambda good: write_image(
+            good.files("fg_masks")[7], np.full((HEIGHT // 2, WIDTH // 2), 255, np.uint8)
+        ),
+        REFUSED,
+    ),
+    Fault("frame left out", "HB105", _edit(TRAIN, lambda v: v["frames"].pop(5)), ("HB113",)),
+    Fault(
+        "gap in timesteps",
+        "HB106",
+        _edit(
+            TEST, lambda v: [f.update(timestep_index=f["timestep_index"] + 1) for f in v["frames"]] and None
+        ),
+        REFUSED,
+    ),
     Fault("frozen images", "HB107", _freeze),
-    Fault("exclusion of nothing", "HB108", _stray_exclusion, REFUSED),
-    Fault("exclusion without reason", "HB109", _bare_exclusion),
-    Fault("short test", "HB110", _short_test),
-    Fault("empty split", "HB111", _empty_split, ("HB113",)),
-    Fault("no declaration", "HB112", _no_declaration),
+    Fault("exclusion of nothing", "HB108", _declare(excluded={99: "tongue out"}), REFUSED),
+    Fault("exclusion without reason", "HB109", _declare(excluded={3: " "})),
+    Fault("short test", "HB110", _declare(excluded={12: "tongue out", 13: "tongue out"})),
+    Fault("empty split", "HB111", _edit(VAL, lambda v: v.update(frames=[])), ("HB113",)),
+    Fault("no declaration", "HB112", lambda good: (good.union / "headbench.json").unlink()),
     Fault("orphan", "HB113", _orphan),
-    Fault("one mask less", "HB114", _one_mask_less),
+    Fault("one mask less", "HB114", _edit(TRAIN, lambda v: v["frames"][2].pop("fg_mask_path") and None)),
     Fault("image copied to the test", "HB201", _copy_to_test, ("HB702",)),
     Fault("image nearly copied to the test", "HB202", _nearly_copy_to_test),
     Fault("test frame in training", "HB203", _move(TEST, 4)),
     Fault("novel view in training", "HB204", _move(VAL, 6)),
-    Fault("entry repeated", "HB205", _repeat_entry, REFUSED),
-    Fault("black declared", "HB301", lambda good: _declare(good, background=(0.0, 0.0, 0.0))),
+    Fault("entry repeated", "HB205", _edit(TRAIN, lambda v: v["frames"].append(v["frames"][0])), REFUSED),
+    Fault("black declared", "HB301", _declare(background=(0.0, 0.0, 0.0))),
     Fault("soiled background", "HB302", _images(_soil)),
     Fault("premultiplied twice", "HB303", _images(_premultiply_again)),
     Fault("never premultiplied", "HB303", _images(_never_multiplied)),
@@ -349,22 +314,27 @@ FAULTS = (
     Fault("BGR", "HB404", _images(lambda image, mask: image[..., ::-1])),
     Fault("one camera tinted", "HB405", _tint_one_camera),
     Fault("JPEG", "HB406", _jpeg),
-    Fault("stretched rotation", "HB501", _stretch_rotation, REFUSED),
+    Fault(
+        "stretched rotation",
+        "HB501",
+        _edit(TRAIN, lambda v: _matrix(lambda m: m * np.array([2.0, 2, 2, 1]))(v["frames"][4])),
+        REFUSED,
+    ),
     Fault("same camera twice", "HB502", _same_camera, ("HB702",)),
     Fault("OpenCV axes", "HB503", _matrices(lambda m: m * np.array([1, -1, -1, 1.0]))),
     Fault("upside down", "HB504", _matrices(lambda m: m * np.array([-1, -1, 1, 1.0]))),
     Fault("millimetres", "HB505", _matrices(_millimetres)),
-    Fault("focal length of twice the size", "HB506", _double_focal, ("HB100", "HB701", "HB702")),
+    Fault(
+        "focal length of twice the size",
+        "HB506",
+        _each(lambda f: f.update(fl_x=2 * f["fl_x"], fl_y=2 * f["fl_y"])),
+        ("HB100", "HB701", "HB702"),
+    ),
     Fault("principal point of another size", "HB507", _set_all(cx=2.0), ("HB510", "HB701", "HB702")),
     Fault("half a pixel", "HB508", _set_all(cx=(WIDTH - 1) / 2, cy=(HEIGHT - 1) / 2)),
-    Fault("principal point dropped", "HB509", lambda good: _declare(good, cy="centre")),
+    Fault("principal point dropped", "HB509", _declare(cy="centre")),
     Fault("camera moves", "HB512", _nudge_one_frame, REFUSED),
-    Fault(
-        "other version declared",
-        "HB601",
-        lambda good: _declare(good, head_model="flame2020"),
-        ("HB100", "HB613"),
-    ),
+    Fault("other version declared", "HB601", _declare(head_model="flame2020"), ("HB100", "HB613")),
     Fault("no head", "HB602", lambda good: (good.union / "head_model.npz").unlink(), REFUSED),
     Fault("too many coefficients", "HB603", _one(5, lambda a: a.update(expr=np.zeros((1, 99)))), REFUSED),
     Fault("NaN", "HB604", _one(5, lambda a: a["expr"].fill(np.nan)), REFUSED),

@@ -2,27 +2,23 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-import torch
 
 from headbench.bench.contracts import Camera, HeadPose
 from headbench.datasets.ga.writer import CapturePlan, CaptureWriter, SequencePlan
 from headbench.datasets.head.arrays import HeadArrays
-from headbench.datasets.head.model import HeadModel
+from headbench.datasets.head.subject import PosedSubject
 from headbench.datasets.head.teeth import with_teeth
 from headbench.datasets.images import write_image
 from headbench.datasets.mesh_pictures import rasterize_mesh
 
 from ..head.toy import toy_head
-from ..tiny_capture import look_at
+from ..tiny_capture import TinyCapture, look_at
 
 WIDTH, HEIGHT = 60, 80
 LENGTHS = {"EMO-1-shout+laugh": 6, "SEN-01-cramp_small_danger": 6, "FREE": 10}
@@ -33,17 +29,10 @@ SKIN = (205, 152, 124)
 
 def cameras(cx: float = WIDTH / 2 + 0.4, cy: float = HEIGHT / 2 - 0.6, scale: int = 1) -> list[Camera]:
     """Four cameras on an arc of 90 degrees, a little above the head; images ``scale`` times as large."""
-    return [
-        look_at(
-            name,
-            np.array([np.sin(a), 0.08, np.cos(a)]),
-            scale * WIDTH,
-            scale * HEIGHT,
-            scale * cx,
-            scale * cy,
-        )
-        for name, a in zip(SERIALS, np.radians([-50.0, -20.0, 10.0, 40.0]))
-    ]
+    size = scale * WIDTH, scale * HEIGHT
+    angles = np.radians([-50.0, -20.0, 10.0, 40.0])
+    places = (np.array([np.sin(a), 0.08, np.cos(a)]) for a in angles)
+    return [look_at(name, at, *size, scale * cx, scale * cy) for name, at in zip(SERIALS, places)]
 
 
 def smooth_poses(head: HeadArrays, count: int, phase: float) -> list[HeadPose]:
@@ -109,54 +98,22 @@ def composite(colour: np.ndarray, alpha: np.ndarray, background: float = 1.0) ->
     return np.round(colour * alpha[..., None] + 255 * background * (1 - alpha[..., None])).astype(np.uint8)
 
 
-def _with_index(change: Callable[[dict, int], None], index: int, arrays: dict) -> None:
-    change(arrays, index)
-
-
 def read_rgb(path: Path) -> np.ndarray:
     """(H, W, 3) 8-bit."""
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    assert image is not None, path
-    return image[..., ::-1]
+    return cv2.imread(str(path), cv2.IMREAD_COLOR)[..., ::-1]
 
 
 def read_grey(path: Path) -> np.ndarray:
     """(H, W) 8-bit."""
-    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    assert image is not None, path
-    return image
+    return cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
 
 
-@dataclass(frozen=True, eq=False)
-class GoodCapture:
+class GoodCapture(TinyCapture):
     """A written capture and ways to damage it."""
-
-    writer: CaptureWriter
-
-    @property
-    def union(self) -> Path:
-        return self.writer.union
 
     def files(self, pattern: str) -> list[Path]:
         """Files of the sequence folders, sorted: "images", "fg_masks" or "flame_param"."""
         return sorted(self.writer.root.glob(f"901_*/{pattern}/*"))
-
-    def edit(self, file: str, change: Callable[[dict], None]) -> None:
-        """Apply ``change`` to a JSON of the union."""
-        path = self.union / file
-        value = json.loads(path.read_text())
-        change(value)
-        path.write_text(json.dumps(value))
-
-    def each_frame(self, change: Callable[[dict], None]) -> None:
-        """Apply ``change`` to every frame of every split."""
-
-        def change_all(value: dict) -> None:
-            for frame in value["frames"]:
-                change(frame)
-
-        for split in ("train", "val", "test"):
-            self.edit(f"transforms_{split}.json", change_all)
 
     def each_image(
         self, change: Callable[[np.ndarray, np.ndarray], np.ndarray], *, masks: bool = False
@@ -170,7 +127,7 @@ class GoodCapture:
     def each_parameters(self, change: Callable[[dict[str, np.ndarray], int], None]) -> None:
         """Apply ``change`` to the arrays of every parameter file, given its position in the order of files."""
         for index, path in enumerate(self.files("flame_param")):
-            self.parameters(path, partial(_with_index, change, index))
+            self.parameters(path, lambda arrays, index=index: change(arrays, index))
 
     def parameters(self, path: Path, change: Callable[[dict[str, np.ndarray]], None]) -> None:
         """Apply ``change`` to the arrays of one parameter file."""
@@ -184,12 +141,9 @@ def write_good_capture(root: Path, plan: CapturePlan | None = None) -> GoodCaptu
     """Write a whole capture."""
     plan = plan or good_plan()
     writer = CaptureWriter(root, plan)
-    model = HeadModel(plan.head, dtype=torch.float64)
-    shape, offset = torch.tensor(plan.shape.astype(float)), torch.tensor(plan.static_offset.astype(float))
+    subject = PosedSubject(plan.head, plan.shape, plan.static_offset)
     for sequence in plan.sequences:
-        arguments = model.pose_arguments(sequence.poses)
-        posed = model(canonical=model.canonical(shape, offset), **arguments).numpy()
-        for timestep, vertices in enumerate(posed):
+        for timestep, vertices in enumerate(subject.meshes(sequence.poses)):
             for camera in plan.cameras:
                 colour, alpha = paint(plan, vertices, camera)
                 image, mask = composite(colour, alpha), np.round(alpha * 255).astype(np.uint8)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from itertools import count
 
 import numpy as np
@@ -11,38 +10,18 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from headbench.bench.errors import InputError
-from headbench.datasets.ga.writer import CaptureWriter
 from headbench.datasets.lint.command import LintSettings, lint
 
 from .good_capture import GoodCapture
 
+PLACED = ([], {}, "../../../../etc/passwd", [[1.0] * 4] * 4, 1e-300)
 JUNK = st.one_of(
-    st.none(),
-    st.booleans(),
-    st.integers(-(10**30), 10**30),
-    st.floats(),
-    st.text(max_size=8),
-    st.just([]),
-    st.just({}),
-    st.just("../../../../etc/passwd"),
-    st.just([[1.0] * 4] * 4),
-    st.just(1e-300),
+    *(st.none(), st.booleans(), st.integers(-(10**30), 10**30), st.floats(), st.text(max_size=8)),
+    *map(st.just, PLACED),
 )
 KEYS = [
-    "timestep_index",
-    "camera_index",
-    "camera_id",
-    "cx",
-    "cy",
-    "fl_x",
-    "fl_y",
-    "h",
-    "w",
-    "camera_angle_x",
-    "transform_matrix",
-    "file_path",
-    "fg_mask_path",
-    "flame_param_path",
+    *("timestep_index", "camera_index", "camera_id", "cx", "cy", "fl_x", "fl_y", "h", "w", "camera_angle_x"),
+    *("transform_matrix", "file_path", "fg_mask_path", "flame_param_path"),
 ]
 ARRAYS = ["translation", "rotation", "neck_pose", "jaw_pose", "eyes_pose", "shape", "expr", "static_offset"]
 _numbers = count()
@@ -55,12 +34,6 @@ fuzz = settings(
 )
 
 
-def copy(pristine, tmp_path) -> GoodCapture:
-    root = tmp_path / f"copy{next(_numbers)}"
-    shutil.copytree(pristine.writer.root, root)
-    return GoodCapture(CaptureWriter(root, pristine.writer.plan))
-
-
 def outcome(capture: GoodCapture) -> list[str]:
     findings = lint(LintSettings(str(capture.union), views=3, duplicates=6))
     json.dumps(findings.data)
@@ -70,7 +43,7 @@ def outcome(capture: GoodCapture) -> list[str]:
 @fuzz
 @given(key=st.sampled_from(KEYS), junk=JUNK, everywhere=st.booleans())
 def test_junk_in_a_frame(pristine, tmp_path, key, junk, everywhere):
-    capture = copy(pristine, tmp_path)
+    capture = pristine.copied(tmp_path / f"{next(_numbers)}")
 
     def spoil(value):
         for frame in value["frames"][:: 1 if everywhere else len(value["frames"])]:
@@ -86,7 +59,7 @@ def test_junk_in_a_frame(pristine, tmp_path, key, junk, everywhere):
     junk=JUNK,
 )
 def test_junk_in_the_declaration(pristine, tmp_path, key, junk):
-    capture = copy(pristine, tmp_path)
+    capture = pristine.copied(tmp_path / f"{next(_numbers)}")
     capture.edit("headbench.json", lambda value: value.update({key: junk}))
     outcome(capture)
 
@@ -99,7 +72,7 @@ def test_junk_in_the_declaration(pristine, tmp_path, key, junk):
     kind=st.sampled_from(["f4", "f8", "i8", "U3", "c8"]),
 )
 def test_junk_in_parameters(pristine, tmp_path, key, shape, value, kind):
-    capture = copy(pristine, tmp_path)
+    capture = pristine.copied(tmp_path / f"{next(_numbers)}")
     finite = value if np.isfinite(value) or kind in ("f4", "f8") else 7
     array = np.full(shape, finite if kind != "i8" else int(min(max(finite, -(2**62)), 2**62))).astype(kind)
     capture.parameters(capture.files("flame_param")[3], lambda arrays: arrays.update({key: array}))
@@ -109,13 +82,9 @@ def test_junk_in_parameters(pristine, tmp_path, key, shape, value, kind):
 @fuzz
 @given(data=st.data())
 def test_files_cut_off_or_overwritten(pristine, tmp_path, data):
-    capture = copy(pristine, tmp_path)
-    files = sorted(
-        path
-        for path in capture.writer.root.rglob("*")
-        if path.is_file() and "transforms.json" not in path.name
-    )
-    path = files[data.draw(st.integers(0, len(files) - 1))]
+    capture = pristine.copied(tmp_path / f"{next(_numbers)}")
+    files = [p for p in capture.writer.root.rglob("*") if p.is_file() and "transforms.json" not in p.name]
+    path = data.draw(st.sampled_from(sorted(files)))
     content = path.read_bytes()
     end = data.draw(st.integers(0, max(0, len(content) - 1)))
     path.write_bytes(content[:end] + data.draw(st.binary(max_size=20)))

@@ -77,7 +77,7 @@ def test_exit_codes_and_json_on_the_command_line(good, capsys):
 
 
 @pytest.mark.slow
-def test_synthetic_captures_without_and_with_a_mix_up_of_versions(tmp_path):
+def test_synthetic_captures_with_and_without_a_version_mix_up(tmp_path):
     """Hair over the mesh, soft masks, dark skin, tracking noise: nothing of that is an error.
 
     Then the coefficients are read with the other version's basis under the same name: only the images tell.
