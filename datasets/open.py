@@ -38,9 +38,8 @@ def find_reader(path: str | PathLike[str], name: str = "") -> DatasetSpec:
         raise InputError(root, "", expected, *describe(root))
     if len(fitting) > 1:
         names = ", ".join(spec.name for spec in fitting)
-        raise InputError(
-            root, "", "a capture that one reader knows", f"one for {names}", "Choose with --reader."
-        )
+        found = f"one for {names}"
+        raise InputError(root, "", "a capture that one reader knows", found, "Choose with --reader.")
     return fitting[0]
 
 

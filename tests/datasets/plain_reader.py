@@ -7,17 +7,8 @@ from headbench import DatasetSpec
 from headbench.datasets.ga.reader import read_capture
 
 HEAD = [
-    "version",
-    "template",
-    "faces",
-    "shape_basis",
-    "expression_basis",
-    "pose_basis",
-    "joint_regressor",
-    "skinning_weights",
-    "parents",
-    "eyelid_basis",
-    "regions",
+    *("version", "template", "faces", "shape_basis", "expression_basis", "pose_basis", "joint_regressor"),
+    *("skinning_weights", "parents", "eyelid_basis", "regions"),
 ]
 
 

@@ -1,5 +1,7 @@
 """Every command on captures works with the reader of a plug-in, whose clips have what `Clip` asks for and no more."""
 
+import json
+
 import pytest
 
 from headbench.bench.cli import main
@@ -20,15 +22,8 @@ COMMANDS = {
 @pytest.mark.parametrize("command", COMMANDS)
 def test_commands_read_by_a_plugins_reader(plain_folder, tmp_path, command):
     options, files = COMMANDS[command]
-    given = [
-        *command.split(),
-        str(plain_folder),
-        "--reader",
-        "plain_reader:SPEC",
-        "--out",
-        str(tmp_path / "out"),
-    ]
-    assert main([*given, *options]) == 0
+    out = ["--reader", "plain_reader:SPEC", "--out", str(tmp_path / "out")]
+    assert main([*command.split(), str(plain_folder), *out, *options]) == 0
     for file in files:
         assert (tmp_path / "out" / file).stat().st_size > 0
         if file.endswith(".png"):
@@ -37,8 +32,6 @@ def test_commands_read_by_a_plugins_reader(plain_folder, tmp_path, command):
 
 def test_the_linter_says_which_checks_it_skips(plain_folder, capsys):
     main(["lint", str(plain_folder), "--reader", "plain_reader:SPEC", "--min-test-timesteps", "1", "--json"])
-    import json
-
     data = json.loads(capsys.readouterr().out)
     assert {"HB101", "HB112", "HB601"} <= set(data["skipped"])
     assert not {"HB201", "HB301", "HB503", "HB701"} & set(data["skipped"])

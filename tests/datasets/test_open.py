@@ -44,26 +44,22 @@ def test_what_is_no_capture_is_described(tmp_path, fill, found):
         open_clip(folder)
 
 
-def test_of_several_fitting_readers_one_has_to_be_named(pristine_capture, monkeypatch):
-    known = registry.discover("datasets")
-    twin = replace(known["ga"], name="other", spec=replace(known["ga"].spec, name="other"))
-    monkeypatch.setattr("headbench.bench.runner.captures.discover", lambda group: {**known, "other": twin})
-    with pytest.raises(InputError, match=r"one for ga, other. Choose with --reader"):
-        open_clip(pristine_capture.union)
-    assert open_clip(pristine_capture.union, "ga").poses
-
-
 def fails(root):
     raise KeyError(root)
 
 
-def test_a_reader_that_fails_to_look_leaves_a_capture_to_the_others(pristine_capture, monkeypatch, caplog):
+def test_readers_of_plug_ins_beside_the_one_that_fits(pristine_capture, monkeypatch, caplog):
     known = registry.discover("datasets")
-    spec = replace(known["ga"].spec, name="other", find=f"{__name__}:fails")
-    monkeypatch.setattr(
-        "headbench.bench.runner.captures.discover",
-        lambda group: {**known, "other": replace(known["ga"], name="other", spec=spec)},
-    )
+
+    def offer(**changes):
+        twin = replace(known["ga"], name="other", spec=replace(known["ga"].spec, name="other", **changes))
+        monkeypatch.setattr("headbench.bench.runner.captures.discover", lambda group: {**known, "other": twin})
+
+    offer()
+    with pytest.raises(InputError, match=r"one for ga, other. Choose with --reader"):
+        open_clip(pristine_capture.union)
+    assert open_clip(pristine_capture.union, "ga").poses
+    offer(find=f"{__name__}:fails")
     assert find_reader(pristine_capture.union).name == "ga"
     assert "reader other cannot look at" in caplog.text
 

@@ -88,7 +88,7 @@ def test_no_part_leaves_the_silhouette_without_a_mask():
     assert not select(found, "foreground").any()
 
 
-def test_the_foreground_is_the_mask_from_a_half_on_and_bounds_the_hair_beyond_the_mesh():
+def test_the_foreground_is_the_mask_from_a_half_on():
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
     mask[10:, 20:76] = 255
     mask[10:, 76:80] = 127

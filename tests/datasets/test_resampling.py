@@ -42,7 +42,7 @@ def test_whole_factors_give_means_of_blocks():
     assert resize_image(image[..., 0], 12, 12).shape == (12, 12)
 
 
-def test_reduced_by_four_and_enlarged_again_a_ramp_is_exact_inside():
+def test_a_ramp_reduced_and_enlarged_again_is_exact_inside():
     y, x = np.mgrid[:64, :96] + 0.5
     ramp = (0.1 + 0.004 * x + 0.007 * y).astype(np.float32)
     again = resize_image(resize_image(ramp, 24, 16), 96, 64)
