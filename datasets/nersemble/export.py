@@ -158,12 +158,9 @@ def rejoin_union(root: Path, subject: str, entries: Sequence[FrameEntry], free: 
     order = {match_sequence(root, name, UNION10_SEQUENCES): folder for name, folder in named.items()}
     train = [root / order[name] for name in UNION10_SEQUENCES if name in order]
     union = root / f"UNION{len(train) + 1}_{subject}{_REJOINED}"
-    write_union(union, train, [root / free], _frontal(entries), None)
+    # The frontal camera by its serial, else by the index that VHAP holds out.
+    ids = {entry.camera_id for entry in entries}
+    by_index = sorted({entry.camera_id for entry in entries if entry.camera_index == FRONTAL_INDEX})
+    held_out = [NOVEL_VIEW_CAMERA] if NOVEL_VIEW_CAMERA in ids else by_index
+    write_union(union, train, [root / free], held_out, None)
     return union.name
-
-
-def _frontal(entries: Sequence[FrameEntry]) -> list[str]:
-    """Ids of the camera for novel views: its serial, else the index that VHAP holds out."""
-    by_index = {entry.camera_id for entry in entries if entry.camera_index == FRONTAL_INDEX}
-    known = {entry.camera_id for entry in entries}
-    return [NOVEL_VIEW_CAMERA] if NOVEL_VIEW_CAMERA in known else sorted(by_index)

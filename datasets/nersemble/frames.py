@@ -159,8 +159,8 @@ def writing(path: Path) -> Iterator[None]:
 
 def _missing(job: SequenceJob, index: int) -> _Stream:
     camera = job.cameras[index]
-    present = _present(job.folder / "images")
-    masks = _present(job.folder / "fg_masks") if job.recorded.has_masks else None
+    present = file_names(job.folder / "images")
+    masks = file_names(job.folder / "fg_masks") if job.recorded.has_masks else None
     timesteps = []
     for timestep in range(job.count):
         image, mask = job.image_path(timestep, index), job.mask_path(timestep, index)
@@ -172,5 +172,6 @@ def _missing(job: SequenceJob, index: int) -> _Stream:
     return _Stream(job, index, tuple(timesteps))
 
 
-def _present(folder: Path) -> set[str]:
+def file_names(folder: Path) -> set[str]:
+    """Names in a folder, none where it is not there."""
     return set(os.listdir(folder)) if folder.is_dir() else set()

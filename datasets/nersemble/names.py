@@ -113,7 +113,7 @@ def union10_held_out(subject: str, sequences: Sequence[str] = UNION10_SEQUENCES)
     return sequences[random.Random(subject).randint(0, len(sequences) - 1)]
 
 
-def chosen_subjects(text: str, key: str = "--subjects") -> list[str]:
+def chosen_subjects(text: str) -> list[str]:
     """Subject ids of an option: ids separated by commas, ``paper`` (the nine) or ``ablation``.
 
     Numbers are padded to three digits, so 74 is 074. Raises `InputError` for anything else and for subjects named twice.
@@ -123,8 +123,8 @@ def chosen_subjects(text: str, key: str = "--subjects") -> list[str]:
     ids = [part.strip() for part in text.split(",") if part.strip()]
     if not ids or not all(part.isascii() and part.isdigit() for part in ids):
         expected = 'numbers separated by commas, "paper" or "ablation"'
-        raise InputError("command line", key, expected, repr(text))
+        raise InputError("command line", "--subjects", expected, repr(text))
     padded = [part.zfill(3) for part in ids]
     if len(set(padded)) != len(padded):
-        raise InputError("command line", key, "every subject once", repr(text))
+        raise InputError("command line", "--subjects", "every subject once", repr(text))
     return padded

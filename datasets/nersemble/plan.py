@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 from ...bench.contracts import Camera
 from ...bench.errors import InputError
@@ -147,19 +146,23 @@ def plan_subject(settings: PrepareSettings, subject: str) -> SubjectPlan:
         if min(small) < 1 or small[0] > size[0] or small[1] > size[1]:
             expected = f"a factor that makes images smaller than {size[0]}x{size[1]}"
             raise InputError("command line", "downscale", expected, f"{settings.downscale}")
-        serials = [*recorded.views]
+        serials, masks = [*recorded.views], recorded.has_masks
+        # Of all cameras in use, or none.
+        stills = {serial: one.backgrounds[serial] for serial in serials if serial in one.backgrounds}
+        unblend = settings.edges == "unblend" and masks and len(stills) == len(serials)
+        label = f"v{len(serials)}_DS{settings.downscale}"
         jobs.append(
             SequenceJob(
                 recorded=recorded,
                 cameras=[aligned.camera(serial, size, small) for serial in serials],
                 corrections=one.corrections(name, serials) if settings.colour == "auto" else {},
-                stills=_stills(settings, one, recorded),
+                stills=stills if unblend else {},
                 tracked=_tracked(settings, recorded, head),
-                folder=out / _folder_name(recorded, settings.downscale),
+                folder=out / f"{subject}_{name}_{label}{'_whiteBg' if masks else ''}",
             )
         )
-    label = f"_v{len(jobs[0].cameras)}_DS{settings.downscale}"
-    union = out / f"UNION{len(jobs)}_{subject}{label}_{settings.split}-test"
+    label = f"v{len(jobs[0].cameras)}_DS{settings.downscale}"
+    union = out / f"UNION{len(jobs)}_{subject}_{label}_{settings.split}-test"
     return SubjectPlan(subject, jobs, test, head, version, union)
 
 
@@ -196,13 +199,6 @@ def wanted_sequences(settings: PrepareSettings, one: Participant) -> tuple[list[
     return matched, [name for name in matched if name == held_out]
 
 
-def _stills(settings: PrepareSettings, one: Participant, recorded: RecordedSequence) -> dict[str, Path]:
-    """Stills of all cameras in use; none where there are no masks, or one of the stills is not there."""
-    known = {serial: one.backgrounds[serial] for serial in recorded.views if serial in one.backgrounds}
-    wanted = settings.edges == "unblend" and recorded.has_masks and len(known) == len(recorded.views)
-    return known if wanted else {}
-
-
 def _tracked(
     settings: PrepareSettings, recorded: RecordedSequence, head: HeadArrays | None
 ) -> TrackedSequence | None:
@@ -217,14 +213,3 @@ def _tracked(
     numbers = set(recorded.numbers)
     kept = [number in numbers for number in recorded.uncut]
     return read_tracked(file, timesteps=len(numbers), head=head, kept=kept)
-
-
-def _folder_name(recorded: RecordedSequence, downscale: int) -> str:
-    background = "_whiteBg" if recorded.has_masks else ""
-    return f"{recorded.subject}_{recorded.name}_v{len(recorded.views)}_DS{downscale}{background}"
-
-
-def describe_pixels(job: SequenceJob) -> dict[str, Any]:
-    """How pixels are made, for the record."""
-    kinds = sorted({type(correction).__name__ for correction in job.corrections.values()})
-    return {"colour": kinds[0] if kinds else "none", "edges": "unblend" if job.stills else "plain"}

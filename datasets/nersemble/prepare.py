@@ -8,7 +8,6 @@ no folder reads as a capture while it is half written.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -25,9 +24,9 @@ from ...bench.io.lock import locked
 from ..ga import layout
 from ..ga.writer import camera_record, file_record, save_npz, transforms_document, write_sequence, write_union
 from ..head.arrays import save_head
-from .frames import write_images, writing
+from .frames import file_names, write_images, writing
 from .names import NOVEL_VIEW_CAMERA
-from .plan import CY, SequenceJob, SubjectPlan, describe_pixels
+from .plan import CY, SequenceJob, SubjectPlan
 from .tracking import TrackedSequence
 
 RECORD_FILE = "headbench-prepare.json"
@@ -135,6 +134,7 @@ _ELSEWHERE = "Give another --out, or delete the folder."
 def _write_state(job: SequenceJob, state: SequenceState) -> None:
     recorded = job.recorded
     videos = any(view.video for view in recorded.views.values())
+    kinds = sorted({type(correction).__name__ for correction in job.corrections.values()})
     value: dict[str, Any] = {
         "format_version": RECORD_VERSION,
         "images": state.images,
@@ -145,7 +145,8 @@ def _write_state(job: SequenceJob, state: SequenceState) -> None:
         "source": "video" if videos else "images",
         "frames": list(recorded.numbers),
         "mattes": recorded.has_masks,
-        **describe_pixels(job),
+        "colour": kinds[0] if kinds else "none",
+        "edges": "unblend" if job.stills else "plain",
     }
     write_json(job.folder / RECORD_FILE, value)
 
@@ -154,7 +155,7 @@ def _has_all_images(job: SequenceJob, state: SequenceState) -> bool:
     if not state.images_complete:
         return False
     expected = job.count * len(job.cameras)
-    masks = len(_names(job.folder / "fg_masks")) if job.recorded.has_masks else expected
+    masks = len(file_names(job.folder / "fg_masks")) if job.recorded.has_masks else expected
     return _count_images(job) == expected == masks
 
 
@@ -164,11 +165,7 @@ def _count_images(job: SequenceJob) -> int:
         for timestep in range(job.count)
         for index in range(len(job.cameras))
     }
-    return len(wanted & _names(job.folder / "images"))
-
-
-def _names(folder: Path) -> set[str]:
-    return set(os.listdir(folder)) if folder.is_dir() else set()
+    return len(wanted & file_names(job.folder / "images"))
 
 
 def _write_metadata(plan: SubjectPlan, job: SequenceJob, state: SequenceState) -> None:

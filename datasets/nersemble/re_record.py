@@ -57,7 +57,10 @@ def re_record(
     writer.write_calibration()
     for one in clip.cameras.values():
         writer.write_background(one.id, studio(one))
-    turn = _alignment(writer.calibration_file, next(iter(clip.cameras.values())))
+    # From the recording's world to the aligned one.
+    first = next(iter(clip.cameras.values()))
+    aligned = read_calibration(writer.calibration_file).aligned().world_to_camera[first.id]
+    turn = aligned[:3, :3].T @ first.world_to_camera[:3, :3]
     by_sequence: dict[str, list[FrameKey]] = {}
     for key in sorted(clip.files):
         by_sequence.setdefault(key.sequence, []).append(key)
@@ -80,9 +83,11 @@ def re_record(
             done += len(own)
             progress(done, len(clip.files), sequence)
         if tracking is not None:
-            poses = [turned_pose(clip, clip.poses[timestep], turn) for timestep in timesteps]
+            poses = [_turned_pose(clip, clip.poses[timestep], turn) for timestep in timesteps]
             folder = tracking / f"{clip.subject}_{sequence}" / "2000-01-01_00-00-00"
-            arrays = _stacked(poses) | {"shape": clip.shape, "static_offset": clip.static_offset[None]}
+            rows = [pose_to_parameters(pose) for pose in poses]
+            arrays = {key: np.concatenate([row[key] for row in rows]) for key in rows[0]}
+            arrays |= {"shape": clip.shape, "static_offset": clip.static_offset[None]}
             write_tracked(folder / "tracked_flame_params_30.npz", arrays, range(len(poses)))
     writer.write_metadata([*by_sequence])
     return [*by_sequence]
@@ -106,33 +111,14 @@ def _before_wall(clip: CaptureClip, key: FrameKey) -> ByteArray:
     return np.clip(np.rint(exchanged), 0, 255).astype(np.uint8)
 
 
-def _alignment(calibration_file: Path, camera: Camera) -> FloatArray:
-    """(3, 3) rotation from the recording's world to the aligned one."""
-    aligned = read_calibration(calibration_file).aligned().world_to_camera[camera.id]
-    rotation: FloatArray = aligned[:3, :3].T @ camera.world_to_camera[:3, :3]
-    return rotation
-
-
-def turned_pose(clip: CaptureClip, pose: HeadPose, turn: FloatArray) -> HeadPose:
+def _turned_pose(clip: CaptureClip, pose: HeadPose, turn: FloatArray) -> HeadPose:
     """The pose in a world turned about its origin; the head itself turns about its root joint."""
-    root = root_joint(clip, pose)
+    head = clip.head
+    shaped = head.template + head.shape_basis @ clip.shape + head.expression_basis @ pose.expression
+    root = head.joint_regressor[0] @ (shaped + clip.static_offset)
     rotation = Rotation.from_matrix(turn) * Rotation.from_rotvec(np.asarray(pose.rotation, np.float64))
     translation = turn @ (root + pose.translation) - root
     return replace(pose, rotation=rotation.as_rotvec(), translation=translation)
-
-
-def root_joint(clip: CaptureClip, pose: HeadPose) -> FloatArray:
-    """(3,) the joint that ``rotation`` turns about, metres: regressed from the mesh with shape, expression and
-    static offset."""
-    head = clip.head
-    shaped = head.template + head.shape_basis @ clip.shape + head.expression_basis @ pose.expression
-    joint: FloatArray = head.joint_regressor[0] @ (shaped + clip.static_offset)
-    return joint
-
-
-def _stacked(poses: Sequence[HeadPose]) -> dict[str, FloatArray]:
-    rows = [pose_to_parameters(pose) for pose in poses]
-    return {key: np.concatenate([row[key] for row in rows]) for key in rows[0]}
 
 
 Release = Literal["v2", "v1", "paper2023"]

@@ -129,24 +129,17 @@ def _participant(root: Path, parts: Iterable[Path], subject: str, listed: tuple[
     stills = sequences.pop(BACKGROUND, None)
     named = {serial_of(path.stem, "image"): path for path in stills.glob("image_*.*")} if stills else {}
     colour_file = folder / "calibration" / COLOUR_FILE
+    places = (folder / "calibration", root / "camera_params" / subject, folder)
+    calibrations = [place / CAMERA_FILE for place in places]
     return Participant(
         subject=subject,
-        calibration_file=_calibration_file(root, subject),
+        calibration_file=next((path for path in calibrations if path.exists()), calibrations[0]),
         sequences=sequences,
         backgrounds={serial: path for serial, path in sorted(named.items(), key=str) if serial},
         listed=listed,
         colour_file=colour_file if colour_file.exists() else None,
         colour_folder=root / "color_correction" / subject,
     )
-
-
-def _calibration_file(root: Path, subject: str) -> Path:
-    choices = (
-        root / subject / "calibration" / CAMERA_FILE,
-        root / "camera_params" / subject / CAMERA_FILE,
-        root / subject / CAMERA_FILE,
-    )
-    return next((path for path in choices if path.exists()), choices[0])
 
 
 def _listed_sequences(root: Path) -> dict[str, tuple[str, ...]]:
