@@ -6,13 +6,14 @@ Qian et al., "GaussianAvatars: Photorealistic Head Avatars with Rigged 3D Gaussi
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ...bench.contracts import Camera, Clip, HeadPose, no_stage
+from ...bench.contracts import Clip, HeadPose
 from ..shared.avatar_files import (
     SUBJECT_FILE,
     TRACKED,
@@ -23,22 +24,12 @@ from ..shared.avatar_files import (
     read_subject,
 )
 from ..shared.avatar_kernel import HarmonicColors, WorldTransform
-from ..shared.binding import Frames, WorldSplats
+from ..shared.binding import Frames
 from ..shared.loop import Fit
 from ..shared.method import TrainedMethod
 from ..shared.networks import coefficient_count, initial_coefficients, occupied_degree
 from ..shared.optimisation import Optimiser
-from ..shared.rendering import (
-    USUAL,
-    Cutoffs,
-    Drawn,
-    PosedSplats,
-    StoredSplatAvatar,
-    View,
-    draw_splats,
-    posed_splats,
-    view_of,
-)
+from ..shared.rendering import USUAL, Cutoffs, PlacedSplats, StoredSplatAvatar, View
 from ..shared.schedule import ShuffledEpochs, Timeline, torch_generator
 from ..shared.splat_training import BoundTraining, ShadedSplats
 from ..shared.subject_mesh import BoundedCache, SubjectMesh
@@ -89,18 +80,11 @@ class GAAppearance:
         row = self._row[timestep]
         if not self._config.refine_tracking:
             return self._cached(row)
-        arguments = {name: values[row : row + 1] for name, values in self.tracked.items()}
-        arguments |= {name: optimiser[name][row : row + 1] for name in TRACKED}
-        return self._mesh.frames(self._mesh.posed(arguments))
+        refined = {name: optimiser[name][row : row + 1] for name in TRACKED}
+        return self._mesh.frames(self._mesh.posed(self._at(row) | refined))
 
     def place(
-        self,
-        frames: Frames,
-        binding: Tensor,
-        view: View,
-        timestep: int,
-        optimiser: Optimiser,
-        iteration: int,
+        self, frames: Frames, binding: Tensor, view: View, timestep: int, optimiser: Optimiser, iteration: int
     ) -> ShadedSplats:
         """Colour by direction from the camera; opacity as it is."""
         world = to_world(frames, binding, optimiser["means"], optimiser["log_scales"], optimiser["quats"])
@@ -117,11 +101,12 @@ class GAAppearance:
         after = {name: optimiser[name].detach().cpu().numpy() for name in TRACKED}
         return RefinedTracking(subject, np.array(self.timesteps), before, after)
 
+    @torch.no_grad()
     def _tracked_frames(self, row: int) -> Frames:
-        with torch.no_grad():
-            return self._mesh.frames(
-                self._mesh.posed({name: values[row : row + 1] for name, values in self.tracked.items()})
-            )
+        return self._mesh.frames(self._mesh.posed(self._at(row)))
+
+    def _at(self, row: int) -> dict[str, Tensor]:
+        return {name: values[row : row + 1] for name, values in self.tracked.items()}
 
 
 class GAAvatar(StoredSplatAvatar):
@@ -150,7 +135,7 @@ class GAAvatar(StoredSplatAvatar):
     ):
         self.mesh, self.subject, self.refined = mesh, subject, refined
         self.splat_tensors, self.binding = splats, binding
-        self._stored, self._device, self._cutoffs = stored, device, cutoffs
+        super().__init__(stored, self._placed, device, cutoffs)
         self._to_world = WorldTransform(binding, splats["log_scales"], splats["quats"])
         occupied = coefficient_count(occupied_degree(splats["sh_rest"])) - 1
         self._shade = HarmonicColors(splats["sh_dc"], splats["sh_rest"][:, :, :occupied].contiguous())
@@ -167,48 +152,18 @@ class GAAvatar(StoredSplatAvatar):
         stored = [folder / PLY_FILE, folder / SUBJECT_FILE]
         return cls(stored, mesh, subject, splats, binding, refined, device)
 
-    @torch.no_grad()
-    def draw(
-        self,
-        camera: Camera,
-        pose: HeadPose,
-        background: Sequence[float],
-        end_stage: Callable[[str], None] = no_stage,
-    ) -> Drawn:
-        """Draw one frame, stage by stage; see `StagedAvatar`."""
-        frames = self._frames(pose)
-        end_stage("drive")
-        world = self._world(frames)
-        view = view_of(camera, self._device)
-        opacities, colors = self._opacities(), self._colors(world, view)
-        end_stage("deform")
-        return draw_splats(world, opacities, colors, view, background, end_stage, self._cutoffs)
-
-    @torch.no_grad()
-    def splats(self, pose: HeadPose, camera: Camera | None = None) -> PosedSplats:
-        """Splats of a pose in the world; with colours where a camera says from where they are seen."""
-        world = self._world(self._frames(pose))
-        colors = None if camera is None else self._colors(world, view_of(camera, self._device))
-        return posed_splats(world, self._opacities(), colors)
-
     def harmonics(self) -> tuple[Tensor, Tensor]:
         """(N, 3) and (N, 3, 15) spherical harmonics along world directions; the pose does not change them."""
         return self.splat_tensors["sh_dc"], self.splat_tensors["sh_rest"]
 
-    def _frames(self, pose: HeadPose) -> Frames:
+    def _placed(self, pose: HeadPose, end_stage: Callable[[str], None]) -> PlacedSplats:
         if self.refined is not None:
             pose = self.refined(pose)
-        return self.mesh.frames(self.mesh.posed(self.mesh.arguments([pose])))
-
-    def _world(self, frames: Frames) -> WorldSplats:
-        s = self.splat_tensors
-        return self._to_world(frames, s["means"], s["log_scales"], s["quats"])
-
-    def _opacities(self) -> Tensor:
-        return torch.sigmoid(self.splat_tensors["opacities"])
-
-    def _colors(self, world: WorldSplats, view: View) -> Tensor:
-        return self._shade(world.means, view.center)
+        frames = self.mesh.frames(self.mesh.posed(self.mesh.arguments([pose])))
+        end_stage("drive")
+        splats = self.splat_tensors
+        world = self._to_world(frames, splats["means"], splats["log_scales"], splats["quats"])
+        return PlacedSplats(world, torch.sigmoid(splats["opacities"]), partial(self._shade, world.means))
 
 
 class GA(TrainedMethod[GAConfig, GAAvatar]):

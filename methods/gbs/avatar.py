@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,21 +11,13 @@ import torch
 from safetensors.torch import save
 from torch import Tensor
 
-from ...bench.contracts import Camera, HeadPose, IntArray, no_stage
+from ...bench.contracts import HeadPose, IntArray, no_stage
 from ...bench.errors import InputError
 from ...bench.io.arrays import Member
 from ...bench.io.files import write_bytes
 from ..shared.avatar_files import SUBJECT_FILE, Subject, read_shared_head, read_subject
 from ..shared.networks import coefficient_count, sh_degree
-from ..shared.rendering import (
-    Drawn,
-    PosedSplats,
-    StoredSplatAvatar,
-    draw_splats,
-    posed_splats,
-    view_of,
-)
-from ..shared.subject_mesh import pose_key
+from ..shared.rendering import LastPose, PlacedSplats, StoredSplatAvatar
 from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors
 from .blendshapes import Entries, PointMotions, PosedAttributes, Rig, apply_pose, difference_widths
 from .points import SurfacePoints, full_barycentric
@@ -43,10 +35,9 @@ class GBSAvatar(StoredSplatAvatar):
     """
 
     def __init__(self, folder: Path, rig: Rig, stored: Stored, device: str):
-        self._stored = [folder / AVATAR_FILE, folder / SUBJECT_FILE]
-        self._rig, self.stored, self._device = rig, stored, device
-        self._degree = sh_degree(stored.neutral["sh_rest"])
-        self._last: tuple[bytes, PosedAttributes] | None = None
+        super().__init__([folder / AVATAR_FILE, folder / SUBJECT_FILE], self._placed, device)
+        self._rig, self.stored = rig, stored
+        self._last = LastPose(self._posed)
 
     @classmethod
     def read(cls, folder: Path, device: str) -> GBSAvatar:
@@ -58,48 +49,22 @@ class GBSAvatar(StoredSplatAvatar):
         return cls(folder, rig, stored, device)
 
     @torch.no_grad()
-    @torch.no_grad()
-    def draw(
-        self,
-        camera: Camera,
-        pose: HeadPose,
-        background: Sequence[float],
-        end_stage: Callable[[str], None] = no_stage,
-    ) -> Drawn:
-        """Draw one frame, stage by stage; see `StagedAvatar`."""
-        posed, view = self._posed(pose, end_stage), view_of(camera, self._device)
-        colors = posed.colors(view.center, self._degree)
-        end_stage("deform")
-        return draw_splats(posed.world, posed.opacities, colors, view, background, end_stage)
-
-    @torch.no_grad()
-    def splats(self, pose: HeadPose, camera: Camera | None = None) -> PosedSplats:
-        """Splats of a pose in the world; with colours where a camera says from where they are seen."""
-        posed = self._posed(pose)
-        colors = None
-        if camera is not None:
-            colors = posed.colors(view_of(camera, self._device).center, self._degree)
-        return posed_splats(posed.world, posed.opacities, colors)
-
-    @torch.no_grad()
     def harmonics(self, pose: HeadPose) -> tuple[Tensor, Tensor, Tensor]:
         """(N, 3) and (N, 3, K - 1) harmonics in a pose, along the splats' axes, and the (N, 3, 3) turn of these."""
-        posed = self._posed(pose)
+        posed = self._last(pose, no_stage)
         return posed.sh_dc.cpu(), posed.sh_rest.cpu(), posed.rotation.cpu()
 
-    def _posed(self, pose: HeadPose, end_stage: Callable[[str], None] = no_stage) -> PosedAttributes:
-        """Splats of a pose; the last pose's are kept, since frames of several cameras follow one another."""
-        arguments, key = self._rig.arguments([pose]), pose_key(pose)
-        if self._last is not None and self._last[0] == key:
-            end_stage("drive")
-            return self._last[1]
+    def _posed(self, pose: HeadPose, end_stage: Callable[[str], None]) -> PosedAttributes:
+        arguments, stored = self._rig.arguments([pose]), self.stored
         motions = PointMotions.of(self._rig.motions(arguments))
         end_stage("drive")
-        stored = self.stored
         differences = stored.entries.sum(stored.differences, self._rig.coefficients(arguments))
-        posed = apply_pose(stored.neutral, differences, motions)
-        self._last = key, posed
-        return posed
+        return apply_pose(stored.neutral, differences, motions)
+
+    def _placed(self, pose: HeadPose, end_stage: Callable[[str], None]) -> PlacedSplats:
+        posed = self._last(pose, end_stage)
+        degree = sh_degree(self.stored.neutral["sh_rest"])
+        return PlacedSplats(posed.world, posed.opacities, lambda center: posed.colors(center, degree))
 
 
 AVATAR_FILE = "avatar.safetensors"

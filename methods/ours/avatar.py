@@ -10,22 +10,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...bench.contracts import Camera, HeadPose, no_stage
+from ...bench.contracts import HeadPose
 from ..compact.file import COMPACT_FILE, read_compact
 from ..shared.avatar_files import SUBJECT_FILE, Subject, read_shared_head, read_subject
 from ..shared.avatar_kernel import HarmonicColors, WorldTransform
-from ..shared.binding import NORMAL, WorldSplats
-from ..shared.rendering import (
-    USUAL,
-    Cutoffs,
-    Drawn,
-    PosedSplats,
-    StoredSplatAvatar,
-    draw_splats,
-    posed_splats,
-    view_of,
-)
-from ..shared.subject_mesh import KnownPoses, SubjectMesh, pose_key
+from ..shared.binding import NORMAL
+from ..shared.rendering import USUAL, Cutoffs, LastPose, PlacedSplats, StoredSplatAvatar
+from ..shared.subject_mesh import KnownPoses, SubjectMesh
 from .appearance import driving_coefficients
 from .field import (
     Bounds,
@@ -36,8 +27,8 @@ from .field import (
     plane_features,
     position_part,
 )
-from .inference import DrivenPose, LineOffsets, PlaneColors, WorldPose
-from .storage import FIELD_FILE, SPLAT_WIDTHS, Field, read_field
+from .inference import DrivenPose, LineOffsets, PlaneColors
+from .storage import FIELD_FILE, Field, read_field, splat_columns
 
 
 class SeenFrom(NamedTuple):
@@ -76,12 +67,10 @@ class OursAvatar(StoredSplatAvatar):
     ):
         tensors = field.tensors
         self.subject, self.field = subject, field
-        self._stored, self.mesh, self._device, self._cutoffs = stored, mesh, device, cutoffs
-        table = tensors["splats"].split(list(SPLAT_WIDTHS.values()), dim=1)
-        columns = {name: column.contiguous() for name, column in zip(SPLAT_WIDTHS, table)}
-        self.neutral = LocalSplats(
-            columns["means"], columns["log_scales"], columns["quats"], columns["opacities"][:, 0]
-        )
+        self.mesh = mesh
+        columns = {name: part.contiguous() for name, part in splat_columns(tensors["splats"]).items()}
+        geometry = columns["means"], columns["log_scales"], columns["quats"]
+        self.neutral = LocalSplats(*geometry, columns["opacities"][:, 0])
         self._binding = columns["binding"][:, 0].to(torch.int64)
         self._canonical = CanonicalFrames.of(mesh.frames(mesh.canonical))
         positions = self._canonical.positions(self._binding, self.neutral.means)
@@ -94,11 +83,12 @@ class OursAvatar(StoredSplatAvatar):
             self.colors = PlaneColors(*weights, position_part(tensors, features))
         else:
             self.colors = HarmonicColors(tensors["sh_dc"], tensors["sh_rest"])
+        self._jaw_bases = tensors["jaw_bases"].cpu().numpy().astype(np.float64)
         if "lines" in tensors:
             self.line_offsets = LineOffsets(tensors, positions)
-        self._jaw_bases = tensors["jaw_bases"].cpu().numpy().astype(np.float64)
+            self._expressions = len(tensors["lines"]) - len(self._jaw_bases)
         self._known = KnownPoses(self._posed, 0)
-        self._last: tuple[bytes, WorldPose] | None = None
+        super().__init__(stored, LastPose(self._placed), device, cutoffs)
 
     @classmethod
     def read(cls, folder: Path, device: str, *, exact: bool = False) -> OursAvatar:
@@ -109,13 +99,12 @@ class OursAvatar(StoredSplatAvatar):
         head = read_shared_head(folder)
         compact = folder / COMPACT_FILE
         if compact.exists() and not exact:
-            faces, expressions = len(head.faces), head.expression_basis.shape[2]
-            subject, field = read_compact(compact, head, faces, expressions, device)
+            subject, field = read_compact(compact, head, device)
             mesh = SubjectMesh(head, subject.shape, subject.static_offset, device)
             return cls([compact], mesh, subject, field, device)
         subject = read_subject(folder / SUBJECT_FILE, head)
         mesh = SubjectMesh(head, subject.shape, subject.static_offset, device)
-        field = read_field(folder / FIELD_FILE, len(mesh.faces), mesh.model.expression_size, device)
+        field = read_field(folder / FIELD_FILE, head, device)
         return cls([folder / FIELD_FILE, folder / SUBJECT_FILE], mesh, subject, field, device)
 
     def prepare(self, poses: Iterable[HeadPose], megabytes: float = 512.0) -> int:
@@ -128,31 +117,6 @@ class OursAvatar(StoredSplatAvatar):
         return self._known.prepare(poses)
 
     @torch.no_grad()
-    def draw(
-        self,
-        camera: Camera,
-        pose: HeadPose,
-        background: Sequence[float],
-        end_stage: Callable[[str], None] = no_stage,
-    ) -> Drawn:
-        """Draw one frame, stage by stage; see `StagedAvatar`. The lines' offsets belong to the first."""
-        splats, world, turns = self._placed(pose, end_stage)
-        view = view_of(camera, self._device)
-        colors = self._colors(splats, world, turns, view.center)
-        opacities = torch.sigmoid(splats.logits)
-        end_stage("deform")
-        return draw_splats(world, opacities, colors, view, background, end_stage, self._cutoffs)
-
-    @torch.no_grad()
-    def splats(self, pose: HeadPose, camera: Camera | None = None) -> PosedSplats:
-        """Splats of a pose in the world; with colours where a camera says from where they are seen."""
-        splats, world, turns = self._placed(pose)
-        colors = None
-        if camera is not None:
-            colors = self._colors(splats, world, turns, view_of(camera, self._device).center)
-        return posed_splats(world, torch.sigmoid(splats.logits), colors)
-
-    @torch.no_grad()
     def seen_from(self, pose: HeadPose) -> SeenFrom:
         """Colours of a pose by world direction."""
         posed = self._known(pose)
@@ -160,8 +124,8 @@ class OursAvatar(StoredSplatAvatar):
 
         @torch.no_grad()
         def radiance(direction: Tensor) -> Tensor:
-            along = -self._canonical_direction(posed.turns, direction)
-            return changed_colors(self.colors.along(along), splats)
+            turned = torch.nn.functional.normalize(posed.turns @ direction.to(posed.turns), dim=1)
+            return changed_colors(self.colors.along(-turned.index_select(0, self._binding)), splats)
 
         return SeenFrom(posed.frames.rotation[:, :, NORMAL].index_select(0, self._binding), radiance)
 
@@ -171,39 +135,29 @@ class OursAvatar(StoredSplatAvatar):
         if self.line_offsets is None:
             return self.neutral.logits
         still = self.neutral.logits.new_zeros
-        expressions = len(self.field.tensors["lines"]) - len(self._jaw_bases)
-        offsets = self.line_offsets(still(expressions), still(len(self._jaw_bases)))
+        offsets = self.line_offsets(still(self._expressions), still(len(self._jaw_bases)))
         return apply_offsets(self.neutral, offsets, self.field.dynamic).logits
 
     def _posed(self, pose: HeadPose) -> DrivenPose:
         frames = self.mesh.frames(self.mesh.posed(self.mesh.arguments([pose])))
         offsets = None
         if self.line_offsets is not None:
-            expressions = len(self.field.tensors["lines"]) - len(self._jaw_bases)
-            coefficients = driving_coefficients(pose, expressions, self._jaw_bases, self._device)
+            coefficients = driving_coefficients(pose, self._expressions, self._jaw_bases, self._device)
             offsets = self.line_offsets(*coefficients)
         return DrivenPose(frames, self._canonical.turns(frames), offsets)
 
-    def _placed(self, pose: HeadPose, end_stage: Callable[[str], None] = no_stage) -> WorldPose:
-        """Splats of a pose in the world; those of the last pose are kept, as several cameras often look at one."""
-        key = pose_key(pose)
-        if self._last is None or self._last[0] != key:
-            posed = self._known(pose)
-            end_stage("drive")
-            splats = self._changed(posed)
-            world = self._to_world(posed.frames, splats.means, splats.log_scales, splats.quats)
-            self._last = key, WorldPose(splats, world, posed.turns)
-        return self._last[1]
+    def _placed(self, pose: HeadPose, end_stage: Callable[[str], None]) -> PlacedSplats:
+        posed = self._known(pose)
+        end_stage("drive")
+        splats = self._changed(posed)
+        world = self._to_world(posed.frames, splats.means, splats.log_scales, splats.quats)
+
+        def colors(center: Tensor) -> Tensor:
+            return changed_colors(self.colors(world.means, center, posed.turns, self._binding), splats)
+
+        return PlacedSplats(world, torch.sigmoid(splats.logits), colors)
 
     def _changed(self, posed: DrivenPose) -> LocalSplats:
         if posed.offsets is None:
             return self.neutral
         return apply_offsets(self.neutral, posed.offsets, self.field.dynamic)
-
-    def _canonical_direction(self, turns: Tensor, direction: Tensor) -> Tensor:
-        """(N, 3) canonical directions of one world direction, common to all splats."""
-        turned = torch.nn.functional.normalize(turns @ direction.to(turns), dim=1)
-        return turned.index_select(0, self._binding)
-
-    def _colors(self, splats: LocalSplats, world: WorldSplats, turns: Tensor, center: Tensor) -> Tensor:
-        return changed_colors(self.colors(world.means, center, turns, self._binding), splats)

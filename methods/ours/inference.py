@@ -13,13 +13,12 @@ import torch
 from torch import Tensor
 
 from ..shared import avatar_kernel
-from ..shared.binding import Frames, WorldSplats
+from ..shared.binding import Frames
 from ..shared.networks import C0, CPU_BLOCK, ENCODING_SIZE, FREQUENCIES, sum_rows
 from .field import (
     AXES,
     Bounds,
     LinePosition,
-    LocalSplats,
     blend_lines,
     canonical_directions,
     line_position,
@@ -42,15 +41,6 @@ class DrivenPose(NamedTuple):
         """Memory it takes."""
         tensors = (*self.frames, self.turns, *(() if self.offsets is None else (self.offsets,)))
         return sum(value.nbytes for value in tensors)
-
-
-class WorldPose(NamedTuple):
-    """Splats of a pose in the world, before a camera looks at them."""
-
-    splats: LocalSplats
-    world: WorldSplats
-    turns: Tensor
-    """(F, 3, 3) world directions to canonical ones."""
 
 
 class LineOffsets:
@@ -194,7 +184,7 @@ class PlaneColors:
 
 
 def encode_columns(directions: Tensor) -> Tensor:
-    """(27, N), the transpose of `encode_directions`, from one sine and one cosine per coordinate.
+    """(27, N), the transpose of `encode`, from one sine and one cosine per coordinate.
 
     The frequencies double, so the other waves follow by sin 2a = 2 sin a cos a and cos 2a = 1 - 2 sin^2 a; each step
     doubles the rounding error, to 1e-6 at frequency 8 in float32.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -16,6 +16,9 @@ from ..splats import rasterize
 from ..splats.constants import ALPHA_MIN, TRANSMITTANCE_MIN
 from .avatar_files import HEAD_FILE
 from .binding import WorldSplats
+from .subject_mesh import pose_key
+
+Value = TypeVar("Value")
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,22 +88,10 @@ def read_back(drawn: Drawn) -> Frame:
     return Frame(_numpy(drawn.image), _numpy(drawn.alpha))
 
 
-def render_splats(
-    world: WorldSplats, opacities: Tensor, colors: Tensor, view: View, background: Sequence[float]
-) -> Frame:
-    """Rasterize to a numpy frame, clipped to [0, 1]."""
-    return read_back(draw_splats(world, opacities, colors, view, background))
-
-
 def posed_splats(world: WorldSplats, opacities: Tensor, colors: Tensor | None) -> PosedSplats:
     """Copy to numpy: avatars keep tensors for the next frame."""
-    return PosedSplats(
-        _numpy(world.means).copy(),
-        _numpy(world.quats).copy(),
-        _numpy(world.scales).copy(),
-        _numpy(opacities).copy(),
-        None if colors is None else _numpy(colors).copy(),
-    )
+    means, quats, scales, of_splats = (_numpy(values).copy() for values in (*world, opacities))
+    return PosedSplats(means, quats, scales, of_splats, None if colors is None else _numpy(colors).copy())
 
 
 def _numpy(values: Tensor) -> np.ndarray:
@@ -139,16 +130,47 @@ def scene_extent(cameras: Mapping[str, Camera]) -> float:
     return 1.1 * max(radius, 1e-3)
 
 
-class StoredSplatAvatar:
-    """What avatars of splats share around their `draw`.
+class PlacedSplats(NamedTuple):
+    """Splats of a pose in the world: geometry, (N,) opacities, and colours (N, 3) >= 0 as a camera's centre sees them."""
 
-    Attributes
+    world: WorldSplats
+    opacities: Tensor
+    colors: Callable[[Tensor], Tensor]
+
+
+class LastPose(Generic[Value]):
+    """What ``compute`` gave for the last pose, as several cameras often look at one."""
+
+    def __init__(self, compute: Callable[[HeadPose, Callable[[str], None]], Value]):
+        self._compute = compute
+        self._last: tuple[bytes, Value] | None = None
+
+    def __call__(self, pose: HeadPose, end_stage: Callable[[str], None]) -> Value:
+        key = pose_key(pose)
+        if self._last is None or self._last[0] != key:
+            self._last = key, self._compute(pose, end_stage)
+        return self._last[1]
+
+
+class StoredSplatAvatar:
+    """What avatars of splats share: a derived class says where its splats are in a pose.
+
+    Parameters
     ----------
-    _stored : files that count as storage, in the avatar's folder.
+    stored : files that count as storage, in the avatar's folder.
+    place : the splats of a pose; calls its second argument with "drive" as soon as the mesh is posed.
     """
 
-    _stored: Sequence[Path]
+    def __init__(
+        self,
+        stored: Sequence[Path],
+        place: Callable[[HeadPose, Callable[[str], None]], PlacedSplats],
+        device: str,
+        cutoffs: Cutoffs = USUAL,
+    ):
+        self._stored, self._place, self._device, self._cutoffs = stored, place, device, cutoffs
 
+    @torch.no_grad()
     def draw(
         self,
         camera: Camera,
@@ -157,15 +179,25 @@ class StoredSplatAvatar:
         end_stage: Callable[[str], None] = no_stage,
     ) -> Drawn:
         """Draw one frame, stage by stage; see `StagedAvatar`."""
-        raise NotImplementedError
+        placed, view = self._place(pose, end_stage), view_of(camera, self._device)
+        colors = placed.colors(view.center)
+        end_stage("deform")
+        return draw_splats(placed.world, placed.opacities, colors, view, background, end_stage, self._cutoffs)
 
     def render(self, camera: Camera, pose: HeadPose, background: Sequence[float] = (1.0, 1.0, 1.0)) -> Frame:
         """Render one frame. Raises `InputError` where the pose is of another head model."""
-        return self.read_back(self.draw(camera, pose, background))
+        return read_back(self.draw(camera, pose, background))
 
     def read_back(self, drawn: Drawn) -> Frame:
         """A drawn frame in host memory."""
         return read_back(drawn)
+
+    @torch.no_grad()
+    def splats(self, pose: HeadPose, camera: Camera | None = None) -> PosedSplats:
+        """Splats of a pose in the world; with colours where a camera says from where they are seen."""
+        placed = self._place(pose, no_stage)
+        colors = None if camera is None else placed.colors(view_of(camera, self._device).center)
+        return posed_splats(placed.world, placed.opacities, colors)
 
     def files(self) -> Sequence[Path]:
         """The files that hold the avatar."""

@@ -34,7 +34,7 @@ from ....methods.ours.field import (
 from ....methods.shared.avatar_kernel import WorldTransform
 from ....methods.shared.binding import to_world
 from ....methods.shared.networks import offset_network, sum_rows
-from ....methods.shared.rendering import render_splats, view_of
+from ....methods.shared.rendering import draw_splats, read_back, view_of
 from ..timing import seconds_of, table, take_turns, torch_threads
 from .untrained import cameras_around, random_poses, untrained_avatar
 
@@ -233,7 +233,7 @@ class _Parts:
 
     def raster(self) -> Any:
         opacities = torch.sigmoid(self._splats.logits)
-        return render_splats(self._world, opacities, self._shown, self._view, (1.0, 1.0, 1.0))
+        return read_back(draw_splats(self._world, opacities, self._shown, self._view, (1.0, 1.0, 1.0)))
 
     def plain(self) -> Any:
         """A whole frame by training's functions, nothing known beforehand but the canonical positions."""
