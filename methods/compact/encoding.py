@@ -11,7 +11,7 @@ from torch import Tensor
 from ...bench.contracts import FloatArray
 from ...bench.errors import InputError
 from ..ours.field import Bounds, normalised_weight, plane_features
-from ..ours.storage import SPLAT_WIDTHS
+from ..ours.storage import splat_columns
 from ..shared.networks import C0, PAIRS
 from .container import Arrays, coded, dequantise, from_smallest_three, narrow, smallest_three
 from .precision import Precision
@@ -172,22 +172,19 @@ def encode_splats(
     turned : an expression adds to the quaternions. Then all four components are kept, of any length; otherwise three
         are enough, see `smallest_three`.
     """
-    means, logits, log_scales, quats, triangles = _columns(tensors["splats"])
+    columns = splat_columns(tensors["splats"].cpu())
+    means, logits, log_scales, quats, triangles = (part.numpy() for part in columns.values())
     deltas = np.diff(triangles[:, 0].astype(np.int64), prepend=0)
     if (deltas < 0).any():
         raise ValueError("splats: expected in the order of their triangles, found another")
-    steps = {
-        "scales": precision.scales,
-        "positions": precision.positions,
-        "rotations": precision.rotations,
-        "opacities": precision.opacities,
-    }
+    steps = {part: getattr(precision, part) for part in ("scales", "positions", "rotations", "opacities")}
     scales = coded(log_scales.T, precision.scales)
+    as_read = dequantise(scales, precision.scales) if precision.scales else scales
     local = quats.T if turned or not precision.rotations else smallest_three(quats).T
     arrays = {
         "triangles": narrow(deltas),
         "log_scales": scales,
-        "positions": coded(means.T, precision.positions * _size(_scales(scales, precision.scales))),
+        "positions": coded(means.T, precision.positions * _size(as_read)),
         "rotations": coded(local, precision.rotations),
         "logits": coded(logits[:, 0], precision.opacities),
     }
@@ -224,16 +221,6 @@ def decode_splats(arrays: Arrays) -> dict[str, Tensor]:
             values = np.moveaxis(arrays.decoded(name, step, *shapes[name]), -1, 0)
             tensors[name] = torch.from_numpy(np.ascontiguousarray(values))
     return tensors
-
-
-def _columns(table: Tensor) -> list[FloatArray]:
-    """Means, logits, log-scales, quaternions and triangles, (N, width) each."""
-    return [part.cpu().numpy() for part in table.split(list(SPLAT_WIDTHS.values()), dim=1)]
-
-
-def _scales(stored: np.ndarray, step: float) -> FloatArray:
-    """(3, N) log-scales as they will be read."""
-    return dequantise(stored, step) if step else stored
 
 
 def _size(log_scales: FloatArray) -> FloatArray:

@@ -53,7 +53,8 @@ def encode(field: Field, subject: Subject, head: HeadAsset, precision: Precision
     # Where the reader will put the splats decides which samples of the planes they need.
     read = Arrays(Path(), Content({**splats, **person.arrays}, text, steps))
     table = decode_splats(read)["splats"]
-    mesh = _mesh(decode_subject(read, head), head)
+    stored = decode_subject(read, head)
+    mesh = SubjectMesh(head, stored.shape, stored.static_offset, "cpu")
     frames = CanonicalFrames.of(mesh.frames(mesh.canonical))
     positions = frames.positions(table[:, -1].to(torch.int64), table[:, : SPLAT_WIDTHS["means"]])
     shared = encode_field(tensors, positions, precision)
@@ -62,9 +63,7 @@ def encode(field: Field, subject: Subject, head: HeadAsset, precision: Precision
     return Content({**splats, **shared, **person.arrays, **other}, text, steps)
 
 
-def decode(
-    path: Path, content: Content, head: HeadAsset, face_count: int, expression_size: int, device: str
-) -> tuple[Subject, Field]:
+def decode(path: Path, content: Content, head: HeadAsset, device: str) -> tuple[Subject, Field]:
     """Subject and field of such a content. Raises `InputError`, which names ``path``, where it does not fit."""
     arrays = Arrays(path, content)
     subject = decode_subject(arrays, head)
@@ -72,7 +71,7 @@ def decode(
     for name, values in arrays.rest().items():
         tensors[name] = torch.from_numpy(np.array(values))
     names = content.text.get("dynamic", "")
-    field = checked_field(path, tensors, names, face_count, expression_size)
+    field = checked_field(path, tensors, names, head)
     return subject, field._replace(tensors={name: value.to(device) for name, value in tensors.items()})
 
 
@@ -81,11 +80,9 @@ def write_compact(path: Path, field: Field, subject: Subject, head: HeadAsset, p
     write_content(path, encode(field, subject, head, precision))
 
 
-def read_compact(
-    path: Path, head: HeadAsset, face_count: int, expression_size: int, device: str
-) -> tuple[Subject, Field]:
+def read_compact(path: Path, head: HeadAsset, device: str) -> tuple[Subject, Field]:
     """Read what `write_compact` wrote. Raises `InputError` for anything else, before it takes more memory."""
-    return decode(path, read_content(path), head, face_count, expression_size, device)
+    return decode(path, read_content(path), head, device)
 
 
 def part_sizes(content: Content) -> dict[str, int]:
@@ -131,7 +128,3 @@ def decode_subject(arrays: Arrays, head: HeadAsset) -> Subject:
     shape = arrays.floats("shape", head.shape_basis.shape[2])
     offset = arrays.decoded("static_offset", arrays.step("subject"), 3, len(head.template))
     return Subject(name, version, shape, np.ascontiguousarray(offset.T))
-
-
-def _mesh(subject: Subject, head: HeadAsset) -> SubjectMesh:
-    return SubjectMesh(head, subject.shape, subject.static_offset, "cpu")

@@ -16,7 +16,7 @@ from ..compact.file import COMPACT_FILE, decode_subject, encode_subject
 from ..compact.precision import Precision
 from ..ga.method import GAAvatar
 from ..ga.storage import PLY_FILE, read_ga_splats, write_ga_splats
-from ..ours.storage import SPLAT_WIDTHS
+from ..ours.storage import SPLAT_WIDTHS, splat_columns
 from ..shared.avatar_files import (
     SUBJECT_FILE,
     Subject,
@@ -81,11 +81,7 @@ def _make(whole: GAAvatar, head: HeadAsset, rows: Tensor, recipe: Recipe, device
 def _content(splats: dict[str, Tensor], binding: Tensor, subject: Subject) -> Content:
     """As "ours" stores splats with harmonics: sorted by triangle, stably, as those of one depth are drawn in order."""
     order = torch.argsort(binding, stable=True)
-    columns = {
-        **splats,
-        "opacities": splats["opacities"][:, None],
-        TRIANGLES: binding[:, None].to(torch.float32),
-    }
+    columns = {**splats, "opacities": splats["opacities"][:, None], TRIANGLES: binding[:, None].float()}
     table = torch.cat([columns[name] for name in SPLAT_WIDTHS], dim=1)
     tensors = {"splats": table, "sh_dc": splats["sh_dc"], "sh_rest": splats["sh_rest"]}
     tensors = {name: value.index_select(0, order).cpu() for name, value in tensors.items()}
@@ -99,9 +95,8 @@ def _read_content(path: Path, head: HeadAsset, device: str) -> tuple[Subject, di
     """Subject, per-splat tensors and binding of a file of `_content`."""
     arrays = Arrays(path, read_content(path))
     subject, tensors = decode_subject(arrays, head), decode_splats(arrays)
-    table = tensors.pop("splats").split(list(SPLAT_WIDTHS.values()), dim=1)
-    splats = {name: column.contiguous().to(device) for name, column in zip(SPLAT_WIDTHS, table)}
-    splats |= {name: value.to(device) for name, value in tensors.items()}
+    columns = splat_columns(tensors.pop("splats"))
+    splats = {name: value.contiguous().to(device) for name, value in {**columns, **tensors}.items()}
     binding = splats.pop(TRIANGLES)[:, 0].to(torch.int64)
     splats["opacities"] = splats["opacities"][:, 0]
     return subject, splats, binding

@@ -38,10 +38,8 @@ _ANY = 1 << 30  # more samples than anything has
 
 def variants(folder: Path, clip: Clip, device: str) -> Iterator[Variant]:
     """The variants of `recipes.OURS` that change this avatar."""
-    whole, head = (
-        OursAvatar.read(folder, device, exact=(folder / FIELD_FILE).exists()),
-        read_shared_head(folder),
-    )
+    whole = OursAvatar.read(folder, device, exact=(folder / FIELD_FILE).exists())
+    head = read_shared_head(folder)
     weights = contributions(whole, training_views(clip))
     for recipe in OURS:
         if _idle(recipe, whole.field):
@@ -73,32 +71,29 @@ def _make(
     tensors = _resampled(tensors, recipe)
     field = Field(tensors, whole.field.dynamic)
     save_shared_head(out, head)
-    faces, expressions = len(head.faces), head.expression_basis.shape[2]
     subject = whole.subject
     if recipe.storage == "compact":
         path, precision = out / COMPACT_FILE, Precision()
         # Sorts the splats by triangle and leaves out lines that would be rounded to nothing.
         field = simplify(OursAvatar([], whole.mesh, subject, field, device), [], precision)
         write_compact(path, field, subject, head, precision)
-        subject, field = read_compact(path, head, faces, expressions, device)
+        subject, field = read_compact(path, head, device)
         stored = [path]
     else:
         write_subject(out / SUBJECT_FILE, subject)
         path = out / FIELD_FILE
         if recipe.storage == "exact":
             save_field(path, field)
-            field = read_field(path, faces, expressions, device)
+            field = read_field(path, head, device)
         else:
-            whole_numbers = tensors["splats"][:, -1].to(torch.int32)
-            narrow = {**tensors, "splats": tensors["splats"][:, :-1], TRIANGLES: whole_numbers}
+            table, triangles = tensors["splats"][:, :-1], tensors["splats"][:, -1]
+            narrow = {**tensors, "splats": table, TRIANGLES: triangles.to(torch.int32)}
             write_reduced(path, narrow, recipe.storage, EXACT_PARTS)
             read = read_reduced(path)
             triangles = read.pop(TRIANGLES)[:, None].to(torch.float32)
             read["splats"] = torch.cat([read["splats"], triangles], dim=1)
-            checked = checked_field(path, read, ",".join(field.dynamic), faces, expressions)
-            field = checked._replace(
-                tensors={name: value.to(device) for name, value in checked.tensors.items()}
-            )
+            checked_field(path, read, ",".join(field.dynamic), head)
+            field = field._replace(tensors={name: value.to(device) for name, value in read.items()})
         stored = [path, out / SUBJECT_FILE]
     mesh = SubjectMesh(head, subject.shape, subject.static_offset, device)
     return OursAvatar(stored, mesh, subject, field, device, recipe.cutoffs)

@@ -12,6 +12,7 @@ import torch
 from safetensors.torch import save
 from torch import Tensor
 
+from ...bench.contracts import HeadAsset
 from ...bench.errors import InputError
 from ...bench.io.arrays import Member
 from ...bench.io.files import write_bytes
@@ -28,6 +29,11 @@ SPLAT_WIDTHS = {"means": 3, "opacities": 1, "log_scales": 3, "quats": 4, "bindin
 """Columns of the (N, 12) float32 splat table, 48 bytes each; the triangle is exact up to 2^24."""
 
 
+def splat_columns(table: Tensor) -> dict[str, Tensor]:
+    """The (N, width) columns of a splat table by name."""
+    return dict(zip(SPLAT_WIDTHS, table.split(list(SPLAT_WIDTHS.values()), dim=1)))
+
+
 def write_field(
     path: Path,
     splats: Mapping[str, Tensor],
@@ -41,15 +47,13 @@ def write_field(
     """Write splats, planes, lines, networks, boxes and jaw bases as float32 safetensors."""
     columns = {**splats, "opacities": splats["opacities"][:, None], "binding": binding[:, None]}
     table = torch.cat([columns[name].detach().to("cpu", torch.float32) for name in SPLAT_WIDTHS], dim=1)
-    tensors = {name: value.detach().cpu().contiguous() for name, value in shared.items()}
+    tensors = {name: value.detach() for name, value in shared.items()}
+    tensors |= {name: splats[name].detach() for name in ("sh_dc", "sh_rest") if name in splats}
     tensors |= {
         "splats": table,
-        "plane_box": torch.stack(list(plane_box)).cpu(),
-        "line_box": torch.stack(list(line_box)).cpu(),
+        "plane_box": torch.stack(list(plane_box)),
+        "line_box": torch.stack(list(line_box)),
         "jaw_bases": torch.from_numpy(np.asarray(jaw_bases, dtype=np.float32)),
-    }
-    tensors |= {
-        name: splats[name].detach().cpu().contiguous() for name in ("sh_dc", "sh_rest") if name in splats
     }
     save_field(path, Field(tensors, tuple(dynamic)))
 
@@ -67,16 +71,14 @@ def save_field(path: Path, field: Field) -> None:
     write_bytes(path, save(tensors, {DYNAMIC: ",".join(field.dynamic)}))
 
 
-def read_field(path: Path, face_count: int, expression_size: int, device: str) -> Field:
+def read_field(path: Path, head: HeadAsset, device: str) -> Field:
     """Read and check what `write_field` wrote. Raises `InputError` where a tensor is missing or does not fit."""
     tensors, metadata = read_safetensors(path)
-    field = checked_field(path, tensors, metadata.get(DYNAMIC, "opacity"), face_count, expression_size)
+    field = checked_field(path, tensors, metadata.get(DYNAMIC, "opacity"), head)
     return field._replace(tensors={name: value.to(device) for name, value in field.tensors.items()})
 
 
-def checked_field(
-    path: Path, tensors: dict[str, Tensor], names: str, face_count: int, expression_size: int
-) -> Field:
+def checked_field(path: Path, tensors: dict[str, Tensor], names: str, head: HeadAsset) -> Field:
     """Make a field of tensors that came from outside, and of what they say the lines change, by comma.
 
     Raises `InputError` where a tensor is missing, is not finite float32 or does not fit the others.
@@ -94,13 +96,11 @@ def checked_field(
         needed += [f"line_{part}_{layer}" for layer in range(3) for part in ("direction", "gain", "bias")]
     number = Member("f", None, MAX_MAGNITUDE, "f4")
     check_tensors(path, tensors, dict.fromkeys([*needed, *tensors], number))
-    _check_shapes(path, tensors, face_count, expression_size, offset_width(dynamic))
+    _check_shapes(path, tensors, head, offset_width(dynamic))
     return Field(tensors, dynamic)
 
 
-def _check_shapes(
-    path: Path, tensors: Mapping[str, Tensor], face_count: int, expression_size: int, outputs: int
-) -> None:
+def _check_shapes(path: Path, tensors: Mapping[str, Tensor], head: HeadAsset, outputs: int) -> None:
     """Raise `InputError` at the first tensor that does not fit the others, so that no rendering can."""
 
     def require(name: str, fits: bool, expected: str) -> None:
@@ -110,6 +110,7 @@ def _check_shapes(
     def exactly(name: str, *shape: int) -> None:
         require(name, tensors[name].shape == shape, f"shape {shape}")
 
+    face_count, expression_size = len(head.faces), head.expression_basis.shape[2]
     splats = tensors["splats"]
     width = sum(SPLAT_WIDTHS.values())
     require("splats", splats.ndim == 2 and splats.shape[1] == width, f"(N, {width})")
@@ -117,9 +118,7 @@ def _check_shapes(
     if len(binding) and not (0 <= float(binding.min()) and float(binding.max()) < face_count):
         found = f"{float(binding.min()):g} to {float(binding.max()):g}"
         raise InputError(path, "splats, triangle", f"0 to {face_count - 1}", found)
-    check_sizes(
-        path, splats.split(list(SPLAT_WIDTHS.values()), dim=1)[list(SPLAT_WIDTHS).index("log_scales")]
-    )
+    check_sizes(path, splat_columns(splats)["log_scales"])
     for name in ("plane_box", "line_box"):
         exactly(name, 2, 3)
         if not (tensors[name][0] < tensors[name][1]).all():
@@ -136,9 +135,8 @@ def _check_shapes(
         for name in planes:
             plane = tensors[name]
             square = plane.ndim == 2 and round(len(plane) ** 0.5) ** 2 == len(plane) >= 4
-            require(
-                name, square and len(plane) == len(tensors[planes[0]]), "(R * R, C), R of all planes equal"
-            )
+            alike = square and len(plane) == len(tensors[planes[0]])
+            require(name, alike, "(R * R, C), R of all planes equal")
         inputs = sum(tensors[name].shape[1] for name in planes) + ENCODING_SIZE
         first = tensors["color_weight_0"]
         require("color_weight_0", first.ndim == 2 and first.shape[1] == inputs, f"(H, {inputs})")
@@ -150,9 +148,8 @@ def _check_shapes(
         return
     lines, jaws = tensors["lines"], len(bases)
     fits = lines.ndim == 4 and lines.shape[1] == 3 and jaws <= len(lines) <= jaws + expression_size
-    require(
-        "lines", fits and lines.shape[2] >= 2, f"(E + {jaws}, 3, L, C), E at most {expression_size}, L > 1"
-    )
+    expected = f"(E + {jaws}, 3, L, C), E at most {expression_size}, L > 1"
+    require("lines", fits and lines.shape[2] >= 2, expected)
     sizes = [6 * lines.shape[3], *(len(tensors[f"line_bias_{layer}"]) for layer in (0, 1)), outputs]
     for layer, (fan_in, fan_out) in enumerate(pairwise(sizes)):
         exactly(f"line_direction_{layer}", fan_out, fan_in)
