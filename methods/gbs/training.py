@@ -130,7 +130,7 @@ class GBSTraining(SplatTrainer):
 
     def loss(self, iteration: int, index: int) -> Tensor:
         """Photometric loss of one image, alpha against the mask, and teeth that leave the mouth."""
-        key, config, optimiser = self.keys[index], self._config, self._optimiser
+        key, config, optimiser = self.keys[index], self._config, self.optimiser
         view = self._views[key.camera]
         image, coverage = self._on_background(self._images.get(iteration, index))
         pose = self._pose[key.timestep]
@@ -165,7 +165,7 @@ class GBSTraining(SplatTrainer):
 
     def merged_differences(self) -> Tensor:
         """(M, C) what is added at coefficient 1: as trained, times the mask."""
-        table = self._optimiser[DIFFERENCES].detach() * self._column_scales
+        table = self.optimiser[DIFFERENCES].detach() * self._column_scales
         return table * self.entries.weights[:, None]
 
     def _on_background(self, image: Tensor) -> tuple[Tensor, Tensor | None]:

@@ -108,13 +108,7 @@ class OursAppearance:
         return self._prepared(timestep).frames
 
     def place(
-        self,
-        frames: Frames,
-        binding: Tensor,
-        view: View,
-        timestep: int,
-        optimiser: Optimiser,
-        iteration: int,
+        self, frames: Frames, binding: Tensor, view: View, timestep: int, optimiser: Optimiser, iteration: int
     ) -> ShadedSplats:
         """Colour by canonical position and direction; what the lines change, once they are on."""
         prepared = self._prepared(timestep)

@@ -21,7 +21,7 @@ from ..shared.networks import (
     ENCODING_SIZE,
     PAIRS,
     color_network,
-    encode_directions,
+    encode,
     offset_network,
     sample_triplane,
     sum_rows,
@@ -264,7 +264,7 @@ def shade_directions(parameters: Parameters, from_position: Tensor, directions: 
     """
     first, last = parameters["color_weight_0"], parameters["color_weight_1"]
     of_direction = first[:, first.shape[1] - ENCODING_SIZE :]
-    hidden = torch.addmm(from_position, encode_directions(directions), of_direction.t()).relu_()
+    hidden = torch.addmm(from_position, encode(directions), of_direction.t()).relu_()
     return torch.relu(0.5 + C0 * (hidden @ last.t()))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from ...bench.errors import InputError
 from ...bench.io.arrays import MAX_MAGNITUDE, TEXT, Member, read_arrays
 from ...bench.io.documents import read_json
 from ...bench.io.files import atomic_path, digest, write_json
-from ...datasets.head.arrays import HeadArrays, read_head, save_head
+from ...datasets.head.arrays import STORED, HeadArrays, read_head, save_head
 from .loop import Fit, Outcome
 
 HEAD_FILE = "head_model.npz"
@@ -45,19 +45,8 @@ def head_arrays(head: HeadAsset) -> HeadArrays:
     """A head model as arrays that can be stored and changed."""
     if isinstance(head, HeadArrays):
         return head
-    return HeadArrays(
-        version=head.version,
-        template=head.template,
-        faces=head.faces,
-        shape_basis=head.shape_basis,
-        expression_basis=head.expression_basis,
-        pose_basis=head.pose_basis,
-        joint_regressor=head.joint_regressor,
-        skinning_weights=head.skinning_weights,
-        parents=head.parents,
-        eyelid_basis=head.eyelid_basis,
-        regions=head.regions,
-    )
+    names = ("version", *STORED, "eyelid_basis", "regions")
+    return HeadArrays(**{name: getattr(head, name) for name in names})
 
 
 def save_shared_head(folder: Path, head: HeadAsset) -> None:
@@ -78,13 +67,9 @@ def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
 
 def write_subject(path: Path, subject: Subject) -> None:
     """Write identity coefficients and static offset as float32 npz."""
-    arrays: dict[str, Any] = {
-        "name": np.array(subject.name),
-        "head_model": np.array(subject.head_model),
-        "shape": subject.shape.astype(np.float32),
-        "static_offset": subject.static_offset.astype(np.float32),
-    }
-    write_arrays(path, arrays)
+    shape, offset = subject.shape.astype(np.float32), subject.static_offset.astype(np.float32)
+    texts = {"name": subject.name, "head_model": subject.head_model}
+    write_arrays(path, {**texts, "shape": shape, "static_offset": offset})
 
 
 def read_subject(path: Path, head: HeadAsset) -> Subject:
@@ -132,21 +117,13 @@ class RefinedTracking:
         for name in TRACKED:
             if not np.array_equal(np.asarray(getattr(pose, name), np.float32), self._tracked[name][row]):
                 return pose
-        values: dict[str, Any] = {name: self._refined[name][row] for name in TRACKED}
-        return HeadPose(
-            pose.head_model,
-            **values,
-            eyelids=pose.eyelids,
-            subject=pose.subject,
-            timestep=pose.timestep,
-        )
+        return replace(pose, **{name: self._refined[name][row] for name in TRACKED})
 
     def save(self, path: Path) -> None:
         """Write as npz."""
-        arrays: dict[str, Any] = {"subject": np.array(self._subject), "timesteps": self._timesteps}
-        arrays |= {f"tracked_{name}": self._tracked[name] for name in TRACKED}
-        arrays |= {f"refined_{name}": self._refined[name] for name in TRACKED}
-        write_arrays(path, arrays)
+        tracked = {f"tracked_{name}": self._tracked[name] for name in TRACKED}
+        refined = {f"refined_{name}": self._refined[name] for name in TRACKED}
+        write_arrays(path, {"subject": self._subject, "timesteps": self._timesteps, **tracked, **refined})
 
     @classmethod
     def read(cls, path: Path) -> RefinedTracking:
@@ -157,10 +134,10 @@ class RefinedTracking:
             for name in TRACKED
         }
         arrays = read_arrays(path, members)
-        timesteps = arrays["timesteps"]
-        tracked = {name: arrays[f"tracked_{name}"] for name in TRACKED}
-        refined = {name: arrays[f"refined_{name}"] for name in TRACKED}
-        return cls(str(arrays["subject"]), timesteps, tracked, refined)
+        tracked, refined = (
+            {name: arrays[f"{kind}_{name}"] for name in TRACKED} for kind in ("tracked", "refined")
+        )
+        return cls(str(arrays["subject"]), arrays["timesteps"], tracked, refined)
 
 
 def run_digest(method: str, version: str, config: Any, clip: Clip, budget: Budget, seed: int) -> str:
@@ -178,26 +155,16 @@ def is_finished(folder: Path, run: str) -> bool:
         return False
     found = read_json(path).get("run")
     if found != run:
-        raise InputError(
-            path,
-            "run",
-            "the same method, clip, settings, budget and seed",
-            "the avatar of another run",
-            "Use another output folder, or delete this one.",
-        )
+        expected = "the same method, clip, settings, budget and seed"
+        remedy = "Use another output folder, or delete this one."
+        raise InputError(path, "run", expected, "the avatar of another run", remedy)
     return True
 
 
 def write_record(fit: Fit, outcome: Outcome, **more: Any) -> None:
     """Write how the run went. The last file of a fit: its presence says that the avatar is whole."""
-    record = {
-        "run": fit.run,
-        "iterations": outcome.iterations,
-        "planned_iterations": outcome.planned,
-        "seconds": round(outcome.seconds, 3),
-        **more,
-    }
-    write_json(fit.out / RECORD_FILE, record)
+    done = {"iterations": outcome.iterations, "planned_iterations": outcome.planned}
+    write_json(fit.out / RECORD_FILE, {"run": fit.run, **done, "seconds": round(outcome.seconds, 3), **more})
 
 
 def finish_fit(fit: Fit, outcome: Outcome, subject: Subject, head: HeadAsset, **more: Any) -> None:

@@ -1,6 +1,6 @@
 """What avatars compute of a frame before its splats are drawn, by the compiled kernel.
 
-Each function has a reference implementation in torch, which is the definition and is used where the kernel is not: other devices, other
+Each function has a reference in torch, which is the definition and is used where the kernel is not: other devices, other
 dtypes, gradients, or no compiler at installation. The kernel's results do not depend on the number of threads.
 """
 
@@ -56,12 +56,7 @@ def splats_to_world(
     means, quats, scales : (N, 3) and (N, 3) in units of the triangle's size, (N, 4) unit quaternions wxyz.
     """
     world = WorldSplats(torch.empty_like(means), torch.empty_like(quats), torch.empty_like(scales))
-    call(
-        "to_world",
-        *(binding, frames.rotation, frames.center, frames.size, frames.quaternion, means, quats, scales),
-        *world,
-        backend=backend,
-    )
+    call("to_world", binding, *frames, means, quats, scales, *world, backend=backend)
     return world
 
 
@@ -98,13 +93,10 @@ def shade(
 
 def pad_units(values: Tensor, *axes: int) -> Tensor:
     """Zeros after the end of the given axes, up to a multiple of `UNITS_STEP`."""
+    widths = [0] * (2 * values.ndim)  # before and after, the last axis first
     for axis in axes:
-        missing = -values.shape[axis] % UNITS_STEP
-        shape = [
-            missing if number == axis % values.ndim else size for number, size in enumerate(values.shape)
-        ]
-        values = torch.cat([values, values.new_zeros(shape)], dim=axis)
-    return values.contiguous()
+        widths[-1 - 2 * axis] = -values.shape[axis] % UNITS_STEP
+    return pad(values, widths).contiguous()
 
 
 def shade_network(
@@ -124,11 +116,8 @@ def shade_network(
     from_position, of_direction, last : (N, H), (27, H) and (3, H), each padded by `pad_units` along H.
     """
     colors = torch.empty_like(means)
-    call(
-        "color_network",
-        *(from_position, of_direction, last, means, turns, binding, center, colors),
-        backend=backend,
-    )
+    network = from_position, of_direction, last
+    call("color_network", *network, means, turns, binding, center, colors, backend=backend)
     return colors
 
 
@@ -159,12 +148,9 @@ def offsets_into(
     """
     # What is interpolated on an axis is no more than its largest sample.
     alive = table.view(3, -1, table.shape[1]).amax(1).sum(0) > 0
-    used = pad_units(table[:, alive], 1), pad_units(second[alive], 0)
-    call(
-        "offset_network",
-        *(used[0], rows, fractions, used[1], second_bias, last, last_bias, splats, out),
-        backend=backend,
-    )
+    first, second = pad_units(table[:, alive], 1), pad_units(second[alive], 0)
+    layers = second, second_bias, last, last_bias
+    call("offset_network", first, rows, fractions, *layers, splats, out, backend=backend)
 
 
 def call(name: str, *arguments: Any, backend: str) -> Any:

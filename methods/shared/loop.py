@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -137,20 +136,16 @@ def train(
         iteration += 1
         loss = trainable.loss(iteration, sampler(iteration))
         loss.backward()
-        if iteration % REPORT_EVERY == 0 or iteration == 1:
-            _check_finite(loss, iteration, fit.out)
+        if (iteration % REPORT_EVERY == 0 or iteration == 1) and not loss.isfinite():
+            remedy = "Training diverged; check the tracking (NaN?) or lower the learning rates."
+            raise InputError(fit.out, f"iteration {iteration}", "a finite loss", str(loss.item()), remedy)
         trainable.after_backward(iteration)
         if iteration < total:
             trainable.optimiser.step()
         trainable.optimiser.zero_grad()
         if clock() - last_save >= checkpoint_every_s and iteration < total:
-            state = {
-                "iteration": iteration,
-                "total": total,
-                "seconds": seconds(),
-                "trainable": trainable.state(),
-            }
-            save_checkpoint(path, fit.run, state)
+            done = {"iteration": iteration, "total": total, "seconds": seconds()}
+            save_checkpoint(path, fit.run, {**done, "trainable": trainable.state()})
             last_save = clock()
         note = ""
         if iteration % REPORT_EVERY == 0 or iteration == total:
@@ -170,11 +165,7 @@ def check_budget(budget: Budget) -> None:
 
 
 def _estimate(
-    trainable: Trainable,
-    sampler: Sampler,
-    seconds: float,
-    published_length: int,
-    clock: Callable[[], float],
+    trainable: Trainable, sampler: Sampler, seconds: float, published_length: int, clock: Callable[[], float]
 ) -> int:
     """How many iterations fit into so many seconds, one at least, from a few steps that change nothing."""
     trainable.begin(Timeline(published_length, published_length))
@@ -187,18 +178,6 @@ def _estimate(
     # The first step pays for lazy initialisation; the median of the rest is robust to an outlier.
     typical = sorted(durations[1:])[TIMED_STEPS // 2]
     return max(1, int(seconds / max(typical * COST_GROWTH, 1e-6)))
-
-
-def _check_finite(loss: Tensor, iteration: int, folder: Path) -> None:
-    value = loss.item()
-    if not math.isfinite(value):
-        raise InputError(
-            folder,
-            f"iteration {iteration}",
-            "a finite loss",
-            str(value),
-            "Training diverged; check the tracking (NaN?) or lower the learning rates.",
-        )
 
 
 class TrainingImages:
@@ -236,22 +215,18 @@ class TrainingImages:
         key = self._keys[index]
         image = self._clip.image(key)
         camera = self._clip.cameras[key.camera]
-        expected = (camera.height, camera.width, 3)
-        if image.shape != expected or image.dtype != np.uint8:
-            raise InputError(
-                str(key), "image", f"uint8 of shape {expected}", f"{image.dtype} of shape {image.shape}"
-            )
+        image = _checked(key, "image", image, (camera.height, camera.width, 3))
         if self._masks:
-            image = np.dstack([image, self._mask(key, expected[:2])])
+            image = np.dstack([image, _checked(key, "mask", self._clip.mask(key), image.shape[:2])])
         # A clip's images may be read-only and shared; torch wants an array it may write to.
         return torch.from_numpy(np.array(image, copy=True))
 
-    def _mask(self, key: FrameKey, expected: tuple[int, int]) -> ByteArray:
-        mask = self._clip.mask(key)
-        if mask is None or mask.shape != expected or mask.dtype != np.uint8:
-            found = "none" if mask is None else f"{mask.dtype} of shape {mask.shape}"
-            raise InputError(str(key), "mask", f"uint8 of shape {expected}", found)
-        return mask
+
+def _checked(key: FrameKey, name: str, pixels: ByteArray | None, shape: tuple[int, ...]) -> ByteArray:
+    if pixels is None or pixels.shape != shape or pixels.dtype != np.uint8:
+        found = "none" if pixels is None else f"{pixels.dtype} of shape {pixels.shape}"
+        raise InputError(str(key), name, f"uint8 of shape {shape}", found)
+    return pixels
 
 
 def recomposited(image: Tensor, coverage: Tensor, recorded_on: Tensor, background: Tensor) -> Tensor:
@@ -261,19 +236,14 @@ def recomposited(image: Tensor, coverage: Tensor, recorded_on: Tensor, backgroun
 
 def check_training_split(clip: Clip) -> None:
     """Raise `InputError` unless the clip has training frames, all with a pose of its head model and a camera."""
-    keys = clip.splits.get("train", ())
-    if not keys:
-        raise InputError(f"clip of {clip.subject}", "splits[train]", "at least one frame", "none")
-    for key in keys:
+    where, version = f"clip of {clip.subject}", clip.head.version
+    if not clip.splits.get("train"):
+        raise InputError(where, "splits[train]", "at least one frame", "none")
+    for key in clip.splits["train"]:
         if key.camera not in clip.cameras:
-            raise InputError(f"clip of {clip.subject}", str(key), "a known camera", repr(key.camera))
+            raise InputError(where, str(key), "a known camera", repr(key.camera))
         pose = clip.poses.get(key.timestep)
         if pose is None:
-            raise InputError(f"clip of {clip.subject}", str(key), "a tracked pose", "none")
-        if pose.head_model != clip.head.version:
-            raise InputError(
-                f"clip of {clip.subject}",
-                f"poses[{key.timestep}].head_model",
-                repr(clip.head.version),
-                repr(pose.head_model),
-            )
+            raise InputError(where, str(key), "a tracked pose", "none")
+        if pose.head_model != version:
+            raise InputError(where, f"poses[{key.timestep}].head_model", repr(version), repr(pose.head_model))

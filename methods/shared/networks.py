@@ -44,7 +44,7 @@ class _Color(torch.autograd.Function):
         half = directions.new_tensor(0.5)
         saved: list[Tensor] = []
         for rows in _blocks(directions):
-            inputs = torch.cat([*(f[rows] for f in features), encode_directions(directions[rows])], dim=1)
+            inputs = torch.cat([*(f[rows] for f in features), encode(directions[rows])], dim=1)
             hidden = (inputs @ first.t()).relu_()
             colors[rows] = torch.addmm(half, hidden, last.t(), alpha=C0).relu_()
             if keep:
@@ -122,7 +122,7 @@ def _relu_adjoint(gradient: Tensor, value: Tensor) -> Tensor:
 
 
 def _encoding_adjoint(encoded: Tensor, gradient: Tensor) -> Tensor:
-    """Gradient by directions, (n, 3), of `encode_directions` from its (n, 27) values and their gradient."""
+    """Gradient by directions, (n, 3), of `encode` from its (n, 27) values and their gradient."""
     waves, by_waves = (values[:, 3:].reshape(-1, len(FREQUENCIES), 2, 3) for values in (encoded, gradient))
     turned = by_waves[:, :, 0] * waves[:, :, 1] - by_waves[:, :, 1] * waves[:, :, 0]
     return gradient[:, :3] + (turned * gradient.new_tensor(FREQUENCIES)[:, None]).sum(1)
@@ -209,11 +209,6 @@ def encode(values: Tensor) -> Tensor:
     angles = frequencies[:, None] * values[:, None, :]
     waves = torch.stack([torch.sin(angles), torch.cos(angles)], dim=2)
     return torch.cat([values, waves.flatten(1)], dim=1)
-
-
-def encode_directions(directions: Tensor) -> Tensor:
-    """(N, 27) positional encoding of (N, 3) unit vectors."""
-    return encode(directions)
 
 
 C0 = 0.28209479177387814

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import zlib
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -68,18 +69,15 @@ class DensifySchedule:
     def of(cls, settings: DensifiedTraining, timeline: Timeline, *, white: bool) -> DensifySchedule:
         """Fit the published schedule to a run; ``white`` says whether splats are trained on a white background."""
         long_enough = timeline.total > settings.min_reset_every
-        full = timeline.total >= settings.schedule_length
-        settle = 1 if full else settings.min_settle
+        settle = 1 if timeline.total >= settings.schedule_length else settings.min_settle
+        start = timeline.at(settings.densify_from)
         return cls(
-            start=timeline.at(settings.densify_from),
+            start=start,
             every=timeline.every(settings.densify_every, settings.min_densify_every),
             stop=min(timeline.at(settings.densify_until), timeline.total - settle + 1),
-            reset_every=None
-            if settings.reset_every is None
-            else timeline.every(settings.reset_every, settings.min_reset_every),
-            first_reset=timeline.at(settings.densify_from)
-            if settings.reset_at_start and white and long_enough
-            else None,
+            reset_every=settings.reset_every
+            and timeline.every(settings.reset_every, settings.min_reset_every),
+            first_reset=start if settings.reset_at_start and white and long_enough else None,
             prune_extent_from=timeline.at(settings.prune_extent_from),
         )
 
@@ -154,9 +152,7 @@ def balanced_weights(timestep_of_image: IntArray, class_of_timestep: dict[int, i
     So a class of expressions has the same share however often it was recorded; "3D Gaussian Head Avatars with
     Expressive Dynamic Appearances", section 3.4.
     """
-    sizes: dict[int, int] = {}
-    for label in class_of_timestep.values():
-        sizes[label] = sizes.get(label, 0) + 1
+    sizes = Counter(class_of_timestep.values())
     return np.array([1.0 / sizes[class_of_timestep[int(t)]] for t in timestep_of_image])
 
 

@@ -59,19 +59,14 @@ class SplatTrainer:
         """
         initial = {**splats, **shared}
         self.splat_names, self.extent = tuple(splats), extent
-        self._optimiser = Optimiser(
+        self.optimiser = Optimiser(
             {name: nn.Parameter(value) for name, (value, _) in initial.items()},
             {name: rate for name, (_, rate) in initial.items()},
         )
         self._rates = {name: rate for name, (_, rate) in initial.items() if name != "means"}
         self._densifier = Densifier(
-            self._settings, self._optimiser, self.splat_names, binding, face_count, extent, seed, **density
+            self._settings, self.optimiser, self.splat_names, binding, face_count, extent, seed, **density
         )
-
-    @property
-    def optimiser(self) -> Optimiser:
-        """Adam over everything trained."""
-        return self._optimiser
 
     @property
     def binding(self) -> Tensor:
@@ -98,22 +93,21 @@ class SplatTrainer:
                 self._densifier.run(iteration, schedule, face_sizes)
         if schedule.is_reset(iteration):
             self._densifier.reset_opacity()
-        rate = log_linear(
-            settings.position_lr, settings.position_lr_final, self._position_progress(iteration)
-        )
-        self._optimiser.set_learning_rate("means", rate * self.extent)
+        progress = self._position_progress(iteration)
+        rate = log_linear(settings.position_lr, settings.position_lr_final, progress)
+        self.optimiser.set_learning_rate("means", rate * self.extent)
         if settings.final_rate < 1:
             decay = log_linear(1.0, settings.final_rate, max(0.0, 2 * self._timeline.fraction(iteration) - 1))
             for name, initial in self._rates.items():
-                self._optimiser.set_learning_rate(name, decay * initial)
+                self.optimiser.set_learning_rate(name, decay * initial)
 
     def state(self) -> dict[str, Any]:
         """Parameters, moments, binding and densification statistics."""
-        return {"optimiser": self._optimiser.state(), "densifier": self._densifier.state()}
+        return {"optimiser": self.optimiser.state(), "densifier": self._densifier.state()}
 
     def load_state(self, state: dict[str, Any]) -> None:
         """Take over what `state` gave."""
-        self._optimiser.load_state(state["optimiser"])
+        self.optimiser.load_state(state["optimiser"])
         self._densifier.load_state(state["densifier"])
 
     def note(self) -> str:
@@ -122,15 +116,9 @@ class SplatTrainer:
 
     def run(self, fit: Fit) -> Outcome:
         """Train to the end of the budget; see `train`."""
-        settings = self._settings
+        length, seconds = self._settings.schedule_length, self._settings.checkpoint_every_s
         try:
-            return train(
-                self,
-                self._sampler,
-                fit,
-                published_length=settings.schedule_length,
-                checkpoint_every_s=settings.checkpoint_every_s,
-            )
+            return train(self, self._sampler, fit, published_length=length, checkpoint_every_s=seconds)
         finally:
             self.close()
 
@@ -164,9 +152,6 @@ class SplatTrainer:
         return rendering, visible
 
 
-GEOMETRY = ("means", "log_scales", "quats", "opacities")
-
-
 class ShadedSplats(NamedTuple):
     """Splats as one camera sees them at one timestep."""
 
@@ -195,13 +180,7 @@ class Appearance(Protocol):
         """Triangle frames of a training timestep."""
 
     def place(
-        self,
-        frames: Frames,
-        binding: Tensor,
-        view: View,
-        timestep: int,
-        optimiser: Optimiser,
-        iteration: int,
+        self, frames: Frames, binding: Tensor, view: View, timestep: int, optimiser: Optimiser, iteration: int
     ) -> ShadedSplats:
         """Splats in the world with their colours and opacities as this camera sees them."""
 
@@ -265,7 +244,7 @@ class BoundTraining(SplatTrainer):
 
     def loss(self, iteration: int, index: int) -> Tensor:
         """Photometric loss of one image and the regularisers of section 3.4 of GaussianAvatars."""
-        key, settings, optimiser = self.keys[index], self._settings, self._optimiser
+        key, settings, optimiser = self.keys[index], self._settings, self.optimiser
         view = self._views[key.camera]
         truth = self._images.get(iteration, index)
         frames = self._appearance.frames(key.timestep, optimiser)

@@ -49,14 +49,9 @@ def rasterize_cpu(request: Request, backend: str, threads: int | None) -> Render
         none if request.means2d_offset is None else request.means2d_offset,
         none if request.means2d_abs is None else request.means2d_abs,
         *(request.backgrounds, request.viewmats, request.Ks),
-        (
-            *(request.near, request.far, request.eps2d, request.antialiased),
-            *(request.alpha_min, request.transmittance_min),
-        ),
-        (request.height, request.width),
-        request.batched,
-        available[backend],
-        threads,
+        (request.near, request.far, request.eps2d, request.antialiased)
+        + (request.alpha_min, request.transmittance_min),
+        *((request.height, request.width), request.batched, available[backend], threads),
     )
     return request.rendering(image, alpha, lambda: radii)
 

@@ -47,10 +47,8 @@ def usable_or_warn(request: Request) -> bool:
         _warn_once("gsplat is not installed", REMEDY)
         return False
     if not _exact(request):
-        _warn_once(
-            "gsplat has no other cut-offs than the defaults of alpha_min and transmittance_min",
-            "Leave them at the defaults, or draw on the CPU.",
-        )
+        reason = "gsplat has no other cut-offs than the defaults of alpha_min and transmittance_min"
+        _warn_once(reason, "Leave them at the defaults, or draw on the CPU.")
         return False
     return True
 
@@ -64,9 +62,8 @@ def _warn_once(reason: str, remedy: str) -> None:
 def load() -> ModuleType:
     """Import gsplat. Raises `UnavailableError` where it or a GPU is missing."""
     if not torch.cuda.is_available():
-        raise UnavailableError(
-            "The renderer's backend 'cuda' needs a GPU that torch sees; there is none.", REMEDY
-        )
+        missing = "The renderer's backend 'cuda' needs a GPU that torch sees; there is none."
+        raise UnavailableError(missing, REMEDY)
     try:
         return importlib.import_module("gsplat")
     except ImportError as error:
@@ -87,10 +84,8 @@ def rasterize_cuda(request: Request) -> Rendering:
     """Render with gsplat; see `rasterize`. Gives no gradient of ``K``, as gsplat does not: refused, not dropped."""
     gsplat = load()
     if not _exact(request):
-        found = f"{request.alpha_min!r}, {request.transmittance_min!r}"
-        raise ValueError(
-            f"alpha_min, transmittance_min: expected the defaults for backend 'cuda', found {found}."
-        )
+        expected = "alpha_min, transmittance_min: expected the defaults for backend 'cuda'"
+        raise ValueError(f"{expected}, found {request.alpha_min!r}, {request.transmittance_min!r}.")
     if not supports(request):
         found = f"{request.means.dtype} on {request.means.device}"
         raise ValueError(f"means: expected torch.float32 on a CUDA device for backend 'cuda', found {found}.")
@@ -190,15 +185,7 @@ def clamp_of(gsplat: Any, device: str) -> float:
         viewmats=torch.eye(4, device=device)[None],
         Ks=torch.tensor([[[100.0, 0.0, 0.5], [0.0, 100.0, 0.5], [0.0, 0.0, 1.0]]], device=device),
         backgrounds=torch.zeros(1, 1, device=device),
-        means2d_offset=None,
-        means2d_abs=None,
         width=1,
         height=1,
-        near=0.01,
-        far=1e10,
-        eps2d=0.3,
-        antialiased=False,
-        batched=False,
-        masked=None,
     )
     return float(draw(gsplat, request).alpha[0, 0])

@@ -15,14 +15,8 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from .constants import (
-    ALPHA_MAX,
-    FRUSTUM_MARGIN,
-    QUATERNION_MIN,
-    RADIUS_MAX,
-    TILE,
-)
-from .request import Rendering, Request, View
+from .constants import ALPHA_MAX, FRUSTUM_MARGIN, QUATERNION_MIN, RADIUS_MAX, TILE
+from .request import CameraInputs, Rendering, Request
 
 CHUNK = 1024
 """Splats composited at once within a tile."""
@@ -45,7 +39,7 @@ def rasterize_reference(request: Request) -> Rendering:
     return request.rendering(request.unstacked(images), request.unstacked(alphas), lambda: radii)
 
 
-def _draw(request: Request, view: View) -> tuple[Tensor, Tensor, Tensor]:
+def _draw(request: Request, view: CameraInputs) -> tuple[Tensor, Tensor, Tensor]:
     """Image, alpha and radii of one camera."""
     with torch.no_grad():
         drawn, extents, radii = _find_drawn(request, view)
@@ -59,6 +53,7 @@ def _draw(request: Request, view: View) -> tuple[Tensor, Tensor, Tensor]:
     )
 
     rows = []
+    cut_offs = request.alpha_min, request.transmittance_min
     for top in range(0, request.height, TILE):
         bottom = min(top + TILE, request.height)
         row = []
@@ -66,13 +61,9 @@ def _draw(request: Request, view: View) -> tuple[Tensor, Tensor, Tensor]:
             right = min(left + TILE, request.width)
             touching = _touching(footprints.means.detach(), extents, left, top, right, bottom)
             pixels = _pixel_centers(left, top, right, bottom).to(request.means)
+            splats = Footprints(*(value[touching] for value in footprints))
             tile = _composite_tile(
-                Footprints(*(value[touching] for value in footprints)),
-                colors[touching],
-                absolute[touching],
-                view.background,
-                pixels,
-                (request.alpha_min, request.transmittance_min),
+                splats, colors[touching], absolute[touching], view.background, pixels, cut_offs
             )
             row.append(tile.reshape(bottom - top, right - left, -1))
         rows.append(torch.cat(row, dim=1))
@@ -97,7 +88,7 @@ def rotation_matrices(quats: Tensor) -> Tensor:
     return torch.stack(entries, dim=-1).reshape(-1, 3, 3)
 
 
-def project(request: Request, view: View, subset: Tensor) -> Footprints:
+def project(request: Request, view: CameraInputs, subset: Tensor) -> Footprints:
     """Project the splats ``subset`` (indices) of ``request`` onto the image plane of ``view``.
 
     The covariance is factored as ``Q Qᵀ + eps2d I`` with ``Q = J W R S`` (EWA Splatting, eq. 24-31: J the
@@ -119,13 +110,8 @@ def project(request: Request, view: View, subset: Tensor) -> Footprints:
     slope_x = torch.clamp(x / z, min=-cx / fx - margin_x, max=(request.width - cx) / fx + margin_x)
     slope_y = torch.clamp(y / z, min=-cy / fy - margin_y, max=(request.height - cy) / fy + margin_y)
     zero = torch.zeros_like(z)
-    jacobian = torch.stack(
-        [
-            torch.stack([fx / z, zero, -fx * slope_x / z], -1),
-            torch.stack([zero, fy / z, -fy * slope_y / z], -1),
-        ],
-        dim=-2,
-    )
+    rows = (fx / z, zero, -fx * slope_x / z), (zero, fy / z, -fy * slope_y / z)
+    jacobian = torch.stack([torch.stack(row, -1) for row in rows], dim=-2)
 
     axes = rotation_matrices(request.quats[subset]) * request.scales[subset][:, None, :]
     q0, q1 = (jacobian @ rotation @ axes).unbind(-2)
@@ -139,7 +125,7 @@ def project(request: Request, view: View, subset: Tensor) -> Footprints:
     return Footprints(means, torch.stack([xx + eps, xy, yy + eps], dim=-1), determinants, z, opacities)
 
 
-def _find_drawn(request: Request, view: View) -> tuple[Tensor, Tensor, Tensor]:
+def _find_drawn(request: Request, view: CameraInputs) -> tuple[Tensor, Tensor, Tensor]:
     """Indices (M,) of the splats to draw, half sizes (M, 2) of their bounding boxes, and radii (N,) of all splats.
 
     Conditions are stated positively, so that a NaN anywhere culls.
@@ -173,7 +159,7 @@ def published_radii(request: Request) -> Tensor:
     return radii
 
 
-def _in_depth(request: Request, view: View) -> Tensor:
+def _in_depth(request: Request, view: CameraInputs) -> Tensor:
     """Indices (M,) of the splats between the near and the far plane."""
     depths = request.means @ view.viewmat[2, :3] + view.viewmat[2, 3]
     return ((depths > request.near) & (depths < request.far)).nonzero().squeeze(-1)

@@ -42,7 +42,7 @@ class Rendering:
         return self.find_radii()
 
 
-class View(NamedTuple):
+class CameraInputs(NamedTuple):
     """What a request asks of one camera."""
 
     viewmat: Tensor  # (4, 4)
@@ -65,22 +65,22 @@ class Request:
     viewmats: Tensor  # (V, 4, 4)
     Ks: Tensor  # (V, 3, 3)
     backgrounds: Tensor  # (V, C)
-    means2d_offset: Tensor | None  # (V, N, 2)
-    means2d_abs: Tensor | None  # (V, N, 2)
     width: int
     height: int
-    near: float
-    far: float
-    eps2d: float
-    antialiased: bool
-    batched: bool
-    masked: Tensor | None  # (N,) bool, splats to leave out; None for none
+    means2d_offset: Tensor | None = None  # (V, N, 2)
+    means2d_abs: Tensor | None = None  # (V, N, 2)
+    near: float = 0.01
+    far: float = 1e10
+    eps2d: float = 0.3
+    antialiased: bool = False
+    batched: bool = False
+    masked: Tensor | None = None  # (N,) bool, splats to leave out; None for none
     alpha_min: float = ALPHA_MIN
     transmittance_min: float = TRANSMITTANCE_MIN
 
-    def view(self, index: int) -> View:
+    def view(self, index: int) -> CameraInputs:
         """The part of the request that differs by camera."""
-        return View(
+        return CameraInputs(
             self.viewmats[index],
             self.Ks[index],
             self.backgrounds[index],
@@ -136,10 +136,7 @@ def make_request(
     if means.dtype not in (torch.float32, torch.float64):
         raise _error("means", "dtype float32 or float64", str(means.dtype))
 
-    cameras = {
-        "viewmat": _as_like("viewmat", viewmat, (4, 4), means),
-        "K": _as_like("K", K, (3, 3), means),
-    }
+    cameras = {"viewmat": _as_like("viewmat", viewmat, (4, 4), means), "K": _as_like("K", K, (3, 3), means)}
     batched, views = _count_views(cameras)
     count = len(means) if means.ndim else 0
     channels = colors.shape[-1] if colors.ndim in (2, 3) else 0
@@ -155,13 +152,11 @@ def make_request(
     for name, value in tensors.items():
         _check_like(name, value, shapes[name], means)
     if not 1 <= channels <= CHANNELS_MAX:
-        raise _error(
-            "colors", f"shape (N, C) with C from 1 to {CHANNELS_MAX}", f"shape {tuple(colors.shape)}"
-        )
+        expected = f"shape (N, C) with C from 1 to {CHANNELS_MAX}"
+        raise _error("colors", expected, f"shape {tuple(colors.shape)}")
 
-    over = _as_like(
-        "background", means.new_zeros(channels) if background is None else background, (channels,), means
-    )
+    background = means.new_zeros(channels) if background is None else background
+    over = _as_like("background", background, (channels,), means)
     if over.ndim == 2 and (not batched or len(over) != views):
         shape = f"({views}, {channels})" if batched else f"({channels},)"
         raise _error("background", f"shape {shape}", f"shape {tuple(over.shape)}")
@@ -190,9 +185,7 @@ def make_request(
         focals = cameras["K"].diagonal(dim1=-2, dim2=-1)[..., :2]
         _check_range("K", focals, "focal lengths > 0", _SMALLEST, math.inf)
     return Request(
-        **{name: tensors[name] for name in splats},
-        means2d_offset=_leading(tensors.get("means2d_offset"), batched),
-        means2d_abs=_leading(tensors.get("means2d_abs"), batched),
+        **{name: tensors[name] if name in splats or batched else tensors[name][None] for name in tensors},
         viewmats=cameras["viewmat"].expand(views, 4, 4),
         Ks=cameras["K"].expand(views, 3, 3),
         backgrounds=over.expand(views, channels),
@@ -220,10 +213,6 @@ def _count_views(cameras: dict[str, Tensor]) -> tuple[bool, int]:
     return bool(counts), views
 
 
-def _leading(value: Tensor | None, batched: bool) -> Tensor | None:
-    return value if value is None or batched else value[None]
-
-
 def _mask(tensors: dict[str, Tensor]) -> tuple[dict[str, Tensor], Tensor | None]:
     """Make splats with any value that is not finite invisible: zeros, and so no opacity and no gradient."""
     count = len(tensors["means"])
@@ -243,10 +232,9 @@ def _mask(tensors: dict[str, Tensor]) -> tuple[dict[str, Tensor], Tensor | None]
 def _check_like(name: str, value: Tensor, shape: tuple[int, ...], means: Tensor) -> None:
     """Require a shape, and the dtype and device of ``means``."""
     if tuple(value.shape) != shape:
-        letters = {"colors": "(N, C), or (V, N, C) with V cameras"}.get(name, str(shape))
-        raise _error(
-            name, f"shape {letters}, with N = {len(means)} from means", f"shape {tuple(value.shape)}"
-        )
+        letters = "(N, C), or (V, N, C) with V cameras" if name == "colors" else str(shape)
+        expected = f"shape {letters}, with N = {len(means)} from means"
+        raise _error(name, expected, f"shape {tuple(value.shape)}")
     if value.dtype != means.dtype:
         raise _error(name, f"dtype {means.dtype}, as means has", str(value.dtype))
     if value.device != means.device:
