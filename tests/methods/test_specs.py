@@ -63,30 +63,28 @@ def test_runs_stored_before_a_move_or_new_name_keep_their_identity(name, expecte
     assert digest(resolve_method(SPECS[name], "paper", {}).identity())[:12] == expected
 
 
+def values(settings, *names):
+    return tuple(getattr(settings, name) for name in names)
+
+
+RATES = ("position_lr", "position_lr_final", "opacity_lr", "scale_lr", "rotation_lr")
+DIFFERENCES = [f"difference_{name}_lr" for name in ("position", "sh", "opacity", "scale", "rotation")]
+
+
 def test_paper_presets_are_the_published_values():
     for spec in (OURS, GA):
         settings = dict(spec.presets["paper"])
         assert settings.pop("budget") == {"iterations": 600_000}
         config = build(resolve(spec.config), settings, "preset")
         assert config.splats == SplatTraining(split_variant="official")
-    splats = SplatTraining()
-    rates = (
-        splats.position_lr,
-        splats.position_lr_final,
-        splats.opacity_lr,
-        splats.scale_lr,
-        splats.rotation_lr,
-    )
-    assert rates == (5e-3, 5e-5, 0.05, 0.017, 1e-3)
-    assert (splats.densify_gradient, splats.densify_extent, splats.prune_opacity) == (2e-4, 0.01, 0.005)
-    ga = GAConfig()
-    rates = (ga.sh_dc_lr, ga.sh_rest_lr, ga.expression_lr, ga.pose_lr, ga.translation_lr)
+    assert values(SplatTraining(), *RATES) == (5e-3, 5e-5, 0.05, 0.017, 1e-3)
+    limits = values(SplatTraining(), "densify_gradient", "densify_extent", "prune_opacity")
+    assert limits == (2e-4, 0.01, 0.005)
+    rates = values(GAConfig(), "sh_dc_lr", "sh_rest_lr", "expression_lr", "pose_lr", "translation_lr")
     assert rates == (0.0025, 0.000125, 1e-3, 1e-5, 1e-6)
     published = build(OursConfig, {k: v for k, v in OURS.presets["paper"].items() if k != "budget"}, "preset")
-    assert published.planes.bounds_variant == "paper"
-    rates = (published.planes.lr, published.planes.network_lr, published.lines.lr, published.lines.network_lr)
-    assert rates == (2e-3, 1e-4, 2e-3, 1e-4)
-    assert published.lines.start == 60_000
+    assert values(published.planes, "bounds_variant", "lr", "network_lr") == ("paper", 2e-3, 1e-4)
+    assert values(published.lines, "start", "lr", "network_lr") == (60_000, 2e-3, 1e-4)
 
 
 def test_the_paper_preset_of_gha_is_the_published_design():
@@ -104,34 +102,13 @@ def test_the_paper_preset_of_gbs_is_the_paper():
     assert settings.pop("budget") == {"iterations": 40_000}
     config = build(GBSConfig, settings, "preset")
     assert config == GBSConfig()
-    assert (config.samples, config.teeth_samples, config.expressions, config.sh_degree) == (
-        50_000,
-        5_000,
-        50,
-        3,
-    )
+    sizes = values(config, "samples", "teeth_samples", "expressions", "sh_degree")
+    assert sizes == (50_000, 5_000, 50, 3)
     splats = config.splats
-    rates = (
-        splats.position_lr,
-        splats.position_lr_final,
-        splats.opacity_lr,
-        splats.scale_lr,
-        splats.rotation_lr,
-    )
-    assert rates == (1.6e-4, 1.6e-6, 0.05, 0.005, 0.001)
-    differences = (
-        config.difference_position_lr,
-        config.difference_sh_lr,
-        config.difference_opacity_lr,
-        config.difference_scale_lr,
-        config.difference_rotation_lr,
-    )
-    assert differences == (3.2e-7, 1.25e-3, 5e-5, 5e-4, 1e-4)
-    assert (splats.densify_gradient, config.teeth_densify_gradient, splats.prune_opacity) == (
-        1e-3,
-        2e-4,
-        0.005,
-    )
+    assert values(splats, *RATES) == (1.6e-4, 1.6e-6, 0.05, 0.005, 0.001)
+    assert values(config, *DIFFERENCES) == (3.2e-7, 1.25e-3, 5e-5, 5e-4, 1e-4)
+    assert values(splats, "densify_gradient", "prune_opacity") == (1e-3, 0.005)
+    assert config.teeth_densify_gradient == 2e-4
     schedule = DensifySchedule.of(splats, Timeline(40_000, 40_000), white=True)
     rounds = [iteration for iteration in range(1, 40_001) if schedule.is_round(iteration)]
     assert rounds == list(range(600, 15_000, 100))
@@ -145,6 +122,7 @@ def test_the_paper_preset_of_gbs_is_the_paper():
         (SplatTraining, {"initial_opacity": 1.0}),
         (SplatTraining, {"ssim_weight": 1.5}),
         (SplatTraining, {"max_splats": 0}),
+        (SplatTraining, {"final_rate": 0.0}),
         (GAConfig, {"sh_degree": 4}),
         (GHAConfig, {"channels": 33}),
         (GHAConfig, {"mesh_fraction": 1.0}),
@@ -158,6 +136,8 @@ def test_the_paper_preset_of_gbs_is_the_paper():
         (GBSConfig, {"mask_floor_mm": 6.0}),
         (Planes, {"resolution": 1}),
         (Lines, {"expressions": -1}),
+        (Lines, {"dynamic": ()}),
+        (Lines, {"dynamic": ("opacity", "opacity")}),
         (Capacity, {"tolerance": 0.0}),
         (Capacity, {"detail": 0.0}),
         (OuterLayers, {"count": -1}),

@@ -21,17 +21,10 @@ def trained(tmp_path_factory):
     """Capture and folder of an avatar."""
     root = tmp_path_factory.mktemp("compact")
     capture = write_tiny_capture(root / "capture").union
-    config = changed(
-        SMALL, splats=SplatTraining(min_settle=4), penalty={"weight": 0.0}, sampling={"balanced": False}
-    )
-    Ours(config).fit(
-        read_capture(capture),
-        root / "avatar",
-        Budget(iterations=30),
-        device="cpu",
-        seed=0,
-        progress=no_progress,
-    )
+    settings = {"penalty": {"weight": 0.0}, "sampling": {"balanced": False}}
+    method = Ours(changed(SMALL, splats=SplatTraining(min_settle=4), **settings))
+    clip, budget = read_capture(capture), Budget(iterations=30)
+    method.fit(clip, root / "avatar", budget, device="cpu", seed=0, progress=no_progress)
     return capture, root / "avatar"
 
 

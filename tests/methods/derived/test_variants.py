@@ -13,8 +13,7 @@ from headbench.methods.ga.method import GAAvatar
 from headbench.methods.ours.avatar import OursAvatar
 from headbench.methods.shared.config import SplatTraining
 
-from ..ours.toy import SMALL, changed
-from ..stored_toy import store
+from ..ours.toy import SMALL, changed, store
 
 
 @pytest.fixture(scope="module")
@@ -60,14 +59,14 @@ def test_recipes_have_names_of_their_own():
 @pytest.mark.parametrize("kind", ["ga", "ours"])
 def test_every_variant_is_read_back_from_files_of_its_own_that_are_smaller(kind, request, clip, tmp_path):
     folder = request.getfixturevalue(kind)
-    derive, read = {
-        "ga": (ga_variants.variants, GAAvatar.read),
-        "ours": (ours_variants.variants, OursAvatar.read),
+    derive, read, recipes = {
+        "ga": (ga_variants.variants, GAAvatar.read, GA),
+        "ours": (ours_variants.variants, OursAvatar.read, OURS),
     }[kind]
     whole = read(folder, "cpu")
     expected = picture(whole, clip)
     variants = by_name(derive, folder, clip)
-    assert set(variants) == {recipe.name for recipe in {"ga": GA, "ours": OURS}[kind]}
+    assert set(variants) == {recipe.name for recipe in recipes}
     quality = {}
     for name, variant in variants.items():
         avatar = variant.make(tmp_path / name)
@@ -92,9 +91,8 @@ def test_pruning_keeps_what_contributes(ga, clip, tmp_path):
     rest = {name: value[others] for name, value in whole.splat_tensors.items()}
     other = GAAvatar([], whole.mesh, whole.subject, rest, whole.binding[others], whole.refined, "cpu")
     assert len(half.binding) == round(0.5 * len(whole.binding))
-    assert (
-        psnr(picture(half, clip), picture(whole, clip)) > psnr(picture(other, clip), picture(whole, clip)) + 3
-    )
+    half, other = (psnr(picture(avatar, clip), picture(whole, clip)) for avatar in (half, other))
+    assert half > other + 3
 
 
 def test_a_lower_degree_is_the_whole_avatar_with_zeros_above(ga, clip, tmp_path):

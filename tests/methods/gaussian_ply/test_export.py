@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from safetensors import safe_open
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 from scipy.special import sph_harm_y
 
 from headbench.bench.contracts import Budget, no_progress
@@ -16,7 +16,8 @@ from headbench.datasets.ga import reader
 from headbench.datasets.ga.reader import read_capture
 from headbench.methods.ga.config import GAConfig
 from headbench.methods.ga.method import GA
-from headbench.methods.gaussian_ply.command import ExportPlySettings, export_ply, neutral_pose
+from headbench.methods.gaussian_ply.command import ExportPlySettings, export_ply
+from headbench.methods.gaussian_ply.files import neutral_pose
 from headbench.methods.gaussian_ply.harmonics import BEHIND, fit_harmonics, sphere
 from headbench.methods.gbs.config import GBSConfig
 from headbench.methods.gbs.method import GBS
@@ -26,8 +27,7 @@ from headbench.methods.shared.rendering import view_of
 from headbench.methods.splats import rasterize
 
 from ...datasets.tiny_capture import write_tiny_capture
-from ..ours.toy import SMALL
-from ..stored_toy import store
+from ..ours.toy import SMALL, store
 
 NAMES = [
     *("x", "y", "z", "nx", "ny", "nz"),
@@ -47,6 +47,12 @@ def parse(path):
     assert lines[3:] == [f"property float {name}" for name in NAMES] + [""]
     assert len(body) == count * 248
     return np.array([struct.unpack("<62f", body[248 * i : 248 * (i + 1)]) for i in range(count)])
+
+
+def exported(folder, out, **options):
+    """The table written, and the findings."""
+    findings = export_ply(ExportPlySettings(str(folder), out=str(out), **options))
+    return parse(out), findings
 
 
 def viewed(table, camera):
@@ -74,8 +80,7 @@ def soft(values):
 def test_a_viewer_shows_what_the_avatar_shows(color, clip, tmp_path):
     config = replace(SMALL, color=color, sh_degree=2)
     folder = store(clip, tmp_path / "avatar", config, (lambda _: None) if color == "sh" else soft)
-    findings = export_ply(ExportPlySettings(str(folder), out=str(tmp_path / "x.ply"), directions=128))
-    table = parse(tmp_path / "x.ply")
+    table, findings = exported(folder, tmp_path / "x.ply", directions=128)
     avatar, pose = OursAvatar.read(folder, "cpu"), neutral_pose(clip.head)
     splats = avatar.splats(pose)
     assert findings.data["splats"] == len(table) == len(splats.means)
@@ -93,16 +98,10 @@ def test_a_viewer_shows_what_the_avatar_shows(color, clip, tmp_path):
 def test_the_pose_of_a_capture_is_written(tmp_path):
     capture = write_tiny_capture(tmp_path / "capture").union
     clip = read_capture(capture)
-    avatar = GA(GAConfig(refine_tracking=False)).fit(
-        clip, tmp_path / "ga", Budget(iterations=3), device="cpu", seed=0, progress=no_progress
-    )
+    folder, options = tmp_path / "ga", {"device": "cpu", "seed": 0, "progress": no_progress}
+    avatar = GA(GAConfig(refine_tracking=False)).fit(clip, folder, Budget(iterations=3), **options)
     timestep = clip.timesteps("self_reenactment")[0]
-    export_ply(
-        ExportPlySettings(
-            str(tmp_path / "ga"), out=str(tmp_path / "x.ply"), capture=str(capture), timestep=timestep
-        )
-    )
-    table = parse(tmp_path / "x.ply")
+    table, _ = exported(folder, tmp_path / "x.ply", capture=str(capture), timestep=timestep)
     np.testing.assert_array_equal(table[:, :3], avatar.splats(clip.poses[timestep]).means)
     camera = next(iter(clip.cameras.values()))
     difference = viewed(table, camera).clip(0, 1) - avatar.render(camera, clip.poses[timestep]).rgb
@@ -120,10 +119,8 @@ def test_a_viewer_shows_a_blendshape_avatar_in_a_turned_pose(tmp_path):
     method.fit(clip, tmp_path / "gbs", Budget(iterations=1), device="cpu", seed=0, progress=no_progress)
     file = tmp_path / "gbs" / "avatar.safetensors"
     with safe_open(file, "pt") as stream:
-        metadata, tensors = (
-            stream.metadata(),
-            {name: stream.get_tensor(name) for name in sorted(stream.keys())},
-        )
+        metadata = stream.metadata()
+    tensors = load_file(file)
     tensors["splats"][:, 11:] = 0.3 * torch.randn(tensors["splats"][:, 11:].shape)
     save_file(tensors, file, metadata)
     avatar = GBS(method.config).load(tmp_path / "gbs", device="cpu")
@@ -132,12 +129,7 @@ def test_a_viewer_shows_a_blendshape_avatar_in_a_turned_pose(tmp_path):
     fixed = {"poses": {**clip.poses, timestep: pose}}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(reader, "read_capture", lambda *_, **__: replace(clip, **fixed))
-        export_ply(
-            ExportPlySettings(
-                str(tmp_path / "gbs"), out=str(tmp_path / "x.ply"), capture=str(capture), timestep=timestep
-            )
-        )
-    table = parse(tmp_path / "x.ply")
+        table, _ = exported(tmp_path / "gbs", tmp_path / "x.ply", capture=str(capture), timestep=timestep)
     assert np.abs(table[:, 9:54]).max() > 0.1
     for camera in clip.cameras.values():
         shown = viewed(table, camera).clip(0, 1)
@@ -200,9 +192,7 @@ def test_directions_from_behind_hardly_count():
     fit = fit_harmonics(radiance, normals, directions)
     front = 0.5 + sh_basis(-normals, 3) @ torch.cat([fit.dc[:, :, None], fit.rest], dim=2)[0].t()
     assert abs(float(front[0, 0]) - 0.7) < 0.03
-    even = fit_harmonics(
-        radiance, torch.zeros(1, 3), directions
-    )  # no direction is in front: all weigh the same
+    even = fit_harmonics(radiance, torch.zeros(1, 3), directions)  # none is in front: all weigh the same
     assert fit.residual[0] < 0.6 * even.residual[0]
     assert BEHIND < 0.1
 

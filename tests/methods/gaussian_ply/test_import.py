@@ -25,12 +25,8 @@ def ga_file(path, rows, rest=45, binding="float"):
     names += [f"f_rest_{i}" for i in range(rest)]
     names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
-    header += [
-        *(f"property float {name}" for name in names),
-        f"property {binding} binding_0",
-        "end_header",
-        "",
-    ]
+    header += [f"property float {name}" for name in names]
+    header += [f"property {binding} binding_0", "end_header", ""]
     body = b""
     for row in rows:
         body += struct.pack(f"<{len(names)}f", *(row.get(name, 0.0) for name in names))
@@ -40,15 +36,8 @@ def ga_file(path, rows, rest=45, binding="float"):
 
 
 ROWS = [
-    {
-        "x": 0.25,
-        "f_dc_0": 1.0,
-        "f_rest_0": 0.5,
-        "opacity": 2.0,
-        "scale_0": -1.0,
-        "rot_0": 2.0,
-        "binding_0": 3,
-    },
+    {"x": 0.25, "f_dc_0": 1.0, "f_rest_0": 0.5, "opacity": 2.0, "scale_0": -1.0, "rot_0": 2.0}
+    | {"binding_0": 3},
     {"z": -0.5, "f_dc_2": -0.5, "opacity": -1.0, "scale_2": -2.0, "rot_1": 1.0, "binding_0": 0},
 ]
 
@@ -58,7 +47,7 @@ ROWS = [
 )
 def test_a_file_made_by_hand_becomes_an_avatar(capture, tmp_path, rest, binding):
     ply = ga_file(tmp_path / "in.ply", ROWS, rest, binding)
-    findings = import_ga(ImportGASettings(str(ply), capture=str(capture), out=str(tmp_path / "out")))
+    findings = imported(capture, tmp_path / "out", ply)
     assert findings.data["splats"] == findings.data["triangles"] == 2
     clip = read_capture(capture)
     avatar = GA().load(tmp_path / "out", device="cpu")
@@ -84,31 +73,28 @@ def test_a_file_made_by_hand_becomes_an_avatar(capture, tmp_path, rest, binding)
     assert np.isfinite(avatar.render(clip.cameras[key.camera], pose).rgb).all()
 
 
-def test_harmonics_of_no_degree_are_refused(capture, tmp_path):
-    ply = ga_file(tmp_path / "in.ply", ROWS, rest=12)
-    with pytest.raises(InputError, match="f_rest"):
-        import_ga(ImportGASettings(str(ply), capture=str(capture), out=str(tmp_path / "out")))
+def imported(capture, out, ply):
+    return import_ga(ImportGASettings(str(ply), capture=str(capture), out=str(out)))
 
 
-@pytest.mark.parametrize("triangle", [-1, 10**6])
-def test_a_triangle_that_the_head_lacks_is_refused(capture, tmp_path, triangle):
-    ply = ga_file(tmp_path / "in.ply", [{**ROWS[0], "binding_0": triangle}])
-    with pytest.raises(InputError, match="binding_0"):
-        import_ga(ImportGASettings(str(ply), capture=str(capture), out=str(tmp_path / "out")))
+@pytest.mark.parametrize(
+    ("change", "rest", "says"),
+    [({}, 12, "f_rest"), ({"binding_0": -1}, 45, "binding_0"), ({"binding_0": 10**6}, 45, "binding_0")],
+)
+def test_what_is_of_no_degree_or_on_no_triangle_is_refused(capture, tmp_path, change, rest, says):
+    ply = ga_file(tmp_path / "in.ply", [{**ROWS[0], **change}], rest)
+    with pytest.raises(InputError, match=says):
+        imported(capture, tmp_path / "out", ply)
     assert not (tmp_path / "out").exists()
 
 
-def test_a_folder_in_use_is_left_alone(capture, tmp_path):
-    ply = ga_file(tmp_path / "in.ply", ROWS)
-    with pytest.raises(InputError, match="empty folder"):
-        import_ga(ImportGASettings(str(ply), capture=str(capture), out=str(tmp_path)))
-
-
-def test_an_import_goes_on_in_its_own_folder_alone(capture, tmp_path):
-    def imported(rows, name):
-        ply = ga_file(tmp_path / name, rows)
-        return import_ga(ImportGASettings(str(ply), capture=str(capture), out=str(tmp_path / "out")))
-
-    assert imported(ROWS, "one.ply") == imported(ROWS, "one.ply")  # as after a kill behind the last file
-    with pytest.raises(InputError, match="empty folder"):
-        imported([{**ROWS[0], "x": 0.5}, ROWS[1]], "other.ply")
+def test_a_folder_in_use_is_left_alone_and_an_import_goes_on_in_its_own(capture, tmp_path):
+    ply, other = (
+        ga_file(tmp_path / "in.ply", ROWS),
+        ga_file(tmp_path / "o.ply", [{**ROWS[0], "x": 0.5}, ROWS[1]]),
+    )
+    # The second as after a kill behind the last file.
+    assert imported(capture, tmp_path / "out", ply) == imported(capture, tmp_path / "out", ply)
+    for folder, file in ((tmp_path, ply), (tmp_path / "out", other)):
+        with pytest.raises(InputError, match="empty folder"):
+            imported(capture, folder, file)

@@ -22,14 +22,15 @@ def write(path, count=30, expressions=50, degree=3, difference_degree=3, share=0
         return torch.randn(*shape, generator=generator)
 
     rest = (degree + 1) ** 2 - 1
-    neutral = {
-        "means": normal(count, 3),
-        "log_scales": normal(count, 3),
-        "quats": normal(count, 4),
-        "opacities": normal(count),
-        "sh_dc": normal(count, 3),
-        "sh_rest": normal(count, 3, rest),
+    widths = {
+        "means": (3,),
+        "log_scales": (3,),
+        "quats": (4,),
+        "opacities": (),
+        "sh_dc": (3,),
+        "sh_rest": (3, rest),
     }
+    neutral = {name: normal(count, *shape) for name, shape in widths.items()}
     moved_by = torch.rand(count, expressions, generator=generator) < share
     owners, moving = moved_by.nonzero().unbind(1)
     entries = Entries.of(moved_by.sum(1), moving, torch.ones(len(owners)))
@@ -48,9 +49,8 @@ def read(path):
 @pytest.mark.parametrize(("degree", "difference_degree"), [(3, 3), (3, 0), (2, 1), (0, 0)])
 def test_everything_comes_back_to_the_bit(tmp_path, degree, difference_degree):
     path = tmp_path / AVATAR_FILE
-    neutral, points, entries, differences = write(
-        path, degree=degree, difference_degree=difference_degree, expressions=37
-    )
+    degrees = {"degree": degree, "difference_degree": difference_degree}
+    neutral, points, entries, differences = write(path, expressions=37, **degrees)
     found = read(path)
     assert found.expressions == 37
     assert set(found.neutral) == set(neutral)
@@ -82,27 +82,15 @@ def test_no_expressions_are_stored_and_read(tmp_path):
     assert found.entries.sum(found.differences, torch.zeros(0)).shape == (30, 59)
 
 
-def altered(path, change, said="50"):
-    tensors = load_file(path)
-    change(tensors)
-    save_file(tensors, path, {EXPRESSIONS: said})
-
-
-@pytest.mark.parametrize("name", MEMBERS)
-def test_no_tensor_can_be_missing_or_of_another_size(tmp_path, name):
-    path = tmp_path / "x"
-    write(path)
-    altered(path, lambda tensors: tensors.update({name: tensors[name][:-1].contiguous()}))
-    with pytest.raises(InputError, match="x"):
-        read(path)
-    altered(path, lambda tensors: tensors.pop(name))
-    with pytest.raises(InputError, match=name):
-        read(path)
+def cut(name):
+    return lambda tensors: tensors.update({name: tensors[name][:-1].contiguous()})
 
 
 @pytest.mark.parametrize(
     ("change", "says"),
     [
+        *((cut(name), "x") for name in MEMBERS),
+        *((lambda t, name=name: t.pop(name), name) for name in MEMBERS),
         (lambda t: t["splats"].__setitem__((0, 0), float("nan")), "splats"),
         (lambda t: t["differences"].__setitem__((0, 0), float("inf")), "differences"),
         (lambda t: t["triangles"].__setitem__(0, FACES), "triangles"),
@@ -112,28 +100,15 @@ def test_no_tensor_can_be_missing_or_of_another_size(tmp_path, name):
         (lambda t: t.update(splats=t["splats"][:, :-1].contiguous()), "splats"),
         (lambda t: t.update(differences=t["differences"][:, :-1].contiguous()), "differences"),
         (lambda t: t["moved_by"].__setitem__((0, 0), 255 - t["moved_by"][0, 0]), "differences"),
+        *((said, "expressions|moved_by") for said in ("", "-3", "fifty", "61", "20")),
     ],
 )
-def test_numbers_that_cannot_be_are_refused(tmp_path, change, says):
+def test_tensors_and_texts_that_cannot_be_are_refused(tmp_path, change, says):
     path = tmp_path / "x"
     write(path)
-    altered(path, change)
+    tensors = load_file(path)
+    if callable(change):
+        change(tensors)
+    save_file(tensors, path, {EXPRESSIONS: "50" if callable(change) else change})
     with pytest.raises(InputError, match=says):
-        read(path)
-
-
-@pytest.mark.parametrize("said", ["", "-3", "fifty", "61", "20"])
-def test_a_wrong_number_of_expressions_is_refused(tmp_path, said):
-    path = tmp_path / "x"
-    write(path)
-    altered(path, lambda tensors: None, said)
-    with pytest.raises(InputError, match="expressions|moved_by"):
-        read(path)
-
-
-def test_a_file_cut_short_is_an_input_error(tmp_path):
-    path = tmp_path / "x"
-    write(path)
-    path.write_bytes(path.read_bytes()[:500])
-    with pytest.raises(InputError, match="safetensors"):
         read(path)

@@ -61,6 +61,12 @@ def test_gradients_by_the_differences_are_exact():
     assert torch.autograd.gradcheck(lambda values: entries.sum(values, coefficients), (table,))
 
 
+def pose_of(rig, pose, neutral=None):
+    """Untrained splats of a rig in a pose."""
+    motions = PointMotions.of(rig.motions(rig.arguments([pose])))
+    return apply_pose(neutral or neutral_of(rig), no_differences(len(rig.rest)), motions)
+
+
 def random_points(head, count, seed=0):
     rng = np.random.default_rng(seed)
     inside = rng.dirichlet(np.ones(3), count)[:, 1:].astype(np.float32)
@@ -89,20 +95,16 @@ def test_untrained_splats_follow_the_head_models_mesh(seed, eyelids):
     """Positions: initial differences, correctives, joints, eyelids and translation, whatever the pose."""
     head = toy_head(16, eyelids=eyelids)
     rng = np.random.default_rng(seed)
-    shape, offset = (
-        rng.standard_normal(head.shape_basis.shape[2]),
-        0.001 * rng.standard_normal(head.template.shape),
-    )
+    shape = rng.standard_normal(head.shape_basis.shape[2])
+    offset = 0.001 * rng.standard_normal(head.template.shape)
     points = random_points(head, 200, seed)
     rig = Rig(head, shape, offset, points, 50, "cpu")
     pose = toy_pose(head, rng, 0, "toy")
     pose = replace(pose, eyelids=np.array([0.7, -0.4])) if eyelids else pose
-    arguments = rig.arguments([pose])
-    posed = apply_pose(neutral_of(rig), no_differences(200), PointMotions.of(rig.motions(arguments)))
+    posed = pose_of(rig, pose)
     model = HeadModel(head, dtype=torch.float64)
-    mesh = model(
-        shape=torch.from_numpy(shape), static_offset=torch.from_numpy(offset), **model.pose_arguments([pose])
-    )[0].numpy()
+    person = {"shape": torch.from_numpy(shape), "static_offset": torch.from_numpy(offset)}
+    mesh = model(**person, **model.pose_arguments([pose]))[0].numpy()
     expected = points.positions(mesh, head.faces)
     # Between corners that hang on the joints alike, skinning and interpolation commute.
     weights = head.skinning_weights[head.faces[points.triangles]]
@@ -121,20 +123,15 @@ def test_splats_turn_with_the_head_and_their_colours_with_them(head):
     still = replace(pose, rotation=np.zeros(3))
     turned = replace(pose, rotation=np.array([0.3, -0.8, 0.2]))
     center = torch.tensor([0.1, 0.2, 0.6])
-    found = []
-    for one in (still, turned):
-        motions = PointMotions.of(rig.motions(rig.arguments([one])))
-        found.append((apply_pose(neutral, no_differences(100), motions), one))
-    (before, _), (after, _) = found
+    before, after = (pose_of(rig, one, neutral) for one in (still, turned))
     turn = Rotation.from_rotvec(turned.rotation)
     model = HeadModel(head, dtype=torch.float64)
     arguments = model.pose_arguments([pose])
     root = model.joints(torch.zeros(1, 6).double(), arguments["expression"])[0, 0].numpy()
     move = root + pose.translation
     moved_center = turn.apply(center.numpy() - move) + move
-    np.testing.assert_allclose(
-        after.world.means, turn.apply(before.world.means.numpy() - move) + move, atol=1e-5
-    )
+    expected = turn.apply(before.world.means.numpy() - move) + move
+    np.testing.assert_allclose(after.world.means, expected, atol=1e-5)
     quats = [Rotation.from_quat(p.world.quats.numpy(), scalar_first=True) for p in (before, after)]
     assert ((turn * quats[0]).inv() * quats[1]).magnitude().max() < 1e-3
     one = before.colors(center, 1)
@@ -177,17 +174,16 @@ def test_an_expression_beyond_those_kept_moves_joints_alone(head):
     rest = replace(pose, rotation=np.zeros(3), neck=np.zeros(3), jaw=np.zeros(3), eyes=np.zeros(6))
     kept, other = rest.expression.copy(), rest.expression.copy()
     kept[3:] = 0
-    one, same = (
-        PointMotions.of(rig.motions(rig.arguments([replace(rest, expression=e)]))) for e in (kept, other)
-    )
+
+    def motions(expression, jaw):
+        pose = replace(rest, expression=expression, jaw=np.array([jaw, 0, 0]))
+        return PointMotions.of(rig.motions(rig.arguments([pose])))
+
+    one, same = motions(kept, 0), motions(other, 0)
     torch.testing.assert_close(one.shift, same.shift)
     # At rest joints turn nothing, so where they are does not matter.
     torch.testing.assert_close(one.offset, same.offset, atol=1e-6, rtol=0)
-    turned = replace(rest, jaw=np.array([0.3, 0, 0]))
-    opened = [
-        PointMotions.of(rig.motions(rig.arguments([replace(turned, expression=e)]))) for e in (kept, other)
-    ]
-    assert (opened[0].offset - opened[1].offset).abs().max() > 1e-5
+    assert (motions(kept, 0.3).offset - motions(other, 0.3).offset).abs().max() > 1e-5
 
 
 MILLIMETRE = 1e-3
@@ -217,9 +213,7 @@ def test_rotations_are_those_of_the_polar_decomposition(seed):
 
 
 def test_matrices_that_are_no_rotations_stay_finite():
-    wild = torch.stack(
-        [torch.zeros(3, 3), torch.diag(torch.tensor([1.0, 1.0, 0.0])), torch.full((3, 3), 1e6)]
-    )
+    wild = torch.stack([torch.zeros(3, 3), torch.eye(3) * torch.tensor([1.0, 1, 0]), torch.full((3, 3), 1e6)])
     assert torch.isfinite(nearest_rotation(wild, 3)).all()
 
 
@@ -251,22 +245,17 @@ def test_turns_are_those_of_the_mesh_that_the_head_model_makes(head):
             corners = head.faces[face]
             gradient = frame(moved[corners]) @ np.linalg.inv(frame(neutral[corners]))
             expected = scipy.linalg.polar(gradient)[0]
-            quaternion = turns[face, :, k] + np.array([1.0, 0, 0, 0])
-            np.testing.assert_allclose(
-                quaternion_to_matrix(torch.from_numpy(quaternion)), expected, atol=1e-7
-            )
+            found = quaternion_to_matrix(torch.from_numpy(turns[face, :, k] + np.array([1.0, 0, 0, 0])))
+            np.testing.assert_allclose(found, expected, atol=1e-7)
     assert np.abs(turns).max() > 0.01
-
-
-def with_expressions(head, *fields):
-    return replace(head, expression_basis=np.stack(fields, axis=2), regions={"neck": head.regions["neck"]})
 
 
 def test_the_mask_is_the_papers_function_of_displacement(head):
     """Whole-head shifts of known length; nothing is held in place in a head without a scalp."""
     up = np.zeros_like(head.template)
     up[:, 1] = MILLIMETRE
-    shifted = with_expressions(head, 0.01 * up, 0.1 * up, 2.1 * up, 10.1 * up)
+    basis = np.stack([0.01 * up, 0.1 * up, 2.1 * up, 10.1 * up], axis=2)
+    shifted = replace(head, expression_basis=basis, regions={"neck": head.regions["neck"]})
     found = consistency_mask(shifted, head.template, 4, 0.1 * MILLIMETRE, 2.1 * MILLIMETRE)
     neck = np.isin(head.faces, head.regions["neck"])
     whole, none = ~neck.any(1), neck.all(1)

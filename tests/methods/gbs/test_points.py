@@ -28,9 +28,8 @@ def ball():
     """Vertices and outward triangles of a sphere of 0.1 m."""
     index = np.arange(600) + 0.5
     polar, around = np.arccos(1 - 2 * index / 600), np.pi * (1 + 5**0.5) * index
-    points = 0.1 * np.stack(
-        [np.cos(around) * np.sin(polar), np.sin(around) * np.sin(polar), np.cos(polar)], axis=1
-    )
+    flat = np.stack([np.cos(around), np.sin(around)], axis=1) * np.sin(polar)[:, None]
+    points = 0.1 * np.column_stack([flat, np.cos(polar)])
     return points, ConvexHull(points).simplices.astype(np.int64)
 
 
@@ -98,6 +97,9 @@ def test_teeth_hang_on_neck_and_jaw_and_know_no_expression(head):
         assert not mouth.expression_basis[corners].any()
     again = with_mouth(mouth, GBSConfig())
     assert len(again.template) == len(mouth.template)
+    offset = padded_offset(np.ones_like(head.template), len(mouth.template))
+    assert (offset[: len(head.template)] == 1).all()
+    assert not offset[len(head.template) :].any()
 
 
 def test_a_head_without_lips_stays_without_teeth(head, caplog):
@@ -109,20 +111,11 @@ def test_a_head_without_lips_stays_without_teeth(head, caplog):
 
 
 def test_the_official_variants_of_the_mouth(head):
-    plain, odd = (
-        with_mouth(head, GBSConfig()),
-        with_mouth(head, GBSConfig(correctives_variant="official", lower_teeth_variant="official")),
-    )
+    official = GBSConfig(correctives_variant="official", lower_teeth_variant="official")
+    plain, odd = with_mouth(head, GBSConfig()), with_mouth(head, official)
     lower = odd.regions["teeth_lower"]
     np.testing.assert_allclose(odd.skinning_weights[lower[0]], [0.0131, 0.0426, 0.9443, 0, 0])
     np.testing.assert_allclose(odd.skinning_weights.sum(1), 1, atol=1e-3)
     others = np.setdiff1d(np.arange(len(odd.template)), lower)
     np.testing.assert_array_equal(odd.skinning_weights[others], plain.skinning_weights[others])
     np.testing.assert_allclose(odd.pose_basis, 3 * plain.pose_basis)
-
-
-def test_offsets_are_zero_for_added_teeth():
-    offset = np.ones((4, 3), np.float32)
-    padded = padded_offset(offset, 6)
-    assert padded.dtype == np.float32
-    np.testing.assert_array_equal(padded, [[1, 1, 1]] * 4 + [[0, 0, 0]] * 2)

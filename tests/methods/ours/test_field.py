@@ -5,20 +5,17 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from headbench.methods.ours.config import Lines, OursConfig, Planes
+from headbench.methods.ours.config import OursConfig
 from headbench.methods.ours.field import (
-    Bounds,
     CanonicalFrames,
     canonical_directions,
+    initial_line_network,
     initial_parameters,
     line_box,
+    normalised_weight,
     plane_box,
-    plane_features,
-    position_part,
-    shade,
-    shade_directions,
 )
-from headbench.methods.shared.binding import to_world, triangle_frames
+from headbench.methods.shared.binding import triangle_frames
 
 GENERATOR = torch.Generator().manual_seed(0)
 
@@ -46,15 +43,6 @@ def test_line_bounds_are_the_mesh_itself_faces_included():
     np.testing.assert_allclose([unit.min(), unit.max()], [0, 1], atol=1e-12)
 
 
-def test_canonical_positions_are_world_positions_on_the_canonical_mesh():
-    vertices, faces = mesh()
-    frames = triangle_frames(vertices, faces)
-    binding, means = torch.tensor([0, 4, 4]), torch.randn(3, 3, dtype=torch.float64, generator=GENERATOR)
-    zeros, ones = torch.zeros(3, 3, dtype=torch.float64), torch.ones(3, 4, dtype=torch.float64)
-    expected = to_world(frames, binding, means, zeros, ones).means
-    np.testing.assert_allclose(CanonicalFrames.of(frames).positions(binding, means), expected, atol=1e-12)
-
-
 def test_canonical_directions_do_not_change_when_head_and_camera_move_together():
     vertices, faces = mesh()
     canonical = CanonicalFrames.of(triangle_frames(vertices, faces))
@@ -68,20 +56,16 @@ def test_canonical_directions_do_not_change_when_head_and_camera_move_together()
     np.testing.assert_allclose(after, still, atol=1e-12)
 
 
-def test_published_sizes():
+def test_published_sizes_and_initial_values():
     """The sizes the paper's files have."""
-    parameters = {
-        name: value for name, (value, _) in initial_parameters(OursConfig(), 80, 16, GENERATOR).items()
-    }
-    size = {name: value.numel() * 4 for name, value in parameters.items()}
-    assert sum(b for name, b in size.items() if name.startswith("plane_")) == 4_194_304
-    assert sum(b for name, b in size.items() if name.startswith("color_weight_")) == 48_128
-    assert size["lines"] == 2_359_296
-    assert sum(b for name, b in size.items() if name.startswith("line_")) == 166_408
+    initial = initial_parameters(OursConfig(), 80, 16, GENERATOR)
+    parameters = {name: value for name, (value, _) in initial.items()}
 
+    def size(start):
+        return sum(4 * value.numel() for name, value in parameters.items() if name.startswith(start))
 
-def test_initial_values():
-    parameters = {k: v for k, (v, _) in initial_parameters(OursConfig(), 80, 16, GENERATOR).items()}
+    assert [size(start) for start in ("plane_", "color_weight_", "lines")] == [4_194_304, 48_128, 2_359_296]
+    assert size("line_") == 166_408
     for name in ("plane_xy", "plane_xz", "plane_yz"):
         assert 0.099 < parameters[name].abs().max() <= 0.1
     assert not parameters["lines"].any()
@@ -89,25 +73,10 @@ def test_initial_values():
     assert parameters["color_weight_1"].abs().max() <= 128**-0.5
 
 
-def test_colour_is_the_network_on_concatenated_features_and_encoding():
-    config = OursConfig(hidden=5, planes=Planes(resolution=6, channels=(3, 2, 2)), lines=Lines(enabled=False))
-    parameters = {k: v.double() for k, (v, _) in initial_parameters(config, 0, 0, GENERATOR).items()}
-    box = Bounds(*(torch.tensor(v, dtype=torch.float64) for v in ([-1.0, -2, -1], [1.0, 1, 3])))
-    positions = torch.rand(8, 3, dtype=torch.float64, generator=GENERATOR)
-    directions = torch.nn.functional.normalize(torch.randn(8, 3, dtype=torch.float64), dim=1)
-    features = plane_features(parameters, box, positions)
-    found = shade_directions(parameters, position_part(parameters, features), directions)
-
-    unit = (2 * (positions - box.low) / (box.high - box.low) - 1).numpy()
-    sampled = []
-    for name, (a, b) in {"xy": (0, 1), "xz": (0, 2), "yz": (1, 2)}.items():
-        image = parameters[f"plane_{name}"].view(6, 6, -1).permute(2, 0, 1)[None]
-        grid = torch.from_numpy(unit[:, [a, b]])[None, None]
-        sampled.append(torch.nn.functional.grid_sample(image, grid, align_corners=True)[0, :, 0].T.numpy())
-    d = directions.numpy()
-    encoded = [d] + [f(d * 2.0**k) for k in range(4) for f in (np.sin, np.cos)]
-    hidden = np.concatenate(sampled + encoded, axis=1) @ parameters["color_weight_0"].numpy().T
-    out = np.maximum(hidden, 0) @ parameters["color_weight_1"].numpy().T
-    expected = np.maximum(0.5 + 0.28209479177387814 * out, 0)
-    np.testing.assert_allclose(found, expected, atol=1e-12)
-    np.testing.assert_allclose(shade(parameters, features, directions), expected, atol=1e-12)
+def test_the_network_starts_within_its_fan_in_and_with_gains_of_its_norms():
+    network = initial_line_network(32, 128, 1, torch.Generator().manual_seed(1))
+    direction = network["line_direction_0"]
+    assert direction.shape == (128, 192)
+    assert direction.abs().max() <= 192**-0.5
+    assert direction.abs().max() > 0.95 * 192**-0.5
+    np.testing.assert_allclose(normalised_weight(network, 0), direction, atol=1e-7)

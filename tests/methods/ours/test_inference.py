@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 import torch
 
+from headbench.bench.contracts import HeadPose
 from headbench.bench.errors import InputError
 from headbench.methods.ours.avatar import OursAvatar
-from headbench.methods.ours.field import Bounds, blend_lines, line_offsets, line_position, shade
+from headbench.methods.ours.field import Bounds, blend_lines, line_offsets, line_position
 from headbench.methods.ours.inference import LineOffsets, PlaneColors, encode_columns
-from headbench.methods.shared.networks import CPU_BLOCK, encode_directions
+from headbench.methods.shared.networks import CPU_BLOCK, encode
 from headbench.methods.shared.subject_mesh import KnownPoses, pose_key
 
-from ..stored_toy import store
-from .toy import SMALL, changed
+from .toy import SMALL, changed, store
 
 
 def directions(count, seed=0, dtype=torch.float32):
@@ -25,7 +25,7 @@ def directions(count, seed=0, dtype=torch.float32):
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 3e-6), (torch.float64, 1e-14)])
 def test_doubling_gives_the_same_waves(dtype, tolerance):
     given = torch.cat([directions(500, dtype=dtype), torch.eye(3, dtype=dtype), -torch.eye(3, dtype=dtype)])
-    exact = encode_directions(given.double())
+    exact = encode(given.double())
     np.testing.assert_allclose(encode_columns(given).t(), exact, atol=tolerance)
 
 
@@ -34,14 +34,6 @@ def planes(count=200, dtype=torch.float64):
     first, last = (torch.randn(*shape, generator=generator, dtype=dtype) for shape in ((16, 40), (3, 16)))
     features = torch.randn(count, 13, generator=generator, dtype=dtype)
     return first, last, features
-
-
-def test_colours_are_those_of_the_whole_network():
-    first, last, features = planes()
-    given = directions(200, dtype=torch.float64)
-    colors = PlaneColors(first, last, features @ first[:, :13].t())
-    expected = shade({"color_weight_0": first, "color_weight_1": last}, (features,), given)
-    np.testing.assert_allclose(colors.along(-given), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -62,10 +54,8 @@ def test_colours_are_kept_for_the_same_place_and_no_other(dtype):
 def test_offsets_are_those_of_training(clip, tmp_path):
     tensors = OursAvatar.read(store(clip, tmp_path), "cpu").field.tensors
     low, high = tensors["line_box"]
-    points = low + (high - low) * (
-        1.4 * torch.rand(15000, 3, generator=torch.Generator().manual_seed(0)) - 0.2
-    )
     generator = torch.Generator().manual_seed(4)
+    points = low + (high - low) * (1.4 * torch.rand(15000, 3, generator=generator) - 0.2)
     jaw = torch.rand(2, generator=generator)
     expression = torch.randn(len(tensors["lines"]) - 2, generator=generator)
     found = LineOffsets(tensors, points)(expression, jaw)
@@ -96,9 +86,7 @@ def test_frames_do_not_depend_on_what_was_drawn_before(case, clip, tmp_path):
     avatar = OursAvatar.read(folder, "cpu")
     cameras, poses = list(clip.cameras.values()), list(clip.poses.values())
     walk = [(0, 0), (1, 0), (1, 0), (1, 1), (0, 1), (0, 0), (2, 3), (2, 2)]
-    fresh = {
-        step: OursAvatar.read(folder, "cpu").render(cameras[step[0]], poses[step[1]]) for step in set(walk)
-    }
+    fresh = {step: OursAvatar.read(folder, "cpu").render(cameras[step[0]], poses[step[1]]) for step in walk}
     for prepared in (False, True):
         if prepared:
             assert avatar.prepare(poses[:2]) == 2
@@ -155,15 +143,7 @@ def test_known_values_are_bounded_and_computed_once():
         computed.append(pose)
         return Value()
 
-    class Pose:
-        head_model, eyelids = "m", None
-
-        def __init__(self, number):
-            self.expression = self.rotation = self.neck = self.jaw = self.eyes = self.translation = np.array(
-                [number]
-            )
-
-    poses = [Pose(number) for number in range(5)]
+    poses = [HeadPose("m", *[np.array([number])] * 6) for number in range(5)]
     known = KnownPoses(compute, 35)
     assert known.prepare([poses[0], poses[0], *poses[1:]]) == 4
     assert len(computed) == 4

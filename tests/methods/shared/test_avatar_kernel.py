@@ -14,7 +14,7 @@ from headbench.methods.splats.cpu import instruction_sets
 
 BACKENDS = list(instruction_sets()) if avatar_kernel.available() else []
 needs_kernel = pytest.mark.skipif(not BACKENDS, reason="no compiled kernel here, or an old one")
-pytestmark = [needs_kernel, pytest.mark.parametrize("backend", BACKENDS or ["cpu"])]
+backends = pytest.mark.parametrize("backend", BACKENDS or ["cpu"])
 
 COUNTS = st.sampled_from([0, 1, 3, 8, 15, 16, 17, 33, 1025])
 
@@ -38,6 +38,8 @@ def unit(vectors):
     return torch.nn.functional.normalize(vectors, dim=1)
 
 
+@needs_kernel
+@backends
 @settings(max_examples=20, deadline=None)
 @given(count=COUNTS, seed=st.integers(0, 1000))
 def test_frames_of_triangles_are_those_of_their_definition(backend, count, seed):
@@ -63,6 +65,8 @@ def test_frames_of_triangles_are_those_of_their_definition(backend, count, seed)
     np.testing.assert_allclose(found.quaternion.norm(dim=1), 1, atol=1e-6)
 
 
+@needs_kernel
+@backends
 def test_a_triangle_without_area_has_a_finite_frame(backend):
     vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
     faces = torch.tensor([[0, 1, 2], [0, 0, 0]])
@@ -76,6 +80,8 @@ def test_a_triangle_without_area_has_a_finite_frame(backend):
             avatar_kernel.triangles(vertices, torch.tensor([[0, 1, number]]), backend)
 
 
+@needs_kernel
+@backends
 @settings(max_examples=20, deadline=None)
 @given(count=COUNTS, seed=st.integers(0, 1000))
 def test_splats_are_transformed_as_defined(backend, count, seed):
@@ -89,6 +95,8 @@ def test_splats_are_transformed_as_defined(backend, count, seed):
         np.testing.assert_allclose(one, other, rtol=1e-5, atol=2e-5)
 
 
+@needs_kernel
+@backends
 @settings(max_examples=30, deadline=None)
 @given(count=COUNTS, degree=st.integers(0, 3), turned=st.booleans(), seed=st.integers(0, 1000))
 def test_harmonics_are_those_of_their_definition(backend, count, degree, turned, seed):
@@ -106,6 +114,8 @@ def test_harmonics_are_those_of_their_definition(backend, count, degree, turned,
     np.testing.assert_allclose(found, expected, atol=2e-5)
 
 
+@needs_kernel
+@backends
 @settings(max_examples=20, deadline=None)
 @given(count=COUNTS, hidden=st.sampled_from([1, 8, 16, 40, 128]), seed=st.integers(0, 1000))
 def test_the_colour_network_is_that_of_its_definition(backend, count, hidden, seed):
@@ -121,6 +131,8 @@ def test_the_colour_network_is_that_of_its_definition(backend, count, hidden, se
     np.testing.assert_allclose(found, expected, atol=3e-5)
 
 
+@needs_kernel
+@backends
 @settings(max_examples=30, deadline=None)
 @given(
     count=COUNTS,
@@ -158,6 +170,8 @@ def test_the_offset_network_is_that_of_its_definition(backend, count, units, hid
     assert (out[others] == 7).all()
 
 
+@needs_kernel
+@backends
 def test_results_do_not_depend_on_the_number_of_threads(backend):
     normal = numbers(0)
     frames, binding = mesh(normal, 40), torch.arange(5000) % 40
@@ -177,6 +191,8 @@ def test_results_do_not_depend_on_the_number_of_threads(backend):
         assert torch.equal(one, other)
 
 
+@needs_kernel
+@backends
 def test_what_would_read_beyond_an_array_is_refused(backend):
     normal = numbers(0)
     frames = mesh(normal, 4)
@@ -191,3 +207,16 @@ def test_what_would_read_beyond_an_array_is_refused(backend):
         rows = torch.tensor([[0, 2, row]], dtype=torch.int32)
         with pytest.raises(ValueError, match="fit"):
             avatar_kernel.offsets_into(*arguments, rows, torch.zeros(1, 3), *layers, backend=backend)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_known_shapes_and_others_are_transformed_as_defined(dtype):
+    """The kernel takes float32; float64 goes the way of torch."""
+    normal, binding = numbers(0), torch.arange(50) % 10
+    means, log_scales, quats = (normal(50, n).to(dtype) for n in (3, 3, 4))
+    frames = Frames(*(value.to(dtype) for value in mesh(normal, 10)))
+    carrier = avatar_kernel.WorldTransform(binding, log_scales, quats)
+    for shape in ((log_scales, quats), (log_scales + 1, quats), (log_scales, 2 * quats.flip(1))):
+        expected = to_world(frames, binding, means, *shape)
+        for found, other in zip(carrier(frames, means, *shape), expected):
+            np.testing.assert_allclose(found, other, rtol=1e-5, atol=1e-5)

@@ -1,11 +1,25 @@
-"""The networks in blocks, and weighted row sums, against torch's autograd over the plain layers."""
+"""Networks in blocks, row sums and planes against torch's own operators; spherical harmonics against scipy's."""
 
 import numpy as np
 import pytest
 import torch
+from scipy.special import sph_harm_y
+from torch.nn.functional import grid_sample
 
 from headbench.methods.shared import networks
-from headbench.methods.shared.networks import color_network, encode_directions, offset_network, sum_rows
+from headbench.methods.shared.networks import (
+    C0,
+    PAIRS,
+    coefficient_count,
+    color_network,
+    encode,
+    offset_network,
+    sample_plane,
+    sample_triplane,
+    sh_basis,
+    sh_to_rgb,
+    sum_rows,
+)
 
 POINTS, HIDDEN = 23, 6
 
@@ -27,8 +41,16 @@ def values_and_gradients(function, inputs, weight):
     return [result.detach(), *torch.autograd.grad((result * weight).sum(), leaves)]
 
 
+def check(function, definition, inputs, weight):
+    """Both give the same values and gradients, which are returned."""
+    expected = values_and_gradients(definition, inputs, weight)
+    for one, other in zip(values_and_gradients(function, inputs, weight), expected, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-11)
+    return expected
+
+
 def plain_color(first, last, directions, *features):
-    hidden = torch.relu(torch.cat([*features, encode_directions(directions)], dim=1) @ first.t())
+    hidden = torch.relu(torch.cat([*features, encode(directions)], dim=1) @ first.t())
     return torch.relu(0.5 + 0.28209479177387814 * (hidden @ last.t()))
 
 
@@ -44,23 +66,16 @@ def test_color_network_equals_autograd_over_its_layers():
     # Large weights, so that the outer ReLU cuts some colours.
     inputs = [random(HIDDEN, 36, seed=2), 4 * random(3, HIDDEN, seed=3), directions, *features]
     weight = random(POINTS, 3, seed=4)
-    expected = values_and_gradients(plain_color, inputs, weight)
-    found = values_and_gradients(lambda a, b, d, *f: color_network(a, b, f, d), inputs, weight)
+    expected = check(lambda a, b, d, *f: color_network(a, b, f, d), plain_color, inputs, weight)
     assert (expected[0] == 0).any()
     assert (expected[0] > 0).any()
-    for one, other in zip(found, expected, strict=True):
-        np.testing.assert_allclose(one, other, atol=1e-11)
 
 
 @pytest.mark.usefixtures("block")
 def test_offset_network_equals_autograd_over_its_layers():
     shapes = [(POINTS, HIDDEN), (HIDDEN,), (HIDDEN, HIDDEN), (HIDDEN,), (1, HIDDEN), (1,)]
     inputs = [random(*shape, seed=number) for number, shape in enumerate(shapes)]
-    weight = random(POINTS, 1, seed=9)
-    expected = values_and_gradients(plain_offset, inputs, weight)
-    found = values_and_gradients(offset_network, inputs, weight)
-    for one, other in zip(found, expected, strict=True):
-        np.testing.assert_allclose(one, other, atol=1e-11)
+    check(offset_network, plain_offset, inputs, random(POINTS, 1, seed=9))
 
 
 def test_no_points_give_no_values_and_zero_gradients():
@@ -81,9 +96,86 @@ def test_row_sums_equal_a_dense_product():
         spread = torch.zeros(POINTS, 9, dtype=torch.float64).scatter_add(1, rows, weights)
         return spread @ table
 
-    expected = values_and_gradients(dense, [table, weights], random(POINTS, 5, seed=3))
-    found = values_and_gradients(
-        lambda t, w: sum_rows(t, rows, w), [table, weights], random(POINTS, 5, seed=3)
+    check(lambda t, w: sum_rows(t, rows, w), dense, [table, weights], random(POINTS, 5, seed=3))
+
+
+RESOLUTION, CHANNELS = 9, 4
+
+
+def by_grid_sample(plane, coordinates):
+    image = plane.view(RESOLUTION, RESOLUTION, -1).permute(2, 0, 1)[None]
+    sampled = grid_sample(
+        image, coordinates[None, None], mode="bilinear", padding_mode="border", align_corners=True
     )
-    for one, other in zip(found, expected, strict=True):
-        np.testing.assert_allclose(one, other, atol=1e-12)
+    return sampled[0, :, 0].T
+
+
+def test_planes_are_sampled_as_by_grid_sample():
+    """Values and gradients, at coordinates inside the plane and outside."""
+    plane, coordinates = random(RESOLUTION**2, CHANNELS), 1.3 * random(40, 2, seed=1).clamp(-1, 1)
+    weight = random(40, CHANNELS, seed=2)
+    check(lambda p, c: sample_plane(p, c, RESOLUTION), by_grid_sample, [plane, coordinates], weight)
+
+
+def test_planes_read_their_own_coordinates_width_first():
+    ramp = torch.arange(RESOLUTION, dtype=torch.float64) / (RESOLUTION - 1) * 2 - 1
+    # Each plane holds (its width coordinate, its height coordinate) as two channels.
+    grid = torch.stack(torch.meshgrid(ramp, ramp, indexing="xy"), dim=-1).reshape(-1, 2)
+    points = torch.rand(6, 3, dtype=torch.float64) * 2 - 1
+    features = torch.cat(sample_triplane({name: grid for name, _, _ in PAIRS}, points, RESOLUTION), dim=1)
+    x, y, z = points.T
+    np.testing.assert_allclose(features, torch.stack([x, y, x, z, y, z], dim=1), atol=1e-12)
+
+
+def test_directions_are_encoded_with_identity_and_four_frequencies_without_pi():
+    direction = torch.tensor([[0.3, -0.5, 0.8]], dtype=torch.float64)
+    expected = [direction]
+    for frequency in (1, 2, 4, 8):
+        expected += [torch.sin(frequency * direction), torch.cos(frequency * direction)]
+    np.testing.assert_allclose(encode(direction), torch.cat(expected, dim=1))
+
+
+def real_harmonics(directions, degree):
+    """Real harmonics from scipy's complex ones, m from -l to l, with the Condon-Shortley phase in Y_l^|m|."""
+    x, y, z = directions.T
+    theta, phi = np.arccos(np.clip(z, -1, 1)), np.arctan2(y, x)
+    columns = []
+    for order in range(degree + 1):
+        for m in range(-order, order + 1):
+            value = sph_harm_y(order, abs(m), theta, phi)
+            columns.append(value.real if m == 0 else np.sqrt(2) * (value.imag if m < 0 else value.real))
+    return np.stack(columns, axis=1)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_basis_equals_scipys(degree):
+    directions = np.random.default_rng(degree).normal(size=(50, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    basis = sh_basis(torch.from_numpy(directions), degree)
+    assert basis.shape == (50, coefficient_count(degree))
+    np.testing.assert_allclose(basis, real_harmonics(directions, degree), atol=1e-12)
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_colours_are_the_clamped_sum_and_higher_coefficients_do_not_count(degree):
+    rng = np.random.default_rng(1)
+    directions = rng.normal(size=(20, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    dc, rest = rng.normal(size=(20, 3)), rng.normal(size=(20, 3, 15))
+    found = sh_to_rgb(*(torch.from_numpy(x) for x in (dc, rest, directions)), degree)
+    count = coefficient_count(degree) - 1
+    basis = real_harmonics(directions, 3)[:, 1 : 1 + count]
+    expected = 0.5 + C0 * dc + np.einsum("nck,nk->nc", rest[:, :, :count], basis)
+    np.testing.assert_allclose(found, np.maximum(expected, 0), atol=1e-12)
+
+
+def test_harmonics_have_gradients_by_directions_too():
+    rng = np.random.default_rng(2)
+    directions = torch.from_numpy(rng.normal(size=(4, 3))).requires_grad_()
+    dc = torch.from_numpy(rng.uniform(1, 2, size=(4, 3))).requires_grad_()
+    rest = torch.from_numpy(0.1 * rng.normal(size=(4, 3, 15))).requires_grad_()
+
+    def colours(dc, rest, directions):
+        return sh_to_rgb(dc, rest, torch.nn.functional.normalize(directions, dim=1), 3)
+
+    assert torch.autograd.gradcheck(colours, (dc, rest, directions))

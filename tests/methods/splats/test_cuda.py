@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import logging
+from functools import partial
 from types import SimpleNamespace
 
 import pytest
@@ -11,8 +12,9 @@ import torch
 
 from headbench.bench.errors import UnavailableError
 from headbench.methods.splats import available_backends, cpu, cuda, rasterize
-from headbench.methods.splats.rasterize import make_request
 from headbench.tests.benchmarks.splats.scenes import cloud, head_shell, relative_error
+
+from .cases import request_of
 
 slow = importlib.import_module("headbench.methods.splats.rasterize")  # the package's name is the function's
 needs_gpu = pytest.mark.skipif(not cuda.usable(), reason="needs a GPU and gsplat (extra `cuda`)")
@@ -25,22 +27,9 @@ class FakeGsplat:
         self.clamp = clamp
 
     def fully_fused_projection(
-        self,
-        means,
-        covars,
-        quats,
-        scales,
-        viewmats,
-        Ks,
-        width,
-        height,
-        *,
-        eps2d,
-        near_plane,
-        far_plane,
-        calc_compensations,
-        opacities,
-    ):
+        self, means, covars, quats, scales, viewmats, Ks, width, height, *, eps2d, near_plane, far_plane,
+        calc_compensations, opacities
+    ):  # fmt: skip
         assert covars is None
         assert opacities.shape == (len(means),)
         w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(1)
@@ -83,10 +72,8 @@ class FakeGsplat:
         centers = [torch.arange(n).to(means2d) + 0.5 for n in (height, width)]
         y, x = torch.meshgrid(*centers, indexing="ij")
         for view, (order, seen) in enumerate(zip(*lists, strict=True)):
-            light, running = (
-                torch.ones(height, width).to(means2d),
-                torch.ones(height, width, dtype=torch.bool),
-            )
+            light = torch.ones(height, width).to(means2d)
+            running = torch.ones(height, width, dtype=torch.bool)
             image = torch.zeros(height, width, colors.shape[-1]).to(means2d)
             for n in order[:seen]:
                 dx, dy = x - means2d[view, n, 0], y - means2d[view, n, 1]
@@ -109,50 +96,26 @@ def test_gsplat_is_driven_to_draw_what_the_reference_draws(antialiased):
     one, other = cloud(25, 19, 14, seed=1, size=0.1), cloud(25, 19, 14, seed=2)
     names = ("means", "quats", "scales", "opacities", "colors", "viewmat", "offset")
 
+    options = {
+        "background": one.background,
+        "near": 0.2,
+        "far": 1e3,
+        "eps2d": 0.4,
+        "antialiased": antialiased,
+    }
+
     def outcome(render):
         leaves = [value.double().requires_grad_() for value in one[:5]]
         leaves.append(torch.stack([one.viewmat, other.viewmat]).double().requires_grad_())
         leaves.append(torch.zeros(2, 25, 2, dtype=torch.float64, requires_grad=True))
-        result = render(leaves, torch.stack([one.K, other.K]), one.background)
+        Ks = torch.stack([one.K, other.K])
+        result = render(*leaves[:6], Ks, 19, 14, means2d_offset=leaves[6], **options)
         rng = torch.Generator().manual_seed(0)
         upstream = torch.randn(result.image.shape, generator=rng).double()
         return result, torch.autograd.grad((result.image, result.alpha), leaves, (upstream, upstream[..., 0]))
 
-    def through_gsplat(leaves, K, background):
-        request = make_request(
-            *leaves[:6],
-            K,
-            19,
-            14,
-            background=background,
-            near=0.2,
-            far=1e3,
-            eps2d=0.4,
-            antialiased=antialiased,
-            means2d_offset=leaves[6],
-            means2d_abs=None,
-            check_values=True,
-            mask_non_finite=False,
-        )
-        return cuda.draw(FakeGsplat(), request)
-
-    def through_reference(leaves, K, background):
-        return rasterize(
-            *leaves[:6],
-            K,
-            19,
-            14,
-            background=background,
-            near=0.2,
-            far=1e3,
-            eps2d=0.4,
-            antialiased=antialiased,
-            means2d_offset=leaves[6],
-            backend="reference",
-        )
-
-    result, gradients = outcome(through_gsplat)
-    truth, true_gradients = outcome(through_reference)
+    result, gradients = outcome(lambda *a, **o: cuda.draw(FakeGsplat(), request_of(*a, **o)))
+    truth, true_gradients = outcome(partial(rasterize, backend="reference"))
     assert torch.equal(result.radii, truth.radii), "not gsplat's own, which opacity changes"
     torch.testing.assert_close(result.image, truth.image)
     torch.testing.assert_close(result.alpha, truth.alpha)
@@ -161,20 +124,9 @@ def test_gsplat_is_driven_to_draw_what_the_reference_draws(antialiased):
 
 
 def test_absolute_gradients_are_taken_from_gsplat():
+    offset, absolute = (torch.zeros(6, 2, requires_grad=True) for _ in range(2))
     scene = cloud(6, 8, 8, seed=3, size=0.1)
-    absolute = torch.zeros(6, 2, requires_grad=True)
-    request = make_request(
-        *scene[:9],
-        background=None,
-        near=0.01,
-        far=1e10,
-        eps2d=0.3,
-        antialiased=False,
-        means2d_offset=torch.zeros(6, 2, requires_grad=True),
-        means2d_abs=absolute,
-        check_values=True,
-        mask_non_finite=False,
-    )
+    request = request_of(*scene[:9], means2d_offset=offset, means2d_abs=absolute)
     cuda.draw(FakeGsplat(), request).image.sum().backward()
     assert absolute.grad is not None
     assert (absolute.grad == 3).all()
@@ -227,12 +179,7 @@ def test_a_slow_backend_on_a_gpu_is_warned_of_once(monkeypatch, caplog, installe
 
 @pytest.mark.parametrize(
     ("device", "dtype", "warned"),
-    [
-        ("mps", torch.float32, 1),
-        ("xpu", torch.float32, 1),
-        ("xpu", torch.float64, 0),
-        ("cpu", torch.float64, 0),
-    ],
+    [("mps", torch.float32, 1), ("xpu", torch.float64, 0), ("cpu", torch.float64, 0)],
 )
 def test_float32_on_a_gpu_without_kernels_is_warned_of_once(caplog, device, dtype, warned):
     request = SimpleNamespace(means=SimpleNamespace(dtype=dtype, device=torch.device(device)))
@@ -262,22 +209,12 @@ def test_gsplat_agrees_with_the_reference_on_a_gpu(antialiased):
 
     def outcome(device, dtype, backend):
         leaves = [value.to(device, dtype).requires_grad_() for value in scene[:6]]
-        offset, absolute = (
-            torch.zeros(3000, 2, device=device, dtype=dtype, requires_grad=True) for _ in range(2)
-        )
-        result = rasterize(
-            *leaves,
-            scene.K,
-            120,
-            100,
-            background=scene.background,
-            antialiased=antialiased,
-            means2d_offset=offset,
-            means2d_abs=absolute,
-            backend=backend,
-        )
-        result.image.backward(upstream.to(device, dtype))
-        return result.image.detach().cpu().double(), [leaf.grad.cpu() for leaf in (*leaves, offset, absolute)]
+        leaves += [torch.zeros(3000, 2, device=device, dtype=dtype, requires_grad=True) for _ in range(2)]
+        options = {"means2d_offset": leaves[6], "means2d_abs": leaves[7], "antialiased": antialiased}
+        view = scene.K, 120, 100
+        image = rasterize(*leaves[:6], *view, background=scene.background, backend=backend, **options).image
+        image.backward(upstream.to(device, dtype))
+        return image.detach().cpu().double(), [leaf.grad.cpu() for leaf in leaves]
 
     image, gradients = outcome("cuda", torch.float32, "cuda")
     truth, true_gradients = outcome("cpu", torch.float64, "reference")

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import pytest
-import torch
 
-from headbench.methods.splats import available_backends, cuda, rasterize
-from headbench.methods.splats.rasterize import make_request
-from headbench.tests.benchmarks.splats.scenes import Scene, cloud, relative_error, render_with_gradients
+from headbench.methods.splats import cuda, rasterize
+from headbench.tests.benchmarks.splats.scenes import Scene, cloud
 
+from .cases import backends, check_kernel, kernels, request_of
 from .dense import render_dense
 
 CUT_OFFS = [
@@ -25,7 +24,7 @@ def thick() -> Scene:
 
 
 @cut_offs
-@pytest.mark.parametrize("backend", available_backends())
+@backends
 def test_images_are_those_of_the_definition(backend, options):
     scene = thick()
     truth = render_dense(scene, **options)
@@ -36,15 +35,9 @@ def test_images_are_those_of_the_definition(backend, options):
 
 
 @cut_offs
-@pytest.mark.parametrize("kernel", [name for name in available_backends() if name.startswith("cpu-")])
+@kernels
 def test_gradients_agree_with_the_reference(kernel, options):
-    scene = thick()
-    safe = render_dense(scene, **options).safe
-    truth = render_with_gradients(scene, torch.float64, weights=safe.double(), backend="reference", **options)
-    result = render_with_gradients(scene, torch.float32, weights=safe.float(), backend=kernel, **options)
-    for name, gradient in truth.gradients.items():
-        assert relative_error(result.gradients[name], gradient) < 1e-4, name
-    assert ((result.rendering.radii - truth.rendering.radii).abs() <= 1).all()
+    check_kernel(thick(), kernel, 0.0, 1.0, **options)
 
 
 def test_splats_fainter_than_the_cut_off_are_not_drawn():
@@ -59,13 +52,7 @@ def test_splats_fainter_than_the_cut_off_are_not_drawn():
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [
-        ("alpha_min", 0.0),
-        ("alpha_min", 1.0),
-        ("alpha_min", float("nan")),
-        ("transmittance_min", 0.0),
-        ("transmittance_min", 1.0),
-    ],
+    [("alpha_min", v) for v in (0.0, 1.0, float("nan"))] + [("transmittance_min", v) for v in (0.0, 1.0)],
 )
 def test_cut_offs_that_make_no_sense_are_refused(name, value):
     with pytest.raises(ValueError, match=f"{name}: expected a number from"):
@@ -73,17 +60,7 @@ def test_cut_offs_that_make_no_sense_are_refused(name, value):
 
 
 def test_cuda_refuses_what_gsplat_cannot_do(monkeypatch):
-    scene = cloud(5, 8, 8)
-    common = {"near": 0.01, "far": 1e10, "eps2d": 0.3, "antialiased": False, "means2d_offset": None}
-    request = make_request(
-        *scene[:9],
-        background=None,
-        means2d_abs=None,
-        check_values=True,
-        mask_non_finite=False,
-        alpha_min=0.1,
-        **common,
-    )
+    request = request_of(*cloud(5, 8, 8)[:9], alpha_min=0.1)
     monkeypatch.setattr(cuda, "load", lambda: None)
     with pytest.raises(ValueError, match=r"alpha_min.*backend 'cuda'.*0\.1"):
         cuda.rasterize_cuda(request)

@@ -12,53 +12,59 @@ from headbench.bench.native.loader import Kernel
 from headbench.methods.splats import available_backends, cpu, rasterize
 from headbench.tests.benchmarks.splats.scenes import (
     DIFFERENTIABLE,
+    Scene,
     cloud,
     relative_error,
     render_with_gradients,
 )
 
-BAD = {
-    "means": [
-        (torch.zeros(5, 2), r"means: expected shape \(5, 3\)"),
-        (torch.zeros(5, 3, dtype=torch.int64), "means: .*int64"),
-    ],
-    "quats": [(torch.zeros(4, 4), r"quats: expected shape \(5, 4\).*found shape \(4, 4\)")],
-    "scales": [(torch.zeros(5, 3, dtype=torch.float64), "scales: expected dtype torch.float32.*float64")],
-    "opacities": [
-        (torch.zeros(5, 1), r"opacities: expected shape \(5,\)"),
-        ([0.0] * 5, "opacities: .*torch tensor.*list"),
-    ],
-    "colors": [
-        (torch.zeros(5), "colors"),
-        (torch.zeros(5, 33), "colors: .*1 to 32"),
-        (torch.zeros(5, 0), "colors"),
-    ],
-    "viewmat": [(torch.eye(3), r"viewmat: expected shape \(4, 4\)")],
-    "K": [(torch.eye(4), r"K: expected shape \(3, 3\)")],
-    "width": [(0, "width: expected a positive integer"), (10.0, "width: expected a positive integer")],
-    "height": [(-3, "height: expected a positive integer")],
-}
+from .cases import backends
+
+BAD = [
+    ("means", torch.zeros(5, 2), r"means: expected shape \(5, 3\)"),
+    ("means", torch.zeros(5, 3, dtype=torch.int64), "means: .*int64"),
+    ("quats", torch.zeros(4, 4), r"quats: expected shape \(5, 4\).*found shape \(4, 4\)"),
+    ("scales", torch.zeros(5, 3, dtype=torch.float64), "scales: expected dtype torch.float32.*float64"),
+    ("opacities", torch.zeros(5, 1), r"opacities: expected shape \(5,\)"),
+    ("opacities", [0.0] * 5, "opacities: .*torch tensor.*list"),
+    ("colors", torch.zeros(5), "colors"),
+    ("colors", torch.zeros(5, 33), "colors: .*1 to 32"),
+    ("colors", torch.zeros(5, 0), "colors"),
+    ("colors", torch.zeros(2, 5, 3), "colors: .*V cameras"),
+    ("viewmat", torch.eye(3), r"viewmat: expected shape \(4, 4\)"),
+    ("viewmat", torch.zeros(0, 4, 4), "viewmat: expected at least one camera"),
+    ("viewmat", torch.eye(4).expand(2, 4, 4), "viewmat, K: .*2 and 3"),
+    ("K", torch.eye(4), r"K: expected shape \(3, 3\)"),
+    ("width", 0, "width: expected a positive integer"),
+    ("width", 10.0, "width: expected a positive integer"),
+    ("height", -3, "height: expected a positive integer"),
+    ("background", torch.zeros(2, 3), r"background: expected shape \(3,\)"),
+    ("background", torch.zeros(3, 3), r"background: expected shape \(2, 3\)"),
+]
+TWO = torch.eye(4).expand(2, 4, 4)
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "message"), [(k, v, m) for k, cases in BAD.items() for v, m in cases]
-)
+@pytest.mark.parametrize(("name", "value", "message"), BAD)
 def test_wrong_arguments_are_named(name, value, message):
-    scene = cloud(5, 8, 8)._replace(**{name: value})
+    more = {"K": torch.eye(3).expand(3, 3, 3)} if "2 and 3" in message else {}
+    more |= {"viewmat": TWO} if "(2, 3" in message else {}
+    scene = cloud(5, 8, 8)._replace(**{**more, name: value})
     with pytest.raises(ValueError, match=message):
-        rasterize(*scene[:9])
+        rasterize(*scene[:9], background=scene.background)
 
 
-@pytest.mark.parametrize("backend", available_backends())
-@pytest.mark.parametrize(
-    "name", ["means", "quats", "scales", "opacities", "colors", "viewmat", "K", "background"]
-)
+def with_value(field, index, value):
+    scene = cloud(5, 8, 8)
+    bad = getattr(scene, field).clone()
+    bad.view(-1)[index] = value
+    return scene._replace(**{field: bad})
+
+
+@backends
+@pytest.mark.parametrize("name", [*Scene._fields[:7], "background"])
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
 def test_values_that_are_not_finite_are_refused(backend, name, value):
-    scene = cloud(5, 8, 8)
-    bad = getattr(scene, name).clone()
-    bad.view(-1)[-1] = value
-    scene = scene._replace(**{name: bad})
+    scene = with_value(name, -1, value)
     with pytest.raises(ValueError, match=rf"{name}: expected finite values, found 1 that are not"):
         rasterize(*scene[:9], background=scene.background, backend=backend)
 
@@ -66,11 +72,7 @@ def test_values_that_are_not_finite_are_refused(backend, name, value):
 @pytest.mark.parametrize(
     ("field", "value", "message"),
     [
-        (
-            "scales",
-            -1e-6,
-            r"scales: expected values >= 0, found 1 outside, the first -1e-06 at index \(0, 0\)",
-        ),
+        ("scales", -1e-6, r"scales: .* >= 0, found 1 outside, the first -1e-06 at index \(0, 0\)"),
         ("opacities", 1.001, r"opacities: expected values in \[0, 1\], found 1 outside, the first 1.001"),
         ("opacities", -0.001, r"opacities: expected values in \[0, 1\]"),
         ("K", -10.0, r"K: expected focal lengths > 0, found 1 outside, the first -10"),
@@ -78,10 +80,7 @@ def test_values_that_are_not_finite_are_refused(backend, name, value):
     ],
 )
 def test_values_outside_of_their_range_are_refused(field, value, message):
-    scene = cloud(5, 8, 8)
-    bad = getattr(scene, field).clone()
-    bad.view(-1)[0] = value
-    scene = scene._replace(**{field: bad})
+    scene = with_value(field, 0, value)
     with pytest.raises(ValueError, match=message):
         rasterize(*scene[:9])
     assert torch.isfinite(rasterize(*scene[:9], check_values=False).alpha).all() or field == "K"
@@ -100,7 +99,7 @@ def test_large_finite_values_are_not_mistaken_for_infinite():
     assert not rasterize(*scene[:9]).alpha.any()
 
 
-@pytest.mark.parametrize("backend", available_backends())
+@backends
 def test_unchecked_geometry_that_is_not_finite_is_culled(backend):
     scene = cloud(40, 20, 20, seed=1, size=0.1)
     for index, field in enumerate(("means", "quats", "scales", "opacities")):
@@ -118,7 +117,6 @@ def test_unchecked_geometry_that_is_not_finite_is_culled(backend):
         ({"near": 2.0, "far": 1.0}, "near, far"),
         ({"eps2d": -0.1}, "eps2d"),
         ({"eps2d": float("inf")}, "eps2d"),
-        ({"background": torch.zeros(4)}, r"background: expected shape \(3,\)"),
         ({"means2d_offset": torch.zeros(5, 3)}, r"means2d_offset: expected shape \(5, 2\)"),
         ({"backend": "gpu"}, "backend: expected one of 'auto'"),
         ({"backend": "cpu", "threads": 0}, "threads: expected a positive integer"),
@@ -131,7 +129,7 @@ def test_wrong_options_are_named(options, message):
         rasterize(*cloud(5, 8, 8)[:9], **options)
 
 
-@pytest.mark.parametrize("backend", available_backends())
+@backends
 def test_near_far_and_low_pass_are_parameters(backend):
     scene = cloud(1, 15, 15)._replace(
         means=torch.tensor([[0.0, 0.0, 1.0]]), viewmat=torch.eye(4), opacities=torch.tensor([0.9])
@@ -182,7 +180,7 @@ def test_without_the_kernel_the_reference_draws_and_warns_once(caplog, without_k
         rasterize(*scene[:9], backend="cpu")
 
 
-@pytest.mark.parametrize("backend", available_backends())
+@backends
 @pytest.mark.parametrize("own_colors", [False, True])
 def test_several_cameras_in_one_call_are_as_many_calls(backend, own_colors):
     scene = cloud(60, 33, 27, seed=5, size=0.1)
@@ -205,12 +203,7 @@ def test_several_cameras_in_one_call_are_as_many_calls(backend, own_colors):
     for view in range(2):
         *splats, colors, viewmats, Ks = leaves
         single = rasterize(
-            *splats,
-            colors[view] if own_colors else colors,
-            viewmats[view],
-            Ks[view],
-            33,
-            27,
+            *(*splats, colors[view] if own_colors else colors, viewmats[view], Ks[view], 33, 27),
             background=backgrounds[view],
             means2d_offset=offsets[view],
             means2d_abs=absolutes[view],
@@ -228,25 +221,3 @@ def test_one_camera_in_a_batch_keeps_its_dimension():
     result = rasterize(*scene[:6], scene.K[None], 9, 8, background=scene.background)
     assert result.image.shape == (1, 8, 9, 3)
     assert torch.equal(result.image[0], rasterize(*scene[:9], background=scene.background).image)
-
-
-@pytest.mark.parametrize(
-    ("parts", "message"),
-    [
-        (
-            {"viewmat": torch.eye(4).expand(2, 4, 4), "K": torch.eye(3).expand(3, 3, 3)},
-            "viewmat, K: .*2 and 3",
-        ),
-        ({"viewmat": torch.zeros(0, 4, 4)}, "viewmat: expected at least one camera"),
-        ({"colors": torch.zeros(2, 5, 3)}, "colors: .*V cameras"),
-        ({"background": torch.zeros(2, 3)}, r"background: expected shape \(3,\)"),
-        (
-            {"viewmat": torch.eye(4).expand(2, 4, 4), "background": torch.zeros(3, 3)},
-            r"background: expected shape \(2, 3\)",
-        ),
-    ],
-)
-def test_batches_that_do_not_fit_are_named(parts, message):
-    scene = cloud(5, 8, 8)._replace(**parts)
-    with pytest.raises(ValueError, match=message):
-        rasterize(*scene[:9], background=scene.background)

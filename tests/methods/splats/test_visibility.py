@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from headbench.methods.splats import available_backends, cuda, rasterize
-from headbench.methods.splats.rasterize import make_request
 from headbench.tests.benchmarks.splats.scenes import Scene, cloud
 
+from .cases import backends, request_of
 from .test_cuda import FakeGsplat
 
 WIDTH, HEIGHT = 44, 29  # neither is a multiple of a tile's 16 pixels
@@ -28,23 +28,12 @@ def published(scene: Scene, near: float = 0.2) -> list[int]:
         if point[2] <= near:
             radii.append(0)
             continue
-        r, x, y, z = quat / np.linalg.norm(quat)
-        rotation = np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - r * z), 2 * (x * z + r * y)],
-                [2 * (x * y + r * z), 1 - 2 * (x * x + z * z), 2 * (y * z - r * x)],
-                [2 * (x * z - r * y), 2 * (y * z + r * x), 1 - 2 * (x * x + y * y)],
-            ]
-        )
+        r, x, y, z = quat
+        rotation = Rotation.from_quat([x, y, z, r]).as_matrix()
         spread = rotation @ np.diag(scale**2) @ rotation.T
         limits = 1.3 * WIDTH / (2 * fx), 1.3 * HEIGHT / (2 * fy)
         slopes = [min(limit, max(-limit, point[i] / point[2])) for i, limit in enumerate(limits)]
-        jacobian = np.array(
-            [
-                [fx / point[2], 0, -fx * slopes[0] / point[2]],
-                [0, fy / point[2], -fy * slopes[1] / point[2]],
-            ]
-        )
+        jacobian = np.array([[fx, 0, -fx * slopes[0]], [0, fy, -fy * slopes[1]]]) / point[2]
         flat = jacobian @ world[:3, :3] @ spread @ world[:3, :3].T @ jacobian.T + 0.3 * np.eye(2)
         determinant, middle = np.linalg.det(flat), 0.5 * np.trace(flat)
         if determinant == 0:
@@ -82,7 +71,7 @@ def crowd() -> Scene:
 def test_radii_are_those_published(backend):
     scene = crowd()
     if backend == "gsplat":
-        found = cuda.draw(FakeGsplat(), a_request(scene)).radii
+        found = cuda.draw(FakeGsplat(), request_of(*scene[:9], near=0.2)).radii
     else:
         found = rasterize(*scene[:9], near=0.2, backend=backend).radii
     wanted = torch.tensor(published(scene))
@@ -95,7 +84,7 @@ def test_radii_are_those_published(backend):
     assert (found != wanted).float().mean() < 0.02
 
 
-@pytest.mark.parametrize("backend", available_backends())
+@backends
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_opacity_does_not_change_radii(backend, antialiased):
     scene = crowd()
@@ -119,33 +108,14 @@ def test_splats_that_are_masked_are_out_of_view():
 
 
 def test_radii_of_several_cameras_have_a_leading_dimension():
-    one, two = (a_request(replace_camera(crowd(), shift)) for shift in (0.0, 0.3))
-    both = replace(
-        one, viewmats=torch.cat([one.viewmats, two.viewmats]), Ks=one.Ks.repeat(2, 1, 1), batched=True
-    )
-    both = replace(both, backgrounds=one.backgrounds.repeat(2, 1))
-    found = cuda.draw(FakeGsplat(), both).radii
-    wanted = [cuda.draw(FakeGsplat(), request).radii for request in (one, two)]
-    assert torch.equal(found, torch.stack(wanted))
-    assert not torch.equal(*wanted)
+    scene = crowd()
+    viewmats = torch.stack([scene.viewmat, scene.viewmat])
+    viewmats[1, 0, 3] = 0.3
 
+    def radii(viewmat):
+        request = request_of(*scene._replace(viewmat=viewmat)[:9], near=0.2)
+        return cuda.draw(FakeGsplat(), request).radii
 
-def replace_camera(scene: Scene, shift: float) -> Scene:
-    viewmat = scene.viewmat.clone()
-    viewmat[0, 3] = shift
-    return scene._replace(viewmat=viewmat)
-
-
-def a_request(scene: Scene):
-    return make_request(
-        *scene[:9],
-        background=None,
-        near=0.2,
-        far=1e10,
-        eps2d=0.3,
-        antialiased=False,
-        means2d_offset=None,
-        means2d_abs=None,
-        check_values=True,
-        mask_non_finite=False,
-    )
+    one, two = map(radii, viewmats)
+    assert torch.equal(radii(viewmats), torch.stack([one, two]))
+    assert not torch.equal(one, two)

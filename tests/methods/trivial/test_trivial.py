@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from headbench.bench.contracts import Avatar, Budget, Method, no_progress
+from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.errors import InputError
 from headbench.methods.trivial.method import INDEX_FILE, MEAN_FILE, MeanImage, NearestCamera, resize
 from headbench.methods.trivial.spec import NearestCameraConfig
@@ -17,20 +17,6 @@ def fit(method, clip, folder):
 
 def show(avatar, clip, key, **options):
     return avatar.render(clip.cameras[key.camera], clip.poses[key.timestep], **options)
-
-
-@pytest.mark.parametrize("method", [MeanImage, NearestCamera])
-def test_contracts_and_reloading(method, clip, tmp_path):
-    avatar = fit(method(), clip, tmp_path)
-    assert isinstance(method(), Method)
-    assert isinstance(avatar, Avatar)
-    key = clip.splits["novel_view"][0]
-    again = method().load(tmp_path, device="cpu")
-    np.testing.assert_array_equal(show(avatar, clip, key).rgb, show(again, clip, key).rgb)
-    assert all(path.exists() for path in avatar.files())
-    pose = replace(clip.poses[0], head_model="another")
-    with pytest.raises(InputError, match="head_model"):
-        avatar.render(clip.cameras["00"], pose)
 
 
 def test_mean_image_is_the_mean_of_training_images_alone(clip, tmp_path):
@@ -56,38 +42,21 @@ def test_a_held_out_view_shows_the_same_timestep_from_the_nearest_camera(clip, t
     avatar = fit(NearestCamera(), clip, tmp_path)
     training = {key.camera for key in clip.splits["train"]}
     for key in clip.splits["novel_view"]:
-        wanted = clip.cameras[key.camera].center - clip.poses[key.timestep].translation
-        angles = {}
-        for name in training:
-            direction = clip.cameras[name].center - clip.poses[key.timestep].translation
-            cosine = direction @ wanted / np.linalg.norm(direction) / np.linalg.norm(wanted)
-            angles[name] = np.arccos(cosine)
-        source = key._replace(camera=min(angles, key=angles.__getitem__))
+        head = clip.poses[key.timestep].translation
+        towards = {name: camera.center - head for name, camera in clip.cameras.items()}
+        cosines = {n: -towards[n] @ towards[key.camera] / np.linalg.norm(towards[n]) for n in training}
+        source = key._replace(camera=min(cosines, key=cosines.__getitem__))
         np.testing.assert_allclose(show(avatar, clip, key).rgb, clip.image(source) / 255.0, atol=1e-6)
 
 
 def test_a_held_out_expression_shows_the_nearest_training_timestep(clip, tmp_path):
     avatar = fit(NearestCamera(), clip, tmp_path)
     pose = clip.poses[1]
-    nudged = replace(
-        pose, expression=pose.expression + np.float32(1e-3), timestep=None, subject="somebody else"
-    )
+    near = pose.expression + np.float32(1e-3)
+    nudged = replace(pose, expression=near, timestep=None, subject="somebody else")
     key = next(key for key in clip.splits["train"] if key.timestep == 1)
     frame = avatar.render(clip.cameras[key.camera], nudged)
     np.testing.assert_allclose(frame.rgb, clip.image(key) / 255.0, atol=1e-6)
-
-
-def test_held_out_images_are_never_shown(clip, tmp_path):
-    marked = {
-        key: image if key in clip.splits["train"] else np.full_like(image, 77)
-        for key, image in clip.images.items()
-    }
-    leaky = replace(clip, images=marked)
-    for method in (MeanImage, NearestCamera):
-        avatar = fit(method(), leaky, tmp_path / method.name)
-        for split in ("novel_view", "self_reenactment"):
-            rgb = show(avatar, leaky, leaky.splits[split][0]).rgb
-            assert abs(rgb - 77 / 255).max() > 0.2
 
 
 def test_the_background_is_exchanged_under_the_mask(clip, tmp_path):

@@ -18,8 +18,8 @@ from headbench.methods.shared.avatar_files import RECORD_FILE, Subject
 from headbench.methods.shared.config import SplatTraining
 from headbench.methods.shared.subject_mesh import SubjectMesh
 
-from ...ours.toy import changed
-from ...toy_clip import ToyClip
+from ..toy_clip import ToyClip
+from .toy import changed
 
 SMALL = OursConfig(
     splats=SplatTraining(max_splats=2000, min_densify_every=40, min_settle=20),
@@ -32,10 +32,13 @@ MEGAPIXEL = 40
 """Enlarges the toy's cameras so that its millimetres are pixels."""
 
 
-def plan(clip, config=SMALL):
+def mesh_of(clip):
     subject = Subject.of(clip)
-    mesh = SubjectMesh(clip.head, subject.shape, subject.static_offset, "cpu")
-    return plan_capacity(clip, mesh, config)
+    return SubjectMesh(clip.head, subject.shape, subject.static_offset, "cpu")
+
+
+def plan(clip, config=SMALL):
+    return plan_capacity(clip, mesh_of(clip), config)
 
 
 def chosen(clip, config=SMALL):
@@ -69,30 +72,29 @@ def test_all_of_an_expressive_sharp_clip_is_modelled(sharp):
     assert plan(sharp).lines
 
 
-def test_a_still_face_has_no_lines(sharp):
-    found = plan(with_poses(sharp, still))
-    assert not found.lines
-    assert not found.apply(SMALL).lines.enabled
-    assert found.lines_within is None
+def leading(pose):
+    return {"expression": np.where(np.arange(len(pose.expression)) < 3, pose.expression, 0.4)}
 
 
-def test_a_still_jaw_has_no_bases(sharp):
-    sizes = chosen(with_poses(sharp, lambda pose: {"jaw": np.zeros(3)}))
-    assert sizes["lines.jaw_bases"] == 0
-    assert sizes["lines.expressions"] > 0
-
-
-def test_a_jaw_without_expressions_has_lines_for_the_jaw_alone(sharp):
-    sizes = chosen(with_poses(sharp, lambda pose: {"expression": 0 * pose.expression}))
-    assert sizes["lines.expressions"] == 0
-    assert sizes["lines.jaw_bases"] == 2
-
-
-def test_only_the_directions_in_use_are_modelled(sharp):
-    def leading(pose):
-        return {"expression": np.where(np.arange(len(pose.expression)) < 3, pose.expression, 0.4)}
-
-    assert chosen(with_poses(sharp, leading))["lines.expressions"] == 3
+@pytest.mark.parametrize(
+    ("change", "expressions", "jaw_bases"),
+    [
+        (still, 0, 0),
+        (lambda pose: {"jaw": np.zeros(3)}, None, 0),
+        (lambda pose: {"expression": 0 * pose.expression}, 0, 2),
+        (leading, 3, 2),
+    ],
+    ids=["still", "jaw still", "jaw alone", "three directions"],
+)
+def test_only_what_moves_is_modelled(sharp, change, expressions, jaw_bases):
+    found = plan(with_poses(sharp, change))
+    sizes = {each.name: each.chosen for each in found.decisions}
+    assert sizes["lines.jaw_bases"] == jaw_bases
+    assert sizes["lines.expressions"] == expressions or (
+        expressions is None and sizes["lines.expressions"] > 0
+    )
+    assert found.lines == found.apply(SMALL).lines.enabled == (expressions != 0 or jaw_bases > 0)
+    assert found.lines or found.lines_within is None
 
 
 def test_motion_that_no_pixel_shows_is_none(clip):
@@ -103,9 +105,7 @@ def test_motion_that_no_pixel_shows_is_none(clip):
 def test_lines_reach_no_further_than_what_moves(sharp):
     found = plan(sharp)
     low, high = map(np.array, found.lines_within)
-    subject = Subject.of(sharp)
-    mesh = SubjectMesh(sharp.head, subject.shape, subject.static_offset, "cpu")
-    canonical = mesh.canonical.numpy()
+    canonical = mesh_of(sharp).canonical.numpy()
     assert (low >= canonical.min(0) - 1e-7).all()
     assert (high <= canonical.max(0) + 1e-7).all()
     strict = plan(sharp, changed(SMALL, penalty={"face_mm": 6.0, "other_mm": 6.0}))
@@ -122,13 +122,11 @@ def test_doubling_the_images_raises_planes_and_splats(clip):
 
 
 def test_half_the_detail_halves_the_planes_samples(sharp):
-    whole = chosen(sharp, changed(SMALL, planes={"resolution": 10**6}))["planes.resolution"] - 1
-    half = (
-        chosen(sharp, changed(SMALL, planes={"resolution": 10**6}, capacity={"detail": 0.5}))[
-            "planes.resolution"
-        ]
-        - 1
+    whole, half = (
+        chosen(sharp, changed(SMALL, planes={"resolution": 10**6}, capacity={"detail": detail}))
+        for detail in (1.0, 0.5)
     )
+    whole, half = whole["planes.resolution"] - 1, half["planes.resolution"] - 1
     assert 2 * half - 1 <= whole <= 2 * half
 
 
@@ -142,9 +140,9 @@ def test_more_tolerance_never_asks_for_more(sharp, tolerance, factor):
 
 def test_configured_sizes_are_limits_and_can_be_kept(sharp, clip):
     config = changed(SMALL, lines={"expressions": 2, "jaw_bases": 1}, planes={"resolution": 9})
-    assert chosen(sharp, config)["lines.expressions"] == 2
-    assert chosen(sharp, config)["lines.jaw_bases"] == 1
-    assert chosen(sharp, config)["planes.resolution"] == 9
+    sizes = chosen(sharp, config)
+    names = ("lines.expressions", "lines.jaw_bases", "planes.resolution")
+    assert [sizes[name] for name in names] == [2, 1, 9]
     kept = changed(SMALL, capacity={"keep": ("lines.expressions", "planes.resolution", "lines.bounds")})
     found = plan(with_poses(clip, still), kept)
     resolved = found.apply(kept)
@@ -158,14 +156,13 @@ def test_held_out_poses_and_images_decide_nothing(clip):
         def image(self, key):
             raise AssertionError("a plan reads no image")
 
-    held = {key.timestep for key in clip.splits["self_reenactment"]}
-    other = {
-        t: replace(pose, expression=50 * pose.expression, jaw=-3 * pose.jaw, translation=pose.translation + 1)
-        if t in held
-        else pose
-        for t, pose in clip.poses.items()
-    }
-    guarded = Guarded(**{**vars(clip), "poses": other})
+    def other(t, pose):
+        if t not in {key.timestep for key in clip.splits["self_reenactment"]}:
+            return pose
+        return replace(pose, expression=50 * pose.expression, jaw=-3 * pose.jaw)
+
+    poses = {t: other(t, pose) for t, pose in clip.poses.items()}
+    guarded = Guarded(**{**vars(clip), "poses": poses})
     assert plan(TrainingView(guarded)) == plan(clip)
 
 
@@ -174,10 +171,9 @@ def test_a_planned_avatar_trains_renders_and_keeps_its_plan(clip, tmp_path, capl
     if change == "still":
         clip = with_poses(clip, still)
     config = changed(SMALL, storage="compact" if change == "still" else "exact", capacity={"tolerance": 0.02})
+    options = {"device": "cpu", "seed": 0, "progress": no_progress}
     with caplog.at_level(logging.INFO, "headbench"):
-        avatar = Ours(config).fit(
-            clip, tmp_path, Budget(iterations=30), device="cpu", seed=0, progress=no_progress
-        )
+        avatar = Ours(config).fit(clip, tmp_path, Budget(iterations=30), **options)
     key = clip.splits["train"][0]
     image = avatar.render(clip.cameras[key.camera], clip.poses[key.timestep]).rgb
     truth = clip.image(key) / 255
@@ -188,9 +184,7 @@ def test_a_planned_avatar_trains_renders_and_keeps_its_plan(clip, tmp_path, capl
     planned = {each["name"]: each for each in record["decisions"]}
     assert len(avatar.field.tensors["plane_xy"]) == planned["planes.resolution"]["chosen"] ** 2
     assert planned["planes.resolution"]["numbers"]["longest_px"] > 0
-    again = Ours(config).fit(
-        clip, tmp_path, Budget(iterations=30), device="cpu", seed=0, progress=no_progress
-    )
+    again = Ours(config).fit(clip, tmp_path, Budget(iterations=30), **options)
     np.testing.assert_array_equal(again.render(clip.cameras[key.camera], clip.poses[key.timestep]).rgb, image)
 
 

@@ -42,17 +42,20 @@ def make(binding, scales, opacities, face_count, config=PUBLISHED, seed=0):
     return densifier, optimiser, values
 
 
-def ask(densifier, which, count):
-    """One view in which the chosen splats have a gradient above the threshold."""
-    gradient = torch.zeros(count, 2, dtype=torch.float64)
-    gradient[which] = 1.0
-    densifier.observe(gradient, torch.ones(count, dtype=torch.bool), 10, 10)
+def densify(densifier, asking, iteration=1, sizes=None):
+    """A round after one view in which the splats ``asking`` had a gradient above the threshold, or those by number."""
+    views = densifier.state()["views"]
+    gradient = views.new_zeros(len(views), 2)
+    for splat in asking:
+        gradient[splat, 0] = asking[splat] if isinstance(asking, dict) else 1.0
+    densifier.observe(gradient, torch.ones(len(views), dtype=torch.bool), 10, 10)
+    faces = int(densifier.binding.max()) + 1 if sizes is None else len(sizes)
+    densifier.run(iteration, ALWAYS, views.new_ones(faces) if sizes is None else views.new_tensor(sizes))
 
 
 def test_small_splats_are_cloned_with_zero_moments():
     densifier, optimiser, values = make([0, 1, 2], [0.005] * 3, [0.5] * 3, 3)
-    ask(densifier, [1], 3)
-    densifier.run(1, ALWAYS, torch.ones(3, dtype=torch.float64))
+    densify(densifier, [1])
     assert densifier.binding.tolist() == [0, 1, 2, 1]
     for name in NAMES:
         np.testing.assert_array_equal(optimiser[name][3].detach(), values[name][1])
@@ -62,8 +65,7 @@ def test_small_splats_are_cloned_with_zero_moments():
 
 def test_large_splats_are_split_and_their_parent_goes():
     densifier, optimiser, values = make([0, 1, 2], [0.005, 0.05, 0.005], [0.5] * 3, 3)
-    ask(densifier, [1], 3)
-    densifier.run(1, ALWAYS, torch.ones(3, dtype=torch.float64))
+    densify(densifier, [1])
     assert densifier.binding.tolist() == [0, 2, 1, 1]
     np.testing.assert_allclose(optimiser["log_scales"][2:].detach().exp(), 0.05 / SHRINK)
     np.testing.assert_array_equal(optimiser["extra"][2:].detach(), values["extra"][[1, 1]])
@@ -82,8 +84,7 @@ def test_children_scatter_by_the_parents_scale_in_its_own_axes(variant, factor):
     optimiser["log_scales"].data.copy_(log_scales)
     half_turn = torch.tensor([0.5**0.5, 0, 0, 0.5**0.5], dtype=torch.float64)  # x to y
     optimiser["quats"].data.copy_(half_turn.expand(count, 4))
-    ask(densifier, list(range(count)), count)
-    densifier.run(1, ALWAYS, torch.tensor([0.001], dtype=torch.float64))
+    densify(densifier, range(count), sizes=[0.001])
     moved = optimiser["means"].detach().numpy() - np.tile(values["means"], (2, 1))
     assert moved.std(0)[1] == pytest.approx(2.0 * factor, rel=0.1)
     assert np.abs(moved[:, [0, 2]]).max() < 1e-4 * factor
@@ -102,8 +103,7 @@ def test_gradients_are_means_over_visible_views_in_device_units():
 
 def test_faint_splats_go_but_never_the_last_of_a_face():
     densifier, _, _ = make([0, 0, 1, 2, 2], [0.005] * 5, [0.5, 0.001, 0.001, 0.001, 0.001], 3)
-    ask(densifier, [], 5)
-    densifier.run(1, ALWAYS, torch.ones(3, dtype=torch.float64))
+    densify(densifier, [])
     # Face 0 loses its faint splat; faces 1 and 2 would be emptied, so all of theirs stay.
     assert densifier.binding.tolist() == [0, 1, 2, 2]
 
@@ -111,8 +111,7 @@ def test_faint_splats_go_but_never_the_last_of_a_face():
 def test_a_split_parent_goes_even_where_its_children_are_faint():
     # Face 0 has nothing but a faint splat, which is split: the children stay in its place, not beside it.
     densifier, optimiser, _ = make([0, 1], [0.05, 0.005], [0.001, 0.5], 2)
-    ask(densifier, [0], 2)
-    densifier.run(1, ALWAYS, torch.ones(2, dtype=torch.float64))
+    densify(densifier, [0])
     assert densifier.binding.tolist() == [1, 0, 0]
     np.testing.assert_allclose(optimiser["log_scales"][1:].detach().exp(), 0.05 / SHRINK)
 
@@ -120,8 +119,7 @@ def test_a_split_parent_goes_even_where_its_children_are_faint():
 @pytest.mark.parametrize(("iteration", "left"), [(100, 2), (101, 1)])
 def test_splats_large_in_the_world_go_once_that_is_on(iteration, left):
     densifier, _, _ = make([0, 0], [0.05, 0.02], [0.5] * 2, 1)
-    ask(densifier, [], 2)
-    densifier.run(iteration, ALWAYS, torch.tensor([4.0], dtype=torch.float64))
+    densify(densifier, [], iteration, [4.0])
     assert len(densifier.binding) == left
 
 
@@ -135,8 +133,8 @@ def test_books_agree_and_no_face_is_ever_emptied(seed):
     densifier, optimiser, _ = make(binding, scales, opacities, faces, seed=seed)
     for iteration in (99, 101, 150):
         current = len(densifier.binding)
-        ask(densifier, np.flatnonzero(rng.random(current) < 0.3), current)
-        densifier.run(iteration, ALWAYS, torch.from_numpy(rng.uniform(0.5, 2, faces)))
+        asking = np.flatnonzero(rng.random(current) < 0.3)
+        densify(densifier, asking, iteration, rng.uniform(0.5, 2, faces))
         current = len(densifier.binding)
         assert np.bincount(densifier.binding.numpy(), minlength=faces).min() >= 1
         for name in NAMES:
@@ -150,10 +148,7 @@ def test_books_agree_and_no_face_is_ever_emptied(seed):
 def test_a_bound_takes_the_largest_gradients():
     config = replace(SplatTraining(), max_splats=5)
     densifier, _, _ = make([0, 1, 2, 3], [0.005] * 4, [0.5] * 4, 4, config)
-    gradient = torch.zeros(4, 2, dtype=torch.float64)
-    gradient[:, 0] = torch.tensor([1.0, 3.0, 2.0, 0.5])
-    densifier.observe(gradient, torch.ones(4, dtype=torch.bool), 10, 10)
-    densifier.run(1, ALWAYS, torch.ones(4, dtype=torch.float64))
+    densify(densifier, {0: 1.0, 1: 3.0, 2: 2.0, 3: 0.5})
     assert densifier.binding.tolist() == [0, 1, 2, 3, 1]
 
 
@@ -175,31 +170,16 @@ def with_table(binding, opacities, rows, **more):
         "opacities": torch.tensor([logit(o) for o in opacities]),
         "table": torch.tensor([[n + 0.1 * k] for n, b in enumerate(binding) for k in range(rows[b])]),
     }
-    optimiser = Optimiser(
-        {name: nn.Parameter(value) for name, value in parameters.items()}, dict.fromkeys(parameters, 0.1)
-    )
-    densifier = Densifier(
-        PUBLISHED,
-        optimiser,
-        tuple(parameters)[:-1],
-        torch.tensor(binding),
-        len(rows),
-        EXTENT,
-        0,
-        tables=("table",),
-        table_rows=torch.tensor(rows),
-        **more,
-    )
-    return densifier, optimiser
+    optimiser = Optimiser({n: nn.Parameter(v) for n, v in parameters.items()}, dict.fromkeys(parameters, 0.1))
+    books = {"tables": ("table",), "table_rows": torch.tensor(rows)}
+    names, binding = tuple(parameters)[:-1], torch.tensor(binding)
+    return Densifier(PUBLISHED, optimiser, names, binding, len(rows), EXTENT, 0, **books, **more), optimiser
 
 
 def test_tables_follow_their_splats():
     """Splats on triangles with 2, 0 and 3 rows: the third is cloned, the second goes, so does the first's first row."""
     densifier, optimiser = with_table([0, 1, 2, 0], [0.5, 0.001, 0.5, 0.001], [2, 0, 3], keep_last=False)
-    gradient = torch.zeros(4, 2)
-    gradient[2] = 1.0
-    densifier.observe(gradient, torch.ones(4, dtype=torch.bool), 10, 10)
-    densifier.run(1, ALWAYS, torch.ones(3))
+    densify(densifier, [2])
     assert densifier.binding.tolist() == [0, 2, 2]
     expected = [0.0, 0.1, 2.0, 2.1, 2.2, 2.0, 2.1, 2.2]
     np.testing.assert_allclose(optimiser["table"].detach()[:, 0], expected, atol=1e-6)
@@ -208,15 +188,13 @@ def test_tables_follow_their_splats():
 @pytest.mark.parametrize("keep_last", [True, False])
 def test_a_last_splat_goes_only_where_that_is_allowed(keep_last):
     densifier, _ = with_table([0, 1], [0.001, 0.5], [1, 1], keep_last=keep_last)
-    densifier.run(1, ALWAYS, torch.ones(2))
+    densify(densifier, [])
     assert densifier.binding.tolist() == ([0, 1] if keep_last else [1])
 
 
 def test_triangles_may_ask_at_thresholds_of_their_own():
     densifier, _ = with_table([0, 1], [0.5, 0.5], [1, 1], thresholds=torch.tensor([1e-3, 2e-4]))
-    gradient = torch.full((2, 2), 5e-4 / 5 / 2**0.5)  # 5e-4 in normalised device units of a 10 x 10 image
-    densifier.observe(gradient, torch.ones(2, dtype=torch.bool), 10, 10)
-    densifier.run(1, ALWAYS, torch.ones(2))
+    densify(densifier, {0: 1e-4, 1: 1e-4})  # 5e-4 in normalised device units of a 10 x 10 image
     assert densifier.binding.tolist() == [0, 1, 1]
 
 
