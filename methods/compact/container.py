@@ -52,12 +52,7 @@ def write_content(path: Path, content: Content) -> None:
     """Write a file whole or not at all; equal content gives equal bytes."""
     packed = {name: np.frombuffer(pack(values), np.uint8) for name, values in content.arrays.items()}
     arrays = {name: [values.dtype.str[1:], list(values.shape)] for name, values in content.arrays.items()}
-    layout = {
-        "version": VERSION,
-        "text": dict(content.text),
-        "steps": dict(content.steps),
-        "arrays": arrays,
-    }
+    layout = {"version": VERSION, "text": dict(content.text), "steps": dict(content.steps), "arrays": arrays}
     write_bytes(path, save(packed, {KEY: json.dumps(layout, separators=(",", ":"))}))
 
 
@@ -180,10 +175,8 @@ class Arrays:
         if name not in self._left:
             raise InputError(self.path, name, "an array of that name", "none")
         values = self._left.pop(name)
-        fits = values.ndim == len(shape) and all(
-            want is None or want == has for want, has in zip(shape, values.shape)
-        )
-        if not fits:
+        wanted = tuple(has if want is None else want for want, has in zip(shape, values.shape))
+        if len(shape) != values.ndim or wanted != values.shape:
             expected = ", ".join("any" if size is None else str(size) for size in shape)
             raise InputError(self.path, name, f"shape ({expected})", f"shape {values.shape}")
         return values
@@ -247,9 +240,8 @@ def smallest_three(quats: FloatArray) -> FloatArray:
     unit = unit / np.maximum(np.linalg.norm(unit, axis=1, keepdims=True), 1e-12)
     w, x, y, z = unit.T
     # q, q i, q j, q k (Hamilton): half turns about the splat's own axes.
-    turned = np.stack(
-        [np.stack(q, axis=1) for q in ((w, x, y, z), (-x, w, z, -y), (-y, -z, w, x), (-z, y, -x, w))]
-    )
+    turns = (w, x, y, z), (-x, w, z, -y), (-y, -z, w, x), (-z, y, -x, w)
+    turned = np.stack([np.stack(q, axis=1) for q in turns])
     best = np.abs(turned[:, :, 0]).argmax(0)
     chosen = turned[best, np.arange(len(unit))]
     return chosen[:, 1:] * np.where(chosen[:, :1] < 0, -1.0, 1.0)

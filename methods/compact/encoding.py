@@ -1,4 +1,4 @@
-"""How finely a compact avatar is stored. Light to import."""
+"""A field's tensors as arrays rounded by what shows, and back."""
 
 from __future__ import annotations
 

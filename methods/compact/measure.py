@@ -40,9 +40,11 @@ def compact_avatar(settings: CompactSettings, progress: Progress) -> Findings:
         raise InputError(folder, FIELD_FILE, "the exact file of an avatar of ours", "none")
     exact = OursAvatar.read(folder, "cpu", exact=True)
     head = read_shared_head(folder)
-    clip = None if settings.compare is None else settings.open(settings.compare, progress)
-    if clip is not None and clip.subject != exact.subject.name:
-        raise InputError(settings.compare, "subject", repr(exact.subject.name), repr(clip.subject))
+    clip = None
+    if settings.compare is not None:
+        clip = settings.open(settings.compare, progress)
+        if clip.subject != exact.subject.name:
+            raise InputError(settings.compare, "subject", repr(exact.subject.name), repr(clip.subject))
     field = simplify(exact, [] if clip is None else training_poses(clip), settings.precision)
     content = encode(field, exact.subject, head, settings.precision)
     write_content(out / COMPACT_FILE, content)

@@ -14,8 +14,6 @@ from ..splats.constants import ALPHA_MIN
 from .encoding import HARMONICS, negligible_lines
 from .precision import Precision
 
-LINE_NETWORK = "line_"
-
 
 def simplify(avatar: OursAvatar, poses: Iterable[HeadPose], precision: Precision) -> Field:
     """The avatar's field with its splats sorted by triangle, without splats and lines that no pose shows.
@@ -40,13 +38,13 @@ def simplify(avatar: OursAvatar, poses: Iterable[HeadPose], precision: Precision
     if "lines" not in tensors:
         return Field(tensors, field.dynamic)
     silent = torch.from_numpy(negligible_lines(tensors, precision.lines))
-    tensors["lines"] = tensors["lines"].masked_fill(
-        silent.to(tensors["lines"].device)[:, None, None, None], 0
-    )
+    mask = silent.to(tensors["lines"].device)[:, None, None, None]
+    tensors["lines"] = tensors["lines"].masked_fill(mask, 0)
     if silent.all() and field.dynamic == ("opacity",):
         column = SPLAT_WIDTHS["means"]
         tensors["splats"][:, column] = avatar.static_logits().index_select(0, order)
-        tensors = {name: value for name, value in tensors.items() if not _of_lines(name)}
+        lines = {name for name in tensors if name.startswith(("lines", "line_"))} - {"line_box"}
+        tensors = {name: value for name, value in tensors.items() if name not in lines}
         tensors["jaw_bases"] = tensors["jaw_bases"][:0]
     return Field(tensors, field.dynamic)
 
@@ -56,17 +54,12 @@ def training_poses(clip: Clip) -> list[HeadPose]:
     return [clip.poses[timestep] for timestep in sorted({key.timestep for key in clip.splits["train"]})]
 
 
-def _of_lines(name: str) -> bool:
-    return name == "lines" or (name.startswith(LINE_NETWORK) and name != "line_box")
-
-
 def _visible(avatar: OursAvatar, poses: Iterable[HeadPose]) -> Tensor:
     """Numbers of the splats that some pose shows."""
-    count = len(avatar.field.tensors["splats"])
-    highest = torch.zeros(count)
-    seen = False
+    splats = avatar.field.tensors["splats"]
+    keep = None
     for pose in poses:
-        highest = torch.maximum(highest, torch.from_numpy(avatar.splats(pose).opacities))
-        seen = True
-    keep = highest >= ALPHA_MIN if seen else torch.ones(count, dtype=torch.bool)
-    return keep.nonzero().squeeze(1).to(avatar.field.tensors["splats"].device)
+        shown = torch.from_numpy(avatar.splats(pose).opacities) >= ALPHA_MIN
+        keep = shown if keep is None else keep | shown
+    keep = torch.ones(len(splats), dtype=torch.bool) if keep is None else keep
+    return keep.nonzero().squeeze(1).to(splats.device)

@@ -129,14 +129,11 @@ def contributions(avatar: SplatAvatar, views: Iterable[tuple[Camera, HeadPose]])
     total: Tensor | None = None
     for camera, pose in views:
         posed, view = avatar.splats(pose), view_of(camera, "cpu")
-        means, quats, scales, opacities = map(
-            torch.from_numpy, (posed.means, posed.quats, posed.scales, posed.opacities)
-        )
+        geometry = posed.means, posed.quats, posed.scales, posed.opacities
+        means, quats, scales, opacities = map(torch.from_numpy, geometry)
         colors = torch.ones(len(means), 1, requires_grad=True)
-        image = rasterize(
-            *(means, quats, scales, opacities, colors),
-            *(view.world_to_camera, view.K, camera.width, camera.height),
-        ).image
+        where = view.world_to_camera, view.K, camera.width, camera.height
+        image = rasterize(means, quats, scales, opacities, colors, *where).image
         (weights,) = torch.autograd.grad(image.sum(), colors)
         total = weights[:, 0] if total is None else total + weights[:, 0]
     if total is None:
@@ -199,12 +196,8 @@ def _eight_bits(name: str, value: Tensor) -> dict[str, Tensor]:
 
 def coarser_planes(tensors: dict[str, Tensor], resolution: int) -> dict[str, Tensor]:
     """The same tensors with (resolution^2, C) planes; unchanged where they have no more samples."""
-    result = dict(tensors)
-    for name, _, _ in PAIRS:
-        key = f"plane_{name}"
-        if key in result:
-            result[key] = _coarser_plane(result[key], resolution)
-    return result
+    planes = [name for name in (f"plane_{pair}" for pair, _, _ in PAIRS) if name in tensors]
+    return tensors | {name: _coarser_plane(tensors[name], resolution) for name in planes}
 
 
 def coarser_lines(tensors: dict[str, Tensor], resolution: int) -> dict[str, Tensor]:

@@ -60,28 +60,22 @@ def read_ga_splats(path: Path, face_count: int, device: str) -> tuple[dict[str, 
     rest_names = tuple(name for name in COLUMNS if name.startswith("f_rest_"))
     needed = tuple(name for name in COLUMNS if name not in (*normals, *rest_names))
     degree_rest = _rest_count(path)
-    table = torch.from_numpy(read_ply(path, (*needed, *rest_names[: 3 * degree_rest])))
+    names = (*needed, *rest_names[: 3 * degree_rest])
+    table = torch.from_numpy(read_ply(path, names))
     binding = table[:, needed.index("binding_0")].to(torch.int64)
-    for column, name in enumerate((*needed, *rest_names[: 3 * degree_rest])):
+    for column, name in enumerate(names):
         if name != "binding_0":
             check_numbers(path, name, table[:, column].numpy(), MAX_MAGNITUDE)
     check_sizes(path, table[:, [needed.index(f"scale_{i}") for i in range(3)]])
     if len(binding) and not (0 <= int(binding.min()) and int(binding.max()) < face_count):
         found = f"{int(binding.min())} to {int(binding.max())}"
         raise InputError(path, "binding_0", f"triangles 0 to {face_count - 1}", found)
-    means, dc, opacity, log_scales, quats, _, rest = table.to(device).split(
-        [3, 3, 1, 3, 4, 1, 3 * degree_rest], dim=1
-    )
+    widths = [3, 3, 1, 3, 4, 1, 3 * degree_rest]
+    means, dc, opacity, log_scales, quats, _, rest = table.to(device).split(widths, dim=1)
     filled = rest.new_zeros(len(rest), 3, REST)
     filled[:, :, :degree_rest] = rest.reshape(len(rest), 3, degree_rest)
-    splats = {
-        "means": means,
-        "log_scales": log_scales,
-        "quats": quats,
-        "opacities": opacity[:, 0],
-        "sh_dc": dc,
-        "sh_rest": filled,
-    }
+    geometry = {"means": means, "log_scales": log_scales, "quats": quats, "opacities": opacity[:, 0]}
+    splats = {**geometry, "sh_dc": dc, "sh_rest": filled}
     return {name: value.contiguous() for name, value in splats.items()}, binding.to(device)
 
 

@@ -38,9 +38,8 @@ def sphere(count: int) -> Tensor:
     number = np.arange(count) + 0.5
     height = 1 - 2 * number / count
     radius, angle = np.sqrt(1 - height**2), np.pi * (1 + 5**0.5) * number
-    return torch.from_numpy(
-        np.stack([radius * np.cos(angle), height, radius * np.sin(angle)], axis=1).astype(np.float32)
-    )
+    points = np.stack([radius * np.cos(angle), height, radius * np.sin(angle)], axis=1)
+    return torch.from_numpy(points.astype(np.float32))
 
 
 def turn_harmonics(dc: Tensor, rest: Tensor, rotation: Tensor) -> tuple[Tensor, Tensor]:

@@ -155,8 +155,7 @@ def _rest(splats: Tensor) -> int:
 
 def _check(path: Path, tensors: Mapping[str, Tensor], face_count: int, expressions: int) -> IntArray:
     """(N, K) which expressions move which splat. Raises `InputError` at the first tensor that does not fit."""
-    bytes_of = {"bytes": -(-expressions // 8)}
-    sizes = check_tensors(path, tensors, MEMBERS, bytes_of)
+    sizes = check_tensors(path, tensors, MEMBERS, {"bytes": -(-expressions // 8)})
     splats, triangles = tensors["splats"], tensors["triangles"]
 
     def require(name: str, fits: bool, expected: str) -> None:
@@ -169,11 +168,7 @@ def _check(path: Path, tensors: Mapping[str, Tensor], face_count: int, expressio
     require("triangles", fits, f"triangles 0 to {face_count - 1}")
     check_sizes(path, splats[:, GEOMETRY["means"] : GEOMETRY["means"] + GEOMETRY["log_scales"]])
     moved_by = np.unpackbits(tensors["moved_by"].numpy(), axis=1, count=expressions)
-    widths = [
-        sum(difference_widths(degree).values())
-        for degree in range(4)
-        if 3 * (coefficient_count(degree) - 1) <= _rest(splats)
-    ]
+    widths = [sum(difference_widths(d).values()) for d in range(4) if rests[d] <= _rest(splats)]
     table = tensors["differences"]
     fits = len(table) == int(moved_by.sum()) and table.shape[1] in widths
     require("differences", fits, f"({int(moved_by.sum())}, C), C one of {widths}")

@@ -108,16 +108,14 @@ def apply_pose(neutral: Mapping[str, Tensor], differences: Tensor, motions: Poin
     rest = neutral["sh_rest"]
     by_rest = differences.shape[1] - sum(difference_widths(0).values())
     moved, scaled, turned, opaque, coloured, rest_change = differences.split([3, 3, 4, 1, 3, by_rest], dim=1)
-    means = (
-        apply_matrices(motions.linear.contiguous(), neutral["means"] + motions.shift + moved) + motions.offset
-    )
+    local = neutral["means"] + motions.shift + moved
+    means = apply_matrices(motions.linear.contiguous(), local) + motions.offset
     quats = normalize(neutral["quats"] + motions.turn + turned, dim=1)
     scales = (neutral["log_scales"] + scaled).exp().clamp(SMALLEST_SCALE, LARGEST_SCALE)
     if by_rest:
         changed = by_rest // 3
-        rest = torch.cat(
-            [rest[:, :, :changed] + rest_change.view(-1, 3, changed), rest[:, :, changed:]], dim=2
-        )
+        sums = rest[:, :, :changed] + rest_change.view(-1, 3, changed)
+        rest = torch.cat([sums, rest[:, :, changed:]], dim=2)
     return PosedAttributes(
         WorldSplats(means, apply_matrices(motions.product.contiguous(), quats), scales),
         torch.sigmoid(neutral["opacities"] + opaque[:, 0]),
@@ -273,9 +271,7 @@ def nearest_rotation(matrices: Tensor, steps: int) -> Tensor:
     """
     for _ in range(steps):
         a, b, c = matrices.unbind(-2)
-        cofactors = torch.stack(
-            [torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], -2
-        )
+        cofactors = torch.stack([torch.linalg.cross(*pair) for pair in ((b, c), (c, a), (a, b))], -2)
         determinant = (a * cofactors[..., 0, :]).sum(-1)[..., None, None]
         safe = torch.where(determinant.abs() < 1e-6, torch.full_like(determinant, 1e-6), determinant)
         matrices = 0.5 * (matrices + cofactors / safe)
@@ -298,9 +294,8 @@ def initial_rotations(vertices: Tensor, basis: Tensor, faces: Tensor) -> Tensor:
     turns = torch.zeros(len(faces), 4, basis.shape[2], dtype=torch.float64, device=vertices.device)
     for k in range(basis.shape[2]):
         moved = rest + basis[:, :, k].to(torch.float64)[faces]
-        turns[:, :, k] = matrix_to_quaternion(
-            nearest_rotation(deformation_gradients(rest, moved), POLAR_STEPS)
-        )
+        rotations = nearest_rotation(deformation_gradients(rest, moved), POLAR_STEPS)
+        turns[:, :, k] = matrix_to_quaternion(rotations)
     turns[:, 0] -= 1
     return turns.to(vertices.dtype)
 
@@ -320,10 +315,10 @@ def consistency_mask(
     expressions : K, how many of the leading expressions.
     floor, full : metres.
     """
-    still = head.regions.get("scalp", np.empty(0, np.int64))
-    neck = head.regions.get("neck", np.empty(0, np.int64))
     # Teeth have no expressions of their own; held in place with the scalp they would seem to have.
-    teeth = head.regions.get("teeth", np.empty(0, np.int64))
+    still, neck, teeth = (
+        head.regions.get(name, np.empty(0, np.int64)) for name in ("scalp", "neck", "teeth")
+    )
     vertices = np.asarray(vertices, np.float64)
     mask = np.empty((len(head.faces), expressions))
     for k in range(expressions):

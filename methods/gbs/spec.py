@@ -25,29 +25,17 @@ SHORT_SPLATS: dict[str, Any] = {
     "position_lr_final": 4e-6,
 }
 
+
+def _preset(iterations: int, samples: int, teeth: int, max_splats: int | None, **more: int) -> dict[str, Any]:
+    splats = SHORT_SPLATS if max_splats is None else {**SHORT_SPLATS, "max_splats": max_splats}
+    sizes = {"samples": samples, "teeth_samples": teeth, "splats": splats}
+    return {"budget": {"iterations": iterations}, **SHORT, **more, **sizes}
+
+
 PRESETS: dict[str, dict[str, Any]] = {
-    "smoke": {
-        "budget": {"iterations": 60},
-        **SHORT,
-        "samples": 3_000,
-        "teeth_samples": 300,
-        "splats": SHORT_SPLATS,
-    },
-    "demo": {
-        "budget": {"iterations": 2_000},
-        **SHORT,
-        "samples": 12_000,
-        "teeth_samples": 600,
-        "splats": {**SHORT_SPLATS, "max_splats": 20_000},
-    },
-    "fast": {
-        "budget": {"iterations": 5_000},
-        **SHORT,
-        "difference_sh_degree": 1,
-        "samples": 30_000,
-        "teeth_samples": 1_500,
-        "splats": {**SHORT_SPLATS, "max_splats": 40_000},
-    },
+    "smoke": _preset(60, 3_000, 300, None),
+    "demo": _preset(2_000, 12_000, 600, 20_000),
+    "fast": _preset(5_000, 30_000, 1_500, 40_000, difference_sh_degree=1),
     "paper": {"budget": {"iterations": 40_000}},
 }
 

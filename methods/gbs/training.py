@@ -82,13 +82,8 @@ class GBSTraining(SplatTrainer):
         self.points = start.points
         self.rig = Rig(head, subject.shape, subject.static_offset, start.points, config.expressions, device)
         vertices = self.rig.mesh.canonical.cpu().numpy()
-        mask = consistency_mask(
-            head,
-            vertices,
-            self.rig.expressions,
-            1e-3 * config.mask_floor_mm,
-            1e-3 * config.mask_full_mm,
-        )
+        limits = 1e-3 * config.mask_floor_mm, 1e-3 * config.mask_full_mm
+        mask = consistency_mask(head, vertices, self.rig.expressions, *limits)
         counts, expressions, weights = entries_of(mask, start.points.triangles)
         self._counts = torch.from_numpy(counts).to(device)
         self._expressions = torch.from_numpy(expressions).to(device)
@@ -108,18 +103,10 @@ class GBSTraining(SplatTrainer):
         splats, shared = self._initial(start, int(counts.sum()), device, seed)
         thresholds = torch.full((len(counts),), config.splats.densify_gradient, device=device)
         thresholds[self._part > 0] = config.teeth_densify_gradient
-        self._start(
-            splats,
-            shared,
-            torch.arange(len(counts), device=device),
-            len(counts),
-            1.0,
-            seed,
-            thresholds=thresholds,
-            keep_last=False,
-            tables=(DIFFERENCES,),
-            table_rows=self._counts,
-        )
+        tables = {"tables": (DIFFERENCES,), "table_rows": self._counts}
+        binding = torch.arange(len(counts), device=device)
+        books = {"thresholds": thresholds, "keep_last": False, **tables}
+        self._start(splats, shared, binding, len(counts), 1.0, seed, **books)
         self._sizes = torch.ones(len(counts), device=device)
         self._entries: tuple[Tensor, Entries] | None = None
 

@@ -158,10 +158,8 @@ class OursAppearance:
         expression, jaw = driving_coefficients(pose, self.expressions, self.jaw_bases, self._device)
         weights = frames.size.new_zeros(len(frames.size))
         if self._config.lines.enabled and self._config.penalty.weight:
-            unposed = self._mesh.unposed(arguments)
-            weights = penalty_weights(
-                unposed, self._mesh.canonical, self._mesh.faces, self._is_face, self._config
-            )
+            meshes = self._mesh.unposed(arguments), self._mesh.canonical
+            weights = penalty_weights(*meshes, self._mesh.faces, self._is_face, self._config)
         return PreparedTimestep(frames, self.canonical.turns(frames), expression, jaw, weights)
 
 
@@ -170,9 +168,7 @@ def driving_coefficients(
 ) -> tuple[Tensor, Tensor]:
     """Blend coefficients of the lines: the first expression coefficients, and the jaw's weights on its bases."""
     expression = torch.as_tensor(np.asarray(pose.expression)[:expressions], dtype=torch.float32)
-    jaw = np.zeros(0)
-    if len(bases):
-        jaw = jaw_weights(jaw_quaternions([pose]), bases)[0]
+    jaw = jaw_weights(jaw_quaternions([pose]), bases)[0] if len(bases) else np.zeros(0)
     return expression.to(device), torch.as_tensor(jaw, dtype=torch.float32).to(device)
 
 
@@ -180,10 +176,8 @@ def softened(offsets: Tensor, softness: float) -> Tensor:
     """|offset|, below ``softness`` a parabola that meets it with the same slope (Huber 1964): offset^2 / (2 softness)."""
     if softness == 0:
         return offsets.abs()
-    return (
-        torch.nn.functional.huber_loss(offsets, torch.zeros_like(offsets), reduction="none", delta=softness)
-        / softness
-    )
+    zero = torch.zeros_like(offsets)
+    return torch.nn.functional.huber_loss(offsets, zero, reduction="none", delta=softness) / softness
 
 
 def penalty_weights(
@@ -223,12 +217,11 @@ def outer_layers_start(mesh: SubjectMesh, clip: Clip, config: OursConfig, device
     chosen = expressive_triangles(mesh, clip, config.penalty.face_mm, device)
     size = mesh.frames(mesh.canonical).size.index_select(0, chosen)
     parts = [start]
+    opacities = torch.full((len(chosen),), config.outer_layers.opacity, device=device)
     for layer in range(1, config.outer_layers.count + 1):
         means = torch.zeros(len(chosen), 3, device=device)
         means[:, NORMAL] = layer * config.outer_layers.gap / size
-        parts.append(
-            Start(chosen, means, torch.full((len(chosen),), config.outer_layers.opacity, device=device))
-        )
+        parts.append(Start(chosen, means, opacities))
     return Start(*(torch.cat(column) for column in zip(*parts)))
 
 

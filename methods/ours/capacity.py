@@ -98,13 +98,11 @@ def plan_capacity(clip: Clip, mesh: SubjectMesh, config: OursConfig) -> Capacity
     config : its sizes are upper limits, those in ``capacity.keep`` are left alone.
     """
     planner = _Planner(clip, mesh, config)
-    decisions = [*planner.lines(), planner.planes(), planner.splats()]
+    planner.lines()
+    planner.planes()
+    planner.splats()
     return CapacityPlan(
-        config.capacity.tolerance,
-        planner.pixel,
-        tuple(each for each in decisions if each is not None),
-        planner.dynamic,
-        planner.within,
+        *(config.capacity.tolerance, planner.pixel, tuple(planner.decisions), planner.dynamic, planner.within)
     )
 
 
@@ -114,136 +112,139 @@ class _Planner:
     def __init__(self, clip: Clip, mesh: SubjectMesh, config: OursConfig):
         self._clip, self._mesh, self._config = clip, mesh, config
         self._canonical = mesh.canonical.cpu().numpy().astype(np.float64)
+        self._faces = np.asarray(clip.head.faces)
         self._poses: list[HeadPose] = training_poses(clip)
         self.pixel = pixel_footprint(clip, 0.5 * (self._canonical.min(0) + self._canonical.max(0)))
         self._metres = config.capacity.tolerance * self.pixel
         self.dynamic = config.lines.enabled
         self.within: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+        self.decisions: list[Decision] = []
 
     def _kept(self, name: Planned) -> bool:
         return name in self._config.capacity.keep
 
-    def lines(self) -> list[Decision]:
+    def _decide(
+        self,
+        name: Planned,
+        configured: int | str | None,
+        chosen: int | str | None,
+        reason: str,
+        **numbers: float,
+    ) -> None:
+        self.decisions.append(Decision(name, configured, chosen, reason, numbers))
+
+    def lines(self) -> None:
         """Directions, jaw bases, box and samples of the lines; nothing where there are none."""
         if not self._config.lines.enabled:
-            return []
-        driving = [self._expressions(), self._jaw_bases()]
-        counts = [self._config.lines.expressions, self._config.lines.jaw_bases]
-        counts = [count if each is None else int(each.chosen or 0) for count, each in zip(counts, driving)]
-        self.dynamic = sum(counts) > 0
-        decisions = [each for each in driving if each is not None]
+            return
+        self.dynamic = self._expressions() + self._jaw_bases() > 0
         if self.dynamic:
-            bounds = self._bounds()
-            decisions += [each for each in (bounds, self._line_resolution()) if each is not None]
-        return decisions
+            self._bounds()
+        if self.dynamic:
+            self._line_resolution()
 
-    def _expressions(self) -> Decision | None:
+    def _expressions(self) -> int:
+        """How many directions have lines."""
+        configured = self._config.lines.expressions
         if self._kept("lines.expressions"):
-            return None
+            return configured
         basis = np.asarray(self._clip.head.expression_basis)
-        limit = min(self._config.lines.expressions, basis.shape[2])
         coefficients = np.array([pose.expression for pose in self._poses], dtype=np.float64)
-        chosen = min(leading_directions(coefficients, basis, self._metres), limit)
+        chosen = min(leading_directions(coefficients, basis, self._metres), configured, basis.shape[2])
         rest = displacement_without(coefficients, basis, chosen) / self.pixel
         total = displacement_without(coefficients, basis, 0) / self.pixel
         reason = f"expressions move the surface by up to {total:.2f} px, {rest:.2f} px without these"
-        numbers = {"moved_px": total, "left_out_px": rest}
-        return Decision("lines.expressions", self._config.lines.expressions, chosen, reason, numbers)
+        self._decide("lines.expressions", configured, chosen, reason, moved_px=total, left_out_px=rest)
+        return chosen
 
-    def _jaw_bases(self) -> Decision | None:
+    def _jaw_bases(self) -> int:
+        """How many jaw bases have lines."""
+        configured = self._config.lines.jaw_bases
         # The official choice looks at held-out poses; it is reproduced as it is or not at all.
-        if (
-            self._kept("lines.jaw_bases")
-            or self._config.lines.jaw_bases_variant == "official"
-            or not self._config.lines.jaw_bases
-        ):
-            return None
+        official = self._config.lines.jaw_bases_variant == "official"
+        if self._kept("lines.jaw_bases") or official or not configured:
+            return configured
         lever = jaw_lever(self._mesh)
-        chosen, rest = spanning_jaw_bases(self._poses, self._config.lines.jaw_bases, lever, self._metres)
-        reason = f"without more the jaw moves the surface by {rest / self.pixel:.2f} px at most"
-        numbers = {"lever_m": lever, "left_out_px": rest / self.pixel}
-        return Decision("lines.jaw_bases", self._config.lines.jaw_bases, chosen, reason, numbers)
+        chosen, metres = spanning_jaw_bases(self._poses, configured, lever, self._metres)
+        rest = metres / self.pixel
+        reason = f"without more the jaw moves the surface by {rest:.2f} px at most"
+        self._decide("lines.jaw_bases", configured, chosen, reason, lever_m=lever, left_out_px=rest)
+        return chosen
 
-    def _bounds(self) -> Decision | None:
+    def _bounds(self) -> None:
         if self._kept("lines.bounds"):
-            return None
-        moves = self._moving()
+            return
+        configured, moves = self._config.lines.bounds, self._moving()
         if not moves.any():
             self.dynamic = False
             reason = "no triangle moves enough in training that the penalty lets it change"
-            return Decision("lines.bounds", self._config.lines.bounds, None, reason, {"triangles": 0})
-        corners = self._canonical[np.asarray(self._clip.head.faces)[moves].ravel()]
+            self._decide("lines.bounds", configured, None, reason, triangles=0)
+            return
+        corners = self._canonical[self._faces[moves].ravel()]
         whole = self._configured_line_box()
         low = np.maximum(corners.min(0) - PLANE_MARGIN, whole.low.numpy())
         high = np.minimum(corners.max(0) + PLANE_MARGIN, whole.high.numpy())
         share = float(np.prod((high - low) / (whole.high - whole.low).numpy()))
         self.within = tuple(map(float, low)), tuple(map(float, high))
         reason = f"{moves.mean():.0%} of the triangles move, {share:.0%} of the volume holds them"
-        numbers = {"triangles": float(moves.sum()), "volume_share": share}
-        return Decision("lines.bounds", self._config.lines.bounds, "moving", reason, numbers)
+        count = float(moves.sum())
+        self._decide("lines.bounds", configured, "moving", reason, triangles=count, volume_share=share)
 
     def _moving(self) -> np.ndarray:
         """(F,) whether the penalty lets a triangle's splats change in some training timestep, visibly."""
-        least = np.full(len(self._mesh.faces), self._metres)
-        if self._config.penalty.weight:
-            is_face = np.zeros(len(least), dtype=bool)
-            is_face[faces_in_region(self._clip.head, "face")] = True
-            config = self._config
-            millimetres = np.where(is_face, config.penalty.face_mm, config.penalty.other_mm)
-            least = np.maximum(least, 1e-3 * millimetres)
+        penalty = self._config.penalty
+        least = np.full(len(self._faces), self._metres)
+        if penalty.weight:
+            least = np.maximum(least, 1e-3 * np.where(self._is_face(), penalty.face_mm, penalty.other_mm))
         displaced = largest_displacements(self._mesh, self._poses) >= least
-        if self._config.lines.bounds == "face":
-            inside = np.zeros(len(least), dtype=bool)
-            inside[faces_in_region(self._clip.head, "face")] = True
-            displaced &= inside
-        return displaced
+        return displaced & self._is_face() if self._config.lines.bounds == "face" else displaced
+
+    def _is_face(self) -> np.ndarray:
+        return np.isin(np.arange(len(self._faces)), faces_in_region(self._clip.head, "face"))
 
     def _configured_line_box(self) -> Bounds:
         vertices: FloatArray = self._canonical
         if self._config.lines.bounds == "face":
-            faces = np.asarray(self._clip.head.faces)[faces_in_region(self._clip.head, "face")]
-            vertices = vertices[faces.ravel()]
+            vertices = vertices[self._faces[self._is_face()].ravel()]
         return line_box(torch.from_numpy(vertices))
 
-    def _line_resolution(self) -> Decision | None:
-        if self._kept("lines.resolution") or not self.dynamic:
-            return None
+    def _line_resolution(self) -> None:
+        if self._kept("lines.resolution"):
+            return
         whole = self._configured_line_box()
         size = (whole.high - whole.low).numpy()
         inside = size if self.within is None else np.subtract(self.within[1], self.within[0])
-        configured = self._config.lines.resolution
+        configured, longest = self._config.lines.resolution, float(inside.max())
         # On no axis finer than configured, and not finer than the images.
         spacing = np.maximum(size / (configured - 1), self.pixel / LINE_SAMPLES_PER_PIXEL)
         needed = 1 + ceil(float((inside / spacing).max()) - 1e-6)
         chosen = min(configured, max(needed, MINIMUM_LINE))
-        reason = f"a sample each {1000 * float(inside.max()) / (chosen - 1):.1f} mm of {1000 * inside.max():.0f} mm"
-        numbers = {"longest_m": float(inside.max())}
-        return Decision("lines.resolution", configured, chosen, reason, numbers)
+        reason = f"a sample each {1000 * longest / (chosen - 1):.1f} mm of {1000 * longest:.0f} mm"
+        self._decide("lines.resolution", configured, chosen, reason, longest_m=longest)
 
-    def planes(self) -> Decision | None:
+    def planes(self) -> None:
         """Samples per side of the planes."""
         if self._kept("planes.resolution") or self._config.color != "planes":
-            return None
+            return
+        configured = self._config.planes.resolution
         box = plane_box(self._mesh.canonical.cpu(), self._config.planes.bounds_variant)
         side = float((box.high - box.low).max())
         pixels = side / self.pixel
-        needed = 1 + ceil(self._config.capacity.detail * pixels)
-        chosen = min(self._config.planes.resolution, max(needed, MINIMUM_PLANE))
+        chosen = min(configured, max(1 + ceil(self._config.capacity.detail * pixels), MINIMUM_PLANE))
         reason = f"the planes' longest side covers {pixels:.0f} px"
-        numbers = {"longest_m": side, "longest_px": pixels}
-        return Decision("planes.resolution", self._config.planes.resolution, chosen, reason, numbers)
+        self._decide("planes.resolution", configured, chosen, reason, longest_m=side, longest_px=pixels)
 
-    def splats(self) -> Decision | None:
+    def splats(self) -> None:
         """Bound on the number of splats; training starts with one on each triangle, so never fewer."""
         if self._kept("splats.max_splats"):
-            return None
-        area = float(triangle_areas(self._canonical, np.asarray(self._clip.head.faces)).sum()) / self.pixel**2
-        needed = max(ceil(SPLATS_PER_PIXEL * area), len(self._mesh.faces))
-        configured = self._config.splats.max_splats
+            return
+        configured, count = self._config.splats.max_splats, len(self._faces)
+        area = float(triangle_areas(self._canonical, self._faces).sum()) / self.pixel**2
+        needed = max(ceil(SPLATS_PER_PIXEL * area), count)
         chosen = needed if configured is None else min(needed, configured)
-        reason = f"the surface covers {area:.0f} px, unrolled, in {len(self._mesh.faces)} triangles"
-        numbers = {"surface_px": area, "triangles": float(len(self._mesh.faces))}
-        return Decision("splats.max_splats", configured, chosen, reason, numbers)
+        reason = f"the surface covers {area:.0f} px, unrolled, in {count} triangles"
+        numbers = {"surface_px": area, "triangles": float(count)}
+        self._decide("splats.max_splats", configured, chosen, reason, **numbers)
 
 
 _BLOCK = 64  # timesteps whose displacement fields are held at once
@@ -329,12 +330,10 @@ def _longest(field: FloatArray) -> float:
 
 def jaw_lever(mesh: SubjectMesh) -> float:
     """Metres from the jaw joint to the vertex it moves most: skinning weight times distance, at most."""
-    model = mesh.model
     joint = JOINT_NAMES.index("jaw")
-    canonical = mesh.canonical
-    center = model.joint_regressor[joint] @ canonical
-    distance = torch.linalg.vector_norm(canonical - center, dim=1)
-    return float((model.skinning_weights[:, joint] * distance).max())
+    center = mesh.model.joint_regressor[joint] @ mesh.canonical
+    distance = torch.linalg.vector_norm(mesh.canonical - center, dim=1)
+    return float((mesh.model.skinning_weights[:, joint] * distance).max())
 
 
 def spanning_jaw_bases(

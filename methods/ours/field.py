@@ -32,6 +32,10 @@ WIDTHS: Mapping[Dynamic, int] = {"opacity": 1, "position": 3, "rotation": 4, "sc
 """Numbers per splat of each thing that may change."""
 
 
+FIELDS = {"opacity": "logits", "position": "means", "rotation": "quats", "scale": "log_scales"}
+"""Of `LocalSplats`, to which offsets are added."""
+
+
 class LocalSplats(NamedTuple):
     """Splats in their triangles' frames, before an expression changes them or after.
 
@@ -59,16 +63,11 @@ def offset_width(dynamic: Sequence[Dynamic]) -> int:
 def apply_offsets(splats: LocalSplats, offsets: Tensor, dynamic: Sequence[Dynamic]) -> LocalSplats:
     """Add (N, `offset_width`) offsets, in the order of ``dynamic``: to logits, local means, quaternions, log-scales."""
     parts = dict(zip(dynamic, offsets.split([WIDTHS[name] for name in dynamic], dim=1)))
-    changed = splats
     if "opacity" in parts:
-        changed = changed._replace(logits=splats.logits + parts["opacity"][:, 0])
-    if "position" in parts:
-        changed = changed._replace(means=splats.means + parts["position"])
-    if "rotation" in parts:
-        changed = changed._replace(quats=splats.quats + parts["rotation"])
-    if "scale" in parts:
-        changed = changed._replace(log_scales=splats.log_scales + parts["scale"])
-    return changed._replace(color_change=parts.get("color"))
+        parts["opacity"] = parts["opacity"][:, 0]
+    fields = {FIELDS[name]: part for name, part in parts.items() if name != "color"}
+    changed = {field: getattr(splats, field) + part for field, part in fields.items()}
+    return splats._replace(**changed, color_change=parts.get("color"))
 
 
 def changed_colors(colors: Tensor, splats: LocalSplats) -> Tensor:
@@ -79,7 +78,7 @@ def changed_colors(colors: Tensor, splats: LocalSplats) -> Tensor:
 AXES = 3
 
 
-class Parameters(Protocol):
+class NamedTensors(Protocol):
     """Tensors by name: an optimiser in training, a dict in an avatar."""
 
     def __getitem__(self, name: str, /) -> Tensor: ...
@@ -99,9 +98,8 @@ def line_position(points: Tensor, resolution: int) -> LinePosition:
     fraction = position - lower
     start = torch.arange(AXES, device=points.device) * resolution
     rows = lower.to(torch.int64) + start
-    return LinePosition(
-        torch.cat([rows, rows + 1], dim=1), torch.cat([1 - fraction, fraction], dim=1).to(points.dtype)
-    )
+    weights = torch.cat([1 - fraction, fraction], dim=1).to(points.dtype)
+    return LinePosition(torch.cat([rows, rows + 1], dim=1), weights)
 
 
 def blend_lines(lines: Tensor, expression: Tensor, jaw: Tensor) -> Tensor:
@@ -118,7 +116,7 @@ def blend_lines(lines: Tensor, expression: Tensor, jaw: Tensor) -> Tensor:
     return blended.view(2, *lines.shape[1:])
 
 
-def line_offsets(parameters: Parameters, blended: Tensor, position: LinePosition) -> Tensor:
+def line_offsets(parameters: NamedTensors, blended: Tensor, position: LinePosition) -> Tensor:
     """(N, D) offsets: 6 C features -> hidden -> hidden -> D, ReLU, weight-normalised; D = 1 is the opacity logit.
 
     The features are [e_x e_y e_z j_x j_y j_z]; none of the inputs but the lines and the network has a gradient.
@@ -126,7 +124,7 @@ def line_offsets(parameters: Parameters, blended: Tensor, position: LinePosition
     table = line_table(blended, normalised_weight(parameters, 0))
     return offset_network(
         sum_rows(table, *position),
-        *(parameters["line_bias_0"],),
+        parameters["line_bias_0"],
         *(normalised_weight(parameters, 1), parameters["line_bias_1"]),
         *(normalised_weight(parameters, 2), parameters["line_bias_2"]),
     )
@@ -139,12 +137,10 @@ def line_table(blended: Tensor, first: Tensor) -> Tensor:
     return torch.einsum("kalc,hkac->alh", blended, weights).reshape(axes * resolution, -1)
 
 
-def normalised_weight(parameters: Parameters, layer: int) -> Tensor:
+def normalised_weight(parameters: NamedTensors, layer: int) -> Tensor:
     """Weight of a layer: gain times direction, normalised per output row (Salimans and Kingma 2016, eq. 2)."""
-    direction = parameters[f"line_direction_{layer}"]
-    return direction * (
-        parameters[f"line_gain_{layer}"] / torch.linalg.vector_norm(direction, dim=1, keepdim=True)
-    )
+    direction, gain = parameters[f"line_direction_{layer}"], parameters[f"line_gain_{layer}"]
+    return direction * (gain / torch.linalg.vector_norm(direction, dim=1, keepdim=True))
 
 
 def initial_line_network(
@@ -239,25 +235,25 @@ def canonical_directions(turns: Tensor, binding: Tensor, means: Tensor, center: 
     return torch.nn.functional.normalize(apply_matrices(rows, directions), dim=1)
 
 
-def plane_features(parameters: Parameters, box: Bounds, positions: Tensor) -> tuple[Tensor, ...]:
+def plane_features(parameters: NamedTensors, box: Bounds, positions: Tensor) -> tuple[Tensor, ...]:
     """Features (N, C_k) of the three planes at canonical positions."""
     planes = {name: parameters[f"plane_{name}"] for name, _, _ in PAIRS}
     resolution = round(len(planes["xy"]) ** 0.5)
     return sample_triplane(planes, 2 * box.unit(positions) - 1, resolution)
 
 
-def shade(parameters: Parameters, features: tuple[Tensor, ...], directions: Tensor) -> Tensor:
+def shade(parameters: NamedTensors, features: tuple[Tensor, ...], directions: Tensor) -> Tensor:
     """Colours (N, 3) >= 0 of plane features and canonical directions; the way of training."""
     return color_network(parameters["color_weight_0"], parameters["color_weight_1"], features, directions)
 
 
-def position_part(parameters: Parameters, features: tuple[Tensor, ...]) -> Tensor:
+def position_part(parameters: NamedTensors, features: tuple[Tensor, ...]) -> Tensor:
     """What plane features, (N, C_k) each, add to the hidden layer; for an avatar it never changes."""
     joined = torch.cat(features, dim=1)
     return joined @ parameters["color_weight_0"][:, : joined.shape[1]].t()
 
 
-def shade_directions(parameters: Parameters, from_position: Tensor, directions: Tensor) -> Tensor:
+def shade_directions(parameters: NamedTensors, from_position: Tensor, directions: Tensor) -> Tensor:
     """Colours (N, 3) >= 0: hidden layer of position and encoded direction, ReLU, relu(0.5 + C0 * out).
 
     The same as `shade` up to rounding, where the part of the position is known beforehand.
@@ -290,10 +286,7 @@ def _initial_planes(config: OursConfig, generator: torch.Generator) -> dict[str,
         plane = uniform((config.planes.resolution**2, channels), 0.1, generator)
         result[f"plane_{name}"] = (plane, config.planes.lr)
     inputs = sum(config.planes.channels) + ENCODING_SIZE
-    weights = [
-        uniform((config.hidden, inputs), inputs**-0.5, generator),
-        uniform((3, config.hidden), config.hidden**-0.5, generator),
-    ]
-    return result | {
-        f"color_weight_{layer}": (w, config.planes.network_lr) for layer, w in enumerate(weights)
-    }
+    for layer, shape in enumerate([(config.hidden, inputs), (3, config.hidden)]):
+        weight = uniform(shape, shape[1] ** -0.5, generator)
+        result[f"color_weight_{layer}"] = (weight, config.planes.network_lr)
+    return result

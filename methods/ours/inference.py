@@ -66,17 +66,23 @@ class LineOffsets:
         # Transposed once, as the products below want them.
         self._second, self._last = (normalised_weight(tensors, layer).t().contiguous() for layer in (1, 2))
         self._biases = tensors["line_bias_1"], tensors["line_bias_2"]
-        self._kernel: KernelOffsets | None = None
-        if avatar_kernel.usable(positions):
-            self._kernel = KernelOffsets(self.inside, self._position, self._second, self._last, self._biases)
+        self._fast = avatar_kernel.usable(positions)
+        if self._fast:
+            rows, weights = self._position
+            pad = avatar_kernel.pad_units
+            self._kernel_places = rows[:, :AXES].to(torch.int32).contiguous(), weights[:, AXES:].contiguous()
+            hidden = pad(self._second, 1), pad(self._biases[0], 0)
+            self._kernel_layers = *hidden, pad(self._last.t(), 1), self._biases[1]
 
     def __call__(self, expression: Tensor, jaw: Tensor) -> Tensor:
         """(N, D) offsets of all splats for a frame's coefficients."""
         table = self.table(expression, jaw)
         out = table.new_empty if len(self.inside) == self._count else table.new_zeros
         offsets = out(self._count, self._last.shape[1])
-        if self._kernel is not None:
-            self._kernel(offsets, table)
+        if self._fast:
+            avatar_kernel.offsets_into(
+                offsets, self.inside, table, *self._kernel_places, *self._kernel_layers
+            )
         else:
             offsets.index_copy_(0, self.inside, self.by_torch(table))
         return offsets
@@ -105,32 +111,6 @@ class LineOffsets:
         return inside
 
 
-class KernelOffsets:
-    """The offset network as the kernel reads it, made once."""
-
-    def __init__(
-        self,
-        inside: Tensor,
-        position: LinePosition,
-        second: Tensor,
-        last: Tensor,
-        biases: tuple[Tensor, Tensor],
-    ):
-        rows = position.rows[:, :AXES].to(torch.int32).contiguous()
-        self._splats = inside, rows, position.weights[:, AXES:].contiguous()
-        self._second = avatar_kernel.pad_units(second, 1)
-        self._second_bias = avatar_kernel.pad_units(biases[0], 0)
-        self._last, self._last_bias = avatar_kernel.pad_units(last.t(), 1), biases[1]
-
-    def __call__(self, out: Tensor, table: Tensor) -> None:
-        """Write the offsets of a frame's (3 L, H) table into (N, D) ``out``."""
-        splats, rows, fractions = self._splats
-        avatar_kernel.offsets_into(
-            *(out, splats, table, rows, fractions),
-            *(self._second, self._second_bias, self._last, self._last_bias),
-        )
-
-
 def _lexicographic(rows: Tensor, resolution: int) -> Tensor:
     """(N,) order of (N, 3) rows by their last number, then the middle one, then the first."""
     x, y, z = rows.unbind(1)
@@ -149,11 +129,10 @@ class PlaneColors:
     def __init__(self, first: Tensor, last: Tensor, from_position: Tensor):
         of_direction = first[:, first.shape[1] - ENCODING_SIZE :].t().contiguous()
         self._fast = avatar_kernel.usable(from_position)
+        self._network = from_position, of_direction, last
         if self._fast:
-            from_position, of_direction, last = (
-                avatar_kernel.pad_units(values, 1) for values in (from_position, of_direction, last)
-            )
-        self.from_position, self._of_direction, self._last = from_position, of_direction, last
+            pad = avatar_kernel.pad_units
+            self._network = pad(from_position, 1), pad(of_direction, 1), pad(last, 1)
         self._known: tuple[Tensor, Tensor, Tensor] | None = None
 
     def __call__(self, means: Tensor, center: Tensor, turns: Tensor, binding: Tensor) -> Tensor:
@@ -169,8 +148,7 @@ class PlaneColors:
         if self._known is not None and self._known[0] is means and torch.equal(self._known[1], center):
             return self._known[2]
         if self._fast:
-            network = self.from_position, self._of_direction, self._last
-            colors = avatar_kernel.shade_network(*network, means, center, turns, binding)
+            colors = avatar_kernel.shade_network(*self._network, means, center, turns, binding)
         else:
             colors = self.along(-canonical_directions(turns, binding, means, center))
         self._known = means, center, colors
@@ -178,9 +156,9 @@ class PlaneColors:
 
     def along(self, directions: Tensor) -> Tensor:
         """Colours (N, 3) >= 0 along (N, 3) canonical unit vectors from the camera to the splats."""
-        encoded = encode_columns(-directions).t()
-        hidden = torch.addmm(self.from_position, encoded, self._of_direction).relu_()
-        return torch.addmm(hidden.new_tensor(0.5), hidden, self._last.t(), alpha=C0).relu_()
+        from_position, of_direction, last = self._network
+        hidden = torch.addmm(from_position, encode_columns(-directions).t(), of_direction).relu_()
+        return torch.addmm(hidden.new_tensor(0.5), hidden, last.t(), alpha=C0).relu_()
 
 
 def encode_columns(directions: Tensor) -> Tensor:

@@ -18,13 +18,7 @@ from ...datasets.steps.jaw_bases import leaks
 from ..compact.file import COMPACT_FILE, write_compact
 from ..compact.precision import Precision
 from ..compact.simplify import simplify, training_poses
-from ..shared.avatar_files import (
-    SUBJECT_FILE,
-    Subject,
-    finish_fit,
-    save_shared_head,
-    write_subject,
-)
+from ..shared.avatar_files import SUBJECT_FILE, Subject, finish_fit, save_shared_head, write_subject
 from ..shared.loop import Fit
 from ..shared.method import TrainedMethod
 from ..shared.schedule import Sampler, ShuffledEpochs, Weighted, balanced_weights
@@ -52,9 +46,7 @@ class Ours(TrainedMethod[OursConfig, OursAvatar]):
         last digits depend on the number of threads."""
         config, lines = self.config, self.config.lines
         if config.sampling.balanced or (lines.enabled and (config.penalty.weight or lines.bounds == "face")):
-            faces_in_region(
-                clip.head, "face"
-            )  # raises before the long work where the head has no face region
+            faces_in_region(clip.head, "face")  # raises before the long work where there is no such region
         if config.capacity.mode == "fixed":
             self._plan = None
             return config, config
@@ -70,15 +62,10 @@ class Ours(TrainedMethod[OursConfig, OursAvatar]):
         mesh = _mesh(clip, device)
         within = None if plan is None else plan.box(device)
         appearance = OursAppearance(mesh, clip, config, device, fit.seed, lines_within=within)
+        sampler, start = self._sampler(clip, fit.seed), outer_layers_start(mesh, clip, config, device)
+        count = len(mesh.faces)
         training = BoundTraining(
-            clip,
-            config.splats,
-            appearance,
-            self._sampler(clip, fit.seed),
-            len(mesh.faces),
-            device,
-            fit.seed,
-            start=outer_layers_start(mesh, clip, config, device),
+            clip, config.splats, appearance, sampler, count, device, fit.seed, start=start
         )
         outcome = training.run(fit)
         optimiser = training.optimiser
@@ -87,10 +74,7 @@ class Ours(TrainedMethod[OursConfig, OursAvatar]):
             {name: optimiser[name] for name in training.splat_names},
             training.binding,
             {name: optimiser[name] for name in appearance.parameters()},
-            appearance.plane_box,
-            appearance.line_box,
-            appearance.jaw_bases,
-            config.lines.dynamic,
+            *(appearance.plane_box, appearance.line_box, appearance.jaw_bases, config.lines.dynamic),
         )
         subject = Subject.of(clip)
         write_subject(out / SUBJECT_FILE, subject)
@@ -111,15 +95,11 @@ class Ours(TrainedMethod[OursConfig, OursAvatar]):
         )
 
     def _sampler(self, clip: Clip, seed: int) -> Sampler:
-        keys = clip.splits["train"]
-        if not self.config.sampling.balanced:
+        keys, sampling = clip.splits["train"], self.config.sampling
+        if not sampling.balanced:
             return ShuffledEpochs(len(keys), seed)
-        clusters = cluster_expressions(
-            clip,
-            self.config.sampling.expression_clusters,
-            seed=seed,
-            variant=self.config.sampling.clusters_variant,
-        )
+        count, variant = sampling.expression_clusters, sampling.clusters_variant
+        clusters = cluster_expressions(clip, count, seed=seed, variant=variant)
         timesteps = np.array([key.timestep for key in keys])
         return Weighted(balanced_weights(timesteps, clusters.by_timestep), seed)
 

@@ -77,11 +77,6 @@ def _header(path: Path, content: bytes) -> tuple[int, dict[str, str], int]:
     if not BEGIN.match(content) or end is None:
         raise InputError(path, "header", "a PLY header", "none")
     lines = content[: end.start()].decode("ascii", errors="replace").splitlines()
-    return *_parse_header(path, lines), end.end()
-
-
-def _parse_header(path: Path, lines: list[str]) -> tuple[int, dict[str, str]]:
-    """Number of vertices, and types of their properties by name, in order."""
     count = -1
     columns: dict[str, str] = {}
     for line in lines[1:]:
@@ -103,4 +98,4 @@ def _parse_header(path: Path, lines: list[str]) -> tuple[int, dict[str, str]]:
             raise InputError(path, "header", "format, element and property lines", line)
     if count < 0 or not columns:
         raise InputError(path, "element", "one vertex element with properties", "none")
-    return count, columns
+    return count, columns, end.end()

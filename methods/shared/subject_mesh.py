@@ -87,13 +87,12 @@ class BoundedCache(Generic[Value]):
         self._values: OrderedDict[int, Value] = OrderedDict()
 
     def __call__(self, key: int) -> Value:
-        if key in self._values:
-            self._values.move_to_end(key)
-            return self._values[key]
-        value = self._values[key] = self._compute(key)
-        if len(self._values) > self._entries:
-            self._values.popitem(last=False)
-        return value
+        if key not in self._values:
+            self._values[key] = self._compute(key)
+            if len(self._values) > self._entries:
+                self._values.popitem(last=False)
+        self._values.move_to_end(key)
+        return self._values[key]
 
     def __len__(self) -> int:
         return len(self._values)

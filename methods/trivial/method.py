@@ -5,14 +5,13 @@ They show what a number is worth: a method that does not clearly beat them has l
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 
-from ...bench.contracts import Camera, Clip, FloatArray, Frame, HeadPose
+from ...bench.contracts import ByteArray, Camera, Clip, FloatArray, Frame, FrameKey, HeadPose
 from ...bench.errors import InputError
 from ...bench.io.arrays import MAX_MAGNITUDE, TEXT, Member, read_arrays
 from ...bench.io.files import atomic_path
@@ -57,34 +56,52 @@ def recomposite(
     return Frame(np.clip(exchanged, 0, 1).astype(np.float32), alpha.astype(np.float32))
 
 
-def _rgba(clip: Clip, key: Any) -> FloatArray:
-    """(H, W, 4) float32 image and coverage; a frame without mask is all foreground."""
-    rgb = clip.image(key).astype(np.float32) / 255
-    mask = clip.mask(key)
-    alpha = np.ones(rgb.shape[:2], np.float32) if mask is None else mask.astype(np.float32) / 255
-    return np.dstack([rgb, alpha])
+def _rgba(clip: Clip, key: FrameKey) -> ByteArray:
+    """(H, W, 4) image and coverage; a frame without mask is all foreground."""
+    rgb, mask = clip.image(key), clip.mask(key)
+    return np.dstack([rgb, np.full(rgb.shape[:2], 255, np.uint8) if mask is None else mask])
 
 
-class MeanImageAvatar:
+class _ImageAvatar:
+    """An avatar that answers with an image of its own, at the camera's size.
+
+    Parameters
+    ----------
+    arrays : ``head_model`` and ``background``, of the images, among them.
+    """
+
+    def __init__(self, arrays: Mapping[str, np.ndarray]):
+        self._head_model, self._background = str(arrays["head_model"]), arrays["background"]
+
+    def render(self, camera: Camera, pose: HeadPose, background: Sequence[float] = (1.0, 1.0, 1.0)) -> Frame:
+        """The image at the camera's size. Raises `InputError` for a pose of another head model."""
+        if pose.head_model != self._head_model:
+            raise InputError("pose", "head_model", repr(self._head_model), repr(pose.head_model))
+        rgba = resize(self._image(camera, pose), camera.width, camera.height)
+        return recomposite(rgba[..., :3], rgba[..., 3], self._background, background)
+
+    def _image(self, camera: Camera, pose: HeadPose) -> FloatArray:
+        """(H, W, 4)."""
+        raise NotImplementedError
+
+
+class MeanImageAvatar(_ImageAvatar):
     """One image for every camera and pose."""
 
     def __init__(self, folder: Path):
         self._path = folder / MEAN_FILE
         arrays = read_arrays(self._path, _MEAN)
-        self._rgba, self._background = arrays["rgba"], arrays["background"]
-        self._head_model = str(arrays["head_model"])
+        super().__init__(arrays)
+        self._rgba = arrays["rgba"]
         if not self._rgba.size:
             raise InputError(self._path, "rgba", "at least one pixel", f"shape {self._rgba.shape}")
-
-    def render(self, camera: Camera, pose: HeadPose, background: Sequence[float] = (1.0, 1.0, 1.0)) -> Frame:
-        """The mean image at the camera's size. Raises `InputError` for a pose of another head model."""
-        _check_head_model(pose, self._head_model)
-        image = resize(self._rgba, camera.width, camera.height)
-        return recomposite(image[..., :3], image[..., 3], self._background, background)
 
     def files(self) -> Sequence[Path]:
         """The image."""
         return [self._path]
+
+    def _image(self, camera: Camera, pose: HeadPose) -> FloatArray:
+        return self._rgba
 
 
 class MeanImage(TrainedMethod[None, MeanImageAvatar]):
@@ -103,7 +120,7 @@ class MeanImage(TrainedMethod[None, MeanImageAvatar]):
         largest = max(cameras, key=lambda camera: camera.width * camera.height)
         total = np.zeros((largest.height, largest.width, 4))
         for done, key in enumerate(keys, 1):
-            total += resize(_rgba(clip, key), largest.width, largest.height)
+            total += resize(_rgba(clip, key).astype(np.float32) / 255, largest.width, largest.height)
             fit.progress(done, len(keys))
         arrays = {
             "rgba": (total / len(keys)).astype(np.float32),
@@ -114,7 +131,7 @@ class MeanImage(TrainedMethod[None, MeanImageAvatar]):
         write_record(fit, Outcome(len(keys), len(keys), 0.0))
 
 
-class NearestCameraAvatar:
+class NearestCameraAvatar(_ImageAvatar):
     """Answers with a training image: nearest timestep by driving signal, then nearest camera by direction.
 
     The distance of two driving signals is the Euclidean one after every parameter was divided by its standard
@@ -125,14 +142,8 @@ class NearestCameraAvatar:
     def __init__(self, folder: Path):
         self._folder = folder
         self._index = read_arrays(folder / INDEX_FILE, _INDEX)
-        self._head_model = str(self._index["head_model"])
+        super().__init__(self._index)
         self._check_index(folder / INDEX_FILE)
-
-    def render(self, camera: Camera, pose: HeadPose, background: Sequence[float] = (1.0, 1.0, 1.0)) -> Frame:
-        """The nearest training image at the camera's size. Raises `InputError` for another head model's pose."""
-        _check_head_model(pose, self._head_model)
-        rgba = resize(self._read(self.nearest(camera, pose)), camera.width, camera.height)
-        return recomposite(rgba[..., :3], rgba[..., 3], self._index["background"], background)
 
     def nearest(self, camera: Camera, pose: HeadPose) -> int:
         """Number of the training image to show."""
@@ -168,8 +179,8 @@ class NearestCameraAvatar:
             if not file.is_file():
                 raise InputError(file, "", f"an image that {INDEX_FILE} names", "no such file")
 
-    def _read(self, number: int) -> FloatArray:
-        path = image_path(self._folder, number)
+    def _image(self, camera: Camera, pose: HeadPose) -> FloatArray:
+        path = image_path(self._folder, self.nearest(camera, pose))
         pixels = read_pixels(path)
         if pixels.ndim != 3 or pixels.shape[2] != 4:
             raise InputError(path, "", "an 8-bit RGBA image", "something else")
@@ -193,7 +204,8 @@ class NearestCamera(TrainedMethod[NearestCameraConfig, NearestCameraAvatar]):
         column = {name: number for number, name in enumerate(sorted({key.camera for key in keys}))}
         images = np.full((len(row), len(column)), -1, dtype=np.int64)
         for number, key in enumerate(keys):
-            _write_image(image_path(fit.out, number), clip, key)
+            with atomic_path(image_path(fit.out, number)) as temporary:
+                cv2.imwrite(str(temporary), cv2.cvtColor(_rgba(clip, key), cv2.COLOR_RGBA2BGRA))
             images[row[key.timestep], column[key.camera]] = number
             fit.progress(number + 1, len(keys))
         signals = np.stack([driving_signal(clip.poses[timestep]) for timestep in timesteps])
@@ -228,19 +240,6 @@ def driving_signal(pose: HeadPose) -> FloatArray:
 def image_path(folder: Path, number: int) -> Path:
     """File of a kept training image."""
     return folder / IMAGE_FOLDER / f"{number:06d}.png"
-
-
-def _write_image(path: Path, clip: Clip, key: Any) -> None:
-    mask = clip.mask(key)
-    rgb = clip.image(key)
-    alpha = np.full(rgb.shape[:2], 255, np.uint8) if mask is None else mask
-    with atomic_path(path) as temporary:
-        cv2.imwrite(str(temporary), np.dstack([rgb[..., ::-1], alpha]))
-
-
-def _check_head_model(pose: HeadPose, version: str) -> None:
-    if pose.head_model != version:
-        raise InputError("pose", "head_model", repr(version), repr(pose.head_model))
 
 
 def _unit(vectors: FloatArray) -> FloatArray:

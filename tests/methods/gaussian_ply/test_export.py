@@ -197,14 +197,6 @@ def test_directions_from_behind_hardly_count():
     assert BEHIND < 0.1
 
 
-def test_directions_spread_evenly():
-    directions = sphere(96).double()
-    np.testing.assert_allclose(torch.linalg.vector_norm(directions, dim=1), 1, atol=1e-6)
-    moment = directions.t() @ directions / 96
-    np.testing.assert_allclose(moment, np.eye(3) / 3, atol=0.01)
-    assert torch.linalg.vector_norm(directions.mean(0)) < 0.01
-
-
 def test_a_timestep_needs_a_capture():
     with pytest.raises(ValueError, match="capture"):
         ExportPlySettings("a", out="b", timestep=3)

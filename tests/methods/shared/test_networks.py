@@ -9,13 +9,11 @@ from torch.nn.functional import grid_sample
 from headbench.methods.shared import networks
 from headbench.methods.shared.networks import (
     C0,
-    PAIRS,
     coefficient_count,
     color_network,
     encode,
     offset_network,
     sample_plane,
-    sample_triplane,
     sh_basis,
     sh_to_rgb,
     sum_rows,
@@ -115,24 +113,6 @@ def test_planes_are_sampled_as_by_grid_sample():
     plane, coordinates = random(RESOLUTION**2, CHANNELS), 1.3 * random(40, 2, seed=1).clamp(-1, 1)
     weight = random(40, CHANNELS, seed=2)
     check(lambda p, c: sample_plane(p, c, RESOLUTION), by_grid_sample, [plane, coordinates], weight)
-
-
-def test_planes_read_their_own_coordinates_width_first():
-    ramp = torch.arange(RESOLUTION, dtype=torch.float64) / (RESOLUTION - 1) * 2 - 1
-    # Each plane holds (its width coordinate, its height coordinate) as two channels.
-    grid = torch.stack(torch.meshgrid(ramp, ramp, indexing="xy"), dim=-1).reshape(-1, 2)
-    points = torch.rand(6, 3, dtype=torch.float64) * 2 - 1
-    features = torch.cat(sample_triplane({name: grid for name, _, _ in PAIRS}, points, RESOLUTION), dim=1)
-    x, y, z = points.T
-    np.testing.assert_allclose(features, torch.stack([x, y, x, z, y, z], dim=1), atol=1e-12)
-
-
-def test_directions_are_encoded_with_identity_and_four_frequencies_without_pi():
-    direction = torch.tensor([[0.3, -0.5, 0.8]], dtype=torch.float64)
-    expected = [direction]
-    for frequency in (1, 2, 4, 8):
-        expected += [torch.sin(frequency * direction), torch.cos(frequency * direction)]
-    np.testing.assert_allclose(encode(direction), torch.cat(expected, dim=1))
 
 
 def real_harmonics(directions, degree):

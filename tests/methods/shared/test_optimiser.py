@@ -52,30 +52,6 @@ def test_select_keeps_rows_with_their_moments():
     np.testing.assert_allclose(optimiser["a"].detach(), expected, rtol=1e-12)
 
 
-def test_appended_rows_start_with_zero_moments_and_old_rows_keep_theirs():
-    optimiser, _ = make()
-    step(optimiser, np.ones((4, 3)))
-    before = {name: value.clone() for name, value in optimiser.moments("a").items()}
-    optimiser.append({"a": torch.full((2, 3), 7.0, dtype=torch.float64)})
-    after = optimiser.moments("a")
-    assert after["exp_avg"].shape == (6, 3)
-    for name in ("exp_avg", "exp_avg_sq"):
-        assert (after[name][:4] == before[name]).all()
-        assert (before[name] > 0).all()
-        assert (after[name][4:] == 0).all()
-    assert (optimiser["a"][4:] == 7).all()
-    assert optimiser["a"].requires_grad
-
-
-def test_new_values_forget_the_moments():
-    optimiser, _ = make()
-    step(optimiser, np.ones((4, 3)))
-    optimiser.set_values("a", torch.zeros(4, 3, dtype=torch.float64))
-    assert (optimiser["a"] == 0).all()
-    assert (optimiser.moments("a")["exp_avg"] == 0).all()
-    assert (optimiser.moments("a")["exp_avg_sq"] == 0).all()
-
-
 def test_state_restores_another_number_of_rows_and_the_same_course():
     one, _ = make()
     gradients = np.random.default_rng(2).normal(size=(4, 3, 3))
