@@ -20,6 +20,8 @@ TRAIN, HELD_OUT = "#0072b2", "#d55e00"
 """Two of Okabe and Ito's colours, told apart with any colour vision."""
 MUTED, RULE, LEAK = "#737373", "#d6d6d6", "#be1e2d"
 DPI = 100
+LONGEST = 2**16 - 1
+"""Pixels of a side that matplotlib draws at most; a larger figure is drawn with fewer of them."""
 
 _STYLE: Any = {
     "text.parse_math": False,  # names hold dollar signs
@@ -55,6 +57,7 @@ def bands(figure: Figure, heights: Sequence[float]) -> list[SubFigure]:
 
 def pixels(figure: Figure) -> ByteArray:
     """(H, W, 3) 8-bit sRGB."""
+    figure.set_dpi(min(figure.dpi, LONGEST / max(figure.get_size_inches())))
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()

@@ -8,6 +8,7 @@ from typing import Literal
 import pandas as pd
 
 from ..bench.rows import ALL, FRAME, Rows
+from ..bench.runner.scoring import FULL
 
 
 @dataclass(frozen=True)
@@ -23,28 +24,28 @@ class Aggregate:
     spread: float | None = None
 
 
-def summarise(rows: Rows, *, method: str, metric: str, task: str, region: str) -> Aggregate:
-    """Aggregate one metric of one method over all its seeds.
+def whole_images(rows: Rows, method: str, metric: str, task: str) -> pd.DataFrame:
+    """One metric of one method over whole images and all seeds; ``task`` "" for one of the avatar as a whole."""
+    return rows.select(method=method, metric=metric, task=task, region=FULL, seeds=ALL)
 
-    Parameters
-    ----------
-    rows : of all methods; they say which frames (for ``task`` "": which subjects) have to be there.
-    """
-    mine = rows.select(method=method, metric=metric, task=task, region=region, seeds=ALL)
+
+def summarise(rows: Rows, method: str, metric: str, task: str) -> Aggregate:
+    """Aggregate `whole_images`; ``rows`` of all methods say which frames (for ``task`` "": subjects) have to be there."""
+    mine = whole_images(rows, method, metric, task)
     if mine.empty:
         own = rows.select(method=method, metric=ALL, task=ALL, region=ALL, seeds=ALL)
         failed = own[own["status"] == "failed"]
         if len(failed):
-            return Aggregate("failed", None, _because(failed))
+            return Aggregate("failed", None, _reason(failed))
         return Aggregate("missing", None, "Not measured: run the comparison with this method and metric.")
     for status in ("failed", "missing"):
         without = mine[mine["status"] == status]
         if len(without):
-            reason = _because(without)
+            reason = _reason(without)
             if len(without) < len(mine):
                 reason = f"{len(without)} of {len(mine)} values {status}: {reason}"
             return Aggregate(status, None, reason)  # type: ignore[arg-type]
-    expected = len(rows.frames(task, region) if task else rows.subjects) * len(rows.seeds(method))
+    expected = len(rows.frames(task, FULL) if task else rows.subjects) * len(rows.seeds(method))
     gap = expected - len(mine)
     if gap:
         what = "frames" if task else "avatars"
@@ -52,12 +53,7 @@ def summarise(rows: Rows, *, method: str, metric: str, task: str, region: str) -
         return Aggregate("missing", None, reason)
     by_seed = _subject_means(mine).groupby(level="seed").mean()
     spread = float(by_seed.std(ddof=1)) if len(by_seed) > 1 else None
-    return Aggregate("ok", macro_mean(mine), spread=spread)
-
-
-def macro_mean(rows: pd.DataFrame) -> float:
-    """Mean over frames of a sequence, then over sequences, then over subjects, then over seeds."""
-    return float(_subject_means(rows).groupby(level="seed").mean().mean())
+    return Aggregate("ok", float(by_seed.mean()), spread=spread)
 
 
 def subject_means(rows: pd.DataFrame) -> dict[str, float]:
@@ -73,7 +69,7 @@ def _subject_means(rows: pd.DataFrame) -> pd.Series[float]:
     return sequences.groupby(level=["seed", "subject"]).mean()
 
 
-def _because(rows: pd.DataFrame) -> str:
-    """Return the reason of the first row in a fixed order, as one line."""
+def _reason(rows: pd.DataFrame) -> str:
+    """The reason of the first row in a fixed order, as one line."""
     first = rows.sort_values(["seed", *FRAME]).iloc[0]
     return " ".join(str(first["reason"]).split()) or f"The rows say {first['status']} and give no reason."

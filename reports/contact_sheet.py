@@ -13,7 +13,7 @@ import numpy as np
 from ..bench.contracts import ByteArray, FloatArray, FrameKey
 from ..bench.errors import InputError
 from ..bench.protocol import TASK_TITLES
-from .drawing import SheetSection, Tile, TilePlace, TileRow, colour_map, write_sheet
+from .drawing import SheetSection, Tile, TileRow, colour_map, write_sheet
 from .runs import RunData, evenly_spaced
 
 FRAMES_PER_TASK = 3
@@ -29,10 +29,7 @@ def write_contact_sheet(run_folder: Path, frames_per_task: int = FRAMES_PER_TASK
         for task in data.tasks
         for key in evenly_spaced(data.keys(task), frames_per_task)
     ]
-    protocols = ", ".join(
-        f"{identifier} ({data.manifest.protocols[task].hash})"
-        for task, identifier in data.protocol_ids.items()
-    )
+    protocols = ", ".join(f"{p.id} ({p.hash})" for p in data.manifest.protocols.values())
     subjects = dict.fromkeys(key.subject for task in data.tasks for key in data.keys(task))
     contact_sheet(
         frames,
@@ -52,7 +49,7 @@ class ComparedFrame:
     Attributes
     ----------
     labels : short lines beside it (sequence, timestep, camera).
-    truth : ground truth, (H, W, 3) 8-bit.
+    ground_truth : (H, W, 3) 8-bit.
     renders : by method, of that size, or the reason why there is none.
     errors : by method with a render, (H, W) absolute difference in levels, mean over the channels.
     captions : by method, a short text under the render (its PSNR).
@@ -60,7 +57,7 @@ class ComparedFrame:
 
     section: str
     labels: Sequence[str]
-    truth: ByteArray
+    ground_truth: ByteArray
     renders: Mapping[str, ByteArray | str]
     errors: Mapping[str, FloatArray]
     captions: Mapping[str, str] = field(default_factory=dict)
@@ -70,32 +67,30 @@ class ComparedFrame:
         cls,
         section: str,
         labels: Sequence[str],
-        truth: ByteArray,
+        ground_truth: ByteArray,
         renders: Mapping[str, ByteArray | str],
         captions: Mapping[str, str],
         width: int = PANEL_WIDTH,
     ) -> ComparedFrame:
-        """Bring images to a width.
-
-        Wider ones are reduced to it (by area), narrower ones enlarged by a whole factor as far as they fit, each
-        pixel a square. Raises `InputError` for a render that has not the size of the ground truth.
+        """Bring images to a width: wider ones are reduced to it (by area), narrower ones enlarged by a whole factor as
+        far as they fit, each pixel a square. Raises `InputError` for a render that has not the size of the ground truth.
         """
-        factor = width // truth.shape[1] or width / truth.shape[1]
-        size = (max(1, round(truth.shape[1] * factor)), max(1, round(truth.shape[0] * factor)))
-        images = {method: image for method, image in renders.items() if not isinstance(image, str)}
-        for method, image in images.items():
-            if image.shape != truth.shape:
-                expected, found = (f"shape {one.shape}" for one in (truth, image))
+        height, own = ground_truth.shape[:2]
+        factor = width // own or width / own
+        size = (max(1, round(own * factor)), max(1, round(height * factor)))
+        shown: dict[str, ByteArray | str] = {}
+        errors = {}
+        for method, image in renders.items():
+            if isinstance(image, str):
+                shown[method] = image
+                continue
+            if image.shape != ground_truth.shape:
+                expected, found = (f"shape {one.shape}" for one in (ground_truth, image))
                 raise InputError("contact sheet", f"render of {method}", expected, found)
-        # Reduced after the difference: reducing before it would average errors of opposite sign away.
-        errors = {
-            method: _resized(np.abs(image.astype(np.float32) - truth).mean(axis=2), size)
-            for method, image in images.items()
-        }
-        shown = {
-            m: image if isinstance(image, str) else _resized(image, size) for m, image in renders.items()
-        }
-        return cls(section, labels, _resized(truth, size), shown, errors, captions)
+            shown[method] = _resized(image, size)
+            # Reduced after the difference: reducing before it would average errors of opposite sign away.
+            errors[method] = _resized(np.abs(image.astype(np.float32) - ground_truth).mean(axis=2), size)
+        return cls(section, labels, _resized(ground_truth, size), shown, errors, captions)
 
 
 def contact_sheet(
@@ -106,8 +101,8 @@ def contact_sheet(
     title: str = "",
     subtitle: str = "",
     scaled_by: Sequence[str] = (),
-) -> list[TilePlace]:
-    """Draw the sheet and write it as a PNG, atomically.
+) -> None:
+    """Draw the sheet and write it as a PNG, atomically: ground truth, then a render and an error map for each method.
 
     Error maps are on one scale for the whole sheet: a round number at or above the 99th percentile of the errors.
     Larger errors take the top colour.
@@ -118,10 +113,6 @@ def contact_sheet(
     methods : columns, in order.
     scaled_by : methods whose errors set the scale (default: all), so that a trivial baseline does not darken the
         rest.
-
-    Returns
-    -------
-    Where each image lies: column 0 has the ground truth, then a render and an error map for each method.
     """
     if not frames:
         raise InputError("contact sheet", "rows", "at least one frame", "none")
@@ -130,7 +121,7 @@ def contact_sheet(
     heads = ["Ground truth", *(head for method in methods for head in (method, "error"))]
 
     def row(frame: ComparedFrame) -> TileRow:
-        tiles = [Tile(frame.truth)]
+        tiles = [Tile(frame.ground_truth)]
         for method in methods:
             error = frame.errors.get(method)
             tiles.append(Tile(frame.renders.get(method, "not rendered"), frame.captions.get(method, "")))
@@ -142,7 +133,7 @@ def contact_sheet(
         for section, members in groupby(frames, key=lambda frame: frame.section)
     ]
     more = " or more" if scale < NICE_SCALES[-1] else ""
-    return write_sheet(
+    write_sheet(
         out, sections, title=title, subtitle=subtitle, error_scale=(scale, more), pairs=True, label_width=150
     )
 
@@ -158,7 +149,7 @@ def _compared(data: RunData, task: str, key: FrameKey) -> ComparedFrame:
         if metric and value is not None:
             captions[method] = f"{metric.label} {value:.{metric.digits}f} {metric.unit}".rstrip()
     labels = (key.sequence, f"subject {key.subject}", f"timestep {key.timestep}", f"camera {key.camera}")
-    return ComparedFrame.of(TASK_TITLES.get(task, task), labels, data.truth(key), renders, captions)
+    return ComparedFrame.of(TASK_TITLES.get(task, task), labels, data.ground_truth(key), renders, captions)
 
 
 def _resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import cv2
 import matplotlib
 import numpy as np
 from matplotlib import style
@@ -26,6 +27,8 @@ TITLE, TEXT, SMALL = 20, 15, 13
 SMALLEST_WIDTH = 760
 """Pixels that a sheet's own text needs."""
 DPI = 100
+LONGEST = 2**16 - 1
+"""Pixels of a side that matplotlib draws at most; a longer sheet becomes smaller."""
 WHITE: ByteArray = np.full((12, 12, 3), 255, np.uint8)
 
 
@@ -58,18 +61,6 @@ class SheetSection:
     rows: Sequence[TileRow]
 
 
-@dataclass(frozen=True)
-class TilePlace:
-    """Where an image lies on the sheet, pixels; rows are counted over all sections."""
-
-    row: int
-    column: int
-    left: int
-    top: int
-    width: int
-    height: int
-
-
 @dataclass
 class _Paper:
     """White paper of fixed width that is written on downwards from the height ``y``; coordinates are pixels."""
@@ -87,7 +78,7 @@ class _Paper:
         self, left: float, text: str, size: int, colour: str = INK, *, drop: int = 0, width: int | None = None
     ) -> None:
         """Write one line, its top ``drop`` below the current height, cut to about ``width``."""
-        limit = len(text) if width is None else characters(width, size)
+        limit = len(text) if width is None else _characters(width, size)
         text = text if len(text) <= limit else text[: limit - 1] + "…"
         points = size * 72 / DPI
         self.axes.text(left, self.y + drop, text, size=points, color=colour, va="top", parse_math=False)
@@ -107,10 +98,8 @@ class _Paper:
         """An image, or a grey box with its reason, as much of it as fits."""
         if isinstance(tile.picture, str):
             self.axes.add_patch(Rectangle((left, self.y), width, height, color=BOX, linewidth=0))
-            lines = max(1, (height - 8) // (SMALL + 4))
-            words = textwrap.wrap(
-                tile.picture, characters(width - 16, SMALL), max_lines=lines, placeholder=" …"
-            )
+            fit, lines = _characters(width - 16, SMALL), max(1, (height - 8) // (SMALL + 4))
+            words = textwrap.wrap(tile.picture, fit, max_lines=lines, placeholder=" …")
             for index, line in enumerate(words):
                 self.text(left + 8, line, SMALL, MUTED, drop=8 + index * (SMALL + 4))
         else:
@@ -121,12 +110,18 @@ class _Paper:
 
     def save(self, path: Path) -> None:
         """Write the paper down to the current height as a PNG, atomically."""
+        scale = min(1.0, LONGEST / max(self.width, self.y))
         self.figure.set_size_inches(self.width / DPI, self.y / DPI)
+        self.figure.set_dpi(scale * DPI)
         self.axes.set(xlim=(0, self.width), ylim=(self.y, 0))
         canvas = FigureCanvasAgg(self.figure)
         canvas.draw()
         pixels = np.array(canvas.buffer_rgba())[..., :3]
         for left, top, image in self.images:  # pixel for pixel
+            if scale < 1:
+                left, top, height, width = (int(scale * size) for size in (left, top, *image.shape[:2]))
+                size = (max(1, width), max(1, height))
+                image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
             pixels[top : top + image.shape[0], left : left + image.shape[1]] = image
         with atomic_path(path) as temporary:
             Image.fromarray(pixels).save(temporary, optimize=True)
@@ -143,20 +138,15 @@ def write_sheet(
     error_scale: tuple[int, str] | None = None,
     pairs: bool = False,
     label_width: int = 120,
-) -> list[TilePlace]:
+) -> None:
     """Draw sections below each other and write a PNG, atomically.
 
     Parameters
     ----------
-    title, subtitle : above everything.
     marks : legend of the colours around images: meaning by colour.
     error_scale : level of the brightest colour of error maps and what follows it, for a colour bar.
     pairs : keep columns 1 and 2, 3 and 4, ... closer together.
     label_width : pixels for the labels left of the rows.
-
-    Returns
-    -------
-    Where each image lies, for those who want to find it again.
     """
     tiles = [tile for section in sections for row in section.rows for tile in row.tiles]
     width = max((t.picture.shape[1] for t in tiles if not isinstance(t.picture, str)), default=label_width)
@@ -168,7 +158,7 @@ def write_sheet(
     paper = _Paper(max(left(columns) + MARGIN - GAP, SMALLEST_WIDTH))
     paper.text(MARGIN, title, TITLE)
     paper.y += TITLE + 10
-    for line in textwrap.wrap(subtitle, characters(paper.width - 2 * MARGIN, SMALL)):
+    for line in textwrap.wrap(subtitle, _characters(paper.width - 2 * MARGIN, SMALL)):
         paper.text(MARGIN, line, SMALL, MUTED)
         paper.y += SMALL + 5
     paper.y += 8
@@ -179,8 +169,6 @@ def write_sheet(
     if error_scale is not None:
         _colour_bar(paper, *error_scale)
 
-    places: list[TilePlace] = []
-    number = 0
     for section in sections:
         paper.y += 10
         paper.text(MARGIN, section.title, TEXT)
@@ -198,15 +186,10 @@ def write_sheet(
                 paper.text(MARGIN, label, SMALL, colour, drop=drop, width=label_width - 8)
             for column, tile in enumerate(row.tiles):
                 paper.tile(left(column), tile, width, height)
-                if not isinstance(tile.picture, str):
-                    shown = tile.picture.shape
-                    places.append(TilePlace(number, column, left(column), paper.y, shown[1], shown[0]))
             caption = SMALL + 7 if any(tile.caption for tile in row.tiles) else 0
             paper.y += max(height + caption, len(row.labels) * (SMALL + 6)) + GAP
-            number += 1
     paper.y += MARGIN - GAP
     paper.save(path)
-    return places
 
 
 def _colour_bar(paper: _Paper, top: int, more: str) -> None:
@@ -221,7 +204,7 @@ def _colour_bar(paper: _Paper, top: int, more: str) -> None:
     paper.y += SMALL + 10
 
 
-def characters(width: int, size: int) -> int:
+def _characters(width: int, size: int) -> int:
     """About how many characters of a text size go into a width, both pixels."""
     return max(2, int(width / (0.6 * size)))
 

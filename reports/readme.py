@@ -49,7 +49,7 @@ def block(gallery: Path) -> str:
     rows = Rows.read(RunFolder(gallery).rows)
     trained = rows.select(method=ALL, metric="training_time", task="", region=FULL, seeds=ALL)
     trained = trained[trained["status"] == "ok"]
-    # Not the run's own length: a demo that was continued would tell that of its last part.
+    # Not the run's own length: of a demo that was continued it is that of its last part.
     spent = zip(trained["method"].astype(str), trained["value"].astype(float))
     minutes = ", ".join(f"{method} {value:.1f}" for method, value in spent if value >= 0.05)
     cost = (

@@ -1,17 +1,18 @@
-"""Reads what reports show from a run folder, checked: rows, metrics, methods, protocols, renders and truth."""
+"""Reads what reports show from a run folder, checked: rows, metrics, methods, protocols, renders, captured images."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, TypeVar
 
 from ..bench.contracts import ByteArray, Clip, FrameKey
 from ..bench.errors import InputError
 from ..bench.io.images import probe_image, read_png
-from ..bench.manifest import Derived, Manifest, MethodRecord
+from ..bench.manifest import Manifest, MethodRecord
 from ..bench.rows import ALL, Rows
 from ..bench.runner.captures import open_run_clips
 from ..bench.runner.config import RunOptions
@@ -24,14 +25,7 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True)
 class RunData:
-    """A finished run, read. Images are read when asked for.
-
-    Attributes
-    ----------
-    folder : where it lies.
-    manifest : content of ``run.json``.
-    rows : one per value.
-    """
+    """A finished run, read; names in the order of its configuration. Images are read when asked for."""
 
     folder: RunFolder
     manifest: Manifest
@@ -46,12 +40,12 @@ class RunData:
 
     @property
     def metrics(self) -> tuple[MetricSpec, ...]:
-        """In the order of the configuration."""
+        """What was measured."""
         return self.manifest.metrics
 
     @property
     def methods(self) -> tuple[str, ...]:
-        """Names, in the order of the configuration."""
+        """Names of the methods."""
         return tuple(method.name for method in self.manifest.methods)
 
     @property
@@ -61,18 +55,8 @@ class RunData:
 
     @property
     def tasks(self) -> tuple[str, ...]:
-        """In the order of the configuration."""
+        """Names of the tasks."""
         return tuple(self.manifest.protocols)
-
-    @property
-    def derived(self) -> dict[str, Derived]:
-        """Of methods whose avatars were derived from trained ones: from which, the variant, what was changed."""
-        return {method.name: method.derived for method in self.manifest.methods if method.derived}
-
-    @property
-    def protocol_ids(self) -> dict[str, str]:
-        """Readable name of each task's protocol."""
-        return {task: protocol.id for task, protocol in self.manifest.protocols.items()}
 
     @property
     def machine(self) -> str:
@@ -100,7 +84,7 @@ class RunData:
         path = self.render_path(method, task, key)
         return None if path is None else read_png(path)
 
-    def truth(self, key: FrameKey) -> ByteArray:
+    def ground_truth(self, key: FrameKey) -> ByteArray:
         """Read the captured image of a frame, (H, W, 3) 8-bit, from the capture the run was made from."""
         return self._clips[key.subject].image(key)
 
@@ -155,15 +139,9 @@ LONGEST_DIFFERENCE = 48
 
 @dataclass(frozen=True)
 class RunSet:
-    """Runs on the same frames.
+    """Runs on the same frames, in the order given. The methods in their ``rows`` are named by labels.
 
-    Attributes
-    ----------
-    runs : in the order given.
-    rows : of all, their methods named by labels.
-    metrics, tasks : those of all runs, in their order.
-    records : by label, in order: what the method was, as in the manifest (name, version, config, budget).
-    trivial : labels of trivial baselines.
+    ``records`` says by label what the method was, as in the manifest; ``trivial`` has labels of trivial baselines.
     """
 
     runs: tuple[RunData, ...]
@@ -190,24 +168,14 @@ class RunSet:
         runs = tuple(RunData.read(folder) for folder in folders)
         _check_protocols(runs)
         labels = _labels(runs)
-        rows = Rows.joined(
-            [
-                run.rows.renamed({name: label for (i, name), label in labels.items() if i == index})
-                for index, run in enumerate(runs)
-            ]
-        )
+        rows = Rows.joined([run.rows.renamed(own) for run, own in zip(runs, labels)])
         rows.check()
         records = {
-            labels[i, method.name]: method for i, run in enumerate(runs) for method in run.manifest.methods
+            own[method.name]: method for run, own in zip(runs, labels) for method in run.manifest.methods
         }
-        return cls(
-            runs,
-            rows,
-            _metrics(runs),
-            tuple(dict.fromkeys(task for run in runs for task in run.tasks)),
-            records,
-            tuple(label for label, record in records.items() if record.trivial),
-        )
+        tasks = tuple(dict.fromkeys(task for run in runs for task in run.tasks))
+        trivial = tuple(label for label, record in records.items() if record.trivial)
+        return cls(runs, rows, _metrics(runs), tasks, records, trivial)
 
     @property
     def methods(self) -> tuple[str, ...]:
@@ -222,7 +190,7 @@ class RunSet:
     @property
     def protocol_ids(self) -> dict[str, str]:
         """Readable name of each task's protocol."""
-        return {task: identifier for run in self.runs for task, identifier in run.protocol_ids.items()}
+        return {task: protocol.id for run in self.runs for task, protocol in run.manifest.protocols.items()}
 
     @property
     def image_size(self) -> str:
@@ -239,65 +207,74 @@ def _check_protocols(runs: Sequence[RunData]) -> None:
     first: dict[str, RunData] = {}
     for run in runs:
         for task in run.tasks:
-            other = first.setdefault(task, run)
-            expected, found = (r.manifest.protocols[task].hash for r in (other, run))
-            if expected != found:
-                known = f"protocol {expected}, that of {other.folder.root}"
-                raise InputError(
-                    run.folder.root, f"protocol of {task}", known, found, "Score the same frames."
-                )
+            check_same_protocol(first.setdefault(task, run), run, task)
+
+
+def check_same_protocol(first: RunData, run: RunData, task: str) -> None:
+    """Raise `InputError` where two runs do not score the same frames of a task by the same protocol."""
+    expected, found = (one.manifest.protocols[task].hash for one in (first, run))
+    if expected != found:
+        known = f"protocol {expected}, that of {first.folder.root}"
+        raise InputError(run.folder.root, f"protocol of {task}", known, found, "Score the same frames.")
 
 
 def _metrics(runs: Sequence[RunData]) -> tuple[MetricSpec, ...]:
+    # What makes values of a metric comparable; its words and digits may change.
+    meaning = attrgetter("unit", "higher_is_better", "implementation", "detail")
     metrics: dict[str, MetricSpec] = {}
     for run in runs:
         for spec in run.metrics:
-            if _meaning(metrics.setdefault(spec.name, spec)) != _meaning(spec):
+            if meaning(metrics.setdefault(spec.name, spec)) != meaning(spec):
                 known = f"{spec.name} as in {runs[0].folder.root}"
                 raise InputError(run.folder.manifest, "metrics", known, "another definition")
     return tuple(metrics.values())
 
 
-def _meaning(spec: MetricSpec) -> tuple[str, bool, str, str]:
-    """Return what makes values of a metric comparable; its words and digits may change."""
-    return spec.unit, spec.higher_is_better, spec.implementation, spec.detail
+@dataclass
+class _Training:
+    """A method with its settings, the runs that it is in, by index, and their seeds."""
+
+    record: MethodRecord
+    runs: list[int]
+    seeds: set[int]
 
 
-def _labels(runs: Sequence[RunData]) -> dict[tuple[int, str], str]:
-    """Label of each run's methods, by index of the run and name."""
-    variants: dict[str, list[tuple[MethodRecord, list[int], set[int]]]] = {}
+def _labels(runs: Sequence[RunData]) -> list[dict[str, str]]:
+    """Label of each run's methods, by name."""
+    trainings: dict[str, list[_Training]] = {}
     for index, run in enumerate(runs):
         for record in run.manifest.methods:
-            name = record.name
-            seeds = run.rows.seeds(name)
-            known = variants.setdefault(name, [])
-            same = next((v for v in known if v[0] == record and not v[2] & seeds), None)
+            seeds = run.rows.seeds(record.name)
+            known = trainings.setdefault(record.name, [])
+            same = next((t for t in known if t.record == record and not t.seeds & seeds), None)
             if same is None:
-                known.append((record, [index], seeds))
+                known.append(_Training(record, [index], seeds))
             else:
-                same[1].append(index)
-                same[2].update(seeds)
-    labels = {}
-    for name, known in variants.items():
-        folders = [[runs[index].folder.root for index in indices] for _, indices, _ in known]
-        for (_, indices, _), label in zip(known, _names(name, [v[0] for v in known], folders)):
-            labels.update({(index, name): label for index in indices})
+                same.runs.append(index)
+                same.seeds |= seeds
+    labels: list[dict[str, str]] = [{} for _ in runs]
+    for name, known in trainings.items():
+        folders = [runs[training.runs[0]].folder.root for training in known]
+        for training, label in zip(known, _names(name, [t.record for t in known], folders)):
+            for index in training.runs:
+                labels[index][name] = label
     return labels
 
 
-def _names(name: str, records: Sequence[MethodRecord], folders: Sequence[Sequence[Path]]) -> list[str]:
-    """Tell variants of a method apart: by what differs in their settings, else by their folders."""
+def _names(name: str, records: Sequence[MethodRecord], folders: Sequence[Path]) -> list[str]:
+    """A name for each training of a method: by what differs in their settings, else by their folders."""
     if len(records) == 1:
         return [name]
     flat = [_flat(asdict(record)) for record in records]
     keys = [k for k in dict.fromkeys(k for f in flat for k in f) if len({f.get(k, "") for f in flat}) > 1]
-    told = [", ".join(f"{key.rpartition('.')[2]}={f.get(key, 'none')}" for key in keys) for f in flat]
-    if len(set(told)) == len(told) and max(map(len, told)) <= LONGEST_DIFFERENCE:
-        return [f"{name} ({text})" for text in told]
-    for told in ([f[0].name for f in folders], [f[0].as_posix() for f in folders]):
-        if len(set(told)) == len(told):
-            return [f"{name} ({text})" for text in told]
-    raise InputError(folders[0][0], f"method {name}", "each training once", "the same run twice")
+    settings = [", ".join(f"{key.rpartition('.')[2]}={f.get(key, 'none')}" for key in keys) for f in flat]
+    choices = [[folder.name for folder in folders], [folder.as_posix() for folder in folders]]
+    if max(map(len, settings)) <= LONGEST_DIFFERENCE:
+        choices.insert(0, settings)
+    for texts in choices:
+        if len(set(texts)) == len(texts):
+            return [f"{name} ({text})" for text in texts]
+    raise InputError(folders[0], f"method {name}", "each training once", "the same run twice")
 
 
 def _flat(value: Any, prefix: str = "") -> dict[str, str]:

@@ -12,14 +12,13 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from ..bench.configuration import build
 from ..bench.errors import InputError
 from ..bench.io.documents import read_json
 from ..bench.io.files import grouped_writes, write_text
 from ..bench.manifest import MethodRecord
 from ..bench.specs import MetricSpec
 from .runs import RunSet
-from .tables import AVATAR_TITLE, Table, TableCell, build_table
+from .tables import AVATAR_TITLE, Table, TableCell, TableRow, build_table
 from .writers import WRITERS, column_name
 
 NAMES = {
@@ -37,13 +36,7 @@ QUALITY = {"psnr": 2, "ssim": 3, "lpips": 3}
 
 @dataclass(frozen=True)
 class PaperLayout:
-    """A table of the paper.
-
-    Attributes
-    ----------
-    digits : of each metric, in the order of the columns.
-    methods : names of those that it compares; () for all.
-    """
+    """A table of the paper: ``digits`` of each metric, in the order of the columns, and ``methods``, () for all."""
 
     summary: str
     digits: Mapping[str, int] = field(default_factory=lambda: {**QUALITY, "storage": 1, "fps": 0})
@@ -53,41 +46,31 @@ class PaperLayout:
         """Columns. Raises `InputError` for a metric or a task that the runs lack."""
         known = {spec.name: spec for spec in runs.metrics}
         for what, wanted, there in (("metrics", self.digits, known), ("tasks", TASKS, runs.tasks)):
-            lacking = [item for item in wanted if item not in there]
-            if lacking:
-                raise InputError(
-                    runs.runs[0].folder.root, f"{what} of layout {name}", ", ".join(wanted), ", ".join(there)
-                )
+            if not set(wanted) <= set(there):
+                expected, found = ", ".join(wanted), ", ".join(there)
+                raise InputError(runs.runs[0].folder.root, f"{what} of layout {name}", expected, found)
         return tuple(replace(known[metric], digits=digits) for metric, digits in self.digits.items())
 
     def labels(self, runs: RunSet, name: str) -> dict[str, str]:
         """Rows: labels of methods and how the paper writes them, in its order; without trivial baselines."""
-        order = list(NAMES)
-        chosen = [
-            label for label in runs.ranked if not self.methods or runs.records[label].name in self.methods
-        ]
-        if not chosen:
+        own = {label: runs.records[label].name for label in runs.ranked}
+        own = {label: method for label, method in own.items() if not self.methods or method in self.methods}
+        if not own:
             found = ", ".join(runs.methods)
             raise InputError(runs.runs[0].folder.root, f"layout {name}", ", ".join(self.methods), found)
-
-        def place(label: str) -> tuple[bool, int]:
-            known = runs.records[label].name
-            # Methods that no table of the paper has come before "ours", which is last.
-            return known == "ours", order.index(known) if known in order else len(order)
-
-        own = {label: runs.records[label].name for label in chosen}
+        # Methods that no table of the paper has come before "ours", which is last.
+        order = [*(method for method in NAMES if method != "ours"), None, "ours"]
+        place = {method: order.index(method if method in order else None) for method in own.values()}
         return {
-            label: NAMES.get(own[label], own[label]) + label.removeprefix(own[label])
-            for label in sorted(chosen, key=place)
+            label: NAMES.get(method, method) + label.removeprefix(method)
+            for label, method in sorted(own.items(), key=lambda item: place[item[1]])
         }
 
 
 PAPER: Mapping[str, PaperLayout] = {
     "paper-1": PaperLayout("every method: both tasks' quality, storage, speed"),
     "paper-3": PaperLayout("INSTA and ours: both tasks' quality, storage, speed", methods=("insta", "ours")),
-    "paper-4": PaperLayout(
-        "settings of ours, one run each: both tasks' quality", digits=QUALITY, methods=("ours",)
-    ),
+    "paper-4": PaperLayout("settings of ours, one run each: both tasks' quality", QUALITY, ("ours",)),
 }
 
 
@@ -96,15 +79,10 @@ FILE = Path(__file__).with_name("published.json")
 
 @dataclass(frozen=True)
 class PublishedRow:
-    """A row of a paper's table.
+    """A row of a paper's table: where it stands, what the figures are of, and the layout that it may stand in.
 
-    Attributes
-    ----------
-    source : key of the paper.
-    table, data : where in the paper, and what the figures are of.
-    layout : of the table it may stand in.
-    method, settings : the method's name here, and the settings, by dotted name, that a measured one needs to be the same.
-    values : as printed, by ``task/metric``.
+    A measured method is the same with this name and these ``settings``, by dotted name. ``values`` are as printed,
+    by ``task/metric``.
     """
 
     source: str
@@ -117,36 +95,28 @@ class PublishedRow:
 
     def is_of(self, record: MethodRecord) -> bool:
         """Whether a measured method, as in a run's manifest, is the one of this row."""
-        settled = all(_setting(record.config, name) == value for name, value in self.settings.items())
-        return record.name == self.method and settled
 
+        def setting(name: str) -> Any:
+            value: Any = record.config
+            for part in name.split("."):
+                value = value.get(part) if isinstance(value, Mapping) else None
+            return value
 
-def _setting(config: Any, name: str) -> Any:
-    """A setting by dotted name; None where there is none."""
-    for part in name.split("."):
-        config = config.get(part) if isinstance(config, Mapping) else None
-    return config
+        return record.name == self.method and all(setting(n) == value for n, value in self.settings.items())
 
 
 @cache
 def published_rows() -> tuple[tuple[PublishedRow, str], ...]:
-    """All rows, each with its source in words. Raises `InputError` for a file that is not as it should be."""
+    """All rows, each with its source in words."""
     content = read_json(FILE)
-    rows = [
-        build(PublishedRow, entry, str(FILE), f"figures.{i}.") for i, entry in enumerate(content["figures"])
-    ]
-    for row in rows:
-        if row.source not in content["sources"]:
-            raise InputError(FILE, "source", ", ".join(content["sources"]), row.source)
-    return tuple((row, str(content["sources"][row.source])) for row in rows)
+    rows = [PublishedRow(**entry) for entry in content["figures"]]
+    return tuple((row, content["sources"][row.source]) for row in rows)
 
 
 def with_published(table: Table, layout: str, records: Mapping[str, MethodRecord]) -> Table:
     """Put a column "published" behind each measured one that a paper's table of this layout has a figure for.
 
-    Parameters
-    ----------
-    records : by label of the table's methods, what they were, as in a run's manifest.
+    ``records`` has by label of the table's methods what they were, as in a run's manifest.
     """
     notes = list(table.notes)
     figures: dict[str, tuple[Mapping[str, str], int]] = {}
@@ -163,22 +133,18 @@ def with_published(table: Table, layout: str, records: Mapping[str, MethodRecord
     for column, beside in zip(table.columns, shown):
         columns += [column, replace(column, published=True)] if beside else [column]
 
-    def cells(method: str, measured: tuple[TableCell, ...]) -> tuple[TableCell, ...]:
-        values, note = figures.get(method, ({}, 0))
-        result = []
-        for column, cell, beside in zip(table.columns, measured, shown):
-            result.append(cell)
+    def with_figures(row: TableRow) -> TableRow:
+        values, note = figures.get(row.method, ({}, 0))
+        cells = []
+        for column, cell, beside in zip(table.columns, row.cells, shown):
+            cells.append(cell)
             if beside:
                 text = values.get(column_name(column))
                 none = TableCell("none", None, "")
-                result.append(none if text is None else TableCell("published", float(text), text, note=note))
-        return tuple(result)
+                cells.append(none if text is None else TableCell("published", float(text), text, note=note))
+        return replace(row, cells=tuple(cells))
 
-    groups = tuple(
-        (title, tuple(replace(row, cells=cells(row.method, row.cells)) for row in rows))
-        for title, rows in table.groups
-    )
-    return replace(table, columns=tuple(columns), groups=groups, notes=tuple(notes))
+    return replace(table.mapped(with_figures), columns=tuple(columns), notes=tuple(notes))
 
 
 COMPARISON = "comparison"
@@ -210,10 +176,9 @@ def table_text(
     if format not in WRITERS:
         raise InputError("table", "format", f"one of {', '.join(WRITERS)}", repr(format))
     runs = RunSet.read(run_folders)
-    if layout not in (*layouts(runs), *PAPER):
-        raise InputError(
-            run_folders[0], "layout", f"one of {', '.join((*layouts(runs), *PAPER))}", repr(layout)
-        )
+    known = (*layouts(runs), *PAPER)
+    if layout not in known:
+        raise InputError(run_folders[0], "layout", f"one of {', '.join(known)}", repr(layout))
     _, write = WRITERS[format]
     return write(table_of(runs, layout, published))
 
@@ -238,8 +203,8 @@ def table_of(runs: RunSet, layout: str = COMPARISON, published: bool = False) ->
         runs.rows,
         metrics,
         list(names),
+        tasks,
         trivial=runs.trivial,
-        tasks=tasks,
         protocol_ids=runs.protocol_ids,
         image_size=runs.image_size,
         machine=runs.machine,
@@ -250,12 +215,4 @@ def table_of(runs: RunSet, layout: str = COMPARISON, published: bool = False) ->
         if not any(column.published for column in table.columns):
             found = f"none for {', '.join(names)} in layout {layout}"
             raise InputError("table", "--published", "a layout with figures that papers printed", found)
-    return _renamed(table, names)
-
-
-def _renamed(table: Table, names: dict[str, str]) -> Table:
-    """Write methods as a layout does."""
-    groups = tuple(
-        (title, tuple(replace(row, method=names[row.method]) for row in rows)) for title, rows in table.groups
-    )
-    return replace(table, groups=groups)
+    return table.mapped(lambda row: replace(row, method=names[row.method]))

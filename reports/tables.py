@@ -6,7 +6,7 @@ A value is a mean of means: frames -> sequence -> subject -> seed, each level we
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -14,8 +14,8 @@ from ..bench.protocol import TASK_TITLES
 from ..bench.rows import ALL, Rows
 from ..bench.runner.scoring import FULL
 from ..bench.specs import MetricSpec
-from .aggregate import Aggregate, subject_means, summarise
-from .statistics.comparisons import LEVEL, BestSet, best_set
+from .aggregate import Aggregate, subject_means, summarise, whole_images
+from .statistics.comparisons import LEVEL, BestSet, best_set, counted
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class TaskSummary:
 
 @dataclass(frozen=True)
 class Table:
-    """A comparison, ready to be written in any format. ``marking`` tells what the ranks say, and by which test."""
+    """A comparison, ready to be written in any format. ``marking`` says what the ranks mean, and by which test."""
 
     columns: tuple[Column, ...]
     groups: tuple[tuple[str, tuple[TableRow, ...]], ...]  # (title, rows); empty groups are left out
@@ -108,21 +108,24 @@ class Table:
         """All rows, in order."""
         return tuple(row for _, rows in self.groups for row in rows)
 
+    def mapped(self, change: Callable[[TableRow], TableRow]) -> Table:
+        """The table with every row changed."""
+        groups = tuple((title, tuple(map(change, rows))) for title, rows in self.groups)
+        return replace(self, groups=groups)
+
     @property
     def caption(self) -> str:
         """One paragraph: what was measured, on how much, under which protocol, and how it was averaged."""
         parts = []
         for task in self.tasks:
-            frames = "1 frame" if task.frames == 1 else f"{task.frames} frames"
-            subjects = "1 subject" if task.subjects == 1 else f"{task.subjects} subjects"
+            size = f"{counted(task.frames, 'frame')}, {counted(task.subjects, 'subject')}"
             name = f"{task.protocol_id} " if task.protocol_id else ""
-            parts.append(f"{task.title}: {frames}, {subjects}, protocol {name}({task.protocol_hash}).")
+            parts.append(f"{task.title}: {size}, protocol {name}({task.protocol_hash}).")
         if self.image_size:
             parts.append(f"Images of {self.image_size} pixels.")
-        parts.append("Mean over frames, then sequences, then subjects; one seed.")
-        if self.seeds > 1:
-            spread = f"mean of {self.seeds} seeds ± its standard deviation from seed to seed."
-            parts[-1] = f"Mean over frames, then sequences, then subjects; {spread}"
+        spread = f"mean of {self.seeds} seeds ± its standard deviation from seed to seed"
+        seeds = spread if self.seeds > 1 else "one seed"
+        parts.append(f"Mean over frames, then sequences, then subjects; {seeds}.")
         parts += [self.marking] if self.marking else []
         if any(column.published for column in self.columns):
             parts.append(
@@ -133,32 +136,111 @@ class Table:
         return " ".join(parts)
 
 
-def best_of_column(
-    rows: Rows, lines: Sequence[TableRow], index: int, column: Column, region: str
-) -> BestSet | None:
-    """Find the methods that may be the best of a column; None where fewer than two have values.
+AVATAR_TITLE = "Avatar"
+METHODS_TITLE = "Methods"
+TRIVIAL_TITLE = "Trivial baselines (not ranked)"
 
-    Trivial baselines do not compete.
+
+def build_table(
+    rows: Rows,
+    metrics: Sequence[MetricSpec],
+    methods: Sequence[str],
+    tasks: Sequence[str],
+    *,
+    trivial: Sequence[str] = (),
+    protocol_ids: Mapping[str, str],
+    image_size: str = "",
+    machine: str = "",
+    avatar_title: str = AVATAR_TITLE,
+) -> Table:
+    """Build the comparison table of whole images.
+
+    A cell has a value only where every frame of the task has one, for every seed the method was run with: means
+    over different frames do not compare. Otherwise it shows "–" or "failed", and a note says why.
+
+    Parameters
+    ----------
+    metrics : columns of the table, in order; those per frame appear once in each task, the others last.
+    methods : in order; one without rows is shown as not measured.
+    trivial : those of ``methods`` that are trivial baselines: listed apart, not ranked.
+    protocol_ids : readable name of each task's protocol, for the caption, like ``image_size`` and ``machine``.
+    avatar_title : heading of the columns that are of no task.
+
+    Raises
+    ------
+    InputError : rows that repeat a frame, or mix versions of a method or protocols in a task.
     """
-    competing = _competing(lines, index)
-    if len(competing) < 2:
+    rows.check()
+    rows.check_protocols("rows")
+    places = [
+        (spec, task, TASK_TITLES.get(task, task)) for task in tasks for spec in metrics if spec.per_frame
+    ]
+    places += [(spec, "", avatar_title) for spec in metrics if not spec.per_frame]
+    columns = tuple(
+        Column(task, title, m.name, m.label, m.unit, m.digits, m.higher_is_better)
+        for m, task, title in places
+    )
+    notes: list[str] = []
+    lines: list[TableRow] = []
+    for method in methods:
+        cells = tuple(_cell(summarise(rows, method, c.metric, c.task), c.digits, notes) for c in columns)
+        lines.append(TableRow(method, ", ".join(rows.versions(method)), method in trivial, cells))
+    bests = [_best(rows, lines, index, column) for index, column in enumerate(columns)]
+    lines = _ranked(lines, columns, bests)
+    groups = (
+        (METHODS_TITLE, tuple(line for line in lines if not line.trivial)),
+        (TRIVIAL_TITLE, tuple(line for line in lines if line.trivial)),
+    )
+    return Table(
+        columns=columns,
+        groups=tuple((title, members) for title, members in groups if members),
+        notes=tuple(notes),
+        tasks=tuple(_task_summary(rows, task, protocol_ids.get(task, "")) for task in tasks),
+        seeds=max(1, len(rows.seeds(ALL))),
+        marking=_marking(columns, lines, bests),
+        image_size=image_size,
+        machine=machine,
+    )
+
+
+def _task_summary(rows: Rows, task: str, protocol_id: str) -> TaskSummary:
+    frames = rows.frames(task, FULL)
+    subjects = {key[0] for key in frames}
+    title = TASK_TITLES.get(task, task)
+    return TaskSummary(task, title, protocol_id, "".join(rows.protocols(task)), len(frames), len(subjects))
+
+
+def _cell(aggregate: Aggregate, digits: int, notes: list[str]) -> TableCell:
+    if aggregate.value is not None:
+        # A digit more than the value: seeds move means less than methods do.
+        spread = "" if aggregate.spread is None else f"{aggregate.spread:.{digits + 1}f}"
+        return TableCell("ok", aggregate.value, f"{aggregate.value:.{digits}f}", spread)
+    if aggregate.reason not in notes:
+        notes.append(aggregate.reason)
+    text = "failed" if aggregate.status == "failed" else "–"
+    return TableCell(aggregate.status, None, text, note=notes.index(aggregate.reason))
+
+
+def _competing(lines: Sequence[TableRow], index: int) -> list[str]:
+    """Methods that have a value in a column; trivial baselines do not compete."""
+    return [line.method for line in lines if not line.trivial and line.cells[index].status == "ok"]
+
+
+def _best(rows: Rows, lines: Sequence[TableRow], index: int, column: Column) -> BestSet | None:
+    """The methods that may be the best of a column; None where fewer than two have values."""
+    names = _competing(lines, index)
+    if len(names) < 2:
         return None
-    means = {
-        method: subject_means(
-            rows.select(method=method, metric=column.metric, task=column.task, region=region, seeds=ALL)
-        )
-        for method in competing
-    }
+    means = {name: subject_means(whole_images(rows, name, column.metric, column.task)) for name in names}
     return best_set(means, higher_is_better=column.higher_is_better)
 
 
-def ranked(
+def _ranked(
     lines: Sequence[TableRow], columns: Sequence[Column], bests: Sequence[BestSet | None]
 ) -> list[TableRow]:
     """Rank each column: 1 for all that may be the best and for all that look like one of them, then by digits.
 
-    Where nothing can be told, digits alone decide. Values that look equal share a rank, and the next distinct
-    one has the next.
+    Without a test, digits alone decide. Values that look equal share a rank, and the next distinct one has the next.
     """
     cells = [list(line.cells) for line in lines]
     for index, (column, best) in enumerate(zip(columns, bests)):
@@ -176,131 +258,25 @@ def ranked(
     return [replace(line, cells=tuple(row)) for line, row in zip(lines, cells)]
 
 
-def marking(columns: Sequence[Column], lines: Sequence[TableRow], bests: Sequence[BestSet | None]) -> str:
-    """Say what the marks of a table mean, and by which test; "" where nothing is ranked."""
+def _marking(columns: Sequence[Column], lines: Sequence[TableRow], bests: Sequence[BestSet | None]) -> str:
+    """What the marks of a table mean, and by which test; "" where nothing is ranked."""
     ranks = {cell.rank for line in lines for cell in line.cells}
     if not ranks - {None}:
         return ""
     tested = [best for best in bests if best is not None and best.methods is not None]
-    open_ = [(c, best) for c, best in zip(columns, bests) if best is not None and best.methods is None]
+    untested = [(c, best) for c, best in zip(columns, bests) if best is not None and best.methods is None]
     places = ", ".join(["second underlined"] + ["third italic"] * (3 in ranks))
+    counts = {counted(best.subjects, "subject") for best in tested or [best for _, best in untested]}
+    subjects = " or ".join(sorted(counts))
     if not tested:
-        subjects = " or ".join(sorted({_count(best.subjects) for _, best in open_}))
-        needed = max(best.needed for _, best in open_)
+        needed = max(best.needed for _, best in untested)
         return (
             f"Best bold, {places}, by the digits shown alone: with {subjects} no test can tell the best"
             f" (it takes {needed})."
         )
-    subjects = " or ".join(sorted({_count(best.subjects) for best in tested}))
     test = f"exact sign-flip test over {subjects}, each method against all others, Holm, {LEVEL:.0%}"
     text = f"Bold: every method that cannot be told from the best ({test}); the others by the digits shown, {places}."
-    if open_:
-        names = ", ".join(f"{column.title} {column.label}" for column, _ in open_)
+    if untested:
+        names = ", ".join(f"{column.title} {column.label}" for column, _ in untested)
         text += f" Too few subjects for the test, so that the digits alone decide: {names}."
     return text
-
-
-def _competing(lines: Sequence[TableRow], index: int) -> list[str]:
-    return [line.method for line in lines if not line.trivial and line.cells[index].status == "ok"]
-
-
-def _count(subjects: int) -> str:
-    return "1 subject" if subjects == 1 else f"{subjects} subjects"
-
-
-AVATAR_TITLE = "Avatar"
-METHODS_TITLE = "Methods"
-TRIVIAL_TITLE = "Trivial baselines (not ranked)"
-
-
-def build_table(
-    rows: Rows,
-    metrics: Sequence[MetricSpec],
-    methods: Sequence[str],
-    *,
-    trivial: Sequence[str] = (),
-    tasks: Sequence[str] | None = None,
-    protocol_ids: Mapping[str, str] | None = None,
-    region: str = FULL,
-    image_size: str = "",
-    machine: str = "",
-    avatar_title: str = AVATAR_TITLE,
-) -> Table:
-    """Build the comparison table.
-
-    A cell has a value only where every frame of the task has one, for every seed the method was run with: means
-    over different frames do not compare. Otherwise it shows "–" or "failed", and a note says why.
-
-    Parameters
-    ----------
-    metrics : columns of the table, in order; those per frame appear once in each task, the others last.
-    methods : in order; one without rows is shown as not measured.
-    trivial : those of ``methods`` that are trivial baselines: listed apart, not ranked.
-    tasks : in order; by default those in ``rows``, the known ones first.
-    protocol_ids : readable name of each task's protocol, for the caption.
-    region : which region's rows are shown.
-    image_size, machine : for the caption.
-    avatar_title : heading of the columns that are of no task.
-
-    Raises
-    ------
-    InputError : rows that lack a column, repeat a frame, have an undefined value, or mix protocols in a task.
-    """
-    rows.check()
-    rows.check_protocols("rows")
-    present = rows.tasks
-    known = [task for task in TASK_TITLES if task in present]
-    tasks = [*known, *sorted(present - set(known))] if tasks is None else tasks
-    columns = _columns(metrics, tasks, avatar_title)
-    summaries = [_task_summary(rows, task, region, (protocol_ids or {}).get(task, "")) for task in tasks]
-
-    notes: list[str] = []
-    lines: list[TableRow] = []
-    for method in methods:
-        found = (summarise(rows, method=method, metric=c.metric, task=c.task, region=region) for c in columns)
-        cells = tuple(_cell(aggregate, c.digits, notes) for aggregate, c in zip(found, columns))
-        lines.append(TableRow(method, ", ".join(rows.versions(method)), method in trivial, cells))
-    markings = [best_of_column(rows, lines, index, column, region) for index, column in enumerate(columns)]
-    lines = ranked(lines, columns, markings)
-    groups = (
-        (METHODS_TITLE, tuple(line for line in lines if not line.trivial)),
-        (TRIVIAL_TITLE, tuple(line for line in lines if line.trivial)),
-    )
-    return Table(
-        columns=columns,
-        groups=tuple((title, members) for title, members in groups if members),
-        notes=tuple(notes),
-        tasks=tuple(summaries),
-        seeds=max(1, len(rows.seeds(ALL))),
-        marking=marking(columns, lines, markings),
-        image_size=image_size,
-        machine=machine,
-    )
-
-
-def _columns(metrics: Sequence[MetricSpec], tasks: Sequence[str], avatar_title: str) -> tuple[Column, ...]:
-    def column(spec: MetricSpec, task: str, title: str) -> Column:
-        return Column(task, title, spec.name, spec.label, spec.unit, spec.digits, spec.higher_is_better)
-
-    per_frame = [
-        column(m, task, TASK_TITLES.get(task, task)) for task in tasks for m in metrics if m.per_frame
-    ]
-    return (*per_frame, *(column(m, "", avatar_title) for m in metrics if not m.per_frame))
-
-
-def _task_summary(rows: Rows, task: str, region: str, protocol_id: str) -> TaskSummary:
-    frames = rows.frames(task, region)
-    subjects = {key[0] for key in frames}
-    title = TASK_TITLES.get(task, task)
-    return TaskSummary(task, title, protocol_id, "".join(rows.protocols(task)), len(frames), len(subjects))
-
-
-def _cell(aggregate: Aggregate, digits: int, notes: list[str]) -> TableCell:
-    if aggregate.value is not None:
-        # A digit more than the value: seeds move means less than methods do.
-        spread = "" if aggregate.spread is None else f"{aggregate.spread:.{digits + 1}f}"
-        return TableCell("ok", aggregate.value, f"{aggregate.value:.{digits}f}", spread)
-    if aggregate.reason not in notes:
-        notes.append(aggregate.reason)
-    text = "failed" if aggregate.status == "failed" else "–"
-    return TableCell(aggregate.status, None, text, note=notes.index(aggregate.reason))

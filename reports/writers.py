@@ -14,8 +14,6 @@ from pathlib import Path
 
 from .tables import Column, Table, TableCell
 
-# ---- Markdown
-
 MARKDOWN_RANKS = {1: ("**", "**"), 2: ("<ins>", "</ins>"), 3: ("*", "*")}
 
 
@@ -54,8 +52,6 @@ def _markdown_cell(cell: TableCell) -> str:
     text = f"{before}{escape_markdown(cell.shown)}{after}"
     return text if cell.note is None else f"{text}<sup>{cell.note + 1}</sup>"
 
-
-# ---- LaTeX
 
 LATEX_ESCAPES = {
     **{c: f"\\{c}" for c in "{}$&#%_"},
@@ -129,9 +125,8 @@ def to_latex(table: Table, label: str = "tab:headbench") -> str:
         body += [r"\midrule"] if index else []
         if len(table.groups) > 1:
             body.append(rf"\multicolumn{{{len(names)}}}{{l}}{{\emph{{{escape_latex(title)}}}}} \\")
-        body += [
-            " & ".join([escape_latex(row.method), *map(_latex_cell, row.cells)]) + r" \\" for row in rows
-        ]
+        lines = ([escape_latex(row.method), *map(_latex_cell, row.cells)] for row in rows)
+        body += [" & ".join(line) + r" \\" for line in lines]
     notes = [rf"\par\textsuperscript{{{i}}}~{escape_latex(note)}" for i, note in enumerate(table.notes, 1)]
     if notes:
         notes = ["", r"\begin{minipage}{\linewidth}", r"\footnotesize", *notes, r"\end{minipage}"]
@@ -151,11 +146,7 @@ def to_latex(table: Table, label: str = "tab:headbench") -> str:
 
 
 def escape_latex(text: str) -> str:
-    """Make text stand for itself in LaTeX, on one line.
-
-    What the default fonts and inputs of pdfLaTeX do not know (anything beyond Latin letters with accents) is
-    written as its code point rather than left to break the author's paper.
-    """
+    """Make text stand for itself in LaTeX, on one line; what pdfLaTeX's default fonts lack becomes its code point."""
 
     def escaped(character: str) -> str:
         known = 32 <= ord(character) < 127 or (192 <= ord(character) < 256 and character.isalpha())
@@ -172,9 +163,6 @@ def _latex_cell(cell: TableCell) -> str:
     return text if cell.note is None else rf"{text}\textsuperscript{{{cell.note + 1}}}"
 
 
-# ---- HTML
-
-
 def to_html(table: Table) -> str:
     """Write one page that needs no script, font or network. Values in full precision stand in tooltips."""
     from jinja2 import Environment
@@ -184,8 +172,6 @@ def to_html(table: Table) -> str:
     page = Environment(autoescape=True, keep_trailing_newline=True).from_string(template)
     return page.render(table=table, spans=_spans(table), ranks=ranks)
 
-
-# ---- CSV
 
 FORMULA_STARTS = ("=", "+", "-", "@")
 
@@ -244,9 +230,6 @@ def column_name(column: Column) -> str:
     """``task/metric``, or the metric alone for one of the avatar as a whole; ``.../published`` for a paper's."""
     name = f"{column.task}/{column.metric}" if column.task else column.metric
     return f"{name}/published" if column.published else name
-
-
-# ---- all
 
 
 def to_json(table: Table) -> str:

@@ -31,7 +31,7 @@ class ParetoSettings:
     """Folder to write: points.csv and pareto.png."""
 
     task: str = "novel_view"
-    """Task whose frames tell the quality."""
+    """Task whose frames give the quality."""
 
     metric: str = ""
     """Metric of quality; default: the first of frames that the runs have."""
@@ -64,7 +64,7 @@ class SweepSettings(RunOptions):
     """Score at most so many frames per subject and task, evenly spaced; default: those of the run."""
 
     task: str = "novel_view"
-    """Task whose frames tell the quality in the plot."""
+    """Task whose frames give the quality in the plot."""
 
     metric: str = ""
     """Metric of quality in the plot; default: the first of frames that the run has."""
@@ -86,16 +86,16 @@ def pareto(settings: ParetoSettings, progress: Progress = no_progress) -> Findin
 
     Write ``points.csv`` and ``pareto.png``. Raises `InputError` for runs that cannot be compared."""
     from ..writers import csv_text
-    from .plot import Panel, write_plot
-    from .points import Point, read_points
+    from .plot import write_plot
+    from .points import Point, front_of, read_points
 
     out = Path(settings.out)
     points, left_out, metric = read_points(
         [Path(r) for r in settings.runs], settings.task, settings.metric, settings.time
     )
     prepare_folder(out)
-    sign = 1.0 if metric.higher_is_better else -1.0
-    fronts = {cost: _front(points, cost, sign, range(len(points))) for cost in COSTS}
+    rising = metric.higher_is_better
+    fronts = {cost: front_of(points, cost, higher_is_better=rising) for cost in COSTS}
     names = [field.name for field in fields(Point)]
     lines: list[list[object]] = [[*names, *(f"on_front_of_{cost}" for cost in COSTS)]]
     for index, point in enumerate(points):
@@ -103,44 +103,13 @@ def pareto(settings: ParetoSettings, progress: Progress = no_progress) -> Findin
         lines.append([*(getattr(point, name) for name in names), *marks])
     write_text(out / "points.csv", csv_text(lines))
     unit = f", {metric.unit}" if metric.unit else ""
-    labels = {
-        **COSTS,
-        **({"milliseconds": f"{settings.time.replace('_', ' ').capitalize()}, ms"} if settings.time else {}),
-    }
-    panels = [
-        Panel(
-            label,
-            [getattr(p, cost) for p in points],
-            [p.quality for p in points],
-            fronts[cost],
-            _series(points),
-            [point.variant for point in points],
-            {
-                name: _front(points, cost, sign, [i for i, own in enumerate(_series(points)) if own == name])
-                for name in _series(points)
-            },
-        )
-        for cost, label in labels.items()
-    ]
-    machines = ", ".join(sorted({point.machine for point in points}))
-    write_plot(
-        out / "pareto.png", panels, f"{metric.label}{unit}, {settings.task.replace('_', ' ')}", machines
-    )
+    labels = dict(COSTS)
+    if settings.time:
+        labels["milliseconds"] = f"{settings.time.replace('_', ' ').capitalize()}, ms"
+    quality = f"{metric.label}{unit}, {settings.task.replace('_', ' ')}"
+    write_plot(out / "pareto.png", points, labels, quality, higher_is_better=rising)
     data = {"out": out, "points": [asdict(point) for point in points], "fronts": fronts, "left_out": left_out}
     return Findings(_text(points, fronts, left_out, metric.label, metric.digits), data)
-
-
-def _front(points: Sequence[Point], cost: str, sign: float, among: Sequence[int]) -> list[int]:
-    """Indices of the front of some points, those whose cost was measured."""
-    from .points import pareto_front
-
-    known = [i for i in among if getattr(points[i], cost) is not None]
-    front = pareto_front([getattr(points[i], cost) for i in known], [sign * points[i].quality for i in known])
-    return [known[i] for i in front]
-
-
-def _series(points: Sequence[Point]) -> list[str]:
-    return [point.derived_from or point.method for point in points]
 
 
 def _text(

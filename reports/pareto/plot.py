@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from matplotlib import style
@@ -15,6 +14,7 @@ from matplotlib.ticker import LogLocator, NullLocator
 from matplotlib.transforms import Bbox
 
 from ...bench.io.files import atomic_path
+from .points import Point, front_of
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 """Okabe and Ito's, told apart with any colour vision."""
@@ -26,75 +26,73 @@ BESIDE = ((7, -8, "left"), (-7, 3, "right"), (7, 3, "left"), (-7, -8, "right"))
 """Where a label may stand: offset of its lower edge from the point, in points, and its alignment."""
 
 
-@dataclass(frozen=True)
-class Panel:
-    """One plot. ``costs`` (None: not measured), ``qualities``, ``series``, ``variants`` go together.
+def write_plot(
+    path: Path, points: Sequence[Point], costs: Mapping[str, str], quality: str, *, higher_is_better: bool
+) -> None:
+    """Draw quality over each cost (label by field of `Point`) side by side and write a PNG, atomically.
 
-    ``front`` indexes the front of all points, ``own_fronts`` that of each series. A variant's name stands beside its
-    point on the front; "" for a trained avatar, drawn as a square.
+    Costs are on a logarithmic axis. Steps join the front of each series: the best quality of that series up to a cost.
+    Points that no point of any series beats are filled; squares are trained avatars.
     """
-
-    label: str
-    costs: Sequence[float | None]
-    qualities: Sequence[float]
-    front: Sequence[int]
-    series: Sequence[str]
-    variants: Sequence[str]
-    own_fronts: Mapping[str, Sequence[int]]
-
-
-def write_plot(path: Path, panels: Sequence[Panel], quality: str, machines: str) -> None:
-    """Draw the panels side by side and write a PNG, atomically. Costs are on a logarithmic axis.
-
-    Steps join the front of each series: the best quality of that series up to a cost. Points that no point of any
-    series beats are filled.
-    """
-    derived = any(variant for panel in panels for variant in panel.variants)
-    shapes = " Squares: trained; circles: derived from them without training." if derived else ""
+    shapes = ""
+    if any(point.variant for point in points):
+        shapes = " Squares: trained; circles: derived from them without training."
+    machines = ", ".join(sorted({point.machine for point in points}))
     note = f"Lines: Pareto front of each method; filled: of all.{shapes} Measured on {machines}."
     with style.context(["default", {"text.parse_math": False, "font.size": 10}]):
-        figure = Figure(figsize=(6.2 * len(panels), 4.9), dpi=200, layout="constrained")
+        figure = Figure(figsize=(6.2 * len(costs), 4.9), dpi=200, layout="constrained")
         figure.supxlabel(note, x=0.01, ha="left", fontsize=SMALL, color=MUTED)
-        names = dict.fromkeys(name for panel in panels for name in panel.series)
-        colours = dict(zip(names, itertools.cycle(COLOURS)))
+        colours = dict(zip(dict.fromkeys(point.series for point in points), itertools.cycle(COLOURS)))
         handles = [
             Line2D([], [], marker="o", linestyle="", color=c, label=name) for name, c in colours.items()
         ]
         figure.legend(handles=handles, loc="outside upper left", ncols=8, fontsize=SMALL, frameon=False)
-        plots = list(zip(figure.subplots(1, len(panels), squeeze=False)[0], panels))
-        for axes, panel in plots:
-            _draw(axes, panel, quality, colours)
+        plots = list(zip(figure.subplots(1, len(costs), squeeze=False)[0], costs))
+        fronts = {}
+        for axes, cost in plots:
+            axes.set(xlabel=costs[cost])
+            axes.set_title(quality, loc="left", fontsize=10)
+            axes.spines[["top", "left", "right"]].set_visible(False)
+            ends = [
+                front_of(points, cost, higher_is_better=higher_is_better, series=s) for s in (None, *colours)
+            ]
+            fronts[cost] = ends
+            _draw(axes, points, cost, dict(zip(colours, ends[1:])), ends[0], colours)
         figure.draw_without_rendering()  # the layout, before labels look for room in it
-        for axes, panel in plots:
-            label_points(axes, panel)
+        for axes, cost in plots:
+            label_points(axes, points, cost, list(itertools.chain(*fronts[cost])))
         with atomic_path(path) as temporary:
             figure.savefig(temporary, format="png")
 
 
-def _draw(axes: Axes, panel: Panel, quality: str, colours: Mapping[str, str]) -> None:
-    """Points, steps, axes and legend of one panel."""
-    axes.set(xlabel=panel.label)
-    axes.set_title(quality, loc="left", fontsize=10)
-    axes.spines[["top", "left", "right"]].set_visible(False)
-    shown = {i: cost for i, cost in enumerate(panel.costs) if cost is not None}
-    if not shown:
+def _draw(
+    axes: Axes,
+    points: Sequence[Point],
+    cost: str,
+    fronts: Mapping[str, Sequence[int]],
+    best: Sequence[int],
+    colours: Mapping[str, str],
+) -> None:
+    """Points, steps and axis of one panel."""
+    if all(getattr(point, cost) is None for point in points):
         axes.text(0.5, 0.5, "not measured in these runs", color=MUTED, ha="center", transform=axes.transAxes)
         axes.set(xticks=[], yticks=[])
         return
-    for name, own_front in panel.own_fronts.items():
-        corners = [(shown[i], panel.qualities[i]) for i in own_front]
+    for name, front in fronts.items():
+        corners = [(getattr(points[i], cost), points[i].quality) for i in front]
         axes.step(*zip(*corners), where="post", color=colours[name], linewidth=1) if corners else None
-    for i, cost in shown.items():
-        colour = colours[panel.series[i]]
-        axes.plot(
-            cost,
-            panel.qualities[i],
-            marker="o" if panel.variants[i] else "s",
-            markersize=MARKER,
-            color=colour,
-            markerfacecolor=colour if i in panel.front else "white",
-            zorder=3,
-        )
+    for index, point in enumerate(points):
+        if getattr(point, cost) is not None:
+            colour = colours[point.series]
+            axes.plot(
+                getattr(point, cost),
+                point.quality,
+                marker="o" if point.variant else "s",
+                markersize=MARKER,
+                color=colour,
+                markerfacecolor=colour if index in best else "white",
+                zorder=3,
+            )
     axes.set_xscale("log")
     axes.margins(0.08, 0.12)
     axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
@@ -104,21 +102,21 @@ def _draw(axes: Axes, panel: Panel, quality: str, colours: Mapping[str, str]) ->
     axes.tick_params(labelsize=SMALL, labelcolor=MUTED)
 
 
-def label_points(axes: Axes, panel: Panel) -> None:
-    """Write the names of variants beside their points on a front, where they touch neither points nor each other.
-
-    Those on the front of all points come first.
-    """
+def label_points(axes: Axes, points: Sequence[Point], cost: str, order: Sequence[int]) -> None:
+    """Write the names of variants beside their points, in an order of their indices, where they touch neither points
+    nor each other."""
     scale = axes.get_figure(root=True).dpi / 72  # type: ignore[union-attr]
-    places = {i: (cost, panel.qualities[i]) for i, cost in enumerate(panel.costs) if cost is not None}
+    costs = {i: getattr(point, cost) for i, point in enumerate(points)}
+    places = {i: (value, points[i].quality) for i, value in costs.items() if value is not None}
     taken = [
         Bbox.from_bounds(x, y, 0, 0).padded(scale * MARKER / 2)
         for x, y in axes.transData.transform(list(places.values()) or [(1, 1)])
     ]
-    for index in dict.fromkeys([*panel.front, *itertools.chain(*panel.own_fronts.values())]):
-        for right, up, align in BESIDE if panel.variants[index] else ():
+    for index in dict.fromkeys(order):
+        variant = points[index].variant
+        for right, up, align in BESIDE if variant else ():
             label = axes.annotate(
-                panel.variants[index],
+                variant,
                 places[index],
                 (right, up),
                 textcoords="offset points",

@@ -1,4 +1,4 @@
-"""The Pareto front of costs and qualities."""
+"""Methods of runs as points of cost and quality, and their Pareto front."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ...bench.errors import InputError
-from ...bench.runner.scoring import FULL
 from ...bench.specs import MetricSpec
 from ..aggregate import summarise
-from ..runs import RunData
+from ..runs import RunData, check_same_protocol
 
 
 def pareto_front(costs: Sequence[float], qualities: Sequence[float]) -> list[int]:
@@ -19,16 +18,11 @@ def pareto_front(costs: Sequence[float], qualities: Sequence[float]) -> list[int
     One point beats another if it costs no more and is no worse, and is strictly better in one of the two. Equal
     points do not beat each other. Lower costs and higher qualities are better; all numbers are finite.
     """
-    order = sorted(range(len(costs)), key=lambda i: (costs[i], -qualities[i]))
     front: list[int] = []
-    for index in order:
-        last = front[-1] if front else None
-        if (
-            last is None
-            or qualities[index] > qualities[last]
-            or qualities[index] == qualities[last]
-            and costs[index] == costs[last]
-        ):
+    for index in sorted(range(len(costs)), key=lambda i: (costs[i], -qualities[i])):
+        point = qualities[index], costs[index]
+        last = (qualities[front[-1]], costs[front[-1]]) if front else None
+        if last is None or point[0] > last[0] or point == last:
             front.append(index)
     return front
 
@@ -54,23 +48,40 @@ class Point:
     milliseconds: float | None
     machine: str
 
+    @property
+    def series(self) -> str:
+        """The method whose training it comes from."""
+        return self.derived_from or self.method
+
+
+def front_of(
+    points: Sequence[Point], cost: str, *, higher_is_better: bool, series: str | None = None
+) -> list[int]:
+    """Indices of the front of all points, or of one series, whose cost (a field of `Point`) was measured."""
+    among = [i for i, point in enumerate(points) if series in (None, point.series)]
+    known = [i for i in among if getattr(points[i], cost) is not None]
+    sign = 1.0 if higher_is_better else -1.0
+    front = pareto_front([getattr(points[i], cost) for i in known], [sign * points[i].quality for i in known])
+    return [known[i] for i in front]
+
 
 def read_points(
     folders: Sequence[Path], task: str, metric: str, time: str = ""
 ) -> tuple[list[Point], list[str], MetricSpec]:
-    """Read every method of every run that is no trivial baseline; return points, what was left out and why, and the metric.
+    """Read every method of every run that is no trivial baseline; return points, what was left out and why, and the
+    metric.
 
-    ``metric`` "" is the first of frames that the runs have; ``time`` names the metric of milliseconds; "" the median latency, or what the frames per second give.
-
-    Raises `InputError` where runs were not scored on the same frames by the same protocol, where one lacks the
-    task or the metric, and where nothing is left to show.
+    ``metric`` "" is the first of frames that the runs have; ``time`` names the metric of milliseconds; "" the median
+    latency, or what the frames per second give. Raises `InputError` where runs were not scored on the same frames by
+    the same protocol, where one lacks the task or the metric, and where nothing is left to show.
     """
     points: list[Point] = []
     left_out: list[str] = []
-    protocols: dict[str, Path] = {}
+    runs: list[RunData] = []
     spec = None
     for folder in folders:
         data = RunData.read(folder)
+        runs.append(data)
         data.rows.check()
         if task not in data.tasks:
             raise InputError(folder, "task", ", ".join(data.tasks), task)
@@ -79,46 +90,31 @@ def read_points(
             names = ", ".join(m.name for m in data.metrics if m.per_frame)
             raise InputError(folder, "metric", f"a metric of frames: {names}", metric)
         metric = found.name
-        units = {m.name: m.unit for m in data.metrics}
-        if time and units.get(time) != "ms":
-            names = ", ".join(name for name, unit in units.items() if unit == "ms") or "none"
-            raise InputError(folder, "time", f"a metric in ms: {names}", time)
         spec = spec or found
-        protocol = data.manifest.protocols[task].hash
-        protocols.setdefault(protocol, folder)
-        if len(protocols) > 1:
-            first = next(iter(protocols))
-            expected = f"protocol {first}, that of {protocols[first]}"
-            raise InputError(folder, f"protocol of {task}", expected, protocol, "Score the same frames.")
-        for method in data.methods:
-            if method in data.trivial:
+        times = [m.name for m in data.metrics if m.unit == "ms"]
+        if time and time not in times:
+            raise InputError(folder, "time", f"a metric in ms: {', '.join(times) or 'none'}", time)
+        check_same_protocol(runs[0], data, task)
+        for record in data.manifest.methods:
+            if record.trivial:
                 continue
             quality, size, speed, latency = (
-                summarise(data.rows, method=method, metric=name, task=where, region=FULL)
+                summarise(data.rows, record.name, name, where)
                 for name, where in ((metric, task), (SIZE, ""), (SPEED, ""), (time or LATENCY, ""))
             )
             if quality.value is None:
-                left_out.append(f"{method} of {folder}: {quality.reason}")
+                left_out.append(f"{record.name} of {folder}: {quality.reason}")
                 continue
             milliseconds = latency.value
             if milliseconds is None and not time and speed.value:
                 milliseconds = 1000.0 / speed.value
-            derived = data.derived.get(method)
+            derived = record.derived
             source, variant = (derived["from"], derived["variant"]) if derived else ("", "")
+            costs = size.value, milliseconds
             points.append(
-                Point(
-                    str(folder),
-                    method,
-                    source,
-                    variant,
-                    quality.value,
-                    size.value,
-                    milliseconds,
-                    data.machine,
-                )
+                Point(str(folder), record.name, source, variant, quality.value, *costs, data.machine)
             )
     if spec is None or not points:
-        raise InputError(
-            "runs", "", "a method, no trivial baseline, with a value", "; ".join(left_out) or "none"
-        )
+        found_instead = "; ".join(left_out) or "none"
+        raise InputError("runs", "", "a method, no trivial baseline, with a value", found_instead)
     return points, left_out, spec

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,18 +11,15 @@ from ...bench.errors import InputError
 from ...bench.io.files import check_name, digest
 from ...bench.manifest import Derived, MethodRecord
 from ...bench.protocol import Protocol, make_protocols
-from ...bench.registry import resolve
+from ...bench.registry import get, resolve
 from ...bench.rows import Rows
-from ...bench.runner.config import resolve_metrics
+from ...bench.runner.config import default_names, resolve_metrics
 from ...bench.runner.run import describe, load, trained
 from ...bench.runner.steps import Job, measure, render
 from ...bench.runner.store import RunFolder
 from ...bench.specs import MetricSpec
 from .command import SweepSettings
 
-log = logging.getLogger(__name__)
-NEEDED = ("storage", "fps", "latency_p50", "processor_time")
-"""Metrics of a sweep, whether the run took them or not."""
 MARK = "+"
 """Between the name of a method and that of a variant."""
 
@@ -32,12 +28,8 @@ def sweep(settings: SweepSettings, out: Path, progress: Progress) -> Rows:
     """Derive, render and measure; return the rows of the run folder that it writes to ``out``.
 
     The trained avatars are measured again beside their variants, so that frame times were taken in one go. Started
-    again, it keeps what is measured.
-
-    Raises
-    ------
-    InputError
-        For a folder that is no finished run, a method that derives nothing, a variant that none of them has.
+    again, it keeps what is measured. Raises `InputError` for a folder that is no finished run, a method that derives
+    nothing, a variant that none of them has.
     """
     config, jobs = trained(Path(settings.run), settings.methods, settings, out)
     able = [job for job in jobs if job.method.spec.variants]
@@ -49,7 +41,9 @@ def sweep(settings: SweepSettings, out: Path, progress: Progress) -> Rows:
         config = replace(config, frames_per_task=settings.frames)
     clips = list({job.clip.subject: job.clip for job in able}.values())
     protocols = make_protocols(config.tasks, clips, config.frames_per_task)
-    config = replace(config, metrics=tuple(dict.fromkeys((*config.metrics, *NEEDED))))
+    # What avatars cost, whether the run measured it or not.
+    costs = [name for name in default_names("metrics") if get("metrics", name).kind == "avatar"]
+    config = replace(config, metrics=tuple(dict.fromkeys((*config.metrics, *costs))))
     metrics = [spec for spec in resolve_metrics(config) if spec.kind != "training"]
     folder = RunFolder(out)
     derived = [(job, list(_chosen(job, settings.variants))) for job in able]
@@ -66,7 +60,10 @@ def sweep(settings: SweepSettings, out: Path, progress: Progress) -> Rows:
             job = _derived(base, variant, protocols, folder)
             progress(len(frames), total, job.name)
             frames.append(_measured(job, base, variant, metrics))
-            records[job.method.spec.name] = _record(job, base, variant)
+            source: Derived | None = None
+            if variant is not None:
+                source = {"from": base.method.spec.name, "variant": variant.name, "change": variant.summary}
+            records[job.method.spec.name] = MethodRecord(**job.method.record(), derived=source)
     rows = Rows.joined(frames)
     rows.write(folder.rows)
     manifest = describe(config, [], metrics, clips, protocols)
@@ -110,11 +107,3 @@ def _measured(job: Job, base: Job, variant: Variant | None, metrics: Sequence[Me
     job.cell.finish("fit", job.fit_fingerprint, derived_from=derived_from, files=files)
     render(job, avatar)
     return measure(job, avatar, metrics)
-
-
-def _record(job: Job, base: Job, variant: Variant | None) -> MethodRecord:
-    """As a run records a method, and what it was derived from."""
-    derived: Derived | None = None
-    if variant is not None:
-        derived = {"from": base.method.spec.name, "variant": variant.name, "change": variant.summary}
-    return MethodRecord(**job.method.record(), derived=derived)

@@ -91,7 +91,7 @@ def run_robustness_test(
     write_sheet: Callable[[Path], Any],
     progress: Progress,
 ) -> Findings:
-    """Judge the avatars of a run and write the contact sheet; not passed where a limit is broken."""
+    """Judge the avatars of a run and write the contact sheet."""
     from ...bench.runner.run import trained
     from ...bench.runner.store import RunFolder
     from .stability import SHEET_FILE, table

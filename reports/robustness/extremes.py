@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -36,14 +36,8 @@ NO_VARIATION = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class ExpressionComponents:
-    """Principal components of expression coefficients.
-
-    Attributes
-    ----------
-    mean : (E,).
-    directions : (D, E) unit vectors, by falling deviation; D is less than asked for where training holds less.
-    deviations : (D,) standard deviation along each, all positive.
-    """
+    """Principal components of expression coefficients: (E,) mean, (D, E) unit vectors by falling deviation, and the
+    (D,) standard deviation along each, all positive. D is less than asked for where training holds less."""
 
     mean: FloatArray
     directions: FloatArray
@@ -64,18 +58,12 @@ class ExpressionComponents:
         return np.asarray(self.mean + sigmas * self.deviations[component] * self.directions[component])
 
 
-@dataclass(frozen=True, eq=False)
-class ExtremePose:
-    """A pose to render: ``component`` counts from 1, 0 for the mean expression, and ``sigmas`` says how far along it."""
+class ExtremePose(NamedTuple):
+    """A pose to render, such as ``pc3+2`` for component 3, or ``mean`` and 0 for the mean expression."""
 
+    name: str
     component: int
-    sigmas: float
     pose: HeadPose
-
-    @property
-    def name(self) -> str:
-        """Such as ``pc3+2``; ``mean`` for the mean expression."""
-        return f"pc{self.component}{self.sigmas:+g}" if self.component else "mean"
 
 
 def training_poses(clip: Clip) -> list[HeadPose]:
@@ -99,14 +87,13 @@ def extremes(clip: Clip, dimensions: int, sigmas: Sequence[float]) -> list[Extre
     base = replace(typical_pose(poses), timestep=None)
     dtype = base.expression.dtype
     components = ExpressionComponents.of(np.array([p.expression for p in poses], np.float64), dimensions)
-
-    def posed(expression: FloatArray) -> HeadPose:
-        return replace(base, expression=expression.astype(dtype))
-
-    found = [ExtremePose(0, 0.0, posed(components.mean))]
+    expressions = [("mean", 0, components.mean)]
     for index in range(len(components.deviations)):
-        found += [ExtremePose(index + 1, float(s), posed(components.at(index, s))) for s in sigmas if s]
-    return found
+        expressions += [(f"pc{index + 1}{s:+g}", index + 1, components.at(index, s)) for s in sigmas]
+    return [
+        ExtremePose(name, number, replace(base, expression=expression.astype(dtype)))
+        for name, number, expression in expressions
+    ]
 
 
 TASK: Literal["extremes"] = "extremes"
@@ -120,18 +107,21 @@ class ExtremesPlan:
     extremes: Sequence[ExtremePose]
     fingerprint: str
 
+    @classmethod
+    def of(cls, clip: Clip, settings: ExtremesSettings) -> ExtremesPlan:
+        """Choose views and expressions for a clip, from its training frames alone."""
+        cameras = [clip.cameras[name] for name in sorted({key.camera for key in clip.splits["train"]})]
+        sigmas = sorted(settings.sigmas)
+        asked = (settings.views, settings.beyond, settings.dimensions, sigmas)
+        limits = (asdict(VIEW_LIMITS), asdict(EXPRESSION_LIMITS))
+        return cls(
+            turntable(cameras, _head_center(clip), settings.views, settings.beyond),
+            extremes(clip, settings.dimensions, sigmas),
+            digest(TASK, 1, clip.fingerprint, asked, limits)[:12],
+        )
 
-def plan_extremes(clip: Clip, settings: ExtremesSettings) -> ExtremesPlan:
-    """Choose views and expressions for a clip, from its training frames alone."""
-    cameras = [clip.cameras[name] for name in sorted({key.camera for key in clip.splits["train"]})]
-    views = turntable(cameras, head_center(clip), settings.views, settings.beyond)
-    wanted = extremes(clip, settings.dimensions, sorted(settings.sigmas))
-    asked = (settings.views, settings.beyond, settings.dimensions, sorted(settings.sigmas))
-    limits = (asdict(VIEW_LIMITS), asdict(EXPRESSION_LIMITS))
-    return ExtremesPlan(views, wanted, digest(TASK, 1, clip.fingerprint, asked, limits)[:12])
 
-
-def head_center(clip: Clip) -> FloatArray:
+def _head_center(clip: Clip) -> FloatArray:
     """(3,) centre of the head in its typical training pose, metres: the middle of the extent of its vertices."""
     head, pose = clip.head, typical_pose(training_poses(clip))
     coefficients = np.asarray(clip.shape, np.float64)
@@ -142,12 +132,6 @@ def head_center(clip: Clip) -> FloatArray:
     return np.asarray(rotation @ (middle - joint) + joint + pose.translation)
 
 
-def on_sheet(plan: ExtremesPlan, view: int, extreme: ExtremePose) -> bool:
-    """Whether the contact sheet shows this pair: in each view every step, along one component that turns with it."""
-    components = max(e.component for e in plan.extremes)
-    return extreme.component == 0 or extreme.component == view % components + 1
-
-
 def judge_extremes(
     jobs: Sequence[Job], settings: ExtremesSettings, out: Path, progress: Progress
 ) -> list[dict[str, Any]]:
@@ -156,7 +140,7 @@ def judge_extremes(
     Under ``out`` it leaves the rows, a record of views, limits and findings, and the frames that the contact
     sheet shows.
     """
-    cases = [_case(job, plan_extremes(job.form.clip, settings), out) for job in jobs]
+    cases = [_case(job, ExtremesPlan.of(job.form.clip, settings), out) for job in jobs]
     limits = {"views": asdict(VIEW_LIMITS), "expressions": asdict(EXPRESSION_LIMITS)}
     return run_cases(TASK, cases, settings, limits, out, progress)
 
@@ -188,6 +172,7 @@ def _judged(job: Job, plan: ExtremesPlan, folder: Path, report: Callable[[int], 
     """The mean expression first, since it is the reference of all others in its view."""
     avatar, clip = load(job), job.form.clip
     background = [float(v) for v in clip.background]
+    components = max(extreme.component for extreme in plan.extremes)
     frames: list[JudgedFrame] = []
     references = []
     for number, extreme in enumerate(plan.extremes):
@@ -196,7 +181,8 @@ def _judged(job: Job, plan: ExtremesPlan, folder: Path, report: Callable[[int], 
         for index, view in enumerate(plan.views):
             frame, found = render_measured(avatar, view.camera, extreme.pose, background, splats)
             measured.append(found)
-            if on_sheet(plan, index, extreme):
+            # The contact sheet shows in each view every step along one component, which changes from view to view.
+            if not extreme.component or extreme.component == index % components + 1:
                 write_frame(folder / f"{extreme.name}_{view.camera.id}.png", frame)
             report(number * len(plan.views) + index + 1)
         if number == 0:

@@ -53,14 +53,8 @@ HIDDEN = ("teeth", "tongue", "eyeball", "lips", "mouth")
 
 @dataclass(frozen=True, eq=False)
 class RigidVertices:
-    """The vertices of a clip's head that follow its rigid motion alone, in the rest pose.
-
-    Attributes
-    ----------
-    indices : (N,) of vertices.
-    points, normals : (N, 3) metres and unit length.
-    root, neck : (3,) joints, metres.
-    """
+    """The (N,) vertices of a clip's head that follow its rigid motion alone: (N, 3) points and unit normals in the rest
+    pose, and its (3,) root and neck joints, metres."""
 
     indices: IntArray
     points: FloatArray
@@ -103,16 +97,12 @@ class RecordedAppearance:
     @classmethod
     def recorded(cls, clip: Clip, camera: str, count: int) -> RecordedAppearance | None:
         """The median over up to ``count`` recorded frames of training timesteps; None where the camera has too few."""
-        keys = sorted(
-            key
-            for split in ("train", "novel_view")
-            for key in clip.splits.get(split, ())
-            if key.camera == camera
-        )
+        recorded = [*clip.splits.get("train", ()), *clip.splits.get("novel_view", ())]
+        keys = sorted(key for key in recorded if key.camera == camera)
         parts = RigidVertices.of(clip)
         if not keys or len(parts.indices) < LEAST_VERTICES:
             return None
-        seen = np.array([colours_of(clip, parts, key) for key in keys[:: max(1, len(keys) // count)]])
+        seen = np.array([_colours_of(clip, parts, key) for key in keys[:: max(1, len(keys) // count)]])
         known = np.isfinite(seen).any(axis=0)
         median = np.full(seen.shape[1:], np.nan)
         median[known] = np.nanmedian(seen[:, known], axis=0)
@@ -148,7 +138,7 @@ def of_recording(
         return None
     parts = RigidVertices.at(clip, appearance.parts.indices)
     chosen = keys[:: max(1, len(keys) // count)]
-    return mean_known([appearance.difference(colours_of(clip, parts, key)) for key in chosen])
+    return mean_known([appearance.difference(_colours_of(clip, parts, key)) for key in chosen])
 
 
 def mean_known(values: Sequence[float | None]) -> float | None:
@@ -157,7 +147,7 @@ def mean_known(values: Sequence[float | None]) -> float | None:
     return float(np.mean(known)) if known else None
 
 
-def colours_of(clip: Clip, parts: RigidVertices, key: FrameKey) -> FloatArray:
+def _colours_of(clip: Clip, parts: RigidVertices, key: FrameKey) -> FloatArray:
     """(N, 3) Lab colours of a clip's steady parts in a recorded frame."""
     return sample(clip.image(key), clip.cameras[key.camera], *parts.posed(clip.poses[key.timestep]))
 

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 
-from ...bench.contracts import Avatar, Camera, Clip, FloatArray, FrameKey, HeadAsset, HeadPose, Progress
+from ...bench.contracts import Camera, Clip, FloatArray, FrameKey, HeadAsset, HeadPose, Progress
 from ...bench.errors import InputError
 from ...bench.io.files import digest
 from ...bench.io.images import write_png
@@ -25,7 +25,6 @@ from .identity import RecordedAppearance, identity, mean_known, of_recording
 from .stability import (
     JudgedFrame,
     Limits,
-    Measures,
     RobustnessCase,
     cell_folder,
     judge,
@@ -47,11 +46,9 @@ class RigidMean:
     @classmethod
     def of(cls, poses: Sequence[HeadPose]) -> RigidMean:
         """Mean over poses; rotations by the chordal mean, the rotation nearest to all in the Frobenius norm."""
-        return cls(
-            _mean_rotation([_matrix(pose.rotation) for pose in poses]),
-            _mean_rotation([_matrix(pose.neck) for pose in poses]),
-            np.mean([np.asarray(pose.translation, np.float64) for pose in poses], axis=0),
-        )
+        translations = np.array([pose.translation for pose in poses], np.float64)
+        rotations, necks = [p.rotation for p in poses], [p.neck for p in poses]
+        return cls(_mean_rotation(rotations), _mean_rotation(necks), translations.mean(axis=0))
 
 
 def retarget(pose: HeadPose, source: RigidMean, target: RigidMean, subject: str) -> HeadPose:
@@ -65,8 +62,8 @@ def retarget(pose: HeadPose, source: RigidMean, target: RigidMean, subject: str)
     moved = target.rotation @ source.rotation.T @ (pose.translation - source.translation)
     return replace(
         pose,
-        rotation=_axis_angle(rotation).astype(pose.rotation.dtype),
-        neck=_axis_angle(neck).astype(pose.neck.dtype),
+        rotation=cv2.Rodrigues(rotation)[0][:, 0].astype(pose.rotation.dtype),
+        neck=cv2.Rodrigues(neck)[0][:, 0].astype(pose.neck.dtype),
         translation=(target.translation + moved).astype(pose.translation.dtype),
         subject=subject,
         timestep=None,
@@ -85,12 +82,8 @@ def _matrix(axis_angle: FloatArray) -> FloatArray:
     return np.asarray(cv2.Rodrigues(np.asarray(axis_angle, np.float64))[0])
 
 
-def _axis_angle(rotation: FloatArray) -> FloatArray:
-    return np.asarray(cv2.Rodrigues(rotation)[0][:, 0])
-
-
 def _mean_rotation(rotations: Sequence[FloatArray]) -> FloatArray:
-    left, _, right = np.linalg.svd(np.sum(rotations, axis=0))
+    left, _, right = np.linalg.svd(np.sum([_matrix(rotation) for rotation in rotations], axis=0))
     return np.asarray(left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right)
 
 
@@ -116,11 +109,14 @@ class Driven:
         return digest(TASK, 1, clips, self.camera.id, [str(key) for key in self.keys], asdict(LIMITS))[:12]
 
 
-def plan_reenactment(jobs: Sequence[Job], settings: ReenactSettings) -> list[Driven]:
-    """Pair every avatar with every other subject that can drive it.
+def judge_reenactment(
+    jobs: Sequence[Job], settings: ReenactSettings, out: Path, progress: Progress
+) -> list[dict[str, Any]]:
+    """Render and judge every avatar driven by every other subject; return the record of each pair.
 
-    Raises `InputError` where there is no other subject, one has no held-out performance, the head models differ,
-    or the camera is not there.
+    Under ``out`` it leaves the frames, those of the source beside them, the rows, and a record. Raises `InputError`
+    where there is no other subject, one has no held-out performance, the head models differ, or the camera is not
+    there.
     """
     pairs = []
     sources = _sources(jobs, settings)
@@ -137,17 +133,7 @@ def plan_reenactment(jobs: Sequence[Job], settings: ReenactSettings) -> list[Dri
         found = ", ".join(sorted({job.clip.subject for job in jobs}))
         remedy = "Name a capture of another subject with --source."
         raise InputError(settings.run, "subjects", "another subject to drive with", f"{found} alone", remedy)
-    return pairs
-
-
-def judge_reenactment(
-    jobs: Sequence[Job], settings: ReenactSettings, out: Path, progress: Progress
-) -> list[dict[str, Any]]:
-    """Render and judge every avatar driven by every other subject; return the record of each pair.
-
-    Under ``out`` it leaves the frames, those of the source beside them, the rows, and a record.
-    """
-    cases = [_case(driven, out) for driven in plan_reenactment(jobs, settings)]
+    cases = [_case(driven, out) for driven in pairs]
     return run_cases(TASK, cases, settings, asdict(LIMITS), out, progress)
 
 
@@ -176,8 +162,11 @@ def _judged(
     appearance = RecordedAppearance.recorded(job.form.clip, camera.id, REFERENCE_FRAMES)
     avatar, clip = load(job), job.form.clip
     background = [float(v) for v in clip.background]
-    reference = _reference(avatar, clip, camera, background)
-    means = RigidMean.of(training_poses(source.form.clip)), RigidMean.of(training_poses(clip))
+    poses = training_poses(clip)
+    means = RigidMean.of(training_poses(source.form.clip)), RigidMean.of(poses)
+    # What the avatar shows of its own training poses in this view.
+    own = [replace(pose, timestep=None) for pose in poses[:: max(1, len(poses) // REFERENCE_FRAMES)]]
+    reference = typical([render_measured(avatar, camera, pose, background)[1] for pose in own])
     frames, shown = [], []
     for index, key in enumerate(driven.keys):
         driver = source.form.clip.poses[source.form.key(key).timestep]
@@ -213,14 +202,6 @@ def _identity(
         "own": of_recording(appearance, target, own, REFERENCE_FRAMES),
         "source": of_recording(appearance, source, theirs, REFERENCE_FRAMES),
     }
-
-
-def _reference(avatar: Avatar, clip: Clip, camera: Camera, background: Sequence[float]) -> Measures:
-    """What the avatar shows of its own training poses in this view."""
-    poses = training_poses(clip)
-    chosen = poses[:: max(1, len(poses) // REFERENCE_FRAMES)]
-    free = [replace(pose, timestep=None) for pose in chosen]
-    return typical([render_measured(avatar, camera, pose, background)[1] for pose in free])
 
 
 def _sources(jobs: Sequence[Job], settings: ReenactSettings) -> list[Job]:

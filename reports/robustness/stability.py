@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +27,6 @@ COVERED, SOLID = 0.05, 0.95
 VISIBLE_OPACITY = 0.05
 NEAR_M = 0.01
 SIGMAS = 3.0
-
-MEASURES = ("non_finite", "coverage", "translucent", "largest_splat", "mean_opacity")
 
 
 @dataclass(frozen=True)
@@ -99,61 +97,51 @@ class LimitCheck:
 
 
 def measure(frame: Frame, camera: Camera, splats: Any = None) -> Measures:
-    """Measure one frame. ``splats`` has means, scales, opacities as numpy arrays, None where there are none."""
+    """Measure one frame. ``splats`` has means, scales, quats, opacities as numpy arrays, None where there are none."""
     alpha = np.asarray(frame.alpha, np.float64)
     arrays = [np.asarray(frame.rgb), alpha]
     covered = alpha > COVERED
     count = int(covered.sum())
-    translucent = float((covered & (alpha < SOLID)).sum() / count) if count else 0.0
-    if splats is None:
-        return Measures(_non_finite(arrays), float(alpha.sum()), translucent)
-    arrays += [np.asarray(a) for a in (splats.means, splats.scales, splats.quats, splats.opacities)]
-    opacities = np.asarray(splats.opacities, np.float64)
+    largest = opacity = None
+    if splats is not None:
+        arrays += [np.asarray(a) for a in (splats.means, splats.scales, splats.quats, splats.opacities)]
+        opacities = np.asarray(splats.opacities, np.float64)
+        largest = _largest_splat(np.asarray(splats.means), np.asarray(splats.scales), opacities, camera)
+        opacity = float(opacities.mean()) if opacities.size else 0.0
+    not_finite = sum(int(a.size - np.isfinite(a).sum()) for a in arrays)
     return Measures(
-        _non_finite(arrays),
+        not_finite / max(sum(a.size for a in arrays), 1),
         float(alpha.sum()),
-        translucent,
-        largest_splat(np.asarray(splats.means), np.asarray(splats.scales), opacities, camera),
-        float(opacities.mean()) if opacities.size else 0.0,
+        float((covered & (alpha < SOLID)).sum() / count) if count else 0.0,
+        largest,
+        opacity,
     )
 
 
-def largest_splat(means: FloatArray, scales: FloatArray, opacities: FloatArray, camera: Camera) -> float:
+def _largest_splat(means: FloatArray, scales: FloatArray, opacities: FloatArray, camera: Camera) -> float:
     """Projected radius of the largest visible splat as a share of the image's height; 0 where none is on screen.
 
     A perspective projection along the axis is taken for the size, which is exact at the image's centre.
     """
     motion = np.asarray(camera.world_to_camera, np.float64)
+    focal = np.diag(camera.K)[:2]
     local = means.astype(np.float64) @ motion[:3, :3].T + motion[:3, 3]
     seen = (local[:, 2] > NEAR_M) & (opacities >= VISIBLE_OPACITY)
     local = local[seen]
-    radius = (
-        SIGMAS * scales[seen].max(axis=1, initial=0.0) * max(camera.K[0, 0], camera.K[1, 1]) / local[:, 2]
-    )
-    x = camera.K[0, 0] * local[:, 0] / local[:, 2] + camera.K[0, 2]
-    y = camera.K[1, 1] * local[:, 1] / local[:, 2] + camera.K[1, 2]
-    inside = (x > -radius) & (x < camera.width + radius) & (y > -radius) & (y < camera.height + radius)
-    return float(radius[inside].max(initial=0.0) / camera.height)
+    radius = SIGMAS * scales[seen].max(axis=1, initial=0.0) * focal.max() / local[:, 2]
+    pixels = focal * local[:, :2] / local[:, 2:] + camera.K[:2, 2]
+    inside = (pixels > -radius[:, None]) & (pixels < [camera.width, camera.height] + radius[:, None])
+    return float(radius[inside.all(axis=1)].max(initial=0.0) / camera.height)
 
 
 def typical(measures: Sequence[Measures]) -> Measures:
-    """Median of each measure."""
-
-    def median(name: str) -> float | None:
-        values = [getattr(m, name) for m in measures]
-        return None if any(v is None for v in values) else float(np.median(values))
-
-    return Measures(
-        median("non_finite") or 0.0,
-        median("coverage") or 0.0,
-        median("translucent") or 0.0,
-        median("largest_splat"),
-        median("mean_opacity"),
-    )
+    """Median of each measure; None where one is."""
+    columns = zip(*map(astuple, measures))
+    return Measures(*(None if None in column else float(np.median(column)) for column in columns))  # type: ignore[arg-type]
 
 
 def judge(found: Measures, reference: Measures, limits: Limits) -> list[LimitCheck]:
-    """Compare a frame with its limits; one check a measure, in the order of `MEASURES`.
+    """Compare a frame with its limits; one check a measure, in the order of `Measures`.
 
     Coverage and mean opacity are given as ratios to the reference. A reference that shows nothing makes the ratio
     infinite, or 1 where the frame shows nothing either.
@@ -176,17 +164,12 @@ def _ratio(value: float | None, reference: float | None) -> float | None:
     return value / reference
 
 
-def _non_finite(arrays: Sequence[FloatArray]) -> float:
-    total = sum(a.size for a in arrays)
-    return sum(int(a.size - np.isfinite(a).sum()) for a in arrays) / max(total, 1)
-
-
 ROWS_FILE, RECORD_FILE, SHEET_FILE = "rows.parquet", "record.json", "contact_sheet.png"
 
 
 @dataclass(frozen=True)
 class JudgedFrame:
-    """A rendered frame; ``checks`` stand in the order of `MEASURES`, further ones after."""
+    """A rendered frame; ``checks`` stand in the order of `Measures`, further ones after."""
 
     key: FrameKey
     checks: Sequence[LimitCheck]
@@ -203,7 +186,6 @@ class RobustnessCase:
 
     Attributes
     ----------
-    job : the avatar's cell.
     name : for the progress.
     clips, keys, sizes : of the protocol: captures that take part, frames, sizes of images (width, height).
     condition : of the protocol: what is rendered in words, and a fingerprint of it.
@@ -218,6 +200,11 @@ class RobustnessCase:
     condition: tuple[str, str]
     render: Callable[[Callable[[int], None]], tuple[list[JudgedFrame], dict[str, Any]]]
 
+    @property
+    def needs(self) -> MethodNeeds:
+        """What the avatar's method wants of a clip."""
+        return MethodNeeds.of(self.job.method.spec)
+
 
 def run_cases(
     task: TaskWithoutTruth,
@@ -230,8 +217,8 @@ def run_cases(
     """Render and judge all cases; leave rows and a record under ``out``, and return the record of each avatar."""
     # Avatars of methods with equal needs are shown the same frames, and so share a protocol.
     protocols: dict[MethodNeeds, Protocol] = {}
-    for needs in {_needs(case): None for case in cases}:
-        own = [case for case in cases if _needs(case) == needs]
+    for needs in {case.needs: None for case in cases}:
+        own = [case for case in cases if case.needs == needs]
         protocols[needs] = make_protocol_without_truth(
             task,
             [clip for case in own for clip in case.clips],
@@ -245,9 +232,9 @@ def run_cases(
     for case in cases:
         frames, details = case.render(lambda n, done=done, name=case.name: progress(done + n, total, name))  # type: ignore[misc]
         done += len(frames)
-        protocol = protocols[_needs(case)].hash
-        rows += to_rows(case.job, task, frames, protocol)
-        avatars.append({**summary(case.job, frames), **details, "protocol": protocol})
+        protocol = protocols[case.needs].hash
+        rows += _rows(case.job, task, frames, protocol)
+        avatars.append({**_summary(case.job, frames), **details, "protocol": protocol})
     Rows.of(rows).write(out / ROWS_FILE)
     by_hash = sorted({protocol.hash: protocol for protocol in protocols.values()}.items())
     record = {
@@ -258,10 +245,6 @@ def run_cases(
     }
     write_json(out / RECORD_FILE, record)
     return avatars
-
-
-def _needs(case: RobustnessCase) -> MethodNeeds:
-    return MethodNeeds.of(case.job.method.spec)
 
 
 def render_measured(
@@ -291,35 +274,23 @@ def cell_folder(root: Path, job: Job) -> Path:
     return root / job.clip.subject / job.method.spec.name / f"seed-{job.seed}"
 
 
-def to_rows(job: Job, task: str, frames: Sequence[JudgedFrame], protocol: str) -> list[Row]:
+def _rows(job: Job, task: str, frames: Sequence[JudgedFrame], protocol: str) -> list[Row]:
     """Rows as every measurement leaves them; a broken limit has status "failed" and says which."""
+    method = job.method.spec
     rows = []
     for frame in frames:
         for check in frame.checks:
-            status, reason = "ok", ""
-            if check.value is None:
-                status, reason = "missing", check.absent
+            value, outcome = check.value, ("ok", "")
+            if value is None:
+                value, outcome = math.nan, ("missing", check.absent)
             elif not check.passed:
-                status, reason = "failed", str(check)
-            rows.append(
-                Row(
-                    method=job.method.spec.name,
-                    version=job.method.spec.version,
-                    seed=job.seed,
-                    task=task,
-                    **frame.key._asdict(),
-                    region=FULL,
-                    metric=check.measure,
-                    value=math.nan if check.value is None else check.value,
-                    protocol=protocol,
-                    status=status,
-                    reason=reason,
-                )
-            )
+                outcome = ("failed", str(check))
+            where = (method.name, method.version, job.seed, task, *frame.key)
+            rows.append(Row(*where, FULL, check.measure, value, protocol, *outcome))
     return rows
 
 
-def summary(job: Job, frames: Sequence[JudgedFrame]) -> dict[str, Any]:
+def _summary(job: Job, frames: Sequence[JudgedFrame]) -> dict[str, Any]:
     """How many frames of an avatar there are, which break limits, and the range of every measure."""
     broken = [frame for frame in frames if frame.broken]
     by_measure = zip(*(frame.checks for frame in frames))
@@ -342,21 +313,13 @@ def _range(values: Sequence[float | None]) -> tuple[float | None, float | None]:
 
 def table(summaries: Sequence[Mapping[str, Any]]) -> str:
     """Summaries for a terminal."""
-    lines = [
-        (
-            f"{'subject':<10} {'method':<16} {'seed':>4} {'frames':>6} {'broken':>6}  "
-            f"{'coverage':>13} {'translucent':>13} {'largest splat':>13} {'mean opacity':>13}"
-        )
-    ]
+    names = ("coverage", "translucent", "largest_splat", "mean_opacity")
+    form = "{:<10} {:<16} {:>4} {:>6} {:>6}  {:>13} {:>13} {:>13} {:>13}".format
+    lines = [form("subject", "method", "seed", "frames", "broken", *(n.replace("_", " ") for n in names))]
     for s in summaries:
-        shown = [
-            "-" if s["ranges"][name][0] is None else "{:.2f} to {:.2f}".format(*s["ranges"][name])
-            for name in ("coverage", "translucent", "largest_splat", "mean_opacity")
-        ]
-        lines.append(
-            f"{s['subject']:<10} {s['method']:<16} {s['seed']:>4} {s['frames']:>6} {s['frames_broken']:>6}  "
-            + " ".join(f"{text:>13}" for text in shown)
-        )
+        ranges = [s["ranges"][name] for name in names]
+        shown = ["-" if low is None else f"{low:.2f} to {high:.2f}" for low, high in ranges]
+        lines.append(form(s["subject"], s["method"], s["seed"], s["frames"], s["frames_broken"], *shown))
         if s.get("identity") is not None:
             known = [f"{name} {value:.1f}" for name, value in s["identity"].items() if value is not None]
             lines.append(f"  colour difference from the subject's recordings (CIEDE2000): {', '.join(known)}")

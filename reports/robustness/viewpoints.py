@@ -12,19 +12,13 @@ from ...bench.errors import InputError
 
 NEAR_M = 1e-6
 LEAST_SPREAD = 0.15
-"""Sideways spread of cameras, as the ratio of the singular values of their right axes, from which on they tell up."""
+"""Ratio of the singular values of the cameras' right axes from which on they determine the upward direction."""
 
 
 @dataclass(frozen=True, eq=False)
 class Viewpoint:
-    """A new view.
-
-    Attributes
-    ----------
-    camera : where it is seen from; looks at the head.
-    extrapolated : lies beyond the outermost training cameras.
-    azimuth : degrees about the upward axis, 0 at the mean training direction, positive to the camera's right.
-    """
+    """A new view of the head: whether it lies beyond the outermost training cameras, and its azimuth in degrees about the
+    upward axis, 0 at the mean training direction, positive to the camera's right."""
 
     camera: Camera
     extrapolated: bool
@@ -34,23 +28,18 @@ class Viewpoint:
 def turntable(
     cameras: Sequence[Camera], center: FloatArray, count: int, beyond_degrees: float
 ) -> list[Viewpoint]:
-    """Walk around a head through the directions of its training cameras, in even steps of azimuth.
+    """Views around a head through the directions of its training cameras, in even steps of azimuth, ordered by it.
 
     Between two cameras that are neighbours in azimuth, the direction from the head is interpolated along the great
-    circle, the distance and the focal lengths linearly. Beyond the outermost two, the walk goes on at their
-    elevation and distance. Where the cameras stand all around, with no gap wider than twice ``beyond_degrees``,
-    the walk is closed and no view is extrapolated.
+    circle, the distance and the focal lengths linearly. Beyond the outermost two, elevation and distance stay theirs.
+    Where the cameras stand all around, with no gap wider than twice ``beyond_degrees``, no view is extrapolated.
 
     Parameters
     ----------
     cameras : training cameras, at least one; views have the size of the first.
     center : (3,) what to look at, metres.
     count : number of views, at least 1.
-    beyond_degrees : how far the walk goes on beyond the outermost cameras on either side, in [0, 180).
-
-    Returns
-    -------
-    Views ordered by azimuth.
+    beyond_degrees : how far views go beyond the outermost cameras on either side, in [0, 180).
     """
     if not cameras:
         raise InputError("turntable", "cameras", "at least one", "none")
@@ -67,29 +56,32 @@ def turntable(
     azimuths = np.degrees(np.arctan2(local[:, 0], local[:, 2]))
 
     order = np.argsort(azimuths, kind="stable")
-    start, arc = _arc(azimuths[order])
-    order = np.roll(order, -start)
-    turns = (azimuths[order] - azimuths[order[0]]) % 360.0  # from the first of the arc on, rising
-    closed = 360.0 - arc <= 2.0 * beyond_degrees
-    if closed:
-        order, turns = np.append(order, order[0]), np.append(turns, 360.0)
+    # The arc that holds all azimuths but the widest gap between two of them.
+    gaps = np.diff(azimuths[order], append=azimuths[order[0]] + 360.0)
+    widest = int(np.argmax(gaps))
+    arc = float(360.0 - gaps[widest])
+    order = np.roll(order, -(widest + 1))
+    degrees = (azimuths[order] - azimuths[order[0]]) % 360.0  # from the first of the arc on, rising
+    if 360.0 - arc <= 2.0 * beyond_degrees:
+        order, degrees = np.append(order, order[0]), np.append(degrees, 360.0)
         steps = np.arange(count) * 360.0 / count
+    elif count > 1:
+        steps = np.linspace(-beyond_degrees, arc + beyond_degrees, count)
     else:
-        steps = (
-            np.linspace(-beyond_degrees, arc + beyond_degrees, count) if count > 1 else np.array([arc / 2])
-        )
+        steps = np.array([arc / 2])
     local, distances, focal = local[order], distances[order], focal[order]
 
     views = []
     for index, step in enumerate(steps):
-        inside = float(np.clip(step, 0.0, turns[-1]))
-        upper = int(np.clip(np.searchsorted(turns, inside), 1, max(len(turns) - 1, 1)))
+        inside = float(np.clip(step, 0.0, degrees[-1]))
+        upper = int(np.clip(np.searchsorted(degrees, inside), 1, max(len(degrees) - 1, 1)))
         lower = upper - 1
-        upper = min(upper, len(turns) - 1)
-        width = turns[upper] - turns[lower]
-        share = (inside - turns[lower]) / width if width > 0 else 0.0
-        direction = _slerp(local[lower], local[upper], share)
-        direction = _turned(direction, np.radians(step - inside))
+        upper = min(upper, len(degrees) - 1)
+        width = degrees[upper] - degrees[lower]
+        share = (inside - degrees[lower]) / width if width > 0 else 0.0
+        right, height, front = _slerp(local[lower], local[upper], share)
+        sin, cos = np.sin(np.radians(step - inside)), np.cos(np.radians(step - inside))
+        direction = np.array([cos * right + sin * front, height, cos * front - sin * right])
         distance = (1 - share) * distances[lower] + share * distances[upper]
         fx, fy = (1 - share) * focal[lower] + share * focal[upper]
         K = np.array([[fx, 0.0, first.width / 2], [0.0, fy, first.height / 2], [0.0, 0.0, 1.0]])
@@ -133,7 +125,7 @@ def _axes(cameras: Sequence[Camera], directions: FloatArray) -> FloatArray:
 def _up(cameras: Sequence[Camera]) -> FloatArray:
     """(3,) the world's upward direction: normal to the rows of the images, since cameras pitch but hardly roll.
 
-    Cameras side by side do not tell it that way; then it is the mean of their own upward directions.
+    Of cameras side by side it is the mean of their own upward directions.
     """
     mean = -np.mean([camera.world_to_camera[1, :3] for camera in cameras], axis=0)
     if np.linalg.norm(mean) < 1e-6:
@@ -144,23 +136,9 @@ def _up(cameras: Sequence[Camera]) -> FloatArray:
     return np.asarray(mean / np.linalg.norm(mean))
 
 
-def _arc(azimuths: FloatArray) -> tuple[int, float]:
-    """Index where the arc begins that holds all azimuths (sorted, degrees) but the widest gap, and its width."""
-    gaps = np.diff(np.append(azimuths, azimuths[0] + 360.0))
-    widest = int(np.argmax(gaps))
-    return (widest + 1) % len(azimuths), float(360.0 - gaps[widest])
-
-
 def _slerp(a: FloatArray, b: FloatArray, share: float) -> FloatArray:
     angle = np.arccos(np.clip(a @ b, -1.0, 1.0))
     if np.sin(angle) < 1e-9:
         return a
     mixed = (np.sin((1 - share) * angle) * a + np.sin(share * angle) * b) / np.sin(angle)
     return np.asarray(mixed / np.linalg.norm(mixed))
-
-
-def _turned(direction: FloatArray, angle: float) -> FloatArray:
-    """Turn a direction (right, up, front) about the upward axis."""
-    right, up, front = direction
-    sin, cos = np.sin(angle), np.cos(angle)
-    return np.array([cos * right + sin * front, up, cos * front - sin * right])

@@ -20,13 +20,8 @@ from ...bench.rows import FRAME
 
 @dataclass(frozen=True, eq=False)
 class SequencePairs:
-    """A sequence of one subject, S1 and S2 seeds, T timesteps in order.
-
-    Attributes
-    ----------
-    first, second : (S1, T) and (S2, T) sums over the cameras of each timestep.
-    cameras : (T,) how many there are.
-    """
+    """A sequence of one subject, S1 and S2 seeds, T timesteps in order: (S1, T) and (S2, T) sums over the cameras of
+    each timestep, and (T,) how many cameras there are."""
 
     first: FloatArray
     second: FloatArray
@@ -66,8 +61,7 @@ class SubjectPairs:
 def pair(first: pd.DataFrame, second: pd.DataFrame) -> tuple[SubjectPairs, ...]:
     """Match two methods' rows of one metric of one task (one per frame and seed, or per subject and seed).
 
-    Raises `InputError` where the two do not have values of exactly the same frames, in every seed: a difference
-    of means over different frames is none of the methods'.
+    Raises `InputError` where the two do not have values of exactly the same frames, in every seed.
     """
     tables = [_by_seed(rows) for rows in (first, second)]
     unmatched = tables[0].index.symmetric_difference(tables[1].index)
@@ -109,17 +103,10 @@ LEAST_SUBJECTS = 3
 def interval(
     subjects: Sequence[SubjectPairs], level: float = 0.05, replicates: int = REPLICATES, seed: int = 0
 ) -> tuple[float, float] | None:
-    """Confidence interval of the mean difference over the population of subjects.
+    """Confidence interval of the mean difference over the population of subjects, in the metric's unit.
 
-    Parameters
-    ----------
-    level : one minus the confidence.
-    seed : of the draws; the same input gives the same interval.
-
-    Returns
-    -------
-    (low, high) in the metric's unit, or None with fewer than `LEAST_SUBJECTS` subjects, or where so few have no
-    bounded interval (values without variation within subjects, three subjects).
+    ``level`` is one minus the confidence; ``seed`` that of the draws. None with fewer than `LEAST_SUBJECTS` subjects,
+    or where so few have no bounded interval (values without variation within subjects, three subjects).
     """
     count = len(subjects)
     if count < LEAST_SUBJECTS:
@@ -164,14 +151,18 @@ def block_length(sequences: Sequence[SequencePairs]) -> int:
 
 
 def _standard_error(values: FloatArray) -> FloatArray:
-    """Return the standard error of means over the last axis."""
+    """Standard error of means over the last axis."""
     return values.std(axis=-1, ddof=1) / math.sqrt(values.shape[-1])
 
 
 def _means_within(subject: SubjectPairs, replicates: int, generator: np.random.Generator) -> FloatArray:
     """(replicates,) differences of one subject, its seeds, sequences and blocks of timesteps drawn anew."""
     length = block_length(subject.sequences)
-    first, second = (_seed_weights(len(means), replicates, generator) for means in subject.means())
+    # Shares of as many seeds, drawn with replacement.
+    first, second = (
+        generator.multinomial(seeds, np.full(seeds, 1 / seeds), size=replicates) / seeds
+        for seeds in map(len, subject.means())
+    )
     chosen = generator.integers(len(subject.sequences), size=(replicates, len(subject.sequences)))
     totals = np.zeros(replicates)
     for index, sequence in enumerate(subject.sequences):
@@ -179,11 +170,6 @@ def _means_within(subject: SubjectPairs, replicates: int, generator: np.random.G
         drawn = _sequence_draws(sequence, length, first[replicate], second[replicate], generator)
         np.add.at(totals, replicate, drawn)
     return totals / len(subject.sequences)
-
-
-def _seed_weights(seeds: int, replicates: int, generator: np.random.Generator) -> FloatArray:
-    """(replicates, seeds) shares of as many seeds, drawn with replacement."""
-    return generator.multinomial(seeds, np.full(seeds, 1 / seeds), size=replicates) / seeds
 
 
 def _sequence_draws(

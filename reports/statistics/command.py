@@ -13,8 +13,7 @@ import tyro
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.protocol import TASK_TITLES
-from ...bench.runner.scoring import FULL
-from ...bench.specs import Findings, MetricSpec
+from ...bench.specs import RENAMED_METRICS, Findings, MetricSpec
 
 if TYPE_CHECKING:
     from ..runs import RunSet
@@ -67,38 +66,30 @@ def compare_runs(settings: CompareSettings, progress: Progress = no_progress) ->
     from .comparisons import compare
 
     runs = RunSet.read([Path(folder) for folder in settings.runs])
-    pairs = method_pairs(runs, settings.against, settings.trivial)
-    metrics = [
-        spec
-        for spec in runs.metrics
-        if (spec.name in settings.metrics if settings.metrics else COMPARISON in spec.tables)
-    ]
-    strange = sorted(set(settings.metrics) - {spec.name for spec in runs.metrics})
-    if strange:
-        names = ", ".join(spec.name for spec in runs.metrics)
-        raise InputError("command line", "--metrics", f"metrics of the runs: {names}", ", ".join(strange))
+    pairs = _pairs(runs, settings.against, settings.trivial)
+    known = {spec.name: spec for spec in runs.metrics}
+    for name in settings.metrics:
+        if name not in known:
+            new = RENAMED_METRICS.get(name)
+            expected = f"its new name, {new}" if new in known else f"metrics of the runs: {', '.join(known)}"
+            raise InputError("command line", "--metrics", expected, name)
+    asked = settings.metrics or [name for name, spec in known.items() if COMPARISON in spec.tables]
+    metrics = [spec for name, spec in known.items() if name in asked]
     columns = [(task, spec) for task in runs.tasks for spec in metrics if spec.per_frame]
     columns += [("", spec) for spec in metrics if not spec.per_frame]
     found: list[tuple[MetricSpec, list[PairedComparison]]] = []
     for index, (task, spec) in enumerate(columns):
-        comparisons = compare(
-            runs.rows,
-            pairs,
-            task=task,
-            metric=spec.name,
-            region=FULL,
-            higher_is_better=spec.higher_is_better,
-            level=settings.level,
-        )
-        found.append((spec, comparisons))
+        better = spec.higher_is_better
+        what = {"task": task, "metric": spec.name}
+        found.append((spec, compare(runs.rows, pairs, **what, higher_is_better=better, level=settings.level)))
         progress(index + 1, len(columns), spec.label)
     every = [comparison for _, comparisons in found for comparison in comparisons]
     text = _csv(every) if settings.format == "csv" else "\n\n".join(_text(spec, c) for spec, c in found)
     return Findings(text, {"level": settings.level, "comparisons": [_plain(c) for c in every]})
 
 
-def method_pairs(runs: RunSet, against: str | None, trivial: bool) -> list[tuple[str, str]]:
-    """Return the pairs to compare: all, or every method with one."""
+def _pairs(runs: RunSet, against: str | None, trivial: bool) -> list[tuple[str, str]]:
+    """The pairs to compare: all, or every method with one."""
     methods = runs.methods if trivial else runs.ranked
     if against is None:
         pairs = list(combinations(methods, 2))
@@ -136,6 +127,7 @@ def _csv(comparisons: Sequence[PairedComparison]) -> str:
 def _text(spec: MetricSpec, comparisons: Sequence[PairedComparison]) -> str:
     """One metric's comparisons as a table for a terminal."""
     from ..tables import AVATAR_TITLE
+    from .comparisons import counted
 
     first = comparisons[0]
     title = TASK_TITLES.get(first.task, first.task) if first.task else AVATAR_TITLE
@@ -144,9 +136,8 @@ def _text(spec: MetricSpec, comparisons: Sequence[PairedComparison]) -> str:
     family = max(c.family for c in comparisons)
     head = f"{title}, {spec.label} ({unit}{better} is better)"
     if family:
-        subjects = max(c.subjects for c in comparisons)
-        counted = "1 subject" if subjects == 1 else f"{subjects} subjects"
-        head += f": {counted}, exact sign-flip test, Holm over {family} comparison{'s' * (family > 1)}"
+        subjects = counted(max(c.subjects for c in comparisons), "subject")
+        head += f": {subjects}, exact sign-flip test, Holm over {counted(family, 'comparison')}"
     confidence = f"{100 * (1 - first.level):g} % interval"
     lines = [["first", "second", "first - second", confidence, "p", "Holm", "first better", ""]]
     for c in comparisons:

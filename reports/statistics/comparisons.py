@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...bench.contracts import FloatArray
-from ...bench.rows import ALL, Rows
-from ..aggregate import summarise
-from .bootstrap import SubjectPairs, interval, pair
+from ...bench.rows import Rows
+from ..aggregate import summarise, whole_images
+from .bootstrap import interval, pair
 
 EXACT_UP_TO = 20
 """Subjects up to which every assignment is tried."""
@@ -56,16 +56,12 @@ def least_p(subjects: int) -> float:
 
 
 def subjects_needed(level: float, comparisons: int = 1) -> int:
-    """Return how many subjects it takes for the first of so many comparisons to reach ``level`` after Holm."""
+    """How many subjects it takes for the first of so many comparisons to reach ``level`` after Holm."""
     return next(n for n in range(1, EXACT_UP_TO + 1) if comparisons * least_p(n) <= level)
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """Adjust p-values of a family of tests, in their order.
-
-    Rejecting those that are at most a level keeps the probability of any false rejection at most that level,
-    however the tests depend on each other.
-    """
+    """Adjust p-values of a family of tests, in their order (S. Holm, Scandinavian Journal of Statistics 6, 1979)."""
     values = np.asarray(p_values, dtype=np.float64)
     order = np.argsort(values, kind="stable")
     factors = len(values) - np.arange(len(values))
@@ -75,6 +71,11 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
 
 LEVEL = 0.05
+
+
+def counted(number: int, noun: str) -> str:
+    """Such as "1 subject" or "2 subjects"."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 @dataclass(frozen=True)
@@ -121,19 +122,14 @@ class PairedComparison:
         return sum(sign * value > 0 for _, value in self.differences)
 
     @property
-    def testable(self) -> bool:
-        """Whether so many subjects could give a corrected p-value at the level at all."""
-        return bool(self.family) and self.family * least_p(self.subjects) <= self.level
-
-    @property
     def verdict(self) -> str:
         """What may be said, in words."""
         if self.difference is None or self.p_holm is None:
             return "no comparison"
-        if not self.testable:
-            unit = "subject" if self.subjects == 1 else "subjects"
+        # Whether so many subjects could give a corrected p-value at the level at all.
+        if self.family * least_p(self.subjects) > self.level:
             needed = subjects_needed(self.level, self.family)
-            return f"not testable with {self.subjects} {unit} (it takes {needed})"
+            return f"not testable with {counted(self.subjects, 'subject')} (it takes {needed})"
         if self.p_holm > self.level:
             return "cannot be told apart"
         return f"{self.first if (self.difference > 0) == self.higher_is_better else self.second} is better"
@@ -145,76 +141,47 @@ def compare(
     *,
     task: str,
     metric: str,
-    region: str,
     higher_is_better: bool,
     level: float = LEVEL,
 ) -> list[PairedComparison]:
-    """Compare pairs of methods on one metric of one task ("" for a metric of the avatar as a whole).
+    """Compare pairs of methods on one metric of one task ("" for a metric of the avatar as a whole), on whole images.
 
     The pairs are one family: their p-values are corrected together, by Holm. A method that lacks a value of any
-    frame has no comparison, and the reason stands in its place; it does not count in the family.
-
-    Parameters
-    ----------
-    rows : checked by `Rows.check`.
-
-    Raises
-    ------
-    InputError : both methods are complete, yet not on the same frames.
+    frame has no comparison, and the reason stands in its place; it does not count in the family. ``rows`` are
+    checked by `Rows.check`. Raises `InputError` where both methods are complete, yet not on the same frames.
     """
-    found = []
-    for first, second in pairs:
-        comparison = PairedComparison(task, metric, higher_is_better, first, second, level)
-        summaries = [
-            summarise(rows, method=method, metric=metric, task=task, region=region)
-            for method in (first, second)
-        ]
-        absent = [f"{m}: {s.reason}" for m, s in zip((first, second), summaries) if s.value is None]
+    comparisons = []
+    for names in pairs:
+        comparison = PairedComparison(task, metric, higher_is_better, *names, level)
+        summaries = [summarise(rows, name, metric, task) for name in names]
+        absent = [f"{name}: {s.reason}" for name, s in zip(names, summaries) if s.value is None]
         if absent:
-            found.append(replace(comparison, reason=" ".join(absent)))
+            comparisons.append(replace(comparison, reason=" ".join(absent)))
             continue
-        values = [
-            rows.select(method=method, metric=metric, task=task, region=region, seeds=ALL)
-            for method in (first, second)
-        ]
-        seeds = (len(rows.seeds(first)), len(rows.seeds(second)))
-        found.append(_compared(replace(comparison, seeds=seeds), pair(*values)))
-    return corrected(found)
-
-
-def corrected(comparisons: Sequence[PairedComparison]) -> list[PairedComparison]:
-    """Correct the p-values of comparisons that belong to one family."""
-    tested = [c for c in comparisons if c.p is not None]
-    adjusted = iter(holm([c.p for c in tested if c.p is not None]))
+        subjects = pair(*(whole_images(rows, name, metric, task) for name in names))
+        values = np.array([subject.difference for subject in subjects])
+        low, high = interval(subjects, level) or (None, None)
+        deviation = float(values.std(ddof=1)) if len(values) > 1 else 0.0
+        comparisons.append(
+            replace(
+                comparison,
+                differences=tuple((s.subject, float(v)) for s, v in zip(subjects, values)),
+                seeds=(len(rows.seeds(names[0])), len(rows.seeds(names[1]))),
+                difference=float(values.mean()),
+                low=low,
+                high=high,
+                effect=float(values.mean()) / deviation if deviation > 0 else None,
+                p=sign_flip_p(values),
+            )
+        )
+    tested = [c.p for c in comparisons if c.p is not None]
+    adjusted = iter(holm(tested))
     return [c if c.p is None else replace(c, p_holm=next(adjusted), family=len(tested)) for c in comparisons]
-
-
-def _compared(comparison: PairedComparison, subjects: Sequence[SubjectPairs]) -> PairedComparison:
-    """Fill in what the pairs of a comparison say."""
-    values = np.array([subject.difference for subject in subjects])
-    bounds = interval(subjects, comparison.level)
-    deviation = float(values.std(ddof=1)) if len(values) > 1 else 0.0
-    return replace(
-        comparison,
-        differences=tuple((s.subject, float(v)) for s, v in zip(subjects, values)),
-        difference=float(values.mean()),
-        low=None if bounds is None else bounds[0],
-        high=None if bounds is None else bounds[1],
-        effect=float(values.mean()) / deviation if deviation > 0 else None,
-        p=sign_flip_p(values),
-    )
 
 
 @dataclass(frozen=True)
 class BestSet:
-    """The methods that may be the best.
-
-    Attributes
-    ----------
-    methods : those that no other one is found better than; None where so few subjects can tell nothing.
-    subjects : how many there are.
-    needed : subjects that it takes for this many methods.
-    """
+    """``methods`` that no other one is found better than; None where ``subjects`` are fewer than the ``needed`` ones."""
 
     methods: frozenset[str] | None
     subjects: int
@@ -229,11 +196,7 @@ def best_set(
     Each method is compared with all others by the sign-flip test, Holm over these comparisons; it is left out if
     one of them is better. Whichever method is truly the best is therefore left out with a probability of at most
     ``level``, however it was chosen: a confidence set of the best (J. Hsu, Multiple Comparisons, 1996, chapter 4).
-
-    Parameters
-    ----------
-    means : by method (at least two), its mean of each subject (means over frames, sequences and seeds); the same
-        subjects for all.
+    ``means`` has by method (at least two) its mean of each subject; the same subjects for all.
     """
     methods = list(means)
     subjects = sorted(means[methods[0]])

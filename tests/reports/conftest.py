@@ -1,4 +1,5 @@
 import itertools
+import json
 from pathlib import Path
 
 import pandas as pd
@@ -11,7 +12,7 @@ from headbench.bench.runner.config import RunConfig
 from headbench.bench.runner.store import RunFolder
 from headbench.bench.specs import MetricSpec
 
-from .made_rows import avatar_row, row
+from .made_rows import TASKS, avatar_row, row
 
 PSNR = MetricSpec("psnr", "PSNR", "dB", True, 2, "m:psnr")
 LPIPS = MetricSpec("lpips", "LPIPS", "", False, 3, "m:lpips")
@@ -24,6 +25,19 @@ def metrics():
 
 
 @pytest.fixture
+def change_manifest():
+    """Change ``run.json`` of a folder by a function of its content."""
+
+    def change(folder, how):
+        path = RunFolder(folder).manifest
+        manifest = json.loads(path.read_text())
+        how(manifest)
+        path.write_text(json.dumps(manifest))
+
+    return change
+
+
+@pytest.fixture
 def make_rows():
     """Table of the rows of a small comparison; values by method, or by a function of the row's place.
 
@@ -32,7 +46,7 @@ def make_rows():
     frames = [("s1", "EMO", 0, "a"), ("s1", "EMO", 1, "a"), ("s1", "EMO", 2, "a")]
     frames += [("s1", "EXP", 3, "a"), ("s2", "EMO", 0, "a")]
 
-    def make(values, tasks=("novel_view", "self_reenactment"), seeds=(0,), size=None, **changes):
+    def make(values, tasks=TASKS, seeds=(0,), size=None):
         rows = []
         for (method, value), seed in itertools.product(values.items(), seeds):
             for task, frame, metric in itertools.product(tasks, frames, ("psnr", "lpips")):
@@ -119,31 +133,19 @@ def write_run(tmp_path, write_manifest):
         folder = RunFolder(tmp_path / name)
         of_avatar = ("storage", "fps")
         specs = [
-            MetricSpec(
-                m,
-                m.upper(),
-                "",
-                m not in ("lpips", "storage"),
-                4,
-                "m:m",
-                kind="avatar" if m in of_avatar else "frame",
-            )
+            MetricSpec(m, m.upper(), "", m not in ("lpips", "storage"), 4, "m:m", kind=kind)
             for m in lines
+            for kind in ["avatar" if m in of_avatar else "frame"]
         ]
-        tasks = ("novel_view", "self_reenactment")
-        write_manifest(
-            folder,
-            specs,
-            {method: (settings or {}).get(method) for method in methods},
-            {task: f"hash-{task}" for task in tasks},
-            trivial=("mean-image",),
-        )
+        settings = {method: (settings or {}).get(method) for method in methods}
+        protocols = {task: f"hash-{task}" for task in TASKS}
+        write_manifest(folder, specs, settings, protocols, trivial=("mean-image",))
         rows = []
         for (method, level), subject, spec in itertools.product(methods.items(), "abcd", specs):
             offset, slope = lines[spec.name]
             number = offset + slope * level
             if spec.per_frame:
-                places = [{"task": task, "protocol": f"hash-{task}"} for task in tasks]
+                places = [{"task": task, "protocol": f"hash-{task}"} for task in TASKS]
                 rows += [row(method, spec.name, number, subject, **place) for place in places]
             else:
                 rows.append(avatar_row(method, spec.name, number, subject))

@@ -1,6 +1,9 @@
 """Rows of results with little to write."""
 
-from headbench.bench.rows import Row
+from headbench.bench.rows import Row, Rows
+from headbench.reports.tables import build_table
+
+TASKS = ("novel_view", "self_reenactment")
 
 
 def row(method, metric, value, subject="s", sequence="EMO", timestep=0, camera="a", **changes):
@@ -22,3 +25,8 @@ def row(method, metric, value, subject="s", sequence="EMO", timestep=0, camera="
 def avatar_row(method, metric, value, subject="s", **changes):
     """A value of an avatar as a whole."""
     return row(method, metric, value, subject, "", -1, "", **{"task": "", "protocol": "", **changes})
+
+
+def table_of(rows, metrics, methods, tasks=TASKS, protocol_ids=None, **options):
+    """Table of a data frame of rows, one for each method of `methods`."""
+    return build_table(Rows(rows), metrics, list(methods), tasks, protocol_ids=protocol_ids or {}, **options)

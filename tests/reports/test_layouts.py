@@ -2,7 +2,7 @@ import pytest
 
 from headbench.bench.errors import InputError
 from headbench.reports.runs import RunSet
-from headbench.reports.table_report import published_rows, table_of, table_text, with_published
+from headbench.reports.table_report import published_rows, table_of, table_text
 
 METRICS = ("psnr", "ssim", "lpips", "storage", "fps")
 OPACITY, GEOMETRY = (
@@ -18,13 +18,9 @@ def test_paper_1_shows_every_method_and_ours_last(write_run):
     folder = write_run("a", {"ours": 33.0, "mine": 32.0, "ga": 31.0, "insta": 28.0, "mean-image": 17.0})
     table = table_of(RunSet.read([folder]), "paper-1")
     assert labels(table) == ["INSTA", "GaussianAvatars", "mine", "Ours"]
+    quality = [("psnr", 2), ("ssim", 3), ("lpips", 3)]
     assert [(c.title, c.metric, c.digits) for c in table.columns] == [
-        ("Novel view", "psnr", 2),
-        ("Novel view", "ssim", 3),
-        ("Novel view", "lpips", 3),
-        ("Self-reenactment", "psnr", 2),
-        ("Self-reenactment", "ssim", 3),
-        ("Self-reenactment", "lpips", 3),
+        *((title, *of) for title in ("Novel view", "Self-reenactment") for of in quality),
         ("Avatar", "storage", 1),
         ("Avatar", "fps", 0),
     ]
@@ -43,8 +39,9 @@ def test_paper_3_compares_insta_and_ours(write_run):
         assert (cell.status, cell.rank) == ("published", None)
         assert "Table 3 (nine NeRSemble subjects)" in table.notes[cell.note]
         assert "arXiv 2504.14967" in table.notes[cell.note]
-    assert table.rows[1].cells[0].text == "33.00"
     assert "not comparable" in table.caption
+    plain = table_of(RunSet.read([folder]), "paper-3")
+    assert [row.cells for row in plain.rows] == [row.cells[::2] for row in table.rows]
 
 
 def test_paper_4_puts_settings_of_ours_from_runs_side_by_side(write_run):
@@ -63,16 +60,6 @@ def test_other_settings_are_not_given_the_papers_figures(write_run):
     table = table_of(RunSet.read([folder]), "paper-3", published=True)
     assert {c.status for c in table.rows[1].cells[1::2]} == {"none"}
     assert {c.text for c in table.rows[1].cells[1::2]} == {""}
-
-
-def test_published_figures_change_nothing_measured(write_run):
-    folder = write_run("a", {"ours": 33.0, "insta": 28.0}, {"ours": OPACITY})
-    runs = RunSet.read([folder])
-    plain, beside = table_of(runs, "paper-3"), table_of(runs, "paper-3", published=True)
-    assert [row.cells for row in plain.rows] == [row.cells[::2] for row in beside.rows]
-    assert (
-        with_published(plain, "comparison", {"INSTA": {"name": "insta"}, "Ours": {"name": "ours"}}) == plain
-    )
 
 
 @pytest.mark.parametrize("format", ["md", "latex", "html"])

@@ -5,25 +5,25 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from headbench.bench.errors import InputError
-from headbench.bench.rows import Rows
 from headbench.bench.specs import MetricSpec
-from headbench.reports.tables import build_table
 
-from .made_rows import row
+from .made_rows import row, table_of
+
+METRIC = MetricSpec("m", "M", "", True, 2, "m:m")
 
 
-def ranks(table, task, metric):
+def cells(table, metric, task="novel_view"):
+    """Cell of each method in a column."""
     index = next(i for i, c in enumerate(table.columns) if (c.task, c.metric) == (task, metric))
-    return {row.method: row.cells[index].rank for row in table.rows}
+    return {row.method: row.cells[index] for row in table.rows}
 
 
-def cell(table, method, task, metric):
-    index = next(i for i, c in enumerate(table.columns) if (c.task, c.metric) == (task, metric))
-    return next(row.cells[index] for row in table.rows if row.method == method)
+def ranks(table, metric):
+    return {method: cell.rank for method, cell in cells(table, metric).items()}
 
 
 def test_columns_are_tasks_then_the_avatar(make_rows, metrics):
-    table = build_table(Rows(make_rows({"a": 1.0})), metrics, ["a"])
+    table = table_of(make_rows({"a": 1.0}), metrics, "a")
     assert [(c.title, c.label, c.arrow) for c in table.columns] == [
         ("Novel view", "PSNR", "↑"),
         ("Novel view", "LPIPS", "↓"),
@@ -35,36 +35,31 @@ def test_columns_are_tasks_then_the_avatar(make_rows, metrics):
 
 def test_a_trivial_baseline_is_listed_apart_and_never_ranked(make_rows, metrics):
     values = {"floor": 99.0, "a": 1.0, "b": 2.0}
-    table = build_table(Rows(make_rows(values)), metrics, list(values), trivial=["floor"])
-    assert ranks(table, "novel_view", "psnr") == {"a": 2, "b": 1, "floor": None}
+    table = table_of(make_rows(values), metrics, values, trivial=["floor"])
+    assert ranks(table, "psnr") == {"a": 2, "b": 1, "floor": None}
     assert [(title, [r.method for r in rows]) for title, rows in table.groups] == [
         ("Methods", ["a", "b"]),
         ("Trivial baselines (not ranked)", ["floor"]),
     ]
-
-
-def test_a_single_method_has_nothing_to_be_best_of(make_rows, metrics):
-    table = build_table(Rows(make_rows({"a": 1.0, "floor": 2.0})), metrics, ["a", "floor"], trivial=["floor"])
-    assert ranks(table, "novel_view", "psnr") == {"a": None, "floor": None}
-    assert "bold" not in table.caption
+    alone = table_of(make_rows(values), metrics, ["a", "floor"], trivial=["floor"])
+    assert ranks(alone, "psnr") == {"a": None, "floor": None}
+    assert "bold" not in alone.caption
 
 
 def test_missing_and_failed_cells_say_why_and_are_not_ranked(make_rows, metrics):
-    rows = make_rows({"a": 1.0, "b": 2.0, "c": 3.0})
+    rows = make_rows({"a": 1.0, "b": 2.0})
     lpips = rows["metric"] == "lpips"
     rows.loc[lpips, ["status", "value", "reason"]] = ["missing", np.nan, "No weights. Put them there."]
-    rows = rows[rows["method"] != "c"]
     given = {"value": np.nan, "status": "failed", "reason": "RuntimeError: diverged"}
-    failed = make_rows({"c": 0.0}).assign(**given)
-    rows = pd.concat([rows, failed], ignore_index=True)
-    table = build_table(Rows(rows), metrics, ["a", "b", "c", "d"])
-    absent = cell(table, "a", "novel_view", "lpips")
+    rows = pd.concat([rows, make_rows({"c": 0.0}).assign(**given)], ignore_index=True)
+    table = table_of(rows, metrics, "abcd")
+    absent = cells(table, "lpips")["a"]
     assert (absent.text, absent.rank, table.notes[absent.note]) == ("–", None, "No weights. Put them there.")
     for column, shown in zip(table.columns, next(r for r in table.rows if r.method == "c").cells):
         assert (shown.status, shown.text, shown.rank) == ("failed", "failed", None), column
         assert table.notes[shown.note] == "RuntimeError: diverged"
-    assert "Not measured" in table.notes[cell(table, "d", "novel_view", "psnr").note]
-    assert ranks(table, "novel_view", "psnr") == {"a": 2, "b": 1, "c": None, "d": None}
+    assert "Not measured" in table.notes[cells(table, "psnr")["d"].note]
+    assert ranks(table, "psnr") == {"a": 2, "b": 1, "c": None, "d": None}
     assert len(table.notes) == len(set(table.notes)) == 3
     assert table.tasks[0].frames == 5
 
@@ -73,25 +68,20 @@ def test_rows_of_different_protocols_are_not_mixed(make_rows, metrics):
     rows = make_rows({"a": 1.0, "b": 2.0})
     rows.loc[(rows["method"] == "b") & (rows["task"] == "novel_view"), "protocol"] = "other"
     with pytest.raises(InputError, match="hash-novel_view, other"):
-        build_table(Rows(rows), metrics, ["a", "b"])
+        table_of(rows, metrics, "ab")
 
 
-def test_the_caption_tells_protocol_frames_and_size(make_rows, metrics):
-    table = build_table(
-        Rows(make_rows({"a": 1.0, "b": 2.0}, seeds=(0, 1))),
-        metrics,
-        ["a", "b"],
-        protocol_ids={"novel_view": "novel_view/canonical/1"},
-        image_size="550 x 802",
-    )
+def test_the_caption_names_protocol_frames_and_size(make_rows, metrics):
+    rows = make_rows({"a": 1.0, "b": 2.0}, seeds=(0, 1))
+    ids = {"novel_view": "novel_view/canonical/1"}
+    caption = table_of(rows, metrics, "ab", protocol_ids=ids, image_size="550 x 802").caption
     for part in (
         "Novel view: 5 frames, 2 subjects, protocol novel_view/canonical/1 (hash-novel_view).",
         "Self-reenactment: 5 frames, 2 subjects, protocol (hash-self_reenactment).",
-        "550 x 802",
-        "2 seeds",
-        "Mean over frames, then sequences, then subjects",
+        "Images of 550 x 802 pixels.",
+        "Mean over frames, then sequences, then subjects; mean of 2 seeds ±",
     ):
-        assert part in table.caption
+        assert part in caption
 
 
 @settings(deadline=None, max_examples=40)
@@ -100,7 +90,7 @@ def test_ranks_agree_with_a_count_of_better_displayed_values(values, higher, dig
     metric = MetricSpec("m", "M", "", higher, digits, "m:m")
     names = [f"method{i}" for i in range(len(values))]
     rows = pd.DataFrame(row(n, "m", v) for n, v in zip(names, values))
-    table = build_table(Rows(rows), [metric], names)
+    table = table_of(rows, [metric], names, ["novel_view"])
     shown = [float(f"{v:.{digits}f}") for v in values]
     for line, own in zip(table.rows, shown):
         better = {other for other in shown if (other > own if higher else other < own)}
@@ -120,26 +110,29 @@ def many_subjects(methods, subjects=9, seeds=(0,), spread=0.0):
     )
 
 
-METRIC = MetricSpec("m", "M", "", True, 2, "m:m")
-
-
-def test_all_that_cannot_be_told_from_the_best_are_marked_best():
-    levels = {"a": 30.0, "b": 30.02, "c": 28.0, "d": 25.0}
-    table = build_table(Rows(many_subjects(levels)), [METRIC], list(levels))
+@pytest.mark.parametrize(
+    ("second", "subjects", "expected", "caption"),
+    [
+        (
+            30.02,
+            9,
+            {"a": 1, "b": 1, "c": 2, "d": 3},
+            "(exact sign-flip test over 9 subjects, each method against all others, Holm, 5%); the others",
+        ),
+        (
+            30.5,
+            5,
+            {"a": 2, "b": 1, "c": 3, "d": 4},
+            "by the digits shown alone: with 5 subjects no test can tell the best (it takes 7)",
+        ),
+    ],
+)
+def test_all_that_a_test_cannot_exclude_are_marked_best(second, subjects, expected, caption):
+    levels = {"a": 30.0, "b": second, "c": 28.0, "d": 25.0}
+    table = table_of(many_subjects(levels, subjects), [METRIC], levels, ["novel_view"])
     assert len({row.cells[0].text for row in table.rows}) == 4
-    assert ranks(table, "novel_view", "m") == {"a": 1, "b": 1, "c": 2, "d": 3}
-    assert "every method that cannot be told from the best" in table.caption
-    assert "exact sign-flip test over 9 subjects, each method against all others, Holm, 5%" in table.caption
-    assert "third italic" in table.caption
-
-
-def test_with_few_subjects_the_digits_alone_decide():
-    levels = {"a": 30.0, "b": 30.5, "c": 28.0, "d": 25.0}
-    table = build_table(Rows(many_subjects(levels, 5)), [METRIC], list(levels))
-    assert sorted(ranks(table, "novel_view", "m").values()) == [1, 2, 3, 4]
-    assert (
-        "by the digits shown alone: with 5 subjects no test can tell the best (it takes 7)" in table.caption
-    )
+    assert ranks(table, "m") == expected
+    assert caption in table.caption
 
 
 def test_a_column_with_too_few_subjects_for_its_test_is_named(metrics):
@@ -147,18 +140,17 @@ def test_a_column_with_too_few_subjects_for_its_test_is_named(metrics):
     rows = many_subjects({"a": 30.0, "b": 28.0, "c": 25.0}, 6)
     both = pd.concat([rows.assign(metric="psnr"), rows.assign(metric="lpips")], ignore_index=True)
     both = both[~((both["metric"] == "lpips") & (both["method"] == "c"))]
-    table = build_table(Rows(both), metrics[:2], ["a", "b", "c"])
-    assert ranks(table, "novel_view", "psnr") == {"a": 1, "b": 2, "c": 3}
+    table = table_of(both, metrics[:2], "abc", ["novel_view"])
+    assert ranks(table, "psnr") == {"a": 1, "b": 2, "c": 3}
     assert "Too few subjects for the test, so that the digits alone decide: Novel view PSNR." in table.caption
     assert "sign-flip test over 6 subjects" in table.caption
 
 
 def test_seeds_have_their_spread_and_subjects_theirs_not():
     levels = {"a": 30.0, "b": 28.0}
-    table = build_table(Rows(many_subjects(levels, seeds=(0, 1, 2), spread=0.5)), [METRIC], list(levels))
-    one = table.rows[0].cells[0]
+    rows = many_subjects(levels, seeds=(0, 1, 2), spread=0.5)
+    one = table_of(rows, [METRIC], levels, ["novel_view"]).rows[0].cells[0]
     assert one.spread == "0.500"  # of 0, 0.5 and 1: no part of it from the subjects, which differ by 0.2
     assert one.shown == f"{one.text} ± 0.500"
-    assert "mean of 3 seeds ± its standard deviation from seed to seed" in table.caption
-    single = build_table(Rows(many_subjects(levels)), [METRIC], list(levels))
+    single = table_of(many_subjects(levels), [METRIC], levels, ["novel_view"])
     assert {row.cells[0].spread for row in single.rows} == {""}

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from headbench.bench.contracts import no_progress
 from headbench.bench.errors import InputError
 from headbench.bench.io.documents import read_json
+from headbench.datasets import figures
 from headbench.datasets.figures import new_figure, pixels
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.steps.clusters import cluster_expressions
@@ -94,6 +95,12 @@ def test_a_matplotlibrc_changes_no_figure():
     expected = drawn()
     with rc_context({"text.usetex": True, "font.size": 30, "figure.facecolor": "red"}):
         np.testing.assert_array_equal(drawn(), expected)
+
+
+def test_a_figure_longer_than_matplotlib_draws_becomes_smaller(monkeypatch):
+    monkeypatch.setattr(figures, "LONGEST", 150)
+    with new_figure(2, 1) as figure:
+        assert pixels(figure).shape == (75, 150, 3)
 
 
 def test_strips_show_the_cluster_of_each_timestep_in_order():

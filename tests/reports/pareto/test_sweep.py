@@ -18,7 +18,7 @@ from headbench.reports.pareto.sweep import sweep
 def finished(toy, tmp_path, monkeypatch):
     """The folder of a finished run of two methods, one of which has variants."""
     monkeypatch.setattr(runner, "write_reports", lambda folder: [])
-    monkeypatch.setattr(module, "NEEDED", ())
+    monkeypatch.setattr(module, "default_names", lambda group: ())
     toy.MADE.clear()
     for subject in ("subject1", "subject2"):
         (tmp_path / "data" / subject).mkdir(parents=True)

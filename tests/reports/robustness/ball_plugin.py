@@ -1,5 +1,6 @@
 """A rig, a head and avatars simple enough to know what a trial must find: a ball that bears anything, or bursts."""
 
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -73,10 +74,8 @@ def find(root):
 class Ball:
     """A ball at the pose's translation. ``bursts`` names what happens where the first coefficient passes 1.5."""
 
-    bursts = ""
-
-    def __init__(self, path):
-        self.path = path
+    def __init__(self, path, bursts=""):
+        self.path, self.bursts = path, bursts
 
     def render(self, camera, pose, background=(1.0, 1.0, 1.0)):
         extreme = abs(pose.expression[0]) > 1.5
@@ -95,14 +94,6 @@ class Ball:
         return [self.path / "ball.txt"]
 
 
-class Bursting(Ball):
-    bursts = "size"
-
-
-class Broken(Ball):
-    bursts = "nan"
-
-
 class Splatty(Ball):
     """Gives splats too, one of which grows."""
 
@@ -117,7 +108,7 @@ class Splatty(Ball):
 
 
 class BallMethod:
-    avatar = Ball
+    avatar = staticmethod(Ball)
 
     def fit(self, clip, out, budget, *, device, seed, progress):
         out.mkdir(parents=True, exist_ok=True)
@@ -129,21 +120,20 @@ class BallMethod:
 
 
 class BurstingMethod(BallMethod):
-    avatar = Bursting
+    avatar = staticmethod(partial(Ball, bursts="size"))
 
 
 class BrokenMethod(BallMethod):
-    avatar = Broken
+    avatar = staticmethod(partial(Ball, bursts="nan"))
 
 
 class SplattyMethod(BallMethod):
-    avatar = Splatty
-
-
-def _spec(name, trivial=False):
-    return MethodSpec(name, name, f"ball_plugin:{name.capitalize()}Method", trivial=trivial)
+    avatar = staticmethod(Splatty)
 
 
 READER = DatasetSpec("balls", "balls", "ball_plugin:BallClip", find="ball_plugin:find")
-BALL, BURSTING, BROKEN, SPLATTY = map(_spec, ("ball", "bursting", "broken", "splatty"))
+BALL, BURSTING, BROKEN, SPLATTY = (
+    MethodSpec(name, name, f"ball_plugin:{name.capitalize()}Method")
+    for name in ("ball", "bursting", "broken", "splatty")
+)
 FLOOR = MethodSpec("floor", "a floor", "ball_plugin:BallMethod", trivial=True)

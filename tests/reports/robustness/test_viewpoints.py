@@ -71,22 +71,19 @@ def test_beyond_the_ends_elevation_and_distance_stay():
     assert first.extrapolated
 
 
-def test_a_rig_all_around_gives_a_closed_walk():
-    views = turntable([camera(a) for a in range(-150, 200, 50)], CENTER, 8, 30.0)
-    azimuths = np.array([azimuth_of(v) for v in views]) % 360
-    assert not any(v.extrapolated for v in views)
-    assert np.allclose(np.diff(np.sort(azimuths)), 45)
-
-
-def test_an_arc_across_the_back_is_found():
-    views = turntable([camera(a) for a in (150, 180, -150)], CENTER, 3, 0.0)
-    assert np.allclose(sorted(azimuth_of(v) % 360 for v in views), [150, 180, 210])
-
-
-def test_one_camera_is_enough():
-    views = turntable([camera(15)], CENTER, 3, 20.0)
-    assert np.allclose([azimuth_of(v) for v in views], [-5, 15, 35])
-    assert [v.extrapolated for v in views] == [True, False, True]
+@pytest.mark.parametrize(
+    ("rig", "count", "beyond", "azimuths", "extrapolated"),
+    [
+        (range(-150, 200, 50), 8, 30.0, np.arange(8) * 45 + 30, [False] * 8),  # all around: closed
+        ((150, 180, -150), 3, 0.0, [150, 180, 210], [False] * 3),  # across the back
+        ((15,), 3, 20.0, [-5, 15, 35], [True, False, True]),
+    ],
+)
+def test_rigs_all_around_behind_and_of_one_camera(rig, count, beyond, azimuths, extrapolated):
+    views = turntable([camera(a) for a in rig], CENTER, count, beyond)
+    found = np.array([azimuth_of(v) for v in views])
+    np.testing.assert_allclose(np.sort(found % 360), np.sort(np.mod(azimuths, 360)), atol=1e-4)
+    assert [v.extrapolated for v in views] == extrapolated
 
 
 def test_a_turned_world_turns_the_views_with_it():

@@ -2,6 +2,7 @@ import csv
 import io
 import itertools
 import json
+from dataclasses import replace
 
 import pandas as pd
 import pytest
@@ -10,10 +11,10 @@ from headbench.bench import cli
 from headbench.bench.errors import InputError
 from headbench.bench.rows import Rows
 from headbench.bench.runner.store import RunFolder
-from headbench.bench.specs import MetricSpec
+from headbench.bench.specs import RENAMED_METRICS, MetricSpec
 from headbench.reports.statistics.command import CompareSettings, compare_runs
 
-from ..made_rows import avatar_row, row
+from ..made_rows import TASKS, avatar_row, row
 
 SUBJECTS = 7
 ERRORS = {"good": 1.0, "bad": 3.0, "floor": 9.0}
@@ -22,32 +23,18 @@ ERRORS = {"good": 1.0, "bad": 3.0, "floor": 9.0}
 @pytest.fixture
 def folder(tmp_path, write_manifest):
     """A finished run of seven subjects: error good < bad < floor on every subject, by other amounts."""
-    tasks, seeds = ("novel_view", "self_reenactment"), (0, 1)
     folder = RunFolder(tmp_path / "run")
-    write_manifest(
-        folder,
-        [
-            MetricSpec("error", "Error", "levels", False, 2, "m:e"),
-            MetricSpec("size", "Error", "levels", False, 2, "m:e", kind="avatar"),
-        ],
-        dict.fromkeys(ERRORS),
-        {task: f"hash-{task}" for task in tasks},
-        seeds,
-        trivial=("floor",),
-    )
-    rows = [
-        [
-            *(
-                row(n, "error", level * (1 + s / 10) + seed, f"s{s}", seed=seed, task=t, protocol=f"hash-{t}")
-                for t in tasks
-            ),
-            avatar_row(n, "size", 2.0, f"s{s}", seed=seed),
-        ]
-        for n, level in ERRORS.items()
-        for s in range(SUBJECTS)
-        for seed in seeds
-    ]
-    Rows.of(itertools.chain(*rows)).write(folder.rows)
+    error = MetricSpec("error", "Error", "levels", False, 2, "m:e")
+    metrics = [error, replace(error, name="size", kind="avatar")]
+    protocols = {task: f"hash-{task}" for task in TASKS}
+    write_manifest(folder, metrics, dict.fromkeys(ERRORS), protocols, (0, 1), trivial=("floor",))
+    rows = []
+    for (name, level), s, seed in itertools.product(ERRORS.items(), range(SUBJECTS), (0, 1)):
+        rows.append(avatar_row(name, "size", 2.0, f"s{s}", seed=seed))
+        for task, protocol in protocols.items():
+            place = {"seed": seed, "task": task, "protocol": protocol}
+            rows.append(row(name, "error", level * (1 + s / 10) + seed, f"s{s}", **place))
+    Rows.of(rows).write(folder.rows)
     return folder.root
 
 
@@ -99,9 +86,15 @@ def test_other_levels_are_kept(folder):
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"), [({"against": "nobody"}, "nobody"), ({"metrics": ("error", "jod")}, "jod")]
+    ("changes", "message"),
+    [
+        ({"against": "nobody"}, "nobody"),
+        ({"metrics": ("error", "jod")}, "metrics of the runs: error, size, found jod"),
+        ({"metrics": ("former",)}, "its new name, error"),
+    ],
 )
-def test_what_is_not_there_is_refused(folder, changes, message):
+def test_what_is_not_there_is_refused(folder, monkeypatch, changes, message):
+    monkeypatch.setitem(RENAMED_METRICS, "former", "error")
     with pytest.raises(InputError, match=message):
         compare_runs(CompareSettings((str(folder),), **changes))
 
