@@ -317,10 +317,10 @@ class Metric(Protocol):
     """One number per frame; never a mean.
 
     A metric that is faster on many frames also offers ``batched(pairs) -> iterator of values``: the values in
-    order, the pairs of image and truth read lazily.
+    order, the pairs of image and ground truth read lazily.
     """
 
-    def __call__(self, image: ByteArray, truth: ByteArray) -> float:
+    def __call__(self, image: ByteArray, target: ByteArray) -> float:
         """Compare two (H, W, 3) 8-bit images. Raises `UnavailableError` where it cannot be had."""
 
 
@@ -329,7 +329,7 @@ class RegionalMetric(Metric, Protocol):
     """A metric that can also be taken over a part of the frame (`MetricSpec.kind` "regional")."""
 
     def in_regions(
-        self, image: ByteArray, truth: ByteArray, masks: Mapping[str, BoolArray]
+        self, image: ByteArray, target: ByteArray, masks: Mapping[str, BoolArray]
     ) -> Mapping[str, float]:
         """Value over each (H, W) mask; masks without a pixel are left out."""
 
@@ -339,9 +339,9 @@ class TemporalMetric(Protocol):
     """One number per frame and its neighbour in time, of one camera and sequence (`MetricSpec.kind` "temporal")."""
 
     def __call__(
-        self, image: ByteArray, truth: ByteArray, other_image: ByteArray, other_truth: ByteArray
+        self, image: ByteArray, target: ByteArray, other_image: ByteArray, other_target: ByteArray
     ) -> float:
-        """Compare how the image changes to its neighbour with how the truth does; (H, W, 3) 8-bit each."""
+        """Compare how the image changes to its neighbour with how the ground truth does; (H, W, 3) 8-bit each."""
 
 
 class Measurement(NamedTuple):

@@ -22,17 +22,17 @@ FLICKER = MetricSpec(
 )
 
 
-def flicker(image: ByteArray, truth: ByteArray, other_image: ByteArray, other_truth: ByteArray) -> float:
-    """Root mean square, in 8-bit levels, of ``(image - other_image) - (truth - other_truth)``.
+def flicker(image: ByteArray, target: ByteArray, other_image: ByteArray, other_target: ByteArray) -> float:
+    """Root mean square, in 8-bit levels, of ``(image - other_image) - (target - other_target)``.
 
     ``other`` is a neighbour in time, from the same camera; which of the two comes first does not matter. What an
     avatar gets wrong alike in both frames (a wrong colour, a blur that moves along) cancels; what appears in one of
     them does not. 0 for a render that changes as the ground truth does. All are (H, W, 3) 8-bit images of one size.
     """
-    check_pair(image, truth)
-    check_pair(other_image, other_truth)
+    check_pair(image, target)
+    check_pair(other_image, other_target)
     check_pair(image, other_image)
     change = np.subtract(image, other_image, dtype=np.int32)
-    change -= truth
-    change += other_truth
+    change -= target
+    change += other_target
     return math.sqrt(np.square(change).sum(dtype=np.int64) / change.size)

@@ -78,20 +78,20 @@ class Flip:
 
     pixels_per_degree: float = PIXELS_PER_DEGREE
 
-    def __call__(self, image: ByteArray, truth: ByteArray) -> float:
+    def __call__(self, image: ByteArray, target: ByteArray) -> float:
         """Mean of `map` over all pixels, 0 for identical images."""
-        return float(self.map(image, truth).mean())
+        return float(self.map(image, target).mean())
 
-    def in_regions(self, image: ByteArray, truth: ByteArray, masks: Mapping[str, Mask]) -> dict[str, float]:
+    def in_regions(self, image: ByteArray, target: ByteArray, masks: Mapping[str, Mask]) -> dict[str, float]:
         """Mean over each (H, W) boolean mask; regions without a pixel are left out."""
-        stack_masks(masks, truth)
-        error = self.map(image, truth)
+        stack_masks(masks, target)
+        error = self.map(image, target)
         return {name: float(error[mask].mean()) for name, mask in masks.items() if mask.any()}
 
-    def map(self, image: ByteArray, truth: ByteArray) -> FloatArray:
+    def map(self, image: ByteArray, target: ByteArray) -> FloatArray:
         """(H, W) float64 error in [0, 1] of each pixel (equation 20)."""
-        check_pair(image, truth)
-        x, y = (_opponent(_linear(array)) for array in (image, truth))
+        check_pair(image, target)
+        x, y = (_opponent(_linear(array)) for array in (image, target))
         color = _color_error(*(self._seen(array) for array in (x, y)))
         feature = self._feature_error(x[..., 0], y[..., 0])
         return color ** (1 - feature)
@@ -103,9 +103,9 @@ class Flip:
         linear = np.clip(_from_opponent(np.stack(blurred, axis=-1)), 0, 1)
         return _hunt(_lab(linear))
 
-    def _feature_error(self, luminance: FloatArray, true_luminance: FloatArray) -> FloatArray:
+    def _feature_error(self, luminance: FloatArray, target_luminance: FloatArray) -> FloatArray:
         """Section 4.2: difference of edges and of points, in [0, 1]."""
-        x, y = ((np.ascontiguousarray(a) + 16) / 116 for a in (luminance, true_luminance))
+        x, y = ((np.ascontiguousarray(a) + 16) / 116 for a in (luminance, target_luminance))
         differences = [
             np.abs(_magnitude(x, pair) - _magnitude(y, pair))
             for pair in _feature_filters(self.pixels_per_degree)

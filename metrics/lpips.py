@@ -51,9 +51,9 @@ class SharedLpips:
     net: str = "alex"
     scaled: bool = True
 
-    def __call__(self, image: ByteArray, truth: ByteArray) -> float:
+    def __call__(self, image: ByteArray, target: ByteArray) -> float:
         """LPIPS of two (H, W, 3) 8-bit images."""
-        return self._loaded()(image, truth)
+        return self._loaded()(image, target)
 
     def batched(self, pairs: Iterable[tuple[ByteArray, ByteArray]]) -> Iterator[float]:
         """Distances of many pairs of one size, in order; ``pairs`` is read lazily."""

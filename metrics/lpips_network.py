@@ -53,7 +53,7 @@ class Lpips:
     Parameters
     ----------
     net : "alex" (customary for reporting), "squeeze" or "vgg".
-    weights : file with the backbone, or folder to look in; see `headbench.metrics.weights` for the default.
+    weights : file with the backbone, or folder to look in; see the module for the default.
     device : where the network runs; always in float32.
     scaled : bring images to [-1, 1], as the constants expect; False feeds [0, 1].
     cache_mb : bound of the features of ground-truth images that are kept for the next method, in 10^6 bytes.
@@ -77,7 +77,9 @@ class Lpips:
         scaled: bool = True,
         cache_mb: float = 256.0,
     ) -> None:
-        self.spec = network_spec(net)
+        if net not in NETWORKS:
+            raise InputError("LPIPS", "net", f"one of {', '.join(NETWORKS)}", repr(net))
+        self.spec = NETWORKS[net]
         self.scaled = scaled
         self._cache: dict[tuple[bytes, tuple[int, ...]], list[Tensor]] = {}
         self._cache_bytes, self._held = int(cache_mb * 1e6), 0
@@ -96,25 +98,25 @@ class Lpips:
         self._shift = torch.tensor(SHIFT, device=self.device).view(1, 3, 1, 1)
         self._scale = torch.tensor(SCALE, device=self.device).view(1, 3, 1, 1)
 
-    def __call__(self, image: ByteArray, truth: ByteArray) -> float:
+    def __call__(self, image: ByteArray, target: ByteArray) -> float:
         """Distance of two (H, W, 3) 8-bit images, 0 for identical ones."""
-        check_pair(image, truth, self.spec.smallest)
-        return float(self.distances(image[None], truth[None])[0])
+        check_pair(image, target, self.spec.smallest)
+        return float(self.distances(image[None], target[None])[0])
 
-    def distances(self, images: ByteArray, truths: ByteArray) -> FloatArray:
+    def distances(self, images: ByteArray, targets: ByteArray) -> FloatArray:
         """(N,) float64 distances of two stacks (N, H, W, 3) of 8-bit images, in one pass."""
-        if images.ndim != 4 or images.shape != truths.shape:
-            found = f"{images.shape} and {truths.shape}"
+        if images.ndim != 4 or images.shape != targets.shape:
+            found = f"{images.shape} and {targets.shape}"
             raise InputError("LPIPS", "images", "two stacks of one shape (N, H, W, 3)", found)
         if not len(images):
             return np.empty(0)
-        check_pair(images[0], truths[0], self.spec.smallest)
+        check_pair(images[0], targets[0], self.spec.smallest)
         # Both stacks go through the network separately: half the peak memory, the same numbers.
         with torch.inference_mode():
             total = torch.zeros(len(images), dtype=torch.float64, device=self.device)
-            layers = zip(self._features(images), self._true_features(truths), self._linear)
-            for features, true_features, weight in layers:
-                difference = features.sub_(true_features).square_()
+            layers = zip(self._features(images), self._target_features(targets), self._linear)
+            for features, target_features, weight in layers:
+                difference = features.sub_(target_features).square_()
                 total += functional.conv2d(difference, weight).mean(dim=(1, 2, 3), dtype=torch.float64)
         return np.asarray(total.cpu().numpy())
 
@@ -122,16 +124,18 @@ class Lpips:
         """Distances of many pairs of one size, in order, ``size`` at a time; ``pairs`` is read lazily."""
         stream = iter(pairs)
         while batch := list(islice(stream, size)):
-            images, truths = zip(*batch)
-            yield from map(float, self.distances(np.stack(images), np.stack(truths)))
+            images, targets = zip(*batch)
+            yield from map(float, self.distances(np.stack(images), np.stack(targets)))
 
-    def _true_features(self, truths: ByteArray) -> list[Tensor]:
+    def _target_features(self, targets: ByteArray) -> list[Tensor]:
         """The same as `_features`, from the cache where a frame was seen before: every method has the same ground truth."""
-        keys = [hashlib.blake2b(np.ascontiguousarray(truth), digest_size=16).digest() for truth in truths]
-        places = [(key, truth.shape) for key, truth in zip(keys, truths)]
+        places = [
+            (hashlib.blake2b(np.ascontiguousarray(target), digest_size=16).digest(), target.shape)
+            for target in targets
+        ]
         if all(place in self._cache for place in places):
             return [torch.cat(layer) for layer in zip(*(self._cache[place] for place in places))]
-        features = self._features(truths)
+        features = self._features(targets)
         for index, place in enumerate(places):
             own = [layer[index : index + 1] for layer in features]
             size = sum(layer.numel() * layer.element_size() for layer in own)
@@ -209,62 +213,43 @@ class NetworkSpec:
         """Where PyTorch publishes the weights."""
         return f"https://download.pytorch.org/models/{self.file}"
 
-    @property
-    def sha256_prefix(self) -> str:
-        """The first digits of the file's SHA-256."""
-        return self.file.removesuffix(".pth").rpartition("-")[2]
-
     def build(self) -> TappedNetwork:
         """Make the network, weights not yet meaningful."""
         return {"alex": _alexnet, "squeeze": _squeezenet, "vgg": _vgg16}[self.name]()
 
 
 ALEX = NetworkSpec("alex", (64, 192, 384, 256, 256), 31, "alexnet-owt-7be5be79.pth", "alexnet_features.pth")
-SQUEEZE = NetworkSpec(
-    "squeeze",
-    (64, 128, 256, 384, 384, 512, 512),
-    17,
-    "squeezenet1_1-b8a52dc0.pth",
-    "squeezenet1_1_features.pth",
-)
+_SQUEEZE_FILES = "squeezenet1_1-b8a52dc0.pth", "squeezenet1_1_features.pth"
+SQUEEZE = NetworkSpec("squeeze", (64, 128, 256, 384, 384, 512, 512), 17, *_SQUEEZE_FILES)
 VGG = NetworkSpec("vgg", (64, 128, 256, 512, 512), 16, "vgg16-397923af.pth", "vgg16_features.pth")
 NETWORKS = {spec.name: spec for spec in (ALEX, SQUEEZE, VGG)}
 
 
+def _rectified(*sizes: int) -> list[nn.Module]:
+    """A convolution of these inputs, outputs, side, stride and padding, and a ReLU."""
+    return [nn.Conv2d(*sizes), nn.ReLU(inplace=True)]  # type: ignore[arg-type]
+
+
 def _alexnet() -> TappedNetwork:
-    layers: list[nn.Module] = [
-        nn.Conv2d(3, 64, 11, stride=4, padding=2),
-        nn.ReLU(inplace=True),
+    layers = [
+        *_rectified(3, 64, 11, 4, 2),
         nn.MaxPool2d(3, 2),
-        nn.Conv2d(64, 192, 5, padding=2),
-        nn.ReLU(inplace=True),
+        *_rectified(64, 192, 5, 1, 2),
         nn.MaxPool2d(3, 2),
-        nn.Conv2d(192, 384, 3, padding=1),
-        nn.ReLU(inplace=True),
-        nn.Conv2d(384, 256, 3, padding=1),
-        nn.ReLU(inplace=True),
-        nn.Conv2d(256, 256, 3, padding=1),
-        nn.ReLU(inplace=True),
     ]
+    for inputs, outputs in ((192, 384), (384, 256), (256, 256)):
+        layers += _rectified(inputs, outputs, 3, 1, 1)
     return TappedNetwork(layers, (1, 4, 7, 9, 11))
 
 
 def _squeezenet() -> TappedNetwork:
-    layers: list[nn.Module] = [
-        nn.Conv2d(3, 64, 3, stride=2),
-        nn.ReLU(inplace=True),
-        nn.MaxPool2d(3, 2, ceil_mode=True),
-        Fire(64, 16, 64),
-        Fire(128, 16, 64),
-        nn.MaxPool2d(3, 2, ceil_mode=True),
-        Fire(128, 32, 128),
-        Fire(256, 32, 128),
-        nn.MaxPool2d(3, 2, ceil_mode=True),
-        Fire(256, 48, 192),
-        Fire(384, 48, 192),
-        Fire(384, 64, 256),
-        Fire(512, 64, 256),
-    ]
+    layers = _rectified(3, 64, 3, 2)
+    for fires in (
+        [(64, 16, 64), (128, 16, 64)],
+        [(128, 32, 128), (256, 32, 128)],
+        [(256, 48, 192), (384, 48, 192), (384, 64, 256), (512, 64, 256)],
+    ):
+        layers += [nn.MaxPool2d(3, 2, ceil_mode=True), *(Fire(*sizes) for sizes in fires)]
     return TappedNetwork(layers, (1, 4, 7, 9, 10, 11, 12))
 
 
@@ -272,10 +257,9 @@ def _vgg16() -> TappedNetwork:
     layers: list[nn.Module] = []
     inputs = 3
     for block, (channels, repeats) in enumerate([(64, 2), (128, 2), (256, 3), (512, 3), (512, 3)]):
-        if block:
-            layers.append(nn.MaxPool2d(2, 2))
+        layers += [nn.MaxPool2d(2, 2)] if block else []
         for _ in range(repeats):
-            layers += [nn.Conv2d(inputs, channels, 3, padding=1), nn.ReLU(inplace=True)]
+            layers += _rectified(inputs, channels, 3, 1, 1)
             inputs = channels
     return TappedNetwork(layers, (3, 8, 15, 22, 29))
 
@@ -296,7 +280,7 @@ def find_backbone(spec: NetworkSpec, path: Path | None = None) -> Path:
         if found := _in_folder(spec, folder):
             return found
     target = cache_folder() / spec.file
-    if problem := _fetch(spec.url, spec.sha256_prefix, target):
+    if problem := _fetch(spec.url, spec.file.removesuffix(".pth").rpartition("-")[2], target):
         raise UnavailableError(
             f"LPIPS needs the ImageNet weights of its {spec.name} network, which are not on this machine and "
             f"could not be fetched ({problem}).",
@@ -318,16 +302,17 @@ def load_linear(spec: NetworkSpec, path: Path | None = None) -> list[Tensor]:
 
     ``path`` defaults to the file in the installed torchmetrics package.
     """
-    path = _torchmetrics_folder() / f"{spec.name}.pth" if path is None else path
+    if path is None:
+        package = importlib.util.find_spec("torchmetrics")
+        if package is None or not package.submodule_search_locations:
+            raise UnavailableError(
+                "LPIPS takes its linear layers from the package torchmetrics, which is not installed.",
+                "Install it: pip install torchmetrics.",
+            )
+        folder = Path(package.submodule_search_locations[0]) / "functional" / "image" / "lpips_models"
+        path = folder / f"{spec.name}.pth"
     shapes = {f"lin{i}.model.1.weight": (1, c, 1, 1) for i, c in enumerate(spec.channels)}
     return list(_read(path, shapes).values())
-
-
-def network_spec(name: str) -> NetworkSpec:
-    """Look up a network by name. Raises `InputError` for an unknown one."""
-    if name not in NETWORKS:
-        raise InputError("LPIPS", "net", f"one of {', '.join(NETWORKS)}", repr(name))
-    return NETWORKS[name]
 
 
 def _named(spec: NetworkSpec, path: Path, option: str) -> Path:
@@ -340,9 +325,8 @@ def _named(spec: NetworkSpec, path: Path, option: str) -> Path:
             f"LPIPS needs the ImageNet weights of its {spec.name} network; {option} names {path}, which has none.",
             f"Download {spec.url} and put it there.",
         )
-    raise InputError(
-        option, "", f"a file, or a folder with {spec.file} or {spec.features_file}", f"{path}, not there"
-    )
+    expected = f"a file, or a folder with {spec.file} or {spec.features_file}"
+    raise InputError(option, "", expected, f"{path}, not there")
 
 
 def _in_folder(spec: NetworkSpec, folder: Path) -> Path | None:
@@ -364,16 +348,6 @@ def _fetch(url: str, sha256_prefix: str, target: Path) -> str:
     except (OSError, HTTPException) as error:
         return f"{url}: {error}"
     return ""
-
-
-def _torchmetrics_folder() -> Path:
-    package = importlib.util.find_spec("torchmetrics")
-    if package is None or not package.submodule_search_locations:
-        raise UnavailableError(
-            "LPIPS takes its linear layers from the package torchmetrics, which is not installed.",
-            "Install it: pip install torchmetrics.",
-        )
-    return Path(package.submodule_search_locations[0]) / "functional" / "image" / "lpips_models"
 
 
 def _read(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Tensor]:

@@ -21,9 +21,9 @@ KERNEL = Kernel(
 )
 
 
-def check_pair(image: ByteArray, truth: ByteArray, smallest: int = 1) -> None:
+def check_pair(image: ByteArray, target: ByteArray, smallest: int = 1) -> None:
     """Raise `InputError` unless both are (H, W, 3) 8-bit images of one size, H and W at least ``smallest``."""
-    for key, array in (("image", image), ("truth", truth)):
+    for key, array in (("image", image), ("target", target)):
         if not isinstance(array, np.ndarray) or array.dtype != np.uint8:
             found = str(getattr(array, "dtype", type(array).__name__))
             remedy = "Quantise renders with headbench.bench.io.images.quantise."
@@ -34,16 +34,18 @@ def check_pair(image: ByteArray, truth: ByteArray, smallest: int = 1) -> None:
             raise InputError(
                 "metric", key, f"at least {smallest} pixels in height and width", str(array.shape)
             )
-    if image.shape != truth.shape:
-        raise InputError("metric", "image", f"the shape of the ground truth, {truth.shape}", str(image.shape))
+    if image.shape != target.shape:
+        raise InputError(
+            "metric", "image", f"the shape of the ground truth, {target.shape}", str(image.shape)
+        )
 
 
-def stack_masks(masks: Mapping[str, Mask], truth: ByteArray) -> ByteArray:
+def stack_masks(masks: Mapping[str, Mask], target: ByteArray) -> ByteArray:
     """(R, H, W) 8-bit stack of the masks of regions, 1 inside.
 
     Raises `InputError` for one that is not boolean or not of the ground truth's size.
     """
-    size = truth.shape[:2]
+    size = target.shape[:2]
     for name, mask in masks.items():
         if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_ or mask.shape != size:
             found = f"{getattr(mask, 'dtype', type(mask).__name__)} {getattr(mask, 'shape', '')}"
@@ -53,23 +55,23 @@ def stack_masks(masks: Mapping[str, Mask], truth: ByteArray) -> ByteArray:
     return np.stack([mask.view(np.uint8) for mask in masks.values()])
 
 
-def squared_errors(image: ByteArray, truth: ByteArray, masks: ByteArray) -> IntArray:
+def squared_errors(image: ByteArray, target: ByteArray, masks: ByteArray) -> IntArray:
     """(1 + R, 3) int64 sums of the squared differences by channel: of the image, then inside each mask. Exact.
 
     Parameters
     ----------
-    image, truth : (H, W, 3) 8-bit.
+    image, target : (H, W, 3) 8-bit.
     masks : (R, H, W) 8-bit, not 0 inside.
     """
     module = KERNEL.load_or_warn()
     if module is None:
-        return squared_errors_numpy(image, truth, masks)
-    arrays = (np.ascontiguousarray(array) for array in (image, truth, masks))
+        return squared_errors_numpy(image, target, masks)
+    arrays = (np.ascontiguousarray(array) for array in (image, target, masks))
     sums = module.squared_error(*arrays, KERNEL.instruction_sets[0])
     return np.array(sums, dtype=np.int64).reshape(-1, 3)
 
 
-def squared_errors_numpy(image: ByteArray, truth: ByteArray, masks: ByteArray) -> IntArray:
+def squared_errors_numpy(image: ByteArray, target: ByteArray, masks: ByteArray) -> IntArray:
     """The definition of `squared_errors`."""
-    square = (image.astype(np.int64) - truth) ** 2
+    square = (image.astype(np.int64) - target) ** 2
     return np.stack([square.sum(axis=(0, 1)), *(square[mask != 0].sum(axis=0) for mask in masks)])

@@ -44,19 +44,19 @@ class Psnr:
     per_channel: bool = False
     floor: float = 0.0
 
-    def __call__(self, image: ByteArray, truth: ByteArray) -> float:
+    def __call__(self, image: ByteArray, target: ByteArray) -> float:
         """PSNR over all pixels of two (H, W, 3) images."""
-        check_pair(image, truth)
-        errors = squared_errors(image, truth, stack_masks({}, truth))
+        check_pair(image, target)
+        errors = squared_errors(image, target, stack_masks({}, target))
         return self._decibels(errors[0], image.shape[0] * image.shape[1])
 
-    def in_regions(self, image: ByteArray, truth: ByteArray, masks: Mapping[str, Mask]) -> dict[str, float]:
+    def in_regions(self, image: ByteArray, target: ByteArray, masks: Mapping[str, Mask]) -> dict[str, float]:
         """PSNR over the pixels of each (H, W) boolean mask: the error is averaged over the region, not diluted.
 
         Regions without a pixel are left out.
         """
-        check_pair(image, truth)
-        errors = squared_errors(image, truth, stack_masks(masks, truth))
+        check_pair(image, target)
+        errors = squared_errors(image, target, stack_masks(masks, target))
         counts = {name: int(mask.sum()) for name, mask in masks.items()}
         return {
             name: self._decibels(error, count)

@@ -12,9 +12,9 @@ import os
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import count, repeat
+from itertools import count, islice, repeat
 from typing import Any, Protocol
 
 import numpy as np
@@ -65,30 +65,21 @@ def _milliseconds(name: str, label: str, detail: str, summary: str) -> MetricSpe
 LATENCY_P50 = _milliseconds("latency_p50", "p50", "p50_ms", "Median time of a frame, each waited for.")
 LATENCY_P95 = _milliseconds("latency_p95", "p95", "p95_ms", "95 % of frames take no longer.")
 LATENCY_P99 = _milliseconds("latency_p99", "p99", "p99_ms", "99 % of frames take no longer.")
-LATENCY_STATIC = _milliseconds(
-    "latency_static",
-    "Static pose",
-    "static_ms",
-    "Median time of a frame where neither camera nor pose changes.",
-)
-PROCESSOR_TIME = _milliseconds(
-    "processor_time", "CPU", "processor_ms", "Processor time of a frame, all threads together."
-)
-STAGE_DRIVE = _milliseconds(
-    "stage_drive", "Drive", "drive_ms", "Median time from driving signal to mesh and features."
-)
-STAGE_DEFORM = _milliseconds(
-    "stage_deform", "Deform", "deform_ms", "Median time from mesh to primitives as the camera sees them."
-)
-STAGE_RASTERIZE = _milliseconds(
-    "stage_rasterize", "Rasterize", "rasterize_ms", "Median time from primitives to image."
-)
-STAGE_POST = _milliseconds(
-    "stage_post", "Post", "post_ms", "Median time of what changes the image afterwards."
-)
-STAGE_READ_BACK = _milliseconds(
-    "stage_read_back", "Read-back", "read_back_ms", "Median time to bring the image into host memory."
-)
+_STATIC = "Median time of a frame where neither camera nor pose changes."
+LATENCY_STATIC = _milliseconds("latency_static", "Static pose", "static_ms", _STATIC)
+_PROCESSOR = "Processor time of a frame, all threads together."
+PROCESSOR_TIME = _milliseconds("processor_time", "CPU", "processor_ms", _PROCESSOR)
+
+
+def _stage(name: str, label: str, what: str) -> MetricSpec:
+    return _milliseconds(f"stage_{name}", label, f"{name}_ms", f"Median time {what}.")
+
+
+STAGE_DRIVE = _stage("drive", "Drive", "from driving signal to mesh and features")
+STAGE_DEFORM = _stage("deform", "Deform", "from mesh to primitives as the camera sees them")
+STAGE_RASTERIZE = _stage("rasterize", "Rasterize", "from primitives to image")
+STAGE_POST = _stage("post", "Post", "of what changes the image afterwards")
+STAGE_READ_BACK = _stage("read_back", "Read-back", "to bring the image into host memory")
 THROUGHPUT = replace(
     FPS,
     name="throughput",
@@ -103,7 +94,8 @@ READ_BACK = "read_back"
 NUDGE = 1e-5  # added to every expression coefficient per lap of the workload: too little to see, a new signal
 
 Clock = Callable[[], float]
-Stream = Iterator[tuple[Camera, HeadPose]]
+Frame = tuple[Camera, HeadPose]
+Stream = Iterator[Frame]
 
 
 class Drawing(Protocol):
@@ -182,50 +174,42 @@ def measure_speed(
 ) -> Measurement:
     """The measurement of `fps` to another protocol or by another clock (seconds, monotonic)."""
     plan = protocol or SpeedProtocol()
-    check_workload(workload)
-    staged = isinstance(avatar, StagedAvatar)
+    if len(workload) < 2:
+        raise InputError("speed", "workload", "two or more pairs of camera and pose", str(len(workload)))
+    for index, (camera, pose) in enumerate(workload):  # the last and the first are neighbours, too
+        if camera is workload[index - 1][0] and pose is workload[index - 1][1]:
+            found = f"entries {(index - 1) % len(workload)} and {index} are the same"
+            raise InputError("speed", "workload", "a new camera or pose every frame", found)
     drawing: Drawing = avatar if isinstance(avatar, StagedAvatar) else WholeFrames(avatar)
     stream = fresh_frames(workload)
     warm_up_frames, stationary = warm_up(drawing, stream, plan, clock)
     processor = time.process_time()
     milliseconds = latencies(drawing, stream, plan.latency, plan.latency_s, clock)
     processor_ms = 1000 * (time.process_time() - processor) / len(milliseconds)
-    p5, p25, p50, p75, p95, p99 = map(float, np.percentile(milliseconds, [5, 25, 50, 75, 95, 99]))
+    percentiles = {f"p{p}_ms": float(np.percentile(milliseconds, p)) for p in (5, 25, 50, 75, 95, 99)}
+    spread = percentiles.pop("p75_ms") - percentiles.pop("p25_ms")
     details: dict[str, float] = {
         "frames": len(milliseconds),
         "mean_ms": float(milliseconds.mean()),
-        "p5_ms": p5,
-        "p50_ms": p50,
-        "p95_ms": p95,
-        "p99_ms": p99,
-        "iqr_ms": p75 - p25,
+        **percentiles,
+        "iqr_ms": spread,
         "max_ms": float(milliseconds.max()),
         "processor_ms": processor_ms,
         "throughput_fps": throughput(drawing, stream, plan.throughput, plan.throughput_s, plan.depth, clock),
     }
-    if staged:
+    if drawing is avatar:
         medians = stage_times(drawing, stream, plan.stages, plan.stages_s, clock)
         details |= {f"{stage}_ms": value for stage, value in medians.items()}
     static = latencies(drawing, repeat(next(stream)), plan.static, plan.static_s, clock)
+    torch = sys.modules.get("torch")
     details |= {
         "static_ms": float(np.median(static)),
         "warm_up_frames": warm_up_frames,
         "stationary": float(stationary),
         "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan"),
-        "threads": _threads(),
+        "threads": 1 if torch is None else int(torch.get_num_threads()),
     }
     return Measurement(1000 / details["mean_ms"], {k: v for k, v in details.items() if np.isfinite(v)})
-
-
-def check_workload(workload: Sequence[tuple[Camera, HeadPose]]) -> None:
-    """Raise `InputError` where a frame repeats its neighbour; the last and the first are neighbours, too."""
-    if len(workload) < 2:
-        raise InputError("speed", "workload", "two or more pairs of camera and pose", str(len(workload)))
-    for index, (camera, pose) in enumerate(workload):
-        previous_camera, previous_pose = workload[index - 1]
-        if camera is previous_camera and pose is previous_pose:
-            found = f"entries {(index - 1) % len(workload)} and {index} are the same"
-            raise InputError("speed", "workload", "a new camera or pose every frame", found)
 
 
 def fresh_frames(workload: Sequence[tuple[Camera, HeadPose]]) -> Stream:
@@ -243,30 +227,40 @@ def fresh_frames(workload: Sequence[tuple[Camera, HeadPose]]) -> Stream:
 def warm_up(drawing: Drawing, stream: Stream, plan: SpeedProtocol, clock: Clock) -> tuple[int, bool]:
     """Draw until frame times are stationary; return after how many frames, and whether they were."""
     times: list[float] = []
-    synchronise = synchroniser()
-    begin = clock()
-    while len(times) < plan.warm_up_limit:
-        times.append(_timed(drawing, next(stream), clock, synchronise))
+    for seconds in _waited_for(drawing, stream, plan.warm_up_limit, plan.warm_up_s, clock):
+        times.append(seconds)
         if len(times) >= max(plan.warm_up, 2 * plan.window):
             last = float(np.median(times[-plan.window :]))
             before = float(np.median(times[-2 * plan.window : -plan.window]))
             if abs(last - before) <= plan.steady * before:
                 return len(times), True
-        if clock() - begin >= plan.warm_up_s:
-            break
     return len(times), False
 
 
 def latencies(drawing: Drawing, stream: Stream, frames: int, limit_s: float, clock: Clock) -> FloatArray:
     """Milliseconds of each frame from driving signal to host memory, one waited for after the other."""
-    times: list[float] = []
+    return 1000 * np.asarray(list(_waited_for(drawing, stream, frames, limit_s, clock)))
+
+
+def _waited_for(
+    drawing: Drawing, stream: Stream, frames: int, limit_s: float, clock: Clock
+) -> Iterator[float]:
+    """Seconds of each of so many frames, or until ``limit_s`` are over."""
     synchronise = synchroniser()
+    for frame in _within(islice(stream, frames), limit_s, clock):
+        synchronise()
+        start = clock()
+        drawing.read_back(drawing.draw(*frame, WHITE, no_stage))
+        yield clock() - start
+
+
+def _within(frames: Iterable[Frame], limit_s: float, clock: Clock) -> Iterator[Frame]:
+    """Frames until so many seconds are over, one at least."""
     begin = clock()
-    while len(times) < frames:
-        times.append(_timed(drawing, next(stream), clock, synchronise))
+    for frame in frames:
+        yield frame
         if clock() - begin >= limit_s:
             break
-    return 1000 * np.asarray(times)
 
 
 def throughput(
@@ -277,8 +271,8 @@ def throughput(
     drawn = 0
     synchroniser()()
     begin = clock()
-    while drawn < frames and (not drawn or clock() - begin < limit_s):
-        under_way.append(drawing.draw(*next(stream), WHITE, no_stage))
+    for frame in _within(islice(stream, frames), limit_s, clock):
+        under_way.append(drawing.draw(*frame, WHITE, no_stage))
         drawn += 1
         if len(under_way) > depth:
             drawing.read_back(under_way.popleft())
@@ -297,7 +291,7 @@ def stage_times(
     """
     times: dict[str, list[float]] = {}
     synchronise = synchroniser()
-    begin = last = clock()
+    last = clock()
 
     def end_stage(stage: str) -> None:
         nonlocal last
@@ -307,16 +301,13 @@ def stage_times(
         times.setdefault(stage, []).append(1000 * (clock() - last))
         last = clock()
 
-    for _ in range(frames):
-        camera, pose = next(stream)
+    for frame in _within(islice(stream, frames), limit_s, clock):
         synchronise()
         last = clock()
-        drawn = drawing.draw(camera, pose, WHITE, end_stage)
+        drawn = drawing.draw(*frame, WHITE, end_stage)
         last = clock()
         drawing.read_back(drawn)
         end_stage(READ_BACK)
-        if clock() - begin >= limit_s:
-            break
     return {stage: float(np.median(values)) for stage, values in times.items()}
 
 
@@ -327,18 +318,3 @@ def synchroniser() -> Callable[[], None]:
         wait: Callable[[], None] = torch.cuda.synchronize
         return wait
     return lambda: None
-
-
-def _timed(
-    drawing: Drawing, frame: tuple[Camera, HeadPose], clock: Clock, synchronise: Callable[[], None]
-) -> float:
-    synchronise()
-    start = clock()
-    drawing.read_back(drawing.draw(*frame, WHITE, no_stage))
-    return clock() - start
-
-
-def _threads() -> int:
-    """Threads of torch, where an avatar uses it, or else 1."""
-    torch = sys.modules.get("torch")
-    return 1 if torch is None else int(torch.get_num_threads())

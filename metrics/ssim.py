@@ -92,36 +92,36 @@ class Ssim:
 
     form: SsimForm = SsimForm()
 
-    def __call__(self, image: ByteArray, truth: ByteArray) -> float:
+    def __call__(self, image: ByteArray, target: ByteArray) -> float:
         """Mean over all windows of two (H, W, 3) images."""
-        check_pair(image, truth, self.form.smallest)
-        if KERNEL.load_or_warn() is None or _blocks(self.form, truth) > 1:
-            return float(ssim_map(image, truth, self.form).mean())
+        check_pair(image, target, self.form.smallest)
+        if KERNEL.load_or_warn() is None or _blocks(self.form, target) > 1:
+            return float(ssim_map(image, target, self.form).mean())
         inset = self.form.inset
         windows = (image.shape[0] - 2 * inset) * (image.shape[1] - 2 * inset)
-        return self._sums(image, truth, stack_masks({}, truth))[0] / (3 * windows)
+        return self._sums(image, target, stack_masks({}, target))[0] / (3 * windows)
 
-    def in_regions(self, image: ByteArray, truth: ByteArray, masks: Mapping[str, Mask]) -> dict[str, float]:
+    def in_regions(self, image: ByteArray, target: ByteArray, masks: Mapping[str, Mask]) -> dict[str, float]:
         """Mean over the windows centred in each (H, W) boolean mask; regions without one are left out."""
-        check_pair(image, truth, self.form.smallest)
-        stack = stack_masks(masks, truth)
-        inset, blocks = self.form.inset, _blocks(self.form, truth)
+        check_pair(image, target, self.form.smallest)
+        stack = stack_masks(masks, target)
+        inset, blocks = self.form.inset, _blocks(self.form, target)
         if blocks > 1:
             stack = np.stack([_block_means(mask, blocks) >= 0.5 for mask in stack]).astype(np.uint8)
         centres = stack[:, inset : stack.shape[1] - inset, inset : stack.shape[2] - inset] != 0
         counts = dict(zip(masks, centres.sum(axis=(1, 2))))
         if KERNEL.load_or_warn() is None or blocks > 1:
-            local = ssim_map(image, truth, self.form).sum(axis=2)
+            local = ssim_map(image, target, self.form).sum(axis=2)
             sums = [float(local[inside].sum()) for inside in centres]
         else:
-            sums = self._sums(image, truth, stack)[1:]
+            sums = self._sums(image, target, stack)[1:]
         return {name: total / (3 * int(count)) for (name, count), total in zip(counts.items(), sums) if count}
 
-    def _sums(self, image: ByteArray, truth: ByteArray, masks: ByteArray) -> list[float]:
+    def _sums(self, image: ByteArray, target: ByteArray, masks: ByteArray) -> list[float]:
         """Sum of the local similarities of the image, then inside each mask, by the kernel."""
         module = KERNEL.load()
         form = self.form
-        arrays = (np.ascontiguousarray(array) for array in (image, truth, masks))
+        arrays = (np.ascontiguousarray(array) for array in (image, target, masks))
         taps = np.ascontiguousarray(form.weights[form.radius :])
         border = _KERNEL_BORDERS[form.border]
         sums: list[float] = module.similarity(
@@ -130,7 +130,7 @@ class Ssim:
         return sums
 
 
-def ssim_map(image: ByteArray, truth: ByteArray, form: SsimForm = SsimForm()) -> FloatArray:
+def ssim_map(image: ByteArray, target: ByteArray, form: SsimForm = SsimForm()) -> FloatArray:
     """(H', W', 3) float64 local similarity of two (H, W, 3) 8-bit images, at most 1. The kernel's definition.
 
     For the border "valid" H' = H - 2 radius, and entry (i, j) belongs to the window centred on pixel (i + radius,
@@ -138,9 +138,9 @@ def ssim_map(image: ByteArray, truth: ByteArray, form: SsimForm = SsimForm()) ->
     """
     import cv2
 
-    check_pair(image, truth, form.smallest)
+    check_pair(image, target, form.smallest)
     borders = {"valid": cv2.BORDER_REFLECT, "reflect": cv2.BORDER_REFLECT_101, "zero": cv2.BORDER_CONSTANT}
-    blocks, window, inset = _blocks(form, truth), form.weights, form.inset
+    blocks, window, inset = _blocks(form, target), form.weights, form.inset
 
     def blur(values: FloatArray) -> FloatArray:
         blurred = cv2.sepFilter2D(values, cv2.CV_64F, window, window, borderType=borders[form.border])
@@ -148,7 +148,7 @@ def ssim_map(image: ByteArray, truth: ByteArray, form: SsimForm = SsimForm()) ->
         return np.asarray(blurred[inset : height - inset, inset : width - inset], dtype=np.float64)
 
     # Only the sum of the two variances enters the formula, so four filters do instead of five.
-    x, y = (_block_means(array, blocks) for array in (image, truth))
+    x, y = (_block_means(array, blocks) for array in (image, target))
     mean_x, mean_y = blur(x), blur(y)
     mean_product = mean_x * mean_y
     mean_squares = mean_x * mean_x + mean_y * mean_y

@@ -27,48 +27,21 @@ STORAGE = MetricSpec(
 )
 
 
-def _storage_detail(name: str, label: str, unit: str, digits: int, detail: str, summary: str) -> MetricSpec:
+def _detail(name: str, detail: str, label: str, unit: str, digits: int, summary: str) -> MetricSpec:
     """A further number of `STORAGE`'s measurement; less is better."""
-    return replace(
-        STORAGE,
-        name=name,
-        label=label,
-        unit=unit,
-        digits=digits,
-        detail=detail,
-        summary=summary,
-        tables=("cost",),
-    )
+    own = {"detail": detail, "label": label, "unit": unit, "digits": digits, "summary": summary}
+    return replace(STORAGE, name=name, tables=("cost",), **own)  # type: ignore[arg-type]
 
 
-STORAGE_PACKED = _storage_detail(
-    "storage_packed", "Packed", "MB", 2, "packed_mb", "The avatar's files packed losslessly by xz."
-)
-STORAGE_SHARED = _storage_detail(
-    "storage_shared",
-    "Shared",
-    "MB",
-    2,
-    "shared_mb",
-    "Assets that all avatars of a method share, such as the head model.",
-)
-PRIMITIVES = _storage_detail("primitives", "Primitives", "", 0, "primitives", "Number of splats.")
-PRIMITIVE_BYTES = _storage_detail(
-    "primitive_bytes",
-    "Per primitive",
-    "B",
-    1,
-    "primitive_bytes",
-    "Bytes of the avatar's files over its primitives.",
-)
-DRIVING_BITRATE = _storage_detail(
-    "driving_bitrate",
-    "Driving",
-    "kB/s",
-    2,
-    "driving_kb_s",
-    "Driving signal as float32, at 25 frames per second.",
-)
+_SHARED = "Assets that all avatars of a method share, such as the head model."
+_PACKED = "The avatar's files packed losslessly by xz."
+_PER_PRIMITIVE = "Bytes of the avatar's files over its primitives."
+_DRIVING = "Driving signal as float32, at 25 frames per second."
+STORAGE_PACKED = _detail("storage_packed", "packed_mb", "Packed", "MB", 2, _PACKED)
+STORAGE_SHARED = _detail("storage_shared", "shared_mb", "Shared", "MB", 2, _SHARED)
+PRIMITIVES = _detail("primitives", "primitives", "Primitives", "", 0, "Number of splats.")
+PRIMITIVE_BYTES = _detail("primitive_bytes", "primitive_bytes", "Per primitive", "B", 1, _PER_PRIMITIVE)
+DRIVING_BITRATE = _detail("driving_bitrate", "driving_kb_s", "Driving", "kB/s", 2, _DRIVING)
 
 MEGA, KILO = 1e6, 1e3
 DRIVING_RATE = 25.0  # frames per second at which the driving signal's bitrate is given
@@ -92,12 +65,11 @@ def storage(avatar: Avatar, workload: Sequence[tuple[Camera, HeadPose]] = ()) ->
     files = _checked(avatar.files())
     if not files:
         raise InputError("avatar", "files()", "at least one file", "none")
-    size = _total(files)
+    size = sum(path.stat().st_size for path in files)
     details: dict[str, float] = {"bytes": size, "files": len(files), "packed_mb": packed_bytes(files) / MEGA}
     if isinstance(avatar, SharingAvatar):
-        details["shared_mb"] = _total(_checked(avatar.shared_files())) / MEGA
-    poses = [pose for _, pose in workload[:1]]
-    for pose in poses:
+        details["shared_mb"] = sum(path.stat().st_size for path in _checked(avatar.shared_files())) / MEGA
+    for _, pose in workload[:1]:
         details["driving_bytes"] = driving_bytes(pose)
         details["driving_kb_s"] = driving_bytes(pose) * DRIVING_RATE / KILO
         if hasattr(avatar, "splats"):
@@ -133,7 +105,3 @@ def _checked(paths: Iterable[Path]) -> list[Path]:
             found = "a folder" if path.is_dir() else "nothing there"
             raise InputError(path, "", "a file of the avatar", found)
     return files
-
-
-def _total(files: Iterable[Path]) -> int:
-    return sum(path.stat().st_size for path in files)

@@ -46,6 +46,10 @@ class _Storage:
     dtype: np.dtype
     count: int
 
+    @property
+    def bytes(self) -> int:
+        return self.count * self.dtype.itemsize
+
 
 @dataclass(frozen=True)
 class _Tensor:
@@ -100,7 +104,11 @@ def _read_archive(
 ) -> dict[str, np.ndarray]:
     with zipfile.ZipFile(stream) as archive:
         # Stored members cannot be larger than the file, whatever its directory says.
-        entries = {entry.filename: entry for entry in archive.infolist() if _is_stored(entry, size)}
+        entries = {
+            entry.filename: entry
+            for entry in archive.infolist()
+            if entry.compress_type == zipfile.ZIP_STORED and entry.file_size == entry.compress_size <= size
+        }
         (root,) = [name.removesuffix("data.pkl") for name in entries if name.endswith("/data.pkl")]
         if f"{root}byteorder" in entries and archive.read(f"{root}byteorder") != b"little":
             raise Malformed("numbers in big-endian order")
@@ -109,14 +117,10 @@ def _read_archive(
         found = {}
         for name, tensor in tensors.items():
             member = f"{root}data/{tensor.storage.key}"
-            if member not in entries or entries[member].file_size != _size(tensor.storage):
-                raise InputError(path, name, f"{_size(tensor.storage)} bytes of numbers", "another number")
+            if member not in entries or entries[member].file_size != tensor.storage.bytes:
+                raise InputError(path, name, f"{tensor.storage.bytes} bytes of numbers", "another number")
             found[name] = tensor.of(archive.read(member))
     return found
-
-
-def _is_stored(entry: zipfile.ZipInfo, size: int) -> bool:
-    return entry.compress_type == zipfile.ZIP_STORED and entry.file_size == entry.compress_size <= size
 
 
 def _read_stream(
@@ -137,7 +141,7 @@ def _read_stream(
         if count != tensor.storage.count:
             raise InputError(path, name, f"{tensor.storage.count} numbers", "another number")
         stream.seek(start)
-        found[name] = tensor.of(stream.read(_size(tensor.storage)))
+        found[name] = tensor.of(stream.read(tensor.storage.bytes))
     return found
 
 
@@ -187,12 +191,8 @@ class _Pickle:
 
 def _rebuild(storage: Any, offset: Any, shape: Any, strides: Any, *rest: Any) -> _Tensor:
     """``torch._utils._rebuild_tensor_v2``; what follows the strides matters to training alone."""
-    whole = (
-        isinstance(shape, tuple)
-        and isinstance(strides, tuple)
-        and len(shape) == len(strides) <= MAX_DIMENSIONS
-    )
-    if not isinstance(storage, _Storage) or not whole:
+    tuples = isinstance(shape, tuple) and isinstance(strides, tuple)
+    if not isinstance(storage, _Storage) or not tuples or not len(shape) == len(strides) <= MAX_DIMENSIONS:
         raise Malformed("a tensor without a storage or a shape")
     numbers = (offset, *shape, *strides)
     if not all(type(number) is int and 0 <= number < 2**48 for number in numbers):
@@ -237,7 +237,3 @@ def _select(path: Path, content: Any, shapes: Mapping[str, tuple[int, ...]]) -> 
             raise InputError(path, name, expected, f"shape {tensor.shape}")
         found[name] = tensor
     return found
-
-
-def _size(storage: _Storage) -> int:
-    return storage.count * storage.dtype.itemsize

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from ..bench.contracts import Measurement
@@ -22,18 +23,13 @@ TRAINING_TIME = MetricSpec(
     machine_bound=True,
     default=True,
 )
-TRAINING_MEMORY = MetricSpec(
+TRAINING_MEMORY = replace(
+    TRAINING_TIME,
     name="training_memory",
     label="Peak memory",
     unit="GB",
-    higher_is_better=False,
-    digits=2,
     implementation="headbench.metrics.training:training_memory",
     summary="Largest resident memory of the training process.",
-    kind="training",
-    tables=("cost",),
-    machine_bound=True,
-    default=True,
 )
 
 

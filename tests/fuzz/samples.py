@@ -25,7 +25,7 @@ from headbench.datasets.colmap.writer import export_model
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import save_head
 from headbench.methods.shared.checkpoint import save_checkpoint
-from headbench.metrics.lpips_network import network_spec
+from headbench.metrics.lpips_network import SQUEEZE
 
 from ..datasets.head.flame_files import write_flame
 from ..datasets.head.toy import toy_head
@@ -187,7 +187,7 @@ def settings(folder: Path, samples: Path) -> None:
 def weights(folder: Path, samples: Path) -> None:
     """Weights of LPIPS' smallest backbone, drawn at random."""
     torch.manual_seed(0)
-    torch.save(network_spec("squeeze").build().state_dict(), folder / BACKBONE)
+    torch.save(SQUEEZE.build().state_dict(), folder / BACKBONE)
 
 
 def images(folder: Path, samples: Path) -> None:

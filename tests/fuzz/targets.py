@@ -20,7 +20,7 @@ from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.loaders import load_head
 from headbench.datasets.steps.exclude import read_exclusions
 from headbench.methods.shared.checkpoint import load_checkpoint
-from headbench.metrics.lpips_network import load_backbone, network_spec
+from headbench.metrics.lpips_network import SQUEEZE, load_backbone
 
 from .cases import ExitCode
 from .samples import AVATAR, BACKBONE, CHECKPOINT, METHODS, PREPARE, SETTINGS, SYNTH
@@ -154,6 +154,6 @@ TARGETS = [
     reader("settings", "settings", "run --config config.yaml", share=600),
     reader("settings yaml", "settings", lambda: read_yaml(Path("config.yaml")), share=500),
     reader("checkpoint", "checkpoint", lambda: load_checkpoint(Path(CHECKPOINT), "run", "cpu"), share=700),
-    reader("weights", "weights", lambda: load_backbone(network_spec("squeeze"), Path(BACKBONE)), share=200),
+    reader("weights", "weights", lambda: load_backbone(SQUEEZE, Path(BACKBONE)), share=200),
     reader("synthetic", "synthetic", f"synth {SYNTH} --out synthetic", share=6),
 ]

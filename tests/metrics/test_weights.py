@@ -78,12 +78,10 @@ def test_what_is_fetched_is_kept_if_its_hash_is_right_and_not_otherwise(bare_mac
 
 
 def test_a_full_file_gives_the_same_as_one_of_features_alone(tmp_path, state):
-    torch.save(state, tmp_path / "features.pth")
     torch.save({**state, "classifier.1.weight": torch.zeros(4, 4)}, tmp_path / "full.pth")
-    loaded = [weights.load_backbone(SQUEEZE, tmp_path / name) for name in ("features.pth", "full.pth")]
-    for values in loaded:
-        assert values.keys() == state.keys()
-        assert all(torch.equal(values[key], state[key]) for key in state)
+    values = weights.load_backbone(SQUEEZE, tmp_path / "full.pth")
+    assert values.keys() == state.keys()
+    assert all(torch.equal(values[key], state[key]) for key in state)
 
 
 @pytest.mark.parametrize(
@@ -103,16 +101,16 @@ def test_a_faulty_entry_is_named(tmp_path, state, spoil, message):
         weights.load_backbone(SQUEEZE, tmp_path / "w.pth")
 
 
-class Payload:
-    def __reduce__(self):
-        return print, ("code from a weights file ran",)
-
-
 @pytest.mark.parametrize("content", [b"", b"<html>404</html>", b"PK\x03\x04 not really a zip"])
 def test_a_file_that_is_no_weights_file_is_bad_input(tmp_path, content):
     (tmp_path / "w.pth").write_bytes(content)
     with pytest.raises(InputError, match="cannot be read"):
         weights.load_backbone(SQUEEZE, tmp_path / "w.pth")
+
+
+class Payload:
+    def __reduce__(self):
+        return print, ("code from a weights file ran",)
 
 
 def test_code_in_a_weights_file_is_not_run(tmp_path, capsys):
@@ -123,8 +121,7 @@ def test_code_in_a_weights_file_is_not_run(tmp_path, capsys):
 
 
 def test_linear_layers_come_from_torchmetrics_and_equal_the_reference(reference_folder):
-    for net in ("alex", "squeeze", "vgg"):
-        spec = weights.network_spec(net)
+    for net, spec in weights.NETWORKS.items():
         ours = weights.load_linear(spec)
         theirs = weights.load_linear(spec, reference_folder / "lin_v0.1" / f"{net}.pth")
         assert [w.shape[1] for w in ours] == list(spec.channels)
@@ -135,4 +132,4 @@ def test_linear_layers_come_from_torchmetrics_and_equal_the_reference(reference_
 
 def test_an_unknown_network_is_named():
     with pytest.raises(InputError, match="alex, squeeze, vgg"):
-        weights.network_spec("resnet")
+        weights.Lpips("resnet")
