@@ -143,10 +143,8 @@ def write_avatar(path: Path, config: GHAConfig, tensors: Mapping[str, Tensor]) -
 def read_avatar(path: Path, expression_size: int, device: str) -> tuple[GaussianHead, dict[str, Tensor]]:
     """Read what `write_avatar` wrote: the networks and their tensors, points apart again.
 
-    Raises
-    ------
-    InputError
-        Where the file is damaged, or a tensor is missing, does not fit the settings, or is not finite float32.
+    Raises `InputError` where the file is damaged, or a tensor is missing, does not fit the settings, or is not finite
+    float32.
     """
     tensors, metadata = read_safetensors(path)
     head = GaussianHead.of(_settings(path, metadata.get(CONFIG, "")), expression_size)

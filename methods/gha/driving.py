@@ -35,35 +35,21 @@ ANGLES = 9
 
 
 class Signal(NamedTuple):
-    """One timestep.
+    """One timestep; rotations and translation as tracked."""
 
-    Attributes
-    ----------
-    expression : (E,) expression code.
-    rotation, neck, translation : (3,) each, as tracked.
-    joints : (2, 3) root and neck of the unposed head, metres.
-    """
-
-    expression: Tensor
-    rotation: Tensor
-    neck: Tensor
-    translation: Tensor
-    joints: Tensor
+    expression: Tensor  # (E,) expression code
+    rotation: Tensor  # (3,)
+    neck: Tensor  # (3,)
+    translation: Tensor  # (3,)
+    joints: Tensor  # (2, 3) root and neck of the unposed head, metres
 
 
 class HeadMotion(NamedTuple):
-    """Where the head is.
+    """Where the head is."""
 
-    Attributes
-    ----------
-    rotation : (3, 3) canonical frame to world.
-    translation : (3,) of the canonical frame's origin, metres.
-    code : (6,) axis-angle and translation, what networks see of it.
-    """
-
-    rotation: Tensor
-    translation: Tensor
-    code: Tensor
+    rotation: Tensor  # (3, 3) canonical frame to world
+    translation: Tensor  # (3,) of the canonical frame's origin, metres
+    code: Tensor  # (6,) axis-angle and translation, what networks see of it
 
 
 class Driver:
@@ -133,9 +119,12 @@ class Driver:
         """Arguments of (B, E) expression codes with the head at rest: the inverse of what `signals` makes of them."""
         if self.expression_scale is not None:
             codes = codes * self.expression_scale
-        rest = codes.new_zeros(len(codes), 3)
-        still = {"rotation": rest, "neck": rest, "translation": rest}
-        return {**still, **code_arguments(codes, self.model.expression_size)}
+        expressions = self.model.expression_size
+        parts = codes.split([expressions, 3, 6, codes.shape[1] - expressions - ANGLES], dim=1)
+        named = {
+            n: values for n, values in zip(("expression", "jaw", "eyes", "eyelids"), parts) if values.shape[1]
+        }
+        return {**dict.fromkeys(("rotation", "neck", "translation"), codes.new_zeros(len(codes), 3)), **named}
 
     def canonical(self, vertices: Tensor) -> Tensor:
         """Canonical coordinates of (..., 3) points of the unposed head, metres."""
@@ -156,13 +145,6 @@ def expression_codes(arguments: Mapping[str, Tensor]) -> Tensor:
     return torch.cat(parts, dim=1)
 
 
-def code_arguments(codes: Tensor, expressions: int) -> dict[str, Tensor]:
-    """The parts of (T, E) `expression_codes` by name; eyelids where there are columns for them."""
-    parts = codes.split([expressions, 3, 6, codes.shape[1] - expressions - ANGLES], dim=1)
-    named = dict(zip(("expression", "jaw", "eyes", "eyelids"), parts))
-    return {name: values for name, values in named.items() if values.shape[1]}
-
-
 def code_size(head: HeadAsset) -> int:
     """E of `expression_codes` for a head model."""
     return head.expression_basis.shape[2] + ANGLES + (0 if head.eyelid_basis is None else 2)
@@ -178,19 +160,10 @@ FACIAL = ("face", "lips", "eye_region", "nose", "forehead", "left_ear", "right_e
 
 
 def landmark_vertices(head: HeadAsset, neutral: FloatArray, count: int) -> IntArray:
-    """Vertices of the face, each the farthest from those before it; as many as there are, if fewer.
+    """Vertices of the face of the (V, 3) neutral head, each the farthest from those before it; all, if they are fewer.
 
-    The published points are 66 detected landmarks and each hundredth vertex of the tracked face; farthest points
-    cover the same surface evenly on any head model.
-
-    Parameters
-    ----------
-    neutral : (V, 3) neutral head of the subject.
-
-    Raises
-    ------
-    InputError
-        Where the head has no face region.
+    The published points are 66 detected landmarks and each hundredth vertex of the tracked face; farthest points cover
+    the same surface evenly on any head model. Raises `InputError` where the head has no face region.
     """
     if "face" not in head.regions:
         known = ", ".join(sorted(head.regions)) or "no regions"
@@ -248,35 +221,24 @@ def influences(
 class TrainingScene(NamedTuple):
     """A clip made ready.
 
-    Attributes
-    ----------
-    keys : training frames.
-    timesteps : of the training frames, ascending; ``row`` gives the place of each.
-    signals : by row.
-    tracked : driving arguments by name, (T, n) each.
-    views : training cameras.
-    background : (3,).
-    rest : (V, 3) the subject's neutral head with the jaw open by the configured angle, canonical units: what the
-        neutral surface is to be.
-    landmark_rows : (L,) vertices of the head model.
-    expression_scale : (E,) that expression codes are divided by.
-    code_low, code_high : (E,) bounds of the expression code that colour and attributes follow.
+    ``rest`` is the subject's neutral head with the jaw open by the configured angle: what the neutral surface is to be.
+    Colour and attributes follow the expression code within its bounds.
     """
 
     clip: Clip
     driver: Driver
-    keys: tuple[FrameKey, ...]
-    timesteps: list[int]
-    row: Mapping[int, int]
-    signals: list[Signal]
-    tracked: Mapping[str, Tensor]
-    views: Mapping[str, View]
-    background: Tensor
-    rest: Tensor
-    landmark_rows: IntArray
-    expression_scale: Tensor
-    code_low: Tensor
-    code_high: Tensor
+    keys: tuple[FrameKey, ...]  # training frames
+    timesteps: list[int]  # of the training frames, ascending
+    row: Mapping[int, int]  # place of each timestep
+    signals: list[Signal]  # by row
+    tracked: Mapping[str, Tensor]  # driving arguments by name, (T, n) each
+    views: Mapping[str, View]  # training cameras
+    background: Tensor  # (3,)
+    rest: Tensor  # (V, 3) canonical units
+    landmark_rows: IntArray  # (L,) vertices of the head model
+    expression_scale: Tensor  # (E,) that expression codes are divided by
+    code_low: Tensor  # (E,)
+    code_high: Tensor  # (E,)
     device: str
     seed: int
 

@@ -63,10 +63,8 @@ class GaussianHead:
 
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Shape of every network's tensors, by name."""
-        controllers = {
-            name: shape for mlp in self.controllers.of_gaussians for name, shape in mlp.shapes().items()
-        }
-        return {**controllers, **self.super_resolution.shapes()}
+        shapes = self.super_resolution.shapes()
+        return {n: s for mlp in self.controllers.of_gaussians for n, s in mlp.shapes().items()} | shapes
 
     def splats(
         self, tensors: Weights, signal: Signal, motion: HeadMotion, noise: Tensor | None = None
@@ -92,7 +90,7 @@ class GaussianHead:
         canonical = points + c.displacement_scale * moves
         world = WorldSplats(
             c.unit * canonical @ motion.rotation.t() + motion.translation,
-            quats @ _left_product(motion.rotation).t(),
+            quats @ left_products(matrix_to_quaternion(motion.rotation)[None])[0].t(),
             c.unit * log_scales.clamp_max(LARGEST_LOG_SCALE).exp(),
         )
         return FeatureSplats(world, opacities, nets.colors(tensors, features, parts, seen, pose))
@@ -145,11 +143,6 @@ def near_drawn(alpha: Tensor) -> Tensor:
 def enlarged(values: Tensor, factor: int) -> Tensor:
     """(u h, u w) of (h, w), each value repeated."""
     return values.repeat_interleave(factor, 0).repeat_interleave(factor, 1)
-
-
-def _left_product(rotation: Tensor) -> Tensor:
-    """(4, 4) matrix M of a (3, 3) rotation: M q is the quaternion of that rotation after q."""
-    return left_products(matrix_to_quaternion(rotation)[None])[0]
 
 
 VARIANCE_FLOOR = 1e-5
@@ -231,17 +224,16 @@ class SuperResolution:
         read: Reader = given
         for block, channels in enumerate(zip(before, self.widths)):
             if block:
-                read, height, width = doubled(read, height), 2 * height, 2 * width
-            rows = rows_at_once(width, max(channels), at_once)
-            raw = convolved(read, height, weights[f"sr.conv_{block}_0"], rows)
-            convolve_in_place(raw, weights[f"sr.conv_{block}_1"], rows, VARIANCE_FLOOR)
-            read = activated(raw, VARIANCE_FLOOR)
+                read, height, width = _doubled(read, height), 2 * height, 2 * width
+            rows = max(1, at_once // (width * max(channels)))
+            raw = _convolved(read, height, weights[f"sr.conv_{block}_0"], rows)
+            _convolve_in_place(raw, weights[f"sr.conv_{block}_1"], rows)
+            read = _activated(raw)
         colors = features.new_empty(1, 3, height, width)
+        color = weights["sr.color"], weights["sr.color_bias"]
         for first in range(0, height, rows):
             strip = read(first, min(first + rows, height))
-            colors[:, :, first : first + rows] = F.conv2d(
-                strip, weights["sr.color"], weights["sr.color_bias"]
-            )
+            colors[:, :, first : first + rows] = F.conv2d(strip, *color)
         return self._finished(colors, features, alpha)
 
     def _finished(self, colors: Tensor, features: Tensor, alpha: Tensor) -> Tensor:
@@ -267,28 +259,20 @@ Reader = Callable[[int, int], Tensor]
 """Rows from the first number to before the second of an image, (1, C, rows, W)."""
 
 
-def rows_at_once(width: int, channels: int, numbers: int) -> int:
-    """Rows of an image in a strip of at most so many numbers; one at least."""
-    return max(1, numbers // (width * channels))
-
-
-def convolved(read: Reader, height: int, weight: Tensor, rows: int) -> Tensor:
+def _convolved(read: Reader, height: int, weight: Tensor, rows: int) -> Tensor:
     """(1, D, H, W) 3x3 convolution, padded with zeros, of the image of ``height`` rows that ``read`` gives."""
-    strips = range(0, height, rows)
-    result = None
-    for first in strips:
+    for first in range(0, height, rows):
         last = min(first + rows, height)
-        strip = _convolution(read(max(first - 1, 0), min(last + 1, height)), weight, first, last, height)
-        if result is None:
-            result = strip.new_empty(1, strip.shape[1], height, strip.shape[3])
-        result[:, :, first:last] = strip
-    assert result is not None
+        source = read(max(first - 1, 0), min(last + 1, height))
+        if not first:
+            result = weight.new_empty(1, len(weight), height, source.shape[3])
+        result[:, :, first:last] = _convolution(source, weight, first, last, height)
     return result
 
 
-def convolve_in_place(raw: Tensor, weight: Tensor, rows: int, floor: float) -> None:
+def _convolve_in_place(raw: Tensor, weight: Tensor, rows: int) -> None:
     """Replace a raw output by that of the next layer, which has as many channels."""
-    read, height = activated(raw, floor), raw.shape[2]
+    read, height = _activated(raw), raw.shape[2]
     above = None
     for first in range(0, height, rows):
         last = min(first + rows, height)
@@ -299,11 +283,11 @@ def convolve_in_place(raw: Tensor, weight: Tensor, rows: int, floor: float) -> N
         raw[:, :, first:last] = _convolution(joined, weight, first, last, height)
 
 
-def activated(raw: Tensor, floor: float) -> Reader:
+def _activated(raw: Tensor) -> Reader:
     """Rows of a raw output, each channel normalised by the present image's statistics, and rectified."""
     variances, means = zip(*(torch.var_mean(plane, correction=0) for plane in raw[0]))
     mean = torch.stack(means)[:, None, None]
-    scale = (torch.stack(variances)[:, None, None] + floor).rsqrt()
+    scale = (torch.stack(variances)[:, None, None] + VARIANCE_FLOOR).rsqrt()
 
     def read(first: int, last: int) -> Tensor:
         return (raw[:, :, first:last] - mean).mul_(scale).relu_()
@@ -311,7 +295,7 @@ def activated(raw: Tensor, floor: float) -> Reader:
     return read
 
 
-def doubled(read: Reader, height: int) -> Reader:
+def _doubled(read: Reader, height: int) -> Reader:
     """Rows of the image of ``height`` rows that ``read`` gives, at twice its size: bilinear, corners on corners."""
 
     def read_doubled(first: int, last: int) -> Tensor:

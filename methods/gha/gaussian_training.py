@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -36,12 +36,7 @@ ALMOST_ONE = 1 - 1e-6
 
 
 class GaussianTraining:
-    """A `Trainable` that starts from a trained mesh head.
-
-    Parameters
-    ----------
-    mesh : tensors that the mesh phase left: its networks and landmarks.
-    """
+    """A `Trainable` that starts from a trained mesh head: ``mesh`` has its networks' tensors and landmarks."""
 
     def __init__(
         self, scene: TrainingScene, head: GaussianHead, mesh_head: MeshHead, mesh: Weights, sampler: Sampler
@@ -67,8 +62,11 @@ class GaussianTraining:
         initial["corrections"] = torch.zeros(len(scene.timesteps), POSE_SIZE, device=scene.device)
         for name in initial:
             self._rates.setdefault(name, config.network_lr)
-        self._landmarks = mesh["landmarks"].detach().clone()
-        self._bounds = {"code_low": scene.code_low, "code_high": scene.code_high}
+        self._fixed = {
+            "landmarks": mesh["landmarks"].detach().clone(),
+            "code_low": scene.code_low,
+            "code_high": scene.code_high,
+        }
         self._motion = TrackedMotion.of(scene, config) if config.motion_weight else None
         self._optimiser = Optimiser({name: nn.Parameter(v) for name, v in initial.items()}, self._rates)
 
@@ -80,7 +78,8 @@ class GaussianTraining:
     def tensors(self) -> dict[str, Tensor]:
         """Points, networks and landmarks: what an avatar is made of."""
         names = [name for name in self._rates if name != "corrections"]
-        return {**{name: self._optimiser[name].detach() for name in names}, "landmarks": self._landmarks}
+        landmarks = self._fixed["landmarks"]
+        return {**{name: self._optimiser[name].detach() for name in names}, "landmarks": landmarks}
 
     def begin(self, timeline: Timeline) -> None:
         """Fit schedules to the length of the run."""
@@ -93,19 +92,17 @@ class GaussianTraining:
         row = scene.row[key.timestep]
         view = scene.views[key.camera]
         target = self._images.get(iteration, index)
-        tensors = _With(self._optimiser, {"landmarks": self._landmarks, **self._bounds})
+        tensors = {**{name: self._optimiser[name] for name in self._rates}, **self._fixed}
         signal = scene.signals[row]
         motion = scene.driver.motion(signal, self._optimiser["corrections"][row])
-        drawn = head.draw(
-            head.splats(tensors, signal, motion, self._noise(signal, iteration)),
-            view.camera,
-            scene.background,
-        )
+        splats = head.splats(tensors, signal, motion, self._noise(signal, iteration))
+        drawn = head.draw(splats, view.camera, scene.background)
         padded = _padded(target, view.camera, config.upscale, scene.background)
         small = reduced(padded, config.upscale, config.low_image_variant)
         loss = config.low_weight * (drawn.features[..., :3] - small).abs().mean()
         if config.augment:
-            zoom = Zoom.of(drawn.alpha.shape, _draws(scene.seed, iteration))
+            draws = torch.rand(3, generator=torch_generator(scene.seed, "gha-zoom", iteration)).tolist()
+            zoom = Zoom.of(drawn.alpha.shape, draws)
             drawn, padded = zoomed(drawn, padded, zoom, scene.background)
         image = head.sharpen(tensors, drawn, scene.background)
         loss = loss + (image - padded).abs().mean()
@@ -113,10 +110,11 @@ class GaussianTraining:
             planes = (values.permute(2, 0, 1).contiguous() for values in (image, padded))
             loss = loss + config.structure_weight * (1 - mean_ssim(*planes))
         if self._motion is not None:
-            network = head.controllers.expression_deform
-            loss = loss + config.motion_weight * self._motion.error(
-                network, tensors, torch_generator(scene.seed, "gha-motion", iteration)
+            network, generator = (
+                head.controllers.expression_deform,
+                torch_generator(scene.seed, "gha-motion", iteration),
             )
+            loss = loss + config.motion_weight * self._motion.error(network, tensors, generator)
         return loss
 
     def _noise(self, signal: Signal, iteration: int) -> Tensor | None:
@@ -152,26 +150,13 @@ class GaussianTraining:
         self._images.close()
 
 
-class _With:
-    """The optimiser's tensors and frozen ones under one roof."""
-
-    def __init__(self, tensors: Weights, frozen: Mapping[str, Tensor]):
-        self._tensors, self._frozen = tensors, frozen
-
-    def __getitem__(self, name: str, /) -> Tensor:
-        return self._frozen[name] if name in self._frozen else self._tensors[name]
-
-
 @torch.no_grad()
 def first_points(
     scene: TrainingScene, config: GHAConfig, mesh_head: MeshHead, mesh: Weights
 ) -> dict[str, Tensor]:
     """Gaussians on the neutral surface of the mesh phase, with its features, and some inside the mouth.
 
-    Raises
-    ------
-    InputError
-        Where the mesh phase ended without a surface.
+    Raises `InputError` where the mesh phase ended without a surface.
     """
     device = scene.device
     grid = grid_about(scene.rest, config, device, finer=2 if config.subdivide else 1)
@@ -219,18 +204,13 @@ def reduced(image: Tensor, factor: int, variant: str) -> Tensor:
 
 
 class Zoom(NamedTuple):
-    """A rescaling of the splatted image, and what is cut out of it or where it is put, in whole pixels.
+    """A rescaling of the splatted image, and what is cut out of it or where it is put, in whole pixels."""
 
-    Attributes
-    ----------
-    factor : of both sides; a whole number of pixels in height, as published.
-    size : (2,) rows and columns of the rescaled image.
-    start : (2,) first row and column cut out of it, or minus those that it is put at where it is the smaller.
-    """
-
-    factor: float
-    size: tuple[int, int]
-    start: tuple[int, int]
+    factor: float  # of both sides; a whole number of pixels in height, as published
+    size: tuple[int, int]  # rows and columns of the rescaled image
+    start: tuple[
+        int, int
+    ]  # first row and column cut out of it; minus those that it is put at where it is the smaller
 
     @classmethod
     def of(cls, shape: Sequence[int], draws: Sequence[float]) -> Zoom:
@@ -272,10 +252,6 @@ def _zoomed(values: Tensor, zoom: Zoom, upscale: int, outside: Tensor) -> Tensor
     )
     moved = values.index_select(0, rows).index_select(1, columns)
     return torch.where((rows_in[:, None] & columns_in)[..., None], moved, outside)
-
-
-def _draws(seed: int, iteration: int) -> list[float]:
-    return torch.rand(3, generator=torch_generator(seed, "gha-zoom", iteration)).tolist()
 
 
 def _padded(image: Tensor, camera: Camera, upscale: int, background: Tensor) -> Tensor:

@@ -117,12 +117,7 @@ def vertex_discs(vertices: Tensor, faces: Tensor) -> WorldSplats:
 
     The published mesh phase draws triangles. Discs that touch are the same surface to our renderer, give gradients for
     colours, silhouette and positions alike, and are what the mesh is to become. Their size and direction follow the
-    mesh without gradients of their own.
-
-    Parameters
-    ----------
-    vertices : (V, 3) metres, differentiable.
-    faces : (F, 3).
+    mesh without gradients of their own; positions are the (V, 3) vertices, metres, differentiable.
     """
     with torch.no_grad():
         corners = vertices.index_select(0, faces.reshape(-1)).view(-1, 3, 3)
@@ -150,33 +145,19 @@ EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
 
 
 class TetGrid(NamedTuple):
-    """Tetrahedra that fill a box.
+    """Tetrahedra that fill a box."""
 
-    Attributes
-    ----------
-    vertices : (V, 3).
-    tets : (T, 4) int64, of positive volume: det[v1 - v0, v2 - v0, v3 - v0] > 0.
-    spacing : edge length of the cubic cells.
-    """
-
-    vertices: Tensor
-    tets: Tensor
-    spacing: float
+    vertices: Tensor  # (V, 3)
+    tets: Tensor  # (T, 4) int64, of positive volume: det[v1 - v0, v2 - v0, v3 - v0] > 0
+    spacing: float  # edge length of the cubic cells
 
 
 class Crossings(NamedTuple):
-    """The zero surface as places on edges; whatever the grid's vertices carry can be interpolated to it.
+    """The zero surface as places on edges; whatever the grid's vertices carry can be interpolated to it."""
 
-    Attributes
-    ----------
-    ends : (K, 2) int64 vertices of the grid, one edge per surface vertex.
-    weights : (K,) of the second end, in [0, 1]; differentiable in the distances.
-    faces : (F, 3) int64, counter-clockwise seen from where the distance is positive.
-    """
-
-    ends: Tensor
-    weights: Tensor
-    faces: Tensor
+    ends: Tensor  # (K, 2) int64 vertices of the grid, one edge per surface vertex
+    weights: Tensor  # (K,) of the second end, in [0, 1]; differentiable in the distances
+    faces: Tensor  # (F, 3) int64, counter-clockwise seen from where the distance is positive
 
     def interpolate(self, values: Tensor) -> Tensor:
         """(K, C) values at the surface of (V, C) values at the grid's vertices."""
@@ -188,12 +169,7 @@ def tet_grid(low: np.ndarray, high: np.ndarray, spacing: float, device: str = "c
     """Fill a box with the tetrahedra of a body-centred cubic lattice.
 
     Inside, all are congruent, and their edges differ by a factor of 1.15 only, which makes the surface nearly as good
-    as the grid is fine. At the box's sides pyramids are cut in two.
-
-    Parameters
-    ----------
-    low, high : (3,) corners; the box grows at ``high`` to whole cells.
-    spacing : edge length of the cubic cells.
+    as the grid is fine. At the box's sides pyramids are cut in two. The box grows at ``high`` to whole cubic cells.
     """
     cells = np.maximum(np.ceil((np.asarray(high) - low) / spacing - 1e-9), 1).astype(np.int64)
     corner_shape, total = cells + 1, int(np.prod(cells + 1))
@@ -212,18 +188,12 @@ def tet_grid(low: np.ndarray, high: np.ndarray, spacing: float, device: str = "c
         step, u, v = np.roll(np.eye(3, dtype=np.int64), axis, axis=1)
         for side, outward in ((0, -step), (1, step)):
             # The face of each cell towards `outward`, its corners in a cycle.
-            cycle = [
-                corner_index(centers + side * step + a * u + b * v)
-                for a, b in ((0, 0), (1, 0), (1, 1), (0, 1))
-            ]
-            own, inside = (
-                center_index(centers),
-                np.all((centers + outward >= 0) & (centers + outward < cells), 1),
-            )
-            border = ~inside
-            tets += [
-                np.stack([own, *(cycle[k] for k in corner)], 1)[border] for corner in ((0, 1, 2), (0, 2, 3))
-            ]
+            ways = [a * u + b * v for a, b in ((0, 0), (1, 0), (1, 1), (0, 1))]
+            cycle = [corner_index(centers + side * step + way) for way in ways]
+            own = center_index(centers)
+            inside = np.all((centers + outward >= 0) & (centers + outward < cells), 1)
+            for corner in ((0, 1, 2), (0, 2, 3)):
+                tets.append(np.stack([own, *(cycle[k] for k in corner)], 1)[~inside])
             if side == 1:
                 other = center_index((centers + outward)[inside])
                 for k in range(4):
@@ -246,17 +216,10 @@ def spacing_for(low: np.ndarray, high: np.ndarray, count: int) -> float:
 
 
 def marching_tetrahedra(distance: Tensor, tets: Tensor) -> Crossings:
-    """The surface where a distance given at the vertices is zero, linear between them.
+    """The surface where a (V,) distance, positive outside, given at the vertices of `TetGrid` is zero, linear between them.
 
-    Parameters
-    ----------
-    distance : (V,), positive outside.
-    tets : (T, 4) int64, of positive volume.
-
-    Returns
-    -------
-    `Crossings`; empty where nothing changes sign. A closed surface inside the grid is watertight: faces share the
-    vertices of common edges.
+    Empty where nothing changes sign. A closed surface inside the grid is watertight: faces share the vertices of common
+    edges.
     """
     inside = distance.detach() < 0
     codes = (inside[tets].to(torch.int64) << torch.arange(4, device=tets.device)).sum(1)

@@ -95,10 +95,11 @@ class MeshTraining:
         loss = self._config.landmark_weight * off / len(rows)
         loss = loss + DISTANCE * distance.abs().mean()
         if self._motion is not None and self._config.motion_weight:
-            network = head.controllers.expression_deform
-            loss = loss + self._config.motion_weight * self._motion.error(
-                network, weights, torch_generator(scene.seed, "gha-motion", iteration)
+            network, generator = (
+                head.controllers.expression_deform,
+                torch_generator(scene.seed, "gha-motion", iteration),
             )
+            loss = loss + self._config.motion_weight * self._motion.error(network, weights, generator)
         if not len(surface.faces):
             return loss
         vertices, colors, displaced = head.posed(weights, surface, landmarks, signal, motion)
@@ -186,10 +187,8 @@ class MeshTraining:
             return F.mse_loss(head.distance(weights, places), target)
 
         def to_mesh(weights: Optimiser, step: int) -> Tensor:
-            rows = torch.randint(
-                MESH_PLACES, (MESH_BATCH,), generator=torch_generator(seed, "gha-start", step)
-            )
-            rows = rows.to(low.device)
+            generator = torch_generator(seed, "gha-start", step)
+            rows = torch.randint(MESH_PLACES, (MESH_BATCH,), generator=generator).to(low.device)
             return F.l1_loss(head.distance(weights, places[rows]), distances[rows])
 
         if config.start == "sphere":

@@ -58,8 +58,8 @@ class GHA(TrainedMethod[GHAConfig, GHAAvatar]):
         size = len(scene.signals[0].expression)
         mesh_head, head = MeshHead.of(config, size), GaussianHead.of(config, size)
         first, second = parted(fit.budget, config.mesh_fraction)
-        before = _PhaseProgress(fit.progress, 0, second.iterations or 0)
-        mesh = mesh_phase(scene, mesh_head, replace(fit, budget=first, progress=before))
+        progress = _phase_progress(fit.progress, 0, second.iterations or 0)
+        mesh = mesh_phase(scene, mesh_head, replace(fit, budget=first, progress=progress))
         sampler = ShuffledEpochs(len(scene.keys), fit.seed)
         began = fit.clock()
         training = GaussianTraining(scene, head, mesh_head, mesh.tensors, sampler)
@@ -68,7 +68,7 @@ class GHA(TrainedMethod[GHAConfig, GHAAvatar]):
             outcome = train(
                 training,
                 sampler,
-                replace(fit, budget=budget, progress=_PhaseProgress(fit.progress, mesh.iterations, 0)),
+                replace(fit, budget=budget, progress=_phase_progress(fit.progress, mesh.iterations, 0)),
                 published_length=round(config.schedule_length * (1 - config.mesh_fraction)),
                 checkpoint_every_s=config.checkpoint_every_s,
                 began=began,
@@ -91,14 +91,13 @@ class GHA(TrainedMethod[GHAConfig, GHAAvatar]):
         remove_mesh_phase(out)
 
 
-class _PhaseProgress:
+def _phase_progress(progress: Progress, before: int, after: int) -> Progress:
     """Progress of one phase within that of the whole."""
 
-    def __init__(self, progress: Progress, before: int, after: int):
-        self._progress, self._before, self._after = progress, before, after
+    def report(done: int, total: int, note: str = "") -> None:
+        progress(before + done, before + total + after, note)
 
-    def __call__(self, done: int, total: int, note: str = "") -> None:
-        self._progress(self._before + done, self._before + total + self._after, note)
+    return report
 
 
 def parted(budget: Budget, fraction: float) -> tuple[Budget, Budget]:

@@ -7,7 +7,8 @@ of the work.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -78,11 +79,8 @@ class Mlp:
             for layer in {0, self._again}:
                 tensors[f"{self.name}.weight_{layer}"][:, -self.condition_inputs :] = 0
         if self.zero_initialised:
-            last = len(self.hidden)
-            tensors |= {
-                name: torch.zeros_like(tensors[name])
-                for name in (f"{self.name}.weight_{last}", f"{self.name}.bias_{last}")
-            }
+            for part in ("weight", "bias"):
+                tensors[f"{self.name}.{part}_{len(self.hidden)}"].zero_()
         return tensors
 
     def __call__(
@@ -121,10 +119,7 @@ def uniform(
     tensors, bound = {}, 0.0
     for name, shape in shapes.items():
         if len(shape) > 1:
-            fan_in = 1
-            for side in shape[1:]:
-                fan_in *= side
-            bound = fan_in**-0.5
+            bound = math.prod(shape[1:]) ** -0.5
         values = (2 * torch.rand(*shape, generator=generator, dtype=torch.float64) - 1) * bound
         tensors[name] = values.to(device, torch.float32)
     return tensors
@@ -155,25 +150,15 @@ class Controllers:
         """Networks of the configured widths for E driving values."""
         pose = encoded_size(POSE_SIZE)
 
-        def pair(
-            kind: str, inputs: int, hidden: tuple[tuple[int, ...], ...], outputs: int
-        ) -> tuple[Mlp, Mlp]:
+        def pair(kind: str, inputs: int, outputs: int) -> Iterator[Mlp]:
             starts = (config.zero_initialised, config.zero_initialised and kind != "color")
-            return (
-                Mlp(f"expression_{kind}", inputs, expression_size, hidden[0], outputs, *starts),
-                Mlp(f"pose_{kind}", inputs, pose, hidden[1], outputs, *starts),
-            )
+            for name, size in ((f"expression_{kind}", expression_size), (f"pose_{kind}", pose)):
+                yield Mlp(name, inputs, size, getattr(config, f"{name}_hidden"), outputs, *starts)
 
-        c = config
         return cls(
-            *pair("color", c.features, (c.expression_color_hidden, c.pose_color_hidden), c.channels),
-            *pair("deform", ENCODING_SIZE, (c.expression_deform_hidden, c.pose_deform_hidden), 3),
-            *pair(
-                "attribute",
-                c.features,
-                (c.expression_attribute_hidden, c.pose_attribute_hidden),
-                sum(ATTRIBUTES),
-            ),
+            *pair("color", config.features, config.channels),
+            *pair("deform", ENCODING_SIZE, 3),
+            *pair("attribute", config.features, sum(ATTRIBUTES)),
         )
 
     @property
@@ -196,36 +181,23 @@ class Controllers:
         channels: int | None = None,
     ) -> Tensor:
         """(N, C) of (N, F) features within (-1, 1), without activation; the first ``channels`` if given."""
-        near, far = influences
-        return _joined(
-            len(features),
-            (near, self.expression_color(weights, _rows(features, near), expression, channels)),
-            (far, self.pose_color(weights, _rows(features, far), pose, channels)),
-        )
+        networks = (self.expression_color, self.pose_color)
+        return _blended(networks, weights, features, influences, (expression, pose), channels=channels)
 
     def attributes(
         self, weights: Weights, features: Tensor, influences: Influences, expression: Tensor, pose: Tensor
     ) -> tuple[Tensor, ...]:
         """(N, 3) log-scale, (N, 4) quaternion and (N, 1) opacity logit offsets, before their common factor."""
-        near, far = influences
-        values = _joined(
-            len(features),
-            (near, self.expression_attribute(weights, _rows(features, near), expression)),
-            (far, self.pose_attribute(weights, _rows(features, far), pose)),
-        )
+        networks = (self.expression_attribute, self.pose_attribute)
+        values = _blended(networks, weights, features, influences, (expression, pose))
         return values.split(list(ATTRIBUTES), dim=1)
 
     def displacements(
         self, weights: Weights, points: Tensor, influences: Influences, expression: Tensor, pose: Tensor
     ) -> Tensor:
         """(N, 3) displacements of (N, 3) points, each within (-1, 1), before their factor."""
-        encoded = encode(points)
-        near, far = influences
-        return _joined(
-            len(points),
-            (near, torch.tanh(self.expression_deform(weights, _rows(encoded, near), expression))),
-            (far, torch.tanh(self.pose_deform(weights, _rows(encoded, far), pose))),
-        )
+        networks = (self.expression_deform, self.pose_deform)
+        return _blended(networks, weights, encode(points), influences, (expression, pose), torch.tanh)
 
 
 def encoded_size(size: int) -> int:
@@ -238,13 +210,21 @@ def encode_pose(code: Tensor) -> Tensor:
     return encode(code[None])[0]
 
 
-def _rows(values: Tensor, influence: Influence) -> Tensor:
-    return values.index_select(0, influence.rows)
-
-
-def _joined(count: int, *parts: tuple[Influence, Tensor]) -> Tensor:
-    """(count, C) sum of the parts' values by their weights."""
-    total = parts[0][1].new_zeros(count, parts[0][1].shape[1])
-    for influence, values in parts:
-        total = total.index_add(0, influence.rows, influence.weights[:, None] * values)
+def _blended(
+    networks: tuple[Mlp, Mlp],
+    weights: Weights,
+    inputs: Tensor,
+    influences: Influences,
+    conditions: tuple[Tensor, Tensor],
+    activation: Callable[[Tensor], Tensor] = lambda values: values,
+    channels: int | None = None,
+) -> Tensor:
+    """(N, C) sum of two networks' outputs at (N, F) inputs by their influences."""
+    parts = [
+        activation(network(weights, inputs.index_select(0, part.rows), condition, channels))
+        for network, part, condition in zip(networks, influences, conditions)
+    ]
+    total = parts[0].new_zeros(len(inputs), parts[0].shape[1])
+    for part, values in zip(influences, parts):
+        total = total.index_add(0, part.rows, part.weights[:, None] * values)
     return total

@@ -20,7 +20,7 @@ from ..shared.networks import encode
 from ..shared.optimisation import Optimiser
 from ..shared.schedule import log_linear, torch_generator
 from .config import GHAConfig
-from .driving import Driver, TrainingScene, influences
+from .driving import TrainingScene, influences
 from .networks import Mlp, Weights
 
 TURNING = ("left_eyeball", "right_eyeball")
@@ -43,22 +43,13 @@ STILL = 0.02
 
 
 class TrackedMotion(NamedTuple):
-    """Displacements of the head model's vertices by expression codes.
+    """Displacements of the head model's n vertices where expression alone rules, by expression codes."""
 
-    Attributes
-    ----------
-    encoded : (n, 27) positional encoding of vertices at rest (`Scene.rest`), those where expression alone rules.
-    codes : (K, E) expression codes.
-    moves : (K, n, 3) displacements from rest, canonical units.
-    weights : (n,) one over each vertex's mean squared motion, so that lids count beside a jaw.
-    scale : factor of the network's outputs.
-    """
-
-    encoded: Tensor
-    codes: Tensor
-    moves: Tensor
-    weights: Tensor
-    scale: float
+    encoded: Tensor  # (n, 27) positional encoding of the vertices at rest (`TrainingScene.rest`)
+    codes: Tensor  # (K, E) expression codes
+    moves: Tensor  # (K, n, 3) displacements from rest, canonical units
+    weights: Tensor  # (n,) one over each vertex's mean squared motion, so that lids count beside a jaw
+    scale: float  # of the network's outputs
 
     @classmethod
     @torch.no_grad()
@@ -72,7 +63,9 @@ class TrackedMotion(NamedTuple):
         chosen = torch.randint(len(tracked), (known,), generator=generator).to(tracked.device)
         codes[:known] = tracked[chosen] + AROUND_TRACKED * codes[:known]
         rest = scene.rest[rows]
-        moves = [_moved(scene.driver, part)[:, rows] - rest for part in codes.split(CODES_AT_ONCE)]
+        driver = scene.driver
+        parts = codes.split(CODES_AT_ONCE)
+        moves = [driver.unposed(driver.rest_arguments(part))[:, rows] - rest for part in parts]
         every = torch.cat(moves)
         weights = 1 / (every.square().sum(2).mean(0) + STILL**2)
         return cls(encode(rest), codes, every, weights, config.displacement_scale)
@@ -96,11 +89,6 @@ class TrackedMotion(NamedTuple):
         return fitted(network, initial, loss, steps, RATES)
 
 
-def _moved(driver: Driver, codes: Tensor) -> Tensor:
-    """(B, V, 3) canonical vertices for (B, E) expression codes."""
-    return driver.unposed(driver.rest_arguments(codes))
-
-
 def _rows(scene: TrainingScene, config: GHAConfig) -> Tensor:
     """Vertices within the landmarks' undivided rule."""
     near, _ = influences(scene.rest, scene.rest[scene.landmark_rows], config.near_squared, config.far_squared)
@@ -119,13 +107,10 @@ def fitted(
     steps: int,
     rates: tuple[float, float],
 ) -> dict[str, Tensor]:
-    """A network's tensors after so many steps of Adam.
+    """A network's tensors after so many steps of Adam; ``initial`` has them and may have others.
 
-    Parameters
-    ----------
-    initial : its tensors by name, and any others.
-    loss : of the tensors and the number of the step, from 1.
-    rates : learning rate of the first half of the steps, and the one that it falls to, log-linearly, in the second.
+    ``loss`` is of the tensors and the number of the step, from 1; ``rates`` are the learning rate of the first half of
+    the steps, and the one that it falls to, log-linearly, in the second.
     """
     names = list(network.shapes())
     weights = Optimiser(
@@ -153,13 +138,8 @@ class TangentDistance:
     """Distance to the nearest vertex, signed by the side of its tangent plane that a point is on; positive outside.
 
     Hoppe et al., "Surface reconstruction from unorganized points", SIGGRAPH 1992, section 3.3. Where a mesh ends (the
-    neck's lower edge) its walls continue, which is what a bust wants.
-
-    Parameters
-    ----------
-    vertices : (V, 3).
-    faces : (F, 3), counter-clockwise seen from outside.
-    keep : (K,) vertices that count.
+    neck's lower edge) its walls continue, which is what a bust wants. ``faces`` are counter-clockwise seen from outside;
+    (K,) ``keep`` are the vertices that count.
     """
 
     def __init__(self, vertices: FloatArray, faces: IntArray, keep: IntArray):

@@ -85,11 +85,16 @@ def test_soft_overlap_of_binary_masks_is_intersection_over_union():
     assert soft_overlap(nothing, nothing).item() == 1
 
 
+def begun(clip, config, *, fitted):
+    """Scene, head and training of the mesh phase."""
+    scene = training_scene(clip, config, "cpu", 0)
+    head = MeshHead.of(config, len(scene.expression_scale))
+    return scene, head, MeshTraining(scene, head, fitted=fitted)
+
+
 def test_the_surface_is_that_of_the_whole_grid(clip):
     """Evaluating only what the surface passes gives what evaluating everything gives."""
-    scene = training_scene(clip, small_config(), "cpu", 0)
-    head = MeshHead.of(small_config(), len(scene.expression_scale))
-    training = MeshTraining(scene, head, fitted=True)
+    _, head, training = begun(clip, small_config(), fitted=True)
     weights = {name: training.optimiser[name].detach() for mlp in head.networks for name in mlp.shapes()}
     surface = head.surface(weights, training.grid)
     values = torch.tanh(head.geometry(weights, encode(training.grid.vertices)))
@@ -105,9 +110,7 @@ def test_the_surface_is_that_of_the_whole_grid(clip):
 @pytest.mark.parametrize("start", ["mesh", "sphere"])
 def test_the_start_is_what_it_was_asked_to_be(clip, start):
     config = small_config(start=start, start_steps=80, geometry_hidden=(32, 32))
-    scene = training_scene(clip, config, "cpu", 0)
-    head = MeshHead.of(config, len(scene.expression_scale))
-    training = MeshTraining(scene, head, fitted=True)
+    scene, head, training = begun(clip, config, fitted=True)
     with torch.no_grad():
         surface = head.surface(training.optimiser, training.grid)
     if start == "sphere":
@@ -127,9 +130,7 @@ def test_images_are_masked_on_black_where_there_are_masks(clip, masked):
     other = replace(clip, images={**clip.images, key: image.astype(np.uint8)}, background=ground)
     if not masked:
         other = replace(other, masks=dict.fromkeys(clip.masks))
-    config = small_config()
-    scene = training_scene(other, config, "cpu", 0)
-    training = MeshTraining(scene, MeshHead.of(config, len(scene.expression_scale)), fitted=False)
+    _, _, training = begun(other, small_config(), fitted=False)
     _, found, mask, background = training._target(key)
     assert (mask is not None) == masked
     np.testing.assert_allclose(background, np.zeros(3) if masked else ground, atol=1e-6)
@@ -142,8 +143,7 @@ def test_the_mesh_phase_learns_shape_motion_and_colour(clip, tmp_path):
     config = small_config(
         geometry_hidden=(32, 32), mesh_lr=6e-3, landmark_weight=300.0, zero_initialised=True
     )
-    scene = training_scene(clip, config, "cpu", 0)
-    head = MeshHead.of(config, len(scene.expression_scale))
+    scene, head, untrained = begun(clip, config, fitted=False)
     losses = []
 
     def record(done, total, note=""):
@@ -157,7 +157,7 @@ def test_the_mesh_phase_learns_shape_motion_and_colour(clip, tmp_path):
     assert all(torch.equal(result.tensors[name], again.tensors[name]) for name in result.tensors)
     rows = torch.as_tensor(scene.landmark_rows)
     tracked = scene.driver.unposed(scene.tracked)[0, rows]
-    spacing = MeshTraining(scene, head, fitted=False).grid.spacing
+    spacing = untrained.grid.spacing
     landmarks = result.tensors["landmarks"]
     with torch.no_grad():
         moved = head.expressed(result.tensors, landmarks, scene.signals[0].expression)
@@ -261,16 +261,6 @@ def test_a_plane_is_exact(normal, shift):
     grid = box(1.0, 0.25)
     vertices, _ = surface(grid, grid.vertices.double() @ direction - shift)
     assert (vertices @ direction - shift).abs().max() < 1e-9
-
-
-def test_values_are_interpolated_along_with_the_surface():
-    grid = box()
-    crossings = marching_tetrahedra(grid.vertices.norm(dim=1) - 1, grid.tets)
-    linear = grid.vertices @ torch.tensor([[1.0, 2.0], [0.5, -1.0], [3.0, 0.0]]) + 0.25
-    expected = (
-        crossings.interpolate(grid.vertices) @ torch.tensor([[1.0, 2.0], [0.5, -1.0], [3.0, 0.0]]) + 0.25
-    )
-    assert torch.allclose(crossings.interpolate(linear), expected, atol=1e-5)
 
 
 def test_gradients_by_the_signed_distances():
