@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,8 +16,7 @@ from ...bench.contracts import Camera, Frame, HeadPose
 from ...bench.errors import HeadbenchError, InputError
 from ...bench.io.arrays import Member, read_arrays
 from ...bench.io.documents import read_json
-from ...bench.io.files import write_json
-from ..shared.avatar_files import SUBJECT_FILE, Subject, read_shared_head, read_subject, write_arrays
+from ..shared.avatar_files import SUBJECT_FILE, read_shared_head, read_subject, write_arrays
 from ..shared.subject_mesh import SubjectMesh, pose_key
 from . import kernel
 from .config import InstaConfig
@@ -33,19 +31,12 @@ MIDDLE = 0.5  # of a step: where samples lie when nothing is left to chance
 
 
 class InstaAvatar:
-    """A trained head: a canonical field and the mesh that carries rays to it.
-
-    Attributes
-    ----------
-    subject, config : whom it shows, and how it was trained.
-    space : where there is density.
-    """
+    """A trained head: a canonical field, the space where there is density, and the mesh that carries rays to it."""
 
     def __init__(
         self,
         folder: Path,
         mesh: SubjectMesh,
-        subject: Subject,
         config: InstaConfig,
         field: Field,
         parameters: Parameters,
@@ -53,8 +44,7 @@ class InstaAvatar:
         surface: PosedSurface,
         mouth: torch.Tensor,
     ):
-        self.subject, self.config, self.space = subject, config, space
-        self._folder, self._mesh, self._surface = folder, mesh, surface.surface
+        self.space, self._folder, self._mesh, self._surface = space, folder, mesh, surface.surface
         marching = Marching(config.step, config.round_samples, config.stop_transmittance)
         self._inference = Inference(field, parameters, space, mouth, marching)
         self._last: tuple[bytes, PosedSurface] | None = None
@@ -73,9 +63,7 @@ class InstaAvatar:
         parameters, cells = read_field(folder / FIELD_FILE, architecture, size, device)
         field = Field(architecture, occupancy.box(device), Prior.of(config))
         space = occupied_space(occupancy, cells)
-        return cls(
-            folder, mesh, subject, config, field, parameters, space, surface.rest, mouth_triangles(head)
-        )
+        return cls(folder, mesh, config, field, parameters, space, surface.rest, mouth_triangles(head))
 
     @torch.no_grad()
     def render(self, camera: Camera, pose: HeadPose, background: Sequence[float] = (1.0, 1.0, 1.0)) -> Frame:
@@ -119,13 +107,8 @@ SETTINGS_FILE = "field.json"
 OCCUPIED = "occupied"
 
 
-def write_settings(path: Path, config: InstaConfig) -> None:
-    """Write the settings that decide how the field is read and rendered."""
-    write_json(path, asdict(config))
-
-
 def read_settings(path: Path) -> InstaConfig:
-    """Read what `write_settings` wrote. Raises `InputError` for settings that are unknown or out of range."""
+    """Read the settings as JSON. Raises `InputError` for settings that are unknown or out of range."""
     try:
         config: InstaConfig = build(InstaConfig, with_new_names(InstaConfig, read_json(path)), str(path))
     except InputError:
@@ -197,12 +180,8 @@ class Inference:
         """What the rays of one pose see."""
         module = scene.surface.surface.module
         if self._trained is None or module is None:
-            rendered = render_rays(
-                self.field, self.parameters, [scene], self.space, self.mouth, self.marching
-            )
-            return RayColors(
-                rendered.color.cpu().numpy(), rendered.transmittance.cpu().numpy(), rendered.samples
-            )
+            seen = render_rays(self.field, self.parameters, [scene], self.space, self.mouth, self.marching)
+            return RayColors(seen.color.cpu().numpy(), seen.transmittance.cpu().numpy(), seen.samples)
         rays = scene.rays
         color = np.empty((len(rays.origins), 3), np.float32)
         transmittance = np.empty(len(color), np.float32)
@@ -210,25 +189,18 @@ class Inference:
             *(scene.surface.guide(self.space), self._trained, self._starts(scene.condition)),
             *(self.mouth.numpy().view(np.uint8), rays.origins, rays.directions, rays.jitter),
             *(self.marching.step, self.marching.round_samples, self.marching.stop_transmittance),
-            *(color, transmittance, self._isa, scene.surface.surface.threads()),
+            *(color, transmittance, self._isa, torch.get_num_threads()),
         )
         return RayColors(color, transmittance, samples)
 
     def _prepared(self, module: Any) -> Any:
         architecture, box, prior = self.field.architecture, self.field.box, self.field.prior
-        arrays = {
-            name: np.ascontiguousarray(value.detach().numpy()) for name, value in self.parameters.items()
-        }
-        networks = [
-            [arrays[f"{name}_{number}"] for number in range(len(shapes))]
-            for name, shapes in (
-                ("density", architecture.density_shapes),
-                ("color", architecture.color_shapes),
-            )
-        ]
+        arrays = {n: np.ascontiguousarray(value.detach().numpy()) for n, value in self.parameters.items()}
+        density = [arrays[f"density_{number}"] for number in range(len(architecture.density_shapes))]
+        color = [arrays[f"color_{number}"] for number in range(len(architecture.color_shapes))]
         levels = [tuple(level) for level in architecture.levels]
         low = box.low.numpy().astype(np.float32)
-        return module.Trained(levels, arrays["table"], low, box.side, *prior, *networks)
+        return module.Trained(levels, arrays["table"], low, box.side, *prior, density, color)
 
     def _starts(self, condition: Tensor) -> np.ndarray:
         """(2, units) that the conditions add to the first layer: outside the mouth, where all are one, and at it."""

@@ -57,23 +57,17 @@ class Architecture(NamedTuple):
     density_shapes: list[tuple[int, int]]
     color_shapes: list[tuple[int, int]]
     conditions: int
-    latent: int
 
     @classmethod
     def of(cls, config: InstaConfig, expressions: int) -> Architecture:
         """Sizes that a configuration asks for, with a head of so many expression coefficients."""
-        levels = make_levels(
-            config.levels, config.base_resolution, config.finest_resolution, config.log2_table
-        )
-        conditions = min(config.conditions, expressions)
-        inputs = config.levels * config.level_features + conditions
+        c, conditions = config, min(config.conditions, expressions)
         return cls(
-            levels,
-            config.level_features,
-            layer_shapes(inputs, config.hidden, config.density_layers, config.latent),
-            layer_shapes(config.latent + DIRECTIONS, config.hidden, config.color_layers, 3),
+            make_levels(c.levels, c.base_resolution, c.finest_resolution, c.log2_table),
+            c.level_features,
+            layer_shapes(c.levels * c.level_features + conditions, c.hidden, c.density_layers, c.latent),
+            layer_shapes(c.latent + DIRECTIONS, c.hidden, c.color_layers, 3),
             conditions,
-            config.latent,
         )
 
     def shapes(self) -> dict[str, tuple[int, ...]]:
@@ -85,35 +79,23 @@ class Architecture(NamedTuple):
     def initial(self, seed: int) -> dict[str, Tensor]:
         """Parameters to start training from."""
         generator = torch_generator(seed, "insta field")
-        table = (2 * torch.rand(self.shapes()["table"], generator=generator) - 1) * INITIAL
-        density = initial_weights(self.density_shapes, generator)
-        color = initial_weights(self.color_shapes, generator)
-        named = {"table": table}
-        named |= {f"density_{i}": weight for i, weight in enumerate(density)}
-        return named | {f"color_{i}": weight for i, weight in enumerate(color)}
+        shapes = self.shapes()
+        table = (2 * torch.rand(shapes.pop("table"), generator=generator) - 1) * INITIAL
+        return {"table": table, **{name: initial_weight(s, generator) for name, s in shapes.items()}}
 
 
 class Field:
-    """Density and colour at canonical points.
-
-    Parameters
-    ----------
-    prior : added to the logarithm of the density per metre.
-    """
+    """Density and colour at canonical points; ``prior`` is added to the logarithm of the density per metre."""
 
     def __init__(self, architecture: Architecture, box: EncodedCube, prior: Prior):
         self.architecture, self.box, self.prior = architecture, box, prior
 
     def latent(self, parameters: Parameters, positions: Tensor, conditions: Tensor, rows: Tensor) -> Tensor:
-        """(N, L) outputs of the density network at (N, 3) positions, metres.
-
-        Parameters
-        ----------
-        conditions : (M, K) sets of coefficients, and (N,) ``rows`` which of them each point sees.
-        """
-        names = [f"density_{i}" for i in range(len(self.architecture.density_shapes))]
+        """(N, L) outputs of the density network at (N, 3) positions, metres; of (M, K) ``conditions``, sets of
+        coefficients, each point sees that of its (N,) ``rows``."""
+        weights = [parameters[f"density_{i}"] for i in range(len(self.architecture.density_shapes))]
         features = encode(self.box.normalised(positions), parameters["table"], self.architecture.levels)
-        return network(features, conditions, rows, [parameters[name] for name in names])
+        return network(features, conditions, rows, weights)
 
     def density(self, latent: Tensor, distances: Tensor) -> Tensor:
         """(N,) per metre, at (N,) distances from the mesh."""
@@ -121,10 +103,9 @@ class Field:
 
     def color(self, parameters: Parameters, latent: Tensor, directions: Tensor) -> Tensor:
         """(N, 3) in (0, 1) for (N, 3) canonical unit directions along the rays."""
-        names = [f"color_{i}" for i in range(len(self.architecture.color_shapes))]
+        weights = [parameters[f"color_{i}"] for i in range(len(self.architecture.color_shapes))]
         basis = sh_basis(directions, SH_DEGREE)
-        rows = torch.arange(len(basis), device=basis.device)
-        return torch.sigmoid(network(latent, basis, rows, [parameters[name] for name in names]))
+        return torch.sigmoid(network(latent, basis, torch.arange(len(basis), device=basis.device), weights))
 
 
 class _BoundedExp(torch.autograd.Function):
@@ -220,8 +201,7 @@ class _Encode(torch.autograd.Function):
         ctx.save_for_backward(positions)
         ctx.levels, ctx.shape = levels, table.shape
         out = table.new_empty(len(positions), len(levels) * table.shape[1])
-        module = kernel.load()
-        assert module is not None
+        module: Any = kernel.load()
         arrays = positions.numpy(), table.detach().numpy()
         module.encode(*arrays, list(levels), out.numpy(), torch.get_num_threads())
         return out
@@ -230,8 +210,7 @@ class _Encode(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         (positions,) = ctx.saved_tensors
         by_table = grads[0].new_zeros(ctx.shape)
-        module = kernel.load()
-        assert module is not None
+        module: Any = kernel.load()
         arrays = positions.numpy(), grads[0].contiguous().numpy()
         module.encode_backward(*arrays, list(ctx.levels), by_table.numpy(), torch.get_num_threads())
         return None, by_table, None
@@ -246,22 +225,15 @@ def layer_shapes(inputs: int, hidden: int, layers: int, outputs: int) -> list[tu
     return [(widths[i + 1], widths[i]) for i in range(len(widths) - 1)]
 
 
-def initial_weights(shapes: Sequence[tuple[int, int]], generator: torch.Generator) -> list[Tensor]:
+def initial_weight(shape: Sequence[int], generator: torch.Generator) -> Tensor:
     """Uniform within +-sqrt(6 / (in + out)): Glorot and Bengio, as tiny-cuda-nn starts its networks."""
-    return [
-        (2 * torch.rand(shape, generator=generator) - 1) * math.sqrt(6 / (shape[0] + shape[1]))
-        for shape in shapes
-    ]
+    return (2 * torch.rand(*shape, generator=generator) - 1) * math.sqrt(6 / sum(shape))
 
 
 def network(inputs: Tensor, constants: Tensor, rows: Tensor, weights: Sequence[Tensor]) -> Tensor:
     """(N, out) of layers with ReLU between them, applied to [inputs, constants[rows]].
 
-    Parameters
-    ----------
-    inputs : (N, C).
-    constants : (M, K) that get no gradient; K may be 0.
-    rows : (N,) int64.
+    ``inputs`` are (N, C), ``constants`` (M, K), which get no gradient (K may be 0), ``rows`` (N,) int64.
     """
     return _Network.apply(inputs, constants, rows, *weights)  # type: ignore[no-untyped-call]
 

@@ -46,20 +46,14 @@ class Samples(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Space:
-    """Where there may be density.
+    """Where there may be density."""
 
-    Attributes
-    ----------
-    reach : (F,) float32 canonical metres from each triangle; negative for nowhere.
-    low : (3,) float32 corner of the occupancy grid, canonical metres.
-    cell : size of its cubic cells, metres.
-    free : (X, Y, Z) uint8, cells to the nearest occupied one along the axis where that is most; 0 where occupied.
-    """
-
-    reach: np.ndarray
-    low: np.ndarray
-    cell: float
-    free: np.ndarray
+    reach: np.ndarray  # (F,) float32 canonical metres from each triangle; negative for nowhere
+    low: np.ndarray  # (3,) float32 corner of the occupancy grid, canonical metres
+    cell: float  # size of its cubic cells, metres
+    free: (
+        np.ndarray
+    )  # (X, Y, Z) uint8, cells to the nearest occupied one along the axis where that is most; 0 in one
 
     @classmethod
     def of(cls, reach: np.ndarray, low: np.ndarray, cell: float, occupied: np.ndarray) -> Space:
@@ -76,12 +70,9 @@ class Space:
 
 
 class CanonicalSurface:
-    """The canonical mesh of a subject, and what all its poses share.
+    """The canonical mesh of a subject, (V, 3) metres, and what all its poses share.
 
-    Parameters
-    ----------
-    canonical : (V, 3) vertices, metres.
-    backend : "kernel" is compiled, "reference" tries every triangle in torch; "auto" takes what there is.
+    Backend "kernel" is compiled, "reference" tries every triangle in torch; "auto" takes what there is.
     """
 
     def __init__(
@@ -90,7 +81,7 @@ class CanonicalSurface:
         self.canonical = canonical.detach().cpu()
         self.faces = torch.from_numpy(np.asarray(head.faces, dtype=np.int64))
         self.blend = Blend.of(head, variant)
-        self.module = None if backend == "reference" else kernel.load()
+        self.module: Any = None if backend == "reference" else kernel.load()
         if backend == "kernel" and self.module is None:
             raise ValueError("backend 'kernel': not installed; 'reference' is")
         self.tree: Any = None
@@ -102,10 +93,6 @@ class CanonicalSurface:
     def pose(self, vertices: Tensor) -> PosedSurface:
         """The surface in one pose, (V, 3) vertices in metres."""
         return PosedSurface(self, vertices.detach().cpu())
-
-    def threads(self) -> int:
-        """Threads for the kernel: as many as torch uses."""
-        return torch.get_num_threads()
 
 
 class PosedSurface:
@@ -132,9 +119,7 @@ class PosedSurface:
         if self._mesh is None:
             return nearest_triangles(torch.from_numpy(points), self.corners.float())
         triangles, squared = np.empty(len(points), np.int32), np.empty(len(points), np.float32)
-        module, threads = self.surface.module, self.surface.threads()
-        assert module is not None
-        module.nearest(self._mesh, points, triangles, squared, threads)
+        self.surface.module.nearest(self._mesh, points, triangles, squared, torch.get_num_threads())
         return Found(torch.from_numpy(triangles).long(), torch.from_numpy(squared))
 
     def first_hit(self, rays: Rays) -> Found:
@@ -143,29 +128,20 @@ class PosedSurface:
         if self._mesh is None:
             return first_hits(torch.from_numpy(origins), torch.from_numpy(directions), self.corners.float())
         triangles, distances = np.empty(len(origins), np.int32), np.empty(len(origins), np.float32)
-        module, threads = self.surface.module, self.surface.threads()
-        assert module is not None
-        module.first_hit(self._mesh, origins, directions, triangles, distances, threads)
+        found = triangles, distances
+        self.surface.module.first_hit(self._mesh, origins, directions, *found, torch.get_num_threads())
         return Found(torch.from_numpy(triangles).long(), torch.from_numpy(distances))
 
     def march(self, rays: Rays, first: np.ndarray, step: float, samples_max: int, space: Space) -> Samples:
         """Samples of rays that may have density, at most ``samples_max`` of each ray.
 
-        Parameters
-        ----------
-        first : (R,) int32 numbers of the samples to start at; -1 for rays that are done.
+        ``first`` has (R,) int32 numbers of the samples to start at; -1 for rays that are done.
         """
         if self._mesh is None:
             return self._march_reference(rays, first, step, samples_max, space)
-        module = self.surface.module
-        assert module is not None
-        return Samples(
-            *module.march(
-                self.guide(space),
-                *(np.ascontiguousarray(rays.origins), np.ascontiguousarray(rays.directions)),
-                *(first, np.ascontiguousarray(rays.jitter), step, samples_max, self.surface.threads()),
-            )
-        )
+        origins, directions, jitter = map(np.ascontiguousarray, rays)
+        how = (first, jitter, step, samples_max, torch.get_num_threads())
+        return Samples(*self.surface.module.march(self.guide(space), origins, directions, *how))
 
     def reach(self, space: Space) -> np.ndarray:
         """(F,) float32 metres from each triangle of this pose within which the space has density; negative for none."""
@@ -182,18 +158,11 @@ class PosedSurface:
     def guide(self, space: Space) -> Any:
         """The kernel's view of this pose and a space; the last one is kept. Needs the kernel."""
         if self._guide is None or self._guide[0] is not space:
-            blend, module = self.surface.blend, self.surface.module
-            assert module is not None
-            made = module.Guide(
-                *(
-                    self._mesh,
-                    self.reach(space),
-                    _array(self.matrices.float()),
-                    _array(self.centroids.float()),
-                ),
-                *(blend.neighbours, blend.own_falloff, blend.neighbour_falloff),
-                *(space.low, 1 / space.cell, space.free),
-            )
+            blend = self.surface.blend
+            posed = (self.reach(space), _array(self.matrices.float()), _array(self.centroids.float()))
+            falloffs = (blend.own_falloff, blend.neighbour_falloff)
+            grid = (space.low, 1 / space.cell, space.free)
+            made = self.surface.module.Guide(self._mesh, *posed, blend.neighbours, *falloffs, *grid)
             self._guide = space, made
         return self._guide[1]
 
@@ -230,10 +199,9 @@ class PosedSurface:
             parts.append(tuple(column[kept] for column in columns))
         if not parts:
             parts = [(np.empty((0, 3)), np.empty((0, 3)), *[np.empty(0)] * 4)]
-        joined = [np.concatenate(column) for column in zip(*parts)]
-        reals = [column.astype(np.float32) for column in joined[:3]]
-        numbers = [column.astype(np.int32) for column in joined[3:]]
-        return Samples(reals[0], reals[1], reals[2], numbers[0], numbers[1], numbers[2], following)
+        kinds = [np.float32] * 3 + [np.int32] * 3
+        joined = [np.concatenate(column).astype(kind) for column, kind in zip(zip(*parts), kinds)]
+        return Samples._make([*joined, following])
 
     def to_canonical(
         self, points: np.ndarray, triangles: np.ndarray, direction: np.ndarray
@@ -266,15 +234,7 @@ def canonical_surface(
     head: HeadAsset, mesh: SubjectMesh, config: InstaConfig, backend: Backend = "auto"
 ) -> CanonicalSurface:
     """The canonical surface of a subject; ``mesh`` lies on the CPU."""
-    still = np.zeros(3)
-    pose = HeadPose(
-        mesh.version,
-        expression=np.zeros(mesh.model.expression_size),
-        rotation=still,
-        neck=still,
-        jaw=np.array([config.jaw_opening, 0, 0]),
-        eyes=np.zeros(6),
-        translation=still,
-    )
+    still, jaw = np.zeros(3), np.array([config.jaw_opening, 0, 0])
+    pose = HeadPose(mesh.version, np.zeros(mesh.model.expression_size), still, still, jaw, np.zeros(6), still)
     vertices = mesh.posed(mesh.arguments([pose]))
     return CanonicalSurface(head, vertices, config.warp_variant, backend)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
+from ...bench.io.files import write_json
 from ..shared.avatar_files import Subject, finish_fit
 from ..shared.loop import Fit, train
 from ..shared.method import TrainedMethod
 from ..shared.schedule import ShuffledEpochs
 from ..shared.subject_mesh import SubjectMesh
-from .avatar import FIELD_FILE, SETTINGS_FILE, InstaAvatar, write_field, write_settings
+from .avatar import FIELD_FILE, SETTINGS_FILE, InstaAvatar, write_field
 from .config import InstaConfig
 from .marching import canonical_surface
 from .spec import INSTA as SPEC
@@ -33,6 +36,6 @@ class Insta(TrainedMethod[InstaConfig, InstaAvatar]):
             checkpoint_every_s=config.checkpoint_every_s,
         )
         write_field(fit.out / FIELD_FILE, training.parameters(), training.space.occupied)
-        write_settings(fit.out / SETTINGS_FILE, config)
+        write_json(fit.out / SETTINGS_FILE, asdict(config))
         occupied = int(training.space.occupied.sum())
         finish_fit(fit, outcome, subject, clip.head, occupied_cells=occupied)

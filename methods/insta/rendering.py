@@ -17,15 +17,10 @@ from .marching import PosedSurface, Rays, Space
 
 @dataclass(frozen=True, eq=False)
 class PosedRays:
-    """One pose of the head with rays into it.
-
-    Attributes
-    ----------
-    condition : (K,) leading expression coefficients.
-    """
+    """One pose of the head with rays into it."""
 
     surface: PosedSurface
-    condition: Tensor
+    condition: Tensor  # (K,) leading expression coefficients
     rays: Rays
 
 
@@ -58,9 +53,7 @@ def render_rays(
 ) -> Rendered:
     """March the rays of several poses together; differentiable in the parameters.
 
-    Parameters
-    ----------
-    mouth : (F,) bool; where the nearest triangle is one of these the density depends on the expression.
+    Where the nearest triangle is one of the (F,) bool ``mouth`` the density depends on the expression.
     """
     device = parameters["table"].device
     counts = [len(scene.rays.origins) for scene in scenes]

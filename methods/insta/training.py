@@ -17,7 +17,7 @@ from ..shared.schedule import Timeline, log_linear, numpy_generator
 from ..shared.subject_mesh import BoundedCache, SubjectMesh, pose_key
 from .config import InstaConfig
 from .field import Architecture, Field, Prior
-from .marching import CanonicalSurface, PosedSurface, Rays, Space
+from .marching import CanonicalSurface, PosedSurface, Space
 from .occupancy import Occupancy
 from .rendering import Marching, PosedRays, Rendered, box_corners, camera_rays, pixels_of_hull, render_rays
 from .warp import bare_triangles, mouth_triangles
@@ -68,11 +68,13 @@ class InstaTraining:
         self._ground = torch.as_tensor(np.asarray(clip.background), dtype=torch.float32)
         self._marching = Marching(config.step, config.round_samples, config.stop_transmittance)
         self._masked = clip.mask(self.keys[0]) is not None
-        self._images = BoundedCache(self._image, self._entries(config.image_cache_mb, self._image_bytes()))
+        cameras = [clip.cameras[key.camera] for key in self.keys]
+        image_bytes = 4 * max(camera.width * camera.height for camera in cameras)
+        self._images = BoundedCache(self._image, max(1, config.image_cache_mb * 2**20 // image_bytes))
         # Frames of one timestep often share their pose; so do frames of a video made of several views.
         self._alike: dict[bytes, int] = {}
-        bytes_of_pose = 2 * surface.rest.bytes
-        self._poses = BoundedCache(self._posed, self._entries(config.mesh_cache_mb, bytes_of_pose))
+        pose_bytes = 2 * surface.rest.bytes
+        self._poses = BoundedCache(self._posed, max(1, config.mesh_cache_mb * 2**20 // pose_bytes))
         self._space = self.occupancy.space()
 
     @property
@@ -190,7 +192,8 @@ class InstaTraining:
         self, index: int, count: int, generator: np.random.Generator
     ) -> tuple[PosedRays, Tensor, Tensor, Tensor, Tensor]:
         key = self.keys[index]
-        camera, surface = self._clip.cameras[key.camera], self._surface_at(key.timestep)
+        camera, pose = self._clip.cameras[key.camera], self._clip.poses[key.timestep]
+        surface = self._poses(self._alike.setdefault(pose_key(pose), key.timestep))
         # Beyond these pixels nothing can be rendered, and no gradient comes of them.
         corners = box_corners(surface.vertices.numpy(), max(float(surface.reach(self._space).max()), 0.0))
         left, top, right, bottom = pixels_of_hull(camera, corners)
@@ -201,21 +204,12 @@ class InstaTraining:
         colors = torch.from_numpy(image[rows, columns].astype(np.float32) / 255)
         covered = np.full(count, 255) if mask is None else mask[rows, columns]
         coverage = torch.from_numpy(covered.astype(np.float32)[:, None] / 255)
-        mouth, depth = self._guides(surface, rays, coverage[:, 0])
-        expression = np.asarray(self._clip.poses[key.timestep].expression)
-        scene = PosedRays(surface, torch.as_tensor(expression, dtype=torch.float32), rays)
-        return scene, colors, coverage, mouth, depth
-
-    def _guides(self, surface: PosedSurface, rays: Rays, coverage: Tensor) -> tuple[Tensor, Tensor]:
-        """Which rays meet the mouth, and where rays meet the bare mesh."""
         found = surface.first_hit(rays)
         hit, triangles = found.triangles >= 0, found.triangles.clamp_min(0)
-        bare = hit & self._bare[triangles] & (coverage > 0.001)
-        return hit & self.mouth[triangles], torch.where(bare, found.values, torch.inf)
-
-    def _surface_at(self, timestep: int) -> PosedSurface:
-        representative = self._alike.setdefault(pose_key(self._clip.poses[timestep]), timestep)
-        return self._poses(representative)
+        bare = hit & self._bare[triangles] & (coverage[:, 0] > 0.001)
+        depth = torch.where(bare, found.values, torch.inf)
+        expression = torch.as_tensor(np.asarray(pose.expression), dtype=torch.float32)
+        return PosedRays(surface, expression, rays), colors, coverage, hit & self.mouth[triangles], depth
 
     @torch.no_grad()
     def _posed(self, timestep: int) -> PosedSurface:
@@ -229,21 +223,12 @@ class InstaTraining:
             found = f"{image.dtype} of shape {image.shape}"
             raise InputError(str(key), "image", f"uint8 of shape {(*size, 3)}", found)
         if (mask is not None) != self._masked:
-            names = ("none", "a mask")
-            expected, found = names[self._masked], names[not self._masked]
+            expected, found = ("a mask", "none") if self._masked else ("none", "a mask")
             raise InputError(str(key), "mask", f"{expected}, as the first training frame has", found)
         if mask is not None and (mask.shape != size or mask.dtype != np.uint8):
             found = f"{mask.dtype} of shape {mask.shape}"
             raise InputError(str(key), "mask", f"uint8 of shape {size}", found)
         return image, mask
-
-    def _image_bytes(self) -> int:
-        cameras = [self._clip.cameras[key.camera] for key in self.keys]
-        return 4 * max(camera.width * camera.height for camera in cameras)
-
-    @staticmethod
-    def _entries(megabytes: int, size: int) -> int:
-        return max(1, megabytes * 2**20 // size)
 
 
 COLOR_PART = 0.2  # the published program divides the Huber loss by 5
@@ -267,12 +252,7 @@ def depth_loss(distance: Tensor, target: Tensor) -> Tensor:
 def target_colors(
     image: Tensor, coverage: Tensor, recorded_on: Tensor, background: Tensor, config: InstaConfig
 ) -> Tensor:
-    """Colours of (R, 3) pixels on another background than the one they were recorded on.
-
-    Parameters
-    ----------
-    coverage : (R, 1) in [0, 1].
-    """
+    """Colours of (R, 3) pixels, (R, 1) covered, on another background than the one they were recorded on."""
     if config.target_variant == "official":
         own = (image - (1 - coverage) * recorded_on).clamp(0, 1) / coverage.clamp_min(1 / 255)
         mixed = coverage * to_linear(own.clamp(0, 1)) + (1 - coverage) * to_linear(background)

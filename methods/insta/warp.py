@@ -21,22 +21,13 @@ Variant = Literal["paper", "official"]
 
 @dataclass(frozen=True, eq=False)
 class Blend:
-    """Whose transforms carry a point.
+    """Whose transforms carry a point, with weights exp(-falloff distance to the centroid)."""
 
-    Attributes
-    ----------
-    neighbours : (F, 3) int32 triangles across the edges, -1 at a border.
-    own_falloff, neighbour_falloff : (F,) float32, per metre: weights exp(-falloff distance to the centroid). Where
-        ``own_falloff`` is negative the nearest triangle's transform alone is taken.
-    scaled : (F,) bool, whether the ratio of areas scales the transform.
-    root : whether it is the root of that ratio.
-    """
-
-    neighbours: IntArray
-    own_falloff: np.ndarray
-    neighbour_falloff: np.ndarray
-    scaled: np.ndarray
-    root: bool
+    neighbours: IntArray  # (F, 3) int32 triangles across the edges, -1 at a border
+    own_falloff: np.ndarray  # (F,) float32 per metre; negative: the nearest triangle's transform alone
+    neighbour_falloff: np.ndarray  # (F,) float32 per metre
+    scaled: np.ndarray  # (F,) bool, whether the ratio of areas scales the transform
+    root: bool  # whether it is the root of that ratio
 
     @classmethod
     def of(cls, head: HeadAsset, variant: Variant) -> Blend:
@@ -102,12 +93,7 @@ def areas(vertices: Tensor, faces: Tensor) -> Tensor:
 
 
 def canonical_from_posed(canonical: Tensor, posed: Tensor, faces: Tensor, blend: Blend) -> Tensor:
-    """(F, 3, 4) transforms that carry each posed triangle's surroundings to its canonical place.
-
-    Parameters
-    ----------
-    canonical, posed : (V, 3) vertices, metres.
-    """
+    """(F, 3, 4) transforms that carry each posed triangle's surroundings to its canonical place; (V, 3) metres."""
     target, source = triangle_bases(canonical, faces), triangle_bases(posed, faces)
     ratio = areas(canonical, faces) / areas(posed, faces).clamp_min(1e-12)
     scale = (ratio.sqrt() if blend.root else ratio).clamp(1 / SCALE_LIMIT, SCALE_LIMIT)
@@ -155,7 +141,8 @@ def nearest_triangles(points: Tensor, corners: Tensor) -> Found:
     Of equally near ones (a shared edge or corner) that whose plane is farthest is taken, which parts the space
     around a convex edge along its bisector.
     """
-    normals = _unit_normal(torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = torch.nn.functional.normalize(normals, dim=-1, eps=torch.finfo(normals.dtype).tiny)
     chunk = max(1, PAIRS_AT_ONCE // max(len(corners), 1))
     found = []
     for part in points.split(chunk):
@@ -215,24 +202,16 @@ def _to_segment(p: Tensor, start: Tensor, end: Tensor) -> Tensor:
     return (way * way).sum(-1)
 
 
-def _unit_normal(vectors: Tensor) -> Tensor:
-    return torch.nn.functional.normalize(vectors, dim=-1, eps=torch.finfo(vectors.dtype).tiny)
-
-
 MOUTH = ("lips", "teeth", "mouth_socket")
 HAIR = ("hair", "scalp", "boundary")
 
 
 def mouth_triangles(head: HeadAsset) -> Tensor:
     """(F,) bool: lips and what the head has inside the mouth."""
-    return _any(head, MOUTH)
+    return torch.from_numpy(np.logical_or.reduce([touching(head, region) for region in MOUTH]))
 
 
 def bare_triangles(head: HeadAsset) -> Tensor:
     """(F,) bool: where the mesh is the visible surface; hair stands off it, and the boundary is cut."""
-    hair = _any(head, HAIR)
-    return ~hair | torch.from_numpy(touching(head, "face"))
-
-
-def _any(head: HeadAsset, regions: tuple[str, ...]) -> Tensor:
-    return torch.from_numpy(np.logical_or.reduce([touching(head, region) for region in regions]))
+    hair = np.logical_or.reduce([touching(head, region) for region in HAIR])
+    return torch.from_numpy(~hair | touching(head, "face"))

@@ -1,4 +1,16 @@
-"""Settings that fit the toy head and train in seconds."""
+"""Settings that fit the toy head and train in seconds, and what is made of them."""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from headbench.methods.insta.config import InstaConfig
+from headbench.methods.insta.field import Architecture, Field, Prior
+from headbench.methods.insta.marching import CanonicalSurface, canonical_surface
+from headbench.methods.insta.occupancy import Occupancy
+from headbench.methods.insta.warp import mouth_triangles
+from headbench.methods.shared.subject_mesh import SubjectMesh
 
 SMALL = {
     "levels": 4,
@@ -21,3 +33,34 @@ SMALL = {
     "first_rays": 128,
     "images_per_iteration": 2,
 }
+
+
+class Stage(NamedTuple):
+    config: InstaConfig
+    surface: CanonicalSurface
+    occupancy: Occupancy
+    field: Field
+    mouth: torch.Tensor
+
+
+def make_stage(head, prior=None, **more):
+    """A blank field about a head at rest, with all cells occupied."""
+    config = InstaConfig(**{**SMALL, **more})
+    mesh = SubjectMesh(head, np.zeros(head.shape_basis.shape[2]), np.zeros_like(head.template), "cpu")
+    surface = canonical_surface(head, mesh, config)
+    occupancy = Occupancy(surface, config)
+    architecture = Architecture.of(config, head.expression_basis.shape[2])
+    field = Field(architecture, occupancy.box("cpu"), prior or Prior.of(config))
+    return Stage(config, surface, occupancy, field, mouth_triangles(head))
+
+
+def by_threads(function):
+    """What a function gives with one thread and with two."""
+    before, results = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            results.append(function())
+    finally:
+        torch.set_num_threads(before)
+    return results

@@ -8,35 +8,24 @@ from headbench.methods.insta import field as networks
 from headbench.methods.insta.config import InstaConfig
 from headbench.methods.insta.field import (
     Architecture,
-    Field,
     Prior,
     encode,
     encode_reference,
-    initial_weights,
+    initial_weight,
     layer_shapes,
     make_levels,
     network,
     table_rows,
 )
-from headbench.methods.insta.marching import canonical_surface
-from headbench.methods.insta.occupancy import Occupancy
 from headbench.methods.insta.rendering import Marching, PosedRays, camera_rays, render_rays
-from headbench.methods.insta.warp import mouth_triangles
-from headbench.methods.shared.subject_mesh import SubjectMesh
 
 from ..toy_clip import look_at
-from .small import SMALL
+from .small import by_threads, make_stage
 
 
 @pytest.fixture(scope="module")
 def stage(head):
-    config = InstaConfig(**SMALL)
-    mesh = SubjectMesh(head, np.zeros(head.shape_basis.shape[2]), np.zeros_like(head.template), "cpu")
-    surface = canonical_surface(head, mesh, config)
-    occupancy = Occupancy(surface, config)
-    architecture = Architecture.of(config, head.expression_basis.shape[2])
-    field = Field(architecture, occupancy.box("cpu"), Prior.of(config))
-    return config, surface, occupancy, field, mouth_triangles(head)
+    return make_stage(head)
 
 
 def scenes_of(surface, count=2):
@@ -172,16 +161,13 @@ def test_the_reference_passes_gradcheck():
 def test_gradients_do_not_depend_on_the_number_of_threads():
     levels = small_levels()
     positions = torch.rand(5000, 3, generator=torch.Generator().manual_seed(5))
-    before, gradients = torch.get_num_threads(), []
-    try:
-        for threads in (1, 2):
-            torch.set_num_threads(threads)
-            table = torch.zeros(table_rows(levels), 4, requires_grad=True)
-            encode(positions, table, levels).square().add(encode(positions, table, levels)).sum().backward()
-            gradients.append(table.grad)
-    finally:
-        torch.set_num_threads(before)
-    assert torch.equal(*gradients)
+
+    def gradient():
+        table = torch.zeros(table_rows(levels), 4, requires_grad=True)
+        encode(positions, table, levels).square().add(encode(positions, table, levels)).sum().backward()
+        return table.grad
+
+    assert torch.equal(*by_threads(gradient))
 
 
 def test_a_table_that_does_not_fit_its_levels_is_refused():
@@ -204,7 +190,8 @@ def test_values_and_gradients_are_those_of_autograd(constants, layers, monkeypat
     inputs = torch.randn(53, 5, generator=generator, dtype=torch.float64)
     others = torch.randn(4, constants, generator=generator, dtype=torch.float64)
     rows = torch.randint(4, (53,), generator=generator)
-    weights = [w.double() for w in initial_weights(layer_shapes(5 + constants, 7, layers, 2), generator)]
+    shapes = layer_shapes(5 + constants, 7, layers, 2)
+    weights = [initial_weight(shape, generator).double() for shape in shapes]
     gradient = torch.randn(53, 2, generator=generator, dtype=torch.float64)
     results = []
     for function in (network, network_reference):

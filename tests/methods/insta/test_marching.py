@@ -12,6 +12,7 @@ from headbench.methods.insta.rendering import camera_rays
 
 from ...datasets.head.toy import toy_head
 from ..toy_clip import look_at
+from .small import by_threads
 
 pytestmark = pytest.mark.skipif(
     kernel.load() is None, reason="INSTA's kernel is not installed: no C++ compiler was found"
@@ -133,14 +134,7 @@ def test_rays_along_axes_and_rays_from_within_are_marched(pair, space):
 
 
 def test_marching_does_not_depend_on_the_number_of_threads(pair, space):
-    before, results = torch.get_num_threads(), []
-    try:
-        for threads in (1, 2):
-            torch.set_num_threads(threads)
-            results.append(all_samples(pair[0], fan(20), space, 16))
-    finally:
-        torch.set_num_threads(before)
-    for one, other in zip(*results):
+    for one, other in zip(*by_threads(lambda: all_samples(pair[0], fan(20), space, 16))):
         np.testing.assert_array_equal(one, other)
 
 

@@ -1,27 +1,19 @@
 """The grid: what is occupied can be reached, what is empty is dropped, and nothing depends on how often one asks."""
 
 import numpy as np
-import pytest
 import torch
 
 from headbench.methods.insta.config import InstaConfig
-from headbench.methods.insta.field import Architecture, Field, Prior
-from headbench.methods.insta.marching import canonical_surface
-from headbench.methods.insta.occupancy import Occupancy, occupied_space
-from headbench.methods.insta.warp import mouth_triangles
-from headbench.methods.shared.subject_mesh import SubjectMesh
+from headbench.methods.insta.field import Prior
+from headbench.methods.insta.occupancy import occupied_space
 
-from .small import SMALL
+from .small import make_stage
 
-
-@pytest.fixture(scope="module")
-def surface(head):
-    mesh = SubjectMesh(head, np.zeros(head.shape_basis.shape[2]), np.zeros_like(head.template), "cpu")
-    return canonical_surface(head, mesh, InstaConfig(**SMALL))
+SMALL_DECAY = InstaConfig().occupancy_decay
 
 
-def test_occupied_cells_are_within_their_triangles_reach(surface):
-    occupancy = Occupancy(surface, InstaConfig(**SMALL))
+def test_occupied_cells_are_within_their_triangles_reach(head):
+    _, surface, occupancy, *_ = make_stage(head)
     rng = np.random.default_rng(0)
     chosen = rng.choice(occupancy.candidates, size=60, replace=False)
     space = occupied_space(occupancy, chosen)
@@ -34,9 +26,8 @@ def test_occupied_cells_are_within_their_triangles_reach(surface):
     assert within.mean() > 0.998
 
 
-def test_candidates_are_the_shell_around_the_mesh(surface):
-    config = InstaConfig(**SMALL)
-    occupancy = Occupancy(surface, config)
+def test_candidates_are_the_shell_around_the_mesh(head):
+    config, surface, occupancy, *_ = make_stage(head)
     rng = np.random.default_rng(1)
     size = occupancy.size
     points = (occupancy.low + occupancy.cell * size * rng.random((3000, 3))).astype(np.float32)
@@ -47,42 +38,35 @@ def test_candidates_are_the_shell_around_the_mesh(surface):
     assert not inside[distances > config.shell_outside + 2 * occupancy.cell].any()
 
 
-def refreshed(head, surface, prior, rounds=1, whole=True):
-    config = InstaConfig(**SMALL)
-    occupancy = Occupancy(surface, config)
-    field = Field(Architecture.of(config, 8), occupancy.box("cpu"), prior)
-    parameters = field.architecture.initial(0)
+def refreshed(head, prior, rounds=1, whole=True, occupancy=None):
+    stage = make_stage(head, prior)
+    occupancy = occupancy or stage.occupancy
+    parameters = stage.field.architecture.initial(0)
     for iteration in range(rounds):
-        occupancy.refresh(field, parameters, torch.zeros(8), mouth_triangles(head), 5, iteration, whole=whole)
+        what = (stage.field, parameters, torch.zeros(8), stage.mouth)
+        occupancy.refresh(*what, 5, iteration, whole=whole)
     return occupancy
 
 
-def test_empty_and_dense_fields_occupy_nothing_and_everything(head, surface):
-    empty = refreshed(head, surface, Prior(-200, 0, 1))
+def test_empty_and_dense_fields_occupy_nothing_and_everything(head):
+    empty = refreshed(head, Prior(-200, 0, 1))
     assert not empty.occupied.any()
     assert (empty.space().reach < 0).all()
-    assert refreshed(head, surface, Prior(5, 0, 1)).occupied.all()
+    dense = refreshed(head, Prior(5, 0, 1))
+    assert dense.occupied.all()
+    before = dense.values.copy()
+    refreshed(head, Prior(-200, 0, 1), occupancy=dense)
+    np.testing.assert_allclose(dense.values, SMALL_DECAY * before, rtol=1e-6)
 
 
-def test_a_field_that_hugs_the_mesh_leaves_a_thin_shell(head, surface):
-    thin = refreshed(head, surface, Prior(6, 50, 0.001))
+def test_a_field_that_hugs_the_mesh_leaves_a_thin_shell(head):
+    thin = refreshed(head, Prior(6, 50, 0.001))
     distances = thin._distances[thin.occupied]
     assert 0.05 < thin.occupied.mean() < 0.7
     assert distances.max() < 0.012
 
 
-def test_values_decay_where_the_field_empties(head, surface):
-    config = InstaConfig(**SMALL)
-    occupancy = refreshed(head, surface, Prior(5, 0, 1))
-    before = occupancy.values.copy()
-    field = Field(Architecture.of(config, 8), occupancy.box("cpu"), Prior(-200, 0, 1))
-    occupancy.refresh(
-        field, field.architecture.initial(0), torch.zeros(8), mouth_triangles(head), 5, 1, whole=True
-    )
-    np.testing.assert_allclose(occupancy.values, config.occupancy_decay * before, rtol=1e-6)
-
-
-def test_partial_refreshes_reach_every_cell(head, surface):
-    one, other = (refreshed(head, surface, Prior(3, 0, 1), rounds=40, whole=False) for _ in range(2))
+def test_partial_refreshes_reach_every_cell(head):
+    one, other = (refreshed(head, Prior(3, 0, 1), rounds=40, whole=False) for _ in range(2))
     assert np.isfinite(one.values).mean() > 0.99
     np.testing.assert_array_equal(one.values, other.values)

@@ -77,15 +77,6 @@ def test_a_slab_of_constant_density_absorbs_by_beer_and_lambert(density):
     assert result.distance.item() == pytest.approx(mean, rel=2e-3)
 
 
-def test_emission_follows_the_integral():
-    # Colour t in a slab of density 30, integrated on a grid a hundred times finer.
-    density, fine = 30.0, np.linspace(0.5, 0.9, 400_001)
-    integrand = density * np.exp(-density * (fine - 0.5)) * fine
-    expected = np.trapezoid(integrand, fine)
-    result = along(lambda t: torch.full_like(t, density), lambda t: t[:, None])
-    assert result.color.item() == pytest.approx(expected, rel=2e-5)
-
-
 def random_rays(seed=0, samples=60, rays=9):
     generator = torch.Generator().manual_seed(seed)
     owner = torch.randint(rays - 2, (samples,), generator=generator).sort().values + 1  # first and last: none

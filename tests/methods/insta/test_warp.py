@@ -20,7 +20,6 @@ from headbench.methods.insta.warp import (
     nearest_triangles,
     squared_distances,
     touching,
-    triangle_bases,
 )
 
 from ...datasets.head.toy import toy_head
@@ -73,18 +72,6 @@ def test_the_official_warp_scales_the_eye_region_alone(head):
     assert eyes.any()
     torch.testing.assert_close(scales[eyes], torch.full_like(scales[eyes], 1.3**-2))
     torch.testing.assert_close(scales[~eyes], torch.ones_like(scales[~eyes]))
-
-
-def test_frames_are_rotations_with_the_normal_last(head):
-    vertices, faces = pieces(head)
-    bases = triangle_bases(vertices, faces)
-    turns = bases[:, :, :3]
-    torch.testing.assert_close(turns @ turns.mT, torch.eye(3).double().expand_as(turns), atol=1e-10, rtol=0)
-    assert (torch.linalg.det(turns) > 0).all()
-    corners = vertices[faces]
-    edge = torch.nn.functional.normalize(corners[:, 1] - corners[:, 0], dim=1)
-    torch.testing.assert_close(turns[:, :, 0], -edge, atol=1e-10, rtol=0)
-    assert ((corners[:, 2] - corners[:, 0]) * turns[:, :, 2]).sum(1).abs().max() < 1e-10
 
 
 def test_neighbours_are_those_that_share_an_edge(head):
@@ -151,15 +138,6 @@ def test_squared_distances_agree_with_dense_sampling(seed):
     spacing = np.linalg.norm(corners[0] - np.roll(corners[0], 1, axis=0), axis=1).max() / SIDE
     assert (exact <= dense + 1e-9).all()
     assert (dense <= exact + spacing).all()
-
-
-def test_closed_forms_over_face_edge_and_corner():
-    corners = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]], dtype=torch.float64)
-    points = torch.tensor(
-        [[0.2, 0.3, 2], [0.5, -3, 4], [-3, -4, 0], [1, 1, 0], [2, 0, 1]], dtype=torch.float64
-    )
-    expected = torch.tensor([4.0, 25.0, 25.0, 0.5, 2.0], dtype=torch.float64)
-    torch.testing.assert_close(squared_distances(points, corners)[:, 0], expected)
 
 
 def test_space_around_a_convex_edge_is_parted_along_the_bisector():
