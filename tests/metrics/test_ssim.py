@@ -1,10 +1,8 @@
 import numpy as np
 import pytest
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from skimage.metrics import structural_similarity
-from torch.nn import functional
 
 from headbench.bench.errors import InputError
 from headbench.metrics import pairs as structural
@@ -39,28 +37,6 @@ def noisy_pair(seed, height=24, width=19, noise=25.0):
     truth = 127 + 120 * waves
     image = truth + rng.normal(0, noise, truth.shape)
     return tuple(np.clip(a, 0, 255).round().astype(np.uint8) for a in (image, truth))
-
-
-def brute_force_map(image, truth):
-    """The definition, window by window, with weighted means taken about the mean."""
-    offsets = np.arange(-5, 6)
-    weights = np.exp(-(offsets[:, None] ** 2 + offsets[None] ** 2) / (2 * 1.5**2))
-    weights /= weights.sum()
-    height, width, channels = image.shape
-    out = np.empty((height - 10, width - 10, channels))
-    for i, j, c in np.ndindex(*out.shape):
-        x, y = (a[i : i + 11, j : j + 11, c].astype(float) for a in (image, truth))
-        mx, my = (weights * x).sum(), (weights * y).sum()
-        vx, vy = (weights * (x - mx) ** 2).sum(), (weights * (y - my) ** 2).sum()
-        cov = (weights * (x - mx) * (y - my)).sum()
-        c1, c2 = (0.01 * 255) ** 2, (0.03 * 255) ** 2
-        out[i, j, c] = (2 * mx * my + c1) * (2 * cov + c2) / ((mx**2 + my**2 + c1) * (vx + vy + c2))
-    return out
-
-
-def test_the_map_equals_a_loop_over_windows():
-    pair = noisy_pair(0)
-    np.testing.assert_allclose(ssim_map(*pair), brute_force_map(*pair), atol=1e-10)
 
 
 GAUSSIAN = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
@@ -107,32 +83,6 @@ def test_without_the_kernel_numpy_gives_the_same(name, monkeypatch):
     monkeypatch.setitem(structural.KERNEL.__dict__, "imported", ImportError("missing"))
     assert FORMS[name](image, truth) == pytest.approx(expected[0], abs=1e-12)
     assert FORMS[name].in_regions(image, truth, masks) == pytest.approx(expected[1], abs=1e-12)
-
-
-def padded_map(image, truth, weights, pad):
-    """SSIM of every pixel in plain torch float64: convolutions of a padded image, as training losses write it."""
-    x, y = (torch.tensor(a, dtype=torch.float64).permute(2, 0, 1)[:, None] / 255 for a in (image, truth))
-    window = torch.tensor(np.outer(weights, weights))[None, None]
-
-    def mean(values):
-        return functional.conv2d(pad(values), window)
-
-    mx, my = mean(x), mean(y)
-    vx, vy, cov = mean(x * x) - mx * mx, mean(y * y) - my * my, mean(x * y) - mx * my
-    top = (2 * mx * my + 0.01**2) * (2 * cov + 0.03**2)
-    return top / ((mx * mx + my * my + 0.01**2) * (vx + vy + 0.03**2))
-
-
-@pytest.mark.parametrize(
-    ("form", "mode"), [(ssim_zero_border, "constant"), (ssim_reflected, "reflect")], ids=["zero", "reflect"]
-)
-@settings(deadline=None, max_examples=15)
-@given(st.integers(0, 2**32 - 1), st.integers(6, 30), st.integers(6, 60))
-def test_borders_equal_a_padded_convolution(form, mode, seed, height, width):
-    image, truth = noisy_pair(seed, height, width)
-    weights = SsimForm().weights
-    expected = padded_map(image, truth, weights, lambda v: functional.pad(v, (5, 5, 5, 5), mode=mode)).mean()
-    assert form(image, truth) == pytest.approx(float(expected), abs=1e-10)
 
 
 @EVERY_FORM
