@@ -191,22 +191,13 @@ class TappedNetwork(nn.Module):
 
 @dataclass(frozen=True)
 class NetworkSpec:
-    """A feature network of LPIPS and where its weights are published.
+    """A feature network of LPIPS and where its weights are published."""
 
-    Attributes
-    ----------
-    name : as `Lpips` and the files of linear layers call it.
-    channels : of each tapped layer, shallow to deep.
-    smallest : pixels that height and width must have for the deepest layer to see anything.
-    file : published name; its last part before the suffix begins the SHA-256 of the content.
-    features_file : customary name of a file with the convolutional part alone.
-    """
-
-    name: str
-    channels: tuple[int, ...]
-    smallest: int
-    file: str
-    features_file: str
+    name: str  # as `Lpips` and the files of linear layers call it
+    channels: tuple[int, ...]  # of each tapped layer, shallow to deep
+    smallest: int  # pixels that height and width must have for the deepest layer to see anything
+    file: str  # published name; its last part before the suffix begins the SHA-256 of the content
+    features_file: str  # customary name of a file with the convolutional part alone
 
     @property
     def url(self) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 
@@ -44,23 +44,16 @@ def write_contact_sheet(run_folder: Path, frames_per_task: int = FRAMES_PER_TASK
 
 @dataclass(frozen=True)
 class ComparedFrame:
-    """One frame at the size it is shown, ``section`` being the heading under which it stands.
-
-    Attributes
-    ----------
-    labels : short lines beside it (sequence, timestep, camera).
-    ground_truth : (H, W, 3) 8-bit.
-    renders : by method, of that size, or the reason why there is none.
-    errors : by method with a render, (H, W) absolute difference in levels, mean over the channels.
-    captions : by method, a short text under the render (its PSNR).
-    """
+    """One frame at the size it is shown, ``section`` being the heading under which it stands."""
 
     section: str
-    labels: Sequence[str]
-    ground_truth: ByteArray
-    renders: Mapping[str, ByteArray | str]
-    errors: Mapping[str, FloatArray]
-    captions: Mapping[str, str] = field(default_factory=dict)
+    labels: Sequence[str]  # short lines beside it (sequence, timestep, camera)
+    ground_truth: ByteArray  # (H, W, 3) 8-bit
+    renders: Mapping[str, ByteArray | str]  # by method, of that size, or the reason why there is none
+    errors: Mapping[
+        str, FloatArray
+    ]  # by method, (H, W) absolute difference in levels, mean over the channels
+    captions: Mapping[str, str]  # by method, a short text under the render (its PSNR)
 
     @classmethod
     def of(

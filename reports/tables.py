@@ -44,23 +44,17 @@ class Column:
 class TableCell:
     """A value, or why there is none.
 
-    Attributes
-    ----------
-    status : "ok", "missing" (could not or was not measured), "failed" (the method ended in an error), "published"
-        (a paper's figure, not measured) or "none" (no paper's figure).
-    value : full precision; None unless ok or published.
-    text : as displayed.
-    spread : standard deviation over seeds, as displayed; "" with one seed.
-    rank : 1 for all that may be the best, then 2, 3, ... for the next displayed values; None where nothing is ranked.
-    note : index into `Table.notes`, or None.
+    ``status`` is "ok", "missing" (could not or was not measured), "failed" (the method ended in an error), "published"
+    (a paper's figure, not measured) or "none" (no paper's figure). ``rank`` is 1 for all that may be the best, then 2,
+    3, ... for the next displayed values; None where nothing is ranked.
     """
 
     status: Literal["ok", "missing", "failed", "published", "none"]
-    value: float | None
-    text: str
-    spread: str = ""
+    value: float | None  # full precision; None unless ok or published
+    text: str  # as displayed
+    spread: str = ""  # standard deviation over seeds, as displayed; "" with one seed
     rank: int | None = None
-    note: int | None = None
+    note: int | None = None  # index into `Table.notes`
 
     @property
     def shown(self) -> str:

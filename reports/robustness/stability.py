@@ -31,43 +31,30 @@ SIGMAS = 3.0
 
 @dataclass(frozen=True)
 class Measures:
-    """What one frame shows.
+    """What one frame shows; without splats there are no measures of them.
 
-    Attributes
-    ----------
-    non_finite : share of the colours, the alpha and the splats' numbers that are infinite or not a number.
-    coverage : sum of alpha over the pixels.
-    translucent : of the pixels with alpha above 0.05, the share below 0.95.
-    largest_splat : radius (three deviations along its longest axis, projected) of the largest splat on screen
-        that has an opacity of at least 0.05, as a share of the image's height; None without splats.
-    mean_opacity : mean over the splats; None without splats.
+    The radius of the largest splat on screen with an opacity of at least 0.05 is three deviations along its longest
+    axis, projected, as a share of the image's height.
     """
 
-    non_finite: float
-    coverage: float
-    translucent: float
+    non_finite: (
+        float  # share of the colours, the alpha and the splats' numbers that are infinite or not a number
+    )
+    coverage: float  # sum of alpha over the pixels
+    translucent: float  # of the pixels with alpha above 0.05, the share below 0.95
     largest_splat: float | None = None
     mean_opacity: float | None = None
 
 
 @dataclass(frozen=True)
 class Limits:
-    """How far a frame may differ from its reference.
+    """How far a frame may differ from its reference."""
 
-    Attributes
-    ----------
-    coverage : least and largest ratio of the coverages.
-    translucent_rise : by how much the translucent share may rise.
-    splat_growth, splat_share : the largest splat may have this many times the radius of the reference's, and in
-        any case this share of the image's height.
-    opacity : least and largest ratio of the mean opacities.
-    """
-
-    coverage: tuple[float, float] = (0.8, 1.25)
-    translucent_rise: float = 0.1
-    splat_growth: float = 2.0
-    splat_share: float = 0.1
-    opacity: tuple[float, float] = (0.67, 1.5)
+    coverage: tuple[float, float] = (0.8, 1.25)  # least and largest ratio of the coverages
+    translucent_rise: float = 0.1  # by how much the translucent share may rise
+    splat_growth: float = 2.0  # how many times the reference's radius the largest splat may have
+    splat_share: float = 0.1  # of the image's height, which the largest splat may have in any case
+    opacity: tuple[float, float] = (0.67, 1.5)  # least and largest ratio of the mean opacities
 
 
 EXPRESSION_LIMITS = Limits()
@@ -184,20 +171,15 @@ class JudgedFrame:
 class RobustnessCase:
     """One avatar and the frames that it is rendered for.
 
-    Attributes
-    ----------
-    name : for the progress.
-    clips, keys, sizes : of the protocol: captures that take part, frames, sizes of images (width, height).
-    condition : of the protocol: what is rendered in words, and a fingerprint of it.
-    render : renders and judges all frames and reports how many are done; also returns entries of the record.
+    ``render`` renders and judges all frames and reports how many are done; it also returns entries of the record.
     """
 
     job: Job
-    name: str
-    clips: Sequence[Clip]
-    keys: Sequence[FrameKey]
-    sizes: Sequence[tuple[int, int]]
-    condition: tuple[str, str]
+    name: str  # for the progress
+    clips: Sequence[Clip]  # that take part in the protocol
+    keys: Sequence[FrameKey]  # of the protocol
+    sizes: Sequence[tuple[int, int]]  # of the images, (width, height)
+    condition: tuple[str, str]  # what is rendered in words, and a fingerprint of it
     render: Callable[[Callable[[int], None]], tuple[list[JudgedFrame], dict[str, Any]]]
 
     @property

@@ -82,15 +82,8 @@ def counted(number: int, noun: str) -> str:
 class PairedComparison:
     """First method minus second on one metric of one task; the subject is the unit.
 
-    Attributes
-    ----------
-    differences : by subject, means over frames, sequences and seeds.
-    seeds : how many of each method.
-    difference : their mean over subjects, in the metric's unit; None where a method lacks values (``reason``).
-    low, high : confidence interval of that mean over the population of subjects; None with too few of them.
-    effect : mean over the standard deviation of the subjects' differences (Cohen's d_z); None where that is 0.
-    p, p_holm : of the exact sign-flip test, alone and corrected for the ``family`` of comparisons of this metric.
-    level : of the test; one minus the confidence of the interval.
+    ``difference`` is None where a method lacks values (``reason``); the interval (``low``, ``high``) over the population
+    of subjects where they are too few.
     """
 
     task: str
@@ -98,16 +91,18 @@ class PairedComparison:
     higher_is_better: bool
     first: str
     second: str
-    level: float = LEVEL
-    differences: tuple[tuple[str, float], ...] = ()
-    seeds: tuple[int, int] = (0, 0)
-    difference: float | None = None
+    level: float = LEVEL  # of the test; one minus the confidence of the interval
+    differences: tuple[tuple[str, float], ...] = ()  # by subject, means over frames, sequences and seeds
+    seeds: tuple[int, int] = (0, 0)  # how many of each method
+    difference: float | None = None  # mean over subjects, in the metric's unit
     low: float | None = None
     high: float | None = None
-    effect: float | None = None
-    p: float | None = None
-    p_holm: float | None = None
-    family: int = 0
+    effect: float | None = (
+        None  # mean over standard deviation of the differences (Cohen's d_z); None where that is 0
+    )
+    p: float | None = None  # of the exact sign-flip test alone
+    p_holm: float | None = None  # corrected for the family
+    family: int = 0  # comparisons of this metric
     reason: str = ""
 
     @property

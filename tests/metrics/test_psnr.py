@@ -103,6 +103,13 @@ def test_the_kernel_equals_numpy_exactly(pair, regions, seed):
     np.testing.assert_array_equal(structural.squared_errors(*pair, masks), expected)
 
 
+def test_without_the_kernel_numpy_gives_the_same(monkeypatch):
+    image, truth = np.random.default_rng(0).integers(0, 256, (2, 9, 14, 3), dtype=np.uint8)
+    expected = psnr(image, truth)
+    monkeypatch.setitem(structural.KERNEL.__dict__, "imported", ImportError("missing"))
+    assert psnr(image, truth) == expected
+
+
 def test_sums_beyond_32_bits_are_exact():
     white = np.full((3000, 2000, 3), 255, np.uint8)
     sums = structural.squared_errors(np.zeros_like(white), white, np.ones((1, 3000, 2000), np.uint8))

@@ -4,8 +4,10 @@ import pytest
 from PIL import Image
 
 from headbench.bench.errors import InputError
+from headbench.bench.registry import resolve
 from headbench.bench.rows import Rows
 from headbench.bench.runner.store import RunFolder
+from headbench.reports import specs
 from headbench.reports.contact_sheet import write_contact_sheet
 from headbench.reports.runs import RunData, RunSet, evenly_spaced
 from headbench.reports.table_report import layouts, table_of, table_text, write_tables
@@ -85,6 +87,11 @@ def test_a_damaged_render_is_named(toy_run):
     path.write_bytes(b"no image")
     with pytest.raises(InputError, match=path.name):
         table_text([toy_run])
+
+
+@pytest.mark.parametrize("name", ["TABLE", "TABLE_TEXT", "CONTACT_SHEET"])
+def test_every_report_is_there(name):
+    assert callable(resolve(getattr(specs, name).implementation))
 
 
 def test_the_number_under_an_image_is_that_of_the_whole_image(toy_run):

@@ -162,7 +162,7 @@ def test_a_plot_without_measured_costs_is_drawn(tmp_path):
 
 
 def test_a_matplotlibrc_changes_no_plot(tmp_path):
-    points = [point("half"), point("", 21.0, 2.0)]
+    points = [point("half"), point("", 21.0, 2.0, 5.0)]
     write_plot(tmp_path / "a.png", points, COSTS, "PSNR", higher_is_better=True)
     with rc_context({"text.usetex": True, "savefig.dpi": 30, "axes.facecolor": "red"}):
         write_plot(tmp_path / "b.png", points, COSTS, "PSNR", higher_is_better=True)
