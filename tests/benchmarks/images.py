@@ -17,7 +17,7 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from ...bench.contracts import ByteArray, Progress, no_progress
 from ...bench.errors import UnavailableError
 from ...bench.specs import Findings
-from ...metrics.lpips_network import Lpips, find_backbone, load_backbone, network_spec
+from ...metrics.lpips_network import ALEX, Lpips, find_backbone, load_backbone
 from ...metrics.psnr import psnr
 from ...metrics.ssim import Ssim, ssim, ssim_map, ssim_reflected
 from .timing import take_turns
@@ -67,7 +67,7 @@ def structural_ways(pairs: Pairs, pool: ThreadPoolExecutor) -> dict[str, Ways]:
 
 def lpips_ways(pairs: Pairs) -> Ways:
     """LPIPS (AlexNet) of every pair, summed. Raises `UnavailableError` without weights."""
-    spec = network_spec("alex")
+    spec = ALEX
     weights = find_backbone(spec)
     fresh, cached = Lpips(weights=weights, cache_mb=0), Lpips(weights=weights, cache_mb=1e4)
     sum(cached.batched(pairs))  # another method's turn: the ground truth is known from then on
