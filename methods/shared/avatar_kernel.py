@@ -76,7 +76,7 @@ def shade(
     binding: Tensor | None = None,
     backend: str = "cpu",
 ) -> Tensor:
-    """Colours (N, 3) >= 0 as a camera sees them: the compiled form of `sh.sh_to_rgb` along the ways from the camera.
+    """Colours (N, 3) >= 0 as a camera sees them: the compiled form of `networks.sh_to_rgb` along the ways from the camera.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ def shade_network(
     binding: Tensor,
     backend: str = "cpu",
 ) -> Tensor:
-    """Colours (N, 3) >= 0 as a camera sees them: the compiled form of `ours_field.shade_directions`.
+    """Colours (N, 3) >= 0 as a camera sees them: the compiled form of `ours.field.shade_directions`.
 
     Parameters
     ----------
@@ -133,7 +133,7 @@ def offsets_into(
     last_bias: Tensor,
     backend: str = "cpu",
 ) -> None:
-    """Write offsets into the rows ``splats`` of (N, D) ``out``: the compiled form of `feature_lines.line_offsets`.
+    """Write offsets into the rows ``splats`` of (N, D) ``out``: the compiled form of `ours.field.line_offsets`.
 
     Units of the first layer that no place on the lines turns on are left out of the whole frame, those that none of a
     few neighbours turns on are left out of their second layer.
