@@ -8,7 +8,10 @@ import select
 import signal
 import sys
 import traceback
+from dataclasses import replace
 from importlib.metadata import version
+from types import NoneType, UnionType
+from typing import Any, Union, get_args
 
 import tyro
 
@@ -77,8 +80,36 @@ def _call(words: list[str]) -> int:
     description += f" `headbench --version` prints the version.\n\n{EXIT_CODES}"
     config = (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
     return tyro.extras.subcommand_cli_from_dict(
-        commands, prog="headbench", description=description, args=words, config=config
+        commands,
+        prog="headbench",
+        description=description,
+        args=words,
+        config=config,
+        registry=_optional_values(),
     )
+
+
+def _optional_values() -> tyro.constructors.ConstructorRegistry:
+    """How options that may be left out (``str | None``) are read and shown: as their values are."""
+    registry = tyro.constructors.ConstructorRegistry()
+
+    @registry.primitive_rule
+    def optional(
+        info: tyro.constructors.PrimitiveTypeInfo,
+    ) -> tyro.constructors.PrimitiveConstructorSpec[Any] | None:
+        kinds = get_args(info.type)
+        if info.type_origin not in (Union, UnionType) or len(kinds) != 2 or NoneType not in kinds:
+            return None
+        (kind,) = set(kinds) - {NoneType}
+        value = registry.get_primitive_spec(tyro.constructors.PrimitiveTypeInfo.make(kind, info.markers))
+        if isinstance(value, tyro.constructors.UnsupportedTypeAnnotationError):
+            return None
+        return replace(
+            value,
+            str_from_instance=lambda found: ["none"] if found is None else value.str_from_instance(found),
+        )
+
+    return registry
 
 
 if __name__ == "__main__":
