@@ -220,3 +220,15 @@ def test_known_shapes_and_others_are_transformed_as_defined(dtype):
         expected = to_world(frames, binding, means, *shape)
         for found, other in zip(carrier(frames, means, *shape), expected):
             np.testing.assert_allclose(found, other, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_harmonics_by_torch_are_those_by_the_kernel(turned):
+    """Float64 goes the way of torch."""
+    normal, binding = numbers(0), torch.arange(50) % 10
+    dc, rest, means, center = normal(50, 3), 0.3 * normal(50, 3, 15), normal(50, 3), normal(3)
+    turns = (mesh(normal, 10).rotation, binding) if turned else ()
+    found = avatar_kernel.HarmonicColors(dc, rest)(means, center, *turns)
+    exact = [value.double() if value.is_floating_point() else value for value in (means, center, *turns)]
+    expected = avatar_kernel.HarmonicColors(dc.double(), rest.double())(*exact)
+    np.testing.assert_allclose(found, expected, atol=2e-5)

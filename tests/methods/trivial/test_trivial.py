@@ -68,6 +68,12 @@ def test_the_background_is_exchanged_under_the_mask(clip, tmp_path):
     np.testing.assert_allclose(black, expected, atol=1e-6)
 
 
+@pytest.mark.parametrize("method", [MeanImage, NearestCamera])
+def test_a_pose_of_another_head_model_is_refused(method, clip, tmp_path):
+    with pytest.raises(InputError, match="head_model"):
+        fit(method(), clip, tmp_path).render(clip.cameras["00"], replace(clip.poses[0], head_model="another"))
+
+
 def test_storage_can_be_bounded(clip, tmp_path):
     avatar = fit(NearestCamera(NearestCameraConfig(max_timesteps=1)), clip, tmp_path)
     cameras = {key.camera for key in clip.splits["train"]}
