@@ -37,6 +37,7 @@ from .field import (
     plane_features,
     shade,
 )
+from .training_kernel import plane_colors, table_offsets, usable
 
 FLOATS_PER_FACE = 17 + 9 + 1  # triangle frame, turn to canonical, penalty weight
 
@@ -131,6 +132,9 @@ class OursAppearance:
 
     def offsets(self, optimiser: Optimiser, positions: Tensor, expression: Tensor, jaw: Tensor) -> Tensor:
         """(N, D) offsets; zero, and not computed, outside the lines' box."""
+        if usable(positions):
+            blended = blend_lines(optimiser["lines"], expression, jaw)
+            return table_offsets(optimiser, self.line_box, blended, positions)
         inside = self.line_box.contains(positions).nonzero().squeeze(1)
         unit = self.line_box.unit(positions.index_select(0, inside))
         blended = blend_lines(optimiser["lines"], expression, jaw)
@@ -148,6 +152,8 @@ class OursAppearance:
         if self._config.color == "sh":
             degree = min(self._config.sh_degree, iteration // self._degree_every)
             return harmonic_colors(optimiser["sh_dc"], optimiser["sh_rest"], -directions, degree)
+        if usable(positions):
+            return plane_colors(optimiser, self.plane_box, positions, directions)
         return shade(optimiser, plane_features(optimiser, self.plane_box, positions), directions)
 
     @torch.no_grad()

@@ -19,8 +19,9 @@ using namespace nb::literals;
 
 namespace headbench {
 
-void bind_avatar(nb::module_& m);    // avatar.cpp
-void bind_training(nb::module_& m);  // training.cpp
+void bind_avatar(nb::module_& m);            // avatar.cpp
+void bind_training(nb::module_& m);          // training.cpp
+void bind_network_training(nb::module_& m);  // network_training.cpp
 
 namespace {
 
@@ -203,5 +204,6 @@ NB_MODULE(_kernel, m) {
         "Add the gradients of drawn splats; write those of background and camera. An empty grad_absolute asks for none.");
   bind_avatar(m);
   bind_training(m);
+  bind_network_training(m);
   m.def("instruction_sets", [] { return names_of(runnable_kernels()); }, "Variants this machine can run, the fastest first.");
 }

@@ -4,6 +4,7 @@
 #include "backward.h"
 #include "binning.h"
 #include "forward.h"
+#include "network_passes.h"
 #include "networks.h"
 #include "projection_backward.h"
 #include "training.h"

@@ -1,0 +1,467 @@
+// The training passes of the two networks of "ours" as a Python module's classes. Splats are dealt out to threads in
+// chunks that do not depend on their number; a chunk's gradients by weights are summed in an accumulator of its own, and
+// accumulators are added in order. A row of a plane belongs to one thread, which adds to it splat by splat. Results are
+// therefore equal bit for bit for any number of threads.
+#include "network_training.h"
+
+#include <nanobind/stl/unique_ptr.h>
+
+#include <algorithm>
+#include <cstring>
+#include <memory>
+#include <string>
+#include <utility>
+#include <vector>
+
+#include "bench/native/module.h"
+#include "bench/native/thread_pool.h"
+#include "workspace.h"
+
+namespace nb = nanobind;
+using namespace nb::literals;
+
+namespace headbench {
+namespace {
+
+constexpr std::int64_t kChunkMin = 2048;  // splats
+constexpr std::int64_t kChunksMax = 32;
+constexpr std::int64_t kSumsPerTask = 8192;  // floats
+constexpr int kBandRows = 16;                // of a plane
+
+std::int64_t divided_up(std::int64_t value, std::int64_t by) { return (value + by - 1) / by; }
+std::int64_t rounded_up(std::int64_t value, std::int64_t step) { return divided_up(value, step) * step; }
+
+// A multiple of kUnitsStep as an odd number of cache lines.
+int odd_stride(std::int64_t width) {
+  static_assert(kUnitsStep * sizeof(float) == 64);
+  return static_cast<int>(width + (width / kUnitsStep % 2 ? 0 : kUnitsStep));
+}
+
+// (rows, columns) numbers in rows of `stride`, zeros behind them.
+Buffer<float>& pad(Buffer<float>& to, const float* from, std::int64_t rows, std::int64_t columns, std::int64_t padded_rows,
+                   std::int64_t stride) {
+  std::memset(to.resize(padded_rows * stride), 0, padded_rows * stride * sizeof(float));
+  for (std::int64_t row = 0; row < rows; ++row) std::copy_n(from + row * columns, columns, to.data() + row * stride);
+  return to;
+}
+
+Buffer<float>& pad_transposed(Buffer<float>& to, const float* from, std::int64_t rows, std::int64_t columns,
+                              std::int64_t padded_rows, std::int64_t stride) {
+  std::memset(to.resize(padded_rows * stride), 0, padded_rows * stride * sizeof(float));
+  for (std::int64_t row = 0; row < rows; ++row)
+    for (std::int64_t column = 0; column < columns; ++column)
+      to.data()[column * stride + row] = from[row * columns + column];
+  return to;
+}
+
+void unpad(const float* from, std::int64_t rows, std::int64_t columns, std::int64_t stride, float* to) {
+  for (std::int64_t row = 0; row < rows; ++row) std::copy_n(from + row * stride, columns, to + row * columns);
+}
+
+// Call body(begin, end, worker's scratch) for chunks of `count` entries.
+template <class Body>
+void share_out(std::int64_t count, std::int64_t chunk, std::size_t scratch_floats, int threads, const Body& body) {
+  const std::size_t stride = rounded_up(static_cast<std::int64_t>(scratch_floats), 16);
+  Buffer<float> scratch;
+  scratch.resize(stride * threads);
+  ThreadPool::instance().run(divided_up(count, chunk), threads, [&](std::int64_t task, int worker) {
+    body(task * chunk, std::min((task + 1) * chunk, count), scratch.data() + stride * worker);
+  });
+}
+
+// Call body(begin, end, accumulator, scratch) for chunks of `count` entries; the sums over all of them in the first
+// `floats` numbers of what is returned.
+template <class Body>
+void sum_chunks(const NetworkKernels& kernels, std::int64_t count, std::size_t floats, std::size_t scratch_floats, int threads,
+                Buffer<float>& sums, const Body& body) {
+  const std::int64_t chunk = std::max(kChunkMin, rounded_up(divided_up(count, kChunksMax), kTrainingTile));
+  const std::int64_t chunks = std::max<std::int64_t>(divided_up(count, chunk), 1);
+  const std::size_t stride = rounded_up(static_cast<std::int64_t>(floats), 16);
+  sums.resize(stride * chunks);
+  if (count == 0) std::fill_n(sums.data(), floats, 0.0f);
+  share_out(count, chunk, scratch_floats, threads, [&](std::int64_t begin, std::int64_t end, float* scratch) {
+    float* own = sums.data() + begin / chunk * stride;
+    std::fill_n(own, floats, 0.0f);
+    body(begin, end, own, scratch);
+  });
+  const std::int64_t all = static_cast<std::int64_t>(floats);
+  ThreadPool::instance().run(divided_up(all, kSumsPerTask), threads, [&](std::int64_t task, int) {
+    const std::int64_t begin = task * kSumsPerTask, end = std::min(begin + kSumsPerTask, all);
+    for (std::int64_t other = 1; other < chunks; ++other)
+      kernels.add(sums.data() + begin, sums.data() + other * stride + begin, end - begin);
+  });
+}
+
+Grid grid_of(const Array<const float, 2, 3>& box, std::size_t samples) {
+  require(samples >= 2 && samples < (std::size_t{1} << 15));
+  Grid grid{};
+  for (int axis = 0; axis < 3; ++axis) {
+    grid.low[axis] = box(0, axis);
+    grid.extent[axis] = box(1, axis) - box(0, axis);
+  }
+  grid.samples = static_cast<int>(samples);
+  return grid;
+}
+
+using Plane = Array<const float, -1, -1>;
+
+// What both passes over the colours are given.
+struct ColorInputs {
+  Array<const float, -1, 3> positions, directions;
+  Plane xy, xz, yz, first, last;
+  Array<const float, 2, 3> box;
+};
+
+class ColorPass {
+ public:
+  ColorPass(const ColorInputs& in, const Array<const std::int64_t, -1>& splats, const Array<float, -1, 3>& colors,
+            const NetworkKernels& kernels, int threads)
+      : kernels_(kernels), count_(static_cast<std::int64_t>(splats.shape(0))), all_(in.positions.shape(0)) {
+    ColorTraining net = describe(in);
+    require(colors.shape(0) == all_);
+    std::copy_n(splats.data(), count_, splats_.resize(count_));
+    for (std::int64_t i = 0; i < count_; ++i)
+      require(splats_.data()[i] >= 0 && static_cast<std::size_t>(splats_.data()[i]) < all_);
+    net.splats = splats_.data();
+    net.kept_hidden = hidden_.resize(rounded_up(count_, kGroupRows) * net.units);
+    net.colors = colors.data();
+    Buffer<float> first, last;
+    net.first = pad_transposed(first, in.first.data(), hidden_units_, input_count_, net.inputs, net.units_stride).data();
+    net.last = pad(last, in.last.data(), 3, hidden_units_, 3, net.units).data();
+    nb::gil_scoped_release unlocked;
+    share_out(count_, kChunkMin, kernels_.color_forward_scratch(net), threads,
+              [&](std::int64_t begin, std::int64_t end, float* scratch) { kernels_.color_forward(net, begin, end, scratch); });
+  }
+
+  void backward(const ColorInputs& in, const Array<const float, -1, 3>& colors, const Array<const float, -1, 3>& by_colors,
+                const Array<float, -1, 3>& by_positions, const Array<float, -1, 3>& by_directions,
+                const Array<float, -1, -1>& by_xy, const Array<float, -1, -1>& by_xz, const Array<float, -1, -1>& by_yz,
+                const Array<float, -1, -1>& by_first, const Array<float, -1, -1>& by_last, int threads) const {
+    ColorTraining net = describe(in);
+    require(colors.shape(0) == all_ && by_colors.shape(0) == all_);
+    require(by_positions.shape(0) == all_ && by_directions.shape(0) == all_);
+    require(by_first.shape(0) == in.first.shape(0) && by_first.shape(1) == in.first.shape(1));
+    require(by_last.shape(0) == 3 && by_last.shape(1) == in.last.shape(1));
+    const Array<float, -1, -1>* by_planes[kPlanes] = {&by_xy, &by_xz, &by_yz};
+    for (int plane = 0; plane < kPlanes; ++plane) {
+      require(by_planes[plane]->shape(0) == in.xy.shape(0));
+      require(static_cast<int>(by_planes[plane]->shape(1)) == net.channels[plane]);
+      net.by_planes[plane] = by_planes[plane]->data();
+    }
+    net.splats = splats_.data();
+    net.kept_hidden = hidden_.data();
+    net.colors = const_cast<float*>(colors.data());
+    net.by_colors = by_colors.data();
+    net.by_positions = by_positions.data();
+    net.by_directions = by_directions.data();
+    Buffer<float> first, last, by_features, sums;
+    Buffer<std::int32_t> lower[2];
+    net.first = pad(first, in.first.data(), hidden_units_, input_count_, net.units, net.inputs_stride).data();
+    net.last = pad(last, in.last.data(), 3, hidden_units_, 3, net.units).data();
+    net.by_features = by_features.resize(count_ * net.features);
+    for (int k = 0; k < 2; ++k) net.lower[k] = lower[k].resize(count_);
+    const std::size_t of_first = static_cast<std::size_t>(net.units) * net.inputs;
+    const ColorSums at{0, of_first, of_first + std::size_t{3} * net.units};
+    float *first_out = by_first.data(), *last_out = by_last.data();
+    nb::gil_scoped_release unlocked;
+    sum_chunks(kernels_, count_, at.end, kernels_.color_backward_scratch(net), threads, sums,
+               [&](std::int64_t begin, std::int64_t end, float* own, float* scratch) {
+                 kernels_.color_backward(net, at, begin, end, own, scratch);
+               });
+    unpad(sums.data() + at.first, hidden_units_, input_count_, net.inputs, first_out);
+    unpad(sums.data() + at.last, 3, hidden_units_, net.units, last_out);
+    scatter(net, threads);
+  }
+
+ private:
+  ColorTraining describe(const ColorInputs& in) {
+    hidden_units_ = static_cast<std::int64_t>(in.first.shape(0));
+    input_count_ = static_cast<std::int64_t>(in.first.shape(1));
+    return std::as_const(*this).describe(in);
+  }
+
+  ColorTraining describe(const ColorInputs& in) const {
+    ColorTraining net{};
+    std::size_t samples = 2;
+    while (samples * samples < in.xy.shape(0)) ++samples;
+    net.grid = grid_of(in.box, samples);
+    const Plane* planes[kPlanes] = {&in.xy, &in.xz, &in.yz};
+    for (int plane = 0; plane < kPlanes; ++plane) {
+      require(planes[plane]->shape(0) == samples * samples);
+      net.channels[plane] = static_cast<int>(planes[plane]->shape(1));
+      net.features += net.channels[plane];
+      net.planes[plane] = planes[plane]->data();
+    }
+    require(in.positions.shape(0) == all_ && in.directions.shape(0) == all_);
+    require(static_cast<std::int64_t>(in.first.shape(0)) == hidden_units_);
+    require(static_cast<std::int64_t>(in.first.shape(1)) == input_count_ && input_count_ == net.features + kEncoding);
+    require(in.last.shape(0) == 3 && static_cast<std::int64_t>(in.last.shape(1)) == hidden_units_);
+    net.units = static_cast<int>(rounded_up(hidden_units_, kUnitsStep));
+    net.inputs = static_cast<int>(rounded_up(input_count_, kUnitsStep));
+    net.units_stride = odd_stride(net.units);
+    net.inputs_stride = odd_stride(net.inputs);
+    net.count = count_;
+    net.positions = in.positions.data();
+    net.directions = in.directions.data();
+    return net;
+  }
+
+  // Gradients by the planes: splats in the order of their lower row of samples, rows dealt out in bands.
+  void scatter(const ColorTraining& net, int threads) const {
+    const int samples = net.grid.samples;
+    Buffer<std::uint32_t> orders[2];
+    std::vector<std::uint32_t> starts[2];
+    for (int k = 0; k < 2; ++k) {
+      starts[k].assign(samples + 1, 0);
+      for (std::int64_t i = 0; i < count_; ++i) ++starts[k][net.lower[k][i] + 1];
+      for (int row = 0; row < samples; ++row) starts[k][row + 1] += starts[k][row];
+      std::vector<std::uint32_t> next(starts[k].begin(), starts[k].end() - 1);
+      orders[k].resize(count_);
+      for (std::int64_t i = 0; i < count_; ++i) orders[k].data()[next[net.lower[k][i]]++] = static_cast<std::uint32_t>(i);
+    }
+    const std::int64_t bands = divided_up(samples, kBandRows);
+    ThreadPool::instance().run(kPlanes * bands, threads, [&](std::int64_t task, int) {
+      const int plane = static_cast<int>(task / bands), k = kPlaneAxes[plane][1] - 1;
+      const int first = static_cast<int>(task % bands) * kBandRows, last = std::min(first + kBandRows, samples) - 1;
+      const std::size_t row_floats = static_cast<std::size_t>(samples) * net.channels[plane];
+      std::fill_n(net.by_planes[plane] + first * row_floats, (last - first + 1) * row_floats, 0.0f);
+      for (int row = std::max(first - 1, 0); row <= last; ++row)
+        kernels_.scatter_plane(net, plane, row, orders[k].data() + starts[k][row], starts[k][row + 1] - starts[k][row],
+                               first, last);
+    });
+  }
+
+  const NetworkKernels& kernels_;
+  const std::int64_t count_;
+  const std::size_t all_;
+  std::int64_t hidden_units_ = 0, input_count_ = 0;
+  Buffer<std::int64_t> splats_;
+  Buffer<float> hidden_;
+};
+
+// The weights that both passes over the lines are given.
+struct LineWeights {
+  Array<const float, -1, -1> table;
+  Array<const float, -1> bias_0;
+  Array<const float, -1, -1> weight_1;
+  Array<const float, -1> bias_1;
+  Array<const float, -1, -1> weight_2;
+  Array<const float, -1> bias_2;
+};
+
+class LinePass {
+ public:
+  LinePass(const LineWeights& in, const Array<const float, -1, 3>& positions, const Array<const std::uint8_t, -1>& wanted,
+           const Array<const float, 2, 3>& box, const Array<float, -1, -1>& offsets, const NetworkKernels& kernels,
+           int threads)
+      : kernels_(kernels), all_(positions.shape(0)), hidden_(in.bias_0.shape(0)), outputs_(in.bias_2.shape(0)),
+        table_rows_(in.table.shape(0)) {
+    require(offsets.shape(0) == all_ && offsets.shape(1) == outputs_ && table_rows_ % 3 == 0);
+    require(wanted.shape(0) == all_ || wanted.shape(0) == 0);
+    find_places(grid_of(box, table_rows_ / 3), box, positions.data(), wanted.shape(0) ? wanted.data() : nullptr);
+    Padded weights(*this, in, true);
+    LineTraining net = describe(weights);
+    net.kept = kept_.resize(rounded_up(count_, kGroupRows) * net.units);
+    net.offsets = offsets.data();
+    nb::gil_scoped_release unlocked;
+    share_out(count_, kChunkMin, kernels_.line_forward_scratch(net), threads,
+              [&](std::int64_t begin, std::int64_t end, float* scratch) { kernels_.line_forward(net, begin, end, scratch); });
+  }
+
+  void backward(const LineWeights& in, const Array<const float, -1, -1>& by_offsets, const Array<float, -1, -1>& by_table,
+                const Array<float, -1>& by_bias_0, const Array<float, -1, -1>& by_weight_1,
+                const Array<float, -1>& by_bias_1, const Array<float, -1, -1>& by_weight_2,
+                const Array<float, -1>& by_bias_2, int threads) const {
+    require(by_offsets.shape(0) == all_ && by_offsets.shape(1) == outputs_);
+    require(by_table.shape(0) == table_rows_ && by_table.shape(1) == hidden_ && by_bias_0.shape(0) == hidden_);
+    require(by_weight_1.shape(0) == hidden_ && by_weight_1.shape(1) == hidden_ && by_bias_1.shape(0) == hidden_);
+    require(by_weight_2.shape(0) == outputs_ && by_weight_2.shape(1) == hidden_ && by_bias_2.shape(0) == outputs_);
+    Padded weights(*this, in, false);
+    LineTraining net = describe(weights);
+    net.kept = kept_.data();
+    net.by_offsets = by_offsets.data();
+    Buffer<std::int64_t> entries;
+    entries.resize(count_);
+    for (std::int64_t entry = 0, found = 0; entry < count_; ++entry) {
+      const float* gradient = net.by_offsets + splats_.data()[entry] * outputs_;
+      bool any = false;
+      for (std::size_t output = 0; output < outputs_; ++output) any |= gradient[output] != 0.0f;
+      entries.data()[found] = entry;
+      found += any;
+      net.count = found;
+    }
+    net.entries = entries.data();
+    const std::size_t units = static_cast<std::size_t>(net.units);
+    LineSums at{};
+    at.bias_0 = table_rows_ * units;
+    at.weight_1 = at.bias_0 + units;
+    at.bias_1 = at.weight_1 + units * units;
+    at.weight_2 = at.bias_1 + units;
+    at.bias_2 = at.weight_2 + outputs_ * units;
+    at.end = at.bias_2 + outputs_;
+    const std::pair<float*, float*> written[] = {
+        {by_table.data(), by_bias_0.data()}, {by_weight_1.data(), by_bias_1.data()}, {by_weight_2.data(), by_bias_2.data()}};
+    nb::gil_scoped_release unlocked;
+    Buffer<float> sums;
+    sum_chunks(kernels_, net.count, at.end, kernels_.line_backward_scratch(net), threads, sums,
+               [&](std::int64_t begin, std::int64_t end, float* own, float* scratch) {
+                 kernels_.line_backward(net, at, begin, end, own, scratch);
+               });
+    const float* from = sums.data();
+    unpad(from + at.table, table_rows_, hidden_, units, written[0].first);
+    unpad(from + at.bias_0, 1, hidden_, units, written[0].second);
+    unpad(from + at.weight_1, hidden_, hidden_, units, written[1].first);
+    unpad(from + at.bias_1, 1, hidden_, units, written[1].second);
+    unpad(from + at.weight_2, outputs_, hidden_, units, written[2].first);
+    unpad(from + at.bias_2, 1, outputs_, outputs_, written[2].second);
+  }
+
+ private:
+  // Weights with zeros added; those of the second layer transposed for the forward pass.
+  struct Padded {
+    Buffer<float> table, bias_0, weight_1, bias_1, weight_2;
+    const float* bias_2;
+    int units;
+    Padded(const LinePass& pass, const LineWeights& in, bool transposed) {
+      const std::int64_t hidden = static_cast<std::int64_t>(pass.hidden_), outputs = static_cast<std::int64_t>(pass.outputs_);
+      const std::int64_t width = rounded_up(hidden, kUnitsStep);
+      require(in.table.shape(0) == pass.table_rows_ && in.table.shape(1) == pass.hidden_ && in.bias_0.shape(0) == pass.hidden_);
+      require(in.weight_1.shape(0) == pass.hidden_ && in.weight_1.shape(1) == pass.hidden_);
+      require(in.bias_1.shape(0) == pass.hidden_ && in.weight_2.shape(0) == pass.outputs_);
+      require(in.weight_2.shape(1) == pass.hidden_ && in.bias_2.shape(0) == pass.outputs_);
+      const std::int64_t rows = static_cast<std::int64_t>(pass.table_rows_);
+      pad(table, in.table.data(), rows, hidden, rows, width);
+      pad(bias_0, in.bias_0.data(), 1, hidden, 1, width);
+      (transposed ? pad_transposed : pad)(weight_1, in.weight_1.data(), hidden, hidden, width, odd_stride(width));
+      pad(bias_1, in.bias_1.data(), 1, hidden, 1, width);
+      pad(weight_2, in.weight_2.data(), outputs, hidden, outputs, width);
+      bias_2 = in.bias_2.data();
+      units = static_cast<int>(width);
+    }
+  };
+
+  LineTraining describe(const Padded& weights) const {
+    LineTraining net{};
+    net.samples = static_cast<int>(table_rows_ / 3);
+    net.units = weights.units;
+    net.units_stride = odd_stride(weights.units);
+    net.outputs = static_cast<int>(outputs_);
+    net.count = count_;
+    net.splats = splats_.data();
+    net.rows = rows_.data();
+    net.fractions = fractions_.data();
+    net.table = weights.table.data();
+    net.bias_0 = weights.bias_0.data();
+    net.weight_1 = weights.weight_1.data();
+    net.bias_1 = weights.bias_1.data();
+    net.weight_2 = weights.weight_2.data();
+    net.bias_2 = weights.bias_2;
+    return net;
+  }
+
+  // The wanted splats in the box and where they lie on the lines, as `line_position` has it. Neighbours on the lines are
+  // beside each other: they read the same rows, and turn the same units on.
+  void find_places(const Grid& grid, const Array<const float, 2, 3>& box, const float* positions,
+                   const std::uint8_t* wanted) {
+    const float last = static_cast<float>(grid.samples - 1);
+    Buffer<std::int64_t> found;
+    Buffer<std::int32_t> lower;
+    Buffer<float> rest;
+    found.resize(all_);
+    lower.resize(3 * all_);
+    rest.resize(3 * all_);
+    std::int64_t count = 0;
+    for (std::size_t splat = 0; splat < all_; ++splat) {
+      const float* position = positions + 3 * splat;
+      bool inside = !wanted || wanted[splat];
+      for (int axis = 0; axis < 3; ++axis) inside &= position[axis] >= box(0, axis) && position[axis] <= box(1, axis);
+      if (!inside) continue;
+      for (int axis = 0; axis < 3; ++axis) {
+        const float along = (position[axis] - grid.low[axis]) / grid.extent[axis] * last;
+        const float clamped = std::min(std::max(along, 0.0f), last);
+        const int row = std::min(static_cast<int>(clamped), grid.samples - 2);
+        lower.data()[3 * count + axis] = row;
+        rest.data()[3 * count + axis] = clamped - static_cast<float>(row);
+      }
+      found.data()[count++] = static_cast<std::int64_t>(splat);
+    }
+    count_ = count;
+    // By x, then stable by y and by z.
+    std::vector<std::uint32_t> order(count), next(count), starts(grid.samples);
+    for (std::int64_t i = 0; i < count; ++i) order[i] = static_cast<std::uint32_t>(i);
+    for (int axis = 0; axis < 3; ++axis) {
+      std::fill(starts.begin(), starts.end(), 0);
+      for (std::int64_t i = 0; i < count; ++i) ++starts[lower.data()[3 * i + axis]];
+      std::uint32_t total = 0;
+      for (std::uint32_t& start : starts) total += std::exchange(start, total);
+      for (const std::uint32_t i : order) next[starts[lower.data()[3 * i + axis]]++] = i;
+      order.swap(next);
+    }
+    splats_.resize(count);
+    rows_.resize(3 * count);
+    fractions_.resize(3 * count);
+    for (std::int64_t i = 0; i < count; ++i) {
+      const std::uint32_t from = order[i];
+      splats_.data()[i] = found.data()[from];
+      for (int axis = 0; axis < 3; ++axis) {
+        rows_.data()[3 * i + axis] = lower.data()[3 * from + axis] + axis * grid.samples;
+        fractions_.data()[3 * i + axis] = rest.data()[3 * from + axis];
+      }
+    }
+  }
+
+  const NetworkKernels& kernels_;
+  const std::size_t all_, hidden_, outputs_, table_rows_;
+  std::int64_t count_ = 0;
+  Buffer<std::int64_t> splats_;
+  Buffer<std::int32_t> rows_;
+  Buffer<float> fractions_, kept_;
+};
+
+const NetworkKernels& kernels_of(const std::string& instruction_set) {
+  return variant_of(runnable_network_kernels(), instruction_set);
+}
+
+}  // namespace
+
+void bind_network_training(nb::module_& m) {
+  using Values = Array<const float, -1, -1>;
+  using Vectors = Array<const float, -1, 3>;
+  using Vector = Array<const float, -1>;
+  nb::class_<ColorPass>(m, "ColorPass", "Colours of the colour network in training, kept for their gradients.")
+      .def("backward", [](const ColorPass& pass, const Vectors& positions, const Vectors& directions, const Plane& xy,
+                          const Plane& xz, const Plane& yz, const Values& first, const Values& last,
+                          const Array<const float, 2, 3>& box, const Vectors& colors, const Vectors& by_colors,
+                          const Array<float, -1, 3>& by_positions, const Array<float, -1, 3>& by_directions,
+                          const Array<float, -1, -1>& by_xy, const Array<float, -1, -1>& by_xz,
+                          const Array<float, -1, -1>& by_yz, const Array<float, -1, -1>& by_first,
+                          const Array<float, -1, -1>& by_last, int threads) {
+        pass.backward({positions, directions, xy, xz, yz, first, last, box}, colors, by_colors, by_positions, by_directions,
+                      by_xy, by_xz, by_yz, by_first, by_last, std::max(threads, 1));
+      });
+  m.def("color_training", [](const Vectors& positions, const Vectors& directions, const Plane& xy, const Plane& xz,
+                             const Plane& yz, const Values& first, const Values& last, const Array<const float, 2, 3>& box,
+                             const Array<const std::int64_t, -1>& splats, const Array<float, -1, 3>& colors,
+                             const std::string& instruction_set, int threads) {
+    return std::make_unique<ColorPass>(ColorInputs{positions, directions, xy, xz, yz, first, last, box}, splats, colors,
+                                       kernels_of(instruction_set), std::max(threads, 1));
+  }, "Write the colours of the splats named, those of no others.");
+  nb::class_<LinePass>(m, "LinePass", "Offsets of the feature lines in training, kept for their gradients.")
+      .def("backward", [](const LinePass& pass, const Values& table, const Vector& bias_0, const Values& weight_1,
+                          const Vector& bias_1, const Values& weight_2, const Vector& bias_2, const Values& by_offsets,
+                          const Array<float, -1, -1>& by_table, const Array<float, -1>& by_bias_0,
+                          const Array<float, -1, -1>& by_weight_1, const Array<float, -1>& by_bias_1,
+                          const Array<float, -1, -1>& by_weight_2, const Array<float, -1>& by_bias_2, int threads) {
+        pass.backward({table, bias_0, weight_1, bias_1, weight_2, bias_2}, by_offsets, by_table, by_bias_0, by_weight_1,
+                      by_bias_1, by_weight_2, by_bias_2, std::max(threads, 1));
+      });
+  m.def("line_training", [](const Values& table, const Vector& bias_0, const Values& weight_1, const Vector& bias_1,
+                            const Values& weight_2, const Vector& bias_2, const Vectors& positions,
+                            const Array<const std::uint8_t, -1>& wanted, const Array<const float, 2, 3>& box,
+                            const Array<float, -1, -1>& offsets, const std::string& instruction_set, int threads) {
+    return std::make_unique<LinePass>(LineWeights{table, bias_0, weight_1, bias_1, weight_2, bias_2}, positions, wanted, box,
+                                      offsets, kernels_of(instruction_set), std::max(threads, 1));
+  }, "Write the offsets of the splats that are wanted and in the box, those of no others; empty: all are wanted.");
+}
+
+}  // namespace headbench

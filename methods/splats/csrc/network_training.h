@@ -1,0 +1,102 @@
+// Training passes of the two networks of "ours", forward and backward: plain data, shared by all instruction sets.
+//
+// A pass works on a list of M splats, whose values are kept in rows of their own. Layers are padded with zeros to `units`
+// and `inputs`, multiples of kUnitsStep, lists to whole groups of kGroupRows rows. Gradients by weights are sums over
+// chunks of the list, each in an accumulator of its own (see network_training.cpp).
+#pragma once
+
+#include "bench/native/instruction_sets.h"
+#include "scene.h"
+
+namespace headbench {
+
+constexpr int kGroupRows = 16;  // rows are allocated in groups of so many
+constexpr int kTrainingTile = 64;  // rows of a backward tile, whose activations stay in the first caches
+constexpr int kPlanes = 3;
+constexpr int kPlaneAxes[kPlanes][2] = {{0, 1}, {0, 2}, {1, 2}};  // PAIRS of methods/shared/networks.py
+
+// Box and samples of planes or lines: sample (p - low) / extent (samples - 1), clamped.
+struct Grid {
+  float low[3], extent[3];
+  int samples;
+};
+
+// Colours of splats by the planes: `plane_features` and `color_network` of methods/ours/field.py and
+// methods/shared/networks.py.
+struct ColorTraining {
+  Grid grid;
+  int channels[kPlanes];
+  int features;                // channels of all planes
+  int units, inputs;           // padded; inputs are features, then the encoded direction
+  int units_stride, inputs_stride;
+  std::int64_t count;          // M
+  const std::int64_t* splats;  // (M,)
+  const float* positions;      // (N, 3)
+  const float* directions;     // (N, 3) unit vectors
+  const float* planes[kPlanes];  // (samples^2, channels)
+  const float* last;             // (3, units)
+  float* kept_hidden;            // (M padded, units) after the ReLU
+  float* colors;                 // (N, 3)
+  // Forward: (inputs, units_stride); backward: (units, inputs_stride).
+  const float* first;
+  // Backward.
+  const float* by_colors;  // (N, 3)
+  float* by_features;      // (M, features)
+  std::int32_t* lower[2];  // (M,) each: lower sample on the y and on the z axis
+  float* by_positions;     // (N, 3)
+  float* by_directions;    // (N, 3)
+  float* by_planes[kPlanes];
+};
+
+// Offsets of splats by the lines: what `line_offsets` of methods/ours/field.py computes of the table.
+struct LineTraining {
+  int samples, units, units_stride, outputs;
+  std::int64_t count;          // M
+  const std::int64_t* splats;  // (M,) which splat each is
+  const std::int32_t* rows;    // (M, 3) the lower of two neighbouring rows of the table
+  const float* fractions;      // (M, 3) from the lower to the upper
+  const float* table;          // (3 samples, units)
+  const float* bias_0;         // (units,)
+  const float* bias_1;         // (units,)
+  const float* weight_2;       // (outputs, units)
+  const float* bias_2;         // (outputs,)
+  // Forward: (units in, units_stride out); backward: (units out, units_stride in).
+  const float* weight_1;
+  float* kept;     // (M padded, units) second hidden layer after its ReLU
+  float* offsets;  // (N, outputs)
+  // Backward.
+  const std::int64_t* entries;  // of the list, those with a gradient
+  const float* by_offsets;      // (N, outputs)
+};
+
+// Where the parts of an accumulator begin, floats.
+struct ColorSums {
+  std::size_t first, last, end;
+};
+struct LineSums {
+  std::size_t table, bias_0, weight_1, bias_1, weight_2, bias_2, end;
+};
+
+struct NetworkKernels {
+  const char* name;
+  std::size_t (*color_forward_scratch)(const ColorTraining&);
+  // Of entries [begin, end), begin a multiple of kGroupRows.
+  void (*color_forward)(const ColorTraining&, std::int64_t begin, std::int64_t end, float* scratch);
+  std::size_t (*color_backward_scratch)(const ColorTraining&);
+  void (*color_backward)(const ColorTraining&, const ColorSums&, std::int64_t begin, std::int64_t end, float* sums,
+                         float* scratch);
+  // Add the gradients of entries order[begin .. end), whose lower row of samples is the same, to that row and the next;
+  // only to those from `first` to `last`.
+  void (*scatter_plane)(const ColorTraining&, int plane, int row, const std::uint32_t* order, std::int64_t count, int first,
+                        int last);
+  std::size_t (*line_forward_scratch)(const LineTraining&);
+  void (*line_forward)(const LineTraining&, std::int64_t begin, std::int64_t end, float* scratch);
+  std::size_t (*line_backward_scratch)(const LineTraining&);
+  void (*line_backward)(const LineTraining&, const LineSums&, std::int64_t begin, std::int64_t end, float* sums,
+                        float* scratch);
+  void (*add)(float* to, const float* from, std::size_t count);  // element by element
+};
+
+HEADBENCH_VARIANTS(NetworkKernels, network_kernels)
+
+}  // namespace headbench
