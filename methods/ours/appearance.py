@@ -37,7 +37,7 @@ from .field import (
     plane_features,
     shade,
 )
-from .training_kernel import plane_colors, table_offsets, usable
+from .training_kernel import directions_to, plane_colors, table_offsets, usable
 
 FLOATS_PER_FACE = 17 + 9 + 1  # triangle frame, turn to canonical, penalty weight
 
@@ -124,9 +124,12 @@ class OursAppearance:
                 size = softened(offsets, self._config.penalty.softness)
                 penalty = self._config.penalty.weight * (size * weights[:, None]).mean()
         world = to_world(frames, binding, splats.means, splats.log_scales, splats.quats)
-        directions = canonical_directions(prepared.turns, binding, world.means, view.center)
-        if self._config.direction_jitter:
-            directions = directions @ self._turn(iteration).t()
+        last = self._turn(iteration) if self._config.direction_jitter else None
+        if usable(world.means):
+            directions = directions_to(prepared.turns, binding, world.means, view.center, last)
+        else:
+            directions = canonical_directions(prepared.turns, binding, world.means, view.center)
+            directions = directions if last is None else directions @ last.t()
         colors = self._colors(optimiser, positions, directions, iteration)
         return ShadedSplats(world, changed_colors(colors, splats), torch.sigmoid(splats.logits), penalty)
 

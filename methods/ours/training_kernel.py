@@ -6,6 +6,7 @@ not (`usable`). Results do not depend on the number of threads.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -67,6 +68,42 @@ def table_offsets(
         *(normalised_weight(parameters, 1), parameters["line_bias_1"]),
         *(normalised_weight(parameters, 2), parameters["line_bias_2"]),
     )
+
+
+def directions_to(
+    turns: Tensor,
+    binding: Tensor,
+    means: Tensor,
+    center: Tensor,
+    last: Tensor | None = None,
+    backend: str = "cpu",
+) -> Tensor:
+    """Compiled form of `field.canonical_directions`; then the rotation ``last`` (3, 3), if any, is applied to all."""
+    last = torch.eye(3) if last is None else last
+    return _Directions.apply(binding, turns, last, center, instruction_sets()[backend], means)  # type: ignore[no-untyped-call]
+
+
+class _Directions(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *inputs: Any) -> Tensor:
+        *fixed, instruction_set, means = inputs
+        fixed = [value.contiguous() for value in (*fixed, means)]
+        ctx.instruction_set, directions = instruction_set, torch.empty_like(fixed[-1])
+        _direct(fixed, means.new_empty(0, 3), directions, instruction_set)
+        ctx.save_for_backward(*fixed)
+        return directions
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, by_directions: Tensor) -> tuple[Tensor | None, ...]:
+        by_means = torch.empty_like(by_directions)
+        _direct(ctx.saved_tensors, by_directions.contiguous(), by_means, ctx.instruction_set)
+        return None, None, None, None, None, by_means
+
+
+def _direct(inputs: Sequence[Tensor], by_directions: Tensor, out: Tensor, instruction_set: str) -> None:
+    arrays = _arrays(*inputs, by_directions, out)
+    KERNEL.load().direction_training(*arrays, instruction_set, torch.get_num_threads())
 
 
 class _Colors(torch.autograd.Function):

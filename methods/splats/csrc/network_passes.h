@@ -113,6 +113,78 @@ HEADBENCH_INLINE int list_lanes(Mask set, int first, std::int32_t* list, int cou
   return count;
 }
 
+// ---- Directions ----
+
+// matrix times v, or its transpose times v, of a matrix by rows.
+template <class T>
+HEADBENCH_INLINE void rotate(const T* m, const Real* v, Real* out) {
+  for (int i = 0; i < 3; ++i) out[i] = fma(m[3 * i], v[0], fma(m[3 * i + 1], v[1], Real(m[3 * i + 2]) * v[2]));
+}
+template <class T>
+HEADBENCH_INLINE void rotate_back(const T* m, const Real* v, Real* out) {
+  for (int i = 0; i < 3; ++i) out[i] = fma(m[i], v[0], fma(m[3 + i], v[1], Real(m[6 + i]) * v[2]));
+}
+
+HEADBENCH_INLINE Real unit_length(const Real* v, Real* unit) {
+  const Real length = max(sqrt(dot3(v, v)), 1e-12f);
+  for (int k = 0; k < 3; ++k) unit[k] = v[k] / length;
+  return length;
+}
+
+// Directions of a vector of splats from `first` on, with the steps on the way to them.
+struct DirectionSteps {
+  Real turn[9], first[3], first_length, second[3], second_length;
+};
+
+HEADBENCH_INLINE void direction_steps(const DirectionTraining& in, std::int64_t first, int used, DirectionSteps& out) {
+  Gathered<9> turn;
+  Gathered<3> mean;
+  for (int lane = 0; lane < W; ++lane) {
+    const std::int64_t splat = first + (lane < used ? lane : 0);
+    turn.set(in.turns + 9 * in.binding[splat], lane);
+    mean.set(in.means + 3 * splat, lane);
+  }
+  for (int k = 0; k < 9; ++k) out.turn[k] = turn[k];
+  Real way[3], turned[3];
+  for (int k = 0; k < 3; ++k) way[k] = Real(in.center[k]) - mean[k];
+  out.first_length = unit_length(way, out.first);
+  rotate(out.turn, out.first, turned);
+  out.second_length = unit_length(turned, out.second);
+}
+
+inline void directions(const DirectionTraining& in, std::int64_t begin, std::int64_t end) {
+  Gathered<3> result;
+  for (std::int64_t first = begin; first < end; first += W) {
+    const int used = lanes_used(first, end);
+    DirectionSteps steps;
+    direction_steps(in, first, used, steps);
+    Real direction[3];
+    rotate(in.last, steps.second, direction);
+    for (int k = 0; k < 3; ++k) result.keep(k, direction[k]);
+    for (int lane = 0; lane < used; ++lane) result.put(in.directions + 3 * (first + lane), lane);
+  }
+}
+
+inline void directions_backward(const DirectionTraining& in, std::int64_t begin, std::int64_t end) {
+  Gathered<3> gradient;
+  for (std::int64_t first = begin; first < end; first += W) {
+    const int used = lanes_used(first, end);
+    DirectionSteps steps;
+    direction_steps(in, first, used, steps);
+    for (int lane = 0; lane < W; ++lane) gradient.set(in.by_directions + 3 * (first + (lane < used ? lane : 0)), lane);
+    const Real by_direction[3] = {gradient[0], gradient[1], gradient[2]};
+    Real by_second[3], by_first[3];
+    rotate_back(in.last, by_direction, by_second);
+    const Real along_second = dot3(by_second, steps.second);
+    for (int k = 0; k < 3; ++k) by_second[k] = fnma(along_second, steps.second[k], by_second[k]) / steps.second_length;
+    rotate_back(steps.turn, by_second, by_first);
+    const Real along_first = dot3(by_first, steps.first);
+    for (int k = 0; k < 3; ++k)
+      gradient.keep(k, fnma(by_first[k], 1.0f, along_first * steps.first[k]) / steps.first_length);
+    for (int lane = 0; lane < used; ++lane) gradient.put(in.by_means + 3 * (first + lane), lane);
+  }
+}
+
 // ---- Colour ----
 
 // Where a point lies between samples: the lower one's number, the way to the next, and whether the point was clamped.
@@ -153,6 +225,19 @@ HEADBENCH_INLINE void sample_planes(const ColorTraining& net, const float* posit
   }
 }
 
+// Ask for the texels that `sample_planes` reads.
+HEADBENCH_INLINE void prefetch_planes(const ColorTraining& net, const float* position) {
+  Between at[3];
+  for (int axis = 0; axis < 3; ++axis) at[axis] = between(net.grid, axis, position[axis]);
+  for (int plane = 0; plane < kPlanes; ++plane) {
+    const int x = at[kPlaneAxes[plane][0]].lower, y = at[kPlaneAxes[plane][1]].lower, channels = net.channels[plane];
+    for (int row = 0; row < 2; ++row) {
+      const float* texels = net.planes[plane] + (static_cast<std::size_t>(y + row) * net.grid.samples + x) * channels;
+      for (int c = 0; c < 2 * channels; c += kUnitsStep) HEADBENCH_PREFETCH(texels + c);
+    }
+  }
+}
+
 // Inputs of entries [first, first + used): features and encoded directions; zeros in the rest of `rows`, whole groups.
 inline void color_inputs(const ColorTraining& net, std::int64_t first, int used, int rows, float* out) {
   alignas(64) float encoded[kEncoding * kBatch];
@@ -163,6 +248,9 @@ inline void color_inputs(const ColorTraining& net, std::int64_t first, int used,
     const Real direction[3] = {d[0], d[1], d[2]};
     encode(direction, encoded);
     for (int lane = 0; lane < W; ++lane) {
+      constexpr std::int64_t ahead = 12;
+      const std::int64_t later = first + offset + lane + ahead;
+      if (later < net.count) prefetch_planes(net, net.positions + 3 * net.splats[later]);
       float* row = out + (offset + lane) * net.inputs_stride;
       int filled = 0;
       if (offset + lane < used) {
@@ -522,9 +610,9 @@ inline void add(float* to, const float* from, std::size_t count) {
 }
 
 extern const NetworkKernels network_kernels;
-const NetworkKernels network_kernels = {HEADBENCH_ISA_NAME,     color_forward_scratch, color_forward,
-                                        color_backward_scratch, color_backward,        scatter_plane,
-                                        line_forward_scratch,   line_forward,          line_backward_scratch,
-                                        line_backward,          add};
+const NetworkKernels network_kernels = {
+    HEADBENCH_ISA_NAME,     directions,     directions_backward, color_forward_scratch, color_forward,
+    color_backward_scratch, color_backward, scatter_plane,       line_forward_scratch,  line_forward,
+    line_backward_scratch,  line_backward,  add};
 
 }  // namespace headbench::HEADBENCH_ISA

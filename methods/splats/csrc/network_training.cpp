@@ -13,9 +13,7 @@
 #include <utility>
 #include <vector>
 
-#include "bench/native/module.h"
-#include "bench/native/thread_pool.h"
-#include "workspace.h"
+#include "tasks.h"
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -60,12 +58,10 @@ void unpad(const float* from, std::int64_t rows, std::int64_t columns, std::int6
 
 // Call body(begin, end, worker's scratch) for chunks of `count` entries.
 template <class Body>
-void share_out(std::int64_t count, std::int64_t chunk, std::size_t scratch_floats, int threads, const Body& body) {
-  const std::size_t stride = rounded_up(static_cast<std::int64_t>(scratch_floats), 16);
-  Buffer<float> scratch;
-  scratch.resize(stride * threads);
+void share_chunks(std::int64_t count, std::int64_t chunk, std::size_t scratch_floats, int threads, const Body& body) {
+  const Scratch scratch(scratch_floats, threads);
   ThreadPool::instance().run(divided_up(count, chunk), threads, [&](std::int64_t task, int worker) {
-    body(task * chunk, std::min((task + 1) * chunk, count), scratch.data() + stride * worker);
+    body(task * chunk, std::min((task + 1) * chunk, count), scratch.of(worker));
   });
 }
 
@@ -79,7 +75,7 @@ void sum_chunks(const NetworkKernels& kernels, std::int64_t count, std::size_t f
   const std::size_t stride = rounded_up(static_cast<std::int64_t>(floats), 16);
   sums.resize(stride * chunks);
   if (count == 0) std::fill_n(sums.data(), floats, 0.0f);
-  share_out(count, chunk, scratch_floats, threads, [&](std::int64_t begin, std::int64_t end, float* scratch) {
+  share_chunks(count, chunk, scratch_floats, threads, [&](std::int64_t begin, std::int64_t end, float* scratch) {
     float* own = sums.data() + begin / chunk * stride;
     std::fill_n(own, floats, 0.0f);
     body(begin, end, own, scratch);
@@ -120,8 +116,7 @@ class ColorPass {
     ColorTraining net = describe(in);
     require(colors.shape(0) == all_);
     std::copy_n(splats.data(), count_, splats_.resize(count_));
-    for (std::int64_t i = 0; i < count_; ++i)
-      require(splats_.data()[i] >= 0 && static_cast<std::size_t>(splats_.data()[i]) < all_);
+    require(below(splats_.data(), splats.shape(0), all_));
     net.splats = splats_.data();
     net.kept_hidden = hidden_.resize(rounded_up(count_, kGroupRows) * net.units);
     net.colors = colors.data();
@@ -129,7 +124,7 @@ class ColorPass {
     net.first = pad_transposed(first, in.first.data(), hidden_units_, input_count_, net.inputs, net.units_stride).data();
     net.last = pad(last, in.last.data(), 3, hidden_units_, 3, net.units).data();
     nb::gil_scoped_release unlocked;
-    share_out(count_, kChunkMin, kernels_.color_forward_scratch(net), threads,
+    share_chunks(count_, kChunkMin, kernels_.color_forward_scratch(net), threads,
               [&](std::int64_t begin, std::int64_t end, float* scratch) { kernels_.color_forward(net, begin, end, scratch); });
   }
 
@@ -264,7 +259,7 @@ class LinePass {
     net.kept = kept_.resize(rounded_up(count_, kGroupRows) * net.units);
     net.offsets = offsets.data();
     nb::gil_scoped_release unlocked;
-    share_out(count_, kChunkMin, kernels_.line_forward_scratch(net), threads,
+    share_chunks(count_, kChunkMin, kernels_.line_forward_scratch(net), threads,
               [&](std::int64_t begin, std::int64_t end, float* scratch) { kernels_.line_forward(net, begin, end, scratch); });
   }
 
@@ -422,9 +417,30 @@ const NetworkKernels& kernels_of(const std::string& instruction_set) {
   return variant_of(runnable_network_kernels(), instruction_set);
 }
 
+void direction_training(const Array<const std::int64_t, -1>& binding, const Array<const float, -1, 3, 3>& turns,
+                        const Array<const float, 3, 3>& last, const Array<const float, 3>& center,
+                        const Array<const float, -1, 3>& means, const Array<const float, -1, 3>& by_directions,
+                        const Array<float, -1, 3>& out, const std::string& instruction_set, int threads) {
+  const std::size_t count = means.shape(0);
+  const bool backward = by_directions.shape(0) != 0;
+  require(binding.shape(0) == count && out.shape(0) == count && (!backward || by_directions.shape(0) == count));
+  require(below(binding.data(), count, turns.shape(0)));
+  DirectionTraining in{binding.data(), turns.data(), {}, {}, means.data(), out.data(), by_directions.data(), out.data()};
+  std::copy_n(last.data(), 9, in.last);
+  std::copy_n(center.data(), 3, in.center);
+  const NetworkKernels& kernels = kernels_of(instruction_set);
+  nb::gil_scoped_release unlocked;
+  share_out(count, threads, [&](std::int64_t begin, std::int64_t end, int) {
+    (backward ? kernels.directions_backward : kernels.directions)(in, begin, end);
+  });
+}
+
 }  // namespace
 
 void bind_network_training(nb::module_& m) {
+  m.def("direction_training", &direction_training, "binding"_a, "turns"_a, "last"_a, "center"_a, "means"_a,
+        "by_directions"_a, "out"_a, "instruction_set"_a, "threads"_a,
+        "Write canonical directions; or, where gradients by them are given, the gradients by the means.");
   using Values = Array<const float, -1, -1>;
   using Vectors = Array<const float, -1, 3>;
   using Vector = Array<const float, -1>;

@@ -21,6 +21,19 @@ struct Grid {
   int samples;
 };
 
+// Directions to the camera in canonical space: `canonical_directions` of methods/ours/field.py, then one more rotation.
+struct DirectionTraining {
+  const std::int64_t* binding;  // (N,) triangles
+  const float* turns;           // (F, 3, 3) applied to the directions
+  float last[9];                // rotation applied to all of them after that
+  float center[3];              // of the camera
+  const float* means;           // (N, 3) in the world
+  float* directions;            // (N, 3)
+  // Backward.
+  const float* by_directions;  // (N, 3)
+  float* by_means;             // (N, 3)
+};
+
 // Colours of splats by the planes: `plane_features` and `color_network` of methods/ours/field.py and
 // methods/shared/networks.py.
 struct ColorTraining {
@@ -79,6 +92,9 @@ struct LineSums {
 
 struct NetworkKernels {
   const char* name;
+  // Of splats [begin, end).
+  void (*directions)(const DirectionTraining&, std::int64_t begin, std::int64_t end);
+  void (*directions_backward)(const DirectionTraining&, std::int64_t begin, std::int64_t end);
   std::size_t (*color_forward_scratch)(const ColorTraining&);
   // Of entries [begin, end), begin a multiple of kGroupRows.
   void (*color_forward)(const ColorTraining&, std::int64_t begin, std::int64_t end, float* scratch);

@@ -9,6 +9,7 @@ from headbench.methods.ours.config import Lines, OursConfig, Planes
 from headbench.methods.ours.field import (
     Bounds,
     blend_lines,
+    canonical_directions,
     initial_parameters,
     line_offsets,
     line_position,
@@ -16,7 +17,7 @@ from headbench.methods.ours.field import (
     shade,
 )
 from headbench.methods.ours.method import Ours
-from headbench.methods.ours.training_kernel import plane_colors, table_offsets
+from headbench.methods.ours.training_kernel import directions_to, plane_colors, table_offsets
 from headbench.methods.shared.schedule import Timeline
 from headbench.methods.shared.splat_training import BoundTraining
 from headbench.methods.splats.cpu import instruction_sets
@@ -86,6 +87,24 @@ def test_colours_and_their_gradients(case, backend):
     (colors * weights).sum().backward()
     assert_near(colors, expected, "colours")
     assert not colors[~chosen].any()
+    assert_same_gradients(found, exact)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("count", [0, 1, 16, 1030])
+def test_directions_and_their_gradients(count, backend):
+    generator = torch.Generator().manual_seed(count)
+    turns, last = torch.randn(5, 3, 3, generator=generator), torch.randn(3, 3, generator=generator)
+    means, weights = torch.randn(2, count, 3, generator=generator)
+    center, binding = torch.tensor([0.1, 0.2, 3.0]), torch.arange(count) % 5
+    exact, found = leaves({"means": means}, torch.float64), leaves({"means": means})
+    expected = canonical_directions(turns.double(), binding, exact["means"], center.double())
+    directions = directions_to(turns, binding, found["means"], center, backend=backend)
+    assert_near(directions, expected, "directions")
+    directions = directions_to(turns, binding, found["means"], center, last, backend)
+    assert_near(directions, expected @ last.double().t(), "rotated directions")
+    ((expected @ last.double().t()) * weights).sum().backward()
+    (directions * weights).sum().backward()
     assert_same_gradients(found, exact)
 
 
