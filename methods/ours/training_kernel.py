@@ -16,7 +16,7 @@ from torch.autograd.function import once_differentiable
 from ..shared import avatar_kernel
 from ..shared.networks import PAIRS
 from ..splats.cpu import KERNEL, instruction_sets
-from .field import Bounds, Parameters, line_table, normalised_weight
+from .field import Bounds, NamedTensors, line_table, normalised_weight
 
 
 def usable(like: Tensor) -> bool:
@@ -25,7 +25,7 @@ def usable(like: Tensor) -> bool:
 
 
 def plane_colors(
-    parameters: Parameters,
+    parameters: NamedTensors,
     box: Bounds,
     positions: Tensor,
     directions: Tensor,
@@ -47,7 +47,7 @@ def plane_colors(
 
 
 def table_offsets(
-    parameters: Parameters,
+    parameters: NamedTensors,
     box: Bounds,
     blended: Tensor,
     positions: Tensor,

@@ -107,6 +107,11 @@ inline void outer_product(const float* left, int left_stride, const std::int32_t
   }
 }
 
+// Ask for what the next tile reads of the forward pass, `most` of the `left` numbers there are: it comes from far away.
+HEADBENCH_INLINE void prefetch_floats(const float* from, std::int64_t left, int most) {
+  for (int k = 0; k < most && k < left; k += kUnitsStep) __builtin_prefetch(from + k, 0, 2);
+}
+
 // Add the lanes that are set to a list, as numbers from `first` on; its new length.
 HEADBENCH_INLINE int list_lanes(Mask set, int first, std::int32_t* list, int count) {
   for (std::uint64_t lanes = bits(set); lanes; lanes &= lanes - 1) list[count++] = first + lowest_bit(lanes);
@@ -355,10 +360,9 @@ inline void color_backward(const ColorTraining& net, const ColorSums& at, std::i
   for (std::int64_t first = begin; first < end; first += kTrainingTile) {
     const int used = end - first < kTrainingTile ? static_cast<int>(end - first) : kTrainingTile;
     const int groups = (used + kSplatGroup - 1) / kSplatGroup;
-    // What the next tile reads of the forward pass comes from far away.
-    if (first + kTrainingTile < end)
-      for (int k = 0; k < kTrainingTile * net.units; k += kUnitsStep)
-        __builtin_prefetch(net.kept_hidden + (first + kTrainingTile) * net.units + k, 0, 2);
+    const std::int64_t next = first + kTrainingTile;
+    prefetch_floats(net.kept_hidden + next * net.units, next < end ? whole_groups(end - next) * net.units : 0,
+                    kTrainingTile * net.units);
     color_inputs(net, first, used, static_cast<int>(whole_groups(used)), inputs);
     Lists on = {list, net.units, {}};
     for (int group = 0; group < groups; ++group) {
@@ -554,6 +558,8 @@ inline void line_backward(const LineTraining& net, const LineSums& at, std::int6
     for (int s = 0; s < rows; ++s) {
       const std::int64_t entry = net.entries[tile + (s < used ? s : 0)];
       second[s] = net.kept + entry * units;
+      if (tile + kTrainingTile + s < end)
+        prefetch_floats(net.kept + net.entries[tile + kTrainingTile + s] * units, units, units);
       line_first(net, entry, first + s * stride);
       for (int output = 0; output < outputs; ++output) {
         const float gradient = s < used ? net.by_offsets[net.splats[entry] * outputs + output] : 0.0f;

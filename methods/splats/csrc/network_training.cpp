@@ -88,6 +88,22 @@ void sum_chunks(const NetworkKernels& kernels, std::int64_t count, std::size_t f
   });
 }
 
+// Order of `count` places by their (count, 3) lower samples: by the last number, then the middle one, then the first.
+// Neighbours come beside each other: they read the same rows, and turn the same units on.
+std::vector<std::uint32_t> order_of_places(const std::int32_t* lower, std::int64_t count, int samples) {
+  std::vector<std::uint32_t> order(count), next(count), starts(samples);
+  for (std::int64_t i = 0; i < count; ++i) order[i] = static_cast<std::uint32_t>(i);
+  for (int axis = 0; axis < 3; ++axis) {
+    std::fill(starts.begin(), starts.end(), 0);
+    for (std::int64_t i = 0; i < count; ++i) ++starts[lower[3 * i + axis]];
+    std::uint32_t total = 0;
+    for (std::uint32_t& start : starts) total += std::exchange(start, total);
+    for (const std::uint32_t i : order) next[starts[lower[3 * i + axis]]++] = i;
+    order.swap(next);
+  }
+  return order;
+}
+
 Grid grid_of(const Array<const float, 2, 3>& box, std::size_t samples) {
   require(samples >= 2 && samples < (std::size_t{1} << 15));
   Grid grid{};
@@ -115,8 +131,8 @@ class ColorPass {
       : kernels_(kernels), count_(static_cast<std::int64_t>(splats.shape(0))), all_(in.positions.shape(0)) {
     ColorTraining net = describe(in);
     require(colors.shape(0) == all_);
+    require(below(splats.data(), splats.shape(0), all_));
     std::copy_n(splats.data(), count_, splats_.resize(count_));
-    require(below(splats_.data(), splats.shape(0), all_));
     net.splats = splats_.data();
     net.kept_hidden = hidden_.resize(rounded_up(count_, kGroupRows) * net.units);
     net.colors = colors.data();
@@ -354,8 +370,7 @@ class LinePass {
     return net;
   }
 
-  // The wanted splats in the box and where they lie on the lines, as `line_position` has it. Neighbours on the lines are
-  // beside each other: they read the same rows, and turn the same units on.
+  // The wanted splats in the box, in the order of their places on the lines, which are as `line_position` has them.
   void find_places(const Grid& grid, const Array<const float, 2, 3>& box, const float* positions,
                    const std::uint8_t* wanted) {
     const float last = static_cast<float>(grid.samples - 1);
@@ -381,17 +396,7 @@ class LinePass {
       found.data()[count++] = static_cast<std::int64_t>(splat);
     }
     count_ = count;
-    // By x, then stable by y and by z.
-    std::vector<std::uint32_t> order(count), next(count), starts(grid.samples);
-    for (std::int64_t i = 0; i < count; ++i) order[i] = static_cast<std::uint32_t>(i);
-    for (int axis = 0; axis < 3; ++axis) {
-      std::fill(starts.begin(), starts.end(), 0);
-      for (std::int64_t i = 0; i < count; ++i) ++starts[lower.data()[3 * i + axis]];
-      std::uint32_t total = 0;
-      for (std::uint32_t& start : starts) total += std::exchange(start, total);
-      for (const std::uint32_t i : order) next[starts[lower.data()[3 * i + axis]]++] = i;
-      order.swap(next);
-    }
+    const std::vector<std::uint32_t> order = order_of_places(lower.data(), count, grid.samples);
     splats_.resize(count);
     rows_.resize(3 * count);
     fractions_.resize(3 * count);
