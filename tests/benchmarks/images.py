@@ -20,7 +20,7 @@ from ...bench.specs import Findings
 from ...metrics.lpips_network import ALEX, Lpips, find_backbone, load_backbone
 from ...metrics.psnr import psnr
 from ...metrics.ssim import Ssim, ssim, ssim_map, ssim_reflected
-from .timing import take_turns
+from .timing import take_turns, torch_threads
 
 Ways = Mapping[str, Callable[[], float]]
 Pairs = list[tuple[ByteArray, ByteArray]]
@@ -161,9 +161,8 @@ def measure(quick: bool = False, progress: Progress = no_progress) -> Findings:
     pairs = noisy_pairs(4, height, width)
     runs = 2 if quick else 4
     threads = os.cpu_count() or 1
-    torch.set_num_threads(threads)
     tables: dict[str, list[Timed]] = {}
-    with ThreadPoolExecutor(threads) as pool:
+    with torch_threads(threads), ThreadPoolExecutor(threads) as pool:
         groups = structural_ways(pairs, pool)
         learned, reason = lpips_ways_or_reason(pairs)
         if learned:
