@@ -203,8 +203,9 @@ def _timed_stages(stages: _Stages) -> Iterator[None]:
         (ga, "to_world", "to world space"),
         (ours, "to_world", "to world space"),
         (ga, "harmonic_colors", "colours"),
-        (ours, "shade", "colours"),
-        (ours, "line_offsets", "lines"),
+        (ours, "plane_colors", "colours"),
+        (ours, "table_offsets", "lines"),
+        (ours, "directions_to", "directions"),
         (gbs, "apply_pose", "to world space"),
     ]
     plain = [(Optimiser, "step"), (Densifier, "observe"), (TrainingImages, "get")]
