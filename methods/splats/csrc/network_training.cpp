@@ -353,7 +353,6 @@ class LinePass {
 
   LineTraining describe(const Padded& weights) const {
     LineTraining net{};
-    net.samples = static_cast<int>(table_rows_ / 3);
     net.units = weights.units;
     net.units_stride = odd_stride(weights.units);
     net.outputs = static_cast<int>(outputs_);
@@ -388,7 +387,7 @@ class LinePass {
       if (!inside) continue;
       for (int axis = 0; axis < 3; ++axis) {
         const float along = (position[axis] - grid.low[axis]) / grid.extent[axis] * last;
-        const float clamped = std::min(std::max(along, 0.0f), last);
+        const float clamped = along > 0.0f ? std::min(along, last) : 0.0f;  // also of NaN, in a box without extent
         const int row = std::min(static_cast<int>(clamped), grid.samples - 2);
         lower.data()[3 * count + axis] = row;
         rest.data()[3 * count + axis] = clamped - static_cast<float>(row);

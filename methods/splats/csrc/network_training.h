@@ -63,12 +63,12 @@ struct ColorTraining {
 
 // Offsets of splats by the lines: what `line_offsets` of methods/ours/field.py computes of the table.
 struct LineTraining {
-  int samples, units, units_stride, outputs;
+  int units, units_stride, outputs;
   std::int64_t count;          // M
   const std::int64_t* splats;  // (M,) which splat each is
   const std::int32_t* rows;    // (M, 3) the lower of two neighbouring rows of the table
   const float* fractions;      // (M, 3) from the lower to the upper
-  const float* table;          // (3 samples, units)
+  const float* table;          // (T, units), T > rows + 1
   const float* bias_0;         // (units,)
   const float* bias_1;         // (units,)
   const float* weight_2;       // (outputs, units)
