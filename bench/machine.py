@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 import threading
+import time
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Self
@@ -108,6 +109,12 @@ def peak_memory_bytes() -> int:
     """Return the largest resident memory of this process so far, its finished children counted singly."""
     own = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * RUSAGE_UNIT
     return max(own, _children_peak())
+
+
+def processor_seconds() -> float:
+    """Return the processor time of this process so far, all threads, and of its finished children."""
+    children = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return time.process_time() + children.ru_utime + children.ru_stime
 
 
 def _children_peak() -> int:

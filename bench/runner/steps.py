@@ -16,7 +16,7 @@ from ..contracts import Avatar, Camera, Clip, FrameKey, HeadPose, Measurement, P
 from ..errors import HeadbenchError, InputError, UnavailableError
 from ..io.files import digest, digest_file, grouped_writes, refuse_links
 from ..io.images import quantise, read_png, write_png
-from ..machine import PeakMemory
+from ..machine import PeakMemory, processor_seconds
 from ..progress import RunProgress, duration, progress
 from ..protocol import Protocol
 from ..rows import ALL, Row, Rows
@@ -119,7 +119,7 @@ def fit(job: Job) -> Avatar:
     """Train, or continue, or read what was trained; return the avatar as read back from disk.
 
     A native method sees the images of the training split alone. An adapter gets the whole clip, since official
-    repositories want a whole capture. The record's ``seconds`` are those since the last of ``interruptions``. An avatar
+    repositories want a whole capture. The record's seconds are those since the last of ``interruptions``. An avatar
     with damaged files is trained again, with a warning.
     """
     method = job.method.create()
@@ -134,7 +134,7 @@ def fit(job: Job) -> Avatar:
     if earlier is None or earlier["status"] != "done":
         interruptions = 0 if earlier is None else earlier.get("interruptions", 0) + 1
         job.cell.begin("fit", job.fit_fingerprint, interruptions=interruptions)
-        start = time.perf_counter()
+        start, processor = time.perf_counter(), processor_seconds()
         with PeakMemory() as memory, job.progress(TRAINING) as report:
             try:
                 _train(job, method, report)
@@ -150,6 +150,7 @@ def fit(job: Job) -> Avatar:
             "fit",
             job.fit_fingerprint,
             seconds=round(seconds, 3),
+            processor_seconds=round(processor_seconds() - processor, 3),
             interruptions=interruptions,
             peak_memory_bytes=memory.peak,
             memory_before_bytes=memory.before,

@@ -45,7 +45,7 @@ class StepState(TypedDict, total=False):
     files : SHA-256 of the files that it left, by their place in the cell's folder.
     rows : SHA-256 of ``rows.parquet``.
     fingerprints, details : of the measurements, by metric.
-    seconds, interruptions, peak_memory_bytes, memory_before_bytes, method : of the training.
+    seconds, processor_seconds, interruptions, peak_memory_bytes, memory_before_bytes, method : of the training.
     derived_from : digest of the trained avatar that this one was derived from without training.
     """
 
@@ -56,6 +56,7 @@ class StepState(TypedDict, total=False):
     fingerprints: dict[str, str]
     details: dict[str, dict[str, Any]]
     seconds: float
+    processor_seconds: float
     interruptions: int
     peak_memory_bytes: int
     memory_before_bytes: int
