@@ -133,6 +133,7 @@ class Manifest:
     capture_seconds : how long the demo's capture took to make.
     evaluated : the folder of images that were scored in place of renders.
     sweep_of : the run whose avatars these were derived from.
+    curve_of : the run whose methods were trained with parts of their budgets.
     """
 
     configuration: RunConfig
@@ -149,6 +150,7 @@ class Manifest:
     capture_seconds: float | None = None
     evaluated: str | None = None
     sweep_of: str | None = None
+    curve_of: str | None = None
     format: Literal[1] = 1
 
     @classmethod

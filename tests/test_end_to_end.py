@@ -204,6 +204,12 @@ CASES = {
         ),
         case("table swept --layout speed", r"ga\+half"),
     ],
+    "curve": [
+        case(
+            "curve {demo} --out curve --methods ga --fractions 1/16 1/8 --frames 1",
+            *(r"(?m)^ga +1/8", "curve/curve.csv", "curve/curve.png"),
+        )
+    ],
     "extremes": [
         case(
             "extremes {demo} --out extremes --views 2 --dimensions 1 --sigmas 1",

@@ -64,7 +64,7 @@ def _run(
     jobs = make_jobs(config, methods, clips, protocols, folder)
     for job in jobs:
         job.check()
-    _warn_of_missing_metrics(metrics, clips[0])
+    warn_of_missing_metrics(metrics, clips[0])
 
     forms = tuple(
         AdaptedRecord(**adaptation.record(job.clip, job.adapted, job.method.spec.name))
@@ -75,9 +75,7 @@ def _run(
     manifest.write(folder.manifest)
     for protocol in protocols.values():
         log.info("%s, protocol %s: %d frames", protocol.task, protocol.hash, len(protocol.keys))
-    with run_progress({job.name: steps_ahead(job, metrics) for job in jobs}) as line:
-        frames = [_run_cell(replace(job, line=line), metrics) for job in jobs]
-    rows = Rows.joined(frames)
+    rows = run_jobs(jobs, metrics)
     rows.write(folder.rows)
     seconds = round(time.perf_counter() - start, 3)
     done = replace(manifest, status="done", seconds=seconds, peak_memory_bytes=peak_memory_bytes())
@@ -173,6 +171,12 @@ def _copy_kept(source: Path, folder: Path) -> None:
                 shutil.copyfile(path, temporary)
 
 
+def run_jobs(jobs: Sequence[Job], metrics: Sequence[MetricSpec]) -> Rows:
+    """Fit, render and measure cell by cell, under one line of progress; a cell that fails has failed rows."""
+    with run_progress({job.name: steps_ahead(job, metrics) for job in jobs}) as line:
+        return Rows.joined([_run_cell(replace(job, line=line), metrics) for job in jobs])
+
+
 def _run_cell(job: Job, metrics: Sequence[MetricSpec]) -> Rows:
     log.info("%s", job.name)
     try:
@@ -187,7 +191,7 @@ def _run_cell(job: Job, metrics: Sequence[MetricSpec]) -> Rows:
         return failed_rows(job, metrics, error)
 
 
-def _warn_of_missing_metrics(metrics: Sequence[MetricSpec], clip: Clip) -> None:
+def warn_of_missing_metrics(metrics: Sequence[MetricSpec], clip: Clip) -> None:
     """Say before the training, not after it, which metric cannot be had."""
     image = clip.image(clip.splits["train"][0])
     for spec in metrics:

@@ -1,0 +1,83 @@
+"""``headbench curve``."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+
+import tyro
+
+from ...bench.contracts import Progress, no_progress
+from ...bench.io.files import output_inside
+from ...bench.io.lock import locked
+from ...bench.runner.config import RunOptions
+from ...bench.specs import Findings
+
+
+@dataclass(frozen=True)
+class CurveSettings(RunOptions):
+    """Quality against training time: trains each method with parts of its budget, a whole training for each part.
+
+    Quality is measured on training frames that are held out of every training, never on test frames."""
+
+    run: tyro.conf.Positional[str]
+    """Folder of a finished run."""
+
+    out: str | None = None
+    """Folder to write, a run folder itself; default: `curve` in the folder of the run."""
+
+    methods: tuple[str, ...] = ()
+    """Methods to train; default: all but the trivial baselines."""
+
+    fractions: tuple[str, ...] = ("1/16", "1/8", "1/4", "1/2", "1")
+    """Parts of the method's budget, above 0 and at most 1."""
+
+    camera: str = ""
+    """Training camera to hold out; default: the one nearest to the mean position of the training cameras."""
+
+    every: int = 8
+    """Hold out one of so many training timesteps."""
+
+    frames: int = 100
+    """Score at most so many frames of each subject in the held-out camera, and as many of the held-out timesteps."""
+
+    def __post_init__(self) -> None:
+        if not self.fractions or len(set(self.parts)) != len(self.parts):
+            raise ValueError(f"fractions: each once, one at least; found {' '.join(self.fractions)}")
+        if self.every < 2:
+            raise ValueError(f"every is {self.every}; at least 2")
+        if self.frames < 1:
+            raise ValueError(f"frames is {self.frames}; at least 1")
+
+    @property
+    def parts(self) -> tuple[Fraction, ...]:
+        """The fractions as numbers, rising. Raises `ValueError` for what is no number above 0 and at most 1."""
+        return tuple(sorted(map(_part, self.fractions)))
+
+
+def _part(text: str) -> Fraction:
+    try:
+        part = Fraction(text)
+    except (ValueError, ZeroDivisionError):
+        part = Fraction(0)
+    if not 0 < part <= 1:
+        raise ValueError(f"fractions: {text!r} is no number above 0 and at most 1, such as 1/4 or 0.25")
+    return part
+
+
+def curve_run(settings: CurveSettings, progress: Progress = no_progress) -> Findings:
+    """Quality against training time: train with parts of the budget, measure on held-out training frames.
+
+    Writes ``curve.csv`` and ``curve.png`` into the run folder of all trainings. Started again, it keeps what is done.
+    Raises `InputError` for a folder that is no finished run, and for methods without a budget.
+    """
+    from ...bench.runner.store import RunFolder
+    from .curve import curve
+
+    run = RunFolder(Path(settings.run))
+    run.read_manifest().check_done(run.manifest)  # before a folder is made in what is no run
+    out = Path(settings.out) if settings.out else run.root / "curve"
+    with nullcontext() if settings.out else output_inside(run.root), locked(out):
+        return curve(settings, out)

@@ -1,0 +1,264 @@
+"""Curves over ball captures and over a tiny capture: what is trained on, measured, resumed and refused."""
+
+import csv
+import importlib
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from PIL import Image
+
+from headbench.bench import cli
+from headbench.bench.contracts import Budget
+from headbench.bench.errors import ExitCode, HeadbenchError, InputError
+from headbench.bench.runner import run as runner
+from headbench.bench.runner.config import RunConfig
+from headbench.bench.runner.store import RunFolder
+from headbench.reports.curve import curve as module
+from headbench.reports.curve.command import CurveSettings, curve_run
+from headbench.reports.curve.held_out import hold_out
+
+from ...datasets.tiny_capture import write_tiny_capture
+
+TESTS = Path(__file__).parents[1]
+HELD_TIMESTEP, HELD_CAMERA = 2, "1"  # of timesteps 0 to 3, and of cameras at -60, -30, 30 and 60 degrees
+
+
+@pytest.fixture
+def plugin(monkeypatch):
+    """The methods that take note, importable by name, and the reader of ball captures."""
+    for folder in ("curve", "robustness"):
+        monkeypatch.syspath_prepend(TESTS / folder)
+    monkeypatch.setattr(runner, "write_reports", lambda folder: [])
+    monkeypatch.setattr(module, "METRICS", ("psnr", "storage"))
+    found = importlib.import_module("curve_plugin")
+    found.FITS.clear()
+    found.RENDERED.clear()
+    monkeypatch.setattr(found.Method, "killed", ())
+    return found
+
+
+@pytest.fixture
+def make_run(plugin, tmp_path):
+    """A finished run of methods on one ball or more."""
+
+    def make(*methods, subjects=("ball-a",)):
+        for subject in subjects:
+            (tmp_path / "data" / subject).mkdir(parents=True)
+        runner.run(
+            RunConfig(
+                data=str(tmp_path / "data"),
+                out=str(tmp_path / "run"),
+                methods=methods,
+                metrics=("psnr",),
+                reader="ball_plugin:READER",
+                preset="smoke",
+            )
+        )
+        plugin.FITS.clear()
+        plugin.RENDERED.clear()
+        return tmp_path / "run"
+
+    return make
+
+
+def settings(run, **changes):
+    return CurveSettings(str(run), trust=True, **changes)
+
+
+def table(run):
+    with open(run / "curve" / "curve.csv", newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def test_neither_held_out_nor_test_frames_are_trained_on_and_only_the_held_out_are_measured(make_run, plugin):
+    curve_run(settings(make_run("curve_plugin:METHOD")))
+    assert [budget for _, budget in plugin.FITS] == [Budget(n) for n in (64, 32, 16, 8, 4)]
+    for train, _ in plugin.FITS:
+        assert {(key.timestep, key.camera) for key in train} == {(t, c) for t in (0, 1, 3) for c in "034"}
+    held_camera = {(t, HELD_CAMERA) for t in (0, 1, 3)}
+    held_timesteps = {(HELD_TIMESTEP, camera) for camera in "0134"}
+    assert set(plugin.RENDERED) == held_camera | held_timesteps
+
+
+def test_a_clip_gives_no_test_frame(plugin, tmp_path):
+    clip = importlib.import_module("ball_plugin").BallClip(tmp_path / "ball-a")
+    held = hold_out(clip, "", 8)
+    assert held.fingerprint not in (clip.fingerprint, hold_out(clip, "0", 8).fingerprint)
+    for key in clip.splits["novel_view"] + clip.splits["self_reenactment"]:
+        for read in (held.image, held.mask):
+            with pytest.raises(HeadbenchError, match="no training frame"):
+                read(key)
+
+
+def test_code_outside_that_looks_at_a_test_frame_fails(make_run):
+    run = make_run("curve_plugin:METHOD", "curve_plugin:PEEKING")
+    findings = curve_run(settings(run, fractions=("1",)))
+    assert not findings.passed
+    assert findings.data["failed"] == ["peeking+1"]
+    assert "failed: peeking+1" in findings.text
+    values = {line["method"]: line["psnr_camera"] for line in table(run)}
+    assert values["noting"]
+    assert not values["peeking"]
+
+
+def test_a_row_for_each_method_subject_and_part(make_run, plugin):
+    run = make_run("curve_plugin:METHOD", "curve_plugin:TIMED", subjects=("ball-a", "ball-bee"))
+    findings = curve_run(settings(run, fractions=("1", "1/4")))
+    assert [(line["method"], line["subject"], line["fraction"]) for line in table(run)] == [
+        (method, subject, part)
+        for method in ("noting", "timed")
+        for part in ("0.25", "1.0")
+        for subject in ("ball-a", "ball-bee")
+    ]
+    assert {line["budget_seconds"] for line in table(run)} == {"", "2.0", "8.0"}
+    record = RunFolder(run / "curve").cell("ball-a", "noting+1-4", 0).step("fit")
+    assert record["method"]["budget"]["iterations"] == 16
+    first = table(run)[0]
+    assert [float(first[name]) for name in module.MEASURED] == [record[name] for name in module.MEASURED]
+    rows = pd.read_parquet(run / "curve" / "rows.parquet")
+    own = rows[(rows["method"] == "noting+1-4") & (rows["subject"] == "ball-a") & (rows["metric"] == "psnr")]
+    by_task = own.groupby("task")["value"].mean()
+    assert float(first["psnr_camera"]) == pytest.approx(by_task["novel_view"])
+    assert float(first["psnr_timesteps"]) == pytest.approx(by_task["self_reenactment"])
+    assert "noting      1/4        16" in findings.text
+    assert Image.open(run / "curve" / "curve.png").width > 300
+
+
+def test_a_kill_half_way_ends_with_the_same_rows(make_run, plugin, monkeypatch):
+    run = make_run("curve_plugin:METHOD")
+    curve_run(settings(run, out=str(run.parent / "whole")))
+    plugin.FITS.clear()
+    monkeypatch.setattr(plugin.Method, "killed", (16,))
+    with pytest.raises(KeyboardInterrupt):
+        curve_run(settings(run))
+    monkeypatch.setattr(plugin.Method, "killed", ())
+    assert RunFolder(run / "curve").read_manifest().status != "done"
+    curve_run(settings(run))
+    # The one that was killed begins again, so that its time is that of the whole training.
+    assert [budget.iterations for _, budget in plugin.FITS] == [64, 32, 16, 16, 8, 4]
+    again = pd.read_parquet(run / "curve" / "rows.parquet")
+    assert again.equals(pd.read_parquet(run.parent / "whole" / "rows.parquet"))
+    assert all(float(line["processor_seconds"]) >= 0 for line in table(run))
+    curve_run(settings(run))
+    assert len(plugin.FITS) == 6
+
+
+def test_the_held_out_camera_and_timesteps_can_be_chosen(make_run, plugin):
+    findings = curve_run(settings(make_run("curve_plugin:METHOD"), fractions=("1",), camera="4", every=2))
+    assert findings.data["held_out"] == {"ball-a": {"camera": "4", "timesteps": [1, 3]}}
+    ((train, _),) = plugin.FITS
+    assert {(key.timestep, key.camera) for key in train} == {(t, c) for t in (0, 2) for c in "013"}
+
+
+def test_with_one_camera_timesteps_alone_are_held_out(plugin, tmp_path):
+    clip = importlib.import_module("ball_plugin").BallClip(tmp_path / "ball-a")
+    clip.splits["train"] = tuple(key for key in clip.splits["train"] if key.camera == "3")
+    held = hold_out(clip, "", 8)
+    assert "novel_view" not in held.splits
+    assert [key.timestep for key in held.splits["self_reenactment"]] == [HELD_TIMESTEP]
+    with pytest.raises(InputError, match="frames to train with"):
+        hold_out(clip, "3", 8)
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"fractions": ("0",)}, "above 0 and at most 1"),
+        ({"fractions": ("3/2",)}, "above 0 and at most 1"),
+        ({"fractions": ("1/0",)}, "above 0 and at most 1"),
+        ({"fractions": ("half",)}, "above 0 and at most 1"),
+        ({"fractions": ("0.5", "1/2")}, "each once"),
+        ({"fractions": ()}, "one at least"),
+        ({"every": 1}, "at least 2"),
+        ({"frames": 0}, "at least 1"),
+    ],
+)
+def test_settings_out_of_range_are_refused(changes, match):
+    with pytest.raises(ValueError, match=match):
+        CurveSettings("run", **changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({}, "budget of endless: expected iterations or seconds"),
+        ({"methods": ("notng",)}, "methods of the run: noting, endless"),
+        ({"methods": ("noting",), "camera": "2"}, "a training camera: 0, 1, 3, 4"),
+    ],
+)
+def test_what_cannot_be_trained_is_refused_before_work(make_run, plugin, changes, match):
+    run = make_run("curve_plugin:METHOD", "curve_plugin:ENDLESS")
+    with pytest.raises(InputError, match=match):
+        curve_run(settings(run, **changes))
+    assert plugin.FITS == []
+
+
+def test_other_frames_held_out_want_another_folder(make_run):
+    run = make_run("curve_plugin:METHOD")
+    curve_run(settings(run, fractions=("1",)))
+    with pytest.raises(InputError, match="Choose another --out"):
+        curve_run(settings(run, fractions=("1",), camera="4"))
+
+
+def test_a_run_that_did_not_end_and_a_curve_are_no_runs(make_run, plugin):
+    run = make_run("curve_plugin:METHOD")
+    curve_run(settings(run, fractions=("1",)))
+    with pytest.raises(InputError, match="none that it trained"):
+        curve_run(settings(run / "curve"))
+    folder = RunFolder(run)
+    replace(folder.read_manifest(), status="started").write(folder.manifest)
+    with pytest.raises(InputError, match="expected 'done'"):
+        curve_run(settings(run, out=str(run.parent / "other")))
+    assert not (run.parent / "other").exists()
+
+
+@pytest.fixture
+def tiny_run(plugin, tmp_path):
+    capture = write_tiny_capture(tmp_path / "data")
+
+    def make(*methods):
+        config = RunConfig(
+            data=str(capture.union),
+            out=str(tmp_path / "run"),
+            methods=methods,
+            preset="smoke",
+            metrics=("psnr",),
+            frames_per_task=1,
+        )
+        runner.run(config)
+        return tmp_path / "run"
+
+    return make
+
+
+def test_a_method_that_keeps_images_keeps_none_that_is_held_out(tiny_run):
+    run = tiny_run("nearest-camera")
+    findings = curve_run(CurveSettings(str(run), methods=("nearest-camera",)))
+    (point,) = findings.data["points"]  # every part of its budget of one iteration is one iteration
+    assert point["fraction"] == 1.0
+    assert 0 < point["psnr_camera"] < 60
+
+
+def test_a_metric_that_is_missing_says_why(make_run, monkeypatch):
+    toy = TESTS.parent / "bench"
+    monkeypatch.syspath_prepend(toy)
+    monkeypatch.setattr(module, "METRICS", ("psnr", "toy_plugin:NOT_HERE"))
+    findings = curve_run(settings(make_run("curve_plugin:METHOD"), fractions=("1",)))
+    assert findings.passed
+    assert "Absent missing: The toy weights are not here." in findings.text
+    assert findings.data["points"][0]["not_here_camera"] is None
+
+
+def test_ga_learns_more_with_more_of_its_budget(tiny_run, capsys):
+    run = tiny_run("ga")
+    assert cli.main(["curve", str(run), "--fractions", "1/16", "1", "--frames", "2", "--json"]) == ExitCode.OK
+    first, last = json.loads(capsys.readouterr().out)["points"]
+    assert (first["budget_iterations"], last["budget_iterations"]) == (4, 60)
+    assert last["processor_seconds"] > first["processor_seconds"] > 0
+    assert last["psnr_camera"] > first["psnr_camera"]
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["curve", str(run), "--fractions", "2"])
+    assert ended.value.code == ExitCode.BAD_INPUT
