@@ -18,7 +18,8 @@ from ...ga.writer import CapturePlan, CaptureWriter, SequencePlan
 def write_capture(clip: CaptureClip, out: Path, progress: Progress = no_progress) -> Path:
     """Write the clip under ``out`` in the GaussianAvatars/VHAP layout; return the union folder.
 
-    Frames keep their sequence and camera; splits, exclusions and background stay as they are.
+    Frames keep their sequence and camera; splits, exclusions and background stay as they are. The timesteps of a
+    sequence are numbered anew, from 0 without a gap as the layout wants it.
 
     Raises
     ------
@@ -26,12 +27,12 @@ def write_capture(clip: CaptureClip, out: Path, progress: Progress = no_progress
         Where the layout cannot hold the clip: a camera without a frame at some timestep, splits other than by
         held-out sequences and cameras, exclusions other than of whole timesteps.
     """
-    plan, first = capture_plan(clip)
+    plan, index = capture_plan(clip)
     writer = CaptureWriter(out, plan)
     with grouped_writes():
         for done, (key, files) in enumerate(sorted(clip.files.items())):
             progress(done, len(clip.files), "writing images")
-            place = (key.sequence, key.timestep - first[key.sequence], key.camera)
+            place = (key.sequence, index[key.timestep], key.camera)
             if (
                 clip.pixel_steps
                 or not _is_png(files.image)
@@ -45,23 +46,18 @@ def write_capture(clip: CaptureClip, out: Path, progress: Progress = no_progress
     return writer.write_metadata()
 
 
-def capture_plan(clip: CaptureClip, source: str | Path = "") -> tuple[CapturePlan, dict[str, int]]:
-    """Plan of the capture a clip makes, and the first timestep of each sequence.
+def capture_plan(clip: CaptureClip, source: str | Path = "") -> tuple[CapturePlan, dict[int, int]]:
+    """Plan of the capture a clip makes, and each timestep's number in its sequence there.
 
     Raises `InputError` as `write_capture` does, naming ``source``, the capture the clip was read from.
     """
     where = str(source) or f"clip of {clip.subject}"
     require_full_grid(clip, where)
     _check_excluded(clip, where)
-    timesteps: dict[str, list[int]] = {}
-    for key in clip.files:
-        timesteps.setdefault(key.sequence, []).append(key.timestep)
-    first = {name: min(found) for name, found in timesteps.items()}
-    names = sorted(first, key=first.__getitem__)
-    for name in names:
-        distinct = sorted({*timesteps[name]})
-        if distinct != [*range(distinct[0], distinct[0] + len(distinct))]:
-            raise InputError(where, name, "timesteps without gaps", f"{len(distinct)} with gaps")
+    timesteps: dict[str, list[int]] = {}  # of each sequence, in order; sequences by their first
+    for timestep, name in sorted({(key.timestep, key.sequence) for key in clip.files}):
+        timesteps.setdefault(name, []).append(timestep)
+    index = {timestep: number for found in timesteps.values() for number, timestep in enumerate(found)}
     test = {key.sequence for key in clip.splits["self_reenactment"]}
     novel = {key.camera for key in clip.splits["novel_view"]}
     for split, keys in clip.splits.items():
@@ -73,10 +69,10 @@ def capture_plan(clip: CaptureClip, source: str | Path = "") -> tuple[CapturePla
     sequences = [
         SequencePlan(
             name,
-            [clip.poses[timestep] for timestep in sorted({*timesteps[name]})],
-            {k.timestep - first[name]: why for k, why in clip.excluded.items() if k.sequence == name},
+            [clip.poses[timestep] for timestep in found],
+            {index[k.timestep]: why for k, why in clip.excluded.items() if k.sequence == name},
         )
-        for name in names
+        for name, found in timesteps.items()
     ]
     plan = CapturePlan(
         subject=clip.subject,
@@ -90,7 +86,7 @@ def capture_plan(clip: CaptureClip, source: str | Path = "") -> tuple[CapturePla
         background=(background[0], background[1], background[2]),
         synthetic=clip.steps[0].parameters.get("synthetic", {}) if clip.steps else {},
     )
-    return plan, first
+    return plan, index
 
 
 def link_or_copy(source: Path, target: Path) -> None:

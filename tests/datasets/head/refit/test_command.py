@@ -134,6 +134,23 @@ def test_splits_the_layout_cannot_hold_are_refused(finished):
         capture_plan(replace(clip, splits=swapped))
 
 
+def test_timesteps_with_gaps_are_numbered_anew(finished, tmp_path):
+    _, settings, _ = finished
+    clip = read_capture(settings.capture)
+    gone = 1
+    files = {key: value for key, value in clip.files.items() if key.timestep != gone}
+    splits = {name: tuple(key for key in keys if key in files) for name, keys in clip.splits.items()}
+    assert len(files) < len(clip.files)
+    written = read_capture(write_capture(replace(clip, files=files, splits=splits), tmp_path))
+    kept = sorted({key.timestep for key in files})
+    assert sorted(written.poses) == [*range(len(kept))]
+    for number, timestep in enumerate(kept):
+        np.testing.assert_allclose(written.poses[number].jaw, clip.poses[timestep].jaw, atol=1e-6)
+    for new, old in zip(sorted(written.files), sorted(files), strict=True):
+        assert (new.sequence, new.camera) == (old.sequence, old.camera)
+        np.testing.assert_array_equal(written.image(new), clip.image(old))
+
+
 def test_images_that_a_step_changed_are_written_as_they_are_now(finished, tmp_path):
     _, settings, _ = finished
     clip = set_background(read_capture(settings.capture), (0.0, 0.0, 0.0))
