@@ -1,7 +1,8 @@
 """headbench: a benchmark suite for animatable 3D head avatars.
 
 Everything a plug-in needs is here: specifications to register, the values and protocols of the contracts, errors,
-and the checks of the conformance kit. Names are imported when first used, so that ``import headbench`` is light.
+what readers share, and the checks of the conformance kit. Names are imported when first used, so that ``import
+headbench`` is light.
 """
 
 from importlib import import_module as _import_module
@@ -51,6 +52,8 @@ if _TYPE_CHECKING:
         ResolutionRule,
         writes,
     )
+    from .datasets.head.loaders import load_head
+    from .datasets.steps.exclude import exclude_given
 
 __all__ = [
     "STAGES",
@@ -93,19 +96,23 @@ __all__ = [
     "check_method",
     "check_metric",
     "check_reader",
+    "exclude_given",
+    "load_head",
     "resolve_method",
     "writes",
 ]
 
 _HOMES = {
-    "runner.adaptation": ("AdaptedClip", "MethodNeeds"),
-    "conformance.methods": ("check_method",),
-    "conformance.metrics": ("check_metric",),
-    "conformance.readers": ("check_clip", "check_reader"),
-    "errors": ("HeadbenchError", "InputError", "UnavailableError"),
-    "runner.config": ("resolve_method",),
-    "specs": tuple(name for name in __all__ if name.endswith("Spec"))
+    "bench.runner.adaptation": ("AdaptedClip", "MethodNeeds"),
+    "bench.conformance.methods": ("check_method",),
+    "bench.conformance.metrics": ("check_metric",),
+    "bench.conformance.readers": ("check_clip", "check_reader"),
+    "bench.errors": ("HeadbenchError", "InputError", "UnavailableError"),
+    "bench.runner.config": ("resolve_method",),
+    "bench.specs": tuple(name for name in __all__ if name.endswith("Spec"))
     + ("Findings", "Renamed", "ResolutionRule", "writes"),
+    "datasets.head.loaders": ("load_head",),
+    "datasets.steps.exclude": ("exclude_given",),
 }
 _HOME = {name: module for module, names in _HOMES.items() for name in names}
 
@@ -113,7 +120,7 @@ _HOME = {name: module for module, names in _HOMES.items() for name in names}
 def __getattr__(name: str) -> _Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(_import_module(f".bench.{_HOME.get(name, 'contracts')}", __name__), name)
+    value = getattr(_import_module(f".{_HOME.get(name, 'bench.contracts')}", __name__), name)
     globals()[name] = value
     return value
 

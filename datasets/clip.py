@@ -22,6 +22,7 @@ from ..bench.contracts import (
     StepRecord,
 )
 from ..bench.errors import InputError
+from ..bench.io.arrays import Member, check_arrays
 from ..bench.io.files import digest
 from ..bench.io.images import quantise
 from .head.arrays import STORED, HeadArrays
@@ -204,7 +205,7 @@ def as_capture(clip: Clip) -> CaptureClip:
     """Any clip as a `CaptureClip`, so that every step and command works on it; one that is such comes back itself.
 
     Pixels stay where they are and are asked of ``clip``. Raises `InputError` where its head model is none in FLAME's
-    layout.
+    layout, or the subject's identity or a pose is of another size.
     """
     if isinstance(clip, CaptureClip):
         return clip
@@ -214,10 +215,17 @@ def as_capture(clip: Clip) -> CaptureClip:
     regions = {name: np.asarray(members) for name, members in clip.head.regions.items()}
     arrays: dict[str, Any] = {name: np.asarray(getattr(clip.head, name)) for name in STORED}
     head = HeadArrays(clip.head.version, **arrays, eyelid_basis=clip.head.eyelid_basis, regions=regions)
+    head.validate(where)
+    sizes = {"S": head.shape_basis.shape[2], "E": head.expression_basis.shape[2], "V": len(head.template)}
+    identity = {"shape": Member("f", ("S",)), "static_offset": Member("f", ("V", 3))}
+    check_arrays(where, {name: np.asarray(getattr(clip, name)) for name in identity}, identity, sizes)
+    for timestep, pose in clip.poses.items():
+        expression = {"expression": np.asarray(pose.expression)}
+        check_arrays(f"{where}, timestep {timestep}", expression, {"expression": Member("f", ("E",))}, sizes)
     keys = [key for part in clip.splits.values() for key in part]
     return CaptureClip(
         subject=clip.subject,
-        head=head.validate(where),
+        head=head,
         shape=np.asarray(clip.shape),
         static_offset=np.asarray(clip.static_offset),
         cameras=clip.cameras,

@@ -48,8 +48,8 @@ def open_clips(
     reader: str = "",
     *,
     wishes: Mapping[str, Any] | None = None,
+    settings: Mapping[str, Any] | None = None,
     progress: Progress = no_progress,
-    **settings: Any,
 ) -> Iterator[CaptureClip]:
     """Read every capture under a folder, one after the other.
 
@@ -57,7 +57,7 @@ def open_clips(
     ----------
     reader : see `find_reader`.
     wishes : settings for readers that have them, such as ``leaks``; others do without.
-    settings : of the reader; those that are None are not given.
+    settings : of the reader.
 
     Raises
     ------
@@ -67,7 +67,7 @@ def open_clips(
     spec = find_reader(path, reader)
     known = inspect.signature(resolve(spec.implementation)).parameters
     given = {key: value for key, value in (wishes or {}).items() if key in known}
-    given |= {key: value for key, value in settings.items() if value is not None}
+    given |= settings or {}
     for _, read in found_captures(spec, Path(path), given):
         yield as_capture(read(progress))
 

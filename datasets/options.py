@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
 
 from ..bench.contracts import Progress
 
@@ -25,21 +27,24 @@ class CaptureOptions:
     cy: Literal["auto", "top", "bottom", "centre"] = "auto"
     """How the reader ga reads the principal point; auto takes the declared convention, else lets the images decide."""
 
+    set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="KEY=VALUE")] = ()
+    """A setting of the reader, such as `exclude=tongue.yaml`, as reader_settings of `headbench run`; repeatable."""
+
     def open(self, path: str, progress: Progress, **settings: Any) -> CaptureClip:
         """Open the one capture at ``path``; see `open_clip`. Leaks between splits are recorded, if the reader can."""
         from .open import open_clip
 
-        return open_clip(path, self.reader, progress=progress, **self._settings(), **settings)
+        return open_clip(path, self.reader, progress=progress, **self._settings(settings))
 
     def open_all(self, path: str, progress: Progress, **settings: Any) -> Iterator[CaptureClip]:
         """Open every capture under ``path``, one after the other."""
         from .open import open_clips
 
-        return open_clips(path, self.reader, progress=progress, **self._settings(), **settings)
+        return open_clips(path, self.reader, progress=progress, **self._settings(settings))
 
-    def _settings(self) -> dict[str, Any]:
-        return {
-            "wishes": {"leaks": "record"},
-            "head": self.head,
-            "cy": None if self.cy == "auto" else self.cy,
-        }
+    def _settings(self, others: dict[str, Any]) -> dict[str, Any]:
+        from ..bench.configuration import merge, parse_assignments  # which takes long to import
+
+        options = {"head": self.head, "cy": None if self.cy == "auto" else self.cy, **others}
+        given = {key: value for key, value in options.items() if value is not None}
+        return {"wishes": {"leaks": "record"}, "settings": merge(given, parse_assignments(self.set))}

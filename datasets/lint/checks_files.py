@@ -209,7 +209,7 @@ def _short_test(evidence: Evidence) -> Iterator[Hit]:
             yield Hit(
                 f"test sequence {evidence.names[folder]} has {several(kept, 'timestep')}{left_out}, "
                 f"fewer than {least}",
-                evidence.folder / layout.SPLIT_FILES["self_reenactment"],
+                evidence.split_file("self_reenactment"),
             )
 
 
@@ -221,7 +221,7 @@ def _empty_split(evidence: Evidence) -> Iterator[Hit]:
     Hold out a camera for novel views and a sequence for self-reenactment.
     """
     faulty = {error.file for error in (*evidence.json_faults, *evidence.frame_faults)}
-    files = {name: evidence.folder / file for name, file in layout.SPLIT_FILES.items()}
+    files = {name: evidence.split_file(name) for name in layout.SPLIT_FILES}
     empty = [
         name for name, path in files.items() if not evidence.splits.get(name) and str(path) not in faulty
     ]

@@ -91,6 +91,10 @@ def lint_capture(settings: LintSettings, progress: Progress = no_progress) -> tu
     from .evidence import gather, gather_clip
 
     if find_reader(settings.clip, settings.reader).name == "ga":
+        if settings.set:
+            found = ", ".join(settings.set)
+            expected = "no settings: of the reader ga, lint looks at the files"
+            raise InputError("command line", "--set", expected, found, "Leave it out.")
         evidence = gather(find_capture(settings.clip), settings, progress)
     else:
         clip = settings.open(settings.clip, progress)

@@ -91,6 +91,10 @@ class Evidence:
         """Frames of all splits."""
         return tuple(entry for part in self.splits.values() for entry in part)
 
+    def split_file(self, split: str) -> Path:
+        """The file that states a split; the capture where its layout is another reader's."""
+        return self.folder / layout.SPLIT_FILES[split] if self.of_layout else self.folder
+
     @cached_property
     def names(self) -> Mapping[str, str]:
         """Sequence name by sequence folder."""

@@ -22,16 +22,18 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from os import PathLike
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import yaml
 from pydantic import NonNegativeInt
 
-from ...bench.contracts import FrameKey
+from ...bench.contracts import Clip, FrameKey
 from ...bench.errors import InputError
 from ...bench.io.documents import checked, read_json, read_yaml
 from ...bench.io.files import check_name, write_text
-from ..clip import CaptureClip
+
+if TYPE_CHECKING:
+    from ..clip import CaptureClip
 
 
 def exclude_timesteps(
@@ -65,8 +67,21 @@ def exclude_timesteps(
     return clip.derive("exclude_timesteps", parameters, splits=splits, excluded=excluded)
 
 
-def exclude_given(clip: CaptureClip, exclude: Mapping[int, str] | str | Path | None) -> CaptureClip:
-    """Leave out what a reader's setting ``exclude`` names: reason by timestep, or a file for `read_reasons`."""
+def exclude_given(clip: Clip, exclude: Mapping[int, str] | str | Path | None) -> CaptureClip:
+    """Leave out what a reader's setting ``exclude`` names, for a clip of any reader.
+
+    Parameters
+    ----------
+    exclude : reason by timestep, or a file for `read_reasons`, such as the one that ``headbench tongue`` writes.
+
+    Raises
+    ------
+    InputError
+        As `exclude_timesteps` and `read_reasons` do, and where the clip's head model is none in FLAME's layout.
+    """
+    from ..clip import as_capture  # which takes long to import
+
+    clip = as_capture(clip)
     if isinstance(exclude, (str, Path)):
         return exclude_timesteps(clip, read_reasons(Path(exclude), clip), source=exclude)
     return exclude_timesteps(clip, exclude) if exclude else clip

@@ -3,7 +3,7 @@
 from pathlib import Path
 from types import SimpleNamespace
 
-from headbench import DatasetSpec
+from headbench import DatasetSpec, exclude_given
 from headbench.datasets.ga.reader import read_capture
 
 HEAD = [
@@ -28,9 +28,10 @@ def find(root):
     return sorted(Path(root).glob("*.plain"))
 
 
-def read(path):
+def read(path, *, exclude: Path | None = None):
     """A file names the capture that holds the frames."""
-    return PlainClip(read_capture(Path(path).read_text()))
+    clip = PlainClip(read_capture(Path(path).read_text()))
+    return clip if exclude is None else exclude_given(clip, exclude)
 
 
 SPEC = DatasetSpec("plain", "Captures named in text files.", "plain_reader:read", find="plain_reader:find")

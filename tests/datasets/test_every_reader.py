@@ -30,6 +30,16 @@ def test_commands_read_by_a_plugins_reader(plain_folder, tmp_path, command):
             assert probe_image(tmp_path / "out" / file).width > 100
 
 
+def test_commands_take_settings_of_the_reader(plain_folder, tmp_path, capsys):
+    labels = tmp_path / "labels.json"
+    labels.write_text('{"0": "a hand"}')
+    command = ["inspect", str(plain_folder), "--reader", "plain_reader:SPEC", "--out", str(tmp_path / "out")]
+    assert main([*command, "--set", f"exclude={labels}", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["sequences"][0]["excluded"] == 1
+    assert main([*command, "--set", "exclud=x"]) == 2
+    assert "exclude" in capsys.readouterr().err
+
+
 def test_the_linter_says_which_checks_it_skips(plain_folder, capsys):
     main(["lint", str(plain_folder), "--reader", "plain_reader:SPEC", "--min-test-timesteps", "1", "--json"])
     data = json.loads(capsys.readouterr().out)
@@ -37,3 +47,14 @@ def test_the_linter_says_which_checks_it_skips(plain_folder, capsys):
     assert not {"HB201", "HB301", "HB503", "HB701"} & set(data["skipped"])
     assert not {finding["code"] for finding in data["findings"]} & set(data["skipped"])
     assert data["looked_at"]["frames_decoded"] > 0
+
+
+def test_the_linter_names_no_file_of_another_layout(plain_folder, capsys):
+    main(["lint", str(plain_folder), "--reader", "plain_reader:SPEC", "--json"])
+    findings = {found["code"]: found for found in json.loads(capsys.readouterr().out)["findings"]}
+    assert findings["HB110"]["file"] == plain_folder.name
+
+
+def test_the_linter_refuses_settings_of_the_reader_that_it_does_without(pristine_capture, capsys):
+    assert main(["lint", str(pristine_capture.union), "--set", "background=1,1,1"]) == 2
+    assert "lint looks at the files" in capsys.readouterr().err

@@ -19,13 +19,13 @@ from headbench.datasets.steps.resolution import align_clip
 
 def test_a_capture_is_opened_by_the_reader_that_finds_it(pristine_capture):
     assert find_reader(pristine_capture.union).name == "ga"
-    clip = open_clip(pristine_capture.union, wishes={"leaks": "record", "unheard of": 1}, head=None)
+    clip = open_clip(pristine_capture.union, wishes={"leaks": "record", "unheard of": 1})
     assert clip.fingerprint == read_capture(pristine_capture.union, leaks="record").fingerprint
 
 
 def test_settings_that_the_reader_lacks_are_refused(pristine_capture):
     with pytest.raises(InputError, match="reader_settings, hed: expected .*head.*found"):
-        open_clip(pristine_capture.union, hed="x")
+        open_clip(pristine_capture.union, settings={"hed": "x"})
 
 
 @pytest.mark.parametrize(
@@ -79,6 +79,25 @@ def test_a_clip_of_another_reader_passes_through_steps(plain_folder, pristine_ca
         np.testing.assert_array_equal(changed.image(key), expected.image(key))
         np.testing.assert_array_equal(changed.mask(key), expected.mask(key))
     assert clip.region_names == same.region_names
+
+
+@pytest.mark.parametrize(
+    ("change", "key"),
+    [
+        (lambda clip: {"shape": clip.shape[:-1]}, "shape"),
+        (lambda clip: {"static_offset": clip.static_offset[:-1]}, "static_offset"),
+        (
+            lambda clip: {"poses": {t: replace(p, expression=np.zeros(1)) for t, p in clip.poses.items()}},
+            "expression",
+        ),
+    ],
+)
+def test_a_clip_of_another_head_model_is_refused(plain_folder, change, key):
+    clip = open_clip(plain_folder, "plain_reader:SPEC").source
+    vars(clip).update(change(clip))
+    with pytest.raises(InputError) as caught:
+        as_capture(clip)
+    assert caught.value.key == key
 
 
 def test_a_clip_of_another_reader_is_adapted_to_methods(plain_folder, pristine_capture, tmp_path):

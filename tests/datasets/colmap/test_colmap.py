@@ -298,7 +298,7 @@ def dataset(clip, tmp_path):
 
 
 def test_an_exported_dataset_with_tracking_is_read_back(clip, dataset):
-    found = open_clip(dataset, held_out_cameras=[next(iter(clip.splits["novel_view"])).camera])
+    found = open_clip(dataset, settings={"held_out_cameras": [next(iter(clip.splits["novel_view"])).camera]})
     assert found.subject == clip.subject
     assert set(found.files) == set(clip.files)
     assert found.excluded == clip.excluded
