@@ -185,7 +185,7 @@ class ListSettings:
     what: tyro.conf.Positional[
         Literal["methods", "presets", "metrics", "profiles", "datasets", "reports", "benchmarks", "commands"]
     ]
-    """What to list."""
+    """What to list; datasets are readers, and what makes captures."""
 
 
 def list_installed(settings: ListSettings, progress: Progress) -> Findings:

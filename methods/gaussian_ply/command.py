@@ -16,7 +16,7 @@ class ExportPlySettings(CaptureOptions):
     """Write an avatar in one pose as a 3D Gaussian splatting PLY that common viewers open."""
 
     avatar: tyro.conf.Positional[str]
-    """Folder of an avatar of ours, ga or gbs (RUN/avatars/...)."""
+    """Folder of an avatar of ours, ga or gbs (RUN/SUBJECT/METHOD/seed-0/avatar)."""
 
     out: str
     """PLY file to write."""
