@@ -72,12 +72,18 @@ def with_groups(commands: Mapping[str, Command | dict[str, Command]]) -> dict[st
 
 
 def check_known(words: Sequence[str], commands: Mapping[str, Command | dict[str, Command]]) -> None:
-    """Raise `InputError` where a command line names none of ``commands``, or an option as it was called before."""
+    """Raise `InputError` where a command line names none of ``commands``, or an option as it was called before.
+
+    Raises `HeadbenchError` where it names a command that cannot be loaded: nobody knows what options that has.
+    """
     word = next(iter(words), "-")
     for option, new in RENAMED_OPTIONS.get(word, {}).items():
         if any(each.partition("=")[0] == option for each in words[1:]):
             raise InputError("command line", option, f"its new name, {new}", "the old one")
     table = commands.get(word)
+    named = table.get(words[1]) if isinstance(table, dict) and words[1:] else table
+    if getattr(named, "broken", False):
+        named()  # type: ignore[operator,misc]
     if isinstance(table, dict) and words[1:]:
         if words[1].startswith("-") or words[1] in table:
             return
@@ -154,6 +160,7 @@ def _broken(name: str, why: str) -> Command:
         raise HeadbenchError(f"command {name!r} is broken: {why}")
 
     command.__doc__ = "Broken; calling it shows why."
+    command.__dict__["broken"] = True
     return command
 
 

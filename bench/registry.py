@@ -82,7 +82,8 @@ def get(group: Group, name: str) -> Any:
         return _checked(resolve(name), group, name)
     plugins = discover(group)
     if name not in plugins:
-        raise unknown(f"registry of {group}", "name", name, plugins)
+        hint = "A plug-in's is known once it is installed here."
+        raise unknown(f"registry of {group}", "name", name, plugins, hint)
     plugin = plugins[name]
     if plugin.spec is None:
         raise HeadbenchError(f"{group[:-1]} {name!r} of {plugin.origin} is broken: {plugin.error}")
@@ -102,12 +103,12 @@ def resolve(reference: str) -> Any:
     return value
 
 
-def unknown(file: str, key: str, name: str, known: Any) -> InputError:
-    """Build the error for a name that is not among ``known``, with the nearest one as a hint."""
+def unknown(file: str, key: str, name: str, known: Any, remedy: str = "") -> InputError:
+    """Build the error for a name that is not among ``known``, with the nearest one as a hint before ``remedy``."""
     names = sorted(known)
     near = difflib.get_close_matches(name, names, n=1, cutoff=0.4)
     hint = f"Did you mean {near[0]!r}?" if near else ""
-    return InputError(file, key, f"one of {', '.join(names)}", repr(name), hint)
+    return InputError(file, key, f"one of {', '.join(names)}", repr(name), f"{hint} {remedy}".strip())
 
 
 def _origin(entry: EntryPoint) -> str:

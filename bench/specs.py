@@ -206,13 +206,27 @@ class ProfileSpec:
     name : as settings and metric names have it.
     summary : one sentence.
     source : which code, at which version, prints these numbers.
-    metrics : each named ``<metric>@<profile>``, but for the canonical profile, whose names are bare.
+    metrics : of this profile by `MetricSpec.profile`, each named ``<metric>@<profile>`` and in a table of the
+        profile's own, ``tables=(profile,)``; but for the canonical profile, whose names are bare.
     """
 
     name: str
     summary: str
     source: str
     metrics: tuple[MetricSpec, ...]
+
+    def __post_init__(self) -> None:
+        """Refuse what would be taken for another profile's metric."""
+        for metric in self.metrics:
+            if metric.profile != self.name:
+                raise ValueError(f"{metric.name}: profile is {metric.profile!r}, not {self.name!r}")
+            if self.name != "canonical" and (
+                not metric.name.endswith(f"@{self.name}") or "comparison" in metric.tables
+            ):
+                wanted = f"a name that ends with @{self.name}, tables=({self.name!r},)"
+                raise ValueError(
+                    f"{metric.name} in tables {metric.tables}: metrics of a profile have {wanted}"
+                )
 
 
 @dataclass(frozen=True)
@@ -308,6 +322,12 @@ class CommandSpec:
         settings = get_type_hints(function).get(parameters[0]) if parameters else None
         if not isinstance(settings, type) or not is_dataclass(settings):
             raise TypeError(f"{function!r}: the first parameter of a command is annotated with a dataclass")
+        try:
+            inspect.signature(function).bind(settings, None)
+        except TypeError as error:
+            raise TypeError(
+                f"{function!r}: a command is called with settings and a Progress: {error}"
+            ) from error
         summary = (function.__doc__ or "").strip().partition("\n")[0]
         return cls(name, summary, function, settings, getattr(function, "writes", ""))
 

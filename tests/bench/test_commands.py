@@ -29,6 +29,9 @@ def make(settings: Settings, progress):
     """Make it."""
     return look(settings, progress)
 
+def look_alone(settings: Settings):
+    return look(settings, None)
+
 def look(settings: Settings, progress):
     """Look at it."""
     if settings.limit < 0:
@@ -62,6 +65,12 @@ def test_findings_decide_the_exit_code(offer, capsys):
     offer("look")
     assert [cli.main(["look", "here", "--limit", limit]) for limit in ("2", "-1", "3")] == [1, 2, 3]
     assert "at least 0" in capsys.readouterr().err
+
+
+def test_a_function_that_cannot_be_called_with_settings_and_progress_is_broken(offer, capsys):
+    offer("look", function="toy_command:look_alone")
+    assert cli.main(["look", "here"]) == 2
+    assert "called with settings and a Progress: too many positional arguments" in capsys.readouterr().err
 
 
 def test_two_words_share_the_first(offer, capsys):

@@ -4,7 +4,7 @@ import pytest
 
 from headbench.bench import registry
 from headbench.bench.errors import HeadbenchError, InputError
-from headbench.bench.specs import MetricSpec
+from headbench.bench.specs import MetricSpec, ProfileSpec
 
 
 def with_entries(monkeypatch, *entries):
@@ -16,7 +16,7 @@ def entry(name, value):
 
 
 def test_an_unknown_name_is_refused_with_the_nearest():
-    with pytest.raises(InputError, match="Did you mean 'psnr'"):
+    with pytest.raises(InputError, match="Did you mean 'psnr'.*installed here"):
         registry.get("metrics", "pnsr")
 
 
@@ -63,3 +63,15 @@ def test_a_spec_not_yet_packaged_is_reached_by_module(toy):
 def test_a_reference_that_leads_nowhere_is_refused(toy, name):
     with pytest.raises(HeadbenchError, match="cannot be imported"):
         registry.get("methods", name)
+
+
+@pytest.mark.parametrize(
+    "changes", [{"profile": "canonical"}, {"name": "psnr"}, {"tables": ("comparison",)}], ids=str
+)
+def test_a_profile_whose_metric_looks_like_another_definition_is_refused(changes):
+    own = {"name": "psnr@lab", "profile": "lab", "tables": ("lab",)}
+    metric = MetricSpec(
+        **(own | changes), label="P", unit="", higher_is_better=True, digits=2, implementation="a:b"
+    )
+    with pytest.raises(ValueError, match="psnr"):
+        ProfileSpec("lab", "in Lab", "", (metric,))
