@@ -1,8 +1,8 @@
 """headbench: a benchmark suite for animatable 3D head avatars.
 
 Everything a plug-in needs is here: specifications to register, the values and protocols of the contracts, errors,
-what readers share, and the checks of the conformance kit. Names are imported when first used, so that ``import
-headbench`` is light.
+what readers share, finished runs to read, and the checks of the conformance kit. Names are imported when first
+used, so that ``import headbench`` is light.
 """
 
 from importlib import import_module as _import_module
@@ -38,6 +38,7 @@ if _TYPE_CHECKING:
         Variant,
     )
     from .bench.errors import HeadbenchError, InputError, UnavailableError
+    from .bench.rows import ALL
     from .bench.runner.adaptation import AdaptedClip, MethodNeeds
     from .bench.runner.config import resolve_method
     from .bench.specs import (
@@ -54,8 +55,10 @@ if _TYPE_CHECKING:
     )
     from .datasets.head.loaders import load_head
     from .datasets.steps.exclude import exclude_given
+    from .reports.runs import RunData
 
 __all__ = [
+    "ALL",
     "STAGES",
     "AdaptedClip",
     "Avatar",
@@ -85,6 +88,7 @@ __all__ = [
     "Renamed",
     "ReportSpec",
     "ResolutionRule",
+    "RunData",
     "SharingAvatar",
     "StagedAvatar",
     "StepRecord",
@@ -109,10 +113,12 @@ _HOMES = {
     "bench.conformance.readers": ("check_clip", "check_reader"),
     "bench.errors": ("HeadbenchError", "InputError", "UnavailableError"),
     "bench.runner.config": ("resolve_method",),
+    "bench.rows": ("ALL",),
     "bench.specs": tuple(name for name in __all__ if name.endswith("Spec"))
     + ("Findings", "Renamed", "ResolutionRule", "writes"),
     "datasets.head.loaders": ("load_head",),
     "datasets.steps.exclude": ("exclude_given",),
+    "reports.runs": ("RunData",),
 }
 _HOME = {name: module for module, names in _HOMES.items() for name in names}
 

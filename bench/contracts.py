@@ -321,7 +321,11 @@ class Metric(Protocol):
     """
 
     def __call__(self, image: ByteArray, target: ByteArray) -> float:
-        """Compare two (H, W, 3) 8-bit images. Raises `UnavailableError` where it cannot be had."""
+        """Compare two (H, W, 3) 8-bit images.
+
+        Raises an error of any kind for images of another type or of two sizes, `UnavailableError` where the metric
+        cannot be had.
+        """
 
 
 @runtime_checkable

@@ -11,7 +11,6 @@ from typing import Any, TypeVar
 
 from ..bench.contracts import ByteArray, Clip, FrameKey
 from ..bench.errors import InputError
-from ..bench.io.images import probe_image, read_png
 from ..bench.manifest import Manifest, MethodRecord
 from ..bench.rows import ALL, Rows
 from ..bench.runner.captures import open_run_clips
@@ -81,6 +80,8 @@ class RunData:
 
     def render(self, method: str, task: str, key: FrameKey) -> ByteArray | None:
         """Read that render, (H, W, 3) 8-bit, or return None where there is none."""
+        from ..bench.io.images import read_png
+
         path = self.render_path(method, task, key)
         return None if path is None else read_png(path)
 
@@ -104,6 +105,8 @@ class RunData:
     @property
     def image_size(self) -> str:
         """Size of the rendered images, "width x height", or the range where they differ; "" without renders."""
+        from ..bench.io.images import probe_image
+
         first_of_camera = {
             (task, key.subject, key.camera): key for task in self.tasks for key in reversed(self.keys(task))
         }

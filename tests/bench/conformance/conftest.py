@@ -10,16 +10,17 @@ ROOT = HERE.parents[2]
 
 @pytest.fixture
 def outside(monkeypatch, tmp_path):
-    """A folder with plug-ins as their authors have it, importable by name: the README's method, a reader, metrics."""
+    """A folder with plug-ins as their authors have it, importable by name: those of the pages and those beside this."""
     folder = tmp_path / "plugins"
     folder.mkdir()
-    for name in ("outside_reader.py", "outside_metric.py"):
-        (folder / name).write_text((HERE / name).read_text())
-    code = re.search(r"```python\n(# grey\.py\n.*?)```", (ROOT / "README.md").read_text("utf-8"), re.DOTALL)
-    (folder / "grey.py").write_text(code[1])
+    for path in HERE.glob("outside_*.py"):
+        (folder / path.name).write_text(path.read_text())
+    for page in ("README.md", "metrics/README.md"):
+        code = re.search(r"```python\n# (\w+\.py)\n(.*?)```", (ROOT / page).read_text("utf-8"), re.DOTALL)
+        (folder / code[1]).write_text(code[2])
     monkeypatch.syspath_prepend(folder)
-    for name in ("outside_reader", "outside_metric", "grey"):
-        monkeypatch.delitem(__import__("sys").modules, name, raising=False)
+    for path in folder.iterdir():
+        monkeypatch.delitem(__import__("sys").modules, path.stem, raising=False)
     return folder
 
 

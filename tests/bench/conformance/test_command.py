@@ -4,15 +4,16 @@ import ast
 import json
 import subprocess
 import sys
+from importlib.metadata import EntryPoint
 
 import pytest
 
 import headbench
-from headbench.bench import cli, contracts, errors, specs
+from headbench.bench import cli, contracts, errors, registry, specs
 from headbench.bench.conformance import command
 from headbench.bench.runner import captures
 
-PLUGINS = ("grey:SPEC", "outside_reader:SPEC") + tuple(
+PLUGINS = ("grey:SPEC", "outside_reader:SPEC", "mae:MAE") + tuple(
     f"outside_metric:{name}" for name in ("ERROR", "JUMP", "FILES", "HOURS")
 )
 
@@ -31,6 +32,27 @@ def test_plugins_written_outside_import_the_root_alone(outside):
             node.module for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom)
         }
         assert {name for name in names if name.startswith("headbench")} <= {"headbench"}
+
+
+def test_a_command_written_outside_reads_a_run(outside, run, capsys, monkeypatch):
+    worst = EntryPoint("worst", "outside_command:worst", "headbench.commands")
+    found = registry.entry_points
+    monkeypatch.setattr(
+        registry, "entry_points", lambda group: [worst] if group == worst.group else found(group=group)
+    )
+    assert cli.main(["worst", str(run), "--count", "2", "--json"]) == 0
+    frames = json.loads(capsys.readouterr().out)
+    values = headbench.RunData.read(run).rows.select(
+        method="toy", metric="psnr", task=frames[0]["task"], region="full", seeds=headbench.ALL
+    )["value"]
+    assert [f["value"] for f in frames[:2]] == sorted(values)[:2]
+    for words, error in (
+        ([str(run), "--metric", "files"], "expected one of psnr, found files"),
+        ([str(run), "--region", "nose"], "one that the run measured"),
+        ([str(outside)], "expected the folder of a run"),
+    ):
+        assert cli.main(["worst", *words]) == 2
+        assert error in capsys.readouterr().err
 
 
 @pytest.fixture
