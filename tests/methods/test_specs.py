@@ -51,7 +51,7 @@ def test_a_run_records_the_version_of_the_method_that_it_runs(name):
     {
         "ours": "d55d7f92e73b",
         "ga": "616f46ce6b19",
-        "gbs": "67bc23562190",
+        "gbs": "05a6a779941c",
         "gha": "ba0fa3f936a0",
         "insta": "aa3d4245fc40",
         "mean-image": "872346b1a896",
@@ -59,7 +59,7 @@ def test_a_run_records_the_version_of_the_method_that_it_runs(name):
     }.items(),
 )
 def test_runs_stored_before_a_move_or_new_name_keep_their_identity(name, expected):
-    """Of version 0.1.0 before its modules moved and settings were grouped: fingerprints in run folders hold them."""
+    """Of before modules moved and settings were grouped (GBS: since version 4): run folders hold them."""
     assert digest(resolve_method(SPECS[name], "paper", {}).identity())[:12] == expected
 
 
