@@ -124,8 +124,9 @@ class RunSettings:
     methods: str | None = None
     """Names, separated by commas; see `headbench list methods`. Default: all that compare fairly here:
     mean-image,nearest-camera,ga,ours."""
-    preset: Preset | None = None
-    """How much training: smoke (seconds), demo (minutes), fast, paper (the published schedule)."""
+    preset: str | None = None
+    """How much training: smoke (seconds), demo (minutes), fast, paper (the published schedule), or another that each
+    method of the run has; see `headbench list presets`. Default: fast."""
     config: str | None = None
     """YAML file with any settings of a run."""
     head: str | None = None

@@ -36,7 +36,7 @@ class RunConfig:
     data : capture folder, or a folder with several.
     out : folder for everything the run makes.
     methods : names of registered methods, or "package.module:SPEC".
-    preset : settings by name: smoke, demo, fast, paper.
+    preset : settings by name: smoke, demo, fast, paper, or another that each method has.
     seeds : one avatar is trained for each.
     tasks, metrics : what is measured.
     metric_profiles : sets of definitions to take the metrics by, see ``headbench list profiles``.

@@ -237,12 +237,14 @@ def test_output_that_goes_nowhere(command, code):
     assert done.stderr == ("headbench: standard output: No space left on device. " + MAKE_ROOM) * (code == 2)
 
 
-def test_seeds_are_given_as_a_list(monkeypatch, tmp_path):
+def test_seeds_are_a_list_and_presets_are_those_of_the_methods(monkeypatch, tmp_path):
     seen = []
-    monkeypatch.setattr(builtin, "_run", lambda config: seen.append(config.seeds) or Findings("", {}))
-    for seeds in ([], ["--seeds", "3,1,4"], ["--seeds", "7"]):
-        assert cli.main(["run", "--data", str(tmp_path), "--out", str(tmp_path / "out"), *seeds]) == 0
-    assert seen == [(0,), (3, 1, 4), (7,)]
+    monkeypatch.setattr(
+        builtin, "_run", lambda config: seen.append((config.seeds, config.preset)) or Findings("", {})
+    )
+    for words in ([], ["--seeds", "3,1,4"], ["--seeds", "7", "--preset", "of-a-plug-in"]):
+        assert cli.main(["run", "--data", str(tmp_path), "--out", str(tmp_path / "out"), *words]) == 0
+    assert seen == [((0,), "fast"), ((3, 1, 4), "fast"), ((7,), "of-a-plug-in")]
 
 
 def test_a_run_takes_the_reader_that_finds_its_capture(monkeypatch, tmp_path, toy):
