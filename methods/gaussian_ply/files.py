@@ -15,7 +15,7 @@ from ...bench.io.lock import LOCK_FILE
 from ...bench.specs import Findings
 from ..compact.file import COMPACT_FILE
 from ..ga.method import GAAvatar
-from ..ga.storage import PLY_FILE, read_ga_splats, write_ga_splats
+from ..ga.storage import COLUMNS, PLY_FILE, read_ga_splats, write_ga_splats
 from ..gbs.avatar import GBSAvatar
 from ..insta.avatar import FIELD_FILE as RADIANCE_FILE
 from ..ours.avatar import OursAvatar
@@ -28,6 +28,7 @@ from ..shared.avatar_files import (
     save_shared_head,
     write_subject,
 )
+from ..shared.ply import read_names
 from ..shared.tensor_files import read_safetensors
 from .command import ExportPlySettings, ImportGASettings
 from .harmonics import fit_harmonics, sphere, turn_harmonics, write_gaussians
@@ -70,6 +71,10 @@ def export_avatar(settings: ExportPlySettings, progress: Progress) -> Findings:
 
 def _read(folder: Path) -> GAAvatar | GBSAvatar | OursAvatar:
     if (folder / PLY_FILE).exists():
+        foreign = [name for name in read_names(folder / PLY_FILE) if name not in COLUMNS]
+        if foreign:
+            found = "a column of another method, which would be lost"
+            raise InputError(folder / PLY_FILE, foreign[0], EXPORTED, found)
         return GAAvatar.read(folder, "cpu")
     if (folder / COMPACT_FILE).exists():
         return OursAvatar.read(folder, "cpu")
@@ -84,7 +89,7 @@ def _read(folder: Path) -> GAAvatar | GBSAvatar | OursAvatar:
         return OursAvatar.read(folder, "cpu")
     if (folder / RADIANCE_FILE).exists():
         raise InputError(folder, "", EXPORTED, "an avatar of insta, a radiance field without splats", DRAWN)
-    remedy = "The avatars of a run lie in the folder avatars/ inside its own."
+    remedy = "The avatars of a run lie in SUBJECT/METHOD/seed-N/avatar inside its folder."
     expected = f"{EXPORTED}: {PLY_FILE}, {FIELD_FILE} or {COMPACT_FILE}"
     raise InputError(folder, "", expected, "none of them", remedy if (folder / "run.json").exists() else "")
 

@@ -23,6 +23,7 @@ from headbench.methods.gbs.config import GBSConfig
 from headbench.methods.gbs.method import GBS
 from headbench.methods.ours.avatar import OursAvatar
 from headbench.methods.shared.networks import sh_basis
+from headbench.methods.shared.ply import write_ply
 from headbench.methods.shared.rendering import view_of
 from headbench.methods.splats import rasterize
 
@@ -140,17 +141,20 @@ def test_a_viewer_shows_a_blendshape_avatar_in_a_turned_pose(tmp_path):
 @pytest.mark.parametrize(
     ("files", "found"),
     [
+        ({"point_cloud.ply": ("x", "offset_0")}, "offset_0: .* a column of another method"),
         ({"avatar.safetensors": {"table": torch.zeros(1)}}, "an avatar of gha"),
         ({"field.npz": None}, "an avatar of insta"),
         ({"mean.npz": None}, "none of them"),
-        ({"run.json": None}, "avatars/ inside"),
+        ({"run.json": None}, "avatar inside"),
     ],
 )
 def test_what_cannot_be_exported_names_what_can(tmp_path, files, found):
-    for name, tensors in files.items():
+    for name, content in files.items():
         (tmp_path / name).touch()
-        if tensors:
-            save_file(tensors, tmp_path / name)
+        if isinstance(content, tuple):
+            write_ply(tmp_path / name, content, np.zeros((1, len(content))))
+        elif content:
+            save_file(content, tmp_path / name)
     with pytest.raises(InputError, match=found) as caught:
         export_ply(ExportPlySettings(str(tmp_path), out=str(tmp_path / "x.ply")))
     assert "ours, ga or gbs" in caught.value.expected
