@@ -114,6 +114,9 @@ def _update(settings: GateSettings) -> Findings:
         if before.get(place, count) != count:
             lines.append(f"  frames: {place}: {before[place]} to {count}")
     lines += [f"  gone: {place}" for place in gone]
-    lines += [f"  unavailable: {place}: {reason}" for place, reason in baseline.unavailable.items()]
+    by_reason: dict[str, list[str]] = {}
+    for place, reason in baseline.unavailable.items():
+        by_reason.setdefault(reason, []).append(str(place))
+    lines += [f"  unavailable: {', '.join(places)}: {reason}" for reason, places in by_reason.items()]
     data = {"baseline": path, "values": len(baseline.values), "gone": [str(place) for place in gone]}
     return Findings("\n".join(lines), data, True, 0)
