@@ -100,6 +100,8 @@ class MethodSpec:
     resolution : the image size it works at.
     preset_resolutions : the same by preset name, for presets that work at another size; see `at_preset`.
     native : runs on our own implementation; False for an adapter to an official repository.
+    version : of what the method makes. Raise it with each change of the code that changes results: a finished avatar is
+        kept as long as version, settings and data are the same, whatever the code is now.
     source : the paper.
     trivial : a trivial baseline, which every real method should beat; shown in tables, never ranked.
     default : a run that names no methods takes it.

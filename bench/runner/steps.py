@@ -95,7 +95,7 @@ class Job:
                 self.cell.folder / "fit.json",
                 "fingerprint",
                 f"{self.fit_fingerprint[:12]}, that of this run's settings and data",
-                f"{str(state.get('fingerprint'))[:12]}, an avatar of other settings or data",
+                f"{str(state.get('fingerprint'))[:12]}, an avatar of other settings, data or method version",
                 "Choose another --out, or delete that folder.",
             )
 
