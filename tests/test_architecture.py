@@ -157,3 +157,17 @@ def test_specs_and_commands_are_light_to_import():
         "assert not heavy, heavy\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_names_of_tests_have_at_most_60_characters():
+    sources = {path: path.read_text() for path in sorted((ROOT / "tests").rglob("*.py"))}
+    names = [
+        (path.name, name) for path, text in sources.items() for name in re.findall(r"def (test_\w+)", text)
+    ]
+    assert len(names) > 1_000
+    assert [(path, name) for path, name in names if len(name) > 60] == []
+    seen: dict[tuple[Path, str], int] = {}
+    for path, text in sources.items():
+        for name in re.findall(r"^def (test_\w+)", text, re.MULTILINE):
+            seen[path, name] = seen.get((path, name), 0) + 1
+    assert [key for key, count in seen.items() if count > 1] == []

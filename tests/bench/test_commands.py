@@ -67,7 +67,7 @@ def test_findings_decide_the_exit_code(offer, capsys):
     assert "at least 0" in capsys.readouterr().err
 
 
-def test_a_function_that_cannot_be_called_with_settings_and_progress_is_broken(offer, capsys):
+def test_a_function_not_taking_settings_and_progress_is_broken(offer, capsys):
     offer("look", function="toy_command:look_alone")
     assert cli.main(["look", "here"]) == 2
     assert "called with settings and a Progress: too many positional arguments" in capsys.readouterr().err

@@ -110,11 +110,11 @@ def test_an_old_name_is_refused_with_the_new_one(values, new):
 
 
 @pytest.mark.parametrize("stored", [{"odd": 5}, {"odd": None}, {"how": [{}]}, {"how": [["code"], 1.5]}])
-def test_stored_settings_of_wrong_types_are_left_to_those_who_build_them(stored):
+def test_stored_settings_of_wrong_types_are_kept_until_used(stored):
     assert with_new_names(Now, stored).keys() <= {"odd_variant", "group"}
 
 
-def test_settings_stored_by_old_names_are_read_and_digested_alike():
+def test_settings_stored_by_old_names_have_the_same_digest():
     stored = {"inner": {"rate": 0.5, "steps": 3}, "group": False, "how": "code", "odd": ["teeth"]}
     now = Now(Inner(0.5), Group(on=False, variant="official"), odd_variant="official")
     assert build(Now, with_new_names(Now, stored), "file") == now

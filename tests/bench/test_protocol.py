@@ -34,7 +34,7 @@ def test_every_field_changes_the_hash(clip):
     assert make_protocol("novel_view", [clip]).hash == protocol.hash
 
 
-def test_a_protocol_without_conditions_keeps_the_hash_it_had_before_there_were_any(clip):
+def test_a_protocol_without_conditions_keeps_its_former_hash(clip):
     protocol = make_protocol("novel_view", [clip])
     fields = {name: value for name, value in asdict(protocol).items() if name != "conditions"}
     assert protocol.hash == digest(protocol.id, fields)[:12]

@@ -34,7 +34,7 @@ def test_an_entry_of_the_wrong_kind_is_broken(monkeypatch, toy):
     assert "MetricSpec" in registry.discover("metrics")["method"].error
 
 
-def test_a_plugin_that_raises_on_import_does_not_take_others_along(monkeypatch, toy, tmp_path):
+def test_a_plugin_that_raises_on_import_leaves_others_usable(monkeypatch, toy, tmp_path):
     (tmp_path / "explodes.py").write_text("raise SystemError('boom')")
     monkeypatch.syspath_prepend(tmp_path)
     with_entries(monkeypatch, entry("explodes", "explodes:SPEC"), entry("good", "toy_plugin:ERROR"))
@@ -68,7 +68,7 @@ def test_a_reference_that_leads_nowhere_is_refused(toy, name):
 @pytest.mark.parametrize(
     "changes", [{"profile": "canonical"}, {"name": "psnr"}, {"tables": ("comparison",)}], ids=str
 )
-def test_a_profile_whose_metric_looks_like_another_definition_is_refused(changes):
+def test_a_profile_with_the_label_of_another_metric_is_refused(changes):
     own = {"name": "psnr@lab", "profile": "lab", "tables": ("lab",)}
     metric = MetricSpec(
         **(own | changes), label="P", unit="", higher_is_better=True, digits=2, implementation="a:b"

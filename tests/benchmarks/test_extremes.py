@@ -45,7 +45,7 @@ def test_masked_splats_are_counted_in_batches_too():
     assert (result.radii[:, :5] == 0).all()
 
 
-def test_a_camera_that_is_not_finite_is_refused_even_when_splats_are_masked():
+def test_a_camera_not_finite_is_refused_even_with_masked_splats():
     scene = stress.facing(3)
     with pytest.raises(ValueError, match="viewmat: expected finite"):
         stress.rasterize(*scene[:5], torch.full((4, 4), float("nan")), *scene[6:9], mask_non_finite=True)

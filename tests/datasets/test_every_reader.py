@@ -55,6 +55,6 @@ def test_the_linter_names_no_file_of_another_layout(plain_folder, capsys):
     assert findings["HB110"]["file"] == plain_folder.name
 
 
-def test_the_linter_refuses_settings_of_the_reader_that_it_does_without(pristine_capture, capsys):
+def test_the_linter_refuses_reader_settings_that_it_does_not_use(pristine_capture, capsys):
     assert main(["lint", str(pristine_capture.union), "--set", "background=1,1,1"]) == 2
     assert "lint looks at the files" in capsys.readouterr().err

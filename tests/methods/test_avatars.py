@@ -93,7 +93,7 @@ def test_shared_files_are_the_rest_of_what_rendering_needs(fitted, clip, tmp_pat
         method.load(tmp_path, device="cpu")
 
 
-def test_a_finished_run_is_not_trained_again_and_another_is_refused(fitted, clip):
+def test_a_finished_run_is_kept_and_another_run_is_refused(fitted, clip):
     _, method, folder, _ = fitted
 
     def fail(*_):

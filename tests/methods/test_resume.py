@@ -70,7 +70,7 @@ def unbroken(request, clip, tmp_path_factory):
 
 
 @pytest.mark.parametrize("seed", [7, 8])
-def test_an_unbroken_run_repeats_itself_and_another_seed_does_not(unbroken, clip, tmp_path, seed):
+def test_equal_seeds_repeat_a_run_and_other_seeds_do_not(unbroken, clip, tmp_path, seed):
     name, expected = unbroken
     assert (content(fit(name, clip, tmp_path, seed=seed)) == expected) == (seed == 7)
 

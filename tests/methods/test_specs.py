@@ -58,7 +58,7 @@ def test_a_run_records_the_version_of_the_method_that_it_runs(name):
         "nearest-camera": "8cb115f71ccc",
     }.items(),
 )
-def test_runs_stored_before_a_move_or_new_name_keep_their_identity(name, expected):
+def test_runs_stored_under_former_names_keep_their_identity(name, expected):
     """Of before modules moved and settings were grouped (GBS: since version 4): run folders hold them."""
     assert digest(resolve_method(SPECS[name], "paper", {}).identity())[:12] == expected
 

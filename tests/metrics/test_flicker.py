@@ -21,7 +21,7 @@ def test_equals_the_definition_in_float64_either_way_in_time(seed):
     assert flicker(other, other_truth, image, truth) == pytest.approx(expected, rel=1e-12)
 
 
-def test_an_error_that_stays_does_not_flicker_and_one_that_comes_does():
+def test_a_constant_error_does_not_flicker_a_new_one_does():
     truth = frames(0, 2) // 2
     wrong = truth + np.uint8(40)
     assert flicker(wrong[0], truth[0], wrong[1], truth[1]) == 0.0

@@ -17,7 +17,7 @@ def test_the_default_viewer_is_that_of_the_paper():
     assert pytest.approx(67.0206, abs=1e-4) == PIXELS_PER_DEGREE
 
 
-def test_green_against_blue_is_the_largest_error_between_constant_images():
+def test_green_against_blue_is_the_largest_constant_error():
     """Section 4.1.5: the two hues that are farthest apart are at 1."""
     assert flip(constant((0, 255, 0)), constant((0, 0, 255))) == pytest.approx(1.0, abs=1e-12)
 

@@ -110,7 +110,7 @@ def test_the_fingerprint_tells_weights_apart_and_not_files(random_weights, tmp_p
     assert first == second != third
 
 
-def test_without_weights_it_is_unavailable_at_every_call_and_asks_once(bare_machine):
+def test_without_weights_every_call_is_unavailable_asking_once(bare_machine):
     a, b = frames(2)
     for _ in range(3):
         with pytest.raises(UnavailableError, match=VARIABLE):
@@ -127,7 +127,7 @@ def test_read_only_and_mirrored_frames_are_fine(random_weights):
     assert metric(a[:, ::-1], b) == expected
 
 
-def test_truths_seen_before_are_not_looked_at_again_and_change_nothing(random_weights):
+def test_ground_truth_seen_before_is_not_read_again(random_weights):
     truths = frames(4, seed=1)
     fresh, cached = (Lpips("alex", weights=random_weights, cache_mb=mb) for mb in (0, 100))
     looked_at = []

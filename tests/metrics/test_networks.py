@@ -15,11 +15,11 @@ def test_taps_have_the_channels_that_the_linear_layers_expect(spec):
 
 
 @SPECS
-def test_one_pixel_less_than_the_smallest_image_leaves_nothing_to_see(spec):
+def test_one_pixel_below_the_smallest_image_is_refused(spec):
     with torch.no_grad(), pytest.raises(RuntimeError):
         spec.build()(torch.rand(1, 3, spec.smallest - 1, 64))
 
 
-def test_parameter_counts_are_those_of_the_published_convolutional_parts():
+def test_parameter_counts_are_those_published():
     counts = {name: sum(p.numel() for p in spec.build().parameters()) for name, spec in NETWORKS.items()}
     assert counts == {"alex": 2_469_696, "squeeze": 722_496, "vgg": 14_714_688}

@@ -107,7 +107,7 @@ def test_only_static_frames_repeat_a_pose():
 
 
 @given(st.integers(2, 7), st.integers(1, 40))
-def test_a_live_signal_is_new_every_frame_and_next_to_the_recorded_one(length, frames):
+def test_a_live_signal_is_new_every_frame_and_near_the_recorded(length, frames):
     workload = [(i, replace(POSES[0], expression=np.array([float(i), -1.0]))) for i in range(length)]
     found = [pair for pair, _ in zip(fresh_frames(workload), range(frames))]
     assert len({pose.expression.tobytes() for _, pose in found}) == frames

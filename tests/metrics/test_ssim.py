@@ -97,7 +97,7 @@ def test_constant_images_have_a_closed_form(form):
 
 
 @EVERY_FORM
-def test_the_smallest_image_is_scored_and_one_pixel_less_is_refused(form):
+def test_the_smallest_image_is_scored_and_a_smaller_refused(form):
     side = form.form.smallest
     image, truth = noisy_pair(1, side, side)
     assert form(image, truth) == pytest.approx(ssim_map(image, truth, form.form).mean(), abs=1e-12)
@@ -116,7 +116,7 @@ def test_a_pixel_is_enough_where_black_surrounds_the_image():
     assert ssim_zero_border(image, truth) == pytest.approx(expected, abs=1e-12)
 
 
-def test_a_mask_of_one_pixel_is_one_window_and_an_empty_one_is_left_out():
+def test_a_one_pixel_mask_is_one_window_an_empty_one_is_left_out():
     image, truth = noisy_pair(2, 30, 30)
     one, none, edge = (np.zeros((30, 30), bool) for _ in range(3))
     one[12, 17] = edge[0, 0] = True

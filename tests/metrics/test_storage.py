@@ -53,7 +53,7 @@ def test_an_avatar_of_splats_tells_primitives_and_what_it_shares(tmp_path):
     assert details["shared_mb"] == 3.0
 
 
-def test_the_driving_signal_counts_as_float32_at_25_frames_a_second(tmp_path):
+def test_the_driving_signal_is_float32_at_25_frames_a_second(tmp_path):
     (tmp_path / "a").write_bytes(b"1")
     details = storage(Files(tmp_path / "a"), [("camera", POSE)]).details
     assert details["driving_bytes"] == 4 * (100 + 3 + 3 + 3 + 6 + 3) == driving_bytes(POSE)

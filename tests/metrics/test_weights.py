@@ -44,7 +44,7 @@ def test_a_named_place_without_weights_is_no_reason_to_look_on(bare_machine, tmp
     assert bare_machine == []
 
 
-def test_without_weights_or_network_it_says_how_to_mend_it_and_asks_once(bare_machine):
+def test_without_weights_or_network_the_remedy_is_named_once(bare_machine):
     for _ in range(2):
         with pytest.raises(UnavailableError) as caught:
             weights.find_backbone(SQUEEZE)
@@ -63,7 +63,7 @@ def test_a_user_without_a_home_is_told_what_to_set(bare_machine, monkeypatch):
         weights.find_backbone(SQUEEZE)
 
 
-def test_what_is_fetched_is_kept_if_its_hash_is_right_and_not_otherwise(bare_machine, monkeypatch, state):
+def test_what_is_fetched_is_kept_only_with_the_right_hash(bare_machine, monkeypatch, state):
     buffer = io.BytesIO()
     torch.save(state, buffer)
     prefix = hashlib.sha256(buffer.getvalue()).hexdigest()[:8]
@@ -120,7 +120,7 @@ def test_code_in_a_weights_file_is_not_run(tmp_path, capsys):
     assert "ran" not in capsys.readouterr().out
 
 
-def test_linear_layers_come_from_torchmetrics_and_equal_the_reference(reference_folder):
+def test_linear_layers_of_torchmetrics_equal_the_reference(reference_folder):
     for net, spec in weights.NETWORKS.items():
         ours = weights.load_linear(spec)
         theirs = weights.load_linear(spec, reference_folder / "lin_v0.1" / f"{net}.pth")

@@ -105,7 +105,7 @@ def test_a_missing_render_is_a_grey_box_with_its_reason(tmp_path):
     assert 0.5 < box.mean() < 0.99  # text on it
 
 
-def test_the_same_frames_make_the_same_file_whatever_matplotlibrc(tmp_path):
+def test_the_same_frames_make_the_same_file_with_any_rc_file(tmp_path):
     frame = ComparedFrame.of("N", ["x"], picture(0), {"a": picture(1)}, {"a": "PSNR $3.00_ dB"})
     contact_sheet([frame], ["a"], tmp_path / "one.png")
     with rc_context({"text.usetex": True, "font.size": 30, "figure.facecolor": "red"}):

@@ -37,7 +37,7 @@ def scored(folder, run, out, label="theirs"):
     return rows[rows["metric"] == "psnr"].reset_index(drop=True)
 
 
-def test_images_of_a_run_score_as_in_the_run_under_their_own_label(run, images, tmp_path):
+def test_images_of_a_run_score_alike_under_their_own_label(run, images, tmp_path):
     theirs = scored(images, run, tmp_path / "out")
     rows = pd.read_parquet(RunFolder(run).rows)
     own = rows[rows["metric"] == "psnr"].reset_index(drop=True)

@@ -47,7 +47,7 @@ def change_json(path, change):
     write_json(path, record)
 
 
-def test_an_untouched_run_verifies_and_says_how_much_was_looked_at(run, capsys):
+def test_an_untouched_run_verifies_with_the_counts_checked(run, capsys):
     assert verify(run, "--json") == 0
     found = json.loads(capsys.readouterr().out)
     # 3 + 2 frames and the avatar's file; a PSNR of each frame and the number of files
@@ -77,7 +77,7 @@ def test_a_changed_frame_is_found_and_rendered_again_by_the_run(run, frame, foun
     assert verify(run) == 0
 
 
-def test_a_frame_recompressed_without_loss_has_another_digest_alone(run, frame, found):
+def test_a_frame_recompressed_without_loss_keeps_its_pixels(run, frame, found):
     write_png(frame, read_png(frame))  # the same bytes again
     assert verify(run) == 0
     compression = [cv2.IMWRITE_PNG_COMPRESSION, 9]

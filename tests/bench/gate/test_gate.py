@@ -75,7 +75,7 @@ def judged(run, baseline, capsys):
     return judged
 
 
-def test_a_run_worse_by_0_3_db_fails_naming_metric_subject_and_size(stored, remeasured, judged):
+def test_a_run_worse_by_0_3_db_fails_with_metric_subject_size(stored, remeasured, judged):
     code, out = judged()
     assert code == 0
     assert "nothing got worse (6 pass)" in out

@@ -44,7 +44,7 @@ def test_a_failed_write_leaves_the_old_file_and_no_rubbish(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_results_are_readable_whatever_their_writer_makes_of_the_file(tmp_path):
+def test_results_are_readable_in_every_layout_of_parquet(tmp_path):
     """safetensors writes beside the file it is given and renames, which leaves the mode of a private file."""
     path = tmp_path / "new" / "a.txt"
     with atomic_path(path) as temporary:
@@ -114,7 +114,7 @@ def test_names_of_the_field_are_accepted(name):
     assert check_name(name, "", "") == name
 
 
-def test_an_error_of_the_system_names_the_file_meant_and_no_other_does(tmp_path):
+def test_an_error_of_the_system_names_the_file_meant(tmp_path):
     with pytest.raises(OSError, match="a.png") as caught, atomic_path(tmp_path / "a.png"):
         raise OSError(errno.ENOSPC, "No space left on device")
     assert caught.value.filename == str(tmp_path / "a.png")

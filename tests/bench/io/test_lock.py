@@ -35,7 +35,7 @@ def holder(tmp_path):
     process.stdout.close()
 
 
-def test_a_folder_that_another_process_works_in_is_refused_naming_it(tmp_path, holder):
+def test_a_folder_that_another_process_uses_is_refused_by_name(tmp_path, holder):
     with (
         pytest.raises(InputError, match=rf"run\.lock.*process {holder.pid} on .*, since 20"),
         locked(tmp_path),
@@ -52,7 +52,7 @@ def test_a_killed_owner_keeps_nobody_out(tmp_path, holder):
         assert json.loads((tmp_path / LOCK_FILE).read_text())["process"] == os.getpid()
 
 
-def test_the_lock_is_gone_after_the_block_and_after_an_error_in_it(tmp_path):
+def test_the_lock_is_gone_after_the_block_and_after_an_error(tmp_path):
     with pytest.raises(RuntimeError), locked(tmp_path):
         raise RuntimeError("in the block")
     assert list(tmp_path.iterdir()) == []
@@ -66,7 +66,7 @@ def test_one_process_does_not_enter_twice(tmp_path):
         pytest.fail("entered twice")
 
 
-def test_a_lock_file_of_nonsense_is_no_obstacle_and_tells_nothing(tmp_path):
+def test_a_damaged_lock_file_is_no_obstacle(tmp_path):
     (tmp_path / LOCK_FILE).write_text("[1, 2")
     with locked(tmp_path):
         (tmp_path / LOCK_FILE).write_text("[1, 2")

@@ -10,7 +10,7 @@ from headbench.bench.errors import UnavailableError
 from headbench.bench.native.loader import Kernel
 
 
-def test_a_kernel_that_is_there_is_loaded_with_its_instruction_sets(monkeypatch):
+def test_an_installed_kernel_is_loaded_with_instruction_sets(monkeypatch):
     module = SimpleNamespace(instruction_sets=lambda: ["avx2", "portable"])
     monkeypatch.setitem(sys.modules, "headbench._there", module)
     kernel = Kernel("headbench._there", "It", "other works")

@@ -129,7 +129,7 @@ def test_methods_of_equal_needs_share_one_adapted_clip(config, toy, monkeypatch)
     assert toy.ADAPTED == ["subject1"]
 
 
-def test_a_need_that_cannot_be_met_is_refused_before_any_adaptation(config, toy, monkeypatch):
+def test_a_need_that_cannot_be_met_is_refused_at_once(config, toy, monkeypatch):
     declare(monkeypatch, toy, resolution=TWICE)
     declare(monkeypatch, toy, "METHOD", head_models=("impossible",))
     monkeypatch.setattr(toy.ToyClip, "head", dataclasses.make_dataclass("Head", ["version"])("toy"))

@@ -56,7 +56,7 @@ def test_a_setting_the_reader_cannot_take_is_named(config, key, value, expected)
     assert expected in caught.value.expected
 
 
-def test_an_error_inside_a_reader_is_not_taken_for_a_wrong_setting(config, toy, monkeypatch):
+def test_an_error_inside_a_reader_is_no_wrong_setting(config, toy, monkeypatch):
     def read(path):
         return len(3)
 

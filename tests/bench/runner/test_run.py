@@ -95,7 +95,7 @@ def test_a_run_killed_in_training_continues(config, toy, monkeypatch):
     assert toy.FITS == ["subject2"]  # the first had been trained
 
 
-def test_the_record_of_training_says_how_often_it_was_interrupted(config, toy, monkeypatch, cell):
+def test_the_record_of_training_counts_interruptions(config, toy, monkeypatch, cell):
     with monkeypatch.context() as patch:
         patch.setattr(toy.ToyMethod, "fit", killed)
         for _ in range(2):

@@ -80,7 +80,7 @@ def spec(monkeypatch):
 FRAMES = Frames(render, RegionalToyClip())
 
 
-def test_whole_frames_and_regions_are_scored_in_the_order_of_the_keys(spec):
+def test_frames_and_regions_are_scored_in_the_order_of_keys(spec):
     scored = score_frames(KEYS, FRAMES, [spec("d", "Difference", kind="regional")], ["face"])["d"]
     full = [s for s in scored if s.region == "full"]
     assert [(s.key, s.value, s.status) for s in full] == [(key, 3.0, "ok") for key in KEYS]
@@ -123,7 +123,7 @@ def test_batches_read_a_bounded_number_of_frames_ahead(spec, monkeypatch):
     assert worst[0] <= scoring._AHEAD + 2
 
 
-def test_a_temporal_metric_sees_the_frame_before_and_at_a_start_the_one_after(spec):
+def test_a_temporal_metric_sees_the_neighbouring_frame(spec):
     scored = score_frames(KEYS, FRAMES, [spec("t", "change", kind="temporal")])["t"]
     assert [s.value for s in scored[:3]] == [-10.0, 10.0, 10.0]
     assert scored[3].status == "missing"
@@ -163,7 +163,7 @@ def test_metrics_are_resolved_in_every_profile_and_others_once():
     assert resolved(metrics=("ssim",), metric_profiles=("skimage",)) == ["ssim@skimage"]
 
 
-def test_the_first_profile_stands_in_the_comparison_and_others_in_tables_of_their_own():
+def test_the_first_profile_is_compared_others_have_own_tables():
     names = ("3dgs", "canonical", "skimage")
     specs = resolve_metrics(RunConfig("data", "out", metrics=("ssim",), metric_profiles=names))
     assert {spec.name: spec.tables for spec in specs} == {
@@ -173,7 +173,7 @@ def test_the_first_profile_stands_in_the_comparison_and_others_in_tables_of_thei
     }
 
 
-def test_unknown_profiles_and_metrics_that_none_defines_are_refused():
+def test_unknown_profiles_and_undefined_metrics_are_refused():
     with pytest.raises(InputError, match="Did you mean 'skimage'"):
         resolved(metric_profiles=("skimge",))
     with pytest.raises(InputError, match=r"metrics, lpips: expected one that the profiles skimage define"):

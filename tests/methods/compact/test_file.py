@@ -44,7 +44,7 @@ def compacted(folder, precision, poses=()):
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_without_rounding_nothing_changes_but_the_order_of_splats(case, clip, tmp_path):
+def test_without_rounding_only_the_order_of_splats_changes(case, clip, tmp_path):
     camera, pose = first(clip)
     before, after = compacted(store(clip, tmp_path, CASES[case], copies=2), EXACT)
     order = torch.argsort(before.field.tensors["splats"][:, -1], stable=True)

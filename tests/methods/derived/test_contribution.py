@@ -26,7 +26,7 @@ class Ball:
         return self.posed
 
 
-def test_contributions_are_the_weights_of_each_splat_drawn_alone_in_colour(clip):
+def test_contributions_are_weights_of_splats_coloured_alone(clip):
     ball, views = Ball(20), training_views(clip, 2)
     found = contributions(ball, views)
     # Independent: splat i painted white and all others black, without gradients, in the float64 reference.

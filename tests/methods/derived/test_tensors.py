@@ -38,7 +38,7 @@ def test_a_linear_plane_reads_the_same_after_resampling():
 
 
 @given(st.integers(2, 12), st.integers(1, 20), st.integers(0, 99))
-def test_what_fewer_samples_can_say_is_kept_and_else_the_nearest_is_taken(fewer, more, seed):
+def test_what_fewer_samples_can_hold_is_kept_else_the_nearest(fewer, more, seed):
     rng = np.random.default_rng(seed)
     samples = fewer + more
     places = np.linspace(0, 1, samples)

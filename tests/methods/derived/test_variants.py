@@ -57,7 +57,7 @@ def test_recipes_have_names_of_their_own():
 
 
 @pytest.mark.parametrize("kind", ["ga", "ours"])
-def test_every_variant_is_read_back_from_files_of_its_own_that_are_smaller(kind, request, clip, tmp_path):
+def test_every_variant_is_read_back_from_smaller_own_files(kind, request, clip, tmp_path):
     folder = request.getfixturevalue(kind)
     derive, read, recipes = {
         "ga": (ga_variants.variants, GAAvatar.read, GA),

@@ -83,7 +83,7 @@ def test_learning_rates_go_to_what_they_are_named_after(clip):
 
 
 @pytest.mark.parametrize("refine", [True, False])
-def test_tracking_of_the_timestep_alone_is_refined_and_only_if_asked(clip, refine):
+def test_tracking_of_the_timestep_alone_is_refined_if_asked(clip, refine):
     appearance, optimiser, binding = make(clip, GAConfig(refine_tracking=refine))
     key, means, _ = shade(clip, appearance, optimiser, binding, 1)
     assert means.requires_grad == refine

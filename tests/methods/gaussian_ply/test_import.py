@@ -88,7 +88,7 @@ def test_what_is_of_no_degree_or_on_no_triangle_is_refused(capture, tmp_path, ch
     assert not (tmp_path / "out").exists()
 
 
-def test_a_folder_in_use_is_left_alone_and_an_import_goes_on_in_its_own(capture, tmp_path):
+def test_a_folder_in_use_is_left_alone_an_own_one_is_continued(capture, tmp_path):
     ply, other = (
         ga_file(tmp_path / "in.ply", ROWS),
         ga_file(tmp_path / "o.ply", [{**ROWS[0], "x": 0.5}, ROWS[1]]),

@@ -116,7 +116,7 @@ def test_view_directions_waver_in_training_and_only_they(clip):
     assert float(angles.square().mean()) == pytest.approx(3 * 0.2**2, rel=0.1)
 
 
-def test_a_softened_penalty_is_the_published_one_but_for_a_parabola_around_nothing():
+def test_a_softened_penalty_is_published_but_for_a_parabola_at_0():
     offsets = torch.tensor([-3.0, -0.1, -0.05, 0.0, 0.02, 0.1, 0.5], dtype=torch.float64, requires_grad=True)
     np.testing.assert_array_equal(softened(offsets, 0.0).detach(), offsets.detach().abs())
     soft = softened(offsets, 0.1)

@@ -39,7 +39,7 @@ def left_out(coefficients, basis, kept):
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0.02, 5))
-def test_leading_directions_are_the_fewest_that_leave_out_less_than_the_tolerance(seed, tolerance):
+def test_leading_directions_are_the_fewest_within_the_tolerance(seed, tolerance):
     coefficients, basis = random_expressions(seed)
     kept = leading_directions(coefficients, basis, tolerance)
     for count in range(kept, basis.shape[2] + 1):
@@ -54,7 +54,7 @@ def jaws(head, *angles):
     return [replace(pose, jaw=np.array(angle, dtype=np.float64)) for angle in angles]
 
 
-def test_a_jaw_that_only_opens_needs_two_bases_and_a_still_one_none(head):
+def test_an_opening_jaw_needs_two_bases_and_a_resting_one_none(head):
     opening = jaws(head, *([x, 0, 0] for x in np.linspace(0, 0.4, 12)))
     assert spanning_jaw_bases(opening, 16, 0.1, 1e-5)[0] == 2
     still = jaws(head, *[[0.2, 0.1, 0]] * 5)

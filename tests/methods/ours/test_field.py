@@ -43,7 +43,7 @@ def test_line_bounds_are_the_mesh_itself_faces_included():
     np.testing.assert_allclose([unit.min(), unit.max()], [0, 1], atol=1e-12)
 
 
-def test_canonical_directions_do_not_change_when_head_and_camera_move_together():
+def test_canonical_directions_follow_head_and_camera_together():
     vertices, faces = mesh()
     canonical = CanonicalFrames.of(triangle_frames(vertices, faces))
     means = torch.randn(4, 3, dtype=torch.float64, generator=GENERATOR)
@@ -73,7 +73,7 @@ def test_published_sizes_and_initial_values():
     assert parameters["color_weight_1"].abs().max() <= 128**-0.5
 
 
-def test_the_network_starts_within_its_fan_in_and_with_gains_of_its_norms():
+def test_the_network_starts_within_its_fan_in_with_its_norms():
     network = initial_line_network(32, 128, 1, torch.Generator().manual_seed(1))
     direction = network["line_direction_0"]
     assert direction.shape == (128, 192)

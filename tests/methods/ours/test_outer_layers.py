@@ -41,7 +41,7 @@ def test_outer_layers_lie_a_gap_apart_along_the_normal(clip, mesh):
     np.testing.assert_array_equal(start.opacities[count:], np.float32(0.2))
 
 
-def test_only_face_triangles_that_a_training_expression_moves_are_expressive(clip, mesh):
+def test_face_triangles_that_expressions_move_are_expressive(clip, mesh):
     face = faces_in_region(clip.head, "face")
     timesteps = {key.timestep for key in clip.splits["train"]}
     moved = np.zeros(len(face))

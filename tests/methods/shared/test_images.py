@@ -23,7 +23,7 @@ class Counting:
         return self.clip.image(key)
 
 
-def test_images_come_as_the_sampler_says_each_decoded_once_and_ahead(clip):
+def test_images_come_in_sampler_order_decoded_once_and_ahead(clip):
     keys = clip.splits["train"]
     sampler = ShuffledEpochs(len(keys), 0)
     counting = Counting(clip)

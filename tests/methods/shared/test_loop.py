@@ -61,7 +61,7 @@ def killing(at):
     return progress
 
 
-def test_iterations_are_counted_from_one_and_the_last_makes_no_step(tmp_path):
+def test_iterations_count_from_one_and_the_last_makes_no_step(tmp_path):
     model = Drift()
     outcome = run(model, tmp_path, Budget(iterations=7))
     assert model.calls == [(i, i % 3) for i in range(1, 8)]
@@ -71,7 +71,7 @@ def test_iterations_are_counted_from_one_and_the_last_makes_no_step(tmp_path):
     assert (model.timeline.total, model.timeline.published) == (7, 100)
 
 
-def test_seconds_alone_estimate_iterations_before_training_and_say_so(tmp_path):
+def test_seconds_alone_give_an_estimate_of_iterations(tmp_path):
     clock, notes = Clock(), []
     model = Drift(clock, cost=0.1)
     outcome = run(model, tmp_path, Budget(seconds=16.0), lambda d, n, note="": notes.append(note), clock)

@@ -137,7 +137,7 @@ def test_basis_equals_scipys(degree):
 
 
 @pytest.mark.parametrize("degree", [0, 3])
-def test_colours_are_the_clamped_sum_and_higher_coefficients_do_not_count(degree):
+def test_colours_are_the_clamped_sum_up_to_the_degree(degree):
     rng = np.random.default_rng(1)
     directions = rng.normal(size=(20, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)

@@ -52,7 +52,7 @@ def test_select_keeps_rows_with_their_moments():
     np.testing.assert_allclose(optimiser["a"].detach(), expected, rtol=1e-12)
 
 
-def test_state_restores_another_number_of_rows_and_the_same_course():
+def test_state_restores_another_number_of_rows_and_continues():
     one, _ = make()
     gradients = np.random.default_rng(2).normal(size=(4, 3, 3))
     step(one, np.ones((4, 3)))

@@ -266,7 +266,7 @@ def wide() -> tuple[Scene, Outcome]:
 
 
 @kernels
-def test_sharp_splats_far_from_the_images_corner_keep_their_place(kernel, wide):
+def test_sharp_splats_far_from_the_corner_keep_their_place(kernel, wide):
     """At 2000 pixels from the corner a float resolves an eight-thousandth of a pixel: too little for the gradients."""
     scene, truth = wide
     assert truth.rendering.alpha[:, -32:].mean() > 0.3

@@ -61,7 +61,7 @@ def test_one_isotropic_splat_has_the_closed_form():
     assert result.radii.tolist() == [math.ceil(3 * math.sqrt(variance + math.sqrt(0.1)))]
 
 
-def test_antialiasing_makes_a_splat_faint_by_the_area_the_filter_adds():
+def test_antialiasing_fades_a_splat_by_the_area_the_filter_adds():
     scale, opacity = 0.02, 0.7
     result = rasterize(*on_axis([DEPTH], [scale], [opacity], [[2.0]]), antialiased=True, backend="reference")
     sharp = (FOCAL * scale / DEPTH) ** 2

@@ -38,7 +38,7 @@ def test_nearest_camera_returns_a_training_frame_itself(clip, tmp_path):
         np.testing.assert_array_equal(frame.alpha, (clip.mask(key) / np.float32(255)).astype(np.float32))
 
 
-def test_a_held_out_view_shows_the_same_timestep_from_the_nearest_camera(clip, tmp_path):
+def test_a_held_out_view_shows_the_nearest_camera_at_that_time(clip, tmp_path):
     avatar = fit(NearestCamera(), clip, tmp_path)
     training = {key.camera for key in clip.splits["train"]}
     for key in clip.splits["novel_view"]:
@@ -49,7 +49,7 @@ def test_a_held_out_view_shows_the_same_timestep_from_the_nearest_camera(clip, t
         np.testing.assert_allclose(show(avatar, clip, key).rgb, clip.image(source) / 255.0, atol=1e-6)
 
 
-def test_a_held_out_expression_shows_the_nearest_training_timestep(clip, tmp_path):
+def test_a_held_out_expression_shows_the_nearest_timestep(clip, tmp_path):
     avatar = fit(NearestCamera(), clip, tmp_path)
     pose = clip.poses[1]
     near = pose.expression + np.float32(1e-3)

@@ -73,7 +73,7 @@ def table(run):
         return list(csv.DictReader(stream))
 
 
-def test_neither_held_out_nor_test_frames_are_trained_on_and_only_the_held_out_are_measured(make_run, plugin):
+def test_held_out_frames_alone_are_measured_and_never_trained_on(make_run, plugin):
     curve_run(settings(make_run("curve_plugin:METHOD")))
     assert [budget for _, budget in plugin.FITS] == [Budget(n) for n in (64, 32, 16, 8, 4)]
     for train, _ in plugin.FITS:
