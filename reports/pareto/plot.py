@@ -6,20 +6,12 @@ import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from matplotlib import style
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.ticker import LogLocator, NullLocator
 from matplotlib.transforms import Bbox
 
-from ...bench.io.files import atomic_path
+from ..plots import GREY, cost_axis, plot_file, show_missing, start_axes
 from .points import Point, front_of
 
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-"""Okabe and Ito's, told apart with any colour vision."""
-MUTED = "#6e6e6e"
-SMALL = 8
 MARKER = 7.0
 """Diameter of a point, in points of 1/72 inch."""
 BESIDE = ((7, -8, "left"), (-7, 3, "right"), (7, 3, "left"), (-7, -8, "right"))
@@ -39,20 +31,14 @@ def write_plot(
         shapes = " Squares: trained; circles: derived from them without training."
     machines = ", ".join(sorted({point.machine for point in points}))
     note = f"Lines: Pareto front of each method; filled: of all.{shapes} Measured on {machines}."
-    with style.context(["default", {"text.parse_math": False, "font.size": 10}]):
-        figure = Figure(figsize=(6.2 * len(costs), 4.9), dpi=200, layout="constrained")
-        figure.supxlabel(note, x=0.01, ha="left", fontsize=SMALL, color=MUTED)
-        colours = dict(zip(dict.fromkeys(point.series for point in points), itertools.cycle(COLOURS)))
-        handles = [
-            Line2D([], [], marker="o", linestyle="", color=c, label=name) for name, c in colours.items()
-        ]
-        figure.legend(handles=handles, loc="outside upper left", ncols=8, fontsize=SMALL, frameon=False)
+    size = (6.2 * len(costs), 4.9)
+    names = [point.series for point in points]
+    with plot_file(path, size, 200, names, note, line="") as (figure, colours):
         plots = list(zip(figure.subplots(1, len(costs), squeeze=False)[0], costs))
         fronts = {}
         for axes, cost in plots:
             axes.set(xlabel=costs[cost])
-            axes.set_title(quality, loc="left", fontsize=10)
-            axes.spines[["top", "left", "right"]].set_visible(False)
+            start_axes(axes, quality)
             ends = [
                 front_of(points, cost, higher_is_better=higher_is_better, series=s) for s in (None, *colours)
             ]
@@ -61,8 +47,6 @@ def write_plot(
         figure.draw_without_rendering()  # the layout, before labels look for room in it
         for axes, cost in plots:
             label_points(axes, points, cost, list(itertools.chain(*fronts[cost])))
-        with atomic_path(path) as temporary:
-            figure.savefig(temporary, format="png")
 
 
 def _draw(
@@ -75,8 +59,7 @@ def _draw(
 ) -> None:
     """Points, steps and axis of one panel."""
     if all(getattr(point, cost) is None for point in points):
-        axes.text(0.5, 0.5, "not measured in these runs", color=MUTED, ha="center", transform=axes.transAxes)
-        axes.set(xticks=[], yticks=[])
+        show_missing(axes, "not measured in these runs")
         return
     for name, front in fronts.items():
         corners = [(getattr(points[i], cost), points[i].quality) for i in front]
@@ -93,13 +76,7 @@ def _draw(
                 markerfacecolor=colour if index in best else "white",
                 zorder=3,
             )
-    axes.set_xscale("log")
-    axes.margins(0.08, 0.12)
-    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    axes.xaxis.set_major_formatter("{x:g}")
-    axes.xaxis.set_minor_locator(NullLocator())
-    axes.grid(axis="y", color="#cdcdcd", linewidth=0.5)
-    axes.tick_params(labelsize=SMALL, labelcolor=MUTED)
+    cost_axis(axes)
 
 
 def label_points(axes: Axes, points: Sequence[Point], cost: str, order: Sequence[int]) -> None:
@@ -122,7 +99,7 @@ def label_points(axes: Axes, points: Sequence[Point], cost: str, order: Sequence
                 textcoords="offset points",
                 ha=align,
                 fontsize=7,
-                color=MUTED,
+                color=GREY,
                 in_layout=False,
             )
             box = label.get_window_extent()

@@ -1,0 +1,71 @@
+"""What plots of quality over a cost have in common: colours, legend, a note below and a logarithmic axis."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Literal
+
+from matplotlib import style
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import LogLocator, NullLocator
+
+from ..bench.io.files import atomic_path
+
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+"""Okabe and Ito's, which any colour vision separates."""
+GREY, LIGHT_GREY = "#6e6e6e", "#cdcdcd"
+SMALL = 8
+"""Size of text beside plots, in points."""
+
+
+@contextmanager
+def plot_file(
+    path: Path,
+    size: tuple[float, float],
+    dpi: int,
+    names: Iterable[str],
+    note: str,
+    *,
+    line: Literal["-", ""],
+) -> Iterator[tuple[Figure, dict[str, str]]]:
+    """A figure of ``size`` inches with a legend of ``names`` and their colours; written as a PNG at the end, atomically.
+
+    ``line`` is matplotlib's style of the lines in the legend.
+    """
+    with style.context(["default", {"text.parse_math": False, "font.size": 10}]):
+        figure = Figure(figsize=size, dpi=dpi, layout="constrained")
+        figure.supxlabel(note, x=0.01, ha="left", fontsize=SMALL, color=GREY)
+        colours = dict(zip(dict.fromkeys(names), itertools.cycle(COLOURS)))
+        handles = [Line2D([], [], marker="o", linestyle=line, color=c, label=n) for n, c in colours.items()]
+        figure.legend(handles=handles, loc="outside upper left", ncols=8, fontsize=SMALL, frameon=False)
+        yield figure, colours
+        with atomic_path(path) as temporary:
+            figure.savefig(temporary, format="png")
+
+
+def start_axes(axes: Axes, title: str) -> None:
+    """A plot without a frame, its title at the left."""
+    axes.set_title(title, loc="left", fontsize=10)
+    axes.spines[["top", "left", "right"]].set_visible(False)
+
+
+def show_missing(axes: Axes, text: str) -> None:
+    """Say why a plot is empty."""
+    axes.text(0.5, 0.5, text, color=GREY, ha="center", va="center", transform=axes.transAxes)
+    axes.set(xticks=[], yticks=[])
+
+
+def cost_axis(axes: Axes) -> None:
+    """A logarithmic horizontal axis with numbers at 1, 2 and 5."""
+    axes.set_xscale("log")
+    axes.margins(0.08, 0.12)
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.grid(axis="y", color=LIGHT_GREY, linewidth=0.5)
+    axes.tick_params(labelsize=SMALL, labelcolor=GREY)
