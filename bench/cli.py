@@ -8,15 +8,10 @@ import select
 import signal
 import sys
 import traceback
-from dataclasses import replace
 from importlib.metadata import version
-from types import NoneType, UnionType
-from typing import Any, Union, get_args
 
-import tyro
-
-from .commands import check_known, offered_commands, prepare_streams, show, with_groups
-from .errors import EXIT_CODES, ExitCode, HeadbenchError, Interruption
+from .errors import ExitCode, HeadbenchError, Interruption
+from .streams import prepare_streams, show
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -72,44 +67,9 @@ def _call(words: list[str]) -> int:
     if words[:1] == ["--version"]:
         show(f"headbench {version('headbench')}")
         return ExitCode.OK
-    offered = offered_commands()
-    check_known(words, offered)
-    first = ("demo", "run", "table")  # what a newcomer needs
-    commands = with_groups({name: offered[name] for name in (*first, *sorted(offered.keys() - set(first)))})
-    description = "Benchmark of animatable 3D head avatars. Start with `headbench demo`."
-    description += f" `headbench --version` prints the version.\n\n{EXIT_CODES}"
-    config = (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
-    return tyro.extras.subcommand_cli_from_dict(
-        commands,
-        prog="headbench",
-        description=description,
-        args=words,
-        config=config,
-        registry=_optional_values(),
-    )
+    from .commands import call  # with the parser, which takes longer to import than the version to print
 
-
-def _optional_values() -> tyro.constructors.ConstructorRegistry:
-    """How options that may be left out (``str | None``) are read and shown: as their values are."""
-    registry = tyro.constructors.ConstructorRegistry()
-
-    @registry.primitive_rule
-    def optional(
-        info: tyro.constructors.PrimitiveTypeInfo,
-    ) -> tyro.constructors.PrimitiveConstructorSpec[Any] | None:
-        kinds = get_args(info.type)
-        if info.type_origin not in (Union, UnionType) or len(kinds) != 2 or NoneType not in kinds:
-            return None
-        (kind,) = set(kinds) - {NoneType}
-        value = registry.get_primitive_spec(tyro.constructors.PrimitiveTypeInfo.make(kind, info.markers))
-        if isinstance(value, tyro.constructors.UnsupportedTypeAnnotationError):
-            return None
-        return replace(
-            value,
-            str_from_instance=lambda found: ["none"] if found is None else value.str_from_instance(found),
-        )
-
-    return registry
+    return call(words)
 
 
 if __name__ == "__main__":

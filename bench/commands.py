@@ -2,25 +2,24 @@
 
 # Without `from __future__ import annotations`: the parser reads annotations that are made when a command is found.
 
-import codecs
 import difflib
-import io
 import json as json_module
-import os
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Union
+from types import NoneType, UnionType
+from typing import Annotated, Any, Union, get_args
 
 import tyro
 
-from .errors import ExitCode, HeadbenchError, InputError
+from .errors import EXIT_CODES, ExitCode, HeadbenchError, InputError
 from .io.files import plain
 from .io.lock import locked
 from .progress import log_to_terminal, progress
 from .registry import discover
 from .specs import CommandSpec
+from .streams import show
 
 Command = Callable[..., int]
 
@@ -46,6 +45,27 @@ RENAMED_OPTIONS = {
 """Options by command and by what they were called before."""
 
 
+def call(words: Sequence[str]) -> int:
+    """Call the command that the words of a command line name, or print its help; returns the exit code."""
+    offered = offered_commands()
+    check_known(words, offered)
+    first = ("demo", "run", "table")  # what a newcomer needs
+    commands = with_groups({name: offered[name] for name in (*first, *sorted(offered.keys() - set(first)))})
+    description = "Benchmark of animatable 3D head avatars. Start with `headbench demo`."
+    description += f" `headbench --version` prints the version.\n\n{EXIT_CODES}"
+    config = (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
+    # Not tyro's own function for subcommands: it looks for help in typing's sources, which takes as long as the rest.
+    code: int = tyro.cli(
+        _nested(commands),
+        prog="headbench",
+        description=description,
+        args=words,
+        config=config,
+        registry=_optional_values(),
+    )
+    return code
+
+
 def offered_commands() -> dict[str, Command | dict[str, Command]]:
     """Commands by name; a word that several share ("prepare nersemble") leads to a table of its own.
 
@@ -67,7 +87,8 @@ def offered_commands() -> dict[str, Command | dict[str, Command]]:
 def with_groups(commands: Mapping[str, Command | dict[str, Command]]) -> dict[str, Command]:
     """Each table of `offered_commands` as one command whose first argument names a command of the table."""
     return {
-        name: _nested(command) if isinstance(command, dict) else command for name, command in commands.items()
+        name: _nested(dict(sorted(command.items()))) if isinstance(command, dict) else command
+        for name, command in commands.items()
     }
 
 
@@ -104,40 +125,6 @@ def check_known(words: Sequence[str], commands: Mapping[str, Command | dict[str,
     raise InputError("command line", "", "a command of headbench", repr(word[:60]), remedy)
 
 
-IN_ASCII = dict(
-    zip("↑↓±×·–—…²µ•→°", ("^", "v", "+/-", "x", "-", "-", "--", "...", "^2", "u", "*", "->", " deg"))
-)
-"""What our output has beyond ASCII, for terminals that have no more."""
-
-
-def prepare_streams() -> None:
-    """Let standard output and error write in ASCII what their encoding lacks, where they would raise otherwise."""
-    codecs.register_error("headbench", _in_ascii)
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="headbench")
-
-
-def _in_ascii(error: UnicodeError) -> tuple[str, int]:
-    """Handle characters that an encoding lacks: ours by `IN_ASCII`, others as JSON escapes them."""
-    if not isinstance(error, UnicodeEncodeError):
-        raise error
-    lacking = error.object[error.start : error.end]
-    return "".join(IN_ASCII.get(c) or json_module.dumps(c)[1:-1] for c in lacking), error.end
-
-
-def show(text: str = "", end: str = "\n") -> None:
-    """Print the result of a command. A reader that has gone (``headbench gate … | head -1``) changes no exit code."""
-    try:
-        print(text, end=end, flush=True)
-    except OSError as error:
-        # What is still buffered must not fail again when the interpreter ends.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        if not isinstance(error, BrokenPipeError):
-            error.filename = "standard output"
-            raise
-
-
 def _command(spec: CommandSpec) -> Command:
     settings_type: Any = Annotated[spec.settings, tyro.conf.OmitArgPrefixes]
 
@@ -166,11 +153,34 @@ def _broken(name: str, why: str) -> Command:
 
 def _nested(group: Mapping[str, Command]) -> Command:
     # The parser calls the command that the second word names, and gives what it returned.
-    choices = [Annotated[Any, tyro.conf.subcommand(name=n, constructor=c)] for n, c in sorted(group.items())]
+    choices = [Annotated[Any, tyro.conf.subcommand(name=n, constructor=c)] for n, c in group.items()]
     choice: Any = Union[(*choices, Annotated[None, tyro.conf.Suppress])]
 
-    def command(what: choice) -> int:
-        return what
+    def chosen(command: choice) -> int:
+        return command
 
-    command.__doc__ = f"Followed by one of: {', '.join(sorted(group))}."
-    return command
+    chosen.__doc__ = f"Followed by one of: {', '.join(group)}."
+    return chosen
+
+
+def _optional_values() -> tyro.constructors.ConstructorRegistry:
+    """How options that may be left out (``str | None``) are read and shown: as their values are."""
+    registry = tyro.constructors.ConstructorRegistry()
+
+    @registry.primitive_rule
+    def optional(
+        info: tyro.constructors.PrimitiveTypeInfo,
+    ) -> tyro.constructors.PrimitiveConstructorSpec[Any] | None:
+        kinds = get_args(info.type)
+        if info.type_origin not in (Union, UnionType) or len(kinds) != 2 or NoneType not in kinds:
+            return None
+        (kind,) = set(kinds) - {NoneType}
+        value = registry.get_primitive_spec(tyro.constructors.PrimitiveTypeInfo.make(kind, info.markers))
+        if isinstance(value, tyro.constructors.UnsupportedTypeAnnotationError):
+            return None
+        return replace(
+            value,
+            str_from_instance=lambda found: ["none"] if found is None else value.str_from_instance(found),
+        )
+
+    return registry

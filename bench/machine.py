@@ -15,8 +15,6 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Self
 
-import psutil
-
 from .errors import HeadbenchError, InputError
 from .registry import resolve
 
@@ -35,6 +33,8 @@ def processor_count() -> int:
 
 def machine_record() -> dict[str, Any]:
     """Processor, memory, system and the versions of packages that influence results."""
+    import psutil
+
     return {
         "processor": _processor(),
         "cores": processor_count(),
@@ -73,6 +73,8 @@ class PeakMemory:
     """
 
     def __init__(self) -> None:
+        import psutil
+
         self.before = self.peak = 0
         self._ended = threading.Event()
         self._watcher: threading.Thread | None = None

@@ -10,12 +10,13 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
-
-from tqdm import tqdm
-from tqdm.contrib.logging import logging_redirect_tqdm
+from typing import TYPE_CHECKING
 
 from .contracts import Progress
 from .io.files import no_link
+
+if TYPE_CHECKING:
+    from tqdm import tqdm
 
 LOG_EVERY_S, SHOW_EVERY_S = 15.0, 0.2
 """Seconds between lines of a log, and between changes of the line on a terminal."""
@@ -204,6 +205,9 @@ def _line() -> Iterator[Show]:
         bars: list[tqdm] = []
 
         def write_over(text: str) -> None:
+            from tqdm import tqdm
+            from tqdm.contrib.logging import logging_redirect_tqdm
+
             if not bars:  # a line in which nothing is shown takes none of the terminal
                 stack.enter_context(logging_redirect_tqdm([log]))
                 bars.append(stack.enter_context(tqdm(bar_format="{desc}", leave=False, dynamic_ncols=True)))

@@ -11,7 +11,8 @@ import importlib
 import itertools
 import logging
 from dataclasses import dataclass, replace
-from importlib.metadata import EntryPoint, entry_points
+from functools import lru_cache
+from importlib.metadata import Distribution, EntryPoint, entry_points
 from typing import Any, Literal
 
 from .errors import HeadbenchError, InputError
@@ -114,11 +115,18 @@ def unknown(file: str, key: str, name: str, known: Any, remedy: str = "") -> Inp
 def _origin(entry: EntryPoint) -> str:
     if entry.value.startswith(f"{_OWN}.bench.builtin:"):
         return _OWN
-    return entry.dist.name if entry.dist is not None else "unknown"
+    return _name_and_version(entry.dist)[0] if entry.dist is not None else "unknown"
+
+
+@lru_cache(maxsize=64)
+def _name_and_version(distribution: Distribution) -> tuple[str, str]:
+    """Of a distribution, whose entries share it; it reads its whole metadata anew for each question."""
+    metadata = distribution.metadata
+    return metadata["Name"], metadata["Version"]
 
 
 def _load(entry: EntryPoint, group: str) -> Plugin:
-    version = f" {entry.dist.version}" if entry.dist is not None else ""
+    version = f" {_name_and_version(entry.dist)[1]}" if entry.dist is not None else ""
     origin = f"{_origin(entry)}{version}"
     try:
         return Plugin(entry.name, origin, _checked(entry.load(), group, entry.name))

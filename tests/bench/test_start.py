@@ -6,8 +6,11 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import get_args, get_type_hints
 
 import pytest
+
+from headbench.bench.builtin import ListSettings
 
 CONSOLE_SCRIPT = "import sys\nfrom headbench.bench.start import main\nsys.exit(main())\n"
 LINES = {
@@ -169,6 +172,48 @@ def test_workers_end_with_the_process_that_started_them(start, tmp_path, number)
         assert (process.returncode, errors.splitlines()[-1]) == (130, LINES[number])
 
 
-def test_the_entry_point_is_light():
-    code = "import sys, headbench.bench.start; sys.exit(bool({'numpy', 'tyro', 'torch'} & set(sys.modules)))"
-    subprocess.run([sys.executable, "-c", code], check=True)
+COMMAND_LINE = {"numpy", "tyro", "yaml", "headbench.bench.commands"}
+USED_BY_COMMANDS = {
+    *(
+        "cv2",
+        "drjit",
+        "matplotlib",
+        "mitsuba",
+        "nlopt",
+        "pandas",
+        "PIL",
+        "psutil",
+        "pyarrow",
+        "pycolmap",
+        "pydantic",
+    ),
+    *("pymeshlab", "safetensors", "scipy", "skimage", "sklearn", "torch", "torchmetrics", "tqdm"),
+}
+
+
+@pytest.mark.parametrize(
+    ("words", "unused"),
+    [
+        ("--version", USED_BY_COMMANDS | COMMAND_LINE),
+        ("--help", USED_BY_COMMANDS),
+        ("demo --help", USED_BY_COMMANDS),
+        ("prepare nersemble --help", USED_BY_COMMANDS),
+        ("runn", USED_BY_COMMANDS),
+        *((f"list {what}", USED_BY_COMMANDS) for what in get_args(get_type_hints(ListSettings)["what"])),
+    ],
+)
+def test_what_calls_no_command_imports_nothing_heavy(words, unused):
+    code = (
+        "import sys\n"
+        "from headbench.bench.start import main\n"
+        f"unused = {sorted(unused)}\n"
+        "assert not set(unused) & set(sys.modules)\n"
+        "try: main()\n"
+        "except SystemExit: pass\n"
+        "print('imported', *sorted(set(unused) & set(sys.modules)))\n"
+    )
+    ended = subprocess.run(
+        [sys.executable, "-c", code, *words.split()], check=True, capture_output=True, text=True
+    )
+    assert ended.stdout.splitlines()[-1] == "imported"
+    assert len(ended.stdout.splitlines()) > 1 or "a command of headbench" in ended.stderr
