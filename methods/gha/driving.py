@@ -25,6 +25,7 @@ from ...datasets.head.rotations import (
 )
 from ..shared.avatar_files import Subject
 from ..shared.rendering import View, view_of
+from . import kernel
 from .config import GHAConfig
 
 POSE_SIZE = 6
@@ -205,17 +206,22 @@ def influences(
     Expression rules up to ``near_squared`` from the nearest of the (L, 3) landmarks, pose from ``far_squared`` on,
     and in between the weights are linear in the squared distance.
     """
-    with torch.no_grad():
-        # |a - b|^2 without |a|^2, which is the same for all landmarks of a point. `min` is three times as fast as
-        # `argmin` on the CPU.
-        nearest = torch.addmm(landmarks.square().sum(1), points, landmarks.t(), alpha=-2).min(1).indices
-    squared = (points - landmarks.index_select(0, nearest)).square().sum(1)
+    squared = (kernel.nearest_squared if kernel.usable(points) else nearest_squared)(points, landmarks)
     weight = ((far_squared - squared) / (far_squared - near_squared)).clamp(0, 1)
     near, far = (weight.detach() > 0).nonzero().squeeze(1), (weight.detach() < 1).nonzero().squeeze(1)
     return (
         Influence(near, weight.index_select(0, near)),
         Influence(far, 1 - weight.index_select(0, far)),
     )
+
+
+def nearest_squared(points: Tensor, landmarks: Tensor) -> Tensor:
+    """(N,) squared distances of (N, 3) points from the nearest of the (L, 3) landmarks."""
+    with torch.no_grad():
+        # |a - b|^2 without |a|^2, which is the same for all landmarks of a point. `min` is three times as fast as
+        # `argmin` on the CPU.
+        nearest = torch.addmm(landmarks.square().sum(1), points, landmarks.t(), alpha=-2).min(1).indices
+    return (points - landmarks.index_select(0, nearest)).square().sum(1)
 
 
 class TrainingScene(NamedTuple):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -14,6 +14,7 @@ from ...bench.contracts import Camera
 from ...datasets.head.rotations import matrix_to_quaternion
 from ..shared.binding import WorldSplats, left_products
 from ..splats import rasterize
+from . import kernel
 from .config import GHAConfig
 from .driving import HeadMotion, Signal, influences
 from .networks import Controllers, Weights, encode_pose, uniform
@@ -193,15 +194,15 @@ class SuperResolution:
 
     def __call__(self, weights: Weights, features: Tensor, alpha: Tensor) -> Tensor:
         """(u H, u W, 3) colours of an (H, W, C) feature image with its (H, W) alpha; in (0, 1) without ``residual``."""
-        values = features.permute(2, 0, 1)[None]
+        convolution = kernel.normalised_convolution if kernel.usable(features) else normalised_convolution
+        values = features
         for block in range(len(self.widths)):
             if block:
-                height, width = values.shape[2:]
-                values = F.interpolate(values, (2 * height, 2 * width), mode="bilinear", align_corners=True)
+                size = 2 * values.shape[0], 2 * values.shape[1]
+                values = _resized(values, size, align_corners=True)
             for layer in range(2):
-                values = F.conv2d(values, weights[f"sr.conv_{block}_{layer}"], padding=1)
-                values = F.relu(_normalised(values))
-        colors = F.conv2d(values, weights["sr.color"], weights["sr.color_bias"])
+                values = convolution(values, weights[f"sr.conv_{block}_{layer}"])
+        colors = F.linear(values, weights["sr.color"].flatten(1), weights["sr.color_bias"])
         return self._finished(colors, features, alpha)
 
     @torch.no_grad()
@@ -234,25 +235,34 @@ class SuperResolution:
         for first in range(0, height, rows):
             strip = read(first, min(first + rows, height))
             colors[:, :, first : first + rows] = F.conv2d(strip, *color)
-        return self._finished(colors, features, alpha)
+        return self._finished(colors[0].permute(1, 2, 0), features, alpha)
 
     def _finished(self, colors: Tensor, features: Tensor, alpha: Tensor) -> Tensor:
-        """(u H, u W, 3) image of the last layer's (1, 3, u H, u W) output."""
+        """(u H, u W, 3) image of the last layer's (u H, u W, 3) output."""
         if not self.residual:
-            return torch.sigmoid(colors)[0].permute(1, 2, 0)
-        plain = torch.cat([features[..., :3], alpha[..., None]], dim=2).permute(2, 0, 1)[None]
+            return torch.sigmoid(colors)
+        plain, covered = features[..., :3], alpha[..., None]
         if self.upscale > 1:
-            plain = F.interpolate(plain, colors.shape[2:], mode="bilinear", align_corners=False)
-        return (plain[:, :3] + plain[:, 3:] * colors)[0].permute(1, 2, 0)
+            enlarged = _resized(torch.cat([plain, covered], dim=2), colors.shape[:2], align_corners=False)
+            plain, covered = enlarged.split([3, 1], dim=2)
+        return plain + covered * colors
 
 
-def _normalised(values: Tensor) -> Tensor:
-    """Each channel with mean 0 and variance 1 over the image: instance normalisation.
+def _resized(values: Tensor, size: Sequence[int], *, align_corners: bool) -> Tensor:
+    """The (H, W, C) image at another size, bilinear."""
+    planes = values.permute(2, 0, 1)[None]
+    resized = F.interpolate(planes, tuple(size), mode="bilinear", align_corners=align_corners)
+    return resized[0].permute(1, 2, 0)
 
-    Of one image that is what batch normalisation does, and torch's kernel for it takes an image of one pixel too
-    (which becomes 0).
-    """
-    return torch.native_batch_norm(values, None, None, None, None, True, 0.0, VARIANCE_FLOOR)[0]
+
+def normalised_convolution(values: Tensor, weight: Tensor) -> Tensor:
+    """(H, W, D) 3x3 convolution, padded with zeros, of an (H, W, C) image by (D, C, 3, 3) weights, each channel normalised
+    to mean 0 and variance 1 over the image, and rectified."""
+    raw = F.conv2d(values.permute(2, 0, 1)[None], weight, padding=1)
+    # Of one image, instance normalisation is what batch normalisation does, and torch's kernel for it takes an image of one
+    # pixel too (which becomes 0).
+    normalised = torch.native_batch_norm(raw, None, None, None, None, True, 0.0, VARIANCE_FLOOR)[0]
+    return F.relu(normalised)[0].permute(1, 2, 0)
 
 
 Reader = Callable[[int, int], Tensor]

@@ -13,9 +13,9 @@ from torch import Tensor, nn
 from ...bench.contracts import Camera
 from ...bench.errors import InputError
 from ..shared.loop import TrainingImages
-from ..shared.losses import mean_ssim
 from ..shared.optimisation import Optimiser, logit
 from ..shared.schedule import Sampler, Timeline, log_linear, torch_generator
+from ..shared.training_kernel import photometric_loss
 from .config import GHAConfig
 from .driving import POSE_SIZE, Signal, TrainingScene, mouth_box
 from .gaussian_head import FeatureImage, GaussianHead, feature_background
@@ -105,10 +105,8 @@ class GaussianTraining:
             zoom = Zoom.of(drawn.alpha.shape, draws)
             drawn, padded = zoomed(drawn, padded, zoom, scene.background)
         image = head.sharpen(tensors, drawn, scene.background)
-        loss = loss + (image - padded).abs().mean()
-        if config.structure_weight:
-            planes = (values.permute(2, 0, 1).contiguous() for values in (image, padded))
-            loss = loss + config.structure_weight * (1 - mean_ssim(*planes))
+        whole = 1 + config.structure_weight
+        loss = loss + whole * photometric_loss(image, padded, config.structure_weight / whole)
         if self._motion is not None:
             network, generator = (
                 head.controllers.expression_deform,

@@ -12,10 +12,10 @@ import torch
 from torch import Tensor
 
 from ..shared.binding import WorldSplats
-from ..shared.networks import ENCODING_SIZE, encode
+from ..shared.networks import ENCODING_SIZE
 from .config import GHAConfig
 from .driving import HeadMotion, Signal, influences
-from .networks import Controllers, Mlp, Weights, encode_pose
+from .networks import Controllers, Mlp, Weights, encode, encode_pose
 
 OFFSET_CELLS = 0.3
 """Reach of the grid's vertices in cells, before two tanh: published are 1/128 units in a grid of about 0.026."""

@@ -16,12 +16,11 @@ from torch import Tensor, nn
 
 from ...bench.contracts import FloatArray, IntArray
 from ...datasets.head.geometry import vertex_normals
-from ..shared.networks import encode
 from ..shared.optimisation import Optimiser
 from ..shared.schedule import log_linear, torch_generator
 from .config import GHAConfig
 from .driving import TrainingScene, influences
-from .networks import Mlp, Weights
+from .networks import Mlp, Weights, encode
 
 TURNING = ("left_eyeball", "right_eyeball")
 """Regions left out: gaze turns them under the lids, where one field of displacements has no room for both."""

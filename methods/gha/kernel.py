@@ -1,0 +1,248 @@
+"""The networks by the compiled kernel, with gradients in closed form.
+
+Each function names its reference in torch, which is the definition, takes float64, and is used where the kernel is not: other
+devices, other dtypes, or no compiler at installation. The kernel's results do not depend on the number of threads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from ...bench.native.loader import Kernel
+from ..shared.networks import ENCODING_SIZE
+
+KERNEL = Kernel(
+    "headbench.methods.gha._kernel", "GHA's kernel", "torch computes its networks meanwhile, slowly"
+)
+UNITS_STEP = 16
+"""Channels are padded to a multiple of it."""
+
+
+def usable(like: Tensor) -> bool:
+    """Whether the kernel is there and takes tensors like this one."""
+    return like.dtype == torch.float32 and like.device.type == "cpu" and bool(KERNEL.instruction_sets)
+
+
+class Part(NamedTuple):
+    """A network at some rows of a table; see `networks.Mlp`.
+
+    Attributes
+    ----------
+    rows : (n,) int64, each at most once.
+    influence : (n,) that its values are multiplied by, or None.
+    condition : (C,), (B, C), or None.
+    weights, biases : by layer.
+    again : the layer that the inputs come into once more, or 0.
+    squashed : whether tanh follows the last layer.
+    """
+
+    rows: Tensor
+    influence: Tensor | None
+    condition: Tensor | None
+    weights: Sequence[Tensor]
+    biases: Sequence[Tensor]
+    again: int
+    squashed: bool
+
+
+def perceptron(points: Tensor, part: Part, outputs: int, slope: float, instruction_set: str = "") -> Tensor:
+    """(n, outputs) first outputs of a network at rows of the (N, F) points; (B, n, outputs) for a (B, C) condition.
+
+    Compiled form of `networks.Mlp.reference`. With several conditions there is no gradient by the points.
+    """
+    values: Tensor = _Perceptrons.apply(  # type: ignore[no-untyped-call]
+        *((part,), outputs, slope, instruction_set, points, part.influence, part.condition),
+        *(*part.weights, *part.biases),
+    )
+    several = part.condition is not None and part.condition.ndim == 2
+    return values.view(-1, len(part.rows), outputs) if several else values
+
+
+def blended(
+    points: Tensor, parts: Sequence[Part], outputs: int, slope: float, instruction_set: str = ""
+) -> Tensor:
+    """(N, outputs) sums of networks' values times their influences at (N, F) points: compiled form of
+    `networks.blended_reference`."""
+    tensors: list[Tensor | None] = []
+    for part in parts:
+        tensors += [part.influence, part.condition, *part.weights, *part.biases]
+    total: Tensor = _Perceptrons.apply(tuple(parts), outputs, slope, instruction_set, points, *tensors)  # type: ignore[no-untyped-call]
+    return total
+
+
+class _Perceptrons(torch.autograd.Function):
+    """Influence, condition, weights and biases of each part follow the points."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        parts: tuple[Part, ...],
+        outputs: int,
+        slope: float,
+        instruction_set: str,
+        points: Tensor,
+        *tensors: Tensor | None,
+    ) -> Tensor:
+        keeps = any(ctx.needs_input_grad)
+        blends = parts[0].influence is not None
+        total = points.new_zeros(len(points), outputs) if blends else points.new_empty(0, outputs)
+        saved: list[Tensor] = [points.contiguous()]
+        for part in parts:
+            conditions = _conditions(part, points)
+            hidden = [len(weight) for weight in part.weights[:-1]]
+            count = KERNEL.load().kept_floats(len(conditions), len(part.rows), hidden) if keeps else 0
+            kept = points.new_empty(count)
+            values = points.new_empty(len(conditions) * len(part.rows), outputs)
+            inputs = _arrays(part, saved[0], conditions, slope)
+            KERNEL.load().forward(
+                *(*inputs, kept.numpy(), values.numpy(), total.numpy()),
+                *(instruction_set, torch.get_num_threads()),
+            )
+            saved += [kept, values]
+        ctx.settings = parts, slope, instruction_set
+        ctx.save_for_backward(*saved)
+        return total if blends else saved[-1]
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        parts, slope, instruction_set = ctx.settings
+        points, *saved = ctx.saved_tensors
+        by_points = (
+            torch.zeros_like(points) if ctx.needs_input_grad[4] else points.new_empty(0, points.shape[1])
+        )
+        gradient = grad.contiguous()
+        found: list[Tensor | None] = []
+        for part, kept, values in zip(parts, saved[::2], saved[1::2]):
+            conditions = _conditions(part, points)
+            by_influence = points.new_empty(0 if part.influence is None else len(part.rows))
+            by_condition = torch.empty_like(conditions)
+            by_weights = [torch.empty_like(weight) for weight in part.weights]
+            by_biases = [torch.empty_like(bias) for bias in part.biases]
+            KERNEL.load().backward(
+                *_arrays(part, points, conditions, slope),
+                *(
+                    tensor.numpy()
+                    for tensor in (kept, values, gradient, by_points, by_influence, by_condition)
+                ),
+                *([tensor.numpy() for tensor in tensors] for tensors in (by_weights, by_biases)),
+                *(instruction_set, torch.get_num_threads()),
+            )
+            found.append(None if part.influence is None else by_influence)
+            found.append(None if part.condition is None else by_condition.view(part.condition.shape))
+            found += [*by_weights, *by_biases]
+        return None, None, None, None, by_points if ctx.needs_input_grad[4] else None, *found
+
+
+def _conditions(part: Part, like: Tensor) -> Tensor:
+    if part.condition is None:
+        return like.new_empty(1, 0)
+    return part.condition.detach().view(-1, part.condition.shape[-1]).contiguous()
+
+
+def _arrays(part: Part, points: Tensor, conditions: Tensor, slope: float) -> list[Any]:
+    """What both passes of the kernel take first."""
+    influence = points.new_empty(0) if part.influence is None else part.influence.detach()
+    return [
+        *(points.detach().numpy(), part.rows.numpy(), influence.contiguous().numpy(), conditions.numpy()),
+        *([t.detach().contiguous().numpy() for t in tensors] for tensors in (part.weights, part.biases)),
+        *(part.again, part.squashed, slope),
+    ]
+
+
+def normalised_convolution(values: Tensor, weight: Tensor, instruction_set: str = "") -> Tensor:
+    """(H, W, D) 3x3 convolution, padded with zeros, of an (H, W, C) image by (D, C, 3, 3) weights, each channel normalised
+    over the image and rectified: compiled form of `gaussian_head.normalised_convolution`."""
+    out: Tensor = _Convolution.apply(values, weight, instruction_set)  # type: ignore[no-untyped-call]
+    return out
+
+
+class _Convolution(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, weight: Tensor, instruction_set: str) -> Tensor:
+        values, weight = values.contiguous(), weight.contiguous()
+        raw = values.new_empty(*values.shape[:2], len(weight))
+        moments = values.new_empty(2, -(-len(weight) // UNITS_STEP) * UNITS_STEP)
+        # Without gradients nobody asks for the raw values again.
+        out = torch.empty_like(raw) if any(ctx.needs_input_grad) else raw
+        KERNEL.load().convolve(
+            *(tensor.detach().numpy() for tensor in (values, weight, raw, moments, out)),
+            *(instruction_set, torch.get_num_threads()),
+        )
+        ctx.save_for_backward(values, weight, raw, moments)
+        ctx.instruction_set = instruction_set
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        values, weight, raw, moments = ctx.saved_tensors
+        wanted = ctx.needs_input_grad[0]
+        by_values = torch.empty_like(values) if wanted else values.new_empty(0, *values.shape[1:])
+        by_weight = torch.empty_like(weight)
+        arrays = (values, weight, raw, moments, grad.contiguous(), by_values, by_weight)
+        KERNEL.load().convolve_backward(
+            *(tensor.detach().numpy() for tensor in arrays), ctx.instruction_set, torch.get_num_threads()
+        )
+        return by_values if wanted else None, by_weight, None
+
+
+def nearest_squared(points: Tensor, landmarks: Tensor, instruction_set: str = "") -> Tensor:
+    """(N,) squared distances of (N, 3) points from the nearest of the (L, 3) landmarks."""
+    squared: Tensor = _NearestSquared.apply(points, landmarks, instruction_set)  # type: ignore[no-untyped-call]
+    return squared
+
+
+class _NearestSquared(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, points: Tensor, landmarks: Tensor, instruction_set: str) -> Tensor:
+        points, landmarks = points.contiguous(), landmarks.contiguous()
+        nearest = torch.empty(len(points), dtype=torch.int32)
+        squared = points.new_empty(len(points))
+        KERNEL.load().nearest(
+            *(tensor.detach().numpy() for tensor in (points, landmarks, nearest, squared)),
+            *(instruction_set, torch.get_num_threads()),
+        )
+        ctx.save_for_backward(points, landmarks, nearest)
+        return squared
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        points, landmarks, nearest = ctx.saved_tensors
+        by_points = 2 * grad[:, None] * (points - landmarks.index_select(0, nearest))
+        by_landmarks = None
+        if ctx.needs_input_grad[1]:
+            by_landmarks = torch.zeros_like(landmarks).index_add_(0, nearest, by_points, alpha=-1)
+        return by_points, by_landmarks, None
+
+
+def encode(points: Tensor, instruction_set: str = "") -> Tensor:
+    """(N, 27) positional encoding of (N, 3) points: compiled form of `shared.networks.encode`."""
+    encoded: Tensor = _Encoding.apply(points, instruction_set)  # type: ignore[no-untyped-call]
+    return encoded
+
+
+class _Encoding(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, points: Tensor, instruction_set: str) -> Tensor:
+        encoded = points.new_empty(len(points), ENCODING_SIZE)
+        arrays = points.detach().contiguous().numpy(), encoded.numpy()
+        KERNEL.load().encode(*arrays, instruction_set, torch.get_num_threads())
+        ctx.save_for_backward(encoded)
+        ctx.instruction_set = instruction_set
+        return encoded
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        (encoded,) = ctx.saved_tensors
+        by_points = encoded.new_empty(len(encoded), 3)
+        arrays = (tensor.detach().numpy() for tensor in (encoded, grad.contiguous(), by_points))
+        KERNEL.load().encode_backward(*arrays, ctx.instruction_set, torch.get_num_threads())
+        return by_points, None
