@@ -183,6 +183,10 @@ class Rows:
         """The same rows, every method under another name."""
         return Rows(self._table.assign(method=[labels[str(name)] for name in self._table["method"]]))
 
+    def of_methods(self, names: Collection[str]) -> Rows:
+        """The rows of some methods."""
+        return Rows(self._table[self._table["method"].isin(list(names))])
+
     def check(self) -> None:
         """Raise `InputError` for rows that repeat a frame, and for a method of several versions."""
         rows = self._table

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
 from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 from .tables import Column, Table, TableCell
 
@@ -165,12 +166,19 @@ def _latex_cell(cell: TableCell) -> str:
 
 def to_html(table: Table) -> str:
     """Write one page that needs no script, font or network. Values in full precision stand in tooltips."""
-    from jinja2 import Environment
+    return render_page("table.html", table=table)
 
-    template = Path(__file__).with_name("table.html").read_text(encoding="utf-8")
+
+def render_page(template: str, **content: Any) -> str:
+    """Fill an HTML template of this package; text is escaped."""
+    from jinja2 import Environment, FileSystemLoader
+
+    here = Path(__file__).parent
+    environment = Environment(
+        autoescape=True, keep_trailing_newline=True, loader=FileSystemLoader([here, here / "leaderboard"])
+    )
     ranks = {1: "first", 2: "second", 3: "third"}
-    page = Environment(autoescape=True, keep_trailing_newline=True).from_string(template)
-    return page.render(table=table, spans=_spans(table), ranks=ranks)
+    return environment.get_template(template).render(spans=_spans, ranks=ranks, **content)
 
 
 FORMULA_STARTS = ("=", "+", "-", "@")

@@ -127,7 +127,11 @@ def test_no_code_contains(what):
 
 
 READ_IN_ONE_PLACE = {
-    r"\bnp\.load\(|\bzipfile\.ZipFile\(": {"bench/io/arrays.py", "metrics/torch_file.py"},
+    r"\bnp\.load\(|\bzipfile\.ZipFile\(": {
+        "bench/audit/bundle.py",
+        "bench/io/arrays.py",
+        "metrics/torch_file.py",
+    },
     r"\bcv2\.(imread|imdecode)\(": {"bench/io/images.py"},
     r"\bImage\.open\(": {"bench/audit/evaluate.py"},  # behind a check of the header
     r"\bsafe_open\(|\bload_file\(": {"methods/shared/tensor_files.py"},

@@ -175,6 +175,17 @@ CASES = {
         case("table {demo} plain", "one seed"),
     ],
     "verify": [case("verify {demo}", "as recorded")],
+    "bundle": [
+        case("bundle plain --out board/plain.zip --by Somebody --renders", "plain.zip", "board/plain.zip"),
+        case("bundle {demo} --out board/all.zip --by Somebody --methods ga ours", "all.zip", "board/all.zip"),
+        case("verify board/plain.zip", "as recorded"),
+        case("verify board/all.zip", "No value was recomputed"),
+    ],
+    "leaderboard build": [
+        case(
+            "leaderboard build board --out page", "2 bundles", "page/leaderboard.md", "page/leaderboard.html"
+        )
+    ],
     "compare": [
         case("compare {demo} --metrics psnr", "ga +ours"),
         case("compare {demo} --metrics psnr ssim --against ours --trivial --format csv", "ours"),

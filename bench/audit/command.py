@@ -1,25 +1,30 @@
-"""``headbench verify`` and ``headbench evaluate``."""
+"""``headbench verify``, ``headbench bundle`` and ``headbench evaluate``."""
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
+from typing import Any
 
 import tyro
 
 from ..contracts import Progress, TaskName, no_progress
+from ..errors import InputError
 from ..runner.config import RunOptions
-from ..specs import Findings
+from ..specs import LABEL, Findings, is_label
 
 
 @dataclass(frozen=True)
 class VerifySettings(RunOptions):
     """Recompute a run's hashes and metrics from the files it left.
 
+    Of a bundle the listed digests are checked, and with renders in it all metrics of frames as well: against the capture
+    that --data names, or for a synthetic one against a capture made again from the recorded seed.
     Exit code 0: as recorded; 1: something differs; 2: wrong usage; 3: the run or its capture is missing or invalid.
     """
 
     run: tyro.conf.Positional[str]
-    """Folder of a finished run, or of `headbench evaluate`."""
+    """Folder of a finished run or of `headbench evaluate`, or a file of `headbench bundle`."""
 
 
 def verify(settings: VerifySettings, progress: Progress = no_progress) -> Findings:
@@ -27,6 +32,58 @@ def verify(settings: VerifySettings, progress: Progress = no_progress) -> Findin
     from .verify import verify_run
 
     return verify_run(settings, progress)
+
+
+@dataclass(frozen=True)
+class BundleSettings:
+    """Write the results of a finished run to one file that a leaderboard takes and `headbench verify` checks.
+
+    It holds the rows and records of a run with the digest of each file, and no folder names of this machine; no images
+    unless asked for. Licensed data stay out: renders of real people only with their consent.
+    """
+
+    run: tyro.conf.Positional[str]
+    """Folder of a finished run, or of `headbench evaluate`."""
+
+    out: str
+    """File to write, for example NAME.zip."""
+
+    by: str
+    """Who submits it, as a leaderboard shows it."""
+
+    link: str = ""
+    """Web address with more, such as that of a paper or a repository."""
+
+    comment: str = ""
+    """Anything else, one line."""
+
+    methods: tuple[str, ...] = ()
+    """Only these methods; default: all of the run."""
+
+    renders: bool = False
+    """Add the scored frames, so that others can recompute the metrics."""
+
+    def __post_init__(self) -> None:
+        """Refuse what no leaderboard could show."""
+        check_shown(self, "command line")
+
+
+def check_shown(submission: Any, source: str) -> None:
+    """Raise `InputError` unless a leaderboard can show ``by``, ``link`` and ``comment``; a link is of the web."""
+    for name in ("by", "link", "comment"):
+        text = getattr(submission, name)
+        if not is_label(text):
+            raise InputError(source, name, LABEL, repr(text[:60]))
+    link = submission.link
+    if link and not re.fullmatch(r"https?://[^\s\"'<>()\[\]]+", link):
+        raise InputError(source, "link", "an address that begins with https:// or http://", repr(link))
+
+
+def bundle(settings: BundleSettings, progress: Progress = no_progress) -> Findings:
+    """Write the results of a finished run to one file, for a leaderboard and for `headbench verify`."""
+    from .bundle import write_bundle
+
+    return write_bundle(settings, progress)
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+import math
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
@@ -10,12 +12,14 @@ from typing import Any
 
 import pandas as pd
 
+from ..configuration import build_arguments
 from ..contracts import Avatar, Clip, FrameKey, Progress, no_progress
 from ..errors import ExitCode, HeadbenchError, InputError
-from ..io.files import digest_file
+from ..io.files import digest, digest_file
 from ..io.images import read_png
 from ..manifest import Manifest, ProtocolRecord
 from ..protocol import Protocol, make_protocols
+from ..registry import get, resolve
 from ..rows import ALL, FRAME, Rows
 from ..runner.captures import open_run_clips
 from ..runner.config import resolve_methods, resolve_metrics
@@ -23,11 +27,15 @@ from ..runner.run import load, make_jobs
 from ..runner.steps import DIGESTS, Job, measure, recorded_frames
 from ..runner.store import Cell, RunFolder
 from ..specs import Findings, MetricSpec
+from .bundle import read_bundle
 from .command import VerifySettings
 from .evaluate import NoAvatar, images_method
 
 KEY = ["method", "seed", "task", *FRAME, "region", "metric"]
 SHOWN = 20
+PIXELS_PER_BYTE = 100
+"""Of the captures that are made again for a bundle; its renders have about one of a byte, a run scores a tenth of them at
+least."""
 
 
 @dataclass(frozen=True)
@@ -65,19 +73,80 @@ def verify_run(settings: VerifySettings, progress: Progress = no_progress) -> Fi
     """
     try:
         with tempfile.TemporaryDirectory() as scratch:
+            if Path(settings.run).is_file():
+                return _verify_bundle(settings, Path(scratch), progress)
             return _verify(settings, Path(scratch), progress)
     except InputError as error:
         text = f"Verify: missing or invalid: {error}"
         return Findings(text, {"error": str(error)}, False, ExitCode.NO_VERDICT)
 
 
-def _verify(settings: VerifySettings, scratch: Path, progress: Progress) -> Findings:
+def _verify_bundle(settings: VerifySettings, scratch: Path, progress: Progress) -> Findings:
+    """Check a bundle's digests and records; recompute the metrics of its renders if it has them."""
+    file, folder = Path(settings.run), RunFolder(scratch / "run")
+    bundle = read_bundle(file, folder.root)
+    manifest = folder.read_manifest()
+    manifest.check_done(folder.manifest)
+    rows = folder.read_rows(manifest)
+    rows.check()
+    rows.check_protocols(file, {task: protocol.hash for task, protocol in manifest.protocols.items()})
+    if not bundle.renders:
+        report = _Report([], len(bundle.files), unverified=len(rows))
+        text = (
+            f"{file}: {report.files} files as listed, rows of one protocol for each task. No value was recomputed: the "
+            "bundle has no renders (`headbench bundle --renders`)."
+        )
+        return Findings(text, asdict(report))
+    if settings.data is None:
+        limit = PIXELS_PER_BYTE * file.stat().st_size
+        settings = replace(
+            settings, data=str(_captured_again(manifest, scratch / "capture", limit, progress))
+        )
+    return _verify(replace(settings, run=str(folder.root)), scratch, progress, shown=file)
+
+
+def _captured_again(manifest: Manifest, out: Path, limit: int, progress: Progress) -> Path:
+    """Make the synthetic captures of a run again from what their clips record; ``limit`` bounds their pixels.
+
+    Raises `InputError` for a capture that is not synthetic, not of the procedural head, or larger.
+    """
+    make = resolve(get("datasets", "synthetic").implementation)
+    options = set(inspect.signature(make).parameters)
+    recorded: dict[str, tuple[str, dict[str, Any]]] = {}
+    for clip in manifest.clips:
+        parameters = clip.steps[0].get("parameters", {}) if clip.steps else {}
+        made = parameters.get("synthetic") or {}
+        recorded[digest(made)] = clip.subject, {key: made[key] for key in options & set(made)}
+    for subject, settings in recorded.values():
+        remedy = "Name the folder of the capture with --data."
+        where = f"capture of {subject}"
+        if not str(settings.get("head", "")).startswith("procedural"):
+            raise InputError(
+                "--data", where, "a folder, as only the procedural head is known", "none", remedy
+            )
+        arguments = build_arguments(make, settings, where, harness=("workers", "progress"))
+        pixels = math.prod(
+            (*arguments["size"], *(arguments[name] for name in ("cameras", "timesteps", "subjects")))
+        )
+        if pixels > limit:
+            raise InputError(
+                where, "", f"at most {limit} pixels for a bundle of this size", str(pixels), remedy
+            )
+        make(out, **arguments, progress=progress)
+    return out
+
+
+def _verify(
+    settings: VerifySettings, scratch: Path, progress: Progress, shown: Path | None = None
+) -> Findings:
+    """Verify a run folder; ``shown``: the bundle that it was unpacked from, which holds no avatars."""
     folder = RunFolder(Path(settings.run))
     manifest = folder.read_manifest()
     manifest.check_done(folder.manifest)
     config, clips = open_run_clips(folder.root, settings, out=scratch, altered=True, remembered=False)
     rows = folder.read_rows(manifest)
-    avatars = any(method.implementation for method in manifest.methods)  # else images that `evaluate` scored
+    # Otherwise there are images alone, of a bundle or scored by `evaluate`.
+    avatars = shown is None and any(method.implementation for method in manifest.methods)
     images = [images_method(method.name, method.version) for method in manifest.methods]
     methods = resolve_methods(config) if avatars else images
     metrics = [metric for metric in resolve_metrics(config) if metric.per_frame or avatars]
@@ -96,7 +165,7 @@ def _verify(settings: VerifySettings, scratch: Path, progress: Progress) -> Find
     looked = f"{report.files} files and {report.values} values recomputed"
     left = f"; {report.unverified} values bound to a machine or absent are not recomputed"
     left = left if report.unverified else ""
-    text = "\n".join([f"{folder.root}: {verdict}: {looked}{left}.", *lines])
+    text = "\n".join([f"{shown or folder.root}: {verdict}: {looked}{left}.", *lines])
     return Findings(text, asdict(report), not report.mismatches)
 
 
@@ -130,7 +199,8 @@ def _verify_cell(job: Job, metrics: Sequence[MetricSpec], rows: Rows, file: Path
         report.unverified += len(own)
         return  # recorded as failed: there is nothing it claims
     state = job.cell.step("fit")
-    digests = {**({} if state is None else state.get("files", {})), **recorded_frames(job)}
+    trained = state is not None and method.implementation
+    digests = {**(state.get("files", {}) if state and trained else {}), **recorded_frames(job)}
     found = list(_files(job, digests, report))
     report.mismatches += found
     if not method.implementation:
@@ -202,7 +272,7 @@ def _values(
     for place, (status, value, _) in recorded.items():
         metric = str(place[-1])
         new = found.pop(place, None)
-        if metric in bound or status == "missing":
+        if metric in bound or metric not in tolerances or status == "missing":
             report.unverified += 1
         elif new is None:
             yield Mismatch(file, _place(place), "no row: nothing asks for it", f"{value:.9g}")

@@ -43,6 +43,7 @@ class Writer:
 
 
 MEASURED_FILES = ("measure.json", "points.csv", "pareto.png", "cost.*")
+MEASURED_CURVE = ("fit.json", "measure.json", "curve.csv", "curve.png")
 WRITERS = [
     Writer("synth", "settings", f"synth {SYNTH} --out out"),
     Writer("run", "unfinished", "run --config config.json"),
@@ -51,6 +52,9 @@ WRITERS = [
     Writer("refit", "heads", "refit capture --target head.npz --out out"),
     Writer("evaluate", "images", "evaluate images --like run --out out --label theirs"),
     Writer("sweep", "run", "sweep run --methods ga --variants half", MEASURED_FILES),
+    Writer("curve", "run", "curve run --methods ga --fractions 1/2 1 --frames 1", MEASURED_CURVE),
+    Writer("bundle", "run", "bundle run --out out.zip --by Somebody --renders"),
+    Writer("leaderboard", "bundles", "leaderboard build . --out out"),
     Writer("extremes", "run", "extremes run --views 1 --dimensions 1 --methods ga ours"),
     Writer("reenact", "two_subjects", "reenact run --frames 1"),
     Writer("pareto", "run", "pareto run --out out"),

@@ -7,6 +7,7 @@ and the result is encoded again, so that the damage lies behind the parser. Ever
 from __future__ import annotations
 
 import copy
+import hashlib
 import io
 import json
 import pickle
@@ -382,6 +383,24 @@ def zip_members(content: bytes, rng: Generator) -> bytes:
     return stream.getvalue()
 
 
+def bundle_member(content: bytes, rng: Generator) -> bytes:
+    """A bundle with a damaged member whose digest is listed as it is now, as somebody would who forges a result."""
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        members = {info.filename: archive.read(info) for info in archive.infolist()}
+    name = pick(rng, "run.json", "rows.parquet", *members)
+    changes = [*BYTES, *(BY_SUFFIX.get(Path(name).suffix, []) * 3)]
+    members[name] = changes[rng.integers(len(changes))][1](members[name], rng)
+    if name != "bundle.json":
+        index = json.loads(members["bundle.json"])
+        index["files"][name] = hashlib.sha256(members[name]).hexdigest()
+        members["bundle.json"] = json.dumps(index).encode()
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        for member in members.items():
+            archive.writestr(*member)
+    return stream.getvalue()
+
+
 def npz_bomb(content: bytes, rng: Generator) -> bytes:
     """A member of 10^8 to 4 * 10^9 zeros."""
     arrays = read_npz(content)
@@ -593,6 +612,7 @@ BY_SUFFIX: dict[str, list[tuple[str, Change]]] = {
     ".yaml": [*[("tree", YAML)] * 4, *[("odd", yaml_odd)] * 2, ("bomb", yaml_bomb), ("line", text_line)],
     ".npz": [*[("tree", NPZ)] * 7, *[("member", zip_members)] * 2, ("bomb", npz_bomb)],
     ".npy": [("array", npy)],
+    ".zip": [*[("member", bundle_member)] * 4, ("archive", zip_members)],
     ".png": [("size", png_size), ("kind", png_kind), ("bomb", png_bomb), *[("other", image_other)] * 2],
     ".jpg": [("other", image_other)],
     ".parquet": [("tree", ROWS), ("column", parquet_column)],

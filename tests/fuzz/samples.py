@@ -196,6 +196,14 @@ def images(folder: Path, samples: Path) -> None:
     shutil.copytree(folder / "run" / "901" / "ga" / "seed-0" / "renders", folder / "images")
 
 
+def bundles(folder: Path, samples: Path) -> None:
+    """A bundle with renders and one without, with the capture they are of."""
+    with_capture(folder, samples)
+    for name, options in (("renders", ["--renders"]), ("values", ["--methods", "ours"])):
+        words = ["--out", str(folder / f"{name}.zip"), "--by", "Somebody", *options]
+        _main("bundle", str(samples / "run" / "run"), *words)
+
+
 def synthetic(folder: Path, samples: Path) -> None:
     """A synthetic capture as `synth` leaves it."""
     _main("synth", *SYNTH.split(), "--out", str(folder / "synthetic"))
@@ -205,7 +213,7 @@ SAMPLES: dict[str, Callable[[Path, Path], None]] = {
     sample.__name__: sample
     for sample in (
         *(capture, heads, recording, videos, run, unfinished, two_subjects, checkpoint, compact, ply, colmap),
-        *(exclusions, baseline, settings, weights, images, synthetic),
+        *(exclusions, baseline, settings, weights, images, bundles, synthetic),
     )
 }
 

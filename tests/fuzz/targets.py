@@ -137,6 +137,8 @@ TARGETS = [
     reader("run gate", "baseline", GATE, (*RUN, "baseline.json"), 500),
     reader("baseline", "baseline", GATE, "baseline.json", 800),
     reader("run verify", "run", "verify run", CELLS, 200),
+    reader("bundle verify", "bundles", "verify renders.zip --data capture", "renders.zip", 300),
+    reader("leaderboard", "bundles", "leaderboard build . --out out", "*.zip", 500),
     reader("run extremes", "run", "extremes run --views 1 --dimensions 1", CELLS, 30),
     reader("run sweep", "run", "sweep run --methods ga --variants half", CELLS, 20),
     reader("run reenact", "two_subjects", "reenact run --frames 1", share=30),

@@ -1,0 +1,200 @@
+"""Bundles: the results of a run in one file, as a leaderboard takes them and others can check them."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import tempfile
+import zipfile
+from dataclasses import asdict, dataclass, replace
+from importlib.metadata import version
+from itertools import product
+from pathlib import Path
+from typing import Literal
+
+from ..contracts import Progress, no_progress
+from ..errors import InputError
+from ..io.documents import MAX_JSON_BYTES, checked, parse_json
+from ..io.files import atomic_path, digest_file, write_json
+from ..manifest import Manifest
+from ..runner.steps import DIGESTS
+from ..runner.store import STAGES, RunFolder
+from ..specs import Findings
+from .command import BundleSettings, check_shown
+
+INDEX = "bundle.json"
+MAX_FILES = 200_000
+MAX_BYTES = 8 * 2**30
+MAX_RATIO = 200
+"""How many times its own size a bundle may hold; JSON shrinks to a thirtieth."""
+
+_CELL = r"[^/\\]+/[^/\\]+/seed-\d+"
+_NAMES = re.compile(
+    rf"run\.json|rows\.parquet|{_CELL}/({'|'.join(STAGES)})\.json|{_CELL}/renders/[^/\\]+/[^/\\]+\.png"
+)
+_TIME = (1980, 1, 1, 0, 0, 0)  # of every file, so that the same results make the same bytes
+_MODE = 0o100644 << 16
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """``bundle.json``.
+
+    Attributes
+    ----------
+    by, link, comment : who submits it, where to read more, anything else; as given.
+    headbench : the version that wrote it.
+    renders : whether the scored frames are in it.
+    files : SHA-256 of every other file, by its place.
+    """
+
+    by: str
+    link: str
+    comment: str
+    headbench: str
+    renders: bool
+    files: dict[str, str]
+    format: Literal[1] = 1
+
+
+def write_bundle(settings: BundleSettings, progress: Progress = no_progress) -> Findings:
+    """Write a bundle of a finished run.
+
+    Raises `InputError` for a run that is not finished, methods that it does not have, and frames that are missing or
+    not as they were rendered.
+    """
+    folder, out = RunFolder(Path(settings.run)), Path(settings.out)
+    manifest = folder.read_manifest()
+    manifest.check_done(folder.manifest)
+    rows = folder.read_rows(manifest)
+    known = tuple(method.name for method in manifest.methods)
+    for name in settings.methods:
+        if name not in known:
+            raise InputError(folder.manifest, "methods", f"methods of the run: {', '.join(known)}", name)
+    methods = settings.methods or known
+    with tempfile.TemporaryDirectory() as scratch:
+        staged = RunFolder(Path(scratch))
+        _without_paths(manifest, methods).write(staged.manifest)
+        rows.of_methods(methods).write(staged.rows)
+        sources = {"run.json": staged.manifest, "rows.parquet": staged.rows}
+        sources |= _cell_files(folder, manifest, methods, renders=settings.renders)
+        files = {name: digest_file(path) for name, path in sorted(sources.items())}
+        index = staged.root / INDEX
+        bundle = Bundle(
+            settings.by, settings.link, settings.comment, version("headbench"), settings.renders, files
+        )
+        write_json(index, asdict(bundle))
+        with atomic_path(out) as temporary, zipfile.ZipFile(temporary, "w") as archive:
+            for number, (name, path) in enumerate([(INDEX, index), *((n, sources[n]) for n in files)]):
+                info = zipfile.ZipInfo(name, _TIME)
+                info.external_attr = _MODE
+                info.compress_type = zipfile.ZIP_DEFLATED if name.endswith(".json") else zipfile.ZIP_STORED
+                with path.open("rb") as source, archive.open(info, "w") as target:
+                    shutil.copyfileobj(source, target)
+                progress(number + 1, len(files) + 1, name)
+    size = out.stat().st_size
+    text = f"{out}: {len(files)} files, {size / 1e6:.1f} MB, methods {', '.join(methods)}"
+    return Findings(text, {"out": out, "bytes": size, "methods": methods, "renders": settings.renders})
+
+
+def _without_paths(manifest: Manifest, methods: tuple[str, ...]) -> Manifest:
+    """The record of some methods of a run, without folders of the machine that made it."""
+    config = manifest.configuration
+
+    def named(path: object) -> str:
+        return Path(str(path)).name
+
+    settings = {
+        key: named(value) if key in {name.rpartition(".")[2] for name in manifest.paths or {}} else value
+        for key, value in config.reader_settings.items()
+    }
+    # A configuration may name a method by its module.
+    ran = [method.name for method in manifest.methods]
+    asked = dict(zip(ran, config.methods)) if len(ran) == len(config.methods) else {}
+    config = replace(
+        config,
+        data=named(config.data),
+        out="",
+        methods=tuple(asked.get(name, name) for name in methods),
+        settings={name: value for name, value in config.settings.items() if name in methods},
+        reader_settings=settings,
+        heads={name: named(path) for name, path in config.heads.items()},
+    )
+    return replace(
+        manifest,
+        configuration=config,
+        methods=tuple(method for method in manifest.methods if method.name in methods),
+        adapted=tuple(record for record in manifest.adapted if record.method in methods),
+        paths=None,
+        evaluated=manifest.evaluated and named(manifest.evaluated),
+        sweep_of=manifest.sweep_of and named(manifest.sweep_of),
+        curve_of=manifest.curve_of and named(manifest.curve_of),
+    )
+
+
+def _cell_files(
+    folder: RunFolder, manifest: Manifest, methods: tuple[str, ...], *, renders: bool
+) -> dict[str, Path]:
+    """Records of the cells, and their frames if asked for, by their place in the run."""
+    files: dict[str, Path] = {}
+    for clip, method, seed in product(manifest.clips, methods, manifest.configuration.seeds):
+        cell = folder.cell(clip.subject, method, seed)
+        paths = [cell.folder / f"{name}.json" for name in STAGES if cell.step(name) is not None]
+        if renders:
+            state = cell.step(DIGESTS)
+            recorded = {} if state is None else state.get("files", {})
+            damaged = cell.damage(recorded)
+            for name, why in damaged.items():
+                remedy = "Start the run again; it renders what is damaged."
+                raise InputError(cell.folder / name, "", "the frame that was rendered", f"it {why}", remedy)
+            paths += [cell.folder / name for name in recorded]
+        files |= {path.relative_to(folder.root).as_posix(): path for path in paths}
+    return files
+
+
+def read_bundle(path: Path, into: Path) -> Bundle:
+    """Check a bundle and unpack it as a run folder into ``into``, which is empty.
+
+    Raises
+    ------
+    InputError
+        For what is no bundle, files that are not as listed or that no bundle has, and content that is larger or of
+        more files than a bundle may have.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return _unpack(archive, path, into)
+    except (zipfile.BadZipFile, zipfile.LargeZipFile, NotImplementedError, RuntimeError, EOFError) as error:
+        raise InputError(
+            path, "", "a bundle of `headbench bundle`", f"a damaged ZIP file ({error})"
+        ) from error
+    except FileNotFoundError as error:
+        raise InputError(path, "", "a bundle of `headbench bundle`", "no such file") from error
+
+
+def _unpack(archive: zipfile.ZipFile, path: Path, into: Path) -> Bundle:
+    infos = archive.infolist()
+    sizes = {info.filename: info.file_size for info in infos}
+    limit = min(MAX_BYTES, MAX_RATIO * path.stat().st_size)
+    if len(infos) > MAX_FILES or len(sizes) < len(infos) or sum(sizes.values()) > limit:
+        found = f"{len(infos)} files, {len(sizes)} names, {sum(sizes.values())} bytes"
+        raise InputError(path, "", f"at most {MAX_FILES} files, each once, of {limit} bytes", found)
+    if sizes.get(INDEX, MAX_JSON_BYTES + 1) > MAX_JSON_BYTES:
+        raise InputError(path, INDEX, f"a list of the files, at most {MAX_JSON_BYTES} bytes", "none")
+    bundle = checked(parse_json(archive.read(INDEX), path, INDEX), Bundle, path)
+    check_shown(bundle, f"{path}, {INDEX}")
+    held = set(sizes) - {INDEX}
+    for name in sorted(held ^ set(bundle.files)):
+        where = "in the list only" if name in bundle.files else "not in the list"
+        raise InputError(path, name, f"the files that {INDEX} lists", where)
+    for name in sorted(held):
+        if not _NAMES.fullmatch(name) or {".", ".."} & set(name.split("/")):
+            raise InputError(path, name, "files of a run", "another")
+    for name, expected in bundle.files.items():
+        target = into / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with archive.open(name) as source, target.open("xb") as copy:
+            shutil.copyfileobj(source, copy)
+        if digest_file(target) != expected:
+            raise InputError(path, f"{name}, digest", expected[:12], digest_file(target)[:12])
+    return bundle
