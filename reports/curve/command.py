@@ -6,6 +6,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
+from typing import Literal
 
 import tyro
 
@@ -18,21 +19,25 @@ from ...bench.specs import Findings
 
 @dataclass(frozen=True)
 class CurveSettings(RunOptions):
-    """Quality against training time: trains each method with parts of its budget, a whole training for each part.
+    """Quality against training time, training cameras or training timesteps: trains each method with parts of them.
 
-    Quality is measured on training frames that are held out of every training, never on test frames."""
+    Each part is a whole training of its own. Quality is measured on training frames that are held out of every training,
+    the same for all parts, never on test frames."""
 
     run: tyro.conf.Positional[str]
     """Folder of a finished run."""
 
     out: str | None = None
-    """Folder to write, a run folder itself; default: `curve` in the folder of the run."""
+    """Folder to write, a run folder itself; default: `curve` in the folder of the run, or `curve-cameras` and so on."""
 
     methods: tuple[str, ...] = ()
     """Methods to train; default: all but the trivial baselines."""
 
+    over: Literal["budget", "cameras", "timesteps"] = "budget"
+    """What to take parts of."""
+
     fractions: tuple[str, ...] = ("1/16", "1/8", "1/4", "1/2", "1")
-    """Parts of the method's budget, above 0 and at most 1."""
+    """Parts of the method's budget, or of the training cameras or timesteps, above 0 and at most 1."""
 
     camera: str = ""
     """Training camera to hold out; default: the one nearest to the mean position of the training cameras."""
@@ -68,7 +73,7 @@ def _part(text: str) -> Fraction:
 
 
 def curve_run(settings: CurveSettings, progress: Progress = no_progress) -> Findings:
-    """Quality against training time: train with parts of the budget, measure on held-out training frames.
+    """Quality against training time, cameras or timesteps, measured on training frames that are held out.
 
     Writes ``curve.csv`` and ``curve.png`` into the run folder of all trainings. Started again, it keeps what is done.
     Raises `InputError` for a folder that is no finished run, and for methods without a budget.
@@ -78,6 +83,7 @@ def curve_run(settings: CurveSettings, progress: Progress = no_progress) -> Find
 
     run = RunFolder(Path(settings.run))
     run.read_manifest().check_done(run.manifest)  # before a folder is made in what is no run
-    out = Path(settings.out) if settings.out else run.root / "curve"
+    name = "curve" if settings.over == "budget" else f"curve-{settings.over}"
+    out = Path(settings.out) if settings.out else run.root / name
     with nullcontext() if settings.out else output_inside(run.root), locked(out):
         return curve(settings, out)

@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from fractions import Fraction
+from itertools import product
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -17,10 +18,10 @@ from ...bench.errors import InputError
 from ...bench.io.files import check_name, write_text
 from ...bench.machine import check_device
 from ...bench.manifest import MethodRecord
-from ...bench.protocol import make_protocols
+from ...bench.protocol import Protocol, make_protocols
 from ...bench.rows import ALL, Rows
 from ...bench.runner.captures import open_run_clips, run_configuration
-from ...bench.runner.config import ResolvedMethod, resolve_methods, resolve_metrics
+from ...bench.runner.config import ResolvedMethod, RunConfig, resolve_methods, resolve_metrics
 from ...bench.runner.run import describe, make_jobs, run_jobs, warn_of_missing_metrics
 from ...bench.runner.scoring import FULL
 from ...bench.runner.steps import Job
@@ -29,7 +30,7 @@ from ...bench.specs import Findings, MetricSpec
 from ..aggregate import subject_means
 from ..writers import csv_text
 from .command import CurveSettings
-from .held_out import CAMERA, TIMESTEPS, HeldOutClip, hold_out
+from .held_out import CAMERA, TIMESTEPS, HeldOutClip, hold_out, reduced
 from .plot import Panel, write_plot
 
 log = logging.getLogger(__name__)
@@ -45,16 +46,18 @@ MARK = "+"
 
 @dataclass(frozen=True)
 class Point:
-    """A method trained with a part of its budget: means over seeds of one subject, or over subjects ("").
+    """A method trained with a part of its budget or of the frames: means over seeds of one subject, or over subjects ("").
 
-    ``cost`` is `MEASURED` by name, ``values`` are the metrics by name and what was held out, such as "psnr_camera".
-    None: not measured.
+    ``cameras`` and ``timesteps`` count what it was trained on. ``cost`` is `MEASURED` by name, ``values`` are the metrics
+    by name and what was held out, such as "psnr_camera". None: not measured.
     """
 
     method: str
     subject: str
     part: Fraction
     budget: Budget
+    cameras: float
+    timesteps: float
     cost: Mapping[str, float | None]
     values: Mapping[str, float | None]
 
@@ -88,13 +91,8 @@ def curve(settings: CurveSettings, out: Path) -> Findings:
     subjects: list[Clip] = [*held]
     protocols = make_protocols(tasks, subjects, settings.frames)
     folder = RunFolder(out)
-    bases = make_jobs(config, wanted, subjects, protocols, run, out)
-    jobs = [
-        _job(base, part, budget, folder)
-        for base in bases
-        # The whole first: start-up, such as imports, falls where it weighs least.
-        for budget, part in reversed(_budgets(base.method.budget, settings.parts).items())
-    ]
+    trainings = _trainings(config, settings, wanted, held, protocols, run, folder)
+    jobs = [job for training in trainings for job in training.jobs]
     for job in jobs:
         job.check()
     warn_of_missing_metrics(metrics, held[0])
@@ -110,12 +108,9 @@ def curve(settings: CurveSettings, out: Path) -> Findings:
     rows.write(folder.rows)
     replace(manifest, status="done").write(folder.manifest)
 
-    points = [
-        _point(method, part, budget, subject, rows, metrics, tasks, jobs)
-        for method in wanted
-        for budget, part in _budgets(method.budget, settings.parts).items()
-        for subject in [clip.subject for clip in clips]
-    ]
+    names, order = [m.spec.name for m in wanted], [clip.subject for clip in clips]
+    trainings.sort(key=lambda t: (names.index(t.method.spec.name), t.part, order.index(t.clip.subject)))
+    points = [_point(training, rows, metrics, tasks) for training in trainings]
     groups: dict[tuple[str, Fraction], list[Point]] = {}
     for point in points:
         groups.setdefault((point.method, point.part), []).append(point)
@@ -124,17 +119,19 @@ def curve(settings: CurveSettings, out: Path) -> Findings:
     write_text(out / "curve.csv", csv_text(_lines(points)))
     clock = "processor_seconds" if config.device == "cpu" else "seconds"
     where = f"{settings.every}th training timestep" if settings.every > 2 else "second training timestep"
+    axis = f"{'Processor seconds' if clock == MEASURED[0] else 'Seconds'} of training"
+    axis = axis if settings.over == "budget" else f"Training {settings.over}"
     write_plot(
         out / "curve.png",
         [
             [
-                _panel(means, spec, task, clock, missing.get(spec.label, ""))
+                _panel(means, spec, task, settings.over, clock, missing.get(spec.label, ""))
                 for spec in metrics
                 if spec.per_frame
             ]
             for task in tasks
         ],
-        f"{'Processor seconds' if clock == MEASURED[0] else 'Seconds'} of training",
+        axis,
         f"Held out of every training: a training camera, every {where}. No test frame was looked at.",
     )
     data = {
@@ -189,6 +186,45 @@ def _name(method: str, part: Fraction) -> str:
     return f"{method}{MARK}{str(part).replace('/', '-')}"
 
 
+@dataclass(frozen=True)
+class _Training:
+    """A method with its whole budget, the part of it or of the frames that it is given, ``clip``: a job for each seed."""
+
+    method: ResolvedMethod
+    part: Fraction
+    clip: HeldOutClip
+    jobs: tuple[Job, ...]
+
+
+def _trainings(
+    config: RunConfig,
+    settings: CurveSettings,
+    wanted: Sequence[ResolvedMethod],
+    held: Sequence[HeldOutClip],
+    protocols: Mapping[str, Protocol],
+    run: RunFolder,
+    folder: RunFolder,
+) -> list[_Training]:
+    """Every training; the whole first: start-up, such as imports, falls where it weighs least."""
+    over, found = settings.over, []
+    given: dict[tuple[str, ...], tuple[Fraction, list[HeldOutClip]]] = {}
+    for part in reversed(settings.parts):
+        clips = [clip if over == "budget" else reduced(clip, over, part) for clip in held]
+        given.setdefault(tuple(clip.fingerprint for clip in clips), (part, clips))
+    for part, clips in given.values():
+        bases = make_jobs(config, wanted, clips, protocols, run, folder.root)
+        for method, (clip, whole) in product(wanted, zip(clips, held)):
+            parts = {method.budget: part} if over != "budget" else _budgets(method.budget, settings.parts)
+            own = [job for job in bases if (job.clip, job.method.spec.name) == (clip, method.spec.name)]
+            for budget, share in reversed(parts.items()):
+                # The frames to measure are those of all trainings, whatever each is given.
+                jobs = [job if clip is whole else replace(job, clip=whole, adapted=job.form) for job in own]
+                found.append(
+                    _Training(method, share, clip, tuple(_job(job, share, budget, folder) for job in jobs))
+                )
+    return found
+
+
 def _job(base: Job, part: Fraction, budget: Budget, folder: RunFolder) -> Job:
     """The cell of a training with a part of the budget."""
     spec = base.method.spec
@@ -210,22 +246,10 @@ def _drop_interrupted(job: Job) -> None:
         (job.cell.folder / "fit.json").unlink()
 
 
-def _point(
-    method: ResolvedMethod,
-    part: Fraction,
-    budget: Budget,
-    subject: str,
-    rows: Rows,
-    metrics: Sequence[MetricSpec],
-    tasks: Sequence[str],
-    jobs: Sequence[Job],
-) -> Point:
-    name = _name(method.spec.name, part)
-    records: list[Mapping[str, Any]] = [
-        job.cell.step("fit") or {}
-        for job in jobs
-        if (job.method.spec.name, job.clip.subject) == (name, subject)
-    ]
+def _point(training: _Training, rows: Rows, metrics: Sequence[MetricSpec], tasks: Sequence[str]) -> Point:
+    job = training.jobs[0]
+    name, subject = job.method.spec.name, job.clip.subject
+    records: list[Mapping[str, Any]] = [job.cell.step("fit") or {} for job in training.jobs]
     cost = {key: mean([_number(record.get(key)) for record in records]) for key in MEASURED}
     values: dict[str, float | None] = {}
     for spec in metrics:
@@ -235,7 +259,10 @@ def _point(
             )
             whole = len(chosen) and (chosen["status"] == "ok").all()
             values[_column(spec, task)] = subject_means(chosen)[subject] if whole else None
-    return Point(method.spec.name, subject, part, budget, cost, values)
+    keys = training.clip.splits["train"]
+    cameras, timesteps = (len({getattr(key, name) for key in keys}) for name in ("camera", "timestep"))
+    method = training.method.spec.name
+    return Point(method, subject, training.part, job.method.budget, cameras, timesteps, cost, values)
 
 
 def _number(value: object) -> float | None:
@@ -257,7 +284,10 @@ def _mean(points: Sequence[Point]) -> Point:
     first = points[0]
     cost = {key: mean([point.cost[key] for point in points]) for key in first.cost}
     values = {key: mean([point.values[key] for point in points]) for key in first.values}
-    return replace(first, subject="", cost=cost, values=values)
+    cameras, timesteps = (
+        fmean(getattr(point, name) for point in points) for name in ("cameras", "timesteps")
+    )
+    return replace(first, subject="", cameras=cameras, timesteps=timesteps, cost=cost, values=values)
 
 
 def _reason(rows: Rows, spec: MetricSpec) -> str:
@@ -275,6 +305,8 @@ def _flat(point: Point) -> dict[str, object]:
         "fraction": float(point.part),
         "budget_iterations": budget["iterations"],
         "budget_seconds": budget["seconds"],
+        "cameras": point.cameras,
+        "timesteps": point.timesteps,
         **point.cost,
         **point.values,
     }
@@ -285,10 +317,13 @@ def _lines(points: Sequence[Point]) -> list[list[object]]:
     return [[*flat[0]], *([*line.values()] for line in flat)]
 
 
-def _panel(points: Sequence[Point], spec: MetricSpec, task: str, clock: str, missing: str) -> Panel:
+def _panel(
+    points: Sequence[Point], spec: MetricSpec, task: str, over: str, clock: str, missing: str
+) -> Panel:
     lines: dict[str, list[tuple[float, float]]] = {}
     for point in points:
-        cost, value = point.cost[clock], point.values[_column(spec, task)]
+        cost = point.cost[clock] if over == "budget" else getattr(point, over)
+        value = point.values[_column(spec, task)]
         line = lines.setdefault(point.method, [])
         if cost is not None and value is not None:
             line.append((max(cost, 1e-3), value))  # recorded to a millisecond
@@ -312,8 +347,8 @@ def _text(
     names = "".join(f"{spec.label:>9}" for _ in tasks for spec in frame)
     names += "".join(f"{spec.label + (f' {spec.unit}' if spec.unit else ''):>12}" for spec in avatar)
     lines = [
-        f"{'':<{wide + 37}}{head}",
-        f"{'method':<{wide}}{'part':>7}{'budget':>10}{'CPU s':>10}{'s':>10}{names}",
+        f"{'':<{wide + 56}}{head}",
+        f"{'method':<{wide}}{'part':>7}{'budget':>10}{'cameras':>8}{'timesteps':>11}{'CPU s':>10}{'s':>10}{names}",
     ]
     for point in points:
         budget = point.budget
@@ -323,7 +358,8 @@ def _text(
         cells += [_shown(point.values[spec.name], spec.digits, 12) for spec in avatar]
         cost = [_shown(point.cost[key], 1, 10) for key in MEASURED[:2]]
         size = f"{budget.seconds:g} s" if budget.iterations is None else f"{budget.iterations}"
-        lines.append(f"{point.method:<{wide}}{point.part!s:>7}{size:>10}{''.join([*cost, *cells])}")
+        given = f"{point.part!s:>7}{size:>10}{point.cameras:>8g}{point.timesteps:>11g}"
+        lines.append(f"{point.method:<{wide}}{given}{''.join([*cost, *cells])}")
     lines.append("Means over subjects. Held out of every training; no test frame was looked at:")
     for clip in held:
         parameters = clip.steps[-1].parameters

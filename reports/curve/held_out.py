@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from fractions import Fraction
 from functools import cached_property
+from typing import Any, Literal
 
 import numpy as np
 
@@ -111,3 +113,47 @@ def hold_out(clip: Clip, camera: str, every: int) -> HeldOutClip:
         steps=(*clip.steps, step),
         fingerprint=digest(clip.fingerprint, "hold_out", camera, held),
     )
+
+
+Part = Literal["cameras", "timesteps"]
+"""Of what a training may see a part only."""
+
+
+def reduced(clip: HeldOutClip, what: Part, part: Fraction) -> HeldOutClip:
+    """A clip with a part of its training cameras or timesteps, one at least, spread evenly; held-out frames stay.
+
+    Of cameras the first is the one nearest to the mean position of all, each further one that farthest from those taken
+    (Gonzalez, "Clustering to minimize the maximum intercluster distance", 1985), so that fewer are among more.
+    """
+    train = clip.splits["train"]
+    chosen: list[Any]
+    if what == "cameras":
+        names = _spread(clip.cameras, sorted({key.camera for key in train}))
+        chosen = names[: max(1, round(len(names) * part))]
+        keys = tuple(key for key in train if key.camera in chosen)
+    else:
+        timesteps = sorted({key.timestep for key in train})
+        count = max(1, round(len(timesteps) * part))
+        chosen = [timesteps[(2 * i + 1) * len(timesteps) // (2 * count)] for i in range(count)]
+        keys = tuple(key for key in train if key.timestep in chosen)
+    if len(keys) == len(train):
+        return clip
+    step = StepRecord("reduce_training", {what: chosen}, clip.fingerprint)
+    return replace(
+        clip,
+        splits={**clip.splits, "train": keys},
+        steps=(*clip.steps, step),
+        fingerprint=digest(clip.fingerprint, what, chosen),
+    )
+
+
+def _spread(cameras: Mapping[str, Camera], names: Sequence[str]) -> list[str]:
+    """Names of cameras, each as far as possible from those before it."""
+    centers = np.array([cameras[name].center for name in names])
+    order = [int(np.linalg.norm(centers - centers.mean(0), axis=1).argmin())]
+    distances = np.full(len(names), np.inf)
+    while len(order) < len(names):
+        distances = np.minimum(distances, np.linalg.norm(centers - centers[order[-1]], axis=1))
+        distances[order] = -1.0
+        order.append(int(distances.argmax()))
+    return [names[index] for index in order]

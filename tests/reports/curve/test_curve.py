@@ -104,6 +104,28 @@ def test_code_outside_that_looks_at_a_test_frame_fails(make_run):
     assert not values["peeking"]
 
 
+@pytest.mark.parametrize(
+    ("over", "seen"),
+    [
+        # Of the cameras at -60, 30 and 60 degrees the one in the middle comes first, then the one farthest from it.
+        ("cameras", [{(t, c) for t in (0, 1, 3) for c in cameras} for cameras in ("034", "03", "3")]),
+        ("timesteps", [{(t, c) for t in steps for c in "034"} for steps in ((0, 1, 3), (0, 3), (1,))]),
+    ],
+)
+def test_less_to_train_on_is_measured_on_the_same_frames(make_run, plugin, over, seen):
+    run = make_run("curve_plugin:METHOD")
+    fractions = ("1", "2/3", "0.6", "0.01")  # two of them are the same number of cameras or timesteps
+    findings = curve_run(settings(run, over=over, fractions=fractions))
+    trained = [
+        ({(key.timestep, key.camera) for key in train}, budget.iterations) for train, budget in plugin.FITS
+    ]
+    assert trained == [(keys, 64) for keys in seen]
+    measured = {(t, HELD_CAMERA) for t in (0, 1, 3)} | {(HELD_TIMESTEP, camera) for camera in "0134"}
+    assert sorted(plugin.RENDERED) == sorted([*measured] * 3)
+    assert [point[over] for point in findings.data["points"]] == [1, 2, 3]
+    assert (run / f"curve-{over}" / "curve.png").is_file()
+
+
 def test_a_row_for_each_method_subject_and_part(make_run, plugin):
     run = make_run("curve_plugin:METHOD", "curve_plugin:TIMED", subjects=("ball-a", "ball-bee"))
     findings = curve_run(settings(run, fractions=("1", "1/4")))
