@@ -200,7 +200,7 @@ def differences(expected: dict[str, Any], found: dict[str, Any]) -> list[str]:
 class Kills:
     """The kills of one command: what an unbroken run leaves, and the changes still to be tried."""
 
-    def __init__(self, writer: Writer, samples: Path, seed: int):
+    def __init__(self, writer: Writer, samples: Path, seed: int, skip: int = 0):
         self.writer, self.place = writer, Place(samples / writer.sample)
         self.findings: list[tuple[int, str]] = []
         self.done = 0
@@ -215,7 +215,8 @@ class Kills:
         every = [*range(1, self.changes + 1)]
         edges = every[:10] + every[-10:]
         rest = [n for n in every if n not in edges]
-        self.waiting = [*dict.fromkeys(edges), *np.random.default_rng(seed).permutation(rest).tolist()]
+        order = [*dict.fromkeys(edges), *np.random.default_rng(seed).permutation(rest).tolist()]
+        self.waiting = order[skip:]
 
     def kill(self, number: int) -> None:
         """Kill the command before a change, start it again, and compare."""
@@ -251,14 +252,14 @@ class Outcome:
 
 
 def kill_all(
-    writers: Sequence[Writer], samples: Path, seed: int, end: float, at: int | None = None
+    writers: Sequence[Writer], samples: Path, seed: int, end: float, at: int | None = None, skip: int = 0
 ) -> list[Outcome]:
     """Kill commands in rounds, one change of each, until all are done or ``end``; those that were not begun are left out."""
     kills: list[Kills] = []
     began = time.monotonic()
     for writer in writers:
         if not kills or time.monotonic() - began < (end - began) / 2:
-            kills.append(Kills(writer, samples, seed))
+            kills.append(Kills(writer, samples, seed, skip))
     if at is not None:
         kills[0].kill(at)
     while at is None and any(k.waiting for k in kills) and time.monotonic() < end:
@@ -296,6 +297,9 @@ def main() -> int:
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--command", action="append", default=[], help="the start of names; default: all")
     parser.add_argument("--at", type=int, help="kill the command before this change only")
+    parser.add_argument(
+        "--skip", type=int, default=0, help="so many of each command were tried with this seed before"
+    )
     parser.add_argument("--samples", type=Path, default=Path("build/fuzz"))
     options = parser.parse_args()
     samples = prepare_samples(options.samples)
@@ -305,7 +309,10 @@ def main() -> int:
     shares = [chosen[index :: options.workers] for index in range(options.workers)]
     shares = [share for share in shares if share]
     with ProcessPoolExecutor(len(shares), multiprocessing.get_context("fork")) as pool:
-        jobs = [pool.submit(kill_all, share, samples, options.seed, end, options.at) for share in shares]
+        jobs = [
+            pool.submit(kill_all, share, samples, options.seed, end, options.at, options.skip)
+            for share in shares
+        ]
         found = {outcome.name: outcome for job in jobs for outcome in job.result()}
     outcomes = [found[writer.name] for writer in chosen if writer.name in found]
     print(describe(outcomes, [writer.name for writer in chosen if writer.name not in found]))
