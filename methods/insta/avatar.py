@@ -23,7 +23,15 @@ from .config import InstaConfig
 from .field import Architecture, Field, Parameters, Prior
 from .marching import PosedSurface, Space, canonical_surface
 from .occupancy import Occupancy, occupied_space
-from .rendering import Marching, PosedRays, box_corners, camera_rays, pixels_of_hull, render_rays
+from .rendering import (
+    Marching,
+    PosedRays,
+    box_corners,
+    camera_rays,
+    pixels_by_blocks,
+    pixels_of_hull,
+    render_rays,
+)
 from .warp import mouth_triangles
 
 RAYS_AT_ONCE = 1 << 15
@@ -76,16 +84,14 @@ class InstaAvatar:
         if reach < 0:
             return Frame(rgb, alpha)
         corners = box_corners(surface.vertices.numpy(), reach)
-        left, top, right, bottom = pixels_of_hull(camera, corners)
         condition = torch.as_tensor(np.asarray(pose.expression), dtype=torch.float32)
-        width = right - left
-        for start in range(0, max(width, 0) * max(bottom - top, 0), RAYS_AT_ONCE):
-            numbers = np.arange(start, min(start + RAYS_AT_ONCE, width * (bottom - top)))
-            rows, columns = top + numbers // width, left + numbers % width
+        for rows, columns in pixels_by_blocks(pixels_of_hull(camera, corners), RAYS_AT_ONCE):
             scene = PosedRays(surface, condition, camera_rays(camera, columns, rows, MIDDLE))
             seen = self._inference.render(scene)
-            left_over = seen.transmittance[:, None]
-            rgb[rows, columns] = seen.color + left_over * rgb[rows, columns]
+            inside = (rows < camera.height) & (columns < camera.width)
+            rows, columns = rows[inside], columns[inside]
+            left_over = seen.transmittance[inside, None]
+            rgb[rows, columns] = seen.color[inside] + left_over * rgb[rows, columns]
             alpha[rows, columns] = 1 - left_over[:, 0]
         return Frame(rgb.clip(0, 1), alpha.clip(0, 1))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -174,6 +174,25 @@ def pixels_of_hull(camera: Camera, points: FloatArray) -> Region:
     low = np.clip(np.floor(pixels.min(0) - 1), 0, size).astype(int)
     high = np.clip(np.ceil(pixels.max(0) + 1), 0, size).astype(int)
     return int(low[0]), int(low[1]), int(high[0]), int(high[1])
+
+
+BLOCK = 4  # pixels on a side: as many rays as the kernel marches together
+
+
+def pixels_by_blocks(region: Region, most: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Rows and columns of a region's pixels, square block by block, up to about ``most`` (or a row of blocks) at a time.
+
+    Blocks at the right and at the bottom are whole and may lie beyond the region.
+    """
+    left, top, right, bottom = region
+    columns = left + np.arange(-(-max(right - left, 0) // BLOCK) * BLOCK)
+    height = max(most // max(len(columns) * BLOCK, 1), 1) * BLOCK
+    for start in range(top, bottom if len(columns) else top, height):
+        rows = np.arange(start, start + -(-(min(start + height, bottom) - start) // BLOCK) * BLOCK)
+        grid = np.stack(np.meshgrid(rows, columns, indexing="ij"))
+        blocks = grid.reshape(2, len(rows) // BLOCK, BLOCK, len(columns) // BLOCK, BLOCK)
+        at = blocks.transpose(0, 1, 3, 2, 4).reshape(2, -1)
+        yield at[0], at[1]
 
 
 def box_corners(points: FloatArray, padding: float) -> FloatArray:

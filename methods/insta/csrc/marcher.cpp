@@ -2,7 +2,6 @@
 
 #include <algorithm>
 #include <cmath>
-#include <limits>
 
 namespace headbench::insta {
 
@@ -58,7 +57,7 @@ Marcher::Marcher(const Posed& mesh, const Warp& warp, const float* reach, const 
 
 Progress Marcher::start(Vec3 origin, Vec3 direction, float jitter, std::int32_t first,
                         std::vector<Interval>& intervals) const {
-  Progress progress{origin, direction, jitter, first, -1, intervals.size(), intervals.size()};
+  Progress progress{origin, direction, jitter, first, -1, intervals.size(), intervals.size(), -1};
   if (first < 0 || padding_[0] < 0) return progress;
   near_intervals(origin, direction, intervals);
   progress.last = intervals.size();
@@ -68,37 +67,40 @@ Progress Marcher::start(Vec3 origin, Vec3 direction, float jitter, std::int32_t 
 
 // One lattice point more at both ends: nothing depends on how an interval's end was rounded.
 void Marcher::enter(Progress& progress, const std::vector<Interval>& intervals) const {
-  const float from = intervals[progress.interval].from;
-  progress.index = std::max(progress.index, static_cast<std::int32_t>(std::floor(from / step_ - progress.jitter)) - 1);
+  const Interval& interval = intervals[progress.interval];
+  const auto before = static_cast<std::int32_t>(std::floor(interval.from / step_ - progress.jitter)) - 1;
+  progress.index = std::max(progress.index, before);
+  progress.until = interval.to / step_ - progress.jitter + 1;
 }
 
-bool Marcher::next(Progress& progress, const std::vector<Interval>& intervals, Sample& sample) const {
+// Whether there are lattice points left in intervals.
+bool Marcher::more(Progress& progress, const std::vector<Interval>& intervals) const {
   while (progress.interval < progress.last) {
-    const Interval& interval = intervals[progress.interval];
-    const float last = interval.to / step_ - progress.jitter + 1;
-    while (static_cast<float>(progress.index) <= last) {
-      const std::int32_t index = progress.index++;
-      const Vec3 point = progress.origin + ((static_cast<float>(index) + progress.jitter) * step_) * progress.direction;
-      const Hit hit = mesh_.nearest(point, std::numeric_limits<float>::infinity(), progress.hint);
-      if (hit.triangle < 0) continue;
-      progress.hint = hit.triangle;
-      const float away = std::sqrt(hit.value);
-      if (away > interval.reach) {
-        // Nor is any triangle in reach before the ray has covered the difference.
-        progress.index += static_cast<std::int32_t>((away - interval.reach) / step_);
-        continue;
-      }
-      const CanonicalPoint placed = place(point, progress.direction, hit.triangle);
-      progress.index += passed(placed, last - static_cast<float>(index));
-      const float reach = reach_[hit.triangle];
-      if (free_at(placed.cells) != 0 || reach < 0 || away > reach) continue;
-      const float length = std::max(std::sqrt(dot(placed.way, placed.way)), 1e-12f);
-      sample = {placed.position, (1 / length) * placed.way, away, index, hit.triangle};
-      return true;
-    }
+    if (static_cast<float>(progress.index) <= progress.until) return true;
     if (++progress.interval < progress.last) enter(progress, intervals);
   }
   return false;
+}
+
+// Goes on from a lattice point whose nearest triangle is known; whether there is a sample at that point.
+bool Marcher::look(Progress& progress, const std::vector<Interval>& intervals, std::int32_t triangle, float squared,
+                   Sample& sample) const {
+  const Vec3 at = point(progress);
+  const std::int32_t index = progress.index++;
+  const float away = std::sqrt(squared), farthest = intervals[progress.interval].reach;
+  if (!std::isfinite(away)) return false;
+  if (triangle < 0 || away > farthest) {
+    // Nor is any triangle in reach before the ray has covered the difference.
+    progress.index += static_cast<std::int32_t>((away - farthest) / step_);
+    return false;
+  }
+  const CanonicalPoint placed = place(at, progress.direction, triangle);
+  progress.index += passed(placed, progress.until - static_cast<float>(index));
+  const float reach = reach_[triangle];
+  if (free_at(placed.cells) != 0 || reach < 0 || away > reach) return false;
+  const float length = std::max(std::sqrt(dot(placed.way, placed.way)), 1e-12f);
+  sample = {placed.position, (1 / length) * placed.way, away, index, triangle};
+  return true;
 }
 
 void Marcher::near_intervals(Vec3 origin, Vec3 direction, std::vector<Interval>& intervals) const {

@@ -1,8 +1,10 @@
 // A ray's way past a posed mesh: its samples near it, warped to canonical space by their nearest triangle.
 #pragma once
 
+#include <algorithm>
 #include <cstddef>
 #include <cstdint>
+#include <limits>
 #include <vector>
 
 #include "mesh_search.h"
@@ -35,6 +37,7 @@ struct Progress {
   float jitter;
   std::int32_t index, hint;    // the lattice point to look at next, the triangle found last
   std::size_t interval, last;  // where it is, and the end of its intervals
+  float until;                 // last lattice point of the interval
 };
 
 struct Sample {
@@ -52,11 +55,38 @@ class Marcher {
  public:
   Marcher(const Posed& mesh, const Warp& warp, const float* reach, const Grid& grid, float step);
 
-  // A ray at the lattice point `first`, or done where that is negative. Appends its intervals, which `next` wants again.
+  // A ray at the lattice point `first`, or done where that is negative. Appends its intervals, which `march` wants again.
   Progress start(Vec3 origin, Vec3 direction, float jitter, std::int32_t first, std::vector<Interval>& intervals) const;
 
-  // The next sample; false where there is none left.
-  bool next(Progress& progress, const std::vector<Interval>& intervals, Sample& sample) const;
+  // Hands the next samples of up to kLanes rays to `take(ray, sample)`, each ray's in order, until that says false or there
+  // are none left. Rays that lie together are marched the fastest.
+  template <class Take>
+  void march(Progress* rays, int count, const std::vector<Interval>& intervals, const Take& take) const {
+    bool open[kLanes];
+    for (int i = 0; i < count; ++i) open[i] = more(rays[i], intervals);
+    for (;;) {
+      std::int32_t first = std::numeric_limits<std::int32_t>::max();
+      for (int i = 0; i < count; ++i)
+        if (open[i]) first = std::min(first, rays[i].index);
+      int chosen[kLanes];
+      Queries queries(0);
+      for (int i = 0; i < count; ++i)
+        if (open[i] && rays[i].index - first <= kBeside) {
+          chosen[queries.count] = i;
+          queries.add(point(rays[i]), rays[i].hint);
+          queries.reach = std::max(queries.reach, intervals[rays[i].interval].reach);
+        }
+      if (queries.count == 0) return;
+      mesh_.nearest(queries);
+      for (int k = 0; k < queries.count; ++k) {
+        Progress& ray = rays[chosen[k]];
+        Sample sample;
+        ray.hint = queries.hint[k];
+        const bool found = look(ray, intervals, queries.triangle[k], queries.squared[k], sample);
+        open[chosen[k]] = (!found || take(chosen[k], sample)) && more(ray, intervals);
+      }
+    }
+  }
 
  private:
   // A point of a ray in canonical space.
@@ -65,6 +95,15 @@ class Marcher {
     Vec3 cells;          // the position in cells of the grid
   };
 
+  // Lattice points that are looked at together may lie so many apart.
+  static constexpr std::int32_t kBeside = 1;
+
+  Vec3 point(const Progress& ray) const {
+    return ray.origin + ((static_cast<float>(ray.index) + ray.jitter) * step_) * ray.direction;
+  }
+  bool more(Progress& progress, const std::vector<Interval>& intervals) const;
+  bool look(Progress& progress, const std::vector<Interval>& intervals, std::int32_t triangle, float squared,
+            Sample& sample) const;
   void near_intervals(Vec3 origin, Vec3 direction, std::vector<Interval>& intervals) const;
   void enter(Progress& progress, const std::vector<Interval>& intervals) const;
   CanonicalPoint place(Vec3 point, Vec3 direction, std::int32_t triangle) const;

@@ -138,18 +138,8 @@ void Tree::build(std::vector<Vec3>& centroids, std::int32_t first, std::int32_t 
 
 Posed::Posed(std::shared_ptr<const Tree> tree, const float* vertices, Nearest nearest)
     : tree_(std::move(tree)), nearest_(nearest) {
-  const std::int64_t count = tree_->face_count();
-  by_face_.resize(count);
-  by_order_.resize(count);
-  const auto& faces = tree_->faces();
-  for (std::int64_t face = 0; face < count; ++face) {
-    Vec3 corners[3];
-    for (int corner = 0; corner < 3; ++corner) {
-      const float* p = vertices + 3 * faces[3 * face + corner];
-      corners[corner] = {p[0], p[1], p[2]};
-    }
-    by_face_[face] = {corners[0], corners[1], corners[2]};
-  }
+  triangles_.resize(tree_->face_count());
+  const auto corner = [&](std::int32_t face, int number) { return row(vertices, tree_->faces()[3 * face + number]); };
   const auto& nodes = tree_->nodes();
   boxes_.resize(nodes.size());
   for (std::size_t i = nodes.size(); i-- > 0;) {
@@ -160,7 +150,8 @@ Posed::Posed(std::shared_ptr<const Tree> tree, const float* vertices, Nearest ne
       continue;
     }
     for (std::int32_t k = node.first; k < node.first + node.count; ++k) {
-      const Triangle& triangle = by_order_[k] = by_face_[tree_->order()[k]];
+      const std::int32_t face = tree_->order()[k];
+      const Triangle& triangle = triangles_[k] = {corner(face, 0), corner(face, 1), corner(face, 2)};
       boxes_[i].add(triangle.a);
       boxes_[i].add(triangle.b);
       boxes_[i].add(triangle.c);
@@ -179,19 +170,18 @@ Posed::Posed(std::shared_ptr<const Tree> tree, const float* vertices, Nearest ne
       }
     }
   leaves_.resize(tree_->leaves().size());
+  double diagonals = 0;
   for (std::size_t i = 0; i < leaves_.size(); ++i) {
     const Node& node = nodes[tree_->leaves()[i]];
+    const Vec3 size = boxes_[tree_->leaves()[i]].high - boxes_[tree_->leaves()[i]].low;
+    diagonals += std::sqrt(dot(size, size));
     const Triangle none{{kFar, kFar, kFar}, {kFar, kFar, kFar}, {kFar, kFar, kFar}};
     for (int lane = 0; lane < kLanes; ++lane) {
       const bool used = lane < node.count;
-      set_lane(leaves_[i], lane, used ? by_order_[node.first + lane] : none, used ? tree_->order()[node.first + lane] : -1);
+      set_lane(leaves_[i], lane, used ? triangles_[node.first + lane] : none, used ? tree_->order()[node.first + lane] : -1);
     }
   }
-}
-
-Hit Posed::nearest(Vec3 point, float limit, std::int32_t hint) const {
-  const Search search{tree_->wide().data(), wide_.data(), leaves_.data(), tree_->leaf_of().data(), by_face_.data()};
-  return nearest_(search, point, limit, hint);
+  together_ = static_cast<float>(0.5 * diagonals / static_cast<double>(leaves_.size()));
 }
 
 Hit Posed::first_hit(Vec3 origin, Vec3 direction) const {
@@ -214,7 +204,7 @@ Hit Posed::first_hit(Vec3 origin, Vec3 direction) const {
     }
     for (std::int32_t k = node.first; k < node.first + node.count; ++k) {
       // Moeller and Trumbore, 1997.
-      const Triangle& t = by_order_[k];
+      const Triangle& t = triangles_[k];
       const Vec3 ab = t.b - t.a, ac = t.c - t.a;
       const Vec3 p = cross(direction, ac);
       const float determinant = dot(ab, p);

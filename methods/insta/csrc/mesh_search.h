@@ -58,21 +58,21 @@ class Posed {
   const Tree& tree() const { return *tree_; }
   const std::vector<Box>& boxes() const { return boxes_; }
 
-  // Nearest triangle of those at most sqrt(limit) away; of equally near ones (a shared edge or corner) that whose
-  // plane is farthest, so that the space around a convex edge is parted along the bisector and not by rounding.
-  // `hint` is a triangle to try first, or -1.
-  Hit nearest(Vec3 point, float limit, std::int32_t hint) const;
+  // Writes the triangles and the squared distances of queries.
+  void nearest(Queries& queries) const {
+    nearest_({tree_->wide().data(), wide_.data(), leaves_.data(), tree_->leaf_of().data(), together_}, queries);
+  }
 
   // First triangle hit at a distance above 0, from either side. `direction` need not have unit length.
   Hit first_hit(Vec3 origin, Vec3 direction) const;
 
  private:
   std::shared_ptr<const Tree> tree_;
-  std::vector<Triangle> by_face_;   // in the order of faces
-  std::vector<Triangle> by_order_;  // in the tree's order
+  std::vector<Triangle> triangles_;  // in the tree's order
   std::vector<Box> boxes_;
   std::vector<WideBox> wide_;
   std::vector<WideTriangles> leaves_;
+  float together_;  // half of a leaf's diagonal, on average
   Nearest nearest_;
 };
 

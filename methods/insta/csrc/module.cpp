@@ -2,6 +2,7 @@
 #include <nanobind/stl/shared_ptr.h>
 #include <nanobind/stl/tuple.h>
 
+#include <algorithm>
 #include <memory>
 #include <string>
 #include <tuple>
@@ -48,11 +49,11 @@ std::shared_ptr<Posed> make_posed(std::shared_ptr<Tree> tree, const Array<const 
   return std::make_shared<Posed>(std::move(tree), vertices.data(), kernels_of(isa).nearest);
 }
 
-template <class Query>
-void each(std::int64_t count, int threads, Query query) {
+// Call body(begin, end) for parts of `count`.
+template <class Body>
+void in_parts(std::int64_t count, int threads, Body body) {
   ThreadPool::instance().run((count + kPointsPerTask - 1) / kPointsPerTask, threads, [&](std::int64_t task, int) {
-    const std::int64_t end = std::min(count, (task + 1) * kPointsPerTask);
-    for (std::int64_t i = task * kPointsPerTask; i < end; ++i) query(i);
+    body(task * kPointsPerTask, std::min(count, (task + 1) * kPointsPerTask));
   });
 }
 
@@ -61,10 +62,14 @@ void nearest(const Posed& mesh, const Array<const float, -1, 3>& points, const A
   const auto count = static_cast<std::int64_t>(points.shape(0));
   require(triangles.shape(0) == points.shape(0) && squared.shape(0) == points.shape(0) && threads >= 1);
   nb::gil_scoped_release unlocked;
-  each(count, threads, [&](std::int64_t i) {
-    const Hit hit = mesh.nearest(row(points.data(), i), std::numeric_limits<float>::infinity(), -1);
-    triangles.data()[i] = hit.triangle;
-    squared.data()[i] = hit.value;
+  in_parts(count, threads, [&](std::int64_t begin, std::int64_t end) {
+    for (; begin < end; begin += kLanes) {
+      Queries queries(std::numeric_limits<float>::infinity());
+      for (std::int64_t i = begin; i < std::min(end, begin + kLanes); ++i) queries.add(row(points.data(), i), -1);
+      mesh.nearest(queries);
+      std::copy_n(queries.triangle, queries.count, triangles.data() + begin);
+      std::copy_n(queries.squared, queries.count, squared.data() + begin);
+    }
   });
 }
 
@@ -74,10 +79,12 @@ void first_hit(const Posed& mesh, const Array<const float, -1, 3>& origins, cons
   require(directions.shape(0) == origins.shape(0) && triangles.shape(0) == origins.shape(0) &&
           distances.shape(0) == origins.shape(0) && threads >= 1);
   nb::gil_scoped_release unlocked;
-  each(count, threads, [&](std::int64_t i) {
-    const Hit hit = mesh.first_hit(row(origins.data(), i), row(directions.data(), i));
-    triangles.data()[i] = hit.triangle;
-    distances.data()[i] = hit.value;
+  in_parts(count, threads, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t i = begin; i < end; ++i) {
+      const Hit hit = mesh.first_hit(row(origins.data(), i), row(directions.data(), i));
+      triangles.data()[i] = hit.triangle;
+      distances.data()[i] = hit.value;
+    }
   });
 }
 

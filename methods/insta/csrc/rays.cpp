@@ -1,7 +1,6 @@
 #include "rays.h"
 
 #include <algorithm>
-#include <array>
 #include <atomic>
 
 #include "bench/native/thread_pool.h"
@@ -14,24 +13,32 @@ constexpr std::int64_t kMarchedPerTask = 128, kRenderedPerTask = 256;
 
 void put(std::vector<float>& to, Vec3 v) { to.insert(to.end(), {v.x, v.y, v.z}); }
 
-void march_ray(const Marcher& marcher, const Rays& rays, std::int64_t number, std::vector<Interval>& intervals,
-               Samples& out) {
-  intervals.clear();
-  Progress progress = marcher.start(row(rays.origins, number), row(rays.directions, number), rays.jitter[number],
-                                    rays.first[number], intervals);
-  out.next.push_back(-1);
-  Sample sample;
-  for (std::int32_t emitted = 0; marcher.next(progress, intervals, sample); ++emitted) {
-    if (emitted == rays.samples_max) {
-      out.next.back() = sample.index;
-      return;
+// The next samples of up to kLanes rays from `begin`.
+void march_together(const Marcher& marcher, const Rays& rays, std::int64_t begin, int count, Samples& out) {
+  std::vector<Interval> intervals;
+  Progress progress[kLanes];
+  std::vector<Sample> found[kLanes];
+  bool ended[kLanes];
+  for (int i = 0; i < count; ++i) {
+    const std::int64_t number = begin + i;
+    progress[i] = marcher.start(row(rays.origins, number), row(rays.directions, number), rays.jitter[number],
+                                rays.first[number], intervals);
+    ended[i] = true;
+  }
+  marcher.march(progress, count, intervals, [&](int ray, const Sample& sample) {
+    found[ray].push_back(sample);
+    return ended[ray] = static_cast<std::int32_t>(found[ray].size()) < rays.samples_max;
+  });
+  for (int i = 0; i < count; ++i) {
+    for (const Sample& sample : found[i]) {
+      put(out.positions, sample.position);
+      put(out.directions, sample.direction);
+      out.distances.push_back(sample.away);
+      out.rays.push_back(static_cast<std::int32_t>(begin + i));
+      out.indices.push_back(sample.index);
+      out.triangles.push_back(sample.triangle);
     }
-    put(out.positions, sample.position);
-    put(out.directions, sample.direction);
-    out.distances.push_back(sample.away);
-    out.rays.push_back(static_cast<std::int32_t>(number));
-    out.indices.push_back(sample.index);
-    out.triangles.push_back(sample.triangle);
+    out.next.push_back(ended[i] ? -1 : progress[i].index);
   }
 }
 
@@ -43,11 +50,12 @@ void append(std::vector<T>& whole, const std::vector<T>& part) {
 // A round's samples of a task's rays, and what the field says of them.
 class Round {
  public:
-  explicit Round(std::int64_t most) : room_((most + kGroupMax - 1) / kGroupMax * kGroupMax), values_(kRows * room_) {}
+  explicit Round(std::int64_t most) : room_((most + kGroupMax - 1) / kGroupMax * kGroupMax), values_(kRows * room_), rays_(room_) {}
 
   std::int64_t count = 0;
 
-  void add(const Sample& sample, bool mouth) {
+  void add(const Sample& sample, bool mouth, std::int32_t ray) {
+    rays_[count] = ray;
     const float values[] = {sample.position.x,  sample.position.y,  sample.position.z, sample.direction.x,
                             sample.direction.y, sample.direction.z, sample.away,       mouth ? 1.0f : 0.0f};
     for (int i = 0; i < 8; ++i) row(i)[count] = values[i];
@@ -55,6 +63,7 @@ class Round {
   }
 
   Points points() { return {{row(0), row(1), row(2)}, {row(3), row(4), row(5)}, row(6), row(7)}; }
+  const std::int32_t* rays() const { return rays_.data(); }  // whose a sample is
   Values values() { return {row(8), {row(9), row(10), row(11)}}; }
 
  private:
@@ -63,14 +72,14 @@ class Round {
 
   std::int64_t room_;
   std::vector<float> values_;
+  std::vector<std::int32_t> rays_;
 };
 
-struct Ray {
-  Progress progress;
+// What a task's rays have gathered so far.
+struct Gathered {
   std::int64_t number;
   std::int32_t samples;  // of this round
   float left;
-  float color[3];
 };
 
 }  // namespace
@@ -79,10 +88,9 @@ Samples march(const Marcher& marcher, const Rays& rays, int threads) {
   const std::int64_t tasks = (rays.count + kMarchedPerTask - 1) / kMarchedPerTask;
   std::vector<Samples> parts(tasks);
   ThreadPool::instance().run(tasks, threads, [&](std::int64_t task, int) {
-    std::vector<Interval> intervals;
     const std::int64_t end = std::min(rays.count, (task + 1) * kMarchedPerTask);
-    for (std::int64_t number = task * kMarchedPerTask; number < end; ++number)
-      march_ray(marcher, rays, number, intervals, parts[task]);
+    for (std::int64_t begin = task * kMarchedPerTask; begin < end; begin += kLanes)
+      march_together(marcher, rays, begin, static_cast<int>(std::min<std::int64_t>(kLanes, end - begin)), parts[task]);
   });
   Samples whole;
   for (const Samples& part : parts) {
@@ -103,43 +111,45 @@ std::int64_t render(const Marcher& marcher, const Kernels& kernels, const Field&
   ThreadPool::instance().run((all.count + kRenderedPerTask - 1) / kRenderedPerTask, threads, [&](std::int64_t task, int) {
     const std::int64_t begin = task * kRenderedPerTask, end = std::min(all.count, begin + kRenderedPerTask);
     std::vector<Interval> intervals;
-    std::vector<Ray> rays;
+    std::vector<Progress> rays;  // that go on, and beside each what it has gathered
+    std::vector<Gathered> gathered;
     Round round((end - begin) * all.round_samples);
     std::vector<float> scratch(kernels.scratch(field));
-    std::int32_t hint = -1;
-    for (std::int64_t number = begin; number < end; ++number)
-      rays.push_back({marcher.start(row(all.origins, number), row(all.directions, number), all.jitter[number], 0,
-                                    intervals),
-                      number, 0, 1.0f, {}});
-    while (!rays.empty()) {
+    std::fill(seen.color + 3 * begin, seen.color + 3 * end, 0.0f);
+    for (std::int64_t number = begin; number < end; ++number) {
+      rays.push_back(marcher.start(row(all.origins, number), row(all.directions, number), all.jitter[number], 0, intervals));
+      gathered.push_back({number, 0, 1.0f});
+    }
+    std::size_t count = rays.size();
+    while (count > 0) {
       round.count = 0;
-      for (Ray& ray : rays) {
-        // The ray beside this one has met the same triangles.
-        if (ray.progress.hint < 0) ray.progress.hint = hint;
-        Sample sample;
-        for (ray.samples = 0; ray.samples < all.round_samples && marcher.next(ray.progress, intervals, sample);
-             ++ray.samples)
-          round.add(sample, mouth[sample.triangle] != 0);
-        hint = ray.progress.hint;
+      for (std::size_t first = 0; first < count; first += kLanes) {
+        Gathered* const group = gathered.data() + first;
+        const int together = static_cast<int>(std::min<std::size_t>(kLanes, count - first));
+        for (int i = 0; i < together; ++i) group[i].samples = 0;
+        marcher.march(rays.data() + first, together, intervals, [&](int ray, const Sample& sample) {
+          round.add(sample, mouth[sample.triangle] != 0, static_cast<std::int32_t>(first) + ray);
+          return ++group[ray].samples < all.round_samples;
+        });
       }
       kernels.evaluate(field, starts, step, round.points(), round.count, round.values(), scratch.data());
       evaluated += round.count;
       const Values values = round.values();
-      std::int64_t at = 0;
-      for (Ray& ray : rays) {
-        for (const std::int64_t stop = at + ray.samples; at < stop; ++at) {
-          const float weight = ray.left * (1 - values.left[at]);
-          for (int channel = 0; channel < 3; ++channel) ray.color[channel] += weight * values.color[channel][at];
-          ray.left *= values.left[at];
-        }
-        std::copy(ray.color, ray.color + 3, seen.color + 3 * ray.number);
-        seen.transmittance[ray.number] = ray.left;
+      for (std::int64_t at = 0; at < round.count; ++at) {
+        Gathered& ray = gathered[round.rays()[at]];
+        const float weight = ray.left * (1 - values.left[at]);
+        for (int channel = 0; channel < 3; ++channel)
+          seen.color[3 * ray.number + channel] += weight * values.color[channel][at];
+        ray.left *= values.left[at];
       }
-      rays.erase(std::remove_if(rays.begin(), rays.end(),
-                                [&](const Ray& ray) {
-                                  return ray.samples < all.round_samples || ray.left < all.stop_transmittance;
-                                }),
-                 rays.end());
+      std::size_t kept = 0;
+      for (std::size_t i = 0; i < count; ++i) {
+        seen.transmittance[gathered[i].number] = gathered[i].left;
+        if (gathered[i].samples < all.round_samples || gathered[i].left < all.stop_transmittance) continue;
+        rays[kept] = rays[i];
+        gathered[kept++] = gathered[i];
+      }
+      count = kept;
     }
   });
   return evaluated;

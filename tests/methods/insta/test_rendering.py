@@ -9,7 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from headbench.bench.contracts import Camera
-from headbench.methods.insta.rendering import box_corners, camera_rays, composite, pixels_of_hull
+from headbench.methods.insta.rendering import (
+    box_corners,
+    camera_rays,
+    composite,
+    pixels_by_blocks,
+    pixels_of_hull,
+)
 
 
 def some_camera(seed, width=40, height=30):
@@ -53,6 +59,21 @@ def test_no_point_of_the_hull_projects_outside_its_pixels(seed):
 def test_a_hull_around_the_camera_takes_the_whole_image():
     camera = some_camera(1)
     assert pixels_of_hull(camera, box_corners(np.stack([camera.center] * 2), 0.1)) == (0, 0, 40, 30)
+
+
+@pytest.mark.parametrize("region", [(0, 0, 8, 12), (3, 5, 16, 18), (2, 2, 3, 3), (5, 5, 5, 9), (5, 9, 5, 5)])
+@pytest.mark.parametrize("most", [1, 40, 10_000])
+def test_blocks_have_every_pixel_once(region, most):
+    left, top, right, bottom = region
+    parts = [np.stack(part, axis=1) for part in pixels_by_blocks(region, most)]
+    assert all(len(part) <= max(most, 4 * (right - left + 3)) for part in parts)
+    pixels = np.concatenate([*parts, np.empty((0, 2), int)])
+    assert len(np.unique(pixels, axis=0)) == len(pixels)
+    assert (np.ptp(pixels.reshape(-1, 16, 2), axis=1) == 3).all()
+    inside = pixels[(pixels < [bottom, right]).all(1)]
+    expected = {(row, column) for row in range(top, bottom) for column in range(left, right)}
+    assert set(map(tuple, inside.tolist())) == expected
+    assert (pixels < [bottom + 4, right + 4]).all()
 
 
 STEP = 0.001

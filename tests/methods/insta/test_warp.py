@@ -179,6 +179,42 @@ def test_the_kernel_finds_the_nearest_triangle_of_all(posed, spread):
 
 
 @needs_kernel
+@pytest.mark.parametrize("instruction_set", kernel.load().instruction_sets() if kernel.load() else [])
+@pytest.mark.parametrize("away", [0.0, 0.003, 0.05, 0.5])
+@pytest.mark.parametrize("spread", [1e-6, 0.001, 0.004, 0.02])
+def test_points_together_find_what_each_finds_alone(posed, instruction_set, away, spread):
+    rng = np.random.default_rng(4)
+    middles = posed.vertices.numpy()[rng.integers(0, len(posed.vertices), 40)] * (1 + away / 0.1)
+    points = (middles[:, None] + spread * rng.uniform(-1, 1, (40, 16, 3))).reshape(-1, 3).astype(np.float32)
+    module = kernel.load()
+    mesh = module.posed(posed.surface.tree, posed.vertices.numpy(), instruction_set)
+
+    def found(order):
+        triangles, squared = np.empty(len(order), np.int32), np.empty(len(order), np.float32)
+        module.nearest(mesh, points[order], triangles, squared, 1)
+        return triangles[np.argsort(order)], squared[np.argsort(order)]
+
+    together, apart = found(np.arange(640)), found(np.arange(640).reshape(40, 16).T.ravel())
+    for one, other in zip(together, apart):
+        np.testing.assert_array_equal(one, other)
+    expected = nearest_triangles(torch.from_numpy(points).double(), posed.corners.double())
+    np.testing.assert_allclose(np.sqrt(together[1]), expected.values.sqrt(), atol=1e-6)
+    if away:  # at a vertex rounding alone tells its triangles apart
+        assert (together[0] == expected.triangles.numpy()).mean() > 0.99
+
+
+@needs_kernel
+def test_points_that_are_not_finite_find_nothing(posed):
+    points = np.tile(posed.vertices.numpy()[:1] + np.float32(0.01), (16, 1))
+    points[3] = np.nan
+    points[7, 1] = np.inf
+    found, expected = posed.nearest(points), posed.nearest(points[:1])
+    spoilt = np.isin(np.arange(16), [3, 7])
+    assert (found.triangles.numpy() == np.where(spoilt, -1, expected.triangles.numpy())).all()
+    assert (found.values.numpy() == np.where(spoilt, np.inf, expected.values.numpy())).all()
+
+
+@needs_kernel
 def test_every_instruction_set_finds_the_same_triangles(posed):
     rng = np.random.default_rng(6)
     base = posed.vertices.numpy()[rng.integers(0, len(posed.vertices), 600)]
