@@ -37,6 +37,15 @@ constexpr float kLn2 = 0.6931471805599453f;
 HEADBENCH_INLINE int lowest_bit(std::uint64_t bits) { return __builtin_ctzll(bits); }
 HEADBENCH_INLINE int highest_bit(std::uint64_t bits) { return 63 - __builtin_clzll(bits); }
 
+#if !defined(HEADBENCH_ISA_avx512)
+// Write the numbers of the lanes that are set, counted from `first`, to a list with room for all lanes; how many they are.
+HEADBENCH_INLINE int list_lanes(Mask set, int first, std::int32_t* list) {
+  int count = 0;
+  for (std::uint32_t lanes = bits(set); lanes; lanes &= lanes - 1) list[count++] = first + lowest_bit(lanes);
+  return count;
+}
+#endif
+
 // 2^x for x up to 127, not below about 2^-126; relative error below 2e-7.
 HEADBENCH_INLINE Real exp2(Real x) {
   Real f;

@@ -20,6 +20,9 @@ struct Mask {
 };
 
 HEADBENCH_INLINE Real load(const float* p) { return _mm256_loadu_ps(p); }
+HEADBENCH_INLINE Real load_int16(const std::int16_t* p) {
+  return _mm256_cvtepi32_ps(_mm256_cvtepi16_epi32(_mm_loadu_si128(reinterpret_cast<const __m128i*>(p))));
+}
 HEADBENCH_INLINE void store(float* p, Real a) { _mm256_storeu_ps(p, a.v); }
 HEADBENCH_INLINE Real operator+(Real a, Real b) { return _mm256_add_ps(a.v, b.v); }
 HEADBENCH_INLINE Real operator-(Real a, Real b) { return _mm256_sub_ps(a.v, b.v); }

@@ -20,6 +20,9 @@ struct Mask {
 };
 
 HEADBENCH_INLINE Real load(const float* p) { return _mm512_loadu_ps(p); }
+HEADBENCH_INLINE Real load_int16(const std::int16_t* p) {
+  return _mm512_cvtepi32_ps(_mm512_cvtepi16_epi32(_mm256_loadu_si256(reinterpret_cast<const __m256i*>(p))));
+}
 HEADBENCH_INLINE void store(float* p, Real a) { _mm512_storeu_ps(p, a.v); }
 HEADBENCH_INLINE Real operator+(Real a, Real b) { return _mm512_add_ps(a.v, b.v); }
 HEADBENCH_INLINE Real operator-(Real a, Real b) { return _mm512_sub_ps(a.v, b.v); }
@@ -39,6 +42,13 @@ HEADBENCH_INLINE Real select(Mask m, Real a, Real b) { return _mm512_mask_mov_ps
 HEADBENCH_INLINE Real zero_unless(Mask m, Real a) { return _mm512_maskz_mov_ps(m.v, a.v); }
 HEADBENCH_INLINE bool any(Mask m) { return m.v != 0; }
 HEADBENCH_INLINE std::uint32_t bits(Mask m) { return m.v; }
+
+// Write the numbers of the lanes that are set, counted from `first`, to a list with room for all lanes; how many they are.
+HEADBENCH_INLINE int list_lanes(Mask set, int first, std::int32_t* list) {
+  const __m512i lanes = _mm512_add_epi32(_mm512_set1_epi32(first), _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15));
+  _mm512_storeu_si512(list, _mm512_maskz_compress_epi32(set.v, lanes));
+  return __builtin_popcount(set.v);
+}
 
 // One Newton step on the 14-bit estimate: 1 to 2 units in the last place.
 HEADBENCH_INLINE Real reciprocal(Real a) {

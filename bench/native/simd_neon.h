@@ -20,6 +20,9 @@ struct Mask {
 };
 
 HEADBENCH_INLINE Real load(const float* p) { return vld1q_f32(p); }
+HEADBENCH_INLINE Real load_int16(const std::int16_t* p) {
+  return vcvtq_f32_s32(vmovl_s16(vld1_s16(p)));
+}
 HEADBENCH_INLINE void store(float* p, Real a) { vst1q_f32(p, a.v); }
 HEADBENCH_INLINE Real operator+(Real a, Real b) { return vaddq_f32(a.v, b.v); }
 HEADBENCH_INLINE Real operator-(Real a, Real b) { return vsubq_f32(a.v, b.v); }

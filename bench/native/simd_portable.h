@@ -27,6 +27,9 @@ HEADBENCH_INLINE Real load(const float* p) {
   __builtin_memcpy(&a.v, p, sizeof a.v);
   return a;
 }
+HEADBENCH_INLINE Real load_int16(const std::int16_t* p) {
+  return __builtin_convertvector((Int4{p[0], p[1], p[2], p[3]}), Float4);
+}
 HEADBENCH_INLINE void store(float* p, Real a) { __builtin_memcpy(p, &a.v, sizeof a.v); }
 HEADBENCH_INLINE Real operator+(Real a, Real b) { return a.v + b.v; }
 HEADBENCH_INLINE Real operator-(Real a, Real b) { return a.v - b.v; }

@@ -12,6 +12,7 @@ from ...bench.contracts import Clip, FloatArray, HeadPose
 from ...datasets.head.arrays import faces_in_region
 from ...datasets.head.rotations import axis_angle_to_matrix
 from ...datasets.steps.jaw_bases import jaw_bases, jaw_quaternions, jaw_weights
+from ..shared.avatar_kernel import usable
 from ..shared.binding import NORMAL, Frames
 from ..shared.networks import initial_coefficients
 from ..shared.optimisation import Optimiser
@@ -37,7 +38,7 @@ from .field import (
     plane_features,
     shade,
 )
-from .training_kernel import directions_to, plane_colors, table_offsets, usable
+from .training_kernel import directions_to, plane_colors, table_offsets
 
 FLOATS_PER_FACE = 17 + 9 + 1  # triangle frame, turn to canonical, penalty weight
 

@@ -15,6 +15,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
+from ..shared import avatar_kernel
 from ..shared.binding import Frames, apply_matrices
 from ..shared.networks import (
     C0,
@@ -225,6 +226,8 @@ class CanonicalFrames:
 
     def turns(self, frames: Frames) -> Tensor:
         """(F, 3, 3) rotations that take world directions of a posed mesh to canonical ones: R_c R_t^T."""
+        if avatar_kernel.usable(frames.rotation) and not frames.rotation.requires_grad:
+            return avatar_kernel.turns_between(self.rotation, frames.rotation)
         return self.rotation @ frames.rotation.transpose(1, 2)
 
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..shared import avatar_kernel
 from ..shared.binding import Frames
-from ..shared.networks import C0, CPU_BLOCK, ENCODING_SIZE, FREQUENCIES, sum_rows
+from ..shared.networks import C0, CPU_BLOCK, ENCODING_SIZE, FREQUENCIES, encode, sum_rows
 from .field import (
     AXES,
     Bounds,
@@ -71,8 +71,9 @@ class LineOffsets:
             rows, weights = self._position
             pad = avatar_kernel.pad_units
             self._kernel_places = rows[:, :AXES].to(torch.int32).contiguous(), weights[:, AXES:].contiguous()
-            hidden = pad(self._second, 1), pad(self._biases[0], 0)
+            hidden = pad(self._second, 0, 1), pad(self._biases[0], 0)
             self._kernel_layers = *hidden, pad(self._last.t(), 1), self._biases[1]
+            self._kernel_first_bias = pad(self._first_bias, 0)
 
     def __call__(self, expression: Tensor, jaw: Tensor) -> Tensor:
         """(N, D) offsets of all splats for a frame's coefficients."""
@@ -80,19 +81,17 @@ class LineOffsets:
         out = table.new_empty if len(self.inside) == self._count else table.new_zeros
         offsets = out(self._count, self._last.shape[1])
         if self._fast:
+            first = avatar_kernel.pad_units(table, 1), self._kernel_first_bias
             avatar_kernel.offsets_into(
-                offsets, self.inside, table, *self._kernel_places, *self._kernel_layers
+                offsets, self.inside, *first, *self._kernel_places, *self._kernel_layers
             )
         else:
             offsets.index_copy_(0, self.inside, self.by_torch(table))
         return offsets
 
     def table(self, expression: Tensor, jaw: Tensor) -> Tensor:
-        """(3 L, H) first layer at the samples of a frame's blended lines."""
-        table = line_table(blend_lines(self._lines, expression, jaw), self._first)
-        # The two weights of an axis add up to 1, so the bias on the rows of one axis reaches each splat once.
-        table[: self._lines.shape[2]] += self._first_bias
-        return table
+        """(3 L, H) first layer, but for its bias, at the samples of a frame's blended lines."""
+        return line_table(blend_lines(self._lines, expression, jaw), self._first)
 
     def by_torch(self, table: Tensor) -> Tensor:
         """(M, D) offsets of the splats inside."""
@@ -104,7 +103,7 @@ class LineOffsets:
         hidden = table.new_empty(min(step, len(rows)), self._second.shape[1])
         for start in range(0, len(rows), step):
             block = slice(start, min(start + step, len(rows)))
-            first = sum_rows(table, rows[block], weights[block]).relu_()
+            first = sum_rows(table, rows[block], weights[block]).add_(self._first_bias).relu_()
             out = hidden[: len(first)]
             torch.addmm(second_bias, first, self._second, out=out).relu_()
             torch.addmm(last_bias, out, self._last, out=inside[block])
@@ -117,8 +116,16 @@ def _lexicographic(rows: Tensor, resolution: int) -> Tensor:
     return torch.argsort((z * AXES * resolution + y) * AXES * resolution + x, stable=True)
 
 
+SAMPLES = 1024
+"""Of a coordinate of directions, from -1 to 1."""
+
+
 class PlaneColors:
     """Colours of the planes as directions ask for them, where the part of the position is known.
+
+    Each coordinate of a direction adds to the hidden layer what its own waves make of it. The kernel reads that from a
+    table, linear between `SAMPLES`: a wave of the highest frequency, 8, is off by 8^2 / (2 SAMPLES^2) = 3e-5 of its
+    amplitude at most. The part of the position is the most that a frame reads; it is kept in 16 bits (`in_steps`).
 
     Parameters
     ----------
@@ -132,7 +139,12 @@ class PlaneColors:
         self._network = from_position, of_direction, last
         if self._fast:
             pad = avatar_kernel.pad_units
-            self._network = pad(from_position, 1), pad(of_direction, 1), pad(last, 1)
+            parts = pad(of_direction, 1), pad(last, 1)
+            self._stored = (
+                *avatar_kernel.in_steps(pad(from_position, 1)),
+                direction_table(parts[0], SAMPLES),
+                parts[1],
+            )
         self._known: tuple[Tensor, Tensor, Tensor] | None = None
 
     def __call__(self, means: Tensor, center: Tensor, turns: Tensor, binding: Tensor) -> Tensor:
@@ -148,7 +160,7 @@ class PlaneColors:
         if self._known is not None and self._known[0] is means and torch.equal(self._known[1], center):
             return self._known[2]
         if self._fast:
-            colors = avatar_kernel.shade_network(*self._network, means, center, turns, binding)
+            colors = avatar_kernel.shade_network(*self._stored, means, center, turns, binding)
         else:
             colors = self.along(-canonical_directions(turns, binding, means, center))
         self._known = means, center, colors
@@ -159,6 +171,16 @@ class PlaneColors:
         from_position, of_direction, last = self._network
         hidden = torch.addmm(from_position, encode_columns(-directions).t(), of_direction).relu_()
         return torch.addmm(hidden.new_tensor(0.5), hidden, last.t(), alpha=C0).relu_()
+
+
+def direction_table(of_direction: Tensor, samples: int) -> Tensor:
+    """(3 L, H): what each coordinate adds to the hidden layer at L samples from -1 to 1, by (27, H) weights of `encode`."""
+    along = torch.linspace(-1, 1, samples, dtype=torch.float64)
+    waves = encode(along[:, None].expand(-1, AXES)).unflatten(
+        1, (-1, AXES)
+    )  # the coordinates' turn in each wave
+    weights = of_direction.double().unflatten(0, (-1, AXES))
+    return torch.einsum("lwa,wah->alh", waves, weights).flatten(0, 1).to(of_direction.dtype)
 
 
 def encode_columns(directions: Tensor) -> Tensor:

@@ -24,7 +24,7 @@ UNITS_STEP = 16
 
 def available() -> bool:
     """Tell whether the kernel is there; one built from older sources, in an editable installation, counts as none."""
-    return hasattr(KERNEL.imported, "to_world")
+    return hasattr(KERNEL.imported, "turns")  # the newest of its functions
 
 
 def usable(like: Tensor) -> bool:
@@ -99,8 +99,23 @@ def pad_units(values: Tensor, *axes: int) -> Tensor:
     return pad(values, widths).contiguous()
 
 
+def turns_between(to: Tensor, origin: Tensor, backend: str = "cpu") -> Tensor:
+    """(F, 3, 3) rotations ``to`` times the transposes of ``origin``: they take directions on one mesh to the other's."""
+    turns = torch.empty_like(to)
+    call("turns", to, origin, turns, backend=backend)
+    return turns
+
+
+def in_steps(values: Tensor) -> tuple[Tensor, Tensor]:
+    """(N, H) int16 and the steps (H,) float32 they count: what is left of a column is half a step, 1.5e-5 of its largest."""
+    largest = values.abs().amax(0) if len(values) else values.new_zeros(values.shape[1])
+    steps = (largest / torch.iinfo(torch.int16).max).clamp_min(torch.finfo(values.dtype).tiny)
+    return (values / steps).round_().to(torch.int16), steps
+
+
 def shade_network(
     from_position: Tensor,
+    steps: Tensor,
     of_direction: Tensor,
     last: Tensor,
     means: Tensor,
@@ -113,10 +128,13 @@ def shade_network(
 
     Parameters
     ----------
-    from_position, of_direction, last : (N, H), (27, H) and (3, H), each padded by `pad_units` along H.
+    from_position, steps : see `in_steps`; (N, H), padded by `pad_units` along H.
+    last : (3, H), padded too.
+    of_direction : (3 L, H), padded too: what the coordinates of a direction from the splat to the camera add to the hidden
+        layer, at L >= 2 samples of each from -1 to 1; linear between them.
     """
     colors = torch.empty_like(means)
-    network = from_position, of_direction, last
+    network = from_position, steps, of_direction, last
     call("color_network", *network, means, turns, binding, center, colors, backend=backend)
     return colors
 
@@ -125,6 +143,7 @@ def offsets_into(
     out: Tensor,
     splats: Tensor,
     table: Tensor,
+    first_bias: Tensor,
     rows: Tensor,
     fractions: Tensor,
     second: Tensor,
@@ -135,30 +154,31 @@ def offsets_into(
 ) -> None:
     """Write offsets into the rows ``splats`` of (N, D) ``out``: the compiled form of `ours.field.line_offsets`.
 
-    Units of the first layer that no place on the lines turns on are left out of the whole frame, those that none of a
-    few neighbours turns on are left out of their second layer.
+    Units of the first layer that none of a few neighbours turns on are left out of their second layer.
 
     Parameters
     ----------
     splats : (M,) int64.
-    table : (3 L, U), the first layer at the lines' samples, its bias included once.
+    table, first_bias : (3 L, U) and (U,), padded by `pad_units` along U: the first layer at the lines' samples.
     rows, fractions : (M, 3) int32 lower samples, and ways from them to the next, 0 to 1.
-    second, second_bias, last : (U, H), (H,) and (D, H), padded by `pad_units` along H.
+    second, second_bias, last : (U, H), (H,) and (D, H), padded by `pad_units` along U and H.
     last_bias : (D,).
     """
-    # What is interpolated on an axis is no more than its largest sample.
-    alive = table.view(3, -1, table.shape[1]).amax(1).sum(0) > 0
-    first, second = pad_units(table[:, alive], 1), pad_units(second[alive], 0)
     layers = second, second_bias, last, last_bias
-    call("offset_network", first, rows, fractions, *layers, splats, out, backend=backend)
+    call("offset_network", table, first_bias, rows, fractions, *layers, splats, out, backend=backend)
 
 
 def call(name: str, *arguments: Any, backend: str) -> Any:
-    """Call a function of the kernel with tensors as arrays, and other arguments as they are."""
-    plain = [
+    """Call a function of the kernel, see `arrays`."""
+    function = getattr(KERNEL.load(), name)
+    return function(*arrays(*arguments), instruction_sets()[backend], torch.get_num_threads())
+
+
+def arrays(*arguments: Any) -> list[Any]:
+    """Tensors as arrays, which reach the kernel faster than tensors do, and other arguments as they are."""
+    return [
         value.detach().contiguous().numpy() if isinstance(value, Tensor) else value for value in arguments
     ]
-    return getattr(KERNEL.load(), name)(*plain, instruction_sets()[backend], torch.get_num_threads())
 
 
 class WorldTransform:

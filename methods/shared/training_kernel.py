@@ -15,20 +15,12 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from ...datasets.head.model import HeadModel
-from ..splats.cpu import KERNEL
 from . import losses
-from .avatar_kernel import call, splats_to_world, triangles
+from .avatar_kernel import call, splats_to_world, triangles, usable
 from .binding import Frames, WorldSplats
 from .binding import to_world as reference_to_world
 from .binding import triangle_frames as reference_triangle_frames
 from .networks import sh_to_rgb
-
-
-def usable(like: Tensor) -> bool:
-    """Whether the kernel is there and takes tensors like this one."""
-    return (
-        like.dtype == torch.float32 and like.device.type == "cpu" and hasattr(KERNEL.imported, "photometric")
-    )
 
 
 def photometric_loss(image: Tensor, truth: Tensor, ssim_weight: float, backend: str = "cpu") -> Tensor:

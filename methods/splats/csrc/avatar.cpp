@@ -65,44 +65,52 @@ void shade(const Array<const float, -1, 3, -1, kHarmonicsBlock>& coefficients, c
   share_out(count, threads, [&](std::int64_t begin, std::int64_t end, int) { kernels.shade(in, begin, end); });
 }
 
-void color_network(const Array<const float, -1, -1>& positions, const Array<const float, kEncoding, -1>& second,
+void turns(const Array<const float, -1, 3, 3>& to, const Array<const float, -1, 3, 3>& from,
+           const Array<float, -1, 3, 3>& out, const std::string& instruction_set, int threads) {
+  const std::size_t count = out.shape(0);
+  require(to.shape(0) == count && from.shape(0) == count);
+  const Turns in{to.data(), from.data(), out.data()};
+  const Kernels& kernels = variant_of(runnable_kernels(), instruction_set);
+  nb::gil_scoped_release unlocked;
+  share_out(count, threads, [&](std::int64_t begin, std::int64_t end, int) { kernels.turns(in, begin, end); });
+}
+
+void color_network(const Array<const std::int16_t, -1, -1>& positions, const Array<const float, -1>& steps, const Array<const float, -1, -1>& table,
                    const Array<const float, 3, -1>& last, const Array<const float, -1, 3>& means,
                    const Array<const float, -1, 3, 3>& rotations, const Array<const std::int64_t, -1>& binding,
                    const Array<const float, 3>& center, const Array<float, -1, 3>& colors,
                    const std::string& instruction_set, int threads) {
   const std::size_t count = means.shape(0), hidden = positions.shape(1);
-  require(hidden % kUnitsStep == 0 && second.shape(1) == hidden && last.shape(1) == hidden);
-  require(positions.shape(0) == count && binding.shape(0) == count && colors.shape(0) == count);
+  require(hidden % kUnitsStep == 0 && table.shape(1) == hidden && last.shape(1) == hidden);
+  require(table.shape(0) % 3 == 0 && table.shape(0) >= 6 && table.shape(0) < 3 << 20);
+  require(positions.shape(0) == count && binding.shape(0) == count && colors.shape(0) == count && steps.shape(0) == hidden);
   require(below(binding.data(), count, rotations.shape(0)));
-  ColorNetwork net{static_cast<int>(hidden), positions.data(), second.data(), last.data(),  means.data(),
-                   rotations.data(),             binding.data(),   {},            colors.data()};
+  ColorNetwork net{static_cast<int>(hidden), static_cast<int>(table.shape(0) / 3), positions.data(), steps.data(),
+                   table.data(),                   last.data(), means.data(), rotations.data(), binding.data(), {}, colors.data()};
   for (int k = 0; k < 3; ++k) net.center[k] = center(k);
   const Kernels& kernels = variant_of(runnable_kernels(), instruction_set);
   nb::gil_scoped_release unlocked;
-  const Scratch scratch(kernels.color_scratch(net.hidden), threads);
-  share_out(count, threads, [&](std::int64_t begin, std::int64_t end, int worker) {
-    kernels.color_network(net, begin, end, scratch.of(worker));
-  });
+  share_out(count, threads, [&](std::int64_t begin, std::int64_t end, int) { kernels.color_network(net, begin, end); });
 }
 
-void offset_network(const Array<const float, -1, -1>& table, const Array<const std::int32_t, -1, 3>& rows,
+void offset_network(const Array<const float, -1, -1>& table, const Array<const float, -1>& first_bias, const Array<const std::int32_t, -1, 3>& rows,
                     const Array<const float, -1, 3>& fractions, const Array<const float, -1, -1>& second,
                     const Array<const float, -1>& second_bias, const Array<const float, -1, -1>& last,
                     const Array<const float, -1>& last_bias, const Array<const std::int64_t, -1>& splats,
                     const Array<float, -1, -1>& offsets, const std::string& instruction_set, int threads) {
   const std::size_t count = splats.shape(0), units = table.shape(1), hidden = second.shape(1);
   require(units % kUnitsStep == 0 && hidden % kUnitsStep == 0 && second.shape(0) == units);
-  require(second_bias.shape(0) == hidden && last.shape(1) == hidden && last_bias.shape(0) == last.shape(0));
+  require(first_bias.shape(0) == units && second_bias.shape(0) == hidden && last.shape(1) == hidden && last_bias.shape(0) == last.shape(0));
   require(rows.shape(0) == count && fractions.shape(0) == count && offsets.shape(1) == last.shape(0));
   require(count == 0 || table.shape(0) > 1);
   require(below(rows.data(), 3 * count, table.shape(0) - 1) && below(splats.data(), count, offsets.shape(0)));
   const OffsetNetwork net{static_cast<int>(units), static_cast<int>(hidden), static_cast<int>(last.shape(0)),
-                          table.data(),            rows.data(),              fractions.data(),
-                          second.data(),           second_bias.data(),       last.data(),
-                          last_bias.data(),        splats.data(),            offsets.data()};
+                          static_cast<int>(hidden), table.data(), first_bias.data(), rows.data(), fractions.data(),
+                          second.data(), second_bias.data(), last.data(), last_bias.data(), splats.data(),
+                          offsets.data(), nullptr};
   const Kernels& kernels = variant_of(runnable_kernels(), instruction_set);
   nb::gil_scoped_release unlocked;
-  const Scratch scratch(kernels.offset_scratch(net.units, net.hidden), threads);
+  const Scratch scratch(kernels.offset_scratch(net), threads);
   share_out(count, threads, [&](std::int64_t begin, std::int64_t end, int worker) {
     kernels.offset_network(net, begin, end, scratch.of(worker));
   });
@@ -118,9 +126,11 @@ void bind_avatar(nb::module_& m) {
         "Write the splats' means, quaternions and scales in the world.");
   m.def("shade", &shade, "coefficients"_a, "means"_a, "rotations"_a, "binding"_a, "center"_a, "colors"_a,
         "instruction_set"_a, "threads"_a, "Write the colours of spherical harmonics; empty rotations rotate nothing.");
-  m.def("color_network", &color_network, "positions"_a, "second"_a, "last"_a, "means"_a, "rotations"_a, "binding"_a,
+  m.def("turns", &turns, "to"_a, "from_"_a, "out"_a, "instruction_set"_a, "threads"_a,
+        "Write the rotations that take directions on triangles to those on others.");
+  m.def("color_network", &color_network, "positions"_a, "steps"_a, "table"_a, "last"_a, "means"_a, "rotations"_a, "binding"_a,
         "center"_a, "colors"_a, "instruction_set"_a, "threads"_a, "Write the colours of the colour network.");
-  m.def("offset_network", &offset_network, "table"_a, "rows"_a, "fractions"_a, "second"_a, "second_bias"_a, "last"_a,
+  m.def("offset_network", &offset_network, "table"_a, "first_bias"_a, "rows"_a, "fractions"_a, "second"_a, "second_bias"_a, "last"_a,
         "last_bias"_a, "splats"_a, "offsets"_a, "instruction_set"_a, "threads"_a,
         "Write the offsets of the splats named, those of no others.");
 }

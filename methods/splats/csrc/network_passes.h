@@ -7,101 +7,48 @@
 
 namespace headbench::HEADBENCH_ISA {
 
-static_assert(kGroupRows % kSplatGroup == 0 && kGroupRows % kBatch == 0 && kTrainingTile % kGroupRows == 0);
+static_assert(kGroupRows % kSplatGroup == 0 && kGroupRows % W == 0 && kNetworkTile % kGroupRows == 0);
 
 HEADBENCH_INLINE std::int64_t whole_groups(std::int64_t rows) { return (rows + kGroupRows - 1) / kGroupRows * kGroupRows; }
 
-constexpr int kProductVectors = W == 16 ? 3 : 1;  // with a group's rows, the sums that registers hold
+constexpr int kOuterVectors = W == 16 ? 6 : 2;  // of the colours' inputs, with kSparseGroup rows
 
-template <int vectors>
-HEADBENCH_INLINE void product_columns(const float* inputs, int stride, const std::int32_t* list, int count,
-                                      const float* weights, int weight_stride, const float* bias, bool relu, float* out,
-                                      int out_stride) {
-  Real sums[kSplatGroup][vectors];
-  for (int v = 0; v < vectors; ++v) {
-    const Real start = bias ? load(bias + v * W) : Real(0.0f);
-    for (int s = 0; s < kSplatGroup; ++s) sums[s][v] = start;
-  }
+// sums[unit][column] += sum over a group's rows of left[row][unit] right[row][column], for the listed units.
+template <int rows, int vectors>
+HEADBENCH_INLINE void outer_columns(const float* left, int left_stride, const std::int32_t* units, int count,
+                                    const float* right, int right_stride, float* sums, int sums_stride) {
+  Real row[rows][vectors];
+  for (int s = 0; s < rows; ++s)
+    for (int v = 0; v < vectors; ++v) row[s][v] = load(right + s * right_stride + v * W);
   for (int i = 0; i < count; ++i) {
-    const float* row = weights + static_cast<std::size_t>(list[i]) * weight_stride;
-    const float* input = inputs + list[i];
-    Real weight[vectors];
-    for (int v = 0; v < vectors; ++v) weight[v] = load(row + v * W);
-    for (int s = 0; s < kSplatGroup; ++s) {
-      const Real value = input[s * stride];
-      for (int v = 0; v < vectors; ++v) sums[s][v] = fma(value, weight[v], sums[s][v]);
+    const float* values = left + units[i];
+    float* to = sums + static_cast<std::size_t>(units[i]) * sums_stride;
+    Real sum[vectors];
+    for (int v = 0; v < vectors; ++v) sum[v] = load(to + v * W);
+    for (int s = 0; s < rows; ++s) {
+      const Real value = values[s * left_stride];
+      for (int v = 0; v < vectors; ++v) sum[v] = fma(value, row[s][v], sum[v]);
     }
+    for (int v = 0; v < vectors; ++v) store(to + v * W, sum[v]);
   }
-  for (int s = 0; s < kSplatGroup; ++s)
-    for (int v = 0; v < vectors; ++v) store(out + s * out_stride + v * W, relu ? max(sums[s][v], 0.0f) : sums[s][v]);
 }
 
-// Which inputs of each group of a tile's rows a product takes.
-struct Lists {
-  const std::int32_t* inputs;  // `stride` after one group's come the next one's
-  int stride;
-  int counts[kTrainingTile / kSplatGroup];
-};
-
-// For the groups of a tile's rows: bias, if any, plus the listed inputs times their rows of the weights, `width` numbers
-// a row. Some columns for all groups before the next: their weights stay in the first cache.
-inline void product(const float* inputs, int stride, const Lists& lists, int groups, const float* weights,
-                    int weight_stride, int width, const float* bias, bool relu, float* out, int out_stride) {
+// The same for all groups of a tile, `width` columns, at most `most_vectors` vectors of them at a time.
+template <int rows, int most_vectors>
+inline void outer_product(const float* left, int left_stride, const Lists<rows>& lists, int groups, const float* right,
+                          int right_stride, int width, float* sums) {
   for (int column = 0; column < width;) {
-    const int vectors = width - column >= kProductVectors * W ? kProductVectors : width - column >= 2 * W ? 2 : 1;
+    const int vectors = width - column >= most_vectors * W ? most_vectors : width - column >= 2 * W ? 2 : 1;
     for (int group = 0; group < groups; ++group) {
-      const float *from = inputs + group * kSplatGroup * stride, *some = weights + column, *start = bias ? bias + column : nullptr;
+      const float *values = left + group * rows * left_stride, *some = right + group * rows * right_stride + column;
       const std::int32_t* list = lists.inputs + group * lists.stride;
       const int count = lists.counts[group];
-      float* to = out + group * kSplatGroup * out_stride + column;
-      if (vectors == kProductVectors)
-        product_columns<kProductVectors>(from, stride, list, count, some, weight_stride, start, relu, to, out_stride);
+      if (vectors == most_vectors)
+        outer_columns<rows, most_vectors>(values, left_stride, list, count, some, right_stride, sums + column, width);
       else if (vectors == 2)
-        product_columns<2>(from, stride, list, count, some, weight_stride, start, relu, to, out_stride);
+        outer_columns<rows, 2>(values, left_stride, list, count, some, right_stride, sums + column, width);
       else
-        product_columns<1>(from, stride, list, count, some, weight_stride, start, relu, to, out_stride);
-    }
-    column += vectors * W;
-  }
-}
-
-// Rows of a gradient by weights in registers at a time, and vectors of each.
-constexpr int kOuterUnits = W == 16 ? 8 : 4;
-constexpr int kOuterVectors = W == 16 ? 3 : 2;
-
-template <int vectors>
-HEADBENCH_INLINE void outer_columns(const float* left, int left_stride, const std::int32_t* units, const float* right,
-                                    int right_stride, int rows, float* sums, int sums_stride) {
-  Real sum[kOuterUnits][vectors];
-  for (int u = 0; u < kOuterUnits; ++u)
-    for (int v = 0; v < vectors; ++v) sum[u][v] = load(sums + static_cast<std::size_t>(units[u]) * sums_stride + v * W);
-  const float* starts[kOuterUnits];
-  for (int u = 0; u < kOuterUnits; ++u) starts[u] = left + units[u];
-  for (int s = 0; s < rows; ++s) {
-    Real row[vectors];
-    for (int v = 0; v < vectors; ++v) row[v] = load(right + s * right_stride + v * W);
-    for (int u = 0; u < kOuterUnits; ++u) {
-      const Real value = starts[u][s * left_stride];
-      for (int v = 0; v < vectors; ++v) sum[u][v] = fma(value, row[v], sum[u][v]);
-    }
-  }
-  for (int u = 0; u < kOuterUnits; ++u)
-    for (int v = 0; v < vectors; ++v) store(sums + static_cast<std::size_t>(units[u]) * sums_stride + v * W, sum[u][v]);
-}
-
-// sums[unit][column] += sum over rows of left[row][unit] right[row][column], for the listed units; their number is a
-// multiple of kOuterUnits, as no unit is listed twice.
-inline void outer_product(const float* left, int left_stride, const std::int32_t* units, int count, const float* right,
-                          int right_stride, int rows, int width, float* sums) {
-  for (int column = 0; column < width;) {
-    const int vectors = width - column >= kOuterVectors * W ? kOuterVectors : width - column >= 2 * W ? 2 : 1;
-    for (int u = 0; u < count; u += kOuterUnits) {
-      if (vectors == kOuterVectors)
-        outer_columns<kOuterVectors>(left, left_stride, units + u, right + column, right_stride, rows, sums + column, width);
-      else if (vectors == 2)
-        outer_columns<2>(left, left_stride, units + u, right + column, right_stride, rows, sums + column, width);
-      else
-        outer_columns<1>(left, left_stride, units + u, right + column, right_stride, rows, sums + column, width);
+        outer_columns<rows, 1>(values, left_stride, list, count, some, right_stride, sums + column, width);
     }
     column += vectors * W;
   }
@@ -110,12 +57,6 @@ inline void outer_product(const float* left, int left_stride, const std::int32_t
 // Ask for what the next tile reads of the forward pass, `most` of the `left` numbers there are: it comes from far away.
 HEADBENCH_INLINE void prefetch_floats(const float* from, std::int64_t left, int most) {
   for (int k = 0; k < most && k < left; k += kUnitsStep) __builtin_prefetch(from + k, 0, 2);
-}
-
-// Add the lanes that are set to a list, as numbers from `first` on; its new length.
-HEADBENCH_INLINE int list_lanes(Mask set, int first, std::int32_t* list, int count) {
-  for (std::uint64_t lanes = bits(set); lanes; lanes &= lanes - 1) list[count++] = first + lowest_bit(lanes);
-  return count;
 }
 
 // ---- Directions ----
@@ -128,12 +69,6 @@ HEADBENCH_INLINE void rotate(const T* m, const Real* v, Real* out) {
 template <class T>
 HEADBENCH_INLINE void rotate_back(const T* m, const Real* v, Real* out) {
   for (int i = 0; i < 3; ++i) out[i] = fma(m[i], v[0], fma(m[3 + i], v[1], Real(m[6 + i]) * v[2]));
-}
-
-HEADBENCH_INLINE Real unit_length(const Real* v, Real* unit) {
-  const Real length = max(sqrt(dot3(v, v)), 1e-12f);
-  for (int k = 0; k < 3; ++k) unit[k] = v[k] / length;
-  return length;
 }
 
 // Directions of a vector of splats from `first` on, with the steps on the way to them.
@@ -150,11 +85,10 @@ HEADBENCH_INLINE void direction_steps(const DirectionTraining& in, std::int64_t 
     mean.set(in.means + 3 * splat, lane);
   }
   for (int k = 0; k < 9; ++k) out.turn[k] = turn[k];
-  Real way[3], turned[3];
-  for (int k = 0; k < 3; ++k) way[k] = Real(in.center[k]) - mean[k];
-  out.first_length = unit_length(way, out.first);
-  rotate(out.turn, out.first, turned);
-  out.second_length = unit_length(turned, out.second);
+  for (int k = 0; k < 3; ++k) out.first[k] = Real(in.center[k]) - mean[k];
+  out.first_length = normalise3(out.first, 1e-24f);
+  rotate(out.turn, out.first, out.second);
+  out.second_length = normalise3(out.second, 1e-24f);
 }
 
 inline void directions(const DirectionTraining& in, std::int64_t begin, std::int64_t end) {
@@ -191,6 +125,40 @@ inline void directions_backward(const DirectionTraining& in, std::int64_t begin,
 }
 
 // ---- Colour ----
+
+// Sine and cosine of numbers in [-1, 1]: Taylor series, whose next terms are below 2e-10.
+HEADBENCH_INLINE void sine_cosine(Real x, Real& sine, Real& cosine) {
+  const Real square = x * x;
+  sine = fma(square, -1.0f / 39916800.0f, 1.0f / 362880.0f);
+  sine = fma(square, sine, -1.0f / 5040.0f);
+  sine = fma(square, sine, 1.0f / 120.0f);
+  sine = fma(square, sine, -1.0f / 6.0f);
+  sine = fma(square * sine, x, x);
+  cosine = fma(square, 1.0f / 479001600.0f, -1.0f / 3628800.0f);
+  cosine = fma(square, cosine, 1.0f / 40320.0f);
+  cosine = fma(square, cosine, -1.0f / 720.0f);
+  cosine = fma(square, cosine, 1.0f / 24.0f);
+  cosine = fma(square, cosine, -0.5f);
+  cosine = fma(square, cosine, 1.0f);
+}
+
+// The encoding of methods/shared/networks.py, `encode`, of W directions: W numbers of each input side by side.
+HEADBENCH_INLINE void encode(const Real* direction, float* out) {
+  constexpr int kFrequencies = (kEncoding - 3) / 6;
+  for (int k = 0; k < 3; ++k) {
+    store(out + k * W, direction[k]);
+    Real sine, cosine;
+    sine_cosine(direction[k], sine, cosine);
+    for (int n = 0; n < kFrequencies; ++n) {
+      store(out + (3 + 6 * n + k) * W, sine);
+      store(out + (6 + 6 * n + k) * W, cosine);
+      // sin 2a = 2 sin a cos a, cos 2a = 1 - 2 sin^2 a.
+      const Real twice = sine + sine, next = twice * cosine;
+      cosine = fnma(twice, sine, 1.0f);
+      sine = next;
+    }
+  }
+}
 
 // Where a point lies between samples: the lower one's number, the way to the next, and whether the point was clamped.
 struct Between {
@@ -245,22 +213,22 @@ HEADBENCH_INLINE void prefetch_planes(const ColorTraining& net, const float* pos
 
 // Inputs of entries [first, first + used): features and encoded directions; zeros in the rest of `rows`, whole groups.
 inline void color_inputs(const ColorTraining& net, std::int64_t first, int used, int rows, float* out) {
-  alignas(64) float encoded[kEncoding * kBatch];
+  alignas(64) float encoded[kEncoding * W];
   for (int offset = 0; offset < rows; offset += W) {
     Gathered<3> d;
     for (int lane = 0; lane < W; ++lane)
-      d.set(net.directions + 3 * net.splats[first + (offset + lane < used ? offset + lane : 0)], lane);
+      d.set(net.directions + 3 * (first + (offset + lane < used ? offset + lane : 0)), lane);
     const Real direction[3] = {d[0], d[1], d[2]};
     encode(direction, encoded);
     for (int lane = 0; lane < W; ++lane) {
       constexpr std::int64_t ahead = 12;
       const std::int64_t later = first + offset + lane + ahead;
-      if (later < net.count) prefetch_planes(net, net.positions + 3 * net.splats[later]);
+      if (later < net.count) prefetch_planes(net, net.positions + 3 * (later));
       float* row = out + (offset + lane) * net.inputs_stride;
       int filled = 0;
       if (offset + lane < used) {
-        sample_planes(net, net.positions + 3 * net.splats[first + offset + lane], row);
-        for (int k = 0; k < kEncoding; ++k) row[net.features + k] = encoded[k * kBatch + lane];
+        sample_planes(net, net.positions + 3 * (first + offset + lane), row);
+        for (int k = 0; k < kEncoding; ++k) row[net.features + k] = encoded[k * W + lane];
         filled = net.features + kEncoding;
       }
       for (; filled < net.inputs; ++filled) row[filled] = 0.0f;
@@ -269,30 +237,30 @@ inline void color_inputs(const ColorTraining& net, std::int64_t first, int used,
 }
 
 inline std::size_t color_forward_scratch(const ColorTraining& net) {
-  return static_cast<std::size_t>(kTrainingTile + 1) * net.inputs_stride;
+  return static_cast<std::size_t>(kNetworkTile + 1) * net.inputs_stride;
 }
 
 inline void color_forward(const ColorTraining& net, std::int64_t begin, std::int64_t end, float* scratch) {
   float* inputs = scratch;
-  std::int32_t* list = reinterpret_cast<std::int32_t*>(inputs + kTrainingTile * net.inputs_stride);
+  std::int32_t* list = reinterpret_cast<std::int32_t*>(inputs + kNetworkTile * net.inputs_stride);
   const int used_inputs = net.features + kEncoding;
   for (int k = 0; k < used_inputs; ++k) list[k] = k;
-  Lists lists = {list, 0, {}};
+  Lists<kSplatGroup> lists = {list, 0, {}};
   for (int& count : lists.counts) count = used_inputs;
-  for (std::int64_t first = begin; first < end; first += kTrainingTile) {
-    const int used = end - first < kTrainingTile ? static_cast<int>(end - first) : kTrainingTile;
+  for (std::int64_t first = begin; first < end; first += kNetworkTile) {
+    const int used = end - first < kNetworkTile ? static_cast<int>(end - first) : kNetworkTile;
     const int rows = static_cast<int>(whole_groups(used));
     color_inputs(net, first, used, rows, inputs);
     float* hidden = net.kept_hidden + first * net.units;
-    product(inputs, net.inputs_stride, lists, rows / kSplatGroup, net.first, net.units_stride, net.units, nullptr, true,
-            hidden, net.units);
+    product<kSplatGroup, kSplatVectors>(inputs, net.inputs_stride, lists, rows / kSplatGroup, net.first,
+                                        net.units_stride, net.units, nullptr, true, hidden, net.units);
     for (int group = 0; group < used; group += kSplatGroup)
       for (int channel = 0; channel < 3; ++channel) {
         float sums[kSplatGroup];
         dots(hidden + group * net.units, net.last + static_cast<std::size_t>(channel) * net.units, net.units, sums);
         for (int s = 0; s < kSplatGroup && group + s < used; ++s) {
           const float color = 0.5f + 0.28209479177387814f * sums[s];
-          net.colors[3 * net.splats[first + group + s] + channel] = color > 0.0f ? color : 0.0f;
+          net.colors[3 * (first + group + s) + channel] = color > 0.0f ? color : 0.0f;
         }
       }
   }
@@ -345,33 +313,31 @@ HEADBENCH_INLINE void planes_backward(const ColorTraining& net, const Between* a
 }
 
 inline std::size_t color_backward_scratch(const ColorTraining& net) {
-  return static_cast<std::size_t>(kTrainingTile) * (net.units_stride + 2 * net.inputs_stride) +
-         (kTrainingTile / kSplatGroup + 1) * net.units;
+  return static_cast<std::size_t>(kNetworkTile) * (net.units_stride + 2 * net.inputs_stride) +
+         kNetworkTile / kSparseGroup * net.units;
 }
 
 inline void color_backward(const ColorTraining& net, const ColorSums& at, std::int64_t begin, std::int64_t end, float* sums,
                            float* scratch) {
   float* by_hidden = scratch;
-  float* inputs = by_hidden + kTrainingTile * net.units_stride;
-  float* by_inputs = inputs + kTrainingTile * net.inputs_stride;
-  std::int32_t* list = reinterpret_cast<std::int32_t*>(by_inputs + kTrainingTile * net.inputs_stride);
-  std::int32_t* all = list + kTrainingTile / kSplatGroup * net.units;
-  for (int unit = 0; unit < net.units; ++unit) all[unit] = unit;
-  for (std::int64_t first = begin; first < end; first += kTrainingTile) {
-    const int used = end - first < kTrainingTile ? static_cast<int>(end - first) : kTrainingTile;
-    const int groups = (used + kSplatGroup - 1) / kSplatGroup;
-    const std::int64_t next = first + kTrainingTile;
+  float* inputs = by_hidden + kNetworkTile * net.units_stride;
+  float* by_inputs = inputs + kNetworkTile * net.inputs_stride;
+  std::int32_t* list = reinterpret_cast<std::int32_t*>(by_inputs + kNetworkTile * net.inputs_stride);
+  for (std::int64_t first = begin; first < end; first += kNetworkTile) {
+    const int used = end - first < kNetworkTile ? static_cast<int>(end - first) : kNetworkTile;
+    const int groups = (used + kSparseGroup - 1) / kSparseGroup;
+    const std::int64_t next = first + kNetworkTile;
     prefetch_floats(net.kept_hidden + next * net.units, next < end ? whole_groups(end - next) * net.units : 0,
-                    kTrainingTile * net.units);
+                    kNetworkTile * net.units);
     color_inputs(net, first, used, static_cast<int>(whole_groups(used)), inputs);
-    Lists on = {list, net.units, {}};
+    Lists<kSparseGroup> on = {list, net.units, {}};
     for (int group = 0; group < groups; ++group) {
-      const float* hidden = net.kept_hidden + (first + group * kSplatGroup) * net.units;
-      float by_out[3][kSplatGroup];
-      for (int s = 0; s < kSplatGroup; ++s)
+      const float* hidden = net.kept_hidden + (first + group * kSparseGroup) * net.units;
+      float by_out[3][kSparseGroup];
+      for (int s = 0; s < kSparseGroup; ++s)
         for (int channel = 0; channel < 3; ++channel) {
-          const int row = group * kSplatGroup + s;
-          const std::int64_t k = 3 * net.splats[first + (row < used ? row : 0)] + channel;
+          const int row = group * kSparseGroup + s;
+          const std::int64_t k = 3 * (first + (row < used ? row : 0)) + channel;
           by_out[channel][s] = row < used && net.colors[k] > 0.0f ? 0.28209479177387814f * net.by_colors[k] : 0.0f;
         }
       int count = 0;
@@ -382,32 +348,32 @@ inline void color_backward(const ColorTraining& net, const ColorSums& at, std::i
           last[channel] = load(net.last + static_cast<std::size_t>(channel) * net.units + unit);
           sum[channel] = load(to + static_cast<std::size_t>(channel) * net.units);
         }
-        for (int s = 0; s < kSplatGroup; ++s) {
+        for (int s = 0; s < kSparseGroup; ++s) {
           const Real value = load(hidden + s * net.units + unit);
           const Real g[3] = {by_out[0][s], by_out[1][s], by_out[2][s]};
           const Real gradient = fma(last[0], g[0], fma(last[1], g[1], last[2] * g[2]));
-          store(by_hidden + (group * kSplatGroup + s) * net.units_stride + unit,
+          store(by_hidden + (group * kSparseGroup + s) * net.units_stride + unit,
                 zero_unless(value > Real(0.0f), gradient));
           for (int channel = 0; channel < 3; ++channel) sum[channel] = fma(value, g[channel], sum[channel]);
           most = max(most, value);
         }
         for (int channel = 0; channel < 3; ++channel) store(to + static_cast<std::size_t>(channel) * net.units, sum[channel]);
-        count = list_lanes(most > Real(0.0f), unit, list + group * net.units, count);
+        count += list_lanes(most > Real(0.0f), unit, list + group * net.units + count);
       }
       on.counts[group] = count;
     }
-    outer_product(by_hidden, net.units_stride, all, net.units, inputs, net.inputs_stride, groups * kSplatGroup,
-                  net.inputs, sums + at.first);
-    product(by_hidden, net.units_stride, on, groups, net.first, net.inputs_stride, net.inputs, nullptr, false, by_inputs,
-            net.inputs_stride);
+    outer_product<kSparseGroup, kOuterVectors>(by_hidden, net.units_stride, on, groups, inputs, net.inputs_stride,
+                                               net.inputs, sums + at.first);
+    product<kSparseGroup, kOuterVectors>(by_hidden, net.units_stride, on, groups, net.first, net.inputs_stride, net.inputs,
+                                         nullptr, false, by_inputs, net.inputs_stride);
     for (int s = 0; s < used; ++s) {
-      const std::int64_t entry = first + s, splat = net.splats[entry];
+      const std::int64_t splat = first + s;
       const float* gradient = by_inputs + s * net.inputs_stride;
-      float* kept = net.by_features + entry * net.features;
+      float* kept = net.by_features + splat * net.features;
       for (int k = 0; k < net.features; ++k) kept[k] = gradient[k];
       Between at_samples[3];
       for (int axis = 0; axis < 3; ++axis) at_samples[axis] = between(net.grid, axis, net.positions[3 * splat + axis]);
-      for (int k = 0; k < 2; ++k) net.lower[k][entry] = at_samples[k + 1].lower;
+      for (int k = 0; k < 2; ++k) net.lower[k][splat] = at_samples[k + 1].lower;
       planes_backward(net, at_samples, gradient, net.by_positions + 3 * splat);
       encoding_backward(inputs + s * net.inputs_stride + net.features, gradient + net.features,
                         net.by_directions + 3 * splat);
@@ -428,7 +394,7 @@ inline void scatter_plane(const ColorTraining& net, int plane, int row, const st
       for (int k = 0; k < channels; k += 16) HEADBENCH_PREFETCH(later + k);
     }
     const float* gradient = features + static_cast<std::size_t>(order[i]) * net.features;
-    const float* position = net.positions + 3 * net.splats[order[i]];
+    const float* position = net.positions + 3 * static_cast<std::size_t>(order[i]);
     const Between x = between(net.grid, across, position[across]), y = between(net.grid, down, position[down]);
     for (int side = 0; side < 2; ++side) {
       if (row + side < first || row + side > last) continue;
@@ -451,161 +417,89 @@ inline void scatter_plane(const ColorTraining& net, int plane, int row, const st
 
 // ---- Lines ----
 
-// First hidden layer of an entry, after its ReLU.
-HEADBENCH_INLINE void line_first(const LineTraining& net, std::int64_t entry, float* out) {
-  const float* lower[3];
-  Real upper_weight[3], lower_weight[3];
-  for (int axis = 0; axis < 3; ++axis) {
-    lower[axis] = net.table + static_cast<std::size_t>(net.rows[3 * entry + axis]) * net.units;
-    upper_weight[axis] = net.fractions[3 * entry + axis];
-    lower_weight[axis] = Real(1.0f) - upper_weight[axis];
-  }
-  for (int unit = 0; unit < net.units; unit += W) {
-    Real sum = load(net.bias_0 + unit);
-    for (int axis = 0; axis < 3; ++axis) {
-      sum = fma(load(lower[axis] + unit), lower_weight[axis], sum);
-      sum = fma(load(lower[axis] + net.units + unit), upper_weight[axis], sum);
-    }
-    store(out + unit, max(sum, 0.0f));
-  }
-}
-
-inline std::size_t line_forward_scratch(const LineTraining& net) {
-  return static_cast<std::size_t>(kTrainingTile) * net.units_stride + kTrainingTile / kSplatGroup * net.units;
-}
-
-// List the units that are on in any row of a group.
-template <class RowOf>
-HEADBENCH_INLINE int list_on(int units, const RowOf& row, std::int32_t* list) {
-  int count = 0;
-  for (int unit = 0; unit < units; unit += W) {
-    Real most = load(row(0) + unit);
-    for (int s = 1; s < kSplatGroup; ++s) most = max(most, load(row(s) + unit));
-    count = list_lanes(most > Real(0.0f), unit, list, count);
-  }
-  return count;
-}
-
-inline void line_forward(const LineTraining& net, std::int64_t begin, std::int64_t end, float* scratch) {
-  float* first = scratch;
-  std::int32_t* list = reinterpret_cast<std::int32_t*>(first + kTrainingTile * net.units_stride);
-  for (std::int64_t tile = begin; tile < end; tile += kTrainingTile) {
-    const int used = end - tile < kTrainingTile ? static_cast<int>(end - tile) : kTrainingTile;
-    const int groups = (used + kSplatGroup - 1) / kSplatGroup;
-    Lists on = {list, net.units, {}};
-    for (int group = 0; group < groups; ++group) {
-      float* rows = first + group * kSplatGroup * net.units_stride;
-      for (int s = 0; s < kSplatGroup; ++s) {
-        const int row = group * kSplatGroup + s;
-        line_first(net, tile + (row < used ? row : 0), rows + s * net.units_stride);
-      }
-      on.counts[group] = list_on(net.units, [&](int s) { return rows + s * net.units_stride; }, list + group * net.units);
-    }
-    float* second = net.kept + tile * net.units;
-    product(first, net.units_stride, on, groups, net.weight_1, net.units_stride, net.units, net.bias_1, true, second,
-            net.units);
-    for (int group = 0; group < used; group += kSplatGroup)
-      for (int output = 0; output < net.outputs; ++output) {
-        float sums[kSplatGroup];
-        dots(second + group * net.units, net.weight_2 + static_cast<std::size_t>(output) * net.units, net.units, sums);
-        for (int s = 0; s < kSplatGroup && group + s < used; ++s)
-          net.offsets[net.splats[tile + group + s] * net.outputs + output] = sums[s] + net.bias_2[output];
-      }
-  }
-}
-
-inline std::size_t line_backward_scratch(const LineTraining& net) {
-  return static_cast<std::size_t>(3 * kTrainingTile) * net.units_stride + kTrainingTile * net.outputs +
-         (kTrainingTile / kSplatGroup + 1) * net.units;
+inline std::size_t line_backward_scratch(const LineTraining& in) {
+  return static_cast<std::size_t>(3 * kNetworkTile) * in.units_stride + kNetworkTile * in.net.outputs +
+         kNetworkTile / kSparseGroup * in.net.units;
 }
 
 // Add the gradient of an entry's first layer to its bias and to the rows of the table that it was interpolated from.
-HEADBENCH_INLINE void add_first(const LineTraining& net, const LineSums& at, std::int64_t entry, const float* first,
+HEADBENCH_INLINE void add_first(const OffsetNetwork& net, const LineSums& at, std::int64_t entry, const float* first,
                                 const float* by_first, float* sums) {
-  float* lower[3];
-  Real upper_weight[3], lower_weight[3];
-  for (int axis = 0; axis < 3; ++axis) {
-    lower[axis] = sums + at.table + static_cast<std::size_t>(net.rows[3 * entry + axis]) * net.units;
-    upper_weight[axis] = net.fractions[3 * entry + axis];
-    lower_weight[axis] = Real(1.0f) - upper_weight[axis];
-  }
+  const Place<float> place = place_of(sums + at.table, net.units, net.rows + 3 * entry, net.fractions + 3 * entry);
   for (int unit = 0; unit < net.units; unit += W) {
     const Mask on = load(first + unit) > Real(0.0f);
     if (!any(on)) continue;
     const Real gradient = zero_unless(on, load(by_first + unit));
     store(sums + at.bias_0 + unit, load(sums + at.bias_0 + unit) + gradient);
     for (int axis = 0; axis < 3; ++axis) {
-      float* to = lower[axis] + unit;
-      store(to, fma(gradient, lower_weight[axis], load(to)));
-      store(to + net.units, fma(gradient, upper_weight[axis], load(to + net.units)));
+      float* to = place.lower[axis] + unit;
+      store(to, fma(gradient, place.lower_weight[axis], load(to)));
+      store(to + net.units, fma(gradient, place.upper_weight[axis], load(to + net.units)));
     }
   }
 }
 
-inline void line_backward(const LineTraining& net, const LineSums& at, std::int64_t begin, std::int64_t end, float* sums,
+inline void line_backward(const LineTraining& in, const LineSums& at, std::int64_t begin, std::int64_t end, float* sums,
                           float* scratch) {
-  const int units = net.units, stride = net.units_stride, outputs = net.outputs;
+  const OffsetNetwork& net = in.net;
+  const int units = net.units, stride = in.units_stride, outputs = net.outputs;
   float* first = scratch;
-  float* by_second = first + kTrainingTile * stride;
-  float* by_first = by_second + kTrainingTile * stride;
-  float* by_out = by_first + kTrainingTile * stride;
-  std::int32_t* list = reinterpret_cast<std::int32_t*>(by_out + kTrainingTile * outputs);
-  std::int32_t* anywhere = list + kTrainingTile / kSplatGroup * units;
-  for (std::int64_t tile = begin; tile < end; tile += kTrainingTile) {
-    const int used = end - tile < kTrainingTile ? static_cast<int>(end - tile) : kTrainingTile;
-    const int groups = (used + kSplatGroup - 1) / kSplatGroup, rows = groups * kSplatGroup;
-    const float* second[kTrainingTile];
+  float* by_second = first + kNetworkTile * stride;
+  float* by_first = by_second + kNetworkTile * stride;
+  float* by_out = by_first + kNetworkTile * stride;
+  std::int32_t* list = reinterpret_cast<std::int32_t*>(by_out + kNetworkTile * outputs);
+  for (std::int64_t tile = begin; tile < end; tile += kNetworkTile) {
+    const int used = end - tile < kNetworkTile ? static_cast<int>(end - tile) : kNetworkTile;
+    const int groups = (used + kSparseGroup - 1) / kSparseGroup, rows = groups * kSparseGroup;
+    const float* second[kNetworkTile];
     for (int s = 0; s < rows; ++s) {
-      const std::int64_t entry = net.entries[tile + (s < used ? s : 0)];
+      const std::int64_t entry = in.entries[tile + (s < used ? s : 0)];
       second[s] = net.kept + entry * units;
-      if (tile + kTrainingTile + s < end)
-        prefetch_floats(net.kept + net.entries[tile + kTrainingTile + s] * units, units, units);
-      line_first(net, entry, first + s * stride);
+      if (tile + kNetworkTile + s < end)
+        prefetch_floats(net.kept + in.entries[tile + kNetworkTile + s] * units, units, units);
+      first_layer(net, entry, first + s * stride);
       for (int output = 0; output < outputs; ++output) {
-        const float gradient = s < used ? net.by_offsets[net.splats[entry] * outputs + output] : 0.0f;
+        const float gradient = s < used ? in.by_offsets[net.splats[entry] * outputs + output] : 0.0f;
         by_out[s * outputs + output] = gradient;
         sums[at.bias_2 + output] += gradient;
       }
     }
-    Lists on = {list, units, {}};
-    int anywhere_count = 0;
+    Lists<kSparseGroup> on = {list, units, {}};
     for (int unit = 0; unit < units; unit += W) {
-      Real by_bias = load(sums + at.bias_1 + unit), most_anywhere = 0.0f;
+      Real by_bias = load(sums + at.bias_1 + unit);
       for (int group = 0; group < groups; ++group) {
-        Real most = 0.0f;
-        for (int s = group * kSplatGroup; s < (group + 1) * kSplatGroup; ++s) {
+        Real most = 0.0f, sum = 0.0f;
+        for (int s = group * kSparseGroup; s < (group + 1) * kSparseGroup; ++s) {
           const Real value = load(second[s] + unit);
           Real gradient = 0.0f;
           for (int output = 0; output < outputs; ++output)
-            gradient = fma(load(net.weight_2 + static_cast<std::size_t>(output) * units + unit),
+            gradient = fma(load(net.last + static_cast<std::size_t>(output) * units + unit),
                            by_out[s * outputs + output], gradient);
           gradient = zero_unless(value > Real(0.0f), gradient);
           store(by_second + s * stride + unit, gradient);
-          by_bias = by_bias + gradient;
+          sum = sum + gradient;
           most = max(most, value);
         }
-        on.counts[group] = list_lanes(most > Real(0.0f), unit, list + group * units, on.counts[group]);
-        most_anywhere = max(most_anywhere, most);
+        by_bias = by_bias + sum;
+        on.counts[group] += list_lanes(most > Real(0.0f), unit, list + group * units + on.counts[group]);
       }
       store(sums + at.bias_1 + unit, by_bias);
-      anywhere_count = list_lanes(most_anywhere > Real(0.0f), unit, anywhere, anywhere_count);
       for (int output = 0; output < outputs; ++output) {
         float* to = sums + at.weight_2 + static_cast<std::size_t>(output) * units + unit;
-        Real sum = load(to);
-        for (int s = 0; s < rows; ++s) sum = fma(load(second[s] + unit), by_out[s * outputs + output], sum);
-        store(to, sum);
+        Real parts[kSparseGroup] = {load(to)};
+        for (int k = 1; k < kSparseGroup; ++k) parts[k] = 0.0f;
+        for (int s = 0; s < rows; s += kSparseGroup)
+          for (int k = 0; k < kSparseGroup; ++k)
+            parts[k] = fma(load(second[s + k] + unit), by_out[(s + k) * outputs + output], parts[k]);
+        for (int k = 1; k < kSparseGroup; ++k) parts[0] = parts[0] + parts[k];
+        store(to, parts[0]);
       }
     }
-    // As many as are dealt with together: units that are off add zero.
-    for (int unit = 0; anywhere_count % kOuterUnits; ++unit) {
-      bool listed = false;
-      for (int k = 0; k < anywhere_count; ++k) listed |= anywhere[k] == unit;
-      if (!listed) anywhere[anywhere_count++] = unit;
-    }
-    outer_product(by_second, stride, anywhere, anywhere_count, first, stride, rows, units, sums + at.weight_1);
-    product(by_second, stride, on, groups, net.weight_1, stride, units, nullptr, false, by_first, stride);
+    outer_product<kSparseGroup, kSparseVectors>(by_second, stride, on, groups, first, stride, units, sums + at.weight_1);
+    product<kSparseGroup, kSparseVectors>(by_second, stride, on, groups, in.second_by_output, stride, units, nullptr, false,
+                                          by_first, stride);
     for (int s = 0; s < used; ++s)
-      add_first(net, at, net.entries[tile + s], first + s * stride, by_first + s * stride, sums);
+      add_first(net, at, in.entries[tile + s], first + s * stride, by_first + s * stride, sums);
   }
 }
 
@@ -618,7 +512,7 @@ inline void add(float* to, const float* from, std::size_t count) {
 extern const NetworkKernels network_kernels;
 const NetworkKernels network_kernels = {
     HEADBENCH_ISA_NAME,     directions,     directions_backward, color_forward_scratch, color_forward,
-    color_backward_scratch, color_backward, scatter_plane,       line_forward_scratch,  line_forward,
+    color_backward_scratch, color_backward, scatter_plane,       offset_scratch,        offset_network,
     line_backward_scratch,  line_backward,  add};
 
 }  // namespace headbench::HEADBENCH_ISA

@@ -70,7 +70,7 @@ void share_chunks(std::int64_t count, std::int64_t chunk, std::size_t scratch_fl
 template <class Body>
 void sum_chunks(const NetworkKernels& kernels, std::int64_t count, std::size_t floats, std::size_t scratch_floats, int threads,
                 Buffer<float>& sums, const Body& body) {
-  const std::int64_t chunk = std::max(kChunkMin, rounded_up(divided_up(count, kChunksMax), kTrainingTile));
+  const std::int64_t chunk = std::max(kChunkMin, rounded_up(divided_up(count, kChunksMax), kNetworkTile));
   const std::int64_t chunks = std::max<std::int64_t>(divided_up(count, chunk), 1);
   const std::size_t stride = rounded_up(static_cast<std::int64_t>(floats), 16);
   sums.resize(stride * chunks);
@@ -126,14 +126,10 @@ struct ColorInputs {
 
 class ColorPass {
  public:
-  ColorPass(const ColorInputs& in, const Array<const std::int64_t, -1>& splats, const Array<float, -1, 3>& colors,
-            const NetworkKernels& kernels, int threads)
-      : kernels_(kernels), count_(static_cast<std::int64_t>(splats.shape(0))), all_(in.positions.shape(0)) {
+  ColorPass(const ColorInputs& in, const Array<float, -1, 3>& colors, const NetworkKernels& kernels, int threads)
+      : kernels_(kernels), count_(static_cast<std::int64_t>(in.positions.shape(0))) {
     ColorTraining net = describe(in);
-    require(colors.shape(0) == all_);
-    require(below(splats.data(), splats.shape(0), all_));
-    std::copy_n(splats.data(), count_, splats_.resize(count_));
-    net.splats = splats_.data();
+    require(colors.shape(0) == in.positions.shape(0));
     net.kept_hidden = hidden_.resize(rounded_up(count_, kGroupRows) * net.units);
     net.colors = colors.data();
     Buffer<float> first, last;
@@ -149,8 +145,9 @@ class ColorPass {
                 const Array<float, -1, -1>& by_xy, const Array<float, -1, -1>& by_xz, const Array<float, -1, -1>& by_yz,
                 const Array<float, -1, -1>& by_first, const Array<float, -1, -1>& by_last, int threads) const {
     ColorTraining net = describe(in);
-    require(colors.shape(0) == all_ && by_colors.shape(0) == all_);
-    require(by_positions.shape(0) == all_ && by_directions.shape(0) == all_);
+    const std::size_t all = in.positions.shape(0);
+    require(colors.shape(0) == all && by_colors.shape(0) == all);
+    require(by_positions.shape(0) == all && by_directions.shape(0) == all);
     require(by_first.shape(0) == in.first.shape(0) && by_first.shape(1) == in.first.shape(1));
     require(by_last.shape(0) == 3 && by_last.shape(1) == in.last.shape(1));
     const Array<float, -1, -1>* by_planes[kPlanes] = {&by_xy, &by_xz, &by_yz};
@@ -159,7 +156,6 @@ class ColorPass {
       require(static_cast<int>(by_planes[plane]->shape(1)) == net.channels[plane]);
       net.by_planes[plane] = by_planes[plane]->data();
     }
-    net.splats = splats_.data();
     net.kept_hidden = hidden_.data();
     net.colors = const_cast<float*>(colors.data());
     net.by_colors = by_colors.data();
@@ -203,7 +199,7 @@ class ColorPass {
       net.features += net.channels[plane];
       net.planes[plane] = planes[plane]->data();
     }
-    require(in.positions.shape(0) == all_ && in.directions.shape(0) == all_);
+    require(static_cast<std::int64_t>(in.positions.shape(0)) == count_ && in.directions.shape(0) == in.positions.shape(0));
     require(static_cast<std::int64_t>(in.first.shape(0)) == hidden_units_);
     require(static_cast<std::int64_t>(in.first.shape(1)) == input_count_ && input_count_ == net.features + kEncoding);
     require(in.last.shape(0) == 3 && static_cast<std::int64_t>(in.last.shape(1)) == hidden_units_);
@@ -244,9 +240,7 @@ class ColorPass {
 
   const NetworkKernels& kernels_;
   const std::int64_t count_;
-  const std::size_t all_;
   std::int64_t hidden_units_ = 0, input_count_ = 0;
-  Buffer<std::int64_t> splats_;
   Buffer<float> hidden_;
 };
 
@@ -262,21 +256,19 @@ struct LineWeights {
 
 class LinePass {
  public:
-  LinePass(const LineWeights& in, const Array<const float, -1, 3>& positions, const Array<const std::uint8_t, -1>& wanted,
-           const Array<const float, 2, 3>& box, const Array<float, -1, -1>& offsets, const NetworkKernels& kernels,
-           int threads)
+  LinePass(const LineWeights& in, const Array<const float, -1, 3>& positions, const Array<const float, 2, 3>& box,
+           const Array<float, -1, -1>& offsets, const NetworkKernels& kernels, int threads)
       : kernels_(kernels), all_(positions.shape(0)), hidden_(in.bias_0.shape(0)), outputs_(in.bias_2.shape(0)),
         table_rows_(in.table.shape(0)) {
     require(offsets.shape(0) == all_ && offsets.shape(1) == outputs_ && table_rows_ % 3 == 0);
-    require(wanted.shape(0) == all_ || wanted.shape(0) == 0);
-    find_places(grid_of(box, table_rows_ / 3), box, positions.data(), wanted.shape(0) ? wanted.data() : nullptr);
+    find_places(grid_of(box, table_rows_ / 3), box, positions.data());
     Padded weights(*this, in, true);
-    LineTraining net = describe(weights);
+    OffsetNetwork net = describe(weights);
     net.kept = kept_.resize(rounded_up(count_, kGroupRows) * net.units);
     net.offsets = offsets.data();
     nb::gil_scoped_release unlocked;
-    share_chunks(count_, kChunkMin, kernels_.line_forward_scratch(net), threads,
-              [&](std::int64_t begin, std::int64_t end, float* scratch) { kernels_.line_forward(net, begin, end, scratch); });
+    share_chunks(count_, kChunkMin, kernels_.offset_scratch(net), threads,
+              [&](std::int64_t begin, std::int64_t end, float* scratch) { kernels_.offset_network(net, begin, end, scratch); });
   }
 
   void backward(const LineWeights& in, const Array<const float, -1, -1>& by_offsets, const Array<float, -1, -1>& by_table,
@@ -288,9 +280,8 @@ class LinePass {
     require(by_weight_1.shape(0) == hidden_ && by_weight_1.shape(1) == hidden_ && by_bias_1.shape(0) == hidden_);
     require(by_weight_2.shape(0) == outputs_ && by_weight_2.shape(1) == hidden_ && by_bias_2.shape(0) == outputs_);
     Padded weights(*this, in, false);
-    LineTraining net = describe(weights);
-    net.kept = kept_.data();
-    net.by_offsets = by_offsets.data();
+    LineTraining net{describe(weights), weights.weight_1.data(), odd_stride(weights.units), 0, nullptr, by_offsets.data()};
+    net.net.kept = kept_.data();
     Buffer<std::int64_t> entries;
     entries.resize(count_);
     for (std::int64_t entry = 0, found = 0; entry < count_; ++entry) {
@@ -302,7 +293,7 @@ class LinePass {
       net.count = found;
     }
     net.entries = entries.data();
-    const std::size_t units = static_cast<std::size_t>(net.units);
+    const std::size_t units = static_cast<std::size_t>(weights.units);
     LineSums at{};
     at.bias_0 = table_rows_ * units;
     at.weight_1 = at.bias_0 + units;
@@ -351,27 +342,25 @@ class LinePass {
     }
   };
 
-  LineTraining describe(const Padded& weights) const {
-    LineTraining net{};
-    net.units = weights.units;
-    net.units_stride = odd_stride(weights.units);
+  OffsetNetwork describe(const Padded& weights) const {
+    OffsetNetwork net{};
+    net.units = net.hidden = weights.units;
     net.outputs = static_cast<int>(outputs_);
-    net.count = count_;
-    net.splats = splats_.data();
+    net.second_stride = odd_stride(weights.units);
+    net.table = weights.table.data();
+    net.first_bias = weights.bias_0.data();
     net.rows = rows_.data();
     net.fractions = fractions_.data();
-    net.table = weights.table.data();
-    net.bias_0 = weights.bias_0.data();
-    net.weight_1 = weights.weight_1.data();
-    net.bias_1 = weights.bias_1.data();
-    net.weight_2 = weights.weight_2.data();
-    net.bias_2 = weights.bias_2;
+    net.second = weights.weight_1.data();
+    net.second_bias = weights.bias_1.data();
+    net.last = weights.weight_2.data();
+    net.last_bias = weights.bias_2;
+    net.splats = splats_.data();
     return net;
   }
 
-  // The wanted splats in the box, in the order of their places on the lines, which are as `line_position` has them.
-  void find_places(const Grid& grid, const Array<const float, 2, 3>& box, const float* positions,
-                   const std::uint8_t* wanted) {
+  // The splats in the box, in the order of their places on the lines, which are as `line_position` has them.
+  void find_places(const Grid& grid, const Array<const float, 2, 3>& box, const float* positions) {
     const float last = static_cast<float>(grid.samples - 1);
     Buffer<std::int64_t> found;
     Buffer<std::int32_t> lower;
@@ -382,7 +371,7 @@ class LinePass {
     std::int64_t count = 0;
     for (std::size_t splat = 0; splat < all_; ++splat) {
       const float* position = positions + 3 * splat;
-      bool inside = !wanted || wanted[splat];
+      bool inside = true;
       for (int axis = 0; axis < 3; ++axis) inside &= position[axis] >= box(0, axis) && position[axis] <= box(1, axis);
       if (!inside) continue;
       for (int axis = 0; axis < 3; ++axis) {
@@ -461,11 +450,10 @@ void bind_network_training(nb::module_& m) {
       });
   m.def("color_training", [](const Vectors& positions, const Vectors& directions, const Plane& xy, const Plane& xz,
                              const Plane& yz, const Values& first, const Values& last, const Array<const float, 2, 3>& box,
-                             const Array<const std::int64_t, -1>& splats, const Array<float, -1, 3>& colors,
-                             const std::string& instruction_set, int threads) {
-    return std::make_unique<ColorPass>(ColorInputs{positions, directions, xy, xz, yz, first, last, box}, splats, colors,
+                             const Array<float, -1, 3>& colors, const std::string& instruction_set, int threads) {
+    return std::make_unique<ColorPass>(ColorInputs{positions, directions, xy, xz, yz, first, last, box}, colors,
                                        kernels_of(instruction_set), std::max(threads, 1));
-  }, "Write the colours of the splats named, those of no others.");
+  }, "Write the colours.");
   nb::class_<LinePass>(m, "LinePass", "Offsets of the feature lines in training, kept for their gradients.")
       .def("backward", [](const LinePass& pass, const Values& table, const Vector& bias_0, const Values& weight_1,
                           const Vector& bias_1, const Values& weight_2, const Vector& bias_2, const Values& by_offsets,
@@ -477,11 +465,11 @@ void bind_network_training(nb::module_& m) {
       });
   m.def("line_training", [](const Values& table, const Vector& bias_0, const Values& weight_1, const Vector& bias_1,
                             const Values& weight_2, const Vector& bias_2, const Vectors& positions,
-                            const Array<const std::uint8_t, -1>& wanted, const Array<const float, 2, 3>& box,
-                            const Array<float, -1, -1>& offsets, const std::string& instruction_set, int threads) {
-    return std::make_unique<LinePass>(LineWeights{table, bias_0, weight_1, bias_1, weight_2, bias_2}, positions, wanted, box,
-                                      offsets, kernels_of(instruction_set), std::max(threads, 1));
-  }, "Write the offsets of the splats that are wanted and in the box, those of no others; empty: all are wanted.");
+                            const Array<const float, 2, 3>& box, const Array<float, -1, -1>& offsets,
+                            const std::string& instruction_set, int threads) {
+    return std::make_unique<LinePass>(LineWeights{table, bias_0, weight_1, bias_1, weight_2, bias_2}, positions, box, offsets,
+                                      kernels_of(instruction_set), std::max(threads, 1));
+  }, "Write the offsets of the splats in the box, those of no others.");
 }
 
 }  // namespace headbench

@@ -1,6 +1,6 @@
 // Training passes of the two networks of "ours", forward and backward: plain data, shared by all instruction sets.
 //
-// A pass works on a list of M splats, whose values are kept in rows of their own. Layers are padded with zeros to `units`
+// The offsets are those of a list of M splats, whose values are kept in rows of their own. Layers are padded with zeros to `units`
 // and `inputs`, multiples of kUnitsStep, lists to whole groups of kGroupRows rows. Gradients by weights are sums over
 // chunks of the list, each in an accumulator of its own (see network_training.cpp).
 #pragma once
@@ -11,7 +11,7 @@
 namespace headbench {
 
 constexpr int kGroupRows = 16;  // rows are allocated in groups of so many
-constexpr int kTrainingTile = 64;  // rows of a backward tile, whose activations stay in the first caches
+constexpr int kEncoding = 27;   // of a direction
 constexpr int kPlanes = 3;
 constexpr int kPlaneAxes[kPlanes][2] = {{0, 1}, {0, 2}, {1, 2}};  // PAIRS of methods/shared/networks.py
 
@@ -42,42 +42,30 @@ struct ColorTraining {
   int features;                // channels of all planes
   int units, inputs;           // padded; inputs are features, then the encoded direction
   int units_stride, inputs_stride;
-  std::int64_t count;          // M
-  const std::int64_t* splats;  // (M,)
+  std::int64_t count;          // N
   const float* positions;      // (N, 3)
   const float* directions;     // (N, 3) unit vectors
   const float* planes[kPlanes];  // (samples^2, channels)
   const float* last;             // (3, units)
-  float* kept_hidden;            // (M padded, units) after the ReLU
+  float* kept_hidden;            // (N padded, units) after the ReLU
   float* colors;                 // (N, 3)
   // Forward: (inputs, units_stride); backward: (units, inputs_stride).
   const float* first;
   // Backward.
   const float* by_colors;  // (N, 3)
-  float* by_features;      // (M, features)
-  std::int32_t* lower[2];  // (M,) each: lower sample on the y and on the z axis
+  float* by_features;      // (N, features)
+  std::int32_t* lower[2];  // (N,) each: lower sample on the y and on the z axis
   float* by_positions;     // (N, 3)
   float* by_directions;    // (N, 3)
   float* by_planes[kPlanes];
 };
 
-// Offsets of splats by the lines: what `line_offsets` of methods/ours/field.py computes of the table.
+// Backward pass of the offsets by the lines, `line_offsets` of methods/ours/field.py; the forward pass is `offset_network`.
 struct LineTraining {
-  int units, units_stride, outputs;
-  std::int64_t count;          // M
-  const std::int64_t* splats;  // (M,) which splat each is
-  const std::int32_t* rows;    // (M, 3) the lower of two neighbouring rows of the table
-  const float* fractions;      // (M, 3) from the lower to the upper
-  const float* table;          // (T, units), T > rows + 1
-  const float* bias_0;         // (units,)
-  const float* bias_1;         // (units,)
-  const float* weight_2;       // (outputs, units)
-  const float* bias_2;         // (outputs,)
-  // Forward: (units in, units_stride out); backward: (units out, units_stride in).
-  const float* weight_1;
-  float* kept;     // (M padded, units) second hidden layer after its ReLU
-  float* offsets;  // (N, outputs)
-  // Backward.
+  OffsetNetwork net;              // units and hidden are the same, `kept` is that of the forward pass
+  const float* second_by_output;  // (hidden, units_stride), the weights of the second layer
+  int units_stride;
+  std::int64_t count;
   const std::int64_t* entries;  // of the list, those with a gradient
   const float* by_offsets;      // (N, outputs)
 };
@@ -105,8 +93,8 @@ struct NetworkKernels {
   // only to those from `first` to `last`.
   void (*scatter_plane)(const ColorTraining&, int plane, int row, const std::uint32_t* order, std::int64_t count, int first,
                         int last);
-  std::size_t (*line_forward_scratch)(const LineTraining&);
-  void (*line_forward)(const LineTraining&, std::int64_t begin, std::int64_t end, float* scratch);
+  std::size_t (*offset_scratch)(const OffsetNetwork&);
+  void (*offset_network)(const OffsetNetwork&, std::int64_t begin, std::int64_t end, float* scratch);
   std::size_t (*line_backward_scratch)(const LineTraining&);
   void (*line_backward)(const LineTraining&, const LineSums&, std::int64_t begin, std::int64_t end, float* sums,
                         float* scratch);

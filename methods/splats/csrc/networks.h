@@ -1,42 +1,124 @@
-// Small networks for a few splats at a time: offsets of splats, and their colours by direction.
+// Small networks for tiles of splats: their offsets, and their colours by direction. Training shares what it can.
 #pragma once
 
 #include "pose.h"
 
 namespace headbench::HEADBENCH_ISA {
 
-constexpr int kSplatGroup = 8;                   // splats
-constexpr int kColumnVectors = W == 16 ? 2 : 1;  // a group's accumulators fit into the registers
 static_assert(kUnitsStep % W == 0);
 
-template <int vectors>
-HEADBENCH_INLINE void dense_columns(const float* const* starts, const float* weights, int width, const float* inputs,
-                                    int stride, const std::int32_t* rows, int count, int column, float* out) {
-  Real sums[kSplatGroup][vectors];
-  for (int s = 0; s < kSplatGroup; ++s)
-    for (int v = 0; v < vectors; ++v) sums[s][v] = load(starts[s] + column + v * W);
+// Rows that go through a layer together, side by side in registers. Few, where units that are off are left out: a row then
+// shares its inputs with fewer others.
+constexpr int kSplatGroup = 8, kSparseGroup = 4;
+constexpr int kSplatVectors = W == 16 ? 3 : 1, kSparseVectors = W == 16 ? 4 : 2;  // with them, what registers hold
+static_assert(kNetworkTile % kSplatGroup == 0 && kSplatGroup % kSparseGroup == 0);
+
+// ---- Places on three axes ----
+
+// Where a table is read: between two neighbouring rows on each of three axes. T is float, const or not.
+template <class T>
+struct Place {
+  T* lower[3];
+  Real lower_weight[3], upper_weight[3];
+};
+
+template <class T>
+HEADBENCH_INLINE Place<T> place_of(T* table, int units, const std::int32_t* rows, const float* fractions) {
+  Place<T> at;
+  for (int axis = 0; axis < 3; ++axis) {
+    at.lower[axis] = table + static_cast<std::size_t>(rows[axis]) * units;
+    at.upper_weight[axis] = fractions[axis];
+    at.lower_weight[axis] = Real(1.0f) - at.upper_weight[axis];
+  }
+  return at;
+}
+
+// What lies there, of the units from `unit` on, all axes added to `sum`.
+HEADBENCH_INLINE Real add_place(const Place<const float>& at, int units, int unit, Real sum) {
+  for (int axis = 0; axis < 3; ++axis) {
+    sum = fma(load(at.lower[axis] + unit), at.lower_weight[axis], sum);
+    sum = fma(load(at.lower[axis] + units + unit), at.upper_weight[axis], sum);
+  }
+  return sum;
+}
+
+// ---- Layers ----
+
+// Which inputs of each group of a tile's rows a product takes.
+template <int rows>
+struct Lists {
+  const std::int32_t* inputs;  // `stride` after one group's come the next one's
+  int stride;
+  int counts[kNetworkTile / rows];
+};
+
+// List the units that are on in any of some rows.
+template <int rows>
+HEADBENCH_INLINE int list_on(const float* values, int stride, int units, std::int32_t* list) {
+  int count = 0;
+  for (int unit = 0; unit < units; unit += W) {
+    Real most = load(values + unit);
+    for (int s = 1; s < rows; ++s) most = max(most, load(values + s * stride + unit));
+    count += list_lanes(most > Real(0.0f), unit, list + count);
+  }
+  return count;
+}
+
+template <int rows, int vectors>
+HEADBENCH_INLINE void product_columns(const float* inputs, int stride, const std::int32_t* list, int count,
+                                      const float* weights, int weight_stride, const float* bias, bool relu, float* out,
+                                      int out_stride) {
+  Real sums[rows][vectors];
+  for (int v = 0; v < vectors; ++v) {
+    const Real start = bias ? load(bias + v * W) : Real(0.0f);
+    for (int s = 0; s < rows; ++s) sums[s][v] = start;
+  }
   for (int i = 0; i < count; ++i) {
-    const float* row = weights + static_cast<std::size_t>(rows[i]) * width + column;
+    const float* row = weights + static_cast<std::size_t>(list[i]) * weight_stride;
+    const float* input = inputs + list[i];
     Real weight[vectors];
     for (int v = 0; v < vectors; ++v) weight[v] = load(row + v * W);
-    for (int s = 0; s < kSplatGroup; ++s) {
-      const Real value = inputs[i * stride + s];
+    for (int s = 0; s < rows; ++s) {
+      const Real value = input[s * stride];
       for (int v = 0; v < vectors; ++v) sums[s][v] = fma(value, weight[v], sums[s][v]);
     }
   }
-  for (int s = 0; s < kSplatGroup; ++s)
-    for (int v = 0; v < vectors; ++v) store(out + s * width + column + v * W, max(sums[s][v], 0.0f));
+  for (int s = 0; s < rows; ++s)
+    for (int v = 0; v < vectors; ++v) store(out + s * out_stride + v * W, relu ? max(sums[s][v], 0.0f) : sums[s][v]);
 }
 
-// relu(start + sum over i of input i times row rows[i] of the weights), `width` numbers for each splat of a group.
-// Splat s finds input i at inputs[i stride + s].
-inline void dense_layer(const float* const* starts, const float* weights, int width, const float* inputs, int stride,
-                        const std::int32_t* rows, int count, float* out) {
-  int column = 0;
-  for (; column + kColumnVectors * W <= width; column += kColumnVectors * W)
-    dense_columns<kColumnVectors>(starts, weights, width, inputs, stride, rows, count, column, out);
-  for (; column < width; column += W)
-    dense_columns<1>(starts, weights, width, inputs, stride, rows, count, column, out);
+// For the groups of a tile's rows: bias, if any, plus the listed inputs times their rows of the weights, `width` numbers
+// a row, at most `most_vectors` vectors of them at a time. Some columns for all groups before the next: their weights stay in the first cache.
+template <int rows, int most_vectors>
+inline void product(const float* inputs, int stride, const Lists<rows>& lists, int groups, const float* weights,
+                    int weight_stride, int width, const float* bias, bool relu, float* out, int out_stride) {
+  for (int column = 0; column < width;) {
+    const int vectors = width - column >= most_vectors * W ? most_vectors : width - column >= 2 * W ? 2 : 1;
+    for (int group = 0; group < groups; ++group) {
+      const float *from = inputs + group * rows * stride, *some = weights + column, *start = bias ? bias + column : nullptr;
+      const std::int32_t* list = lists.inputs + group * lists.stride;
+      const int count = lists.counts[group];
+      float* to = out + group * rows * out_stride + column;
+      if (vectors == most_vectors)
+        product_columns<rows, most_vectors>(from, stride, list, count, some, weight_stride, start, relu, to, out_stride);
+      else if (vectors == 2)
+        product_columns<rows, 2>(from, stride, list, count, some, weight_stride, start, relu, to, out_stride);
+      else
+        product_columns<rows, 1>(from, stride, list, count, some, weight_stride, start, relu, to, out_stride);
+    }
+    column += vectors * W;
+  }
+}
+
+// The sums of the lanes of four vectors.
+HEADBENCH_INLINE void sum_lanes(Real* four, float* out) {
+  transpose_quads(four);
+  alignas(64) float lanes[W];
+  store(lanes, (four[0] + four[1]) + (four[2] + four[3]));
+  for (int i = 0; i < 4; ++i) {
+    out[i] = lanes[i];
+    for (int quad = 4; quad < W; quad += 4) out[i] += lanes[quad + i];
+  }
 }
 
 // Products of each row of a group, `width` numbers, with the same weights.
@@ -48,141 +130,93 @@ HEADBENCH_INLINE void dots(const float* rows, const float* weights, int width, f
       const Real weight = load(weights + k);
       for (int i = 0; i < 4; ++i) sums[i] = fma(load(rows + (s + i) * width + k), weight, sums[i]);
     }
-    transpose_quads(sums);
-    alignas(64) float lanes[W];
-    store(lanes, (sums[0] + sums[1]) + (sums[2] + sums[3]));
-    for (int i = 0; i < 4; ++i) {
-      float sum = lanes[i];
-      for (int quad = 4; quad < W; quad += 4) sum += lanes[quad + i];
-      out[s + i] = sum;
-    }
+    sum_lanes(sums, out + s);
   }
 }
 
-// The offset network. Most units of a trained network's first layer are off at any one splat, and neighbours share them: a
-// group's second layer takes only the units that are on at one of its splats. What is left out is exactly 0.
+// ---- Offsets ----
 
-// Floats: first layer, second layer, values of the units that are on, their largest, their numbers.
-inline std::size_t offset_scratch(int units, int hidden) {
-  return static_cast<std::size_t>(kSplatGroup) * (2 * units + hidden) + 2 * static_cast<std::size_t>(units) + 1;
+// Most units of a trained network's first layer are off at any one splat, and neighbours share them: a group's second
+// layer takes only the units that are on at one of its splats. What is left out is exactly 0.
+
+// Floats: both layers of a tile, and the units that are on in its groups.
+inline std::size_t offset_scratch(const OffsetNetwork& net) {
+  return static_cast<std::size_t>(kNetworkTile) * (net.units + net.hidden) + kNetworkTile / kSparseGroup * net.units;
 }
 
-// First layer of a splat after its ReLU.
-HEADBENCH_INLINE void first_layer(const OffsetNetwork& net, std::int64_t splat, float* out) {
-  const float* lower[3];
-  Real upper_weight[3], lower_weight[3];
-  for (int axis = 0; axis < 3; ++axis) {
-    lower[axis] = net.table + static_cast<std::size_t>(net.rows[3 * splat + axis]) * net.units;
-    upper_weight[axis] = net.fractions[3 * splat + axis];
-    lower_weight[axis] = Real(1.0f) - upper_weight[axis];
-  }
-  for (int unit = 0; unit < net.units; unit += W) {
-    Real sum = 0.0f;
-    for (int axis = 0; axis < 3; ++axis) {
-      sum = fma(load(lower[axis] + unit), lower_weight[axis], sum);
-      sum = fma(load(lower[axis] + net.units + unit), upper_weight[axis], sum);
-    }
-    store(out + unit, max(sum, 0.0f));
-  }
+// First layer of an entry after its ReLU.
+HEADBENCH_INLINE void first_layer(const OffsetNetwork& net, std::int64_t entry, float* out) {
+  const Place<const float> at = place_of(net.table, net.units, net.rows + 3 * entry, net.fractions + 3 * entry);
+  for (int unit = 0; unit < net.units; unit += W)
+    store(out + unit, max(add_place(at, net.units, unit, load(net.first_bias + unit)), 0.0f));
 }
 
-// Offsets of entries [begin, end); `scratch` has offset_scratch floats.
+// Offsets of entries [begin, end); `begin` is a multiple of kSplatGroup, and `scratch` has offset_scratch floats.
 inline void offset_network(const OffsetNetwork& net, std::int64_t begin, std::int64_t end, float* scratch) {
   float* first = scratch;
-  float* second = first + kSplatGroup * net.units;
-  float* on = second + kSplatGroup * net.hidden;
-  float* largest = on + kSplatGroup * net.units;
-  std::int32_t* units = reinterpret_cast<std::int32_t*>(largest + net.units);
-  for (std::int64_t start = begin; start < end; start += kSplatGroup) {
-    const int used = end - start < kSplatGroup ? static_cast<int>(end - start) : kSplatGroup;
-    for (int s = 0; s < kSplatGroup; ++s) first_layer(net, start + (s < used ? s : 0), first + s * net.units);
-    for (int unit = 0; unit < net.units; unit += W) {
-      Real most = load(first + unit);
-      for (int s = 1; s < kSplatGroup; ++s) most = max(most, load(first + s * net.units + unit));
-      store(largest + unit, most);
-    }
-    int count = 0;
-    for (int unit = 0; unit < net.units; ++unit) {
-      units[count] = unit;
-      count += largest[unit] > 0.0f;
-    }
-    for (int i = 0; i < count; ++i)
-      for (int s = 0; s < kSplatGroup; ++s) on[i * kSplatGroup + s] = first[s * net.units + units[i]];
-    const float* starts[kSplatGroup];
-    for (int s = 0; s < kSplatGroup; ++s) starts[s] = net.second_bias;
-    dense_layer(starts, net.second, net.hidden, on, kSplatGroup, units, count, second);
-    for (int output = 0; output < net.outputs; ++output) {
-      float sums[kSplatGroup];
-      dots(second, net.last + static_cast<std::size_t>(output) * net.hidden, net.hidden, sums);
-      for (int s = 0; s < used; ++s)
-        net.offsets[net.splats[start + s] * net.outputs + output] = sums[s] + net.last_bias[output];
-    }
-  }
-}
-
-constexpr int kBatch = W > kSplatGroup ? W : kSplatGroup;
-
-// Sine and cosine of numbers in [-1, 1]: Taylor series, whose next terms are below 2e-10.
-HEADBENCH_INLINE void sine_cosine(Real x, Real& sine, Real& cosine) {
-  const Real square = x * x;
-  sine = fma(square, -1.0f / 39916800.0f, 1.0f / 362880.0f);
-  sine = fma(square, sine, -1.0f / 5040.0f);
-  sine = fma(square, sine, 1.0f / 120.0f);
-  sine = fma(square, sine, -1.0f / 6.0f);
-  sine = fma(square * sine, x, x);
-  cosine = fma(square, 1.0f / 479001600.0f, -1.0f / 3628800.0f);
-  cosine = fma(square, cosine, 1.0f / 40320.0f);
-  cosine = fma(square, cosine, -1.0f / 720.0f);
-  cosine = fma(square, cosine, 1.0f / 24.0f);
-  cosine = fma(square, cosine, -0.5f);
-  cosine = fma(square, cosine, 1.0f);
-}
-
-// The encoding of methods/ours/inference.py, `encode_columns`, for the W splats in one column of `out`.
-HEADBENCH_INLINE void encode(const Real* direction, float* out) {
-  constexpr int kFrequencies = (kEncoding - 3) / 6;
-  for (int k = 0; k < 3; ++k) {
-    store(out + k * kBatch, direction[k]);
-    Real sine, cosine;
-    sine_cosine(direction[k], sine, cosine);
-    for (int n = 0; n < kFrequencies; ++n) {
-      store(out + (3 + 6 * n + k) * kBatch, sine);
-      store(out + (6 + 6 * n + k) * kBatch, cosine);
-      // sin 2a = 2 sin a cos a, cos 2a = 1 - 2 sin^2 a.
-      const Real twice = sine + sine, next = twice * cosine;
-      cosine = fnma(twice, sine, 1.0f);
-      sine = next;
-    }
-  }
-}
-
-inline std::size_t color_scratch(int hidden) { return static_cast<std::size_t>(kSplatGroup) * hidden; }
-
-// Colours of splats [begin, end); `scratch` has color_scratch floats.
-inline void color_network(const ColorNetwork& net, std::int64_t begin, std::int64_t end, float* scratch) {
-  alignas(64) float encoded[kEncoding * kBatch] = {};
-  std::int32_t rows[kEncoding];
-  for (int k = 0; k < kEncoding; ++k) rows[k] = k;
-  for (std::int64_t first = begin; first < end; first += kBatch) {
-    for (int offset = 0; offset < kBatch && first + offset < end; offset += W) {
-      Real direction[3];
-      directions_from(net.center, net.means, net.rotations, net.binding, first + offset,
-                      lanes_used(first + offset, end), direction);
-      for (int k = 0; k < 3; ++k) direction[k] = Real(0.0f) - direction[k];
-      encode(direction, encoded + offset);
-    }
-    for (int offset = 0; offset < kBatch && first + offset < end; offset += kSplatGroup) {
-      const std::int64_t splat = first + offset;
-      const int used = end - splat < kSplatGroup ? static_cast<int>(end - splat) : kSplatGroup;
-      const float* starts[kSplatGroup];
-      for (int s = 0; s < kSplatGroup; ++s) starts[s] = net.positions + (splat + (s < used ? s : 0)) * net.hidden;
-      dense_layer(starts, net.second, net.hidden, encoded + offset, kBatch, rows, kEncoding, scratch);
-      for (int channel = 0; channel < 3; ++channel) {
+  float* own = first + kNetworkTile * net.units;
+  std::int32_t* list = reinterpret_cast<std::int32_t*>(own + kNetworkTile * net.hidden);
+  for (std::int64_t tile = begin; tile < end; tile += kNetworkTile) {
+    const int used = end - tile < kNetworkTile ? static_cast<int>(end - tile) : kNetworkTile;
+    const int rows = (used + kSplatGroup - 1) / kSplatGroup * kSplatGroup;
+    Lists<kSparseGroup> on = {list, net.units, {}};
+    for (int s = 0; s < rows; ++s) first_layer(net, tile + (s < used ? s : 0), first + s * net.units);
+    for (int group = 0; group < rows / kSparseGroup; ++group)
+      on.counts[group] =
+          list_on<kSparseGroup>(first + group * kSparseGroup * net.units, net.units, net.units, list + group * net.units);
+    float* second = net.kept ? net.kept + tile * net.hidden : own;
+    product<kSparseGroup, kSparseVectors>(first, net.units, on, rows / kSparseGroup, net.second, net.second_stride, net.hidden, net.second_bias, true,
+            second, net.hidden);
+    for (int group = 0; group < used; group += kSplatGroup)
+      for (int output = 0; output < net.outputs; ++output) {
         float sums[kSplatGroup];
-        dots(scratch, net.last + channel * net.hidden, net.hidden, sums);
-        for (int s = 0; s < used; ++s) {
-          const float color = 0.5f + 0.28209479177387814f * sums[s];
-          net.colors[3 * (splat + s) + channel] = color > 0.0f ? color : 0.0f;
+        dots(second + group * net.hidden, net.last + static_cast<std::size_t>(output) * net.hidden, net.hidden, sums);
+        for (int s = 0; s < kSplatGroup && group + s < used; ++s)
+          net.offsets[net.splats[tile + group + s] * net.outputs + output] = sums[s] + net.last_bias[output];
+      }
+  }
+}
+
+// ---- Colours ----
+
+// Colours of splats [begin, end).
+inline void color_network(const ColorNetwork& net, std::int64_t begin, std::int64_t end) {
+  constexpr int kTogether = 4;
+  Gathered<3> lower, fraction;
+  const Real half = 0.5f * static_cast<float>(net.samples - 1), before_last = static_cast<float>(net.samples - 2);
+  for (std::int64_t first = begin; first < end; first += W) {
+    const int used = lanes_used(first, end);
+    Real direction[3];
+    directions_from(net.center, net.means, net.rotations, net.binding, first, used, direction);
+    for (int axis = 0; axis < 3; ++axis) {
+      // From the splat to the camera: the other way.
+      const Real along = fnma(direction[axis], half, half), row = floor(max(min(along, before_last), 0.0f));
+      lower.keep(axis, row);
+      fraction.keep(axis, along - row);
+    }
+    for (int group = 0; group < used; group += kTogether) {
+      Real sums[3][4];
+      for (int s = 0; s < kTogether; ++s) {
+        const int lane = group + s < used ? group + s : group;
+        std::int32_t rows[3];
+        float fractions[3];
+        for (int axis = 0; axis < 3; ++axis) rows[axis] = static_cast<std::int32_t>(lower.values[axis][lane]) + axis * net.samples;
+        fraction.put(fractions, lane);
+        const Place<const float> at = place_of(net.table, net.hidden, rows, fractions);
+        const std::int16_t* known = net.positions + (first + lane) * net.hidden;
+        Real sum[3] = {0.0f, 0.0f, 0.0f};
+        for (int unit = 0; unit < net.hidden; unit += W) {
+          const Real value = max(add_place(at, net.hidden, unit, load_int16(known + unit) * load(net.steps + unit)), 0.0f);
+          for (int channel = 0; channel < 3; ++channel) sum[channel] = fma(value, load(net.last + channel * net.hidden + unit), sum[channel]);
+        }
+        for (int channel = 0; channel < 3; ++channel) sums[channel][s] = sum[channel];
+      }
+      for (int channel = 0; channel < 3; ++channel) {
+        float found[kTogether];
+        sum_lanes(sums[channel], found);
+        for (int s = 0; s < kTogether && group + s < used; ++s) {
+          const float color = 0.5f + 0.28209479177387814f * found[s];
+          net.colors[3 * (first + group + s) + channel] = color > 0.0f ? color : 0.0f;
         }
       }
     }

@@ -25,9 +25,9 @@ HEADBENCH_INLINE int lanes_used(std::int64_t first, std::int64_t end) {
   return end - first < W ? static_cast<int>(end - first) : W;
 }
 
-// Divides by the length, 1e-10 at least, and gives it.
-HEADBENCH_INLINE Real normalise3(Real* a) {
-  const Real length = sqrt(max(dot3(a, a), 1e-20f));
+// Divides by the length, whose square is taken as `least` at least, and gives it.
+HEADBENCH_INLINE Real normalise3(Real* a, float least = 1e-20f) {
+  const Real length = sqrt(max(dot3(a, a), least));
   for (int k = 0; k < 3; ++k) a[k] = a[k] / length;
   return length;
 }
@@ -91,6 +91,22 @@ inline void triangles(const Triangles& in, std::int64_t begin, std::int64_t end)
       size.put(in.sizes + first + lane, lane);
       quaternion.put(in.quaternions + 4 * (first + lane), lane);
     }
+  }
+}
+
+inline void turns(const Turns& in, std::int64_t begin, std::int64_t end) {
+  Gathered<9> to, from, result;
+  for (std::int64_t first = begin; first < end; first += W) {
+    const int used = lanes_used(first, end);
+    for (int lane = 0; lane < W; ++lane) {
+      const std::int64_t triangle = 9 * (first + (lane < used ? lane : 0));
+      to.set(in.to + triangle, lane);
+      from.set(in.from + triangle, lane);
+    }
+    for (int i = 0; i < 3; ++i)
+      for (int j = 0; j < 3; ++j)
+        result.keep(3 * i + j, fma(to[3 * i], from[3 * j], fma(to[3 * i + 1], from[3 * j + 1], to[3 * i + 2] * from[3 * j + 2])));
+    for (int lane = 0; lane < used; ++lane) result.put(in.turns + 9 * (first + lane), lane);
   }
 }
 

@@ -134,6 +134,13 @@ struct Triangles {
   float* quaternions;         // (F, 4)
 };
 
+// Rotations from posed triangles to those of another mesh, to^T of the first applied before the second.
+struct Turns {
+  const float* to;    // (F, 3, 3)
+  const float* from;  // (F, 3, 3)
+  float* turns;       // (F, 3, 3) to times the transpose of from
+};
+
 // Splats from their triangles' frames to the world; the formulas of binding.py, `to_world`.
 struct ToWorld {
   const std::int64_t* binding;  // (N,) triangles
@@ -167,15 +174,17 @@ struct Harmonics {
 
 // Both networks' layers are this wide, or multiples of it.
 constexpr int kUnitsStep = 16;
+// Splats that go through one layer before the next: what they keep between them stays in the first caches.
+constexpr int kNetworkTile = 64;
 
-// The colour network, `shade_directions` in methods/ours/field.py: what is known of the position, plus the encoded
-// direction from the splat to the camera by its weights, ReLU, a layer.
-constexpr int kEncoding = 27;
-
+// The colour network, `shade_directions` in methods/ours/field.py: what is known of the position, plus what the direction
+// from the splat to the camera adds, ReLU, a layer. Each coordinate of the direction adds its own part, which a table holds
+// at equidistant samples from -1 to 1.
 struct ColorNetwork {
-  int hidden;
-  const float* positions;       // (N, hidden)
-  const float* second;          // (27, hidden)
+  int hidden, samples;
+  const std::int16_t* positions;   // (N, hidden) in steps
+  const float* steps;           // (hidden,)
+  const float* table;           // (3 samples, hidden)
   const float* last;            // (3, hidden)
   const float* means;           // (N, 3) in the world
   const float* rotations;       // (F, 3, 3) applied to the directions
@@ -188,7 +197,9 @@ struct ColorNetwork {
 // axes and added, ReLU, a layer, ReLU, a layer.
 struct OffsetNetwork {
   int units, hidden, outputs;
+  int second_stride;          // numbers from one row of `second` to the next
   const float* table;         // (T, units), T > rows + 1
+  const float* first_bias;    // (units,)
   const std::int32_t* rows;   // (M, 3) the lower of two neighbours
   const float* fractions;     // (M, 3) from the lower to the upper
   const float* second;        // (units, hidden)
@@ -197,6 +208,7 @@ struct OffsetNetwork {
   const float* last_bias;     // (outputs,)
   const std::int64_t* splats; // (M,) which splat each is
   float* offsets;             // (N, outputs)
+  float* kept;                // (M to whole tiles, hidden) the second layer after its ReLU, where it is asked for
 };
 
 // What training computes of splats beside the rasteriser; gradients are named by what they are taken by.
@@ -312,9 +324,9 @@ struct Kernels {
   void (*triangles)(const Triangles&, std::int64_t begin, std::int64_t end);
   void (*to_world)(const ToWorld&, std::int64_t begin, std::int64_t end);
   void (*shade)(const Harmonics&, std::int64_t begin, std::int64_t end);
-  std::size_t (*color_scratch)(int hidden);
-  void (*color_network)(const ColorNetwork&, std::int64_t begin, std::int64_t end, float* scratch);
-  std::size_t (*offset_scratch)(int units, int hidden);
+  void (*turns)(const Turns&, std::int64_t begin, std::int64_t end);
+  void (*color_network)(const ColorNetwork&, std::int64_t begin, std::int64_t end);
+  std::size_t (*offset_scratch)(const OffsetNetwork&);
   void (*offset_network)(const OffsetNetwork&, std::int64_t begin, std::int64_t end, float* scratch);
   // Of training, for vertices, triangles, splats or rows [begin, end).
   void (*pose_vertices)(const Posing&, std::int64_t begin, std::int64_t end);

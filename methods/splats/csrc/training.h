@@ -386,9 +386,7 @@ constexpr int kRest = (kDegreeMax + 1) * (kDegreeMax + 1) - 1;
 // Unit vectors of W vectors, and their lengths.
 HEADBENCH_INLINE Real direction_of(const Gathered<3>& vector, Real* direction) {
   for (int k = 0; k < 3; ++k) direction[k] = vector[k];
-  const Real length = sqrt(max(dot3(direction, direction), Real(1e-24f)));
-  for (int k = 0; k < 3; ++k) direction[k] = direction[k] / length;
-  return length;
+  return normalise3(direction, 1e-24f);
 }
 
 template <int degree>

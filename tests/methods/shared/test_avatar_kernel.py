@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from headbench.methods.ours.field import canonical_directions, offset_network, shade_directions
+from headbench.methods.ours.inference import SAMPLES, direction_table
 from headbench.methods.shared import avatar_kernel
 from headbench.methods.shared.binding import Frames, to_world, triangle_frames
 from headbench.methods.shared.networks import sh_to_rgb
@@ -97,6 +98,15 @@ def test_splats_are_transformed_as_defined(backend, count, seed):
 
 @needs_kernel
 @backends
+@pytest.mark.parametrize("count", [0, 1, 33, 1025])
+def test_turns_are_products_of_rotations(backend, count):
+    to, origin = (mesh(numbers(seed), count).rotation for seed in (1, 2))
+    found = avatar_kernel.turns_between(to, origin, backend)
+    np.testing.assert_allclose(found, to.double() @ origin.double().transpose(1, 2), atol=1e-6)
+
+
+@needs_kernel
+@backends
 @settings(max_examples=30, deadline=None)
 @given(count=COUNTS, degree=st.integers(0, 3), turned=st.booleans(), seed=st.integers(0, 1000))
 def test_harmonics_are_those_of_their_definition(backend, count, degree, turned, seed):
@@ -123,12 +133,13 @@ def test_the_colour_network_is_that_of_its_definition(backend, count, hidden, se
     means, center = normal(count, 3), 3 * normal(3)
     turns, binding = mesh(normal, 7).rotation, torch.arange(count) % 7
     first, last, known = 0.3 * normal(hidden, 27), normal(3, hidden) / hidden**0.5, normal(count, hidden)
-    network = (avatar_kernel.pad_units(values, 1) for values in (known, first.t(), last))
+    known, of_direction, last = (avatar_kernel.pad_units(values, 1) for values in (known, first.t(), last))
+    network = *avatar_kernel.in_steps(known), direction_table(of_direction, SAMPLES), last
     found = avatar_kernel.shade_network(*network, means, center, turns, binding, backend)
     directions = canonical_directions(turns.double(), binding, means.double(), center.double())
-    weights = {"color_weight_0": first.double(), "color_weight_1": last.double()}
+    weights = {"color_weight_0": of_direction.t().double(), "color_weight_1": last.double()}
     expected = shade_directions(weights, known.double(), directions)
-    np.testing.assert_allclose(found, expected, atol=3e-5)
+    np.testing.assert_allclose(found, expected, atol=1e-4)
 
 
 @needs_kernel
@@ -145,7 +156,7 @@ def test_the_colour_network_is_that_of_its_definition(backend, count, hidden, se
 def test_the_offset_network_is_that_of_its_definition(backend, count, units, hidden, outputs, off, seed):
     """Whether all units are on somewhere, few are, or none is; splats not named keep what they have."""
     normal, samples = numbers(seed), 5
-    table = normal(3 * samples, units) - off / 3
+    table, first_bias = normal(3 * samples, units), normal(units) - off
     rows = torch.randint(samples - 1, (count, 3), generator=torch.Generator().manual_seed(seed))
     rows = rows + samples * torch.arange(3)
     fractions = torch.rand(count, 3, generator=torch.Generator().manual_seed(seed))
@@ -154,8 +165,9 @@ def test_the_offset_network_is_that_of_its_definition(backend, count, units, hid
     out = torch.full((count + 5, outputs), 7.0)
     splats = torch.randperm(count + 5, generator=torch.Generator().manual_seed(seed))[:count]
     avatar_kernel.offsets_into(
-        *(out, splats, table, rows.to(torch.int32), fractions),
-        *(avatar_kernel.pad_units(second, 1), avatar_kernel.pad_units(second_bias, 0)),
+        *(out, splats, avatar_kernel.pad_units(table, 1), avatar_kernel.pad_units(first_bias, 0)),
+        *(rows.to(torch.int32), fractions),
+        *(avatar_kernel.pad_units(second, 0, 1), avatar_kernel.pad_units(second_bias, 0)),
         *(avatar_kernel.pad_units(last, 1), last_bias),
         backend=backend,
     )
@@ -163,8 +175,8 @@ def test_the_offset_network_is_that_of_its_definition(backend, count, units, hid
     summed = (
         exact[rows] * (1 - fractions.double())[:, :, None] + exact[rows + 1] * fractions.double()[:, :, None]
     ).sum(1)
-    rest = (second.t(), second_bias, last, last_bias)
-    expected = offset_network(summed, exact.new_zeros(units), *(value.double() for value in rest))
+    rest = (first_bias, second.t(), second_bias, last, last_bias)
+    expected = offset_network(summed, *(value.double() for value in rest))
     np.testing.assert_allclose(out[splats], expected, atol=5e-5)
     others = torch.ones(count + 5, dtype=torch.bool).index_fill(0, splats, False)
     assert (out[others] == 7).all()
@@ -176,14 +188,14 @@ def test_results_do_not_depend_on_the_number_of_threads(backend):
     normal = numbers(0)
     frames, binding = mesh(normal, 40), torch.arange(5000) % 40
     means, quats, scales = normal(5000, 3), unit(normal(5000, 4)), normal(5000, 3).exp()
-    known, first, last = normal(5000, 32), normal(27, 32), normal(3, 32)
+    parts = *avatar_kernel.in_steps(normal(5000, 32)), normal(3 * 20, 32), normal(3, 32)
     before = torch.get_num_threads()
     results = []
     try:
         for threads in (1, 3):
             torch.set_num_threads(threads)
             world = avatar_kernel.splats_to_world(frames, binding, means, quats, scales, backend)
-            network = known, first, last, world.means, normal(3) * 0 + 2, frames.rotation, binding
+            network = *parts, world.means, normal(3) * 0 + 2, frames.rotation, binding
             results.append((*world, avatar_kernel.shade_network(*network, backend)))
     finally:
         torch.set_num_threads(before)
@@ -201,7 +213,7 @@ def test_what_would_read_beyond_an_array_is_refused(backend):
             avatar_kernel.splats_to_world(
                 *(frames, torch.tensor([triangle]), normal(1, 3), normal(1, 4), normal(1, 3)), backend
             )
-    arguments = normal(1, 1).new_zeros(2, 1), torch.tensor([0]), normal(6, 16)
+    arguments = normal(1, 1).new_zeros(2, 1), torch.tensor([0]), normal(6, 16), normal(16)
     layers = normal(16, 16), normal(16), normal(1, 16), normal(1)
     for row in (-1, 5):
         rows = torch.tensor([[0, 2, row]], dtype=torch.int32)
