@@ -99,6 +99,9 @@ class SynthSettings:
     """`expressions` leaves out jaw and tongue, `still` moves only head, neck and eyes."""
     dynamics: float = 1.0
     """Scales what expressions do to skin beyond moving it (wrinkles, blush), 0 to 3."""
+    tracking_error: float = 0.0
+    """Level of the errors that trackers make: shrunk and mixed expressions, drift; 1 is 0.5 to 1 mm on the face, 2 to 3 mm
+    on lips and lids. 0 to 4."""
 
 
 def synth(settings: SynthSettings, progress: Progress) -> Findings:

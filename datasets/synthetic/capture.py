@@ -52,6 +52,7 @@ def synthesize(
     samples_per_pixel: int | None = None,
     performance: Kind = "full",
     dynamics: float = 1.0,
+    tracking_error: float = 0.0,
     workers: int | None = None,
     progress: Progress = no_progress,
 ) -> list[Path]:
@@ -68,6 +69,7 @@ def synthesize(
         parameter's own standard deviation over the subject's timesteps. Images show the exact poses.
     samples_per_pixel : rounded up to a count that the sampler takes; by default enough for 40 dB between two
         renders of a frame.
+    tracking_error : level of the errors that trackers make, see `tracking.with_tracking_error`; 0 to 4.
     performance : see `performance.Kind`; with less than all of it, captures for which less has to be modelled.
     dynamics : scales wrinkles and blush, 0 to 3: 0 leaves skin as it is at rest, wherever it moves.
     workers : processes that render; by default as many as there are cores, or one where there is little to do.
@@ -80,7 +82,17 @@ def synthesize(
     samples = default_samples(*size) if samples_per_pixel is None else sample_count(samples_per_pixel)
     pixels = (size[0], size[1])
     settings = SynthSettings(
-        subjects, cameras, timesteps, pixels, head, seed, tracking_noise, samples, performance, dynamics
+        subjects,
+        cameras,
+        timesteps,
+        pixels,
+        head,
+        seed,
+        tracking_noise,
+        samples,
+        performance,
+        dynamics,
+        tracking_error,
     )
     _check(settings)
     geometry = load_geometry(head)
@@ -165,6 +177,7 @@ def _missing(plan: SubjectPlan, sequence: str, timestep: int) -> tuple[str, ...]
 
 def _check(settings: SynthSettings) -> None:
     size, noise, most = settings.size, settings.tracking_noise, len(SERIALS)
+    error = settings.tracking_error
     count, kinds = settings.cameras, ", ".join(KINDS)
     checks = (
         ("--subjects", settings.subjects >= 1, "at least 1", settings.subjects),
@@ -172,6 +185,7 @@ def _check(settings: SynthSettings) -> None:
         ("--performance", settings.performance in KINDS, f"one of {kinds}", repr(settings.performance)),
         ("--dynamics", 0.0 <= settings.dynamics <= 3.0, "0 to 3", settings.dynamics),
         ("--size", min(size) >= 16, "at least 16 pixels each way", "x".join(map(str, size))),
+        ("--tracking-error", np.isfinite(error) and 0.0 <= error <= 4.0, "0 to 4", error),
         ("--tracking-noise", np.isfinite(noise) and noise >= 0.0, "a number from 0 up", noise),
     )
     for option, fits, expected, found in checks:

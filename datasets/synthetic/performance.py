@@ -7,8 +7,8 @@ monotone cubics, so nothing overshoots and a held face stays held. Blinks, gaze 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
@@ -376,26 +376,3 @@ def procedural_translation(head: HeadAsset) -> Translation:
     expression, eyelids = semantic_to_coefficients(head.version)
     rows = [SEMANTIC_NAMES.index(control) for control in EXPRESSION_CONTROLS]
     return Translation(head.version, expression[rows], None if eyelids is None else eyelids[rows])
-
-
-_FIELDS = ("expression", "rotation", "neck", "jaw", "eyes", "translation", "eyelids")
-
-
-def with_tracking_noise(poses: Sequence[HeadPose], amount: float, seed: int) -> list[HeadPose]:
-    """Add Gaussian noise to every parameter, independent from timestep to timestep.
-
-    Its standard deviation is ``amount`` times that parameter's own over ``poses``, so a parameter that never
-    moves stays exact. ``amount`` 0 returns the poses as they are.
-    """
-    if amount == 0.0:
-        return list(poses)
-    rng = np.random.default_rng([seed, 5])
-    changed: list[dict[str, Any]] = [{} for _ in poses]
-    for name in _FIELDS:
-        if getattr(poses[0], name) is None:
-            continue
-        values = np.stack([getattr(pose, name) for pose in poses])
-        noisy = values + amount * values.std(axis=0) * rng.standard_normal(values.shape)
-        for fields, row in zip(changed, noisy):
-            fields[name] = row.astype(np.float32).astype(np.float64)
-    return [replace(pose, **fields) for pose, fields in zip(poses, changed)]

@@ -33,8 +33,8 @@ from .performance import (
     perform,
     procedural_translation,
     share_out,
-    with_tracking_noise,
 )
+from .tracking import with_tracking_error, with_tracking_noise
 
 FIRST_SUBJECT = 900
 """Synthetic subjects count from here: no participant of NeRSemble has such a number."""
@@ -57,11 +57,12 @@ class SynthSettings:
     samples_per_pixel: int
     performance: Kind = "full"
     dynamics: float = 1.0
+    tracking_error: float = 0.0
 
     def described(self) -> dict[str, Any]:
         """The settings for records; those that came later are left out where they have their default."""
         described = asdict(self)
-        for name, usual in (("performance", "full"), ("dynamics", 1.0)):
+        for name, usual in (("performance", "full"), ("dynamics", 1.0), ("tracking_error", 0.0)):
             if described[name] == usual:
                 del described[name]
         return described
@@ -115,7 +116,16 @@ def plan_subject(out: Path, index: int, geometry: Geometry, settings: SynthSetti
             geometry.translation.pose(activations, name, timestep)
             for timestep, activations in enumerate(performed[sequence].activations)
         )
-    every = [pose for sequence in poses.values() for pose in sequence]
+    tracked_by_name = with_tracking_error(
+        poses,
+        {sequence: played.activations for sequence, played in performed.items()},
+        geometry.translation,
+        head,
+        shape,
+        settings.tracking_error,
+        settings.seed + 101 * index,
+    )
+    every = [pose for sequence in tracked_by_name.values() for pose in sequence]
     tracked = iter(with_tracking_noise(every, settings.tracking_noise, settings.seed + 101 * index))
     plan = CapturePlan(
         subject=name,

@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 
-from headbench.bench.contracts import HeadPose
 from headbench.datasets.synthetic.performance import (
     CONTROLS,
     EXPRESSION_CONTROLS,
@@ -9,7 +8,6 @@ from headbench.datasets.synthetic.performance import (
     SEQUENCES,
     perform,
     share_out,
-    with_tracking_noise,
 )
 
 
@@ -55,30 +53,3 @@ def test_performance_kinds_mute_controls_and_keep_the_others(name):
         assert not played.excluded
         for before, after in zip(full, played.activations):
             assert after == {control: 0.0 if control in muted else before[control] for control in CONTROLS}
-
-
-@pytest.fixture(scope="module")
-def poses():
-    rng = np.random.default_rng(0)
-    return [
-        HeadPose(
-            "m",
-            rng.normal(0, [1.0, 4.0, 0.0], 3),
-            *rng.normal(0, 0.1, (3, 3)),
-            rng.normal(0, 1, 6),
-            np.zeros(3),
-        )
-        for _ in range(4000)
-    ]
-
-
-def test_zero_noise_changes_nothing(poses):
-    assert with_tracking_noise(poses, 0.0, 1) == poses
-
-
-def test_noise_is_the_stated_fraction_of_each_deviation(poses):
-    noisy = with_tracking_noise(poses, 0.1, 1)
-    error = np.stack([a.expression - b.expression for a, b in zip(noisy, poses)])
-    np.testing.assert_allclose(error.std(0), [0.1, 0.4, 0.0], rtol=0.06, atol=1e-7)
-    assert all((a.translation == 0).all() for a in noisy)
-    assert with_tracking_noise(poses, 0.1, 1)[7].jaw.tolist() == noisy[7].jaw.tolist()

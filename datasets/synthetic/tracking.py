@@ -1,0 +1,197 @@
+"""Errors of the stored tracking: what a tracker of real recordings gets wrong, at a chosen level.
+
+Trackers fit a regularised model to images: coefficients are drawn towards zero, a basis that is not the face's own takes one
+expression for a mix of others, and what is left drifts from frame to frame. Lips and lids suffer most: they move fastest and
+have the fewest vertices. Images always show the exact poses.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.optimize import nnls
+
+from ...bench.contracts import FloatArray, HeadPose
+from ..head.arrays import HeadArrays, region
+from ..head.model import HeadModel
+from ..rounding import COEFFICIENT_BITS, on_grid
+from .anatomy import SIDES
+from .performance import EXPRESSION_CONTROLS, Activations, Translation
+
+FIELDS = ("expression", "rotation", "neck", "jaw", "eyes", "translation", "eyelids")
+
+FACE_MM, DETAIL_MM = 0.5, 2.5
+"""Root mean square displacement at level 1: of the face by the error that is everywhere, and of lips and lids by all."""
+LID_SHARE = 0.5
+"""Of the largest displacement by a blink: what moves more belongs to the lids."""
+PERSISTENCE = 0.8
+"""Correlation of the drift from one timestep to the next."""
+SHRINKAGE = (0.05, 0.3)
+"""Part of a coefficient that regularisation takes away, drawn for each coefficient."""
+MIXING = 0.3
+"""Norm of what a unit coefficient leaks into the others."""
+_MOMENTS = 48  # poses that amplitudes are measured on
+_PROBE = 1e-2  # part of an error at which its displacement is measured: there it is linear
+DRIFT = 0.2
+"""Of the drift, in spreads of a parameter or of the range of a control."""
+LID_CONTROLS = tuple(f"{name}_{side}" for name in ("blink", "squint", "eye_wide") for side in SIDES)
+LIP_CONTROLS = (
+    *(f"{name}_{side}" for name in ("upper_lip_up", "lower_lip_down") for side in SIDES),
+    *("pucker", "funnel", "lip_press", "lip_roll", "mouth_left", "mouth_right"),
+)
+
+
+def with_tracking_noise(poses: Sequence[HeadPose], amount: float, seed: int) -> list[HeadPose]:
+    """Add Gaussian noise to every parameter, independent from timestep to timestep.
+
+    Its standard deviation is ``amount`` times that parameter's own over ``poses``, so a parameter that never
+    moves stays exact. ``amount`` 0 returns the poses as they are.
+    """
+    if amount == 0.0:
+        return list(poses)
+    rng = np.random.default_rng([seed, 5])
+    noise: dict[str, FloatArray] = {}
+    for name, values in _values(poses).items():
+        noise[name] = amount * values.std(axis=0) * rng.standard_normal(values.shape)
+    return _moved(poses, noise)
+
+
+def with_tracking_error(
+    sequences: Mapping[str, Sequence[HeadPose]],
+    activations: Mapping[str, Sequence[Activations]],
+    translation: Translation,
+    head: HeadArrays,
+    shape: FloatArray,
+    level: float,
+    seed: int,
+) -> dict[str, list[HeadPose]]:
+    """Poses as a tracker would give them; drift begins anew in each sequence.
+
+    Parameters
+    ----------
+    sequences, activations, translation : exact poses, the controls that made them, and how.
+    level : 0 returns the poses as they are; 1 displaces the face by 0.5 to 1 mm, lips and lids by about
+        `DETAIL_MM`, and so on in proportion.
+    """
+    if level == 0.0:
+        return {name: list(each) for name, each in sequences.items()}
+    poses = [pose for each in sequences.values() for pose in each]
+    rng = np.random.default_rng([seed, 6])
+    begins = {0, *itertools.accumulate(map(len, sequences.values()))}
+    values = _values(poses)
+    overall: dict[str, FloatArray] = {}
+    for name, exact in values.items():
+        # A part of the spread of all, so that what hardly moves is not tracked exactly.
+        spread = np.maximum(exact.std(axis=0), 0.1 * exact.std() + 1e-4)
+        overall[name] = DRIFT * spread * _drift(exact.shape, begins, rng)
+    overall["expression"] += _systematic(values["expression"], rng)
+    errors = [overall]
+    for names in (LIP_CONTROLS, LID_CONTROLS):
+        rows = [EXPRESSION_CONTROLS.index(name) for name in names]
+        played = np.array([[a[name] for name in names] for each in activations.values() for a in each])
+        wrong = DRIFT * _drift(played.shape, begins, rng) - rng.uniform(*SHRINKAGE, len(names)) * played
+        matrices = {"expression": translation.expression, "eyelids": translation.eyelids}
+        errors.append(
+            {
+                name: (wrong[:, :, None] * matrix[rows]).sum(axis=1)
+                for name, matrix in matrices.items()
+                if matrix is not None
+            }
+        )
+    measure = _Displacement(head, shape, translation, poses)
+    everywhere, *local = map(measure, errors)
+    # Squares of displacements add up, but for what errors have in common.
+    first = (FACE_MM**2) / everywhere[0]
+    wanted = DETAIL_MM**2 - first * everywhere[1:]
+    others, _ = nnls(np.stack([squares[1:] for squares in local], axis=1), np.maximum(wanted, 0.0))
+    amplitudes = on_grid(level * np.sqrt([first, *others]), COEFFICIENT_BITS)
+    total = {
+        name: sum(amplitude * error[name] for amplitude, error in zip(amplitudes, errors) if name in error)
+        for name in overall
+    }
+    moved = iter(_moved(poses, total))
+    return {name: [next(moved) for _ in each] for name, each in sequences.items()}
+
+
+def _systematic(expression: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """(T, E) what shrinkage and leakage between coefficients make of an expression, beyond itself."""
+    size = expression.shape[1]
+    shrinkage = rng.uniform(*SHRINKAGE, size)
+    mixing = rng.standard_normal((size, size)) * (MIXING / np.sqrt(size))
+    np.fill_diagonal(mixing, -shrinkage)
+    spread = np.maximum(expression.std(axis=0), 1e-6)
+    # In units of each coefficient's own spread, so that none leaks into one that the face hardly uses.
+    units = expression / spread
+    return np.stack([(row[:, None] * mixing).sum(axis=0) for row in units]) * spread
+
+
+def _drift(shape: tuple[int, ...], begins: Collection[int], rng: np.random.Generator) -> FloatArray:
+    """(T, n) unit noise, each row correlated with the one before unless a sequence begins there."""
+    fresh = rng.standard_normal(shape)
+    drift = fresh.copy()
+    for row in range(1, shape[0]):
+        if row not in begins:
+            drift[row] = PERSISTENCE * drift[row - 1] + np.sqrt(1 - PERSISTENCE**2) * fresh[row]
+    return drift
+
+
+class _Displacement:
+    """Mean squared displacement, mm², of face (without lips and lids), lips and lids by an error of the poses."""
+
+    def __init__(
+        self, head: HeadArrays, shape: FloatArray, translation: Translation, poses: Sequence[HeadPose]
+    ):
+        self._model = HeadModel(head, dtype=torch.float64)
+        self._canonical = self._model.canonical(torch.from_numpy(shape))
+        blinks = [EXPRESSION_CONTROLS.index(f"blink_{side}") for side in SIDES]
+        closing = np.abs(np.asarray(head.expression_basis) @ translation.expression[blinks].sum(axis=0)).sum(
+            1
+        )
+        if translation.eyelids is not None and head.eyelid_basis is not None:
+            lids = np.asarray(head.eyelid_basis) @ translation.eyelids[blinks].sum(axis=0)
+            closing = closing + np.abs(lids).sum(axis=1)
+        skin = np.setdiff1d(
+            region(head, "face"), np.union1d(region(head, "left_eyeball"), region(head, "right_eyeball"))
+        )
+        lids = skin[closing[skin] > LID_SHARE * closing[skin].max()]
+        lips = np.asarray(region(head, "lips"))
+        self.parts = {"face": np.setdiff1d(skin, np.union1d(lips, lids)), "lips": lips, "lids": lids}
+        self._rows = np.unique(np.linspace(0, len(poses) - 1, min(_MOMENTS, len(poses))).round().astype(int))
+        self._poses = [poses[row] for row in self._rows]
+        self._exact = self._vertices(self._poses)
+
+    def __call__(self, errors: Mapping[str, FloatArray]) -> FloatArray:
+        """One number for each part, of errors by field of all poses."""
+        small = {name: _PROBE * error[self._rows] for name, error in errors.items()}
+        moved = self._vertices(_moved(self._poses, small, exact=True)) - self._exact
+        squared = (moved / _PROBE * 1e3) ** 2
+        return np.array([squared[:, part].sum(axis=2).mean() for part in self.parts.values()])
+
+    def _vertices(self, poses: Sequence[HeadPose]) -> FloatArray:
+        with torch.no_grad():
+            arguments = self._model.pose_arguments(poses)
+            return self._model(canonical=self._canonical, **arguments).numpy()
+
+
+def _values(poses: Sequence[HeadPose]) -> dict[str, FloatArray]:
+    """(T, n) values of the poses' fields, by name."""
+    present = [name for name in FIELDS if getattr(poses[0], name) is not None]
+    return {name: np.stack([getattr(pose, name) for pose in poses]) for name in present}
+
+
+def _moved(
+    poses: Sequence[HeadPose], errors: Mapping[str, FloatArray], *, exact: bool = False
+) -> list[HeadPose]:
+    """Poses with errors added, rounded to float32 as they are stored unless ``exact``."""
+    moved = []
+    for row, pose in enumerate(poses):
+        fields: dict[str, Any] = {name: getattr(pose, name) + error[row] for name, error in errors.items()}
+        if not exact:
+            fields = {name: value.astype(np.float32).astype(np.float64) for name, value in fields.items()}
+        moved.append(replace(pose, **fields))
+    return moved
