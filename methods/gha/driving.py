@@ -206,22 +206,27 @@ def influences(
     Expression rules up to ``near_squared`` from the nearest of the (L, 3) landmarks, pose from ``far_squared`` on,
     and in between the weights are linear in the squared distance.
     """
-    squared = (kernel.nearest_squared if kernel.usable(points) else nearest_squared)(points, landmarks)
+    if not kernel.usable(points):
+        return reference_influences(points, landmarks, near_squared, far_squared)
+    near, near_weights, far, far_weights = kernel.influences(points, landmarks, near_squared, far_squared)
+    return Influence(near, near_weights), Influence(far, far_weights)
+
+
+def reference_influences(
+    points: Tensor, landmarks: Tensor, near_squared: float, far_squared: float
+) -> tuple[Influence, Influence]:
+    """What `influences` gives, by torch's functions."""
+    with torch.no_grad():
+        # |a - b|^2 without |a|^2, which is the same for all landmarks of a point. `min` is three times as fast as
+        # `argmin` on the CPU.
+        nearest = torch.addmm(landmarks.square().sum(1), points, landmarks.t(), alpha=-2).min(1).indices
+    squared = (points - landmarks.index_select(0, nearest)).square().sum(1)
     weight = ((far_squared - squared) / (far_squared - near_squared)).clamp(0, 1)
     near, far = (weight.detach() > 0).nonzero().squeeze(1), (weight.detach() < 1).nonzero().squeeze(1)
     return (
         Influence(near, weight.index_select(0, near)),
         Influence(far, 1 - weight.index_select(0, far)),
     )
-
-
-def nearest_squared(points: Tensor, landmarks: Tensor) -> Tensor:
-    """(N,) squared distances of (N, 3) points from the nearest of the (L, 3) landmarks."""
-    with torch.no_grad():
-        # |a - b|^2 without |a|^2, which is the same for all landmarks of a point. `min` is three times as fast as
-        # `argmin` on the CPU.
-        nearest = torch.addmm(landmarks.square().sum(1), points, landmarks.t(), alpha=-2).min(1).indices
-    return (points - landmarks.index_select(0, nearest)).square().sum(1)
 
 
 class TrainingScene(NamedTuple):

@@ -17,7 +17,7 @@ from ..splats import rasterize
 from . import kernel
 from .config import GHAConfig
 from .driving import HeadMotion, Signal, influences
-from .networks import Controllers, Weights, encode_pose, uniform
+from .networks import ATTRIBUTES, Controllers, Weights, encode_pose, uniform
 
 POINTS = {"points": 3, "log_scales": 3, "quats": 4, "opacities": 1}
 """What a Gaussian has besides its features, with columns: canonical position and scale, rotation, opacity logit."""
@@ -42,10 +42,20 @@ class FeatureSplats(NamedTuple):
 
 
 class FeatureImage(NamedTuple):
-    """What a camera sees: the (h, w, C) feature image and its (h, w) alpha, at the splatted size."""
+    """What a camera sees at the splatted size: the (h, w, C) feature image, its (h, w) alpha, and the (h, w, 3) colours
+    that the first features are."""
 
     features: Tensor
     alpha: Tensor
+    colors: Tensor
+
+    @classmethod
+    def of(cls, features: Tensor, alpha: Tensor) -> FeatureImage:
+        """With the colours of the features."""
+        if kernel.usable(features) and features.requires_grad:
+            features, colors = kernel.with_colors(features)
+            return cls(features, alpha, colors)
+        return cls(features, alpha, features[..., :3])
 
 
 @dataclass(frozen=True)
@@ -76,7 +86,7 @@ class GaussianHead:
         on it.
         """
         c, nets = self.config, self.controllers
-        points, features = tensors["points"], torch.tanh(tensors["features"])
+        points, features = tensors["points"], tanh(tensors["features"])
         landmarks = tensors["landmarks"].detach()
         parts = influences(points, landmarks, c.near_squared, c.far_squared)
         pose, code = encode_pose(motion.code), signal.expression
@@ -84,17 +94,16 @@ class GaussianHead:
         seen = torch.minimum(torch.maximum(code, tensors["code_low"]), tensors["code_high"])
         if noise is not None:
             seen = seen + noise
-        scale, turn, faint = nets.attributes(tensors, features, parts, seen, pose)
-        log_scales = tensors["log_scales"] + c.attribute_scale * scale
-        quats = tensors["quats"] + c.attribute_scale * turn
-        opacities = torch.sigmoid(tensors["opacities"] + c.attribute_scale * faint[:, 0])
-        canonical = points + c.displacement_scale * moves
-        world = WorldSplats(
-            c.unit * canonical @ motion.rotation.t() + motion.translation,
-            quats @ left_products(matrix_to_quaternion(motion.rotation)[None])[0].t(),
-            c.unit * log_scales.clamp_max(LARGEST_LOG_SCALE).exp(),
+        changes = nets.attributes(tensors, features, parts, seen, pose)
+        scales = kernel.Scales(c.unit, c.displacement_scale, c.attribute_scale, LARGEST_LOG_SCALE)
+        turn = left_products(matrix_to_quaternion(motion.rotation)[None])[0]
+        placed = (kernel.posed if kernel.usable(points) else posed)(
+            *(scales, motion.rotation, motion.translation, turn, points, moves),
+            *(tensors["log_scales"], tensors["quats"], tensors["opacities"], changes),
         )
-        return FeatureSplats(world, opacities, nets.colors(tensors, features, parts, seen, pose))
+        means, quats, sizes, opacities = placed
+        colors = nets.colors(tensors, features, parts, seen, pose)
+        return FeatureSplats(WorldSplats(means, quats, sizes), opacities, colors)
 
     def draw(self, splats: FeatureSplats, camera: Camera, background: Tensor) -> FeatureImage:
         """Splat the features for a camera of the full size; their background is (3,) colour, then ones."""
@@ -105,8 +114,9 @@ class GaussianHead:
             *(small.world_to_camera, small.K, small.width, small.height),
             background=feature_background(background, self.config.channels),
             check_values=False,
+            threads=kernel.threads(),
         )
-        return FeatureImage(rendering.image, rendering.alpha)
+        return FeatureImage.of(rendering.image, rendering.alpha)
 
     def sharpen(
         self, tensors: Weights, drawn: FeatureImage, background: Tensor, *, bounded: bool = False
@@ -116,9 +126,7 @@ class GaussianHead:
         ``bounded`` keeps the memory for large images small, without gradients.
         """
         network = self.super_resolution.bounded if bounded else self.super_resolution
-        colors = network(tensors, drawn.features, drawn.alpha)
-        near = enlarged(near_drawn(drawn.alpha), self.config.upscale)
-        return torch.where(near[..., None] > 0, colors, background)
+        return network(tensors, drawn, background)
 
 
 def feature_background(background: Tensor, channels: int) -> Tensor:
@@ -192,8 +200,10 @@ class SuperResolution:
             tensors |= {name: torch.zeros_like(tensors[name]) for name in ("sr.color", "sr.color_bias")}
         return tensors
 
-    def __call__(self, weights: Weights, features: Tensor, alpha: Tensor) -> Tensor:
-        """(u H, u W, 3) colours of an (H, W, C) feature image with its (H, W) alpha; in (0, 1) without ``residual``."""
+    def __call__(self, weights: Weights, drawn: FeatureImage, background: Tensor) -> Tensor:
+        """(u H, u W, 3) colours of an (H, W) feature image, within (0, 1) without ``residual``; ``background`` where
+        nothing is drawn near."""
+        features = drawn.features
         convolution = kernel.normalised_convolution if kernel.usable(features) else normalised_convolution
         values = features
         for block in range(len(self.widths)):
@@ -202,21 +212,23 @@ class SuperResolution:
                 values = _resized(values, size, align_corners=True)
             for layer in range(2):
                 values = convolution(values, weights[f"sr.conv_{block}_{layer}"])
-        colors = F.linear(values, weights["sr.color"].flatten(1), weights["sr.color_bias"])
-        return self._finished(colors, features, alpha)
+        return self._image(weights, values, drawn, background)
 
     @torch.no_grad()
-    def bounded(self, weights: Weights, features: Tensor, alpha: Tensor, at_once: int = AT_ONCE) -> Tensor:
+    def bounded(
+        self, weights: Weights, drawn: FeatureImage, background: Tensor, at_once: int = AT_ONCE
+    ) -> Tensor:
         """What calling gives, without gradients, in bounded memory, in strips of rows.
 
         By calling, where no tensor there has more than ``at_once`` numbers. Otherwise no more than a block's output and
         that of the block before exist at a time, beside strips of so many numbers.
         """
+        features = drawn.features
         height, width = features.shape[:2]
         before = (self.channels, *self.widths[:-1])
         largest = [4**b * max(pair) * height * width for b, pair in enumerate(zip(before, self.widths))]
         if max(largest) <= at_once:
-            return self(weights, features, alpha)
+            return self(weights, drawn, background)
         planes = features.permute(2, 0, 1)[None]
 
         def given(first: int, last: int) -> Tensor:
@@ -235,17 +247,78 @@ class SuperResolution:
         for first in range(0, height, rows):
             strip = read(first, min(first + rows, height))
             colors[:, :, first : first + rows] = F.conv2d(strip, *color)
-        return self._finished(colors[0].permute(1, 2, 0), features, alpha)
+        return self._finished(colors[0].permute(1, 2, 0), drawn, background)
 
-    def _finished(self, colors: Tensor, features: Tensor, alpha: Tensor) -> Tensor:
+    def _image(self, weights: Weights, values: Tensor, drawn: FeatureImage, background: Tensor) -> Tensor:
+        """(u H, u W, 3) image of the last block's (u H, u W, D) output."""
+        layer = weights["sr.color"].flatten(1), weights["sr.color_bias"]
+        if self.residual and kernel.usable(values):
+            near = kernel.near_drawn(drawn.alpha.detach(), REACH, COVERED)
+            plain, covered = self._plain(drawn)
+            return kernel.residual_image(
+                values, *layer, plain, covered, enlarged(near, self.upscale), background
+            )
+        return self._finished(F.linear(values, *layer), drawn, background)
+
+    def _finished(self, colors: Tensor, drawn: FeatureImage, background: Tensor) -> Tensor:
         """(u H, u W, 3) image of the last layer's (u H, u W, 3) output."""
+        near = enlarged(near_drawn(drawn.alpha), self.upscale)
         if not self.residual:
-            return torch.sigmoid(colors)
-        plain, covered = features[..., :3], alpha[..., None]
-        if self.upscale > 1:
-            enlarged = _resized(torch.cat([plain, covered], dim=2), colors.shape[:2], align_corners=False)
-            plain, covered = enlarged.split([3, 1], dim=2)
-        return plain + covered * colors
+            return torch.where(near[..., None] > 0, torch.sigmoid(colors), background)
+        return residual_image(colors, *self._plain(drawn), near, background)
+
+    def _plain(self, drawn: FeatureImage) -> tuple[Tensor, Tensor]:
+        """(u H, u W, 3) splatted colours and their (u H, u W) alpha."""
+        if self.upscale == 1:
+            return drawn.colors, drawn.alpha
+        height, width = drawn.alpha.shape
+        size = self.upscale * height, self.upscale * width
+        joined = torch.cat([drawn.colors, drawn.alpha[..., None]], dim=2)
+        enlarged = _resized(joined, size, align_corners=False)
+        return enlarged[..., :3], enlarged[..., 3]
+
+
+def residual_image(colors: Tensor, plain: Tensor, alpha: Tensor, near: Tensor, background: Tensor) -> Tensor:
+    """(H, W, 3): ``plain + alpha colors`` where the (H, W) ``near`` is above 0, else the (3,) background."""
+    return torch.where(near[..., None] > 0, plain + alpha[..., None] * colors, background)
+
+
+def tanh(values: Tensor) -> Tensor:
+    """Hyperbolic tangent, by the kernel where it can be."""
+    return kernel.tanh(values) if kernel.usable(values) else torch.tanh(values)
+
+
+def posed(
+    scales: kernel.Scales,
+    rotation: Tensor,
+    translation: Tensor,
+    turn: Tensor,
+    points: Tensor,
+    moves: Tensor,
+    log_scales: Tensor,
+    quats: Tensor,
+    opacities: Tensor,
+    changes: Tensor,
+) -> tuple[Tensor, ...]:
+    """(N, 3) means, (N, 4) quaternions of any length, (N, 3) scales and (N,) opacities of a pose, in the world.
+
+    Parameters
+    ----------
+    rotation, translation : (3, 3) and (3,) of the canonical frame.
+    turn : (4, 4), what multiplies by the rotation's quaternion.
+    points, moves : (N, 3) canonical points, and displacements before their factor.
+    log_scales, quats, opacities : (N, 3), (N, 4) and (N,) logits, canonical.
+    changes : (N, 8) what networks add to them, before its factor.
+    """
+    unit, displacement, attribute, largest = scales
+    scale, quat, faint = (attribute * changes).split(list(ATTRIBUTES), dim=1)
+    canonical = points + displacement * moves
+    return (
+        unit * canonical @ rotation.t() + translation,
+        (quats + quat) @ turn.t(),
+        unit * (log_scales + scale).clamp_max(largest).exp(),
+        torch.sigmoid(opacities + faint[:, 0]),
+    )
 
 
 def _resized(values: Tensor, size: Sequence[int], *, align_corners: bool) -> Tensor:

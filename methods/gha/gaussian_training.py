@@ -99,7 +99,7 @@ class GaussianTraining:
         drawn = head.draw(splats, view.camera, scene.background)
         padded = _padded(target, view.camera, config.upscale, scene.background)
         small = reduced(padded, config.upscale, config.low_image_variant)
-        loss = config.low_weight * (drawn.features[..., :3] - small).abs().mean()
+        loss = config.low_weight * (drawn.colors - small).abs().mean()
         if config.augment:
             draws = torch.rand(3, generator=torch_generator(scene.seed, "gha-zoom", iteration)).tolist()
             zoom = Zoom.of(drawn.alpha.shape, draws)
@@ -234,7 +234,7 @@ def zoomed(
     outside = feature_background(background, drawn.features.shape[2])
     features = _zoomed(drawn.features, zoom, 1, outside)
     alpha = _zoomed(drawn.alpha[..., None], zoom, 1, drawn.alpha.new_zeros(1))[..., 0]
-    return FeatureImage(features, alpha), _zoomed(target, zoom, upscale, background)
+    return FeatureImage.of(features, alpha), _zoomed(target, zoom, upscale, background)
 
 
 def _zoomed(values: Tensor, zoom: Zoom, upscale: int, outside: Tensor) -> Tensor:

@@ -6,7 +6,8 @@ devices, other dtypes, or no compiler at installation. The kernel's results do n
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import torch
@@ -26,6 +27,35 @@ UNITS_STEP = 16
 def usable(like: Tensor) -> bool:
     """Whether the kernel is there and takes tensors like this one."""
     return like.dtype == torch.float32 and like.device.type == "cpu" and bool(KERNEL.instruction_sets)
+
+
+_threads: int | None = None
+
+
+def threads() -> int:
+    """Threads that kernels run on: as many as torch has, or had outside of `torch_on_one_thread`."""
+    return _threads or torch.get_num_threads()
+
+
+@contextmanager
+def torch_on_one_thread() -> Iterator[None]:
+    """Leave torch's own functions to the calling thread, where the kernel is there to do the long work.
+
+    Torch's threads spin while they wait, on the cores that the kernels' threads need, and its results depend on their
+    number.
+    """
+    global _threads
+    before, outer = torch.get_num_threads(), _threads
+    if not KERNEL.instruction_sets or before == 1:
+        yield
+        return
+    _threads = before
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+        _threads = outer
 
 
 class Part(NamedTuple):
@@ -101,7 +131,7 @@ class _Perceptrons(torch.autograd.Function):
             inputs = _arrays(part, saved[0], conditions, slope)
             KERNEL.load().forward(
                 *(*inputs, kept.numpy(), values.numpy(), total.numpy()),
-                *(instruction_set, torch.get_num_threads()),
+                *(instruction_set, threads()),
             )
             saved += [kept, values]
         ctx.settings = parts, slope, instruction_set
@@ -131,7 +161,7 @@ class _Perceptrons(torch.autograd.Function):
                     for tensor in (kept, values, gradient, by_points, by_influence, by_condition)
                 ),
                 *([tensor.numpy() for tensor in tensors] for tensors in (by_weights, by_biases)),
-                *(instruction_set, torch.get_num_threads()),
+                *(instruction_set, threads()),
             )
             found.append(None if part.influence is None else by_influence)
             found.append(None if part.condition is None else by_condition.view(part.condition.shape))
@@ -172,7 +202,7 @@ class _Convolution(torch.autograd.Function):
         out = torch.empty_like(raw) if any(ctx.needs_input_grad) else raw
         KERNEL.load().convolve(
             *(tensor.detach().numpy() for tensor in (values, weight, raw, moments, out)),
-            *(instruction_set, torch.get_num_threads()),
+            *(instruction_set, threads()),
         )
         ctx.save_for_backward(values, weight, raw, moments)
         ctx.instruction_set = instruction_set
@@ -187,39 +217,61 @@ class _Convolution(torch.autograd.Function):
         by_weight = torch.empty_like(weight)
         arrays = (values, weight, raw, moments, grad.contiguous(), by_values, by_weight)
         KERNEL.load().convolve_backward(
-            *(tensor.detach().numpy() for tensor in arrays), ctx.instruction_set, torch.get_num_threads()
+            *(tensor.detach().numpy() for tensor in arrays), ctx.instruction_set, threads()
         )
         return by_values if wanted else None, by_weight, None
 
 
-def nearest_squared(points: Tensor, landmarks: Tensor, instruction_set: str = "") -> Tensor:
-    """(N,) squared distances of (N, 3) points from the nearest of the (L, 3) landmarks."""
-    squared: Tensor = _NearestSquared.apply(points, landmarks, instruction_set)  # type: ignore[no-untyped-call]
-    return squared
+def influences(
+    points: Tensor, landmarks: Tensor, near_squared: float, far_squared: float, instruction_set: str = ""
+) -> tuple[Tensor, ...]:
+    """Rows and weights of the near points, then of the far ones: compiled form of `driving.reference_influences`."""
+    found: tuple[Tensor, ...] = _Influences.apply(  # type: ignore[no-untyped-call]
+        points, landmarks, near_squared, far_squared, instruction_set
+    )
+    return found
 
 
-class _NearestSquared(torch.autograd.Function):
+class _Influences(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, points: Tensor, landmarks: Tensor, instruction_set: str) -> Tensor:
+    def forward(
+        ctx: Any,
+        points: Tensor,
+        landmarks: Tensor,
+        near_squared: float,
+        far_squared: float,
+        instruction_set: str,
+    ) -> tuple[Tensor, ...]:
         points, landmarks = points.contiguous(), landmarks.contiguous()
         nearest = torch.empty(len(points), dtype=torch.int32)
-        squared = points.new_empty(len(points))
-        KERNEL.load().nearest(
-            *(tensor.detach().numpy() for tensor in (points, landmarks, nearest, squared)),
-            *(instruction_set, torch.get_num_threads()),
+        rows = torch.empty(2, len(points), dtype=torch.int64)
+        weights = points.new_empty(2, len(points))
+        near, far = KERNEL.load().influences(
+            *_plain(points, landmarks, near_squared, far_squared, nearest, rows, weights),
+            *(instruction_set, threads()),
         )
-        ctx.save_for_backward(points, landmarks, nearest)
-        return squared
+        found = rows[0, :near], weights[0, :near].clone(), rows[1, :far], weights[1, :far].clone()
+        ctx.mark_non_differentiable(found[0], found[2])
+        ctx.save_for_backward(points, landmarks, nearest, *found)
+        ctx.distances = near_squared, far_squared
+        return found
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        points, landmarks, nearest = ctx.saved_tensors
-        by_points = 2 * grad[:, None] * (points - landmarks.index_select(0, nearest))
-        by_landmarks = None
-        if ctx.needs_input_grad[1]:
-            by_landmarks = torch.zeros_like(landmarks).index_add_(0, nearest, by_points, alpha=-1)
-        return by_points, by_landmarks, None
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        points, landmarks, nearest, near, near_weights, far, far_weights = ctx.saved_tensors
+        by_points = torch.empty_like(points)
+        by_landmarks = torch.empty_like(landmarks) if ctx.needs_input_grad[1] else landmarks.new_empty(0, 3)
+        KERNEL.load().influences_backward(
+            *_plain(points, landmarks, *ctx.distances, nearest, near, near_weights, grads[1].contiguous()),
+            *_plain(far, far_weights, grads[3].contiguous(), by_points, by_landmarks),
+        )
+        return by_points, by_landmarks if ctx.needs_input_grad[1] else None, None, None, None
+
+
+def _plain(*values: Any) -> list[Any]:
+    """Tensors as arrays, other values as they are."""
+    return [value.detach().numpy() if isinstance(value, Tensor) else value for value in values]
 
 
 def encode(points: Tensor, instruction_set: str = "") -> Tensor:
@@ -233,7 +285,7 @@ class _Encoding(torch.autograd.Function):
     def forward(ctx: Any, points: Tensor, instruction_set: str) -> Tensor:
         encoded = points.new_empty(len(points), ENCODING_SIZE)
         arrays = points.detach().contiguous().numpy(), encoded.numpy()
-        KERNEL.load().encode(*arrays, instruction_set, torch.get_num_threads())
+        KERNEL.load().encode(*arrays, instruction_set, threads())
         ctx.save_for_backward(encoded)
         ctx.instruction_set = instruction_set
         return encoded
@@ -244,5 +296,132 @@ class _Encoding(torch.autograd.Function):
         (encoded,) = ctx.saved_tensors
         by_points = encoded.new_empty(len(encoded), 3)
         arrays = (tensor.detach().numpy() for tensor in (encoded, grad.contiguous(), by_points))
-        KERNEL.load().encode_backward(*arrays, ctx.instruction_set, torch.get_num_threads())
+        KERNEL.load().encode_backward(*arrays, ctx.instruction_set, threads())
         return by_points, None
+
+
+def tanh(values: Tensor, instruction_set: str = "") -> Tensor:
+    """Hyperbolic tangent."""
+    found: Tensor = _Tanh.apply(values, instruction_set)  # type: ignore[no-untyped-call]
+    return found
+
+
+class _Tanh(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, instruction_set: str) -> Tensor:
+        values = values.contiguous()
+        found = torch.empty_like(values)
+        KERNEL.load().tanh(*_plain(values.view(-1), found.view(-1)), instruction_set, threads())
+        ctx.save_for_backward(found)
+        ctx.instruction_set = instruction_set
+        return found
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        (found,) = ctx.saved_tensors
+        by_values = torch.empty_like(found)
+        tensors = (tensor.view(-1) for tensor in (found, grad.contiguous(), by_values))
+        KERNEL.load().tanh_backward(*_plain(*tensors), ctx.instruction_set, threads())
+        return by_values, None
+
+
+def near_drawn(alpha: Tensor, reach: int, covered: float) -> Tensor:
+    """(h, w) uint8: compiled form of `gaussian_head.near_drawn`."""
+    near = torch.empty(alpha.shape, dtype=torch.uint8)
+    KERNEL.load().near_drawn(*_plain(alpha.contiguous(), reach, covered, near))
+    return near
+
+
+def residual_image(
+    values: Tensor,
+    weight: Tensor,
+    bias: Tensor,
+    plain: Tensor,
+    alpha: Tensor,
+    near: Tensor,
+    background: Tensor,
+    instruction_set: str = "",
+) -> Tensor:
+    """(H, W, 3) image: compiled form of `gaussian_head.residual_image`, whose ``near`` is uint8 here."""
+    image: Tensor = _ResidualImage.apply(
+        values, weight, bias, plain, alpha, near, background, instruction_set
+    )  # type: ignore[no-untyped-call]
+    return image
+
+
+class _ResidualImage(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *inputs: Any) -> Tensor:
+        tensors = [tensor.contiguous() for tensor in inputs[:7]]
+        image = torch.empty_like(tensors[3])
+        KERNEL.load().colors(*_plain(*tensors, image), inputs[7], threads())
+        ctx.save_for_backward(*tensors[:6])
+        ctx.instruction_set = inputs[7]
+        return image
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        gradients = [torch.empty_like(tensor) for tensor in ctx.saved_tensors[:5]]
+        KERNEL.load().colors_backward(
+            *_plain(*ctx.saved_tensors, grad.contiguous(), *gradients), ctx.instruction_set, threads()
+        )
+        return *gradients, None, None, None
+
+
+class Scales(NamedTuple):
+    """How numbers become lengths; see `GHAConfig`, and `gaussian_head.LARGEST_LOG_SCALE` for the last."""
+
+    unit: float
+    displacement: float
+    attribute: float
+    largest_log_scale: float
+
+
+def posed(scales: Scales, *tensors: Tensor, instruction_set: str = "") -> tuple[Tensor, ...]:
+    """Means, quaternions, scales and opacities of a pose: compiled form of `gaussian_head.posed`."""
+    found: tuple[Tensor, ...] = _Posed.apply(scales, instruction_set, *tensors)  # type: ignore[no-untyped-call]
+    return found
+
+
+class _Posed(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, scales: Scales, instruction_set: str, *tensors: Tensor) -> tuple[Tensor, ...]:
+        inputs = [tensor.contiguous() for tensor in tensors]
+        _, _, _, points, _, _, quats, opacities, _ = inputs
+        found = tuple(torch.empty_like(like) for like in (points, quats, points, opacities))
+        KERNEL.load().pose(*scales, *_plain(*inputs, *found), instruction_set, threads())
+        ctx.save_for_backward(*inputs, *found[2:])
+        ctx.settings = scales, instruction_set
+        return found
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        scales, instruction_set = ctx.settings
+        gradients = [torch.empty_like(tensor) for tensor in ctx.saved_tensors[:9]]
+        outer = (grad.contiguous() for grad in grads)
+        KERNEL.load().pose_backward(
+            *scales, *_plain(*ctx.saved_tensors, *outer, *gradients), *(instruction_set, threads())
+        )
+        return None, None, *gradients
+
+
+def with_colors(features: Tensor) -> tuple[Tensor, Tensor]:
+    """The (H, W, C) features, and a copy of their first three channels; one pass for both gradients."""
+    found: tuple[Tensor, Tensor] = _WithColors.apply(features)  # type: ignore[no-untyped-call]
+    return found
+
+
+class _WithColors(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, features: Tensor) -> tuple[Tensor, Tensor]:
+        return features.view_as(features), features[..., :3].contiguous()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grads: Tensor) -> Tensor:
+        gradient = grads[0].clone()
+        gradient[..., :3] += grads[1]
+        return gradient

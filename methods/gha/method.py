@@ -32,6 +32,7 @@ from .config import GHAConfig
 from .driving import TrainingScene, training_scene
 from .gaussian_head import GaussianHead
 from .gaussian_training import GaussianTraining
+from .kernel import torch_on_one_thread
 from .mesh_head import MeshHead
 from .mesh_training import mesh_phase, remove_mesh_phase
 from .spec import GHA as SPEC
@@ -53,6 +54,10 @@ class GHA(TrainedMethod[GHAConfig, GHAAvatar]):
         self._clock = clock
 
     def _train(self, fit: Fit, config: GHAConfig) -> None:
+        with torch_on_one_thread():
+            self._train_phases(fit, config)
+
+    def _train_phases(self, fit: Fit, config: GHAConfig) -> None:
         clip, out = fit.clip, fit.out
         scene = training_scene(clip, config, fit.device, fit.seed)
         size = len(scene.signals[0].expression)

@@ -154,7 +154,7 @@ def uniform(
 
 
 ATTRIBUTES = (3, 4, 1)
-"""Offsets of log-scale, quaternion and opacity logit."""
+"""Columns of log-scale, quaternion and opacity logit."""
 
 Influences = tuple[Influence, Influence]
 
@@ -214,11 +214,10 @@ class Controllers:
 
     def attributes(
         self, weights: Weights, features: Tensor, influences: Influences, expression: Tensor, pose: Tensor
-    ) -> tuple[Tensor, ...]:
-        """(N, 3) log-scale, (N, 4) quaternion and (N, 1) opacity logit offsets, before their common factor."""
+    ) -> Tensor:
+        """(N, 8) offsets of `ATTRIBUTES`, before their common factor."""
         networks = (self.expression_attribute, self.pose_attribute)
-        values = blended(networks, weights, features, influences, (expression, pose))
-        return values.split(list(ATTRIBUTES), dim=1)
+        return blended(networks, weights, features, influences, (expression, pose))
 
     def displacements(
         self, weights: Weights, points: Tensor, influences: Influences, expression: Tensor, pose: Tensor

@@ -197,4 +197,77 @@ inline void convolve_backward(const Convolution& c, int begin, int end, float* s
   }
 }
 
+// ---- Colours of a residual image ----
+
+using gha::Colors;
+using gha::kUnitsStep;
+
+inline std::size_t colors_scratch(const Colors& c) {
+  return static_cast<std::size_t>(whole_units(c.width)) * (c.stride + kUnitsStep);
+}
+
+// A row's values, padded, and its last layer before alpha: (width, kUnitsStep), of which three count.
+inline void last_layer(const Colors& c, int y, float* values, float* out) {
+  const float* from = c.values + static_cast<std::ptrdiff_t>(y) * c.width * c.channels;
+  const int padded = whole_units(c.width);
+  for (int x = 0; x < c.width; ++x) {
+    for (int k = 0; k < c.channels; ++k) values[x * c.stride + k] = from[x * c.channels + k];
+    for (int k = c.channels; k < c.stride; ++k) values[x * c.stride + k] = 0.0f;
+  }
+  fill_zero(values + static_cast<std::ptrdiff_t>(c.width) * c.stride, static_cast<std::int64_t>(padded - c.width) * c.stride);
+  const Part part = {values, c.stride, 1, c.weight, kUnitsStep, c.channels};
+  product(&part, 1, padded, kUnitsStep, c.bias, 0, out, kUnitsStep);
+}
+
+inline void colors(const Colors& c, int begin, int end, float* scratch) {
+  float *values = scratch, *last = scratch + static_cast<std::ptrdiff_t>(whole_units(c.width)) * c.stride;
+  for (int y = begin; y < end; ++y) {
+    last_layer(c, y, values, last);
+    for (int x = 0; x < c.width; ++x) {
+      const std::ptrdiff_t pixel = static_cast<std::ptrdiff_t>(y) * c.width + x;
+      for (int k = 0; k < 3; ++k)
+        c.image[3 * pixel + k] =
+            c.near[pixel] ? c.plain[3 * pixel + k] + c.alpha[pixel] * last[x * kUnitsStep + k] : c.background[k];
+    }
+  }
+}
+
+inline void colors_backward(const Colors& c, int begin, int end, float* scratch) {
+  float *values = scratch, *last = scratch + static_cast<std::ptrdiff_t>(whole_units(c.width)) * c.stride;
+  for (int y = begin; y < end; ++y) {
+    last_layer(c, y, values, last);
+    float* sums = c.row_sums + static_cast<std::ptrdiff_t>(y) * 3 * (c.stride + 1);
+    fill_zero(sums, 3 * (c.stride + 1));
+    for (int x = 0; x < c.width; ++x) {
+      const std::ptrdiff_t pixel = static_cast<std::ptrdiff_t>(y) * c.width + x;
+      float by_last[3], by_alpha = 0.0f;
+      for (int k = 0; k < 3; ++k) {
+        const float by = c.near[pixel] ? c.by_image[3 * pixel + k] : 0.0f;
+        c.by_plain[3 * pixel + k] = by;
+        by_alpha += by * last[x * kUnitsStep + k];
+        by_last[k] = c.alpha[pixel] * by;
+        sums[k * (c.stride + 1) + c.stride] += by_last[k];
+      }
+      c.by_alpha[pixel] = by_alpha;
+      float* by_values = c.by_values + pixel * c.channels;
+      for (int channel = 0; channel < c.stride; channel += W) {
+        Real by = 0.0f;
+        const Real value = load(values + x * c.stride + channel);
+        for (int k = 0; k < 3; ++k) {
+          by = fma(load(c.rows + k * c.stride + channel), by_last[k], by);
+          float* sum = sums + k * (c.stride + 1) + channel;
+          store(sum, fma(value, by_last[k], load(sum)));
+        }
+        if (channel + W <= c.channels) {
+          store(by_values + channel, by);
+        } else {
+          alignas(64) float lanes[W];
+          store(lanes, by);
+          for (int lane = 0; channel + lane < c.channels; ++lane) by_values[channel + lane] = lanes[lane];
+        }
+      }
+    }
+  }
+}
+
 }  // namespace headbench::HEADBENCH_ISA

@@ -8,7 +8,10 @@
 #include <memory>
 #include <new>
 #include <string>
+#include <utility>
 #include <vector>
+
+#include <nanobind/stl/pair.h>
 
 #include "bench/native/module.h"
 #include "bench/native/thread_pool.h"
@@ -429,16 +432,62 @@ void convolve_backward(const Image& values, const Array<const float, -1, -1, 3, 
 
 // ---- Influence ----
 
-void nearest(const Array<const float, -1, 3>& points, const Array<const float, -1, 3>& landmarks,
-             const Array<std::int32_t, -1>& found, const VectorOut& squared, const std::string& isa, int threads) {
+// `influences` of driving.py: how many points are near, and how many far.
+std::pair<std::int64_t, std::int64_t> influences(
+    const Array<const float, -1, 3>& points, const Array<const float, -1, 3>& landmarks, float near_squared, float far_squared,
+    const Array<std::int32_t, -1>& nearest, const Array<std::int64_t, 2, -1>& rows, const Array<float, 2, -1>& weights,
+    const std::string& isa, int threads) {
   const auto count = static_cast<std::int64_t>(points.shape(0)), of = static_cast<std::int64_t>(landmarks.shape(0));
-  require(found.shape(0) == points.shape(0) && squared.shape(0) == points.shape(0) && of >= 1 && of < (1 << 24) && threads >= 1);
+  require(nearest.shape(0) == points.shape(0) && rows.shape(1) == points.shape(0) && weights.shape(1) == points.shape(0));
+  require(of >= 1 && of < (1 << 24) && threads >= 1);
   const Kernels& kernels = kernels_of(isa);
   nb::gil_scoped_release unlocked;
+  const Floats squared(count);
   ThreadPool::instance().run(divided_up(count, kPointsPerTask), threads, [&](std::int64_t task, int) {
     const std::int64_t begin = task * kPointsPerTask, end = std::min(begin + kPointsPerTask, count);
-    kernels.nearest(points.data(), landmarks.data(), of, begin, end, found.data(), squared.data());
+    kernels.nearest(points.data(), landmarks.data(), of, begin, end, nearest.data(), squared.data());
   });
+  std::int64_t near = 0, far = 0;
+  for (std::int64_t i = 0; i < count; ++i) {
+    const float weight = std::clamp((far_squared - squared.data()[i]) / (far_squared - near_squared), 0.0f, 1.0f);
+    if (weight > 0) {
+      rows.data()[near] = i;
+      weights.data()[near++] = weight;
+    }
+    if (weight < 1) {
+      rows.data()[count + far] = i;
+      weights.data()[count + far++] = 1 - weight;
+    }
+  }
+  return {near, far};
+}
+
+// Gradients by points and, if asked for, landmarks, of those by the near and the far points' weights.
+void influences_backward(const Array<const float, -1, 3>& points, const Array<const float, -1, 3>& landmarks,
+                         float near_squared, float far_squared, const Array<const std::int32_t, -1>& nearest,
+                         const Array<const std::int64_t, -1>& near, const Array<const float, -1>& near_weights,
+                         const Array<const float, -1>& by_near, const Array<const std::int64_t, -1>& far,
+                         const Array<const float, -1>& far_weights, const Array<const float, -1>& by_far,
+                         const Array<float, -1, 3>& by_points, const Array<float, -1, 3>& by_landmarks) {
+  require(nearest.shape(0) == points.shape(0) && by_points.shape(0) == points.shape(0));
+  require(near.shape(0) == by_near.shape(0) && far.shape(0) == by_far.shape(0));
+  require(near.shape(0) == near_weights.shape(0) && far.shape(0) == far_weights.shape(0));
+  require(by_landmarks.shape(0) == 0 || by_landmarks.shape(0) == landmarks.shape(0));
+  require(within(near, points.shape(0)) && within(far, points.shape(0)));
+  const float slope = -2 / (far_squared - near_squared);
+  std::fill_n(by_points.data(), 3 * points.shape(0), 0.0f);
+  std::fill_n(by_landmarks.data(), 3 * by_landmarks.shape(0), 0.0f);
+  const auto add = [&](std::int64_t i, float weight, float gradient) {
+    if (!(weight > 0 && weight < 1)) return;
+    const std::int64_t landmark = nearest.data()[i];
+    for (int k = 0; k < 3; ++k) {
+      const float by = gradient * slope * (points.data()[3 * i + k] - landmarks.data()[3 * landmark + k]);
+      by_points.data()[3 * i + k] += by;
+      if (by_landmarks.shape(0)) by_landmarks.data()[3 * landmark + k] -= by;
+    }
+  };
+  for (std::size_t i = 0; i < near.shape(0); ++i) add(near.data()[i], near_weights.data()[i], by_near.data()[i]);
+  for (std::size_t i = 0; i < far.shape(0); ++i) add(far.data()[i], far_weights.data()[i], -by_far.data()[i]);
 }
 
 // ---- Encoding ----
@@ -467,6 +516,260 @@ void encode_backward(const Array<const float, -1, kEncoding>& encoded, const Arr
   });
 }
 
+// ---- Features ----
+
+constexpr std::int64_t kNumbersPerTask = 1 << 14;
+
+void tanh_of(const Vector& values, const VectorOut& out, const std::string& isa, int threads) {
+  const auto count = static_cast<std::int64_t>(values.shape(0));
+  require(out.shape(0) == values.shape(0) && threads >= 1);
+  const Kernels& kernels = kernels_of(isa);
+  nb::gil_scoped_release unlocked;
+  ThreadPool::instance().run(divided_up(count, kNumbersPerTask), threads, [&](std::int64_t task, int) {
+    const std::int64_t begin = task * kNumbersPerTask;
+    kernels.tanh(values.data(), begin, std::min(begin + kNumbersPerTask, count), out.data());
+  });
+}
+
+void tanh_backward(const Vector& out, const Vector& by_out, const VectorOut& by_values, const std::string& isa, int threads) {
+  const auto count = static_cast<std::int64_t>(out.shape(0));
+  require(by_out.shape(0) == out.shape(0) && by_values.shape(0) == out.shape(0) && threads >= 1);
+  const Kernels& kernels = kernels_of(isa);
+  nb::gil_scoped_release unlocked;
+  ThreadPool::instance().run(divided_up(count, kNumbersPerTask), threads, [&](std::int64_t task, int) {
+    const std::int64_t begin = task * kNumbersPerTask;
+    kernels.tanh_backward(out.data(), by_out.data(), begin, std::min(begin + kNumbersPerTask, count), by_values.data());
+  });
+}
+
+// ---- Colours of a residual image ----
+
+// Whether any alpha within `reach` pixels is above `covered`.
+void near_drawn(const Rows& alpha, int reach, float covered, const Array<std::uint8_t, -1, -1>& near) {
+  const auto height = static_cast<int>(alpha.shape(0)), width = static_cast<int>(alpha.shape(1));
+  require(near.shape(0) == alpha.shape(0) && near.shape(1) == alpha.shape(1) && reach >= 0);
+  std::vector<std::uint8_t> across(static_cast<std::size_t>(height) * width);
+  for (int y = 0; y < height; ++y) {
+    int last = -reach - 1;  // drawn pixel seen last, from the left
+    const float* row = alpha.data() + static_cast<std::ptrdiff_t>(y) * width;
+    std::uint8_t* to = across.data() + static_cast<std::ptrdiff_t>(y) * width;
+    for (int x = 0; x < std::min(reach, width); ++x)
+      if (row[x] > covered) last = x;
+    for (int x = 0; x < width; ++x) {
+      if (x + reach < width && row[x + reach] > covered) last = x + reach;
+      to[x] = last >= x - reach;
+    }
+  }
+  for (int y = 0; y < height; ++y) {
+    std::uint8_t* to = near.data() + static_cast<std::ptrdiff_t>(y) * width;
+    std::fill_n(to, width, std::uint8_t{0});
+    for (int other = std::max(y - reach, 0); other <= std::min(y + reach, height - 1); ++other) {
+      const std::uint8_t* from = across.data() + static_cast<std::ptrdiff_t>(other) * width;
+      for (int x = 0; x < width; ++x) to[x] |= from[x];
+    }
+  }
+}
+
+// What both passes are given.
+struct ColorInputs {
+  Image values;
+  Array<const float, 3, -1> weight;
+  Array<const float, 3> bias;
+  Array<const float, -1, -1, 3> plain;
+  Rows alpha;
+  Array<const std::uint8_t, -1, -1> near;
+};
+
+class PaddedColors {
+ public:
+  explicit PaddedColors(const ColorInputs& in)
+      : weight_(static_cast<std::size_t>(whole_units(in.values.shape(2))) * kUnitsStep),
+        rows_(std::size_t{3} * whole_units(in.values.shape(2))), bias_(kUnitsStep) {
+    const std::size_t channels = in.values.shape(2);
+    for (const auto shape : {in.plain.shape(0), in.alpha.shape(0), in.near.shape(0)}) require(shape == in.values.shape(0));
+    for (const auto shape : {in.plain.shape(1), in.alpha.shape(1), in.near.shape(1)}) require(shape == in.values.shape(1));
+    require(in.weight.shape(1) == channels && in.values.shape(0) < (1u << 20) && in.values.shape(1) < (1u << 20));
+    net.height = static_cast<int>(in.values.shape(0));
+    net.width = static_cast<int>(in.values.shape(1));
+    net.channels = static_cast<int>(channels);
+    net.stride = whole_units(channels);
+    std::fill_n(weight_.data(), static_cast<std::size_t>(net.stride) * kUnitsStep, 0.0f);
+    std::fill_n(rows_.data(), std::size_t{3} * net.stride, 0.0f);
+    std::fill_n(bias_.data(), kUnitsStep, 0.0f);
+    for (int color = 0; color < 3; ++color) {
+      bias_.data()[color] = in.bias.data()[color];
+      for (std::size_t k = 0; k < channels; ++k)
+        weight_.data()[k * kUnitsStep + color] = rows_.data()[color * net.stride + k] = in.weight.data()[color * channels + k];
+    }
+    net.values = in.values.data();
+    net.weight = weight_.data();
+    net.rows = rows_.data();
+    net.bias = bias_.data();
+    net.plain = in.plain.data();
+    net.alpha = in.alpha.data();
+    net.near = in.near.data();
+  }
+
+  Colors net{};
+
+ private:
+  const Floats weight_, rows_, bias_;
+};
+
+template <class Body>
+void share_strips(int height, std::size_t scratch_floats, int threads, const Body& body) {
+  share_out(divided_up(height, kStripRows), scratch_floats, threads, [&](std::int64_t strip, float* scratch) {
+    const int begin = static_cast<int>(strip) * kStripRows;
+    body(begin, std::min(begin + kStripRows, height), scratch);
+  });
+}
+
+void colors(const Image& values, const Array<const float, 3, -1>& weight, const Array<const float, 3>& bias,
+            const Array<const float, -1, -1, 3>& plain, const Rows& alpha, const Array<const std::uint8_t, -1, -1>& near,
+            const Array<const float, 3>& background, const Array<float, -1, -1, 3>& image, const std::string& isa, int threads) {
+  const ColorInputs in{values, weight, bias, plain, alpha, near};
+  PaddedColors padded(in);
+  require(image.shape(0) == values.shape(0) && image.shape(1) == values.shape(1) && threads >= 1);
+  padded.net.background = background.data();
+  padded.net.image = image.data();
+  const Kernels& kernels = kernels_of(isa);
+  nb::gil_scoped_release unlocked;
+  share_strips(padded.net.height, kernels.colors_scratch(padded.net), threads,
+               [&](int begin, int end, float* scratch) { kernels.colors(padded.net, begin, end, scratch); });
+}
+
+void colors_backward(const Image& values, const Array<const float, 3, -1>& weight, const Array<const float, 3>& bias,
+                     const Array<const float, -1, -1, 3>& plain, const Rows& alpha,
+                     const Array<const std::uint8_t, -1, -1>& near, const Array<const float, -1, -1, 3>& by_image,
+                     const ImageOut& by_values, const Array<float, 3, -1>& by_weight, const Array<float, 3>& by_bias,
+                     const Array<float, -1, -1, 3>& by_plain, const RowsOut& by_alpha, const std::string& isa, int threads) {
+  const ColorInputs in{values, weight, bias, plain, alpha, near};
+  PaddedColors padded(in);
+  Colors& net = padded.net;
+  for (const auto shape : {by_image.shape(0), by_values.shape(0), by_plain.shape(0), by_alpha.shape(0)})
+    require(shape == values.shape(0));
+  for (const auto shape : {by_image.shape(1), by_values.shape(1), by_plain.shape(1), by_alpha.shape(1)})
+    require(shape == values.shape(1));
+  require(by_values.shape(2) == values.shape(2) && by_weight.shape(1) == values.shape(2) && threads >= 1);
+  const std::size_t stride = net.stride + 1;
+  const Floats of_rows(3 * stride * net.height);
+  net.by_image = by_image.data();
+  net.by_values = by_values.data();
+  net.by_plain = by_plain.data();
+  net.by_alpha = by_alpha.data();
+  net.row_sums = of_rows.data();
+  const Kernels& kernels = kernels_of(isa);
+  nb::gil_scoped_release unlocked;
+  share_strips(net.height, kernels.colors_scratch(net), threads,
+               [&](int begin, int end, float* scratch) { kernels.colors_backward(net, begin, end, scratch); });
+  const std::size_t last = net.stride, channels = net.channels;
+  for (int color = 0; color < 3; ++color)
+    for (std::size_t k = 0; k < stride; ++k) {
+      if (k >= channels && k < last) continue;
+      double sum = 0;
+      for (int y = 0; y < net.height; ++y) sum += of_rows.data()[(3 * y + color) * stride + k];
+      (k == last ? by_bias.data()[color] : by_weight.data()[color * channels + k]) = static_cast<float>(sum);
+    }
+}
+
+// ---- Splats of a pose ----
+
+using Triples = Array<const float, -1, 3>;
+using Quads = Array<const float, -1, 4>;
+
+Posing posing_of(float unit, float displacement_scale, float attribute_scale, float largest,
+                 const Array<const float, 3, 3>& rotation, const Array<const float, 3>& translation,
+                 const Array<const float, 4, 4>& turn, const Triples& points, const Triples& moves, const Triples& log_scales,
+                 const Quads& quats, const Vector& opacities, const Array<const float, -1, 8>& changes) {
+  for (const auto shape : {moves.shape(0), log_scales.shape(0), quats.shape(0), opacities.shape(0), changes.shape(0)})
+    require(shape == points.shape(0));
+  Posing in{};
+  in.unit = unit;
+  in.displacement_scale = displacement_scale;
+  in.attribute_scale = attribute_scale;
+  in.largest = largest;
+  std::copy_n(rotation.data(), 9, in.rotation);
+  std::copy_n(translation.data(), 3, in.translation);
+  std::copy_n(turn.data(), 16, in.turn);
+  in.points = points.data();
+  in.moves = moves.data();
+  in.log_scales = log_scales.data();
+  in.quats = quats.data();
+  in.opacities = opacities.data();
+  in.changes = changes.data();
+  return in;
+}
+
+void pose(float unit, float displacement_scale, float attribute_scale, float largest,
+          const Array<const float, 3, 3>& rotation, const Array<const float, 3>& translation,
+          const Array<const float, 4, 4>& turn, const Triples& points, const Triples& moves, const Triples& log_scales,
+          const Quads& quats, const Vector& opacities, const Array<const float, -1, 8>& changes,
+          const Array<float, -1, 3>& means, const Array<float, -1, 4>& world_quats, const Array<float, -1, 3>& scales,
+          const VectorOut& seen, const std::string& isa, int threads) {
+  Posing in = posing_of(unit, displacement_scale, attribute_scale, largest, rotation, translation, turn, points, moves,
+                        log_scales, quats, opacities, changes);
+  for (const auto shape : {means.shape(0), world_quats.shape(0), scales.shape(0), seen.shape(0)})
+    require(shape == points.shape(0));
+  require(threads >= 1);
+  in.means = means.data();
+  in.world_quats = world_quats.data();
+  in.scales = scales.data();
+  in.seen = seen.data();
+  const Kernels& kernels = kernels_of(isa);
+  const auto count = static_cast<std::int64_t>(points.shape(0));
+  nb::gil_scoped_release unlocked;
+  ThreadPool::instance().run(divided_up(count, kPointsPerTask), threads, [&](std::int64_t task, int) {
+    kernels.pose(in, task * kPointsPerTask, std::min((task + 1) * kPointsPerTask, count));
+  });
+}
+
+void pose_backward(float unit, float displacement_scale, float attribute_scale, float largest,
+                   const Array<const float, 3, 3>& rotation, const Array<const float, 3>& translation,
+                   const Array<const float, 4, 4>& turn, const Triples& points, const Triples& moves,
+                   const Triples& log_scales, const Quads& quats, const Vector& opacities,
+                   const Array<const float, -1, 8>& changes, const Triples& scales, const Vector& seen,
+                   const Triples& by_means, const Quads& by_world_quats, const Triples& by_scales, const Vector& by_seen,
+                   const Array<float, 3, 3>& by_rotation, const Array<float, 3>& by_translation,
+                   const Array<float, 4, 4>& by_turn, const Array<float, -1, 3>& by_points,
+                   const Array<float, -1, 3>& by_moves, const Array<float, -1, 3>& by_log_scales,
+                   const Array<float, -1, 4>& by_quats, const VectorOut& by_opacities, const Array<float, -1, 8>& by_changes,
+                   const std::string& isa, int threads) {
+  Posing in = posing_of(unit, displacement_scale, attribute_scale, largest, rotation, translation, turn, points, moves,
+                        log_scales, quats, opacities, changes);
+  for (const auto shape : {scales.shape(0), seen.shape(0), by_means.shape(0), by_world_quats.shape(0), by_scales.shape(0),
+                           by_seen.shape(0), by_points.shape(0), by_moves.shape(0), by_log_scales.shape(0),
+                           by_quats.shape(0), by_opacities.shape(0), by_changes.shape(0)})
+    require(shape == points.shape(0));
+  require(threads >= 1);
+  in.scales = const_cast<float*>(scales.data());
+  in.seen = const_cast<float*>(seen.data());
+  in.by_means = by_means.data();
+  in.by_world_quats = by_world_quats.data();
+  in.by_scales = by_scales.data();
+  in.by_seen = by_seen.data();
+  in.by_points = by_points.data();
+  in.by_moves = by_moves.data();
+  in.by_log_scales = by_log_scales.data();
+  in.by_quats = by_quats.data();
+  in.by_opacities = by_opacities.data();
+  in.by_changes = by_changes.data();
+  const Kernels& kernels = kernels_of(isa);
+  const auto count = static_cast<std::int64_t>(points.shape(0));
+  const std::int64_t tasks = divided_up(count, kPointsPerTask);
+  nb::gil_scoped_release unlocked;
+  const Floats sums(static_cast<std::size_t>(tasks) * kPosingSums);
+  ThreadPool::instance().run(tasks, threads, [&](std::int64_t task, int) {
+    kernels.pose_backward(in, task * kPointsPerTask, std::min((task + 1) * kPointsPerTask, count),
+                          sums.data() + task * kPosingSums);
+  });
+  for (int k = 0; k < kPosingSums; ++k) {
+    double sum = 0;
+    for (std::int64_t task = 0; task < tasks; ++task) sum += sums.data()[task * kPosingSums + k];
+    float* to = k < 9 ? by_rotation.data() + k : k < 12 ? by_translation.data() + (k - 9) : by_turn.data() + (k - 12);
+    *to = static_cast<float>(sum);
+  }
+}
+
 }  // namespace
 }  // namespace headbench::gha
 
@@ -487,11 +790,31 @@ NB_MODULE(_kernel, m) {
         "A convolution, raw, then normalised over the image and rectified.");
   m.def("convolve_backward", &convolve_backward, "values"_a, "weight"_a, "raw"_a, "moments"_a, "by_out"_a, "by_values"_a,
         "by_weight"_a, "instruction_set"_a, "threads"_a, "Its gradients. An empty by_values asks for none.");
-  m.def("nearest", &nearest, "points"_a, "landmarks"_a, "found"_a, "squared"_a, "instruction_set"_a, "threads"_a,
-        "The nearest landmark of each point, and the squared distance from it.");
+  m.def("influences", &influences, "points"_a, "landmarks"_a, "near_squared"_a, "far_squared"_a, "nearest"_a, "rows"_a,
+        "weights"_a, "instruction_set"_a, "threads"_a,
+        "Rows and weights of the near and of the far points, and their numbers; the nearest landmark of each point.");
+  m.def("influences_backward", &influences_backward, "points"_a, "landmarks"_a, "near_squared"_a, "far_squared"_a,
+        "nearest"_a, "near"_a, "near_weights"_a, "by_near"_a, "far"_a, "far_weights"_a, "by_far"_a, "by_points"_a,
+        "by_landmarks"_a, "Gradients of the weights. An empty by_landmarks asks for none.");
   m.def("encode", &encode, "points"_a, "encoded"_a, "instruction_set"_a, "threads"_a, "Positional encoding of points.");
   m.def("encode_backward", &encode_backward, "encoded"_a, "by_encoded"_a, "by_points"_a, "instruction_set"_a, "threads"_a,
         "Its gradient by the points.");
+  m.def("tanh", &tanh_of, "values"_a, "out"_a, "instruction_set"_a, "threads"_a);
+  m.def("tanh_backward", &tanh_backward, "out"_a, "by_out"_a, "by_values"_a, "instruction_set"_a, "threads"_a);
+  m.def("near_drawn", &near_drawn, "alpha"_a, "reach"_a, "covered"_a, "near"_a, "Where something is drawn near.");
+  m.def("colors", &colors, "values"_a, "weight"_a, "bias"_a, "plain"_a, "alpha"_a, "near"_a, "background"_a, "image"_a,
+        "instruction_set"_a, "threads"_a, "Colours of a residual image.");
+  m.def("colors_backward", &colors_backward, "values"_a, "weight"_a, "bias"_a, "plain"_a, "alpha"_a, "near"_a, "by_image"_a,
+        "by_values"_a, "by_weight"_a, "by_bias"_a, "by_plain"_a, "by_alpha"_a, "instruction_set"_a, "threads"_a,
+        "Their gradients.");
+  m.def("pose", &pose, "unit"_a, "displacement_scale"_a, "attribute_scale"_a, "largest"_a, "rotation"_a, "translation"_a,
+        "turn"_a, "points"_a, "moves"_a, "log_scales"_a, "quats"_a, "opacities"_a, "changes"_a, "means"_a, "world_quats"_a,
+        "scales"_a, "seen"_a, "instruction_set"_a, "threads"_a, "Splats of a pose.");
+  m.def("pose_backward", &pose_backward, "unit"_a, "displacement_scale"_a, "attribute_scale"_a, "largest"_a, "rotation"_a,
+        "translation"_a, "turn"_a, "points"_a, "moves"_a, "log_scales"_a, "quats"_a, "opacities"_a, "changes"_a, "scales"_a,
+        "seen"_a, "by_means"_a, "by_world_quats"_a, "by_scales"_a, "by_seen"_a, "by_rotation"_a, "by_translation"_a,
+        "by_turn"_a, "by_points"_a, "by_moves"_a, "by_log_scales"_a, "by_quats"_a, "by_opacities"_a, "by_changes"_a,
+        "instruction_set"_a, "threads"_a, "Their gradients.");
   m.def("instruction_sets", [] { return names_of(runnable_gha_kernels()); },
         "Variants this machine can run, the fastest first.");
 }

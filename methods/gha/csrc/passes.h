@@ -70,6 +70,39 @@ struct Convolution {
   float* by_values;      // (height, width, inputs), or none
 };
 
+// Colours of a residual image: plain + alpha (weight values + bias) where something is near, else the background.
+struct Colors {
+  int height, width, channels, stride;  // channels as they are, and padded
+  const float* values;      // (height, width, channels)
+  const float* weight;      // (stride, kUnitsStep), colours side by side
+  const float* bias;        // (kUnitsStep,)
+  const float* plain;       // (height, width, 3)
+  const float* alpha;       // (height, width)
+  const std::uint8_t* near;  // (height, width)
+  const float* background;  // (3,)
+  float* image;             // (height, width, 3)
+  // Backward.
+  const float* rows;      // (3, stride) of the weights
+  const float* by_image;  // (height, width, 3)
+  float* by_values;       // (height, width, channels)
+  float* by_plain;        // (height, width, 3)
+  float* by_alpha;        // (height, width)
+  float* row_sums;        // (height, 3, stride + 1) gradients by weights and bias of each row
+};
+
+// Splats of a pose from canonical points: `posed` of gaussian_head.py.
+struct Posing {
+  float unit, displacement_scale, attribute_scale, largest;  // the last of log-scales
+  float rotation[9], translation[3], turn[16];  // by rows; the last multiplies quaternions
+  const float *points, *moves, *log_scales, *quats, *opacities;  // (N, 3), (N, 3), (N, 3), (N, 4), (N,)
+  const float* changes;  // (N, 8) of log-scales, quaternions and opacities
+  float *means, *world_quats, *scales, *seen;  // (N, 3), (N, 4), (N, 3), (N,)
+  // Backward: gradients by what was written.
+  const float *by_means, *by_world_quats, *by_scales, *by_seen;
+  float *by_points, *by_moves, *by_log_scales, *by_quats, *by_opacities, *by_changes;
+};
+constexpr int kPosingSums = 28;  // rotation, translation, turn
+
 struct Kernels {
   const char* name;
   std::size_t (*forward_scratch)(const Perceptron&);
@@ -93,6 +126,14 @@ struct Kernels {
   void (*encode)(const float* points, std::int64_t begin, std::int64_t end, float* encoded);
   void (*encode_backward)(const float* encoded, const float* by_encoded, std::int64_t begin, std::int64_t end,
                           float* by_points);
+  void (*tanh)(const float* values, std::int64_t begin, std::int64_t end, float* out);
+  void (*tanh_backward)(const float* out, const float* by_out, std::int64_t begin, std::int64_t end, float* by_values);
+  std::size_t (*colors_scratch)(const Colors&);
+  void (*colors)(const Colors&, int begin, int end, float* scratch);
+  void (*colors_backward)(const Colors&, int begin, int end, float* scratch);
+  void (*pose)(const Posing&, std::int64_t begin, std::int64_t end);
+  // Writes the sums of splats [begin, end).
+  void (*pose_backward)(const Posing&, std::int64_t begin, std::int64_t end, float* sums);
 };
 
 }  // namespace headbench::gha

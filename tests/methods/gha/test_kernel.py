@@ -102,6 +102,60 @@ def _convolution(height: int, width: int, before: int, after: int) -> Case:
     )
 
 
+def _influences() -> Case:
+    def joined(found: Sequence[Tensor]) -> Tensor:
+        rows, weights, far, far_weights = found
+        assert rows.dtype == far.dtype == torch.int64
+        return torch.cat([rows.to(weights), 3 * weights, far.to(weights), far_weights])
+
+    def slow(points: Tensor, landmarks: Tensor) -> Tensor:
+        near, far = driving.reference_influences(points, landmarks, 0.1, 0.5)
+        return joined([*near, *far])
+
+    return Case(
+        lambda points, landmarks, isa: joined(kernel.influences(points, landmarks, 0.1, 0.5, isa)),
+        slow,
+        [_random(POINTS, 3), _random(50, 3, seed=1)],
+    )
+
+
+def _residual_image(channels: int) -> Case:
+    alpha = _random(21, 35, seed=3).clamp_min(0)
+    alpha[:, 20:] = 0
+    ground = torch.tensor([1.0, 0.5, 0.25])
+    near = gaussian_head.near_drawn(alpha)
+    assert 0.2 < near.mean() < 0.8
+
+    def slow(values: Tensor, weight: Tensor, bias: Tensor, plain: Tensor, alpha: Tensor) -> Tensor:
+        colors = torch.nn.functional.linear(values, weight, bias)
+        return gaussian_head.residual_image(colors, plain, alpha, near, ground.double())
+
+    return Case(
+        lambda *x: kernel.residual_image(*x[:5], near.to(torch.uint8), ground, x[5]),
+        slow,
+        [_random(21, 35, channels), _random(3, channels), _random(3), _random(21, 35, 3), alpha],
+    )
+
+
+def _posed() -> Case:
+    scales = kernel.Scales(0.1, 0.3, 0.2, 0.5)
+    shapes = (3, 3), (3,), (4, 4), (POINTS, 3), (POINTS, 3), (POINTS, 3), (POINTS, 4), (POINTS,), (POINTS, 8)
+    inputs = [_random(*shape, seed=number) for number, shape in enumerate(shapes)]
+    return Case(
+        lambda *x: torch.cat([t.flatten() for t in kernel.posed(scales, *x[:-1], instruction_set=x[-1])]),
+        lambda *x: torch.cat([t.flatten() for t in gaussian_head.posed(scales, *x)]),
+        inputs,
+    )
+
+
+def _with_colors() -> Case:
+    return Case(
+        lambda features, _: torch.cat(kernel.with_colors(features), dim=2),
+        lambda features: torch.cat([features, features[..., :3]], dim=2),
+        [_random(5, 6, 7)],
+    )
+
+
 CASES = {
     "perceptron": _perceptron((70, 64, 20), (11,), 5, False),
     "perceptron, squashed, some outputs": _perceptron((33, 20), (11,), 2, True),
@@ -115,9 +169,12 @@ CASES = {
     "convolution of many channels": _convolution(6, 70, 70, 80),
     "convolution of one row": _convolution(1, 50, 5, 3),
     "encoding": Case(kernel.encode, encode, [4 * _random(POINTS, 3)]),
-    "nearest": Case(
-        kernel.nearest_squared, driving.nearest_squared, [_random(POINTS, 3), _random(50, 3, seed=1)]
-    ),
+    "hyperbolic tangent": Case(kernel.tanh, torch.tanh, [3 * _random(POINTS, 7)]),
+    "influences": _influences(),
+    "posing": _posed(),
+    "residual image": _residual_image(16),
+    "residual image, other channels": _residual_image(21),
+    "colours beside features": _with_colors(),
 }
 
 
@@ -164,3 +221,22 @@ def test_values_are_the_same_without_gradients(name):
     with torch.no_grad():
         plain = case.fast(*inputs, "")
     assert torch.equal(plain, case.fast(*(value.requires_grad_() for value in inputs), "").detach())
+
+
+@pytest.mark.skipif(not kernel.KERNEL.instruction_sets, reason="the kernel is missing")
+@pytest.mark.parametrize("shape", [(9, 13), (1, 1), (30, 2), (2, 30)])
+def test_surroundings_of_what_is_drawn(shape):
+    alpha = torch.rand(shape, generator=torch.Generator().manual_seed(1)).sub(0.93).clamp_min(0)
+    near = kernel.near_drawn(alpha, gaussian_head.REACH, gaussian_head.COVERED)
+    assert torch.equal(near.float(), gaussian_head.near_drawn(alpha))
+
+
+@pytest.mark.skipif(not kernel.KERNEL.instruction_sets, reason="the kernel is missing")
+def test_torch_on_one_thread_leaves_kernels_theirs():
+    with torch_threads(3):
+        with kernel.torch_on_one_thread():
+            assert (torch.get_num_threads(), kernel.threads()) == (1, 3)
+            with kernel.torch_on_one_thread():
+                assert (torch.get_num_threads(), kernel.threads()) == (1, 3)
+            assert (torch.get_num_threads(), kernel.threads()) == (1, 3)
+        assert (torch.get_num_threads(), kernel.threads()) == (3, 3)
