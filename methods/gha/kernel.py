@@ -24,9 +24,14 @@ UNITS_STEP = 16
 """Channels are padded to a multiple of it."""
 
 
+def available() -> bool:
+    """Whether the kernel is there; one built from older sources, in an editable installation, counts as none."""
+    return hasattr(KERNEL.imported, "pose_backward")
+
+
 def usable(like: Tensor) -> bool:
     """Whether the kernel is there and takes tensors like this one."""
-    return like.dtype == torch.float32 and like.device.type == "cpu" and bool(KERNEL.instruction_sets)
+    return like.dtype == torch.float32 and like.device.type == "cpu" and available()
 
 
 _threads: int | None = None
@@ -46,7 +51,7 @@ def torch_on_one_thread() -> Iterator[None]:
     """
     global _threads
     before, outer = torch.get_num_threads(), _threads
-    if not KERNEL.instruction_sets or before == 1:
+    if not available() or before == 1:
         yield
         return
     _threads = before

@@ -15,6 +15,7 @@ from headbench.methods.gha.networks import SLOPE, Mlp, blended_reference
 from headbench.methods.shared.networks import encode
 from headbench.tests.benchmarks.timing import torch_threads
 
+needs_kernel = pytest.mark.skipif(not kernel.available(), reason="the kernel is missing")
 POINTS = 331  # no multiple of a tile, more than one chunk
 
 
@@ -186,6 +187,7 @@ def _outcome(function: Callable[..., Tensor], inputs: Sequence[Tensor], *more: s
     return [found.detach(), *torch.autograd.grad(weighted, leaves)]
 
 
+@needs_kernel
 @pytest.mark.parametrize("instruction_set", kernel.KERNEL.instruction_sets)
 @pytest.mark.parametrize("name", CASES)
 def test_kernel_agrees_with_its_reference(name, instruction_set):
@@ -197,7 +199,7 @@ def test_kernel_agrees_with_its_reference(name, instruction_set):
         torch.testing.assert_close(fast.double(), slow, rtol=3e-5, atol=3e-6 * float(slow.abs().max()))
 
 
-@pytest.mark.skipif(not kernel.KERNEL.instruction_sets, reason="the kernel is missing")
+@needs_kernel
 @pytest.mark.parametrize("name", CASES)
 def test_any_number_of_threads_gives_the_same_bits(name):
     case = CASES[name]
@@ -213,7 +215,7 @@ def test_any_number_of_threads_gives_the_same_bits(name):
         assert all(torch.equal(a, b) for a, b in zip(outcomes[0], other, strict=True))
 
 
-@pytest.mark.skipif(not kernel.KERNEL.instruction_sets, reason="the kernel is missing")
+@needs_kernel
 @pytest.mark.parametrize("name", CASES)
 def test_values_are_the_same_without_gradients(name):
     case = CASES[name]
@@ -223,7 +225,7 @@ def test_values_are_the_same_without_gradients(name):
     assert torch.equal(plain, case.fast(*(value.requires_grad_() for value in inputs), "").detach())
 
 
-@pytest.mark.skipif(not kernel.KERNEL.instruction_sets, reason="the kernel is missing")
+@needs_kernel
 @pytest.mark.parametrize("shape", [(9, 13), (1, 1), (30, 2), (2, 30)])
 def test_surroundings_of_what_is_drawn(shape):
     alpha = torch.rand(shape, generator=torch.Generator().manual_seed(1)).sub(0.93).clamp_min(0)
@@ -231,7 +233,7 @@ def test_surroundings_of_what_is_drawn(shape):
     assert torch.equal(near.float(), gaussian_head.near_drawn(alpha))
 
 
-@pytest.mark.skipif(not kernel.KERNEL.instruction_sets, reason="the kernel is missing")
+@needs_kernel
 def test_torch_on_one_thread_leaves_kernels_theirs():
     with torch_threads(3):
         with kernel.torch_on_one_thread():
