@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import time
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -174,11 +175,15 @@ class TableSettings:
     (all methods), paper-3 (INSTA and ours), paper-4 (what an expression may change: a run each)."""
     published: bool = False
     """Add columns with the figures that papers printed, where a layout has some."""
+    region: str = "full"
+    """Region of the frames to show instead of the whole, such as face."""
+    sequences: tuple[str, ...] = ()
+    """Only frames of these sequences; default: all."""
 
 
 def table(settings: TableSettings, progress: Progress) -> Findings:
     """Print a table of finished runs on the same frames."""
-    text = _table(settings.runs, settings.format, settings.layout, settings.published)
+    text = _table(**asdict(settings))
     return Findings(text, {"format": settings.format, "table": text})
 
 
@@ -263,18 +268,14 @@ def _run(config: RunConfig, **record: Any) -> Findings:
     )
 
 
-def _table(
-    runs: tuple[str, ...] | list[str], form: str = "md", layout: str = "comparison", published: bool = False
-) -> str:
-    text: str = resolve(get("reports", "table-text").implementation)(
-        list(map(Path, runs)), form, layout, published
-    )
+def _table(runs: Sequence[str], **options: Any) -> str:
+    text: str = resolve(get("reports", "table-text").implementation)(list(map(Path, runs)), **options)
     return text
 
 
 def means(run_folder: str) -> list[dict[str, Any]]:
     """Numbers of the comparison table, so that a machine reads what a person does; None where there is none."""
-    table = json.loads(_table([run_folder], "json"))
+    table = json.loads(_table([run_folder], format="json"))
     return [
         {
             **{name: column[name] for name in ("task", "metric")},

@@ -183,6 +183,28 @@ class Rows:
         """The same rows, every method under another name."""
         return Rows(self._table.assign(method=[labels[str(name)] for name in self._table["method"]]))
 
+    def of_part(self, region: str, sequences: Collection[str], full: str) -> Rows:
+        """Rows of frames over one region, which stands for the ``full`` one, in some sequences (none named: all).
+
+        Rows of avatars as a whole stay.
+        """
+        table = self._table
+        avatar = table["task"] == ""
+        chosen = table["region"] == region
+        if sequences:
+            chosen &= table["sequence"].isin(list(sequences))
+        return Rows(table[avatar | chosen].assign(region=full))
+
+    @property
+    def regions(self) -> set[str]:
+        """Regions that frames were measured over."""
+        return set(self._table.loc[self._table["task"] != "", "region"])
+
+    @property
+    def sequences(self) -> set[str]:
+        """Sequences of the frames."""
+        return set(self._table.loc[self._table["task"] != "", "sequence"])
+
     def of_methods(self, names: Collection[str]) -> Rows:
         """The rows of some methods."""
         return Rows(self._table[self._table["method"].isin(list(names))])

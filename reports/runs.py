@@ -141,10 +141,29 @@ LONGEST_DIFFERENCE = 48
 
 
 @dataclass(frozen=True)
+class Part:
+    """A part of the frames: one region of the head instead of the whole frame, and some sequences (none named: all)."""
+
+    region: str = FULL
+    sequences: tuple[str, ...] = ()
+
+    @property
+    def text(self) -> str:
+        """In words; "" for whole frames of all sequences."""
+        region = "" if self.region == FULL else f"Region: {self.region}."
+        return " ".join(
+            filter(None, [region, f"Sequences: {', '.join(self.sequences)}." if self.sequences else ""])
+        )
+
+
+WHOLE = Part()
+
+
+@dataclass(frozen=True)
 class RunSet:
     """Runs on the same frames, in the order given. The methods in their ``rows`` are named by labels.
 
-    ``records`` says by label what the method was, as in the manifest; ``trivial`` has labels of trivial baselines.
+    ``part`` says in words which part of the frames the rows are of, "" for all. ``records`` says by label what the method was, as in the manifest; ``trivial`` has labels of trivial baselines.
     """
 
     runs: tuple[RunData, ...]
@@ -153,10 +172,11 @@ class RunSet:
     tasks: tuple[str, ...]
     records: Mapping[str, MethodRecord]
     trivial: tuple[str, ...]
+    part: str = ""
 
     @classmethod
-    def read(cls, folders: Sequence[Path]) -> RunSet:
-        """Read runs. The same method with the same settings and other seeds is one method with more seeds.
+    def read(cls, folders: Sequence[Path], part: Part = WHOLE) -> RunSet:
+        """Read runs, or a part of their frames. The same method with the same settings and other seeds is one method with more seeds.
 
         With other settings it is another, named after the settings that differ ("ours (dynamic=opacity)"), or after
         the folders where that would be too long.
@@ -164,7 +184,7 @@ class RunSet:
         Raises
         ------
         InputError : runs that do not score the same frames by the same protocol, define a metric differently, or hold
-            the same training twice; faulty rows.
+            the same training twice; faulty rows; a region or a sequence that they do not have.
         """
         if not folders:
             raise InputError("runs", "", "at least one folder", "none")
@@ -178,7 +198,12 @@ class RunSet:
         }
         tasks = tuple(dict.fromkeys(task for run in runs for task in run.tasks))
         trivial = tuple(label for label, record in records.items() if record.trivial)
-        return cls(runs, rows, _metrics(runs), tasks, records, trivial)
+        metrics = _metrics(runs)
+        if part != WHOLE:
+            rows = _of_part(rows, part, runs[0].folder.rows)
+            tasks = tuple(task for task in tasks if task in rows.tasks)
+            metrics = tuple(spec for spec in metrics if spec.name in rows.metrics)
+        return cls(runs, rows, metrics, tasks, records, trivial, part.text)
 
     @property
     def methods(self) -> tuple[str, ...]:
@@ -204,6 +229,15 @@ class RunSet:
     def machine(self) -> str:
         """Machines that speed was measured on."""
         return "; ".join(dict.fromkeys(run.machine for run in self.runs))
+
+
+def _of_part(rows: Rows, part: Part, file: Path) -> Rows:
+    asked = (("region", {part.region}, rows.regions), ("sequences", {*part.sequences}, rows.sequences))
+    for key, names, known in asked:
+        if names - known:
+            expected, found = f"one of {', '.join(sorted(known))}", ", ".join(sorted(names - known))
+            raise InputError(file, key, expected, found)
+    return rows.of_part(part.region, part.sequences, FULL)
 
 
 def _check_protocols(runs: Sequence[RunData]) -> None:

@@ -17,7 +17,7 @@ from ..bench.io.documents import read_json
 from ..bench.io.files import grouped_writes, write_text
 from ..bench.manifest import MethodRecord
 from ..bench.specs import MetricSpec
-from .runs import RunSet
+from .runs import WHOLE, Part, RunSet
 from .tables import AVATAR_TITLE, Table, TableCell, TableRow, build_table
 from .writers import WRITERS, column_name
 
@@ -166,16 +166,21 @@ def write_tables(run_folder: Path) -> list[Path]:
 
 
 def table_text(
-    run_folders: Sequence[Path], format: str = "md", layout: str = COMPARISON, published: bool = False
+    run_folders: Sequence[Path],
+    format: str = "md",
+    layout: str = COMPARISON,
+    published: bool = False,
+    region: str = WHOLE.region,
+    sequences: tuple[str, ...] = (),
 ) -> str:
     """Return a table of one or more runs as text, in a format of `WRITERS`.
 
-    ``published`` adds columns with the figures that papers printed. Raises `InputError` for a format, a layout or
+    ``published`` adds columns with the figures that papers printed; ``region`` and ``sequences`` are those of `Part`. Raises `InputError` for a format, a layout or
     runs that do not fit.
     """
     if format not in WRITERS:
         raise InputError("table", "format", f"one of {', '.join(WRITERS)}", repr(format))
-    runs = RunSet.read(run_folders)
+    runs = RunSet.read(run_folders, Part(region, sequences))
     known = (*layouts(runs), *PAPER)
     if layout not in known:
         raise InputError(run_folders[0], "layout", f"one of {', '.join(known)}", repr(layout))
@@ -215,4 +220,5 @@ def table_of(runs: RunSet, layout: str = COMPARISON, published: bool = False) ->
         if not any(column.published for column in table.columns):
             found = f"none for {', '.join(names)} in layout {layout}"
             raise InputError("table", "--published", "a layout with figures that papers printed", found)
+    table = replace(table, part=runs.part if tasks else "")
     return table.mapped(lambda row: replace(row, method=names[row.method]))

@@ -86,7 +86,8 @@ class TaskSummary:
 
 @dataclass(frozen=True)
 class Table:
-    """A comparison, ready to be written in any format. ``marking`` says what the ranks mean, and by which test."""
+    """A comparison, ready to be written in any format. ``marking`` says what the ranks mean, and by which test,
+    ``part`` which part of the frames the values are of, "" for all."""
 
     columns: tuple[Column, ...]
     groups: tuple[tuple[str, tuple[TableRow, ...]], ...]  # (title, rows); empty groups are left out
@@ -96,6 +97,7 @@ class Table:
     marking: str = ""
     image_size: str = ""
     machine: str = ""
+    part: str = ""
 
     @property
     def rows(self) -> tuple[TableRow, ...]:
@@ -115,6 +117,7 @@ class Table:
             size = f"{counted(task.frames, 'frame')}, {counted(task.subjects, 'subject')}"
             name = f"{task.protocol_id} " if task.protocol_id else ""
             parts.append(f"{task.title}: {size}, protocol {name}({task.protocol_hash}).")
+        parts += [self.part] if self.part else []
         if self.image_size:
             parts.append(f"Images of {self.image_size} pixels.")
         spread = f"mean of {self.seeds} seeds ± its standard deviation from seed to seed"

@@ -173,6 +173,7 @@ CASES = {
         *(case(f"table {{demo}} --layout {layout} --format csv", FORMATS["csv"]) for layout in LAYOUTS),
         case("table {demo} --layout paper-4 --published", "Published"),
         case("table {demo} plain", "one seed"),
+        case("table {demo} --region face --sequences FREE", "Region: face. Sequences: FREE."),
     ],
     "verify": [case("verify {demo}", "as recorded")],
     "bundle": [
@@ -188,6 +189,7 @@ CASES = {
     ],
     "compare": [
         case("compare {demo} --metrics psnr", "ga +ours"),
+        case("compare {demo} --metrics psnr --region face", "(?s)Region: face.*ga +ours"),
         case("compare {demo} --metrics psnr ssim --against ours --trivial --format csv", "ours"),
     ],
     "evaluate": [

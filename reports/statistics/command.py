@@ -37,6 +37,12 @@ class CompareSettings:
     trivial: bool = False
     """Compare the trivial baselines (mean image, nearest camera), too."""
 
+    region: str = "full"
+    """Region of the frames to compare on, such as face."""
+
+    sequences: tuple[str, ...] = ()
+    """Only frames of these sequences; default: all."""
+
     level: float = 0.05
     """Level of the tests; intervals have a confidence of one minus it."""
 
@@ -61,11 +67,11 @@ def compare_runs(settings: CompareSettings, progress: Progress = no_progress) ->
 
     Raises `InputError` for runs, methods and metrics that do not fit.
     """
-    from ..runs import RunSet
+    from ..runs import Part, RunSet
     from ..table_report import COMPARISON
     from .comparisons import compare
 
-    runs = RunSet.read([Path(folder) for folder in settings.runs])
+    runs = RunSet.read([Path(folder) for folder in settings.runs], Part(settings.region, settings.sequences))
     pairs = _pairs(runs, settings.against, settings.trivial)
     known = {spec.name: spec for spec in runs.metrics}
     for name in settings.metrics:
@@ -85,6 +91,7 @@ def compare_runs(settings: CompareSettings, progress: Progress = no_progress) ->
         progress(index + 1, len(columns), spec.label)
     every = [comparison for _, comparisons in found for comparison in comparisons]
     text = _csv(every) if settings.format == "csv" else "\n\n".join(_text(spec, c) for spec, c in found)
+    text = f"{runs.part}\n\n{text}" if runs.part and settings.format == "text" else text
     return Findings(text, {"level": settings.level, "comparisons": [_plain(c) for c in every]})
 
 

@@ -2,7 +2,8 @@ import pytest
 
 from headbench.bench.errors import InputError
 from headbench.bench.rows import ALL
-from headbench.reports.runs import RunSet
+from headbench.reports.runs import Part, RunSet
+from headbench.reports.table_report import table_of, table_text
 
 
 def test_other_seeds_of_the_same_settings_join(make_run):
@@ -50,6 +51,59 @@ def test_a_metric_of_another_definition_is_refused(make_run, change_manifest):
     change_manifest(second, lambda m: m["metrics"][0].update(implementation="other:error"))
     with pytest.raises(InputError, match="error as in"):
         RunSet.read([first, second])
+
+
+@pytest.fixture
+def faces(make_run):
+    """A run with a region: rows of the face are 10 lower, of which the frame at timestep 0 is 5 lower still."""
+    import pandas as pd
+
+    run = make_run("a")
+    rows = pd.read_parquet(run / "rows.parquet")
+    frames = rows[rows["task"] != ""]
+    face = frames.assign(region="face", value=frames["value"] - 10 - 5 * (frames["timestep"] == 0))
+    pd.concat([rows, face]).to_parquet(run / "rows.parquet", index=False)
+    return run
+
+
+def cell(table, task, metric):
+    (index,) = [i for i, column in enumerate(table.columns) if (column.task, column.metric) == (task, metric)]
+    return table.rows[0].cells[index].value
+
+
+def test_a_region_stands_for_the_whole_frame(faces):
+    whole, face = (table_of(RunSet.read([faces], part)) for part in (Part(), Part("face")))
+    frames = RunSet.read([faces]).rows.frames("novel_view", "full")
+    early = len({frame for frame in frames if frame[2] == 0}) / len(frames)
+    expected = cell(whole, "novel_view", "error") - 10 - 5 * early
+    assert cell(face, "novel_view", "error") == pytest.approx(expected)
+    assert cell(face, "", "files") == cell(whole, "", "files")
+    assert "Region: face." in face.caption
+    assert "Region" not in whole.caption
+
+
+def test_sequences_leave_tasks_without_them_out(faces):
+    runs = RunSet.read([faces])
+    free = {frame[1] for frame in runs.rows.frames("self_reenactment", "full")}
+    assert not free & {frame[1] for frame in runs.rows.frames("novel_view", "full")}
+    part = RunSet.read([faces], Part(sequences=tuple(free)))
+    assert part.tasks == ("self_reenactment",)
+    assert cell(table_of(part), "self_reenactment", "error") == cell(
+        table_of(runs), "self_reenactment", "error"
+    )
+    assert f"Sequences: {', '.join(free)}." in table_text([faces], sequences=tuple(free))
+
+
+@pytest.mark.parametrize(
+    ("part", "words"),
+    [
+        (Part("nose"), "region: expected one of face, full, found nose"),
+        (Part(sequences=("X",)), "sequences: .* X"),
+    ],
+)
+def test_a_part_that_runs_do_not_have_is_refused(faces, part, words):
+    with pytest.raises(InputError, match=words):
+        RunSet.read([faces], part)
 
 
 def test_no_run_is_refused():
