@@ -18,11 +18,23 @@ def mesh_edges(faces: IntArray) -> IntArray:
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 
+def unique_pairs(pairs: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+    """Each pair of an (n, 2) array of indices once, in order, (m, 2); which of them each is, (n,); how many are each, (m,).
+
+    What `numpy.unique` does along an axis, a tenth of its time: it compares rows, this numbers.
+    """
+    base = int(pairs.max(initial=0)) + 1
+    codes, inverse, count = np.unique(
+        pairs[:, 0].astype(np.int64) * base + pairs[:, 1], return_inverse=True, return_counts=True
+    )
+    return np.stack(np.divmod(codes, base), axis=1), inverse, count
+
+
 def border_edges(faces: IntArray) -> IntArray:
     """(B, 2) directed edges that belong to one triangle only."""
     edges = mesh_edges(faces)
-    _, inverse, count = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
-    return edges[count[inverse.ravel()] == 1]
+    _, inverse, count = unique_pairs(np.sort(edges, axis=1))
+    return edges[count[inverse] == 1]
 
 
 def triangle_areas(vertices: FloatArray, faces: IntArray) -> FloatArray:

@@ -172,19 +172,21 @@ def front_depth(
     grid = (corner[..., :2] - low) / step
     first = np.clip(np.ceil(grid.min(axis=1)), 0, size).astype(int)
     last = np.clip(np.floor(grid.max(axis=1)) + 1, 0, size).astype(int)
-    for index in np.flatnonzero((first < last).all(axis=1)):
-        (x0, y0), (x1, y1) = first[index], last[index]
-        a, b, c = grid[index]
-        area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
-        if abs(area) < 1e-12:
-            continue
-        y, x = np.mgrid[y0:y1, x0:x1]
-        v = ((x - a[0]) * (c[1] - a[1]) - (y - a[1]) * (c[0] - a[0])) / area
-        w = ((b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0])) / area
-        inside = (v >= -1e-9) & (w >= -1e-9) & (v + w <= 1.0 + 1e-9)
-        z = corner[index, :, 2] @ np.stack([(1.0 - v - w).ravel(), v.ravel(), w.ravel()])
-        patch = depth[y0:y1, x0:x1]
-        np.maximum(patch, np.where(inside, z.reshape(v.shape), -np.inf), out=patch)
+    a, b, c = grid.transpose(1, 2, 0)
+    area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+    seen = np.flatnonzero((first < last).all(axis=1) & (np.abs(area) >= 1e-12))
+    columns, rows = (last - first)[seen].T
+    count = columns * rows
+    index = np.repeat(seen, count)  # each triangle for every grid point of its box
+    place = np.arange(len(index)) - np.repeat(np.cumsum(count) - count, count)
+    row, column = np.divmod(place, np.repeat(columns, count))
+    x, y = first[index].T + (column, row)
+    a, b, c, area, z = a[:, index], b[:, index], c[:, index], area[index], corner[index, :, 2].T
+    v = ((x - a[0]) * (c[1] - a[1]) - (y - a[1]) * (c[0] - a[0])) / area
+    w = ((b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0])) / area
+    inside = (v >= -1e-9) & (w >= -1e-9) & (v + w <= 1.0 + 1e-9)
+    depths = (1.0 - v - w) * z[0] + v * z[1] + w * z[2]
+    np.maximum.at(depth, (y[inside], x[inside]), depths[inside])
     return depth
 
 

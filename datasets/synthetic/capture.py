@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from threadpoolctl import threadpool_limits
 
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
@@ -155,6 +156,7 @@ _renderer: list[CaptureRenderer] = []
 def _begin(out: Path, index: int, settings: SynthSettings) -> None:
     end_with_parent()
     torch.set_num_threads(1)  # the processes share the cores already
+    threadpool_limits(1)
     _renderer.append(CaptureRenderer(plan_subject(out, index, load_geometry(settings.head), settings)))
 
 

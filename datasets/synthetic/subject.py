@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from ...bench.contracts import FloatArray, HeadAsset, HeadPose, IntArray
-from ..head.geometry import vertex_normals
+from ..head.geometry import unique_pairs, vertex_normals
 from ..head.model import HeadModel, chain_transforms
 from ..head.rotations import axis_angle_to_matrix
 from .anatomy import SIDES, Anatomy, Person, measure
@@ -216,7 +216,7 @@ def refine(vertices: FloatArray, faces: IntArray, target: FloatArray, rounds: in
     position, wanted = vertices[used], target[used]
     for _ in range(rounds):
         edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-        unique, inverse = np.unique(edges, axis=0, return_inverse=True)
+        unique, inverse, _ = unique_pairs(edges)
         length = np.linalg.norm(position[unique[:, 0]] - position[unique[:, 1]], axis=1)
         split = length > 0.5 * (wanted[unique[:, 0]] + wanted[unique[:, 1]])
         if not split.any():
@@ -224,7 +224,7 @@ def refine(vertices: FloatArray, faces: IntArray, target: FloatArray, rounds: in
         new_id = np.full(len(unique), -1)
         new_id[split] = len(position) + np.arange(split.sum())
         edge_owner = np.zeros(len(unique), np.int64)
-        edge_owner[inverse.ravel()] = np.repeat(owner, 3)
+        edge_owner[inverse] = np.repeat(owner, 3)
         ends, above = unique[split], edge_owner[split]
         new_parents = faces[above]
         new_weights = 0.5 * (

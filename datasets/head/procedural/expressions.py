@@ -17,7 +17,7 @@ from scipy.sparse.linalg import splu
 
 from ....bench.contracts import FloatArray
 from ...rounding import COEFFICIENT_BITS, LENGTH_BITS, on_grid
-from ..geometry import mesh_edges, smoothstep
+from ..geometry import mesh_edges, smoothstep, unique_pairs
 from .anatomy import EYE_CENTER, EYE_RADIUS, MOUTH_HALF_WIDTH, eye_front, lid_curves, lip_arc
 from .surface import MIRROR, SculptedHead, jaw_weight
 
@@ -307,7 +307,7 @@ def harmonic(surface: SculptedHead, field: FloatArray, free: NDArray[np.bool_]) 
     """The field with its values at ``free`` vertices made the mean of their neighbours' (uniform weights)."""
     count = len(surface.vertices)
     edges = mesh_edges(surface.faces)
-    pairs = np.unique(np.concatenate([edges, edges[:, ::-1]]), axis=0)
+    pairs, _, _ = unique_pairs(np.concatenate([edges, edges[:, ::-1]]))
     adjacency = coo_matrix((np.ones(len(pairs)), pairs.T), (count, count)).tocsr()
     inside, known = np.flatnonzero(free), np.flatnonzero(~free)
     laplacian = diags(np.asarray(adjacency.sum(axis=1)).ravel()) - adjacency

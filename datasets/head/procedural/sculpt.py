@@ -16,7 +16,7 @@ from skimage.measure import marching_cubes
 
 from ....bench.contracts import FloatArray, IntArray
 from ....bench.io.files import atomic_path
-from ..geometry import border_edges, mesh_edges, triangle_areas
+from ..geometry import border_edges, mesh_edges, triangle_areas, unique_pairs
 from .anatomy import (
     CLOSED_LIP_GAP,
     EYE_CENTER,
@@ -213,7 +213,7 @@ def surface_graph(vertices: FloatArray, faces: IntArray, size: FloatArray, *, di
     same = (key[order][1:] == key[order][:-1]).all(1)
     diagonal = np.column_stack([opposite[order][1:][same], opposite[order][:-1][same]])
     pairs = np.concatenate([key, diagonal]) if diagonals else key
-    pairs = np.unique(np.sort(pairs, axis=1), axis=0)
+    pairs, _, _ = unique_pairs(np.sort(pairs, axis=1))
     length = np.linalg.norm(vertices[pairs[:, 0]] - vertices[pairs[:, 1]], axis=1)
     weight = 2 * np.maximum(length, 1e-9) / (size[pairs[:, 0]] + size[pairs[:, 1]])
     return coo_matrix((weight, (pairs[:, 0], pairs[:, 1])), (len(vertices),) * 2).tocsr()

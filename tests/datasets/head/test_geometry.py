@@ -12,6 +12,7 @@ from headbench.datasets.head.geometry import (
     rigid_alignment,
     smoothstep,
     triangle_areas,
+    unique_pairs,
     vertex_normals,
 )
 
@@ -55,6 +56,17 @@ def test_sphere():
     center, radius = fit_sphere([0.3, -0.2, 0.9] + 0.012 * directions[directions[:, 2] < 0.3])
     np.testing.assert_allclose(center, [0.3, -0.2, 0.9], atol=1e-10)
     assert radius == pytest.approx(0.012, abs=1e-10)
+
+
+@pytest.mark.parametrize("count", [0, 1, 500])
+@pytest.mark.parametrize("kind", [np.int32, np.int64])
+def test_unique_pairs_are_those_of_numpy(count, kind):
+    pairs = np.random.default_rng(count).integers(0, 20, (count, 2)).astype(kind)
+    unique, inverse, counts = unique_pairs(pairs)
+    expected, places, times = np.unique(pairs, axis=0, return_inverse=True, return_counts=True)
+    np.testing.assert_array_equal(unique, expected)
+    np.testing.assert_array_equal(inverse, places.ravel())
+    np.testing.assert_array_equal(counts, times)
 
 
 def test_normals_and_border_of_a_cap():

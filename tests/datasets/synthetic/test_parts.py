@@ -39,6 +39,25 @@ def test_tongue_slides_over_the_lower_lip(share):
     assert middle[lowest : rim - 4].all(), "skin shows between the mouth's opening and the tongue's tip"
 
 
+def test_front_depth_is_the_nearest_triangle_at_each_point():
+    """Against each grid point's place in each triangle, solved for singly; some triangles have no area or lie outside."""
+    rng = np.random.default_rng(2)
+    vertices, faces = rng.uniform(-0.2, 1.2, (40, 3)), rng.integers(0, 40, (60, 3))
+    low, step, size = np.array([0.01, -0.02]), 0.05, np.array([19, 23])
+    expected = np.full((size[1], size[0]), -np.inf)
+    for corners in vertices[faces]:
+        system = np.vstack([corners[:, :2].T, np.ones(3)])
+        if abs(np.linalg.det(system)) > 1e-9:
+            for row, column in np.ndindex(*expected.shape):
+                weights = np.linalg.solve(system, [*(low + step * np.array([column, row])), 1.0])
+                if weights.min() >= 0.0:
+                    expected[row, column] = max(expected[row, column], weights @ corners[:, 2])
+    found = front_depth(vertices, faces, low, step, size)
+    assert np.isinf(expected).any()
+    assert np.isfinite(expected).mean() > 0.5
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
 FAR = 50.0
 
 
