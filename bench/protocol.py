@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from typing import Literal
 
 from .contracts import Clip, FrameKey, TaskName
@@ -58,9 +59,9 @@ class Protocol:
         """Readable name."""
         return f"{self.task}/{self.metric_profile}/1"
 
-    @property
+    @cached_property
     def hash(self) -> str:
-        """First 12 hex digits of the digest of all fields."""
+        """First 12 hex digits of the digest of all fields; made once, since every row asks for it."""
         fields = asdict(self)
         if not self.conditions:
             del fields["conditions"]  # so that protocols made before there were any keep their hashes
