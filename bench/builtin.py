@@ -96,8 +96,9 @@ class SynthSettings:
     """Decides subjects and performances."""
     tracking_noise: float = 0.0
     """Noise on the tracked parameters, as a fraction of their standard deviation."""
-    performance: Literal["full", "expressions", "still"] = "full"
-    """`expressions` leaves out jaw and tongue, `still` moves only head, neck and eyes."""
+    performance: Literal["full", "parts", "expressions", "still"] = "full"
+    """`parts` plays every sequence and holds out three parts of FREE, each scored as a sequence: seen, recombined and
+    beyond the range of training. `expressions` leaves out jaw and tongue, `still` moves only head, neck and eyes."""
     dynamics: float = 1.0
     """Scales what expressions do to skin beyond moving it (wrinkles, blush), 0 to 3."""
     tracking_error: float = 0.0

@@ -193,7 +193,7 @@ def _check(settings: SynthSettings) -> None:
     for option, fits, expected, found in checks:
         if not fits:
             raise InputError(option, "", expected, str(found))
-    share_out(settings.timesteps)
+    share_out(settings.timesteps, settings.performance)
 
 
 def _claim(out: Path, settings: SynthSettings, head: str) -> None:

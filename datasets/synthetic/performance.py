@@ -80,19 +80,21 @@ class Translation:
 
 Face = Mapping[str, float]
 
-Kind = Literal["full", "expressions", "still"]
-"""How much of the performance is played: all; without jaw and tongue; head, neck and gaze alone."""
+Kind = Literal["full", "parts", "expressions", "still"]
+"""How much of the performance is played: all; all, with FREE in the parts of `FREE_PARTS`, each a sequence; without jaw and
+tongue; head, neck and gaze alone."""
 
 _JAW = ("jaw_open", "jaw_side", "tongue_out")
 _MUTED: Mapping[Kind, frozenset[str]] = {
     "full": frozenset(),
+    "parts": frozenset(),
     "expressions": frozenset(_JAW),
     "still": frozenset((*_JAW, *EXPRESSION_CONTROLS)),
 }
 KINDS = tuple(_MUTED)
 
 HELD_OUT = "FREE"
-"""The sequence kept for self-reenactment."""
+"""The sequence kept for self-reenactment; its parts begin with this."""
 
 TONGUE = "tongue out"
 """Why a frame is left out of a comparison: no head model of FLAME's layout has a tongue."""
@@ -217,6 +219,49 @@ SEQUENCES: Mapping[str, tuple[Face, ...]] = {
 }
 """Phrases by sequence, in NeRSemble's order."""
 
+BEYOND = 1.3
+"""How far beyond training the last part of FREE goes."""
+
+
+def _beyond(face: Face) -> Face:
+    """More of everything that has no end of its own, unlike lids that close, eyes that turn, and the tongue."""
+    free = {name for name in EXPRESSION_CONTROLS if not name.startswith("blink")} | {"jaw_open", "jaw_side"}
+    return {name: BEYOND * value if name in free else value for name, value in face.items()}
+
+
+FREE_PARTS: Mapping[str, tuple[Face, ...]] = {
+    "FREE-1-seen": (
+        {**_HAPPY, "gaze_left": 0.5},
+        {name: 0.8 * value for name, value in _SURPRISE.items()},
+        {"pucker": 0.9},
+        _both(squint=0.8, blink=0.4, cheek_raise=0.5),
+        {"jaw_open": 0.7},
+        {name: 0.85 * value for name, value in _DISGUST.items()},
+        {"mouth_frown": 0.8, "chin_raise": 0.5},
+        {**_LAUGH, "jaw_open": 0.3},
+    ),
+    "FREE-2-recombined": SEQUENCES[HELD_OUT],
+    "FREE-3-beyond": tuple(
+        map(
+            _beyond,
+            (
+                {**_both(smile=1.0), "gaze_left": 0.4},
+                _SURPRISE,
+                {"pucker": 1.0},
+                _DISGUST,
+                {"jaw_open": 0.95, **_both(lower_lip_down=0.6)},
+                {"mouth_frown": 0.9, "brow_inner_up": 0.9},
+                {**_ANGRY, "jaw_open": 0.0},
+                {"jaw_open": 0.5, "jaw_side": 0.9},
+            ),
+        )
+    ),
+}
+"""Held-out phrases by how far they are from training: poses of training, in part or less of them; controls that training
+has, in combinations that it has not; beyond the range of training."""
+
+_HELD_OUT_SHARE = 0.25  # of the timesteps of a performance in parts
+
 # The order in which sequences join as timesteps allow: first those that differ most.
 _PRIORITY = (
     *("FREE", "EMO-1-shout+laugh", "EXP-4-lips", "EMO-2-surprise+fear", "EXP-2-eyes", "EMO-4-disgust+happy"),
@@ -234,11 +279,23 @@ class Performed:
     excluded: Mapping[int, str]
 
 
-def share_out(timesteps: int) -> dict[str, int]:
+def share_out(timesteps: int, kind: Kind = "full") -> dict[str, int]:
     """Timesteps of each sequence, in NeRSemble's order; they sum to ``timesteps``.
 
-    FREE gets a double share. Few timesteps make few sequences, two at least.
+    FREE gets a double share. Few timesteps make few sequences, two at least. A performance in parts has all sequences,
+    each with as many timesteps as it has phrases to show, and a quarter of them for FREE.
     """
+    if kind == "parts":
+        train = {name: len(phrases) for name, phrases in SEQUENCES.items() if name != HELD_OUT}
+        shares = {name: count / sum(train.values()) * (1 - _HELD_OUT_SHARE) for name, count in train.items()}
+        shares |= dict.fromkeys(FREE_PARTS, _HELD_OUT_SHARE / len(FREE_PARTS))
+        least = int(np.ceil(2.5 / min(shares.values())))
+        if timesteps < least:
+            raise InputError(
+                "--timesteps", "", f"at least {least} for a performance in parts", str(timesteps)
+            )
+        ends = np.round(np.cumsum([*shares.values()]) * timesteps).astype(int)
+        return {name: int(n) for name, n in zip(shares, np.diff(ends, prepend=0))}
     if timesteps < 4:
         raise InputError("--timesteps", "", "at least 4 (two sequences)", str(timesteps))
     count = int(np.clip(timesteps // _MINIMUM, 2, len(_PRIORITY)))
@@ -256,9 +313,9 @@ def perform(
     ``tongue_shows`` is the share in [0, 1] by which the tongue has to be out for a timestep to be labelled. What
     ``kind`` leaves out stays at rest; everything else moves as in the full performance.
     """
-    number = list(SEQUENCES).index(name)
-    rng = np.random.default_rng([seed, number])
-    phrases = SEQUENCES[name]
+    every = {**SEQUENCES, **FREE_PARTS}
+    rng = np.random.default_rng([seed, list(every).index(name)])
+    phrases = every[name]
     seconds = _PHRASE_SECONDS * (len(phrases) + 1)
     time = (np.arange(timesteps) + 0.5) / timesteps * seconds
     middles = _PHRASE_SECONDS * np.arange(1, len(phrases) + 1) + rng.uniform(-0.08, 0.08, len(phrases))

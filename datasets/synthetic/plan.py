@@ -108,7 +108,7 @@ def plan_subject(out: Path, index: int, geometry: Geometry, settings: SynthSetti
     tongue_shows = share_that_shows(geometry.mouth(who, anatomy, shape), anatomy, neutral)
     views = cameras(settings.cameras, width, height, target, seed=settings.seed + 101 * index)
     performed, poses = {}, {}
-    for sequence, count in share_out(settings.timesteps).items():
+    for sequence, count in share_out(settings.timesteps, settings.performance).items():
         performed[sequence] = perform(
             sequence, count, settings.seed + 101 * index, tongue_shows, settings.performance
         )
@@ -137,7 +137,7 @@ def plan_subject(out: Path, index: int, geometry: Geometry, settings: SynthSetti
             SequencePlan(sequence, [next(tracked) for _ in exact], performed[sequence].excluded)
             for sequence, exact in poses.items()
         ],
-        test_sequences=[HELD_OUT],
+        test_sequences=[sequence for sequence in poses if sequence.startswith(HELD_OUT)],
         novel_view_cameras=[FRONTAL],
         synthetic={**settings.described(), "head": geometry.source, "style": who.style},
     )

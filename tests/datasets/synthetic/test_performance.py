@@ -1,9 +1,12 @@
 import numpy as np
 import pytest
 
+from headbench.bench.errors import InputError
 from headbench.datasets.synthetic.performance import (
+    BEYOND,
     CONTROLS,
     EXPRESSION_CONTROLS,
+    FREE_PARTS,
     HELD_OUT,
     SEQUENCES,
     perform,
@@ -21,12 +24,44 @@ def test_timesteps_are_shared_out_exactly(timesteps):
     assert timesteps < 300 or list(shares) == list(SEQUENCES)
 
 
-@pytest.mark.parametrize("name", SEQUENCES)
+@pytest.mark.parametrize("timesteps", [60, 156, 400])
+def test_a_performance_in_parts_has_every_sequence(timesteps):
+    shares = share_out(timesteps, "parts")
+    assert sum(shares.values()) == timesteps
+    assert set(shares) == set(SEQUENCES) - {HELD_OUT} | set(FREE_PARTS)
+    assert min(shares.values()) >= 2
+    held = sum(count for name, count in shares.items() if name.startswith(HELD_OUT))
+    assert held == pytest.approx(0.25 * timesteps, abs=1)
+
+
+def test_too_few_timesteps_for_parts_are_refused():
+    with pytest.raises(InputError, match="at least 59"):
+        share_out(20, "parts")
+
+
+def test_parts_of_free_are_further_and_further_from_training():
+    def controls(names):
+        played = [a for name in names for a in perform(name, 200, seed=1).activations]
+        return np.array([[a[control] for control in EXPRESSION_CONTROLS] for a in played])
+
+    train = controls(name for name in SEQUENCES if name != HELD_OUT)
+    assert train.max(0).min() > 0.5  # every control is trained
+    seen, recombined, beyond = (controls([name]) for name in FREE_PARTS)
+    near = [
+        np.linalg.norm(part[:, None] - train[None], axis=2).min(1).mean()
+        for part in (seen, recombined, beyond)
+    ]
+    assert near[0] < 0.7 * min(near[1:])
+    assert (recombined <= train.max(0) + 0.05).all()
+    assert (beyond > train.max(0) + 0.05).any(1).mean() > 0.1
+
+
+@pytest.mark.parametrize("name", [*SEQUENCES, *FREE_PARTS])
 def test_curves_are_bounded_smooth_and_repeatable(name):
     played = perform(name, 400, seed=1)
     values = np.array([[a[control] for control in CONTROLS] for a in played.activations])
     assert np.isfinite(values).all()
-    assert np.abs(values).max() <= 1.3
+    assert np.abs(values).max() <= (BEYOND + 0.05 if name == "FREE-3-beyond" else 1.3)
     # No jumps: about 40 moments a second, and a blink closes in about 80 ms.
     assert np.abs(np.diff(values, axis=0)).max() < 0.5
     again = perform(name, 400, seed=1).activations
