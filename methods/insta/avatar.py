@@ -35,6 +35,9 @@ from .rendering import (
 from .warp import mouth_triangles
 
 RAYS_AT_ONCE = 1 << 15
+ROUND_SAMPLES = (
+    4  # at most: without gradients looking at the transmittance costs less than samples that are hidden
+)
 MIDDLE = 0.5  # of a step: where samples lie when nothing is left to chance
 
 
@@ -53,7 +56,8 @@ class InstaAvatar:
         mouth: torch.Tensor,
     ):
         self.space, self._folder, self._mesh, self._surface = space, folder, mesh, surface.surface
-        marching = Marching(config.step, config.round_samples, config.stop_transmittance)
+        round_samples = min(config.round_samples, ROUND_SAMPLES)
+        marching = Marching(config.step, round_samples, config.stop_transmittance)
         self._inference = Inference(field, parameters, space, mouth, marching)
         self._last: tuple[bytes, PosedSurface] | None = None
 

@@ -46,7 +46,8 @@ bool crossing(const Box& box, float padding, Vec3 origin, Vec3 inverse, float li
     if (near > from) from = near;
     if (far < to) to = far;
   }
-  interval = {from, to, padding};
+  interval.from = from;
+  interval.to = to;
   return from <= to;
 }
 
@@ -55,14 +56,36 @@ bool crossing(const Box& box, float padding, Vec3 origin, Vec3 inverse, float li
 Marcher::Marcher(const Posed& mesh, const Warp& warp, const float* reach, const Grid& grid, float step)
     : mesh_(mesh), warp_(warp), reach_(reach), grid_(grid), step_(step), padding_(paddings(mesh.tree(), reach)) {}
 
-Progress Marcher::start(Vec3 origin, Vec3 direction, float jitter, std::int32_t first,
-                        std::vector<Interval>& intervals) const {
-  Progress progress{origin, direction, jitter, first, -1, intervals.size(), intervals.size(), -1};
-  if (first < 0 || padding_[0] < 0) return progress;
-  near_intervals(origin, direction, intervals);
-  progress.last = intervals.size();
-  if (progress.interval < progress.last) enter(progress, intervals);
-  return progress;
+// Rays that stay together share the intervals of one between them, to boxes that are larger by as much as they part.
+void Marcher::start(Progress* rays, int count, std::vector<Interval>& intervals) const {
+  const auto set_out = [&](int begin, int end, Vec3 origin, Vec3 direction, float spread, float farthest) {
+    const std::size_t first = intervals.size();
+    if (padding_[0] >= 0) near_intervals(origin, direction, spread, farthest, intervals);
+    for (int i = begin; i < end; ++i) {
+      Progress& ray = rays[i];
+      ray.interval = ray.last = intervals.size();
+      if (ray.index < 0 || first == ray.last) continue;
+      ray.interval = first;
+      enter(ray, intervals);
+    }
+  };
+  Box origins, directions;
+  for (int i = 0; i < count; ++i) {
+    origins.add(rays[i].origin);
+    directions.add(rays[i].direction);
+  }
+  const Vec3 origin = 0.5f * (origins.low + origins.high), direction = 0.5f * (directions.low + directions.high);
+  const float farthest = farthest_from(origin);
+  const float spread = length(origins.high - origin) + farthest * length(directions.high - direction);
+  if (spread <= mesh_.together()) return set_out(0, count, origin, direction, spread, farthest);
+  for (int i = 0; i < count; ++i)
+    set_out(i, i + 1, rays[i].origin, rays[i].direction, 0, farthest_from(rays[i].origin));
+}
+
+// Where a ray from a place has left the mesh behind.
+float Marcher::farthest_from(Vec3 origin) const {
+  const Box& whole = mesh_.boxes()[0];
+  return length(0.5f * (whole.low + whole.high) - origin) + length(0.5f * (whole.high - whole.low)) + 2 * padding_[0];
 }
 
 // One lattice point more at both ends: nothing depends on how an interval's end was rounded.
@@ -82,33 +105,73 @@ bool Marcher::more(Progress& progress, const std::vector<Interval>& intervals) c
   return false;
 }
 
+// Goes on from the next lattice points of rays where one between them tells that there are no samples at any of them; whether
+// it does.
+bool Marcher::pass(Progress* rays, const Together& together, const std::vector<Interval>& intervals) const {
+  if (together.count == 1) return false;
+  Box box;
+  float farthest = 0, most = 0;
+  for (int k = 0; k < together.count; ++k) {
+    const Progress& ray = rays[together.rays[k]];
+    box.add(point(ray));
+    farthest = std::max(farthest, intervals[ray.interval].reach);
+    most = std::max(most, ray.until - static_cast<float>(ray.index));
+  }
+  const Vec3 half = 0.5f * (box.high - box.low), middle = box.low + half;
+  const float spread = length(half);
+  if (!(spread <= mesh_.together())) return false;
+  Queries query;
+  query.add(middle, rays[together.rays[0]].hint);
+  mesh_.nearest(query);
+  const std::int32_t triangle = query.triangle[0];
+  if (triangle < 0) return false;
+  for (int k = 0; k < together.count; ++k) rays[together.rays[k]].hint = triangle;
+  const float away = std::sqrt(query.squared[0]) - spread;
+  std::int32_t clear = 0;
+  if (away > farthest) {
+    clear = static_cast<std::int32_t>((away - farthest) / step_);
+  } else {
+    const CanonicalPoint placed = place(middle, rays[together.rays[0]].direction, triangle);
+    const float about = (1 + kBend) * spread * grid_.cells_per_metre * length(placed.way);
+    if (static_cast<float>(free_at(placed.cells)) - 1 < about) return false;
+    clear = passed(placed, about, most);
+  }
+  for (int k = 0; k < together.count; ++k) {
+    Progress& ray = rays[together.rays[k]];
+    ray.index += 1 + std::min(clear, static_cast<std::int32_t>(std::max(ray.until - static_cast<float>(ray.index), 0.0f)));
+  }
+  return true;
+}
+
 // Goes on from a lattice point whose nearest triangle is known; whether there is a sample at that point.
 bool Marcher::look(Progress& progress, const std::vector<Interval>& intervals, std::int32_t triangle, float squared,
                    Sample& sample) const {
   const Vec3 at = point(progress);
   const std::int32_t index = progress.index++;
+  if (triangle < 0) return false;
+  progress.hint = triangle;
   const float away = std::sqrt(squared), farthest = intervals[progress.interval].reach;
-  if (!std::isfinite(away)) return false;
-  if (triangle < 0 || away > farthest) {
+  if (away > farthest) {
     // Nor is any triangle in reach before the ray has covered the difference.
     progress.index += static_cast<std::int32_t>((away - farthest) / step_);
     return false;
   }
   const CanonicalPoint placed = place(at, progress.direction, triangle);
-  progress.index += passed(placed, progress.until - static_cast<float>(index));
+  if (free_at(placed.cells) != 0) {
+    progress.index += passed(placed, 0, progress.until - static_cast<float>(index));
+    return false;
+  }
   const float reach = reach_[triangle];
-  if (free_at(placed.cells) != 0 || reach < 0 || away > reach) return false;
-  const float length = std::max(std::sqrt(dot(placed.way, placed.way)), 1e-12f);
-  sample = {placed.position, (1 / length) * placed.way, away, index, triangle};
+  if (reach < 0 || away > reach) return false;
+  const float scale = std::max(length(placed.way), 1e-12f);
+  sample = {placed.position, (1 / scale) * placed.way, away, index, triangle};
   return true;
 }
 
-void Marcher::near_intervals(Vec3 origin, Vec3 direction, std::vector<Interval>& intervals) const {
+void Marcher::near_intervals(Vec3 origin, Vec3 direction, float spread, float farthest,
+                             std::vector<Interval>& intervals) const {
   const std::size_t begin = intervals.size();
   const Vec3 inverse{1 / direction.x, 1 / direction.y, 1 / direction.z};
-  const Box& whole = mesh_.boxes()[0];
-  const Vec3 way = 0.5f * (whole.low + whole.high) - origin, half = 0.5f * (whole.high - whole.low);
-  const float farthest = std::sqrt(dot(way, way)) + std::sqrt(dot(half, half)) + 2 * padding_[0];
   if (!(farthest / step_ < kLatticeMax)) return;
   const auto& nodes = mesh_.tree().nodes();
   std::int32_t stack[64];
@@ -117,8 +180,9 @@ void Marcher::near_intervals(Vec3 origin, Vec3 direction, std::vector<Interval>&
   while (top > 0) {
     const std::int32_t at = stack[--top];
     Interval interval;
-    if (padding_[at] < 0 || !crossing(mesh_.boxes()[at], padding_[at], origin, inverse, farthest, interval))
+    if (padding_[at] < 0 || !crossing(mesh_.boxes()[at], padding_[at] + spread, origin, inverse, farthest, interval))
       continue;
+    interval.reach = padding_[at];
     if (is_cluster(nodes[at], mesh_.boxes()[at], padding_[at])) {
       intervals.push_back(interval);
       continue;
@@ -155,18 +219,18 @@ Marcher::CanonicalPoint Marcher::place(Vec3 point, Vec3 direction, std::int32_t 
   return placed;
 }
 
-// How many lattice points in a row, up to `most`, follow a point into free cells.
-std::int32_t Marcher::passed(const CanonicalPoint& placed, float most) const {
+// How many lattice points in a row, up to `most`, follow a point, and those `about` cells from it, into free cells.
+std::int32_t Marcher::passed(const CanonicalPoint& placed, float about, float most) const {
   const Vec3 step = (step_ * grid_.cells_per_metre) * placed.way;
-  const float length = std::sqrt(dot(step, step)), bend = kBend * length;
-  if (!(length > 0)) return 0;  // a triangle without area leads nowhere
+  const float stride = length(step), bend = kBend * stride;
+  if (!(stride > 0)) return 0;  // a triangle without area leads nowhere
   std::int32_t clear = 0;
   while (static_cast<float>(clear) < most) {
-    const float steps = static_cast<float>(clear + 1), slack = steps * bend;
+    const float steps = static_cast<float>(clear + 1), slack = about + steps * bend;
     const Vec3 at = placed.cells + steps * step;
     const float room = static_cast<float>(free_at(at)) - 1;
     if (room >= slack)
-      clear += 1 + static_cast<std::int32_t>(std::min((room - slack) / (length + bend), most));
+      clear += 1 + static_cast<std::int32_t>(std::min((room - slack) / (stride + bend), most));
     else if (slack <= 0.5f && clear_around(at, slack))
       ++clear;
     else
@@ -204,8 +268,7 @@ void Marcher::matrix(Vec3 point, std::int32_t triangle, float* m) const {
   }
   const auto weight = [&](std::int32_t face, float falloff) {
     const float* c = warp_.centroids + 3 * face;
-    const Vec3 way = point - Vec3{c[0], c[1], c[2]};
-    return std::exp(-falloff * std::sqrt(dot(way, way)));
+    return std::exp(-falloff * length(point - Vec3{c[0], c[1], c[2]}));
   };
   float total = weight(triangle, own_falloff);
   for (int i = 0; i < 12; ++i) m[i] = total * own[i];

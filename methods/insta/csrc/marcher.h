@@ -35,9 +35,9 @@ struct Interval {
 struct Progress {
   Vec3 origin, direction;
   float jitter;
-  std::int32_t index, hint;    // the lattice point to look at next, the triangle found last
-  std::size_t interval, last;  // where it is, and the end of its intervals
-  float until;                 // last lattice point of the interval
+  std::int32_t index, hint = -1;       // the lattice point to look at next, the triangle found last
+  std::size_t interval = 0, last = 0;  // where it is, and the end of its intervals
+  float until = 0;                     // last lattice point of the interval
 };
 
 struct Sample {
@@ -50,40 +50,46 @@ struct Sample {
 // away and whose canonical position lies in an occupied cell. Two kinds of points are passed over: those too near to one
 // whose nearest triangle is beyond every reach, which loses nothing; and those that lead on through free cells, where half
 // of the way is allowed for what the warp bends a ray. Only a fold of the warp could bring one of them to an
-// occupied cell after all.
+// occupied cell after all. Both kinds are told for rays that lie together by one point between them.
 class Marcher {
  public:
   Marcher(const Posed& mesh, const Warp& warp, const float* reach, const Grid& grid, float step);
 
-  // A ray at the lattice point `first`, or done where that is negative. Appends its intervals, which `march` wants again.
-  Progress start(Vec3 origin, Vec3 direction, float jitter, std::int32_t first, std::vector<Interval>& intervals) const;
+  // Sets out with up to kLanes rays, each at the lattice point `index`, or done where that is negative. Appends their intervals,
+  // which `march` wants again.
+  void start(Progress* rays, int count, std::vector<Interval>& intervals) const;
 
   // Hands the next samples of up to kLanes rays to `take(ray, sample)`, each ray's in order, until that says false or there
   // are none left. Rays that lie together are marched the fastest.
   template <class Take>
   void march(Progress* rays, int count, const std::vector<Interval>& intervals, const Take& take) const {
-    bool open[kLanes];
+    bool open[kLanes], found = false;
     for (int i = 0; i < count; ++i) open[i] = more(rays[i], intervals);
     for (;;) {
       std::int32_t first = std::numeric_limits<std::int32_t>::max();
       for (int i = 0; i < count; ++i)
         if (open[i]) first = std::min(first, rays[i].index);
-      int chosen[kLanes];
-      Queries queries(0);
+      Together together;
       for (int i = 0; i < count; ++i)
-        if (open[i] && rays[i].index - first <= kBeside) {
-          chosen[queries.count] = i;
-          queries.add(point(rays[i]), rays[i].hint);
-          queries.reach = std::max(queries.reach, intervals[rays[i].interval].reach);
-        }
-      if (queries.count == 0) return;
-      mesh_.nearest(queries);
-      for (int k = 0; k < queries.count; ++k) {
-        Progress& ray = rays[chosen[k]];
+        if (open[i] && rays[i].index - first <= kBeside) together.rays[together.count++] = i;
+      if (together.count == 0) return;
+      // Samples are seldom alone.
+      if (found || !pass(rays, together, intervals)) {
+        Queries queries;
+        for (int k = 0; k < together.count; ++k) queries.add(point(rays[together.rays[k]]), rays[together.rays[k]].hint);
+        mesh_.nearest(queries);
+        found = false;
         Sample sample;
-        ray.hint = queries.hint[k];
-        const bool found = look(ray, intervals, queries.triangle[k], queries.squared[k], sample);
-        open[chosen[k]] = (!found || take(chosen[k], sample)) && more(ray, intervals);
+        for (int k = 0; k < together.count; ++k) {
+          const int ray = together.rays[k];
+          if (!look(rays[ray], intervals, queries.triangle[k], queries.squared[k], sample)) continue;
+          found = true;
+          open[ray] = take(ray, sample);
+        }
+      }
+      for (int k = 0; k < together.count; ++k) {
+        const int ray = together.rays[k];
+        open[ray] = open[ray] && more(rays[ray], intervals);
       }
     }
   }
@@ -98,16 +104,23 @@ class Marcher {
   // Lattice points that are looked at together may lie so many apart.
   static constexpr std::int32_t kBeside = 1;
 
+  struct Together {
+    int count = 0;
+    int rays[kLanes];
+  };
+
   Vec3 point(const Progress& ray) const {
     return ray.origin + ((static_cast<float>(ray.index) + ray.jitter) * step_) * ray.direction;
   }
+  bool pass(Progress* rays, const Together& together, const std::vector<Interval>& intervals) const;
   bool more(Progress& progress, const std::vector<Interval>& intervals) const;
   bool look(Progress& progress, const std::vector<Interval>& intervals, std::int32_t triangle, float squared,
             Sample& sample) const;
-  void near_intervals(Vec3 origin, Vec3 direction, std::vector<Interval>& intervals) const;
+  void near_intervals(Vec3 origin, Vec3 direction, float spread, float farthest, std::vector<Interval>& intervals) const;
+  float farthest_from(Vec3 origin) const;
   void enter(Progress& progress, const std::vector<Interval>& intervals) const;
   CanonicalPoint place(Vec3 point, Vec3 direction, std::int32_t triangle) const;
-  std::int32_t passed(const CanonicalPoint& placed, float most) const;
+  std::int32_t passed(const CanonicalPoint& placed, float about, float most) const;
   int free_at(Vec3 cells) const;
   bool clear_around(Vec3 cells, float half) const;
   void matrix(Vec3 point, std::int32_t triangle, float* m) const;

@@ -1,7 +1,6 @@
 #include "mesh_search.h"
 
 #include <algorithm>
-#include <cmath>
 #include <numeric>
 #include <stdexcept>
 
@@ -173,14 +172,15 @@ Posed::Posed(std::shared_ptr<const Tree> tree, const float* vertices, Nearest ne
   double diagonals = 0;
   for (std::size_t i = 0; i < leaves_.size(); ++i) {
     const Node& node = nodes[tree_->leaves()[i]];
-    const Vec3 size = boxes_[tree_->leaves()[i]].high - boxes_[tree_->leaves()[i]].low;
-    diagonals += std::sqrt(dot(size, size));
+    const Box& box = boxes_[tree_->leaves()[i]];
+    diagonals += length(box.high - box.low);
     const Triangle none{{kFar, kFar, kFar}, {kFar, kFar, kFar}, {kFar, kFar, kFar}};
     for (int lane = 0; lane < kLanes; ++lane) {
       const bool used = lane < node.count;
       set_lane(leaves_[i], lane, used ? triangles_[node.first + lane] : none, used ? tree_->order()[node.first + lane] : -1);
     }
   }
+  // Half of a leaf's diagonal, on average.
   together_ = static_cast<float>(0.5 * diagonals / static_cast<double>(leaves_.size()));
 }
 

@@ -1,6 +1,7 @@
 // Nearest triangle and first hit on a posed mesh, exact, by a tree of boxes that is built once and refitted.
 #pragma once
 
+#include <cmath>
 #include <cstdint>
 #include <limits>
 #include <memory>
@@ -9,6 +10,8 @@
 #include "search.h"
 
 namespace headbench::insta {
+
+inline float length(Vec3 v) { return std::sqrt(dot(v, v)); }
 
 struct Box {
   Vec3 low{std::numeric_limits<float>::infinity(), std::numeric_limits<float>::infinity(),
@@ -57,6 +60,7 @@ class Posed {
 
   const Tree& tree() const { return *tree_; }
   const std::vector<Box>& boxes() const { return boxes_; }
+  float together() const { return together_; }  // points within so many metres of their middle are searched for together
 
   // Writes the triangles and the squared distances of queries.
   void nearest(Queries& queries) const {
@@ -72,7 +76,7 @@ class Posed {
   std::vector<Box> boxes_;
   std::vector<WideBox> wide_;
   std::vector<WideTriangles> leaves_;
-  float together_;  // half of a leaf's diagonal, on average
+  float together_;
   Nearest nearest_;
 };
 

@@ -64,7 +64,7 @@ void nearest(const Posed& mesh, const Array<const float, -1, 3>& points, const A
   nb::gil_scoped_release unlocked;
   in_parts(count, threads, [&](std::int64_t begin, std::int64_t end) {
     for (; begin < end; begin += kLanes) {
-      Queries queries(std::numeric_limits<float>::infinity());
+      Queries queries;
       for (std::int64_t i = begin; i < std::min(end, begin + kLanes); ++i) queries.add(row(points.data(), i), -1);
       mesh.nearest(queries);
       std::copy_n(queries.triangle, queries.count, triangles.data() + begin);

@@ -114,8 +114,6 @@ class Nearby {
 
   Nearby(const Search& search, const Wide3& centre) : search_(search), centre_(centre) {}
 
-  float least() const { return sqrtf(best_); }
-
   // Finds the triangles nearest to the centre, kFoundMax of them at most.
   void nearest(std::int32_t hint) {
     const std::int32_t tried = hint < 0 ? -1 : search_.leaf_of[hint];
@@ -149,19 +147,21 @@ class Nearby {
     drop_farther();
   }
 
-  // Finds those for all points within `spread` of the centre; false where there are more than kFoundMax. `nearest` goes
-  // before.
+  // Finds those that may be nearest to points within `spread` metres of the centre, given a triangle that should be near it;
+  // false where there are more than kFoundMax.
   //
-  // Let d be the distance of the centre c to a triangle, n the unit way there from its foot; d', n' those of the nearest. A
+  // Let d be the distance of the centre c from a triangle, n the unit way from its foot; d' and n' those of the one given. A
   // point c + e is d + n e or more from the one, distances being convex, and from the other's foot, and so from the other,
-  // no more than d' + n' e + e^2 / 2 d', nor than d' + |e|. So none is nearer to the one where
+  // no more than d' + n' e + e^2 / 2 d', nor than d' + |e|. So the one is nowhere nearest where
   // d - d' > min(2 |e|, |n - n'| |e| + e^2 / 2 d'). The same holds for boxes.
-  bool widen(float spread) {
-    if (count == 0) return true;
-    const Found first = found[0];
+  bool about(float spread, std::int32_t given) {
+    const WideTriangles& leaf = search_.leaves[search_.leaf_of[given]];
+    int place = 0;
+    while (leaf.index[place] != given) ++place;
     Wide3 way;
-    squared_distance(*first.leaf, Everywhere{first.lane}, centre_, &way);
-    const float least = sqrtf(first.squared), tiny = 1e-12f, by_least = 1 / (least > tiny ? least : tiny);
+    alignas(64) float squared[W];
+    store(squared, squared_distance(leaf, Everywhere{place}, centre_, &way));
+    const float least = sqrtf(squared[0]), tiny = 1e-12f, by_least = 1 / (least > tiny ? least : tiny);
     for (int i = 0; i < 3; ++i) towards_.x[i] = way.x[i] * by_least;
     spread_ = spread * 1.001f;
     bent_ = 0.5f * spread_ * spread_ * by_least;
@@ -320,18 +320,12 @@ inline void nearest(const Search& search, Queries& queries, int first, int last)
   const bool alone = last - first == 1;
   if (alone || spread <= search.together) {
     Nearby nearby(search, centre);
-    nearby.nearest(queries.hint[first]);
-    const std::int32_t hint = nearby.count > 0 ? nearby.found[0].leaf->index[nearby.found[0].lane] : -1;
-    const float beyond = nearby.least() - spread;
-    const bool far = beyond > queries.reach;
-    if (far || alone || nearby.widen(spread)) {
-      if (far)
-        for (int lane = first; lane < last; ++lane) queries.triangle[lane] = -1, queries.squared[lane] = beyond * beyond;
-      else
-        choose(nearby, queries, first, last);
-      for (int lane = first; lane < last; ++lane) queries.hint[lane] = hint;
-      return;
+    std::int32_t near = queries.hint[first];
+    if (alone || near < 0) {
+      nearby.nearest(near);
+      near = nearby.count > 0 ? nearby.found[0].leaf->index[nearby.found[0].lane] : -1;
     }
+    if (alone || near < 0 || nearby.about(spread, near)) return choose(nearby, queries, first, last);
   }
   nearest(search, queries, first, (first + last) / 2);
   nearest(search, queries, (first + last) / 2, last);

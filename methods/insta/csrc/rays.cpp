@@ -21,10 +21,10 @@ void march_together(const Marcher& marcher, const Rays& rays, std::int64_t begin
   bool ended[kLanes];
   for (int i = 0; i < count; ++i) {
     const std::int64_t number = begin + i;
-    progress[i] = marcher.start(row(rays.origins, number), row(rays.directions, number), rays.jitter[number],
-                                rays.first[number], intervals);
+    progress[i] = {row(rays.origins, number), row(rays.directions, number), rays.jitter[number], rays.first[number]};
     ended[i] = true;
   }
+  marcher.start(progress, count, intervals);
   marcher.march(progress, count, intervals, [&](int ray, const Sample& sample) {
     found[ray].push_back(sample);
     return ended[ray] = static_cast<std::int32_t>(found[ray].size()) < rays.samples_max;
@@ -117,10 +117,12 @@ std::int64_t render(const Marcher& marcher, const Kernels& kernels, const Field&
     std::vector<float> scratch(kernels.scratch(field));
     std::fill(seen.color + 3 * begin, seen.color + 3 * end, 0.0f);
     for (std::int64_t number = begin; number < end; ++number) {
-      rays.push_back(marcher.start(row(all.origins, number), row(all.directions, number), all.jitter[number], 0, intervals));
+      rays.push_back({row(all.origins, number), row(all.directions, number), all.jitter[number], 0});
       gathered.push_back({number, 0, 1.0f});
     }
     std::size_t count = rays.size();
+    for (std::size_t first = 0; first < count; first += kLanes)
+      marcher.start(rays.data() + first, static_cast<int>(std::min<std::size_t>(kLanes, count - first)), intervals);
     while (count > 0) {
       round.count = 0;
       for (std::size_t first = 0; first < count; first += kLanes) {

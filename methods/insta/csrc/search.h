@@ -62,23 +62,20 @@ struct Search {
   float together;               // points within so many metres of their middle are searched for together
 };
 
-// Up to kLanes points, the triangle nearest to each and its squared distance. Of equally near ones (a shared edge or corner)
-// that whose plane is farthest is found, so that the space around a convex edge is parted along the bisector and not by
-// rounding; of those the first. Beyond `reach` the triangle may be -1 and the distance a smaller one, not below `reach`; for a
-// point that is not finite they are -1 and infinite. What is found within `reach` depends neither on the other points nor on
-// hints. Points that lie together are found the fastest.
+// Up to kLanes points, the triangle nearest to each and its squared distance; -1 and infinity for one that is not finite. Of
+// equally near triangles (a shared edge or corner) that whose plane is farthest is found, so that the space around a convex
+// edge is parted along the bisector and not by rounding; of those the first. What is found for a point depends neither on the
+// others nor on hints. Points that lie together are found the fastest.
 struct alignas(64) Queries {
   int count = 0;
-  float reach;  // metres
   float point[3][kLanes];
-  std::int32_t hint[kLanes];  // a triangle to try first, or -1; afterwards one that is near
+  std::int32_t hint[kLanes];  // a triangle that is near, or -1
   std::int32_t triangle[kLanes];
   float squared[kLanes];
 
-  explicit Queries(float reach) : reach(reach) {}
-  void add(Vec3 p, std::int32_t first) {
+  void add(Vec3 p, std::int32_t near) {
     point[0][count] = p.x, point[1][count] = p.y, point[2][count] = p.z;
-    hint[count++] = first;
+    hint[count++] = near;
   }
 };
 

@@ -8,7 +8,7 @@ import torch
 
 from headbench.methods.insta import kernel
 from headbench.methods.insta.marching import CanonicalSurface, Rays, Space, occupied_at
-from headbench.methods.insta.rendering import camera_rays
+from headbench.methods.insta.rendering import camera_rays, pixels_by_blocks
 
 from ...datasets.head.toy import toy_head
 from ..toy_clip import look_at
@@ -102,6 +102,28 @@ def test_rounds_together_are_all_samples(pair, space, most):
     whole, rounds = all_samples(pair[0], rays, space, 10_000), all_samples(pair[0], rays, space, most)
     for one, other in zip(whole, rounds):
         np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize(("roughness", "lost"), [(0.0005, 0.002), (0.003, 0.03)])  # as above
+@pytest.mark.parametrize("occupied", [0.02, 0.3])
+def test_rays_together_have_the_samples_of_each_alone(space, occupied, roughness, lost):
+    mesh = make("kernel", roughness)
+    size = space.free.shape
+    sparse = np.random.default_rng(5).random(size) < occupied
+    thin = Space.of(space.reach, space.low, space.cell, sparse)
+    camera = look_at(np.array([0.1, 0.05, 0.5]), np.zeros(3), "c", 96, 96)
+    rows, columns = next(pixels_by_blocks((24, 24, 72, 72), 10_000))
+    rays = camera_rays(camera, columns, rows, 0.5)
+    mixed = np.random.default_rng(6).permutation(len(rows))
+    together = all_samples(mesh, rays, thin, 10_000)
+    alone = all_samples(mesh, Rays(*(column[mixed] for column in rays)), thin, 10_000)
+    owners = mixed[alone[3]]
+    keys = [
+        set(zip(together[3].tolist(), together[4].tolist())),
+        set(zip(owners.tolist(), alone[4].tolist())),
+    ]
+    assert len(keys[1]) > 1_000
+    assert len(keys[0] ^ keys[1]) <= lost * len(keys[1])
 
 
 def test_samples_are_where_they_are_said_to_be(pair, space):
