@@ -139,39 +139,39 @@ class Rows:
     @property
     def failed(self) -> list[str]:
         """Methods that have a failed row, sorted."""
-        return sorted(set(self._table.loc[self._table["status"] == "failed", "method"]))
+        return sorted(set(self._table.loc[self._table["status"] == "failed", "method"].unique()))
 
     @property
     def tasks(self) -> set[str]:
         """Tasks that there are rows of; "" is none."""
-        return set(self._table["task"]) - {""}
+        return set(self._table["task"].unique()) - {""}
 
     @property
     def methods(self) -> set[str]:
         """Methods that there are rows of."""
-        return set(self._table["method"])
+        return set(self._table["method"].unique())
 
     @property
     def metrics(self) -> set[str]:
         """Metrics that there are rows of."""
-        return set(self._table["metric"])
+        return set(self._table["metric"].unique())
 
     @property
     def subjects(self) -> set[str]:
         """Subjects that there are rows of."""
-        return set(self._table["subject"])
+        return set(self._table["subject"].unique())
 
     def seeds(self, method: str | All) -> set[int]:
         """Seeds that a method was run with."""
-        return set(map(int, self._of(method)["seed"]))
+        return set(map(int, self._of(method)["seed"].unique()))
 
     def versions(self, method: str) -> list[str]:
         """Versions of a method, sorted."""
-        return sorted(set(self._of(method)["version"].astype(str)))
+        return sorted(map(str, self._of(method)["version"].unique()))
 
     def protocols(self, task: str) -> list[str]:
         """Hashes of the protocols that a task was scored by, sorted."""
-        return sorted(set(self._table.loc[self._table["task"] == task, "protocol"].astype(str)))
+        return sorted(map(str, self._table.loc[self._table["task"] == task, "protocol"].unique()))
 
     def frames(self, task: str, region: str) -> set[tuple[str, str, int, str]]:
         """Frames of a task: those that any method has a row for in a region."""
@@ -198,12 +198,12 @@ class Rows:
     @property
     def regions(self) -> set[str]:
         """Regions that frames were measured over."""
-        return set(self._table.loc[self._table["task"] != "", "region"])
+        return set(self._table.loc[self._table["task"] != "", "region"].unique())
 
     @property
     def sequences(self) -> set[str]:
         """Sequences of the frames."""
-        return set(self._table.loc[self._table["task"] != "", "sequence"])
+        return set(self._table.loc[self._table["task"] != "", "sequence"].unique())
 
     def of_methods(self, names: Collection[str]) -> Rows:
         """The rows of some methods."""

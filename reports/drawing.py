@@ -124,7 +124,7 @@ class _Paper:
                 image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
             pixels[top : top + image.shape[0], left : left + image.shape[1]] = image
         with atomic_path(path) as temporary:
-            Image.fromarray(pixels).save(temporary, optimize=True)
+            Image.fromarray(pixels).save(temporary)
 
 
 @style.context("default")  # whatever the user's matplotlibrc says, such as text.usetex
