@@ -14,7 +14,7 @@ from torch.autograd.function import once_differentiable
 
 from ..shared.avatar_kernel import arrays, call
 from ..shared.networks import PAIRS
-from .field import Bounds, NamedTensors, line_table, normalised_weight
+from .field import Bounds, CanonicalFrames, NamedTensors, line_table, normalised_weight
 
 
 def plane_colors(
@@ -62,6 +62,32 @@ def directions_to(
     """Compiled form of `field.canonical_directions`; then the rotation ``last`` (3, 3), if any, is applied to all."""
     last = torch.eye(3) if last is None else last
     return _Directions.apply(binding, turns, last, center, backend, means)  # type: ignore[no-untyped-call]
+
+
+def canonical_positions(
+    canonical: CanonicalFrames, binding: Tensor, means: Tensor, backend: str = "cpu"
+) -> Tensor:
+    """Compiled form of `field.CanonicalFrames.positions`; only ``means`` receive a gradient."""
+    return _Positions.apply(binding, canonical.linear, canonical.center, backend, means)  # type: ignore[no-untyped-call]
+
+
+class _Positions(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, binding: Tensor, linear: Tensor, center: Tensor, backend: str, means: Tensor
+    ) -> Tensor:
+        positions = torch.empty_like(means)
+        call("position_training", binding, linear, center, means, positions, False, backend=backend)
+        ctx.save_for_backward(binding, linear, center)
+        ctx.backend = backend
+        return positions
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, by_positions: Tensor) -> tuple[Tensor | None, ...]:
+        by_means = torch.empty_like(by_positions)
+        call("position_training", *ctx.saved_tensors, by_positions, by_means, True, backend=ctx.backend)
+        return None, None, None, None, by_means
 
 
 class _Directions(torch.autograd.Function):

@@ -1,4 +1,5 @@
-"""Processor time of a training iteration by stage, forward and backward, against the rasteriser's in the same run.
+"""Processor time of a training iteration by stage, forward and backward, against the rasteriser's in the same run, and
+the shares of the processor's multiply-adds and memory bandwidth that are used.
 
 Splats lie at random on the procedural head, as training leaves them, and the images are drawn from an untrained avatar: what an
 iteration costs does not depend on what it learns.
@@ -39,17 +40,20 @@ from ...methods.gbs.config import GBSConfig
 from ...methods.gbs.spec import GBS
 from ...methods.ours import appearance as ours
 from ...methods.ours.config import OursConfig
+from ...methods.ours.field import line_position, line_table, normalised_weight, plane_features
 from ...methods.ours.spec import OURS
 from ...methods.shared import splat_training
 from ...methods.shared.avatar_files import Subject
 from ...methods.shared.loop import TrainingImages
+from ...methods.shared.networks import encode, sum_rows
 from ...methods.shared.optimisation import Densifier, Optimiser
 from ...methods.shared.schedule import ShuffledEpochs, Timeline
 from ...methods.shared.splat_training import BoundTraining, SplatTrainer, Start
 from ...methods.shared.subject_mesh import SubjectMesh
+from ...methods.splats.cpu import instruction_sets, peak_flops
 from ...methods.splats.request import Rendering
 from .avatar.untrained import cameras_around, random_poses, untrained_avatar
-from .timing import table, torch_threads
+from .timing import seconds_of, table, torch_threads
 
 SIZE = (144, 208)  # of the demo's images
 SPLATS = 20_000  # the most that the demo's preset allows
@@ -206,6 +210,7 @@ def _timed_stages(stages: _Stages) -> Iterator[None]:
         (ours, "plane_colors", "colours"),
         (ours, "table_offsets", "lines"),
         (ours, "directions_to", "directions"),
+        (ours, "canonical_positions", "canonical positions"),
         (gbs, "apply_pose", "to world space"),
     ]
     plain = [(Optimiser, "step"), (Densifier, "observe"), (TrainingImages, "get")]
@@ -230,14 +235,85 @@ def _method(stages: _Stages, kind: type, name: str) -> Callable[..., Any]:
 
 
 @dataclass(frozen=True)
+class Limits:
+    """What one thread can do at best, measured: floating-point operations and bytes a second."""
+
+    flops: float
+    bandwidth: float
+
+
+TRIAD = 1 << 23  # numbers in each of three arrays, more than caches hold
+
+
+def measure_limits() -> Limits:
+    """Multiply-adds in registers, and the triad a = b + s c of STREAM (McCalpin 1995): 12 bytes a number."""
+    flops = peak_flops("cpu") if instruction_sets() else float("nan")
+    a, b, c = torch.empty(3, TRIAD).fill_(1.0)
+    triad = seconds_of(lambda: torch.add(b, c, alpha=2.0, out=a), time.thread_time)
+    return Limits(flops, 12 * TRIAD / min(triad() for _ in range(8)))
+
+
+@dataclass(frozen=True)
 class Iteration:
-    """Milliseconds of one thread, the least of the iterations; ``stages`` are medians."""
+    """Milliseconds of one thread, the least of the iterations; ``stages`` are medians.
+
+    ``operations`` and ``bytes`` are what stages cannot do without, where that is known.
+    """
 
     method: str
     splats: int
     whole: float
     rasteriser: float
     stages: Mapping[str, float]
+    operations: Mapping[str, float]
+    bytes: Mapping[str, float]
+
+    def shares(self, limits: Limits) -> dict[str, tuple[str, float]]:
+        """By stage, which of the limits it is compared with and how much of it is used."""
+        compared = (("multiply-add", self.operations, limits.flops), ("memory", self.bytes, limits.bandwidth))
+        return {
+            stage: (name, amount / (1e-3 * self.stages[stage]) / limit)
+            for name, amounts, limit in compared
+            for stage, amount in amounts.items()
+        }
+
+
+@torch.no_grad()
+def _network_operations(training: SplatTrainer) -> dict[str, float]:
+    """Floating-point operations of the two networks of "ours" in an iteration, without units that are off at a splat."""
+    seen: dict[str, tuple[Any, ...]] = {}
+
+    def noting(name: str) -> Callable[..., Any]:
+        function = getattr(ours, name)
+
+        def run(*arguments: Any) -> Any:
+            seen[name] = arguments
+            return function(*arguments)
+
+        return run
+
+    with ExitStack() as entered:
+        for name in ("plane_colors", "table_offsets"):
+            entered.enter_context(patch.object(ours, name, noting(name)))
+        training.loss(FIRST_ITERATION, 0)
+    parameters, box, positions, directions = seen["plane_colors"]
+    inputs = torch.cat([*plane_features(parameters, box, positions), encode(directions)], dim=1)
+    on = float((inputs @ parameters["color_weight_0"].t() > 0).sum())
+    hidden, width = parameters["color_weight_0"].shape
+    counts = {
+        "colours": len(positions) * hidden * (width + 3),
+        "colours, backward": on * 2 * (width + 3),
+    }
+    parameters, box, blended, positions = seen["table_offsets"]
+    place = line_position(box.unit(positions[box.contains(positions)]), parameters["lines"].shape[2])
+    table = line_table(blended, normalised_weight(parameters, 0))
+    first = torch.relu(sum_rows(table, *place) + parameters["line_bias_0"])
+    second = first @ normalised_weight(parameters, 1).t() + parameters["line_bias_1"] > 0
+    places, of_first, of_second = first.numel(), float((first > 0).sum()), float(second.sum())
+    outputs, hidden = parameters["line_direction_2"].shape
+    counts["lines"] = 6 * places + of_first * hidden + places * outputs
+    counts["lines, backward"] = 6 * (places + of_first) + of_second * 2 * (hidden + outputs)
+    return {stage: 2.0 * count for stage, count in counts.items()}
 
 
 def measure_iteration(name: str, clip: _Clip, count: int, repeats: int) -> Iteration:
@@ -245,6 +321,7 @@ def measure_iteration(name: str, clip: _Clip, count: int, repeats: int) -> Itera
     training = METHODS[name](clip, count)
     training.begin(Timeline(LENGTH, 600_000))
     whole, by_stage = [], defaultdict(list)
+    operations = _network_operations(training) if name == "ours" else {}
     try:
         for number in range(WARM_UP + repeats):
             stages = _Stages()
@@ -262,7 +339,12 @@ def measure_iteration(name: str, clip: _Clip, count: int, repeats: int) -> Itera
     rasteriser = [
         a + b for a, b in zip(by_stage[RASTERISER], by_stage[f"{RASTERISER}, backward"], strict=True)
     ]
-    return Iteration(name, len(training.binding), 1e3 * min(whole), 1e3 * min(rasteriser), medians)
+    numbers = sum(group["value"].numel() for group in training.optimiser.state().values() if group["moments"])
+    return Iteration(
+        *(name, len(training.binding), 1e3 * min(whole), 1e3 * min(rasteriser), medians, operations),
+        # Four arrays are read, three of them written.
+        bytes={"Adam": 7.0 * 4 * numbers},
+    )
 
 
 def _iterate(training: SplatTrainer, iteration: int) -> None:
@@ -281,6 +363,7 @@ def measure(quick: bool, progress: Progress) -> Findings:
     count, repeats = (QUICK_SPLATS, 6) if quick else (SPLATS, 30)
     found = []
     with torch_threads(1):
+        limits = measure_limits()
         for number, name in enumerate(METHODS):
             found.append(measure_iteration(name, clip, count, repeats))
             progress(number + 1, len(METHODS), name)
@@ -298,6 +381,11 @@ def measure(quick: bool, progress: Progress) -> Findings:
     stages = [
         (name, *(f"{one.stages[name]:.2f}" if name in one.stages else "-" for one in found)) for name in names
     ]
+    shares = [
+        (one.method, stage, kind, f"{share:.2f}")
+        for one in found
+        for stage, (kind, share) in one.shares(limits).items()
+    ]
     width, height = SIZE
     text = (
         f"Training at {width}x{height}, processor ms of one thread: an iteration, the least of {repeats}, and the "
@@ -305,6 +393,9 @@ def measure(quick: bool, progress: Progress) -> Findings:
         + table(("method", "splats", "iteration", "rasteriser", "ratio"), rows)
         + "\n\nStages, medians.\n\n"
         + table(("stage", *(one.method for one in found)), stages)
+        + f"\n\nOf what this thread can do, measured in this run: {limits.flops / 1e9:.0f} Gflop/s of multiply-adds, "
+        f"{limits.bandwidth / 1e9:.0f} GB/s of memory.\nUnits that are off at a splat are not counted.\n\n"
+        + table(("method", "stage", "limit", "share"), shares)
     )
     data = {
         one.method: {
@@ -312,7 +403,9 @@ def measure(quick: bool, progress: Progress) -> Findings:
             "iteration_ms": one.whole,
             "rasteriser_ms": one.rasteriser,
             "stages_ms": dict(one.stages),
+            "shares": {stage: share for stage, (_, share) in one.shares(limits).items()},
         }
         for one in found
     }
+    data["limits"] = {"gflops": limits.flops / 1e9, "gb_s": limits.bandwidth / 1e9}
     return Findings(text, data)

@@ -59,7 +59,7 @@ HEADBENCH_INLINE void prefetch_floats(const float* from, std::int64_t left, int 
   for (int k = 0; k < most && k < left; k += kUnitsStep) __builtin_prefetch(from + k, 0, 2);
 }
 
-// ---- Directions ----
+// ---- Positions and directions ----
 
 // matrix times v, or its transpose times v, of a matrix by rows.
 template <class T>
@@ -69,6 +69,27 @@ HEADBENCH_INLINE void rotate(const T* m, const Real* v, Real* out) {
 template <class T>
 HEADBENCH_INLINE void rotate_back(const T* m, const Real* v, Real* out) {
   for (int i = 0; i < 3; ++i) out[i] = fma(m[i], v[0], fma(m[3 + i], v[1], Real(m[6 + i]) * v[2]));
+}
+
+template <bool backward>
+inline void positions(const PositionTraining& in, std::int64_t begin, std::int64_t end) {
+  Gathered<9> linear;
+  Gathered<3> center, value;
+  for (std::int64_t first = begin; first < end; first += W) {
+    const int used = lanes_used(first, end);
+    for (int lane = 0; lane < W; ++lane) {
+      const std::int64_t splat = first + (lane < used ? lane : 0), triangle = in.binding[splat];
+      linear.set(in.linear + 9 * triangle, lane);
+      if (!backward) center.set(in.centers + 3 * triangle, lane);
+      value.set(in.values + 3 * splat, lane);
+    }
+    Real matrix[9], out[3];
+    for (int k = 0; k < 9; ++k) matrix[k] = linear[k];
+    const Real from[3] = {value[0], value[1], value[2]};
+    backward ? rotate_back(matrix, from, out) : rotate(matrix, from, out);
+    for (int k = 0; k < 3; ++k) value.keep(k, backward ? out[k] : out[k] + center[k]);
+    for (int lane = 0; lane < used; ++lane) value.put(in.out + 3 * (first + lane), lane);
+  }
 }
 
 // Directions of a vector of splats from `first` on, with the steps on the way to them.
@@ -167,20 +188,40 @@ struct Between {
   bool clamped;
 };
 
-HEADBENCH_INLINE Between between(const Grid& grid, int axis, float value) {
-  // The steps of `plane_features` and `sample_plane`, each rounded as there.
-  const float last = static_cast<float>(grid.samples - 1);
-  const float unit = (value - grid.low[axis]) / grid.extent[axis];
-  const float position = ((2.0f * unit - 1.0f) + 1.0f) * (0.5f * last);
-  const float inside = position > 0.0f ? position < last ? position : last : 0.0f;
-  int lower = static_cast<int>(inside);
-  lower = lower < grid.samples - 2 ? lower : grid.samples - 2;
-  return {lower, inside - static_cast<float>(lower), !(position >= 0.0f && position <= last)};
+HEADBENCH_INLINE Between between(const ColorTraining& net, std::int64_t splat, int axis) {
+  const std::int32_t lower = net.lower[3 * splat + axis];
+  return {lower < 0 ? ~lower : lower, net.fractions[3 * splat + axis], lower < 0};
 }
 
-HEADBENCH_INLINE void sample_planes(const ColorTraining& net, const float* position, float* out) {
+// Find where splats lie, by the steps of `plane_features` and `sample_plane`, each rounded as there.
+inline void find_places(const ColorTraining& net, std::int64_t begin, std::int64_t end) {
+  const Real last = static_cast<float>(net.grid.samples - 1), before_last = static_cast<float>(net.grid.samples - 2);
+  const Real half = 0.5f * static_cast<float>(net.grid.samples - 1), zero = 0.0f, one = 1.0f;
+  Gathered<3> value, lower, clamped;
+  for (std::int64_t first = begin; first < end; first += W) {
+    const int used = lanes_used(first, end);
+    for (int lane = 0; lane < W; ++lane) value.set(net.positions + 3 * (first + (lane < used ? lane : 0)), lane);
+    for (int axis = 0; axis < 3; ++axis) {
+      const Real unit = (value[axis] - Real(net.grid.low[axis])) / Real(net.grid.extent[axis]);
+      const Real position = ((Real(2.0f) * unit - one) + one) * half;
+      const Real inside = select(position > zero, min(position, last), zero), row = min(floor(inside), before_last);
+      lower.keep(axis, row);
+      value.keep(axis, inside - row);
+      clamped.keep(axis, select((position >= zero) & (last >= position), zero, one));
+    }
+    for (int lane = 0; lane < used; ++lane) {
+      value.put(net.fractions + 3 * (first + lane), lane);
+      for (int axis = 0; axis < 3; ++axis) {
+        const std::int32_t row = static_cast<std::int32_t>(lower.values[axis][lane]);
+        net.lower[3 * (first + lane) + axis] = clamped.values[axis][lane] != 0.0f ? ~row : row;
+      }
+    }
+  }
+}
+
+HEADBENCH_INLINE void sample_planes(const ColorTraining& net, std::int64_t splat, float* out) {
   Between at[3];
-  for (int axis = 0; axis < 3; ++axis) at[axis] = between(net.grid, axis, position[axis]);
+  for (int axis = 0; axis < 3; ++axis) at[axis] = between(net, splat, axis);
   for (int plane = 0; plane < kPlanes; ++plane) {
     const Between &x = at[kPlaneAxes[plane][0]], &y = at[kPlaneAxes[plane][1]];
     const int channels = net.channels[plane];
@@ -199,9 +240,9 @@ HEADBENCH_INLINE void sample_planes(const ColorTraining& net, const float* posit
 }
 
 // Ask for the texels that `sample_planes` reads.
-HEADBENCH_INLINE void prefetch_planes(const ColorTraining& net, const float* position) {
+HEADBENCH_INLINE void prefetch_planes(const ColorTraining& net, std::int64_t splat) {
   Between at[3];
-  for (int axis = 0; axis < 3; ++axis) at[axis] = between(net.grid, axis, position[axis]);
+  for (int axis = 0; axis < 3; ++axis) at[axis] = between(net, splat, axis);
   for (int plane = 0; plane < kPlanes; ++plane) {
     const int x = at[kPlaneAxes[plane][0]].lower, y = at[kPlaneAxes[plane][1]].lower, channels = net.channels[plane];
     for (int row = 0; row < 2; ++row) {
@@ -211,8 +252,9 @@ HEADBENCH_INLINE void prefetch_planes(const ColorTraining& net, const float* pos
   }
 }
 
-// Inputs of entries [first, first + used): features and encoded directions; zeros in the rest of `rows`, whole groups.
-inline void color_inputs(const ColorTraining& net, std::int64_t first, int used, int rows, float* out) {
+// Inputs of splats [first, first + used): features and encoded directions; zeros in the rest of `rows`, whole groups. Splats
+// to `end` have their places.
+inline void color_inputs(const ColorTraining& net, std::int64_t first, int used, int rows, std::int64_t end, float* out) {
   alignas(64) float encoded[kEncoding * W];
   for (int offset = 0; offset < rows; offset += W) {
     Gathered<3> d;
@@ -223,11 +265,11 @@ inline void color_inputs(const ColorTraining& net, std::int64_t first, int used,
     for (int lane = 0; lane < W; ++lane) {
       constexpr std::int64_t ahead = 12;
       const std::int64_t later = first + offset + lane + ahead;
-      if (later < net.count) prefetch_planes(net, net.positions + 3 * (later));
+      if (later < end) prefetch_planes(net, later);
       float* row = out + (offset + lane) * net.inputs_stride;
       int filled = 0;
       if (offset + lane < used) {
-        sample_planes(net, net.positions + 3 * (first + offset + lane), row);
+        sample_planes(net, first + offset + lane, row);
         for (int k = 0; k < kEncoding; ++k) row[net.features + k] = encoded[k * W + lane];
         filled = net.features + kEncoding;
       }
@@ -247,10 +289,11 @@ inline void color_forward(const ColorTraining& net, std::int64_t begin, std::int
   for (int k = 0; k < used_inputs; ++k) list[k] = k;
   Lists<kSplatGroup> lists = {list, 0, {}};
   for (int& count : lists.counts) count = used_inputs;
+  find_places(net, begin, end);
   for (std::int64_t first = begin; first < end; first += kNetworkTile) {
     const int used = end - first < kNetworkTile ? static_cast<int>(end - first) : kNetworkTile;
     const int rows = static_cast<int>(whole_groups(used));
-    color_inputs(net, first, used, rows, inputs);
+    color_inputs(net, first, used, rows, end, inputs);
     float* hidden = net.kept_hidden + first * net.units;
     product<kSplatGroup, kSplatVectors>(inputs, net.inputs_stride, lists, rows / kSplatGroup, net.first,
                                         net.units_stride, net.units, nullptr, true, hidden, net.units);
@@ -329,7 +372,7 @@ inline void color_backward(const ColorTraining& net, const ColorSums& at, std::i
     const std::int64_t next = first + kNetworkTile;
     prefetch_floats(net.kept_hidden + next * net.units, next < end ? whole_groups(end - next) * net.units : 0,
                     kNetworkTile * net.units);
-    color_inputs(net, first, used, static_cast<int>(whole_groups(used)), inputs);
+    color_inputs(net, first, used, static_cast<int>(whole_groups(used)), end, inputs);
     Lists<kSparseGroup> on = {list, net.units, {}};
     for (int group = 0; group < groups; ++group) {
       const float* hidden = net.kept_hidden + (first + group * kSparseGroup) * net.units;
@@ -372,8 +415,7 @@ inline void color_backward(const ColorTraining& net, const ColorSums& at, std::i
       float* kept = net.by_features + splat * net.features;
       for (int k = 0; k < net.features; ++k) kept[k] = gradient[k];
       Between at_samples[3];
-      for (int axis = 0; axis < 3; ++axis) at_samples[axis] = between(net.grid, axis, net.positions[3 * splat + axis]);
-      for (int k = 0; k < 2; ++k) net.lower[k][splat] = at_samples[k + 1].lower;
+      for (int axis = 0; axis < 3; ++axis) at_samples[axis] = between(net, splat, axis);
       planes_backward(net, at_samples, gradient, net.by_positions + 3 * splat);
       encoding_backward(inputs + s * net.inputs_stride + net.features, gradient + net.features,
                         net.by_directions + 3 * splat);
@@ -394,8 +436,7 @@ inline void scatter_plane(const ColorTraining& net, int plane, int row, const st
       for (int k = 0; k < channels; k += 16) HEADBENCH_PREFETCH(later + k);
     }
     const float* gradient = features + static_cast<std::size_t>(order[i]) * net.features;
-    const float* position = net.positions + 3 * static_cast<std::size_t>(order[i]);
-    const Between x = between(net.grid, across, position[across]), y = between(net.grid, down, position[down]);
+    const Between x = between(net, order[i], across), y = between(net, order[i], down);
     for (int side = 0; side < 2; ++side) {
       if (row + side < first || row + side > last) continue;
       const float weight = side ? y.fraction : 1.0f - y.fraction;
@@ -422,7 +463,7 @@ inline std::size_t line_backward_scratch(const LineTraining& in) {
          kNetworkTile / kSparseGroup * in.net.units;
 }
 
-// Add the gradient of an entry's first layer to its bias and to the rows of the table that it was interpolated from.
+// Add the gradient of an entry's first layer to the rows of the table that it was interpolated from.
 HEADBENCH_INLINE void add_first(const OffsetNetwork& net, const LineSums& at, std::int64_t entry, const float* first,
                                 const float* by_first, float* sums) {
   const Place<float> place = place_of(sums + at.table, net.units, net.rows + 3 * entry, net.fractions + 3 * entry);
@@ -430,7 +471,6 @@ HEADBENCH_INLINE void add_first(const OffsetNetwork& net, const LineSums& at, st
     const Mask on = load(first + unit) > Real(0.0f);
     if (!any(on)) continue;
     const Real gradient = zero_unless(on, load(by_first + unit));
-    store(sums + at.bias_0 + unit, load(sums + at.bias_0 + unit) + gradient);
     for (int axis = 0; axis < 3; ++axis) {
       float* to = place.lower[axis] + unit;
       store(to, fma(gradient, place.lower_weight[axis], load(to)));
@@ -511,7 +551,7 @@ inline void add(float* to, const float* from, std::size_t count) {
 
 extern const NetworkKernels network_kernels;
 const NetworkKernels network_kernels = {
-    HEADBENCH_ISA_NAME,     directions,     directions_backward, color_forward_scratch, color_forward,
+    HEADBENCH_ISA_NAME, positions<false>, positions<true>, directions,     directions_backward, color_forward_scratch, color_forward,
     color_backward_scratch, color_backward, scatter_plane,       offset_scratch,        offset_network,
     line_backward_scratch,  line_backward,  add};
 

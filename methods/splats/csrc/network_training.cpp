@@ -131,6 +131,8 @@ class ColorPass {
     ColorTraining net = describe(in);
     require(colors.shape(0) == in.positions.shape(0));
     net.kept_hidden = hidden_.resize(rounded_up(count_, kGroupRows) * net.units);
+    net.lower = lower_.resize(3 * count_);
+    net.fractions = fractions_.resize(3 * count_);
     net.colors = colors.data();
     Buffer<float> first, last;
     net.first = pad_transposed(first, in.first.data(), hidden_units_, input_count_, net.inputs, net.units_stride).data();
@@ -157,16 +159,16 @@ class ColorPass {
       net.by_planes[plane] = by_planes[plane]->data();
     }
     net.kept_hidden = hidden_.data();
+    net.lower = lower_.data();
+    net.fractions = fractions_.data();
     net.colors = const_cast<float*>(colors.data());
     net.by_colors = by_colors.data();
     net.by_positions = by_positions.data();
     net.by_directions = by_directions.data();
     Buffer<float> first, last, by_features, sums;
-    Buffer<std::int32_t> lower[2];
     net.first = pad(first, in.first.data(), hidden_units_, input_count_, net.units, net.inputs_stride).data();
     net.last = pad(last, in.last.data(), 3, hidden_units_, 3, net.units).data();
     net.by_features = by_features.resize(count_ * net.features);
-    for (int k = 0; k < 2; ++k) net.lower[k] = lower[k].resize(count_);
     const std::size_t of_first = static_cast<std::size_t>(net.units) * net.inputs;
     const ColorSums at{0, of_first, of_first + std::size_t{3} * net.units};
     float *first_out = by_first.data(), *last_out = by_last.data();
@@ -213,6 +215,11 @@ class ColorPass {
     return net;
   }
 
+  static std::int32_t row_of(const ColorTraining& net, std::int64_t splat, int axis) {
+    const std::int32_t lower = net.lower[3 * splat + axis];
+    return lower < 0 ? ~lower : lower;
+  }
+
   // Gradients by the planes: splats in the order of their lower row of samples, rows dealt out in bands.
   void scatter(const ColorTraining& net, int threads) const {
     const int samples = net.grid.samples;
@@ -220,11 +227,11 @@ class ColorPass {
     std::vector<std::uint32_t> starts[2];
     for (int k = 0; k < 2; ++k) {
       starts[k].assign(samples + 1, 0);
-      for (std::int64_t i = 0; i < count_; ++i) ++starts[k][net.lower[k][i] + 1];
+      for (std::int64_t i = 0; i < count_; ++i) ++starts[k][row_of(net, i, k + 1) + 1];
       for (int row = 0; row < samples; ++row) starts[k][row + 1] += starts[k][row];
       std::vector<std::uint32_t> next(starts[k].begin(), starts[k].end() - 1);
       orders[k].resize(count_);
-      for (std::int64_t i = 0; i < count_; ++i) orders[k].data()[next[net.lower[k][i]]++] = static_cast<std::uint32_t>(i);
+      for (std::int64_t i = 0; i < count_; ++i) orders[k].data()[next[row_of(net, i, k + 1)]++] = static_cast<std::uint32_t>(i);
     }
     const std::int64_t bands = divided_up(samples, kBandRows);
     ThreadPool::instance().run(kPlanes * bands, threads, [&](std::int64_t task, int) {
@@ -241,7 +248,8 @@ class ColorPass {
   const NetworkKernels& kernels_;
   const std::int64_t count_;
   std::int64_t hidden_units_ = 0, input_count_ = 0;
-  Buffer<float> hidden_;
+  Buffer<float> hidden_, fractions_;
+  Buffer<std::int32_t> lower_;
 };
 
 // The weights that both passes over the lines are given.
@@ -295,8 +303,7 @@ class LinePass {
     net.entries = entries.data();
     const std::size_t units = static_cast<std::size_t>(weights.units);
     LineSums at{};
-    at.bias_0 = table_rows_ * units;
-    at.weight_1 = at.bias_0 + units;
+    at.weight_1 = table_rows_ * units;
     at.bias_1 = at.weight_1 + units * units;
     at.weight_2 = at.bias_1 + units;
     at.bias_2 = at.weight_2 + outputs_ * units;
@@ -311,7 +318,10 @@ class LinePass {
                });
     const float* from = sums.data();
     unpad(from + at.table, table_rows_, hidden_, units, written[0].first);
-    unpad(from + at.bias_0, 1, hidden_, units, written[0].second);
+    // An entry's two weights on an axis add up to 1: what the first axis' rows were given is what the bias gets.
+    std::fill_n(written[0].second, hidden_, 0.0f);
+    for (std::size_t row = 0; row < table_rows_ / 3; ++row)
+      for (std::size_t unit = 0; unit < hidden_; ++unit) written[0].second[unit] += from[at.table + row * units + unit];
     unpad(from + at.weight_1, hidden_, hidden_, units, written[1].first);
     unpad(from + at.bias_1, 1, hidden_, units, written[1].second);
     unpad(from + at.weight_2, outputs_, hidden_, units, written[2].first);
@@ -410,6 +420,20 @@ const NetworkKernels& kernels_of(const std::string& instruction_set) {
   return variant_of(runnable_network_kernels(), instruction_set);
 }
 
+void position_training(const Array<const std::int64_t, -1>& binding, const Array<const float, -1, 9>& linear,
+                       const Array<const float, -1, 3>& centers, const Array<const float, -1, 3>& values,
+                       const Array<float, -1, 3>& out, bool backward, const std::string& instruction_set, int threads) {
+  const std::size_t count = values.shape(0);
+  require(binding.shape(0) == count && out.shape(0) == count && linear.shape(0) == centers.shape(0));
+  require(below(binding.data(), count, linear.shape(0)));
+  const PositionTraining in{binding.data(), linear.data(), centers.data(), values.data(), out.data()};
+  const NetworkKernels& kernels = kernels_of(instruction_set);
+  nb::gil_scoped_release unlocked;
+  share_out(count, threads, [&](std::int64_t begin, std::int64_t end, int) {
+    (backward ? kernels.positions_backward : kernels.positions)(in, begin, end);
+  });
+}
+
 void direction_training(const Array<const std::int64_t, -1>& binding, const Array<const float, -1, 3, 3>& turns,
                         const Array<const float, 3, 3>& last, const Array<const float, 3>& center,
                         const Array<const float, -1, 3>& means, const Array<const float, -1, 3>& by_directions,
@@ -431,6 +455,9 @@ void direction_training(const Array<const std::int64_t, -1>& binding, const Arra
 }  // namespace
 
 void bind_network_training(nb::module_& m) {
+  m.def("position_training", &position_training, "binding"_a, "linear"_a, "centers"_a, "values"_a, "out"_a,
+        "backward"_a, "instruction_set"_a, "threads"_a,
+        "Write canonical positions of local means; backward, the gradients by the means of those by the positions.");
   m.def("direction_training", &direction_training, "binding"_a, "turns"_a, "last"_a, "center"_a, "means"_a,
         "by_directions"_a, "out"_a, "instruction_set"_a, "threads"_a,
         "Write canonical directions; or, where gradients by them are given, the gradients by the means.");

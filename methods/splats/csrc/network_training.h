@@ -21,6 +21,15 @@ struct Grid {
   int samples;
 };
 
+// Positions of splats in canonical space: `CanonicalFrames.positions` of methods/ours/field.py.
+struct PositionTraining {
+  const std::int64_t* binding;  // (N,) triangles
+  const float* linear;          // (F, 3, 3)
+  const float* centers;         // (F, 3)
+  const float* values;          // (N, 3) local means; backward: gradients by the positions
+  float* out;                   // (N, 3) positions; backward: gradients by the local means
+};
+
 // Directions to the camera in canonical space: `canonical_directions` of methods/ours/field.py, then one more rotation.
 struct DirectionTraining {
   const std::int64_t* binding;  // (N,) triangles
@@ -48,13 +57,14 @@ struct ColorTraining {
   const float* planes[kPlanes];  // (samples^2, channels)
   const float* last;             // (3, units)
   float* kept_hidden;            // (N padded, units) after the ReLU
+  std::int32_t* lower;           // (N, 3) the lower of two neighbouring samples, all bits inverted where clamped
+  float* fractions;              // (N, 3) from the lower to the upper
   float* colors;                 // (N, 3)
   // Forward: (inputs, units_stride); backward: (units, inputs_stride).
   const float* first;
   // Backward.
   const float* by_colors;  // (N, 3)
   float* by_features;      // (N, features)
-  std::int32_t* lower[2];  // (N,) each: lower sample on the y and on the z axis
   float* by_positions;     // (N, 3)
   float* by_directions;    // (N, 3)
   float* by_planes[kPlanes];
@@ -75,12 +85,14 @@ struct ColorSums {
   std::size_t first, last, end;
 };
 struct LineSums {
-  std::size_t table, bias_0, weight_1, bias_1, weight_2, bias_2, end;
+  std::size_t table, weight_1, bias_1, weight_2, bias_2, end;
 };
 
 struct NetworkKernels {
   const char* name;
   // Of splats [begin, end).
+  void (*positions)(const PositionTraining&, std::int64_t begin, std::int64_t end);
+  void (*positions_backward)(const PositionTraining&, std::int64_t begin, std::int64_t end);
   void (*directions)(const DirectionTraining&, std::int64_t begin, std::int64_t end);
   void (*directions_backward)(const DirectionTraining&, std::int64_t begin, std::int64_t end);
   std::size_t (*color_forward_scratch)(const ColorTraining&);

@@ -8,6 +8,7 @@ from headbench.methods.ours import appearance
 from headbench.methods.ours.config import Lines, OursConfig, Planes
 from headbench.methods.ours.field import (
     Bounds,
+    CanonicalFrames,
     blend_lines,
     canonical_directions,
     initial_parameters,
@@ -17,7 +18,12 @@ from headbench.methods.ours.field import (
     shade,
 )
 from headbench.methods.ours.method import Ours
-from headbench.methods.ours.training_kernel import directions_to, plane_colors, table_offsets
+from headbench.methods.ours.training_kernel import (
+    canonical_positions,
+    directions_to,
+    plane_colors,
+    table_offsets,
+)
 from headbench.methods.shared.avatar_kernel import usable
 from headbench.methods.shared.schedule import Timeline
 from headbench.methods.shared.splat_training import BoundTraining
@@ -86,6 +92,22 @@ def test_colours_and_their_gradients(case, backend):
     colors = plane_colors(found, BOX, found["positions"], found["directions"], backend)
     (colors * weights).sum().backward()
     assert_near(colors, expected, "colours")
+    assert_same_gradients(found, exact)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("count", [0, 1, 16, 1030])
+def test_positions_and_their_gradients(count, backend):
+    generator = torch.Generator().manual_seed(count)
+    parts = torch.randn(5, 9, generator=generator), torch.randn(5, 3, generator=generator), torch.eye(3)
+    means, weights = torch.randn(2, count, 3, generator=generator)
+    binding = torch.arange(count) % 5
+    exact, found = leaves({"means": means}, torch.float64), leaves({"means": means})
+    expected = CanonicalFrames(*(part.double() for part in parts)).positions(binding, exact["means"])
+    positions = canonical_positions(CanonicalFrames(*parts), binding, found["means"], backend)
+    assert_near(positions, expected, "positions")
+    (expected * weights).sum().backward()
+    (positions * weights).sum().backward()
     assert_same_gradients(found, exact)
 
 
