@@ -112,6 +112,7 @@ def summary(
             "explained_variance": space.explained.tolist(),
             "components_for_95_percent": space.kept,
             "novelty_of_test_mm": {str(t): value for t, value in space.novelty_mm.items()},
+            "outside_of_training": {name: found._asdict() for name, found in space.novelty.items()},
         },
     }
 
@@ -135,4 +136,10 @@ def _text(
             f"{sequence.head_deg:>10.1f}{sequence.head_mm:>9.1f}{sequence.reach_mm[1]:>15.1f}"
             f"{sequence.expression_sigma:>11.2f}" + ("  held out" if sequence.held_out else "")
         )
-    return "\n".join([*lines, "", space_summary(space) + "."])
+    lines += ["", space_summary(space) + "."]
+    for name, found in space.novelty.items():
+        lines.append(
+            f"{name}: {found.outside:.0%} of the expression lies outside the span of training, {found.beyond:.0%} of the "
+            "timesteps beyond its range."
+        )
+    return "\n".join(lines)

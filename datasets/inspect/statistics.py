@@ -12,6 +12,7 @@ import torch
 from ...bench.contracts import FloatArray, FrameKey, HeadPose
 from ..clip import CaptureClip
 from ..head.rotations import axis_angle_to_matrix
+from ..novelty import Novelty, displacement_metric, novelty
 
 KEPT_VARIANCE = 0.95
 
@@ -66,6 +67,7 @@ class ExpressionSpace:
     scores_mm : (T, K) root-mean-square displacement of the face's vertices along each component.
     explained : (K,) share of the training variance.
     novelty_mm : by held-out timestep, RMS distance of its face to the nearest training face.
+    novelty : of each held-out sequence against training.
     """
 
     timesteps: Sequence[int]
@@ -73,6 +75,7 @@ class ExpressionSpace:
     scores_mm: FloatArray
     explained: FloatArray
     novelty_mm: Mapping[int, float]
+    novelty: Mapping[str, Novelty]
 
     @cached_property
     def kept(self) -> int:
@@ -159,12 +162,8 @@ def expression_space(clip: CaptureClip) -> ExpressionSpace:
     timesteps = [t for t in sorted(clip.poses) if t not in excluded]
     held_out = np.array([t in test for t in timesteps])
     members = clip.head.regions.get("face", np.arange(len(clip.head.template)))
-    basis = clip.head.expression_basis[members].astype(np.float64)
-    # Distances between faces are distances between coefficients in the metric of the basis: B^T B / vertices.
-    gram = np.einsum("vie,vif->ef", basis, basis) / len(members)
-    values, vectors = np.linalg.eigh(gram)
-    root = vectors * np.sqrt(np.maximum(values, 0))
-    faces = 1000 * np.stack([clip.poses[t].expression for t in timesteps]).astype(np.float64) @ root
+    metric = displacement_metric(clip.head.expression_basis[members])
+    faces = 1000 * np.stack([clip.poses[t].expression for t in timesteps]).astype(np.float64) @ metric
     train = faces[~held_out]
     centred = faces - train.mean(axis=0)
     _, singular, axes = np.linalg.svd(centred[~held_out], full_matrices=False)
@@ -172,12 +171,18 @@ def expression_space(clip: CaptureClip) -> ExpressionSpace:
     scores = centred @ axes.T
     # A component's sign is arbitrary; the larger half of its skew points to the right.
     scores = scores * np.where((scores[~held_out] ** 3).sum(axis=0) < 0, -1.0, 1.0)
-    novelty = {
+    nearest = {
         t: float(np.linalg.norm(train - face, axis=1).min())
         for t, face, new in zip(timesteps, faces, held_out)
         if new
     }
+    sequences: dict[str, set[int]] = {}
+    for key in clip.splits.get("self_reenactment", ()):
+        sequences.setdefault(key.sequence, set()).add(key.timestep)
+    new = {
+        name: novelty(train, faces[[index for index, t in enumerate(timesteps) if t in members]])
+        for name, members in sequences.items()
+    }
     total = variance.sum()
-    return ExpressionSpace(
-        timesteps, held_out, scores, variance / total if total > 0 else variance[:0], novelty
-    )
+    explained = variance / total if total > 0 else variance[:0]
+    return ExpressionSpace(timesteps, held_out, scores, explained, nearest, new)

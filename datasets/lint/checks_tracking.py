@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import numpy as np
 from ...bench.contracts import FloatArray
 from ...bench.errors import InputError
 from ..ga import layout
+from ..novelty import displacement_metric, novelty
 from .checks_cameras import misplaced
 from .checks_images import sound_mask
 from .evidence import Evidence
@@ -32,6 +34,9 @@ JUMP_M, JUMP_TIMES = 0.03, 6.0
 
 WORSE = 1.05
 """Expressions that fit the images by so much worse than none are not these images' expressions."""
+
+UNTRAINED = 0.25
+"""Share of a test's expressions that training does not show from which its results are extrapolation."""
 
 CHANGE = 1e-4
 
@@ -183,6 +188,36 @@ def _still_expression(evidence: Evidence) -> Iterator[Hit]:
     if len(poses) >= FEW and np.ptp(expressions, axis=0).max(initial=0.0) < STILL:
         text = f"the expression never changes over {several(len(poses), 'timestep')}"
         yield Hit(text, poses[0].path.parent, "expr")
+
+
+@rule("HB616", "note")
+def _untrained_expressions(evidence: Evidence) -> Iterator[Hit]:
+    """The test's expressions are unlike those of training.
+
+    Record or train on more expressions, or read the results as extrapolation: what a method does there, no training frame
+    shows.
+    """
+    if evidence.subject is None:
+        return
+    test: dict[str, set[int]] = defaultdict(set)
+    for entry in evidence.splits.get("self_reenactment", ()):
+        test[evidence.names[entry.sequence_folder]].add(entry.timestep)
+    train = {entry.timestep for entry in evidence.splits.get("train", ())}
+    poses = {p.timestep: p.pose.expression for p in evidence.posed if p.pose}
+    head = evidence.subject.head
+    metric = displacement_metric(head.expression_basis[head.regions.get("face", slice(None))])
+    known = [poses[t] for t in sorted(train & poses.keys())]
+    for name, timesteps in test.items():
+        new = [poses[t] for t in sorted(timesteps & poses.keys())]
+        if len(known) < FEW or not new:
+            continue
+        found = novelty(np.stack(known) @ metric, np.stack(new) @ metric)
+        if max(found) > UNTRAINED:
+            text = (
+                f"test sequence {name}: {found.outside:.0%} of its expressions lie outside the span of training, "
+                f"{found.beyond:.0%} of its timesteps beyond the range of training"
+            )
+            yield Hit(text, evidence.split_file("self_reenactment"))
 
 
 @rule("HB608", "warning")

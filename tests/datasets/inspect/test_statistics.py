@@ -92,8 +92,8 @@ def test_novelty_is_the_distance_to_the_nearest_training_face(clip, space):
 
 
 def test_a_test_face_that_was_trained_on_is_not_new(clip):
-    twin = dict(clip.poses)
-    twin[15] = replace(clip.poses[15], expression=clip.poses[3].expression)
-    novelty = expression_space(replace(clip, poses=twin)).novelty_mm
+    changed = dict(clip.poses)
+    changed[15] = replace(clip.poses[15], expression=clip.poses[3].expression)
+    novelty = expression_space(replace(clip, poses=changed)).novelty_mm
     assert novelty[15] < 1e-6
     assert min(value for t, value in novelty.items() if t != 15) > 0.01

@@ -237,6 +237,11 @@ def _repeat_parameters(good):
     files[6].write_bytes(files[5].read_bytes())
 
 
+def _far_test(good):
+    for path in good.writer.sequence_folder("FREE").glob("flame_param/*"):
+        good.parameters(path, lambda a: a.update(expr=2.5 * a["expr"]))
+
+
 def _jump(arrays):
     arrays["translation"][0, 1] += 0.05
 
@@ -355,6 +360,7 @@ FAULTS = (
     Fault("tracking jumps", "HB612", _one(15, _jump), ("HB702",)),
     Fault("sequence of another version", "HB613", _sequence_version),
     Fault("expression at rest", "HB614", _parameters(change=lambda a, i: a["expr"].fill(0.0))),
+    Fault("untrained test", "HB616", _far_test, ("HB701", "HB702", "HB612", "HB615")),
     Fault("mesh aside", "HB701", _parameters(change=lambda a, i: a["translation"].__iadd__(0.04))),
     Fault("one camera aside", "HB702", _shift_one_camera),
     Fault("small mesh", "HB703", _shrink),

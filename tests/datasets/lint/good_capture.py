@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +56,12 @@ def smooth_poses(head: HeadArrays, count: int, phase: float) -> list[HeadPose]:
     return poses
 
 
+def trained_poses(head: HeadArrays, count: int, phase: float) -> list[HeadPose]:
+    """Poses whose expressions are about those of the first sequence."""
+    expressions = [0.96 * pose.expression for pose in smooth_poses(head, count, 0)]
+    return [replace(p, expression=e) for p, e in zip(smooth_poses(head, count, phase), expressions)]
+
+
 def good_plan(**changes: Any) -> CapturePlan:
     """Two training sequences and FREE."""
     head = changes.pop("head", None) or with_teeth(toy_head(16, version="toy2023"))
@@ -66,7 +73,10 @@ def good_plan(**changes: Any) -> CapturePlan:
         "shape": rng.normal(size=identities).astype(np.float32),
         "static_offset": (0.0005 * rng.normal(size=(vertices, 3))).astype(np.float32),
         "cameras": cameras(),
-        "sequences": [SequencePlan(n, smooth_poses(head, c, i)) for i, (n, c) in enumerate(LENGTHS.items())],
+        "sequences": [
+            SequencePlan(n, trained_poses(head, c, i) if n == "FREE" else smooth_poses(head, c, i))
+            for i, (n, c) in enumerate(LENGTHS.items())
+        ],
         "test_sequences": ("FREE",),
         "novel_view_cameras": (FRONTAL,),
     }

@@ -11,6 +11,7 @@ import torch
 
 from headbench.bench.io.images import ImageInfo
 from headbench.datasets.ga.layout import Declaration
+from headbench.datasets.ga.writer import SequencePlan
 from headbench.datasets.head.arrays import save_head
 from headbench.datasets.images import write_image
 from headbench.datasets.lint.catalogue import GROUPS, RULES
@@ -21,12 +22,14 @@ from ..head.toy import toy_head
 from .faults import FAULTS
 from .good_capture import (
     HEIGHT,
+    LENGTHS,
     WIDTH,
     GoodCapture,
     cameras,
     good_plan,
     read_grey,
     read_rgb,
+    smooth_poses,
     write_good_capture,
 )
 
@@ -107,14 +110,15 @@ def test_alpha_in_the_image_is_a_mask_and_has_no_background(good):
 
 @pytest.fixture(scope="module")
 def detailed(tmp_path_factory) -> GoodCapture:
-    """A finer head in larger images, so that colours say where the skin is."""
+    """A finer head in larger images, so that colours say where the skin is; all of FREE's expressions are new."""
     head = toy_head(48, version="toy2023")
-    plan = good_plan(head=head, cameras=cameras(WIDTH / 2, HEIGHT / 2, scale=2)[1:3])
+    sequences = [SequencePlan(n, smooth_poses(head, c, i)) for i, (n, c) in enumerate(LENGTHS.items())]
+    plan = good_plan(head=head, cameras=cameras(WIDTH / 2, HEIGHT / 2, scale=2)[1:3], sequences=sequences)
     return write_good_capture(tmp_path_factory.mktemp("detailed"), plan)
 
 
 def test_right_expressions_explain_the_images(detailed):
-    evidence, findings = lint_capture(LintSettings(str(detailed.union), views=8))
+    evidence, findings = lint_capture(LintSettings(str(detailed.union), views=8, ignore=("HB616",)))
     assert [finding.code for finding in findings] == []
     assert evidence.expression_fit is not None
     assert evidence.expression_fit.mean < 0.3
@@ -128,7 +132,7 @@ def test_coefficients_of_another_basis(detailed, tmp_path, seed):
     head = detailed.writer.plan.head
     other = toy_head(48, seed=seed).expression_basis
     save_head(mixed.union / "head_model.npz", replace(head, expression_basis=other))
-    evidence, findings = lint_capture(LintSettings(str(mixed.union), views=8))
+    evidence, findings = lint_capture(LintSettings(str(mixed.union), views=8, ignore=("HB616",)))
     assert [finding.code for finding in findings] == ["HB615"]
     assert evidence.expression_fit is not None
     assert min(evidence.expression_fit.mean, evidence.expression_fit.median) > 1.1
