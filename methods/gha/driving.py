@@ -20,7 +20,7 @@ from ...datasets.head.model import HeadModel
 from ...datasets.head.rotations import (
     axis_angle_to_matrix,
     axis_angle_to_quaternion,
-    matrix_to_axis_angle,
+    matrix_to_quaternion,
     quaternion_to_axis_angle,
 )
 from ..shared.avatar_files import Subject
@@ -51,6 +51,19 @@ class HeadMotion(NamedTuple):
     rotation: Tensor  # (3, 3) canonical frame to world
     translation: Tensor  # (3,) of the canonical frame's origin, metres
     code: Tensor  # (6,) axis-angle and translation, what networks see of it
+    quaternion: Tensor  # (4,) of the rotation
+
+
+def reference_motion(tracked: Tensor, correction: Tensor) -> tuple[Tensor, ...]:
+    """A `HeadMotion` of (6, 3) rotation, neck, translation, root and neck joint, and origin, and a (6,) correction."""
+    turn, bend, shift, base, joint, origin = tracked
+    root, neck = axis_angle_to_matrix(torch.stack([turn + correction[:3], bend]))
+    rotation = root @ neck
+    moved = base + shift + correction[3:] + root @ (joint - base)
+    translation = moved + rotation @ (origin - joint)
+    quaternion = matrix_to_quaternion(rotation)
+    code = torch.cat([quaternion_to_axis_angle(quaternion), translation])
+    return rotation, translation, code, quaternion
 
 
 class Driver:
@@ -107,14 +120,11 @@ class Driver:
 
     def motion(self, signal: Signal, correction: Tensor | None = None) -> HeadMotion:
         """Rigid motion of the head; differentiable in the (6,) correction of rotation and translation."""
-        turn, shift = signal.rotation, signal.translation
-        if correction is not None:
-            turn, shift = turn + correction[:3], shift + correction[3:]
-        root, neck = axis_angle_to_matrix(torch.stack([turn, signal.neck]))
-        base, joint = signal.joints
-        rotation = root @ neck
-        translation = base + shift + root @ (joint - base) + rotation @ (self.origin - joint)
-        return HeadMotion(rotation, translation, torch.cat([matrix_to_axis_angle(rotation), translation]))
+        if correction is None:
+            correction = torch.zeros(POSE_SIZE).to(signal.rotation)
+        parts = signal.rotation, signal.neck, signal.translation, *signal.joints, self.origin
+        found = kernel.motion if kernel.usable(signal.rotation) else reference_motion
+        return HeadMotion(*found(torch.stack(parts), correction))
 
     def rest_arguments(self, codes: Tensor) -> dict[str, Tensor]:
         """Arguments of (B, E) expression codes with the head at rest: the inverse of what `signals` makes of them."""

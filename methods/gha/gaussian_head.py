@@ -11,7 +11,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ...bench.contracts import Camera
-from ...datasets.head.rotations import matrix_to_quaternion
 from ..shared.binding import WorldSplats, left_products
 from ..splats import rasterize
 from . import kernel
@@ -96,7 +95,7 @@ class GaussianHead:
             seen = seen + noise
         changes = nets.attributes(tensors, features, parts, seen, pose)
         scales = kernel.Scales(c.unit, c.displacement_scale, c.attribute_scale, LARGEST_LOG_SCALE)
-        turn = left_products(matrix_to_quaternion(motion.rotation)[None])[0]
+        turn = left_products(motion.quaternion[None])[0]
         placed = (kernel.posed if kernel.usable(points) else posed)(
             *(scales, motion.rotation, motion.translation, turn, points, moves),
             *(tensors["log_scales"], tensors["quats"], tensors["opacities"], changes),
@@ -139,6 +138,8 @@ def feature_background(background: Tensor, channels: int) -> Tensor:
 def feature_camera(camera: Camera, upscale: int) -> Camera:
     """The camera of the feature image: ``upscale`` times smaller, its image padded at the right and below to whole
     pixels."""
+    if upscale == 1:
+        return camera
     width, height = -(-camera.width // upscale), -(-camera.height // upscale)
     return camera.boxed(0, 0, width * upscale, height * upscale).resized(width, height)
 

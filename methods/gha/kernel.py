@@ -26,7 +26,7 @@ UNITS_STEP = 16
 
 def available() -> bool:
     """Whether the kernel is there; one built from older sources, in an editable installation, counts as none."""
-    return hasattr(KERNEL.imported, "pose_backward")
+    return hasattr(KERNEL.imported, "motion")
 
 
 def usable(like: Tensor) -> bool:
@@ -430,3 +430,36 @@ class _WithColors(torch.autograd.Function):
         gradient = grads[0].clone()
         gradient[..., :3] += grads[1]
         return gradient
+
+
+MOTION = (9, 3, 6, 4)
+"""Numbers of a motion: rotation, translation, code, quaternion."""
+
+
+def motion(tracked: Tensor, correction: Tensor) -> tuple[Tensor, ...]:
+    """(3, 3), (3,), (6,) and (4,) of a head motion: compiled form of `driving.reference_motion`.
+
+    Parameters
+    ----------
+    tracked : (6, 3) rotation, neck, translation, root and neck joint, origin.
+    correction : (6,).
+    """
+    numbers: Tensor = _Motion.apply(tracked, correction)  # type: ignore[no-untyped-call]
+    rotation, translation, code, quaternion = numbers.split(MOTION)
+    return rotation.view(3, 3), translation, code, quaternion
+
+
+class _Motion(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, tracked: Tensor, correction: Tensor) -> Tensor:
+        found, derivatives = tracked.new_empty(sum(MOTION)), tracked.new_empty(sum(MOTION), len(correction))
+        KERNEL.load().motion(
+            *_plain(tracked.contiguous().view(-1), correction.contiguous(), found, derivatives)
+        )
+        ctx.save_for_backward(derivatives)
+        return found
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        return None, grad @ ctx.saved_tensors[0]

@@ -15,6 +15,7 @@
 
 #include "bench/native/module.h"
 #include "bench/native/thread_pool.h"
+#include "motion.h"
 #include "passes.h"
 
 namespace nb = nanobind;
@@ -770,6 +771,19 @@ void pose_backward(float unit, float displacement_scale, float attribute_scale, 
   }
 }
 
+void motion(const Array<const float, 18>& tracked, const Array<const float, kCorrection>& correction,
+            const Array<float, kMotion>& out, const Array<float, kMotion, kCorrection>& derivatives) {
+  double fixed[18], moved[kCorrection];
+  std::copy_n(tracked.data(), 18, fixed);
+  std::copy_n(correction.data(), kCorrection, moved);
+  Dual found[kMotion];
+  head_motion(fixed, moved, found);
+  for (int i = 0; i < kMotion; ++i) {
+    out.data()[i] = static_cast<float>(found[i].value);
+    for (int k = 0; k < kCorrection; ++k) derivatives.data()[kCorrection * i + k] = static_cast<float>(found[i].by[k]);
+  }
+}
+
 }  // namespace
 }  // namespace headbench::gha
 
@@ -815,6 +829,8 @@ NB_MODULE(_kernel, m) {
         "seen"_a, "by_means"_a, "by_world_quats"_a, "by_scales"_a, "by_seen"_a, "by_rotation"_a, "by_translation"_a,
         "by_turn"_a, "by_points"_a, "by_moves"_a, "by_log_scales"_a, "by_quats"_a, "by_opacities"_a, "by_changes"_a,
         "instruction_set"_a, "threads"_a, "Their gradients.");
+  m.def("motion", &motion, "tracked"_a, "correction"_a, "out"_a, "derivatives"_a,
+        "Rigid motion of a head, and its derivatives by the correction.");
   m.def("instruction_sets", [] { return names_of(runnable_gha_kernels()); },
         "Variants this machine can run, the fastest first.");
 }

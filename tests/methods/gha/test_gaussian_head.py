@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from headbench.datasets.head.rotations import matrix_to_quaternion
 from headbench.methods.gha.driving import HeadMotion, Signal
 from headbench.methods.gha.gaussian_head import FeatureImage, GaussianHead, enlarged, near_drawn
 from headbench.methods.gha.gaussian_training import Zoom, reduced, zoomed
@@ -38,7 +39,7 @@ def model(**more):
         "code_high": torch.full((CODE,), 9.0, dtype=torch.float64),
     }
     turn = torch.tensor(Rotation.from_rotvec([0.2, -0.1, 0.3]).as_matrix())
-    motion = HeadMotion(turn, random(3, scale=0.01), random(6))
+    motion = HeadMotion(turn, random(3, scale=0.01), random(6), matrix_to_quaternion(turn))
     empty = torch.zeros(3, dtype=torch.float64)
     signal = Signal(random(CODE), empty, empty, empty, torch.zeros(2, 3, dtype=torch.float64))
     camera = look_at(np.array([0.0, 0.05, 0.4]), np.zeros(3), "c", 10, 12)
@@ -82,7 +83,8 @@ def test_gradients_of_the_whole_model(residual):
 
 def test_a_rigid_motion_turns_splats_and_their_covariances():
     head, tensors, signal, motion, _ = model()
-    still = motion._replace(rotation=torch.eye(3, dtype=torch.float64), translation=torch.zeros(3).double())
+    identity = torch.eye(4, dtype=torch.float64)
+    still = motion._replace(rotation=identity[:3, :3], translation=identity[3, :3], quaternion=identity[0])
     before, after = (head.splats(tensors, signal, m).world for m in (still, motion))
     np.testing.assert_allclose(
         after.means, before.means @ motion.rotation.t() + motion.translation, atol=1e-12

@@ -157,6 +157,16 @@ def _with_colors() -> Case:
     )
 
 
+def _motion(scale: float) -> Case:
+    tracked = _random(6, 3)
+    tracked[:2] *= scale
+    return Case(
+        lambda correction, _: torch.cat([t.flatten() for t in kernel.motion(tracked.float(), correction)]),
+        lambda correction: torch.cat([t.flatten() for t in driving.reference_motion(tracked, correction)]),
+        [0.1 * scale * _random(6)],
+    )
+
+
 CASES = {
     "perceptron": _perceptron((70, 64, 20), (11,), 5, False),
     "perceptron, squashed, some outputs": _perceptron((33, 20), (11,), 2, True),
@@ -175,6 +185,9 @@ CASES = {
     "posing": _posed(),
     "residual image": _residual_image(16),
     "residual image, other channels": _residual_image(21),
+    "motion of the head": _motion(1.0),
+    "motion of the head, small angles": _motion(0.01),
+    "motion of the head, large angles": _motion(2.5),
     "colours beside features": _with_colors(),
 }
 
