@@ -16,8 +16,9 @@ from ...datasets.head.geometry import rigid_alignment
 from ...datasets.head.model import chain_transforms
 from ...datasets.head.rotations import axis_angle_to_matrix, matrix_to_quaternion, quaternion_to_matrix
 from ..shared.binding import WorldSplats, apply_matrices, left_products
-from ..shared.networks import coefficient_count, sh_to_rgb
+from ..shared.networks import coefficient_count
 from ..shared.subject_mesh import SubjectMesh
+from ..shared.training_kernel import harmonic_colors
 from .points import SurfacePoints
 
 LARGEST_SCALE = 0.1
@@ -88,9 +89,8 @@ class PosedAttributes(NamedTuple):
 
     def colors(self, center: Tensor, degree: int) -> Tensor:
         """(N, 3) as seen from a camera at ``center`` (3,); the harmonics turn with the surface."""
-        directions = normalize(self.world.means - center, dim=1)
-        own = torch.bmm(directions[:, None], self.rotation)[:, 0]
-        return sh_to_rgb(self.sh_dc, self.sh_rest, own, degree)
+        own = torch.bmm((self.world.means - center)[:, None], self.rotation)[:, 0]
+        return harmonic_colors(self.sh_dc, self.sh_rest, own, degree)
 
 
 def apply_pose(neutral: Mapping[str, Tensor], differences: Tensor, motions: PointMotions) -> PosedAttributes:
@@ -109,7 +109,7 @@ def apply_pose(neutral: Mapping[str, Tensor], differences: Tensor, motions: Poin
     by_rest = differences.shape[1] - sum(difference_widths(0).values())
     moved, scaled, turned, opaque, coloured, rest_change = differences.split([3, 3, 4, 1, 3, by_rest], dim=1)
     local = neutral["means"] + motions.shift + moved
-    means = apply_matrices(motions.linear.contiguous(), local) + motions.offset
+    means = apply_matrices(motions.linear, local) + motions.offset
     quats = normalize(neutral["quats"] + motions.turn + turned, dim=1)
     scales = (neutral["log_scales"] + scaled).exp().clamp(SMALLEST_SCALE, LARGEST_SCALE)
     if by_rest:
@@ -117,7 +117,7 @@ def apply_pose(neutral: Mapping[str, Tensor], differences: Tensor, motions: Poin
         sums = rest[:, :, :changed] + rest_change.view(-1, 3, changed)
         rest = torch.cat([sums, rest[:, :, changed:]], dim=2)
     return PosedAttributes(
-        WorldSplats(means, apply_matrices(motions.product.contiguous(), quats), scales),
+        WorldSplats(means, apply_matrices(motions.product, quats), scales),
         torch.sigmoid(neutral["opacities"] + opaque[:, 0]),
         neutral["sh_dc"] + coloured,
         rest,
@@ -151,7 +151,7 @@ class PointMotions(NamedTuple):
     @classmethod
     def of(cls, rows: Tensor) -> PointMotions:
         """Part the columns of `PARTS`."""
-        return cls(*rows.split(list(PARTS.values()), dim=1))
+        return cls(*(part.contiguous() for part in rows.split(list(PARTS.values()), dim=1)))
 
 
 class Rig:

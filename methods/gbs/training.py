@@ -98,8 +98,9 @@ class GBSTraining(SplatTrainer):
         row = {name: index for index, name in enumerate(poses)}
         self._pose = {key.timestep: row[pose_key(clip.poses[key.timestep])] for key in self.keys}
         self._arguments = self.rig.arguments(list(poses.values()))
-        entries = config.splats.mesh_cache_mb * 2**20 // (4 * sum(PARTS.values()) * len(counts))
-        self._motions = BoundedCache(self._motions_at, entries)
+        # Half of the memory for points, half for splats.
+        self._poses_kept = config.splats.mesh_cache_mb * 2**19 // (4 * sum(PARTS.values()) * len(counts))
+        self._motions = BoundedCache(self._motions_at, self._poses_kept)
         splats, shared = self._initial(start, int(counts.sum()), device, seed)
         thresholds = torch.full((len(counts),), config.splats.densify_gradient, device=device)
         thresholds[self._part > 0] = config.teeth_densify_gradient
@@ -109,6 +110,7 @@ class GBSTraining(SplatTrainer):
         self._start(splats, shared, binding, len(counts), 1.0, seed, **books)
         self._sizes = torch.ones(len(counts), device=device)
         self._entries: tuple[Tensor, Entries] | None = None
+        self._of_splats: tuple[Tensor, BoundedCache[PointMotions]] | None = None
 
     def begin(self, timeline: Timeline) -> None:
         """Fit schedules to the length of the run."""
@@ -121,7 +123,7 @@ class GBSTraining(SplatTrainer):
         view = self._views[key.camera]
         image, coverage = self._on_background(self._images.get(iteration, index))
         pose = self._pose[key.timestep]
-        motions = PointMotions.of(self._motions(pose).index_select(0, self.binding))
+        motions = self._splat_motions(pose)
         coefficients = self._arguments["expression"][pose, : self.rig.expressions]
         differences = self.entries.sum(optimiser[DIFFERENCES], coefficients) * self._column_scales
         posed = apply_pose({name: optimiser[name] for name in self.splat_names}, differences, motions)
@@ -139,6 +141,16 @@ class GBSTraining(SplatTrainer):
                     violation = self._cylinder.violation(optimiser["means"].index_select(0, teeth))
                     loss = loss + config.teeth_weight * violation
         return loss
+
+    def _splat_motions(self, pose: int) -> PointMotions:
+        """What a pose does to the splats as they are now bound."""
+        binding = self.binding
+        if self._of_splats is None or self._of_splats[0] is not binding:
+            self._of_splats = binding, BoundedCache(self._splat_motions_at, self._poses_kept)
+        return self._of_splats[1](pose)
+
+    def _splat_motions_at(self, pose: int) -> PointMotions:
+        return PointMotions.of(self._motions(pose).index_select(0, self.binding))
 
     @property
     def entries(self) -> Entries:
