@@ -25,9 +25,10 @@ from ...bench.io.files import TEMPORARY, grouped_writes, write_json, write_text
 from ...bench.machine import processor_count
 from ...bench.start import end_with_parent, starting_workers
 from ..images import is_whole
+from . import panels, renderer
 from .performance import KINDS, Kind, share_out
-from .plan import SERIALS, SubjectPlan, SynthSettings, load_geometry, plan_subject
-from .renderer import CaptureRenderer, default_samples, sample_count
+from .plan import LIGHTS, SERIALS, LightKind, SubjectPlan, SynthSettings, load_geometry, plan_subject
+from .renderer import CaptureRenderer
 
 MANIFEST = "synthesis.json"
 _VERSION = 3
@@ -54,6 +55,7 @@ def synthesize(
     performance: Kind = "full",
     dynamics: float = 1.0,
     tracking_error: float = 0.0,
+    light: LightKind = "lamps",
     workers: int | None = None,
     progress: Progress = no_progress,
 ) -> list[Path]:
@@ -71,6 +73,8 @@ def synthesize(
     samples_per_pixel : rounded up to a count that the sampler takes; by default enough for 40 dB between two
         renders of a frame.
     tracking_error : level of the errors that trackers make, see `tracking.with_tracking_error`; 0 to 4.
+    light : ``lamps``, five distant ones without a bounce, as Mitsuba renders them; or ``panels``, eight large ones and one
+        bounce, see `panels`, with the same bytes on every processor.
     performance : see `performance.Kind`; with less than all of it, captures for which less has to be modelled.
     dynamics : scales wrinkles and blush, 0 to 3: 0 leaves skin as it is at rest, wherever it moves.
     workers : processes that render; by default as many as there are cores, or one where there is little to do.
@@ -79,8 +83,13 @@ def synthesize(
     ------
     InputError
         Before rendering, for settings out of range or a folder that holds a capture of other settings.
+    UnavailableError
+        For panels where the compiled kernel is missing.
     """
-    samples = default_samples(*size) if samples_per_pixel is None else sample_count(samples_per_pixel)
+    counts = panels if light == "panels" else renderer
+    samples = (
+        counts.default_samples(*size) if samples_per_pixel is None else counts.sample_count(samples_per_pixel)
+    )
     pixels = (size[0], size[1])
     settings = SynthSettings(
         subjects,
@@ -94,8 +103,11 @@ def synthesize(
         performance,
         dynamics,
         tracking_error,
+        light,
     )
     _check(settings)
+    if light == "panels":
+        panels.KERNEL.load()
     geometry = load_geometry(head)
     out = Path(out)
     _claim(out, settings, geometry.head.fingerprint())
@@ -186,6 +198,7 @@ def _check(settings: SynthSettings) -> None:
         ("--cameras", 2 <= count <= most, f"2 to {most}, as the frontal one is held out", count),
         ("--performance", settings.performance in KINDS, f"one of {kinds}", repr(settings.performance)),
         ("--dynamics", 0.0 <= settings.dynamics <= 3.0, "0 to 3", settings.dynamics),
+        ("--light", settings.light in LIGHTS, " or ".join(LIGHTS), repr(settings.light)),
         ("--size", min(size) >= 16, "at least 16 pixels each way", "x".join(map(str, size))),
         ("--tracking-error", np.isfinite(error) and 0.0 <= error <= 4.0, "0 to 4", error),
         ("--tracking-noise", np.isfinite(noise) and noise >= 0.0, "a number from 0 up", noise),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -43,6 +43,10 @@ _IDENTITY_SPREAD = 0.65  # standard deviations of the identity basis; 1 would dr
 _LOOK_BELOW = 0.004  # metres below the middle of the head
 
 
+LightKind = Literal["lamps", "panels"]
+LIGHTS: tuple[LightKind, ...] = get_args(LightKind)
+
+
 @dataclass(frozen=True)
 class SynthSettings:
     """What decides a synthetic capture's content. ``size`` is (width, height)."""
@@ -58,12 +62,14 @@ class SynthSettings:
     performance: Kind = "full"
     dynamics: float = 1.0
     tracking_error: float = 0.0
+    light: LightKind = "lamps"
 
     def described(self) -> dict[str, Any]:
         """The settings for records; those that came later are left out where they have their default."""
         described = asdict(self)
-        for name, usual in (("performance", "full"), ("dynamics", 1.0), ("tracking_error", 0.0)):
-            if described[name] == usual:
+        usual = {"performance": "full", "dynamics": 1.0, "tracking_error": 0.0, "light": "lamps"}
+        for name, value in usual.items():
+            if described[name] == value:
                 del described[name]
         return described
 
@@ -170,7 +176,7 @@ _LOWER = {
 }
 _ARC = np.radians(93.0)
 _RISE = np.radians(32.0)
-_DISTANCE = 1.0  # metres from the head's middle
+CAMERA_DISTANCE = 1.0  # metres from the head's middle
 _FRAME_HEIGHT = 0.394  # metres of the scene that the image's height shows at the head's middle
 _FRAME_WIDTH = 0.270
 
@@ -194,7 +200,7 @@ def cameras(count: int, width: int, height: int, target: FloatArray, seed: int =
     """
     if not 1 <= count <= len(SERIALS):
         raise InputError("--cameras", "", f"1 to {len(SERIALS)} cameras", str(count))
-    focal = _DISTANCE * min(width / _FRAME_WIDTH, height / _FRAME_HEIGHT)
+    focal = CAMERA_DISTANCE * min(width / _FRAME_WIDTH, height / _FRAME_HEIGHT)
     shift = np.random.default_rng([seed, 11]).uniform(-0.008, 0.008, 2) * width
     K = np.array(
         [[focal, 0.0, 0.5 * width + shift[0]], [0.0, focal, 0.5 * height + shift[1]], [0.0, 0.0, 1.0]]
@@ -225,7 +231,7 @@ def _look_at(azimuth: float, elevation: float, target: FloatArray) -> FloatArray
     matrix = np.eye(4)
     matrix[:3, :3] = rotation
     # Along the rounded axis, and summed in one order: the JSONs state these numbers to the last digit.
-    matrix[:3, 3] = -(rotation * (target - _DISTANCE * rotation[2])).sum(axis=1) + 0.0
+    matrix[:3, 3] = -(rotation * (target - CAMERA_DISTANCE * rotation[2])).sum(axis=1) + 0.0
     return matrix
 
 

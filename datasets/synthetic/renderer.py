@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import drjit
 import mitsuba
@@ -21,7 +21,7 @@ import numpy as np
 from ...bench.contracts import ByteArray, Camera, FloatArray, HeadPose, IntArray
 from ...bench.errors import InputError
 from .performance import CONTROLS, Activations
-from .plan import Light, SubjectPlan, lights
+from .plan import FRONTAL, Light, SubjectPlan, lights
 from .subject import RenderedSubject
 
 SAMPLE_COUNTS = (9, 25, 49, 121, 169, 289)
@@ -220,13 +220,32 @@ def _flat(values: FloatArray) -> Any:
     return np.ascontiguousarray(values, np.float32).ravel()
 
 
+class Tracer(Protocol):
+    """What `PathTracer` and `panels.PanelTracer` share."""
+
+    def add(
+        self, name: str, vertices: FloatArray, faces: IntArray, albedo: FloatArray, material: str
+    ) -> None: ...
+    def move(self, name: str, vertices: FloatArray, albedo: FloatArray | None = None) -> None: ...
+    def image(self, camera: Camera, seed: int) -> tuple[FloatArray, FloatArray]: ...
+
+
+def _tracer(plan: SubjectPlan) -> Tracer:
+    samples = plan.settings.samples_per_pixel
+    if plan.settings.light == "lamps":
+        return PathTracer(lights(), samples, threads=1)
+    from .panels import PanelTracer, panels, rig_middle  # which takes materials from here
+
+    return PanelTracer(panels(rig_middle(plan.cameras[FRONTAL])), samples, threads=1, seed=plan.person.seed)
+
+
 class CaptureRenderer:
     """Renders the frames of one subject, on one thread: processes share the work better."""
 
     def __init__(self, plan: SubjectPlan):
         self._plan = plan
         self._subject = RenderedSubject(plan.person, plan.geometry, plan.shape)
-        self._tracer = PathTracer(lights(), plan.settings.samples_per_pixel, threads=1)
+        self._tracer = _tracer(plan)
         rest = dict.fromkeys(CONTROLS, 0.0)
         posed = self._subject.posed_meshes(plan.geometry.translation.pose(rest, plan.person.name, None), rest)
         for name, mesh in self._subject.rest_meshes().items():

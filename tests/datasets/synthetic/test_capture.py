@@ -11,6 +11,7 @@ import pytest
 from headbench.bench.errors import InputError
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.synthetic.capture import synthesize
+from headbench.datasets.synthetic.panels import KERNEL
 from headbench.datasets.synthetic.plan import FRONTAL
 
 SMALL = {"cameras": 2, "timesteps": 8, "size": (32, 46), "samples_per_pixel": 9, "workers": 1}
@@ -66,6 +67,7 @@ def test_other_settings_are_refused(capture, tmp_path):
         synthesize(capture[0], **SMALL, performance="still")
     settings = json.loads((capture[0] / "synthesis.json").read_text())
     assert "performance" not in settings  # as captures were recorded before there was a choice
+    assert "light" not in settings
     (tmp_path / "synthesis.json").write_text(json.dumps({**settings, "performance": "still"}))
     with pytest.raises(InputError, match="performance"):
         synthesize(tmp_path, **SMALL)
@@ -89,6 +91,26 @@ def test_a_start_killed_before_the_first_image_is_resumed(capture, tmp_path, mon
         assert (tmp_path / name).read_bytes() == (capture[0] / name).read_bytes()
 
 
+needs_panels = pytest.mark.skipif(not KERNEL.instruction_sets, reason="the compiled kernel is missing")
+
+
+@needs_panels
+def test_panels_light_a_capture_of_its_own(capture, tmp_path):
+    with pytest.raises(InputError, match="light"):
+        synthesize(capture[0], **SMALL, light="panels")
+    (union,) = synthesize(tmp_path / "capture", **SMALL, light="panels")
+    assert json.loads((tmp_path / "capture/synthesis.json").read_text())["light"] == "panels"
+    assert json.loads((union / "headbench.json").read_text())["synthetic"]["light"] == "panels"
+    lamps, lit = read_capture(capture[1]), read_capture(union)
+    key = lit.splits["novel_view"][0]
+    pictures, masks = (
+        np.array([ask(key) for ask in asked], float)
+        for asked in ((lamps.image, lit.image), (lamps.mask, lit.mask))
+    )
+    assert 1 < np.abs(pictures[0] - pictures[1]).mean() < 40
+    assert np.abs(masks[0] - masks[1]).mean() < 0.01 * masks.max()
+
+
 @pytest.mark.parametrize("name", ["thesis.txt", "README.txt", ".hidden"])
 def test_foreign_folder_is_refused(tmp_path, name):
     (tmp_path / name).write_text("irreplaceable")
@@ -106,6 +128,7 @@ def test_foreign_folder_is_refused(tmp_path, name):
         {"tracking_noise": -0.1},
         {"subjects": 0},
         {"performance": "asleep"},
+        {"light": "candles"},
         {"dynamics": -0.5},
         {"dynamics": float("nan")},
         {"head": "no-such-file.npz"},
@@ -164,8 +187,9 @@ class Blank:  # writes all but the pictures of a capture
 if sys.argv[2] == "blank":
     capture.CaptureRenderer = Blank
     capture._missing = lambda plan, sequence, timestep: tuple(plan.cameras)
+light = "panels" if sys.argv[2] == "panels" else "lamps"
 capture.synthesize(sys.argv[1], cameras=2, timesteps=8, size=(32, 46), samples_per_pixel=9,
-                   tracking_noise=0.1, workers=1)
+                   tracking_noise=0.1, light=light, workers=1)
 """
 
 
@@ -188,7 +212,14 @@ def files_by_machine(folder, pictures):
     }
 
 
-@pytest.mark.parametrize("pictures", ["blank", pytest.param("rendered", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "pictures",
+    [
+        "blank",
+        pytest.param("rendered", marks=pytest.mark.slow),
+        pytest.param("panels", marks=[pytest.mark.slow, needs_panels]),
+    ],
+)
 def test_threads_and_instruction_sets_leave_all_bytes(tmp_path, pictures):
     first, *others = files_by_machine(tmp_path, pictures).values()
     assert any(name.endswith("head_model.npz") for name in first)
