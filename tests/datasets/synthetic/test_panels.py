@@ -190,7 +190,7 @@ def test_threads_and_instruction_sets_leave_all_bytes(plan, posed):
         assert alpha.tobytes() == images[0][1].tobytes()
 
 
-def test_light_depends_neither_on_earlier_poses_nor_on_what_was_asked_before(plan, posed):
+def test_light_does_not_depend_on_what_was_rendered_before(plan, posed):
     camera = plan.cameras[FRONTAL]
     fresh = lit_head(plan, posed, 9).image(camera, 3)[0]
     scene = lit_head(plan, posed, 9)
@@ -260,7 +260,7 @@ def test_a_ball_over_a_floor_looks_as_mitsuba_traces_it():
     assert psnr(*pictures) > 42
 
 
-def test_a_missing_kernel_and_bad_input_are_said_before_anything_is_written(tmp_path, monkeypatch):
+def test_missing_kernel_and_bad_input_are_said_first(tmp_path, monkeypatch):
     with pytest.raises(InputError, match="at most 8"):
         PanelTracer([OVERHEAD] * 9, 16)
     assert [sample_count(n) for n in (1, 4, 5, 16, 17)] == [1, 4, 9, 16, 25]
