@@ -133,5 +133,5 @@ def test_a_clip_with_holes_and_without_tests_is_drawn(clip):
     [((0.97, 0.03), "1 component explains 95%"), ((0.8, 0.2), "2 components explain 95%")],
 )
 def test_the_summary_counts_in_singular_and_plural(explained, begins):
-    space = ExpressionSpace([0], np.zeros(1, bool), np.zeros((1, 2)), np.array(explained), {})
+    space = ExpressionSpace([0], np.zeros(1, bool), np.zeros((1, 2)), np.array(explained), {}, {})
     assert space_summary(space).startswith(begins)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -58,8 +59,10 @@ def smooth_poses(head: HeadArrays, count: int, phase: float) -> list[HeadPose]:
 
 def trained_poses(head: HeadArrays, count: int, phase: float) -> list[HeadPose]:
     """Poses whose expressions are about those of the first sequence."""
-    expressions = [0.96 * pose.expression for pose in smooth_poses(head, count, 0)]
-    return [replace(p, expression=e) for p, e in zip(smooth_poses(head, count, phase), expressions)]
+    known = itertools.cycle(smooth_poses(head, next(iter(LENGTHS.values())), 0)[1:])
+    return [
+        replace(p, expression=0.96 * k.expression) for p, k in zip(smooth_poses(head, count, phase), known)
+    ]
 
 
 def good_plan(**changes: Any) -> CapturePlan:
