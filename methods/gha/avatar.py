@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 
@@ -13,14 +13,15 @@ from safetensors.torch import save
 from torch import Tensor
 
 from ...bench.configuration import build
-from ...bench.contracts import Camera, Frame, HeadPose
+from ...bench.contracts import Camera, Frame, HeadPose, no_stage
 from ...bench.errors import InputError
 from ...bench.io.arrays import Member
 from ...bench.io.documents import parse_json
 from ...bench.io.files import write_bytes
 from ..shared.avatar_files import SUBJECT_FILE, RefinedTracking, read_shared_head, read_subject
-from ..shared.rendering import PosedSplats, posed_splats
+from ..shared.rendering import LastPose, PosedSplats, posed_splats
 from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors
+from . import kernel
 from .config import GHAConfig
 from .driving import Driver, code_size
 from .gaussian_head import POINTS, FeatureSplats, GaussianHead
@@ -45,6 +46,7 @@ class GHAAvatar:
     ):
         self._folder, self._driver, self._head = folder, driver, head
         self._tensors, self._corrected = tensors, corrected
+        self._last = LastPose(self._computed)
 
     @classmethod
     def read(cls, folder: Path, device: str) -> GHAAvatar:
@@ -71,15 +73,19 @@ class GHAAvatar:
         the difference to the one asked for is added.
         """
         trained = self._tensors["background"]
-        drawn = self._head.draw(self._posed(pose), camera, trained)
+        with kernel.torch_on_one_thread():
+            drawn = self._head.draw(self._posed(pose), camera, trained)
         image = self._head.sharpen(self._tensors, drawn, trained, bounded=True)
         image = image[: camera.height, : camera.width]
-        size = [side * self._head.config.upscale for side in drawn.alpha.shape]
-        alpha = F.interpolate(drawn.alpha[None, None], size, mode="bilinear", align_corners=False)
-        alpha = alpha[0, 0, : camera.height, : camera.width].clamp(0, 1)
+        alpha = drawn.alpha
+        if self._head.config.upscale > 1:
+            size = [side * self._head.config.upscale for side in alpha.shape]
+            alpha = F.interpolate(alpha[None, None], size, mode="bilinear", align_corners=False)[0, 0]
+        alpha = alpha[: camera.height, : camera.width].clamp(0, 1)
         other = image.new_tensor([float(channel) for channel in background]) - trained
-        image = (image + (1 - alpha)[..., None] * other).clamp(0, 1)
-        return Frame(image.cpu().numpy(), alpha.contiguous().cpu().numpy())
+        if other.any():
+            image = image + (1 - alpha)[..., None] * other
+        return Frame(image.clamp(0, 1).cpu().numpy(), alpha.contiguous().cpu().numpy())
 
     @torch.no_grad()
     def splats(self, pose: HeadPose, camera: Camera | None = None) -> PosedSplats:
@@ -94,8 +100,9 @@ class GHAAvatar:
         return [self._folder / AVATAR_FILE, self._folder / SUBJECT_FILE]
 
     def _posed(self, pose: HeadPose) -> FeatureSplats:
-        if self._corrected is not None:
-            pose = self._corrected(pose)
+        return self._last(pose if self._corrected is None else self._corrected(pose), no_stage)
+
+    def _computed(self, pose: HeadPose, end_stage: Callable[[str], None]) -> FeatureSplats:
         signal = self._driver.signals(self._driver.arguments([pose]))[0]
         return self._head.splats(self._tensors, signal, self._driver.motion(signal))
 

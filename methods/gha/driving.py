@@ -149,8 +149,8 @@ class Driver:
 
 def expression_codes(arguments: Mapping[str, Tensor]) -> Tensor:
     """(T, E) expression, jaw, eyes and, where there are any, eyelids; angles within half a turn."""
-    parts = [arguments["expression"], _principal(arguments["jaw"])]
-    parts.append(_principal(arguments["eyes"].unflatten(1, (2, 3))).flatten(1))
+    angles = torch.cat([arguments["jaw"], arguments["eyes"]], dim=1).unflatten(1, (ANGLES // 3, 3))
+    parts = [arguments["expression"], _principal(angles).flatten(1)]
     if "eyelids" in arguments:
         parts.append(arguments["eyelids"])
     return torch.cat(parts, dim=1)

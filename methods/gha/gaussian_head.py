@@ -229,7 +229,8 @@ class SuperResolution:
         before = (self.channels, *self.widths[:-1])
         largest = [4**b * max(pair) * height * width for b, pair in enumerate(zip(before, self.widths))]
         if max(largest) <= at_once:
-            return self(weights, drawn, background)
+            with kernel.torch_on_one_thread():
+                return self(weights, drawn, background)
         planes = features.permute(2, 0, 1)[None]
 
         def given(first: int, last: int) -> Tensor:
