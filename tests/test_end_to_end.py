@@ -155,6 +155,7 @@ def cell(method):
 
 OTHERS = "synth --out others --subjects 2 --cameras 2 --timesteps 4 --size 24x32"
 PLAIN = "run --data {capture} --out plain --methods mean-image,nearest-camera --preset smoke --set metrics=psnr,ssim --set frames_per_task=3"
+SUITE = "suite --out suite --methods mean-image --preset smoke --subjects 1 --cameras 2 --timesteps 60 --size 16x16"
 GATE = "gate plain --baseline baseline.json"
 RECORD = "record nersemble {capture} --out recording"
 PREPARE = "prepare nersemble --root recording/recording --tracking recording/tracking --head recording/head_model.npz"
@@ -166,6 +167,7 @@ CASES = {
     "demo": [],  # the run of this module, and `test_the_result_is_there_for_machines`
     "synth": [case(OTHERS, "others", "others/synthesis.json")],
     "run": [case(PLAIN, r"\| nearest-camera", "plain/rows.parquet", "plain/tables/comparison.md")],
+    "suite": [case(SUITE, "Sequence FREE-3-beyond", "suite/results.md", "suite/run/rows.parquet")],
     "list": [case(f"list {what}", r"\w") for what in (*SPEC_TYPES, "presets")],
     "table": [
         *(case(f"table {{demo}} --format {name}", mark) for name, mark in FORMATS.items()),

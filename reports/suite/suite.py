@@ -1,0 +1,97 @@
+"""Runs the suite and writes its results as tables."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ...bench.contracts import Progress
+from ...bench.io.files import write_text
+from ...bench.machine import check_device
+from ...bench.registry import discover, get, resolve
+from ...bench.runner.config import RunConfig, parse_size, resolve_methods, resolve_metrics
+from ...bench.runner.run import run
+from ...bench.runner.scoring import FULL
+from ...bench.specs import Findings
+from ..runs import Part, RunSet
+from ..table_report import table_of
+from ..writers import to_markdown
+from .command import SEED, SuiteSettings
+
+ABLATIONS: Mapping[str, Mapping[str, Any]] = {
+    "no-lines": {"lines": {"enabled": False}},
+    "lines-move-splats": {"lines": {"dynamic": ["position", "rotation", "scale"]}},
+    "lines-color": {"lines": {"dynamic": ["color"]}},
+    "no-penalty": {"penalty": {"weight": 0.0}},
+    "no-balanced-sampling": {"sampling": {"balanced": False}},
+    "harmonics": {"color": "sh"},
+    "lines-in-face": {"lines": {"bounds": "face"}},
+}
+"""Settings of ours by the name of what is left out or changed; the first two are the paper's Table 4."""
+
+
+def run_suite(settings: SuiteSettings, progress: Progress) -> Findings:
+    """Make the captures, run the comparison and, if asked for, the ablations; write ``results.md`` into ``out``.
+
+    Raises `InputError` for methods, presets and sizes that do not fit, before the first capture is made.
+    """
+    out = Path(settings.out)
+    methods = settings.methods or tuple(
+        name for name, plugin in discover("methods").items() if plugin.spec and plugin.spec.demo
+    )
+    runs = {"run": _config(settings, out, "run", methods, {})}
+    for name, changes in ABLATIONS.items() if settings.ablations else ():
+        runs[f"ablation-{name}"] = _config(
+            settings, out, f"ablation-{name}", ("ours",), {"ours": dict(changes)}
+        )
+    for config in runs.values():
+        resolve_methods(config)
+        resolve_metrics(config)
+        check_device(config.device)
+    make = resolve(get("datasets", "synthetic").implementation)
+    make(
+        out / "capture",
+        subjects=settings.subjects,
+        cameras=settings.cameras,
+        timesteps=settings.timesteps,
+        size=parse_size(settings.size),
+        seed=SEED,
+        performance="parts",
+        light=settings.light,
+        tracking_error=settings.tracking_error,
+        progress=progress,
+    )
+    failed = {name: run(config).failed for name, config in runs.items()}
+    text = results(out / "run", [out / name for name in runs])
+    write_text(out / "results.md", text)
+    data = {"out": out, "runs": [out / name for name in runs], "failed": failed}
+    return Findings(f"{text}\n{out / 'results.md'}", data, not any(failed.values()))
+
+
+def _config(
+    settings: SuiteSettings, out: Path, name: str, methods: tuple[str, ...], changes: dict[str, Any]
+) -> RunConfig:
+    return RunConfig(
+        data=str(out / "capture"),
+        out=str(out / name),
+        methods=methods,
+        preset=settings.preset,
+        seeds=settings.seeds,
+        settings=changes,
+    )
+
+
+def results(run_folder: Path, every: list[Path]) -> str:
+    """Tables of a suite as Markdown: whole frames, each region, each held-out sequence, and the ablations of ours."""
+    runs = RunSet.read([run_folder])
+    parts = {"All frames": Part()}
+    parts |= {f"Region {region}": Part(region) for region in sorted(runs.rows.regions - {FULL})}
+    tested = {frame[1] for frame in runs.rows.frames("self_reenactment", FULL)}
+    parts |= {f"Sequence {name}": Part(sequences=(name,)) for name in sorted(tested)}
+    sections = [(title, RunSet.read([run_folder], part)) for title, part in parts.items()]
+    if len(every) > 1:
+        sections.append(("Ablations of ours", RunSet.read(every)))
+    return (
+        "\n\n".join(f"## {title}\n\n{to_markdown(table_of(runs)).strip()}" for title, runs in sections) + "\n"
+    )
