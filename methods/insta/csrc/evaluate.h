@@ -26,8 +26,8 @@ HEADBENCH_INLINE Real exponential(Real x) { return exp2(min(Real(kLog2e) * x, 12
 struct Cells {
   alignas(64) std::uint32_t cell[3][G];
   alignas(64) float part[3][G];
-  alignas(64) std::uint32_t row[G];
-  alignas(64) float weight[G];
+  alignas(64) std::uint32_t row[8][G];  // of the corners
+  alignas(64) float weight[8][G];
 };
 
 inline void find_cells(const Level& level, const float (*at)[G], Cells& cells) {
@@ -52,29 +52,33 @@ inline void find_corner(const Level& level, int corner, Cells& cells) {
     const std::uint32_t flat = x + side * (y + side * z);
     const std::uint32_t wrapped = flat < rows ? flat : flat - rows;
     const std::uint32_t mixed = (x ^ y * 2654435761u ^ z * 805459861u) & (rows - 1);
-    cells.row[lane] = dense ? wrapped : mixed;
+    cells.row[corner][lane] = dense ? wrapped : mixed;
     float weight = 1;
     for (int axis = 0; axis < 3; ++axis)
       weight *= up[axis] ? cells.part[axis][lane] : 1 - cells.part[axis][lane];
-    cells.weight[lane] = weight;
+    cells.weight[corner][lane] = weight;
   }
 }
 
 // (levels features, G) values at (3, G) positions in [0, 1].
 template <int features>
 inline void encode_group(const Field& field, const float (*at)[G], float* out) {
+  typedef float Row __attribute__((vector_size(features * sizeof(float))));
   Cells cells;
   for (int number = 0; number < field.level_count; ++number) {
     const Level& level = field.levels[number];
     find_cells(level, at, cells);
+    for (int corner = 0; corner < 8; ++corner) find_corner(level, corner, cells);
     const float* table = field.table + level.first * features;
-    alignas(64) float sums[G][features] = {};
-    for (int corner = 0; corner < 8; ++corner) {
-      find_corner(level, corner, cells);
-      for (int lane = 0; lane < G; ++lane) {
-        const float* from = table + static_cast<std::size_t>(cells.row[lane]) * features;
-        for (int f = 0; f < features; ++f) sums[lane][f] += cells.weight[lane] * from[f];
+    alignas(64) float sums[G][features];
+    for (int lane = 0; lane < G; ++lane) {
+      Row sum = {};
+      for (int corner = 0; corner < 8; ++corner) {
+        Row row;
+        __builtin_memcpy(&row, table + static_cast<std::size_t>(cells.row[corner][lane]) * features, sizeof row);
+        sum += cells.weight[corner][lane] * row;
       }
+      __builtin_memcpy(sums[lane], &sum, sizeof sum);
     }
     for (int f = 0; f < features; ++f, out += G)
       for (int lane = 0; lane < G; ++lane) out[lane] = sums[lane][f];
@@ -87,6 +91,23 @@ inline void encode_group(const Field& field, const float (*at)[G], float* out) {
     case 2: return encode_group<2>(field, at, out);
     case 4: return encode_group<4>(field, at, out);
     default: return encode_group<8>(field, at, out);
+  }
+}
+
+// (N, levels features) values at (N, 3) positions in [0, 1].
+inline void encode(const Field& field, const float* positions, std::int64_t count, float* out, float* buffer) {
+  const int width = field.features * field.level_count;
+  for (std::int64_t first = 0; first < count; first += G) {
+    const int lanes = static_cast<int>(count - first < G ? count - first : G);
+    alignas(64) float at[3][G] = {};
+    for (int lane = 0; lane < lanes; ++lane)
+      for (int axis = 0; axis < 3; ++axis) {
+        const float value = positions[3 * (first + lane) + axis];
+        at[axis][lane] = value > 0 ? value < 1 ? value : 1 : 0;  // NaN must not leave the table either
+      }
+    encode_group(field, at, buffer);
+    for (int lane = 0; lane < lanes; ++lane)
+      for (int i = 0; i < width; ++i) out[(first + lane) * width + i] = buffer[i * G + lane];
   }
 }
 

@@ -57,6 +57,8 @@ struct Values {
 struct Kernels {
   const char* name;
   Nearest nearest;
+  // (N, levels features) values at (N, 3) positions in [0, 1]; `buffer` has as many floats for kGroupMax of them.
+  void (*encode)(const Field& field, const float* positions, std::int64_t count, float* out, float* buffer);
   std::size_t (*scratch)(const Field& field);  // floats
   // Values of `count` samples at steps of `step` metres. `starts` is (2, outputs of the first layer): what the
   // conditions add to that layer's sums outside the mouth and at it.

@@ -50,23 +50,6 @@ inline Corners corners(const float* position, const Level& level) {
 }
 
 template <int Features>
-void encode_points(const float* positions, std::int64_t begin, std::int64_t end, const float* table,
-                   const std::vector<Level>& levels, float* out) {
-  for (std::int64_t point = begin; point < end; ++point) {
-    float* to = out + point * static_cast<std::int64_t>(levels.size()) * Features;
-    for (const Level& level : levels) {
-      const Corners found = corners(positions + 3 * point, level);
-      float sum[Features] = {};
-      for (int corner = 0; corner < 8; ++corner) {
-        const float* from = table + Features * found.row[corner];
-        for (int f = 0; f < Features; ++f) sum[f] += found.weight[corner] * from[f];
-      }
-      for (int f = 0; f < Features; ++f) *to++ = sum[f];
-    }
-  }
-}
-
-template <int Features>
 void spread_level(const float* positions, std::int64_t count, const float* gradient, const Level& level,
                   std::int64_t stride, float* table_gradient) {
   for (std::int64_t point = 0; point < count; ++point) {
@@ -92,13 +75,18 @@ void with_features(int features, Body body) {
 
 }  // namespace
 
-void encode(const float* positions, std::int64_t count, const float* table, const std::vector<Level>& levels,
-            int features, float* out, int threads) {
-  with_features(features, [&](auto size) {
-    ThreadPool::instance().run((count + kPointsPerTask - 1) / kPointsPerTask, threads, [&](std::int64_t task, int) {
-      const std::int64_t end = std::min(count, (task + 1) * kPointsPerTask);
-      encode_points<decltype(size)::value>(positions, task * kPointsPerTask, end, table, levels, out);
-    });
+void encode(const Kernels& kernels, const float* positions, std::int64_t count, const float* table,
+            const std::vector<Level>& levels, int features, float* out, int threads) {
+  Field field{};
+  field.level_count = static_cast<int>(levels.size());
+  field.levels = levels.data();
+  field.features = features;
+  field.table = table;
+  const std::int64_t width = features * static_cast<std::int64_t>(levels.size());
+  ThreadPool::instance().run((count + kPointsPerTask - 1) / kPointsPerTask, threads, [&](std::int64_t task, int) {
+    const std::int64_t begin = task * kPointsPerTask, end = std::min(count, begin + kPointsPerTask);
+    std::vector<float> buffer(width * kGroupMax);
+    kernels.encode(field, positions + 3 * begin, end - begin, out + begin * width, buffer.data());
   });
 }
 

@@ -164,12 +164,16 @@ std::vector<Level> levels_of(const std::vector<LevelTuple>& given, std::size_t r
 }
 
 void encode_points(const Array<const float, -1, 3>& positions, const Array<const float, -1, -1>& table,
-                   const std::vector<LevelTuple>& levels, const Array<float, -1, -1>& out, int threads) {
+                   const std::vector<LevelTuple>& levels, const Array<float, -1, -1>& out, int threads,
+                   const std::string& isa) {
   const auto parsed = levels_of(levels, table.shape(0));
-  require(out.shape(0) == positions.shape(0) && out.shape(1) == parsed.size() * table.shape(1) && threads >= 1);
+  const std::size_t features = table.shape(1);
+  require((features == 1 || features == 2 || features == 4 || features == 8) && out.shape(0) == positions.shape(0) &&
+          out.shape(1) == parsed.size() * features && threads >= 1);
+  const Kernels& kernels = kernels_of(isa);
   nb::gil_scoped_release unlocked;
-  encode(positions.data(), positions.shape(0), table.data(), parsed, static_cast<int>(table.shape(1)), out.data(),
-         threads);
+  encode(kernels, positions.data(), positions.shape(0), table.data(), parsed, static_cast<int>(table.shape(1)),
+         out.data(), threads);
 }
 
 void encode_points_backward(const Array<const float, -1, 3>& positions, const Array<const float, -1, -1>& gradient,
@@ -277,7 +281,7 @@ NB_MODULE(_kernel, m) {
   m.def("render", &render_rays, "guide"_a, "trained"_a, "starts"_a, "mouth"_a, "origins"_a, "directions"_a, "jitter"_a,
         "step"_a, "round_samples"_a, "stop_transmittance"_a, "color"_a, "transmittance"_a, "isa"_a, "threads"_a,
         "Write what rays see and what they leave; return the number of samples.");
-  m.def("encode", &encode_points, "positions"_a, "table"_a, "levels"_a, "out"_a, "threads"_a);
+  m.def("encode", &encode_points, "positions"_a, "table"_a, "levels"_a, "out"_a, "threads"_a, "isa"_a = "");
   m.def("encode_backward", &encode_points_backward, "positions"_a, "gradient"_a, "levels"_a, "table_gradient"_a,
         "threads"_a);
 }

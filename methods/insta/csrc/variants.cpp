@@ -7,6 +7,6 @@
 namespace headbench::HEADBENCH_ISA {
 
 extern const insta::Kernels kernels;
-const insta::Kernels kernels = {HEADBENCH_ISA_NAME, nearest, scratch, evaluate};
+const insta::Kernels kernels = {HEADBENCH_ISA_NAME, nearest, encode, scratch, evaluate};
 
 }  // namespace headbench::HEADBENCH_ISA

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from headbench.methods.insta import field as networks
+from headbench.methods.insta import kernel
 from headbench.methods.insta.config import InstaConfig
 from headbench.methods.insta.field import (
     Architecture,
@@ -149,6 +150,26 @@ def test_kernel_values_and_gradients_are_those_of_float64(features):
     (values * weights).sum().backward()
     (expected * weights.double()).sum().backward()
     torch.testing.assert_close(table.grad.double(), exact.grad, atol=3e-4, rtol=0)
+
+
+@pytest.mark.skipif(
+    kernel.load() is None, reason="INSTA's kernel is not installed: no C++ compiler was found"
+)
+@pytest.mark.parametrize("features", [1, 2, 4, 8])
+def test_every_instruction_set_encodes_to_the_same_bits(features):
+    levels, module = small_levels(), kernel.load()
+    rng = np.random.default_rng(features)
+    positions = rng.random((77, 3), np.float32)
+    positions[:2] = [[0, 0, 0], [1, 1, 1]]
+    positions[2:5] = [[np.nan, 0.5, 0.5], [-3, 0.5, 0.5], [9e9, 0.5, 0.5]]
+    table = rng.standard_normal((table_rows(levels), features), np.float32)
+    found = {name: np.empty((77, 4 * features), np.float32) for name in ("", *module.instruction_sets())}
+    for name, out in found.items():
+        module.encode(positions, table, levels, out, 1, name)
+        np.testing.assert_array_equal(out, found[""])
+    clamped = torch.from_numpy(np.nan_to_num(positions).clip(0, 1)).double()
+    expected = encode_reference(clamped, torch.from_numpy(table).double(), levels)
+    np.testing.assert_allclose(found[""], expected, atol=1e-4)
 
 
 def test_the_reference_passes_gradcheck():
