@@ -116,7 +116,7 @@ def _lexicographic(rows: Tensor, resolution: int) -> Tensor:
     return torch.argsort((z * AXES * resolution + y) * AXES * resolution + x, stable=True)
 
 
-SAMPLES = 1024
+SAMPLES = 512
 """Of a coordinate of directions, from -1 to 1."""
 
 
@@ -124,8 +124,9 @@ class PlaneColors:
     """Colours of the planes as directions ask for them, where the part of the position is known.
 
     Each coordinate of a direction adds to the hidden layer what its own waves make of it. The kernel reads that from a
-    table, linear between `SAMPLES`: a wave of the highest frequency, 8, is off by 8^2 / (2 SAMPLES^2) = 3e-5 of its
-    amplitude at most. The part of the position is the most that a frame reads; it is kept in 16 bits (`in_steps`).
+    table, linear between `SAMPLES`: a wave of the highest frequency, 8, is off by 8^2 / (2 SAMPLES^2) = 1e-4 of its
+    amplitude at most, and more samples would not stay in the first caches. The part of the position is the most that a
+    frame reads; it is kept in 16 bits (`in_steps`). README.md says what both change of an image.
 
     Parameters
     ----------

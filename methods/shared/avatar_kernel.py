@@ -96,7 +96,7 @@ def pad_units(values: Tensor, *axes: int) -> Tensor:
     widths = [0] * (2 * values.ndim)  # before and after, the last axis first
     for axis in axes:
         widths[-1 - 2 * axis] = -values.shape[axis] % UNITS_STEP
-    return pad(values, widths).contiguous()
+    return (pad(values, widths) if any(widths) else values).contiguous()
 
 
 def turns_between(to: Tensor, origin: Tensor, backend: str = "cpu") -> Tensor:

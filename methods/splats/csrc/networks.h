@@ -7,11 +7,12 @@ namespace headbench::HEADBENCH_ISA {
 
 static_assert(kUnitsStep % W == 0);
 
-// Rows that go through a layer together, side by side in registers. Few, where units that are off are left out: a row then
-// shares its inputs with fewer others.
-constexpr int kSplatGroup = 8, kSparseGroup = 4;
-constexpr int kSplatVectors = W == 16 ? 3 : 1, kSparseVectors = W == 16 ? 4 : 2;  // with them, what registers hold
-static_assert(kNetworkTile % kSplatGroup == 0 && kSplatGroup % kSparseGroup == 0);
+// Rows that go through a layer together, and with them the vectors of outputs that registers hold. Few rows, where units that
+// are off are left out: each then shares its inputs with fewer others. Two are best forward, four backward.
+constexpr int kSplatGroup = 8, kSplatVectors = W == 16 ? 3 : 1;
+constexpr int kSparseGroup = 4, kSparseVectors = W == 16 ? 4 : 2;
+constexpr int kPairGroup = 2, kPairVectors = W == 16 ? 8 : 4;
+static_assert(kNetworkTile % kSplatGroup == 0 && kSplatGroup % kSparseGroup == 0 && kSplatGroup % kPairGroup == 0);
 
 // ---- Places on three axes ----
 
@@ -141,7 +142,7 @@ HEADBENCH_INLINE void dots(const float* rows, const float* weights, int width, f
 
 // Floats: both layers of a tile, and the units that are on in its groups.
 inline std::size_t offset_scratch(const OffsetNetwork& net) {
-  return static_cast<std::size_t>(kNetworkTile) * (net.units + net.hidden) + kNetworkTile / kSparseGroup * net.units;
+  return static_cast<std::size_t>(kNetworkTile) * (net.units + net.hidden) + kNetworkTile / kPairGroup * net.units;
 }
 
 // First layer of an entry after its ReLU.
@@ -159,13 +160,13 @@ inline void offset_network(const OffsetNetwork& net, std::int64_t begin, std::in
   for (std::int64_t tile = begin; tile < end; tile += kNetworkTile) {
     const int used = end - tile < kNetworkTile ? static_cast<int>(end - tile) : kNetworkTile;
     const int rows = (used + kSplatGroup - 1) / kSplatGroup * kSplatGroup;
-    Lists<kSparseGroup> on = {list, net.units, {}};
+    Lists<kPairGroup> on = {list, net.units, {}};
     for (int s = 0; s < rows; ++s) first_layer(net, tile + (s < used ? s : 0), first + s * net.units);
-    for (int group = 0; group < rows / kSparseGroup; ++group)
+    for (int group = 0; group < rows / kPairGroup; ++group)
       on.counts[group] =
-          list_on<kSparseGroup>(first + group * kSparseGroup * net.units, net.units, net.units, list + group * net.units);
+          list_on<kPairGroup>(first + group * kPairGroup * net.units, net.units, net.units, list + group * net.units);
     float* second = net.kept ? net.kept + tile * net.hidden : own;
-    product<kSparseGroup, kSparseVectors>(first, net.units, on, rows / kSparseGroup, net.second, net.second_stride, net.hidden, net.second_bias, true,
+    product<kPairGroup, kPairVectors>(first, net.units, on, rows / kPairGroup, net.second, net.second_stride, net.hidden, net.second_bias, true,
             second, net.hidden);
     for (int group = 0; group < used; group += kSplatGroup)
       for (int output = 0; output < net.outputs; ++output) {
@@ -181,7 +182,7 @@ inline void offset_network(const OffsetNetwork& net, std::int64_t begin, std::in
 
 // Colours of splats [begin, end).
 inline void color_network(const ColorNetwork& net, std::int64_t begin, std::int64_t end) {
-  constexpr int kTogether = 4;
+  constexpr int kTogether = 4, kPair = W == 16 ? 2 : 1;
   Gathered<3> lower, fraction;
   const Real half = 0.5f * static_cast<float>(net.samples - 1), before_last = static_cast<float>(net.samples - 2);
   for (std::int64_t first = begin; first < end; first += W) {
@@ -195,21 +196,32 @@ inline void color_network(const ColorNetwork& net, std::int64_t begin, std::int6
       fraction.keep(axis, along - row);
     }
     for (int group = 0; group < used; group += kTogether) {
-      Real sums[3][4];
-      for (int s = 0; s < kTogether; ++s) {
-        const int lane = group + s < used ? group + s : group;
-        std::int32_t rows[3];
-        float fractions[3];
-        for (int axis = 0; axis < 3; ++axis) rows[axis] = static_cast<std::int32_t>(lower.values[axis][lane]) + axis * net.samples;
-        fraction.put(fractions, lane);
-        const Place<const float> at = place_of(net.table, net.hidden, rows, fractions);
-        const std::int16_t* known = net.positions + (first + lane) * net.hidden;
-        Real sum[3] = {0.0f, 0.0f, 0.0f};
-        for (int unit = 0; unit < net.hidden; unit += W) {
-          const Real value = max(add_place(at, net.hidden, unit, load_int16(known + unit) * load(net.steps + unit)), 0.0f);
-          for (int channel = 0; channel < 3; ++channel) sum[channel] = fma(value, load(net.last + channel * net.hidden + unit), sum[channel]);
+      Real sums[3][kTogether];
+      for (int s = 0; s < kTogether; s += kPair) {
+        Place<const float> at[kPair];
+        const std::int16_t* known[kPair];
+        Real sum[3][kPair];
+        for (int k = 0; k < kPair; ++k) {
+          const int lane = group + s + k < used ? group + s + k : group;
+          std::int32_t rows[3];
+          float fractions[3];
+          for (int axis = 0; axis < 3; ++axis) rows[axis] = static_cast<std::int32_t>(lower.values[axis][lane]) + axis * net.samples;
+          fraction.put(fractions, lane);
+          at[k] = place_of(net.table, net.hidden, rows, fractions);
+          known[k] = net.positions + (first + lane) * net.hidden;
+          for (int channel = 0; channel < 3; ++channel) sum[channel][k] = 0.0f;
         }
-        for (int channel = 0; channel < 3; ++channel) sums[channel][s] = sum[channel];
+        for (int unit = 0; unit < net.hidden; unit += W) {
+          const Real step = load(net.steps + unit);
+          Real last[3];
+          for (int channel = 0; channel < 3; ++channel) last[channel] = load(net.last + channel * net.hidden + unit);
+          for (int k = 0; k < kPair; ++k) {
+            const Real value = max(add_place(at[k], net.hidden, unit, load_int16(known[k] + unit) * step), 0.0f);
+            for (int channel = 0; channel < 3; ++channel) sum[channel][k] = fma(value, last[channel], sum[channel][k]);
+          }
+        }
+        for (int channel = 0; channel < 3; ++channel)
+          for (int k = 0; k < kPair; ++k) sums[channel][s + k] = sum[channel][k];
       }
       for (int channel = 0; channel < 3; ++channel) {
         float found[kTogether];

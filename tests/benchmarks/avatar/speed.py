@@ -8,12 +8,14 @@ from dataclasses import asdict, dataclass
 from itertools import cycle
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from ....bench.contracts import Camera, HeadAsset, HeadPose, Progress, no_progress
 from ....bench.specs import Findings
 from ....datasets.head.procedural.model import procedural_head
+from ....methods.ga.method import GAAvatar
 from ....methods.ours.appearance import driving_coefficients
 from ....methods.ours.avatar import OursAvatar
 from ....methods.ours.field import (
@@ -50,6 +52,15 @@ class Pair:
     before: float
     after: float
     note: str = ""
+
+
+@dataclass(frozen=True)
+class Beside:
+    """Milliseconds of a frame, medians of runs that take turns: processor time, all threads together."""
+
+    threads: int
+    ours: float
+    ga: float
 
 
 class Bench:
@@ -104,6 +115,28 @@ class Bench:
             "rasterise, to numpy": parts.raster,
         }
         return list(self._least(runs).items())
+
+    def beside_ga(self) -> list[Beside]:
+        """Whole frames of `ours` and of `ga` with the same splats, harmonics of degree 3, poses and cameras."""
+        avatar, found = self.avatar, []
+        splats = {name: getattr(avatar.neutral, name) for name in ("means", "log_scales", "quats")}
+        generator = torch.Generator().manual_seed(0)
+        harmonics = 0.2 * torch.randn(self.count, 3, 16, generator=generator)
+        splats |= {
+            "opacities": avatar.neutral.logits,
+            "sh_dc": harmonics[:, :, 0],
+            "sh_rest": harmonics[:, :, 1:],
+        }
+        binding = avatar.field.tensors["splats"][:, -1].to(torch.int64)
+        other = GAAvatar([], avatar.mesh, avatar.subject, splats, binding, None, "cpu")
+        runs = {"ours": self._frames(avatar), "ga": self._frames(other)}
+        for threads in (1, 2):
+            timed = {name: seconds_of(run, time.process_time) for name, run in runs.items()}
+            with torch_threads(threads), torch.no_grad():
+                seconds = take_turns(timed, budget=self._budget, least_runs=self._least_runs)
+            medians = (1e3 * float(np.median(seconds[name])) for name in runs)
+            found.append(Beside(threads, *medians))
+        return found
 
     def _least(self, runs: dict[str, Run]) -> dict[str, float]:
         timed = {name: seconds_of(run, time.thread_time) for name, run in runs.items()}
@@ -276,7 +309,7 @@ def _blend_samples(lines: Tensor, weights: Tensor, place: LinePosition) -> Tenso
     return torch.einsum("nakc,k->nac", samples, weights).flatten(1)
 
 
-SIZES = ((20_000, 144, 208), (60_000, 550, 802))
+SIZES = ((20_000, 144, 208), (20_000, 550, 802), (60_000, 550, 802))
 QUICK = ((2_000, 72, 104),)
 
 
@@ -295,13 +328,14 @@ def measure(quick: bool = False, progress: Progress = no_progress) -> Findings:
                 "height": height,
                 "stages_ms": dict(bench.stages()),
                 "savings": [asdict(pair) for pair in bench.pairs()],
+                "beside_ga": [asdict(beside) for beside in bench.beside_ga()],
             }
         )
     text = "\n\n".join(_text(result) for result in results)
     note = (
-        "Processor time of one thread, ms, the least of runs that take turns. Before: the same frame, or step, by the "
-        "functions of\ntraining, or without what is known. Nothing is approximated: after differs from before by "
-        "rounding alone."
+        "Processor time, ms, of one thread, the least of runs that take turns; of whole frames beside ga's that of all\n"
+        "threads, medians. Before: the same frame, or step, by the functions of training, or without what is known. After\n"
+        "differs from before by rounding; colours also by a table of directions, see methods/ours/README.md."
     )
     return Findings(f"{text}\n\n{note}", {"sizes": results})
 
@@ -318,9 +352,14 @@ def _text(result: Mapping[str, Any]) -> str:
         )
         for pair in (Pair(**values) for values in result["savings"])
     ]
+    beside = [
+        (str(one.threads), f"{one.ours:.2f}", f"{one.ga:.2f}", f"{one.ours / one.ga:.2f}")
+        for one in (Beside(**values) for values in result["beside_ga"])
+    ]
     head = f"{result['splats']} splats, {result['width']}x{result['height']}"
     tables = (
         table(("step of a frame", "ms"), stages),
         table(("saving", "before", "after", "times", "note"), savings),
+        table(("frame, threads", "ours", "ga", "ratio"), beside),
     )
     return "\n\n".join([head, *tables])

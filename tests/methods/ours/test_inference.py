@@ -46,7 +46,10 @@ def test_colours_are_kept_for_the_same_place_and_no_other(dtype):
     assert colors(means, center.clone(), turns, binding) is one
     for moved, place in ((means + 0.5, center), (means, center + 0.5)):
         expected = colors.along(torch.nn.functional.normalize(moved - place, dim=1))
-        np.testing.assert_allclose(colors(moved, place, turns, binding), expected, atol=4e-4)
+        tolerance = (
+            5e-3 if dtype == torch.float32 else 1e-5
+        )  # by a table, whose waves have amplitudes of 1 here
+        np.testing.assert_allclose(colors(moved, place, turns, binding), expected, atol=tolerance)
         assert (colors(moved, place, turns, binding) - one).abs().max() > 0.01
     np.testing.assert_array_equal(colors(means, center, turns, binding), one)
 

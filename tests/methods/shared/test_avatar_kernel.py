@@ -134,7 +134,11 @@ def test_the_colour_network_is_that_of_its_definition(backend, count, hidden, se
     turns, binding = mesh(normal, 7).rotation, torch.arange(count) % 7
     first, last, known = 0.3 * normal(hidden, 27), normal(3, hidden) / hidden**0.5, normal(count, hidden)
     known, of_direction, last = (avatar_kernel.pad_units(values, 1) for values in (known, first.t(), last))
-    network = *avatar_kernel.in_steps(known), direction_table(of_direction, SAMPLES), last
+    network = (
+        *avatar_kernel.in_steps(known),
+        direction_table(of_direction, 4 * SAMPLES),
+        last,
+    )  # near the definition
     found = avatar_kernel.shade_network(*network, means, center, turns, binding, backend)
     directions = canonical_directions(turns.double(), binding, means.double(), center.double())
     weights = {"color_weight_0": of_direction.t().double(), "color_weight_1": last.double()}
