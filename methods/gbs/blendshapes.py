@@ -41,41 +41,54 @@ class Entries(NamedTuple):
     owners : (M,) int64, splat of each row, ascending.
     expressions : (M,) int64.
     weights : (M,) with which a row counts; 1 where it holds what is added at coefficient 1.
+    rows : (M,) int64, 0 to M - 1.
     """
 
     starts: Tensor
     owners: Tensor
     expressions: Tensor
     weights: Tensor
+    rows: Tensor
 
     @classmethod
     def of(cls, counts: Tensor, expressions: Tensor, weights: Tensor) -> Entries:
         """From the (N,) numbers of rows."""
         starts = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
         owners = torch.arange(len(counts), device=counts.device).repeat_interleave(counts)
-        return cls(starts, owners, expressions, weights)
+        return cls(starts, owners, expressions, weights, torch.arange(len(owners), device=counts.device))
+
+    def shares(self, coefficients: Tensor) -> Tensor:
+        """(M,) with which rows count in a pose of (K,) coefficients."""
+        return self.weights * coefficients.index_select(0, self.expressions)
 
     def sum(self, differences: Tensor, coefficients: Tensor) -> Tensor:
         """(N, C) differences of each splat, blended by the (K,) coefficients of a pose."""
-        weights = self.weights * coefficients.index_select(0, self.expressions)
-        return _SumEntries.apply(differences, weights, self.starts, self.owners)  # type: ignore[no-untyped-call]
+        return self.blended(differences, self.shares(coefficients))
+
+    def blended(self, differences: Tensor, shares: Tensor) -> Tensor:
+        """(N, C) differences of each splat, blended by the `shares` of a pose."""
+        return _SumEntries.apply(differences, shares, self)  # type: ignore[no-untyped-call]
 
 
 class _SumEntries(torch.autograd.Function):
     """Sums of weighted rows of a table, run by run. The adjoint is one gather: torch's own scatters."""
 
     @staticmethod
-    def forward(ctx: Any, table: Tensor, weights: Tensor, starts: Tensor, owners: Tensor) -> Tensor:
-        ctx.save_for_backward(weights, owners)
-        rows = torch.arange(len(table), device=table.device)
+    def forward(ctx: Any, table: Tensor, shares: Tensor, entries: Entries) -> Tensor:
+        ctx.save_for_backward(shares, entries.owners)
         return embedding_bag(
-            rows, table, starts, per_sample_weights=weights, mode="sum", include_last_offset=True
+            entries.rows,
+            table,
+            entries.starts,
+            per_sample_weights=shares,
+            mode="sum",
+            include_last_offset=True,
         )
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        weights, owners = ctx.saved_tensors
-        return grads[0].index_select(0, owners).mul_(weights[:, None]), None, None, None
+        shares, owners = ctx.saved_tensors
+        return grads[0].index_select(0, owners).mul_(shares[:, None]), None, None
 
 
 class PosedAttributes(NamedTuple):

@@ -110,7 +110,7 @@ class GBSTraining(SplatTrainer):
         self._start(splats, shared, binding, len(counts), 1.0, seed, **books)
         self._sizes = torch.ones(len(counts), device=device)
         self._entries: tuple[Tensor, Entries] | None = None
-        self._of_splats: tuple[Tensor, BoundedCache[PointMotions]] | None = None
+        self._of_splats: tuple[Tensor, BoundedCache[tuple[PointMotions, Tensor]]] | None = None
 
     def begin(self, timeline: Timeline) -> None:
         """Fit schedules to the length of the run."""
@@ -123,9 +123,8 @@ class GBSTraining(SplatTrainer):
         view = self._views[key.camera]
         image, coverage = self._on_background(self._images.get(iteration, index))
         pose = self._pose[key.timestep]
-        motions = self._splat_motions(pose)
-        coefficients = self._arguments["expression"][pose, : self.rig.expressions]
-        differences = self.entries.sum(optimiser[DIFFERENCES], coefficients) * self._column_scales
+        motions, shares = self._splat_motions(pose)
+        differences = self.entries.blended(optimiser[DIFFERENCES], shares) * self._column_scales
         posed = apply_pose({name: optimiser[name] for name in self.splat_names}, differences, motions)
         degree = min(config.sh_degree, iteration // self._degree_every)
         colors = posed.colors(view.center, degree)
@@ -142,15 +141,17 @@ class GBSTraining(SplatTrainer):
                     loss = loss + config.teeth_weight * violation
         return loss
 
-    def _splat_motions(self, pose: int) -> PointMotions:
-        """What a pose does to the splats as they are now bound."""
+    def _splat_motions(self, pose: int) -> tuple[PointMotions, Tensor]:
+        """What a pose does to the splats as they are now bound, and with which shares it takes their differences."""
         binding = self.binding
         if self._of_splats is None or self._of_splats[0] is not binding:
             self._of_splats = binding, BoundedCache(self._splat_motions_at, self._poses_kept)
         return self._of_splats[1](pose)
 
-    def _splat_motions_at(self, pose: int) -> PointMotions:
-        return PointMotions.of(self._motions(pose).index_select(0, self.binding))
+    def _splat_motions_at(self, pose: int) -> tuple[PointMotions, Tensor]:
+        coefficients = self._arguments["expression"][pose, : self.rig.expressions]
+        motions = PointMotions.of(self._motions(pose).index_select(0, self.binding))
+        return motions, self.entries.shares(coefficients)
 
     @property
     def entries(self) -> Entries:
