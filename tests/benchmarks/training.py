@@ -242,15 +242,19 @@ class Limits:
     bandwidth: float
 
 
-TRIAD = 1 << 23  # numbers in each of three arrays, more than caches hold
+TRIAD = 1 << 23  # numbers in each of two arrays, more than caches hold
 
 
 def measure_limits() -> Limits:
-    """Multiply-adds in registers, and the triad a = b + s c of STREAM (McCalpin 1995): 12 bytes a number."""
+    """Multiply-adds in registers, and a = a + s c over memory, 12 bytes a number.
+
+    The triad of STREAM (McCalpin 1995) with one array read and written: a third one would be read before it is
+    overwritten, which its count leaves out.
+    """
     flops = peak_flops("cpu") if instruction_sets() else float("nan")
-    a, b, c = torch.empty(3, TRIAD).fill_(1.0)
-    triad = seconds_of(lambda: torch.add(b, c, alpha=2.0, out=a), time.thread_time)
-    return Limits(flops, 12 * TRIAD / min(triad() for _ in range(8)))
+    a, c = torch.ones(2, TRIAD)
+    triad = seconds_of(lambda: torch.add(a, c, alpha=2.0, out=a), time.thread_time)
+    return Limits(flops, 12 * TRIAD / min(triad() for _ in range(12)))
 
 
 @dataclass(frozen=True)
