@@ -6,6 +6,7 @@ import re
 import shutil
 import tempfile
 import zipfile
+import zlib
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from itertools import product
@@ -28,6 +29,8 @@ MAX_BYTES = 8 * 2**30
 MAX_RATIO = 200
 """How many times its own size a bundle may hold; JSON shrinks to a thirtieth."""
 
+_DAMAGED = (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError, ValueError)
+"""What reading a damaged archive raises, a password included."""
 _CELL = r"[^/\\]+/[^/\\]+/seed-\d+"
 _NAMES = re.compile(
     rf"run\.json|rows\.parquet|{_CELL}/({'|'.join(STAGES)})\.json|{_CELL}/renders/[^/\\]+/[^/\\]+\.png"
@@ -164,7 +167,7 @@ def read_bundle(path: Path, into: Path) -> Bundle:
     try:
         with zipfile.ZipFile(path) as archive:
             return _unpack(archive, path, into)
-    except (zipfile.BadZipFile, zipfile.LargeZipFile, NotImplementedError, RuntimeError, EOFError) as error:
+    except _DAMAGED as error:
         raise InputError(
             path, "", "a bundle of `headbench bundle`", f"a damaged ZIP file ({error})"
         ) from error
@@ -179,6 +182,12 @@ def _unpack(archive: zipfile.ZipFile, path: Path, into: Path) -> Bundle:
     if len(infos) > MAX_FILES or len(sizes) < len(infos) or sum(sizes.values()) > limit:
         found = f"{len(infos)} files, {len(sizes)} names, {sum(sizes.values())} bytes"
         raise InputError(path, "", f"at most {MAX_FILES} files, each once, of {limit} bytes", found)
+    for info in infos:
+        if info.compress_type not in (
+            zipfile.ZIP_STORED,
+            zipfile.ZIP_DEFLATED,
+        ):  # others take memory without bound
+            raise InputError(path, info.filename, "stored or deflated", f"compression {info.compress_type}")
     if sizes.get(INDEX, MAX_JSON_BYTES + 1) > MAX_JSON_BYTES:
         raise InputError(path, INDEX, f"a list of the files, at most {MAX_JSON_BYTES} bytes", "none")
     bundle = checked(parse_json(archive.read(INDEX), path, INDEX), Bundle, path)

@@ -131,6 +131,35 @@ def test_content_much_larger_than_the_file_is_refused(packed, tmp_path):
         read_bundle(packed, tmp_path / "again")
 
 
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        # Within the deflated run.json, past names and sizes.
+        (
+            lambda data, at: data[: at + 20] + bytes([data[at + 20] ^ 255]) + data[at + 21 :],
+            "a damaged ZIP file",
+        ),
+        (lambda data, at: data[: len(data) // 2], "a damaged ZIP file"),
+    ],
+)
+def test_damaged_archives_are_refused(packed, tmp_path, change, words):
+    with zipfile.ZipFile(packed) as archive:
+        info = archive.getinfo("run.json")
+    data = packed.read_bytes()
+    packed.write_bytes(change(data, info.header_offset + 30 + len(info.filename)))
+    with pytest.raises(InputError, match=words):
+        read_bundle(packed, tmp_path / "again")
+
+
+def test_compressions_without_bound_are_refused(packed, tmp_path):
+    files = members(packed)
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_LZMA) as archive:
+        for name, content in files.items():
+            archive.writestr(name, content)
+    with pytest.raises(InputError, match="stored or deflated"):
+        read_bundle(packed, tmp_path / "again")
+
+
 @pytest.mark.parametrize("content", [b"", b"text", b"PK\x03\x04 and nothing more"])
 def test_what_is_no_archive_is_refused(tmp_path, content, capsys):
     path = tmp_path / "b.zip"
