@@ -28,7 +28,7 @@ KERNEL = Kernel(
 )
 
 MOST_PANELS = 8
-SURROUNDINGS = (0.10, 0.10, 0.10)
+SURROUNDINGS = (0.25, 0.25, 0.25)
 """Radiance of everything around that is no panel."""
 
 MIRRORS = ("eye",)
@@ -36,7 +36,7 @@ MIRRORS = ("eye",)
 
 _MOST_SAMPLES = 289
 _FILTER, _FILTER_REACH = 0.55, 2  # standard deviation and reach of the pixel filter, pixels
-_RAYS, _PATTERNS = 16, 256  # rays from a vertex to what surrounds it, and sets of them to draw from
+_RAYS, _PATTERNS = 8, 256  # rays from a vertex to what surrounds it, and sets of them to draw from
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +97,7 @@ def panels(middle: FloatArray) -> tuple[Panel, ...]:
     )
 
 
-_EXPOSURE = 5.0
+_EXPOSURE = 3.7
 
 
 def _panel(
@@ -274,8 +274,8 @@ def _hemisphere() -> FloatArray:
     rng = np.random.default_rng(0)
     index = np.arange(_RAYS)
     shift = rng.random((_PATTERNS, 1, 2))
-    # Rank-1 lattice of 16 points with the best generator, shifted around the torus.
-    square = (np.stack([index / _RAYS, index * 7 / _RAYS % 1.0], axis=1) + 0.5 / _RAYS + shift) % 1.0
+    # A rank-1 lattice, shifted around the torus.
+    square = (np.stack([index / _RAYS, index * 3 / _RAYS % 1.0], axis=1) + 0.5 / _RAYS + shift) % 1.0
     radius, turn = np.sqrt(square[..., 0]), 2.0 * np.pi * square[..., 1]
     up = np.sqrt(np.maximum(1.0 - square[..., 0], 0.0))
     directions = np.stack([radius * np.cos(turn), radius * np.sin(turn), up], axis=-1)

@@ -18,6 +18,8 @@ namespace headbench::light {
 namespace {
 
 constexpr std::int64_t kSidesPerTask = 64;
+constexpr double kRoom = 0.01;          // cells
+constexpr std::int64_t kStripRows = 4;  // of pixels, that a thread draws at a time
 constexpr std::int64_t kBand = 32;  // rows of pixels between one search for what is seen and the next
 
 using Floats = std::vector<float>;
@@ -139,17 +141,29 @@ class World {
     lens.top = static_cast<double>(top - reach);
     lens.grid = grid;
     lens.seed = seed;
-    const std::int64_t band = kBand * grid;
+    const std::int64_t band = kBand * grid, strip_rows = kStripRows * grid;
+    const std::vector<Extent> extents = extents_in(lens, rows, columns);
+    std::vector<std::vector<std::int32_t>> seen((rows + strip_rows - 1) / strip_rows);
+    for (std::size_t i = 0; i < extents.size(); ++i)
+      for (std::int64_t strip = extents[i].top / strip_rows; strip * strip_rows < extents[i].bottom; ++strip)
+        seen[strip].push_back(static_cast<std::int32_t>(i));
     std::vector<Sample> samples(band * columns);
     Floats narrow(rows * width * 4);
     const Scene scene = current();
     ThreadPool& pool = ThreadPool::instance();
     for (std::int64_t begin = 0; begin < rows; begin += band) {
       const std::int64_t taken = std::min(band, rows - begin);
-      pool.run(taken, threads, [&](std::int64_t task, int) {
-        Sample* row = samples.data() + task * columns;
-        kernels_.see(scene, lens, begin + task, columns, row);
-        for (std::int64_t i = 0; i < columns; ++i) {
+      pool.run((taken + strip_rows - 1) / strip_rows, threads, [&](std::int64_t task, int) {
+        const std::int64_t first = task * strip_rows, count_rows = std::min(strip_rows, taken - first);
+        Floats memory(kStripFloats * count_rows * stride_of(columns));
+        std::vector<std::int32_t> met(count_rows * stride_of(columns));
+        const std::vector<std::int32_t>& triangles = seen[(begin + first) / strip_rows];
+        Sample* row = samples.data() + first * columns;
+        kernels_.see(scene, lens,
+                     {begin + first, count_rows, columns, triangles.data(), static_cast<std::int64_t>(triangles.size()),
+                      extents.data(), memory.data(), met.data()},
+                     row);
+        for (std::int64_t i = 0; i < count_rows * columns; ++i) {
           if (row[i].triangle < 0) continue;
           for (int corner = 0; corner < 3; ++corner)
             wanted_.add(2 * static_cast<std::int64_t>(faces_[3 * static_cast<std::int64_t>(row[i].triangle) + corner]) + row[i].back);
@@ -239,6 +253,46 @@ class World {
       for (int axis = 0; axis < 3; ++axis) normals_[3 * i + axis] = static_cast<float>(n[axis] * inverse);
       if (squared <= 0.0) normals_[3 * i + 2] = 1.0f;
     }
+  }
+
+  // Cells that each triangle may be seen in, with some room for rounding; all of them where one reaches beside the camera.
+  std::vector<Extent> extents_in(const Lens& lens, std::int64_t rows, std::int64_t columns) const {
+    const double* c[3] = {lens.columns[0], lens.columns[1], lens.columns[2]};
+    double inverse[3][3];  // pixel position times depth, of a direction
+    for (int i = 0; i < 3; ++i) {
+      const double *a = c[(i + 1) % 3], *b = c[(i + 2) % 3];
+      for (int axis = 0; axis < 3; ++axis)
+        inverse[i][axis] = a[(axis + 1) % 3] * b[(axis + 2) % 3] - a[(axis + 2) % 3] * b[(axis + 1) % 3];
+    }
+    const double volume = c[0][0] * inverse[0][0] + c[0][1] * inverse[0][1] + c[0][2] * inverse[0][2];
+    std::vector<double> cells(2 * count_);
+    std::vector<std::uint8_t> before(count_);
+    for (std::int64_t i = 0; i < count_; ++i) {
+      double p[3] = {};
+      for (int part = 0; part < 3; ++part)
+        for (int axis = 0; axis < 3; ++axis)
+          p[part] += inverse[part][axis] * (vertices_[3 * i + axis] - lens.origin[axis]) / volume;
+      before[i] = p[2] > 1e-3;
+      cells[2 * i] = (p[0] / p[2] - lens.left) * lens.grid;
+      cells[2 * i + 1] = (p[1] / p[2] - lens.top) * lens.grid;
+    }
+    const auto cell = [](double place, std::int64_t most) {
+      return static_cast<std::int32_t>(std::floor(std::min(std::max(place, 0.0), static_cast<double>(most))));
+    };
+    std::vector<Extent> extents(faces_.size() / 3);
+    for (std::size_t i = 0; i < extents.size(); ++i) {
+      const std::int32_t* face = faces_.data() + 3 * i;
+      const double* at[3] = {&cells[2 * face[0]], &cells[2 * face[1]], &cells[2 * face[2]]};
+      if (!before[face[0]] || !before[face[1]] || !before[face[2]]) {
+        extents[i] = {0, static_cast<std::int32_t>(columns), 0, static_cast<std::int32_t>(rows)};
+        continue;
+      }
+      extents[i] = {cell(std::min({at[0][0], at[1][0], at[2][0]}) - kRoom, columns),
+                    cell(std::max({at[0][0], at[1][0], at[2][0]}) + kRoom + 1.0, columns),
+                    cell(std::min({at[0][1], at[1][1], at[2][1]}) - kRoom, rows),
+                    cell(std::max({at[0][1], at[1][1], at[2][1]}) + kRoom + 1.0, rows)};
+    }
+    return extents;
   }
 
   // From a place to the box around all vertices, or 0 inside of it.

@@ -84,11 +84,30 @@ struct Lens {
   std::uint32_t seed;
 };
 
+// Which cells a triangle may be seen in: [left, right), [top, bottom).
+struct Extent {
+  std::int32_t left, right, top, bottom;
+};
+
+// Some rows of samples, the triangles that may be seen there by number, ascending, and memory for `kStripFloats` floats and
+// one number a sample.
+struct Strip {
+  std::int64_t first, rows, columns;
+  const std::int32_t* triangles;
+  std::int64_t count;
+  const Extent* extents;  // by triangle
+  float* memory;
+  std::int32_t* met;
+};
+constexpr int kStripFloats = 9;
+// Samples of a row in memory: eight more, so that eight may be taken from anywhere.
+inline std::int64_t stride_of(std::int64_t columns) { return columns + kWide; }
+
 // The functions of one instruction set. All give the same numbers: none forms sums in an order of its own.
 struct Kernels {
   const char* name;
-  // Fill row `row` of samples.
-  void (*see)(const Scene&, const Lens&, std::int64_t row, std::int64_t count, Sample* samples);
+  // Fill rows of samples from `strip.first` on, trying the triangles that may be seen there.
+  void (*see)(const Scene&, const Lens&, const Strip& strip, Sample* samples);
   // Light of the panels on one side of a vertex: 2 vertex + back.
   void (*direct)(const Scene&, std::int64_t side);
   // Sides of vertices that `rays` directions from a side meet; kNothing for the surroundings.

@@ -140,38 +140,90 @@ HEADBENCH_INLINE Vec3 place_of(const Scene& scene, const Surface& surface) {
 
 HEADBENCH_INLINE Vec3 mirrored(Vec3 towards, Vec3 normal) { return normal * (2.0f * dot(normal, towards)) - towards; }
 
-inline void see(const Scene& scene, const Lens& lens, std::int64_t row, std::int64_t count, Sample* samples) {
+HEADBENCH_INLINE void store(float* p, Float8 a) { __builtin_memcpy(p, &a, sizeof a); }
+
+// Try a triangle for the samples of its cells, eight at a time. Triangles come in ascending order, and of equally near ones the
+// first stays.
+HEADBENCH_INLINE void cover(const Scene& scene, const Strip& strip, std::int32_t triangle, float* const* rays, float* distances,
+                            float* us, float* vs) {
+  const Extent extent = strip.extents[triangle];
+  const std::int32_t* face = scene.faces + 3 * static_cast<std::int64_t>(triangle);
+  const Vec3 corner = at(scene.vertices, face[0]);
+  const Vec3 edge1 = at(scene.vertices, face[1]) - corner, edge2 = at(scene.vertices, face[2]) - corner;
+  const Float8 ax = all(edge1.x), ay = all(edge1.y), az = all(edge1.z);
+  const Float8 bx = all(edge2.x), by = all(edge2.y), bz = all(edge2.z);
+  const std::int64_t stride = stride_of(strip.columns);
+  const std::int64_t top = extent.top > strip.first ? extent.top - strip.first : 0;
+  const std::int64_t bottom = extent.bottom < strip.first + strip.rows ? extent.bottom - strip.first : strip.rows;
+  for (std::int64_t row = top; row < bottom; ++row) {
+    for (std::int64_t column = extent.left; column < extent.right; column += kWide) {
+      const std::int64_t i = row * stride + column;
+      const Float8 dx = load(rays[0] + i), dy = load(rays[1] + i), dz = load(rays[2] + i);
+      const Float8 px = dy * bz - dz * by, py = dz * bx - dx * bz, pz = dx * by - dy * bx;
+      const Float8 inverse = all(1.0f) / (ax * px + ay * py + az * pz);
+      const Float8 tx = load(rays[3] + i) - all(corner.x), ty = load(rays[4] + i) - all(corner.y), tz = load(rays[5] + i) - all(corner.z);
+      const Float8 u = (tx * px + ty * py + tz * pz) * inverse;
+      const Float8 qx = ty * az - tz * ay, qy = tz * ax - tx * az, qz = tx * ay - ty * ax;
+      const Float8 v = (dx * qx + dy * qy + dz * qz) * inverse;
+      const Float8 distance = (bx * qx + by * qy + bz * qz) * inverse, before = load(distances + i);
+      const Int8 nearer = (u >= all(-kOverlap)) & (v >= all(-kOverlap)) & (u + v <= all(1.0f + kOverlap)) &
+                          (distance > all(0.0f)) & (distance < before);
+      if (!bits(nearer)) continue;
+      store(distances + i, select(nearer, distance, before));
+      store(us + i, select(nearer, u, load(us + i)));
+      store(vs + i, select(nearer, v, load(vs + i)));
+      for (unsigned found = bits(nearer); found; found &= found - 1) strip.met[i + __builtin_ctz(found)] = triangle;
+    }
+  }
+}
+
+inline void see(const Scene& scene, const Lens& lens, const Strip& strip, Sample* samples) {
+  const std::int64_t stride = stride_of(strip.columns), count = strip.rows * stride;
+  float* rays[6];
+  for (int part = 0; part < 6; ++part) rays[part] = strip.memory + part * count;
+  float *distances = strip.memory + 6 * count, *us = strip.memory + 7 * count, *vs = strip.memory + 8 * count;
   const double cell = 1.0 / lens.grid;
-  std::int32_t likely = 0, likely_mirrored = 0;
-  for (std::int64_t column = 0; column < count; ++column) {
+  for (std::int64_t i = 0; i < count; ++i) {
+    const std::int64_t row = i / stride, column = i % stride;
+    distances[i] = kFar;
+    us[i] = vs[i] = 0.0f;
+    strip.met[i] = -1;
     // Each sample lies anywhere in its cell.
-    const std::uint32_t random = mixed(mixed(static_cast<std::uint32_t>(row) ^ lens.seed) + static_cast<std::uint32_t>(column));
+    const std::uint32_t random = mixed(mixed(static_cast<std::uint32_t>(strip.first + row) ^ lens.seed) + static_cast<std::uint32_t>(column));
     const double x = lens.left + (static_cast<double>(column) + ((random & 0xffff) + 0.5) / 65536.0) * cell;
-    const double y = lens.top + (static_cast<double>(row) + ((random >> 16) + 0.5) / 65536.0) * cell;
+    const double y = lens.top + (static_cast<double>(strip.first + row) + ((random >> 16) + 0.5) / 65536.0) * cell;
     double d[3], squared = 0.0;
     for (int axis = 0; axis < 3; ++axis) {
       d[axis] = lens.columns[0][axis] * x + lens.columns[1][axis] * y + lens.columns[2][axis];
       squared += d[axis] * d[axis];
     }
     const double inverse = 1.0 / __builtin_sqrt(squared);
-    for (double& each : d) each *= inverse;
-    const Vec3 along = {static_cast<float>(d[0]), static_cast<float>(d[1]), static_cast<float>(d[2])};
-    const Vec3 from = {static_cast<float>(lens.origin[0] + lens.start * d[0]), static_cast<float>(lens.origin[1] + lens.start * d[1]),
-                       static_cast<float>(lens.origin[2] + lens.start * d[2])};
-    const Hit hit = nearest(scene, Ray(from, along), likely);
-    Sample& sample = samples[column];
-    sample.triangle = hit.triangle;
-    sample.mirrored = kNoMirror;
-    if (hit.triangle < 0) continue;
-    sample.u = hit.u;
-    sample.v = hit.v;
-    sample.towards = along * -1.0f;
-    sample.back = side_of(scene, hit, along) & 1;
-    if (scene.materials[scene.material_of[hit.triangle]].roughness > 0.0f) continue;
-    const Surface surface = surface_of(scene, sample);
-    const Vec3 reflected = mirrored(sample.towards, surface.normal);
-    const Hit behind = nearest(scene, Ray(place_of(scene, surface) + surface.normal * kLift, reflected), likely_mirrored);
-    sample.mirrored = behind.triangle < 0 ? kNothing : side_of(scene, behind, reflected);
+    for (int axis = 0; axis < 3; ++axis) {
+      const double along = d[axis] * inverse;
+      rays[axis][i] = static_cast<float>(along);
+      rays[3 + axis][i] = static_cast<float>(lens.origin[axis] + lens.start * along);
+    }
+  }
+  for (std::int64_t i = 0; i < strip.count; ++i) cover(scene, strip, strip.triangles[i], rays, distances, us, vs);
+  std::int32_t likely = 0;
+  for (std::int64_t row = 0; row < strip.rows; ++row) {
+    for (std::int64_t column = 0; column < strip.columns; ++column) {
+      const std::int64_t i = row * stride + column;
+      Sample& sample = samples[row * strip.columns + column];
+      sample.triangle = strip.met[i];
+      sample.mirrored = kNoMirror;
+      if (sample.triangle < 0) continue;
+      const Vec3 along = {rays[0][i], rays[1][i], rays[2][i]};
+      sample.u = us[i];
+      sample.v = vs[i];
+      sample.towards = along * -1.0f;
+      sample.back = side_of(scene, {distances[i], sample.triangle, sample.u, sample.v}, along) & 1;
+      if (scene.materials[scene.material_of[sample.triangle]].roughness > 0.0f) continue;
+      const Surface surface = surface_of(scene, sample);
+      const Vec3 reflected = mirrored(sample.towards, surface.normal);
+      const Hit behind = nearest(scene, Ray(place_of(scene, surface) + surface.normal * kLift, reflected), likely);
+      sample.mirrored = behind.triangle < 0 ? kNothing : side_of(scene, behind, reflected);
+    }
   }
 }
 
