@@ -3,8 +3,9 @@
 A folder belongs to one set of settings. Each image is written whole or not at all and depends on nothing but
 those settings, so a killed run continues where it stopped and ends with the same capture.
 
-Everything but the pictures has the same bytes on every x86-64 machine (see `rounding`). Pictures have them with any
-number of threads and whatever numpy, BLAS, torch and libm use, but not on every kind of processor: see `renderer`.
+Everything but the pictures has the same bytes on every x86-64 machine (see `rounding`). So do pictures
+by the light of `panels`. Those by lamps have them with any number of threads and whatever numpy, BLAS, torch and libm use, but
+not on every kind of processor: see `renderer`.
 """
 
 from __future__ import annotations
