@@ -11,6 +11,7 @@ from pathlib import Path
 
 import cv2
 
+from ..bench.audit.bundle import without_paths
 from ..bench.errors import InputError
 from ..bench.io.files import atomic_path, write_text
 from ..bench.io.images import read_png
@@ -25,11 +26,13 @@ PICTURE = "contact_sheet.jpg"
 
 
 def publish(run_folder: Path, readme: Path) -> None:
-    """Copy manifest, rows and contact sheet of a run beside the README, and write the block made of them."""
+    """Copy manifest (without this machine's folders), rows and contact sheet of a run beside the README, and write the
+    block made of them."""
     source, target = RunFolder(run_folder), RunFolder(readme.parent / GALLERY)
-    for name in ("manifest", "rows"):
-        with atomic_path(getattr(target, name)) as temporary:
-            shutil.copyfile(getattr(source, name), temporary)
+    manifest = source.read_manifest()
+    without_paths(manifest, tuple(method.name for method in manifest.methods)).write(target.manifest)
+    with atomic_path(target.rows) as temporary:
+        shutil.copyfile(source.rows, temporary)
     # A page's picture, not a measurement: a lossy copy a third the size.
     sheet = cv2.cvtColor(read_png(source.contact_sheet), cv2.COLOR_RGB2BGR)
     with atomic_path(target.root / PICTURE) as temporary:

@@ -77,7 +77,7 @@ def write_bundle(settings: BundleSettings, progress: Progress = no_progress) -> 
     methods = settings.methods or known
     with tempfile.TemporaryDirectory() as scratch:
         staged = RunFolder(Path(scratch))
-        _without_paths(manifest, methods).write(staged.manifest)
+        without_paths(manifest, methods).write(staged.manifest)
         rows.of_methods(methods).write(staged.rows)
         sources = {"run.json": staged.manifest, "rows.parquet": staged.rows}
         sources |= _cell_files(folder, manifest, methods, renders=settings.renders)
@@ -100,7 +100,7 @@ def write_bundle(settings: BundleSettings, progress: Progress = no_progress) -> 
     return Findings(text, {"out": out, "bytes": size, "methods": methods, "renders": settings.renders})
 
 
-def _without_paths(manifest: Manifest, methods: tuple[str, ...]) -> Manifest:
+def without_paths(manifest: Manifest, methods: tuple[str, ...]) -> Manifest:
     """The record of some methods of a run, without folders of the machine that made it."""
     config = manifest.configuration
 
