@@ -10,7 +10,7 @@ from pathlib import Path
 from ...bench.audit.bundle import Bundle, read_bundle
 from ...bench.contracts import Progress
 from ...bench.errors import InputError
-from ...bench.io.files import digest_file, prepare_folder, write_text
+from ...bench.io.files import digest_file, write_text
 from ...bench.manifest import Manifest
 from ...bench.runner.store import RunFolder
 from ...bench.specs import Findings
@@ -69,7 +69,6 @@ def build(folder: Path, out: Path, title: str, progress: Progress) -> Findings:
     files = sorted(folder.glob("*.zip"))
     if not files:
         raise InputError(folder, "", "bundles (*.zip) of `headbench bundle`", "none")
-    prepare_folder(out)
     with tempfile.TemporaryDirectory() as scratch:
         submissions = []
         for number, file in enumerate(files):

@@ -8,10 +8,10 @@ from headbench.datasets.novelty import displacement_metric, novelty
 
 @pytest.fixture
 def train():
-    """Faces that move along the first two of five directions, between -1 and 1."""
+    """Faces that move along the first two of five directions, between -1 and 1 and between -0.5 and 0.5."""
     rng = np.random.default_rng(0)
     faces = np.zeros((200, 5))
-    faces[:, :2] = rng.uniform(-1, 1, (200, 2))
+    faces[:, :2] = rng.uniform(-1, 1, (200, 2)) * [1.0, 0.5]
     return faces
 
 
@@ -19,7 +19,7 @@ def train():
     ("direction", "outside", "beyond"),
     [
         ([0.9, 0.0, 0, 0, 0], 0.0, 0.0),
-        ([0.6, -0.6, 0, 0, 0], 0.0, 0.0),
+        ([0.6, -0.4, 0, 0, 0], 0.0, 0.0),
         ([1.5, 0.0, 0, 0, 0], 0.0, 1.0),
         ([0.0, 0.0, 0.8, 0, 0], 1.0, 0.0),
         ([0.3, 0.0, 0.4, 0, 0], 0.8, 0.0),
