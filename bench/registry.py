@@ -120,7 +120,7 @@ def _origin(entry: EntryPoint) -> str:
 
 @lru_cache(maxsize=64)
 def _name_and_version(distribution: Distribution) -> tuple[str, str]:
-    """Of a distribution, whose entries share it; it reads its whole metadata anew for each question."""
+    """Of a distribution, whose entries share it; it reads its whole metadata for each question."""
     metadata = distribution.metadata
     return metadata["Name"], metadata["Version"]
 

@@ -213,6 +213,7 @@ def table_of(runs: RunSet, layout: str = COMPARISON, published: bool = False) ->
         protocol_ids=runs.protocol_ids,
         image_size=runs.image_size,
         machine=runs.machine,
+        part=runs.part if tasks else "",
         avatar_title=TITLES.get(layout, AVATAR_TITLE),
     )
     if published:
@@ -220,5 +221,4 @@ def table_of(runs: RunSet, layout: str = COMPARISON, published: bool = False) ->
         if not any(column.published for column in table.columns):
             found = f"none for {', '.join(names)} in layout {layout}"
             raise InputError("table", "--published", "a layout with figures that papers printed", found)
-    table = replace(table, part=runs.part if tasks else "")
     return table.mapped(lambda row: replace(row, method=names[row.method]))

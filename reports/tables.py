@@ -148,6 +148,7 @@ def build_table(
     protocol_ids: Mapping[str, str],
     image_size: str = "",
     machine: str = "",
+    part: str = "",
     avatar_title: str = AVATAR_TITLE,
 ) -> Table:
     """Build the comparison table of whole images.
@@ -160,7 +161,7 @@ def build_table(
     metrics : columns of the table, in order; those per frame appear once in each task, the others last.
     methods : in order; one without rows is shown as not measured.
     trivial : those of ``methods`` that are trivial baselines: listed apart, not ranked.
-    protocol_ids : readable name of each task's protocol, for the caption, like ``image_size`` and ``machine``.
+    protocol_ids : readable name of each task's protocol, for the caption, like ``image_size``, ``machine`` and ``part``.
     avatar_title : heading of the columns that are of no task.
 
     Raises
@@ -197,6 +198,7 @@ def build_table(
         marking=_marking(columns, lines, bests),
         image_size=image_size,
         machine=machine,
+        part=part,
     )
 
 

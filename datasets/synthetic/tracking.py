@@ -70,7 +70,7 @@ def with_tracking_error(
     level: float,
     seed: int,
 ) -> dict[str, list[HeadPose]]:
-    """Poses as a tracker would give them; drift begins anew in each sequence.
+    """Poses as a tracker would give them; drift starts again in each sequence.
 
     Parameters
     ----------

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from ...bench.audit.bundle import Bundle, read_bundle
@@ -17,7 +17,7 @@ from ...bench.specs import Findings
 from ..runs import RunSet
 from ..table_report import table_of
 from ..tables import Table
-from ..writers import escape_markdown, render_page, to_json, to_markdown
+from ..writers import escape_markdown, render_page, to_markdown
 
 HEADS = ("Bundle", "By", "Methods", "Comment", "headbench", "Machine", "Renders", "SHA-256")
 
@@ -79,7 +79,7 @@ def build(folder: Path, out: Path, title: str, progress: Progress) -> Findings:
     page = render_page("leaderboard.html", title=title, boards=boards, heads=HEADS)
     write_text(out / "leaderboard.html", page)
     text = f"{len(files)} bundles, {len(boards)} tables: {out / 'leaderboard.md'}, {out / 'leaderboard.html'}"
-    return Findings(text, {"out": out, "tables": [to_json(board.table) for board in boards]})
+    return Findings(text, {"out": out, "tables": [asdict(board.table) for board in boards]})
 
 
 def _read(file: Path, into: Path) -> Submission:

@@ -44,16 +44,16 @@ def _perceptron(hidden: tuple[int, ...], condition: tuple[int, ...], outputs: in
     several = len(condition) == 2
 
     def slow(*values: Tensor) -> Tensor:
-        points_, code_, layers = _parted(values)
+        points_, code_, layers = _split_up(values)
         found = mlp.reference(layers, points_, code_, outputs)
         return torch.tanh(found) if squashed else found
 
     def fast(*values: Tensor) -> Tensor:
-        points_, code_, layers = _parted(values[:-1])
+        points_, code_, layers = _split_up(values[:-1])
         part = mlp.part(layers, rows, None, code_, squashed=squashed)
         return kernel.perceptron(points_, part, outputs, SLOPE, values[-1])
 
-    def _parted(values: Sequence[Tensor]) -> tuple[Tensor, Tensor | None, dict[str, Tensor]]:
+    def _split_up(values: Sequence[Tensor]) -> tuple[Tensor, Tensor | None, dict[str, Tensor]]:
         rest = list(values)
         at = points.to(rest[0].dtype) if several else rest.pop(0)
         return at, rest.pop(0) if code is not None else None, dict(zip(weights, rest))
@@ -70,7 +70,7 @@ def _blend(squashed: bool, channels: int) -> Case:
     share = share.clamp(0, 1)
     near, far = (share > 0).nonzero().squeeze(1), (share < 1).nonzero().squeeze(1)
 
-    def parted(values: Sequence[Tensor]) -> tuple[object, ...]:
+    def split_up(values: Sequence[Tensor]) -> tuple[object, ...]:
         points, first, second, one, other, *layers = values
         return (
             dict(zip(weights, layers)),
@@ -80,7 +80,7 @@ def _blend(squashed: bool, channels: int) -> Case:
         )
 
     def fast(*values: Tensor) -> Tensor:
-        layers, points, influences, conditions = parted(values[:-1])
+        layers, points, influences, conditions = split_up(values[:-1])
         parts = [
             network.part(layers, part.rows, part.weights, condition, squashed=squashed)
             for network, part, condition in zip(networks, influences, conditions)
@@ -88,7 +88,7 @@ def _blend(squashed: bool, channels: int) -> Case:
         return kernel.blended(points, parts, channels, SLOPE, values[-1])
 
     def slow(*values: Tensor) -> Tensor:
-        return blended_reference(networks, *parted(values), squashed=squashed, channels=channels)
+        return blended_reference(networks, *split_up(values), squashed=squashed, channels=channels)
 
     shares = share[near], 1 - share[far]
     inputs = [_random(POINTS, 9), *shares, _random(20), _random(6), *weights.values()]
