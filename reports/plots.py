@@ -60,12 +60,13 @@ def show_missing(axes: Axes, text: str) -> None:
     axes.set(xticks=[], yticks=[])
 
 
-def cost_axis(axes: Axes) -> None:
-    """A logarithmic horizontal axis with numbers at 1, 2 and 5."""
-    axes.set_xscale("log")
+def cost_axis(axes: Axes, *, logarithmic: bool = True) -> None:
+    """A horizontal axis, a logarithmic one with numbers at 1, 2 and 5."""
     axes.margins(0.08, 0.12)
-    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    if logarithmic:
+        axes.set_xscale("log")
+        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.xaxis.set_minor_locator(NullLocator())
     axes.xaxis.set_major_formatter("{x:g}")
-    axes.xaxis.set_minor_locator(NullLocator())
     axes.grid(axis="y", color=LIGHT_GREY, linewidth=0.5)
     axes.tick_params(labelsize=SMALL, labelcolor=GREY)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -12,7 +11,6 @@ from typing import Any
 
 import pandas as pd
 
-from ..configuration import build_arguments
 from ..contracts import Avatar, Clip, FrameKey, Progress, no_progress
 from ..errors import ExitCode, HeadbenchError, InputError
 from ..io.files import digest, digest_file
@@ -21,7 +19,7 @@ from ..manifest import Manifest, ProtocolRecord
 from ..protocol import Protocol, make_protocols
 from ..registry import get, resolve
 from ..rows import ALL, FRAME, Rows
-from ..runner.captures import open_run_clips
+from ..runner.captures import open_run_clips, synthesis_arguments
 from ..runner.config import resolve_methods, resolve_metrics
 from ..runner.run import load, make_jobs
 from ..runner.steps import DIGESTS, Job, measure, recorded_frames
@@ -111,27 +109,20 @@ def _captured_again(manifest: Manifest, out: Path, limit: int, progress: Progres
     Raises `InputError` for a capture that is not synthetic, not of the procedural head, or larger.
     """
     make = resolve(get("datasets", "synthetic").implementation)
-    options = set(inspect.signature(make).parameters)
-    recorded: dict[str, tuple[str, dict[str, Any]]] = {}
+    captures = {}
     for clip in manifest.clips:
-        parameters = clip.steps[0].get("parameters", {}) if clip.steps else {}
-        made = parameters.get("synthetic") or {}
-        recorded[digest(made)] = clip.subject, {key: made[key] for key in options & set(made)}
-    for subject, settings in recorded.values():
-        remedy = "Name the folder of the capture with --data."
-        where = f"capture of {subject}"
-        if not str(settings.get("head", "")).startswith("procedural"):
-            raise InputError(
-                "--data", where, "a folder, as only the procedural head is known", "none", remedy
-            )
-        arguments = build_arguments(make, settings, where, harness=("workers", "progress"))
+        arguments = synthesis_arguments(clip.steps, clip.subject)
+        captures[digest(arguments)] = f"capture of {clip.subject}", arguments
+    for where, arguments in captures.values():
         pixels = math.prod(
             (*arguments["size"], *(arguments[name] for name in ("cameras", "timesteps", "subjects")))
         )
         if pixels > limit:
-            raise InputError(
-                where, "", f"at most {limit} pixels for a bundle of this size", str(pixels), remedy
+            expected, remedy = (
+                f"at most {limit} pixels for a bundle of this size",
+                "Name the folder of the capture with --data.",
             )
+            raise InputError(where, "", expected, str(pixels), remedy)
         make(out, **arguments, progress=progress)
     return out
 

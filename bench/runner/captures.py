@@ -107,6 +107,23 @@ def reader_of(root: str) -> str:
     return found[0]
 
 
+def synthesis_arguments(steps: Sequence[Mapping[str, Any]], subject: str) -> dict[str, Any]:
+    """Settings that make a subject's synthetic capture again, from the steps that its clip records.
+
+    Raises `InputError` for a capture that is not synthetic, or not of the procedural head.
+    """
+    make = resolve(get("datasets", "synthetic").implementation)
+    where, given = f"capture of {subject}", ("out", "pictures", "workers", "progress")
+    recorded = (steps[0].get("parameters", {}).get("synthetic") or {}) if steps else {}
+    options = inspect.signature(make).parameters.keys() - set(given)
+    if not str(recorded.get("head", "")).startswith("procedural"):
+        expected = "a folder, as only synthetic captures of the procedural head can be made again"
+        raise InputError("--data", where, expected, "none", "Name the folder of the capture with --data.")
+    return build_arguments(
+        make, {key: recorded[key] for key in options & set(recorded)}, where, harness=given
+    )
+
+
 def relative_paths(config: RunConfig) -> dict[str, str]:
     """Files and folders that settings name, by dotted key, relative to the run folder: both can be moved together."""
     root = Path(config.out).resolve()

@@ -8,13 +8,13 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from ..contracts import Avatar, Camera, Clip, FrameKey, HeadPose, Measurement, Progress
+from ..contracts import Avatar, Budget, Camera, Clip, FrameKey, HeadPose, Measurement, Progress
 from ..errors import HeadbenchError, InputError, UnavailableError
-from ..io.files import digest, digest_file, grouped_writes, refuse_links
+from ..io.files import check_name, digest, digest_file, grouped_writes, refuse_links
 from ..io.images import quantise, read_png, write_png
 from ..machine import PeakMemory, processor_seconds
 from ..progress import RunProgress, duration, progress
@@ -24,12 +24,14 @@ from ..specs import MetricSpec
 from .adaptation import AdaptedClip, TrainingView
 from .config import ResolvedMethod
 from .scoring import FULL, Frames, make_metric, score_frames
-from .store import Cell
+from .store import Cell, RunFolder
 
 log = logging.getLogger(__name__)
 RESULT_FORMAT = 1  # raise when a step changes what it leaves behind
 TRAINING, RENDERING, MEASURING_AVATAR = "training", "rendering", "measuring the avatar"
 DIGESTS = "digests"
+VARIANT_MARK = "+"
+"""Between the name of a method and what makes a variant of it."""
 RECORD_EVERY_S = 10.0
 """Seconds between records of the frames rendered; those after the last one are rendered again after a kill."""
 
@@ -81,6 +83,20 @@ class Job:
             for key in protocol.keys
             if key.subject == self.clip.subject
         }
+
+    def variant(self, name: str, folder: RunFolder, *, budget: Budget | None = None) -> Job:
+        """The cell of a variant of the method, "METHOD+NAME", or of the method itself (""), in another folder.
+
+        ``budget`` None: that of the method. Raises `InputError` for what cannot name a folder.
+        """
+        spec = self.method.spec
+        if name:
+            name = check_name(
+                f"{spec.name}{VARIANT_MARK}{name}", spec.variants or spec.name, "name of a variant"
+            )
+        spec = replace(spec, name=name or spec.name)
+        method = replace(self.method, spec=spec, budget=budget or self.method.budget)
+        return replace(self, method=method, cell=folder.cell(self.clip.subject, spec.name, self.seed))
 
     def check(self) -> None:
         """Refuse a folder that holds an avatar made of something else, or links out of it.

@@ -11,9 +11,12 @@ not on every kind of processor: see `renderer`.
 from __future__ import annotations
 
 import multiprocessing
-from collections.abc import Iterator
+import os
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,7 +25,7 @@ from threadpoolctl import threadpool_limits
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.io.documents import read_json
-from ...bench.io.files import TEMPORARY, grouped_writes, write_json, write_text
+from ...bench.io.files import TEMPORARY, grouped_writes, write_bytes, write_json, write_text
 from ...bench.machine import processor_count
 from ...bench.start import end_with_parent, starting_workers
 from ..images import is_whole
@@ -57,6 +60,7 @@ def synthesize(
     dynamics: float = 1.0,
     tracking_error: float = 0.0,
     light: LightKind = "lamps",
+    pictures: str | Path | None = None,
     workers: int | None = None,
     progress: Progress = no_progress,
 ) -> list[Path]:
@@ -78,12 +82,15 @@ def synthesize(
         bounce, see `panels`, with the same bytes on every processor.
     performance : see `performance.Kind`; with less than all of it, captures for which less has to be modelled.
     dynamics : scales wrinkles and blush, 0 to 3: 0 leaves skin as it is at rest, wherever it moves.
+    pictures : folder of an earlier capture that differs in its tracking alone: its pictures are linked (copied where links
+        cannot be), not rendered.
     workers : processes that render; by default as many as there are cores, or one where there is little to do.
 
     Raises
     ------
     InputError
-        Before rendering, for settings out of range or a folder that holds a capture of other settings.
+        Before rendering, for settings out of range, a folder that holds a capture of other settings, and ``pictures`` of
+        other settings or not whole.
     UnavailableError
         For panels where the compiled kernel is missing.
     """
@@ -111,8 +118,13 @@ def synthesize(
         panels.KERNEL.load()
     geometry = load_geometry(head)
     out = Path(out)
-    _claim(out, settings, geometry.head.fingerprint())
+    wanted = _manifest(settings, geometry.head.fingerprint())
+    if pictures is not None:
+        _check_pictures(Path(pictures), wanted)
+    _claim(out, wanted)
     plans = [plan_subject(out, index, geometry, settings) for index in range(subjects)]
+    if pictures is not None:
+        _take_over(Path(pictures), out, plans)
     total = subjects * timesteps * cameras
     done = 0
     progress(done, total, "planned")
@@ -210,15 +222,48 @@ def _check(settings: SynthSettings) -> None:
     share_out(settings.timesteps, settings.performance)
 
 
-def _claim(out: Path, settings: SynthSettings, head: str) -> None:
-    """Mark the folder as this capture's, or refuse one that is another's."""
-    wanted = {
+def _manifest(settings: SynthSettings, head: str) -> dict[str, Any]:
+    """What a folder holds that is of these settings and of a head of this fingerprint."""
+    return {
         "version": _VERSION,
         **settings.described(),
         "head": Path(settings.head).name,  # the same file may lie elsewhere: its content counts, not its path
         "size": list(settings.size),
         "head_fingerprint": head,
     }
+
+
+def _check_pictures(pictures: Path, wanted: Mapping[str, Any]) -> None:
+    """Refuse pictures of settings that differ in more than what trackers see."""
+    manifest = pictures / MANIFEST
+    found = read_json(manifest)
+    tracking = {"tracking_error", "tracking_noise"}
+    for key in {**wanted, **found}.keys() - tracking - {"head"}:  # what a head is called is no matter
+        if found.get(key) != wanted.get(key):
+            raise InputError(manifest, key, f"{wanted.get(key)!r}, as asked for", f"{found.get(key)!r}")
+
+
+def _take_over(pictures: Path, out: Path, plans: Sequence[SubjectPlan]) -> None:
+    """Link the pictures and masks of another capture, or copy them to where they cannot be linked."""
+    for plan in plans:
+        for (sequence, timestep), camera in product(plan.moments(), plan.cameras):
+            place = (sequence, timestep, camera)
+            for path in (plan.writer.mask_path(*place), plan.writer.image_path(*place)):
+                source = pictures / path.relative_to(out)
+                if not is_whole(source, *plan.settings.size):
+                    remedy = "Make that capture whole, or give no pictures."
+                    raise InputError(source, "", "a picture of the capture", "none that is whole", remedy)
+                if path.exists():
+                    continue
+                path.parent.mkdir(parents=True, exist_ok=True)
+                try:
+                    os.link(source, path)
+                except OSError:  # another file system, or one without links
+                    write_bytes(path, source.read_bytes())
+
+
+def _claim(out: Path, wanted: Mapping[str, Any]) -> None:
+    """Mark the folder as the capture's that ``wanted`` describes, or refuse one that is another's."""
     manifest, readme = out / MANIFEST, out / "README.txt"
     if manifest.exists():
         found = read_json(manifest)

@@ -16,12 +16,15 @@ from ...bench.io.lock import locked
 from ...bench.runner.config import RunOptions
 from ...bench.specs import Findings
 
+MOST_TRACKING_ERROR = 4.0
+"""What `headbench synth` takes at most."""
+
 
 @dataclass(frozen=True)
 class CurveSettings(RunOptions):
-    """Quality against training time, training cameras or training timesteps: trains each method with parts of them.
+    """Quality against training time, cameras, timesteps or tracking error: trains each method with parts of them.
 
-    Each part is a whole training of its own. Quality is measured on training frames that are held out of every training,
+    Each part or level is a whole training of its own. Quality is measured on training frames that are held out of every training,
     the same for all parts, never on test frames."""
 
     run: tyro.conf.Positional[str]
@@ -33,11 +36,14 @@ class CurveSettings(RunOptions):
     methods: tuple[str, ...] = ()
     """Methods to train; default: all but the trivial baselines."""
 
-    over: Literal["budget", "cameras", "timesteps"] = "budget"
-    """What to take parts of."""
+    over: Literal["budget", "cameras", "timesteps", "tracking_error"] = "budget"
+    """What to take parts of; or the error of tracking, of a synthetic capture, whose pictures stay."""
 
     fractions: tuple[str, ...] = ("1/16", "1/8", "1/4", "1/2", "1")
     """Parts of the method's budget, or of the training cameras or timesteps, above 0 and at most 1."""
+
+    levels: tuple[float, ...] = (0.0, 1.0, 2.0)
+    """Levels of tracking error, as for `headbench synth`."""
 
     camera: str = ""
     """Training camera to hold out; default: the one nearest to the mean position of the training cameras."""
@@ -51,6 +57,11 @@ class CurveSettings(RunOptions):
     def __post_init__(self) -> None:
         if not self.fractions or len(set(self.parts)) != len(self.parts):
             raise ValueError(f"fractions: each once, one at least; found {' '.join(self.fractions)}")
+        if not self.levels or len(set(self.levels)) != len(self.levels):
+            raise ValueError(f"levels: each once, one at least; found {' '.join(map(str, self.levels))}")
+        if not all(0 <= level <= MOST_TRACKING_ERROR for level in self.levels):
+            expected = f"from 0 to {MOST_TRACKING_ERROR:g}"
+            raise ValueError(f"levels: {expected}; found {' '.join(map(str, self.levels))}")
         if self.every < 2:
             raise ValueError(f"every is {self.every}; at least 2")
         if self.frames < 1:
@@ -73,7 +84,7 @@ def _part(text: str) -> Fraction:
 
 
 def curve_run(settings: CurveSettings, progress: Progress = no_progress) -> Findings:
-    """Quality against training time, cameras or timesteps, measured on training frames that are held out.
+    """Quality against training time and what else a training is given, measured on training frames that are held out.
 
     Writes ``curve.csv`` and ``curve.png`` into the run folder of all trainings. Started again, it keeps what is done.
     Raises `InputError` for a folder that is no finished run, and for methods without a budget.
@@ -83,7 +94,7 @@ def curve_run(settings: CurveSettings, progress: Progress = no_progress) -> Find
 
     run = RunFolder(Path(settings.run))
     run.read_manifest().check_done(run.manifest)  # before a folder is made in what is no run
-    name = "curve" if settings.over == "budget" else f"curve-{settings.over}"
+    name = "curve" if settings.over == "budget" else f"curve-{settings.over.replace('_', '-')}"
     out = Path(settings.out) if settings.out else run.root / name
     with nullcontext() if settings.out else output_inside(run.root), locked(out):
         return curve(settings, out)

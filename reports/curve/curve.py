@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import logging
-import math
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from itertools import product
 from pathlib import Path
-from statistics import fmean
 from typing import Any
 
 from ...bench.contracts import Budget, Clip
 from ...bench.errors import InputError
-from ...bench.io.files import check_name, write_text
+from ...bench.io.files import write_text
 from ...bench.machine import check_device
 from ...bench.manifest import MethodRecord
 from ...bench.protocol import Protocol, make_protocols
@@ -32,34 +30,17 @@ from ..writers import csv_text
 from .command import CurveSettings
 from .held_out import CAMERA, TIMESTEPS, HeldOutClip, hold_out, reduced
 from .plot import Panel, write_plot
+from .points import HELD_OUT, MEASURED, Point, column, mean, mean_point, points_text
+from .tracking import clips_by_level, tracking_error
 
 log = logging.getLogger(__name__)
+AXES = {
+    "cameras": "Training cameras",
+    "timesteps": "Training timesteps",
+    "tracking_error": "Level of tracking error",
+}
 METRICS: tuple[str, ...] = ("psnr", "ssim", "lpips", "storage", "primitives")
 """Metrics of a curve, whether the run took them or not, as the canonical profile defines them."""
-HELD_OUT = {CAMERA: "camera", TIMESTEPS: "timesteps"}
-"""What is held out, by the task that it is measured as."""
-MEASURED = ("processor_seconds", "seconds", "peak_memory_bytes")
-"""What the record of a training says of its cost."""
-MARK = "+"
-"""Between the name of a method and the part of its budget."""
-
-
-@dataclass(frozen=True)
-class Point:
-    """A method trained with a part of its budget or of the frames: means over seeds of one subject, or over subjects ("").
-
-    ``cameras`` and ``timesteps`` count what it was trained on. ``cost`` is `MEASURED` by name, ``values`` are the metrics
-    by name and what was held out, such as "psnr_camera". None: not measured.
-    """
-
-    method: str
-    subject: str
-    part: Fraction
-    budget: Budget
-    cameras: float
-    timesteps: float
-    cost: Mapping[str, float | None]
-    values: Mapping[str, float | None]
 
 
 def curve(settings: CurveSettings, out: Path) -> Findings:
@@ -78,7 +59,7 @@ def curve(settings: CurveSettings, out: Path) -> Findings:
     config, clips = open_run_clips(run.root, settings, out=out)
     check_device(config.device)
     held = [hold_out(clip, settings.camera, settings.every) for clip in clips]
-    tasks = tuple(task for task in HELD_OUT if all(task in clip.splits for clip in held))
+    tasks = tuple(task for task in (CAMERA, TIMESTEPS) if all(task in clip.splits for clip in held))
     config = replace(
         config,
         tasks=tasks,
@@ -109,39 +90,47 @@ def curve(settings: CurveSettings, out: Path) -> Findings:
     replace(manifest, status="done").write(folder.manifest)
 
     names, order = [m.spec.name for m in wanted], [clip.subject for clip in clips]
-    trainings.sort(key=lambda t: (names.index(t.method.spec.name), t.part, order.index(t.clip.subject)))
+    trainings.sort(
+        key=lambda t: (
+            names.index(t.method.spec.name),
+            t.part,
+            tracking_error(t.clip) or 0.0,
+            order.index(t.clip.subject),
+        )
+    )
     points = [_point(training, rows, metrics, tasks) for training in trainings]
-    groups: dict[tuple[str, Fraction], list[Point]] = {}
+    groups: dict[tuple[str, Fraction, float | None], list[Point]] = {}
     for point in points:
-        groups.setdefault((point.method, point.part), []).append(point)
-    means = [_mean(group) for group in groups.values()]
+        groups.setdefault((point.method, point.part, point.tracking_error), []).append(point)
+    means = [mean_point(group) for group in groups.values()]
     missing = {spec.label: _reason(rows, spec) for spec in metrics if spec.per_frame and _reason(rows, spec)}
     write_text(out / "curve.csv", csv_text(_lines(points)))
     clock = "processor_seconds" if config.device == "cpu" else "seconds"
     where = f"{settings.every}th training timestep" if settings.every > 2 else "second training timestep"
     axis = f"{'Processor seconds' if clock == MEASURED[0] else 'Seconds'} of training"
-    axis = axis if settings.over == "budget" else f"Training {settings.over}"
+    axis = axis if settings.over == "budget" else AXES[settings.over]
     write_plot(
         out / "curve.png",
         [
             [
-                _panel(means, spec, task, settings.over, clock, missing.get(spec.label, ""))
+                _panel(means, spec, task, clock if settings.over == "budget" else settings.over, missing)
                 for spec in metrics
                 if spec.per_frame
             ]
             for task in tasks
         ],
         axis,
-        f"Held out of every training: a training camera, every {where}. No test frame was looked at.",
+        f"Held out of every training: a training camera, every {where}. No test frame was looked at."
+        + (f" Bars: 95 % intervals of the mean over {len(clips)} subjects." if len(clips) > 1 else ""),
     )
     data = {
         "out": out,
         "held_out": {clip.subject: clip.steps[-1].parameters for clip in held},
-        "points": [_flat(point) for point in points],
+        "points": [point.flat() for point in points],
         "missing": missing,
         "failed": rows.failed,
     }
-    return Findings(_text(means, metrics, tasks, held, missing, rows.failed), data, not rows.failed)
+    return Findings(points_text(means, metrics, tasks, held, missing, rows.failed), data, not rows.failed)
 
 
 def _wanted(settings: CurveSettings, run: RunFolder) -> list[ResolvedMethod]:
@@ -182,18 +171,40 @@ def _budgets(whole: Budget, parts: Iterable[Fraction]) -> dict[Budget, Fraction]
     }
 
 
-def _name(method: str, part: Fraction) -> str:
-    return f"{method}{MARK}{str(part).replace('/', '-')}"
+@dataclass(frozen=True)
+class _Given:
+    """What a training is given: ``part`` of its budget or of the frames, and ``clips``, one for each subject."""
+
+    name: str
+    part: Fraction
+    clips: Sequence[HeldOutClip]
 
 
 @dataclass(frozen=True)
 class _Training:
-    """A method with its whole budget, the part of it or of the frames that it is given, ``clip``: a job for each seed."""
+    """A method with its whole budget, and what it is given of that and of the frames: a job for each seed."""
 
     method: ResolvedMethod
     part: Fraction
     clip: HeldOutClip
     jobs: tuple[Job, ...]
+
+
+def _given(settings: CurveSettings, config: RunConfig, held: Sequence[HeldOutClip]) -> Iterator[_Given]:
+    """What the trainings are given besides parts of their budgets; the whole first."""
+    if settings.over == "budget":
+        yield _Given("", Fraction(1), held)
+    elif settings.over == "tracking_error":
+        for level, clips in clips_by_level(config, [clip.source for clip in held], settings.levels):
+            found = [hold_out(clip, settings.camera, settings.every) for clip in clips]
+            yield _Given(f"tracking-{level:g}", Fraction(1), found)
+    else:
+        for part in reversed(settings.parts):
+            yield _Given(_named(part), part, [reduced(clip, settings.over, part) for clip in held])
+
+
+def _named(part: Fraction) -> str:
+    return str(part).replace("/", "-")
 
 
 def _trainings(
@@ -206,34 +217,24 @@ def _trainings(
     folder: RunFolder,
 ) -> list[_Training]:
     """Every training; the whole first: start-up, such as imports, falls where it weighs least."""
-    over, found = settings.over, []
-    given: dict[tuple[str, ...], tuple[Fraction, list[HeldOutClip]]] = {}
-    for part in reversed(settings.parts):
-        clips = [clip if over == "budget" else reduced(clip, over, part) for clip in held]
-        given.setdefault(tuple(clip.fingerprint for clip in clips), (part, clips))
-    for part, clips in given.values():
-        bases = make_jobs(config, wanted, clips, protocols, run, folder.root)
-        for method, (clip, whole) in product(wanted, zip(clips, held)):
-            parts = {method.budget: part} if over != "budget" else _budgets(method.budget, settings.parts)
+    found: list[_Training] = []
+    different: dict[tuple[str, ...], _Given] = {}
+    for given in _given(settings, config, held):
+        different.setdefault(tuple(clip.fingerprint for clip in given.clips), given)
+    for given in different.values():
+        bases = make_jobs(config, wanted, given.clips, protocols, run, folder.root)
+        for method, (clip, whole) in product(wanted, zip(given.clips, held)):
+            parts = {method.budget: given.part}
+            if settings.over == "budget":
+                parts = _budgets(method.budget, settings.parts)
             own = [job for job in bases if (job.clip, job.method.spec.name) == (clip, method.spec.name)]
-            for budget, share in reversed(parts.items()):
+            for budget, part in reversed(parts.items()):
                 # The frames to measure are those of all trainings, whatever each is given.
                 jobs = [job if clip is whole else replace(job, clip=whole, adapted=job.form) for job in own]
-                found.append(
-                    _Training(method, share, clip, tuple(_job(job, share, budget, folder) for job in jobs))
-                )
+                name = given.name or _named(part)
+                named = tuple(job.variant(name, folder, budget=budget) for job in jobs)
+                found.append(_Training(method, part, clip, named))
     return found
-
-
-def _job(base: Job, part: Fraction, budget: Budget, folder: RunFolder) -> Job:
-    """The cell of a training with a part of the budget."""
-    spec = base.method.spec
-    name = check_name(_name(spec.name, part), "registry of methods", "name")
-    return replace(
-        base,
-        method=replace(base.method, spec=replace(spec, name=name), budget=budget),
-        cell=folder.cell(base.clip.subject, name, base.seed),
-    )
 
 
 def _drop_interrupted(job: Job) -> None:
@@ -258,36 +259,18 @@ def _point(training: _Training, rows: Rows, metrics: Sequence[MetricSpec], tasks
                 method=name, metric=spec.name, task=task, region=FULL, seeds=ALL, subject=subject
             )
             whole = len(chosen) and (chosen["status"] == "ok").all()
-            values[_column(spec, task)] = subject_means(chosen)[subject] if whole else None
+            values[column(spec, task)] = subject_means(chosen)[subject] if whole else None
     keys = training.clip.splits["train"]
     cameras, timesteps = (len({getattr(key, name) for key in keys}) for name in ("camera", "timestep"))
     method = training.method.spec.name
-    return Point(method, subject, training.part, job.method.budget, cameras, timesteps, cost, values)
+    level = tracking_error(training.clip)
+    return Point(
+        method, subject, training.part, job.method.budget, cameras, timesteps, level, cost, values, {}
+    )
 
 
 def _number(value: object) -> float | None:
     return float(value) if isinstance(value, (int, float)) else None
-
-
-def _column(spec: MetricSpec, task: str) -> str:
-    return f"{spec.name}_{HELD_OUT[task]}" if task in HELD_OUT else spec.name  # type: ignore[index]
-
-
-def mean(values: Sequence[float | None]) -> float | None:
-    """Mean of numbers; None where one is missing, or all."""
-    known = [value for value in values if value is not None]
-    return fmean(known) if known and len(known) == len(values) else None
-
-
-def _mean(points: Sequence[Point]) -> Point:
-    """The mean over subjects."""
-    first = points[0]
-    cost = {key: mean([point.cost[key] for point in points]) for key in first.cost}
-    values = {key: mean([point.values[key] for point in points]) for key in first.values}
-    cameras, timesteps = (
-        fmean(getattr(point, name) for point in points) for name in ("cameras", "timesteps")
-    )
-    return replace(first, subject="", cameras=cameras, timesteps=timesteps, cost=cost, values=values)
 
 
 def _reason(rows: Rows, spec: MetricSpec) -> str:
@@ -297,81 +280,23 @@ def _reason(rows: Rows, spec: MetricSpec) -> str:
     return " ".join(str(reasons.iloc[0]).split()) if len(reasons) else ""
 
 
-def _flat(point: Point) -> dict[str, object]:
-    budget = asdict(point.budget)
-    return {
-        "method": point.method,
-        "subject": point.subject,
-        "fraction": float(point.part),
-        "budget_iterations": budget["iterations"],
-        "budget_seconds": budget["seconds"],
-        "cameras": point.cameras,
-        "timesteps": point.timesteps,
-        **point.cost,
-        **point.values,
-    }
+def _panel(
+    points: Sequence[Point], spec: MetricSpec, task: str, axis: str, missing: Mapping[str, str]
+) -> Panel:
+    """Quality over what the horizontal axis has: a field of `Point` or a cost."""
+    lines: dict[str, list[tuple[float, float, float]]] = {}
+    for point in points:
+        cost = point.cost[axis] if axis in point.cost else getattr(point, axis)
+        value, half = point.values[column(spec, task)], point.halves[column(spec, task)]
+        line = lines.setdefault(point.method, [])
+        if cost is not None and value is not None:
+            cost = max(cost, 1e-3) if axis in point.cost else cost  # recorded to a millisecond
+            line.append((cost, value, half or 0.0))
+    unit = f", {spec.unit}" if spec.unit else ""
+    title = f"{spec.label}{unit}, held-out {HELD_OUT[task]}"
+    return Panel(title, lines, missing.get(spec.label, ""))
 
 
 def _lines(points: Sequence[Point]) -> list[list[object]]:
-    flat = [_flat(point) for point in points]
+    flat = [point.flat() for point in points]
     return [[*flat[0]], *([*line.values()] for line in flat)]
-
-
-def _panel(
-    points: Sequence[Point], spec: MetricSpec, task: str, over: str, clock: str, missing: str
-) -> Panel:
-    lines: dict[str, list[tuple[float, float]]] = {}
-    for point in points:
-        cost = point.cost[clock] if over == "budget" else getattr(point, over)
-        value = point.values[_column(spec, task)]
-        line = lines.setdefault(point.method, [])
-        if cost is not None and value is not None:
-            line.append((max(cost, 1e-3), value))  # recorded to a millisecond
-    unit = f", {spec.unit}" if spec.unit else ""
-    return Panel(f"{spec.label}{unit}, held-out {HELD_OUT[task]}", lines, missing)  # type: ignore[index]
-
-
-def _text(
-    points: Sequence[Point],
-    metrics: Sequence[MetricSpec],
-    tasks: Sequence[str],
-    held: Sequence[HeldOutClip],
-    missing: Mapping[str, str],
-    failed: Sequence[str],
-) -> str:
-    wide = max(8, *(len(point.method) + 2 for point in points))
-    frame = [spec for spec in metrics if spec.per_frame]
-    avatar = [spec for spec in metrics if not spec.per_frame]
-    group = 9 * len(frame)
-    head = "".join(f"{'held-out ' + HELD_OUT[task]:>{group}}" for task in tasks)  # type: ignore[index]
-    names = "".join(f"{spec.label:>9}" for _ in tasks for spec in frame)
-    names += "".join(f"{spec.label + (f' {spec.unit}' if spec.unit else ''):>12}" for spec in avatar)
-    lines = [
-        f"{'':<{wide + 56}}{head}",
-        f"{'method':<{wide}}{'part':>7}{'budget':>10}{'cameras':>8}{'timesteps':>11}{'CPU s':>10}{'s':>10}{names}",
-    ]
-    for point in points:
-        budget = point.budget
-        cells = [
-            _shown(point.values[_column(spec, task)], spec.digits, 9) for task in tasks for spec in frame
-        ]
-        cells += [_shown(point.values[spec.name], spec.digits, 12) for spec in avatar]
-        cost = [_shown(point.cost[key], 1, 10) for key in MEASURED[:2]]
-        size = f"{budget.seconds:g} s" if budget.iterations is None else f"{budget.iterations}"
-        given = f"{point.part!s:>7}{size:>10}{point.cameras:>8g}{point.timesteps:>11g}"
-        lines.append(f"{point.method:<{wide}}{given}{''.join([*cost, *cells])}")
-    lines.append("Means over subjects. Held out of every training; no test frame was looked at:")
-    for clip in held:
-        parameters = clip.steps[-1].parameters
-        steps = ", ".join(map(str, parameters["timesteps"][:6])) + (
-            ", ..." if len(parameters["timesteps"]) > 6 else ""
-        )
-        lines.append(
-            f"  {clip.subject}: camera {parameters['camera'] or 'none'}, timesteps {steps or 'none'}"
-        )
-    lines += [f"{label} missing: {reason}" for label, reason in missing.items()]
-    return "\n".join([*lines, *(f"failed: {name}" for name in failed)])
-
-
-def _shown(value: float | None, digits: int, width: int) -> str:
-    return f"{'-' if value is None or not math.isfinite(value) else f'{value:.{digits}f}':>{width}}"

@@ -1,4 +1,4 @@
-"""Lines of quality over training time, a panel for each metric."""
+"""Lines of quality over what trainings were given, a panel for each metric."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from ..plots import SMALL, cost_axis, plot_file, show_missing, start_axes
 
 @dataclass(frozen=True)
 class Panel:
-    """One plot: (seconds, quality) of each method's points, by rising part; ``reason`` why there are none."""
+    """One plot: (cost, quality, half the interval's width) of each method's points; ``reason`` why there are none."""
 
     title: str
-    lines: Mapping[str, Sequence[tuple[float, float]]]
+    lines: Mapping[str, Sequence[tuple[float, float, float]]]
     reason: str
 
 
 def write_plot(path: Path, rows: Sequence[Sequence[Panel]], cost: str, note: str) -> None:
-    """Draw rows of panels of equal number and write a PNG, atomically. Seconds are above 0, on a logarithmic axis."""
+    """Draw rows of panels of equal number and write a PNG, atomically; costs on a logarithmic axis if all are above 0."""
     names = (name for row in rows for panel in row for name in panel.lines)
     size = (4.2 * len(rows[0]), 3.2 * len(rows) + 0.8)
     with plot_file(path, size, 150, names, note, line="-") as (figure, colours):
@@ -40,5 +40,8 @@ def _draw(axes: Axes, panel: Panel, cost: str, colours: Mapping[str, str]) -> No
         return
     for name, points in panel.lines.items():
         if points:
-            axes.plot(*zip(*points), marker="o", markersize=4, linewidth=1.2, color=colours[name])
-    cost_axis(axes)
+            costs, values, halves = zip(*points)
+            bars = halves if any(halves) else None
+            line = axes.errorbar(costs, values, bars, color=colours[name], linewidth=1.2, capsize=2)
+            line.lines[0].set(marker="o", markersize=4)
+    cost_axis(axes, logarithmic=all(cost > 0 for line in panel.lines.values() for cost, _, _ in line))

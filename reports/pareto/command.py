@@ -115,8 +115,6 @@ def pareto(settings: ParetoSettings, progress: Progress = no_progress) -> Findin
 def _text(
     points: Sequence[Point], fronts: dict[str, list[int]], left_out: Sequence[str], label: str, digits: int
 ) -> str:
-    from .sweep import MARK
-
     wide = max([16, *(len(point.method) + 2 for point in points)])
     lines = [f"{'method':<{wide}}{label:>10}{'MB':>12}{'ms':>12}  run (* on the front of size, of time)"]
     for index, point in enumerate(points):
@@ -126,7 +124,7 @@ def _text(
         ]
         lines.append(f"{point.method:<{wide}}{point.quality:>10.{digits}f}{''.join(cells)}  {point.run}")
     if any(point.derived_from for point in points):
-        lines.append(f"METHOD{MARK}VARIANT was derived from the trained avatar, without training.")
+        lines.append("METHOD+VARIANT was derived from the trained avatar, without training.")
     return "\n".join([*lines, *(f"left out: {text}" for text in left_out)])
 
 

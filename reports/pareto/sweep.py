@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from ...bench.contracts import Progress, Variant
 from ...bench.errors import InputError
 from ...bench.io.files import check_name, digest
 from ...bench.manifest import Derived, MethodRecord
-from ...bench.protocol import Protocol, make_protocols
+from ...bench.protocol import make_protocols
 from ...bench.registry import get, resolve
 from ...bench.rows import Rows
 from ...bench.runner.config import default_names, resolve_metrics
@@ -19,9 +19,6 @@ from ...bench.runner.steps import Job, measure, render
 from ...bench.runner.store import RunFolder
 from ...bench.specs import MetricSpec
 from .command import SweepSettings
-
-MARK = "+"
-"""Between the name of a method and that of a variant."""
 
 
 def sweep(settings: SweepSettings, out: Path, progress: Progress) -> Rows:
@@ -57,7 +54,7 @@ def sweep(settings: SweepSettings, out: Path, progress: Progress) -> Rows:
     total = sum(len(variants) + 1 for _, variants in derived)
     for base, variants in derived:
         for variant in (None, *variants):
-            job = _derived(base, variant, protocols, folder)
+            job = replace(base, protocols=protocols).variant(variant.name if variant else "", folder)
             progress(len(frames), total, job.name)
             frames.append(_measured(job, base, variant, metrics))
             source: Derived | None = None
@@ -76,25 +73,9 @@ def _chosen(job: Job, names: Sequence[str]) -> Iterator[Variant]:
     """Variants of a job's avatar, those named or all."""
     derive = resolve(job.method.spec.variants)
     for variant in derive(job.cell.avatar, job.form.clip, job.device):
-        check_name(_name(job, variant), job.method.spec.variants, "name of a variant")
+        check_name(variant.name, job.method.spec.variants, "name of a variant")
         if not names or variant.name in names:
             yield variant
-
-
-def _derived(base: Job, variant: Variant | None, protocols: Mapping[str, Protocol], folder: RunFolder) -> Job:
-    """The cell of a variant in the sweep's folder; of the trained avatar itself where there is none."""
-    spec = base.method.spec
-    name = spec.name if variant is None else _name(base, variant)
-    return replace(
-        base,
-        method=replace(base.method, spec=replace(spec, name=name)),
-        protocols=protocols,
-        cell=folder.cell(base.clip.subject, name, base.seed),
-    )
-
-
-def _name(base: Job, variant: Variant) -> str:
-    return f"{base.method.spec.name}{MARK}{variant.name}"
 
 
 def _measured(job: Job, base: Job, variant: Variant | None, metrics: Sequence[MetricSpec]) -> Rows:

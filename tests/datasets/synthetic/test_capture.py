@@ -73,6 +73,22 @@ def test_other_settings_are_refused(capture, tmp_path):
         synthesize(tmp_path, **SMALL)
 
 
+def test_pictures_are_those_of_a_capture_tracked_otherwise(capture, tmp_path):
+    (union,) = synthesize(tmp_path / "other", **SMALL, tracking_error=1.0, pictures=capture[0])
+    assert images(tmp_path / "other") == images(capture[0])
+    exact, other = read_capture(capture[1]), read_capture(union)
+    assert exact.splits == other.splits
+    assert not np.array_equal(exact.poses[0].expression, other.poses[0].expression)
+    with pytest.raises(InputError, match="seed: expected 5, as asked for, found 0"):
+        synthesize(tmp_path / "seed", **SMALL, seed=5, pictures=capture[0])
+    assert not (tmp_path / "seed").exists()
+    half = tmp_path / "half"
+    half.mkdir()
+    (half / "synthesis.json").write_bytes((capture[0] / "synthesis.json").read_bytes())
+    with pytest.raises(InputError, match="found none that is whole"):
+        synthesize(tmp_path / "third", **SMALL, tracking_error=1.0, pictures=half)
+
+
 @pytest.mark.parametrize("left", [["README.txt"], [".tmp-headbench-a.json"], ["synthesis.json"], []])
 def test_a_start_killed_before_the_first_image_is_resumed(capture, tmp_path, monkeypatch, left):
     class Planned(Exception):

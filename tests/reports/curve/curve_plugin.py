@@ -9,6 +9,8 @@ from headbench.bench.specs import MethodSpec
 
 FITS = []
 """(frames to train with, budget) of every training."""
+POSES = []
+"""The tracked poses of every training's clip."""
 RENDERED = []
 """(timestep, camera) of every frame."""
 
@@ -33,6 +35,7 @@ class Method:
 
     def fit(self, clip, out, budget, *, device, seed, progress):
         FITS.append((clip.splits["train"], budget))
+        POSES.append(clip.poses)
         for key in clip.splits["train"]:
             clip.image(key)
         out.mkdir(parents=True, exist_ok=True)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+import scipy.stats
 from PIL import Image
 
 from headbench.bench import cli
@@ -16,9 +17,11 @@ from headbench.bench.errors import ExitCode, HeadbenchError, InputError
 from headbench.bench.runner import run as runner
 from headbench.bench.runner.config import RunConfig
 from headbench.bench.runner.store import RunFolder
+from headbench.datasets.synthetic.capture import synthesize
 from headbench.reports.curve import curve as module
 from headbench.reports.curve.command import CurveSettings, curve_run
 from headbench.reports.curve.held_out import hold_out
+from headbench.reports.curve.points import MEASURED, half_width
 
 from ...datasets.tiny_capture import write_tiny_capture
 
@@ -35,6 +38,7 @@ def plugin(monkeypatch):
     monkeypatch.setattr(module, "METRICS", ("psnr", "storage"))
     found = importlib.import_module("curve_plugin")
     found.FITS.clear()
+    found.POSES.clear()
     found.RENDERED.clear()
     monkeypatch.setattr(found.Method, "killed", ())
     return found
@@ -126,6 +130,43 @@ def test_less_to_train_on_is_measured_on_the_same_frames(make_run, plugin, over,
     assert (run / f"curve-{over}" / "curve.png").is_file()
 
 
+def test_tracking_error_changes_poses_alone(plugin, tmp_path):
+    capture = tmp_path / "capture"
+    synthesize(capture, cameras=4, timesteps=24, size=(16, 16), samples_per_pixel=4, workers=1)
+    (union,) = capture.glob("UNION*")
+    config = RunConfig(
+        data=str(union),
+        out=str(tmp_path / "run"),
+        methods=("curve_plugin:METHOD",),
+        preset="smoke",
+        metrics=("psnr",),
+    )
+    runner.run(config)
+    plugin.FITS.clear()
+    plugin.POSES.clear()
+    findings = curve_run(settings(tmp_path / "run", over="tracking_error", levels=(0.0, 2.0), frames=2))
+    assert [point["tracking_error"] for point in findings.data["points"]] == [0.0, 2.0]
+    exact, wrong = plugin.POSES
+    assert exact.keys() == wrong.keys()
+    assert any((exact[t].expression != wrong[t].expression).any() for t in exact)
+    made = tmp_path / "run" / "curve-tracking-error" / "capture-tracking-2"
+    for picture in capture.rglob("*.png"):
+        assert (made / picture.relative_to(capture)).samefile(picture)
+
+
+def test_the_tracking_of_recordings_stays(make_run):
+    with pytest.raises(InputError, match="expected a synthetic capture"):
+        curve_run(settings(make_run("curve_plugin:METHOD"), over="tracking_error"))
+
+
+def test_bars_are_intervals_of_students_t():
+    values = [30.0, 31.0, 33.0, 32.0, 30.5]
+    low, high = scipy.stats.ttest_1samp(values, 0.0).confidence_interval(0.95)
+    assert half_width(values) == pytest.approx((high - low) / 2, rel=1e-12)
+    assert half_width([30.0]) is None
+    assert half_width([30.0, None]) is None
+
+
 def test_a_row_for_each_method_subject_and_part(make_run, plugin):
     run = make_run("curve_plugin:METHOD", "curve_plugin:TIMED", subjects=("ball-a", "ball-bee"))
     findings = curve_run(settings(run, fractions=("1", "1/4")))
@@ -139,7 +180,7 @@ def test_a_row_for_each_method_subject_and_part(make_run, plugin):
     record = RunFolder(run / "curve").cell("ball-a", "noting+1-4", 0).step("fit")
     assert record["method"]["budget"]["iterations"] == 16
     first = table(run)[0]
-    assert [float(first[name]) for name in module.MEASURED] == [record[name] for name in module.MEASURED]
+    assert [float(first[name]) for name in MEASURED] == [record[name] for name in MEASURED]
     rows = pd.read_parquet(run / "curve" / "rows.parquet")
     own = rows[(rows["method"] == "noting+1-4") & (rows["subject"] == "ball-a") & (rows["metric"] == "psnr")]
     by_task = own.groupby("task")["value"].mean()
@@ -194,6 +235,10 @@ def test_with_one_camera_timesteps_alone_are_held_out(plugin, tmp_path):
         ({"fractions": ("half",)}, "above 0 and at most 1"),
         ({"fractions": ("0.5", "1/2")}, "each once"),
         ({"fractions": ()}, "one at least"),
+        ({"levels": (1.0, 1.0)}, "each once"),
+        ({"levels": ()}, "one at least"),
+        ({"levels": (4.5,)}, "from 0 to 4"),
+        ({"levels": (float("nan"),)}, "from 0 to 4"),
         ({"every": 1}, "at least 2"),
         ({"frames": 0}, "at least 1"),
     ],

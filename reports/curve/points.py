@@ -1,0 +1,142 @@
+"""Points of a curve: what trainings cost and reached, means over subjects, and their table and text."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from fractions import Fraction
+from statistics import fmean, stdev
+
+from scipy.stats import t as student_t
+
+from ...bench.contracts import Budget
+from ...bench.specs import MetricSpec
+from .held_out import CAMERA, TIMESTEPS, HeldOutClip
+
+HELD_OUT: Mapping[str, str] = {CAMERA: "camera", TIMESTEPS: "timesteps"}
+"""What is held out, by the task that it is measured as."""
+MEASURED = ("processor_seconds", "seconds", "peak_memory_bytes")
+"""What the record of a training says of its cost."""
+
+
+@dataclass(frozen=True)
+class Point:
+    """A method trained with a part of its budget or of the frames, or with a level of tracking error.
+
+    Means over seeds of one subject, or over subjects (""). ``cameras`` and ``timesteps`` count what it was trained on.
+    ``tracking_error`` is the level of a synthetic capture, None for a recording. ``cost`` is `MEASURED` by name, ``values``
+    are the metrics by name and what was held out, such as "psnr_camera"; None: not measured. ``halves`` are half the widths
+    of the 95 % intervals of means over subjects, by the same names, where there are at least two subjects.
+    """
+
+    method: str
+    subject: str
+    part: Fraction
+    budget: Budget
+    cameras: float
+    timesteps: float
+    tracking_error: float | None
+    cost: Mapping[str, float | None]
+    values: Mapping[str, float | None]
+    halves: Mapping[str, float | None]
+
+    def flat(self) -> dict[str, object]:
+        """The point as a line of ``curve.csv``, by column."""
+        budget = asdict(self.budget)
+        return {
+            "method": self.method,
+            "subject": self.subject,
+            "fraction": float(self.part),
+            "budget_iterations": budget["iterations"],
+            "budget_seconds": budget["seconds"],
+            "cameras": self.cameras,
+            "timesteps": self.timesteps,
+            "tracking_error": self.tracking_error,
+            **self.cost,
+            **self.values,
+        }
+
+
+def mean(values: Sequence[float | None]) -> float | None:
+    """Mean of numbers; None where one is missing, or all."""
+    known = [value for value in values if value is not None]
+    return fmean(known) if known and len(known) == len(values) else None
+
+
+def half_width(values: Sequence[float | None]) -> float | None:
+    """Half the width of the 95 % interval of a mean by Student's t; None for fewer than two numbers or a missing one."""
+    known = [value for value in values if value is not None]
+    if len(known) < 2 or len(known) < len(values):
+        return None
+    return float(student_t.ppf(0.975, len(known) - 1)) * stdev(known) / math.sqrt(len(known))
+
+
+def mean_point(points: Sequence[Point]) -> Point:
+    """The mean over subjects of points that differ in nothing else."""
+    first = points[0]
+    by_name = {key: [point.values[key] for point in points] for key in first.values}
+    cameras, timesteps = (
+        fmean(getattr(point, name) for point in points) for name in ("cameras", "timesteps")
+    )
+    return replace(
+        first,
+        subject="",
+        cameras=cameras,
+        timesteps=timesteps,
+        cost={key: mean([point.cost[key] for point in points]) for key in first.cost},
+        values={key: mean(values) for key, values in by_name.items()},
+        halves={key: half_width(values) for key, values in by_name.items()},
+    )
+
+
+def column(spec: MetricSpec, task: str) -> str:
+    """Name of a metric's value in `Point.values`."""
+    return f"{spec.name}_{HELD_OUT[task]}" if task in HELD_OUT else spec.name
+
+
+def points_text(
+    points: Sequence[Point],
+    metrics: Sequence[MetricSpec],
+    tasks: Sequence[str],
+    held: Sequence[HeldOutClip],
+    missing: Mapping[str, str],
+    failed: Sequence[str],
+) -> str:
+    """Means over subjects as a table, what was held out, and what is missing."""
+    wide = max(8, *(len(point.method) + 2 for point in points))
+    frame = [spec for spec in metrics if spec.per_frame]
+    avatar = [spec for spec in metrics if not spec.per_frame]
+    tracked = any(point.tracking_error is not None for point in points)
+    group = 9 * len(frame)
+    head = "".join(f"{'held-out ' + HELD_OUT[task]:>{group}}" for task in tasks)
+    names = "".join(f"{spec.label:>9}" for _ in tasks for spec in frame)
+    names += "".join(f"{spec.label + (f' {spec.unit}' if spec.unit else ''):>12}" for spec in avatar)
+    columns = f"{'method':<{wide}}{'part':>7}{'budget':>10}{'cameras':>8}{'timesteps':>11}"
+    columns += f"{'tracking':>10}" if tracked else ""
+    columns += f"{'CPU s':>10}{'s':>10}"
+    lines = [f"{'':<{len(columns)}}{head}", f"{columns}{names}"]
+    for point in points:
+        budget = point.budget
+        cells = [_shown(point.values[column(spec, task)], spec.digits, 9) for task in tasks for spec in frame]
+        cells += [_shown(point.values[spec.name], spec.digits, 12) for spec in avatar]
+        cost = [_shown(point.cost[key], 1, 10) for key in MEASURED[:2]]
+        size = f"{budget.seconds:g} s" if budget.iterations is None else f"{budget.iterations}"
+        given = f"{point.part!s:>7}{size:>10}{point.cameras:>8g}{point.timesteps:>11g}"
+        given += _shown(point.tracking_error, 2, 10) if tracked else ""
+        lines.append(f"{point.method:<{wide}}{given}{''.join([*cost, *cells])}")
+    lines.append("Means over subjects. Held out of every training; no test frame was looked at:")
+    for clip in held:
+        parameters = clip.steps[-1].parameters
+        steps = ", ".join(map(str, parameters["timesteps"][:6])) + (
+            ", ..." if len(parameters["timesteps"]) > 6 else ""
+        )
+        lines.append(
+            f"  {clip.subject}: camera {parameters['camera'] or 'none'}, timesteps {steps or 'none'}"
+        )
+    lines += [f"{label} missing: {reason}" for label, reason in missing.items()]
+    return "\n".join([*lines, *(f"failed: {name}" for name in failed)])
+
+
+def _shown(value: float | None, digits: int, width: int) -> str:
+    return f"{'-' if value is None or not math.isfinite(value) else f'{value:.{digits}f}':>{width}}"
