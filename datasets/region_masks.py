@@ -4,6 +4,7 @@
 * ``face``: the mesh's face, lips, eyes and the opening of the mouth, where nothing of the mesh is before them.
 * ``mouth``: the convex hull of the visible lips, so that teeth, tongue and the dark between them belong to it.
 * ``eyes``: eyeballs and the skin about them.
+* ``neck`` and ``ears``: the mesh's, where nothing of it is before them.
 * ``hair``: the mesh's scalp, and foreground beyond the mesh whose nearest pixel of the mesh is scalp: hair stands
   off the head that carries it. Hair that hangs down beside the neck is not told from it.
 
@@ -29,10 +30,12 @@ PARTS: Mapping[str, tuple[str, ...]] = {
     "mouth": ("lips",),
     "eyes": ("eye_region", "left_eyeball", "right_eyeball"),
     "hair": ("scalp",),
+    "neck": ("neck", "boundary"),
+    "ears": ("left_ear", "right_ear"),
 }
 """Regions of the head model that each part is made of; those that a model does not have are done without."""
 
-_NEEDED = {"face": "face", "mouth": "lips", "eyes": "eye_region", "hair": "scalp"}
+_NEEDED = {name: regions[0] for name, regions in PARTS.items()}
 _BITS = {name: 1 << bit for bit, name in enumerate((FOREGROUND, *PARTS))}
 
 
@@ -74,12 +77,12 @@ class HeadRegions:
         bits = np.zeros(len(faces), dtype=np.uint8)
         for name in self.names:
             inside = np.zeros(len(self._head.template), dtype=bool)
-            for region in PARTS[name]:
-                inside[regions.get(region, ())] = True
+            for region in regions.keys() & set(PARTS[name]):
+                inside[regions[region]] = True
             if name == "hair":
                 # The scalp of FLAME's masks runs into face and neck.
-                for region in ("face", "neck"):
-                    inside[regions.get(region, ())] = False
+                for region in regions.keys() & {"face", "neck"}:
+                    inside[regions[region]] = False
             bits[inside[faces].sum(axis=1) >= 2] |= _BITS[name]
         return bits
 

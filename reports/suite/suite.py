@@ -19,6 +19,8 @@ from ..table_report import table_of
 from ..writers import to_markdown
 from .command import SEED, SuiteSettings
 
+REGIONS = ("face", "mouth", "eyes", "hair", "neck", "ears")
+"""Parts of the frame that have tables of their own."""
 ABLATIONS: Mapping[str, Mapping[str, Any]] = {
     "no-lines": {"lines": {"enabled": False}},
     "lines-move-splats": {"lines": {"dynamic": ["position", "rotation", "scale"]}},
@@ -78,6 +80,7 @@ def _config(
         methods=methods,
         preset=settings.preset,
         seeds=settings.seeds,
+        regions=REGIONS,
         settings=changes,
     )
 

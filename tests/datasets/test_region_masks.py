@@ -103,8 +103,23 @@ def test_the_foreground_is_the_mask_from_a_half_on():
 
 def test_parts_are_offered_where_the_head_has_their_regions():
     bare = replace(HEAD, regions={"lips": HEAD.regions["lips"]})
-    assert HeadRegions(HEAD, SHAPE, OFFSET).names == ("face", "mouth", "eyes", "hair")
+    assert HeadRegions(HEAD, SHAPE, OFFSET).names == ("face", "mouth", "eyes", "hair", "neck", "ears")
     assert HeadRegions(bare, SHAPE, OFFSET).names == ("mouth",)
+    lips_alone = HeadRegions(bare, SHAPE, OFFSET).labels(FRONT, pose(), None)
+    np.testing.assert_array_equal(select(lips_alone, "mouth"), select(labels(), "mouth"))
+    without_balls = replace(HEAD, regions={name: HEAD.regions[name] for name in ("face", "lips", "scalp")})
+    assert not select(labels(BACK, head=without_balls), "face").any()
+
+
+def test_ears_are_at_the_sides_and_the_neck_below_the_face():
+    found = labels(camera(1, 0, 0))
+    rows, _ = np.nonzero(select(found, "ears"))
+    below, _ = np.nonzero(select(found, "neck"))
+    assert len(rows)
+    assert rows.max() < below.min()
+    turned_away = select(labels(), "ears").sum()
+    assert turned_away < 0.5 * select(found, "ears").sum()
+    assert not (select(found, "neck") & select(found, "face")).any()
 
 
 @pytest.mark.parametrize("threads", [1, 4])
