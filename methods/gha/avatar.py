@@ -21,6 +21,7 @@ from ...bench.io.files import write_bytes
 from ..shared.avatar_files import SUBJECT_FILE, RefinedTracking, read_shared_head, read_subject
 from ..shared.rendering import LastPose, PosedSplats, posed_splats
 from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors
+from ..shared.threads import torch_on_one_thread
 from . import kernel
 from .config import GHAConfig
 from .driving import Driver, code_size
@@ -73,7 +74,7 @@ class GHAAvatar:
         the difference to the one asked for is added.
         """
         trained = self._tensors["background"]
-        with kernel.torch_on_one_thread():
+        with torch_on_one_thread(kernel.available()):
             drawn = self._head.draw(self._posed(pose), camera, trained)
         image = self._head.sharpen(self._tensors, drawn, trained, bounded=True)
         image = image[: camera.height, : camera.width]

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ...bench.contracts import Camera
 from ..shared.binding import WorldSplats, left_products
+from ..shared.threads import torch_on_one_thread
 from ..splats import rasterize
 from . import kernel
 from .config import GHAConfig
@@ -113,7 +114,6 @@ class GaussianHead:
             *(small.world_to_camera, small.K, small.width, small.height),
             background=feature_background(background, self.config.channels),
             check_values=False,
-            threads=kernel.threads(),
         )
         return FeatureImage.of(rendering.image, rendering.alpha)
 
@@ -229,7 +229,7 @@ class SuperResolution:
         before = (self.channels, *self.widths[:-1])
         largest = [4**b * max(pair) * height * width for b, pair in enumerate(zip(before, self.widths))]
         if max(largest) <= at_once:
-            with kernel.torch_on_one_thread():
+            with torch_on_one_thread(kernel.available()):
                 return self(weights, drawn, background)
         planes = features.permute(2, 0, 1)[None]
 

@@ -6,8 +6,7 @@ devices, other dtypes, or no compiler at installation. The kernel's results do n
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -16,6 +15,7 @@ from torch.autograd.function import once_differentiable
 
 from ...bench.native.loader import Kernel
 from ..shared.networks import ENCODING_SIZE
+from ..shared.threads import threads
 
 KERNEL = Kernel(
     "headbench.methods.gha._kernel", "GHA's kernel", "torch computes its networks meanwhile, slowly"
@@ -32,35 +32,6 @@ def available() -> bool:
 def usable(like: Tensor) -> bool:
     """Whether the kernel is there and takes tensors like this one."""
     return like.dtype == torch.float32 and like.device.type == "cpu" and available()
-
-
-_threads: int | None = None
-
-
-def threads() -> int:
-    """Threads that kernels run on: as many as torch has, or had outside of `torch_on_one_thread`."""
-    return _threads or torch.get_num_threads()
-
-
-@contextmanager
-def torch_on_one_thread() -> Iterator[None]:
-    """Leave torch's own functions to the calling thread, where the kernel is there to do the long work.
-
-    Torch's threads spin while they wait, on the cores that the kernels' threads need, and its results depend on their
-    number.
-    """
-    global _threads
-    before, outer = torch.get_num_threads(), _threads
-    if not available() or before == 1:
-        yield
-        return
-    _threads = before
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-        _threads = outer
 
 
 class Part(NamedTuple):

@@ -19,7 +19,6 @@ from ..shared.optimisation import Optimiser
 from ..shared.rendering import View, view_of
 from ..shared.schedule import ShuffledEpochs, Timeline, torch_generator
 from ..splats import rasterize
-from . import kernel
 from .config import GHAConfig
 from .driving import TrainingScene
 from .mesh_head import DISC_OPACITY, MeshHead, TetGrid, spacing_for, tet_grid, vertex_discs
@@ -115,7 +114,6 @@ class MeshTraining:
                 *(view.world_to_camera, view.K, view.camera.width, view.camera.height),
                 background=background,
                 check_values=False,
-                threads=kernel.threads(),
             )
             part = COLOR * (rendering.image - target).abs().mean()
             if mask is not None:

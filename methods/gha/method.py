@@ -27,12 +27,13 @@ from ..shared.avatar_files import TRACKED, RefinedTracking, Subject, finish_fit
 from ..shared.loop import Fit, Outcome, train
 from ..shared.method import TrainedMethod
 from ..shared.schedule import ShuffledEpochs
+from ..shared.threads import torch_on_one_thread
+from . import kernel
 from .avatar import AVATAR_FILE, DRIVING_FILE, GHAAvatar, write_avatar
 from .config import GHAConfig
 from .driving import TrainingScene, training_scene
 from .gaussian_head import GaussianHead
 from .gaussian_training import GaussianTraining
-from .kernel import torch_on_one_thread
 from .mesh_head import MeshHead
 from .mesh_training import mesh_phase, remove_mesh_phase
 from .spec import GHA as SPEC
@@ -54,7 +55,7 @@ class GHA(TrainedMethod[GHAConfig, GHAAvatar]):
         self._clock = clock
 
     def _train(self, fit: Fit, config: GHAConfig) -> None:
-        with torch_on_one_thread():
+        with torch_on_one_thread(kernel.available()):
             self._train_phases(fit, config)
 
     def _train_phases(self, fit: Fit, config: GHAConfig) -> None:

@@ -18,6 +18,7 @@ from ...bench.io.arrays import Member, read_arrays
 from ...bench.io.documents import read_json
 from ..shared.avatar_files import SUBJECT_FILE, read_shared_head, read_subject, write_arrays
 from ..shared.subject_mesh import SubjectMesh, pose_key
+from ..shared.threads import threads
 from . import kernel
 from .config import InstaConfig
 from .field import Architecture, Field, Parameters, Prior
@@ -199,7 +200,7 @@ class Inference:
             *(scene.surface.guide(self.space), self._trained, self._starts(scene.condition)),
             *(self.mouth.numpy().view(np.uint8), rays.origins, rays.directions, rays.jitter),
             *(self.marching.step, self.marching.round_samples, self.marching.stop_transmittance),
-            *(color, transmittance, self._isa, torch.get_num_threads()),
+            *(color, transmittance, self._isa, threads()),
         )
         return RayColors(color, transmittance, samples)
 

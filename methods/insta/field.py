@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ..shared.networks import sh_basis
 from ..shared.schedule import torch_generator
+from ..shared.threads import threads
 from . import kernel
 from .config import InstaConfig
 
@@ -203,7 +204,7 @@ class _Encode(torch.autograd.Function):
         out = table.new_empty(len(positions), len(levels) * table.shape[1])
         module: Any = kernel.load()
         arrays = positions.numpy(), table.detach().numpy()
-        module.encode(*arrays, list(levels), out.numpy(), torch.get_num_threads())
+        module.encode(*arrays, list(levels), out.numpy(), threads())
         return out
 
     @staticmethod
@@ -212,7 +213,7 @@ class _Encode(torch.autograd.Function):
         by_table = grads[0].new_zeros(ctx.shape)
         module: Any = kernel.load()
         arrays = positions.numpy(), grads[0].contiguous().numpy()
-        module.encode_backward(*arrays, list(ctx.levels), by_table.numpy(), torch.get_num_threads())
+        module.encode_backward(*arrays, list(ctx.levels), by_table.numpy(), threads())
         return None, by_table, None
 
 

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from ...bench.contracts import HeadAsset, HeadPose
 from ..shared.subject_mesh import SubjectMesh
+from ..shared.threads import threads
 from . import kernel
 from .config import InstaConfig
 from .warp import Blend, Found, Variant, blended, canonical_from_posed, first_hits, nearest_triangles
@@ -119,7 +120,7 @@ class PosedSurface:
         if self._mesh is None:
             return nearest_triangles(torch.from_numpy(points), self.corners.float())
         triangles, squared = np.empty(len(points), np.int32), np.empty(len(points), np.float32)
-        self.surface.module.nearest(self._mesh, points, triangles, squared, torch.get_num_threads())
+        self.surface.module.nearest(self._mesh, points, triangles, squared, threads())
         return Found(torch.from_numpy(triangles).long(), torch.from_numpy(squared))
 
     def first_hit(self, rays: Rays) -> Found:
@@ -129,7 +130,7 @@ class PosedSurface:
             return first_hits(torch.from_numpy(origins), torch.from_numpy(directions), self.corners.float())
         triangles, distances = np.empty(len(origins), np.int32), np.empty(len(origins), np.float32)
         found = triangles, distances
-        self.surface.module.first_hit(self._mesh, origins, directions, *found, torch.get_num_threads())
+        self.surface.module.first_hit(self._mesh, origins, directions, *found, threads())
         return Found(torch.from_numpy(triangles).long(), torch.from_numpy(distances))
 
     def march(self, rays: Rays, first: np.ndarray, step: float, samples_max: int, space: Space) -> Samples:
@@ -140,7 +141,7 @@ class PosedSurface:
         if self._mesh is None:
             return self._march_reference(rays, first, step, samples_max, space)
         origins, directions, jitter = map(np.ascontiguousarray, rays)
-        how = (first, jitter, step, samples_max, torch.get_num_threads())
+        how = (first, jitter, step, samples_max, threads())
         return Samples(*self.surface.module.march(self.guide(space), origins, directions, *how))
 
     def reach(self, space: Space) -> np.ndarray:

@@ -14,6 +14,7 @@ from torch.autograd.function import once_differentiable
 
 from ..shared.avatar_kernel import arrays, call
 from ..shared.networks import PAIRS
+from ..shared.threads import threads
 from .field import Bounds, CanonicalFrames, NamedTensors, line_table, normalised_weight
 
 
@@ -121,7 +122,7 @@ class _Colors(torch.autograd.Function):
     def backward(ctx: Any, by_colors: Tensor) -> tuple[Tensor | None, ...]:
         *inputs, box, colors = ctx.saved_tensors
         gradients = [torch.empty_like(value) for value in inputs]
-        ctx.done.backward(*arrays(*inputs, box, colors, by_colors, *gradients), torch.get_num_threads())
+        ctx.done.backward(*arrays(*inputs, box, colors, by_colors, *gradients), threads())
         return None, None, *gradients
 
 
@@ -138,5 +139,5 @@ class _Offsets(torch.autograd.Function):
     def backward(ctx: Any, by_offsets: Tensor) -> tuple[Tensor | None, ...]:
         weights = ctx.saved_tensors
         gradients = [torch.empty_like(value) for value in weights]
-        ctx.done.backward(*arrays(*weights, by_offsets, *gradients), torch.get_num_threads())
+        ctx.done.backward(*arrays(*weights, by_offsets, *gradients), threads())
         return None, None, None, *gradients

@@ -15,6 +15,7 @@ from torch.nn.functional import pad
 from ..splats.cpu import KERNEL, instruction_sets
 from .binding import Frames, WorldSplats, apply_matrices, to_world
 from .networks import sh_degree, sh_to_rgb
+from .threads import threads
 
 HARMONICS_BLOCK = 16
 """Splats whose coefficients lie side by side."""
@@ -171,7 +172,7 @@ def offsets_into(
 def call(name: str, *arguments: Any, backend: str) -> Any:
     """Call a function of the kernel, see `arrays`."""
     function = getattr(KERNEL.load(), name)
-    return function(*arrays(*arguments), instruction_sets()[backend], torch.get_num_threads())
+    return function(*arrays(*arguments), instruction_sets()[backend], threads())
 
 
 def arrays(*arguments: Any) -> list[Any]:

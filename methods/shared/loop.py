@@ -15,9 +15,11 @@ from torch import Tensor
 
 from ...bench.contracts import Budget, ByteArray, Clip, FrameKey, Progress
 from ...bench.errors import InputError
+from .avatar_kernel import available
 from .checkpoint import REMEDY, load_checkpoint, save_checkpoint
 from .optimisation import Optimiser
 from .schedule import Sampler, Timeline
+from .threads import torch_on_one_thread
 
 CHECKPOINT = "checkpoint.safetensors"
 TIMED_STEPS = 5  # steps timed to turn seconds into iterations
@@ -107,7 +109,7 @@ def train(
     """
     budget, clock = fit.budget, fit.clock
     check_budget(budget)
-    path = fit.out / CHECKPOINT
+    path, compiled = fit.out / CHECKPOINT, available()
     saved = load_checkpoint(path, fit.run, fit.device)
     started = clock() if began is None else began
     if saved is None:
@@ -116,7 +118,8 @@ def train(
         if total is None:
             assert budget.seconds is not None
             left = budget.seconds if began is None else budget.seconds - (clock() - began)
-            total = _estimate(trainable, sampler, left, published_length, clock)
+            with torch_on_one_thread(compiled):
+                total = _estimate(trainable, sampler, left, published_length, clock)
         trainable.begin(Timeline(total, published_length))
     else:
         try:
@@ -132,25 +135,26 @@ def train(
         return spent + clock() - started
 
     last_save = clock()
-    while iteration < total and (budget.seconds is None or seconds() < budget.seconds):
-        iteration += 1
-        loss = trainable.loss(iteration, sampler(iteration))
-        loss.backward()
-        if (iteration % REPORT_EVERY == 0 or iteration == 1) and not loss.isfinite():
-            remedy = "Training diverged; check the tracking (NaN?) or lower the learning rates."
-            raise InputError(fit.out, f"iteration {iteration}", "a finite loss", str(loss.item()), remedy)
-        trainable.after_backward(iteration)
-        if iteration < total:
-            trainable.optimiser.step()
-        trainable.optimiser.zero_grad()
-        if clock() - last_save >= checkpoint_every_s and iteration < total:
-            done = {"iteration": iteration, "total": total, "seconds": seconds()}
-            save_checkpoint(path, fit.run, {**done, "trainable": trainable.state()})
-            last_save = clock()
-        note = ""
-        if iteration % REPORT_EVERY == 0 or iteration == total:
-            note = f"{estimated}loss {loss.item():.4f}; {trainable.note()}"
-        fit.progress(iteration, total, note)
+    with torch_on_one_thread(compiled):
+        while iteration < total and (budget.seconds is None or seconds() < budget.seconds):
+            iteration += 1
+            loss = trainable.loss(iteration, sampler(iteration))
+            loss.backward()
+            if (iteration % REPORT_EVERY == 0 or iteration == 1) and not loss.isfinite():
+                remedy = "Training diverged; check the tracking (NaN?) or lower the learning rates."
+                raise InputError(fit.out, f"iteration {iteration}", "a finite loss", str(loss.item()), remedy)
+            trainable.after_backward(iteration)
+            if iteration < total:
+                trainable.optimiser.step()
+            trainable.optimiser.zero_grad()
+            if clock() - last_save >= checkpoint_every_s and iteration < total:
+                done = {"iteration": iteration, "total": total, "seconds": seconds()}
+                save_checkpoint(path, fit.run, {**done, "trainable": trainable.state()})
+                last_save = clock()
+            note = ""
+            if iteration % REPORT_EVERY == 0 or iteration == total:
+                note = f"{estimated}loss {loss.item():.4f}; {trainable.note()}"
+            fit.progress(iteration, total, note)
     return Outcome(iteration, total, seconds())
 
 

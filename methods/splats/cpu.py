@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from ...bench.native.loader import Kernel
+from ..shared.threads import threads as kernel_threads
 from .request import Rendering, Request
 
 KERNEL = Kernel(
@@ -40,7 +41,7 @@ def rasterize_cpu(request: Request, backend: str, threads: int | None) -> Render
     if backend not in available:
         names = ", ".join(map(repr, ("auto", *available, "reference")))
         raise ValueError(f"backend: expected one of {names} on this machine, found {backend!r}.")
-    threads = torch.get_num_threads() if threads is None else threads
+    threads = kernel_threads() if threads is None else threads
     if not isinstance(threads, int) or threads < 1:
         raise ValueError(f"threads: expected a positive integer or None, found {threads!r}.")
     none = request.means.new_empty(len(request.viewmats), 0, 2)

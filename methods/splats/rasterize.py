@@ -68,7 +68,7 @@ def rasterize(
         2024): a measure for densification, not a derivative.
     backend : one of `available_backends`, or "auto": for float32 the kernel on the CPU and gsplat on a GPU, else the
         reference. Where float32 goes to the reference, which is slow, a warning names the remedy once per process.
-    threads : of the kernel; None takes ``torch.get_num_threads()``. Results are equal bit for bit for any number.
+    threads : of the kernel; None takes `shared.threads.threads`. Results are equal bit for bit for any number.
     check_values : refuse NaN and infinity in any tensor, and scales, opacities and focal lengths outside of their ranges.
         Training leaves the check out: it costs a pass over the splats, and on a GPU a wait for its result. Then a
         non-finite geometry is culled, a non-finite colour spreads to the pixels about it, and ranges are the caller's

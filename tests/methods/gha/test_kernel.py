@@ -244,14 +244,3 @@ def test_surroundings_of_what_is_drawn(shape):
     alpha = torch.rand(shape, generator=torch.Generator().manual_seed(1)).sub(0.93).clamp_min(0)
     near = kernel.near_drawn(alpha, gaussian_head.REACH, gaussian_head.COVERED)
     assert torch.equal(near.float(), gaussian_head.near_drawn(alpha))
-
-
-@needs_kernel
-def test_torch_on_one_thread_leaves_kernels_theirs():
-    with torch_threads(3):
-        with kernel.torch_on_one_thread():
-            assert (torch.get_num_threads(), kernel.threads()) == (1, 3)
-            with kernel.torch_on_one_thread():
-                assert (torch.get_num_threads(), kernel.threads()) == (1, 3)
-            assert (torch.get_num_threads(), kernel.threads()) == (1, 3)
-        assert (torch.get_num_threads(), kernel.threads()) == (3, 3)

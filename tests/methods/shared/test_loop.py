@@ -6,8 +6,11 @@ from torch import nn
 
 from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.errors import InputError
+from headbench.methods.shared import loop
 from headbench.methods.shared.loop import CHECKPOINT, Fit, train
 from headbench.methods.shared.optimisation import Optimiser
+from headbench.methods.shared.threads import threads
+from headbench.tests.benchmarks.timing import torch_threads
 
 
 class Drift:
@@ -69,6 +72,16 @@ def test_iterations_count_from_one_and_the_last_makes_no_step(tmp_path):
     assert model.optimiser["x"].item() == pytest.approx(-3.0)
     assert (outcome.iterations, outcome.planned) == (7, 7)
     assert (model.timeline.total, model.timeline.published) == (7, 100)
+
+
+@pytest.mark.parametrize(("compiled", "expected"), [(True, (1, 3)), (False, (3, 3))])
+def test_torch_has_one_thread_where_kernels_are_compiled(tmp_path, monkeypatch, compiled, expected):
+    monkeypatch.setattr(loop, "available", lambda: compiled)
+    seen = []
+    with torch_threads(3):
+        report = lambda *_: seen.append((torch.get_num_threads(), threads()))
+        run(Drift(), tmp_path, Budget(iterations=2), report)
+    assert seen == [expected] * 2
 
 
 def test_seconds_alone_give_an_estimate_of_iterations(tmp_path):

@@ -1,0 +1,36 @@
+"""How many threads kernels run on, and torch beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+
+import torch
+
+_kernels: ContextVar[int | None] = ContextVar("threads of kernels", default=None)
+
+
+def threads() -> int:
+    """Threads that kernels run on: as many as torch has, or had outside of `torch_on_one_thread`."""
+    return _kernels.get() or torch.get_num_threads()
+
+
+@contextmanager
+def torch_on_one_thread(compiled: bool) -> Iterator[None]:
+    """Leave torch's own functions to the calling thread, where the long work is done by ``compiled`` kernels, on `threads`.
+
+    Torch's threads spin while they wait, on the cores that the kernels' threads need, and its results depend on their
+    number.
+    """
+    before = torch.get_num_threads()
+    if before == 1 or not compiled:
+        yield
+        return
+    token = _kernels.set(before)
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+        _kernels.reset(token)
