@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from ..shared.config import SplatTraining
+from ..shared.config import Capacity, SplatTraining
 
 
 @dataclass(frozen=True)
@@ -19,6 +19,7 @@ class GAConfig:
     """
 
     splats: SplatTraining = field(default_factory=SplatTraining)
+    capacity: Capacity = field(default_factory=Capacity)
     sh_degree: int = 3
     sh_every: int = 1_000
     min_sh_every: int = 100

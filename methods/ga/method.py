@@ -31,6 +31,7 @@ from ..shared.networks import coefficient_count, initial_coefficients, occupied_
 from ..shared.optimisation import Optimiser
 from ..shared.rendering import USUAL, Cutoffs, PlacedSplats, StoredSplatAvatar, View
 from ..shared.schedule import ShuffledEpochs, Timeline, torch_generator
+from ..shared.sizes import Size, halves
 from ..shared.splat_training import BoundTraining, ShadedSplats
 from ..shared.subject_mesh import BoundedCache, SubjectMesh
 from ..shared.training_kernel import harmonic_colors, to_world
@@ -171,6 +172,13 @@ class GA(TrainedMethod[GAConfig, GAAvatar]):
 
     name, version = SPEC.name, SPEC.version
     config_class, avatar_class = GAConfig, GAAvatar
+
+    def _sizes(self, clip: Clip, config: GAConfig) -> tuple[Size, ...]:
+        degrees = tuple(degree for degree in (2, 1, 0) if degree < config.sh_degree)
+        splats = halves(config.splats.max_splats, len(clip.head.faces))
+        return Size("sh_degree", degrees), Size(
+            "splats.max_splats", splats, lambda avatar: len(avatar.binding)
+        )
 
     def _train(self, fit: Fit, config: GAConfig) -> None:
         clip, subject = fit.clip, Subject.of(fit.clip)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
 from ...bench.specs import Renamed
-from ..shared.config import DensifiedTraining
+from ..shared.config import Capacity, DensifiedTraining
 
 
 @dataclass(frozen=True)
@@ -63,6 +63,7 @@ class GBSConfig:
     """
 
     splats: BlendshapeTraining = field(default_factory=BlendshapeTraining)
+    capacity: Capacity = field(default_factory=Capacity)
     samples: int = 50_000
     teeth_samples: int = 5_000
     sample_spacing: float = 0.0

@@ -9,10 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
+from ...bench.contracts import Clip
 from ..shared.avatar_files import Subject, finish_fit
 from ..shared.loop import Fit
 from ..shared.method import TrainedMethod
 from ..shared.schedule import ShuffledEpochs
+from ..shared.sizes import Size, halves
 from .avatar import AVATAR_FILE, GBSAvatar, write_avatar
 from .config import GBSConfig
 from .points import SurfacePoints, padded_offset, with_mouth
@@ -20,11 +22,23 @@ from .spec import GBS as SPEC
 from .training import GBSTraining
 
 
+def _splats(avatar: GBSAvatar) -> int:
+    return len(avatar.stored.neutral["sh_rest"])
+
+
 class GBS(TrainedMethod[GBSConfig, GBSAvatar]):
     """The method: see the module."""
 
     name, version = SPEC.name, SPEC.version
     config_class, avatar_class = GBSConfig, GBSAvatar
+
+    def _sizes(self, clip: Clip, config: GBSConfig) -> tuple[Size, ...]:
+        degrees = tuple(degree for degree in (1, 0) if degree < config.difference_sh_degree)
+        return (
+            Size("expressions", halves(min(config.expressions, clip.head.expression_basis.shape[2]), 1)),
+            Size("difference_sh_degree", degrees),
+            Size("splats.max_splats", halves(config.splats.max_splats, config.samples), _splats),
+        )
 
     def _train(self, fit: Fit, config: GBSConfig) -> None:
         clip, seed = fit.clip, fit.seed

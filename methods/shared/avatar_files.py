@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -163,7 +163,9 @@ def is_finished(folder: Path, run: str) -> bool:
 
 def write_record(fit: Fit, outcome: Outcome, **more: Any) -> None:
     """Write how the run went. The last file of a fit: its presence says that the avatar is whole."""
-    done = {"iterations": outcome.iterations, "planned_iterations": outcome.planned}
+    done: dict[str, Any] = {"iterations": outcome.iterations, "planned_iterations": outcome.planned}
+    if fit.trials:
+        done["trials"] = [asdict(trial) for trial in fit.trials]
     write_json(fit.out / RECORD_FILE, {"run": fit.run, **done, "seconds": round(outcome.seconds, 3), **more})
 
 

@@ -113,6 +113,30 @@ class SplatTraining(DensifiedTraining):
     scale_threshold: float = 0.6
 
 
+@dataclass(frozen=True)
+class Capacity:
+    """How large an avatar is.
+
+    Attributes
+    ----------
+    mode : "fixed" takes the configured sizes as they are. "auto" takes them as upper limits: short trainings without the
+        ends of the training sequences try smaller ones (`sizes.choose_sizes`), which takes time beyond the budget.
+    share : of the budget, for each of these trainings.
+    tolerance_db, tolerance_ssim : what PSNR and SSIM of the held-out timesteps may lose.
+    """
+
+    mode: Literal["fixed", "auto"] = "fixed"
+    share: float = 0.25
+    tolerance_db: float = 0.05
+    tolerance_ssim: float = 0.0005
+
+    def __post_init__(self) -> None:
+        if not 0 < self.share <= 1:
+            raise ValueError(f"share must lie in (0, 1], found {self.share}")
+        if self.tolerance_db < 0 or self.tolerance_ssim < 0:
+            raise ValueError("tolerance_db and tolerance_ssim must not be negative")
+
+
 PAPER_ITERATIONS = 600_000
 
 SHORT_SPLATS: Mapping[str, Any] = {

@@ -60,6 +60,7 @@ class Fit:
     out : folder of the avatar, its checkpoint and its record.
     run : digest of everything that decides how training goes; another run's checkpoint is refused.
     clock : seconds, from any start; what budgets in seconds are measured by.
+    trials : the sizes that were tried before, for the record.
     """
 
     clip: Clip
@@ -70,6 +71,7 @@ class Fit:
     progress: Progress
     run: str
     clock: Callable[[], float] = time.monotonic
+    trials: Sequence[Any] = ()
 
 
 @dataclass(frozen=True)

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import shutil
 import time
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 
 from ...bench.contracts import Budget, Clip, Progress
 from .avatar_files import is_finished, run_digest
 from .loop import CHECKPOINT, Fit, check_budget, check_training_split
+from .sizes import FOLDER, Size, choose_sizes
 
 Config = TypeVar("Config")
 Avatar = TypeVar("Avatar")
@@ -43,7 +47,8 @@ class TrainedMethod(Generic[Config, Avatar]):
         config, settings = self._resolved(clip, device)
         run = run_digest(self.name, self.version, settings, clip, budget, seed)
         if not is_finished(out, run):
-            self._train(Fit(clip, out, budget, device, seed, progress, run, self._clock), config)
+            work = Fit(clip, out, budget, device, seed, progress, run, self._clock)
+            self._train(*self._sized(work, config))
         self._remove_training_files(out)
         return self.load(out, device=device)
 
@@ -56,9 +61,28 @@ class TrainedMethod(Generic[Config, Avatar]):
         """The configuration to train with, and what of it tells one run from another."""
         return self.config, self.config
 
+    def _sizes(self, clip: Clip, config: Any) -> Sequence[Size]:
+        """The sizes that are tried where ``config.capacity`` says so."""
+        return ()
+
+    def _sized(self, fit: Fit, config: Any) -> tuple[Fit, Any]:
+        """The fit and its configuration with sizes as tried, where they are."""
+        sizes = [size for size in self._sizes(fit.clip, config) if size.values]
+        if not sizes or config.capacity.mode == "fixed":
+            return fit, config
+        fixed = replace(config, capacity=replace(config.capacity, mode="fixed"))
+
+        def train(candidate: Any, clip: Clip, folder: Path, budget: Budget, progress: Progress) -> Any:
+            method = type(self)(candidate)
+            return method.fit(clip, folder, budget, device=fit.device, seed=fit.seed, progress=progress)
+
+        config, trials = choose_sizes(fit, fixed, config.capacity, sizes, train)
+        return replace(fit, trials=trials), config
+
     def _remove_training_files(self, out: Path) -> None:
         """Remove what a finished avatar no longer needs, that of a run killed just before it did so included."""
         (out / CHECKPOINT).unlink(missing_ok=True)
+        shutil.rmtree(out / FOLDER, ignore_errors=True)
 
     def _train(self, fit: Fit, config: Any) -> None:
         raise NotImplementedError

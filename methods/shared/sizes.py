@@ -1,0 +1,174 @@
+"""How large an avatar has to be, found by short trainings that are judged on training timesteps they have not seen.
+
+A method names its sizes and what smaller values to try; a smaller one is taken where the held-out frames lose no more than
+a tolerance against the configured sizes. No test frame is looked at.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+
+from ...bench.contracts import Avatar, Budget, ByteArray, Clip, FrameKey, Progress
+from ...bench.io.files import digest
+from .config import Capacity
+from .loop import Fit
+from .losses import mean_ssim
+
+log = logging.getLogger(__name__)
+Config = TypeVar("Config")
+FRAMES = 48
+"""Held-out frames that a trial is judged by, at most, evenly spaced."""
+HELD_OUT_SHARE = 8
+"""The last of so many parts of each training sequence is held out. One whole sequence says too little of the others:
+without it half the expressions seemed enough for `gbs`, and lost 0.7 dB in self-reenactment (`gbs/README.md`)."""
+FOLDER = "trials"
+
+
+@dataclass(frozen=True)
+class Size:
+    """A size of an avatar: dotted name of the setting, and smaller values to try, falling.
+
+    ``used`` tells how much of it an avatar has: values that the avatar of the configured sizes does not exceed are not
+    tried, as its training was too short to say anything of them. None: all that is configured.
+    """
+
+    name: str
+    values: tuple[int, ...]
+    used: Callable[[Any], int] | None = None
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A setting and value that was tried, what the held-out frames came to, and whether it was taken."""
+
+    name: str
+    value: int | None
+    psnr: float
+    ssim: float
+    taken: bool
+
+
+class HeldOut:
+    """A `Clip` without the ends of its training sequences; everything else is the clip's own."""
+
+    def __init__(self, clip: Clip):
+        self._clip = clip
+        self.held_out = held_out_frames(clip)
+        left_out = frozenset(self.held_out)
+        train = tuple(key for key in clip.splits["train"] if key not in left_out)
+        self.splits = {"train": train}
+        self.fingerprint = digest(clip.fingerprint, "held out", self.held_out)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._clip, name)
+
+    def image(self, key: FrameKey) -> ByteArray:
+        """(H, W, 3) 8-bit sRGB."""
+        return self._clip.image(key)
+
+
+def held_out_frames(clip: Clip) -> tuple[FrameKey, ...]:
+    """The training frames of the last timesteps of each sequence that has two or more; () where none has."""
+    train = clip.splits["train"]
+    sequences: dict[str, set[int]] = {}
+    for key in train:
+        sequences.setdefault(key.sequence, set()).add(key.timestep)
+    chosen: set[int] = set()
+    for timesteps in sequences.values():
+        count = min(max(1, round(len(timesteps) / HELD_OUT_SHARE)), len(timesteps) - 1)
+        chosen |= set(sorted(timesteps)[len(timesteps) - count :])
+    return tuple(key for key in train if key.timestep in chosen)
+
+
+def choose_sizes(
+    fit: Fit,
+    config: Config,
+    capacity: Capacity,
+    sizes: Sequence[Size],
+    train: Callable[[Config, Clip, Path, Budget, Progress], Avatar],
+) -> tuple[Config, tuple[Trial, ...]]:
+    """The configuration with the smallest sizes that hold, one size after the other, and what was tried.
+
+    Parameters
+    ----------
+    sizes : one after the other; of each, values are tried until one loses too much.
+    train : trains an avatar with a configuration on a clip into a folder, and continues it after a kill.
+    """
+    clip = HeldOut(fit.clip)
+    if not clip.held_out or not clip.splits["train"]:
+        log.warning("one timestep of training: nothing can be held out; sizes stay as they are configured")
+        return config, ()
+    frames = _evenly(clip.held_out, FRAMES)
+    budget = Budget(
+        None if fit.budget.iterations is None else max(1, round(fit.budget.iterations * capacity.share)),
+        None if fit.budget.seconds is None else fit.budget.seconds * capacity.share,
+    )
+
+    def trained(candidate: Config, name: str = "", value: int | None = None) -> Avatar:
+        what = "the configured sizes" if value is None else f"{name} {value}"
+
+        def report(done: int, total: int, note: str = "") -> None:
+            fit.progress(0, fit.budget.iterations or 1, f"trying {what}: {done} of {total}")
+
+        folder = fit.out / FOLDER / digest(asdict(candidate))[:12]  # type: ignore[call-overload]
+        return train(candidate, clip, folder, budget, report)
+
+    configured = trained(config)
+    most_psnr, most_ssim = _quality(configured, fit.clip, frames)
+    trials = [Trial("", None, most_psnr, most_ssim, taken=True)]
+    for size in sizes:
+        for value in size.values:
+            if size.used and value >= size.used(configured):
+                continue
+            candidate = with_size(config, size.name, value)
+            psnr, ssim = _quality(trained(candidate, size.name, value), fit.clip, frames)
+            holds = most_psnr - psnr <= capacity.tolerance_db and most_ssim - ssim <= capacity.tolerance_ssim
+            trials.append(Trial(size.name, value, psnr, ssim, holds))
+            log.info(
+                "%s %d: %s", size.name, value, f"{psnr:.2f} dB" + ("" if holds else ", too much is lost")
+            )
+            if not holds:
+                break
+            config = candidate
+    return config, tuple(trials)
+
+
+def with_size(config: Config, name: str, value: int) -> Config:
+    """A configuration with another value of a setting, which may lie in a group of its own."""
+    group, _, last = name.rpartition(".")
+    changed = {last: value} if not group else {group: replace(getattr(config, group), **{last: value})}
+    return replace(config, **changed)  # type: ignore[type-var]
+
+
+def halves(configured: int | None, least: int, count: int = 2) -> tuple[int, ...]:
+    """A half, a quarter and so on of a number, as far as they are not below ``least``; none of no number."""
+    values = () if configured is None else tuple(configured >> power for power in range(1, count + 1))
+    return tuple(value for value in values if value >= least)
+
+
+def _evenly(frames: Sequence[FrameKey], most: int) -> list[FrameKey]:
+    rows = np.unique(np.linspace(0, len(frames) - 1, min(most, len(frames))).round().astype(int))
+    return [frames[row] for row in rows]
+
+
+def _quality(avatar: Avatar, clip: Clip, frames: Sequence[FrameKey]) -> tuple[float, float]:
+    """Mean PSNR (dB) and SSIM of 8-bit renders over frames."""
+    found = []
+    for key in frames:
+        camera, pose = clip.cameras[key.camera], clip.poses[key.timestep]
+        rgb = np.asarray(avatar.render(camera, pose, tuple(map(float, clip.background))).rgb)
+        image, truth = (
+            torch.from_numpy(pixels.astype(np.float32) / 255).permute(2, 0, 1).contiguous()
+            for pixels in (np.rint(np.clip(rgb, 0, 1) * 255), clip.image(key))
+        )
+        squared = float((image - truth).double().square().mean())
+        found.append((-10 * np.log10(max(squared, 1e-10)), float(mean_ssim(image, truth))))
+    psnr, ssim = np.mean(found, axis=0)
+    return float(psnr), float(ssim)
