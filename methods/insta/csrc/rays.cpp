@@ -13,33 +13,22 @@ constexpr std::int64_t kMarchedPerTask = 128, kRenderedPerTask = 256;
 
 void put(std::vector<float>& to, Vec3 v) { to.insert(to.end(), {v.x, v.y, v.z}); }
 
-// The next samples of up to kLanes rays from `begin`.
-void march_together(const Marcher& marcher, const Rays& rays, std::int64_t begin, int count, Samples& out) {
+// The next samples of one ray: those of training are drawn at random, and few lie together.
+void march(const Marcher& marcher, const Rays& rays, std::int64_t number, Samples& out) {
   std::vector<Interval> intervals;
-  Progress progress[kLanes];
-  std::vector<Sample> found[kLanes];
-  bool ended[kLanes];
-  for (int i = 0; i < count; ++i) {
-    const std::int64_t number = begin + i;
-    progress[i] = {row(rays.origins, number), row(rays.directions, number), rays.jitter[number], rays.first[number]};
-    ended[i] = true;
-  }
-  marcher.start(progress, count, intervals);
-  marcher.march(progress, count, intervals, [&](int ray, const Sample& sample) {
-    found[ray].push_back(sample);
-    return ended[ray] = static_cast<std::int32_t>(found[ray].size()) < rays.samples_max;
+  Progress progress{row(rays.origins, number), row(rays.directions, number), rays.jitter[number], rays.first[number]};
+  std::int32_t count = 0;
+  marcher.start(&progress, 1, intervals);
+  marcher.march(&progress, 1, intervals, [&](int, const Sample& sample) {
+    put(out.positions, sample.position);
+    put(out.directions, sample.direction);
+    out.distances.push_back(sample.away);
+    out.rays.push_back(static_cast<std::int32_t>(number));
+    out.indices.push_back(sample.index);
+    out.triangles.push_back(sample.triangle);
+    return ++count < rays.samples_max;
   });
-  for (int i = 0; i < count; ++i) {
-    for (const Sample& sample : found[i]) {
-      put(out.positions, sample.position);
-      put(out.directions, sample.direction);
-      out.distances.push_back(sample.away);
-      out.rays.push_back(static_cast<std::int32_t>(begin + i));
-      out.indices.push_back(sample.index);
-      out.triangles.push_back(sample.triangle);
-    }
-    out.next.push_back(ended[i] ? -1 : progress[i].index);
-  }
+  out.next.push_back(count < rays.samples_max ? -1 : progress.index);
 }
 
 template <class T>
@@ -89,8 +78,7 @@ Samples march(const Marcher& marcher, const Rays& rays, int threads) {
   std::vector<Samples> parts(tasks);
   ThreadPool::instance().run(tasks, threads, [&](std::int64_t task, int) {
     const std::int64_t end = std::min(rays.count, (task + 1) * kMarchedPerTask);
-    for (std::int64_t begin = task * kMarchedPerTask; begin < end; begin += kLanes)
-      march_together(marcher, rays, begin, static_cast<int>(std::min<std::int64_t>(kLanes, end - begin)), parts[task]);
+    for (std::int64_t number = task * kMarchedPerTask; number < end; ++number) march(marcher, rays, number, parts[task]);
   });
   Samples whole;
   for (const Samples& part : parts) {
