@@ -11,7 +11,7 @@ from torch import Tensor
 from ...bench.contracts import FloatArray
 from ...bench.errors import InputError
 from ..ours.field import Bounds, normalised_weight, plane_features
-from ..ours.storage import splat_columns
+from ..ours.storage import RESIDUAL, splat_columns
 from ..shared.networks import C0, PAIRS
 from .container import Arrays, coded, dequantise, from_smallest_three, narrow, smallest_three
 from .precision import Precision
@@ -194,6 +194,9 @@ def encode_splats(
             name: coded(np.moveaxis(tensors[name].cpu().numpy(), 0, -1), precision.harmonics)
             for name in HARMONICS
         }
+    if RESIDUAL in tensors:
+        steps["colors"] = precision.colors
+        arrays[RESIDUAL] = coded(tensors[RESIDUAL].cpu().numpy().T, precision.colors)
     return arrays, steps
 
 
@@ -220,6 +223,9 @@ def decode_splats(arrays: Arrays) -> dict[str, Tensor]:
         for name in HARMONICS:
             values = np.moveaxis(arrays.decoded(name, step, *shapes[name]), -1, 0)
             tensors[name] = torch.from_numpy(np.ascontiguousarray(values))
+    if RESIDUAL in arrays:
+        values = arrays.decoded(RESIDUAL, arrays.step("colors"), 3, count)
+        tensors[RESIDUAL] = torch.from_numpy(np.ascontiguousarray(values.T))
     return tensors
 
 

@@ -11,7 +11,7 @@ import torch
 from ...bench.contracts import HeadAsset
 from ...bench.errors import InputError
 from ..ours.field import CanonicalFrames
-from ..ours.storage import SPLAT_WIDTHS, Field, checked_field
+from ..ours.storage import PER_SPLAT, RESIDUAL, SPLAT_WIDTHS, Field, checked_field
 from ..shared.avatar_files import Subject
 from ..shared.subject_mesh import SubjectMesh
 from .container import Arrays, Content, coded, packed_sizes, read_content, write_content
@@ -35,6 +35,7 @@ PARTS: Mapping[str, tuple[str, ...]] = {
     "opacities": ("logits",),
     "triangles": ("triangles",),
     "harmonics": HARMONICS,
+    "colors": (RESIDUAL,),
     "planes": PLANES,
     "lines": ("lines",),
     "networks": (*MATRICES, "line_gain", "line_bias"),
@@ -58,7 +59,7 @@ def encode(field: Field, subject: Subject, head: HeadAsset, precision: Precision
     frames = CanonicalFrames.of(mesh.frames(mesh.canonical))
     positions = frames.positions(table[:, -1].to(torch.int64), table[:, : SPLAT_WIDTHS["means"]])
     shared = encode_field(tensors, positions, precision)
-    coded_names = {"splats", *HARMONICS, *PLANES, "lines", *MATRICES}
+    coded_names = {*PER_SPLAT, *PLANES, "lines", *MATRICES}
     other = {name: value.numpy() for name, value in tensors.items() if name not in coded_names}
     return Content({**splats, **shared, **person.arrays, **other}, text, steps)
 

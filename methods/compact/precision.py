@@ -29,6 +29,9 @@ class Precision:
     harmonics: float = 0.02
     """Of spherical-harmonics coefficients, where they hold the colour: 0.0056 of colour in degree 0."""
 
+    colors: float = 0.02
+    """Of the colours of their own that splats have beside that of the planes."""
+
     planes: float = 0.005
     """Of the colour that one plane channel contributes, in [0, 1], as the colour network weighs it."""
 

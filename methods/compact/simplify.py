@@ -9,9 +9,9 @@ from torch import Tensor
 
 from ...bench.contracts import Clip, HeadPose
 from ..ours.avatar import OursAvatar
-from ..ours.storage import SPLAT_WIDTHS, Field
+from ..ours.storage import PER_SPLAT, SPLAT_WIDTHS, Field
 from ..splats.constants import ALPHA_MIN
-from .encoding import HARMONICS, negligible_lines
+from .encoding import negligible_lines
 from .precision import Precision
 
 
@@ -32,7 +32,7 @@ def simplify(avatar: OursAvatar, poses: Iterable[HeadPose], precision: Precision
     kept = _visible(avatar, poses)
     # Splats of one depth are drawn in order; sorting is stable, so those of one triangle keep theirs.
     order = kept[torch.argsort(tensors["splats"][kept, -1], stable=True)]
-    for name in ("splats", *HARMONICS):
+    for name in PER_SPLAT:
         if name in tensors:
             tensors[name] = tensors[name].index_select(0, order)
     if "lines" not in tensors:

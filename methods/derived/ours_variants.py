@@ -11,12 +11,11 @@ import torch
 from torch import Tensor
 
 from ...bench.contracts import Clip, HeadAsset, Variant
-from ..compact.encoding import HARMONICS
 from ..compact.file import COMPACT_FILE, read_compact, write_compact
 from ..compact.precision import Precision
 from ..compact.simplify import simplify
 from ..ours.avatar import OursAvatar
-from ..ours.storage import FIELD_FILE, Field, checked_field, read_field, save_field
+from ..ours.storage import FIELD_FILE, PER_SPLAT, Field, checked_field, read_field, save_field
 from ..shared.avatar_files import SUBJECT_FILE, read_shared_head, save_shared_head, write_subject
 from ..shared.subject_mesh import SubjectMesh
 from .recipes import (
@@ -65,7 +64,7 @@ def _make(
 ) -> OursAvatar:
     """Write what a recipe leaves of an avatar; return what is read back."""
     tensors = dict(whole.field.tensors)
-    for name in ("splats", *HARMONICS):
+    for name in PER_SPLAT:
         if name in tensors:
             tensors[name] = tensors[name].index_select(0, rows)
     tensors = _resampled(tensors, recipe)

@@ -38,6 +38,7 @@ from .field import (
     plane_features,
     shade,
 )
+from .storage import RESIDUAL
 from .training_kernel import canonical_positions, directions_to, plane_colors, table_offsets
 
 FLOATS_PER_FACE = 17 + 9 + 1  # triangle frame, turn to canonical, penalty weight
@@ -86,9 +87,10 @@ class OursAppearance:
         self._lines_from, self._degree_every = 0, 1
 
     def splat_parameters(self, count: int) -> dict[str, tuple[Tensor, float]]:
-        """None: a splat has geometry and opacity only. Spherical harmonics where they replace the planes."""
+        """A colour beside that of the planes, if any; spherical harmonics where they replace the planes."""
         if self._config.color == "planes":
-            return {}
+            rate = self._config.planes.residual_lr
+            return {RESIDUAL: (torch.zeros(count, 3, device=self._device), rate)} if rate else {}
         rates = {"sh_dc": self._config.sh_dc_lr, "sh_rest": self._config.sh_rest_lr}
         generator = torch_generator(self._seed, "sh")
         initial = initial_coefficients(count, self._config.sh_degree, generator)
@@ -121,6 +123,8 @@ class OursAppearance:
             else self.canonical.positions(binding, means)
         )
         splats = LocalSplats(*(optimiser[name] for name in ("means", "log_scales", "quats", "opacities")))
+        if self._config.color == "planes" and self._config.planes.residual_lr:
+            splats = splats._replace(color_change=optimiser[RESIDUAL])
         penalty = None
         if self._config.lines.enabled and iteration > self._lines_from:
             offsets = self.offsets(optimiser, positions.detach(), prepared.expression, prepared.jaw)

@@ -28,7 +28,7 @@ from .field import (
     position_part,
 )
 from .inference import DrivenPose, LineOffsets, PlaneColors
-from .storage import FIELD_FILE, Field, read_field, splat_columns
+from .storage import FIELD_FILE, RESIDUAL, Field, read_field, splat_columns
 
 
 class SeenFrom(NamedTuple):
@@ -70,7 +70,7 @@ class OursAvatar(StoredSplatAvatar):
         self.mesh = mesh
         columns = {name: part.contiguous() for name, part in splat_columns(tensors["splats"]).items()}
         geometry = columns["means"], columns["log_scales"], columns["quats"]
-        self.neutral = LocalSplats(*geometry, columns["opacities"][:, 0])
+        self.neutral = LocalSplats(*geometry, columns["opacities"][:, 0], tensors.get(RESIDUAL))
         self._binding = columns["binding"][:, 0].to(torch.int64)
         self._canonical = CanonicalFrames.of(mesh.frames(mesh.canonical))
         positions = self._canonical.positions(self._binding, self.neutral.means)

@@ -33,6 +33,8 @@ class Planes:
     bounds_variant : "mesh" fits the planes to the canonical mesh in all directions; "paper" sets x to +-0.25 m, which
         leaves half the samples in x unused on a head without long hair.
     lr, network_lr : learning rates of the planes and of the network.
+    residual_lr : learning rate of a colour of its own for each splat, added to that of the planes; 0, as published, gives
+        it none.
     """
 
     resolution: int = 128
@@ -40,10 +42,13 @@ class Planes:
     bounds_variant: Literal["mesh", "paper"] = "mesh"
     lr: float = 2e-3
     network_lr: float = 1e-4
+    residual_lr: float = 0.0
 
     def __post_init__(self) -> None:
         if self.resolution < 2 or min(self.channels) < 1:
             raise ValueError("resolution must be at least 2, and channels at least 1")
+        if self.residual_lr < 0:
+            raise ValueError(f"residual_lr must not be negative, found {self.residual_lr}")
 
 
 @dataclass(frozen=True)

@@ -68,7 +68,10 @@ def apply_offsets(splats: LocalSplats, offsets: Tensor, dynamic: Sequence[Dynami
         parts["opacity"] = parts["opacity"][:, 0]
     fields = {FIELDS[name]: part for name, part in parts.items() if name != "color"}
     changed = {field: getattr(splats, field) + part for field, part in fields.items()}
-    return splats._replace(**changed, color_change=parts.get("color"))
+    if "color" in parts:
+        own = splats.color_change
+        changed["color_change"] = parts["color"] if own is None else own + parts["color"]
+    return splats._replace(**changed)
 
 
 def changed_colors(colors: Tensor, splats: LocalSplats) -> Tensor:

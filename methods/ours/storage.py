@@ -25,6 +25,12 @@ FIELD_FILE = "avatar.safetensors"
 DYNAMIC = "dynamic"
 """Key of the file's metadata: what the lines change, in the order of the offset network's outputs."""
 
+RESIDUAL = "color_residual"
+"""The (N, 3) colours of their own, where splats have one beside that of the planes."""
+
+PER_SPLAT = ("splats", "sh_dc", "sh_rest", RESIDUAL)
+"""Tensors with a row for each splat."""
+
 SPLAT_WIDTHS = {"means": 3, "opacities": 1, "log_scales": 3, "quats": 4, "binding": 1}
 """Columns of the (N, 12) float32 splat table, 48 bytes each; the triangle is exact up to 2^24."""
 
@@ -48,7 +54,7 @@ def write_field(
     columns = {**splats, "opacities": splats["opacities"][:, None], "binding": binding[:, None]}
     table = torch.cat([columns[name].detach().to("cpu", torch.float32) for name in SPLAT_WIDTHS], dim=1)
     tensors = {name: value.detach() for name, value in shared.items()}
-    tensors |= {name: splats[name].detach() for name in ("sh_dc", "sh_rest") if name in splats}
+    tensors |= {name: splats[name].detach() for name in PER_SPLAT if name in splats}
     tensors |= {
         "splats": table,
         "plane_box": torch.stack(list(plane_box)),
@@ -131,6 +137,8 @@ def _check_shapes(path: Path, tensors: Mapping[str, Tensor], head: HeadAsset, ou
         fits = rest.shape[:2] == (len(splats), 3) and rest.ndim == 3 and rest.shape[2] in counts
         require("sh_rest", fits, f"({len(splats)}, 3, K), K one of {counts}")
     else:
+        if RESIDUAL in tensors:
+            exactly(RESIDUAL, len(splats), 3)
         planes = [f"plane_{pair}" for pair, _, _ in PAIRS]
         for name in planes:
             plane = tensors[name]

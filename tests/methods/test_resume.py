@@ -20,7 +20,7 @@ from headbench.methods.shared.loop import CHECKPOINT
 from headbench.methods.shared.optimisation import Optimiser
 
 from ..datasets.head.toy import toy_head
-from .ours.toy import SMALL, changed
+from .ours.toy import REPAIRED, changed
 from .toy_clip import toy_clip
 
 # Rounds at 8, 16, ..., 32, resets at 10, 30; lines from iteration 4 on.
@@ -37,7 +37,7 @@ BLENDSHAPES = BlendshapeTraining(
 )
 METHODS = {
     "ga": lambda: GA(GAConfig(splats=SPLATS, min_sh_every=5)),
-    "ours": lambda: Ours(changed(SMALL, splats=SPLATS, hidden=16)),
+    "ours": lambda: Ours(changed(REPAIRED, splats=SPLATS, hidden=16)),
     "gbs": lambda: GBS(GBSConfig(splats=BLENDSHAPES, samples=400, teeth_samples=40, mask_floor_mm=0.5)),
 }
 BUDGET = Budget(iterations=40)

@@ -16,15 +16,16 @@ from headbench.methods.compact.simplify import simplify, training_poses
 from headbench.methods.ours.avatar import OursAvatar
 from headbench.methods.ours.config import Lines, OursConfig, Planes
 from headbench.methods.ours.method import Ours
-from headbench.methods.ours.storage import FIELD_FILE
+from headbench.methods.ours.storage import FIELD_FILE, RESIDUAL
 from headbench.methods.shared.avatar_files import read_shared_head
 from headbench.methods.shared.config import SplatTraining
 
-from ..ours.toy import SMALL, changed, store
+from ..ours.toy import REPAIRED, SMALL, changed, store
 
 CASES = {
     "opacity": SMALL,
     "others": changed(SMALL, lines={"dynamic": ("position", "rotation", "scale", "color")}),
+    "repaired": REPAIRED,
     "harmonics": replace(SMALL, color="sh", sh_degree=2),
     "no lines": changed(SMALL, lines={"enabled": False}),
 }
@@ -72,9 +73,10 @@ def test_rounding_stays_within_its_steps(case, clip, tmp_path):
     assert ((means - means2).abs() / size).max() <= 0.5 * precision.positions + 1e-4
     if case == "others":
         assert (quats - quats2).abs().max() <= 0.5 * precision.rotations + 1e-5
-    for name in ("sh_dc", "sh_rest"):
+    steps = {"sh_dc": precision.harmonics, "sh_rest": precision.harmonics, RESIDUAL: precision.colors}
+    for name, step in steps.items():
         if name in one:
-            assert (one[name][order] - other[name]).abs().max() <= 0.5 * precision.harmonics + 1e-5
+            assert (one[name][order] - other[name]).abs().max() <= 0.5 * step + 1e-5
     for name in ("color_weight_0", "line_direction_1"):
         if name in one:
             largest = one[name].abs().amax(1, keepdim=True)

@@ -14,11 +14,14 @@ from headbench.datasets.head.model import HeadModel
 from headbench.methods.ours.appearance import OursAppearance
 from headbench.methods.ours.config import Lines, OursConfig, Planes
 from headbench.methods.ours.method import Ours
+from headbench.methods.ours.storage import RESIDUAL
 from headbench.methods.shared.config import SplatTraining
 from headbench.methods.shared.optimisation import Optimiser
 from headbench.methods.shared.rendering import view_of
 from headbench.methods.shared.schedule import Timeline
 from headbench.methods.shared.subject_mesh import SubjectMesh
+
+from .toy import changed
 
 CONFIG = OursConfig(
     splats=SplatTraining(min_densify_every=10, min_settle=4),
@@ -26,6 +29,10 @@ CONFIG = OursConfig(
     planes=Planes(resolution=7, channels=(4, 3, 2)),
     lines=Lines(resolution=5, channels=3, expressions=5, jaw_bases=3, lr=0.05),
 )
+CONFIGS = {
+    "published": CONFIG,
+    "repaired": changed(CONFIG, planes={"residual_lr": 0.05}),
+}
 
 
 def frame(vertices, triangle):
@@ -85,21 +92,23 @@ def definition(clip, key, tensors, splats, boxes, jaw_bases):
     expression = np.asarray(pose.expression, float)[: len(tensors["lines"]) - len(jaw)]
     camera = torch.from_numpy(clip.cameras[key.camera].center)
     means, colors, opacities = [], [], []
-    for mean, logit, triangle in zip(splats["means"], splats["opacities"], splats["binding"]):
+    own = splats.get(RESIDUAL, torch.zeros(len(splats["means"]), 3))
+    for mean, logit, triangle, residual in zip(*(splats[n] for n in ("means", "opacities", "binding")), own):
         corners = torch.from_numpy(np.asarray(clip.head.faces, np.int64)[int(triangle)])
         rotation, size, center = frame(vertices, corners)
         own_rotation, own_size, own_center = frame(canonical[0], corners)
         means.append(size * rotation @ mean + center)
         position = own_size * own_rotation @ mean + own_center
         direction = F.normalize(own_rotation @ rotation.T @ F.normalize(camera - means[-1], dim=0), dim=0)
-        colors.append(color(tensors, boxes[0], position, direction))
+        colors.append(torch.relu(color(tensors, boxes[0], position, direction) + residual))
         delta = offset(tensors, boxes[1], position.detach(), expression, jaw)
         opacities.append(torch.sigmoid(logit + delta))
     return torch.stack(means), torch.stack(colors), torch.stack(opacities)
 
 
-def test_a_stored_avatar_shows_the_definition(clip, tmp_path):
-    avatar = Ours(CONFIG).fit(
+@pytest.mark.parametrize("case", CONFIGS)
+def test_a_stored_avatar_shows_the_definition(case, clip, tmp_path):
+    avatar = Ours(CONFIGS[case]).fit(
         clip, tmp_path, Budget(iterations=40), device="cpu", seed=0, progress=no_progress
     )
     key = clip.splits["self_reenactment"][0]
@@ -108,6 +117,8 @@ def test_a_stored_avatar_shows_the_definition(clip, tmp_path):
     some = torch.arange(0, len(found.means), 7)
     table = stored["splats"][some]
     splats = {"means": table[:, :3], "opacities": table[:, 3], "binding": table[:, 11]}
+    if RESIDUAL in stored:
+        splats[RESIDUAL] = stored[RESIDUAL][some]
     boxes = stored["plane_box"], stored["line_box"]
     means, colors, opacities = definition(clip, key, stored, splats, boxes, stored["jaw_bases"].numpy())
     np.testing.assert_allclose(found.means[some], means, atol=1e-6)
@@ -116,11 +127,11 @@ def test_a_stored_avatar_shows_the_definition(clip, tmp_path):
     assert stored["lines"].abs().max() > 0.01
 
 
-@pytest.fixture(scope="module")
-def both(clip):
+@pytest.fixture(scope="module", params=[*CONFIGS])
+def both(clip, request):
     """Training's shading with lines on and the definition's, each with the gradients of one scalar of both."""
     mesh = SubjectMesh(clip.head, clip.shape, clip.static_offset, "cpu")
-    appearance = OursAppearance(mesh, clip, CONFIG, "cpu", 0)
+    appearance = OursAppearance(mesh, clip, CONFIGS[request.param], "cpu", 0)
     appearance.begin(Timeline(600_000, 600_000))
     count = len(mesh.faces)
     binding = torch.arange(0, count, 5)
@@ -131,6 +142,8 @@ def both(clip):
         values[plane] = 5 * values[plane]  # so that no colour is cut at 0 and all depend on their features
     values["means"] = 0.3 * torch.randn(len(binding), 3, generator=generator)
     values["opacities"] = torch.randn(len(binding), generator=generator)
+    own = appearance.splat_parameters(len(binding))
+    values |= {name: 0.2 * torch.randn(value.shape, generator=generator) for name, (value, _) in own.items()}
     still = {"log_scales": torch.zeros(len(binding), 3), "quats": torch.ones(len(binding), 4)}
     optimiser = Optimiser(
         {name: torch.nn.Parameter(value.clone()) for name, value in {**values, **still}.items()},
@@ -144,7 +157,7 @@ def both(clip):
     ((shading.colors * mix[:, :3]).sum() + (shading.opacities * mix[:, 3]).sum()).backward()
 
     exact = {name: value.double().requires_grad_() for name, value in values.items()}
-    splats = {"means": exact["means"], "opacities": exact["opacities"], "binding": binding}
+    splats = {**{name: exact[name] for name in ("means", "opacities", *own)}, "binding": binding}
     boxes = [torch.stack(list(box)).double() for box in (appearance.plane_box, appearance.line_box)]
     _, colors, opacities = definition(clip, key, exact, splats, boxes, appearance.jaw_bases)
     ((colors * mix[:, :3]).sum() + (opacities * mix[:, 3]).sum()).backward()

@@ -14,7 +14,7 @@ from headbench.methods.ours.inference import LineOffsets, PlaneColors, encode_co
 from headbench.methods.shared.networks import CPU_BLOCK, encode
 from headbench.methods.shared.subject_mesh import KnownPoses, pose_key
 
-from .toy import SMALL, changed, store
+from .toy import REPAIRED, SMALL, changed, store
 
 
 def directions(count, seed=0, dtype=torch.float32):
@@ -77,6 +77,7 @@ def test_offsets_are_those_of_training(clip, tmp_path):
 CASES = {
     "opacity": SMALL,
     "others": changed(SMALL, lines={"dynamic": ("position", "rotation", "scale", "color")}),
+    "repaired": REPAIRED,
     "harmonics": replace(SMALL, color="sh", sh_degree=2),
     "no lines": changed(SMALL, lines={"enabled": False}),
 }
@@ -157,7 +158,7 @@ def test_known_values_are_bounded_and_computed_once():
     assert len(computed) == 6
 
 
-@pytest.mark.parametrize("case", ["opacity", "harmonics"])
+@pytest.mark.parametrize("case", ["opacity", "harmonics", "repaired"])
 def test_colours_by_direction_are_those_of_a_camera_far_away(case, clip, tmp_path):
     avatar = OursAvatar.read(store(clip, tmp_path, CASES[case]), "cpu")
     pose = replace(clip.poses[0], rotation=np.array([0.3, -0.8, 0.5], np.float32))

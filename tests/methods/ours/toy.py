@@ -30,6 +30,9 @@ def changed(config, **settings):
     )
 
 
+REPAIRED = changed(SMALL, planes={"residual_lr": 0.01})
+
+
 def make(clip, config=SMALL):
     subject = Subject.of(clip)
     mesh = SubjectMesh(clip.head, subject.shape, subject.static_offset, "cpu")
