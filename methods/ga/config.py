@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 from ..shared.config import Capacity, SplatTraining
 
@@ -29,6 +30,8 @@ class GAConfig:
     expression_lr: float = 1e-3
     pose_lr: float = 1e-5
     translation_lr: float = 1e-6
+
+    added: ClassVar = ("capacity",)
 
     def __post_init__(self) -> None:
         if not 0 <= self.sh_degree <= 3:

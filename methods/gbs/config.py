@@ -88,6 +88,7 @@ class GBSConfig:
     correctives_variant: Literal["paper", "official"] = "paper"
     lower_teeth_variant: Literal["paper", "official"] = "paper"
 
+    added: ClassVar = ("capacity",)
     renamed: ClassVar[Mapping[str, Renamed]] = {
         "departures:triple_correctives": Renamed("correctives_variant"),
         "departures:blended_lower_teeth": Renamed("lower_teeth_variant"),

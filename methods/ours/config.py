@@ -44,6 +44,8 @@ class Planes:
     network_lr: float = 1e-4
     residual_lr: float = 0.0
 
+    added: ClassVar = ("residual_lr",)
+
     def __post_init__(self) -> None:
         if self.resolution < 2 or min(self.channels) < 1:
             raise ValueError("resolution must be at least 2, and channels at least 1")

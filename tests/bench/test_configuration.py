@@ -93,6 +93,9 @@ class Now:
     inner: Inner = field(default_factory=Inner)
     group: Group = field(default_factory=Group)
     odd_variant: Literal["paper", "official"] = "paper"
+    size: Group = field(default_factory=Group)
+
+    added: ClassVar = ("size",)
     renamed: ClassVar = {
         "group": Renamed("group.on"),
         "how": Renamed("group.variant", {"": "paper", "code": "official"}),
@@ -132,3 +135,4 @@ def test_settings_stored_by_old_names_have_the_same_digest():
         "odd": (),
         "group.": {"later": 0},
     }
+    assert with_first_names(Now(size=Group(on=False)))["size"] == asdict(Group(on=False))
