@@ -104,9 +104,10 @@ class SynthSettings:
     tracking_error: float = 0.0
     """Level of the errors that trackers make: shrunk and mixed expressions, drift; 1 is 0.5 to 1 mm on the face, 2 to 3 mm
     on lips and lids. 0 to 4."""
-    light: Literal["lamps", "panels"] = "lamps"
-    """`lamps` are five distant ones with hard shadows; `panels` are eight large ones, with soft shadows, one bounce, and
-    pictures whose bytes are the same on every processor. Panels need the compiled kernel."""
+    edition: Literal[1, 2] = 1
+    """1 has five distant lamps with hard shadows, and skin that follows the expression at once. 2 has eight large panels with
+    soft shadows and one bounce, folds that buckle, blood with delay, all ages, beards, glasses, hair in the tracked mesh, and
+    pictures whose bytes are the same on every processor; it needs the compiled kernel."""
 
 
 def synth(settings: SynthSettings, progress: Progress) -> Findings:

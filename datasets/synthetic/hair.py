@@ -16,7 +16,7 @@ from ...bench.contracts import FloatArray, IntArray
 from ..head.geometry import smoothstep
 from .anatomy import SIDES, Anatomy, Eye, Person
 from .fields import fractal_noise, value_noise
-from .skin import brow_color, brow_curve
+from .skin import beard_share, brow_color, brow_curve
 
 
 @dataclass(frozen=True)
@@ -45,6 +45,8 @@ STYLES = {
     "short": Style(0.042, 0.0100, 1500, 0.0085, 0.0030, 0.30, 0.80, 0.55, 0.20, 0.028),
     "bob": Style(0.105, 0.0120, 900, 0.0130, 0.0060, 0.85, 0.90, 0.70, 0.12, -0.020),
     "swept": Style(0.068, 0.0100, 1300, 0.0100, 0.0035, 0.20, 0.15, 1.30, 0.16, 0.0),
+    "curly": Style(0.036, 0.0150, 2400, 0.0060, 0.0130, 0.10, 0.35, 0.40, 1.10, 0.015),
+    "long": Style(0.180, 0.0120, 900, 0.0140, 0.0060, 0.90, 0.80, 0.75, 0.14, 0.010),
 }
 
 _TOO_SHORT_TO_HANG = 0.02  # metres; such hair cannot hang into the face
@@ -69,6 +71,7 @@ def hair_share(person: Person, anatomy: Anatomy, points: FloatArray, ears: Float
     middle_z = 0.5 * (anatomy["glabella"][2] + anatomy["vertex_top"][2]) - 0.045 * s
     azimuth = np.arctan2(np.abs(points[:, 0]), points[:, 2] - middle_z)
     line = anatomy["glabella"][1] + s * np.interp(azimuth, _AZIMUTH, _HEIGHT)
+    line = line + person.recession * s * smoothstep(azimuth, 1.15, 0.6)
     ragged = 0.0035 * s * fractal_noise(points, 0.012 * s, person.seed + 80, 3)
     grown = smoothstep(points[:, 1] - line + ragged, -0.002 * s, 0.009 * s)
     return grown * (1.0 - ears) * (1.0 - _around_lobes(points, ears, s))
@@ -380,3 +383,46 @@ def _lashes(
         )
         made.append((paths, 0.00042 if up > 0 else 0.0003, color))
     return made
+
+
+_BEARD_LOCKS = 1900
+_MOUSTACHE = 0.008  # metres, at most: longer hairs above the mouth would hang into it
+
+
+def make_beard(
+    person: Person,
+    anatomy: Anatomy,
+    points: FloatArray,
+    normals: FloatArray,
+    faces: IntArray,
+    cavity: FloatArray,
+) -> RootedStrands | None:
+    """A beard that grows from cheeks, chin and upper lip and moves with them, or none."""
+    if not person.beard:
+        return None
+    s, rng = anatomy.scale, np.random.default_rng(person.seed + 86)
+    share = np.where(cavity > 0.0, 0.0, beard_share(person, anatomy, points))
+    fine = 0.65 if person.beard < _MOUSTACHE else 1.0
+    chosen = _sample(points, faces, share, int(_BEARD_LOCKS / fine), rng)
+    root = faces[chosen, rng.integers(0, 3, len(chosen))]
+    root = root[share[root] > 0.15]
+    start, normal, count = points[root], normals[root], len(root)
+    above = smoothstep(start[:, 1], anatomy["mouth"][1] - 0.001 * s, anatomy["mouth"][1] + 0.005 * s)
+    aside = np.sign(start[:, 0]) * smoothstep(np.abs(start[:, 0]), 0.0, 0.012 * s)
+    lean = np.stack([(0.15 + 0.9 * above) * aside, -np.ones(count), np.full(count, -0.1)], axis=1)
+    lean += 0.22 * rng.standard_normal(lean.shape)
+    lean -= 0.85 * np.einsum("ni,ni->n", lean, normal)[:, None] * normal
+    lean /= np.linalg.norm(lean, axis=1, keepdims=True)
+    length = person.beard * rng.uniform(0.6, 1.1, count) * (0.4 + 0.6 * share[root])
+    length = s * np.where(above > 0.5, np.minimum(length, _MOUSTACHE), length)
+    t = np.linspace(0.0, 1.0, 4)[None, :, None]
+    out = (0.35 + 0.25 * rng.random((count, 1, 1))) * t * (1.0 - 0.45 * t)
+    paths = start[:, None] + length[:, None, None] * (t * lean[:, None] + out * normal[:, None])
+    tone = (
+        0.35 * rng.standard_normal((count, 2))
+        + 0.3 * fractal_noise(start, 0.012 * s, person.seed + 87, 2)[:, None]
+    )
+    color = 0.9 * person.hair * np.exp(tone)[:, :, None]
+    facing = normal[:, None] + rng.normal(0.0, 0.25, (count, 1, 3))
+    width = 0.0024 * fine * s * rng.uniform(0.7, 1.3, count)
+    return RootedStrands(ribbons(paths, facing, width, color, tip_shade=1.2, tip_width=0.3), root)

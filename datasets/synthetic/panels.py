@@ -23,9 +23,7 @@ from ..rounding import ANGLE_BITS, COEFFICIENT_BITS, LENGTH_BITS, on_grid
 from .plan import CAMERA_DISTANCE
 from .renderer import MATERIALS, window
 
-KERNEL = Kernel(
-    "headbench.datasets.synthetic._light", "The light of panels", "or render with `--light lamps`"
-)
+KERNEL = Kernel("headbench.datasets.synthetic._light", "The light of panels", "or make edition 1")
 
 MOST_PANELS = 8
 SURROUNDINGS = (0.25, 0.25, 0.25)
@@ -154,6 +152,7 @@ class PanelTracer:
         self._threads, self._seed = threads, seed
         self._vertices: dict[str, FloatArray] = {}
         self._albedo: dict[str, FloatArray] = {}
+        self._gloss: dict[str, FloatArray] = {}
         self._faces: dict[str, IntArray] = {}
         self._materials: dict[str, str] = {}
         self._world: Any = None
@@ -166,13 +165,23 @@ class PanelTracer:
         """Add a mesh: (n, 3) world positions, (m, 3) triangles, (n, 3) linear reflectance."""
         self._vertices[name], self._albedo[name] = vertices, albedo
         self._faces[name], self._materials[name] = faces, material
+        self._gloss[name] = np.ones(len(vertices))
         self._world = None
 
-    def move(self, name: str, vertices: FloatArray, albedo: FloatArray | None = None) -> None:
-        """Give a mesh new positions, and colours if they changed. Takes effect with the next image."""
+    def move(
+        self,
+        name: str,
+        vertices: FloatArray,
+        albedo: FloatArray | None = None,
+        gloss: FloatArray | None = None,
+    ) -> None:
+        """Give a mesh new positions, and what changed of colours and of ``gloss`` (n,), factors on the panels' reflections
+        (1 unless given; mirrors have none). Takes effect with the next image."""
         self._vertices[name] = vertices
         if albedo is not None:
             self._albedo[name] = albedo
+        if gloss is not None:
+            self._gloss[name] = gloss
         self._moved = True
 
     def image(self, camera: Camera, seed: int) -> tuple[FloatArray, FloatArray]:
@@ -216,7 +225,8 @@ class PanelTracer:
             self._world = self._build(vertices)
         else:
             self._world.move(vertices)
-        self._world.paint(np.concatenate(list(self._albedo.values())).astype(np.float32))
+        painted = (np.concatenate(list(each.values())) for each in (self._albedo, self._gloss))
+        self._world.paint(*(values.astype(np.float32) for values in painted))
         self._moved = False
         return self._world
 

@@ -272,11 +272,12 @@ _MINIMUM = 8  # timesteps below which another sequence is not worth opening
 
 @dataclass(frozen=True, eq=False)
 class Performed:
-    """A performed sequence: one dictionary of controls per timestep, and the timesteps to label."""
+    """A performed sequence: one dictionary of controls per timestep, the timesteps to label, and seconds between two."""
 
     name: str
     activations: Sequence[Mapping[str, float]]
     excluded: Mapping[int, str]
+    step: float
 
 
 def share_out(timesteps: int, kind: Kind = "full") -> dict[str, int]:
@@ -340,7 +341,7 @@ def perform(
     values = {control: on_grid(curve, COEFFICIENT_BITS) for control, curve in values.items()}
     activations = [{control: float(values[control][t]) for control in CONTROLS} for t in range(timesteps)]
     excluded = {t: TONGUE for t, a in enumerate(activations) if a["tongue_out"] >= tongue_shows}
-    return Performed(name, activations, excluded)
+    return Performed(name, activations, excluded, seconds / timesteps)
 
 
 _IDLE = (

@@ -23,6 +23,7 @@ from ..rounding import ANGLE_BITS, COEFFICIENT_BITS, LENGTH_BITS, on_grid
 from .anatomy import Anatomy, Person, measure, person
 from .hair import STYLES, Style
 from .parts import MouthPart, procedural_parts, share_that_shows, tongue
+from .people import person_of_any_age
 from .performance import (
     HELD_OUT,
     ICT_TARGETS,
@@ -35,6 +36,7 @@ from .performance import (
     share_out,
 )
 from .tracking import with_tracking_error, with_tracking_noise
+from .volume import tracked_volume
 
 FIRST_SUBJECT = 900
 """Synthetic subjects count from here: no participant of NeRSemble has such a number."""
@@ -43,8 +45,8 @@ _IDENTITY_SPREAD = 0.65  # standard deviations of the identity basis; 1 would dr
 _LOOK_BELOW = 0.004  # metres below the middle of the head
 
 
-LightKind = Literal["lamps", "panels"]
-LIGHTS: tuple[LightKind, ...] = get_args(LightKind)
+Edition = Literal[1, 2]
+EDITIONS: tuple[Edition, ...] = get_args(Edition)
 
 
 @dataclass(frozen=True)
@@ -62,12 +64,12 @@ class SynthSettings:
     performance: Kind = "full"
     dynamics: float = 1.0
     tracking_error: float = 0.0
-    light: LightKind = "lamps"
+    edition: Edition = 1
 
     def described(self) -> dict[str, Any]:
         """The settings for records; those that came later are left out where they have their default."""
         described = asdict(self)
-        usual = {"performance": "full", "dynamics": 1.0, "tracking_error": 0.0, "light": "lamps"}
+        usual = {"performance": "full", "dynamics": 1.0, "tracking_error": 0.0, "edition": 1}
         for name, value in usual.items():
             if described[name] == value:
                 del described[name]
@@ -102,7 +104,8 @@ class SubjectPlan:
 def plan_subject(out: Path, index: int, geometry: Geometry, settings: SynthSettings) -> SubjectPlan:
     """Plan subject number ``index``: nothing is rendered or written."""
     name = f"{FIRST_SUBJECT + index}"
-    who = person(name, index, settings.seed, settings.dynamics)
+    draw = person if settings.edition == 1 else person_of_any_age
+    who = draw(name, index, settings.seed, settings.dynamics)
     rng = np.random.default_rng([settings.seed, index, 3])
     head = geometry.head
     drawn = rng.standard_normal(head.shape_basis.shape[2]) * _IDENTITY_SPREAD
@@ -133,11 +136,14 @@ def plan_subject(out: Path, index: int, geometry: Geometry, settings: SynthSetti
     )
     every = [pose for sequence in tracked_by_name.values() for pose in sequence]
     tracked = iter(with_tracking_noise(every, settings.tracking_noise, settings.seed + 101 * index))
+    offset: FloatArray = np.zeros(head.template.shape)
+    if settings.edition == 2:
+        offset = tracked_volume(who, anatomy, head, neutral)
     plan = CapturePlan(
         subject=name,
         head=head,
         shape=shape,
-        static_offset=np.zeros(head.template.shape),
+        static_offset=offset,
         cameras=list(views.values()),
         sequences=[
             SequencePlan(sequence, [next(tracked) for _ in exact], performed[sequence].excluded)

@@ -20,6 +20,7 @@ import numpy as np
 
 from ...bench.contracts import ByteArray, Camera, FloatArray, HeadPose, IntArray
 from ...bench.errors import InputError
+from .history import SkinState, over_time
 from .performance import CONTROLS, Activations
 from .plan import FRONTAL, Light, SubjectPlan, lights
 from .subject import RenderedSubject
@@ -51,6 +52,7 @@ MATERIALS: Mapping[str, Material] = {
     "gums": Material(0.28, 0.5, two_sided=True),
     "tongue": Material(0.35, 0.45, two_sided=True),
     "mouth": Material(0.6, 0.2, two_sided=True),
+    "frame": Material(0.25, 0.5, two_sided=True),
     "cloth": Material(0.9, 0.05, two_sided=True),
 }
 
@@ -105,8 +107,14 @@ class PathTracer:
         self._places[name] = vertices
         self._scene = None
 
-    def move(self, name: str, vertices: FloatArray, albedo: FloatArray | None = None) -> None:
-        """Give a mesh new positions, and colours if they changed. Takes effect with the next image."""
+    def move(
+        self,
+        name: str,
+        vertices: FloatArray,
+        albedo: FloatArray | None = None,
+        gloss: FloatArray | None = None,
+    ) -> None:
+        """Give a mesh new positions, and colours if they changed. Takes effect with the next image. No ``gloss`` is shown."""
         parameters = self._traverse()
         parameters[f"{name}.vertex_positions"] = _flat(vertices)
         self._places[name] = vertices
@@ -226,13 +234,19 @@ class Tracer(Protocol):
     def add(
         self, name: str, vertices: FloatArray, faces: IntArray, albedo: FloatArray, material: str
     ) -> None: ...
-    def move(self, name: str, vertices: FloatArray, albedo: FloatArray | None = None) -> None: ...
+    def move(
+        self,
+        name: str,
+        vertices: FloatArray,
+        albedo: FloatArray | None = None,
+        gloss: FloatArray | None = None,
+    ) -> None: ...
     def image(self, camera: Camera, seed: int) -> tuple[FloatArray, FloatArray]: ...
 
 
 def _tracer(plan: SubjectPlan) -> Tracer:
     samples = plan.settings.samples_per_pixel
-    if plan.settings.light == "lamps":
+    if plan.settings.edition == 1:
         return PathTracer(lights(), samples, threads=1)
     from .panels import PanelTracer, panels, rig_middle  # which takes materials from here
 
@@ -246,6 +260,7 @@ class CaptureRenderer:
         self._plan = plan
         self._subject = RenderedSubject(plan.person, plan.geometry, plan.shape)
         self._tracer = _tracer(plan)
+        self._states: dict[str, list[SkinState]] = {}
         rest = dict.fromkeys(CONTROLS, 0.0)
         posed = self._subject.posed_meshes(plan.geometry.translation.pose(rest, plan.person.name, None), rest)
         for name, mesh in self._subject.rest_meshes().items():
@@ -254,15 +269,23 @@ class CaptureRenderer:
     def render_frames(self, sequence: str, timestep: int, cameras: Sequence[str]) -> None:
         """Render and store one timestep as the named cameras see it."""
         plan = self._plan
-        self.set_pose(plan.poses[sequence][timestep], plan.performed[sequence].activations[timestep])
+        self.pose_at(sequence, timestep)
         for camera in cameras:
             image, mask = self.render(camera, plan.render_seed(sequence, timestep, camera))
             plan.writer.write_frame(sequence, timestep, camera, image, mask)
 
-    def set_pose(self, pose: HeadPose, activations: Activations) -> None:
-        """Move all meshes to a pose; skin follows the ``activations``."""
-        for name, mesh in self._subject.posed_meshes(pose, activations).items():
-            self._tracer.move(name, mesh.vertices, mesh.albedo)
+    def pose_at(self, sequence: str, timestep: int) -> None:
+        """Move all meshes to where they are at a timestep, with what skin remembers of those before."""
+        plan, performed = self._plan, self._plan.performed[sequence]
+        if sequence not in self._states and plan.settings.edition > 1:
+            self._states[sequence] = over_time(performed.activations, performed.step, plan.person)
+        skin = self._states[sequence][timestep] if plan.settings.edition > 1 else None
+        self.set_pose(plan.poses[sequence][timestep], performed.activations[timestep], skin)
+
+    def set_pose(self, pose: HeadPose, activations: Activations, skin: SkinState | None = None) -> None:
+        """Move all meshes to a pose; skin is in the state given, or follows the ``activations`` at once."""
+        for name, mesh in self._subject.posed_meshes(pose, activations, skin).items():
+            self._tracer.move(name, mesh.vertices, mesh.albedo, mesh.gloss)
 
     def render(self, camera: str, seed: int) -> tuple[ByteArray, ByteArray]:
         """(H, W, 3) 8-bit image on the capture's background and (H, W) foreground mask."""

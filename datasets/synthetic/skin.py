@@ -49,10 +49,15 @@ def paint_skin(
     color = _mix(
         color, person.skin * np.array([0.62, 0.44, 0.34]), person.freckles * _freckles(anatomy, points, seed)
     )
+    if person.spots:
+        brown = 0.5 * person.spots * spots(points, 0.014 * s, 0.0026 * s, 0.3, seed + 32)
+        color = _mix(color, person.skin * np.array([0.60, 0.46, 0.38]), brown)
     moles = spots(points, 0.045 * s, 0.0016 * s, 0.25, seed + 31)
     color = _mix(color, person.skin * np.array([0.22, 0.14, 0.12]), moles)
     beard = person.hair * 0.6 + person.skin * np.array([0.10, 0.12, 0.13])
-    color = _mix(color, beard, 0.55 * person.stubble * _beard(anatomy, points, seed))
+    color = _mix(color, beard, 0.55 * person.stubble * stubble_share(anatomy, points, seed))
+    if person.beard:
+        color = _mix(color, 0.8 * beard, 0.9 * beard_share(person, anatomy, points))
     lips = lip_share(anatomy, points) * facing
     stripes = 1.0 + 0.10 * value_noise(points / (np.array([0.0012, 0.02, 0.02]) * s), seed + 40)
     color = _mix(color, person.lips[None] * stripes[:, None], 0.92 * lips)
@@ -96,6 +101,38 @@ def lip_share(anatomy: Anatomy, points: FloatArray) -> FloatArray:
     share = np.zeros(len(points))
     share[near] = smoothstep(polygon_distance(points[near, :2], outline[:, :2]), 0.0006 * s, -0.0010 * s)
     return share * (points[:, 2] > outline[:, 2].min() - 0.008 * s)
+
+
+def sagging(person: Person, anatomy: Anatomy, points: FloatArray) -> FloatArray:
+    """(N,) metres along the normal by which skin of age differs from young skin: jowls and bags, hollow temples and cheeks."""
+    s, total = anatomy.scale, np.zeros(len(points))
+    for side, sign in zip(SIDES, (1.0, -1.0)):
+        corner, eye = anatomy[f"{side}_mouth_corner"], anatomy.eyes[side]
+        jowl = corner + np.array([sign * 0.018, -0.024, -0.014]) * s
+        total += 0.0042 * blob(points, jowl, np.array([0.011, 0.010, 0.014]) * s)
+        cheek = 0.5 * (anatomy[f"{side}_cheek"] + corner) + np.array([sign * 0.016, 0.0, -0.010]) * s
+        total -= 0.0030 * blob(points, cheek, np.array([0.010, 0.013, 0.014]) * s)
+        bag = np.append(
+            eye.lower[len(eye.lower) // 2] - np.array([0.0, 0.0085 * s]), anatomy[f"{side}_eye_inner"][2]
+        )
+        total += 0.0016 * blob(points, bag, np.array([0.010, 0.0035, 0.012]) * s)
+        temple = anatomy[f"{side}_brow_outer"] + np.array([sign * 0.012, 0.010, -0.016]) * s
+        total -= 0.0026 * blob(points, temple, np.array([0.012, 0.012, 0.016]) * s)
+    return person.sag * s * total
+
+
+def gloss_at_rest(person: Person, anatomy: Anatomy, points: FloatArray, lips: FloatArray) -> FloatArray:
+    """(N,) factors on reflections: oily forehead, nose and chin by ``person.oil``, dull neck, moist lips."""
+    s = anatomy.scale
+    zone = 0.9 * blob(points, anatomy["forehead"], np.array([0.038, 0.022, 0.03]) * s)
+    zone += blob(
+        points, anatomy["nose_tip"] + np.array([0.0, 0.008, 0.0]) * s, np.array([0.011, 0.02, 0.02]) * s
+    )
+    zone += 0.6 * blob(points, anatomy["chin"] + np.array([0.0, 0.006, 0.0]) * s, 0.012 * s)
+    for side in SIDES:
+        zone += 0.5 * blob(points, anatomy[f"{side}_cheek"] + np.array([0.0, 0.008, 0.0]) * s, 0.015 * s)
+    pores = 1.0 + 0.25 * fractal_noise(points, 0.005 * s, person.seed + 99, 2)
+    return (0.6 + person.oil * np.minimum(zone, 1.2)) * pores * (1.0 - lips) + 1.3 * lips
 
 
 def _mix(color: FloatArray, other: FloatArray, share: FloatArray) -> FloatArray:
@@ -169,7 +206,7 @@ def _freckles(anatomy: Anatomy, points: FloatArray, seed: int) -> FloatArray:
     return 0.8 * where * spots(points, 0.0042 * s, 0.0013 * s, 0.55, seed + 21)
 
 
-def _beard(anatomy: Anatomy, points: FloatArray, seed: int) -> FloatArray:
+def stubble_share(anatomy: Anatomy, points: FloatArray, seed: int) -> FloatArray:
     """Where a beard would grow, grained as stubble."""
     s = anatomy.scale
     mouth, chin = anatomy["mouth"], anatomy["chin"]
@@ -180,6 +217,21 @@ def _beard(anatomy: Anatomy, points: FloatArray, seed: int) -> FloatArray:
     cheeks = sum(blob(points, anatomy[f"{side}_cheek"], np.array([0.02, 0.026, 0.03]) * s) for side in SIDES)
     grain = 0.75 + 0.35 * value_noise(points / (0.0016 * s), seed + 60)
     return np.clip(low * front * (1.0 - 0.9 * np.minimum(cheeks, 1.0)) * grain, 0.0, 1.0)
+
+
+def beard_share(person: Person, anatomy: Anatomy, points: FloatArray) -> FloatArray:
+    """(N,) coverage by a beard that is let grow: stubble's area and the upper lip, but neither lips nor what lies behind them."""
+    s, mouth = anatomy.scale, anatomy["mouth"]
+    upper = 0.5 * (anatomy["upper_lip_mid"] + anatomy["nose_base"]) - np.array([0.0, 0.002, 0.0]) * s
+    share = np.maximum(
+        stubble_share(anatomy, points, person.seed), blob(points, upper, np.array([0.020, 0.0055, 0.02]) * s)
+    )
+    near = _near(points, mouth, 0.07 * s)
+    bare = np.zeros(len(points))
+    distance = polygon_distance(points[near, :2], anatomy.lip_outline[:, :2])
+    bare[near] = smoothstep(distance, 0.0022 * s, 0.0008 * s)
+    bare = np.maximum(bare, smoothstep(points[:, 2], mouth[2] - 0.062 * s, mouth[2] - 0.075 * s))
+    return smoothstep(share, 0.22, 0.6) * (1.0 - bare)
 
 
 _FOLD_WIDTH = 0.0013  # standard deviation of a line's groove, metres
@@ -199,20 +251,19 @@ class Folds:
     flush: FloatArray
     tint: FloatArray
 
-    def apply(self, activations: Activations, albedo: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Displacement (N,) in metres and reflectance (N, 3) of skin under an expression."""
-        fold, blood = fold_strengths(activations), flush_strengths(activations)
+    def apply(self, fold: FloatArray, blood: FloatArray, albedo: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Displacement (N,) in metres and reflectance (N, 3) of skin with folds of strengths (G,) and flushes (F,)."""
         color = albedo * (1.0 - np.clip(fold @ self.shade, 0.0, 0.9))[:, None] ** np.array([0.85, 1.1, 1.15])
         change = (blood[:, None] * self.flush).T @ np.log(self.tint)
         return fold @ self.height, np.clip(color * np.exp(change), 0.003, 0.95)
 
 
-_FOLDS = (
+FOLDS = (
     *("forehead_mid", "forehead_left", "forehead_right", "glabella", "crow_left", "crow_right"),
     *("nasolabial_left", "nasolabial_right", "bunny", "under_eye_left", "under_eye_right"),
     *("chin", "dimple_left", "dimple_right", "lip_lines", "neck"),
 )
-_FLUSHES = {
+FLUSHES = {
     "cheeks": (1.04, 0.83, 0.84),
     "forehead_pale": (1.10, 1.17, 1.18),
     "lips_pale": (1.05, 1.55, 1.5),
@@ -247,7 +298,7 @@ def fold_strengths(a: Activations) -> FloatArray:
         "lip_lines": a["pucker"],
         "neck": 0.5 * (a["mouth_stretch_left"] + a["mouth_stretch_right"]),
     }
-    return np.clip([strengths[name] for name in _FOLDS], 0.0, 1.3)
+    return np.clip([strengths[name] for name in FOLDS], 0.0, 1.3)
 
 
 def flush_strengths(a: Activations) -> FloatArray:
@@ -262,7 +313,7 @@ def flush_strengths(a: Activations) -> FloatArray:
         "anger": down,
         "nose": 0.5 * (a["nose_sneer_left"] + a["nose_sneer_right"]),
     }
-    return np.clip([strengths[name] for name in _FLUSHES], 0.0, 1.2)
+    return np.clip([strengths[name] for name in FLUSHES], 0.0, 1.2)
 
 
 def make_folds(
@@ -274,14 +325,12 @@ def make_folds(
     """
     sketch = _Sketch(person, anatomy, points)
     groups = sketch.groups()
-    height = np.stack([groups[name][0] for name in _FOLDS]) * (person.lines * person.dynamics)
-    shade = np.stack([groups[name][1] for name in _FOLDS]) * (
-        np.minimum(person.lines, 1.15) * person.dynamics
-    )
+    height = np.stack([groups[name][0] for name in FOLDS]) * (person.lines * person.dynamics)
+    shade = np.stack([groups[name][1] for name in FOLDS]) * (np.minimum(person.lines, 1.15) * person.dynamics)
     keep = (1.0 - 0.9 * lips) * bare
-    keep_lip_lines = np.where(np.array([name == "lip_lines" for name in _FOLDS])[:, None], 1.0, keep)
-    flush = np.stack([sketch.flush(name, lips) for name in _FLUSHES]) * (bare * person.dynamics)
-    tint = np.array(list(_FLUSHES.values()))
+    keep_lip_lines = np.where(np.array([name == "lip_lines" for name in FOLDS])[:, None], 1.0, keep)
+    flush = np.stack([sketch.flush(name, lips) for name in FLUSHES]) * (bare * person.dynamics)
+    tint = np.array(list(FLUSHES.values()))
     return Folds(height * keep_lip_lines, shade * keep_lip_lines, flush, tint)
 
 

@@ -9,16 +9,20 @@ import numpy as np
 import torch
 
 from ...bench.contracts import FloatArray, HeadAsset, HeadPose, IntArray
-from ..head.geometry import unique_pairs, vertex_normals
+from ..head.geometry import triangle_areas, unique_pairs, vertex_normals
 from ..head.model import HeadModel, chain_transforms
 from ..head.rotations import axis_angle_to_matrix
 from .anatomy import SIDES, Anatomy, Person, measure
-from .hair import ear_share, make_brows_and_lashes, make_hair
+from .glasses import make_glasses
+from .hair import ear_share, make_beard, make_brows_and_lashes, make_hair
+from .history import SkinState, at_once
 from .parts import eye_mesh, tracked_parts
 from .performance import Activations
 from .plan import Geometry
-from .skin import make_folds, paint_skin
+from .skin import gloss_at_rest, make_folds, paint_skin, sagging
 
+_STRETCH_GLOSS = 3.0  # exponent of the stretch of area
+_WET = 1.2  # what wetness adds to the gloss of lips
 HEAD_JOINT, EYE_JOINTS = 1, (3, 4)
 
 # Edge lengths of the fine mesh (metres at average size) by distance from the bridge of the nose.
@@ -27,10 +31,11 @@ _DETAIL = ((0.085, 0.0018), (0.13, 0.0035), (np.inf, 0.007))
 
 @dataclass(frozen=True, eq=False)
 class PosedMesh:
-    """A mesh to render: ``vertices`` (n, 3) and ``albedo`` (n, 3) of one moment."""
+    """A mesh to render: ``vertices`` (n, 3), ``albedo`` (n, 3) and ``gloss`` (n,) of one moment, where they change."""
 
     vertices: FloatArray
     albedo: FloatArray | None
+    gloss: FloatArray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,11 +68,21 @@ class RenderedSubject:
         self._skin_albedo, self._cap = under, hair.cap
         self._hair = hair.strands
         self._rooted = make_brows_and_lashes(person, self.anatomy, points, normals)
+        self._beard = make_beard(person, self.anatomy, points, normals, self._fine.faces, cavity)
+        self._glasses = make_glasses(person, self.anatomy, points, normals)
+        if person.sag:
+            self._cap = self._cap + sagging(person, self.anatomy, points)
         self._rest_points = points
+        self._lips = paint.lips
+        self._area = np.maximum(_area_around(self.neutral, self.anatomy.skin_faces), 1e-9)
+        self._gloss = None
+        if person.oil:
+            self._gloss = gloss_at_rest(person, self.anatomy, points, paint.lips) * (1.0 - 0.5 * hair.share)
         self._eyes = {side: eye_mesh(person, self.anatomy.eyes[side]) for side in SIDES}
         self._mouth = tuple(geometry.mouth(person, self.anatomy, self.shape))
         self._tracked_parts = tracked_parts(head)
-        self._frames = self._fine.frames(self.neutral, self._rooted.root)
+        rooted = (self._rooted,) if self._beard is None else (self._rooted, self._beard)
+        self._frames = [self._fine.frames(self.neutral, each.root) for each in rooted]
 
     def rest_meshes(self) -> dict[str, RestMesh]:
         """Meshes by name."""
@@ -76,6 +91,10 @@ class RenderedSubject:
             "hair": RestMesh(self._hair.faces, self._hair.albedo, "hair"),
             "brows": RestMesh(self._rooted.strands.faces, self._rooted.strands.albedo, "lash"),
         }
+        if self._beard:
+            fixed["beard"] = RestMesh(self._beard.strands.faces, self._beard.strands.albedo, "hair")
+        if self._glasses:
+            fixed["glasses"] = RestMesh(self._glasses.faces, self._glasses.albedo, "frame")
         fixed |= {f"eye_{side}": RestMesh(e.faces, e.albedo, "eye") for side, e in self._eyes.items()}
         fixed |= {p.name: RestMesh(p.faces, p.albedo, p.material) for p in self._mouth}
         return fixed | {p.name: RestMesh(p.faces, p.albedo, p.material) for p in self._tracked_parts}
@@ -86,18 +105,28 @@ class RenderedSubject:
         with torch.no_grad():
             return self._model(shape=torch.from_numpy(self.shape), **arguments)[0].numpy()
 
-    def posed_meshes(self, pose: HeadPose, activations: Activations) -> dict[str, PosedMesh]:
-        """All meshes in a pose; wrinkles and colour follow ``activations``."""
+    def posed_meshes(
+        self, pose: HeadPose, activations: Activations, skin: SkinState | None = None
+    ) -> dict[str, PosedMesh]:
+        """All meshes in a pose; wrinkles and colour are those of the state given, or follow ``activations`` at once."""
+        state = skin or at_once(activations)
         tracked = self.tracked(pose)
         joints = self._joint_motions(pose)
         points = self._fine.positions(tracked)
         normals = vertex_normals(points, self._fine.faces)
-        lift, albedo = self._folds.apply(activations, self._skin_albedo)
+        lift, albedo = self._folds.apply(state.folds, state.flushes, self._skin_albedo)
+        gloss = None if self._gloss is None else self._stretched_gloss(tracked, self._gloss, state.wet)
         made = {
-            "skin": PosedMesh(points + (lift + self._cap)[:, None] * normals, albedo),
+            "skin": PosedMesh(points + (lift + self._cap)[:, None] * normals, albedo, gloss),
             "hair": PosedMesh(_moved(joints[HEAD_JOINT], self._hair.vertices), None),
-            "brows": PosedMesh(self._rooted_vertices(tracked, points + lift[:, None] * normals), None),
+            "brows": PosedMesh(self._rooted_vertices(0, tracked, points + lift[:, None] * normals), None),
         }
+        if self._beard:
+            made["beard"] = PosedMesh(
+                self._rooted_vertices(1, tracked, points + (lift + self._cap)[:, None] * normals), None
+            )
+        if self._glasses:
+            made["glasses"] = PosedMesh(_moved(joints[HEAD_JOINT], self._glasses.vertices), None)
         for side, joint in zip(SIDES, EYE_JOINTS):
             made[f"eye_{side}"] = PosedMesh(_moved(joints[joint], self._eyes[side].vertices), None)
         for inner in self._tracked_parts:
@@ -110,11 +139,19 @@ class RenderedSubject:
             )
         return made
 
-    def _rooted_vertices(self, tracked: FloatArray, points: FloatArray) -> FloatArray:
-        """Brows and lashes turn with the triangle they grow from."""
-        root, strand = self._rooted.root, self._rooted.strands.strand
-        turn = self._fine.frames(tracked, root) @ self._frames.transpose(0, 2, 1)
-        local = self._rooted.strands.vertices - self._rest_points[root][strand]
+    def _stretched_gloss(self, tracked: FloatArray, rest: FloatArray, wet: float) -> FloatArray:
+        """Skin that is stretched loses its fine relief and shines more; so do wet lips."""
+        area = _area_around(tracked, self._fine.coarse_faces)
+        stretch = self._fine.interpolate(np.clip(area / self._area, 0.6, 1.6))
+        return np.clip(rest * stretch**_STRETCH_GLOSS * (1.0 + _WET * wet * self._lips), 0.1, 4.0)
+
+    def _rooted_vertices(self, number: int, tracked: FloatArray, points: FloatArray) -> FloatArray:
+        """Brows and lashes (number 0) and beard (1) turn with the triangle they grow from."""
+        rooted = self._rooted if number == 0 else self._beard
+        assert rooted is not None
+        root, strand = rooted.root, rooted.strands.strand
+        turn = self._fine.frames(tracked, root) @ self._frames[number].transpose(0, 2, 1)
+        local = rooted.strands.vertices - self._rest_points[root][strand]
         return points[root][strand] + np.einsum("nab,nb->na", turn[strand], local)
 
     def _joint_motions(self, pose: HeadPose) -> FloatArray:
@@ -128,6 +165,12 @@ class RenderedSubject:
         turned = np.einsum("jab,jb->ja", world[..., :3], joints[0].numpy())
         offset = world[..., 3] - turned + pose.translation
         return np.concatenate([world[..., :3], offset[..., None]], axis=-1)
+
+
+def _area_around(vertices: FloatArray, faces: IntArray) -> FloatArray:
+    """(V,) area of the triangles around each vertex."""
+    areas = np.repeat(triangle_areas(vertices, faces), 3)
+    return np.asarray(np.bincount(faces.ravel(), areas, len(vertices)), np.float64)
 
 
 def _moved(motion: FloatArray, points: FloatArray) -> FloatArray:

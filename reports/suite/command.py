@@ -48,7 +48,7 @@ class SuiteSettings:
     size: str = "144x208"
     """Width x height of the images in pixels."""
 
-    light: Literal["panels", "lamps"] = "panels"
+    edition: Literal[2, 1] = 2
     """As for `headbench synth`."""
 
     tracking_error: float = 1.0

@@ -60,7 +60,7 @@ def run_suite(settings: SuiteSettings, progress: Progress) -> Findings:
         size=parse_size(settings.size),
         seed=SEED,
         performance="parts",
-        light=settings.light,
+        edition=settings.edition,
         tracking_error=settings.tracking_error,
         progress=progress,
     )

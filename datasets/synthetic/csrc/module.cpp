@@ -74,6 +74,7 @@ class World {
         tree_(vertices_.data(), faces_.data(), static_cast<std::int64_t>(faces.shape(0))),
         normals_(vertices_.size()),
         albedo_(vertices_.size(), 0.5f),
+        gloss_(count_, 1.0f),
         reached_(2 * count_),
         states_(2 * count_),
         wanted_(2 * count_),
@@ -99,9 +100,10 @@ class World {
     darken();
   }
 
-  void paint(const Array<const float, -1, 3>& albedo) {
-    require(static_cast<std::int64_t>(albedo.shape(0)) == count_);
+  void paint(const Array<const float, -1, 3>& albedo, const Array<const float, -1>& gloss) {
+    require(static_cast<std::int64_t>(albedo.shape(0)) == count_ && static_cast<std::int64_t>(gloss.shape(0)) == count_);
     std::copy_n(albedo.data(), 3 * count_, albedo_.data());
+    std::copy_n(gloss.data(), count_, gloss_.data());
     darken();
   }
 
@@ -203,6 +205,7 @@ class World {
     scene_.vertices = vertices_.data();
     scene_.normals = normals_.data();
     scene_.albedo = albedo_.data();
+    scene_.gloss = gloss_.data();
     scene_.hemisphere = hemisphere_.data();
     scene_.reached = reached_.data();
     return scene_;
@@ -354,7 +357,7 @@ class World {
   Floats hemisphere_;
   std::int64_t count_;
   Tree tree_;
-  Floats normals_, albedo_;
+  Floats normals_, albedo_, gloss_;
   std::vector<Reached> reached_;
   std::vector<std::uint8_t> states_;
   Sides wanted_, mirrored_;
@@ -376,7 +379,7 @@ NB_MODULE(_light, m) {
            "vertices"_a, "faces"_a, "material_of"_a, "materials"_a, "panels"_a, "surroundings"_a, "hemisphere"_a, "seed"_a,
            "instruction_set"_a)
       .def("move", &World::move, "vertices"_a)
-      .def("paint", &World::paint, "albedo"_a)
+      .def("paint", &World::paint, "albedo"_a, "gloss"_a)
       .def("light", &World::light, "sides"_a, "out"_a, "threads"_a)
       .def("render", &World::render, "matrix"_a, "left"_a, "top"_a, "grid"_a, "taps"_a, "seed"_a, "image"_a, "threads"_a);
 }

@@ -57,6 +57,7 @@ struct Scene {
   const std::uint8_t* material_of;  // by triangle
   const Material* materials;
   const float *vertices, *normals, *albedo;  // (vertices, 3)
+  const float* gloss;  // (vertices,), factors on the panels' reflections
   Panels panels;
   float surroundings[3];  // radiance
   Reached* reached;       // 2 by vertex: front, where the normal points, and back

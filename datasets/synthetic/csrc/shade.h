@@ -298,12 +298,14 @@ inline void shade(const Scene& scene, const Sample* samples, std::int64_t count,
     const Material& material = scene.materials[scene.material_of[sample.triangle]];
     Vec3 albedo = {0.0f, 0.0f, 0.0f}, light = {0.0f, 0.0f, 0.0f};
     Float8 visible = all(0.0f);
+    float gloss = 0.0f;
     for (int corner = 0; corner < 3; ++corner) {
       const float weight = surface.weights[corner];
       const Reached& reached = scene.reached[2 * static_cast<std::int64_t>(surface.face[corner]) + sample.back];
       albedo = albedo + at(scene.albedo, surface.face[corner]) * weight;
       light = light + Vec3{reached.all[0], reached.all[1], reached.all[2]} * weight;
       visible = visible + load(reached.visible) * all(weight);
+      gloss += scene.gloss[surface.face[corner]] * weight;
     }
     const float color[3] = {albedo.x * light.x, albedo.y * light.y, albedo.z * light.z};
     float shine[3] = {0.0f, 0.0f, 0.0f};
@@ -325,7 +327,7 @@ inline void shade(const Scene& scene, const Sample* samples, std::int64_t count,
       kept = 1.0f - share;
     } else if (material.specular > 0.0f) {
       const Float8 sent = glossy(scene, place_of(scene, surface), surface.normal, sample.towards, material) * visible;
-      for (int channel = 0; channel < 3; ++channel) shine[channel] = sum(sent * load(scene.panels.radiance[channel]));
+      for (int channel = 0; channel < 3; ++channel) shine[channel] = gloss * sum(sent * load(scene.panels.radiance[channel]));
     }
     for (int channel = 0; channel < 3; ++channel) pixel[channel] = color[channel] * kept + shine[channel];
     pixel[3] = 1.0f;

@@ -130,6 +130,23 @@ def test_a_convex_body_in_a_white_furnace_shows_its_albedo():
     )
 
 
+def test_gloss_scales_reflections_alone():
+    rng = np.random.default_rng(1)
+    unit = rng.standard_normal((300, 3))
+    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+    frontal = panel([0.0, 0.5, 1.0], [0.4, 0, 0], [0, 0.3, 0.15], [0, -0.45, -0.9])
+    scene = tracer({"ball": (0.1 * unit, hull_faces(unit))}, [frontal], material="skin", albedo=0.3)
+    shown = []
+    for gloss in (1.0, 0.0, 2.5):
+        scene.move("ball", 0.1 * unit, gloss=np.full(300, gloss))
+        shown.append(scene.image(front_camera(32, 24), 0)[0])
+    plain = tracer({"ball": (0.1 * unit, hull_faces(unit))}, [frontal], material="skin", albedo=0.3)
+    np.testing.assert_array_equal(plain.image(front_camera(32, 24), 0)[0], shown[0])
+    reflected = shown[0] - shown[1]
+    assert reflected.max() > 0.02
+    np.testing.assert_allclose(shown[2] - shown[1], 2.5 * reflected, atol=1e-5)
+
+
 def front_camera(width, height, focal=100.0, shift=(0.0, 0.0)):
     """At one metre before the origin."""
     world_to_camera = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -269,5 +286,5 @@ def test_missing_kernel_and_bad_input_are_said_first(tmp_path, monkeypatch):
     small = {"cameras": 2, "timesteps": 8, "size": (32, 46)}
     monkeypatch.setattr(module, "KERNEL", Kernel("headbench.none", "The light of panels", "or take lamps"))
     with pytest.raises(UnavailableError, match="The light of panels"):
-        synthesize(tmp_path / "capture", **small, light="panels")
+        synthesize(tmp_path / "capture", **small, edition=2)
     assert not (tmp_path / "capture").exists()

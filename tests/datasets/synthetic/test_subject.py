@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from headbench.datasets.synthetic.history import at_once
 from headbench.datasets.synthetic.skin import make_folds
 from headbench.datasets.synthetic.subject import RenderedSubject, refine
 
@@ -102,11 +103,12 @@ def test_dynamics_scale_folds_and_colour_changes(plan, subject, rest):
     """Folds and logarithms of colour factors are proportional to it; at 0 skin stays as it is."""
     points = subject._rest_points[::50]
     lips = np.linspace(0.0, 1.0, len(points))
+    state = at_once({**rest, "brow_inner_up": 0.4})
 
     def change(factor):
         person = replace(plan.person, dynamics=factor)
         folds = make_folds(person, subject.anatomy, points, lips, np.ones(len(points)))
-        lift, albedo = folds.apply({**rest, "brow_inner_up": 0.4}, np.full((len(points), 3), 0.1))
+        lift, albedo = folds.apply(state.folds, state.flushes, np.full((len(points), 3), 0.1))
         return lift, np.log(albedo / 0.1)
 
     still, once, twice = change(0.0), change(1.0), change(2.0)

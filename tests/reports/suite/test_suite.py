@@ -9,7 +9,7 @@ from headbench.bench.registry import get
 from headbench.bench.runner.config import resolve_method
 from headbench.reports.suite import suite as module
 
-SMALL = ("--subjects", "2", "--cameras", "2", "--timesteps", "60", "--size", "16x16", "--light", "lamps")
+SMALL = ("--subjects", "2", "--cameras", "2", "--timesteps", "60", "--size", "16x16", "--edition", "1")
 
 
 @pytest.mark.slow

@@ -1,0 +1,118 @@
+"""What skin remembers, in the second edition: folds that buckle, blood that takes its time, lips that dry.
+
+A state is a function of the exact controls of a sequence up to its moment, which begins at rest, and of nothing that a tracker
+stores: tracked parameters alone do not tell it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...bench.contracts import FloatArray
+from ..rounding import COEFFICIENT_BITS, on_grid
+from .anatomy import SIDES, Person
+from .performance import Activations
+from .skin import FLUSHES, FOLDS, flush_strengths, fold_strengths
+
+BUCKLES = (0.30, 0.55)
+"""Range of the strength at which a fold buckles, drawn for each subject and fold."""
+SLACK = (0.12, 0.25)
+"""How far below that strength it becomes smooth again: the hysteresis, drawn likewise."""
+_SMOOTH = 0.3  # depth, as a share of the strength, of a fold that has not buckled
+_BUCKLED = (0.25, 0.75)  # depth of one that has: a constant, and a share of the strength
+_DEEPEST = 1.1
+
+FLUSH_SECONDS = {"cheeks": (0.9, 2.5), "anger": (0.9, 2.5), "nose": (0.6, 1.5), "lips_full": (0.4, 0.8)}
+"""Time constants with which blood comes and goes."""
+_REFILL = (0.0, 0.8)  # of skin that is pressed: pale at once, filled again within about two seconds
+DRYING = 4.0
+"""Seconds after which lips keep 1/e of what lip roll or tongue wetted."""
+
+
+@dataclass(frozen=True, eq=False)
+class SkinState:
+    """Strengths of folds (G,) and of flushes (F,), and how wet the lips are, 0 to 1."""
+
+    folds: FloatArray
+    flushes: FloatArray
+    wet: float = 0.0
+
+
+def at_once(activations: Activations) -> SkinState:
+    """The state of skin that follows the controls and remembers nothing: the first edition's."""
+    return SkinState(fold_strengths(activations), flush_strengths(activations))
+
+
+def over_time(activations: Sequence[Activations], seconds: float, person: Person) -> list[SkinState]:
+    """States at the timesteps of a sequence, which are ``seconds`` apart."""
+    rng = np.random.default_rng([person.seed, 13])
+    upper = on_grid(rng.uniform(*BUCKLES, len(FOLDS)), COEFFICIENT_BITS)
+    lower = upper - on_grid(rng.uniform(*SLACK, len(FOLDS)), COEFFICIENT_BITS)
+    coming, going = (
+        np.array([_kept(seconds, FLUSH_SECONDS.get(name, _REFILL)[way]) for name in FLUSHES])
+        for way in (0, 1)
+    )
+    drying = _kept(seconds, DRYING)
+    buckled = np.zeros(len(FOLDS), bool)
+    flushes, wet, states = np.zeros(len(FLUSHES)), 0.0, []
+    for a in activations:
+        strength = coupled_strengths(a)
+        buckled = strength > np.where(buckled, lower, upper)
+        depth = np.where(buckled, _BUCKLED[0] + _BUCKLED[1] * strength, _SMOOTH * strength)
+        target = flush_strengths(a)
+        kept = np.where(target > flushes, coming, going)
+        flushes = target + kept * (flushes - target)
+        wet = min(max(a["lip_roll"], a["tongue_out"], drying * wet), 1.0)
+        folds = np.maximum(person.lines_at_rest * _AGED, depth) + 0.25 * person.lines_at_rest * _AGED
+        states.append(SkinState(np.minimum(folds, _DEEPEST), flushes, wet))
+    return states
+
+
+def _kept(seconds: float, constant: float) -> float:
+    """Share of a difference that is left after ``seconds``."""
+    return float(on_grid(np.exp(-seconds / constant), COEFFICIENT_BITS)) if constant else 0.0
+
+
+_AGED = np.array(
+    [
+        {"forehead": 0.5, "glabella": 0.6, "crow": 0.6, "nasolabial": 0.9, "under": 0.4, "neck": 0.6}.get(
+            name.split("_")[0], 0.0
+        )
+        for name in FOLDS
+    ]
+)
+"""How deep folds of an aged face are at rest."""
+
+
+def coupled_strengths(a: Activations) -> FloatArray:
+    """(G,) strengths of the folds where muscles work together: most are products of controls."""
+    jaw = min(max(a["jaw_open"], 0.0), 1.0)
+    smile = {side: min(max(a[f"smile_{side}"], 0.0), 1.2) for side in SIDES}
+    down = {side: a[f"brow_down_{side}"] for side in SIDES}
+    tense = {side: max(a[f"squint_{side}"], a[f"cheek_raise_{side}"]) for side in SIDES}
+    frown = 0.5 * (down["left"] + down["right"])
+    sneer = 0.5 * (a["nose_sneer_left"] + a["nose_sneer_right"])
+    upper = 0.5 * (a["upper_lip_up_left"] + a["upper_lip_up_right"])
+    stretch = 0.5 * (a["mouth_stretch_left"] + a["mouth_stretch_right"])
+    strengths = {
+        "forehead_mid": a["brow_inner_up"] * (1.0 - 0.6 * frown),
+        **{f"forehead_{side}": a[f"brow_outer_up_{side}"] * (1.0 - 0.6 * down[side]) for side in SIDES},
+        "glabella": frown * (0.75 + 0.5 * a["brow_inner_up"]) + 0.35 * sneer,
+        **{f"crow_{side}": tense[side] * (0.35 + 0.6 * smile[side]) + 0.15 * smile[side] for side in SIDES},
+        **{
+            f"nasolabial_{side}": smile[side] * (0.5 + 0.9 * jaw)
+            + a[f"nose_sneer_{side}"] * (0.5 + 0.5 * a[f"upper_lip_up_{side}"])
+            + 0.5 * a[f"mouth_stretch_{side}"] * jaw
+            for side in SIDES
+        },
+        "bunny": sneer * (0.6 + 0.7 * upper),
+        **{f"under_eye_{side}": tense[side] * (0.55 + 0.6 * smile[side]) for side in SIDES},
+        "chin": max(a["chin_raise"], 0.6 * a["mouth_frown"], 0.8 * a["lip_press"]) * (1.0 - 0.8 * jaw),
+        **{f"dimple_{side}": smile[side] * (1.0 - 0.8 * jaw) for side in SIDES},
+        "lip_lines": a["pucker"] * (1.0 - 0.6 * jaw),
+        "neck": stretch * (0.5 + 0.8 * jaw),
+    }
+    return np.clip([strengths[name] for name in FOLDS], 0.0, 1.3)

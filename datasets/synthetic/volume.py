@@ -1,0 +1,50 @@
+"""Hair in the tracked mesh: what a tracker with vertex offsets, such as VHAP, would make of hair, beard and sagging skin.
+
+VHAP fits one offset a vertex to all frames under a Laplacian penalty: the hair's volume without its locks. Here it is a part of
+the mean thickness of hair over the head model's own vertices, smoothed over its edges.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...bench.contracts import FloatArray, HeadAsset
+from ..head.geometry import mesh_edges, vertex_normals
+from ..rounding import LENGTH_BITS, on_grid
+from .anatomy import Anatomy, Person
+from .hair import STYLES, ear_share, hair_share
+from .skin import beard_share, sagging
+
+FOUND = 0.8
+"""Part of the thickness that the offset shows: penalties draw it towards the head model."""
+_ROUNDS = 6  # of averaging over neighbours
+_LOCKS = 0.6  # mean height of locks over the cap, as a part of their rise
+_BEARD = 0.35  # mean thickness of a beard, as a part of its length
+
+
+def tracked_volume(person: Person, anatomy: Anatomy, head: HeadAsset, neutral: FloatArray) -> FloatArray:
+    """(V, 3) offsets, metres, of a subject's neutral vertices (V, 3); 0 where there is no skin. Joints stay where they are."""
+    s, style = anatomy.scale, STYLES[person.style]
+    named = np.zeros(len(neutral))
+    for ear in ("left_ear", "right_ear"):
+        named[head.regions.get(ear, [])] = 1.0
+    thickness = (
+        (style.cap + _LOCKS * style.rise)
+        * s
+        * hair_share(person, anatomy, neutral, ear_share(anatomy, neutral, named))
+    )
+    thickness = thickness + _BEARD * person.beard * s * beard_share(person, anatomy, neutral)
+    thickness = thickness + sagging(person, anatomy, neutral)
+    skin = np.zeros(len(neutral), bool)
+    skin[anatomy.skin_faces] = True
+    offset = FOUND * np.where(skin, thickness, 0.0)[:, None] * vertex_normals(neutral, anatomy.skin_faces)
+    edges = mesh_edges(anatomy.skin_faces)
+    both = np.concatenate([edges, edges[:, ::-1]])
+    around = np.bincount(both[:, 0], minlength=len(neutral))
+    for _ in range(_ROUNDS):
+        mean = [np.bincount(both[:, 0], offset[both[:, 1], axis], len(neutral)) for axis in range(3)]
+        offset = 0.5 * (offset + np.stack(mean, axis=1) / np.maximum(around, 1)[:, None])
+    offset *= skin[:, None]
+    # The least change that leaves the joints, which are regressed from these vertices, where the poses have them.
+    regressor = np.asarray(head.joint_regressor, np.float64)
+    return on_grid(offset - np.linalg.pinv(regressor) @ (regressor @ offset), LENGTH_BITS)

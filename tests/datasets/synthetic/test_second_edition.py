@@ -1,0 +1,140 @@
+"""People, skin and tracked mesh of the second edition."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial import cKDTree
+
+from headbench.datasets.head.model import HeadModel
+from headbench.datasets.synthetic.anatomy import linear
+from headbench.datasets.synthetic.hair import STYLES
+from headbench.datasets.synthetic.history import coupled_strengths, over_time
+from headbench.datasets.synthetic.people import person_of_any_age
+from headbench.datasets.synthetic.plan import SynthSettings, plan_subject
+from headbench.datasets.synthetic.skin import FLUSHES, FOLDS
+from headbench.datasets.synthetic.subject import RenderedSubject
+
+
+@pytest.mark.parametrize("seed", [0, 7, 14])
+def test_ten_subjects_are_of_all_kinds(seed):
+    people = [person_of_any_age(str(index), index, seed) for index in range(10)]
+    assert {who.style for who in people} == set(STYLES)
+    assert {"", "metal", "plastic"} == {who.glasses for who in people}
+    assert 2 <= sum(who.beard > 0 for who in people) <= 6
+    assert {who.beard > 0.01 for who in people if who.beard} == {True, False}
+    tones = sorted(float(who.skin.mean()) for who in people)
+    assert tones[0] < 1.5 * linear("#6a4430").mean() < 0.7 * linear("#e2b49a").mean() < tones[-1]
+    assert min(who.sag for who in people) == 0.0
+    assert max(who.sag for who in people) > 0.7
+    assert all(
+        0.0 < value < 1.0 for who in people for color in (who.skin, who.hair, who.lips) for value in color
+    )
+
+
+@pytest.fixture(scope="module")
+def bearded(geometry):
+    """A subject with everything that there is."""
+    settings = SynthSettings(1, 2, 8, (48, 70), "procedural", 0, 0.0, 16, edition=2)
+    plan = plan_subject(Path("unused"), 0, geometry, settings)
+    return replace(plan, person=replace(plan.person, beard=0.015, glasses="plastic", sag=1.0))
+
+
+def folds(states):
+    return np.array([state.folds for state in states])
+
+
+def ramp(rest, control, values, **others):
+    return [{**rest, **others, control: value} for value in values]
+
+
+def test_folds_buckle_and_stay_so_on_the_way_back(bearded, rest):
+    who = replace(bearded.person, lines_at_rest=0.0)
+    values = np.linspace(0.0, 1.0, 101)
+    up_and_down = ramp(rest, "brow_inner_up", [*values, *values[::-1]])
+    depth = folds(over_time(up_and_down, 0.04, who))[:, FOLDS.index("forehead_mid")]
+    up, down = depth[:101], depth[101:][::-1]
+    jumps = np.flatnonzero(np.diff(up) > 0.1), np.flatnonzero(np.diff(down) > 0.1)
+    assert [len(each) for each in jumps] == [1, 1]
+    assert 0.30 <= values[jumps[0][0] + 1] <= 0.56
+    assert 0.11 <= values[jumps[0][0]] - values[jumps[1][0]] <= 0.26
+    away = np.ones(101, bool)
+    away[jumps[1][0] : jumps[0][0] + 2] = False
+    np.testing.assert_array_equal(up[away], down[away])
+
+
+def test_strengths_of_folds_do_not_add_up(rest):
+    def strength(**controls):
+        return coupled_strengths({**rest, **controls})[FOLDS.index("nasolabial_left")]
+
+    together = strength(smile_left=0.5, jaw_open=0.6)
+    assert together > 1.4 * (strength(smile_left=0.5) + strength(jaw_open=0.6))
+
+
+def test_blood_comes_late_and_pressed_skin_fills_again(bearded, rest):
+    smile = {**rest, "smile_left": 1.0, "smile_right": 1.0, "lip_press": 1.0}
+    states = over_time([smile] * 10 + [rest] * 10, 0.5, bearded.person)
+    flushes = np.array([state.flushes for state in states])
+    cheeks, lips = (flushes[:, list(FLUSHES).index(name)] for name in ("cheeks", "lips_pale"))
+    np.testing.assert_allclose(cheeks[[0, 9]], 1.0 - np.exp([-0.5 / 0.9, -5.0 / 0.9]), atol=1e-4)
+    np.testing.assert_allclose(cheeks[10:] / cheeks[9], np.exp(-0.2 * np.arange(1, 11)), atol=1e-4)
+    assert lips[0] == lips[9]
+    assert lips[10] / lips[9] == pytest.approx(np.exp(-0.5 / 0.8), abs=1e-4)
+    wet = [state.wet for state in over_time([{**rest, "lip_roll": 1.0}, rest, rest], 2.0, bearded.person)]
+    np.testing.assert_allclose(wet, np.exp([0.0, -0.5, -1.0]), atol=1e-5)
+
+
+def test_what_is_to_come_changes_no_state(bearded):
+    played = bearded.performed["FREE"].activations
+    whole, part = over_time(played, 0.3, bearded.person), over_time(played[:3], 0.3, bearded.person)
+    for a, b in zip(whole, part):
+        np.testing.assert_array_equal(a.folds, b.folds)
+        np.testing.assert_array_equal(a.flushes, b.flushes)
+
+
+def test_the_tracked_mesh_has_hair_volume_and_not_locks(bearded):
+    head, offset = bearded.geometry.head, bearded.writer.plan.static_offset
+    model = HeadModel(head, dtype=torch.float64)
+    plain = model.canonical(torch.from_numpy(bearded.shape))
+    joints = np.asarray(head.joint_regressor, np.float64) @ offset
+    assert np.abs(joints).max() < 1e-7
+    eyes = np.concatenate([head.regions["left_eyeball"], head.regions["right_eyeball"]])
+    assert np.linalg.norm(offset[eyes], axis=1).max() < 1e-6
+    top = plain[0, :, 1].numpy().argmax()
+    style = STYLES[bearded.person.style]
+    assert 0.5 * style.cap < offset[top, 1] < style.cap + style.rise
+    edges = head.faces[:, :2]
+    assert np.linalg.norm(offset[edges[:, 0]] - offset[edges[:, 1]], axis=1).max() < 0.5 * style.cap + 0.002
+
+
+def test_beard_and_glasses_lie_on_the_face_and_move_with_it(bearded, rest):
+    subject = RenderedSubject(bearded.person, bearded.geometry, bearded.shape)
+    assert {"beard", "glasses"} <= subject.rest_meshes().keys()
+    pose = bearded.geometry.translation.pose(rest, "900", 0)
+    calm = subject.posed_meshes(pose, rest)
+    skin = calm["skin"].vertices
+    assert cKDTree(skin).query(calm["beard"].vertices)[0].max() < 0.025
+    assert 0.001 < cKDTree(skin).query(calm["glasses"].vertices)[0].max() < 0.04
+    mouth = subject.anatomy["mouth"]
+    middle = np.abs(calm["beard"].vertices - mouth)[:, :2] < np.array([0.012, 0.002])
+    assert middle.all(axis=1).mean() < 0.002  # hardly any hair lies over the lips
+    opened = {**rest, "jaw_open": 1.0}
+    moved = subject.posed_meshes(bearded.geometry.translation.pose(opened, "900", 0), opened)
+    fall = calm["beard"].vertices[:, 1] - moved["beard"].vertices[:, 1]
+    assert np.percentile(fall, 90) > 0.01
+    np.testing.assert_array_equal(moved["glasses"].vertices, calm["glasses"].vertices)
+
+
+def test_stretched_skin_shines_more(bearded, rest):
+    subject = RenderedSubject(bearded.person, bearded.geometry, bearded.shape)
+    puffed = {**rest, "cheek_puff": 1.0}
+    gloss = [
+        subject.posed_meshes(bearded.geometry.translation.pose(a, "900", 0), a)["skin"].gloss
+        for a in (rest, puffed)
+    ]
+    cheek = np.linalg.norm(subject._rest_points - subject.anatomy["left_cheek"], axis=1) < 0.025
+    change = gloss[1][cheek] / gloss[0][cheek]
+    assert np.percentile(change, 95) > 1.1
+    assert all(each.min() >= 0.1 and each.max() <= 4.0 for each in gloss)
