@@ -116,14 +116,15 @@ class OursAppearance:
     ) -> ShadedSplats:
         """Colour by canonical position and direction; what the lines change, once they are on."""
         prepared = self._prepared(timestep)
-        means = optimiser["means"]
+        planes = self._config.planes
+        means = optimiser["means"] if planes.move_splats else optimiser["means"].detach()
         positions = (
             canonical_positions(self.canonical, binding, means)
             if usable(means)
             else self.canonical.positions(binding, means)
         )
         splats = LocalSplats(*(optimiser[name] for name in ("means", "log_scales", "quats", "opacities")))
-        if self._config.color == "planes" and self._config.planes.residual_lr:
+        if self._config.color == "planes" and planes.residual_lr:
             splats = splats._replace(color_change=optimiser[RESIDUAL])
         penalty = None
         if self._config.lines.enabled and iteration > self._lines_from:
@@ -134,11 +135,12 @@ class OursAppearance:
                 size = softened(offsets, self._config.penalty.softness)
                 penalty = self._config.penalty.weight * (size * weights[:, None]).mean()
         world = to_world(frames, binding, splats.means, splats.log_scales, splats.quats)
+        seen = world.means if self._config.color == "sh" or planes.move_splats else world.means.detach()
         last = self._turn(iteration) if self._config.direction_jitter else None
-        if usable(world.means):
-            directions = directions_to(prepared.turns, binding, world.means, view.center, last)
+        if usable(seen):
+            directions = directions_to(prepared.turns, binding, seen, view.center, last)
         else:
-            directions = canonical_directions(prepared.turns, binding, world.means, view.center)
+            directions = canonical_directions(prepared.turns, binding, seen, view.center)
             directions = directions if last is None else directions @ last.t()
         colors = self._colors(optimiser, positions, directions, iteration)
         return ShadedSplats(world, changed_colors(colors, splats), torch.sigmoid(splats.logits), penalty)

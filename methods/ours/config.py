@@ -33,6 +33,7 @@ class Planes:
     bounds_variant : "mesh" fits the planes to the canonical mesh in all directions; "paper" sets x to +-0.25 m, which
         leaves half the samples in x unused on a head without long hair.
     lr, network_lr : learning rates of the planes and of the network.
+    move_splats : whether the loss moves splats to where the planes, seen from there, have better colours, as published.
     residual_lr : learning rate of a colour of its own for each splat, added to that of the planes; 0, as published, gives
         it none.
     """
@@ -42,9 +43,10 @@ class Planes:
     bounds_variant: Literal["mesh", "paper"] = "mesh"
     lr: float = 2e-3
     network_lr: float = 1e-4
+    move_splats: bool = True
     residual_lr: float = 0.0
 
-    added: ClassVar = ("residual_lr",)
+    added: ClassVar = ("move_splats", "residual_lr")
 
     def __post_init__(self) -> None:
         if self.resolution < 2 or min(self.channels) < 1:

@@ -8,8 +8,8 @@ from ...bench.specs import MethodSpec
 from ..shared.config import splat_presets
 
 SHORT: dict[str, Any] = {
-    "planes": {"lr": 8e-3, "network_lr": 1.5e-3},
-    "lines": {"lr": 2e-2, "network_lr": 1e-3},
+    "planes": {"lr": 8e-3, "network_lr": 1.5e-3, "residual_lr": 1e-2, "move_splats": False},
+    "lines": {"lr": 2e-2, "network_lr": 1e-3, "bounds": "face"},
     "penalty": {"weight": 1e-3, "softness": 0.1},
     "outer_layers": {"count": 1},
     "direction_jitter": 0.15,

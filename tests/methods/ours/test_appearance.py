@@ -98,6 +98,14 @@ def test_capacity_follows_the_clip(clip, head):
     assert len(lines) == appearance.expressions + len(appearance.jaw_bases)
 
 
+@pytest.mark.parametrize("moved", [True, False])
+def test_colours_of_the_planes_move_splats_only_where_they_may(clip, moved):
+    appearance, optimiser, binding = make(clip, changed(SMALL, planes={"move_splats": moved}))
+    place(clip, appearance, optimiser, binding, 1).colors.sum().backward()
+    assert (optimiser["means"].grad is not None) == moved
+    assert optimiser["plane_xy"].grad.any()
+
+
 def test_view_directions_waver_in_training_and_only_they(clip):
     steady, optimiser, binding = make(clip)
     wavering = make(clip, changed(SMALL, direction_jitter=0.2))[0]

@@ -30,7 +30,7 @@ def changed(config, **settings):
     )
 
 
-REPAIRED = changed(SMALL, planes={"residual_lr": 0.01})
+REPAIRED = changed(SMALL, planes={"residual_lr": 0.01, "move_splats": False})
 
 
 def make(clip, config=SMALL):
