@@ -34,8 +34,9 @@ class GBS(TrainedMethod[GBSConfig, GBSAvatar]):
 
     def _sizes(self, clip: Clip, config: GBSConfig) -> tuple[Size, ...]:
         degrees = tuple(degree for degree in (1, 0) if degree < config.difference_sh_degree)
+        expressions = min(config.expressions, clip.head.expression_basis.shape[2])
         return (
-            Size("expressions", halves(min(config.expressions, clip.head.expression_basis.shape[2]), 1)),
+            Size("expressions", (*halves(expressions, 1, 3), 0) if expressions else ()),
             Size("difference_sh_degree", degrees),
             Size("splats.max_splats", halves(config.splats.max_splats, config.samples), _splats),
         )

@@ -15,10 +15,12 @@ from ...bench.runner.run import run
 from ...bench.runner.scoring import FULL
 from ...bench.specs import Findings
 from ..runs import Part, RunSet
+from ..statistics.command import CompareSettings, compare_runs
 from ..table_report import table_of
 from ..writers import to_markdown
 from .command import SEED, SuiteSettings
 
+OURS = "ours"
 REGIONS = ("face", "mouth", "eyes", "hair", "neck", "ears")
 """Parts of the frame that have tables of their own."""
 ABLATIONS: Mapping[str, Mapping[str, Any]] = {
@@ -86,15 +88,28 @@ def _config(
 
 
 def results(run_folder: Path, every: list[Path]) -> str:
-    """Tables of a suite as Markdown: whole frames, each region, each held-out sequence, and the ablations of ours."""
+    """Tables of a suite as Markdown: whole frames, each region, each held-out sequence, and the ablations of ours.
+
+    Under each table are the paired differences of every method from ours, with intervals and tests.
+    """
     runs = RunSet.read([run_folder])
     parts = {"All frames": Part()}
     parts |= {f"Region {region}": Part(region) for region in sorted(runs.rows.regions - {FULL})}
     tested = {frame[1] for frame in runs.rows.frames("self_reenactment", FULL)}
     parts |= {f"Sequence {name}": Part(sequences=(name,)) for name in sorted(tested)}
-    sections = [(title, RunSet.read([run_folder], part)) for title, part in parts.items()]
+    sections = [_section(title, [run_folder], part) for title, part in parts.items()]
     if len(every) > 1:
-        sections.append(("Ablations of ours", RunSet.read(every)))
-    return (
-        "\n\n".join(f"## {title}\n\n{to_markdown(table_of(runs)).strip()}" for title, runs in sections) + "\n"
+        sections.append(_section("Ablations of ours", every, Part()))
+    return "\n\n".join(sections) + "\n"
+
+
+def _section(title: str, folders: list[Path], part: Part) -> str:
+    """A table and, where ours is among several methods, what tells them from it."""
+    runs = RunSet.read(folders, part)
+    text = f"## {title}\n\n{to_markdown(table_of(runs)).strip()}"
+    if OURS not in runs.ranked or len(runs.ranked) < 2:
+        return text
+    settings = CompareSettings(
+        tuple(map(str, folders)), against=OURS, region=part.region, sequences=part.sequences
     )
+    return f"{text}\n\n```text\n{compare_runs(settings).text}\n```"
