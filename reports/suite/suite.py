@@ -30,7 +30,8 @@ ABLATIONS: Mapping[str, Mapping[str, Any]] = {
     "no-penalty": {"penalty": {"weight": 0.0}},
     "no-balanced-sampling": {"sampling": {"balanced": False}},
     "harmonics": {"color": "sh"},
-    "lines-in-face": {"lines": {"bounds": "face"}},
+    "lines-in-head": {"lines": {"bounds": "head"}},
+    "published": {"lines": {"bounds": "head"}, "planes": {"residual_lr": 0.0, "move_splats": True}},
 }
 """Settings of ours by the name of what is left out or changed; the first two are the paper's Table 4."""
 

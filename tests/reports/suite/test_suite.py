@@ -14,13 +14,14 @@ SMALL = ("--subjects", "2", "--cameras", "2", "--timesteps", "60", "--size", "16
 
 @pytest.mark.slow
 def test_the_suite_makes_subjects_and_tables_by_region_and_part(tmp_path, capsys):
-    words = ["suite", "--out", str(tmp_path / "s"), "--methods", "mean-image", "nearest-camera"]
+    words = ["suite", "--out", str(tmp_path / "s"), "--methods", "mean-image", "ga", "ours"]
     assert cli.main([*words, "--preset", "smoke", *SMALL]) == 0
     text = (tmp_path / "s" / "results.md").read_text()
     titles = re.findall("^## (.*)", text, re.MULTILINE)
     parts = [f"Sequence FREE-{part}" for part in ("1-seen", "2-recombined", "3-beyond")]
     assert titles == ["All frames", *(f"Region {name}" for name in sorted(module.REGIONS)), *parts]
     assert text.count("2 subjects") >= len(titles)
+    assert text.count("first - second") >= len(titles)
     assert text in capsys.readouterr().out
     made = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.png")}
     assert cli.main([*words, "--preset", "smoke", *SMALL]) == 0
