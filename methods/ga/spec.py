@@ -7,7 +7,7 @@ from typing import Any
 from ...bench.specs import MethodSpec
 from ..shared.config import splat_presets
 
-SHORT: dict[str, Any] = {"sh_dc_lr": 0.01, "sh_rest_lr": 5e-4}
+SHORT: dict[str, Any] = {"sh_dc_lr": 0.02, "sh_rest_lr": 1e-3}
 """Of runs much shorter than published (README.md, "Presets")."""
 
 GA = MethodSpec(

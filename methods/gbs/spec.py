@@ -8,8 +8,8 @@ from ...bench.specs import MethodSpec
 
 SHORT: dict[str, Any] = {
     "sample_spacing": 2.0,
-    "sh_dc_lr": 0.01,
-    "sh_rest_lr": 5e-4,
+    "sh_dc_lr": 0.02,
+    "sh_rest_lr": 1e-3,
     "difference_sh_degree": 0,
     "difference_position_lr": 1e-5,
     "difference_sh_lr": 0.01,
@@ -23,6 +23,8 @@ SHORT_SPLATS: dict[str, Any] = {
     "final_rate": 0.1,
     "position_lr": 4e-4,
     "position_lr_final": 4e-6,
+    "scale_lr": 0.05,
+    "rotation_lr": 0.01,
 }
 
 

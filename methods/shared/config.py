@@ -142,10 +142,13 @@ PAPER_ITERATIONS = 600_000
 SHORT_SPLATS: Mapping[str, Any] = {
     "initial_opacity": 0.5,
     "final_rate": 0.1,
-    "position_lr": 0.1,
+    "position_lr": 0.2,
     "position_lr_final": 1e-3,
+    "scale_lr": 0.05,
+    "rotation_lr": 0.01,
 }
-"""Of runs much shorter than published: splats start half opaque and move far before rates fall (`ga/README.md`)."""
+"""Of runs much shorter than published: splats start half opaque, and move, grow and turn far before rates fall
+(`ga/README.md`)."""
 
 
 def splat_presets(short: Mapping[str, Any], paper: Mapping[str, Any]) -> dict[str, dict[str, Any]]:

@@ -87,6 +87,14 @@ def test_paper_presets_are_the_published_values():
     assert values(published.lines, "start", "lr", "network_lr") == (60_000, 2e-3, 1e-4)
 
 
+@pytest.mark.parametrize("preset", ["smoke", "demo", "fast"])
+def test_short_presets_share_rates_that_paper_leaves_alone(preset):
+    ga, gbs, ours = (resolve_method(spec, preset, {}).config for spec in (GA, GBS, OURS))
+    assert values(ga.splats, *RATES) == values(ours.splats, *RATES) == (0.2, 1e-3, 0.05, 0.05, 0.01)
+    assert values(gbs.splats, *RATES[2:]) == values(ga.splats, *RATES[2:])
+    assert values(gbs, "sh_dc_lr", "sh_rest_lr") == values(ga, "sh_dc_lr", "sh_rest_lr") == (0.02, 1e-3)
+
+
 def test_the_paper_preset_of_gha_is_the_published_design():
     paper = resolve_method(GHA, "paper", {})
     assert paper.config == GHAConfig()
