@@ -40,12 +40,13 @@ void ThreadPool::run(std::int64_t tasks, int threads, const std::function<void(s
     body_ = &body;
     tasks_ = tasks;
     next_ = 0;
-    busy_ = joining_;
+    open_ = true;
     ++job_;
   }
   wake_.notify_all();
   for (std::int64_t task; (task = next_.fetch_add(1)) < tasks;) body(task, 0);
   std::unique_lock<std::mutex> lock(mutex_);
+  open_ = false;
   done_.wait(lock, [this] { return busy_ == 0; });
 }
 
@@ -53,9 +54,10 @@ void ThreadPool::work(int worker) {
   std::uint64_t seen = 0;
   std::unique_lock<std::mutex> lock(mutex_);
   for (;;) {
-    wake_.wait(lock, [&] { return job_ != seen; });
+    wake_.wait(lock, [&] { return open_ && job_ != seen; });
     seen = job_;
     if (worker > joining_) continue;
+    ++busy_;
     const auto* body = body_;
     const std::int64_t tasks = tasks_;
     lock.unlock();

@@ -33,7 +33,8 @@ class ThreadPool {
   std::uint64_t job_ = 0;
   int started_ = 0;  // workers in existence, numbered from 1
   int joining_ = 0;  // workers with a number up to this one take part
-  int busy_ = 0;
+  int busy_ = 0;      // workers at the job; those that wake up after its last task was taken are not waited for
+  bool open_ = false;  // whether workers may still begin with the job
   std::int64_t tasks_ = 0;
   std::atomic<std::int64_t> next_{0};
 };

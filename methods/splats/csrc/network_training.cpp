@@ -224,15 +224,20 @@ class ColorPass {
   void scatter(const ColorTraining& net, int threads) const {
     const int samples = net.grid.samples;
     Buffer<std::uint32_t> orders[2];
-    std::vector<std::uint32_t> starts[2];
+    std::vector<std::uint32_t> starts[2], next[2];
     for (int k = 0; k < 2; ++k) {
-      starts[k].assign(samples + 1, 0);
-      for (std::int64_t i = 0; i < count_; ++i) ++starts[k][row_of(net, i, k + 1) + 1];
-      for (int row = 0; row < samples; ++row) starts[k][row + 1] += starts[k][row];
-      std::vector<std::uint32_t> next(starts[k].begin(), starts[k].end() - 1);
       orders[k].resize(count_);
-      for (std::int64_t i = 0; i < count_; ++i) orders[k].data()[next[row_of(net, i, k + 1)]++] = static_cast<std::uint32_t>(i);
+      starts[k].assign(samples + 1, 0);
+      next[k].resize(samples);
     }
+    ThreadPool::instance().run(2, threads, [&](std::int64_t k, int) {
+      const int axis = static_cast<int>(k) + 1;
+      std::vector<std::uint32_t>& from = starts[k];
+      for (std::int64_t i = 0; i < count_; ++i) ++from[row_of(net, i, axis) + 1];
+      for (int row = 0; row < samples; ++row) from[row + 1] += from[row];
+      std::copy(from.begin(), from.end() - 1, next[k].begin());
+      for (std::int64_t i = 0; i < count_; ++i) orders[k].data()[next[k][row_of(net, i, axis)]++] = static_cast<std::uint32_t>(i);
+    });
     const std::int64_t bands = divided_up(samples, kBandRows);
     ThreadPool::instance().run(kPlanes * bands, threads, [&](std::int64_t task, int) {
       const int plane = static_cast<int>(task / bands), k = kPlaneAxes[plane][1] - 1;

@@ -301,6 +301,16 @@ struct Photometric {
 };
 
 // The functions compiled for one instruction set.
+// A step of Adam on one tensor; see `methods/shared/optimisation.py`.
+struct AdamStep {
+  float* values;           // (n,)
+  const float* gradients;  // (n,)
+  float* first;            // (n,) moments
+  float* second;           // (n,)
+  float first_weight, second_decay, second_weight;  // 1 - beta_1, beta_2, 1 - beta_2
+  float step, root_scale, eps;                      // rate / (1 - beta_1^t), 1 / sqrt(1 - beta_2^t)
+};
+
 struct Kernels {
   const char* name;
   int lanes;
@@ -340,6 +350,7 @@ struct Kernels {
   void (*harmonics_backward)(const TrainedHarmonics&, std::int64_t begin, std::int64_t end);
   std::size_t (*photometric_scratch)(int width);
   void (*photometric)(const Photometric&, int begin, int end, float* scratch);
+  void (*adam)(const AdamStep&, std::int64_t begin, std::int64_t end);
 };
 
 }  // namespace headbench

@@ -2,6 +2,7 @@
 // number of threads, and sums are taken in one order, so that results are equal bit for bit.
 #include <cmath>
 #include <string>
+#include <utility>
 #include <vector>
 
 #include "tasks.h"
@@ -463,6 +464,36 @@ double photometric(const Array<const float, -1, -1, 3>& image, const Array<const
   return (1.0 - weight) * l1_sum / numbers + weight * (1.0 - ssim_sum / numbers);
 }
 
+using Flat = Array<float, -1>;
+
+constexpr std::int64_t kAdamPerTask = 16384;
+
+void adam(const std::vector<Flat>& values, const std::vector<Array<const float, -1>>& gradients,
+          const std::vector<Flat>& first, const std::vector<Flat>& second, const std::vector<double>& rates,
+          const std::vector<double>& steps, double beta_1, double beta_2, double eps, const std::string& instruction_set,
+          int threads) {
+  const std::size_t tensors = values.size();
+  require(gradients.size() == tensors && first.size() == tensors && second.size() == tensors);
+  require(rates.size() == tensors && steps.size() == tensors);
+  const Kernels& kernels = variant_of(runnable_kernels(), instruction_set);
+  std::vector<AdamStep> parts;
+  std::vector<std::pair<std::size_t, std::int64_t>> tasks;  // tensor and first number
+  for (std::size_t k = 0; k < tensors; ++k) {
+    const std::size_t count = values[k].shape(0);
+    require(gradients[k].shape(0) == count && first[k].shape(0) == count && second[k].shape(0) == count);
+    parts.push_back({values[k].data(), gradients[k].data(), first[k].data(), second[k].data(),
+                     static_cast<float>(1 - beta_1), static_cast<float>(beta_2), static_cast<float>(1 - beta_2),
+                     static_cast<float>(rates[k] / (1 - std::pow(beta_1, steps[k]))),
+                     static_cast<float>(1 / std::sqrt(1 - std::pow(beta_2, steps[k]))), static_cast<float>(eps)});
+    for (std::int64_t begin = 0; begin < static_cast<std::int64_t>(count); begin += kAdamPerTask) tasks.emplace_back(k, begin);
+  }
+  nb::gil_scoped_release unlocked;
+  ThreadPool::instance().run(static_cast<std::int64_t>(tasks.size()), std::max(threads, 1), [&](std::int64_t task, int) {
+    const auto [tensor, begin] = tasks[task];
+    kernels.adam(parts[tensor], begin, std::min(begin + kAdamPerTask, static_cast<std::int64_t>(values[tensor].shape(0))));
+  });
+}
+
 }  // namespace
 
 void bind_training(nb::module_& m) {
@@ -490,6 +521,8 @@ void bind_training(nb::module_& m) {
         "Write the gradients by coefficients and vectors.");
   m.def("photometric", &photometric, "image"_a, "truth"_a, "window"_a, "ssim_weight"_a, "gradient"_a, "instruction_set"_a,
         "threads"_a, "The photometric loss of two images; writes its gradient by the first.");
+  m.def("adam", &adam, "values"_a, "gradients"_a, "first"_a, "second"_a, "rates"_a, "steps"_a, "beta_1"_a, "beta_2"_a,
+        "eps"_a, "instruction_set"_a, "threads"_a, "Update tensors and their moments, each in its `steps`-th step.");
 }
 
 }  // namespace headbench

@@ -641,4 +641,33 @@ inline void photometric(const Photometric& in, int begin, int end, float* scratc
   }
 }
 
+// Adam.
+
+// One vector of numbers. Where gradient and moments are 0 nothing would change, and nothing is written: half of what planes
+// hold lies where no splat does.
+HEADBENCH_INLINE void adam_vector(const AdamStep& in, const float* gradients, float* values, float* firsts, float* seconds) {
+  const Real zero = 0.0f, g = load(gradients), m = load(firsts), v = load(seconds);
+  const Mask still = (g >= zero) & (zero >= g) & (m >= zero) & (zero >= m) & (zero >= v);
+  if (!any(select(still, zero, Real(1.0f)) > zero)) return;
+  const Real first = fma(in.first_weight, g - m, m), second = fma(in.second_decay, v, in.second_weight * g * g);
+  store(firsts, first);
+  store(seconds, second);
+  store(values, fnma(in.step, first / fma(sqrt(second), in.root_scale, in.eps), load(values)));
+}
+
+inline void adam(const AdamStep& in, std::int64_t begin, std::int64_t end) {
+  std::int64_t i = begin;
+  for (; i + W <= end; i += W) adam_vector(in, in.gradients + i, in.values + i, in.first + i, in.second + i);
+  if (i == end) return;
+  alignas(64) float rest[4][W] = {};
+  float* const from[3] = {in.values + i, in.first + i, in.second + i};
+  for (std::int64_t k = 0; k < end - i; ++k) {
+    rest[3][k] = in.gradients[i + k];
+    for (int part = 0; part < 3; ++part) rest[part][k] = from[part][k];
+  }
+  adam_vector(in, rest[3], rest[0], rest[1], rest[2]);
+  for (std::int64_t k = 0; k < end - i; ++k)
+    for (int part = 0; part < 3; ++part) from[part][k] = rest[part][k];
+}
+
 }  // namespace headbench::HEADBENCH_ISA

@@ -67,6 +67,6 @@ const Kernels kernels = {HEADBENCH_ISA_NAME, W, project, find_entries, scratch_f
                          project_backward, count_work, multiply_add, kChains, triangles, to_world, shade, turns,
                          color_network, offset_scratch, offset_network,
                          pose_vertices, pose_backward, triangles_backward, activate, to_world_backward, penalties, harmonics, harmonics_backward,
-                         photometric_scratch, photometric};
+                         photometric_scratch, photometric, adam};
 
 }  // namespace headbench::HEADBENCH_ISA
