@@ -12,6 +12,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 from unittest.mock import patch
 
@@ -40,12 +41,12 @@ from ...methods.gbs.config import GBSConfig
 from ...methods.gbs.spec import GBS
 from ...methods.ours import appearance as ours
 from ...methods.ours.config import OursConfig
-from ...methods.ours.field import line_position, line_table, normalised_weight, plane_features
+from ...methods.ours.field import NamedTensors, line_position, line_table, normalised_weight, plane_features
 from ...methods.ours.spec import OURS
 from ...methods.shared import splat_training
 from ...methods.shared.avatar_files import Subject
 from ...methods.shared.loop import TrainingImages
-from ...methods.shared.networks import encode, sum_rows
+from ...methods.shared.networks import PAIRS, encode, sum_rows
 from ...methods.shared.optimisation import Densifier, Optimiser
 from ...methods.shared.schedule import ShuffledEpochs, Timeline
 from ...methods.shared.splat_training import BoundTraining, SplatTrainer, Start
@@ -199,6 +200,8 @@ class _Mark(torch.autograd.Function):
 
 @contextmanager
 def _timed_stages(stages: _Stages) -> Iterator[None]:
+    # Where planes do not move splats, the planes alone have a gradient: they go in as tensors of their own.
+    timed_colors = stages.timed("colours", _colors_of_planes(ours.plane_colors))
     functions = [
         (splat_training, "rasterize", RASTERISER),
         (splat_training, "photometric_loss", "L1 and SSIM"),
@@ -207,7 +210,6 @@ def _timed_stages(stages: _Stages) -> Iterator[None]:
         (ga, "to_world", "to world space"),
         (ours, "to_world", "to world space"),
         (ga, "harmonic_colors", "colours"),
-        (ours, "plane_colors", "colours"),
         (ours, "table_offsets", "lines"),
         (ours, "directions_to", "directions"),
         (ours, "canonical_positions", "canonical positions"),
@@ -217,9 +219,24 @@ def _timed_stages(stages: _Stages) -> Iterator[None]:
     with ExitStack() as entered:
         for owner, name, stage in functions:
             entered.enter_context(patch.object(owner, name, stages.timed(stage, getattr(owner, name))))
+        entered.enter_context(patch.object(ours, "plane_colors", partial(_with_planes, timed_colors)))
         for kind, name in plain:
             entered.enter_context(patch.object(kind, name, _method(stages, kind, name)))
         yield
+
+
+PLANE_TENSORS = (*(f"plane_{name}" for name, _, _ in PAIRS), "color_weight_0", "color_weight_1")
+
+
+def _with_planes(function: Callable[..., Tensor], parameters: NamedTensors, *arguments: Any) -> Tensor:
+    return function(*arguments, *(parameters[name] for name in PLANE_TENSORS))
+
+
+def _colors_of_planes(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    def run(box: Any, positions: Tensor, directions: Tensor, *tensors: Tensor) -> Tensor:
+        return function(dict(zip(PLANE_TENSORS, tensors)), box, positions, directions)
+
+    return run
 
 
 def _method(stages: _Stages, kind: type, name: str) -> Callable[..., Any]:
