@@ -121,9 +121,12 @@ class _Colors(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, by_colors: Tensor) -> tuple[Tensor | None, ...]:
         *inputs, box, colors = ctx.saved_tensors
-        gradients = [torch.empty_like(value) for value in inputs]
-        ctx.done.backward(*arrays(*inputs, box, colors, by_colors, *gradients), threads())
-        return None, None, *gradients
+        places, weights = inputs[:2], inputs[2:]
+        wanted = any(ctx.needs_input_grad[2:4])
+        by_places = [torch.empty_like(value) if wanted else value.new_empty(0, 3) for value in places]
+        gradients = [torch.empty_like(value) for value in weights]
+        ctx.done.backward(*arrays(*inputs, box, colors, by_colors, *by_places, *gradients), threads())
+        return None, None, *(by_places if wanted else [None] * 2), *gradients
 
 
 class _Offsets(torch.autograd.Function):

@@ -321,9 +321,11 @@ def _network_operations(training: SplatTrainer) -> dict[str, float]:
     inputs = torch.cat([*plane_features(parameters, box, positions), encode(directions)], dim=1)
     on = float((inputs @ parameters["color_weight_0"].t() > 0).sum())
     hidden, width = parameters["color_weight_0"].shape
+    # Where planes do not move splats, nobody asks for gradients by the directions.
+    back = width if positions.requires_grad else width - encode(directions).shape[1]
     counts = {
         "colours": len(positions) * hidden * (width + 3),
-        "colours, backward": on * 2 * (width + 3),
+        "colours, backward": on * (width + back + 6),
     }
     parameters, box, blended, positions = seen["table_offsets"]
     place = line_position(box.unit(positions[box.contains(positions)]), parameters["lines"].shape[2])

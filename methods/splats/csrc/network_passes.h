@@ -407,13 +407,19 @@ inline void color_backward(const ColorTraining& net, const ColorSums& at, std::i
     }
     outer_product<kSparseGroup, kOuterVectors>(by_hidden, net.units_stride, on, groups, inputs, net.inputs_stride,
                                                net.inputs, sums + at.first);
-    product<kSparseGroup, kOuterVectors>(by_hidden, net.units_stride, on, groups, net.first, net.inputs_stride, net.inputs,
-                                         nullptr, false, by_inputs, net.inputs_stride);
+    if (net.by_positions)
+      product<kSparseGroup, kOuterVectors>(by_hidden, net.units_stride, on, groups, net.first, net.inputs_stride,
+                                           net.inputs, nullptr, false, by_inputs, net.inputs_stride);
+    else  // features alone
+      product<kSparseGroup, kSparseVectors>(by_hidden, net.units_stride, on, groups, net.first, net.inputs_stride,
+                                            (net.features + kUnitsStep - 1) / kUnitsStep * kUnitsStep, nullptr, false,
+                                            by_inputs, net.inputs_stride);
     for (int s = 0; s < used; ++s) {
       const std::int64_t splat = first + s;
       const float* gradient = by_inputs + s * net.inputs_stride;
       float* kept = net.by_features + splat * net.features;
       for (int k = 0; k < net.features; ++k) kept[k] = gradient[k];
+      if (!net.by_positions) continue;
       Between at_samples[3];
       for (int axis = 0; axis < 3; ++axis) at_samples[axis] = between(net, splat, axis);
       planes_backward(net, at_samples, gradient, net.by_positions + 3 * splat);

@@ -149,7 +149,8 @@ class ColorPass {
     ColorTraining net = describe(in);
     const std::size_t all = in.positions.shape(0);
     require(colors.shape(0) == all && by_colors.shape(0) == all);
-    require(by_positions.shape(0) == all && by_directions.shape(0) == all);
+    const std::size_t wanted = by_positions.shape(0);
+    require((wanted == all || wanted == 0) && by_directions.shape(0) == wanted);
     require(by_first.shape(0) == in.first.shape(0) && by_first.shape(1) == in.first.shape(1));
     require(by_last.shape(0) == 3 && by_last.shape(1) == in.last.shape(1));
     const Array<float, -1, -1>* by_planes[kPlanes] = {&by_xy, &by_xz, &by_yz};
@@ -163,8 +164,8 @@ class ColorPass {
     net.fractions = fractions_.data();
     net.colors = const_cast<float*>(colors.data());
     net.by_colors = by_colors.data();
-    net.by_positions = by_positions.data();
-    net.by_directions = by_directions.data();
+    net.by_positions = wanted ? by_positions.data() : nullptr;
+    net.by_directions = wanted ? by_directions.data() : nullptr;
     Buffer<float> first, last, by_features, sums;
     net.first = pad(first, in.first.data(), hidden_units_, input_count_, net.units, net.inputs_stride).data();
     net.last = pad(last, in.last.data(), 3, hidden_units_, 3, net.units).data();

@@ -65,8 +65,8 @@ struct ColorTraining {
   // Backward.
   const float* by_colors;  // (N, 3)
   float* by_features;      // (N, features)
-  float* by_positions;     // (N, 3)
-  float* by_directions;    // (N, 3)
+  float* by_positions;     // (N, 3), or null where nobody asks for gradients by positions and directions
+  float* by_directions;    // (N, 3), or null with it
   float* by_planes[kPlanes];
 };
 

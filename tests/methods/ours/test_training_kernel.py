@@ -96,6 +96,19 @@ def test_colours_and_their_gradients(case, backend):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("case", CASES)
+def test_gradients_by_planes_where_splats_stay(case, backend):
+    parameters, positions, directions, generator = scene(**CASES[case])
+    weights = torch.randn(len(positions), 3, generator=generator)
+    moved, stay = leaves(parameters), leaves(parameters)
+    places = positions.clone().requires_grad_(), directions
+    (plane_colors(moved, BOX, *places, backend) * weights).sum().backward()
+    (plane_colors(stay, BOX, positions, directions, backend) * weights).sum().backward()
+    for name, value in moved.items():
+        assert (value.grad is None and stay[name].grad is None) or torch.equal(stay[name].grad, value.grad)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("count", [0, 1, 16, 1030])
 def test_positions_and_their_gradients(count, backend):
     generator = torch.Generator().manual_seed(count)
