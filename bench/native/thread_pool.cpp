@@ -1,10 +1,37 @@
 #include "thread_pool.h"
 
+#include <chrono>
 #include <system_error>
 
 #include <unistd.h>
 
 namespace headbench {
+namespace {
+
+// How long a thread looks for work before it sleeps: about as long as the gaps between the kernels of a training iteration.
+// On two threads an iteration of `ga` takes 7.6 ms by the clock without, 7.1 with 50 and 6.8 with 200.
+constexpr std::chrono::microseconds kPatience{200};
+
+void pause() {
+#if defined(__x86_64__)
+  __builtin_ia32_pause();
+#elif defined(__aarch64__)
+  asm volatile("yield");
+#endif
+}
+
+template <typename Condition>
+void look_for(const Condition& condition) {
+  const auto until = std::chrono::steady_clock::now() + kPatience;
+  do {
+    for (int turn = 0; turn < 16; ++turn) {
+      if (condition()) return;
+      pause();
+    }
+  } while (std::chrono::steady_clock::now() < until);
+}
+
+}  // namespace
 
 ThreadPool& ThreadPool::instance() {
   // Never destroyed: at exit its threads sleep on a condition that must outlive them.
@@ -45,6 +72,7 @@ void ThreadPool::run(std::int64_t tasks, int threads, const std::function<void(s
   }
   wake_.notify_all();
   for (std::int64_t task; (task = next_.fetch_add(1)) < tasks;) body(task, 0);
+  look_for([this] { return busy_ == 0; });
   std::unique_lock<std::mutex> lock(mutex_);
   open_ = false;
   done_.wait(lock, [this] { return busy_ == 0; });
@@ -64,6 +92,9 @@ void ThreadPool::work(int worker) {
     for (std::int64_t task; (task = next_.fetch_add(1)) < tasks;) (*body)(task, worker);
     lock.lock();
     if (--busy_ == 0) done_.notify_one();
+    lock.unlock();
+    look_for([&] { return job_ != seen; });
+    lock.lock();
   }
 }
 

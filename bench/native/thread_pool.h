@@ -1,4 +1,4 @@
-// A small pool of threads that sleep while there is nothing to do.
+// A small pool of threads that sleep while there is nothing to do for longer than a moment.
 #pragma once
 
 #include <atomic>
@@ -30,10 +30,10 @@ class ThreadPool {
   std::mutex mutex_;   // guards what follows
   std::condition_variable wake_, done_;
   const std::function<void(std::int64_t, int)>* body_ = nullptr;
-  std::uint64_t job_ = 0;
+  std::atomic<std::uint64_t> job_{0};
   int started_ = 0;  // workers in existence, numbered from 1
   int joining_ = 0;  // workers with a number up to this one take part
-  int busy_ = 0;      // workers at the job; those that wake up after its last task was taken are not waited for
+  std::atomic<int> busy_{0};  // workers at the job; those that wake up after its last task was taken are not waited for
   bool open_ = false;  // whether workers may still begin with the job
   std::int64_t tasks_ = 0;
   std::atomic<std::int64_t> next_{0};
