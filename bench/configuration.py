@@ -109,17 +109,18 @@ def with_new_names(cls: type, values: Mapping[str, Any]) -> dict[str, Any]:
 def with_first_names(config: Any) -> Any:
     """The settings of a dataclass by the names that they first had: digests of them outlive a change of names.
 
-    A setting named in the class variable ``added`` came later and is left out at its default, which is as before.
+    A setting that came later is left out where it has the value that means what was so before, which the class variable
+    ``added`` gives by name.
     """
     if isinstance(config, tuple):
         return tuple(map(with_first_names, config))
     if not dataclasses.is_dataclass(config):
         return config
-    added = getattr(config, "added", ())
+    added: Mapping[str, Any] = getattr(config, "added", {})
     result = {
         field.name: with_first_names(getattr(config, field.name))
         for field in dataclasses.fields(config)
-        if field.name not in added or getattr(config, field.name) != _default(field)
+        if field.name not in added or getattr(config, field.name) != added[field.name]
     }
     first: dict[str, Any] = {}
     for old, entry in getattr(config, "renamed", {}).items():
@@ -136,11 +137,6 @@ def with_first_names(config: Any) -> Any:
         if path and not group:
             del result[path[0]]
     return {f"{name}." if name in first else name: value for name, value in result.items()} | first
-
-
-def _default(field: dataclasses.Field[Any]) -> Any:
-    factory = field.default_factory
-    return field.default if factory is dataclasses.MISSING else factory()
 
 
 def _new_names(cls: type, key: str, value: Any) -> dict[str, Renamed]:

@@ -113,16 +113,15 @@ def _captured_again(manifest: Manifest, out: Path, limit: int, progress: Progres
     for clip in manifest.clips:
         arguments = synthesis_arguments(clip.steps, clip.subject)
         captures[digest(arguments)] = f"capture of {clip.subject}", arguments
+    total = 0
     for where, arguments in captures.values():
-        pixels = math.prod(
-            (*arguments["size"], *(arguments[name] for name in ("cameras", "timesteps", "subjects")))
-        )
-        if pixels > limit:
-            expected, remedy = (
-                f"at most {limit} pixels for a bundle of this size",
-                "Name the folder of the capture with --data.",
-            )
-            raise InputError(where, "", expected, str(pixels), remedy)
+        factors = (*arguments["size"], *(arguments[name] for name in ("cameras", "timesteps", "subjects")))
+        total += math.prod(factors)
+        if total > limit or min(factors) < 1:
+            expected = f"at most {limit} pixels in all for a bundle of this size"
+            found = " x ".join(map(str, factors))
+            raise InputError(where, "", expected, found, "Name the folder of the capture with --data.")
+    for _, arguments in captures.values():
         make(out, **arguments, progress=progress)
     return out
 

@@ -8,9 +8,9 @@
 namespace headbench {
 namespace {
 
-// How long a thread looks for work before it sleeps: about as long as the gaps between the kernels of a training iteration.
-// On two threads an iteration of `ga` takes 7.6 ms by the clock without, 7.1 with 50 and 6.8 with 200.
-constexpr std::chrono::microseconds kPatience{200};
+// How long a thread spins before it sleeps: about as long as the gaps between the kernels of a training iteration, as to
+// sleep and to be woken takes longer than most of them.
+constexpr std::chrono::microseconds kSpinTime{200};
 
 void pause() {
 #if defined(__x86_64__)
@@ -21,8 +21,8 @@ void pause() {
 }
 
 template <typename Condition>
-void look_for(const Condition& condition) {
-  const auto until = std::chrono::steady_clock::now() + kPatience;
+void spin_until(const Condition& condition) {
+  const auto until = std::chrono::steady_clock::now() + kSpinTime;
   do {
     for (int turn = 0; turn < 16; ++turn) {
       if (condition()) return;
@@ -72,7 +72,7 @@ void ThreadPool::run(std::int64_t tasks, int threads, const std::function<void(s
   }
   wake_.notify_all();
   for (std::int64_t task; (task = next_.fetch_add(1)) < tasks;) body(task, 0);
-  look_for([this] { return busy_ == 0; });
+  spin_until([this] { return busy_ == 0; });
   std::unique_lock<std::mutex> lock(mutex_);
   open_ = false;
   done_.wait(lock, [this] { return busy_ == 0; });
@@ -93,7 +93,7 @@ void ThreadPool::work(int worker) {
     lock.lock();
     if (--busy_ == 0) done_.notify_one();
     lock.unlock();
-    look_for([&] { return job_ != seen; });
+    spin_until([&] { return job_ != seen; });
     lock.lock();
   }
 }

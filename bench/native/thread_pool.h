@@ -1,4 +1,4 @@
-// A small pool of threads that sleep while there is nothing to do for longer than a moment.
+// A small pool of threads that spin for up to 0.2 ms between jobs and sleep after that.
 #pragma once
 
 #include <atomic>

@@ -110,17 +110,18 @@ def reader_of(root: str) -> str:
 def synthesis_arguments(steps: Sequence[Mapping[str, Any]], subject: str) -> dict[str, Any]:
     """Settings that make a subject's synthetic capture again, from the steps that its clip records.
 
-    Raises `InputError` for a capture that is not synthetic, or not of the procedural head.
+    Raises `InputError` for a capture that is not synthetic, not of the procedural head, or made by settings that are not
+    known here.
     """
     make = resolve(get("datasets", "synthetic").implementation)
     where, given = f"capture of {subject}", ("out", "pictures", "workers", "progress")
-    recorded = (steps[0].get("parameters", {}).get("synthetic") or {}) if steps else {}
-    options = inspect.signature(make).parameters.keys() - set(given)
-    if not str(recorded.get("head", "")).startswith("procedural"):
+    parameters = steps[0].get("parameters") if steps else None
+    recorded = parameters.get("synthetic") if isinstance(parameters, Mapping) else None
+    if not isinstance(recorded, Mapping) or not str(recorded.get("head")).startswith("procedural"):
         expected = "a folder, as only synthetic captures of the procedural head can be made again"
         raise InputError("--data", where, expected, "none", "Name the folder of the capture with --data.")
     return build_arguments(
-        make, {key: recorded[key] for key in options & set(recorded)}, where, harness=given
+        make, {key: value for key, value in recorded.items() if key != "style"}, where, harness=given
     )
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from ...bench.specs import Renamed
 from ..shared.config import Capacity, DensifiedTraining
@@ -88,7 +88,7 @@ class GBSConfig:
     correctives_variant: Literal["paper", "official"] = "paper"
     lower_teeth_variant: Literal["paper", "official"] = "paper"
 
-    added: ClassVar = ("capacity",)
+    added: ClassVar[Mapping[str, Any]] = {"capacity": Capacity(mode="fixed")}
     renamed: ClassVar[Mapping[str, Renamed]] = {
         "departures:triple_correctives": Renamed("correctives_variant"),
         "departures:blended_lower_teeth": Renamed("lower_teeth_variant"),

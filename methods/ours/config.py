@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from ...bench.specs import Renamed
 from ..shared.config import SplatTraining
@@ -46,7 +46,7 @@ class Planes:
     move_splats: bool = True
     residual_lr: float = 0.0
 
-    added: ClassVar = ("move_splats", "residual_lr")
+    added: ClassVar[Mapping[str, Any]] = {"move_splats": True, "residual_lr": 0.0}
 
     def __post_init__(self) -> None:
         if self.resolution < 2 or min(self.channels) < 1:

@@ -95,7 +95,7 @@ class Now:
     odd_variant: Literal["paper", "official"] = "paper"
     size: Group = field(default_factory=Group)
 
-    added: ClassVar = ("size",)
+    added: ClassVar = {"size": Group()}
     renamed: ClassVar = {
         "group": Renamed("group.on"),
         "how": Renamed("group.variant", {"": "paper", "code": "official"}),
@@ -115,6 +115,18 @@ def test_an_old_name_is_refused_with_the_new_one(values, new):
 @pytest.mark.parametrize("stored", [{"odd": 5}, {"odd": None}, {"how": [{}]}, {"how": [["code"], 1.5]}])
 def test_stored_settings_of_wrong_types_are_kept_until_used(stored):
     assert with_new_names(Now, stored).keys() <= {"odd_variant", "group"}
+
+
+@dataclass(frozen=True)
+class Faster:
+    speed: int = 2
+
+    added: ClassVar = {"speed": 1}
+
+
+@pytest.mark.parametrize(("config", "first"), [(Faster(), {"speed": 2}), (Faster(speed=1), {})])
+def test_a_later_setting_is_left_out_where_all_is_as_before(config, first):
+    assert with_first_names(config) == first
 
 
 def test_settings_stored_by_old_names_have_the_same_digest():

@@ -300,7 +300,6 @@ struct Photometric {
   double* row_ssim;  // (H,)
 };
 
-// The functions compiled for one instruction set.
 // A step of Adam on one tensor; see `methods/shared/optimisation.py`.
 struct AdamStep {
   float* values;           // (n,)
@@ -311,6 +310,7 @@ struct AdamStep {
   float step, root_scale, eps;                      // rate / (1 - beta_1^t), 1 / sqrt(1 - beta_2^t)
 };
 
+// The functions compiled for one instruction set.
 struct Kernels {
   const char* name;
   int lanes;
