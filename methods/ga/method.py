@@ -176,8 +176,9 @@ class GA(TrainedMethod[GAConfig, GAAvatar]):
     def _sizes(self, clip: Clip, config: GAConfig) -> tuple[Size, ...]:
         degrees = tuple(degree for degree in (2, 1, 0) if degree < config.sh_degree)
         splats = halves(config.splats.max_splats, len(clip.head.faces))
-        return Size("sh_degree", degrees), Size(
-            "splats.max_splats", splats, lambda avatar: len(avatar.binding)
+        return (
+            Size("sh_degree", degrees, lambda avatar: occupied_degree(avatar.splat_tensors["sh_rest"])),
+            Size("splats.max_splats", splats, lambda avatar: len(avatar.binding)),
         )
 
     def _train(self, fit: Fit, config: GAConfig) -> None:

@@ -121,7 +121,7 @@ class Capacity:
     ----------
     mode : "fixed" takes the configured sizes as they are. "auto" takes them as upper limits: short trainings without the
         ends of the training sequences try smaller ones (`sizes.choose_sizes`), which takes time beyond the budget.
-    share : of the budget, for each of these trainings.
+    share : of the budget, for each of these trainings; at least 500 iterations of it.
     tolerance_db, tolerance_ssim : what PSNR and SSIM of the held-out timesteps may lose.
     """
 

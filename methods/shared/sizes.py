@@ -28,6 +28,8 @@ FRAMES = 48
 HELD_OUT_SHARE = 8
 """The last of so many parts of each training sequence is held out. One whole sequence says too little of the others:
 without it half the expressions seemed enough for `gbs`, and lost 0.7 dB in self-reenactment (`gbs/README.md`)."""
+LEAST_ITERATIONS = 500
+"""Of a trial, if the training itself has as many: what is learnt later says nothing in shorter ones."""
 FOLDER = "trials"
 
 
@@ -107,7 +109,7 @@ def choose_sizes(
         return config, ()
     frames = _evenly(clip.held_out, FRAMES)
     budget = Budget(
-        None if fit.budget.iterations is None else max(1, round(fit.budget.iterations * capacity.share)),
+        _trial_iterations(fit.budget.iterations, capacity.share),
         None if fit.budget.seconds is None else fit.budget.seconds * capacity.share,
     )
 
@@ -138,6 +140,10 @@ def choose_sizes(
                 break
             config = candidate
     return config, tuple(trials)
+
+
+def _trial_iterations(iterations: int | None, share: float) -> int | None:
+    return None if iterations is None else min(iterations, max(round(iterations * share), LEAST_ITERATIONS))
 
 
 def with_size(config: Config, name: str, value: int) -> Config:

@@ -370,6 +370,7 @@ class World {
 
 NB_MODULE(_light, m) {
   using headbench::light::World;
+  nb::set_leak_warnings(false);  // the renderer of a process lives until it exits
   m.def("instruction_sets", [] { return headbench::names_of(headbench::runnable_light_kernels()); });
   nb::class_<World>(m, "World")
       .def(nb::init<const headbench::Array<const float, -1, 3>&, const headbench::Array<const std::int32_t, -1, 3>&,

@@ -83,7 +83,8 @@ class Avatar:
         ({}, 40, (0, 25), 1 + 3 + 1),  # 50 says nothing where no more than 40 were used
     ],
 )
-def test_the_smallest_size_that_holds_is_taken(tmp_path, errors, used, chosen, tried):
+@pytest.mark.parametrize(("budget", "trial"), [(4_000, 1_000), (1_000, 500), (100, 100)])
+def test_the_smallest_size_that_holds_is_taken(tmp_path, errors, used, chosen, tried, budget, trial):
     train = keys(A=range(14), B=range(14, 16))
     pixels = np.random.default_rng(0).integers(60, 200, (24, 20, 3)).astype(np.uint8)
     clip = SimpleNamespace(
@@ -103,10 +104,10 @@ def test_the_smallest_size_that_holds_is_taken(tmp_path, errors, used, chosen, t
         return Avatar(part, 0.02 if enough else 0.03, config.group.count)
 
     sizes = (SIZES[0], replace(SIZES[1], used=used and (lambda avatar: used)))
-    fit = Fit(clip, tmp_path, Budget(iterations=100), "cpu", 0, no_progress, "run")
+    fit = Fit(clip, tmp_path, Budget(iterations=budget), "cpu", 0, no_progress, "run")
     config, trials = choose_sizes(fit, Config(), Capacity("auto"), sizes, fake)
     assert (config.degree, config.group.count) == chosen
-    assert {budget.iterations for _, budget in seen} == {25}
+    assert {budget.iterations for _, budget in seen} == {trial}
     assert len(trials) == len(seen) == tried
     assert trials[0].psnr == pytest.approx(-20 * np.log10(5 / 255), abs=1e-6)  # 0.02 of 255, rounded
 
