@@ -1,7 +1,7 @@
-"""What skin remembers, in the second edition: folds that buckle, blood that takes its time, lips that dry.
+"""State of the skin over a sequence, in the second edition: hysteresis of folds, delay of blood flow, lips that dry.
 
 A state is a function of the exact controls of a sequence up to its moment, which begins at rest, and of nothing that a tracker
-stores: tracked parameters alone do not tell it.
+stores: tracked parameters alone do not determine it.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class SkinState:
 
 
 def at_once(activations: Activations) -> SkinState:
-    """The state of skin that follows the controls and remembers nothing: the first edition's."""
+    """The state of skin that follows the controls without hysteresis or delay: the first edition's."""
     return SkinState(fold_strengths(activations), flush_strengths(activations))
 
 

@@ -275,7 +275,7 @@ class CaptureRenderer:
             plan.writer.write_frame(sequence, timestep, camera, image, mask)
 
     def pose_at(self, sequence: str, timestep: int) -> None:
-        """Move all meshes to where they are at a timestep, with what skin remembers of those before."""
+        """Move all meshes to where they are at a timestep, with the state of skin that the timesteps before led to."""
         plan, performed = self._plan, self._plan.performed[sequence]
         if sequence not in self._states and plan.settings.edition > 1:
             self._states[sequence] = over_time(performed.activations, performed.step, plan.person)

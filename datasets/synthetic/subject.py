@@ -14,7 +14,7 @@ from ..head.model import HeadModel, chain_transforms
 from ..head.rotations import axis_angle_to_matrix
 from .anatomy import SIDES, Anatomy, Person, measure
 from .glasses import make_glasses
-from .hair import ear_share, make_beard, make_brows_and_lashes, make_hair
+from .hair import RootedStrands, ear_share, make_beard, make_brows_and_lashes, make_hair
 from .history import SkinState, at_once
 from .parts import eye_mesh, tracked_parts
 from .performance import Activations
@@ -67,7 +67,7 @@ class RenderedSubject:
         self._folds = make_folds(person, self.anatomy, points, paint.lips, 1.0 - hair.share)
         self._skin_albedo, self._cap = under, hair.cap
         self._hair = hair.strands
-        self._rooted = make_brows_and_lashes(person, self.anatomy, points, normals)
+        self._brows = make_brows_and_lashes(person, self.anatomy, points, normals)
         self._beard = make_beard(person, self.anatomy, points, normals, self._fine.faces, cavity)
         self._glasses = make_glasses(person, self.anatomy, points, normals)
         if person.sag:
@@ -81,15 +81,17 @@ class RenderedSubject:
         self._eyes = {side: eye_mesh(person, self.anatomy.eyes[side]) for side in SIDES}
         self._mouth = tuple(geometry.mouth(person, self.anatomy, self.shape))
         self._tracked_parts = tracked_parts(head)
-        rooted = (self._rooted,) if self._beard is None else (self._rooted, self._beard)
-        self._frames = [self._fine.frames(self.neutral, each.root) for each in rooted]
+        self._brow_frames = self._fine.frames(self.neutral, self._brows.root)
+        self._beard_frames = (
+            None if self._beard is None else self._fine.frames(self.neutral, self._beard.root)
+        )
 
     def rest_meshes(self) -> dict[str, RestMesh]:
         """Meshes by name."""
         fixed = {
             "skin": RestMesh(self._fine.faces, self._skin_albedo, "skin"),
             "hair": RestMesh(self._hair.faces, self._hair.albedo, "hair"),
-            "brows": RestMesh(self._rooted.strands.faces, self._rooted.strands.albedo, "lash"),
+            "brows": RestMesh(self._brows.strands.faces, self._brows.strands.albedo, "lash"),
         }
         if self._beard:
             fixed["beard"] = RestMesh(self._beard.strands.faces, self._beard.strands.albedo, "hair")
@@ -116,15 +118,16 @@ class RenderedSubject:
         normals = vertex_normals(points, self._fine.faces)
         lift, albedo = self._folds.apply(state.folds, state.flushes, self._skin_albedo)
         gloss = None if self._gloss is None else self._stretched_gloss(tracked, self._gloss, state.wet)
+        outer = points + (lift + self._cap)[:, None] * normals
+        bare = points + lift[:, None] * normals
         made = {
-            "skin": PosedMesh(points + (lift + self._cap)[:, None] * normals, albedo, gloss),
+            "skin": PosedMesh(outer, albedo, gloss),
             "hair": PosedMesh(_moved(joints[HEAD_JOINT], self._hair.vertices), None),
-            "brows": PosedMesh(self._rooted_vertices(0, tracked, points + lift[:, None] * normals), None),
+            "brows": PosedMesh(self._rooted_vertices(self._brows, self._brow_frames, tracked, bare), None),
         }
-        if self._beard:
-            made["beard"] = PosedMesh(
-                self._rooted_vertices(1, tracked, points + (lift + self._cap)[:, None] * normals), None
-            )
+        if self._beard and self._beard_frames is not None:
+            grown = self._rooted_vertices(self._beard, self._beard_frames, tracked, outer)
+            made["beard"] = PosedMesh(grown, None)
         if self._glasses:
             made["glasses"] = PosedMesh(_moved(joints[HEAD_JOINT], self._glasses.vertices), None)
         for side, joint in zip(SIDES, EYE_JOINTS):
@@ -145,12 +148,12 @@ class RenderedSubject:
         stretch = self._fine.interpolate(np.clip(area / self._area, 0.6, 1.6))
         return np.clip(rest * stretch**_STRETCH_GLOSS * (1.0 + _WET * wet * self._lips), 0.1, 4.0)
 
-    def _rooted_vertices(self, number: int, tracked: FloatArray, points: FloatArray) -> FloatArray:
-        """Brows and lashes (number 0) and beard (1) turn with the triangle they grow from."""
-        rooted = self._rooted if number == 0 else self._beard
-        assert rooted is not None
+    def _rooted_vertices(
+        self, rooted: RootedStrands, frames: FloatArray, tracked: FloatArray, points: FloatArray
+    ) -> FloatArray:
+        """Hairs turn with the triangle that they grow from, whose frames at rest are ``frames``."""
         root, strand = rooted.root, rooted.strands.strand
-        turn = self._fine.frames(tracked, root) @ self._frames[number].transpose(0, 2, 1)
+        turn = self._fine.frames(tracked, root) @ frames.transpose(0, 2, 1)
         local = rooted.strands.vertices - self._rest_points[root][strand]
         return points[root][strand] + np.einsum("nab,nb->na", turn[strand], local)
 

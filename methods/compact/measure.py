@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 
 from ...bench.contracts import ByteArray, Clip, HeadAsset, Progress
 from ...bench.errors import InputError
@@ -18,7 +17,8 @@ from ...bench.specs import Findings
 from ..ours.avatar import OursAvatar
 from ..ours.storage import FIELD_FILE, Field
 from ..shared.avatar_files import read_shared_head, save_shared_head
-from ..shared.losses import mean_ssim
+from ..shared.losses import picture_ssim, psnr, squared_error
+from ..shared.schedule import evenly
 from ..shared.subject_mesh import SubjectMesh
 from .command import CompactSettings
 from .container import Content, write_content
@@ -169,8 +169,7 @@ class Comparison:
     def __init__(self, clip: Clip, exact: OursAvatar, frames: int, scale: int = 1):
         self._clip, self._scale = clip, scale
         keys = [*clip.splits["novel_view"], *clip.splits["self_reenactment"]]
-        chosen = np.unique(np.linspace(0, len(keys) - 1, min(frames, len(keys))).round().astype(int))
-        self.keys = [keys[index] for index in chosen]
+        self.keys = evenly(keys, frames)
         self._truth = [clip.image(key) for key in self.keys] if scale == 1 else None
         self._exact = self._pictures(exact)
         self.exact = self._quality(self._exact)
@@ -189,12 +188,13 @@ class Comparison:
         return pictures
 
     def _quality(self, pictures: Sequence[ByteArray]) -> Quality:
-        against_exact = _psnr(float(np.mean([_error(a, b) for a, b in zip(pictures, self._exact)])))
+        against_exact = psnr(float(np.mean([squared_error(a, b) for a, b in zip(pictures, self._exact)])))
         if self._truth is None:
             return Quality(math.nan, math.nan, against_exact)
-        psnr = [_psnr(_error(picture, truth)) for picture, truth in zip(pictures, self._truth)]
-        similarity = [_ssim(picture, truth) for picture, truth in zip(pictures, self._truth)]
-        return Quality(float(np.mean(psnr)), float(np.mean(similarity)), against_exact)
+        pairs = list(zip(pictures, self._truth))
+        decibels = [psnr(squared_error(*pair)) for pair in pairs]
+        similarity = [picture_ssim(*pair) for pair in pairs]
+        return Quality(float(np.mean(decibels)), float(np.mean(similarity)), against_exact)
 
 
 def avatar_of(content: Content, head: HeadAsset) -> OursAvatar:
@@ -202,16 +202,3 @@ def avatar_of(content: Content, head: HeadAsset) -> OursAvatar:
     subject, field = decode(Path(COMPACT_FILE), content, head, "cpu")
     mesh = SubjectMesh(head, subject.shape, subject.static_offset, "cpu")
     return OursAvatar([], mesh, subject, field, "cpu")
-
-
-def _error(picture: ByteArray, truth: ByteArray) -> float:
-    return float(np.mean((picture.astype(np.float64) - truth) ** 2))
-
-
-def _psnr(error: float) -> float:
-    return math.inf if error == 0 else 10 * math.log10(255**2 / error)
-
-
-def _ssim(picture: ByteArray, truth: ByteArray) -> float:
-    planes = [torch.from_numpy(image.astype(np.float32) / 255).permute(2, 0, 1) for image in (picture, truth)]
-    return float(mean_ssim(*(image.contiguous() for image in planes)))

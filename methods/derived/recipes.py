@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, Protocol
 
-import numpy as np
 import torch
 from safetensors.torch import save
 from torch import Tensor
@@ -16,6 +15,7 @@ from ...bench.contracts import Camera, Clip, HeadPose
 from ...bench.io.files import write_bytes
 from ..shared.networks import PAIRS
 from ..shared.rendering import USUAL, Cutoffs, PosedSplats, view_of
+from ..shared.schedule import evenly
 from ..shared.tensor_files import read_safetensors
 from ..splats import rasterize
 
@@ -114,9 +114,8 @@ class SplatAvatar(Protocol):
 
 def training_views(clip: Clip, count: int = VIEWS) -> list[tuple[Camera, HeadPose]]:
     """At most ``count`` training frames, evenly spread over their sorted keys."""
-    keys = sorted(clip.splits["train"])
-    chosen = np.unique(np.linspace(0, len(keys) - 1, min(count, len(keys))).round().astype(int))
-    return [(clip.cameras[keys[i].camera], clip.poses[keys[i].timestep]) for i in chosen]
+    keys = evenly(sorted(clip.splits["train"]), count)
+    return [(clip.cameras[key.camera], clip.poses[key.timestep]) for key in keys]
 
 
 def contributions(avatar: SplatAvatar, views: Iterable[tuple[Camera, HeadPose]]) -> Tensor:

@@ -1,13 +1,17 @@
-"""Losses of splat training: L1 with SSIM, and the two regularisers of GaussianAvatars."""
+"""Losses of splat training: L1 with SSIM, and the two regularisers of GaussianAvatars; quality of 8-bit pictures."""
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 from typing import Any
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+
+from ...bench.contracts import ByteArray
 
 WINDOW, SIGMA = 11, 1.5
 C1, C2 = 0.01**2, 0.03**2
@@ -92,6 +96,22 @@ def photometric_loss(image: Tensor, truth: Tensor, ssim_weight: float) -> Tensor
         ssim = mean_ssim(image.permute(2, 0, 1).contiguous(), truth.permute(2, 0, 1).contiguous())
         loss = loss + ssim_weight * (1 - ssim)
     return loss
+
+
+def squared_error(picture: ByteArray, truth: ByteArray) -> float:
+    """Mean squared difference of two 8-bit pictures, in levels squared."""
+    return float(np.mean((picture.astype(np.float64) - truth) ** 2))
+
+
+def psnr(error: float) -> float:
+    """PSNR, dB, of a mean squared difference of 8-bit pictures; infinite at 0."""
+    return math.inf if error == 0 else 10 * math.log10(255**2 / error)
+
+
+def picture_ssim(picture: ByteArray, truth: ByteArray) -> float:
+    """`mean_ssim` of two (H, W, 3) 8-bit pictures."""
+    planes = [torch.from_numpy(image.astype(np.float32) / 255).permute(2, 0, 1) for image in (picture, truth)]
+    return float(mean_ssim(*(image.contiguous() for image in planes)))
 
 
 def mean_over_visible(values: Tensor, visible: Tensor) -> Tensor:

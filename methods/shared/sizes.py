@@ -13,13 +13,14 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-import torch
 
-from ...bench.contracts import Avatar, Budget, ByteArray, Clip, FrameKey, Progress
+from ...bench.contracts import Avatar, Budget, Clip, FrameKey, Progress
 from ...bench.io.files import digest
+from ...bench.io.images import quantise
 from .config import Capacity
 from .loop import Fit
-from .losses import mean_ssim
+from .losses import picture_ssim, psnr, squared_error
+from .schedule import evenly
 
 log = logging.getLogger(__name__)
 Config = TypeVar("Config")
@@ -37,7 +38,7 @@ FOLDER = "trials"
 class Size:
     """A size of an avatar: dotted name of the setting, and smaller values to try, falling.
 
-    ``used`` tells how much of it an avatar has: values that the avatar of the configured sizes does not exceed are not
+    ``used`` gives how much of it an avatar has: values that the avatar of the configured sizes does not exceed are not
     tried, as its training was too short to say anything of them. None: all that is configured.
     """
 
@@ -71,10 +72,6 @@ class HeldOut:
     def __getattr__(self, name: str) -> Any:
         return getattr(self._clip, name)
 
-    def image(self, key: FrameKey) -> ByteArray:
-        """(H, W, 3) 8-bit sRGB."""
-        return self._clip.image(key)
-
 
 def held_out_frames(clip: Clip) -> tuple[FrameKey, ...]:
     """The training frames of the last timesteps of each sequence that has two or more; () where none has."""
@@ -107,7 +104,7 @@ def choose_sizes(
     if not clip.held_out or not clip.splits["train"]:
         log.warning("one timestep of training: nothing can be held out; sizes stay as they are configured")
         return config, ()
-    frames = _evenly(clip.held_out, FRAMES)
+    frames = evenly(clip.held_out, FRAMES)
     budget = Budget(
         _trial_iterations(fit.budget.iterations, capacity.share),
         None if fit.budget.seconds is None else fit.budget.seconds * capacity.share,
@@ -159,22 +156,13 @@ def halves(configured: int | None, least: int, count: int = 2) -> tuple[int, ...
     return tuple(value for value in values if value >= least)
 
 
-def _evenly(frames: Sequence[FrameKey], most: int) -> list[FrameKey]:
-    rows = np.unique(np.linspace(0, len(frames) - 1, min(most, len(frames))).round().astype(int))
-    return [frames[row] for row in rows]
-
-
 def _quality(avatar: Avatar, clip: Clip, frames: Sequence[FrameKey]) -> tuple[float, float]:
-    """Mean PSNR (dB) and SSIM of 8-bit renders over frames."""
+    """Mean PSNR (dB, 100 at most) and SSIM of 8-bit renders over frames."""
+    background = tuple(map(float, clip.background))
     found = []
     for key in frames:
-        camera, pose = clip.cameras[key.camera], clip.poses[key.timestep]
-        rgb = np.asarray(avatar.render(camera, pose, tuple(map(float, clip.background))).rgb)
-        image, truth = (
-            torch.from_numpy(pixels.astype(np.float32) / 255).permute(2, 0, 1).contiguous()
-            for pixels in (np.rint(np.clip(rgb, 0, 1) * 255), clip.image(key))
-        )
-        squared = float((image - truth).double().square().mean())
-        found.append((-10 * np.log10(max(squared, 1e-10)), float(mean_ssim(image, truth))))
-    psnr, ssim = np.mean(found, axis=0)
-    return float(psnr), float(ssim)
+        render = avatar.render(clip.cameras[key.camera], clip.poses[key.timestep], background)
+        picture, truth = quantise(render.rgb), clip.image(key)
+        found.append((min(psnr(squared_error(picture, truth)), 100.0), picture_ssim(picture, truth)))
+    decibels, similarity = np.mean(found, axis=0)
+    return float(decibels), float(similarity)

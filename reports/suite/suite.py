@@ -105,7 +105,7 @@ def results(run_folder: Path, every: list[Path]) -> str:
 
 
 def _section(title: str, folders: list[Path], part: Part) -> str:
-    """A table and, where ours is among several methods, what tells them from it."""
+    """A table and, where ours is among several methods, their differences from it."""
     runs = RunSet.read(folders, part)
     text = f"## {title}\n\n{to_markdown(table_of(runs)).strip()}"
     if OURS not in runs.ranked or len(runs.ranked) < 2:
