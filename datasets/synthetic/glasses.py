@@ -18,7 +18,7 @@ _COLORS = {
     "metal": ("#8a8a8c", "#b3975f", "#3a3a3c"),
     "plastic": ("#1c1a19", "#5a3420", "#25324a", "#6b1f24"),
 }
-_RADIUS = {"metal": 0.0009, "plastic": 0.0019}
+_RADIUS = {"metal": 0.0009, "plastic": 0.0014}
 
 
 @dataclass(frozen=True, eq=False)

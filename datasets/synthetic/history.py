@@ -78,7 +78,7 @@ def _kept(seconds: float, constant: float) -> float:
 
 _AGED = np.array(
     [
-        {"forehead": 0.5, "glabella": 0.6, "crow": 0.6, "nasolabial": 0.9, "under": 0.4, "neck": 0.6}.get(
+        {"forehead": 0.4, "glabella": 0.35, "crow": 0.3, "nasolabial": 0.9, "under": 0.4, "neck": 0.6}.get(
             name.split("_")[0], 0.0
         )
         for name in FOLDS
@@ -101,7 +101,7 @@ def coupled_strengths(a: Activations) -> FloatArray:
         "forehead_mid": a["brow_inner_up"] * (1.0 - 0.6 * frown),
         **{f"forehead_{side}": a[f"brow_outer_up_{side}"] * (1.0 - 0.6 * down[side]) for side in SIDES},
         "glabella": frown * (0.75 + 0.5 * a["brow_inner_up"]) + 0.35 * sneer,
-        **{f"crow_{side}": tense[side] * (0.35 + 0.6 * smile[side]) + 0.15 * smile[side] for side in SIDES},
+        **{f"crow_{side}": tense[side] * (0.3 + 0.4 * smile[side]) + 0.1 * smile[side] for side in SIDES},
         **{
             f"nasolabial_{side}": smile[side] * (0.5 + 0.9 * jaw)
             + a[f"nose_sneer_{side}"] * (0.5 + 0.5 * a[f"upper_lip_up_{side}"])

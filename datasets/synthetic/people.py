@@ -61,5 +61,5 @@ def person_of_any_age(name: str, index: int, seed: int, dynamics: float = 1.0) -
         spots=old * float(rng.uniform(0.2, 1.0)),
         recession=recession if STYLES[worn].length < _SHORT else 0.0,
         beard=beard,
-        glasses="" if eyewear < 0.6 else "metal" if eyewear < 0.8 else "plastic",
+        glasses="" if eyewear < 0.7 else "metal" if eyewear < 0.9 else "plastic",
     )
