@@ -14,7 +14,7 @@ from ...datasets.head.arrays import faces_in_region
 from ...datasets.steps.jaw_bases import jaw_bases, jaw_quaternions, jaw_weights
 from ..shared.avatar_kernel import usable
 from ..shared.binding import NORMAL, Frames
-from ..shared.networks import initial_coefficients
+from ..shared.networks import PAIRS, initial_coefficients
 from ..shared.optimisation import Optimiser
 from ..shared.rendering import View
 from ..shared.schedule import Timeline, torch_generator
@@ -37,10 +37,12 @@ from .field import (
     plane_box,
     plane_features,
     shade,
+    smoothing,
 )
 from .storage import RESIDUAL
 from .training_kernel import canonical_positions, directions_to, plane_colors, table_offsets
 
+PLANE_NETWORK = (*(f"plane_{name}" for name, _, _ in PAIRS), "color_weight_0", "color_weight_1")
 FLOATS_PER_FACE = 17 + 9 + 1  # triangle frame, turn to canonical, penalty weight
 
 
@@ -101,6 +103,10 @@ class OursAppearance:
         generator = torch_generator(self._seed, "field")
         initial = initial_parameters(self._config, self.expressions, len(self.jaw_bases), generator)
         return {name: (value.to(self._device), rate) for name, (value, rate) in initial.items()}
+
+    def stored(self, optimiser: Optimiser) -> dict[str, Tensor]:
+        """What `parameters` became, as an avatar reads it: the factors on directions are part of the weights."""
+        return {name: optimiser[name] for name in self.parameters()} | self._network(optimiser)
 
     def begin(self, timeline: Timeline) -> None:
         """Fit the start of the lines, and the steps of the harmonics' degree, to the run."""
@@ -170,9 +176,20 @@ class OursAppearance:
         if self._config.color == "sh":
             degree = min(self._config.sh_degree, iteration // self._degree_every)
             return harmonic_colors(optimiser["sh_dc"], optimiser["sh_rest"], -directions, degree)
+        network = self._network(optimiser)
         if usable(positions):
-            return plane_colors(optimiser, self.plane_box, positions, directions)
-        return shade(optimiser, plane_features(optimiser, self.plane_box, positions), directions)
+            return plane_colors(network, self.plane_box, positions, directions)
+        return shade(network, plane_features(network, self.plane_box, positions), directions)
+
+    def _network(self, optimiser: Optimiser) -> dict[str, Tensor]:
+        """Planes and weights of the colour network, if any."""
+        if self._config.color == "sh":
+            return {}
+        network = {name: optimiser[name] for name in PLANE_NETWORK}
+        spread, first = self._config.planes.direction_smoothing, PLANE_NETWORK[-2]
+        if spread:
+            network[first] = network[first] * smoothing(network[first].shape[1], spread).to(network[first])
+        return network
 
     @torch.no_grad()
     def _prepare(self, timestep: int) -> PreparedTimestep:

@@ -34,6 +34,8 @@ class Planes:
         leaves half the samples in x unused on a head without long hair.
     lr, network_lr : learning rates of the planes and of the network.
     move_splats : whether the loss moves splats to where the planes, seen from there, have better colours, as published.
+    direction_smoothing : standard deviation of a view direction, radians: the colour network is given the mean of the
+        encoding over such directions, so that it invents no colours between the training cameras. 0 as published.
     residual_lr : learning rate of a colour of its own for each splat, added to that of the planes; 0, as published, gives
         it none.
     """
@@ -44,15 +46,21 @@ class Planes:
     lr: float = 2e-3
     network_lr: float = 1e-4
     move_splats: bool = True
+    direction_smoothing: float = 0.0
     residual_lr: float = 0.0
 
-    added: ClassVar[Mapping[str, Any]] = {"move_splats": True, "residual_lr": 0.0}
+    added: ClassVar[Mapping[str, Any]] = {
+        "direction_smoothing": 0.0,
+        "move_splats": True,
+        "residual_lr": 0.0,
+    }
 
     def __post_init__(self) -> None:
         if self.resolution < 2 or min(self.channels) < 1:
             raise ValueError("resolution must be at least 2, and channels at least 1")
-        if self.residual_lr < 0:
-            raise ValueError(f"residual_lr must not be negative, found {self.residual_lr}")
+        for name in ("direction_smoothing", "residual_lr"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} must not be negative, found {getattr(self, name)}")
 
 
 @dataclass(frozen=True)

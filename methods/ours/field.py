@@ -20,6 +20,7 @@ from ..shared.binding import Frames, apply_matrices
 from ..shared.networks import (
     C0,
     ENCODING_SIZE,
+    FREQUENCIES,
     PAIRS,
     color_network,
     encode,
@@ -251,6 +252,18 @@ def plane_features(parameters: NamedTensors, box: Bounds, positions: Tensor) -> 
 def shade(parameters: NamedTensors, features: tuple[Tensor, ...], directions: Tensor) -> Tensor:
     """Colours (N, 3) >= 0 of plane features and canonical directions; the way of training."""
     return color_network(parameters["color_weight_0"], parameters["color_weight_1"], features, directions)
+
+
+def smoothing(inputs: int, spread: float) -> Tensor:
+    """(inputs,) factors on the colour network's inputs for directions known to ``spread`` radians.
+
+    The mean of the encoding of x + n, n normal with that deviation: a wave of frequency f keeps exp(-(f spread)^2 / 2)
+    (integrated positional encoding; Barron et al. 2021, arXiv 2103.13415, eq. 13). The encoded direction comes last.
+    """
+    frequencies = torch.cat([torch.zeros(3), torch.tensor(FREQUENCIES).repeat_interleave(6)])
+    factors = torch.ones(inputs)
+    factors[inputs - ENCODING_SIZE :] = torch.exp(-0.5 * (frequencies * spread) ** 2)
+    return factors
 
 
 def position_part(parameters: NamedTensors, features: tuple[Tensor, ...]) -> Tensor:

@@ -73,7 +73,7 @@ class Ours(TrainedMethod[OursConfig, OursAvatar]):
             out / FIELD_FILE,
             {name: optimiser[name] for name in training.splat_names},
             training.binding,
-            {name: optimiser[name] for name in appearance.parameters()},
+            appearance.stored(optimiser),
             *(appearance.plane_box, appearance.line_box, appearance.jaw_bases, config.lines.dynamic),
         )
         subject = Subject.of(clip)

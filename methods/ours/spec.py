@@ -8,11 +8,17 @@ from ...bench.specs import MethodSpec
 from ..shared.config import splat_presets
 
 SHORT: dict[str, Any] = {
-    "planes": {"lr": 8e-3, "network_lr": 1.5e-3, "residual_lr": 1e-2, "move_splats": False},
+    "planes": {
+        "lr": 8e-3,
+        "network_lr": 1.5e-3,
+        "residual_lr": 1e-2,
+        "direction_smoothing": 0.3,
+        "move_splats": False,
+    },
     "lines": {"lr": 2e-2, "network_lr": 1e-3, "bounds": "face"},
     "penalty": {"weight": 1e-3, "softness": 0.1},
-    "outer_layers": {"count": 1},
-    "direction_jitter": 0.15,
+    "sh_dc_lr": 0.02,
+    "sh_rest_lr": 1e-3,
     "storage": "compact",
 }
 """Of runs much shorter than published (README.md, "Presets")."""

@@ -31,7 +31,11 @@ ABLATIONS: Mapping[str, Mapping[str, Any]] = {
     "no-balanced-sampling": {"sampling": {"balanced": False}},
     "harmonics": {"color": "sh"},
     "lines-in-head": {"lines": {"bounds": "head"}},
-    "published": {"lines": {"bounds": "head"}, "planes": {"residual_lr": 0.0, "move_splats": True}},
+    "no-direction-smoothing": {"planes": {"direction_smoothing": 0.0}},
+    "published": {
+        "lines": {"bounds": "head"},
+        "planes": {"direction_smoothing": 0.0, "residual_lr": 0.0, "move_splats": True},
+    },
 }
 """Settings of ours by the name of what is left out or changed; the first two are the paper's Table 4."""
 

@@ -31,7 +31,7 @@ CONFIG = OursConfig(
 )
 CONFIGS = {
     "published": CONFIG,
-    "repaired": changed(CONFIG, planes={"residual_lr": 0.05}),
+    "repaired": changed(CONFIG, planes={"residual_lr": 0.05, "direction_smoothing": 0.3}),
 }
 
 
@@ -45,8 +45,8 @@ def frame(vertices, triangle):
     return torch.stack([a0, a1, a2], dim=1), size, (v0 + v1 + v2) / 3
 
 
-def color(tensors, box, position, direction):
-    """Tri-plane, encoded direction, two layers."""
+def color(tensors, box, position, direction, spread):
+    """Tri-plane, encoded direction known to ``spread`` radians, two layers."""
     x, y, z = 2 * (position - box[0]) / (box[1] - box[0]) - 1
     features = []
     for name, point in {"xy": (x, y), "xz": (x, z), "yz": (y, z)}.items():
@@ -55,7 +55,11 @@ def color(tensors, box, position, direction):
         image = plane.view(side, side, -1).permute(2, 0, 1)[None]
         grid = torch.stack(point).view(1, 1, 1, 2)
         features.append(F.grid_sample(image, grid, padding_mode="border", align_corners=True).flatten())
-    waves = [wave(direction * scale) for scale in (1, 2, 4, 8) for wave in (torch.sin, torch.cos)]
+    waves = [
+        np.exp(-0.5 * (scale * spread) ** 2) * wave(direction * scale)
+        for scale in (1, 2, 4, 8)
+        for wave in (torch.sin, torch.cos)
+    ]
     hidden = torch.relu(tensors["color_weight_0"] @ torch.cat([*features, direction, *waves]))
     return torch.relu(0.5 + tensors["color_weight_1"] @ hidden / (2 * np.sqrt(np.pi)))
 
@@ -80,8 +84,11 @@ def offset(tensors, box, position, expression, jaw):
     return value[0]
 
 
-def definition(clip, key, tensors, splats, boxes, jaw_bases):
-    """World means, colours and opacities of all splats, from the clip's arrays alone."""
+def definition(clip, key, tensors, splats, boxes, jaw_bases, spread=0.0):
+    """World means, colours and opacities of all splats, from the clip's arrays alone.
+
+    Of a stored avatar the spread of directions is part of the weights.
+    """
     model = HeadModel(clip.head, dtype=torch.float64)
     pose = clip.poses[key.timestep]
     canonical = model.canonical(torch.from_numpy(clip.shape), torch.from_numpy(clip.static_offset))
@@ -100,7 +107,7 @@ def definition(clip, key, tensors, splats, boxes, jaw_bases):
         means.append(size * rotation @ mean + center)
         position = own_size * own_rotation @ mean + own_center
         direction = F.normalize(own_rotation @ rotation.T @ F.normalize(camera - means[-1], dim=0), dim=0)
-        colors.append(torch.relu(color(tensors, boxes[0], position, direction) + residual))
+        colors.append(torch.relu(color(tensors, boxes[0], position, direction, spread) + residual))
         delta = offset(tensors, boxes[1], position.detach(), expression, jaw)
         opacities.append(torch.sigmoid(logit + delta))
     return torch.stack(means), torch.stack(colors), torch.stack(opacities)
@@ -159,7 +166,8 @@ def both(clip, request):
     exact = {name: value.double().requires_grad_() for name, value in values.items()}
     splats = {**{name: exact[name] for name in ("means", "opacities", *own)}, "binding": binding}
     boxes = [torch.stack(list(box)).double() for box in (appearance.plane_box, appearance.line_box)]
-    _, colors, opacities = definition(clip, key, exact, splats, boxes, appearance.jaw_bases)
+    spread = CONFIGS[request.param].planes.direction_smoothing
+    _, colors, opacities = definition(clip, key, exact, splats, boxes, appearance.jaw_bases, spread)
     ((colors * mix[:, :3]).sum() + (opacities * mix[:, 3]).sum()).backward()
     return shading, optimiser, colors, opacities, exact
 
