@@ -185,7 +185,7 @@ class OursAppearance:
         """Planes and weights of the colour network, if any."""
         if self._config.color == "sh":
             return {}
-        network = {name: optimiser[name] for name in PLANE_NETWORK}
+        network: dict[str, Tensor] = {name: optimiser[name] for name in PLANE_NETWORK}
         spread, first = self._config.planes.direction_smoothing, PLANE_NETWORK[-2]
         if spread:
             network[first] = network[first] * smoothing(network[first].shape[1], spread).to(network[first])
