@@ -74,7 +74,7 @@ bench: setup
 
 # The README's table and picture are those of the last demo.
 readme: demo
-	$(BIN)/python -m headbench.reports.readme $(OUT) README.md
+	$(BIN)/python -m headbench.reports.readme demo $(OUT) README.md
 
 # The committed tree, ready to be built. An index page has no files beside it: with URL, the README's links become
 # absolute and the package names its repository.

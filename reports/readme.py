@@ -1,6 +1,7 @@
-"""Puts the result of a run into the README: the table, the picture, and the rows they are views of.
+"""Puts results into the README: the tables, the demo's picture, and the rows they are views of.
 
-python -m headbench.reports.readme demo-output README.md
+python -m headbench.reports.readme demo demo-output README.md
+python -m headbench.reports.readme suite suite-output README.md
 """
 
 from __future__ import annotations
@@ -18,43 +19,64 @@ from ..bench.io.images import read_png
 from ..bench.rows import ALL, Rows
 from ..bench.runner.scoring import FULL
 from ..bench.runner.store import RunFolder
+from .suite.suite import results
 from .table_report import table_text
 
-BEGIN, END = "<!-- demo:begin -->", "<!-- demo:end -->"
 GALLERY = "reports/gallery"
+SUITE = f"{GALLERY}/suite"
 PICTURE = "contact_sheet.jpg"
+RESULTS = "results.md"
 
 
-def publish(run_folder: Path, readme: Path) -> None:
-    """Copy manifest (without this machine's folders), rows and contact sheet of a run beside the README, and write the
-    block made of them."""
-    source, target = RunFolder(run_folder), RunFolder(readme.parent / GALLERY)
+def publish_demo(out: Path, readme: Path) -> None:
+    """Copy manifest, rows and contact sheet of a run beside the README, and write the block made of them."""
+    target = RunFolder(readme.parent / GALLERY)
+    _copy(RunFolder(out), target)
+    # A page's picture, not a measurement: a lossy copy a third the size.
+    sheet = cv2.cvtColor(read_png(RunFolder(out).contact_sheet), cv2.COLOR_RGB2BGR)
+    with atomic_path(target.root / PICTURE) as temporary:
+        cv2.imwrite(str(temporary), sheet, [cv2.IMWRITE_JPEG_QUALITY, 90])
+    _write(readme, "demo", demo_block(target.root))
+
+
+def publish_suite(out: Path, readme: Path) -> None:
+    """Copy manifest and rows of each run of a suite beside the README, and write its tables and the block made of them."""
+    target = readme.parent / SUITE
+    for manifest in sorted(out.glob(f"*/{RunFolder(out).manifest.name}")):
+        _copy(RunFolder(manifest.parent), RunFolder(target / manifest.parent.name))
+    write_text(target / RESULTS, suite_results(target))
+    _write(readme, "suite", suite_block(target))
+
+
+def _copy(source: RunFolder, target: RunFolder) -> None:
+    """Manifest, without this machine's folders, and rows of a run."""
     manifest = source.read_manifest()
+    target.root.mkdir(parents=True, exist_ok=True)
     without_paths(manifest, tuple(method.name for method in manifest.methods)).write(target.manifest)
     with atomic_path(target.rows) as temporary:
         shutil.copyfile(source.rows, temporary)
-    # A page's picture, not a measurement: a lossy copy a third the size.
-    sheet = cv2.cvtColor(read_png(source.contact_sheet), cv2.COLOR_RGB2BGR)
-    with atomic_path(target.root / PICTURE) as temporary:
-        cv2.imwrite(str(temporary), sheet, [cv2.IMWRITE_JPEG_QUALITY, 90])
+
+
+def marks(name: str) -> tuple[str, str]:
+    """What stands before and after a block of the README."""
+    return f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
+
+
+def _write(readme: Path, name: str, block: str) -> None:
+    begin, end = marks(name)
     text = readme.read_text(encoding="utf-8")
-    if text.count(BEGIN) != 1 or text.count(END) != 1:
-        raise InputError(readme, "", f"the marks {BEGIN} and {END} once each", "something else")
-    before, rest = text.split(BEGIN)
-    _, after = rest.split(END)
-    write_text(readme, f"{before}{BEGIN}\n{block(target.root)}\n{END}{after}")
+    if text.count(begin) != 1 or text.count(end) != 1:
+        raise InputError(readme, "", f"the marks {begin} and {end} once each", "something else")
+    before, rest = text.split(begin)
+    _, after = rest.split(end)
+    write_text(readme, f"{before}{begin}\n{block}\n{end}{after}")
 
 
-def block(gallery: Path) -> str:
-    """Return the README's block for the stored result in ``gallery``: Markdown."""
+def demo_block(gallery: Path) -> str:
+    """Return the README's block for the stored result of the demo: Markdown."""
     record = RunFolder(gallery).read_manifest()
     machine = record.machine
-    rows = Rows.read(RunFolder(gallery).rows)
-    trained = rows.select(method=ALL, metric="training_time", task="", region=FULL, seeds=ALL)
-    trained = trained[trained["status"] == "ok"]
-    # Not the run's own length: of a demo that was continued it is that of its last part.
-    spent = zip(trained["method"].astype(str), trained["value"].astype(float))
-    minutes = ", ".join(f"{method} {value:.1f}" for method, value in spent if value >= 0.05)
+    minutes = ", ".join(f"{method} {value:.1f}" for method, value in _minutes(gallery) if value >= 0.05)
     cost = (
         f"Minutes of training: {minutes}, on {machine['cores']} cores ({machine['processor']}); the largest process took "
         f"{(record.peak_memory_bytes or 0) / 1e9:.1f} GB."
@@ -63,5 +85,39 @@ def block(gallery: Path) -> str:
     return f"{picture}\n\n{table_text([gallery], 'md').strip()}\n\n{cost}"
 
 
+def _minutes(run_folder: Path) -> list[tuple[str, float]]:
+    """Minutes of training of every method that was trained, of one subject after another.
+
+    Not the run's own length: of one that was continued it is that of its last part.
+    """
+    rows = Rows.read(RunFolder(run_folder).rows)
+    trained = rows.select(method=ALL, metric="training_time", task="", region=FULL, seeds=ALL)
+    trained = trained[trained["status"] == "ok"]
+    return list(zip(trained["method"].astype(str), trained["value"].astype(float)))
+
+
+def suite_results(folder: Path) -> str:
+    """All tables of the stored runs of the suite."""
+    return results(folder / "run", [path.parent for path in _runs(folder)])
+
+
+def _runs(folder: Path) -> list[Path]:
+    """Manifests of the stored runs, the comparison itself first."""
+    name = RunFolder(folder).manifest.name
+    return [folder / "run" / name, *sorted(folder.glob(f"ablation-*/{name}"))]
+
+
+def suite_block(folder: Path) -> str:
+    """Return the README's block for the stored results of the suite: Markdown."""
+    hours = sum(value for path in _runs(folder) for _, value in _minutes(path.parent)) / 60
+    return (
+        f"{table_text([folder / 'run'], 'md').strip()}\n\n"
+        f"[Tables by region and by part of FREE, paired differences with tests]({SUITE}/{RESULTS}). "
+        f"Training took {hours:.1f} hours."
+    )
+
+
+PUBLISH = {"demo": publish_demo, "suite": publish_suite}
+
 if __name__ == "__main__":
-    publish(Path(sys.argv[1]), Path(sys.argv[2]))
+    PUBLISH[sys.argv[1]](Path(sys.argv[2]), Path(sys.argv[3]))

@@ -98,8 +98,15 @@ def test_ci_runs_the_test_command_of_the_readme():
     assert "make test" in (ROOT / ".ci" / "run").read_text(encoding="utf-8")
 
 
-def test_the_table_is_generated_from_the_stored_rows_never_typed():
-    from headbench.reports.readme import BEGIN, END, GALLERY, block
+def test_tables_are_generated_from_the_stored_rows_never_typed():
+    from headbench.reports import readme
 
-    shown = README.split(BEGIN)[1].split(END)[0].strip()
-    assert shown == block(ROOT / GALLERY).strip()
+    blocks = {
+        "demo": readme.demo_block(ROOT / readme.GALLERY),
+        "suite": readme.suite_block(ROOT / readme.SUITE),
+    }
+    for name, block in blocks.items():
+        begin, end = readme.marks(name)
+        assert README.split(begin)[1].split(end)[0].strip() == block.strip()
+    results = ROOT / readme.SUITE / readme.RESULTS
+    assert results.read_text(encoding="utf-8") == readme.suite_results(ROOT / readme.SUITE)
