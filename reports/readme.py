@@ -42,8 +42,8 @@ def publish_demo(out: Path, readme: Path) -> None:
 def publish_suite(out: Path, readme: Path) -> None:
     """Copy manifest and rows of each run of a suite beside the README, and write its tables and the block made of them."""
     target = readme.parent / SUITE
-    for manifest in sorted(out.glob(f"*/{RunFolder(out).manifest.name}")):
-        _copy(RunFolder(manifest.parent), RunFolder(target / manifest.parent.name))
+    for folder in _runs(out):
+        _copy(RunFolder(folder), RunFolder(target / folder.name))
     write_text(target / RESULTS, suite_results(target))
     _write(readme, "suite", suite_block(target))
 
@@ -98,18 +98,17 @@ def _minutes(run_folder: Path) -> list[tuple[str, float]]:
 
 def suite_results(folder: Path) -> str:
     """All tables of the stored runs of the suite."""
-    return results(folder / "run", [path.parent for path in _runs(folder)])
+    return results(folder / "run", _runs(folder))
 
 
 def _runs(folder: Path) -> list[Path]:
-    """Manifests of the stored runs, the comparison itself first."""
-    name = RunFolder(folder).manifest.name
-    return [folder / "run" / name, *sorted(folder.glob(f"ablation-*/{name}"))]
+    """Folders of a suite's runs, the comparison itself first."""
+    return [folder / "run", *sorted(folder.glob("ablation-*"))]
 
 
 def suite_block(folder: Path) -> str:
     """Return the README's block for the stored results of the suite: Markdown."""
-    hours = sum(value for path in _runs(folder) for _, value in _minutes(path.parent)) / 60
+    hours = sum(value for each in _runs(folder) for _, value in _minutes(each)) / 60
     return (
         f"{table_text([folder / 'run'], 'md').strip()}\n\n"
         f"[Tables by region and by part of FREE, paired differences with tests]({SUITE}/{RESULTS}). "

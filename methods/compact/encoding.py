@@ -10,14 +10,13 @@ from torch import Tensor
 
 from ...bench.contracts import FloatArray
 from ...bench.errors import InputError
-from ..ours.field import Bounds, normalised_weight, plane_features
+from ..ours.field import FIRST_LAYER, LAST_LAYER, PLANES, Bounds, normalised_weight, plane_features
 from ..ours.storage import RESIDUAL, splat_columns
-from ..shared.networks import C0, PAIRS
+from ..shared.networks import C0
 from .container import Arrays, coded, dequantise, from_smallest_three, narrow, smallest_three
 from .precision import Precision
 
-PLANES = tuple(f"plane_{pair}" for pair, _, _ in PAIRS)
-MATRICES = ("color_weight_0", "color_weight_1", *(f"line_direction_{layer}" for layer in range(3)))
+MATRICES = (FIRST_LAYER, LAST_LAYER, *(f"line_direction_{layer}" for layer in range(3)))
 MAX_TABLE = 2**25
 """Numbers of a plane or of all lines, those left out included; 512 x 512 samples of 128 channels."""
 SENSITIVITY_FLOOR = 1e-6  # a channel that changes nothing may have any step, but a finite one
@@ -134,7 +133,7 @@ def _used_samples(tensors: Mapping[str, Tensor], positions: Tensor) -> list[np.n
 
 def _color_sensitivity(tensors: Mapping[str, Tensor]) -> FloatArray:
     """(C,) change of colour by a unit of each plane channel, were all hidden units at work with random signs."""
-    first, last = _numpy(tensors["color_weight_0"]), _numpy(tensors["color_weight_1"])
+    first, last = _numpy(tensors[FIRST_LAYER]), _numpy(tensors[LAST_LAYER])
     channels = sum(tensors[name].shape[1] for name in PLANES)
     weight = C0 * np.linalg.norm(last, axis=0)
     return np.maximum(np.linalg.norm(weight[:, None] * first[:, :channels], axis=0), SENSITIVITY_FLOOR)

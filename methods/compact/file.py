@@ -10,7 +10,7 @@ import torch
 
 from ...bench.contracts import HeadAsset
 from ...bench.errors import InputError
-from ..ours.field import CanonicalFrames
+from ..ours.field import PLANES, CanonicalFrames
 from ..ours.storage import PER_SPLAT, RESIDUAL, SPLAT_WIDTHS, Field, checked_field
 from ..shared.avatar_files import Subject
 from ..shared.subject_mesh import SubjectMesh
@@ -18,7 +18,6 @@ from .container import Arrays, Content, coded, packed_sizes, read_content, write
 from .encoding import (
     HARMONICS,
     MATRICES,
-    PLANES,
     decode_field,
     decode_splats,
     encode_field,

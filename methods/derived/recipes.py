@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ...bench.contracts import Camera, Clip, HeadPose
 from ...bench.io.files import write_bytes
-from ..shared.networks import PAIRS
+from ..ours.field import PLANES
 from ..shared.rendering import USUAL, Cutoffs, PosedSplats, view_of
 from ..shared.schedule import evenly
 from ..shared.tensor_files import read_safetensors
@@ -195,7 +195,7 @@ def _eight_bits(name: str, value: Tensor) -> dict[str, Tensor]:
 
 def coarser_planes(tensors: dict[str, Tensor], resolution: int) -> dict[str, Tensor]:
     """The same tensors with (resolution^2, C) planes; unchanged where they have no more samples."""
-    planes = [name for name in (f"plane_{pair}" for pair, _, _ in PAIRS) if name in tensors]
+    planes = [name for name in PLANES if name in tensors]
     return tensors | {name: _coarser_plane(tensors[name], resolution) for name in planes}
 
 

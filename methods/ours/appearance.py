@@ -14,7 +14,7 @@ from ...datasets.head.arrays import faces_in_region
 from ...datasets.steps.jaw_bases import jaw_bases, jaw_quaternions, jaw_weights
 from ..shared.avatar_kernel import usable
 from ..shared.binding import NORMAL, Frames
-from ..shared.networks import PAIRS, initial_coefficients
+from ..shared.networks import initial_coefficients, smoothing
 from ..shared.optimisation import Optimiser
 from ..shared.rendering import View
 from ..shared.schedule import Timeline, torch_generator
@@ -23,6 +23,8 @@ from ..shared.subject_mesh import BoundedCache, SubjectMesh, centroid_displaceme
 from ..shared.training_kernel import harmonic_colors, to_world
 from .config import OursConfig
 from .field import (
+    COLOR_NETWORK,
+    FIRST_LAYER,
     Bounds,
     CanonicalFrames,
     LocalSplats,
@@ -37,12 +39,10 @@ from .field import (
     plane_box,
     plane_features,
     shade,
-    smoothing,
 )
 from .storage import RESIDUAL
 from .training_kernel import canonical_positions, directions_to, plane_colors, table_offsets
 
-PLANE_NETWORK = (*(f"plane_{name}" for name, _, _ in PAIRS), "color_weight_0", "color_weight_1")
 FLOATS_PER_FACE = 17 + 9 + 1  # triangle frame, turn to canonical, penalty weight
 
 
@@ -87,6 +87,11 @@ class OursAppearance:
         entries = config.splats.mesh_cache_mb * 2**20 // (4 * FLOATS_PER_FACE * len(mesh.faces))
         self._prepared = BoundedCache(self._prepare, entries)
         self._lines_from, self._degree_every = 0, 1
+        self._smoothing = None
+        if config.planes.direction_smoothing:
+            features = torch.ones(sum(config.planes.channels))
+            factors = torch.cat([features, smoothing(config.planes.direction_smoothing)])
+            self._smoothing = factors.to(device)
 
     def splat_parameters(self, count: int) -> dict[str, tuple[Tensor, float]]:
         """A colour beside that of the planes, if any; spherical harmonics where they replace the planes."""
@@ -185,10 +190,9 @@ class OursAppearance:
         """Planes and weights of the colour network, if any."""
         if self._config.color == "sh":
             return {}
-        network: dict[str, Tensor] = {name: optimiser[name] for name in PLANE_NETWORK}
-        spread, first = self._config.planes.direction_smoothing, PLANE_NETWORK[-2]
-        if spread:
-            network[first] = network[first] * smoothing(network[first].shape[1], spread).to(network[first])
+        network: dict[str, Tensor] = {name: optimiser[name] for name in COLOR_NETWORK}
+        if self._smoothing is not None:
+            network[FIRST_LAYER] = network[FIRST_LAYER] * self._smoothing
         return network
 
     @torch.no_grad()

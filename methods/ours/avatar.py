@@ -19,6 +19,8 @@ from ..shared.rendering import USUAL, Cutoffs, LastPose, PlacedSplats, StoredSpl
 from ..shared.subject_mesh import KnownPoses, SubjectMesh
 from .appearance import driving_coefficients
 from .field import (
+    FIRST_LAYER,
+    LAST_LAYER,
     Bounds,
     CanonicalFrames,
     LocalSplats,
@@ -79,7 +81,7 @@ class OursAvatar(StoredSplatAvatar):
         self.line_offsets: LineOffsets | None = None
         if "sh_dc" not in tensors:
             features = plane_features(tensors, Bounds(*tensors["plane_box"]), positions)
-            weights = tensors["color_weight_0"], tensors["color_weight_1"]
+            weights = tensors[FIRST_LAYER], tensors[LAST_LAYER]
             self.colors = PlaneColors(*weights, position_part(tensors, features))
         else:
             self.colors = HarmonicColors(tensors["sh_dc"], tensors["sh_rest"])

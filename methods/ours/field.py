@@ -20,7 +20,6 @@ from ..shared.binding import Frames, apply_matrices
 from ..shared.networks import (
     C0,
     ENCODING_SIZE,
-    FREQUENCIES,
     PAIRS,
     color_network,
     encode,
@@ -33,6 +32,11 @@ from .config import Dynamic, OursConfig
 WIDTHS: Mapping[Dynamic, int] = {"opacity": 1, "position": 3, "rotation": 4, "scale": 3, "color": 3}
 """Numbers per splat of each thing that may change."""
 
+PLANES = tuple(f"plane_{pair}" for pair, _, _ in PAIRS)
+FIRST_LAYER = "color_weight_0"
+LAST_LAYER = "color_weight_1"
+COLOR_NETWORK = (*PLANES, FIRST_LAYER, LAST_LAYER)
+"""What gives colours by place and direction: planes and the weights of both layers."""
 
 FIELDS = {"opacity": "logits", "position": "means", "rotation": "quats", "scale": "log_scales"}
 """Of `LocalSplats`, to which offsets are added."""
@@ -244,32 +248,20 @@ def canonical_directions(turns: Tensor, binding: Tensor, means: Tensor, center: 
 
 def plane_features(parameters: NamedTensors, box: Bounds, positions: Tensor) -> tuple[Tensor, ...]:
     """Features (N, C_k) of the three planes at canonical positions."""
-    planes = {name: parameters[f"plane_{name}"] for name, _, _ in PAIRS}
+    planes = {pair: parameters[name] for (pair, _, _), name in zip(PAIRS, PLANES)}
     resolution = round(len(planes["xy"]) ** 0.5)
     return sample_triplane(planes, 2 * box.unit(positions) - 1, resolution)
 
 
 def shade(parameters: NamedTensors, features: tuple[Tensor, ...], directions: Tensor) -> Tensor:
     """Colours (N, 3) >= 0 of plane features and canonical directions; the way of training."""
-    return color_network(parameters["color_weight_0"], parameters["color_weight_1"], features, directions)
-
-
-def smoothing(inputs: int, spread: float) -> Tensor:
-    """(inputs,) factors on the colour network's inputs for directions known to ``spread`` radians.
-
-    The mean of the encoding of x + n, n normal with that deviation: a wave of frequency f keeps exp(-(f spread)^2 / 2)
-    (integrated positional encoding; Barron et al. 2021, arXiv 2103.13415, eq. 13). The encoded direction comes last.
-    """
-    frequencies = torch.cat([torch.zeros(3), torch.tensor(FREQUENCIES).repeat_interleave(6)])
-    factors = torch.ones(inputs)
-    factors[inputs - ENCODING_SIZE :] = torch.exp(-0.5 * (frequencies * spread) ** 2)
-    return factors
+    return color_network(parameters[FIRST_LAYER], parameters[LAST_LAYER], features, directions)
 
 
 def position_part(parameters: NamedTensors, features: tuple[Tensor, ...]) -> Tensor:
     """What plane features, (N, C_k) each, add to the hidden layer; for an avatar it never changes."""
     joined = torch.cat(features, dim=1)
-    return joined @ parameters["color_weight_0"][:, : joined.shape[1]].t()
+    return joined @ parameters[FIRST_LAYER][:, : joined.shape[1]].t()
 
 
 def shade_directions(parameters: NamedTensors, from_position: Tensor, directions: Tensor) -> Tensor:
@@ -277,7 +269,7 @@ def shade_directions(parameters: NamedTensors, from_position: Tensor, directions
 
     The same as `shade` up to rounding, where the part of the position is known beforehand.
     """
-    first, last = parameters["color_weight_0"], parameters["color_weight_1"]
+    first, last = parameters[FIRST_LAYER], parameters[LAST_LAYER]
     of_direction = first[:, first.shape[1] - ENCODING_SIZE :]
     hidden = torch.addmm(from_position, encode(directions), of_direction.t()).relu_()
     return torch.relu(0.5 + C0 * (hidden @ last.t()))
@@ -301,11 +293,11 @@ def initial_parameters(
 
 def _initial_planes(config: OursConfig, generator: torch.Generator) -> dict[str, tuple[Tensor, float]]:
     result: dict[str, tuple[Tensor, float]] = {}
-    for (name, _, _), channels in zip(PAIRS, config.planes.channels):
+    for name, channels in zip(PLANES, config.planes.channels):
         plane = uniform((config.planes.resolution**2, channels), 0.1, generator)
-        result[f"plane_{name}"] = (plane, config.planes.lr)
+        result[name] = (plane, config.planes.lr)
     inputs = sum(config.planes.channels) + ENCODING_SIZE
-    for layer, shape in enumerate([(config.hidden, inputs), (3, config.hidden)]):
+    for name, shape in ((FIRST_LAYER, (config.hidden, inputs)), (LAST_LAYER, (3, config.hidden))):
         weight = uniform(shape, shape[1] ** -0.5, generator)
-        result[f"color_weight_{layer}"] = (weight, config.planes.network_lr)
+        result[name] = (weight, config.planes.network_lr)
     return result

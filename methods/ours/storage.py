@@ -16,10 +16,10 @@ from ...bench.contracts import HeadAsset
 from ...bench.errors import InputError
 from ...bench.io.arrays import Member
 from ...bench.io.files import write_bytes
-from ..shared.networks import ENCODING_SIZE, PAIRS, coefficient_count
+from ..shared.networks import ENCODING_SIZE, coefficient_count
 from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors
 from .config import Dynamic
-from .field import WIDTHS, Bounds, offset_width
+from .field import COLOR_NETWORK, FIRST_LAYER, LAST_LAYER, PLANES, WIDTHS, Bounds, offset_width
 
 FIELD_FILE = "avatar.safetensors"
 DYNAMIC = "dynamic"
@@ -97,7 +97,7 @@ def checked_field(path: Path, tensors: dict[str, Tensor], names: str, head: Head
     if "sh_dc" in tensors:
         needed += ["sh_rest"]
     else:
-        needed += ["color_weight_0", "color_weight_1", *(f"plane_{name}" for name, _, _ in PAIRS)]
+        needed += COLOR_NETWORK
     if "lines" in tensors:
         needed += [f"line_{part}_{layer}" for layer in range(3) for part in ("direction", "gain", "bias")]
     number = Member("f", None, MAX_MAGNITUDE, "f4")
@@ -139,16 +139,15 @@ def _check_shapes(path: Path, tensors: Mapping[str, Tensor], head: HeadAsset, ou
     else:
         if RESIDUAL in tensors:
             exactly(RESIDUAL, len(splats), 3)
-        planes = [f"plane_{pair}" for pair, _, _ in PAIRS]
-        for name in planes:
+        for name in PLANES:
             plane = tensors[name]
             square = plane.ndim == 2 and round(len(plane) ** 0.5) ** 2 == len(plane) >= 4
-            alike = square and len(plane) == len(tensors[planes[0]])
+            alike = square and len(plane) == len(tensors[PLANES[0]])
             require(name, alike, "(R * R, C), R of all planes equal")
-        inputs = sum(tensors[name].shape[1] for name in planes) + ENCODING_SIZE
-        first = tensors["color_weight_0"]
-        require("color_weight_0", first.ndim == 2 and first.shape[1] == inputs, f"(H, {inputs})")
-        exactly("color_weight_1", 3, len(first))
+        inputs = sum(tensors[name].shape[1] for name in PLANES) + ENCODING_SIZE
+        first = tensors[FIRST_LAYER]
+        require(FIRST_LAYER, first.ndim == 2 and first.shape[1] == inputs, f"(H, {inputs})")
+        exactly(LAST_LAYER, 3, len(first))
 
     bases = tensors["jaw_bases"]
     require("jaw_bases", bases.ndim == 2 and bases.shape[1] == 4, "(J, 4)")

@@ -13,9 +13,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from ..shared.avatar_kernel import arrays, call
-from ..shared.networks import PAIRS
 from ..shared.threads import threads
-from .field import Bounds, CanonicalFrames, NamedTensors, line_table, normalised_weight
+from .field import COLOR_NETWORK, Bounds, CanonicalFrames, NamedTensors, line_table, normalised_weight
 
 
 def plane_colors(
@@ -26,9 +25,8 @@ def plane_colors(
     backend: str = "cpu",
 ) -> Tensor:
     """Colours (N, 3) >= 0 of (N, 3) canonical positions seen along (N, 3) canonical unit vectors."""
-    planes = (parameters[f"plane_{name}"] for name, _, _ in PAIRS)
-    weights = parameters["color_weight_0"], parameters["color_weight_1"]
-    return _Colors.apply(torch.stack([*box]), backend, positions, directions, *planes, *weights)  # type: ignore[no-untyped-call]
+    network = (parameters[name] for name in COLOR_NETWORK)
+    return _Colors.apply(torch.stack([*box]), backend, positions, directions, *network)  # type: ignore[no-untyped-call]
 
 
 def table_offsets(

@@ -211,6 +211,16 @@ def encode(values: Tensor) -> Tensor:
     return torch.cat([values, waves.flatten(1)], dim=1)
 
 
+def smoothing(spread: float) -> Tensor:
+    """(9 D,) factors on `encode` of D = 3 values known to the standard deviation ``spread``, which make it its mean.
+
+    Of x + n, n normal: a wave of frequency f keeps exp(-(f spread)^2 / 2) (integrated positional encoding; Barron et al.
+    2021, arXiv 2103.13415, eq. 13).
+    """
+    frequencies = torch.tensor(FREQUENCIES).repeat_interleave(2 * 3)
+    return torch.cat([torch.ones(3), torch.exp(-0.5 * (frequencies * spread) ** 2)])
+
+
 C0 = 0.28209479177387814
 C1 = 0.4886025119029199
 C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)

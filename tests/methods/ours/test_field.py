@@ -14,10 +14,8 @@ from headbench.methods.ours.field import (
     line_box,
     normalised_weight,
     plane_box,
-    smoothing,
 )
 from headbench.methods.shared.binding import triangle_frames
-from headbench.methods.shared.networks import encode
 
 GENERATOR = torch.Generator().manual_seed(0)
 
@@ -43,16 +41,6 @@ def test_line_bounds_are_the_mesh_itself_faces_included():
     assert not box.contains(vertices.amax(0)[None] + 1e-9).any()
     unit = box.unit(vertices)
     np.testing.assert_allclose([unit.min(), unit.max()], [0, 1], atol=1e-12)
-
-
-def test_smoothing_is_the_mean_encoding_of_noisy_directions():
-    direction = torch.tensor([[0.3, -0.5, 0.8]], dtype=torch.float64)
-    noise = torch.randn(200_000, 3, dtype=torch.float64, generator=GENERATOR)
-    mean = encode(direction + 0.3 * noise).mean(0)
-    factors = smoothing(5 + len(mean), 0.3).double()
-    assert (factors[:5] == 1).all()  # features of the planes
-    np.testing.assert_allclose(factors[5:] * encode(direction)[0], mean, atol=5e-3)
-    assert factors.min() == pytest.approx(np.exp(-0.5 * (8 * 0.3) ** 2))
 
 
 def test_canonical_directions_follow_head_and_camera_together():

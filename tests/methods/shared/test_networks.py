@@ -16,6 +16,7 @@ from headbench.methods.shared.networks import (
     sample_plane,
     sh_basis,
     sh_to_rgb,
+    smoothing,
     sum_rows,
 )
 
@@ -159,3 +160,12 @@ def test_harmonics_have_gradients_by_directions_too():
         return sh_to_rgb(dc, rest, torch.nn.functional.normalize(directions, dim=1), 3)
 
     assert torch.autograd.gradcheck(colours, (dc, rest, directions))
+
+
+def test_smoothing_is_the_mean_encoding_of_noisy_directions():
+    direction = torch.tensor([[0.3, -0.5, 0.8]], dtype=torch.float64)
+    noise = torch.randn(200_000, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    mean = encode(direction + 0.3 * noise).mean(0)
+    factors = smoothing(0.3).double()
+    np.testing.assert_allclose(factors * encode(direction)[0], mean, atol=5e-3)
+    assert factors.min() == pytest.approx(np.exp(-0.5 * (8 * 0.3) ** 2))
