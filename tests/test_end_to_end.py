@@ -248,7 +248,14 @@ CASES = {
             *("splats on", "imported/point_cloud.ply"),
         )
     ],
-    "export colmap": [case("export colmap {capture} --out colmap", "points", "colmap/sparse/0/points3D.bin")],
+    "export colmap": [
+        case(
+            f"export colmap {{capture}} --out {names} --names {names}",
+            "points",
+            f"{names}/sparse/0/images.bin",
+        )
+        for names in ("nested", "flat")
+    ],
     "check-plugin": [
         case("check-plugin mean-image --data {capture}", "keeps its contract"),
         case("check-plugin psnr", "keeps its contract"),

@@ -36,6 +36,10 @@ class ExportColmapSettings(CaptureOptions):
     format: Literal["bin", "txt"] = "bin"
     """Of the sparse model."""
 
+    names: Literal["nested", "flat"] = "nested"
+    """Of images: SUBJECT/SEQUENCE/TIMESTEP/CAMERA.png, or SEQUENCE_TIMESTEP_CAMERA.png in one folder, as readers of 3D
+    Gaussian splatting, GaussianAvatars, OpenSplat and nerfbaselines need it; masks are then NAME.png and NAME.png.png."""
+
 
 @writes("out")
 def export_colmap(settings: ExportColmapSettings, progress: Progress) -> Findings:
@@ -55,7 +59,9 @@ def export_colmap(settings: ExportColmapSettings, progress: Progress) -> Finding
         raise InputError("--timesteps", "", expected, ", ".join(map(str, unknown)))
     keys = [key for key in clip.files if key.timestep in chosen]
     out = Path(settings.out)
-    written = export_model(clip, keys, out, model_format=settings.format, progress=progress)
+    written = export_model(
+        clip, keys, out, model_format=settings.format, naming=settings.names, progress=progress
+    )
     if settings.tracking:
         export_tracking(clip, chosen, out)
     text = (

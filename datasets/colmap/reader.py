@@ -3,7 +3,8 @@
 COLMAP gives cameras and images. What methods need besides is the tracked head: parameter files of VHAP beside the
 model, one for each timestep, and the head model they belong to. `export colmap --tracking` writes such a dataset::
 
-    images/<subject>/<sequence>/<timestep>/<camera>.png     or images/<timestep>_<camera>.png
+    images/<subject>/<sequence>/<timestep>/<camera>.png     or images/<sequence>_<timestep>_<camera>.png
+                                                            or images/<timestep>_<camera>.png
     masks/<the image's name>.png                            optional, 255 is the subject; else the image's alpha
     sparse/0/{cameras,images}.{bin,txt}
     flame_param/<timestep as %05d>.npz                      as in the GaussianAvatars/VHAP layout
@@ -46,6 +47,7 @@ TRACKING_FOLDER = "flame_param"
 SAME_CAMERA = 1e-4
 """Largest difference of two entries of world-to-camera matrices that are one camera's, metres."""
 
+_FLAT_NAME = re.compile(r"(?P<sequence>.+)_(?P<timestep>\d{5,})_(?P<camera>.+)")
 _VHAP_NAME = re.compile(r"(?P<timestep>\d+)_(?P<camera>.+)")
 
 
@@ -147,7 +149,7 @@ def read_dataset(
             "Track with VHAP in the model's world, or export with `headbench export colmap --tracking`.",
         )
     declaration = Declaration.read(root)
-    keys = {name: _frame_key(root, name) for name in sorted(i.name for i in model.images.values())}
+    keys = {name: frame_key(root, name) for name in sorted(i.name for i in model.images.values())}
     subjects = {
         subject or key.subject or (declaration.subject if declaration else "") for key in keys.values()
     }
@@ -197,16 +199,18 @@ def read_dataset(
     return exclude_given(clip, exclude)
 
 
-def _frame_key(root: Path, name: str) -> FrameKey:
-    """Key of an image by its name; no subject, and the folder as sequence, where the name has none."""
+def frame_key(root: Path, name: str) -> FrameKey:
+    """Key of an image by its name; no subject, and "capture" as the sequence, where the name has none."""
     parts = Path(name).with_suffix("").parts
     if len(parts) == 4 and parts[2].isdecimal():
         return FrameKey(parts[0], parts[1], int(parts[2]), parts[3])
-    match = _VHAP_NAME.fullmatch(parts[-1])
+    match = _FLAT_NAME.fullmatch(parts[-1]) or _VHAP_NAME.fullmatch(parts[-1])
     if match and len(parts) == 1:
-        return FrameKey("", "capture", int(match["timestep"]), match["camera"])
+        sequence = match.groupdict().get("sequence", "capture")
+        return FrameKey("", sequence, int(match["timestep"]), match["camera"])
     expected = (
-        "<subject>/<sequence>/<timestep>/<camera> or <timestep>_<camera>, which name timestep and camera"
+        "<subject>/<sequence>/<timestep>/<camera>, <sequence>_<timestep of five digits>_<camera> or "
+        "<timestep>_<camera>, which name timestep and camera"
     )
     raise InputError(root, f"image {name}", expected, name)
 

@@ -24,9 +24,10 @@ from ..head.subject import PosedSubject
 from ..images import write_image
 from ..mesh_pictures import rasterize_mesh
 from .model import pycolmap
-from .reader import TRACKING_FOLDER
+from .reader import TRACKING_FOLDER, frame_key
 
 ModelFormat = Literal["bin", "txt"]
+Naming = Literal["nested", "flat"]
 _DEPTH_TOLERANCE = (
     2e-3  # metres a vertex may lie behind the surface drawn at its pixel and still count as seen
 )
@@ -51,9 +52,12 @@ class _Observation(NamedTuple):
     colors: ByteArray
 
 
-def image_name(key: FrameKey) -> str:
-    """Name of a frame in the model and its path under ``images/``: subject/sequence/timestep/camera.png."""
-    return f"{key}.png"
+def image_name(key: FrameKey, naming: Naming = "nested") -> str:
+    """Name of a frame in the model and its path under ``images/``.
+
+    "nested": subject/sequence/timestep/camera.png; "flat": sequence_timestep_camera.png.
+    """
+    return f"{key}.png" if naming == "nested" else f"{key.sequence}_{key.timestep:05d}_{key.camera}.png"
 
 
 def export_model(
@@ -62,6 +66,7 @@ def export_model(
     out: Path,
     *,
     model_format: ModelFormat = "bin",
+    naming: Naming = "nested",
     progress: Progress = no_progress,
 ) -> Exported:
     """Write frames of a clip as a COLMAP dataset.
@@ -73,11 +78,14 @@ def export_model(
     Parameters
     ----------
     keys : frames to write, at least one; their cameras become the model's.
+    naming : of images, see `image_name`. "flat" is for readers that look for all images in one folder (3D Gaussian
+        splatting and what derives from it); masks are then written under the image's own name, too.
 
     Raises
     ------
     InputError
-        Where there is no frame, or a camera has skew, which COLMAP's pinhole cannot express.
+        Where there is no frame, a camera has skew, which COLMAP's pinhole cannot express, or a flat name could be
+        read as that of another frame.
     """
     if not keys:
         raise InputError("frames to export", "", "at least one", "none")
@@ -85,6 +93,11 @@ def export_model(
     for name in ids:
         if abs(clip.cameras[name].K[0, 1]) > _SKEW_TOLERANCE:
             raise InputError("clip", f"camera {name}, K", "no skew", f"{clip.cameras[name].K[0, 1]:g} pixels")
+    names = {key: image_name(key, naming) for key in keys}
+    for key, name in names.items():
+        if naming == "flat" and frame_key(out, name) != key._replace(subject=""):
+            expected = "names of sequence and camera without _NUMBER_ of five digits in them"
+            raise InputError("clip", str(key), expected, name, "Export with --names nested.")
     first = min(key.timestep for key in keys)
     vertices = PosedSubject.of(clip).meshes([clip.poses[first]])[0]
     model = pycolmap.Reconstruction()
@@ -103,13 +116,15 @@ def export_model(
             if key.timestep == first:
                 views[number] = _observe(vertices, np.asarray(clip.head.faces), camera, picture)
             pixels = views[number].pixels if number in views else np.zeros((0, 2))
-            image = pycolmap.Image(image_name(key), pixels, ids.index(key.camera) + 1, number)
+            image = pycolmap.Image(names[key], pixels, ids.index(key.camera) + 1, number)
             model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(camera.world_to_camera[:3]))
-            write_image(out / "images" / image_name(key), picture)
+            write_image(out / "images" / names[key], picture)
             mask = clip.mask(key)
             if mask is not None:
                 # COLMAP's own convention: the image's whole name and one more suffix, 0 for what to leave out.
-                write_image(out / "masks" / f"{image_name(key)}.png", mask)
+                write_image(out / "masks" / f"{names[key]}.png", mask)
+                if naming == "flat":
+                    write_image(out / "masks" / names[key], mask)  # as nerfbaselines looks for it
             progress(number, len(keys), str(key))
     _add_points(model, vertices, views)
     _write_model(model, out / "sparse" / "0", model_format)

@@ -289,15 +289,42 @@ def test_command_writes_the_first_training_timestep(capture, tmp_path):
         export_colmap(ExportColmapSettings(str(capture.union), str(out), timesteps=(0, 99)), no_progress)
 
 
+def with_tracking(clip, out, naming="nested"):
+    """A COLMAP dataset of all frames, with tracking."""
+    export_model(clip, list(clip.files), out, naming=naming)
+    export_tracking(clip, set(clip.poses), out)
+    return out
+
+
 @pytest.fixture
 def dataset(clip, tmp_path):
-    """A COLMAP dataset of all frames, with tracking."""
-    export_model(clip, list(clip.files), tmp_path / "dataset")
-    export_tracking(clip, set(clip.poses), tmp_path / "dataset")
-    return tmp_path / "dataset"
+    return with_tracking(clip, tmp_path / "dataset")
 
 
-def test_an_exported_dataset_with_tracking_is_read_back(clip, dataset):
+def test_flat_names_lie_where_other_readers_look(clip, tmp_path):
+    out = with_tracking(clip, tmp_path / "flat", naming="flat")
+    images = theirs(out).images.values()
+    # 3D Gaussian splatting opens the base name, nerfbaselines takes the mask of the image's own stem.
+    assert {image.name for image in images} == {path.name for path in (out / "images").iterdir()}
+    for key in clip.files:
+        name = image_name(key, "flat")
+        for mask in (out / "masks" / name, out / "masks" / f"{name}.png"):
+            np.testing.assert_array_equal(cv2.imread(str(mask), cv2.IMREAD_UNCHANGED), clip.mask(key))
+
+
+def test_flat_names_that_mean_another_frame_are_refused(clip, tmp_path):
+    key = next(iter(clip.files))
+    camera = "a_00003_b"
+    frames = {key._replace(camera=camera): clip.files[key]}
+    other = clip.derive("test", {}, cameras={camera: clip.cameras[key.camera]}, files=frames)
+    with pytest.raises(InputError, match="--names nested"):
+        export_model(other, list(frames), tmp_path / "o", naming="flat")
+    assert not (tmp_path / "o").exists()
+
+
+@pytest.mark.parametrize("naming", ["nested", "flat"])
+def test_an_exported_dataset_with_tracking_is_read_back(clip, tmp_path, naming):
+    dataset = with_tracking(clip, tmp_path / "dataset", naming)
     found = open_clip(dataset, settings={"held_out_cameras": [next(iter(clip.splits["novel_view"])).camera]})
     assert found.subject == clip.subject
     assert set(found.files) == set(clip.files)
