@@ -240,6 +240,8 @@ class DatasetSpec:
     of every file have to be read, whatever it remembers of an earlier time. ``reads`` is False for one that
     makes captures instead: its function takes ``out`` and settings and writes what another reader reads.
     Settings whose annotation admits a `Path` name files; a run finds them again after it was moved together with them.
+    ``listing`` names a function ``path -> {split: [(timestep, camera), ...]}``: the frames in the order in which the
+    capture's own files list them, all of them, by which official repositories number their renders; "" for none.
     """
 
     name: str
@@ -247,6 +249,7 @@ class DatasetSpec:
     implementation: str
     find: str = ""
     reads: bool = True
+    listing: str = ""
 
 
 @dataclass(frozen=True)

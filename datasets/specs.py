@@ -7,6 +7,7 @@ GA_LAYOUT = DatasetSpec(
     summary="A capture in the GaussianAvatars/VHAP layout: a UNION folder or a single sequence.",
     implementation="headbench.datasets.ga.reader:read_capture",
     find="headbench.datasets.ga.reader:find_captures",
+    listing="headbench.datasets.ga.reader:listed_frames",
 )
 
 COLMAP = DatasetSpec(

@@ -93,7 +93,7 @@ class EvaluateSettings:
     An image is SEQUENCE_TIMESTEP_CAMERA.png (timestep of five digits), as `headbench run` names its renders: 8-bit RGB
     PNG of the ground truth's size, composited on the capture's background. It lies in FOLDER itself, in a folder named after
     the task, or in renders/TASK; with several subjects, in a folder named after the subject. A cell of a run
-    (SUBJECT/METHOD/seed-N) has this layout, too.
+    (SUBJECT/METHOD/seed-N) has this layout, too. Other names are told by --names.
     """
 
     folder: tyro.conf.Positional[str]
@@ -107,6 +107,11 @@ class EvaluateSettings:
 
     label: str = "images"
     """What the method is called in tables; not the name of a registered method."""
+
+    names: str = ""
+    """How the images are named, if not by key: official-ga, official-tga (FOLDER is the model's, with test/ours_N/renders and
+    val/ours_N/renders as their render.py writes them), official-gbs (test/split_N, put on the capture's background by
+    their masks), or a file MAP.csv with the columns file, sequence, timestep, camera (and subject with several)."""
 
     like: str | None = None
     """Run whose protocols to follow: capture, reader and its settings, tasks, frames, metrics are taken from it."""

@@ -12,7 +12,7 @@ from PIL import Image, UnidentifiedImageError
 from ..contracts import Budget, Camera, Clip, Frame, FrameKey, HeadPose, Progress, no_progress
 from ..errors import HeadbenchError, InputError
 from ..io.files import atomic_path, check_name, digest, digest_file, grouped_writes, prepare_folder
-from ..io.images import probe_image
+from ..io.images import probe_image, write_png
 from ..io.lock import locked
 from ..protocol import Protocol, make_protocols
 from ..registry import discover, get, resolve
@@ -24,6 +24,7 @@ from ..runner.steps import DIGESTS, Job, measure
 from ..runner.store import Cell, RunFolder
 from ..specs import Findings, MethodSpec
 from .command import EvaluateSettings
+from .naming import Render, check_truth, composited, named_renders
 
 
 class NoAvatar:
@@ -55,8 +56,11 @@ def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress
     if not metrics:
         raise InputError("metrics", "", "at least one metric of frames", ", ".join(config.metrics))
     protocols = make_protocols(config.tasks, clips, config.frames_per_task)
-    images = find_images(Path(settings.folder), clips, protocols)
-    digests = [[task, str(key), digest_file(path)] for (task, key), path in sorted(images.items())]
+    images = find_images(Path(settings.folder), clips, protocols, settings.names, config)
+    digests = [
+        [task, str(key), *(digest_file(path) for path in (render.image, render.alpha) if path is not None)]
+        for (task, key), render in sorted(images.items())
+    ]
     method = images_method(config.methods[0], digest(digests)[:12])
     folder = RunFolder(Path(config.out))
     prepare_folder(folder.root)
@@ -113,52 +117,80 @@ def _open(settings: EvaluateSettings) -> tuple[RunConfig, list[Clip]]:
     return config, clips
 
 
-def _copy(images: Mapping[tuple[str, FrameKey], Path], job: Job) -> None:
+def _copy(images: Mapping[tuple[str, FrameKey], Render], job: Job) -> None:
     """Bring the images of a subject to where a run has its renders."""
     with grouped_writes():
         for (task, key), source in images.items():
             target = job.cell.render(task, key)
-            if key.subject != job.clip.subject or (target.exists() and target.samefile(source)):
+            if key.subject != job.clip.subject or (target.exists() and target.samefile(source.image)):
+                continue
+            if source.alpha is not None:
+                write_png(target, composited(source, job.clip.background.tolist()))
                 continue
             with atomic_path(target) as temporary:
-                shutil.copyfile(source, temporary)
+                shutil.copyfile(source.image, temporary)
 
 
 SHOWN = 3
 
 
 def find_images(
-    folder: Path, clips: Sequence[Clip], protocols: Mapping[str, Protocol]
-) -> dict[tuple[str, FrameKey], Path]:
+    folder: Path,
+    clips: Sequence[Clip],
+    protocols: Mapping[str, Protocol],
+    names: str = "",
+    config: RunConfig | None = None,
+) -> dict[tuple[str, FrameKey], Render]:
     """Find the image of every frame of every protocol, by task and key, each checked but for its pixels.
+
+    Parameters
+    ----------
+    names : how images are named, see `named_renders`; "" for by key.
+    config : by which the captures were opened; needed with ``names``.
 
     Raises
     ------
     InputError
-        For a folder that is not there, images that are missing (how many, and where the first was looked for), and one
-        that is not 8-bit RGB, not of the truth's size, or not fully opaque.
+        For a folder that is not there, images that are missing (how many, and where the first was looked for), one
+        that is not 8-bit RGB, not of the truth's size, or not fully opaque, and as `named_renders` does.
     """
     if not folder.is_dir():
         raise InputError(folder, "", "a folder of images", "no such folder")
-    cameras = {clip.subject: clip.cameras for clip in clips}
-    found: dict[tuple[str, FrameKey], Path] = {}
+    named = named_renders(names, folder, config, clips) if names and config is not None else None
+    found: dict[tuple[str, FrameKey], Render] = {}
     missing: list[tuple[str, FrameKey]] = []
     for task, protocol in protocols.items():
         for key in protocol.keys:
-            path = next((p for p in _places(folder, task, key, len(clips)) if p.is_file()), None)
-            if path is None:
+            if named is not None:
+                render = named.get(key)
+            else:
+                paths = _places(folder, task, key, len(clips))
+                render = next((Render(path) for path in paths if path.is_file()), None)
+            if render is None or not render.image.is_file():
                 missing.append((task, key))
             else:
-                found[task, key] = path
+                found[task, key] = render
     if missing:
-        looked = ", ".join(str(p.relative_to(folder)) for p in _places(folder, *missing[0], len(clips)))
         expected = f"an image for each of {len(found) + len(missing)} frames"
         first = "; ".join(f"{task} {key}" for task, key in missing[:SHOWN])
-        remedy = f"The first was looked for as {looked}."
+        if named is None:
+            looked = ", ".join(str(p.relative_to(folder)) for p in _places(folder, *missing[0], len(clips)))
+            remedy = f"The first was looked for as {looked}; other names are told by --names."
+        elif missing[0][1] in named:
+            remedy = f"The first was looked for as {named[missing[0][1]].image}."
+        else:
+            remedy = (
+                f"{names} names none for the first. Leave a task out with --tasks, or render all its frames."
+            )
         raise InputError(folder, "", expected, f"{len(missing)} without, such as {first}", remedy)
-    for (_, key), path in found.items():
-        camera = cameras[key.subject][key.camera]
-        _check(path, (camera.width, camera.height))
+    for clip in clips:
+        frames = {key: render for (_, key), render in found.items() if key.subject == clip.subject}
+        for key, render in frames.items():
+            camera = clip.cameras[key.camera]
+            _check(render.image, (camera.width, camera.height))
+            if render.alpha is not None:
+                _check(render.alpha, (camera.width, camera.height))
+        check_truth(clip, frames, frames)
     return found
 
 
@@ -173,7 +205,8 @@ def _check(path: Path, size: tuple[int, int]) -> None:
     info = probe_image(path)  # before Pillow decodes what may be a bomb
     if (info.width, info.height) != size:
         expected, found = ("{} x {} pixels".format(*pair) for pair in (size, (info.width, info.height)))
-        raise InputError(path, "size", f"{expected}, as the ground truth", found)
+        remedy = "Render at the capture's size; a resized image would be scored for its resizing, too."
+        raise InputError(path, "size", f"{expected}, as the ground truth", found, remedy)
     try:
         with Image.open(path) as image:
             if image.format != "PNG":

@@ -189,6 +189,19 @@ def find_capture(path: str | Path) -> Path:
     return captures[0]
 
 
+def listed_frames(path: str | Path) -> dict[str, list[tuple[int, str]]]:
+    """Timestep and camera of every frame of ``transforms_{train,val,test}.json``, in their order.
+
+    Raises `InputError` as `read_transforms` does.
+    """
+    files = (find_capture(path) / file for file in layout.SPLIT_FILES.values())
+    listed = {file.stem: read_transforms(file) for file in files if file.exists()}
+    return {
+        name.removeprefix("transforms_"): [(entry.timestep, entry.camera_id) for entry in entries]
+        for name, entries in listed.items()
+    }
+
+
 def _read_splits(folder: Path, resplit: bool) -> dict[str, list[FrameEntry]]:
     """Entries by split name; with ``resplit``, ``transforms.json`` will do in place of the three."""
     paths = {name: folder / file for name, file in layout.SPLIT_FILES.items()}

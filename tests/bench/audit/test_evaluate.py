@@ -1,6 +1,7 @@
 """Folders of images by key: scored as a run scores its own, in every layout; what is wrong is said before work."""
 
 import shutil
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -9,6 +10,8 @@ import pytest
 
 from headbench.bench import cli
 from headbench.bench.audit.command import EvaluateSettings, evaluate
+from headbench.bench.audit.naming import OFFICIAL, Render, composited
+from headbench.bench.contracts import FrameKey
 from headbench.bench.errors import InputError
 from headbench.bench.io.images import read_png, write_png
 from headbench.bench.rows import ALL, COLUMNS
@@ -138,3 +141,131 @@ def test_the_runs_own_folder_is_no_place_to_write(run, images):
 def test_what_to_score_against_has_to_be_said(images, tmp_path):
     with pytest.raises(ValueError, match="--clip"):
         EvaluateSettings(str(images), out=str(tmp_path / "out"))
+
+
+def options(folder, run, out, **others):
+    return EvaluateSettings(str(folder), out=str(out), like=str(run), label="theirs", trust=True, **others)
+
+
+@pytest.fixture
+def model(toy, images, tmp_path):
+    """The images as GaussianAvatars' render.py leaves them in the folder of a model, and what it saw as their truth."""
+    clip, root = toy.read(tmp_path / "subject1"), tmp_path / "model"
+    for split, frames in toy.listed("").items():
+        for index, (timestep, camera) in enumerate(frames):
+            sequence = "EMO" if timestep < 3 else "FREE"
+            source = images / f"{sequence}_{timestep:05d}_{camera}.png"
+            made = root / split / "ours_600"
+            pixels = read_png(source) if source.exists() else np.zeros((6, 8, 3), np.uint8)
+            write_png(made / "renders" / f"{index:05d}.png", pixels)
+            truth = clip.image(FrameKey("subject1", sequence, timestep, camera))
+            write_png(made / "gt" / f"{index:05d}.png", truth)
+        (root / split / "ours_30" / "renders").mkdir(parents=True)  # of an earlier iteration, empty
+    return root
+
+
+def test_renders_numbered_by_gaussianavatars_get_their_keys(run, images, model, tmp_path):
+    evaluate(options(model, run, tmp_path / "out", names="official-ga"))
+    for path in (tmp_path / "out").glob("subject1/theirs/seed-0/renders/*/*.png"):
+        np.testing.assert_array_equal(read_png(path), read_png(images / path.name))
+    assert scored(images, run, tmp_path / "named").equals(
+        pd.read_parquet(RunFolder(tmp_path / "out").rows).query("metric == 'psnr'").reset_index(drop=True)
+    )
+
+
+def one_too_few(model):
+    (model / "test/ours_600/renders/00002.png").unlink()
+
+
+def a_gap(model):
+    (model / "val/ours_600/renders/00001.png").rename(model / "val/ours_600/renders/00003.png")
+
+
+def another_order(model):
+    gt = model / "val/ours_600/gt"
+    write_png(gt / "00000.png", read_png(gt / "00001.png"))
+
+
+@pytest.mark.parametrize(
+    ("damage", "names", "match"),
+    [
+        (
+            one_too_few,
+            "official-ga",
+            "3 images, .*transforms_test.json, found 2.*Render the split again.*MAP",
+        ),
+        (a_gap, "official-ga", "found 3, 00000.png to 00003.png"),
+        (another_order, "official-ga", "gt/00000.png: expected the ground truth of .* found .*another order"),
+        (lambda m: shutil.rmtree(m / "test"), "official-ga", "names none for the first.*--tasks"),
+        (lambda m: shutil.rmtree(m), "official-ga", "a folder of images"),
+        (lambda m: [shutil.rmtree(m / s) for s in ("val", "test")], "official-ga", "test/ours_N/renders"),
+        (lambda m: None, "official-gbs", "a capture of one camera.*MAP.csv"),
+        (lambda m: None, "oficial-ga", "Did you mean 'official-ga'"),
+        (lambda m: None, "none.csv", "no such file"),
+    ],
+)
+def test_official_renders_that_do_not_fit_are_refused(run, model, tmp_path, damage, names, match):
+    damage(model)
+    with pytest.raises(InputError, match=match):
+        evaluate(options(model, run, tmp_path / "out", names=names))
+    assert not (tmp_path / "out").exists()
+
+
+HEADER = "file,sequence,timestep,camera\n"
+
+
+def test_a_list_in_csv_names_images(run, images, tmp_path):
+    lines = [HEADER]
+    for number, path in enumerate(sorted(images.iterdir())):
+        sequence, timestep, camera = path.stem.split("_")
+        path.rename(images / f"{number}.png")
+        lines.append(f"{number}.png,{sequence},{int(timestep)},{camera}\n")
+    (tmp_path / "map.csv").write_text("".join(lines))
+    evaluate(options(images, run, tmp_path / "out", names=str(tmp_path / "map.csv")))
+    assert cli.main(["verify", str(tmp_path / "out"), "--trust"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("file,sequence,timestep\n", "line 1.*camera"),
+        (HEADER + "../a.png,EMO,0,a\n", "line 2, file"),
+        (HEADER + "/a.png,EMO,0,a\n", "line 2, file"),
+        (HEADER + "a.png,EMO,-1,a\n", "line 2, timestep"),
+        (HEADER + "a.png,EMO,1\n", "line 2: expected 4 entries"),
+        (HEADER + "a.png,EMO,77,a\n", "a frame of the capture"),
+        (HEADER + "a.png,EMO,0,b\nb.png,EMO,0,b\n", "each frame once"),
+        (HEADER + "a.png,EMO,0,b\n", "5 without.*looked for as .*a.png"),
+        ("\xff", "line 1"),
+    ],
+)
+def test_lists_in_csv_that_do_not_fit_are_refused(run, images, tmp_path, text, match):
+    (tmp_path / "map.csv").write_text(text)
+    with pytest.raises(InputError, match=match):
+        evaluate(options(images, run, tmp_path / "out", names=str(tmp_path / "map.csv")))
+    assert not (tmp_path / "out").exists()
+
+
+def test_gaussianblendshapes_numbers_the_last_350_frames(tmp_path):
+    keys = [FrameKey("s", "video", timestep, "0") for timestep in range(400)]
+    clip = SimpleNamespace(subject="s", splits={"train": keys[:50]}, excluded=dict.fromkeys(keys[50:], "why"))
+    for name, count in (("test", 350), ("seq", 400)):
+        made = tmp_path / name / "split_40000"
+        made.mkdir(parents=True)
+        for index in range(count):
+            (made / f"pred_{index:05d}.png").touch()
+        found = OFFICIAL["official-gbs"](tmp_path, clip, {})
+        for key in keys[-count:]:
+            index = key.timestep - (400 - count) if name == "test" else key.timestep
+            assert found[key].image.name == f"pred_{index:05d}.png" or name == "seq"
+        assert len(found) == count
+    (tmp_path / "seq/split_40000/pred_00399.png").unlink()
+    with pytest.raises(InputError, match="400 images.*found 399"):
+        OFFICIAL["official-gbs"](tmp_path, clip, {})
+
+
+def test_renders_on_black_are_put_on_the_background(tmp_path):
+    write_png(tmp_path / "pred.png", np.full((2, 3, 3), (100, 50, 0), np.uint8))
+    write_png(tmp_path / "mask.png", np.full((2, 3, 3), (204, 0, 0), np.uint8))  # red has the coverage, 0.8
+    image = composited(Render(tmp_path / "pred.png", tmp_path / "mask.png"), (1.0, 0.5, 0.0))
+    assert image.tolist() == np.full((2, 3, 3), (151, 76, 0)).tolist()  # 100 + 51, 50 + 25.5 to even, 0

@@ -1,0 +1,224 @@
+"""Which image of a folder shows which frame, where they are not named by key: official repositories, a list in CSV."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path, PurePosixPath
+from typing import NamedTuple
+
+import numpy as np
+
+from ..contracts import ByteArray, Clip, FrameKey
+from ..errors import InputError
+from ..io.files import read_bytes
+from ..io.images import read_png
+from ..registry import get, resolve, unknown
+from ..runner.captures import found_captures
+from ..runner.config import RunConfig
+from ..specs import DatasetSpec
+
+MAP = "a list of names, MAP.csv"
+COLUMNS = ("file", "sequence", "timestep", "camera")
+MAX_MAP_BYTES = 64 * 2**20
+_MAP_REMEDY = "Name the images one by one with --names MAP.csv (columns file, sequence, timestep, camera)."
+
+
+class Render(NamedTuple):
+    """An image of a frame. With ``alpha``, whose red channel is its coverage, it is on black; else on the background."""
+
+    image: Path
+    alpha: Path | None = None
+    truth: Path | None = None  # what the repository took for the ground truth of this frame
+
+
+Renders = dict[FrameKey, Render]
+Listing = Mapping[str, Sequence[tuple[int, str]]]
+
+
+def named_renders(names: str, folder: Path, config: RunConfig, clips: Sequence[Clip]) -> Renders:
+    """Image of each frame by ``names``: one of `OFFICIAL`, or the path of a CSV file.
+
+    The official rules take the images of a subject from a folder named after it, or with one subject from ``folder``.
+
+    Raises
+    ------
+    InputError
+        For an unknown name, a list that does not fit the captures, a count of images that is not that of the frames, and
+        images whose ground truth, as the repository wrote it beside them, is another than that of their frames.
+    """
+    if names.endswith(".csv"):
+        return _listed(Path(names), folder, clips)
+    if names not in OFFICIAL:
+        raise unknown("command line", "--names", names, OFFICIAL, f"Or {MAP}.")
+    spec: DatasetSpec = get("datasets", config.reader)
+    found: Renders = {}
+    for clip, (path, _) in zip(clips, found_captures(spec, Path(config.data), config.reader_settings)):
+        own = folder / clip.subject if (folder / clip.subject).is_dir() else folder
+        if own == folder and len(clips) > 1:
+            raise InputError(folder, clip.subject, "a folder with its images for each subject", "none")
+        listing: Listing = resolve(spec.listing)(path) if spec.listing else {}
+        found |= OFFICIAL[names](own, clip, listing)
+    return found
+
+
+def check_truth(clip: Clip, renders: Renders, keys: Iterable[FrameKey], count: int = 8) -> None:
+    """Hold the ground truth that lies beside renders against the clip's, at some frames.
+
+    Raises `InputError` where they differ by more than `TRUTH_RMS`: renders of other frames, or of another background.
+    """
+    chosen = [key for key in sorted(keys) if key in renders and renders[key].truth is not None]
+    for key in chosen[:: max(1, len(chosen) // count)]:
+        path = renders[key].truth
+        assert path is not None
+        if not path.is_file():
+            continue
+        truth, own = read_png(path), clip.image(key)
+        if truth.shape != own.shape:
+            found = f"one of {truth.shape[1]} x {truth.shape[0]}"
+            expected = f"the ground truth of {key}, {own.shape[1]} x {own.shape[0]} pixels"
+            raise InputError(path, "size", expected, found, "Train and render at the capture's size.")
+        error = float(np.sqrt(np.mean((truth.astype(np.float32) - own) ** 2)))
+        if error > TRUTH_RMS:
+            expected = f"the ground truth of {key}"
+            found = f"an image that differs by {error:.1f} of 255 (root mean square)"
+            remedy = (
+                "These are renders of another capture, another background or another order. " + _MAP_REMEDY
+            )
+            raise InputError(path, "", expected, found, remedy)
+
+
+TRUTH_RMS = 1.5
+"""Of 255: more than what rounding does."""
+
+
+def composited(render: Render, background: Sequence[float]) -> ByteArray:
+    """(H, W, 3) pixels of a render on black, put on ``background`` by its coverage."""
+    assert render.alpha is not None
+    image = read_png(render.image).astype(np.float32)
+    coverage = read_png(render.alpha)[..., :1].astype(np.float32) / 255
+    ground = 255 * np.asarray(background, np.float32)
+    return np.rint(image + (1 - coverage) * ground).clip(0, 255).astype(np.uint8)
+
+
+def _numbered(folder: Path, prefix: str, count: Sequence[int], of: str) -> list[Path]:
+    """Images ``<prefix>00000.png`` and on in a folder; their number has to be one of ``count``."""
+    pattern = re.compile(re.escape(prefix) + r"(\d{5,})\.png")
+    numbers = sorted(int(match[1]) for path in folder.iterdir() if (match := pattern.fullmatch(path.name)))
+    if len(numbers) not in count or numbers != [*range(len(numbers))]:
+        wanted = " or ".join(map(str, sorted(set(count))))
+        last = f", {prefix}{numbers[0]:05d}.png to {prefix}{numbers[-1]:05d}.png" if numbers else ""
+        expected = f"{wanted} images, {prefix}00000.png and on, one for each frame of {of}"
+        remedy = f"Render the split again, whole and with all cameras. {_MAP_REMEDY}"
+        raise InputError(folder, "", expected, f"{len(numbers)}{last}", remedy)
+    return [folder / f"{prefix}{number:05d}.png" for number in numbers]
+
+
+def _latest(folder: Path, stem: str) -> Path | None:
+    """The folder ``<stem>_<iterations>`` of most iterations, which the repositories load by default, too."""
+    made = {
+        int(match[1]): path
+        for path in (folder.iterdir() if folder.is_dir() else ())
+        if (match := re.fullmatch(rf"{stem}_(\d{{1,9}})", path.name)) and path.is_dir()
+    }
+    return made[max(made)] if made else None
+
+
+def _gaussian_avatars(folder: Path, clip: Clip, listing: Listing) -> Renders:
+    """``{train,val,test}/ours_<iterations>/renders/<index>.png``, by the order of ``transforms_<split>.json``."""
+    if not listing:
+        expected = "a capture in the GaussianAvatars/VHAP layout, whose files give the order"
+        raise InputError("command line", "--names", expected, f"another for {clip.subject}", _MAP_REMEDY)
+    known = {(key.timestep, key.camera): key for key in _every_frame(clip)}
+    found: Renders = {}
+    for split, frames in listing.items():
+        made = _latest(folder / split, "ours")
+        if made is None or not (made / "renders").is_dir():
+            continue
+        images = _numbered(made / "renders", "", [len(frames)], f"transforms_{split}.json")
+        for frame, image in zip(frames, images):
+            if frame in known:
+                found[known[frame]] = Render(image, truth=made / "gt" / image.name)
+    if not found:
+        expected = "test/ours_N/renders or val/ours_N/renders, as render.py leaves them in the model's folder"
+        raise InputError(folder, "", expected, "neither")
+    return found
+
+
+GBS_TEST_FRAMES = 350
+
+
+def _gaussian_blendshapes(folder: Path, clip: Clip, listing: Listing) -> Renders:
+    """``test/split_<iterations>/pred_<index>.png``: the last 350 frames; ``seq/...``: all of them. On black."""
+    frames = sorted(_every_frame(clip), key=lambda key: (key.timestep, key.camera))
+    repeated = [t for t, n in Counter(key.timestep for key in frames).items() if n > 1]
+    if repeated:
+        expected = "a capture of one camera, whose timesteps give the order"
+        found = f"several frames at timestep {repeated[0]}"
+        raise InputError(f"clip {clip.subject}", "cameras", expected, found, _MAP_REMEDY)
+    found_: Renders = {}
+    for name, numbered in (("seq", frames), ("test", frames[-GBS_TEST_FRAMES:])):
+        made = _latest(folder / name, "split")
+        if made is None:
+            continue
+        of = "the capture" if name == "seq" else f"its last {GBS_TEST_FRAMES}"
+        images = _numbered(made, "pred_", [len(numbered)], of)
+        for key, image in zip(numbered, images):
+            found_[key] = Render(image, made / image.name.replace("pred_", "pred_mask_"))
+    if not found_:
+        raise InputError(folder, "", "test/split_N, as test.py leaves it in the model's folder", "none")
+    return found_
+
+
+OFFICIAL: Mapping[str, Callable[[Path, Clip, Listing], Renders]] = {
+    "official-ga": _gaussian_avatars,
+    "official-tga": _gaussian_avatars,
+    "official-gbs": _gaussian_blendshapes,
+}
+"""How the official repositories of GaussianAvatars, ours (TensorialGaussianAvatar) and GaussianBlendshapes number renders."""
+
+
+def _every_frame(clip: Clip) -> set[FrameKey]:
+    return {key for keys in clip.splits.values() for key in keys} | set(clip.excluded)
+
+
+def _listed(path: Path, folder: Path, clips: Sequence[Clip]) -> Renders:
+    """Images that a CSV file names, relative to ``folder``; a column ``subject`` is needed with several captures."""
+    text = read_bytes(path, "a CSV file", MAX_MAP_BYTES)
+    needed = {*COLUMNS, *(["subject"] if len(clips) > 1 else [])}
+    try:
+        reader = csv.reader(io.StringIO(text.decode("utf-8-sig"), newline=""), strict=True)
+        header = next(reader, [])
+        rows = [(reader.line_num, row) for row in reader if row]
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(path, "", "a CSV file in UTF-8", str(error)) from error
+    allowed = needed | {"subject"}
+    if len(set(header)) != len(header) or not needed <= set(header) <= allowed:
+        raise InputError(path, "line 1", f"the columns {', '.join(sorted(needed))}", ", ".join(header))
+    by_subject = {clip.subject: clip for clip in clips}
+    known = {key for clip in clips for key in _every_frame(clip)}
+    found: Renders = {}
+    for line, row in rows:
+        where = f"line {line}"
+        if len(row) != len(header):
+            raise InputError(path, where, f"{len(header)} entries", f"{len(row)}")
+        entry = dict(zip(header, row))
+        place = PurePosixPath(entry["file"])
+        if not entry["file"] or place.is_absolute() or ".." in place.parts:
+            expected = f"a path inside {folder}"
+            raise InputError(path, f"{where}, file", expected, repr(entry["file"]))
+        if not (entry["timestep"].isascii() and entry["timestep"].isdigit() and len(entry["timestep"]) < 10):
+            raise InputError(path, f"{where}, timestep", "a whole number", repr(entry["timestep"]))
+        subject = entry.get("subject", "") or next(iter(by_subject))
+        key = FrameKey(subject, entry["sequence"], int(entry["timestep"]), entry["camera"])
+        if key not in known:
+            expected = "a frame of the capture"
+            example = f"Its frames are named like {min(known)} (subject/sequence/timestep/camera)."
+            raise InputError(path, where, expected, str(key), example)
+        if key in found:
+            raise InputError(path, where, "each frame once", f"{key} again")
+        found[key] = Render(folder / place)
+    return found
