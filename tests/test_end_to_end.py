@@ -199,7 +199,27 @@ CASES = {
             f"evaluate {cell('ours')} --like {{demo}} --out theirs --label theirs",
             r"\| theirs",
             "theirs/run.json",
-        )
+        ),
+        case(
+            f"evaluate {cell('ours')}/avatar --avatar --clip {{capture}} --out stored --frames-per-task 1",
+            r"(?s)images .*Storage|Storage.*images",
+            "stored/rows.parquet",
+        ),
+        case("verify stored", "as recorded"),
+    ],
+    "render": [
+        case(
+            f"render {cell('ga')} --capture {{capture}} --out rendered --video",
+            "rendered/self_reenactment_FREE",
+        ),
+        case(
+            f"render {cell('insta')}/avatar --capture {{capture}} --out rendered --frames orbit --views 2 --video",
+            *("2 frames in orbit", "rendered/orbit/00001.png", "rendered/orbit.mp4"),
+        ),
+        case(
+            f"render {cell('gha')} --method gha --capture {{capture}} --out gha --frames novel_view --timesteps 0",
+            "frames in novel_view",
+        ),
     ],
     "gate": [
         case("gate {demo} --baseline demo.json --update", "numbers written", "demo.json"),

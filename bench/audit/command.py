@@ -88,7 +88,7 @@ def bundle(settings: BundleSettings, progress: Progress = no_progress) -> Findin
 
 @dataclass(frozen=True)
 class EvaluateSettings:
-    """Score a folder of images named by key, so that a method needs no plug-in to be compared.
+    """Score a folder of images named by key, so that a method needs no plug-in to be compared, or a stored avatar.
 
     An image is SEQUENCE_TIMESTEP_CAMERA.png (timestep of five digits), as `headbench run` names its renders: 8-bit RGB
     PNG of the ground truth's size, composited on the capture's background. It lies in FOLDER itself, in a folder named after
@@ -97,7 +97,7 @@ class EvaluateSettings:
     """
 
     folder: tyro.conf.Positional[str]
-    """Folder with the images."""
+    """Folder with the images, or with --avatar that of a stored avatar."""
 
     out: str
     """Folder to write: that of a run with one method, which every report, `table`, `compare`, `gate` and `verify` read."""
@@ -107,6 +107,18 @@ class EvaluateSettings:
 
     label: str = "images"
     """What the method is called in tables; not the name of a registered method."""
+
+    avatar: bool = False
+    """FOLDER holds an avatar: it is rendered, and its storage and speed are measured, too."""
+
+    method: str = ""
+    """With --avatar: the method that reads it; default: that of the run whose folder it lies in."""
+
+    preset: str = ""
+    """With --avatar: preset of the method, where the image size depends on it; default: that of the run, else fast."""
+
+    device: str = "cpu"
+    """With --avatar: where to render."""
 
     names: str = ""
     """How the images are named, if not by key: official-ga, official-tga (FOLDER is the model's, with test/ours_N/renders and
@@ -139,10 +151,14 @@ class EvaluateSettings:
         """Refuse what leaves open what to score against."""
         if self.clip is None and self.like is None:
             raise ValueError("say what to score against: --clip CAPTURE, or --like RUN")
+        if self.avatar and self.names:
+            raise ValueError("names tells how images are named; an avatar has none")
+        if not self.avatar and (self.method or self.preset):
+            raise ValueError("method and preset are those of an avatar: give --avatar as well")
 
 
 def evaluate(settings: EvaluateSettings, progress: Progress = no_progress) -> Findings:
-    """Score a folder of images named by key: a method is compared without a plug-in."""
+    """Score a folder of images, or a stored avatar: a method is compared without a plug-in."""
     from .evaluate import evaluate_folder
 
     return evaluate_folder(settings, progress)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from PIL import Image, UnidentifiedImageError
 
-from ..contracts import Budget, Camera, Clip, Frame, FrameKey, HeadPose, Progress, no_progress
+from ..contracts import Avatar, Budget, Camera, Clip, Frame, FrameKey, HeadPose, Progress, no_progress
 from ..errors import HeadbenchError, InputError
 from ..io.files import atomic_path, check_name, digest, digest_file, grouped_writes, prepare_folder
 from ..io.images import probe_image, write_png
@@ -20,8 +20,9 @@ from ..rows import Rows
 from ..runner.captures import open_clips, open_run_clips, reader_of
 from ..runner.config import ResolvedMethod, RunConfig, RunOptions, default_names, resolve_metrics
 from ..runner.run import describe, make_jobs, write_reports
-from ..runner.steps import DIGESTS, Job, measure
+from ..runner.steps import DIGESTS, Job, measure, render
 from ..runner.store import Cell, RunFolder
+from ..runner.stored import avatar_digest, avatar_folder, stored_method
 from ..specs import Findings, MethodSpec
 from .command import EvaluateSettings
 from .naming import Render, check_truth, composited, named_renders
@@ -45,36 +46,60 @@ def images_method(label: str, version: str) -> ResolvedMethod:
 
 
 def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress) -> Findings:
-    """Check everything, copy the images into the layout of a run, score them, write rows, manifest and reports.
+    """Check everything, bring the images into the layout of a run, score them, write rows, manifest and reports.
 
     The text is the table, together with the run named by ``like``.
 
     Raises `InputError` for whatever is wrong with settings, capture or images, before anything is written.
     """
-    config, clips = _open(settings)
-    metrics = [metric for metric in resolve_metrics(config) if metric.per_frame]
-    if not metrics:
+    source, config, clips = Path(settings.folder), *_open(settings)
+    kinds = ("frame", "regional", "temporal", *(["avatar"] if settings.avatar else []))
+    metrics = [metric for metric in resolve_metrics(config) if metric.kind in kinds]
+    if not any(metric.per_frame for metric in metrics):
         raise InputError("metrics", "", "at least one metric of frames", ", ".join(config.metrics))
     protocols = make_protocols(config.tasks, clips, config.frames_per_task)
-    images = find_images(Path(settings.folder), clips, protocols, settings.names, config)
-    digests = [
-        [task, str(key), *(digest_file(path) for path in (render.image, render.alpha) if path is not None)]
-        for (task, key), render in sorted(images.items())
-    ]
-    method = images_method(config.methods[0], digest(digests)[:12])
+    images: dict[tuple[str, FrameKey], Render] = {}
+    avatar: Avatar = NoAvatar()
+    if settings.avatar:
+        if len(clips) > 1:
+            raise InputError(
+                str(config.data), "", "the capture of the avatar's subject", f"{len(clips)} captures"
+            )
+        of = stored_method(source, settings.method, settings.preset)
+        avatar = of.create().load(avatar_folder(source), device=config.device)
+        method = images_method(config.methods[0], avatar_digest(source)[:12])
+        method = replace(method, spec=replace(method.spec, resolution=of.spec.resolution))
+        adapted_for = [replace(of, spec=replace(of.spec, name=method.spec.name))]
+    else:
+        images = find_images(source, clips, protocols, settings.names, config)
+        digests = [
+            [
+                task,
+                str(key),
+                *(digest_file(path) for path in (render.image, render.alpha) if path is not None),
+            ]
+            for (task, key), render in sorted(images.items())
+        ]
+        method = images_method(config.methods[0], digest(digests)[:12])
+        adapted_for = [method]
     folder = RunFolder(Path(config.out))
     prepare_folder(folder.root)
     with locked(folder.root):
-        jobs = make_jobs(config, [method], clips, protocols, folder)
+        jobs = [
+            replace(job, method=method) for job in make_jobs(config, adapted_for, clips, protocols, folder)
+        ]
         manifest = describe(config, [method], metrics, clips, protocols)
-        manifest = replace(manifest, evaluated=str(Path(settings.folder)))
+        manifest = replace(manifest, evaluated=str(source))
         manifest.write(folder.manifest)
         parts = []
         for index, job in enumerate(jobs):
             job.check()
-            _copy(images, job)
-            job.cell.finish(DIGESTS, job.fit_fingerprint, files=job.cell.digests(job.frame_paths))
-            parts.append(measure(job, NoAvatar(), metrics))
+            if settings.avatar:
+                render(job, avatar)
+            else:
+                _copy(images, job)
+                job.cell.finish(DIGESTS, job.fit_fingerprint, files=job.cell.digests(job.frame_paths))
+            parts.append(measure(job, avatar, metrics))
             progress(index + 1, len(jobs), job.name)
         rows = Rows.joined(parts)
         rows.write(folder.rows)
@@ -105,14 +130,21 @@ def _open(settings: EvaluateSettings) -> tuple[RunConfig, list[Clip]]:
             out=settings.out,
             tasks=settings.tasks,
             metrics=settings.metrics
-            or tuple(name for name in default_names("metrics") if get("metrics", name).per_frame),
+            or tuple(n for n in default_names("metrics") if settings.avatar or get("metrics", n).per_frame),
             reader=settings.reader or reader_of(str(settings.clip)),
             reader_settings={} if settings.head is None else {"head": settings.head},
             frames_per_task=settings.frames_per_task,
         )
         clips = open_clips(config)
+    heads = config.heads if settings.avatar else {}
     config = replace(
-        config, out=settings.out, methods=(label,), seeds=(0,), settings={}, heads={}, device="cpu"
+        config,
+        out=settings.out,
+        methods=(label,),
+        seeds=(0,),
+        settings={},
+        heads=heads,
+        device=settings.device,
     )
     return config, clips
 

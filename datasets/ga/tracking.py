@@ -140,6 +140,38 @@ def read_tracking(
     return Tracking(head, poses, shape, static_offset, notes)
 
 
+def read_animation(
+    path: Path, head: HeadArrays, subject: str = "", *, teeth: TeethPolicy = "auto"
+) -> Tracking:
+    """Read and check one file with the parameters of all timesteps, as GaussianAvatars stores it beside its splats.
+
+    As a parameter file of `read_tracking`, but with a row of each pose array for every timestep; the timestep of a pose is
+    its row. A file of one timestep is an animation of one row. Errors as of `read_tracking`.
+    """
+    arrays = read_npz(path)
+    identity = _vector(path, arrays, "shape", head.shape_basis.shape[2])
+    static = _offset(path, arrays, "static_offset")
+    head, rows = resolve_teeth(head, len(static) if static is not None else None, teeth, path)
+    moving = [*POSE_SIZES, "expr"]
+    moving += ["eyelids"] if head.eyelid_basis is not None and "eyelids" in arrays else []
+    table = {key: np.atleast_2d(_array(path, arrays, key)) for key in moving}
+    length = len(table["expr"])
+    for key, values in table.items():
+        if values.ndim != 2 or len(values) != length or not length:
+            expected = f"a row for each of the {length} timesteps of expr" if length else "a timestep or more"
+            raise InputError(path, key, expected, f"shape {arrays[key].shape}")
+    poses = {
+        row: _pose(path, {key: values[row : row + 1] for key, values in table.items()}, head, subject, row)
+        for row in range(length)
+    }
+    static_offset = np.zeros((len(head.template), 3), dtype=np.float32)
+    if static is not None:
+        static_offset[:rows] = static[:rows]
+    _check_motion(dict.fromkeys(poses, path), head, identity, static_offset, poses)
+    dynamic = _array(path, arrays, "dynamic_offset") if "dynamic_offset" in arrays else None
+    return Tracking(head, poses, identity, static_offset, {"dynamic_offset_ignored_m": _largest(dynamic)})
+
+
 def resolve_teeth(
     head: HeadArrays, rows: int | None, teeth: TeethPolicy, file: Path
 ) -> tuple[HeadArrays, int]:

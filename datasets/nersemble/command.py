@@ -172,7 +172,8 @@ def record_nersemble(settings: RecordSettings, progress: Progress = no_progress)
 
     For synthetic captures, as they bring their own head model.
     """
-    from .re_record import re_record, video_codec
+    from ...bench.io.video import video_codec
+    from .re_record import re_record
 
     clip = settings.open(settings.capture, progress)
     out = Path(settings.out)

@@ -6,9 +6,6 @@ takes them for recorded people.
 
 from __future__ import annotations
 
-import functools
-import subprocess
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from ...bench.contracts import ByteArray, Camera, FloatArray, FrameKey, HeadPose, Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.io.files import atomic_path, write_json, write_text
+from ...bench.io.video import write_video
 from ..clip import CaptureClip
 from ..ga.validate import require_full_grid
 from ..ga.writer import pose_to_parameters, save_npz
@@ -130,7 +128,6 @@ MARKER_FILE = "SYNTHETIC.txt"
 _MARKER = "Synthetic recordings in NeRSemble's layout, written by headbench. No person was recorded.\n"
 
 _JPEG = (cv2.IMWRITE_JPEG_QUALITY, 97)
-_H264, _MPEG4 = "avc1", "mp4v"
 
 
 class RecordingWriter:
@@ -208,7 +205,7 @@ class RecordingWriter:
         """Write a camera's video of RGB frames; return the codec, see `video_codec`."""
         folder = self.sequence_folder(sequence)
         folder = folder / "images" if self.release == "v2" else folder
-        return write_video(folder / f"cam_{serial}.mp4", frames)
+        return write_video(folder / f"cam_{serial}.mp4", frames, FPS)
 
     def write_frame(
         self, sequence: str, serial: str, number: int, rgb: ByteArray, mask: ByteArray | None = None
@@ -242,47 +239,3 @@ def write_tracked(path: Path, arrays: Mapping[str, FloatArray], numbers: Sequenc
     values["timestep_id"] = np.array([f"{number:06d}" for number in numbers])
     values["n_processed_frames"] = np.array(len(numbers))
     save_npz(path, values)
-
-
-@functools.cache
-def video_codec() -> str:
-    """Codec that videos are written with: H.264 ("avc1") where OpenCV can, else MPEG-4 part 2 ("mp4v").
-
-    OpenCV's wheels come without an H.264 encoder. They say so at length on the error stream, so another process
-    asks.
-    """
-    asked = (
-        "import cv2, sys, tempfile\n"
-        "with tempfile.NamedTemporaryFile(suffix='.mp4') as file:\n"
-        f"    code = cv2.VideoWriter_fourcc(*{_H264!r})\n"
-        "    writer = cv2.VideoWriter(file.name, cv2.CAP_FFMPEG, code, 73.0, (64, 64))\n"
-        "    sys.exit(not writer.isOpened())\n"
-    )
-    answer = subprocess.run([sys.executable, "-c", asked], capture_output=True, check=False)
-    return _MPEG4 if answer.returncode else _H264
-
-
-def write_video(path: Path, frames: Iterable[ByteArray]) -> str:
-    """Write RGB (or one-channel) frames as an mp4 of 73 frames per second; return the codec.
-
-    Raises `InputError` for no frames, odd sizes, or where OpenCV cannot write a video.
-    """
-    codec = video_codec()
-    writer: cv2.VideoWriter | None = None
-    with atomic_path(path) as temporary:
-        for frame in frames:
-            height, width = frame.shape[:2]
-            if writer is None:
-                if width % 2 or height % 2:
-                    expected = "even width and height, as the codec asks"
-                    raise InputError(path, "size", expected, f"{width}x{height}")
-                code = cv2.VideoWriter.fourcc(*codec)
-                writer = cv2.VideoWriter(str(temporary), cv2.CAP_FFMPEG, code, FPS, (width, height))
-                if not writer.isOpened():
-                    raise InputError(path, "", "a video that OpenCV can write", f"no encoder for {codec}")
-            order = cv2.COLOR_GRAY2BGR if frame.ndim == 2 else cv2.COLOR_RGB2BGR
-            writer.write(cv2.cvtColor(frame, order))
-        if writer is None:
-            raise InputError(path, "", "at least one frame", "none")
-        writer.release()
-    return codec

@@ -41,16 +41,23 @@ class ExportPlySettings(CaptureOptions):
 
 @dataclass(frozen=True)
 class ImportGASettings(CaptureOptions):
-    """Make an avatar of a GaussianAvatars PLY and the capture it was trained on."""
+    """Make an avatar of a GaussianAvatars PLY, and of the flame_param.npz beside it or the capture it was trained on."""
 
     ply: tyro.conf.Positional[str]
     """The PLY, with a column binding_0 (`point_cloud/iteration_<N>/point_cloud.ply`)."""
 
-    capture: str
-    """Capture, in a layout that a reader knows: it brings the head model, the shape and the static offset."""
-
     out: str
-    """Folder to write; `headbench export ply` and the method ga load it."""
+    """Folder to write; `headbench export ply`, `headbench render` and the method ga load it."""
+
+    capture: str | None = None
+    """Capture it was trained on, in a layout that a reader knows; not needed with a flame_param.npz and --head."""
+
+    flame_param: str | None = None
+    """The parameters that the official repository stored with the splats, of one timestep or of all; default: the file
+    flame_param.npz beside the PLY, if there is one. "none" leaves it out."""
+
+    subject: str = ""
+    """Name of the subject, where no capture tells it."""
 
 
 def export_ply(settings: ExportPlySettings, progress: Progress = no_progress) -> Findings:
@@ -65,10 +72,11 @@ def export_ply(settings: ExportPlySettings, progress: Progress = no_progress) ->
 
 @writes("out")
 def import_ga(settings: ImportGASettings, progress: Progress = no_progress) -> Findings:
-    """Make an avatar of a GaussianAvatars PLY and the capture it was trained on.
+    """Make an avatar of a GaussianAvatars PLY, and of flame_param.npz or its capture.
 
-    Harmonics of a lower degree are filled up with zeros, and whatever other columns there are is left out. Tracking
-    that the training refined is in another file (`flame_param.npz`) and is not read: the avatar follows the capture's.
+    Harmonics of a lower degree are filled up with zeros, and whatever other columns there are is left out. Shape and
+    static offset come from flame_param.npz, else from the capture. With both, training timesteps are shown in the pose that
+    the official training refined, as official renders of them are; held-out timesteps follow the capture.
     """
     from .files import import_avatar
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +11,14 @@ import torch
 
 from ...bench.contracts import HeadAsset, HeadPose, Progress
 from ...bench.errors import InputError
-from ...bench.io.files import check_writable
+from ...bench.io.files import check_name, check_writable
 from ...bench.io.lock import LOCK_FILE
 from ...bench.specs import Findings
+from ...datasets.clip import CaptureClip
+from ...datasets.ga.tracking import Tracking, find_head, read_animation
+from ...datasets.head.arrays import HeadArrays
 from ..compact.file import COMPACT_FILE
-from ..ga.method import GAAvatar
+from ..ga.method import DRIVING_FILE, GAAvatar
 from ..ga.storage import COLUMNS, PLY_FILE, read_ga_splats, write_ga_splats
 from ..gbs.avatar import GBSAvatar
 from ..insta.avatar import FIELD_FILE as RADIANCE_FILE
@@ -23,7 +27,10 @@ from ..ours.storage import FIELD_FILE
 from ..shared.avatar_files import (
     HEAD_FILE,
     SUBJECT_FILE,
+    TRACKED,
+    RefinedTracking,
     Subject,
+    head_arrays,
     read_shared_head,
     save_shared_head,
     write_subject,
@@ -122,27 +129,108 @@ def neutral_pose(head: HeadAsset) -> HeadPose:
     )
 
 
+FLAME_PARAM_FILE = "flame_param.npz"
+SAME_SHAPE = 1e-4
+"""Largest difference of two shape coefficients of one subject; files hold float32."""
+
+
 def import_avatar(settings: ImportGASettings, progress: Progress) -> Findings:
-    """Make an avatar of a GaussianAvatars PLY and the capture it was trained on.
+    """Make an avatar of a GaussianAvatars PLY, and of flame_param.npz or its capture.
 
     Raises `InputError` for a file that does not fit, and for a folder that holds something already.
     """
     ply, out = Path(settings.ply), Path(settings.out)
-    ours = {LOCK_FILE, SUBJECT_FILE, HEAD_FILE, PLY_FILE}
+    ours = {LOCK_FILE, SUBJECT_FILE, HEAD_FILE, PLY_FILE, DRIVING_FILE}
     other = InputError(out, "", "a new or an empty folder", "one with files in it")
     if out.exists() and any(path.name not in ours for path in out.iterdir()):
         raise other
-    clip = settings.open(settings.capture, progress)
-    splats, binding = read_ga_splats(ply, len(clip.head.faces), "cpu")
+    head, subject, refined, notes = _identity(settings, ply, progress)
+    splats, binding = read_ga_splats(ply, len(head.faces), "cpu")
     # The splats are written last: those of this import, killed at its end, or others.
     if (out / PLY_FILE).exists():
-        there, on = read_ga_splats(out / PLY_FILE, len(clip.head.faces), "cpu")
+        there, on = read_ga_splats(out / PLY_FILE, len(head.faces), "cpu")
         if not (binding.equal(on) and all(splats[name].equal(there[name]) for name in splats)):
             raise other
-    write_subject(out / SUBJECT_FILE, Subject.of(clip))
-    save_shared_head(out, clip.head)
+    write_subject(out / SUBJECT_FILE, subject)
+    save_shared_head(out, head)
+    if refined is not None:
+        refined.save(out / DRIVING_FILE)
     write_ga_splats(out / PLY_FILE, splats, binding)
     used = len(binding.unique())
-    triangles = f"{used} of {len(clip.head.faces)} triangles"
-    text = f"{out}: {len(binding)} splats on {triangles}, subject {clip.subject}"
-    return Findings(text, {"out": out, "splats": len(binding), "triangles": used, "subject": clip.subject})
+    triangles = f"{used} of {len(head.faces)} triangles"
+    text = f"{out}: {len(binding)} splats on {triangles}, subject {subject.name}"
+    data = {"out": out, "splats": len(binding), "triangles": used, "subject": subject.name, **notes}
+    return Findings("; ".join([text, *(f"{name}: {value}" for name, value in notes.items())]), data)
+
+
+def _identity(
+    settings: ImportGASettings, ply: Path, progress: Progress
+) -> tuple[HeadArrays, Subject, RefinedTracking | None, dict[str, str]]:
+    """Head model, subject and refined tracking of an import, and what to say of them."""
+    beside = ply.with_name(FLAME_PARAM_FILE)
+    given = settings.flame_param or (str(beside) if beside.is_file() else "none")
+    path = None if given == "none" else Path(given)
+    clip = None if settings.capture is None else settings.open(settings.capture, progress)
+    if path is None:
+        if clip is None:
+            expected = f"a capture, or a {FLAME_PARAM_FILE} beside the PLY and --head"
+            remedy = "Name the capture that the avatar was trained on with --capture."
+            raise InputError(ply, "", expected, "neither", remedy)
+        return head_arrays(clip.head), Subject.of(clip), None, {}
+    if clip is None and settings.head is None:
+        remedy = "Name it with --head: flame2023.pkl for the official avatars; or the capture with --capture."
+        raise InputError("command line", "--head", "the head model of the avatar", "none", remedy)
+    if clip is None:
+        name = settings.subject or ply.stem
+        tracking = read_animation(path, find_head(path.parent, None, settings.head), name)
+        subject = Subject(
+            check_name(name, "command line", "--subject"),
+            tracking.head.version,
+            np.asarray(tracking.shape, np.float32),
+            tracking.static_offset,
+        )
+        refined = None
+    else:
+        tracking = read_animation(path, head_arrays(clip.head), clip.subject)
+        differs = float(np.abs(tracking.shape - np.asarray(clip.shape)).max(initial=0))
+        if differs > SAME_SHAPE:
+            expected = f"the shape of subject {clip.subject}"
+            remedy = (
+                f"Leave {FLAME_PARAM_FILE} out with --flame-param none, or name the avatar's own capture."
+            )
+            raise InputError(path, "shape", expected, f"one that differs by {differs:.3g}", remedy)
+        subject = Subject.of(clip)
+        subject = replace(subject, static_offset=np.asarray(tracking.static_offset, np.float32))
+        refined = _refined(clip, tracking, path)
+    count = 0 if refined is None else len(refined)
+    notes = {FLAME_PARAM_FILE: f"{len(tracking.poses)} timesteps, {count} of them refined training poses"}
+    ignored = float(tracking.notes["dynamic_offset_ignored_m"])
+    if ignored > 0:
+        notes["dynamic offset left out"] = f"up to {1000 * ignored:.2f} mm"
+    return tracking.head, subject, refined, notes
+
+
+def _refined(clip: CaptureClip, tracking: Tracking, path: Path) -> RefinedTracking | None:
+    """The poses that training refined, in the clip's world: those of its training timesteps; none in a file of one pose.
+
+    GaussianAvatars numbers the rows by ``timestep_index`` and leaves each sequence in its own world.
+    """
+    timesteps = sorted({key.timestep for key in clip.splits["train"]})
+    if len(tracking.poses) == 1 < len(timesteps):
+        return None
+    if timesteps[-1] not in tracking.poses:
+        expected = f"a row for every training timestep, {timesteps[-1] + 1} at least"
+        raise InputError(path, "expr", expected, f"{len(tracking.poses)}", "It is of another capture.")
+    recorded = clip.steps[0].parameters.get("sequence_shifts_m", {}) if clip.steps else {}
+    sequence = {key.timestep: key.sequence for key in clip.splits["train"]}
+    tracked = [clip.poses[timestep] for timestep in timesteps]
+    shifted = []
+    for timestep in timesteps:
+        pose = tracking.poses[timestep]
+        shift = np.asarray(recorded.get(sequence[timestep], np.zeros(3)), np.float32)
+        shifted.append(replace(pose, translation=pose.translation + shift))
+    before, after = (
+        {name: np.array([getattr(p, name) for p in poses], np.float32) for name in TRACKED}
+        for poses in (tracked, shifted)
+    )
+    return RefinedTracking(clip.subject, np.array(timesteps), before, after)

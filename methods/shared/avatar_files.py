@@ -109,6 +109,9 @@ class RefinedTracking:
         self._timesteps = np.asarray(timesteps, dtype=np.int64)
         self._row = {int(timestep): row for row, timestep in enumerate(self._timesteps)}
 
+    def __len__(self) -> int:
+        return len(self._timesteps)
+
     def __call__(self, pose: HeadPose) -> HeadPose:
         """Return the pose to render for a driving pose."""
         row = self._row.get(-1 if pose.timestep is None else pose.timestep)

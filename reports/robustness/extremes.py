@@ -115,13 +115,13 @@ class ExtremesPlan:
         asked = (settings.views, settings.beyond, settings.dimensions, sigmas)
         limits = (asdict(VIEW_LIMITS), asdict(EXPRESSION_LIMITS))
         return cls(
-            turntable(cameras, _head_center(clip), settings.views, settings.beyond),
+            turntable(cameras, head_center(clip), settings.views, settings.beyond),
             extremes(clip, settings.dimensions, sigmas),
             digest(TASK, 1, clip.fingerprint, asked, limits)[:12],
         )
 
 
-def _head_center(clip: Clip) -> FloatArray:
+def head_center(clip: Clip) -> FloatArray:
     """(3,) centre of the head in its typical training pose, metres: the middle of the extent of its vertices."""
     head, pose = clip.head, typical_pose(training_poses(clip))
     coefficients = np.asarray(clip.shape, np.float64)

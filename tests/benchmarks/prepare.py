@@ -19,10 +19,11 @@ import cv2
 import numpy as np
 
 from ...bench.contracts import ByteArray, Camera, Progress, no_progress
+from ...bench.io.video import video_codec
 from ...bench.machine import processor_count
 from ...bench.specs import Findings
 from ...datasets.nersemble.command import PrepareSettings, prepare_nersemble
-from ...datasets.nersemble.re_record import RecordingWriter, video_codec
+from ...datasets.nersemble.re_record import RecordingWriter
 from ...datasets.synthetic.plan import cameras
 
 SUBJECT = "999"

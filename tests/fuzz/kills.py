@@ -51,6 +51,13 @@ WRITERS = [
     Writer("record", "synthetic", "record nersemble synthetic/UNION2_900 --out out"),
     Writer("refit", "heads", "refit capture --target head.npz --out out"),
     Writer("evaluate", "images", "evaluate images --like run --out out --label theirs"),
+    Writer(
+        "evaluate avatar",
+        "run",
+        f"evaluate {AVATAR.format('ga')} --avatar --like run --out out",
+        MEASURED_FILES,
+    ),
+    Writer("render", "run", f"render {AVATAR.format('ga')} --capture capture --out out --video", ("*.mp4",)),
     Writer("sweep", "run", "sweep run --methods ga --variants half", MEASURED_FILES),
     Writer("curve", "run", "curve run --methods ga --fractions 1/2 1 --frames 1", MEASURED_CURVE),
     Writer("bundle", "run", "bundle run --out out.zip --by Somebody --renders"),

@@ -269,3 +269,37 @@ def test_renders_on_black_are_put_on_the_background(tmp_path):
     write_png(tmp_path / "mask.png", np.full((2, 3, 3), (204, 0, 0), np.uint8))  # red has the coverage, 0.8
     image = composited(Render(tmp_path / "pred.png", tmp_path / "mask.png"), (1.0, 0.5, 0.0))
     assert image.tolist() == np.full((2, 3, 3), (151, 76, 0)).tolist()  # 100 + 51, 50 + 25.5 to even, 0
+
+
+AVATAR = {"avatar": True, "method": "toy_plugin:METHOD"}
+
+
+def test_a_stored_avatar_scores_as_in_its_run(run, cell, images, tmp_path):
+    """Its frames and, of what is measured of it as a whole, what the run asks for."""
+    findings = evaluate(options(cell.folder, run, tmp_path / "out", **AVATAR))
+    rows = pd.read_parquet(RunFolder(tmp_path / "out").rows)
+    own = pd.read_parquet(RunFolder(run).rows)
+    same = [column for column in COLUMNS if column not in ("method", "version")]
+    assert rows[same].equals(own[same])
+    assert "theirs" in findings.text
+    evaluate(options(cell.avatar, run, tmp_path / "out", **AVATAR))  # kept, as a run keeps it
+    assert cli.main(["verify", str(tmp_path / "out"), "--trust"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("folder", "others", "match"),
+    [
+        ("seed-0", {"avatar": True}, "toy"),  # a method of the run that is not registered
+        ("elsewhere", {"avatar": True}, "--method: expected the method of the avatar: .*ga"),
+        ("seed-0", {"avatar": True, "method": "gaa"}, "Did you mean"),
+        ("nowhere", AVATAR, "no such folder"),
+        ("empty", AVATAR, "one without files"),
+    ],
+)
+def test_what_is_no_avatar_of_a_known_method_is_refused(run, cell, tmp_path, folder, others, match):
+    shutil.copytree(cell.avatar, tmp_path / "elsewhere")
+    (tmp_path / "empty").mkdir()
+    place = cell.folder if folder == "seed-0" else tmp_path / folder
+    with pytest.raises(InputError, match=match):
+        evaluate(options(place, run, tmp_path / "out", **others))
+    assert not (tmp_path / "out").exists()

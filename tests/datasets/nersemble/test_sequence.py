@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from headbench.bench.errors import InputError
+from headbench.bench.io.video import write_video
 from headbench.datasets.nersemble import sequence as sequence_module
 from headbench.datasets.nersemble.frames import read_frames
-from headbench.datasets.nersemble.re_record import write_video
 from headbench.datasets.nersemble.recording import participant, read_calibration
 from headbench.datasets.nersemble.sequence import check_boxes, probe_video, read_sequence
 
@@ -64,7 +64,7 @@ def test_videos_of_masks_are_read_with_the_frames(videos):
     for serial in SERIALS:
         # What OpenCV's MPEG-4 keeps best is flat, so the masks tell their number by a flat level.
         levels = (np.full((HEIGHT, WIDTH), 40 * number, np.uint8) for number in range(6))
-        write_video(folder / "alpha_maps" / f"cam_{serial}.mp4", levels)
+        write_video(folder / "alpha_maps" / f"cam_{serial}.mp4", levels, 73.0)
     sequence = look(videos, every=2)
     assert sequence.has_masks
     for frame in read_frames(sequence.views[SERIALS[1]], sequence.numbers):

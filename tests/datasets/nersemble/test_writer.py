@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from headbench.bench.errors import InputError
-from headbench.datasets.nersemble.re_record import RecordingWriter, video_codec, write_tracked, write_video
+from headbench.bench.io.video import video_codec, write_video
+from headbench.datasets.nersemble.re_record import RecordingWriter, write_tracked
 
 from ..head.toy import toy_head
 from .recordings import HEIGHT, SUBJECT, WIDTH, tracked_arrays, world_cameras
@@ -45,7 +46,7 @@ def test_synthetic_people_cannot_take_real_numbers(subject, tmp_path):
 
 def test_videos_run_at_73_frames_per_second(tmp_path):
     path = tmp_path / "cam_1.mp4"
-    codec = write_video(path, (np.full((32, 48, 3), 20 * n, np.uint8) for n in range(7)))
+    codec = write_video(path, (np.full((32, 48, 3), 20 * n, np.uint8) for n in range(7)), 73.0)
     assert codec == video_codec()
     assert codec in ("avc1", "mp4v")
     capture = cv2.VideoCapture(str(path))
@@ -57,9 +58,9 @@ def test_videos_run_at_73_frames_per_second(tmp_path):
 
 def test_videos_of_odd_sizes_or_without_frames_are_refused(tmp_path):
     with pytest.raises(InputError, match="even"):
-        write_video(tmp_path / "a.mp4", [np.zeros((33, 48, 3), np.uint8)])
+        write_video(tmp_path / "a.mp4", [np.zeros((33, 48, 3), np.uint8)], 25.0)
     with pytest.raises(InputError, match="none"):
-        write_video(tmp_path / "a.mp4", [])
+        write_video(tmp_path / "a.mp4", [], 25.0)
     assert [*tmp_path.iterdir()] == []
 
 

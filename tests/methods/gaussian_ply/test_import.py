@@ -1,12 +1,15 @@
 """GaussianAvatars' files, written by hand, as avatars."""
 
+import json
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from headbench.bench.errors import InputError
 from headbench.datasets.ga.reader import read_capture
+from headbench.datasets.head.arrays import save_head
 from headbench.methods.ga.method import GA
 from headbench.methods.gaussian_ply.command import ImportGASettings, import_ga
 from headbench.methods.shared.subject_mesh import SubjectMesh
@@ -98,3 +101,94 @@ def test_a_folder_in_use_is_left_alone_an_own_one_is_continued(capture, tmp_path
     for folder, file in ((tmp_path, ply), (tmp_path / "out", other)):
         with pytest.raises(InputError, match="empty folder"):
             imported(capture, folder, file)
+
+
+KEYS = ("expr", "rotation", "neck_pose", "jaw_pose", "eyes_pose", "translation")
+
+
+def flame_param(capture, path, change=None):
+    """What the official training stores beside its splats: the capture's parameters in rows by timestep, refined a little."""
+    clip = read_capture(capture)
+    listed = [json.loads((capture / f"transforms_{s}.json").read_text()) for s in ("train", "val", "test")]
+    by_timestep = {
+        frame["timestep_index"]: dict(np.load(capture / frame["flame_param_path"]))
+        for part in listed
+        for frame in part["frames"]
+    }
+    rows = [by_timestep[timestep] for timestep in range(len(by_timestep))]
+    arrays = {key: np.concatenate([row[key] for row in rows]) for key in KEYS}
+    train = clip.timesteps("train")
+    arrays["jaw_pose"][train] += np.float32(0.125)
+    arrays["translation"][train] += np.float32(0.01)
+    arrays |= {"shape": rows[0]["shape"], "static_offset": rows[0]["static_offset"]}
+    arrays["dynamic_offset"] = np.zeros((len(rows), *arrays["static_offset"].shape[1:]), np.float32)
+    np.savez(path, **(arrays | (change or {})))
+    return path
+
+
+def with_beside(tmp_path, **settings):
+    ply = ga_file(tmp_path / "point_cloud.ply", ROWS)
+    findings = import_ga(ImportGASettings(str(ply), out=str(tmp_path / "out"), **settings))
+    return GA().load(tmp_path / "out", device="cpu"), findings
+
+
+def test_stored_parameters_refine_training_poses_only(capture, tmp_path):
+    flame_param(capture, tmp_path / "flame_param.npz")
+    avatar, findings = with_beside(tmp_path, capture=str(capture))
+    clip = read_capture(capture)
+    assert f"{len(clip.poses)} timesteps, {len(clip.timesteps('train'))} of them" in findings.text
+    plain = GA().load(plain_import(capture, tmp_path), device="cpu")
+    for timestep, pose in clip.poses.items():
+        shown = pose
+        if timestep in clip.timesteps("train"):
+            moved = pose.translation + np.float32(0.01)
+            shown = replace(pose, jaw=pose.jaw + np.float32(0.125), translation=moved)
+        found, expected = avatar.splats(pose), plain.splats(shown)
+        np.testing.assert_allclose(found.means, expected.means, atol=1e-6)
+
+
+def plain_import(capture, tmp_path):
+    ply = ga_file(tmp_path / "point_cloud.ply", ROWS)
+    out = tmp_path / "plain"
+    import_ga(ImportGASettings(str(ply), capture=str(capture), out=str(out), flame_param="none"))
+    return out
+
+
+@pytest.mark.parametrize("rows", [1, None])
+def test_no_capture_is_needed_with_stored_parameters(capture, tmp_path, rows):
+    """Of one timestep, too; the avatar is the same in the same pose."""
+    path = flame_param(capture, tmp_path / "flame_param.npz")
+    arrays = dict(np.load(path))
+    np.savez(path, **{k: v[:rows] if k in KEYS else v for k, v in arrays.items()})
+    head = tmp_path / "head.npz"
+    save_head(head, read_capture(capture).head)
+    avatar, findings = with_beside(tmp_path, head=str(head), subject="nobody")
+    assert findings.data["subject"] == "nobody"
+    pose = read_capture(capture).poses[0]
+    other = GA().load(plain_import(capture, tmp_path), device="cpu")
+    np.testing.assert_allclose(avatar.splats(pose).means, other.splats(pose).means, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "settings", "says"),
+    [
+        ({"shape": np.full(4, 0.5, np.float32)}, {}, "shape of subject .*--flame-param none"),
+        ({"jaw_pose": np.zeros((2, 3), np.float32)}, {}, "jaw_pose: expected a row for each of"),
+        ({"expr": np.zeros((2, 2, 2), np.float32)}, {}, "expr"),
+        ({"rotation": np.full((9, 3), np.nan, np.float32)}, {}, "rotation"),
+        (
+            {key: np.zeros((2, 6 if key == "eyes_pose" else 3), np.float32) for key in KEYS},
+            {},
+            "training timestep",
+        ),
+        ({}, {"capture": None}, "--head"),
+        (None, {"capture": None}, "neither.*--capture"),
+        ({}, {"flame_param": "nowhere.npz"}, "nowhere.npz"),
+    ],
+)
+def test_stored_parameters_that_do_not_fit_are_refused(capture, tmp_path, change, settings, says):
+    if change is not None:
+        flame_param(capture, tmp_path / "flame_param.npz", change)
+    with pytest.raises(InputError, match=says):
+        with_beside(tmp_path, **{"capture": str(capture), **settings})
+    assert not (tmp_path / "out").exists()

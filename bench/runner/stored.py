@@ -1,0 +1,61 @@
+"""Avatars that lie in a folder, of a run or of `headbench import`: which method reads one, and with which settings."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from ..errors import InputError
+from ..io.files import digest, digest_file
+from ..registry import get
+from ..specs import MethodSpec
+from .config import ResolvedMethod, default_names, resolve_method
+from .store import RunFolder
+
+
+def avatar_folder(folder: Path) -> Path:
+    """The folder with the files of an avatar: this one, or ``avatar`` in the cell of a run. Raises `InputError`."""
+    inside = folder / "avatar"
+    found = inside if inside.is_dir() else folder
+    if not found.is_dir() or not any(path.is_file() for path in found.iterdir()):
+        expected = "the folder of an avatar, such as RUN/SUBJECT/METHOD/seed-0/avatar"
+        raise InputError(
+            folder, "", expected, "no such folder" if not found.is_dir() else "one without files"
+        )
+    return found
+
+
+def stored_method(folder: Path, method: str = "", preset: str = "") -> ResolvedMethod:
+    """The method that made the avatar in a folder, as the run that the folder lies in resolved it.
+
+    Parameters
+    ----------
+    method : its name, or "module:SPEC"; "" for that of the run.
+    preset : decides the image size that some methods work at; "" for that of the run, else "fast".
+
+    Raises
+    ------
+    InputError
+        Where ``method`` is left out and no run tells it, and for names that are not known.
+    """
+    home = avatar_folder(folder).resolve()
+    seed, of = home.parent.name, home.parent.parent.name
+    run = RunFolder(home.parents[3]) if len(home.parents) > 3 else None
+    inside = run is not None and home.name == "avatar" and re.fullmatch(r"seed-\d+", seed) is not None
+    config = run.read_manifest().configuration if run and inside and run.manifest.is_file() else None
+    if not method and config is None:
+        expected = f"the method of the avatar: {', '.join(default_names('methods'))}, or another"
+        raise InputError("command line", "--method", expected, "none, and the folder is not that of a run")
+    spec: MethodSpec = get("methods", method or of)
+    settings = {}
+    if config is not None and spec.name == of:
+        preset, settings = preset or config.preset, dict(config.settings.get(of, {}))
+    preset = preset or ("fast" if "fast" in spec.presets or not spec.presets else next(iter(spec.presets)))
+    return resolve_method(spec, preset, settings)
+
+
+def avatar_digest(folder: Path) -> str:
+    """Digest of all files of an avatar."""
+    home = avatar_folder(folder)
+    files = sorted(path for path in home.rglob("*") if path.is_file())
+    return digest([[path.relative_to(home).as_posix(), digest_file(path)] for path in files])

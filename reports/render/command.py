@@ -1,0 +1,79 @@
+"""``headbench render``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import tyro
+
+from ...bench.contracts import Progress, no_progress
+from ...bench.specs import Findings, writes
+
+
+@dataclass(frozen=True)
+class RenderSettings:
+    """Render a stored avatar: frames of a task, or an orbit; as images, and as video."""
+
+    avatar: tyro.conf.Positional[str]
+    """Folder of an avatar, such as RUN/SUBJECT/METHOD/seed-0/avatar or what `headbench import ga` wrote."""
+
+    capture: str
+    """Capture with the cameras and poses; of another subject, too, if its head model is that of the avatar."""
+
+    out: str
+    """Folder to write: FRAMES/SEQUENCE_TIMESTEP_CAMERA.png, as `headbench evaluate` reads them, or orbit/00000.png."""
+
+    frames: Literal["self_reenactment", "novel_view", "train", "orbit"] = "self_reenactment"
+    """Which frames of the capture, by split; or an orbit between and beyond its training cameras."""
+
+    cameras: tuple[str, ...] = ()
+    """Only these cameras; for an orbit, those that it passes."""
+
+    timesteps: tuple[int, ...] = ()
+    """Only these timesteps; for an orbit, the poses shown in turn (default: the first of training)."""
+
+    views: int = 60
+    """Of the orbit."""
+
+    beyond: float = 30.0
+    """How far the orbit goes on beyond the outermost cameras, degrees."""
+
+    video: bool = False
+    """Write videos, too: one for each sequence and camera."""
+
+    fps: float = 25.0
+    """Frames per second of the videos."""
+
+    method: str = ""
+    """Method that reads the avatar; default: that of the run whose folder it lies in."""
+
+    preset: str = ""
+    """Preset of the method, where the image size depends on it; default: that of the run, else fast."""
+
+    reader: str = ""
+    """Reader of the capture; default: the one that finds it."""
+
+    head: str | None = None
+    """Head model for captures that bring none: FLAME pickle or npz."""
+
+    device: str = "cpu"
+    """Where to render."""
+
+    def __post_init__(self) -> None:
+        if self.views < 1 or not 0.0 <= self.beyond < 180.0:
+            raise ValueError("views is at least 1, beyond from 0 to less than 180 degrees")
+        if not 0.0 < self.fps <= 1000.0:
+            raise ValueError(f"fps is {self.fps}; above 0, at most 1000")
+
+
+@writes("out")
+def render(settings: RenderSettings, progress: Progress = no_progress) -> Findings:
+    """Render a stored avatar: frames of a task, or an orbit; as images and video.
+
+    Images are 8-bit PNG of the capture's size on its background, an orbit's of the size that the method works at. Videos are
+    H.264 where OpenCV has an encoder, else MPEG-4.
+    """
+    from .render import render_avatar
+
+    return render_avatar(settings, progress)

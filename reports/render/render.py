@@ -1,0 +1,143 @@
+"""Renders stored avatars: frames of a capture's splits, orbits, videos of both."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from ...bench.contracts import ByteArray, Camera, Clip, FloatArray, FrameKey, HeadPose, Progress
+from ...bench.errors import InputError
+from ...bench.io.files import grouped_writes
+from ...bench.io.images import quantise, read_png, write_png
+from ...bench.io.video import write_video
+from ...bench.runner.adaptation import AdaptedClip, MethodNeeds, carry_out, plan
+from ...bench.runner.captures import open_clips, reader_of
+from ...bench.runner.config import RunConfig
+from ...bench.runner.store import Cell
+from ...bench.runner.stored import avatar_folder, stored_method
+from ...bench.specs import Findings
+from ..robustness.extremes import head_center
+from ..robustness.viewpoints import turntable
+from .command import RenderSettings
+
+ORBIT = "orbit"
+
+
+class Shot(NamedTuple):
+    """A frame to render: its file, what it is of, and the way to the size it is written at."""
+
+    path: Path
+    video: Path
+    camera: Camera
+    pose: HeadPose
+    finish: Callable[[FloatArray], FloatArray]
+
+
+def render_avatar(settings: RenderSettings, progress: Progress) -> Findings:
+    """Render a stored avatar; see the settings.
+
+    Raises `InputError` for what is no avatar, a capture that the method cannot take, and for cameras and timesteps
+    that the capture lacks.
+    """
+    method = stored_method(Path(settings.avatar), settings.method, settings.preset)
+    clip = _clip(settings)
+    needs = MethodNeeds.of(method.spec)
+    adaptation = plan(clip, needs, {})
+    avatar = method.create().load(avatar_folder(Path(settings.avatar)), device=settings.device)
+    out = Path(settings.out)
+    form = AdaptedClip(clip)
+    if adaptation is not None:
+        form = carry_out(adaptation, needs, out / "adapted" / clip.subject, f"adapting {clip.subject}")
+    shots = [
+        *(_orbit(settings, form, out) if settings.frames == ORBIT else _frames(settings, clip, form, out))
+    ]
+    background = clip.background.tolist()
+    with grouped_writes():
+        for index, shot in enumerate(shots):
+            rgb = avatar.render(shot.camera, shot.pose, background).rgb
+            write_png(shot.path, quantise(shot.finish(rgb)))
+            progress(index + 1, len(shots), shot.path.name)
+    videos = _videos(shots, settings.fps) if settings.video else []
+    text = f"{out}: {len(shots)} frames in {shots[0].path.parent.name}/" + "".join(f"\n{v}" for v in videos)
+    return Findings(text, {"out": out, "frames": [shot.path for shot in shots], "videos": videos})
+
+
+def _clip(settings: RenderSettings) -> Clip:
+    config = RunConfig(
+        data=settings.capture,
+        out=settings.out,
+        reader=settings.reader or reader_of(settings.capture),
+        reader_settings={} if settings.head is None else {"head": settings.head},
+        device=settings.device,
+    )
+    clips = open_clips(config)
+    if len(clips) > 1:
+        names = ", ".join(clip.subject for clip in clips)
+        raise InputError(settings.capture, "", "one capture", names, "Name one capture.")
+    return clips[0]
+
+
+def _frames(settings: RenderSettings, clip: Clip, form: AdaptedClip, out: Path) -> Iterator[Shot]:
+    keys = sorted(clip.splits[settings.frames])
+    _known("--cameras", settings.cameras, {key.camera for key in keys}, settings.frames)
+    _known("--timesteps", settings.timesteps, {key.timestep for key in keys}, settings.frames)
+    keys = [
+        key
+        for key in keys
+        if (not settings.cameras or key.camera in settings.cameras)
+        and (not settings.timesteps or key.timestep in settings.timesteps)
+    ]
+    if not keys:
+        raise InputError(settings.capture, settings.frames, "at least one frame", "none")
+    for key in keys:
+        seen = form.key(key)
+        camera, pose = form.clip.cameras[seen.camera], form.clip.poses[seen.timestep]
+        name = Cell(out).render(settings.frames, key).name
+        video = out / f"{settings.frames}_{key.sequence}_{key.camera}.mp4"
+        yield Shot(out / settings.frames / name, video, camera, pose, _finish(form, key))
+
+
+def _finish(form: AdaptedClip, key: FrameKey) -> Callable[[FloatArray], FloatArray]:
+    return lambda rgb: form.restore(key, rgb)
+
+
+def _orbit(settings: RenderSettings, form: AdaptedClip, out: Path) -> Iterator[Shot]:
+    clip = form.clip
+    trained = sorted({key.camera for key in clip.splits["train"]})
+    _known("--cameras", settings.cameras, set(clip.cameras), "the capture")
+    _known("--timesteps", settings.timesteps, set(clip.poses), "the capture")
+    first = min(key.timestep for key in clip.splits["train"])
+    poses = [clip.poses[timestep] for timestep in settings.timesteps or (first,)]
+    cameras = [clip.cameras[name] for name in settings.cameras or trained]
+    views = turntable(cameras, head_center(clip), settings.views, settings.beyond)
+    for number, view in enumerate(views):
+        pose = poses[number % len(poses)]
+        yield Shot(
+            out / ORBIT / f"{number:05d}.png", out / f"{ORBIT}.mp4", view.camera, pose, lambda rgb: rgb
+        )
+
+
+def _known(option: str, asked: Sequence[int | str], known: Iterable[int | str], of: str) -> None:
+    unknown = sorted(set(asked) - set(known))
+    if unknown:
+        names = sorted(known)
+        shown = ", ".join(map(str, names if len(names) < 20 else [names[0], "...", names[-1]]))
+        raise InputError("command line", option, f"those of {of}: {shown}", ", ".join(map(str, unknown)))
+
+
+def _videos(shots: Sequence[Shot], fps: float) -> list[Path]:
+    """Write the frames of each video in order of their names, which is that of time."""
+    parts: dict[Path, list[Path]] = {}
+    for shot in shots:
+        parts.setdefault(shot.video, []).append(shot.path)
+    for video, paths in parts.items():
+        write_video(video, (_even(read_png(path)) for path in paths), fps)
+    return list(parts)
+
+
+def _even(image: ByteArray) -> ByteArray:
+    """The image, its last row or column repeated where the codec would not take an odd size."""
+    return np.pad(image, ((0, image.shape[0] % 2), (0, image.shape[1] % 2), (0, 0)), mode="edge")

@@ -1,0 +1,79 @@
+"""Frames of stored avatars: those of a run to the bit, named so that they can be scored; orbits; videos."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from headbench.bench.errors import InputError
+from headbench.bench.io.images import read_png
+from headbench.bench.runner.store import RunFolder
+from headbench.reports.render.command import RenderSettings, render
+
+
+@pytest.fixture
+def cell(ball_run):
+    return RunFolder(ball_run("BALL")).cell("ball-a", "ball", 0)
+
+
+@pytest.fixture
+def settings(cell, tmp_path):
+    (tmp_path / "one" / "ball-a").mkdir(parents=True)
+    return RenderSettings(
+        str(cell.folder),
+        capture=str(tmp_path / "one"),
+        out=str(tmp_path / "out"),
+        reader="ball_plugin:READER",
+        method="ball_plugin:BALL",
+    )
+
+
+@pytest.mark.parametrize("split", ["novel_view", "self_reenactment"])
+def test_frames_are_those_of_the_run(settings, cell, tmp_path, split):
+    found = render(replace(settings, frames=split)).data["frames"]
+    theirs = sorted((cell.folder / "renders" / split).iterdir())
+    assert [path.name for path in found] == [path.name for path in theirs]
+    assert all(a.read_bytes() == b.read_bytes() for a, b in zip(found, theirs))
+
+
+def test_cameras_and_timesteps_choose_what_videos_hold(settings):
+    findings = render(replace(settings, cameras=("1", "3"), timesteps=(4, 5), video=True, fps=10.0))
+    assert len(findings.data["frames"]) == 4
+    for video in findings.data["videos"]:
+        stream = cv2.VideoCapture(str(video))
+        assert (stream.get(cv2.CAP_PROP_FRAME_COUNT), stream.get(cv2.CAP_PROP_FPS)) == (2, 10)
+    assert len(findings.data["videos"]) == 2
+
+
+def test_an_orbit_looks_at_the_head_from_all_sides(settings):
+    frames = render(replace(settings, frames="orbit", views=5, beyond=100.0, timesteps=(0, 5), video=True))
+    for path in frames.data["frames"]:
+        rows, columns = np.nonzero(read_png(path)[..., 0] < 200)
+        assert abs(rows.mean() - 14.5) < 1  # the ball is where the cameras look, and its picture where K says
+        assert abs(columns.mean() - 11.5) < 1
+    assert [path.name for path in frames.data["videos"]] == ["orbit.mp4"]
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"cameras": ("9",)}, "--cameras: expected those of self_reenactment: 0, 1, 2, 3, 4, found 9"),
+        ({"timesteps": (0,)}, "--timesteps: expected those of self_reenactment: 4, 5, found 0"),
+        ({"frames": "orbit", "timesteps": (77,)}, "--timesteps"),
+        ({"avatar": "nowhere"}, "no such folder"),
+        ({"capture": "nowhere"}, "no such folder"),
+        ({"method": ""}, "ball"),
+    ],
+)
+def test_what_cannot_be_rendered_is_refused_before_work(settings, tmp_path, monkeypatch, change, match):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=match):
+        render(replace(settings, **change))
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("change", [{"views": 0}, {"beyond": 180.0}, {"fps": 0.0}])
+def test_settings_without_meaning_are_refused(settings, change):
+    with pytest.raises(ValueError, match="is"):
+        replace(settings, **change)
