@@ -25,6 +25,7 @@ Command = Callable[..., int]
 
 _OF_OTHERS = {
     "compare": "analyze",
+    "doctor": "diagnose info",
     "evaluate": "eval evaluation metrics test",
     "export ply": "view viewer",
     "inspect": "visualize",

@@ -218,7 +218,7 @@ class Manifest:
                 if method[name] is None:
                     del method[name]
         for metric in record["metrics"]:
-            del metric["default"]
+            del metric["default"], metric["needs"]
         write_json(path, record)
 
     def check_done(self, path: Path) -> None:

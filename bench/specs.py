@@ -27,6 +27,23 @@ def _check_labels(**texts: str) -> None:
             raise ValueError(f"{name} is {text[:60]!r}; {LABEL}")
 
 
+class Need(NamedTuple):
+    """Something that a method, a metric or a reader uses, and whether this machine has it (``headbench doctor``).
+
+    Attributes
+    ----------
+    what : its name: a kernel, a package, weights, a checkout, a GPU.
+    found : what there is, such as a version; "" where it is missing.
+    remedy : how to get it, if it is missing, and what happens meanwhile.
+    required : nothing works without it; else it works more slowly, or in part.
+    """
+
+    what: str
+    found: str
+    remedy: str = ""
+    required: bool = True
+
+
 @dataclass(frozen=True)
 class ResolutionRule:
     """The image size that a method works at, as declared by it. Metrics are taken at the protocol's size.
@@ -108,6 +125,8 @@ class MethodSpec:
     demo : ``headbench demo`` takes it.
     variants : "package.module:function" of ``(avatar folder, clip, device) -> Iterator[Variant]``: what can be derived
         from a trained avatar without training (``headbench sweep``); "" for nothing.
+    needs : "package.module:function" of ``(config, device) -> Iterable[Need]``: what a machine has to have, each looked
+        for without long work, network or changes of the disk; "" for nothing but what headbench is installed with.
     first_implementation : what ``implementation`` was when the first runs were made, "" for the same: digests of what an
         avatar was made of outlive a move of the class.
     """
@@ -126,6 +145,7 @@ class MethodSpec:
     default: bool = False
     demo: bool = False
     variants: str = ""
+    needs: str = ""
     first_implementation: str = ""
     resolution: ResolutionRule = ResolutionRule()
     preset_resolutions: Mapping[str, ResolutionRule] = field(default_factory=dict)
@@ -171,6 +191,7 @@ class MetricSpec:
     profile : the set of definitions it belongs to, see `ProfileSpec`. Other profiles than the canonical one stand in
         the metric's name, too, behind an "@": a row names its profile, ``ssim@3dgs`` is never taken for ``ssim``.
     default : a run that names no metrics takes it. Not recorded in runs.
+    needs : as of a method, called with None for the config. Not recorded in runs.
     """
 
     name: str
@@ -186,6 +207,7 @@ class MetricSpec:
     machine_bound: bool = False
     profile: str = "canonical"
     default: bool = field(default=False, compare=False)
+    needs: str = field(default="", compare=False)
 
     @property
     def per_frame(self) -> bool:
@@ -242,6 +264,7 @@ class DatasetSpec:
     Settings whose annotation admits a `Path` name files; a run finds them again after it was moved together with them.
     ``listing`` names a function ``path -> {split: [(timestep, camera), ...]}``: the frames in the order in which the
     capture's own files list them, all of them, by which official repositories number their renders; "" for none.
+    ``needs`` is as that of a method, called with None for the config.
     """
 
     name: str
@@ -250,6 +273,7 @@ class DatasetSpec:
     find: str = ""
     reads: bool = True
     listing: str = ""
+    needs: str = ""
 
 
 @dataclass(frozen=True)

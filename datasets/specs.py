@@ -22,4 +22,5 @@ SYNTHETIC = DatasetSpec(
     summary="A path-traced procedural head with exact tracking, written in the same layout.",
     implementation="headbench.datasets.synthetic.capture:synthesize",
     reads=False,
+    needs="headbench.datasets.synthetic.needs:needs",
 )

@@ -11,11 +11,11 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ..bench.contracts import ByteArray
-from ..bench.errors import UnavailableError
-from ..bench.specs import MetricSpec
+from ..bench.errors import HeadbenchError, UnavailableError
+from ..bench.specs import MetricSpec, Need
 
 if TYPE_CHECKING:
     from .lpips_network import Lpips
@@ -29,6 +29,7 @@ LPIPS = MetricSpec(
     implementation="headbench.metrics.lpips:lpips",
     summary="Learned perceptual distance v0.1, AlexNet, inputs scaled to [-1, 1].",
     default=True,
+    needs="headbench.metrics.lpips:needs_alex",
 )
 
 LPIPS_VGG = replace(
@@ -37,6 +38,7 @@ LPIPS_VGG = replace(
     default=False,
     label="LPIPS VGG",
     implementation="headbench.metrics.lpips:lpips_vgg",
+    needs="headbench.metrics.lpips:needs_vgg",
     summary="Learned perceptual distance v0.1, VGG-16, inputs scaled to [-1, 1].",
 )
 
@@ -81,3 +83,28 @@ lpips = SharedLpips()
 lpips_vgg = SharedLpips("vgg")
 lpips_unscaled = SharedLpips(scaled=False)
 lpips_vgg_unscaled = SharedLpips("vgg", scaled=False)
+
+
+def needs_alex(config: Any, device: str) -> Iterator[Need]:
+    """Weights of AlexNet, looked for and not fetched."""
+    yield _weights("alex")
+
+
+def needs_vgg(config: Any, device: str) -> Iterator[Need]:
+    """Weights of VGG-16, likewise."""
+    yield _weights("vgg")
+
+
+def _weights(net: str) -> Need:
+    from .lpips_network import NETWORKS, VARIABLE, cache_folder, present_backbone
+
+    spec = NETWORKS[net]
+    remedy = (
+        f"They are fetched from {spec.url} when first used; without a network, put that file into {cache_folder()} or set "
+        f"{VARIABLE} to it. Cells of {net} LPIPS stay empty meanwhile."
+    )
+    try:
+        found = present_backbone(spec)
+    except HeadbenchError as error:
+        return Need(f"weights of {net}", "", str(error), required=False)
+    return Need(f"weights of {net}", "" if found is None else str(found), remedy, required=False)

@@ -255,6 +255,16 @@ def _vgg16() -> TappedNetwork:
     return TappedNetwork(layers, (3, 8, 15, 22, 29))
 
 
+def present_backbone(spec: NetworkSpec, path: Path | None = None) -> Path | None:
+    """The file with the weights of ``spec`` on this machine, None where there is none; errors as of `find_backbone`."""
+    if path is not None:
+        return _named(spec, path, "weights")
+    if value := os.environ.get(VARIABLE):
+        return _named(spec, Path(value), f"environment variable {VARIABLE}")
+    folders = (cache_folder(), Path(torch.hub.get_dir()) / "checkpoints")
+    return next(filter(None, (_in_folder(spec, folder) for folder in folders)), None)
+
+
 def find_backbone(spec: NetworkSpec, path: Path | None = None) -> Path:
     """Return the file with the weights of ``spec``, fetched if need be (see the module).
 
@@ -263,13 +273,8 @@ def find_backbone(spec: NetworkSpec, path: Path | None = None) -> Path:
     InputError : ``path`` or the environment variable names something that is not there.
     UnavailableError : not in the folder named, or not found anywhere and not to be fetched; names the remedy.
     """
-    if path is not None:
-        return _named(spec, path, "weights")
-    if value := os.environ.get(VARIABLE):
-        return _named(spec, Path(value), f"environment variable {VARIABLE}")
-    for folder in (cache_folder(), Path(torch.hub.get_dir()) / "checkpoints"):
-        if found := _in_folder(spec, folder):
-            return found
+    if found := present_backbone(spec, path):
+        return found
     target = cache_folder() / spec.file
     if problem := _fetch(spec.url, spec.file.removesuffix(".pth").rpartition("-")[2], target):
         raise UnavailableError(

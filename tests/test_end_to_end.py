@@ -276,6 +276,10 @@ CASES = {
         )
         for names in ("nested", "flat")
     ],
+    "doctor": [
+        case("doctor", r"(?s)ours +ready.*All default methods can run here"),
+        case("doctor gha --device cpu", "The methods named can run here"),
+    ],
     "check-plugin": [
         case("check-plugin mean-image --data {capture}", "keeps its contract"),
         case("check-plugin psnr", "keeps its contract"),

@@ -9,6 +9,7 @@ from functools import cached_property
 from types import ModuleType
 
 from ..errors import UnavailableError
+from ..specs import Need
 
 log = logging.getLogger(__name__)
 
@@ -47,6 +48,11 @@ class Kernel:
             _warn_once(self.label, str(self.imported), self.remedy)
             return None
         return self.imported
+
+    def need(self) -> Need:
+        """Whether this machine has it, for `MethodSpec.needs`; a substitute works meanwhile."""
+        found = "" if isinstance(self.imported, ImportError) else ", ".join(self.instruction_sets) or "there"
+        return Need(self.label, found, self.remedy, required=False)
 
     @cached_property
     def instruction_sets(self) -> tuple[str, ...]:

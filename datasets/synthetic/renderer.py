@@ -28,7 +28,7 @@ from .subject import RenderedSubject
 SAMPLE_COUNTS = (9, 25, 49, 121, 169, 289)
 """Squares of primes: what the orthogonal-array sampler takes. 25 divides evenly among five lights."""
 
-_VARIANT = "scalar_rgb"
+VARIANT = "scalar_rgb"
 _FILTER = 0.55  # standard deviation of the pixel filter, pixels
 _FILTER_REACH = 3  # pixels beyond which it gives nothing
 
@@ -80,8 +80,8 @@ class PathTracer:
     """
 
     def __init__(self, lights: Sequence[Light], samples: int, threads: int = 1):
-        if mitsuba.variant() != _VARIANT:
-            mitsuba.set_variant(_VARIANT)
+        if mitsuba.variant() != VARIANT:
+            mitsuba.set_variant(VARIANT)
         mitsuba.set_log_level(mitsuba.LogLevel.Error)  # it writes to the terminal, past Python's logging
         drjit.set_thread_count(threads)
         self._lights = lights

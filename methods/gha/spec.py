@@ -69,6 +69,7 @@ GHA = MethodSpec(
     summary="Gaussian Head Avatar: splats driven by networks, drawn as features, sharpened by another network.",
     implementation="headbench.methods.gha.method:GHA",
     config="headbench.methods.gha.config:GHAConfig",
+    needs="headbench.methods.shared.needs:gha",
     presets={**SHORT_PRESETS, "paper": {"budget": {"iterations": PAPER_ITERATIONS}}},
     preset_resolutions={
         "paper": ResolutionRule(square="pad", size=(2048, 2048), speed_size=(1024, 1024)),

@@ -42,6 +42,7 @@ INSTA = MethodSpec(
     summary="INSTA: a canonical hash-grid radiance field, warped by the nearest triangle of the tracked mesh.",
     implementation="headbench.methods.insta.method:Insta",
     config="headbench.methods.insta.config:InstaConfig",
+    needs="headbench.methods.shared.needs:insta",
     presets={
         "smoke": {"budget": {"iterations": 40}, **SHORT},
         "demo": {"budget": {"iterations": 400}, **SHORT},

@@ -1,0 +1,181 @@
+"""``headbench doctor``: what methods, metrics and readers need, and what of it this machine has."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, NamedTuple
+
+import tyro
+
+from .contracts import Progress
+from .errors import ExitCode, HeadbenchError
+from .specs import Findings, MethodSpec, Need
+
+State = Literal["ready", "partly", "missing"]
+
+
+@dataclass(frozen=True)
+class DoctorSettings:
+    """Say for every method, metric and reader what is missing on this machine, and how to get it.
+
+    Exit code 0: all default methods, or those named, can run here; 3: one cannot. Nothing is fetched or written.
+    """
+
+    methods: tyro.conf.Positional[tuple[str, ...]] = ()
+    """Methods to look at, and to decide the exit code by: names or "module:SPEC"; default: all, decided by the default
+    methods. Official repositories are looked at where settings name their checkout."""
+
+    device: str = "cpu"
+    """Where the methods are to run: cpu, cuda, cuda:1, ..."""
+
+    set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="KEY=VALUE")] = ()
+    """A setting of a method, as for `headbench run`: `settings.ga-official.checkout=DIR`; repeatable."""
+
+
+class Patient(NamedTuple):
+    """A plug-in that was looked at."""
+
+    group: str
+    name: str
+    counts: bool
+    """Whether the exit code depends on it."""
+    needs: tuple[Need, ...]
+
+    @property
+    def missing(self) -> list[Need]:
+        return [need for need in self.needs if not need.found]
+
+    @property
+    def state(self) -> State:
+        if any(need.required for need in self.missing):
+            return "missing"
+        return "partly" if self.missing else "ready"
+
+
+def doctor(settings: DoctorSettings, progress: Progress) -> Findings:
+    """Say for every method, metric and reader what is missing here, and how to get it.
+
+    Raises `InputError` for unknown methods and settings, and for a device that is none.
+    """
+    from .configuration import parse_assignments
+    from .errors import InputError
+    from .machine import machine_record
+    from .registry import discover, get, unknown
+    from .runner.config import RunConfig
+
+    own = parse_assignments(settings.set)
+    stray = set(own) - {"settings"}
+    if stray:
+        raise unknown("command line", "--set", min(stray), ["settings"])
+    chosen: Mapping[str, Mapping[str, Any]] = own.get("settings", {})
+    RunConfig("", "", device=settings.device)  # refuses what is no device
+    named = {get("methods", name).name: name for name in settings.methods}
+    known = [*named] if named else [*discover("methods")]
+    if unfit := sorted(set(chosen) - set(known)):
+        raise unknown("command line", "--set settings", unfit[0], known)
+    if not all(isinstance(values, Mapping) for values in chosen.values()):
+        raise InputError("command line", "--set settings", "settings.METHOD.KEY=VALUE", "another")
+    patients = [Patient("machine", settings.device, True, tuple(_device(settings.device)))]
+    for name in known:
+        patients.append(_method(named.get(name, name), name in named, not named, settings.device, chosen))
+        progress(len(patients), len(known) + 1, name)
+    for group in ("metrics", "datasets") if not named else ():
+        for name, plugin in discover(group).items():  # type: ignore[arg-type]
+            if plugin.spec is None:
+                patients.append(Patient(group, name, False, (_broken(plugin.error),)))
+            elif plugin.spec.needs:
+                needs = tuple(_asked(plugin.spec.needs, None, settings.device))
+                patients.append(Patient(group, name, False, needs))
+    ill = [patient for patient in patients if patient.counts and patient.state == "missing"]
+    machine = machine_record()
+    head = (
+        f"{machine['processor']}, {machine['cores']} cores, {machine['memory_bytes'] / 1e9:.0f} GB; "
+        f"Python {machine['python']}, torch {machine['packages']['torch']}"
+    )
+    what = "The methods named" if named else "All default methods"
+    verdict = (
+        f"{what} can run here."
+        if not ill
+        else f"Cannot run here: {', '.join(patient.name for patient in ill)}."
+    )
+    data = {
+        "machine": machine,
+        "plugins": [
+            {
+                "group": patient.group,
+                "name": patient.name,
+                "state": patient.state,
+                "counts": patient.counts,
+                "needs": [need._asdict() for need in patient.needs],
+            }
+            for patient in patients
+        ],
+    }
+    text = "\n".join([head, *_lines(patients), verdict])
+    return Findings(text, data, not ill, ExitCode.NO_VERDICT if ill else ExitCode.OK)
+
+
+def _device(device: str) -> Iterator[Need]:
+    from .machine import check_device
+
+    try:
+        check_device(device)
+    except HeadbenchError as error:
+        yield Need(f"device {device}", "", str(error))
+    else:
+        yield Need(f"device {device}", "there")
+
+
+def _method(
+    name: str, named: bool, all_defaults: bool, device: str, chosen: Mapping[str, Mapping[str, Any]]
+) -> Patient:
+    from .registry import discover, get, resolve
+    from .runner.config import resolve_method
+
+    plugin = discover("methods").get(name)
+    if plugin is not None and plugin.spec is None:
+        return Patient("methods", name, named, (_broken(plugin.error),))
+    spec: MethodSpec = get("methods", name)
+    counts = named or (all_defaults and spec.default)
+    try:
+        resolve(spec.implementation)
+        preset = "fast" if "fast" in spec.presets or not spec.presets else next(iter(spec.presets))
+        method = resolve_method(spec, preset, chosen.get(spec.name, {}))
+    except HeadbenchError as error:
+        if chosen.get(spec.name):
+            raise
+        return Patient("methods", spec.name, counts, (_broken(str(error)),))
+    needs = [*_asked(spec.needs, method.config, device)] if spec.needs else []
+    if not spec.native and not needs:
+        remedy = "See methods/official/README.md; its settings are checked when it is run."
+        needs = [Need("checkout and environment", "", remedy)]
+    return Patient("methods", spec.name, counts, tuple(needs))
+
+
+def _asked(needs: str, config: Any, device: str) -> Iterator[Need]:
+    """What a plug-in says that it needs; how it fails to say so is what it lacks."""
+    from .registry import resolve
+
+    try:
+        yield from resolve(needs)(config, device)
+    except Exception as error:  # noqa: BLE001 - a plug-in may fail in any way; the others must still be asked
+        yield _broken(f"{type(error).__name__}: {error}")
+
+
+def _broken(error: str | None) -> Need:
+    return Need("its code", "", f"It cannot be used: {error or 'it does not load'}")
+
+
+def _lines(patients: list[Patient]) -> Iterator[str]:
+    group = ""
+    for patient in patients:
+        if patient.group != group:
+            group = patient.group
+            yield f"\n{group}"
+        there = "; ".join(f"{need.what}: {need.found}" for need in patient.needs if need.found)
+        yield f"  {patient.name:<18}{patient.state:<9}{there}".rstrip()
+        for need in patient.missing:
+            effect = "" if need.required else " (works without)"
+            yield f"    no {need.what}{effect}. {need.remedy}".rstrip()
+    yield ""

@@ -1,0 +1,39 @@
+"""What native methods need of a machine, for `MethodSpec.needs`."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+
+from ...bench.specs import Need
+from ..splats import cpu, cuda
+
+
+def splats(config: Any, device: str) -> Iterator[Need]:
+    """The splat renderer: its kernel on CPUs, gsplat on GPUs."""
+    if not device.startswith("cuda"):
+        yield cpu.KERNEL.need()
+        return
+    gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else ""
+    there = importlib.util.find_spec("gsplat") is not None
+    slow = f"{cuda.REMEDY} The slow reference backend draws meanwhile."
+    yield Need("GPU", gpu, "PyTorch with CUDA, and an NVIDIA driver: https://pytorch.org/get-started.")
+    yield Need("gsplat", "installed" if there else "", slow, required=False)
+
+
+def insta(config: Any, device: str) -> Iterator[Need]:
+    """INSTA's kernel."""
+    from ..insta.kernel import KERNEL
+
+    yield KERNEL.need()
+
+
+def gha(config: Any, device: str) -> Iterator[Need]:
+    """GHA's kernel, and the splat renderer."""
+    from ..gha.kernel import KERNEL
+
+    yield KERNEL.need()
+    yield from splats(config, device)

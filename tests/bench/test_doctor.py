@@ -1,0 +1,104 @@
+"""What a machine lacks: told for each plug-in by what it says itself, and decided by those that count."""
+
+import json
+import re
+from dataclasses import replace
+
+import pytest
+
+from headbench.bench import cli
+from headbench.bench.contracts import no_progress
+from headbench.bench.doctor import DoctorSettings, doctor
+from headbench.bench.errors import InputError, UnavailableError
+from headbench.bench.native.loader import Kernel
+from headbench.bench.specs import Need
+
+
+@pytest.fixture
+def plugin(toy, monkeypatch):
+    """The toy plug-in with methods that need this and that."""
+
+    def needs(config, device):
+        yield Need("a wheel", "round", "Turn it.")
+        yield Need("a spare wheel", "", "Carry one.", required=False)
+        if config.level > 0.9:
+            yield Need("an engine", "", "Build one.")
+
+    def fails(config, device):
+        yield Need("a wheel", "round")
+        raise UnavailableError("The garage is closed.", "Come back.")
+
+    monkeypatch.setattr(toy, "needs", needs, raising=False)
+    monkeypatch.setattr(toy, "fails", fails, raising=False)
+    made = {
+        "CAR": replace(toy.METHOD, name="car", needs="toy_plugin:needs"),
+        "TAXI": replace(toy.METHOD, name="taxi", needs="toy_plugin:fails"),
+        "GONE": replace(toy.METHOD, name="gone", implementation="toy_plugin:Nothing"),
+        "OFFICIAL": replace(toy.METHOD, name="toy-official", native=False),
+    }
+    for name, spec in made.items():
+        monkeypatch.setattr(toy, name, spec, raising=False)
+    return toy
+
+
+@pytest.mark.parametrize(
+    ("names", "settings", "code", "says"),
+    [
+        (["CAR"], [], 0, "(?s)car +partly +a wheel: round.*no a spare wheel .works without.. Carry one."),
+        (
+            ["CAR"],
+            ["settings.car.level=1.0"],
+            3,
+            "(?s)missing.*no an engine. Build one.*Cannot run here: car",
+        ),
+        (["CAR", "TAXI"], [], 3, "(?s)The garage is closed. Come back.*Cannot run here: taxi"),
+        (["GONE"], [], 3, "cannot be imported"),
+        (["OFFICIAL"], [], 3, "methods/official/README.md"),
+        (["METHOD"], [], 0, "toy +ready"),
+    ],
+)
+def test_what_is_missing_is_told_and_decides(plugin, capsys, names, settings, code, says):
+    words = [f"toy_plugin:{name}" for name in names]
+    for setting in settings:
+        words += ["--set", setting]
+    assert cli.main(["doctor", *words]) == code
+    printed = capsys.readouterr().out
+    assert re.search(says, printed), printed
+
+
+def test_default_methods_decide_and_others_inform(capsys):
+    assert cli.main(["doctor", "--json"]) == 0
+    found = {entry["name"]: entry for entry in json.loads(capsys.readouterr().out)["plugins"]}
+    assert found["ours"]["counts"]
+    assert not found["lpips"]["counts"]
+    assert found["synthetic"]["state"] == "ready"
+
+
+def test_a_default_method_that_cannot_run_gives_no_verdict(monkeypatch):
+    from headbench.methods.shared import needs
+
+    monkeypatch.setattr(needs, "splats", lambda config, device: [Need("a kernel", "", "Compile it.")])
+    findings = doctor(DoctorSettings(), no_progress)
+    assert (findings.passed, findings.code) == (False, 3)
+    assert re.search("Cannot run here: .*ours", findings.text)
+
+
+@pytest.mark.parametrize(
+    ("settings", "match"),
+    [
+        ({"methods": ("oours",)}, "Did you mean 'ours'"),
+        ({"set": ("settings.oours.level=1",)}, "Did you mean 'ours'"),
+        ({"set": ("tasks=novel_view",)}, "settings"),
+        ({"set": ("settings.ours.leveller=1",)}, "leveller"),
+    ],
+)
+def test_names_that_are_not_known_are_refused(settings, match):
+    with pytest.raises(InputError, match=match):
+        doctor(DoctorSettings(**settings), no_progress)
+
+
+def test_a_kernel_that_is_missing_is_a_need_with_a_substitute():
+    need = Kernel("headbench.nowhere", "the kernel", "numpy does meanwhile").need()
+    assert need[:2] == ("the kernel", "")
+    assert "numpy does meanwhile" in need.remedy
+    assert not need.required
