@@ -17,6 +17,7 @@ SHORT: dict[str, Any] = {
     },
     "lines": {"lr": 2e-2, "network_lr": 1e-3, "bounds": "face"},
     "penalty": {"weight": 1e-3, "softness": 0.1},
+    "capacity": {"mode": "auto"},
     "sh_dc_lr": 0.02,
     "sh_rest_lr": 1e-3,
     "storage": "compact",

@@ -29,6 +29,7 @@ ABLATIONS: Mapping[str, Mapping[str, Any]] = {
     "lines-color": {"lines": {"dynamic": ["color"]}},
     "no-penalty": {"penalty": {"weight": 0.0}},
     "no-balanced-sampling": {"sampling": {"balanced": False}},
+    "fixed-sizes": {"capacity": {"mode": "fixed"}},
     "harmonics": {"color": "sh"},
     "lines-in-head": {"lines": {"bounds": "head"}},
     "no-direction-smoothing": {"planes": {"direction_smoothing": 0.0}},
