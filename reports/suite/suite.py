@@ -34,6 +34,7 @@ ABLATIONS: Mapping[str, Mapping[str, Any]] = {
     "lines-in-head": {"lines": {"bounds": "head"}},
     "no-direction-smoothing": {"planes": {"direction_smoothing": 0.0}},
     "published": {
+        "capacity": {"mode": "fixed"},
         "lines": {"bounds": "head"},
         "planes": {"direction_smoothing": 0.0, "residual_lr": 0.0, "move_splats": True},
     },
