@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ...bench.contracts import Progress
+from ...bench.errors import InputError
 from ...bench.io.files import write_text
 from ...bench.machine import check_device
 from ...bench.registry import discover, get, resolve
@@ -18,6 +19,7 @@ from ..runs import Part, RunSet
 from ..statistics.command import CompareSettings, compare_runs
 from ..table_report import table_of
 from ..writers import to_markdown
+from .ablations import ablation_table
 from .command import SEED, SuiteSettings
 
 OURS = "ours"
@@ -51,6 +53,9 @@ def run_suite(settings: SuiteSettings, progress: Progress) -> Findings:
     methods = settings.methods or tuple(
         name for name, plugin in discover("methods").items() if plugin.spec and plugin.spec.demo
     )
+    if settings.ablations and OURS not in methods:
+        expected = f"{OURS} among them, which --ablations are compared with"
+        raise InputError("command line", "--methods", expected, ", ".join(methods))
     runs = {"run": _config(settings, out, "run", methods, {})}
     for name, changes in ABLATIONS.items() if settings.ablations else ():
         runs[f"ablation-{name}"] = _config(
@@ -97,7 +102,8 @@ def _config(
 def results(run_folder: Path, every: list[Path]) -> str:
     """Tables of a suite as Markdown: whole frames, each region, each held-out sequence, and the ablations of ours.
 
-    Under each table are the paired differences of every method from ours, with intervals and tests.
+    Under each table are the paired differences of every method from ours, with intervals and tests. Those of the ablations
+    are such differences, of whole frames and of the face, in all sequences and in each held-out one.
     """
     runs = RunSet.read([run_folder])
     parts = {"All frames": Part()}
@@ -105,8 +111,11 @@ def results(run_folder: Path, every: list[Path]) -> str:
     tested = {frame[1] for frame in runs.rows.frames("self_reenactment", FULL)}
     parts |= {f"Sequence {name}": Part(sequences=(name,)) for name in sorted(tested)}
     sections = [_section(title, [run_folder], part) for title, part in parts.items()]
-    if len(every) > 1:
-        sections.append(_section("Ablations of ours", every, Part()))
+    for region in (FULL, "face") if len(every) > 1 else ():
+        for chosen in ((), *((name,) for name in sorted(tested))):
+            title = ", ".join(["Ablations of ours", *([] if region == FULL else [region]), *chosen])
+            table = ablation_table(every, OURS, Part(region, chosen))
+            sections.append(f"## {title}\n\n{to_markdown(table).strip()}")
     return "\n\n".join(sections) + "\n"
 
 

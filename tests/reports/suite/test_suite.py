@@ -41,6 +41,7 @@ def test_every_ablation_is_a_setting_of_ours_that_changes_it(name):
         (["--methods", "nothing"], "nothing"),
         (["--preset", "huge"], "huge"),
         (["--size", "big"], "WIDTHxHEIGHT"),
+        (["--ablations", "--methods", "ga"], "ours among them"),
     ],
 )
 def test_what_cannot_be_run_is_refused_before_a_capture_is_made(tmp_path, capsys, words, match):

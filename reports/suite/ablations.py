@@ -1,0 +1,58 @@
+"""What leaving out a part of a method changes: paired differences of its runs from the method as it is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from ..runs import WHOLE, Part, RunSet
+from ..statistics.comparisons import LEVEL, PairedComparison, compare
+from ..table_report import table_of
+from ..tables import Table, TableCell, TableRow
+
+MARKING = (
+    f"Ablation minus method, mean over subjects and its {100 * (1 - LEVEL):g} % interval. Bold: they differ by the exact "
+    f"sign-flip test over subjects, Holm over the ablations of a column, {LEVEL:.0%}."
+)
+
+
+def ablation_table(folders: Sequence[Path], method: str, part: Part = WHOLE) -> Table:
+    """Differences of ablations from a method, with the columns of the comparison table.
+
+    Parameters
+    ----------
+    folders : a run with ``method``, then of each ablation a run that has nothing else; they give the rows' names.
+    part : of the frames.
+    """
+    runs = RunSet.read(folders, part)
+    in_first = [record.name for record in runs.runs[0].manifest.methods if not record.trivial]
+    own, ablations = runs.ranked[in_first.index(method)], runs.ranked[len(in_first) :]
+    table = table_of(runs)
+    columns = []
+    for column in table.columns:
+        found = compare(
+            *(runs.rows, [(label, own) for label in ablations]),
+            task=column.task,
+            metric=column.metric,
+            higher_is_better=column.higher_is_better,
+            level=LEVEL,
+        )
+        columns.append([_cell(each, column.digits) for each in found])
+    versions = {row.method: row.version for row in table.rows}
+    rows = tuple(
+        TableRow(folder.name, versions[label], False, cells)
+        for folder, label, cells in zip(folders[1:], ablations, zip(*columns), strict=True)
+    )
+    return replace(table, groups=(("Ablations", rows),), notes=(), marking=MARKING)
+
+
+def _cell(found: PairedComparison, digits: int) -> TableCell:
+    if found.difference is None:
+        return TableCell("missing", None, found.reason)
+    # A digit more than the table: differences are smaller than values.
+    text = f"{found.difference:+.{digits + 1}f}"
+    if found.low is not None and found.high is not None:
+        text += f" ({found.low:+.{digits + 1}f}, {found.high:+.{digits + 1}f})"
+    differs = found.p_holm is not None and found.p_holm <= LEVEL
+    return TableCell("ok", found.difference, text, rank=1 if differs else None)

@@ -1,0 +1,39 @@
+"""Tables of ablations: each cell a difference from the method in the first run."""
+
+import pytest
+
+from headbench.reports.runs import RunSet
+from headbench.reports.statistics.comparisons import PairedComparison
+from headbench.reports.suite.ablations import _cell, ablation_table
+from headbench.reports.table_report import table_of
+
+
+def test_rows_are_ablations_and_cells_their_differences(make_run):
+    both = ("toy_plugin:MIRROR", "toy_plugin:METHOD")
+    whole = make_run("whole", methods=both, settings={"toy": {"level": 0.25}})
+    less = make_run("less", settings={"toy": {"level": 0.5}})
+    table = ablation_table([whole, less], "toy")
+    (row,) = table.rows
+    assert row.method == "less"
+    plain = {line.method: line for line in table_of(RunSet.read([whole, less])).rows}
+    assert "mirror" in plain
+    wanted = [
+        b.value - a.value for a, b in zip(plain["toy (level=0.25)"].cells, plain["toy (level=0.5)"].cells)
+    ]
+    assert [cell.value for cell in row.cells] == pytest.approx(wanted)
+    assert any(wanted)
+    assert [float(cell.text.split()[0]) for cell in row.cells] == pytest.approx(wanted, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("found", "text", "rank"),
+    [
+        ({"difference": -0.25, "low": -0.3, "high": -0.2, "p_holm": 0.02}, "-0.250 (-0.300, -0.200)", 1),
+        ({"difference": 0.25, "low": -0.1, "high": 0.4, "p_holm": 0.2}, "+0.250 (-0.100, +0.400)", None),
+        ({"difference": 0.25, "p_holm": 1.0}, "+0.250", None),
+        ({"reason": "failed on 1 subject"}, "failed on 1 subject", None),
+    ],
+)
+def test_a_cell_has_difference_interval_and_mark(found, text, rank):
+    cell = _cell(PairedComparison("novel_view", "psnr", True, "less", "whole", **found), 2)
+    assert (cell.text, cell.rank) == (text, rank)
