@@ -18,6 +18,8 @@ from ...bench.specs import Findings
 
 MOST_TRACKING_ERROR = 4.0
 """What `headbench synth` takes at most."""
+FRACTIONS = ("1/16", "1/8", "1/4", "1/2", "1")
+LEVELS = (0.0, 1.0, 2.0)
 
 
 @dataclass(frozen=True)
@@ -39,11 +41,12 @@ class CurveSettings(RunOptions):
     over: Literal["budget", "cameras", "timesteps", "tracking_error"] = "budget"
     """What to take parts of; or the error of tracking, of a synthetic capture, whose pictures stay."""
 
-    fractions: tuple[str, ...] = ("1/16", "1/8", "1/4", "1/2", "1")
-    """Parts of the method's budget, or of the training cameras or timesteps, above 0 and at most 1."""
+    fractions: tuple[str, ...] = ()
+    """Parts of the method's budget, or of the training cameras or timesteps, above 0 and at most 1; default: 1/16 1/8 1/4 1/2
+    1."""
 
-    levels: tuple[float, ...] = (0.0, 1.0, 2.0)
-    """Levels of tracking error, as for `headbench synth`."""
+    levels: tuple[float, ...] = ()
+    """Levels for `--over tracking_error`, as for `headbench synth`; default: 0 1 2."""
 
     camera: str = ""
     """Training camera to hold out; default: the one nearest to the mean position of the training cameras."""
@@ -55,10 +58,13 @@ class CurveSettings(RunOptions):
     """Score at most so many frames of each subject in the held-out camera, and as many of the held-out timesteps."""
 
     def __post_init__(self) -> None:
-        if not self.fractions or len(set(self.parts)) != len(self.parts):
-            raise ValueError(f"fractions: each once, one at least; found {' '.join(self.fractions)}")
-        if not self.levels or len(set(self.levels)) != len(self.levels):
-            raise ValueError(f"levels: each once, one at least; found {' '.join(map(str, self.levels))}")
+        unused = "fractions" if self.over == "tracking_error" else "levels"
+        if getattr(self, unused):
+            raise ValueError(f"{unused}: none with --over {self.over}")
+        if len(set(self.parts)) != len(self.parts):
+            raise ValueError(f"fractions: each once; found {' '.join(self.fractions)}")
+        if len(set(self.levels)) != len(self.levels):
+            raise ValueError(f"levels: each once; found {' '.join(map(str, self.levels))}")
         if not all(0 <= level <= MOST_TRACKING_ERROR for level in self.levels):
             expected = f"from 0 to {MOST_TRACKING_ERROR:g}"
             raise ValueError(f"levels: {expected}; found {' '.join(map(str, self.levels))}")
@@ -70,7 +76,12 @@ class CurveSettings(RunOptions):
     @property
     def parts(self) -> tuple[Fraction, ...]:
         """The fractions as numbers, rising. Raises `ValueError` for what is no number above 0 and at most 1."""
-        return tuple(sorted(map(_part, self.fractions)))
+        return tuple(sorted(map(_part, self.fractions or FRACTIONS)))
+
+    @property
+    def tracking_errors(self) -> tuple[float, ...]:
+        """The levels, rising."""
+        return tuple(sorted(self.levels or LEVELS))
 
 
 def _part(text: str) -> Fraction:

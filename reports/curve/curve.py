@@ -195,7 +195,7 @@ def _given(settings: CurveSettings, config: RunConfig, held: Sequence[HeldOutCli
     if settings.over == "budget":
         yield _Given("", Fraction(1), held)
     elif settings.over == "tracking_error":
-        for level, clips in clips_by_level(config, [clip.source for clip in held], settings.levels):
+        for level, clips in clips_by_level(config, [clip.source for clip in held], settings.tracking_errors):
             found = [hold_out(clip, settings.camera, settings.every) for clip in clips]
             yield _Given(f"tracking-{level:g}", Fraction(1), found)
     else:

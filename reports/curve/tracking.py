@@ -36,7 +36,7 @@ def clips_by_level(
     arguments = synthesis_arguments([asdict(step) for step in clips[0].steps], clips[0].subject)
     data = Path(config.data)
     pictures = data if (data / "synthesis.json").is_file() else data.parent  # of one subject's folder, or all
-    for level in sorted(levels):
+    for level in levels:
         capture = Path(config.out) / f"capture-tracking-{level:g}"
         with progress(f"tracking with error {level:g}") as report:
             make(capture, **{**arguments, "tracking_error": level}, pictures=pictures, progress=report)
