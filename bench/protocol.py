@@ -6,7 +6,7 @@ never compared.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Literal
@@ -111,8 +111,22 @@ def make_protocol(task: TaskName, clips: Sequence[Clip], max_frames: int | None 
 def make_protocols(
     tasks: Sequence[TaskName], clips: Sequence[Clip], max_frames: int | None
 ) -> dict[str, Protocol]:
-    """The protocol of each task, see `make_protocol`."""
-    return {task: make_protocol(task, clips, max_frames) for task in tasks}
+    """The protocol of each task that can be done, see `make_protocol`.
+
+    A task that no clip has frames for is left out where another can be done: a video of one camera has no novel view.
+    """
+    done = [task for task in tasks if any(clip.splits.get(task) for clip in clips)] or tasks
+    return {task: make_protocol(task, clips, max_frames) for task in done}
+
+
+def missing_tasks(tasks: Sequence[str], done: Container[str]) -> dict[str, str]:
+    """Why a task that was asked for is not measured, by task: what tables and the run's log say in place of numbers."""
+    reasons = {"novel_view": "the captures hold out no camera, as videos of one camera cannot"}
+    return {
+        task: f"{TASK_TITLES.get(task, task)} is missing: {reasons.get(task, 'the captures hold out no frames for it')}."
+        for task in tasks
+        if task not in done
+    }
 
 
 def make_protocol_without_truth(

@@ -25,6 +25,13 @@ TRACK = (
 )
 
 
+MONOCULAR = (
+    "The reader monocular reads what INSTA's generate.sh makes of Metrical Tracker's output (transforms_train.json, "
+    "flame/exp, meshes, canonical.obj), and IMavatar's flame_params.json: choose it with --reader monocular "
+    "(`headbench run`: --set reader=monocular)."
+)
+
+
 class Foreign(NamedTuple):
     """What was found in place of a capture, and what to do about it."""
 
@@ -42,7 +49,7 @@ def frame_route(frame: Mapping[str, Any]) -> str:
     if "flame_param_path" in frame:
         return ""
     if "mesh_path" in frame or "exp_path" in frame:
-        return f"Frames with meshes and coefficients are INSTA's, which headbench does not read. {TRACK}"
+        return "Frames with meshes and coefficients are INSTA's: with flame/exp beside them the reader monocular reads them."
     return f"It has cameras alone, as the JSONs of nerfstudio and instant-ngp. {TRACK}"
 
 
@@ -132,12 +139,12 @@ def _tracked(path: Path, names: list[str]) -> Foreign | None:
         ),
         (
             "a capture of IMavatar or PointAvatar (flame_params.json)",
-            f"headbench has no reader for it. {TRACK}",
+            MONOCULAR,
             lambda name: name == "flame_params.json" or (path / name / "flame_params.json").is_file(),
         ),
         (
             "a capture of INSTA or its Metrical Tracker",
-            f"headbench has no reader for it. {TRACK}",
+            MONOCULAR,
             lambda name: name in ("canonical.obj", "checkpoint", "meshes"),
         ),
         (

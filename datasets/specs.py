@@ -17,6 +17,13 @@ COLMAP = DatasetSpec(
     find="headbench.datasets.colmap.reader:find_datasets",
 )
 
+MONOCULAR = DatasetSpec(
+    name="monocular",
+    summary="A tracked video of one camera, as INSTA and Metrical Tracker or IMavatar and PointAvatar lay it out.",
+    implementation="headbench.datasets.monocular.reader:read_video",
+    find="headbench.datasets.monocular.reader:find_videos",
+)
+
 SYNTHETIC = DatasetSpec(
     name="synthetic",
     summary="A path-traced procedural head with exact tracking, written in the same layout.",

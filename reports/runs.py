@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 from ..bench.contracts import ByteArray, Clip, FrameKey
 from ..bench.errors import InputError
 from ..bench.manifest import Manifest, MethodRecord
+from ..bench.protocol import missing_tasks
 from ..bench.rows import ALL, Rows
 from ..bench.runner.captures import open_run_clips
 from ..bench.runner.config import RunOptions
@@ -219,6 +220,13 @@ class RunSet:
     def protocol_ids(self) -> dict[str, str]:
         """Readable name of each task's protocol."""
         return {task: protocol.id for run in self.runs for task, protocol in run.manifest.protocols.items()}
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """A sentence for each task that was asked for and that no run could measure."""
+        done = {task for run in self.runs for task in run.tasks}
+        asked = dict.fromkeys(task for run in self.runs for task in run.manifest.configuration.tasks)
+        return tuple(missing_tasks([*asked], done).values())
 
     @property
     def image_size(self) -> str:

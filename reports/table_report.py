@@ -214,6 +214,7 @@ def table_of(runs: RunSet, layout: str = COMPARISON, published: bool = False) ->
         image_size=runs.image_size,
         machine=runs.machine,
         part=runs.part if tasks else "",
+        missing=runs.missing if tasks else (),
         avatar_title=TITLES.get(layout, AVATAR_TITLE),
     )
     if published:

@@ -87,7 +87,7 @@ class TaskSummary:
 @dataclass(frozen=True)
 class Table:
     """A comparison, ready to be written in any format. ``marking`` says what the ranks mean, and by which test,
-    ``part`` which part of the frames the values are of, "" for all."""
+    ``part`` which part of the frames the values are of, "" for all, ``missing`` why a task has no columns."""
 
     columns: tuple[Column, ...]
     groups: tuple[tuple[str, tuple[TableRow, ...]], ...]  # (title, rows); empty groups are left out
@@ -98,6 +98,7 @@ class Table:
     image_size: str = ""
     machine: str = ""
     part: str = ""
+    missing: tuple[str, ...] = ()
 
     @property
     def rows(self) -> tuple[TableRow, ...]:
@@ -117,7 +118,7 @@ class Table:
             size = f"{counted(task.frames, 'frame')}, {counted(task.subjects, 'subject')}"
             name = f"{task.protocol_id} " if task.protocol_id else ""
             parts.append(f"{task.title}: {size}, protocol {name}({task.protocol_hash}).")
-        parts += [self.part] if self.part else []
+        parts += [*self.missing, *([self.part] if self.part else [])]
         if self.image_size:
             parts.append(f"Images of {self.image_size} pixels.")
         spread = f"mean of {self.seeds} seeds ± its standard deviation from seed to seed"
@@ -149,6 +150,7 @@ def build_table(
     image_size: str = "",
     machine: str = "",
     part: str = "",
+    missing: Sequence[str] = (),
     avatar_title: str = AVATAR_TITLE,
 ) -> Table:
     """Build the comparison table of whole images.
@@ -161,7 +163,8 @@ def build_table(
     metrics : columns of the table, in order; those per frame appear once in each task, the others last.
     methods : in order; one without rows is shown as not measured.
     trivial : those of ``methods`` that are trivial baselines: listed apart, not ranked.
-    protocol_ids : readable name of each task's protocol, for the caption, like ``image_size``, ``machine`` and ``part``.
+    protocol_ids : readable name of each task's protocol, for the caption, like ``image_size``, ``machine``, ``part`` and the
+        sentences of ``missing``.
     avatar_title : heading of the columns that are of no task.
 
     Raises
@@ -199,6 +202,7 @@ def build_table(
         image_size=image_size,
         machine=machine,
         part=part,
+        missing=tuple(missing),
     )
 
 

@@ -19,7 +19,7 @@ from ..io.lock import locked
 from ..machine import check_device, machine_record, peak_memory_bytes
 from ..manifest import AdaptedRecord, ClipRecord, Manifest, MethodRecord, ProtocolRecord
 from ..progress import duration, run_progress
-from ..protocol import Protocol, make_protocols
+from ..protocol import Protocol, make_protocols, missing_tasks
 from ..registry import discover, resolve
 from ..rows import Rows
 from ..specs import MetricSpec
@@ -73,6 +73,8 @@ def _run(
     )
     manifest = replace(describe(config, methods, metrics, clips, protocols), adapted=forms, **record)
     manifest.write(folder.manifest)
+    for reason in missing_tasks(config.tasks, protocols).values():
+        log.warning("%s", reason)
     for protocol in protocols.values():
         log.info("%s, protocol %s: %d frames", protocol.task, protocol.hash, len(protocol.keys))
     rows = run_jobs(jobs, metrics)

@@ -20,7 +20,7 @@ from ...bench.errors import InputError
 from ...bench.io.files import check_name, digest
 from ...bench.io.images import ImageInfo
 from ..clip import CaptureClip, FrameFiles
-from ..foreign import describe
+from ..foreign import MONOCULAR, describe
 from ..head.arrays import HeadArrays
 from ..images import ImageStore
 from ..steps.exclude import exclude_given, exclude_timesteps
@@ -171,6 +171,10 @@ def find_captures(root: Path) -> list[Path]:
     if not root.exists():
         raise InputError(root, "", expected, "no such folder")
     if any((root / file).exists() for file in (*layout.SPLIT_FILES.values(), layout.ALL_FRAMES_FILE)):
+        if (root / "flame" / "exp").is_dir() and not (root / "flame_param").is_dir():
+            raise InputError(
+                root, "", expected, "a capture of INSTA, whose JSONs have the same names", MONOCULAR
+            )
         return [root]
     captures = sorted(path.parent for path in root.glob(f"UNION*/{layout.SPLIT_FILES['train']}"))
     if not captures:

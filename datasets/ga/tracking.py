@@ -129,7 +129,7 @@ def read_tracking(
     static_offset = np.zeros((len(head.template), 3), dtype=np.float32)
     if static is not None:
         static_offset[:rows] = static[:rows]
-    _check_motion(files, head, shape, static_offset, poses)
+    check_motion(files, head, shape, static_offset, poses)
     notes = {
         "static_offset": "zeros, as the files have none" if static is None else f"{len(static)} rows",
         "teeth": len(head.regions.get("teeth", ())),
@@ -167,7 +167,7 @@ def read_animation(
     static_offset = np.zeros((len(head.template), 3), dtype=np.float32)
     if static is not None:
         static_offset[:rows] = static[:rows]
-    _check_motion(dict.fromkeys(poses, path), head, identity, static_offset, poses)
+    check_motion(dict.fromkeys(poses, path), head, identity, static_offset, poses)
     dynamic = _array(path, arrays, "dynamic_offset") if "dynamic_offset" in arrays else None
     return Tracking(head, poses, identity, static_offset, {"dynamic_offset_ignored_m": _largest(dynamic)})
 
@@ -198,7 +198,7 @@ def resolve_teeth(
     raise InputError(file, "static_offset", expected, found, remedy)
 
 
-def _check_motion(
+def check_motion(
     files: Mapping[int, Path],
     head: HeadArrays,
     shape: FloatArray,

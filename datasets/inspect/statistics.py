@@ -34,7 +34,7 @@ class SequenceRow:
 
     Attributes
     ----------
-    held_out : whether it is the test of self-reenactment.
+    held_out : whether its timesteps are tests of self-reenactment.
     jaw_deg : least, median and largest opening of the jaw, degrees.
     head_deg : largest turn of the head away from its mean direction, degrees.
     head_mm : largest distance of the head from its mean place, millimetres.
@@ -101,18 +101,21 @@ def split_rows(clip: CaptureClip) -> list[SplitRow]:
 
 
 def sequence_rows(clip: CaptureClip) -> list[SequenceRow]:
-    """One row per sequence, in the order of timesteps."""
-    held_out = {key.sequence for key in clip.splits.get("self_reenactment", ())}
+    """One row per sequence, in the order of timesteps; two where its end is held out, as of a video of one camera."""
+    held_out = {key.timestep for key in clip.splits.get("self_reenactment", ())}
     excluded = {key.timestep for key in clip.excluded}
     groups: dict[str, set[int]] = {}
     for key in clip.files:
         groups.setdefault(key.sequence, set()).add(key.timestep)
     rows = []
     for sequence, timesteps in sorted(groups.items(), key=lambda item: min(item[1])):
-        kept = sorted(timesteps - excluded)
-        if kept:
-            poses = [clip.poses[t] for t in kept]
-            rows.append(_row(clip, sequence, sequence in held_out, poses, len(timesteps) - len(kept)))
+        kept = timesteps - excluded
+        left_out = len(timesteps) - len(kept)
+        for tested, part in ((False, kept - held_out), (True, kept & held_out)):
+            if part:
+                poses = [clip.poses[t] for t in sorted(part)]
+                rows.append(_row(clip, sequence, tested, poses, left_out))
+                left_out = 0
     return rows
 
 

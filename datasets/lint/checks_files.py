@@ -216,12 +216,14 @@ def _short_test(evidence: Evidence) -> Iterator[Hit]:
 @rule("HB111", "warning")
 def _empty_split(evidence: Evidence) -> Iterator[Hit]:
     # A file that does not read, or whose frames do not, is another fault.
-    """A split is empty.
+    """A split is empty. A video of one camera has no novel views to hold out.
 
     Hold out a camera for novel views and a sequence for self-reenactment.
     """
+    cameras = {entry.camera_id for part in evidence.splits.values() for entry in part}
+    needed = [name for name in layout.SPLIT_FILES if name != "novel_view" or len(cameras) > 1]
     faulty = {error.file for error in (*evidence.json_faults, *evidence.frame_faults)}
-    files = {name: evidence.split_file(name) for name in layout.SPLIT_FILES}
+    files = {name: evidence.split_file(name) for name in needed}
     empty = [
         name for name, path in files.items() if not evidence.splits.get(name) and str(path) not in faulty
     ]

@@ -6,7 +6,12 @@ import pytest
 from headbench.bench.contracts import FrameKey
 from headbench.bench.errors import InputError
 from headbench.bench.io.files import digest
-from headbench.bench.protocol import make_protocol, make_protocol_without_truth
+from headbench.bench.protocol import (
+    make_protocol,
+    make_protocol_without_truth,
+    make_protocols,
+    missing_tasks,
+)
 
 SIZE = (8, 6)
 
@@ -67,6 +72,19 @@ def test_a_task_without_frames_is_refused(clip):
     clip.splits["novel_view"] = ()
     with pytest.raises(InputError, match="at least one frame"):
         make_protocol("novel_view", [clip])
+
+
+def test_a_task_that_no_clip_can_do_is_left_out_and_named(toy, clip, tmp_path):
+    tasks = ("novel_view", "self_reenactment")
+    assert [*make_protocols(tasks, [clip], None)] == [*tasks]
+    assert missing_tasks(tasks, tasks) == {}
+    other = toy.ToyClip(tmp_path / "subject2")
+    other.splits["novel_view"] = ()
+    assert [*make_protocols(tasks, [other], None)] == ["self_reenactment"]
+    assert "one camera" in missing_tasks(tasks, ["self_reenactment"])["novel_view"]
+    for clips, asked in (([clip, other], tasks), ([other], ("novel_view",))):
+        with pytest.raises(InputError, match="at least one frame"):
+            make_protocols(asked, clips, None)
 
 
 def test_clips_on_different_backgrounds_are_not_one_comparison(toy, clip, tmp_path):

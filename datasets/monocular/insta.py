@@ -1,0 +1,275 @@
+"""Read the folders that INSTA trains on, made of Metrical Tracker's output by INSTA's ``generate.sh``::
+
+    transforms_train.json, transforms_test.json (or transforms.json alone), transforms_val.json
+    images/00012.png            straight alpha; without, matted/00012.png has it
+    flame/exp/00012.txt         expression, one number a line
+    flame/jaw, flame/eyes       6D rotations, one and two; only older versions of the script write them
+    meshes/00012.obj            FLAME's vertices, its faces simplified
+    canonical.obj               the subject's head without expression, its jaw open by 12 degrees
+    depth, seg_mask             not used
+
+``transform_matrix`` is camera-to-world with OpenCV's axes, in metres; unlike in GaussianAvatars' JSONs of the same names
+no axis is flipped. The world is FLAME's own, in which root and neck rest. Identity is in no parameter file: it
+follows from ``canonical.obj``, and what else is missing from the meshes (see `mesh_fit`). The tracker's eyelids are
+in the meshes alone and taken from there where the head model has a basis for them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from ...bench.contracts import Camera, FloatArray, HeadPose, Progress
+from ...bench.errors import InputError
+from ...bench.io.arrays import MAX_MAGNITUDE, check_numbers
+from ...bench.io.documents import checked, read_json
+from ...bench.io.files import read_bytes
+from ...bench.io.images import probe_image
+from ..ga.layout import ALL_FRAMES_FILE, SPLIT_FILES
+from ..ga.transforms import read_rigid
+from ..head.arrays import HeadArrays
+from ..head.model import HeadModel
+from .mesh_fit import MeshFit, check_distance, read_vertices, spread
+from .track import Track, VideoFrame, coefficients, frame_number, ordered
+
+EXPRESSIONS, CANONICAL = "flame/exp", "canonical.obj"
+VIDEO = "video"
+"""Name of the one sequence."""
+CHECKED_MESHES = 5
+"""Of a video whose parameters are all in files: meshes that are compared with them."""
+MAX_TEXT = 2**16
+
+
+@dataclass(frozen=True)
+class _Intrinsics:
+    fl_x: float | None = None
+    fl_y: float | None = None
+    cx: float | None = None
+    cy: float | None = None
+    camera_angle_x: float | None = None
+    w: float | None = None
+    h: float | None = None
+
+
+@dataclass(frozen=True)
+class _Frame(_Intrinsics):
+    file_path: str = ""
+    mesh_path: str = ""
+    exp_path: str = ""
+    timestep_index: int | None = None
+    transform_matrix: Any = None
+
+
+@dataclass(frozen=True)
+class _Document(_Intrinsics):
+    frames: tuple[_Frame, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class _Source:
+    """A frame's files, and what the JSON says of it."""
+
+    where: tuple[Path, str]
+    number: int
+    image: Path
+    mask: Path
+    camera: Camera
+    expression: Path
+    mesh: Path
+
+
+def is_insta(root: Path) -> bool:
+    """Whether a folder looks like one: coefficients as text, and frames."""
+    return (root / EXPRESSIONS).is_dir() and any((root / file).is_file() for file in _files())
+
+
+def read_insta(root: Path, head: HeadArrays, progress: Progress) -> Track:
+    """Read a folder. Raises `InputError` for what is missing or does not fit the head model."""
+    held_out: frozenset[tuple[str, int]] | None = None
+    documents = [root / file for file in (SPLIT_FILES["train"], SPLIT_FILES["self_reenactment"])]
+    if not all(document.is_file() for document in documents):
+        documents = [root / ALL_FRAMES_FILE]
+    parts = [_read_document(root, document) for document in documents]
+    if len(parts) == 2:
+        held_out = frozenset((VIDEO, source.number) for source in parts[1])
+        shared = held_out & {(VIDEO, source.number) for source in parts[0]}
+        if shared:
+            found = f"{len(shared)} frames of {documents[0].name} again, such as {min(shared)[1]}"
+            raise InputError(documents[1], "frames", "frames that are not trained on", found)
+    sources = sorted((source for part in parts for source in part), key=lambda source: source.number)
+    fit = MeshFit(head)
+    canonical = root / CANONICAL
+    identity = fit.fit_identity(read_vertices(canonical, len(head.template)))
+    check_distance(canonical, identity.distance, head.version)
+    meshes = _Meshes(root, head, fit, identity.shape, sources)
+    frames = []
+    for done, source in enumerate(sources, start=1):
+        camera, pose = source.camera, meshes.pose(source)
+        frames.append(VideoFrame(source.where, VIDEO, source.number, source.image, source.mask, camera, pose))
+        progress(done, len(sources), "reading tracked parameters")
+    notes = {
+        "layout": "insta",
+        "shape_from": CANONICAL,
+        "canonical_jaw": identity.turns[:3].round(4).tolist(),
+        "canonical_distance_mm": 1e3 * identity.distance,
+        **meshes.notes(),
+    }
+    files = frozenset([*documents, canonical, *meshes.files])
+    return Track(ordered(root, frames), identity.shape, held_out, files, notes)
+
+
+def _files() -> tuple[str, ...]:
+    return (SPLIT_FILES["train"], ALL_FRAMES_FILE)
+
+
+def _read_document(root: Path, path: Path) -> list[_Source]:
+    document = checked(read_json(path), _Document, path, foreign=True)
+    return [_source(root, path, f"frames[{i}]", frame, document) for i, frame in enumerate(document.frames)]
+
+
+def _source(root: Path, path: Path, where: str, frame: _Frame, document: _Document) -> _Source:
+    if frame.timestep_index is not None:
+        raise InputError(
+            path,
+            f"{where}.timestep_index",
+            "a frame of INSTA's, which has none",
+            "VHAP's export of meshes",
+            "Its meshes hold no jaw or eye rotation: export the tracking again with --flame-mode param.",
+        )
+    if not frame.file_path:
+        raise InputError(path, f"{where}.file_path", "the file of an image", "none")
+    image = root / frame.file_path
+    image = image if image.suffix else image.with_suffix(".png")
+    number = frame_number(path, f"{where}.file_path", image.stem)
+    info = probe_image(image)
+    mask = image
+    if not info.has_alpha:
+        mask = root / "matted" / f"{image.stem}.png"
+        if not mask.is_file() or not probe_image(mask).has_alpha:
+            expected = f"an alpha channel, or matted/{mask.name} with one"
+            raise InputError(image, "", expected, "colours alone", "Run INSTA's generate.sh to the end.")
+        other = probe_image(mask)
+        if (other.width, other.height) != (info.width, info.height):
+            raise InputError(mask, "", f"{info.width}x{info.height} pixels", f"{other.width}x{other.height}")
+    world_to_camera = np.linalg.inv(read_rigid(path, f"{where}.transform_matrix", frame.transform_matrix))
+    K = _intrinsics(path, where, frame, document, info.width, info.height)
+    camera = Camera("0", info.width, info.height, K, world_to_camera)
+    expression = root / (frame.exp_path or f"{EXPRESSIONS}/{image.stem}.txt")
+    mesh = root / (frame.mesh_path or f"meshes/{image.stem}.obj")
+    return _Source((path, where), number, image, mask, camera, expression, mesh)
+
+
+def _intrinsics(
+    path: Path, where: str, frame: _Frame, document: _Document, width: int, height: int
+) -> FloatArray:
+    """(3, 3) K; an entry of the frame goes before the document's."""
+    given = {
+        name: own if own is not None else getattr(document, name)
+        for name, own in ((name, getattr(frame, name)) for name in _Intrinsics.__dataclass_fields__)
+    }
+    for name, size in (("w", width), ("h", height)):
+        if given[name] not in (None, size):
+            remedy = "Intrinsics in pixels belong to images of the size that was tracked."
+            raise InputError(path, f"{where}.{name}", f"{size}, as the image", f"{given[name]:g}", remedy)
+    focal, angle = given["fl_x"], given["camera_angle_x"]
+    if focal is None and angle is not None and 0 < angle < np.pi:
+        focal = width / (2 * np.tan(angle / 2))
+    if focal is None or focal <= 0:
+        raise InputError(path, f"{where}.fl_x", "a positive focal length in pixels", f"{focal}")
+    second = focal if given["fl_y"] is None else given["fl_y"]
+    if second <= 0:
+        raise InputError(path, f"{where}.fl_y", "a positive focal length in pixels", f"{second:g}")
+    cx = width / 2 if given["cx"] is None else given["cx"]
+    cy = height / 2 if given["cy"] is None else given["cy"]
+    return np.array([[focal, 0.0, cx], [0.0, second, cy], [0.0, 0.0, 1.0]])
+
+
+class _Meshes:
+    """Poses of frames, from text files where they are there and from meshes where not."""
+
+    def __init__(
+        self, root: Path, head: HeadArrays, fit: MeshFit, shape: FloatArray, sources: list[_Source]
+    ) -> None:
+        self._root, self._head, self._fit = root, head, fit
+        with torch.no_grad():
+            model = HeadModel(head, dtype=torch.float64)
+            self._neutral = model.canonical(torch.from_numpy(shape))[0].numpy()
+        self._expressions = np.asarray(head.expression_basis, np.float64)
+        few = spread(CHECKED_MESHES, len(sources))
+        self._compared = {sources[i].number for i in few}
+        self._farthest, self._fitted, self._read = 0.0, 0, 0
+        self.files: set[Path] = set()
+
+    def pose(self, source: _Source) -> HeadPose:
+        """Pose of a frame in FLAME's own world."""
+        head, stem = self._head, source.expression.stem
+        expression = coefficients(
+            source.expression, "", self._numbers(source.expression), head.expression_basis.shape[2]
+        )
+        jaw = self._rotations(self._root / "flame/jaw" / f"{stem}.txt", 1)
+        eyes = self._rotations(self._root / "flame/eyes" / f"{stem}.txt", 2)
+        known: FloatArray | None = None if jaw is None or eyes is None else np.concatenate([jaw, eyes])
+        lids: FloatArray | None = None
+        if known is None or head.eyelid_basis is not None or source.number in self._compared:
+            if known is not None and not source.mesh.is_file():
+                lids = None if head.eyelid_basis is None else np.zeros(2)
+            else:
+                mesh = read_vertices(source.mesh, len(head.template))
+                self.files.add(source.mesh)
+                found = self._fit.fit_pose(mesh, self._neutral + self._expressions @ expression, known)
+                check_distance(source.mesh, found.distance, head.version)
+                self._farthest, self._read = max(self._farthest, found.distance), self._read + 1
+                self._fitted += known is None
+                known = found.turns
+                lids = found.lids if len(found.lids) else None
+        assert known is not None, "fitted where it was not given"
+        rest = np.zeros(3)
+        return HeadPose(head.version, expression, rest, rest, known[:3], known[3:], rest, lids)
+
+    def notes(self) -> dict[str, Any]:
+        """How poses were had."""
+        return {
+            "jaw_and_eyes_from_meshes": self._fitted,
+            "meshes_compared": self._read,
+            "mesh_distance_mm": 1e3 * self._farthest,
+            "eyelids": "the head model has no basis" if self._head.eyelid_basis is None else "from meshes",
+        }
+
+    def _rotations(self, path: Path, count: int) -> FloatArray | None:
+        """Axis-angle vectors, one behind the other, of 6D rotations or axis-angle in a file; None where there is none."""
+        if not path.is_file():
+            return None
+        values = self._numbers(path)
+        if len(values) == 3 * count:
+            return values
+        if len(values) != 6 * count:
+            expected = f"{6 * count} numbers (6D rotations) or {3 * count} (axis-angle)"
+            raise InputError(path, "", expected, f"{len(values)}")
+        return rotations_of_6d(path, values.reshape(count, 6)).ravel()
+
+    def _numbers(self, path: Path) -> FloatArray:
+        text = read_bytes(path, "a text file of numbers", MAX_TEXT)
+        try:
+            values = np.array(text.split(), dtype=bytes).astype(np.float64)
+        except ValueError as error:
+            raise InputError(path, "", "numbers, one a line", "other text") from error
+        check_numbers(path, "", values, MAX_MAGNITUDE)
+        self.files.add(path)
+        return values
+
+
+def rotations_of_6d(path: Path, rows: FloatArray) -> FloatArray:
+    """(N, 3) axis-angle of (N, 6) rotations that are the first two rows of a matrix, made orthonormal in order."""
+    first, second = rows[:, :3], rows[:, 3:]
+    normal = np.cross(first, second)
+    if np.linalg.norm(normal, axis=1).min() < 1e-6:
+        raise InputError(path, "", "6D rotations: two vectors of different directions", "none")
+    first = first / np.linalg.norm(first, axis=1, keepdims=True)
+    third = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+    matrices = np.stack([first, np.cross(third, first), third], axis=1)
+    return Rotation.from_matrix(matrices).as_rotvec()

@@ -1,0 +1,155 @@
+"""What the layouts of tracked videos have in common once they are read: frames with a camera and a pose each.
+
+In these layouts the head stands still, or nearly so, and every frame has a camera of its own. A clip has one camera,
+and the head moves before it: `fix_camera` turns the one into the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from ...bench.contracts import Camera, FloatArray, HeadPose
+from ...bench.errors import InputError
+from ..head.arrays import HeadArrays
+from ..head.model import HeadModel
+
+SAME_INTRINSICS = 1e-3
+"""Largest difference of intrinsics that are one camera's, pixels."""
+
+
+@dataclass(frozen=True, eq=False)
+class VideoFrame:
+    """One frame as its layout has it, in this project's units and axes.
+
+    Attributes
+    ----------
+    where : file and entry, for messages.
+    sequence, number : the video's name, and the frame's number in its file's name.
+    image, mask : files; the mask is the image itself where that has straight alpha.
+    camera : of this frame alone.
+    pose : in the world that ``camera`` maps from; its timestep is not set yet.
+    """
+
+    where: tuple[Path, str]
+    sequence: str
+    number: int
+    image: Path
+    mask: Path
+    camera: Camera
+    pose: HeadPose
+
+    @property
+    def name(self) -> tuple[str, int]:
+        """What frames are sorted and told apart by."""
+        return self.sequence, self.number
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """A tracked video, or several of one subject.
+
+    Attributes
+    ----------
+    frames : sorted by `VideoFrame.name`, each once.
+    shape : (S,) identity coefficients of the head model.
+    hard_masks : masks are cut at one half, as the layout's own loader does.
+    held_out : names of the frames that the layout itself holds out; None where it says nothing.
+    files : all that was read, images aside.
+    notes : what the layout leaves open, and how it was settled.
+    """
+
+    frames: Sequence[VideoFrame]
+    shape: FloatArray
+    held_out: frozenset[tuple[str, int]] | None
+    files: frozenset[Path]
+    notes: Mapping[str, Any] = field(default_factory=dict)
+    hard_masks: bool = False
+
+
+def ordered(root: Path, frames: Sequence[VideoFrame]) -> list[VideoFrame]:
+    """Frames by name. Raises `InputError` for none, and for two of one name."""
+    if not frames:
+        raise InputError(root, "frames", "at least one frame", "none")
+    found: dict[tuple[str, int], VideoFrame] = {}
+    for frame in frames:
+        other = found.setdefault(frame.name, frame)
+        if other is not frame:
+            file, entry = frame.where
+            expected = "every frame once"
+            raise InputError(
+                file, entry, expected, f"frame {frame.number} again, which is {other.where[1]} too"
+            )
+    return [found[name] for name in sorted(found)]
+
+
+def frame_number(file: Path, entry: str, stem: str) -> int:
+    """Number that a frame's files are named by. Raises `InputError` for a name that is none."""
+    if not (stem.isascii() and stem.isdecimal() and len(stem) < 10):
+        raise InputError(file, entry, "files named by the frame's number, such as 00012", repr(stem)[:60])
+    return int(stem)
+
+
+def fix_camera(
+    frames: Sequence[VideoFrame], head: HeadArrays, shape: FloatArray, subject: str
+) -> tuple[Camera, dict[int, HeadPose]]:
+    """One camera, that of the first frame, and by index the poses that show in it what each frame's own camera shows.
+
+    With W the camera of a frame and W0 the first, the head moves by M = W0^-1 W: its global rotation becomes R_M R, and
+    since that turns about joint 0 at J (which moves with the expression) its translation R_M (J + t) + t_M - J.
+
+    Raises `InputError` where frames differ in image size or intrinsics.
+    """
+    first = frames[0].camera
+    for frame in frames:
+        camera = frame.camera
+        off = float(np.abs(camera.K - first.K).max())
+        if (camera.width, camera.height) != (first.width, first.height):
+            expected = f"{first.width}x{first.height} pixels, as the first image of the video"
+            raise InputError(frame.image, "", expected, f"{camera.width}x{camera.height}")
+        if off > SAME_INTRINSICS:
+            file, entry = frame.where
+            expected = "the intrinsics of the first frame, as one camera has"
+            raise InputError(file, entry, expected, f"others, by {off:g} pixels")
+    model = HeadModel(head, dtype=torch.float64)
+    expressions = torch.from_numpy(np.stack([frame.pose.expression for frame in frames]))
+    with torch.no_grad():
+        roots = model.joints(torch.from_numpy(np.asarray(shape, np.float64)), expressions)[:, 0].numpy()
+    back = np.linalg.inv(first.world_to_camera)
+    poses = {}
+    for index, (frame, root) in enumerate(zip(frames, roots)):
+        motion = back @ frame.camera.world_to_camera if index else np.eye(4)
+        turn = Rotation.from_matrix(motion[:3, :3])
+        own = frame.pose
+        poses[index] = HeadPose(
+            head_model=own.head_model,
+            expression=own.expression,
+            rotation=(turn * Rotation.from_rotvec(own.rotation)).as_rotvec(),
+            neck=own.neck,
+            jaw=own.jaw,
+            eyes=own.eyes,
+            translation=turn.apply(root + own.translation) + motion[:3, 3] - root,
+            eyelids=own.eyelids,
+            subject=subject,
+            timestep=index,
+        )
+    return first, poses
+
+
+def coefficients(file: Path, entry: str, values: FloatArray, size: int) -> FloatArray:
+    """Coefficients as a vector of ``size``: padded with zeros, and cut where what is cut is zero.
+
+    Raises `InputError` where the head model lacks a direction that is used.
+    """
+    if np.any(values[size:]):
+        expected = f"at most {size} coefficients, which the head model has, or zeros behind them"
+        remedy = "Give the head model the video was tracked with."
+        raise InputError(file, entry, expected, f"{len(values)}", remedy)
+    kept = values[:size]
+    return np.pad(kept, (0, size - len(kept)))

@@ -1,0 +1,332 @@
+"""Videos written in the layouts of INSTA and IMavatar show what the capture they are made of shows."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from headbench.bench.conformance.readers import check_clip
+from headbench.bench.contracts import no_progress
+from headbench.bench.errors import InputError
+from headbench.bench.protocol import make_protocols
+from headbench.datasets.ga.reader import read_capture
+from headbench.datasets.head.arrays import save_head
+from headbench.datasets.head.subject import PosedSubject
+from headbench.datasets.monocular.reader import CONVENTION, _last, find_videos, read_video
+from headbench.datasets.open import find_reader, open_clip
+
+from ..head.toy import toy_head
+from ..tiny_capture import FRONTAL, make_plan, rig, write_tiny_capture
+from .videos import HEAD_FILE, Recording, write_imavatar, write_insta
+
+KINDS = ["insta", "insta, meshes", "insta, eyelids", "imavatar"]
+
+
+def recording_of(folder, **changes):
+    """A capture whose necks rest, and one of its cameras."""
+    plan = make_plan(
+        cameras=rig()[:2], lengths={"FREE": 4, "EMO-1-shout+laugh": 4, "SEN-01-port": 4}, **changes
+    )
+    sequences = [
+        replace(
+            sequence,
+            poses=[replace(pose, neck=np.zeros(3, np.float32)) for pose in sequence.poses],
+            excluded={},
+        )
+        for sequence in plan.sequences
+    ]
+    still = replace(plan, sequences=sequences, static_offset=np.zeros_like(plan.static_offset))
+    # The files' meshes have no teeth, which readers add to FLAME's.
+    return Recording(read_capture(write_tiny_capture(folder, still).union), FRONTAL, plan.head)
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory):
+    made = {}
+    for lids in (False, True):
+        head = toy_head(16, eyelids=lids)
+        made[lids] = recording_of(tmp_path_factory.mktemp("capture"), head=head)
+    return made
+
+
+@pytest.fixture(scope="module")
+def written(recordings, tmp_path_factory):
+    root = tmp_path_factory.mktemp("videos")
+    write_insta(recordings[False], root / "insta", test=3)
+    write_insta(recordings[False], root / "insta, meshes", parameters=("exp",))
+    write_insta(recordings[True], root / "insta, eyelids")
+    write_imavatar(recordings[False], root / "imavatar" / "imavatar", ["MVI_1810", "MVI_1812"])
+    return root
+
+
+def folder_of(written, kind):
+    return find_videos(written / kind)[0]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_video_shows_what_its_capture_shows(recordings, written, kind):
+    recording = recordings["eyelids" in kind]
+    clip = open_clip(folder_of(written, kind))
+    assert clip.steps[0].name == "read_video"
+    (camera,) = clip.cameras.values()
+    np.testing.assert_allclose(camera.K, recording.camera.K, atol=1e-9)
+    np.testing.assert_allclose(clip.shape, recording.clip.shape, atol=1e-4)
+    keys = sorted((key for part in clip.splits.values() for key in part), key=lambda key: key.timestep)
+    assert [key.timestep for key in keys] == [*range(12)]
+    for key, source in zip(keys, recording.keys):
+        found, truth = clip.poses[key.timestep], recording.pose(source)
+        for name in ("expression", "jaw", "eyes"):
+            np.testing.assert_allclose(getattr(found, name), getattr(truth, name), atol=1e-4, err_msg=name)
+        if "eyelids" in kind:
+            np.testing.assert_allclose(found.eyelids, truth.eyelids, atol=1e-4)
+        np.testing.assert_allclose(
+            seen(clip, camera, found), seen(recording.clip, recording.camera, truth), atol=1e-6
+        )
+        np.testing.assert_array_equal(clip.mask(key), recording.clip.mask(source))
+        difference = clip.image(key).astype(int) - recording.clip.image(source)
+        assert np.abs(difference).max() <= 1
+    assert check_clip(clip) == []
+
+
+def seen(clip, camera, pose):
+    """(V, 3) vertices before the camera, metres."""
+    vertices = PosedSubject(clip.head, clip.shape, clip.static_offset).meshes([pose])[0]
+    return vertices @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+
+
+def test_one_camera_serves_all_and_is_that_of_the_first_frame(written):
+    clip = open_clip(folder_of(written, "insta"))
+    assert list(clip.cameras) == ["0"]
+    first = clip.poses[0]
+    assert not np.any([first.rotation, first.translation])
+    assert any(np.any(pose.rotation) for pose in clip.poses.values())
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings", "held_out", "said"),
+    [
+        ("insta", {}, 3, "as the folder's own split"),
+        ("insta", {"held_out_frames": 5}, 5, "as asked for"),
+        ("insta, meshes", {}, 3, "a quarter: fewer than the 350"),
+        ("imavatar", {"held_out_sequences": ["MVI_1812"]}, 6, "videos MVI_1812"),
+    ],
+)
+def test_the_last_frames_by_name_are_held_out(written, kind, settings, held_out, said):
+    clip = open_clip(folder_of(written, kind), settings=settings)
+    assert clip.timesteps("self_reenactment") == [*range(12 - held_out, 12)]
+    assert clip.timesteps("train") == [*range(12 - held_out)]
+    assert clip.splits["novel_view"] == ()
+    assert said in clip.steps[0].parameters["held_out"]
+    assert "one camera" in clip.steps[0].parameters["novel_view"]
+
+
+@pytest.mark.parametrize(("frames", "held_out"), [(4000, CONVENTION), (700, CONVENTION), (699, 174), (8, 2)])
+def test_the_convention_is_350_frames_of_at_least_700(frames, held_out):
+    assert _last(frames, None)[0] == held_out
+
+
+def test_the_order_of_the_json_means_nothing(written, tmp_path):
+    folder = tmp_path / "shuffled"
+    shutil.copytree(folder_of(written, "insta, meshes"), folder)
+    edit(folder / "transforms.json", lambda document: document["frames"].reverse())
+    one, other = open_clip(folder), open_clip(folder_of(written, "insta, meshes"))
+    assert one.splits["train"] == tuple(key._replace(subject="shuffled") for key in other.splits["train"])
+    np.testing.assert_array_equal(one.poses[7].rotation, other.poses[7].rotation)
+
+
+def test_images_without_alpha_are_composited_by_matted(written, tmp_path):
+    folder = tmp_path / "raw"
+    shutil.copytree(folder_of(written, "insta"), folder)
+    truth = open_clip(folder_of(written, "insta"))
+    (folder / "matted").mkdir()
+    for image in sorted((folder / "images").iterdir()):
+        shutil.copy(image, folder / "matted" / image.name)
+        pixels = cv2.imread(str(image), cv2.IMREAD_UNCHANGED)
+        pixels[pixels[..., 3] == 0] = [30, 60, 90, 0]
+        cv2.imwrite(str(image), pixels[..., :3])
+    clip = open_clip(folder)
+    for key in truth.splits["train"]:
+        np.testing.assert_array_equal(clip.image(key._replace(subject="raw")), truth.image(key))
+
+
+def test_each_reader_takes_its_own_folders(written, pristine_capture):
+    assert find_reader(folder_of(written, "insta")).name == "monocular"
+    assert find_reader(written / "imavatar").name == "monocular"
+    assert find_reader(pristine_capture.union).name == "ga"
+    assert find_videos(written)[:3] == [written / name for name in sorted(KINDS)[1:]]
+    with pytest.raises(InputError, match="choose it with --reader monocular"):
+        read_capture(folder_of(written, "insta"))
+
+
+def edit(path, change):
+    document = json.loads(path.read_text())
+    change(document)
+    path.write_text(json.dumps(document))
+
+
+def each(document, **entries):
+    for frame in document["frames"]:
+        frame.update(entries)
+
+
+def of_first(name, value):
+    return lambda document: document["frames"][0].update({name: value})
+
+
+INSTA_FAULTS = {
+    "two frames of one name": (of_first("file_path", "images/00002.png"), "every frame once"),
+    "no number": (of_first("file_path", "images/first.png"), "named by the frame's number"),
+    "no image": (of_first("file_path", "images/00099.png"), "00099.png"),
+    "no matrix": (of_first("transform_matrix", None), "transform_matrix"),
+    "scaled": (of_first("transform_matrix", (2 * np.eye(4)).tolist()), "rigid"),
+    "a focal length of its own": (of_first("fl_x", 99.0), "intrinsics of the first frame"),
+    "another size": (lambda document: document.update(w=512.0), "expected 48"),
+    "text": (lambda document: document.update(fl_x="far"), "fl_x"),
+    "negative": (lambda document: document.update(fl_x=-1.0), "positive focal length"),
+    "VHAP's meshes": (lambda document: each(document, timestep_index=0), "--flame-mode param"),
+    "no frames": (lambda document: document.update(frames=[]), "at least one frame"),
+}
+
+
+@pytest.mark.parametrize("fault", INSTA_FAULTS)
+def test_faults_of_insta_are_named(written, tmp_path, fault):
+    change, message = INSTA_FAULTS[fault]
+    folder = tmp_path / "damaged"
+    shutil.copytree(folder_of(written, "insta, meshes"), folder)
+    edit(folder / "transforms.json", change)
+    with pytest.raises(InputError, match=message):
+        read_video(folder)
+
+
+FILE_FAULTS = {
+    "exp text": ("flame/exp/00003.txt", b"1.0\nfoo\n", "numbers, one a line"),
+    "exp long": ("flame/exp/00003.txt", b"1.0\n" * 20, "at most 8 coefficients"),
+    "exp nan": ("flame/exp/00003.txt", b"nan\n", "finite"),
+    "jaw short": ("flame/jaw/00003.txt", b"1 0 0 0", "6 numbers"),
+    "jaw flat": ("flame/jaw/00003.txt", b"1 0 0 1 0 0", "different directions"),
+    "mesh short": ("canonical.obj", b"v 0 0 0\n", "278 vertices"),
+    "mesh text": ("canonical.obj", b"v a b c\n" * 278, "three numbers"),
+    "mesh gone": ("canonical.obj", None, "canonical.obj"),
+    "exp gone": ("flame/exp/00003.txt", None, "00003.txt"),
+}
+
+
+@pytest.mark.parametrize("fault", FILE_FAULTS)
+def test_faulty_files_of_insta_are_named(written, tmp_path, fault):
+    file, content, message = FILE_FAULTS[fault]
+    folder = tmp_path / "damaged"
+    shutil.copytree(folder_of(written, "insta"), folder)
+    (folder / file).unlink()
+    if content is not None:
+        (folder / file).write_bytes(content)
+    with pytest.raises(InputError, match=message):
+        read_video(folder)
+
+
+def test_splits_that_share_frames_are_refused(written, tmp_path):
+    folder = tmp_path / "leaky"
+    shutil.copytree(folder_of(written, "insta"), folder)
+    shutil.copy(folder / "transforms.json", folder / "transforms_train.json")
+    with pytest.raises(InputError, match="not trained on"):
+        read_video(folder)
+
+
+def test_another_head_model_is_told_by_its_meshes(written):
+    other = toy_head(16, seed=5)
+    with pytest.raises(InputError, match="FLAME 2020"):
+        read_video(folder_of(written, "insta"), head=other)
+
+
+def test_without_a_head_model_its_name_and_place_are_told(written, tmp_path):
+    folder = tmp_path / "headless"
+    shutil.copytree(folder_of(written, "insta"), folder)
+    (folder / HEAD_FILE).unlink()
+    with pytest.raises(InputError, match=r"generic_model\.pkl"):
+        read_video(folder)
+    save_head(tmp_path / "head.npz", toy_head(16))
+    with pytest.raises(InputError, match="vertices"):
+        read_video(folder, head=toy_head(24))
+
+
+IMAVATAR_FAULTS = {
+    "positive focal length": (lambda document: document["intrinsics"].__setitem__(0, 3.0), "negative"),
+    "pose of 12": (of_first("pose", [0.0] * 12), "15 numbers"),
+    "no mask": (of_first("file_path", "./image/77"), "77.png"),
+    "too many": (of_first("expression", [1.0] * 50), "at most 8"),
+    "no intrinsics": (lambda document: document.pop("intrinsics"), "intrinsics"),
+    "another identity": (
+        lambda document: document["shape_params"].__setitem__(0, 9.0),
+        "identity of MVI_1810",
+    ),
+}
+
+
+@pytest.mark.parametrize("fault", IMAVATAR_FAULTS)
+def test_faults_of_imavatar_are_named(written, tmp_path, fault):
+    change, message = IMAVATAR_FAULTS[fault]
+    folder = tmp_path / "damaged"
+    shutil.copytree(folder_of(written, "imavatar"), folder)
+    edit(folder / "MVI_1812" / "flame_params.json", change)
+    with pytest.raises(InputError, match=message):
+        read_video(folder, progress=no_progress)
+
+
+def test_short_coefficients_are_padded_and_zeros_cut(written, tmp_path):
+    folder = tmp_path / "padded"
+    shutil.copytree(folder_of(written, "imavatar"), folder)
+    for video in folder.glob("MVI*"):
+        edit(
+            video / "flame_params.json", lambda document: each(document, expression=[0.5, -1.0, *[0.0] * 48])
+        )
+    clip = read_video(folder)
+    np.testing.assert_array_equal(clip.poses[0].expression, [0.5, -1.0, *[0.0] * 6])
+    for video in folder.glob("MVI*"):
+        edit(video / "flame_params.json", lambda document: each(document, expression=[0.5, -1.0]))
+    np.testing.assert_array_equal(read_video(folder).poses[0].expression, clip.poses[0].expression)
+
+
+def write_vhap(folder, count=10):
+    """VHAP's monocular export: its split, its camera, stale intrinsics at the top, nothing of ours; the head beside it."""
+    camera = replace(rig(cx=24.0, cy=32.0)[1], id="0")
+    plan = make_plan(
+        cameras=[camera],
+        lengths={"obama": count},
+        test_sequences=(),
+        novel_view_cameras=(),
+        head=toy_head(16),
+    )
+    written = write_tiny_capture(folder / "written", plan)
+    export = folder / "obama_whiteBg_staticOffset_maskBelowLine"
+    written.writer.sequence_folder("obama").rename(export)
+    (export / "headbench.json").unlink()
+    document = json.loads((export / "transforms.json").read_text())
+    stale = {"fl_x": 512.0, "fl_y": 512.0, "cx": 512.0, "cy": 512.0, "camera_angle_x": 0.9}
+    first = int(np.ceil(0.7 * count))
+    parts = {"_train": range(first), "_val": range(0), "_test": range(first, count), "_backup": range(count)}
+    for part, timesteps in {**parts, "": range(count)}.items():
+        frames = [frame for frame in document["frames"] if frame["timestep_index"] in timesteps]
+        text = json.dumps(document | stale | {"frames": frames, "timestep_indices": [*timesteps]})
+        (export / f"transforms{part}.json").write_text(text)
+    return export, plan
+
+
+def test_vhaps_monocular_export_opens_with_the_reader_ga(tmp_path):
+    export, plan = write_vhap(tmp_path)
+    assert find_reader(export).name == "ga"
+    save_head(tmp_path / "head.npz", plan.head)
+    clip = open_clip(export, settings={"head": str(tmp_path / "head.npz")})
+    assert (clip.subject, list(clip.cameras)) == ("obama", ["0"])
+    assert {name: len(keys) for name, keys in clip.splits.items()} == {
+        "train": 7,
+        "novel_view": 0,
+        "self_reenactment": 3,
+    }
+    np.testing.assert_allclose(clip.cameras["0"].K, plan.cameras[0].K, atol=1e-9)
+    np.testing.assert_allclose(clip.poses[9].jaw, plan.sequences[0].poses[9].jaw)
+    assert check_clip(clip) == []
+    assert [*make_protocols(("novel_view", "self_reenactment"), [clip], None)] == ["self_reenactment"]
