@@ -1,17 +1,20 @@
-"""Videos, written by OpenCV."""
+"""Videos, written by OpenCV, or by FFmpeg where its encoder of H.264 is asked for."""
 
 from __future__ import annotations
 
 import functools
+import importlib
+import shutil
 import subprocess
 import sys
+import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 
 import cv2
 
 from ..contracts import ByteArray
-from ..errors import InputError
+from ..errors import HeadbenchError, InputError, UnavailableError
 from .files import atomic_path
 
 _H264, _MPEG4 = "avc1", "mp4v"
@@ -59,3 +62,53 @@ def write_video(path: Path, frames: Iterable[ByteArray], fps: float) -> str:
             raise InputError(path, "", "at least one frame", "none")
         writer.release()
     return codec
+
+
+def ffmpeg() -> str:
+    """The program ffmpeg: that on PATH, else the one in the package imageio-ffmpeg.
+
+    Raises `UnavailableError` where there is neither.
+    """
+    found = shutil.which("ffmpeg")
+    if found is None:
+        try:
+            found = str(importlib.import_module("imageio_ffmpeg").get_ffmpeg_exe())
+        except (ImportError, RuntimeError):
+            remedy = "Install it: apt-get install ffmpeg, or pip install imageio-ffmpeg."
+            raise UnavailableError(
+                "H.264 is encoded by the program ffmpeg, which is not here.", remedy
+            ) from None
+    return found
+
+
+def encode_h264(path: Path, frames: Iterable[ByteArray], size: tuple[int, int], fps: float, crf: int) -> None:
+    """Encode (H, W, 3) RGB frames of (width, height) ``size`` as H.264, YUV 4:2:0 of 8 bits, by a constant rate factor.
+
+    Raises `UnavailableError` without ffmpeg, `HeadbenchError` with its words where it fails, and `InputError` for a frame of
+    another size.
+    """
+    width, height = size
+    with atomic_path(path) as temporary, tempfile.TemporaryFile() as errors:
+        command = [ffmpeg(), "-v", "error", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"]
+        command += ["-r", f"{fps:g}", "-i", "-", "-an", "-vcodec", "libx264", "-pix_fmt", "yuv420p"]
+        command += ["-crf", str(crf), "-y", str(temporary)]
+        process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=errors)
+        assert process.stdin is not None
+        try:
+            for number, frame in enumerate(frames):
+                if frame.shape != (height, width, 3):
+                    found = f"{frame.shape[1]}x{frame.shape[0]}"
+                    raise InputError(path, f"frame {number}", f"{width}x{height} pixels", found)
+                process.stdin.write(frame.tobytes())
+            process.stdin.close()
+        except BrokenPipeError:
+            pass  # it ended, and says why
+        except BaseException:
+            process.kill()
+            raise
+        finally:
+            code = process.wait()
+        if code:
+            errors.seek(0)
+            said = errors.read(2000).decode(errors="replace").strip()
+            raise HeadbenchError(f"{path}: ffmpeg failed: {said or f'exit code {code}'}")

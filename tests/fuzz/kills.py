@@ -71,6 +71,11 @@ WRITERS = [
     Writer("export ply", "run", f"export ply {AVATAR.format('ga')} --out out.ply"),
     Writer("export colmap", "capture", "export colmap capture --out out"),
     Writer("import ga", "ply", "import ga point_cloud.ply --capture capture --out out"),
+    Writer(
+        "submission render",
+        "benchmark",
+        "submission render avatar --method ga --data benchmark --participant 393 --out out",
+    ),
     Writer("tongue", "exclusions", "tongue capture --out reviewed"),
     Writer("inspect", "capture", "inspect capture --out out"),
     Writer("steps", "capture", "steps capture --out out"),

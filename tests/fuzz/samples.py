@@ -24,11 +24,13 @@ from headbench.bench.io.files import digest
 from headbench.datasets.colmap.writer import export_model
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import save_head
+from headbench.methods.shared.avatar_files import read_shared_head
 from headbench.methods.shared.checkpoint import save_checkpoint
 from headbench.metrics.lpips_network import SQUEEZE
 
 from ..datasets.head.flame_files import write_flame
 from ..datasets.head.toy import toy_head
+from ..datasets.nersemble.benchmark_folder import write_benchmark
 from ..datasets.nersemble.recordings import write_recording
 from ..datasets.tiny_capture import make_plan, rig, write_tiny_capture
 from ..methods.gha.small import SMALL as SMALL_GHA
@@ -158,6 +160,13 @@ def ply(folder: Path, samples: Path) -> None:
     shutil.copyfile(avatars / "ga" / "seed-0" / "avatar" / "point_cloud.ply", folder / "point_cloud.ply")
 
 
+def benchmark(folder: Path, samples: Path) -> None:
+    """An avatar, and a participant's folder of the NeRSemble benchmark."""
+    shutil.copytree(samples / "run" / "run" / "901" / "ga" / "seed-0" / "avatar", folder / "avatar")
+    head = read_shared_head(folder / "avatar")
+    write_benchmark(folder / "benchmark", head, frames=1)
+
+
 def colmap(folder: Path, samples: Path) -> None:
     """Sparse models of COLMAP, as text and binary."""
     clip = read_capture(samples / "capture" / "capture")
@@ -213,6 +222,7 @@ SAMPLES: dict[str, Callable[[Path, Path], None]] = {
     sample.__name__: sample
     for sample in (
         *(capture, heads, recording, videos, run, unfinished, two_subjects, checkpoint, compact, ply, colmap),
+        benchmark,
         *(exclusions, baseline, settings, weights, images, bundles, synthetic),
     )
 }

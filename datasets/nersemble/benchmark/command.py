@@ -1,0 +1,147 @@
+"""``headbench submission render``, ``submission write`` and ``submission check``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from ....bench.contracts import Progress, no_progress
+from ....bench.errors import ExitCode, UnavailableError
+from ....bench.specs import Findings, writes
+
+SHOWN = 20
+
+
+@dataclass(frozen=True)
+class SubmissionRenderSettings:
+    """Render the test frames of a participant of the NeRSemble benchmark's monocular track from a stored avatar."""
+
+    avatar: tyro.conf.Positional[str]
+    """Folder of the avatar, trained on the participant's training sequences."""
+
+    data: str
+    """The benchmark's folder, as nersemble-benchmark-download leaves it: it holds mono_flame_avatar/."""
+
+    participant: str
+    """Whom the avatar shows: 393, 404, 461, 477 or 486."""
+
+    out: str
+    """Folder to write: OUT/PARTICIPANT/SEQUENCE_TIMESTEP_SERIAL.png."""
+
+    head: str | None = None
+    """FLAME 2023 (flame2023.pkl); default: the head model that lies beside the avatar."""
+
+    method: str = ""
+    """Method that reads the avatar; default: that of the run whose folder it lies in."""
+
+    preset: str = ""
+    """Preset of the method; default: that of the run, else fast."""
+
+    device: str = "cpu"
+    """Where to render."""
+
+
+@writes("out")
+def submission_render(settings: SubmissionRenderSettings, progress: Progress = no_progress) -> Findings:
+    """Render the test frames of a NeRSemble benchmark participant: four sequences, four cameras.
+
+    Poses and cameras come from the benchmark's tracking (version 2) and calibration; there is no ground truth of them.
+    """
+    from .render import render_participant
+
+    return render_participant(settings, progress)
+
+
+@dataclass(frozen=True)
+class SubmissionWriteSettings:
+    """Encode rendered frames and write the zip that the NeRSemble benchmark takes."""
+
+    frames: tyro.conf.Positional[str]
+    """Folder with PARTICIPANT/SEQUENCE_TIMESTEP_SERIAL.png, or a run whose subjects are the participants."""
+
+    zip: tyro.conf.Positional[str]
+    """File to write."""
+
+    track: Literal["nvs", "mono_flame_avatar"]
+    """Task of the benchmark."""
+
+    method: str = ""
+    """Method of a run with several."""
+
+    data: str | None = None
+    """The benchmark's folder: its tracking tells how many frames a sequence has. Without it, published totals are held to."""
+
+
+def submission_write(settings: SubmissionWriteSettings, progress: Progress = no_progress) -> Findings:
+    """Write a submission to the NeRSemble benchmark, and say what its codec costs; 3 without the program ffmpeg.
+
+    Videos are H.264 of constant rate factor 14, YUV 4:2:0, as the benchmark's documentation says. The cost is measured on
+    the encoded frames themselves.
+    """
+    from .submission import after_encoding, decibels, find_frames, write_submission
+    from .tracks import TRACKS
+
+    track = TRACKS[settings.track]
+    data = None if settings.data is None else Path(settings.data)
+    frames = find_frames(Path(settings.frames), track, settings.method, data)
+    out = Path(settings.zip)
+    try:
+        encoded = write_submission(frames, track, out, progress)
+    except UnavailableError as error:
+        return Findings(str(error), {"error": str(error)}, False, ExitCode.NO_VERDICT)
+    lines = [f"{'video':<56}{'frames':>7}{'MB':>8}{'dB to frames':>14}"]
+    lines += [
+        f"{e.video.name:<56}{e.frames:>7}{e.size / 1e6:>8.2f}{decibels(e.error):>14.2f}" for e in encoded
+    ]
+    mean = sum(e.error for e in encoded) / len(encoded)
+    costs = {psnr: psnr - after_encoding(psnr, mean) for psnr in (20.0, 25.0, 30.0, 35.0, 40.0)}
+    lines.append(
+        f"The codec costs renders of {', '.join(f'{psnr:g}' for psnr in costs)} dB "
+        f"{', '.join(f'{cost:.2f}' for cost in costs.values())} dB of PSNR."
+    )
+    lines.append(
+        f"{out}: {len(encoded)} videos, {out.stat().st_size / 1e6:.1f} MB; check it: headbench submission check"
+    )
+    videos = [
+        {**e._asdict(), "video": e.video.name, "psnr": decibels(e.error) if e.error else None}
+        for e in encoded
+    ]
+    data_out = {"out": out, "videos": videos, "cost_db": {str(psnr): cost for psnr, cost in costs.items()}}
+    return Findings("\n".join(lines), data_out)
+
+
+@dataclass(frozen=True)
+class SubmissionCheckSettings:
+    """Say what the NeRSemble benchmark's server would refuse of a submission.
+
+    Exit code 0: nothing; 1: something; 2: it is no zip that can be looked at.
+    """
+
+    zip: tyro.conf.Positional[str]
+    """The submission."""
+
+    track: Literal["", "nvs", "mono_flame_avatar"] = ""
+    """Task of the benchmark; default: the one that the zip has most files of."""
+
+    data: str | None = None
+    """The benchmark's folder: its tracking tells how many frames a sequence has. Without it, published totals are held to."""
+
+
+def submission_check(settings: SubmissionCheckSettings, progress: Progress = no_progress) -> Findings:
+    """Check a submission to the NeRSemble benchmark as its server does, and decode every frame."""
+    from .submission import check_submission
+
+    data = None if settings.data is None else Path(settings.data)
+    track, issues = check_submission(Path(settings.zip), data, settings.track, progress)
+    lines = [f"{settings.zip}: track {track.name}"]
+    for title, found in (("Would be refused", issues.refused), ("Worth a look", issues.noted)):
+        if found:
+            lines += [f"{title}:", *(f"  {line}" for line in found[:SHOWN])]
+            lines += [f"  and {len(found) - SHOWN} more"] if len(found) > SHOWN else []
+    if not issues.refused:
+        lines.append("Nothing that the server would refuse.")
+    data_out = {"track": track.name, "refused": issues.refused, "noted": issues.noted}
+    return Findings("\n".join(lines), data_out, not issues.refused)

@@ -1,0 +1,318 @@
+"""Submissions to the NeRSemble benchmark: a zip of videos. Written from frames, checked as the server checks it, and more."""
+
+from __future__ import annotations
+
+import math
+import re
+import shutil
+import tempfile
+import zipfile
+import zlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from ....bench.contracts import ByteArray, Progress
+from ....bench.errors import InputError
+from ....bench.io.files import atomic_path, check_writable
+from ....bench.io.images import probe_image, read_png
+from ....bench.io.video import encode_h264, ffmpeg
+from ..sequence import open_video, probe_video
+from .tracks import CRF, TRACKS, Track, Video
+
+MOST_ENTRIES = 10_000
+MOST_VIDEO_BYTES = 2**32
+MOST_PER_BYTE = 20
+"""Bytes that an entry may unpack to for each of its own: videos do not compress."""
+_DAMAGED = (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError, ValueError)
+COMPARED = 24
+"""Frames of a video that are compared with what was encoded, evenly spaced."""
+_FRAME = re.compile(r"(?P<sequence>.+)_(?P<timestep>\d{5,})_(?P<camera>[^_]+)\.png")
+_CODECS = {"avc1": "H.264", "h264": "H.264", "H264": "H.264"}
+
+
+# Frames
+
+
+def find_frames(folder: Path, track: Track, method: str, data: Path | None) -> dict[Video, list[Path]]:
+    """Frames of every video of a submission, in order of time.
+
+    They are ``<folder>/<participant>/<sequence>_<timestep>_<serial>.png``, or those of a run's method:
+    ``<folder>/<participant>/<method>/seed-<n>/renders/<task>/...``.
+
+    Parameters
+    ----------
+    method : of a run with several.
+    data : the benchmark's folder, which tells how many frames a sequence has, where that is not published.
+
+    Raises
+    ------
+    InputError
+        For participants, sequences, cameras and frames that are missing, a gap between timesteps, and a wrong size.
+    """
+    found: dict[Video, list[Path]] = {}
+    by_participant = {name: _by_camera(folder, name, method) for name in track.sequences}
+    lacking = []
+    for video in track.videos(data):
+        frames = by_participant[video.participant].get((video.sequence, video.serial), {})
+        if not frames:
+            lacking.append(video.name.removesuffix(".mp4"))
+            continue
+        numbers = sorted(frames)
+        where = folder / video.participant
+        key = f"{video.sequence}, camera {video.serial}"
+        if video.frames is not None and len(numbers) != video.frames:
+            remedy = "Render every frame of the sequence, without leaving any out."
+            raise InputError(where, key, f"{video.frames} frames", f"{len(numbers)}", remedy)
+        if numbers[-1] - numbers[0] + 1 != len(numbers):
+            gap = next(b for a, b in pairwise(numbers) if b != a + 1) - 1
+            raise InputError(where, key, "timesteps without a gap", f"none of timestep {gap}")
+        found[video] = [frames[number] for number in numbers]
+    if lacking:
+        expected = f"frames of {len(found) + len(lacking)} videos, such as {lacking[0]}"
+        remedy = "Frames are PARTICIPANT/SEQUENCE_TIMESTEP_SERIAL.png, as `headbench submission render` writes them."
+        raise InputError(folder, "", expected, f"none for {len(lacking)} of them", remedy)
+    _check_lengths(folder, track, {video: len(frames) for video, frames in found.items()})
+    for paths in found.values():
+        for path in paths:
+            info = probe_image(path)
+            if (info.width, info.height) != track.size or info.channels != 3:
+                size = "x".join(map(str, track.size))
+                expected = f"RGB of {size} pixels, the size of this track"
+                raise InputError(path, "", expected, f"{info.width}x{info.height}, {info.channels} channels")
+    return found
+
+
+def _by_camera(folder: Path, participant: str, method: str) -> dict[tuple[str, str], dict[int, Path]]:
+    """Frames of a participant by sequence and camera, and timestep."""
+    home = folder / participant
+    places = [home]
+    runs = sorted(home.glob("*/seed-*/renders")) if home.is_dir() else []
+    if runs:
+        chosen = [path for path in runs if method in ("", path.parent.parent.name)]
+        if len(chosen) != 1:
+            names = ", ".join(f"{path.parent.parent.name} {path.parent.name}" for path in runs)
+            expected = (
+                "one method and seed, named by --method" if method else "--method, one of those of the run"
+            )
+            raise InputError(home, "--method", expected, names)
+        places = sorted(path for path in chosen[0].iterdir() if path.is_dir())
+    found: dict[tuple[str, str], dict[int, Path]] = {}
+    for place in places:
+        for path in sorted(place.iterdir()) if place.is_dir() else ():
+            if match := _FRAME.fullmatch(path.name):
+                of = found.setdefault((match["sequence"], match["camera"]), {})
+                of[int(match["timestep"])] = path
+    return found
+
+
+def _check_lengths(where: Path, track: Track, counts: dict[Video, int]) -> None:
+    """Cameras of a sequence have one length; the sequences of a participant have as many frames as is published."""
+    by_sequence: dict[tuple[str, str], set[int]] = {}
+    for video, count in counts.items():
+        by_sequence.setdefault((video.participant, video.sequence), set()).add(count)
+    for (participant, sequence), lengths in by_sequence.items():
+        if len(lengths) > 1:
+            expected = "as many frames from every camera"
+            raise InputError(
+                where, f"{participant}, {sequence}", expected, ", ".join(map(str, sorted(lengths)))
+            )
+    for participant, total in (track.totals or {}).items():
+        own = sum(max(lengths) for (name, _), lengths in by_sequence.items() if name == participant)
+        if own != total:
+            expected = f"{total} frames in all sequences together, as published"
+            remedy = "Render every frame of every test sequence."
+            raise InputError(where, participant, expected, f"{own}", remedy)
+
+
+# Writing
+
+
+class Encoded(NamedTuple):
+    """What encoding did to a video: mean squared error of some frames after decoding, of 255 squared."""
+
+    video: Video
+    frames: int
+    size: int
+    error: float
+
+
+def write_submission(
+    frames: dict[Video, list[Path]], track: Track, out: Path, progress: Progress
+) -> list[Encoded]:
+    """Encode all videos and write the zip, whole or not at all; say what the encoding cost."""
+    ffmpeg()
+    check_writable(out, "ZIP")
+    done = []
+    with (
+        tempfile.TemporaryDirectory() as scratch,
+        atomic_path(out) as temporary,
+        zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive,
+    ):
+        for number, (video, paths) in enumerate(frames.items()):
+            path = Path(scratch) / "video.mp4"
+            encode_h264(path, (read_png(frame) for frame in paths), track.size, track.fps, CRF)
+            error = _encoding_error(path, paths)
+            entry = zipfile.ZipInfo(video.name, (1980, 1, 1, 0, 0, 0))  # equal frames give equal zips
+            entry.external_attr = 0o644 << 16
+            with path.open("rb") as source, archive.open(entry, "w", force_zip64=True) as target:
+                shutil.copyfileobj(source, target, 1 << 20)
+            done.append(Encoded(video, len(paths), path.stat().st_size, error))
+            progress(number + 1, len(frames), video.name)
+    return done
+
+
+def _encoding_error(path: Path, frames: Sequence[Path]) -> float:
+    """Mean squared error of decoded frames against those encoded, some of them; raises where a frame is missing."""
+    chosen = {int(i) for i in np.linspace(0, len(frames) - 1, min(COMPARED, len(frames)))}
+    errors = []
+    count = 0
+    for number, image in enumerate(_decoded(path)):
+        count += 1
+        if number in chosen:
+            difference = image.astype(np.float32) - read_png(frames[number])
+            errors.append(float(np.mean(difference**2)))
+    if count != len(frames):
+        raise InputError(path, "", f"{len(frames)} frames after encoding", f"{count}")
+    return float(np.mean(errors))
+
+
+def _decoded(path: Path) -> Iterator[ByteArray]:
+    """RGB frames of a video, in order."""
+    capture = open_video(path)
+    try:
+        while True:
+            there, image = capture.read()
+            if not there:
+                return
+            yield np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
+    finally:
+        capture.release()
+
+
+def decibels(error: float) -> float:
+    """PSNR of a mean squared error of 8-bit values; infinite for none."""
+    return math.inf if error == 0 else 10 * math.log10(255**2 / error)
+
+
+def after_encoding(psnr: float, error: float) -> float:
+    """PSNR that renders of ``psnr`` have after an encoding of that mean squared error, the two errors being unrelated."""
+    return decibels(255**2 / 10 ** (psnr / 10) + error)
+
+
+# Checking
+
+
+@dataclass
+class Issues:
+    """What is wrong with a submission: what the server refuses, and what else should be seen to."""
+
+    refused: list[str] = field(default_factory=list)
+    noted: list[str] = field(default_factory=list)
+
+
+def check_submission(file: Path, data: Path | None, name: str, progress: Progress) -> tuple[Track, Issues]:
+    """Look at a zip as the server does (files, frame counts, sizes), and beyond: every frame decoded, codec, rate.
+
+    Parameters
+    ----------
+    data : the benchmark's folder; without it, frames of the monocular track are held to the published totals alone.
+    name : of the track; "" takes the one that the zip has most files of.
+
+    Raises
+    ------
+    InputError
+        For a file that is no zip, or whose entries are too many or too large to be looked at.
+    """
+    issues = Issues()
+    with _open(file) as archive, tempfile.TemporaryDirectory() as scratch:
+        entries = {entry.filename: entry for entry in archive.infolist()}
+        if len(entries) != len(archive.infolist()):
+            issues.refused.append("Entries of the zip have the same name.")
+        track = TRACKS[name] if name else _track_of(entries)  # type: ignore[index]
+        wanted = {video.name: video for video in track.videos(data)}
+        issues.refused += [f"{missing}: missing." for missing in wanted if missing not in entries]
+        issues.noted += [f"{extra}: not asked for." for extra in sorted(entries.keys() - wanted.keys())]
+        counts: dict[Video, int] = {}
+        present = [video for name, video in wanted.items() if name in entries]
+        for number, video in enumerate(present):
+            path = Path(scratch) / "video.mp4"
+            _unpack(file, archive, entries[video.name], path)
+            counts[video] = _check_video(path, video, track, issues)
+            progress(number + 1, len(present), video.name)
+        whole = len(present) == len(wanted) and all(counts.values())
+        if whole and not any(video.frames for video in wanted.values()):
+            try:
+                _check_lengths(file, track, counts)
+            except InputError as error:
+                issues.refused.append(str(error))
+    return track, issues
+
+
+def _open(file: Path) -> zipfile.ZipFile:
+    if not file.is_file():
+        raise InputError(file, "", "the zip of a submission", "no such file")
+    try:
+        archive = zipfile.ZipFile(file)
+    except (*_DAMAGED, OSError) as error:
+        raise InputError(file, "", "the zip of a submission", f"no zip ({error})") from error
+    if len(archive.infolist()) > MOST_ENTRIES:
+        archive.close()
+        raise InputError(file, "", f"at most {MOST_ENTRIES} entries", f"{len(archive.infolist())}")
+    return archive
+
+
+def _track_of(names: Sequence[str] | dict[str, zipfile.ZipInfo]) -> Track:
+    return max(TRACKS.values(), key=lambda track: sum(video.name in names for video in track.videos()))
+
+
+def _unpack(file: Path, archive: zipfile.ZipFile, entry: zipfile.ZipInfo, path: Path) -> None:
+    if entry.compress_type not in (
+        zipfile.ZIP_STORED,
+        zipfile.ZIP_DEFLATED,
+    ):  # others take memory without bound
+        raise InputError(file, entry.filename, "stored or deflated", f"compression {entry.compress_type}")
+    most = min(MOST_VIDEO_BYTES, MOST_PER_BYTE * entry.compress_size)
+    if entry.file_size > most:
+        raise InputError(file, entry.filename, f"a video of at most {most} bytes", f"{entry.file_size}")
+    try:
+        with archive.open(entry) as source, path.open("wb") as target:
+            shutil.copyfileobj(source, target, 1 << 20)
+    except (*_DAMAGED, OSError) as error:
+        raise InputError(
+            file, entry.filename, "an entry that unpacks", str(error) or type(error).__name__
+        ) from error
+
+
+def _check_video(path: Path, video: Video, track: Track, issues: Issues) -> int:
+    """Decode a video; note what is wrong with it, return how many frames it has."""
+    try:
+        declared, size = probe_video(path)
+    except InputError as error:
+        issues.refused.append(f"{video.name}: no video: expected {error.expected}, found {error.found}.")
+        return 0
+    if size != track.size:
+        expected, found = ("x".join(map(str, pair)) for pair in (track.size, size))
+        issues.refused.append(f"{video.name}: {found} pixels, {expected} are asked for.")
+        return declared
+    capture = open_video(path)
+    fps, code = capture.get(cv2.CAP_PROP_FPS), int(capture.get(cv2.CAP_PROP_FOURCC))
+    capture.release()
+    count = sum(1 for _ in _decoded(path))
+    if video.frames is not None and count != video.frames:
+        issues.refused.append(f"{video.name}: {count} frames, {video.frames} are asked for.")
+    if count != declared:
+        issues.refused.append(f"{video.name}: {count} frames can be decoded of {declared} that it declares.")
+    name = code.to_bytes(4, "little").decode("ascii", errors="replace")
+    if name not in _CODECS:
+        issues.noted.append(f"{video.name}: codec {name!r}, the documentation names H.264.")
+    if abs(fps - track.fps) > 0.01 * track.fps:
+        issues.noted.append(
+            f"{video.name}: {fps:g} frames per second, the documentation names {track.fps:g}."
+        )
+    return count

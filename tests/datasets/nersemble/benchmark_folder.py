@@ -1,0 +1,57 @@
+"""The benchmark's folder in small: calibration and tracking of one participant, random but right."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from headbench.datasets.head.arrays import HeadArrays
+from headbench.datasets.nersemble.benchmark.tracks import MONO, TRACKING_FILE
+
+SCALE = 4.0
+
+
+def tracking(head: HeadArrays, frames: int, seed: int = 0) -> dict[str, np.ndarray]:
+    """Arrays of a tracking file for a head."""
+    rng = np.random.default_rng(seed)
+    euler = rng.normal(0, 0.2, (frames, 3))
+    draw = {
+        "shape": rng.normal(size=(1, head.shape_basis.shape[2])),
+        "expression": rng.normal(size=(frames, head.expression_basis.shape[2])),
+        "rotation": euler,
+        "rotation_matrices": Rotation.from_euler("XYZ", euler).as_matrix(),
+        "translation": rng.normal(0, 0.1, (frames, 3)),
+        "jaw": rng.normal(0, 0.1, (frames, 3)),
+        "neck": rng.normal(0, 0.1, (frames, 3)),
+        "eyes": rng.normal(0, 0.1, (frames, 6)),
+        "scale": np.full((1, 1), SCALE),
+    }
+    return {name: values.astype(np.float32) for name, values in draw.items()} | {"frames": np.arange(frames)}
+
+
+def write_benchmark(
+    root: Path, head: HeadArrays, participant: str = "393", frames: int = 2, focal: float = 1500.0
+) -> Path:
+    """Write cameras and tracking of a participant; return the benchmark's folder."""
+    home = root / MONO.name / participant
+    for number, sequence in enumerate(MONO.sequences[participant]):
+        folder = home / "sequences" / sequence / "tracking"
+        folder.mkdir(parents=True)
+        np.savez(folder / TRACKING_FILE, **tracking(head, frames, number))
+    turns = Rotation.from_rotvec([[0, turn, 0] for turn in (0.0, -0.5, 0.1, 0.5)]).as_matrix()
+    turns = turns * np.array(
+        [[1.0], [-1.0], [-1.0]]
+    )  # OpenCV's axes: the head's top is up, its face towards the camera
+    matrices = {}
+    for serial, turn in zip(MONO.serials, turns):
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[2, 3] = turn, SCALE
+        matrices[serial] = matrix.tolist()
+    K = [[focal, 0, 250.0], [0, focal, 260.0], [0, 0, 1]]
+    (home / "calibration").mkdir()
+    document = {"world_2_cam": matrices, "intrinsics": dict.fromkeys(MONO.serials, K)}
+    (home / "calibration" / "camera_params.json").write_text(json.dumps(document))
+    return root

@@ -1,0 +1,366 @@
+"""The NeRSemble benchmark: its tracking against its own formula, its zip against what its documentation says."""
+
+import json
+import os
+import re
+import sys
+import zipfile
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from headbench.bench import cli
+from headbench.bench.contracts import Frame, no_progress
+from headbench.bench.errors import HeadbenchError, InputError
+from headbench.bench.io.images import write_png
+from headbench.bench.io.video import write_video
+from headbench.datasets.head.arrays import save_head
+from headbench.datasets.head.subject import PosedSubject
+from headbench.datasets.nersemble.benchmark import tracks
+from headbench.datasets.nersemble.benchmark.command import SubmissionWriteSettings, submission_write
+from headbench.datasets.nersemble.benchmark.data import read_sequence
+from headbench.datasets.nersemble.benchmark.submission import after_encoding, check_submission, decibels
+from headbench.datasets.nersemble.benchmark.tracks import MONO, NVS, tracking_file
+
+from ..head.toy import toy_head
+from .benchmark_folder import SCALE, tracking, write_benchmark
+
+# Tracking
+
+
+@pytest.fixture(scope="module")
+def head():
+    return toy_head(16)
+
+
+@pytest.fixture
+def benchmark(head, tmp_path):
+    return write_benchmark(tmp_path / "benchmark", head)
+
+
+def test_tracking_gives_the_benchmarks_meshes_and_pictures(head, benchmark):
+    """Its own formula: FLAME without rotation and translation, then scale, rotation, translation."""
+    sequence = read_sequence(benchmark, MONO, "393", "FREE", head)
+    arrays = dict(np.load(tracking_file(benchmark, "393", "FREE")))
+    subject = PosedSubject(head, sequence.shape, np.zeros_like(head.template))
+    zero = np.zeros(3)
+    still = subject.meshes([replace(pose, rotation=zero, translation=zero) for pose in sequence.poses])
+    turned = np.einsum("tij,tvj->tvi", arrays["rotation_matrices"], still)
+    world = SCALE * turned + arrays["translation"][:, None]
+    ours = subject.meshes(sequence.poses)
+    np.testing.assert_allclose(SCALE * ours, world, atol=1e-5)
+    calibration = json.loads(
+        (benchmark / MONO.name / "393" / "calibration" / "camera_params.json").read_text()
+    )
+    for serial, camera in sequence.cameras.items():
+        W, K = (np.array(calibration[name][serial]) for name in ("world_2_cam", "intrinsics"))
+        theirs = (world[0] @ W[:3, :3].T + W[:3, 3]) @ K.T
+        own = (ours[0] @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]) @ camera.K.T
+        assert (own[:, 2] > 0).all()
+        np.testing.assert_allclose(own[:, :2] / own[:, 2:], theirs[:, :2] / theirs[:, 2:], atol=1e-2)
+    assert {(camera.width, camera.height) for camera in sequence.cameras.values()} == {(512, 512)}
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (
+            {"rotation": np.full((2, 3), 0.5, np.float32)},
+            "rotation_matrices: expected the matrices of the angles",
+        ),
+        ({"expression": np.zeros((2, 99), np.float32)}, "expression: expected at most the 8 coefficients"),
+        ({"scale": np.zeros((1, 1), np.float32)}, "scale"),
+        ({"jaw": np.zeros((3, 3), np.float32)}, "jaw"),
+        ({"eyes": np.full((2, 6), np.nan, np.float32)}, "eyes"),
+    ],
+)
+def test_tracking_that_does_not_fit_is_refused(head, benchmark, change, says):
+    path = tracking_file(benchmark, "393", "FREE")
+    np.savez(path, **(tracking(head, 2) | change))
+    with pytest.raises(InputError, match=says):
+        read_sequence(benchmark, MONO, "393", "FREE", head)
+
+
+def test_tracking_of_version_1_is_refused(head, benchmark):
+    path = tracking_file(benchmark, "393", "FREE")
+    path.rename(path.with_name("flame2023_tracking.npz"))
+    with pytest.raises(InputError, match="version 1, which is no longer taken.*nersemble-benchmark-download"):
+        read_sequence(benchmark, MONO, "393", "FREE", head)
+
+
+def test_a_missing_camera_is_named(head, benchmark):
+    path = benchmark / MONO.name / "393" / "calibration" / "camera_params.json"
+    document = json.loads(path.read_text())
+    del document["world_2_cam"]["220700191"]
+    path.write_text(json.dumps(document))
+    with pytest.raises(InputError, match="no 220700191"):
+        read_sequence(benchmark, MONO, "393", "FREE", head)
+
+
+# Submissions
+
+
+def test_files_are_those_of_the_documentation():
+    nvs, mono = ([video.name for video in track.videos()] for track in (NVS, MONO))
+    assert (len(set(nvs)), len(set(mono))) == (15, 80)
+    assert "388/GLASSES/cam_222200037.mp4" in nvs
+    assert "475/HAIR/cam_222200046.mp4" in nvs
+    assert "393/EMO-1-shout+laugh/cam_220700191.mp4" in mono
+    assert "486/SEN-10-port_strong_smokey/cam_222200037.mp4" in mono
+    assert sum(video.frames or 0 for video in NVS.videos()) == 3 * 3516
+
+
+SIZE, FRAMES = (32, 48), 3
+FAKE = """#!{python}
+import sys
+sys.path[:] = {path!r}
+import cv2, numpy as np
+words = sys.argv[1:]
+open({log!r}, "w").write(" ".join(words))
+data = np.frombuffer(sys.stdin.buffer.read(), np.uint8)
+if {fails}:
+    sys.exit("no such encoder")
+width, height = map(int, words[words.index("-s") + 1].split("x"))
+rate = float(words[words.index("-r") + 1])
+writer = cv2.VideoWriter(words[-1], cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"mp4v"), rate, (width, height))
+for frame in data.reshape(-1, height, width, 3):
+    writer.write(frame)  # grey
+writer.release()
+"""
+
+
+@pytest.fixture
+def track(monkeypatch):
+    """The monocular track with one participant, two sequences of three small frames, two cameras."""
+    small = replace(
+        MONO,
+        size=SIZE,
+        sequences={"393": {"FREE": None, "EMO-1-shout+laugh": None}},
+        serials=MONO.serials[:2],
+        totals={"393": 2 * FRAMES},
+    )
+    monkeypatch.setattr(tracks, "TRACKS", {MONO.name: small})
+    monkeypatch.setattr("headbench.datasets.nersemble.benchmark.submission.TRACKS", {MONO.name: small})
+    return small
+
+
+@pytest.fixture
+def ffmpeg(tmp_path, monkeypatch):
+    """A program of that name that encodes by OpenCV, whose encoder of H.264 is not everywhere; it notes its words."""
+
+    def make(fails=False):
+        program = tmp_path / "bin" / "ffmpeg"
+        program.parent.mkdir(exist_ok=True)
+        log = tmp_path / "words"
+        program.write_text(FAKE.format(python=sys.executable, path=sys.path, log=str(log), fails=fails))
+        program.chmod(0o755)
+        monkeypatch.setenv("PATH", f"{program.parent}{os.pathsep}{os.environ['PATH']}")
+        return log
+
+    return make
+
+
+@pytest.fixture
+def frames(track, tmp_path):
+    folder = tmp_path / "frames"
+    for video in track.videos():
+        for timestep in range(FRAMES):
+            image = np.full((SIZE[1], SIZE[0], 3), 60 + 20 * timestep, np.uint8)
+            write_png(folder / "393" / f"{video.sequence}_{timestep:05d}_{video.serial}.png", image)
+    return folder
+
+
+def written(frames, out, **others):
+    return submission_write(SubmissionWriteSettings(str(frames), str(out), MONO.name, **others), no_progress)
+
+
+@pytest.mark.parametrize("layout", ["", "ours/seed-0/renders/self_reenactment"])
+def test_what_is_written_passes_the_check(track, frames, ffmpeg, tmp_path, layout, capsys):
+    """Of a folder, and of a run."""
+    words = ffmpeg()
+    if layout:
+        target = tmp_path / "run" / "393" / layout
+        target.parent.mkdir(parents=True)
+        (frames / "393").rename(target)
+        frames = tmp_path / "run"
+    out = tmp_path / "out.zip"
+    findings = written(frames, out)
+    assert "-crf 14" in words.read_text()
+    assert "-vcodec libx264 -pix_fmt yuv420p" in words.read_text()
+    assert "-r 24.3" in words.read_text()
+    with zipfile.ZipFile(out) as archive:
+        assert set(archive.namelist()) == {video.name for video in track.videos()}
+        assert {entry.compress_type for entry in archive.infolist()} == {zipfile.ZIP_STORED}
+    assert min(video["psnr"] for video in findings.data["videos"]) > 30
+    assert cli.main(["submission", "check", str(out)]) == 0
+    assert "Nothing that the server would refuse" in capsys.readouterr().out
+    if not layout:
+        first = out.read_bytes()
+        written(frames, out)
+        assert out.read_bytes() == first
+
+
+def missing(frames):
+    for path in (frames / "393").glob("FREE_*_222200046.png"):
+        path.unlink()
+
+
+def gap(frames):
+    (frames / "393" / "FREE_00001_222200046.png").unlink()
+
+
+def short(frames):
+    for path in (frames / "393").glob("FREE_00002_*.png"):
+        path.unlink()
+
+
+def uneven(frames):
+    (frames / "393" / "FREE_00002_222200046.png").unlink()
+
+
+def larger(frames):
+    write_png(frames / "393" / "FREE_00001_222200046.png", np.zeros((50, 32, 3), np.uint8))
+
+
+def two_methods(frames):
+    for name in ("ga", "ours"):
+        (frames / "393" / name / "seed-0" / "renders" / "novel_view").mkdir(parents=True)
+
+
+@pytest.mark.parametrize(
+    ("damage", "says"),
+    [
+        (missing, "none for 1 of them"),
+        (gap, "without a gap, found none of timestep 1"),
+        (short, "393: expected 6 frames in all sequences together"),
+        (uneven, "as many frames from every camera, found 2, 3"),
+        (larger, "RGB of 32x48 pixels, the size of this track, found 32x50"),
+        (two_methods, "--method.*ga seed-0, ours seed-0"),
+    ],
+)
+def test_frames_that_would_be_refused_are_not_encoded(frames, ffmpeg, tmp_path, damage, says):
+    words = ffmpeg()
+    damage(frames)
+    with pytest.raises(InputError, match=says):
+        written(frames, tmp_path / "out.zip")
+    assert not words.exists()
+    assert not (tmp_path / "out.zip").exists()
+
+
+def test_tracking_tells_how_many_frames_there_are(frames, ffmpeg, head, tmp_path):
+    ffmpeg()
+    with pytest.raises(InputError, match="FREE, camera 222200037: expected 2 frames, found 3"):
+        written(frames, tmp_path / "out.zip", data=str(write_benchmark(tmp_path / "data", head, frames=2)))
+
+
+def test_without_the_encoder_it_says_where_to_get_it(frames, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    words = ["submission", "write", str(frames), str(tmp_path / "out.zip"), "--track", MONO.name]
+    assert cli.main(words) == 3
+    assert "apt-get install ffmpeg" in capsys.readouterr().out
+    assert not (tmp_path / "out.zip").exists()
+
+
+def test_an_encoder_that_fails_is_quoted(frames, ffmpeg, tmp_path):
+    ffmpeg(fails=True)
+    with pytest.raises(HeadbenchError, match="ffmpeg failed: no such encoder"):
+        written(frames, tmp_path / "out.zip")
+    assert not (tmp_path / "out.zip").exists()
+
+
+def encoded(tmp_path, size=SIZE, count=FRAMES):
+    path = tmp_path / f"{size[0]}-{count}.mp4"
+    write_video(path, [np.full((size[1], size[0], 3), 80, np.uint8)] * count, MONO.fps)
+    return path.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda files, make: None, ""),
+        (lambda files, make: files.pop(next(iter(files))), r"393/FREE/cam_222200037.mp4: missing"),
+        (lambda files, make: files.update({next(iter(files)): b"junk"}), "no video"),
+        (lambda files, make: files.update({next(iter(files)): make()[:-900]}), "no video|can be decoded"),
+        (lambda files, make: files.update({next(iter(files)): make((48, 32))}), "48x32 pixels, 32x48 are"),
+        (
+            lambda files, make: files.update({next(iter(files)): make(count=2)}),
+            "as many frames from every camera",
+        ),
+        (lambda files, make: files.update(dict.fromkeys(files, make(count=2))), "6 frames in all sequences"),
+    ],
+)
+def test_what_the_server_would_refuse_is_named(track, tmp_path, change, says):
+    def make(size=SIZE, count=FRAMES):
+        return encoded(tmp_path, size, count)
+
+    files = {video.name: make() for video in track.videos()}
+    files["README.txt"] = b"of mine"
+    change(files, make)
+    with zipfile.ZipFile(tmp_path / "s.zip", "w") as archive:
+        for name, content in files.items():
+            archive.writestr(name, content)
+    _, issues = check_submission(tmp_path / "s.zip", None, "", no_progress)
+    assert bool(issues.refused) == bool(says)
+    assert any(line.startswith("README.txt") for line in issues.noted)
+    if says:
+        assert len(issues.refused) == 1
+        assert re.search(says, issues.refused[0]), issues.refused
+
+
+def test_a_bomb_and_what_is_no_zip_are_bad_input(track, tmp_path):
+    (tmp_path / "no.zip").write_bytes(b"PK nothing")
+    with pytest.raises(InputError, match="no zip"):
+        check_submission(tmp_path / "no.zip", None, "", no_progress)
+    with pytest.raises(InputError, match="no such file"):
+        check_submission(tmp_path / "nowhere.zip", None, "", no_progress)
+    with zipfile.ZipFile(tmp_path / "bomb.zip", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(next(track.videos()).name, bytes(10**7))
+    with pytest.raises(InputError, match="a video of at most"):
+        check_submission(tmp_path / "bomb.zip", None, "", no_progress)
+
+
+def test_the_cost_of_the_codec_is_that_of_unrelated_errors():
+    error = 255**2 / 10**3  # 30 dB
+    assert decibels(error) == pytest.approx(30)
+    assert after_encoding(30.0, error) == pytest.approx(30 - 10 * np.log10(2))
+    assert after_encoding(30.0, 0.0) == pytest.approx(30)
+    rng = np.random.default_rng(0)
+    truth = rng.uniform(60, 190, (200, 200))
+    render, codec = rng.normal(0, 8, truth.shape), rng.normal(0, 3, truth.shape)
+    before, after = (decibels(float(np.mean(e**2))) for e in (render, render + codec))
+    assert after_encoding(before, float(np.mean(codec**2))) == pytest.approx(after, abs=0.02)
+
+
+def test_an_avatar_renders_all_test_frames(benchmark, head, tmp_path, monkeypatch):
+    """Frames that the writer takes, of the size and names of the track; the pose tells them apart."""
+    from headbench.datasets.nersemble.benchmark import render as module
+
+    def shown(camera, pose, background):
+        level = 0.5 + 0.2 * np.tanh(5 * pose.rotation[0])
+        return Frame(np.full((camera.height, camera.width, 3), level, np.float32), np.ones((512, 512)))
+
+    avatar = SimpleNamespace(render=shown)
+    method = SimpleNamespace(create=lambda: SimpleNamespace(load=lambda path, device: avatar))
+    monkeypatch.setattr(module, "stored_method", lambda *_: method)
+    (tmp_path / "avatar").mkdir()
+    words = [
+        "submission",
+        "render",
+        str(tmp_path / "avatar"),
+        "--data",
+        str(benchmark),
+        "--participant",
+        "393",
+    ]
+    words += ["--out", str(tmp_path / "out")]
+    assert cli.main(words) == 2  # no files
+    save_head(tmp_path / "avatar" / "head_model.npz", head)
+    assert cli.main(words) == 0
+    files = sorted((tmp_path / "out" / "393").iterdir())
+    assert len(files) == 2 * 4 * 4
+    assert files[0].name == "EMO-1-shout+laugh_00000_220700191.png"
+    assert len({path.read_bytes() for path in files}) > 4
+    assert cli.main([*words[:5], "--participant", "074", "--out", str(tmp_path / "o")]) == 2
