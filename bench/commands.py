@@ -31,7 +31,7 @@ _OF_OTHERS = {
     "inspect": "visualize",
     "lint": "check validate",
     "prepare nersemble": "preprocess process-data process",
-    "run": "benchmark fit render train",
+    "run": "benchmark fit train",
     "sweep": "prune",
     "synth": "generate synthesize",
     "table": "report results show",

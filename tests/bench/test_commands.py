@@ -92,7 +92,7 @@ def test_two_words_share_the_first(offer, capsys):
     [
         ("train", "`headbench run`"),
         ("fit", "`headbench run`"),
-        ("render", "`headbench run`"),
+        ("diagnose", "`headbench doctor`"),
         ("benchmark", "`headbench run`"),
         ("eval", "`headbench evaluate`"),
         ("EVAL", "`headbench evaluate`"),
