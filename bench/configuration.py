@@ -110,7 +110,7 @@ def with_first_names(config: Any) -> Any:
     """The settings of a dataclass by the names that they first had: digests of them outlive a change of names.
 
     A setting that came later is left out where it has the value that means what was so before, which the class variable
-    ``added`` gives by name.
+    ``added`` gives by name; so are those named in ``places``, which say where something lies on this machine.
     """
     if isinstance(config, tuple):
         return tuple(map(with_first_names, config))
@@ -120,7 +120,8 @@ def with_first_names(config: Any) -> Any:
     result = {
         field.name: with_first_names(getattr(config, field.name))
         for field in dataclasses.fields(config)
-        if field.name not in added or getattr(config, field.name) != added[field.name]
+        if field.name not in getattr(config, "places", ())
+        and (field.name not in added or getattr(config, field.name) != added[field.name])
     }
     first: dict[str, Any] = {}
     for old, entry in getattr(config, "renamed", {}).items():

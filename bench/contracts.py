@@ -16,7 +16,7 @@ Conventions, fixed once here
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
@@ -288,6 +288,26 @@ class SharingAvatar(Avatar, Protocol):
         """Files needed besides `files`, the same for every subject; not counted as an avatar's storage."""
 
 
+@runtime_checkable
+class ListedFrames(Avatar, Protocol):
+    """An avatar that another program draws, for many frames in one call. Optional.
+
+    Its `render` raises `UnavailableError`, which says so: what asks for single frames (speed, extremes) is missing for it.
+    """
+
+    def render_listed(
+        self,
+        views: Mapping[FrameKey, tuple[Camera, HeadPose]],
+        background: Sequence[float],
+        progress: Progress,
+    ) -> Iterator[tuple[FrameKey, Frame]]:
+        """Render these frames and no others; give each once, with its key, in any order.
+
+        Where the program tells no coverage, ``alpha`` is 1. Raises `HeadbenchError` with the program's last lines where it
+        fails or leaves a frame out.
+        """
+
+
 class Progress(Protocol):
     """Where long work reports to. A no-op is a valid implementation."""
 
@@ -310,6 +330,14 @@ class Method(Protocol):
 
     def load(self, path: Path, *, device: str) -> Avatar:
         """Read an avatar that `fit` wrote to ``path``. Its files are data, never code."""
+
+
+@runtime_checkable
+class CheckedMethod(Method, Protocol):
+    """A method that can tell before any long work whether `fit` could do it. Optional."""
+
+    def check(self, clip: Clip, budget: Budget) -> None:
+        """Raise `InputError` for settings that name what is not there, and for what `fit` would refuse."""
 
 
 @runtime_checkable

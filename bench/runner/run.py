@@ -64,6 +64,7 @@ def _run(
     jobs = make_jobs(config, methods, clips, protocols, folder)
     for job in jobs:
         job.check()
+        job.check_method()
     warn_of_missing_metrics(metrics, clips[0])
 
     forms = tuple(
@@ -185,7 +186,7 @@ def _run_cell(job: Job, metrics: Sequence[MetricSpec]) -> Rows:
         avatar = fit(job)
         render(job, avatar)
         return measure(job, avatar, metrics)
-    except InputError as error:
+    except HeadbenchError as error:
         log.error("%s failed: %s", job.name, error)
         return failed_rows(job, metrics, error)
     except Exception as error:

@@ -6,13 +6,25 @@ import hashlib
 import logging
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from ..contracts import Avatar, Budget, Camera, Clip, FrameKey, HeadPose, Measurement, Progress
+from ..contracts import (
+    Avatar,
+    Budget,
+    Camera,
+    CheckedMethod,
+    Clip,
+    FloatArray,
+    FrameKey,
+    HeadPose,
+    ListedFrames,
+    Measurement,
+    Progress,
+)
 from ..errors import HeadbenchError, InputError, UnavailableError
 from ..io.files import check_name, digest, digest_file, grouped_writes, refuse_links
 from ..io.images import quantise, read_png, write_png
@@ -115,6 +127,12 @@ class Job:
                 "Choose another --out, or delete that folder.",
             )
 
+    def check_method(self) -> None:
+        """Let a method that can tell refuse what it could not train or render; not where all is done already."""
+        method = self.method.create()
+        if isinstance(method, CheckedMethod) and not self.cell.is_done("measure", self.fit_fingerprint):
+            method.check(TrainingView(self.form.clip), self.method.budget)
+
 
 def steps_ahead(job: Job, metrics: Sequence[MetricSpec]) -> dict[str, str]:
     """The steps of a cell that are not done, each with the kind of cells that it takes as long for."""
@@ -134,8 +152,7 @@ def steps_ahead(job: Job, metrics: Sequence[MetricSpec]) -> dict[str, str]:
 def fit(job: Job) -> Avatar:
     """Train, or continue, or read what was trained; return the avatar as read back from disk.
 
-    A native method sees the images of the training split alone. An adapter gets the whole clip, since official
-    repositories want a whole capture. The record's seconds are those since the last of ``interruptions``. An avatar
+    A method sees the images of the training split alone. The record's seconds are those since the last of ``interruptions``. An avatar
     with damaged files is trained again, with a warning.
     """
     method = job.method.create()
@@ -180,7 +197,7 @@ def fit(job: Job) -> Avatar:
 
 def _train(job: Job, method: Any, report: Progress) -> None:
     method.fit(
-        TrainingView(job.form.clip) if job.method.spec.native else job.form.clip,
+        TrainingView(job.form.clip),
         job.cell.avatar,
         job.method.budget,
         device=job.device,
@@ -214,21 +231,51 @@ def render(job: Job, avatar: Avatar) -> None:
         return
     recorded = time.monotonic()
     with job.progress(RENDERING) as report, grouped_writes():
-        for index, (name, (protocol, key)) in enumerate(missing.items()):
-            seen = form.key(key)
-            camera, pose = form.clip.cameras[seen.camera], form.clip.poses[seen.timestep]
-            frame = avatar.render(camera, pose, protocol.background)
-            if frame.rgb.shape != (camera.height, camera.width, 3):
+        for index, (name, rgb) in enumerate(_drawn(job, avatar, missing, report)):
+            protocol, key = missing[name]
+            camera = form.clip.cameras[form.key(key).camera]
+            if rgb.shape != (camera.height, camera.width, 3):
                 raise InputError(
-                    job.name, str(key), f"shape {(camera.height, camera.width, 3)}", f"{frame.rgb.shape}"
+                    job.name, str(key), f"shape {(camera.height, camera.width, 3)}", f"{rgb.shape}"
                 )
-            written = write_png(cell.folder / name, quantise(form.restore(key, frame.rgb)))
+            written = write_png(cell.folder / name, quantise(form.restore(key, rgb)))
             known[name] = hashlib.sha256(written).hexdigest()
             if time.monotonic() - recorded > RECORD_EVERY_S:
                 cell.begin(DIGESTS, made_of, files=known)
                 recorded = time.monotonic()
             report(index + 1, len(missing), protocol.task)
+        lacking = missing.keys() - known.keys()
+        if lacking:
+            first = missing[min(lacking)][1]
+            raise InputError(job.name, str(first), "a render", f"none of it and {len(lacking) - 1} more")
         cell.finish(DIGESTS, made_of, files=dict(sorted(known.items())))
+
+
+def _drawn(
+    job: Job, avatar: Avatar, missing: Mapping[str, tuple[Protocol, FrameKey]], report: Progress
+) -> Iterator[tuple[str, FloatArray]]:
+    """Place and (H, W, 3) colours of each frame: one by one, or by task where the avatar renders lists."""
+    clip = job.form.clip
+    views: dict[str, dict[FrameKey, tuple[str, tuple[Camera, HeadPose], Sequence[float]]]] = {}
+    for name, (protocol, key) in missing.items():
+        seen = job.form.key(key)
+        view = clip.cameras[seen.camera], clip.poses[seen.timestep]
+        if isinstance(avatar, ListedFrames):
+            views.setdefault(protocol.task, {})[seen] = (name, view, protocol.background)
+        else:
+            yield name, avatar.render(*view, protocol.background).rgb
+    before = 0
+    for task, listed in views.items():
+        assert isinstance(avatar, ListedFrames)
+        background = next(iter(listed.values()))[2]
+        asked = {key: view for key, (_, view, _) in listed.items()}
+
+        def drawing(done: int, total: int, note: str = "", task: str = task, before: int = before) -> None:
+            report(before, len(missing), f"{task}, {done} of {total} drawn {note}")  # none of them read yet
+
+        for key, frame in avatar.render_listed(asked, background, drawing):
+            yield listed[key][0], frame.rgb
+        before += len(listed)
 
 
 def recorded_frames(job: Job) -> dict[str, str]:

@@ -57,6 +57,11 @@ def curve(settings: CurveSettings, out: Path) -> Findings:
     run = RunFolder(Path(settings.run))
     wanted = _wanted(settings, run)
     config, clips = open_run_clips(run.root, settings, out=out)
+    programs = [method.spec.name for method in wanted if not method.spec.native]
+    if programs and not settings.trust:
+        expected = "methods that run no program which the run folder names"
+        remedy = "Give --trust to run it, if you trust who made the run; or name other methods."
+        raise InputError(run.manifest, "configuration.settings", expected, ", ".join(programs), remedy)
     check_device(config.device)
     held = [hold_out(clip, settings.camera, settings.every) for clip in clips]
     tasks = tuple(task for task in (CAMERA, TIMESTEPS) if all(task in clip.splits for clip in held))
@@ -76,6 +81,7 @@ def curve(settings: CurveSettings, out: Path) -> Findings:
     jobs = [job for training in trainings for job in training.jobs]
     for job in jobs:
         job.check()
+        job.check_method()
     warn_of_missing_metrics(metrics, held[0])
     manifest = replace(
         describe(config, [], metrics, subjects, protocols),

@@ -100,10 +100,12 @@ def _extremes_section(folder: Path, avatar: Mapping[str, Any], width: int) -> Sh
 
 
 def _avatars(folder: Path) -> Sequence[Mapping[str, Any]]:
+    """Records of the avatars that were rendered."""
     avatars: Sequence[Mapping[str, Any]] = read_json(folder / RECORD_FILE)["avatars"]
-    if not avatars:
-        raise InputError(folder / RECORD_FILE, "avatars", "at least one", "none")
-    return avatars
+    rendered = [avatar for avatar in avatars if "missing" not in avatar]
+    if not rendered:
+        raise InputError(folder / RECORD_FILE, "avatars", "at least one that was rendered", "none")
+    return rendered
 
 
 def _picture(path: Path, width: int) -> Any:

@@ -6,15 +6,17 @@ low resolution, whose edges are, does not count against it.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, astuple, dataclass
+from dataclasses import asdict, astuple, dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ...bench.contracts import Avatar, Camera, Clip, FloatArray, Frame, FrameKey, HeadPose, Progress
+from ...bench.errors import UnavailableError
 from ...bench.io.files import write_json
 from ...bench.io.images import quantise, write_png
 from ...bench.protocol import Protocol, TaskWithoutTruth, make_protocol_without_truth
@@ -23,6 +25,7 @@ from ...bench.runner.adaptation import MethodNeeds
 from ...bench.runner.scoring import FULL
 from ...bench.runner.steps import Job
 
+log = logging.getLogger(__name__)
 COVERED, SOLID = 0.05, 0.95
 VISIBLE_OPACITY = 0.05
 NEAR_M = 0.01
@@ -196,7 +199,10 @@ def run_cases(
     out: Path,
     progress: Progress,
 ) -> list[dict[str, Any]]:
-    """Render and judge all cases; leave rows and a record under ``out``, and return the record of each avatar."""
+    """Render and judge all cases; leave rows and a record under ``out``, and return the record of each avatar.
+
+    An avatar that cannot be rendered so (`UnavailableError`) has missing rows, and its record says why.
+    """
     # Avatars of methods with equal needs are shown the same frames, and so share a protocol.
     protocols: dict[MethodNeeds, Protocol] = {}
     for needs in {case.needs: None for case in cases}:
@@ -212,9 +218,16 @@ def run_cases(
     rows: list[Row] = []
     avatars = []
     for case in cases:
-        frames, details = case.render(lambda n, done=done, name=case.name: progress(done + n, total, name))  # type: ignore[misc]
-        done += len(frames)
         protocol = protocols[case.needs].hash
+        try:
+            frames, details = case.render(
+                lambda n, done=done, name=case.name: progress(done + n, total, name)  # type: ignore[misc]
+            )
+        except UnavailableError as error:
+            log.warning("%s is missing: %s", case.name, error)
+            absent = [LimitCheck(field.name, None, 0.0, 0.0, str(error)) for field in fields(Measures)]
+            frames, details = [JudgedFrame(key, absent) for key in case.keys], {"missing": str(error)}
+        done += len(case.keys)
         rows += _rows(case.job, task, frames, protocol)
         avatars.append({**_summary(case.job, frames), **details, "protocol": protocol})
     Rows.of(rows).write(out / ROWS_FILE)
@@ -302,6 +315,8 @@ def table(summaries: Sequence[Mapping[str, Any]]) -> str:
         ranges = [s["ranges"][name] for name in names]
         shown = ["-" if low is None else f"{low:.2f} to {high:.2f}" for low, high in ranges]
         lines.append(form(s["subject"], s["method"], s["seed"], s["frames"], s["frames_broken"], *shown))
+        if "missing" in s:
+            lines.append(f"  missing: {s['missing']}")
         if s.get("identity") is not None:
             known = [f"{name} {value:.1f}" for name, value in s["identity"].items() if value is not None]
             lines.append(f"  colour difference from the subject's recordings (CIEDE2000): {', '.join(known)}")

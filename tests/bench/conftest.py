@@ -17,6 +17,7 @@ def toy(monkeypatch):
 
     toy_plugin.FITS.clear()
     toy_plugin.ADAPTED.clear()
+    toy_plugin.LISTS.clear()
     toy_plugin.WORKLOAD_SIZES.clear()
     return toy_plugin
 

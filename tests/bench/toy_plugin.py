@@ -163,6 +163,36 @@ class MirrorMethod(ToyMethod):
         return MirrorAvatar(path)
 
 
+LISTS: list[list[FrameKey]] = []
+
+
+class ListingAvatar(MirrorAvatar):
+    """The mirror, for lists of frames alone."""
+
+    short = False
+
+    def render(self, camera, pose, background=(1.0, 1.0, 1.0)):
+        raise UnavailableError("Frames come in lists alone.", "Ask for a list.")
+
+    def render_listed(self, views, background, progress):
+        LISTS.append(list(views))
+        progress(1, len(views))
+        for key, view in list(reversed(views.items()))[self.short :]:
+            yield key, super().render(*view, background)
+
+
+class ListingMethod(ToyMethod):
+    def load(self, path, *, device):
+        return ListingAvatar(path)
+
+
+class CheckingMethod(ToyMethod):
+    def check(self, clip, budget):
+        raise InputError(
+            "settings.checking", "checkout", f"a folder, for {budget.iterations} steps", "no checkout"
+        )
+
+
 class PeekingMethod(ToyMethod):
     def fit(self, clip, out, budget, **arguments):
         clip.image(clip.splits["train"][0])
@@ -175,6 +205,10 @@ MIRROR = MethodSpec(
     "mirror", "the driving signal", "toy_plugin:MirrorMethod", "toy_plugin:ToyConfig", PRESETS
 )
 METHOD = MethodSpec("toy", "one grey level", "toy_plugin:ToyMethod", "toy_plugin:ToyConfig", PRESETS)
+
+
+LISTING = replace(MIRROR, name="listing", implementation="toy_plugin:ListingMethod", native=False)
+CHECKING = replace(METHOD, name="checking", implementation="toy_plugin:CheckingMethod")
 
 
 def levels(folder, clip, device):

@@ -112,9 +112,40 @@ def test_a_method_that_looks_at_held_out_frames_fails(config):
     assert rows["reason"].str.contains("not a training frame").all()
 
 
-def test_an_adapter_is_given_the_whole_capture(config, toy, monkeypatch):
+def test_an_adapter_sees_training_frames_alone_as_well(config, toy, monkeypatch):
     monkeypatch.setattr(toy, "PEEKING", replace(toy.PEEKING, native=False))
-    assert set(rows_of(config, methods=("toy_plugin:PEEKING",))["status"]) == {"ok"}
+    assert set(rows_of(config, methods=("toy_plugin:PEEKING",))["status"]) == {"failed"}
+
+
+def test_an_avatar_that_renders_lists_is_asked_for_lists(config, toy):
+    metrics = ("psnr", "storage", "fps")
+    rows = rows_of(config, methods=("toy_plugin:LISTING",), metrics=metrics)
+    by_metric = dict(iter(rows.groupby("metric")))
+    assert set(by_metric["psnr"]["status"]) == {"ok"} == set(by_metric["storage"]["status"])
+    assert set(by_metric["fps"]["status"]) == {"missing"}
+    assert by_metric["fps"]["reason"].str.contains("lists alone").all()
+    one_by_one = rows_of(config, methods=("toy_plugin:MIRROR",), metrics=metrics, out=f"{config.out}-one")
+    expected = one_by_one[one_by_one["metric"] == "psnr"]["value"]
+    assert by_metric["psnr"]["value"].tolist() == expected.tolist()
+    # The tasks are one list each, and what is rendered already is not asked for again.
+    assert [len(keys) for keys in toy.LISTS] == [3, 2] * 2
+    toy.LISTS.clear()
+    next((Path(config.out) / "subject1" / "listing").rglob("*.png")).unlink()
+    rows_of(config, methods=("toy_plugin:LISTING",), metrics=metrics)
+    assert [len(keys) for keys in toy.LISTS] == [1]
+
+
+def test_a_list_that_comes_back_short_fails_the_cell(config, toy, monkeypatch):
+    monkeypatch.setattr(toy.ListingAvatar, "short", True)
+    rows = rows_of(config, methods=("toy_plugin:LISTING", "toy_plugin:METHOD"))
+    assert set(rows[rows["method"] == "listing"]["status"]) == {"failed"}
+    assert set(rows[rows["method"] == "toy"]["status"]) == {"ok"}
+
+
+def test_a_method_that_checks_is_asked_before_any_work(config, toy):
+    with pytest.raises(InputError, match="no checkout"):
+        rows_of(config, methods=("toy_plugin:METHOD", "toy_plugin:CHECKING"))
+    assert toy.FITS == []
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from headbench.bench.contracts import Camera, Frame, FrameKey, HeadPose
+from headbench.bench.errors import UnavailableError
 from headbench.bench.specs import DatasetSpec, MethodSpec
 from headbench.reports.robustness.viewpoints import look_at
 
@@ -127,13 +128,28 @@ class BrokenMethod(BallMethod):
     avatar = staticmethod(partial(Ball, bursts="nan"))
 
 
+class Listed(Ball):
+    """One that another program renders."""
+
+    def render(self, camera, pose, background=(1.0, 1.0, 1.0)):
+        raise UnavailableError("Frames come in lists alone.", "Ask for a list.")
+
+    def render_listed(self, views, background, progress):
+        for key, view in views.items():
+            yield key, super().render(*view, background)
+
+
+class ListedMethod(BallMethod):
+    avatar = staticmethod(Listed)
+
+
 class SplattyMethod(BallMethod):
     avatar = staticmethod(Splatty)
 
 
 READER = DatasetSpec("balls", "balls", "ball_plugin:BallClip", find="ball_plugin:find")
-BALL, BURSTING, BROKEN, SPLATTY = (
+BALL, BURSTING, BROKEN, SPLATTY, LISTED = (
     MethodSpec(name, name, f"ball_plugin:{name.capitalize()}Method")
-    for name in ("ball", "bursting", "broken", "splatty")
+    for name in ("ball", "bursting", "broken", "splatty", "listed")
 )
 FLOOR = MethodSpec("floor", "a floor", "ball_plugin:BallMethod", trivial=True)

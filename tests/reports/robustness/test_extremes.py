@@ -58,6 +58,20 @@ def test_a_stable_avatar_passes_and_every_pair_has_its_rows(ball_run):
     assert EXTRAPOLATED in shown
 
 
+@pytest.mark.parametrize("others", [(), ("BALL",)])
+def test_avatars_that_render_lists_alone_are_missing(ball_run, others):
+    folder = ball_run("LISTED", *others)
+    found = extremes_run(settings(folder))
+    assert found.passed
+    assert "missing: Frames come in lists alone. Ask for a list." in found.text
+    rows = pd.read_parquet(folder / "extremes" / ROWS_FILE)
+    missing = rows[rows["method"] == "listed"]
+    assert set(missing["status"]) == {"missing"}
+    assert missing["reason"].str.contains("in lists alone").all()
+    assert len(missing) == 2 * 5 * VIEWS * (1 + COMPONENTS * STEPS)
+    assert (folder / "extremes" / SHEET_FILE).exists() == bool(others)
+
+
 def test_a_burst_is_found_where_it_is_and_nowhere_else(ball_run):
     folder = ball_run("BURSTING", "BALL")
     found = extremes_run(settings(folder))

@@ -1,0 +1,221 @@
+"""The authors' checkout and interpreter: looked at before any long work."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import shlex
+import shutil
+import subprocess
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ...bench.errors import InputError
+from ...bench.io.files import read_bytes
+from .config import OfficialConfig
+from .process import environment
+
+SHORTEST_COMMIT = 7
+PROBE_S = 300.0
+"""Seconds that the interpreter has to import the modules that are asked of it; the first time they come from disk."""
+MOST_SOURCE = 2**22
+
+_PROBE = """
+import importlib, json, sys
+found = {"python": sys.version.split()[0], "missing": {}}
+for name in sys.argv[1:]:
+    try:
+        importlib.import_module(name)
+    except BaseException as error:
+        found["missing"][name] = (type(error).__name__ + ": " + str(error))[:200]
+if "torch" in sys.argv[1:] and "torch" not in found["missing"]:
+    import torch
+    found["torch"], found["cuda"] = torch.__version__, bool(torch.cuda.is_available())
+print("\\nheadbench-probe " + json.dumps(found))
+"""
+
+
+@dataclass(frozen=True)
+class Repository:
+    """What there is to know of an official repository.
+
+    Attributes
+    ----------
+    url : where it is.
+    commit : the one that its adapter was written for.
+    scripts : files that tell its checkout from another folder.
+    modules : what has to be importable in its interpreter.
+    """
+
+    url: str
+    commit: str
+    scripts: tuple[str, ...]
+    modules: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Checkout:
+    """A checkout that was looked at.
+
+    Attributes
+    ----------
+    folder : of the checkout, absolute.
+    python : command of the interpreter.
+    record : commit, files that differ from it, versions; for the avatar's record.
+    """
+
+    folder: Path
+    python: tuple[str, ...]
+    record: dict[str, Any]
+
+    def constant(self, file: str, pattern: str, what: str) -> str:
+        """What the first group of ``pattern`` matches in a source file. Raises `InputError` where nothing does."""
+        return find_constant(self.folder, file, pattern, what)
+
+
+def find_constant(folder: Path, file: str, pattern: str, what: str) -> str:
+    """A value that stands in a source file of a checkout; see `Checkout.constant`."""
+    path = folder / file
+    match = re.search(pattern, read_bytes(path, "a source file", MOST_SOURCE).decode(errors="replace"))
+    if match is None:
+        remedy = "Check out the commit that this adapter was written for."
+        raise InputError(path, what, f"a line like {pattern}", "none", remedy)
+    return match[1]
+
+
+def look(method: str, config: OfficialConfig, repository: Repository) -> Checkout:
+    """Check the settings of a method: folder, commit, interpreter, what it can import, and a GPU.
+
+    Raises `InputError` that names the setting and the next step for the first that is not as it should be.
+    """
+    folder, record = _folder(method, config, repository)
+    python = _interpreter(method, config)
+    return Checkout(folder, python, record | _probed(method, python, repository))
+
+
+def _folder(method: str, config: OfficialConfig, repository: Repository) -> tuple[Path, dict[str, Any]]:
+    source, commit = f"settings.{method}", config.commit
+    remedy = (
+        f"git clone --recursive {repository.url} DIR && git -C DIR checkout {repository.commit[:12]}; then --set "
+        f"settings.{method}.checkout=DIR and --set settings.{method}.python=PYTHON of an environment made as its "
+        "installation page says (methods/official/README.md)."
+    )
+    if not config.checkout:
+        raise InputError(source, "checkout", f"the folder of a checkout of {repository.url}", "none", remedy)
+    folder = Path(config.checkout).expanduser().resolve()
+    if not folder.is_dir():
+        raise InputError(folder, f"{source}.checkout", "a folder", "no such folder", remedy)
+    missing = [name for name in repository.scripts if not (folder / name).is_file()]
+    if missing:
+        expected = f"a checkout of {repository.url}, with {', '.join(repository.scripts)}"
+        raise InputError(folder, f"{source}.checkout", expected, f"none of {', '.join(missing)}", remedy)
+    if commit and not re.fullmatch(rf"[0-9a-f]{{{SHORTEST_COMMIT},40}}", commit):
+        expected = f"{SHORTEST_COMMIT} to 40 digits of a commit, or nothing"
+        raise InputError(source, "commit", expected, repr(commit)[:60])
+    found, changed = _commit(folder)
+    if commit and not found.startswith(commit):
+        what = "a folder that git does not know" if not found else f"commit {found[:12]}"
+        step = (
+            f"git -C {folder} checkout {commit[:12]}, or --set settings.{method}.commit={found[:12] or chr(39) * 2} "
+            "to take what is there; results then name that."
+        )
+        raise InputError(folder, f"{source}.commit", f"commit {commit[:12]}", what, step)
+    return folder, {"repository": repository.url, "commit": found, **changed}
+
+
+def _commit(folder: Path) -> tuple[str, dict[str, Any]]:
+    """Commit of a checkout ("" where there is none), and which of its files differ from it."""
+    top = _git(folder, "rev-parse", "--show-toplevel").strip()
+    if not top or Path(top).resolve() != folder:
+        return "", {}
+    commit = _git(folder, "rev-parse", "HEAD").strip()
+    difference = _git(folder, "diff", "--no-ext-diff", "--no-textconv", "--ignore-submodules", "HEAD")
+    if not difference:
+        return commit, {"changed": []}
+    names = _git(
+        folder, "diff", "--no-ext-diff", "--no-textconv", "--ignore-submodules", "--name-only", "HEAD"
+    ).split("\n")
+    changed = [name for name in names if name][:40]
+    return commit, {"changed": changed, "difference": hashlib.sha256(difference.encode()).hexdigest()}
+
+
+def _git(folder: Path, *arguments: str) -> str:
+    """Output of git, "" where it fails. Hooks and programs that the checkout's configuration names are not run."""
+    safe = ("-c", "core.fsmonitor=false", "-c", "core.hooksPath=/dev/null", "-c", f"safe.directory={folder}")
+    try:
+        done = subprocess.run(
+            ["git", "-C", str(folder), *safe, *arguments],
+            check=False,
+            capture_output=True,
+            stdin=subprocess.DEVNULL,
+            timeout=60,
+            env=environment({"GIT_OPTIONAL_LOCKS": "0"}),
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    return done.stdout.decode(errors="replace") if done.returncode == 0 else ""
+
+
+def _interpreter(method: str, config: OfficialConfig) -> tuple[str, ...]:
+    source = f"settings.{method}"
+    remedy = f"--set settings.{method}.python=/path/to/environment/bin/python, or a command that starts one."
+    try:
+        words = shlex.split(config.python)
+    except ValueError:
+        words = []
+    if not words:
+        found = repr(config.python)[:80] if config.python else "none"
+        raise InputError(source, "python", "the interpreter that the checkout's code runs in", found, remedy)
+    program = shutil.which(str(Path(words[0]).expanduser()))
+    if program is None:
+        raise InputError(
+            words[0], f"{source}.python", "a program that can be run", "none of that name", remedy
+        )
+    # Not resolved: the interpreter of a virtual environment is a link, and known by where the link is.
+    absolute = Path(program) if Path(program).is_absolute() else Path.cwd() / program
+    return (str(absolute), *words[1:])
+
+
+def _probed(method: str, python: Sequence[str], repository: Repository) -> dict[str, Any]:
+    """Versions of the interpreter, once it has shown that it can import what the code needs."""
+    source, command = f"settings.{method}.python", [*python, "-c", _PROBE, *repository.modules]
+    try:
+        done = subprocess.run(
+            command,
+            check=False,
+            capture_output=True,
+            stdin=subprocess.DEVNULL,
+            timeout=PROBE_S,
+            env=environment(),
+            start_new_session=True,
+        )
+        lines = done.stdout.decode(errors="replace").split("\n")
+        answer = next((line for line in lines if line.startswith("headbench-probe ")), "")
+        found = json.loads(answer.partition(" ")[2])
+        missing, cuda, versions = (
+            dict(found["missing"]),
+            found.get("cuda"),
+            (found["python"], found.get("torch")),
+        )
+    except subprocess.TimeoutExpired as error:
+        expected = f"an answer within {PROBE_S:g} s"
+        raise InputError(python[0], source, expected, "none", "Try it by hand: import torch.") from error
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        said = (
+            done.stderr.decode(errors="replace").strip()[-200:]
+            if isinstance(error, ValueError)
+            else str(error)
+        )
+        raise InputError(python[0], source, "a Python interpreter", said or "no answer") from error
+    if missing:
+        name, why = next(iter(missing.items()))
+        expected = f"an interpreter that imports {', '.join(repository.modules)}"
+        remedy = f"Install {', '.join(missing)} as {repository.url} says (methods/official/README.md)."
+        raise InputError(python[0], source, expected, f"{name}: {why}", remedy)
+    if cuda is False:
+        remedy = "Run it on a machine with an NVIDIA GPU and a CUDA build of PyTorch."
+        raise InputError(python[0], source, "PyTorch that finds a CUDA device", "none", remedy)
+    return {"python": str(versions[0])[:40], "torch": versions[1] and str(versions[1])[:40]}

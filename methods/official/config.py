@@ -1,0 +1,44 @@
+"""Settings that all official methods share. Light: nothing but the standard library is imported."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+
+@dataclass(frozen=True)
+class OfficialConfig:
+    """Where the authors' code is, and what runs it.
+
+    Attributes
+    ----------
+    checkout : folder of a checkout of the authors' repository. It is read, never written.
+    python : command that starts the interpreter in which their code runs: a path, or words such as ``conda run -n ga
+        python`` or ``apptainer exec --nv ga.sif python``. A container has to see the checkout and the run folder by the
+        same paths.
+    commit : what is checked out, by the first seven digits or more; "" takes whatever is there.
+    arguments : appended to their training command.
+    device : where their code computes; "cuda" is all that it knows.
+    """
+
+    checkout: str = ""
+    python: str = ""
+    commit: str = ""
+    arguments: tuple[str, ...] = ()
+    device: Literal["cuda"] = "cuda"
+
+    places: ClassVar[tuple[str, ...]] = ("checkout", "python")
+
+
+@dataclass(frozen=True)
+class GAOfficialConfig(OfficialConfig):
+    """GaussianAvatars by its authors' code; the commit is the one that the adapter was written for."""
+
+    commit: str = "30cc4bde86b59968c2848934bdd962f410fb63f6"
+
+
+@dataclass(frozen=True)
+class TGAOfficialConfig(OfficialConfig):
+    """The method of `ours` by its authors' code; the commit is the one that the adapter was written for."""
+
+    commit: str = "828adf5575cfe493907de7cc04ad78aba70bcd10"

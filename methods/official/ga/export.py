@@ -1,0 +1,127 @@
+"""Captures and lists of frames in the form that GaussianAvatars' loader reads."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ....bench.contracts import ByteArray, Camera, Clip, FrameKey, HeadPose, Progress
+from ....bench.errors import InputError
+from ....bench.io.files import grouped_writes, write_json
+from ....bench.io.images import read_png, write_png
+from ....datasets.ga import layout
+from ....datasets.ga.writer import CANONICAL_JAW, camera_record, save_npz, transforms_document
+from ..method import Listed, Workplace
+from .head_files import OfficialTracking
+from .windows import Window, around, inside
+
+TRAIN, VALIDATION, TEST = layout.SPLIT_FILES.values()
+MARK_LEVELS, MARK_STEP = 16, 16
+"""A mark is a colour of one of 16 levels per channel, 16 apart, so that no rounding turns one into another."""
+
+
+def write_training(
+    clip: Clip, tracking: OfficialTracking, work: Workplace, progress: Progress
+) -> dict[str, FrameKey]:
+    """Write the training frames as a capture without any other: timesteps numbered from 0, other splits empty.
+
+    Returns the key of every image by its place. The loader opens the JSONs of all three splits, takes the static offset
+    from timestep 0, and chooses its dynamic reader by the canonical parameters, whose content it never reads.
+    """
+    timesteps = sorted({key.timestep for key in clip.splits["train"]})
+    number = {timestep: index for index, timestep in enumerate(timesteps)}
+    names = sorted({key.camera for key in clip.splits["train"]})
+    windows = {name: inside(clip.cameras[name]) for name in names}
+    keys = sorted(clip.splits["train"], key=lambda key: (key.timestep, key.camera))
+    records, images = [], {}
+    with grouped_writes():
+        for done, key in enumerate(keys, 1):
+            index = names.index(key.camera)
+            image = f"images/{layout.frame_name(number[key.timestep], index)}.png"
+            write_png(work.input / image, windows[key.camera].cut(clip.image(key)))
+            records.append(_record(windows[key.camera], index, number[key.timestep], image))
+            images[f"input/{image}"] = key
+            progress(done, len(keys), "exporting")
+        for timestep, index in number.items():
+            tracking.write(work.input / _parameters(index), clip.poses[timestep])
+    _write_splits(work.input, {TRAIN: records}, windows[names[-1]].camera)
+    _write_canonical(work.input, tracking, clip.poses[timesteps[0]])
+    return images
+
+
+def write_list(frames: Sequence[Listed], tracking: OfficialTracking, work: Workplace) -> list[HeadPose]:
+    """Write frames to render as the test split of a capture; return the pose of each of its timesteps.
+
+    The image of each is a mark, one colour that tells its number: the loader reads it as ground truth and the renderer
+    writes it beside the render, so that `check_mark` sees which frame a file shows. The training split, which the loader
+    takes the scene's size from, is the first frame.
+    """
+    poses: list[HeadPose] = []
+    number: dict[int, int] = {}
+    records = []
+    with grouped_writes():
+        for frame in frames:
+            if id(frame.pose) not in number:
+                number[id(frame.pose)] = len(poses)
+                tracking.write(work.input / _parameters(len(poses)), frame.pose)
+                poses.append(frame.pose)
+            window, image = around(frame.camera), f"images/{frame.number:05d}.png"
+            size = window.camera.height, window.camera.width, 3
+            write_png(work.input / image, np.full(size, mark(frame.number), np.uint8))
+            records.append(_record(window, frame.number, number[id(frame.pose)], image))
+    _write_splits(work.input, {TRAIN: records[:1], TEST: records}, frames[-1].camera)
+    _write_canonical(work.input, tracking, poses[0])
+    return poses
+
+
+def mark(number: int) -> ByteArray:
+    """(3,) colour that tells a frame's number, modulo 4,096."""
+    digits = [number // MARK_LEVELS**place % MARK_LEVELS for place in range(3)]
+    return np.array([MARK_STEP * digit + MARK_STEP // 2 for digit in digits], np.uint8)
+
+
+def check_mark(path: Path, number: int) -> None:
+    """Raise `InputError` where a file is not the mark of a frame: what is rendered there is another one."""
+    pixels = read_png(path).reshape(-1, 3).astype(int)
+    off = int(np.abs(pixels - mark(number).astype(int)).max())
+    if off >= MARK_STEP // 2:
+        raise InputError(path, "", f"the mark of frame {number}", "that of another: the order was changed")
+
+
+def read_window(frame: Listed, path: Path) -> ByteArray:
+    """A render at the size of its camera. Raises `InputError` for one that is not of its window's size."""
+    window = around(frame.camera)
+    image = read_png(path)
+    wanted = (window.camera.height, window.camera.width)
+    if image.shape[:2] != wanted:
+        found = f"{image.shape[1]}x{image.shape[0]}"
+        raise InputError(path, str(frame.key), f"{wanted[1]}x{wanted[0]} pixels", found)
+    return window.uncut(image, frame.camera)
+
+
+def _parameters(timestep: int) -> str:
+    return f"flame_param/{layout.parameter_name(timestep)}"
+
+
+def _record(window: Window, index: int, timestep: int, image: str) -> dict[str, Any]:
+    return {
+        "timestep_index": timestep,
+        **camera_record(window.camera, index, "bottom"),
+        "file_path": image,
+        "flame_param_path": _parameters(timestep),
+    }
+
+
+def _write_splits(folder: Path, frames: Mapping[str, Sequence[Mapping[str, Any]]], camera: Camera) -> None:
+    shared = layout.intrinsics_to_json(camera, "bottom")
+    for file in (TRAIN, VALIDATION, TEST):
+        write_json(folder / file, transforms_document(frames.get(file, ()), shared))
+
+
+def _write_canonical(folder: Path, tracking: OfficialTracking, pose: HeadPose) -> None:
+    values = tracking.parameters(pose)
+    zeros = {k: v if k in ("shape", "static_offset") else np.zeros_like(v) for k, v in values.items()}
+    save_npz(folder / layout.CANONICAL_FILE, {**zeros, "jaw_pose": np.array([CANONICAL_JAW])})

@@ -1,0 +1,231 @@
+"""A head model as the files that GaussianAvatars' code opens: FLAME's pickle, its masks, a template, landmarks.
+
+Their paths are relative to the program's working directory, so that a clip's own head model stands in for the one in the
+checkout. The code adds teeth, hung on thirty vertices that it knows by number, and reads 300 and 100 coefficients: a
+head of another topology is renumbered so that these vertices are its lips, one with fewer coefficients is padded.
+"""
+
+from __future__ import annotations
+
+import pickle
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ....bench.contracts import FloatArray, HeadAsset, HeadPose, IntArray
+from ....bench.errors import InputError
+from ....bench.io.files import atomic_path, read_bytes, write_bytes, write_text
+from ....datasets.ga.writer import pose_to_parameters, save_npz
+from ....datasets.head.arrays import JOINT_NAMES, RING_REGIONS, HeadArrays
+from ....datasets.head.loaders import FLAME_IDENTITY_SIZE
+from ....datasets.head.teeth import lip_rings
+from ..checkout import find_constant
+
+ASSETS = Path("flame_model/assets/flame")
+MODEL_FILE, MASKS_FILE = ASSETS / "flame2023.pkl", ASSETS / "FLAME_masks.pkl"
+TEMPLATE_FILE, LANDMARKS_FILE = ASSETS / "head_template_mesh.obj", ASSETS / "landmark_embedding_with_eyes.npy"
+SOURCE = "flame_model/flame.py"
+EXPRESSION_SIZE = 100
+"""Expression coefficients that their code reads."""
+MASKS = (
+    *(
+        "face",
+        "neck",
+        "scalp",
+        "boundary",
+        "right_eyeball",
+        "left_eyeball",
+        "right_ear",
+        "left_ear",
+        "forehead",
+    ),
+    *("eye_region", "nose", "lips", "right_eye_region", "left_eye_region"),
+)
+"""Regions of FLAME's masks; one that a head does not have is left empty."""
+LANDMARKS = 70
+MOST_TEMPLATE = 2**26
+
+
+@dataclass(frozen=True, eq=False)
+class OfficialHead:
+    """A head model as their code is given it: without teeth, its vertices in their order.
+
+    Attributes
+    ----------
+    order : (V',) vertex of the clip's head for each of theirs; -1 for one that stands for nothing.
+    """
+
+    head: HeadAsset
+    order: IntArray
+    faces: IntArray
+
+    @classmethod
+    def of(cls, head: HeadAsset, checkout: Path) -> OfficialHead:
+        """Fit a clip's head model to their code. Raises `InputError` where it does not."""
+        where = f"head model {head.version!r}"
+        for name, size, most in (
+            ("identity", head.shape_basis.shape[2], FLAME_IDENTITY_SIZE),
+            ("expression", head.expression_basis.shape[2], EXPRESSION_SIZE),
+        ):
+            if size > most:
+                raise InputError(
+                    where, f"{name} basis", f"at most {most} directions; their code reads no more", f"{size}"
+                )
+        if list(head.parents) != [-1, 0, 1, 1, 1]:
+            raise InputError(
+                where, "parents", f"FLAME's joints, {', '.join(JOINT_NAMES)}", f"{list(head.parents)}"
+            )
+        kept = np.setdiff1d(np.arange(len(head.template)), head.regions.get("teeth", []))
+        faces = head.faces[np.isin(head.faces, kept).all(axis=1)]
+        number = np.full(len(head.template), -1)
+        number[kept] = np.arange(len(kept))
+        own = cls(head, kept, number[faces])
+        if _same_faces(own.faces, checkout / TEMPLATE_FILE):
+            return own  # FLAME's own topology: their numbers are right as they are
+        return own._with_lips(_their_rings(checkout), where)
+
+    def _with_lips(self, wanted: tuple[IntArray, IntArray], where: str) -> OfficialHead:
+        """Number the vertices anew so that those wanted are the rings of the lips."""
+        rings = [np.searchsorted(self.order, ring) for ring in lip_rings(self.head)]
+        for ring, numbers in zip(rings, wanted):
+            if len(ring) != len(numbers):
+                expected = f"rings of {len(numbers)} vertices, on which their code hangs teeth"
+                raise InputError(where, " and ".join(RING_REGIONS), expected, f"{len(ring)}")
+        lips, places = np.concatenate(rings), np.concatenate(wanted)
+        count = max(len(self.order), int(places.max()) + 1)
+        free = np.setdiff1d(np.arange(count), places)
+        rest = np.setdiff1d(np.arange(len(self.order)), lips)
+        old = np.full(count, -1)
+        old[places] = lips
+        old[free[: len(rest)]] = rest
+        new = np.empty(len(self.order), np.int64)
+        new[old[old >= 0]] = np.flatnonzero(old >= 0)
+        return OfficialHead(self.head, np.where(old < 0, -1, self.order[old]), new[self.faces])
+
+    def vertices(self, values: FloatArray) -> FloatArray:
+        """Values per vertex, in their order; 0 for vertices that stand for nothing."""
+        taken = np.asarray(values)[np.maximum(self.order, 0)]
+        taken[self.order < 0] = 0
+        return taken
+
+    def write(self, folder: Path) -> None:
+        """Write the four files below the program's working directory."""
+        head, weights = self.head, self.vertices(self.head.skinning_weights).astype(np.float64)
+        weights[self.order < 0, 0] = 1.0
+        parents = np.maximum(head.parents, 0)
+        model: dict[str, np.ndarray] = {
+            "v_template": self.vertices(head.template).astype(np.float64),
+            "f": self.faces.astype(np.uint32),
+            "shapedirs": np.concatenate(
+                [
+                    _padded(self.vertices(head.shape_basis), FLAME_IDENTITY_SIZE),
+                    _padded(self.vertices(head.expression_basis), EXPRESSION_SIZE),
+                ],
+                axis=2,
+            ).astype(np.float32),
+            "posedirs": self.vertices(head.pose_basis).astype(np.float64),
+            "J_regressor": self.vertices(head.joint_regressor.T).T.astype(np.float64),
+            "kintree_table": np.stack([parents, np.arange(len(parents))]).astype(np.int64),
+            "weights": weights,
+        }
+        write_bytes(folder / MODEL_FILE, pickled(model))
+        write_bytes(folder / MASKS_FILE, pickled({name: self._region(name) for name in MASKS}))
+        # One texture coordinate for all corners: nothing of it is ever drawn.
+        lines = ["v {:.9g} {:.9g} {:.9g}".format(*vertex) for vertex in model["v_template"]]
+        lines += ["vt 0 0", *("f {}/1 {}/1 {}/1".format(*face) for face in self.faces + 1)]
+        write_text(folder / TEMPLATE_FILE, "\n".join(lines) + "\n")
+        # Landmarks are loaded, never asked for: all stand on one triangle. A record of fields is read like a dictionary.
+        fields = [
+            ("full_lmk_faces_idx", "<i8", (1, LANDMARKS)),
+            ("full_lmk_bary_coords", "<f4", (1, LANDMARKS, 3)),
+        ]
+        landmarks = np.zeros((), dtype=fields)
+        landmarks["full_lmk_bary_coords"] = 1 / 3
+        with atomic_path(folder / LANDMARKS_FILE) as temporary, temporary.open("wb") as stream:
+            np.save(stream, landmarks, allow_pickle=False)
+
+    def _region(self, name: str) -> IntArray:
+        return np.flatnonzero(np.isin(self.order, self.head.regions.get(name, []))).astype(np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class OfficialTracking:
+    """Tracked parameters of one subject as their code reads them."""
+
+    head: OfficialHead
+    shape: FloatArray
+    static_offset: FloatArray
+
+    def write(self, path: Path, pose: HeadPose) -> None:
+        """Write the parameters of one timestep."""
+        save_npz(path, self.parameters(pose))
+
+    def parameters(self, pose: HeadPose) -> dict[str, np.ndarray]:
+        """Parameters of one timestep, padded: ``shape`` (300,), ``static_offset`` (1, V, 3), all else with one row.
+
+        Raises `InputError` for a pose of another head model.
+        """
+        version = self.head.head.version
+        if pose.head_model != version:
+            raise InputError("pose", "head_model", repr(version), repr(pose.head_model))
+        values = {k: v for k, v in pose_to_parameters(pose).items() if k != "eyelids"}
+        values["expr"] = _padded(values["expr"], EXPRESSION_SIZE)
+        shape = _padded(np.asarray(self.shape, np.float32)[None], FLAME_IDENTITY_SIZE)[0]
+        offset = self.head.vertices(np.asarray(self.static_offset, np.float32))[None]
+        return {**values, "shape": shape, "static_offset": offset}
+
+
+def pickled(arrays: Mapping[str, np.ndarray]) -> bytes:
+    """Arrays by name as a pickle that every version of numpy reads: it calls nothing but ``numpy.ndarray``."""
+    from io import BytesIO
+
+    stream = BytesIO()
+    _Pickler(stream, protocol=4).dump(dict(arrays))
+    return stream.getvalue()
+
+
+class _Pickler(pickle.Pickler):
+    """Writes an array as a call of its class with shape, type and bytes.
+
+    How numpy itself pickles an array names a module that moved with version 2, which older versions cannot find.
+    """
+
+    def reducer_override(self, value: Any) -> Any:
+        if not isinstance(value, np.ndarray):
+            return NotImplemented
+        contiguous = np.ascontiguousarray(value)
+        return np.ndarray, (value.shape, value.dtype.str, bytearray(contiguous.tobytes()))
+
+
+def _padded(values: FloatArray, size: int) -> FloatArray:
+    """Zeros appended along the last axis."""
+    missing = size - values.shape[-1]
+    return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, missing)])
+
+
+def _their_rings(checkout: Path) -> tuple[IntArray, IntArray]:
+    """The vertices of the upper and the lower lip that their teeth hang on, as their source has them."""
+    rings = []
+    for name in RING_REGIONS:
+        pattern = rf'"{name}",\s*torch\.tensor\(\[\s*([\d,\s]+?),?\s*\]\)'
+        numbers = find_constant(checkout, SOURCE, pattern, name)
+        rings.append(np.array([int(number) for number in numbers.split(",")]))
+    return rings[0], rings[1]
+
+
+def _same_faces(faces: IntArray, template: Path) -> bool:
+    """Whether the triangles are those of the template in the checkout; False where it has none."""
+    if not template.is_file():
+        return False
+    text = read_bytes(template, "an OBJ file", MOST_TEMPLATE).decode(errors="replace")
+    corners = re.findall(r"^f\s+(\d+)\S*\s+(\d+)\S*\s+(\d+)\S*\s*$", text, re.MULTILINE)
+    return len(corners) == len(faces) and bool(np.array_equal(np.array(corners, np.int64) - 1, faces))
+
+
+def eyelids_are_lost(head: HeadAsset) -> bool:
+    """Whether a head moves its eyelids by bases that their code does not have."""
+    return isinstance(head, HeadArrays) and head.eyelid_basis is not None

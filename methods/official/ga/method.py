@@ -1,0 +1,298 @@
+"""GaussianAvatars by its authors' code.
+
+Qian et al., "GaussianAvatars: Photorealistic Head Avatars with Rigged 3D Gaussians", CVPR 2024.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import socket
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from ....bench.contracts import Clip, FloatArray, Frame, FrameKey, Progress
+from ....bench.errors import InputError
+from ....bench.io.arrays import MAX_MAGNITUDE, Member, read_arrays
+from ....bench.io.files import atomic_path
+from ...shared.avatar_files import (
+    HEAD_FILE,
+    SUBJECT_FILE,
+    TRACKED,
+    RefinedTracking,
+    Subject,
+    read_shared_head,
+    read_subject,
+    save_shared_head,
+    write_subject,
+)
+from ...shared.config import PAPER_ITERATIONS, SplatTraining
+from ...shared.loop import Fit
+from ...shared.schedule import DensifySchedule, Timeline
+from ..checkout import Checkout, Repository
+from ..config import GAOfficialConfig, OfficialConfig
+from ..method import Listed, OfficialMethod, Workplace, opaque
+from ..spec import GA_OFFICIAL
+from .export import check_mark, read_window, write_list, write_training
+from .head_files import OfficialHead, OfficialTracking, eyelids_are_lost
+from .windows import check_square_pixels
+
+PLY_FILE, TRACKING_FILE, ARGUMENTS_FILE = "point_cloud.ply", "driving.npz", "cfg_args"
+PARAMETERS_FILE = "flame_param.npz"
+RENDERS, TRUTHS = "renders", "gt"
+_PROGRESS, _LOSS = re.compile(r"Training progress:.*?(\d+)/\d+ \["), re.compile(r"Loss=([\d.]+)")
+_DRAWN = re.compile(r"Rendering progress:.*?(\d+)/\d+ ")
+
+GA_REPOSITORY = Repository(
+    "https://github.com/ShenhanQian/GaussianAvatars",
+    GAOfficialConfig().commit,
+    ("train.py", "render.py", "scene/dataset_readers.py", "flame_model/flame.py"),
+    (
+        "torch",
+        "diff_gaussian_rasterization",
+        "simple_knn._C",
+        "nvdiffrast.torch",
+        "roma",
+        "plyfile",
+        "tqdm",
+        "PIL",
+    ),
+)
+
+Config = TypeVar("Config", bound=OfficialConfig)
+
+THEIR_NAMES = {
+    "expression": "expr",
+    "rotation": "rotation",
+    "neck": "neck_pose",
+    "jaw": "jaw_pose",
+    "eyes": "eyes_pose",
+    "translation": "translation",
+}
+"""Tracked values by our name: theirs."""
+
+
+class GALayoutMethod(OfficialMethod[Config]):
+    """What the repositories with GaussianAvatars' loader and head model have in common."""
+
+    def check_clip(self, clip: Clip, checkout: Checkout) -> None:
+        """Refuse other backgrounds than white and black, pixels that are not square, heads that their code cannot take."""
+        where = f"clip {clip.subject}"
+        _white(clip.background, where)
+        for name in sorted({key.camera for keys in clip.splits.values() for key in keys}):
+            check_square_pixels(clip.cameras[name], where)
+        OfficialHead.of(clip.head, checkout.folder)
+
+    def export(
+        self, clip: Clip, checkout: Checkout, work: Workplace, progress: Progress
+    ) -> dict[str, FrameKey]:
+        """The training frames in GaussianAvatars' layout, the head model in FLAME's files."""
+        head = OfficialHead.of(clip.head, checkout.folder)
+        head.write(work.program)
+        subject = Subject.of(clip)
+        return write_training(
+            clip, OfficialTracking(head, subject.shape, subject.static_offset), work, progress
+        )
+
+    def train_command(self, fit: Fit, checkout: Checkout, work: Workplace) -> list[str]:
+        """Their script, with densification and learning rates on the course that a run of this length has."""
+        iterations = fit.budget.iterations or 0
+        white = _white(fit.clip.background, f"clip {fit.clip.subject}")
+        schedule = _schedule(iterations)
+        options: dict[str, Any] = {
+            "--source_path": work.input,
+            "--model_path": work.model,
+            "--port": free_port(),
+            "--resolution": 1,
+            "--iterations": iterations,
+            "--position_lr_max_steps": iterations,
+            "--densify_from_iter": schedule.start,
+            "--densification_interval": schedule.every,
+            "--densify_until_iter": max(0, schedule.stop),
+            "--opacity_reset_interval": schedule.reset_every,
+            "--save_iterations": iterations,
+            "--test_iterations": -1,  # their own scores of held-out frames, which there are none of
+            "--checkpoint_iterations": -1,
+        }
+        flags = ["--eval", "--bind_to_mesh", *(["--white_background"] if white else [])]
+        words = [str(word) for pair in options.items() for word in pair]
+        return [*checkout.python, str(checkout.folder / "train.py"), *words, *flags]
+
+    def done(self, line: str) -> tuple[int, str] | None:
+        """From the progress bar of their training."""
+        match, loss = _PROGRESS.search(line), _LOSS.search(line)
+        return None if match is None else (int(match[1]), f"loss {loss[1]}" if loss else "")
+
+    def keep(self, fit: Fit, work: Workplace) -> dict[str, Any]:
+        """Their splats and arguments; the subject's shape and offset, without the zeros that their file has beside them."""
+        made = self._made(work, fit.budget.iterations or 0)
+        for name in self._model_files():
+            copy_file(made / name, fit.out / name)
+        copy_file(work.model / ARGUMENTS_FILE, fit.out / ARGUMENTS_FILE)
+        write_subject(fit.out / SUBJECT_FILE, Subject.of(fit.clip))
+        save_shared_head(fit.out, fit.clip.head)
+        return {}
+
+    def files(self, folder: Path) -> list[Path]:
+        """Splats, subject, and the arguments that their renderer reads again."""
+        return [folder / name for name in (*self._model_files(), SUBJECT_FILE, ARGUMENTS_FILE)]
+
+    def shared_files(self, folder: Path) -> list[Path]:
+        """The head model."""
+        return [folder / HEAD_FILE]
+
+    def write_list(
+        self,
+        folder: Path,
+        frames: Sequence[Listed],
+        background: Sequence[float],
+        checkout: Checkout,
+        work: Workplace,
+    ) -> None:
+        """The frames as a test split, and a model folder whose parameters are those of the frames."""
+        trained_on = (folder / ARGUMENTS_FILE).read_text(errors="replace")
+        if _white(background, "render") != ("white_background=True" in trained_on):
+            expected = "the background that it was trained on; their renders have no coverage"
+            raise InputError(folder, "background", expected, str(tuple(background)))
+        head, subject = self._head(folder, checkout)
+        head.write(work.program)
+        tracking = OfficialTracking(head, subject.shape, subject.static_offset)
+        poses = write_list(frames, tracking, work)
+        refined = folder / TRACKING_FILE
+        if refined.exists():
+            poses = [RefinedTracking.read(refined)(pose) for pose in poses]
+        made = self._made(work, 1)
+        for name in self._model_files():
+            copy_file(folder / name, made / name)
+        copy_file(folder / ARGUMENTS_FILE, work.model / ARGUMENTS_FILE)
+        values = [tracking.parameters(pose) for pose in poses]
+        moving = {name: np.concatenate([value[name] for value in values]) for name in THEIR_NAMES.values()}
+        still = {"shape": values[0]["shape"], "static_offset": values[0]["static_offset"]}
+        arrays = {**moving, **still, **self._more_parameters(len(poses), still["static_offset"])}
+        with atomic_path(made / PARAMETERS_FILE) as temporary:
+            np.savez_compressed(temporary, allow_pickle=False, **arrays)
+
+    def render_command(self, folder: Path, checkout: Checkout, work: Workplace) -> list[str]:
+        """Their script, for the test split alone."""
+        options: dict[str, Any] = {"--source_path": work.input, "--model_path": work.model, "--iteration": 1}
+        words = [str(word) for pair in options.items() for word in pair]
+        return [*checkout.python, str(checkout.folder / "render.py"), *words, "--skip_train", "--skip_val"]
+
+    def drawn(self, line: str) -> int | None:
+        """From the progress bar of their renderer."""
+        match = _DRAWN.search(line)
+        return None if match is None else int(match[1])
+
+    def render_folder(self, folder: Path, work: Workplace) -> Path:
+        """Renders of the test split."""
+        return work.model / "test" / "ours_1" / RENDERS
+
+    def render_name(self, number: int) -> str:
+        """By the place in the JSON of the split."""
+        return f"{number:05d}.png"
+
+    def read_back(self, frame: Listed, path: Path, work: Workplace) -> Frame:
+        """A render, once the ground truth that they wrote beside it has shown which frame it is."""
+        check_mark(path.parent.parent / TRUTHS / path.name, frame.number)
+        return opaque(read_window(frame, path))
+
+    def remarks(self, clip: Clip, seed: int) -> dict[str, list[str]]:
+        """What a reader of results has to know."""
+        differences = ["the capture has no held-out frames in it; cameras and timesteps are numbered anew"]
+        moved = [
+            c
+            for c in clip.cameras.values()
+            if np.abs(c.K[:2, 2] - np.array([c.width, c.height]) / 2).max() > 1e-6
+        ]
+        if moved:
+            differences.append(
+                "their code takes the middle of the image for the principal point: images are cut so that it is "
+                f"({len(moved)} of {len(clip.cameras)} cameras)"
+            )
+        if eyelids_are_lost(clip.head):
+            differences.append("their head model has no eyelid bases: eyelids follow the expression alone")
+        if seed:
+            differences.append(
+                f"their code fixes the seed at 0; seed {seed} is a repetition, not another start"
+            )
+        return {"leaks": [], "differences": differences}
+
+    def _head(self, folder: Path, checkout: Checkout) -> tuple[OfficialHead, Subject]:
+        head = read_shared_head(folder)
+        return OfficialHead.of(head, checkout.folder), read_subject(folder / SUBJECT_FILE, head)
+
+    def _model_files(self) -> tuple[str, ...]:
+        return (PLY_FILE,)
+
+    def _more_parameters(self, count: int, offset: FloatArray) -> Mapping[str, FloatArray]:
+        """Further arrays of their parameter file, for so many timesteps."""
+        return {}
+
+    @staticmethod
+    def _made(work: Workplace, iterations: int) -> Path:
+        return work.model / "point_cloud" / f"iteration_{iterations}"
+
+
+class GAOfficial(GALayoutMethod[GAOfficialConfig]):
+    """The method: see the module."""
+
+    name, version = GA_OFFICIAL.name, GA_OFFICIAL.version
+    config_class, repository = GAOfficialConfig, GA_REPOSITORY
+
+    def keep(self, fit: Fit, work: Workplace) -> dict[str, Any]:
+        """Besides, the tracking that their training refined."""
+        kept = super().keep(fit, work)
+        timesteps = np.array(sorted({key.timestep for key in fit.clip.splits["train"]}))
+        _refined(fit.clip, timesteps, self._made(work, fit.budget.iterations or 0)).save(
+            fit.out / TRACKING_FILE
+        )
+        return kept
+
+    def _more_parameters(self, count: int, offset: FloatArray) -> Mapping[str, FloatArray]:
+        return {"dynamic_offset": np.zeros((count, *offset.shape[1:]), np.float32)}
+
+
+def _refined(clip: Clip, timesteps: np.ndarray, made: Path) -> RefinedTracking:
+    """Their tracking after training, which numbers the training timesteps from 0."""
+    tracked = {
+        name: np.stack([np.asarray(getattr(clip.poses[t], name), np.float32) for t in timesteps.tolist()])
+        for name in TRACKED
+    }
+    members = {name: Member("f", (len(timesteps), None), MAX_MAGNITUDE) for name in THEIR_NAMES.values()}
+    arrays = read_arrays(made / PARAMETERS_FILE, members)
+    refined = {
+        name: arrays[theirs][:, : tracked[name].shape[1]].astype(np.float32)
+        for name, theirs in THEIR_NAMES.items()
+    }
+    return RefinedTracking(clip.subject, timesteps, tracked, refined)
+
+
+def free_port() -> int:
+    """A port that nobody listens on now; their training opens one for a viewer."""
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        return int(listener.getsockname()[1])
+
+
+def _schedule(iterations: int) -> DensifySchedule:
+    """When splats are added in a run of this length: fractions of the published one, as in the native method."""
+    return DensifySchedule.of(SplatTraining(), Timeline(iterations, PAPER_ITERATIONS), white=True)
+
+
+def _white(background: Sequence[float] | FloatArray, where: str) -> bool:
+    """Whether a background is white. Raises `InputError` for one that is neither white nor black."""
+    levels = [float(value) for value in background]
+    if levels not in ([1.0] * 3, [0.0] * 3):
+        raise InputError(where, "background", "white or black; the code knows no others", str(tuple(levels)))
+    return levels[0] == 1.0
+
+
+def copy_file(source: Path, target: Path) -> None:
+    """Copy a file, whole or not at all. Raises `InputError` where there is none."""
+    if not source.is_file() or not source.stat().st_size:
+        raise InputError(source, "", "a file that the program writes", "none")
+    with atomic_path(target) as temporary:
+        shutil.copyfile(source, temporary)

@@ -1,0 +1,424 @@
+"""What all official methods share: check, export, train by the authors' program, render by it, read back by key."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any, ClassVar, Generic, TypeVar
+
+import numpy as np
+
+from ...bench.contracts import Budget, Camera, Clip, Frame, FrameKey, HeadPose, Progress
+from ...bench.errors import InputError, UnavailableError
+from ...bench.io.documents import read_json
+from ...bench.io.files import digest_file, prepare_folder, write_json
+from ..shared.avatar_files import is_finished, run_digest, write_record
+from ..shared.loop import Fit, Outcome, check_budget, check_training_split
+from .checkout import Checkout, Repository, look
+from .config import OfficialConfig
+from .process import Ended, described, run_program
+
+TRAINING, RENDERING = "training", "rendering"
+"""Folders inside the avatar's: of a training under way, and of frames being rendered. Neither outlives its work."""
+TRAINING_LOG, RENDERING_LOG = "training.log", "rendering.log"
+EXPORTED = "exported.json"
+INDEX = "index.json"
+
+Config = TypeVar("Config", bound=OfficialConfig)
+
+
+@dataclass(frozen=True)
+class Workplace:
+    """Folders of one call of the authors' program.
+
+    Attributes
+    ----------
+    input : the capture in the repository's own form.
+    program : the program's working directory, with the files that it expects there; the checkout stays clean.
+    model : what the program writes.
+    """
+
+    root: Path
+
+    @property
+    def input(self) -> Path:
+        return self.root / "input"
+
+    @property
+    def program(self) -> Path:
+        return self.root / "program"
+
+    @property
+    def model(self) -> Path:
+        return self.root / "model"
+
+    def make(self) -> None:
+        """Make the folders."""
+        for folder in (self.input, self.program, self.model):
+            folder.mkdir(parents=True, exist_ok=True)
+
+
+@dataclass(frozen=True)
+class Listed:
+    """A frame to render: its number in the program's list, its key, camera and pose."""
+
+    number: int
+    key: FrameKey
+    camera: Camera
+    pose: HeadPose
+
+
+class OfficialMethod(ABC, Generic[Config]):
+    """A `CheckedMethod` around an official repository.
+
+    A derived class names its spec and repository, and says how a clip is exported, which commands are run, what of the
+    program's output has to be kept, and where its renders are.
+    """
+
+    name: ClassVar[str]
+    version: ClassVar[str]
+    config_class: ClassVar[Any]
+    repository: ClassVar[Repository]
+
+    def __init__(self, config: Config | None = None):
+        self.config: Config = config or self.config_class()
+
+    # ------------------------------------------------------------------ what a repository needs
+
+    @abstractmethod
+    def check_clip(self, clip: Clip, checkout: Checkout) -> None:
+        """Raise `InputError` for a clip that the repository's code cannot take."""
+
+    def check_length(self, iterations: int, checkout: Checkout) -> None:
+        """Raise `InputError` for a run of a length that the repository's code cannot make sense of."""
+
+    @abstractmethod
+    def export(
+        self, clip: Clip, checkout: Checkout, work: Workplace, progress: Progress
+    ) -> dict[str, FrameKey]:
+        """Write the training frames in the repository's form; return the key of every image, by place in the input."""
+
+    @abstractmethod
+    def train_command(self, fit: Fit, checkout: Checkout, work: Workplace) -> list[str]:
+        """The training command."""
+
+    def resume(self, work: Workplace) -> list[str] | None:
+        """Arguments that continue from the program's own checkpoints; None where it is to begin anew, as by default."""
+        return None
+
+    @abstractmethod
+    def done(self, line: str) -> tuple[int, str] | None:
+        """Iterations done and a few words, where a line of the training's output tells."""
+
+    @abstractmethod
+    def keep(self, fit: Fit, work: Workplace) -> dict[str, Any]:
+        """Put what rendering needs of the program's output into the avatar's folder; return more for the record."""
+
+    @abstractmethod
+    def files(self, folder: Path) -> list[Path]:
+        """The subject's files that rendering needs."""
+
+    def shared_files(self, folder: Path) -> list[Path]:
+        """Files that rendering needs and that are the same for every subject."""
+        return []
+
+    @abstractmethod
+    def write_list(
+        self,
+        folder: Path,
+        frames: Sequence[Listed],
+        background: Sequence[float],
+        checkout: Checkout,
+        work: Workplace,
+    ) -> None:
+        """Write the frames to render, in order, in the repository's form."""
+
+    @abstractmethod
+    def render_command(self, folder: Path, checkout: Checkout, work: Workplace) -> list[str]:
+        """The render command."""
+
+    @abstractmethod
+    def drawn(self, line: str) -> int | None:
+        """Frames drawn, where a line of the renderer's output tells."""
+
+    @abstractmethod
+    def render_folder(self, folder: Path, work: Workplace) -> Path:
+        """Where the renders are."""
+
+    @abstractmethod
+    def render_name(self, number: int) -> str:
+        """File name of a render, by its number in the list: the repository's rule."""
+
+    @abstractmethod
+    def read_back(self, frame: Listed, path: Path, work: Workplace) -> Frame:
+        """A render as the camera asked for it. Raises `InputError` for one of another size or of another frame."""
+
+    def excused(self, ended: Ended) -> bool:
+        """Whether a renderer that failed has failed after its work was done."""
+        return False
+
+    def remarks(self, clip: Clip, seed: int) -> dict[str, list[str]]:
+        """For the record: ``leaks`` of held-out data, and ``differences`` from what the authors publish."""
+        return {"leaks": [], "differences": []}
+
+    # ------------------------------------------------------------------ the method
+
+    def look(self) -> Checkout:
+        """Check the settings; see `checkout.look`."""
+        return look(self.name, self.config, self.repository)
+
+    def check(self, clip: Clip, budget: Budget) -> None:
+        """Raise `InputError` for a checkout or an interpreter that is not there, and work that the code cannot do."""
+        self._checked(clip, budget)
+
+    def _checked(self, clip: Clip, budget: Budget) -> Checkout:
+        check_budget(budget)
+        if budget.iterations is None or budget.seconds is not None:
+            remedy = f"--set settings.{self.name}.budget.iterations=N, and no seconds."
+            raise InputError(
+                "budget", "seconds", "iterations alone; their code knows no clock", "seconds", remedy
+            )
+        check_training_split(clip)
+        checkout = self.look()
+        self.check_clip(clip, checkout)
+        self.check_length(budget.iterations, checkout)
+        return checkout
+
+    def fit(
+        self, clip: Clip, out: Path, budget: Budget, *, device: str, seed: int, progress: Progress
+    ) -> OfficialAvatar:
+        """Export the training frames, run the authors' training on them, and keep what rendering needs.
+
+        A call that was killed continues from the program's checkpoints where it has any that are whole, and from its
+        export. Raises `InputError` before any work for what `check` refuses and a budget in seconds, `ProgramError`
+        where the program fails.
+        """
+        run = run_digest(self.name, self.version, self.config, clip, budget, seed)
+        if not is_finished(out, run):
+            checkout = self._checked(clip, budget)
+            prepare_folder(out / TRAINING)
+            with _alone(out / TRAINING) as held:
+                self._train(Fit(clip, out, budget, self.config.device, seed, progress, run), checkout, held)
+        _remove(out / TRAINING)
+        return self.load(out, device=device)
+
+    def load(self, path: Path, *, device: str) -> OfficialAvatar:
+        """Read an avatar that `fit` wrote; the checkout is looked at when frames are asked for."""
+        avatar = OfficialAvatar(self, path)
+        for file in avatar.files():
+            if not file.is_file():
+                raise InputError(file, "", f"a file of an avatar of {self.name}", "no such file")
+        return avatar
+
+    def _train(self, fit: Fit, checkout: Checkout, held: IO[str]) -> None:
+        work, start = Workplace(fit.out / TRAINING), time.monotonic()
+        frames, iterations = len(fit.clip.splits["train"]), fit.budget.iterations or 0
+        self._export(fit, checkout, work)
+        command = self.train_command(fit, checkout, work)
+        more = self.resume(work)
+        if more is None:
+            _remove(work.model)
+        work.make()
+
+        def on_line(line: str) -> None:
+            found = self.done(line)
+            if found is not None:
+                fit.progress(frames + min(found[0], iterations), frames + iterations, found[1])
+
+        command = [*command, *(more or ()), *self.config.arguments]
+        ended = run_program(command, work.program, fit.out / TRAINING_LOG, on_line, held=held)
+        if ended.code:
+            raise ended.error(f"The training command of {checkout.folder} {described(ended.code)}")
+        try:
+            kept = self.keep(fit, work)
+        except (InputError, OSError) as error:
+            raise ended.error(
+                f"The training command of {checkout.folder} left no whole avatar: {error}"
+            ) from error
+        fit.progress(frames + iterations, frames + iterations)
+        official = {
+            **checkout.record,
+            "arguments": list(self.config.arguments),
+            "continued": more is not None,
+        }
+        remarks = {**self.remarks(fit.clip, fit.seed), "official": official}
+        write_record(fit, Outcome(iterations, iterations, time.monotonic() - start), **remarks, **kept)
+
+    def _export(self, fit: Fit, checkout: Checkout, work: Workplace) -> None:
+        """Write the program's input, or keep what an earlier call wrote whole; then hold it to the training split."""
+        record = work.root / EXPORTED
+        steps = len(fit.clip.splits["train"]) + (fit.budget.iterations or 0)
+
+        def exporting(done: int, total: int, note: str = "") -> None:
+            fit.progress(done, steps, note or "exporting")
+
+        if not (record.exists() and read_json(record).get("run") == fit.run and _as_recorded(record, work)):
+            for folder in (work.input, work.program, work.model):
+                _remove(folder)
+            record.unlink(missing_ok=True)
+            work.make()
+            images = self.export(fit.clip, checkout, work, exporting)
+            digests = {path: digest_file(work.root / path) for path in _files(work)}
+            named = {path: list(key) for path, key in images.items()}
+            write_json(record, {"run": fit.run, "images": named, "files": digests})
+        check_export(work, {p: FrameKey(*key) for p, key in read_json(record)["images"].items()}, fit.clip)
+
+
+class OfficialAvatar:
+    """A trained avatar of an official repository (`ListedFrames`, `SharingAvatar`)."""
+
+    def __init__(self, method: OfficialMethod[Any], folder: Path):
+        self._method, self._folder = method, folder
+
+    def files(self) -> Sequence[Path]:
+        """Files of the subject that the authors' program needs to render; the driving signal does not count."""
+        return self._method.files(self._folder)
+
+    def shared_files(self) -> Sequence[Path]:
+        """Files that it needs besides, the same for every subject; not their checkout."""
+        return self._method.shared_files(self._folder)
+
+    def render(self, camera: Camera, pose: HeadPose, background: Sequence[float] = (1.0, 1.0, 1.0)) -> Frame:
+        """Never a single frame: raises `UnavailableError`, see `ListedFrames`."""
+        raise UnavailableError(
+            f"{self._method.name} renders lists of frames by the authors' program, never one frame on its own.",
+            "The native method of the same paper can be measured so.",
+        )
+
+    def render_listed(
+        self,
+        views: Mapping[FrameKey, tuple[Camera, HeadPose]],
+        background: Sequence[float],
+        progress: Progress,
+    ) -> Iterator[tuple[FrameKey, Frame]]:
+        """Render frames by the authors' program; give each with its key. See `ListedFrames`."""
+        method, folder = self._method, self._folder
+        checkout = method.look()
+        frames = [Listed(number, key, *view) for number, (key, view) in enumerate(views.items())]
+        work = Workplace(folder / RENDERING)
+        prepare_folder(work.root)
+        with _alone(work.root) as held:
+            _remove(work.root, but=_LOCK)
+            work.make()
+            write_json(work.root / INDEX, {method.render_name(f.number): list(f.key) for f in frames})
+            method.write_list(folder, frames, background, checkout, work)
+
+            def on_line(line: str) -> None:
+                drawn = method.drawn(line)
+                if drawn is not None:
+                    progress(min(drawn, len(frames)), len(frames))
+
+            command = method.render_command(folder, checkout, work)
+            ended = run_program(command, work.program, folder / RENDERING_LOG, on_line, held=held)
+            if ended.code and not method.excused(ended):
+                raise ended.error(f"The render command of {checkout.folder} {described(ended.code)}")
+            yield from _read_back(method, folder, frames, work, ended)
+        _remove(work.root)
+
+
+def _read_back(
+    method: OfficialMethod[Any], folder: Path, frames: Sequence[Listed], work: Workplace, ended: Ended
+) -> Iterator[tuple[FrameKey, Frame]]:
+    """Renders by the names of the index that was written before; all are there and none besides."""
+    renders = method.render_folder(folder, work)
+    index = {name: FrameKey(*key) for name, key in read_json(work.root / INDEX).items()}
+    found = {path.name for path in renders.iterdir()} if renders.is_dir() else set()
+    for what, names in (("lacks", index.keys() - found), ("has besides", found - index.keys())):
+        if names:
+            first = min(names)
+            named = f" ({index[first]})" if first in index else ""
+            raise ended.error(f"{renders} {what} {len(names)} of {len(index)} renders, first {first}{named}")
+    by_key = {frame.key: frame for frame in frames}
+    for name, key in index.items():
+        try:
+            frame = method.read_back(by_key[key], renders / name, work)
+        except InputError as error:
+            raise ended.error(str(error)) from error
+        yield key, frame
+
+
+def check_export(work: Workplace, images: Mapping[str, FrameKey], clip: Clip) -> None:
+    """Prove that the program is given training frames alone.
+
+    Every image under the program's folders is one that was exported for a training key, each key once. `clip` gives no
+    pixels of other frames (`headbench.bench.runner.adaptation.TrainingView`), so that none can stand under such a name.
+
+    Raises `InputError` for an image of another frame, one that nobody exported, and one that is gone.
+    """
+    allowed = frozenset(clip.splits["train"])
+    for path, key in images.items():
+        if key not in allowed:
+            raise InputError(work.root / path, str(key), "a training frame", "a held-out one")
+    if len(set(images.values())) != len(images):
+        raise InputError(work.root, "images", "each training frame once", "one twice")
+    there = {path for path in _files(work) if Path(path).suffix.lower() in _IMAGES}
+    for what, names in (
+        ("an exported image", images.keys() - there),
+        ("exported images alone", there - images.keys()),
+    ):
+        if names:
+            raise InputError(
+                work.root / min(names), "", what, "none" if what.startswith("an ") else "another image"
+            )
+
+
+_IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".exr", ".mp4", ".avi", ".mkv")
+_LOCK = "program.lock"
+
+
+def _files(work: Workplace) -> list[str]:
+    """Files of the program's input and working directory, by their place."""
+    folders = (work.input, work.program)
+    found = (path for folder in folders for path in folder.rglob("*") if path.is_file() or path.is_symlink())
+    return sorted(path.relative_to(work.root).as_posix() for path in found)
+
+
+def _as_recorded(record: Path, work: Workplace) -> bool:
+    """Whether everything that was exported is there as it was written."""
+    files = read_json(record).get("files", {})
+    return files.keys() <= set(_files(work)) and all(
+        digest_file(work.root / path) == known for path, known in files.items()
+    )
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[IO[str]]:
+    """Hold the lock of a folder; a program that inherits it holds it on, should we be killed before it ends.
+
+    Raises `InputError` where a program of an earlier call still runs.
+    """
+    with (folder / _LOCK).open("a+") as stream:
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            stream.seek(0)
+            started = stream.read(200).strip()
+            remedy = "Wait until it ends, or end it."
+            found = f"one of an earlier call ({started})"
+            raise InputError(folder, "", "no program at work there", found, remedy) from None
+        stream.truncate(0)
+        stream.write(f"started by process {os.getpid()}")
+        stream.flush()
+        yield stream
+
+
+def _remove(folder: Path, but: str = "") -> None:
+    """Remove a folder, or all in it but one name."""
+    if not but:
+        shutil.rmtree(folder, ignore_errors=True)
+        return
+    for path in folder.iterdir():
+        if path.name != but:
+            shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
+
+
+def opaque(rgb: np.ndarray) -> Frame:
+    """A frame of an 8-bit image (H, W, 3) whose coverage nobody knows."""
+    return Frame(rgb.astype(np.float32) / 255, np.ones(rgb.shape[:2], np.float32))

@@ -1,0 +1,50 @@
+"""What there is to know of the official methods before they are imported. Light: no implementation is imported."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from ...bench.specs import MethodSpec
+from ..ga.spec import SHORT
+from ..shared.config import PAPER_ITERATIONS, SHORT_SPLATS
+
+
+def _short_run() -> tuple[str, ...]:
+    """Learning rates of the native methods' short presets, as options of their training script."""
+    rates: Mapping[str, Any] = {
+        "--position_lr_init": SHORT_SPLATS["position_lr"],
+        "--position_lr_final": SHORT_SPLATS["position_lr_final"],
+        "--scaling_lr": SHORT_SPLATS["scale_lr"],
+        "--rotation_lr": SHORT_SPLATS["rotation_lr"],
+        "--feature_lr": SHORT["sh_dc_lr"],
+    }
+    return tuple(str(word) for pair in rates.items() for word in pair)
+
+
+GA_OFFICIAL = MethodSpec(
+    name="ga-official",
+    summary="GaussianAvatars by its authors' code, in a checkout and an environment of yours; needs CUDA.",
+    implementation="headbench.methods.official.ga.method:GAOfficial",
+    config="headbench.methods.official.config:GAOfficialConfig",
+    presets={
+        "smoke": {"budget": {"iterations": 60}, "arguments": _short_run()},
+        "demo": {"budget": {"iterations": 2_000}, "arguments": _short_run()},
+        "fast": {"budget": {"iterations": 4_000}, "arguments": _short_run()},
+        "paper": {"budget": {"iterations": PAPER_ITERATIONS}},
+    },
+    native=False,
+    source="GaussianAvatars: Photorealistic Head Avatars with Rigged 3D Gaussians, CVPR 2024, arXiv 2312.02069",
+)
+
+TGA_OFFICIAL = MethodSpec(
+    name="tga-official",
+    summary="The method of ours by its authors' code, in a checkout and an environment of yours; needs CUDA.",
+    implementation="headbench.methods.official.tga.method:TGAOfficial",
+    config="headbench.methods.official.config:TGAOfficialConfig",
+    # Their feature lines begin at an iteration that their code fixes: no shorter run trains the method.
+    presets={"paper": {"budget": {"iterations": PAPER_ITERATIONS}}},
+    native=False,
+    source="3D Gaussian Head Avatars with Expressive Dynamic Appearances by Compact Tensorial Representations, "
+    "CVPR 2025, arXiv 2504.14967",
+)

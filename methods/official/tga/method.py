@@ -1,0 +1,133 @@
+"""The method of `ours` by its authors' code.
+
+Wang et al., "3D Gaussian Head Avatars with Expressive Dynamic Appearances by Compact Tensorial Representations",
+CVPR 2025. Their loader, head model and files are GaussianAvatars', see `..ga.method`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ....bench.contracts import Clip, FloatArray, FrameKey, Progress
+from ....bench.errors import InputError
+from ....datasets.ga.writer import save_npz
+from ....datasets.head.teeth import RING_LENGTH, ROWS
+from ....datasets.steps.clusters import cluster_expressions
+from ....datasets.steps.jaw_bases import DEFAULT_COUNT, jaw_bases
+from ...shared.loop import Fit
+from ..checkout import Checkout, Repository
+from ..config import TGAOfficialConfig
+from ..ga.head_files import OfficialHead
+from ..ga.method import PLY_FILE, GALayoutMethod, copy_file
+from ..method import Listed, Workplace
+from ..process import Ended
+from ..spec import TGA_OFFICIAL
+
+JAW_FILE, CLUSTER_FILE = "sorted_jaw_poses.npz", "train_cluster_16.npz"
+NETWORKS = ("triplane.pth", "feat_line.pth")
+_MODEL_SOURCE, _TRAIN_SOURCE = "scene/flame_gaussian_model.py", "train.py"
+
+
+class TGAOfficial(GALayoutMethod[TGAOfficialConfig]):
+    """The method: see the module.
+
+    Their preprocessing draws the jaw bases from validation and test poses. It is not run: bases and expression clusters
+    are those of `datasets.steps`, from training frames alone, in the files that their training opens.
+    """
+
+    name, version = TGA_OFFICIAL.name, TGA_OFFICIAL.version
+    config_class = TGAOfficialConfig
+    repository = Repository(
+        "https://github.com/ant-research/TensorialGaussianAvatar",
+        TGAOfficialConfig().commit,
+        ("train.py", "render.py", "scene/dataset_readers.py", "flame_model/flame.py"),
+        ("torch", "diff_gaussian_rasterization", "simple_knn._C", "roma", "plyfile", "tqdm", "PIL"),
+    )
+
+    def check_clip(self, clip: Clip, checkout: Checkout) -> None:
+        """Refuse, besides, a mesh of another size than the one that their code fixes, and a head without a face."""
+        super().check_clip(clip, checkout)
+        where = f"head model {clip.head.version!r}"
+        head = OfficialHead.of(clip.head, checkout.folder)
+        teeth = len(ROWS) * RING_LENGTH, 12 * (RING_LENGTH - 1)
+        found = len(head.order) + teeth[0], len(head.faces) + teeth[1]
+        fixed = tuple(
+            int(checkout.constant(_MODEL_SOURCE, rf"self\.{name} = torch\.zeros\(\[T, (\d+), 3\]", name))
+            for name in ("mesh_lst", "face_center_lst")
+        )
+        if found != fixed:
+            expected = (
+                f"{fixed[0]} vertices and {fixed[1]} triangles with teeth, as {_MODEL_SOURCE} fixes them"
+            )
+            remedy = "Refit the capture to FLAME (headbench refit), or compare with ours, the native method."
+            raise InputError(where, "template, faces", expected, f"{found[0]} and {found[1]}", remedy)
+        if "face" not in clip.head.regions:
+            raise InputError(where, "regions", "a region face", "none", "Load the head model with its masks.")
+
+    def export(
+        self, clip: Clip, checkout: Checkout, work: Workplace, progress: Progress
+    ) -> dict[str, FrameKey]:
+        """Besides, jaw bases and expression clusters of the training timesteps."""
+        images = super().export(clip, checkout, work, progress)
+        bases = jaw_bases(clip, DEFAULT_COUNT)
+        # Their lines are 16: a base that stands there twice shares the weight with its twin.
+        filled = bases[np.arange(DEFAULT_COUNT) % len(bases)]
+        save_npz(work.input / JAW_FILE, {"jaw_poses": filled.astype(np.float32)})
+        clusters = cluster_expressions(clip)
+        # By timestep, in the order in which the export numbers them.
+        labels = [label for _, label in sorted(clusters.by_timestep.items())]
+        save_npz(work.input / CLUSTER_FILE, {"labels": np.array(labels, np.int64)})
+        return images
+
+    def check_length(self, iterations: int, checkout: Checkout) -> None:
+        """Refuse a run too short for their feature lines to begin."""
+        begin = int(checkout.constant(_TRAIN_SOURCE, r"offset_start_iter = (\d+)", "offset_start_iter"))
+        if iterations <= begin:
+            expected = f"more than {begin}, where {_TRAIN_SOURCE} begins to train its feature lines"
+            raise InputError(f"settings.{self.name}", "budget.iterations", expected, f"{iterations}")
+
+    def keep(self, fit: Fit, work: Workplace) -> dict[str, Any]:
+        """Besides, the jaw bases, which their renderer reads again."""
+        kept = super().keep(fit, work)
+        copy_file(work.input / JAW_FILE, fit.out / JAW_FILE)
+        return kept
+
+    def files(self, folder: Path) -> list[Path]:
+        """Besides, the jaw bases."""
+        return [*super().files(folder), folder / JAW_FILE]
+
+    def write_list(
+        self,
+        folder: Path,
+        frames: Sequence[Listed],
+        background: Sequence[float],
+        checkout: Checkout,
+        work: Workplace,
+    ) -> None:
+        """Besides, the jaw bases."""
+        super().write_list(folder, frames, background, checkout, work)
+        copy_file(folder / JAW_FILE, work.input / JAW_FILE)
+
+    def excused(self, ended: Ended) -> bool:
+        """Their renderer appends its speed to a file of its author's, once all images of a split are written."""
+        return any(re.search(r"FileNotFoundError.*fps\.txt", line) for line in ended.lines)
+
+    def remarks(self, clip: Clip, seed: int) -> dict[str, list[str]]:
+        """Besides, what takes the place of their preprocessing."""
+        remarks = super().remarks(clip, seed)
+        remarks["differences"] += [
+            "jaw bases from training poses, first the identity; published: validation and test poses, first a half turn",
+            "expression clusters without random starts",
+        ]
+        return remarks
+
+    def _model_files(self) -> tuple[str, ...]:
+        return (PLY_FILE, *NETWORKS)
+
+    def _more_parameters(self, count: int, offset: FloatArray) -> Mapping[str, FloatArray]:
+        return {"jaw_quat_weight": np.zeros((count, DEFAULT_COUNT), np.float32)}

@@ -1,0 +1,50 @@
+"""The stand-in repository, and a clip whose principal points are not in the middle."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from headbench.datasets.head.teeth import lip_rings
+
+from ..toy_clip import toy_clip
+from .repository import make_repository
+
+OFFSETS = {"00": (0.0, 0.0), "01": (3.3, -2.2), "02": (-1.6, 4.1)}
+
+
+@pytest.fixture(scope="session")
+def official_clip(head):
+    """Two training cameras and one held out; principal points off by whole pixels and parts of them."""
+    clip = toy_clip(head, timesteps=3, cameras=3, width=28, height=36)
+    cameras = {}
+    for name, camera in clip.cameras.items():
+        K = camera.K.copy()
+        K[:2, 2] += OFFSETS[name]
+        cameras[name] = replace(camera, K=K)
+    return replace(clip, cameras=cameras)
+
+
+@pytest.fixture
+def repository(tmp_path, head):
+    """Folder and commit of the stand-in, whose lips have numbers that no vertex of the head has."""
+    count = len(lip_rings(head)[0])
+    first = len(head.template) + 5
+    rings = list(range(first, first + 2 * count, 2)), list(range(first + 1, first + 2 * count, 2))
+    return tmp_path / "repository", make_repository(tmp_path / "repository", rings)
+
+
+@pytest.fixture
+def behave(repository):
+    """Make the stand-in behave in another way."""
+
+    def set_behaviour(what):
+        (repository[0] / "behaviour.txt").write_text(what)
+
+    return set_behaviour
+
+
+def brightness(pose, refined):
+    """What the stand-in draws of a pose: red by expression, green by rotation."""
+    red = 100 + 40 * (float(pose.expression[0]) + 0.25 * refined)
+    return np.floor(np.clip([red, 100 + 900 * float(pose.rotation[0])], 0, 255))

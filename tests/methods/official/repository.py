@@ -1,0 +1,155 @@
+"""A stand-in for an official repository: its file names, options and output, a few lines of Python behind them."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+from headbench.bench.contracts import Budget
+from headbench.methods.official.config import GAOfficialConfig
+from headbench.methods.official.ga.method import GAOfficial
+
+BUDGET = Budget(iterations=20)
+
+COMMON = """
+import argparse, json, os, sys, time
+from pathlib import Path
+from pickle import load
+import numpy as np
+from PIL import Image
+
+parser = argparse.ArgumentParser()
+for name in ("source_path", "model_path", "iterations", "iteration", "start_checkpoint"):
+    parser.add_argument("--" + name)
+arguments, others = parser.parse_known_args()
+source, model = Path(arguments.source_path), Path(arguments.model_path)
+here = Path(__file__).parent
+behaviour = (here / "behaviour.txt").read_text() if (here / "behaviour.txt").exists() else ""
+with open("flame_model/assets/flame/flame2023.pkl", "rb") as stream:
+    head = load(stream, encoding="latin1")
+with open("flame_model/assets/flame/FLAME_masks.pkl", "rb") as stream:
+    masks = load(stream, encoding="latin1")
+landmarks = np.load("flame_model/assets/flame/landmark_embedding_with_eyes.npy")[()]
+assert landmarks["full_lmk_faces_idx"].shape == (1, 70)
+assert head["shapedirs"].shape[2] == 400 and head["posedirs"].shape[-1] == 36
+
+def frames(split):
+    return json.loads((source / f"transforms_{split}.json").read_text())["frames"]
+"""
+
+TRAIN = """
+print("environment", sorted(os.environ))
+listed = frames("train")
+assert not frames("val") and not frames("test")
+meshes = {f["timestep_index"]: dict(np.load(source / f["flame_param_path"])) for f in listed}
+assert sorted(meshes) == list(range(len(meshes)))
+sizes = {Image.open(source / f["file_path"]).size == (f["w"], f["h"]) for f in listed}
+assert sizes == {True}
+iterations = int(arguments.iterations)
+done = int(Path(arguments.start_checkpoint).read_text()) if arguments.start_checkpoint else 0
+print("starts at", done)
+model.mkdir(parents=True, exist_ok=True)
+for iteration in range(done + 1, iterations + 1):
+    bar = f"\\rTraining progress:  {iteration}%|#| {iteration}/{iterations} [00:01<00:10, 5.0it/s, Loss=0.{iteration}]"
+    print(bar, end="", flush=True)
+    (model / "checkpoint").write_text(str(iteration))
+    if behaviour == "crash" and iteration == 5:
+        raise RuntimeError("CUDA out of memory")
+    if behaviour == "hang" and iteration == 5:
+        child = os.fork()
+        if child:
+            (here / "pids.txt").write_text(f"{os.getpid()} {child}")
+            print(flush=True)
+        time.sleep(60)
+print()
+made = model / "point_cloud" / f"iteration_{iterations}"
+made.mkdir(parents=True)
+(model / "cfg_args").write_text(f"Namespace(white_background={'--white_background' in others})")
+if behaviour != "no ply":
+    (made / "point_cloud.ply").write_bytes(b"ply of " + str(len(listed)).encode())
+dynamic = ("expr", "rotation", "neck_pose", "jaw_pose", "eyes_pose", "translation")
+refined = {name: np.concatenate([meshes[t][name] for t in sorted(meshes)]) for name in dynamic}
+refined["expr"] = refined["expr"] + np.float32(0.25)
+np.savez(made / "flame_param.npz", **refined, dynamic_offset=np.zeros((len(meshes), 9, 3), np.float32))
+"""
+
+RENDER = """
+parameters = np.load(model / "point_cloud" / f"iteration_{arguments.iteration}" / "flame_param.npz")
+folder = model / "test" / f"ours_{arguments.iteration}"
+for name in ("renders", "gt"):
+    (folder / name).mkdir(parents=True)
+listed = frames("test")
+shown = listed[::-1] if behaviour == "reversed" else listed
+for index, frame in enumerate(shown):
+    print(f"\\rRendering progress:  5%|#| {index + 1}/{len(listed)} [00:01<00:10]", end="", flush=True)
+    if behaviour == "crash in rendering" and index == 1:
+        raise RuntimeError("CUDA out of memory")
+    if behaviour == "one too few" and index == 1:
+        continue
+    t, width, height = frame["timestep_index"], frame["w"], frame["h"]
+    if behaviour == "other size":
+        width -= 1
+    # What a frame shows: its expression, rotation and camera, and where in the window it is.
+    image = np.zeros((height, width, 3), np.uint8)
+    image[..., 0] = np.clip(100 + 40 * parameters["expr"][t, 0], 0, 255)
+    image[..., 1] = np.clip(100 + 900 * parameters["rotation"][t, 0], 0, 255)
+    image[..., 2] = 20 * int(frame["camera_id"])
+    Image.fromarray(image).save(folder / "renders" / f"{index:05d}.png")
+    Image.open(source / frame["file_path"]).save(folder / "gt" / f"{index:05d}.png")
+print()
+if behaviour == "crash in the end":
+    open("/nowhere/fps.txt", "a")
+"""
+
+
+def make_repository(folder: Path, rings: tuple[list[int], list[int]]) -> str:
+    """Write the stand-in and commit it; return its commit. ``rings`` are the vertices its teeth would hang on."""
+    for name in ("scene", "flame_model"):
+        (folder / name).mkdir(parents=True)
+    (folder / "train.py").write_text(COMMON + TRAIN)
+    (folder / "render.py").write_text(COMMON + RENDER)
+    (folder / "scene" / "dataset_readers.py").write_text("")
+    upper, lower = (", ".join(map(str, ring)) + "," for ring in rings)
+    source = "".join(
+        f'self.v.register_buffer(\n    "lip_outside_ring_{name}",\n    torch.tensor([\n        {ring} \n    ])\n)\n'
+        for name, ring in (("upper", upper), ("lower", lower))
+    )
+    (folder / "flame_model" / "flame.py").write_text(source)
+    git = [
+        "git",
+        "-C",
+        str(folder),
+        "-c",
+        "user.name=A",
+        "-c",
+        "user.email=a@b.c",
+        "-c",
+        "commit.gpgsign=false",
+    ]
+    for words in (["init", "-q"], ["add", "."], ["commit", "-q", "-m", "first"]):
+        subprocess.run([*git, *words], check=True)
+    done = subprocess.run([*git, "rev-parse", "HEAD"], check=True, capture_output=True, text=True)
+    return done.stdout.strip()
+
+
+class StandIn(GAOfficial):
+    """`GAOfficial` around the stand-in, which needs no module that is not here."""
+
+    repository = replace(GAOfficial.repository, modules=("json",))
+
+
+class Resuming(StandIn):
+    """One whose program has checkpoints to continue from."""
+
+    def resume(self, work):
+        """Its checkpoint, where there is one."""
+        path = work.model / "checkpoint"
+        return ["--start_checkpoint", str(path)] if path.exists() else None
+
+
+def settings(checkout: Path, commit: str, **changes) -> GAOfficialConfig:
+    """Settings that find the stand-in."""
+    values = {"checkout": str(checkout), "python": sys.executable, "commit": commit} | changes
+    return GAOfficialConfig(**values)

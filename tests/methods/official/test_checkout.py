@@ -1,0 +1,115 @@
+"""Settings of official methods are looked at before any work: each fault names the setting and the next step."""
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from headbench.bench.configuration import with_first_names
+from headbench.bench.errors import InputError
+from headbench.methods.official.checkout import Repository, look
+from headbench.methods.official.config import GAOfficialConfig
+
+from .repository import BUDGET, StandIn, settings
+
+REPOSITORY = Repository("https://example.org/code", "0" * 40, ("train.py", "render.py"), ("json",))
+
+
+def test_a_checkout_as_it_should_be_is_recorded(repository):
+    found = look("ga-official", settings(*repository), REPOSITORY)
+    assert found.folder == repository[0].resolve()
+    assert found.record["commit"] == repository[1]
+    assert found.record["changed"] == []
+    assert found.record["python"] == sys.version.split()[0]
+    (repository[0] / "train.py").write_text("changed")
+    changed = look("ga-official", settings(repository[0], repository[1][:8]), REPOSITORY).record
+    assert changed["changed"] == ["train.py"]
+    assert len(changed["difference"]) == 64
+
+
+@pytest.mark.parametrize(
+    ("changes", "key", "step"),
+    [
+        ({"checkout": ""}, "checkout: expected", "git clone"),
+        ({"checkout": "nowhere"}, "no such folder", "git clone"),
+        ({"checkout": "."}, "none of train.py, render.py", "git clone"),
+        ({"commit": "0" * 40}, "expected commit 000000000000, found commit ", "git -C"),
+        ({"commit": "main"}, "7 to 40 digits of a commit", ""),
+        ({"python": ""}, "python: expected the interpreter", "--set settings.ga-official.python="),
+        ({"python": "no-such-python"}, "no-such-python", "--set settings.ga-official.python="),
+        ({"python": "'unclosed"}, "python: expected the interpreter", "--set"),
+        ({"python": "/bin/false"}, "expected a Python interpreter", ""),
+        ({"python": "/bin/echo"}, "expected a Python interpreter", ""),
+    ],
+)
+def test_faults_of_settings_name_the_next_step(repository, tmp_path, monkeypatch, changes, key, step):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError) as raised:
+        look("ga-official", replace(settings(*repository), **changes), REPOSITORY)
+    assert key in str(raised.value)
+    assert step in str(raised.value)
+
+
+def test_modules_that_are_missing_are_named(repository):
+    lacking = replace(REPOSITORY, modules=("json", "no_such_module"))
+    with pytest.raises(InputError, match="no_such_module: ModuleNotFoundError"):
+        look("ga-official", settings(*repository), lacking)
+
+
+def test_a_folder_without_git_needs_an_empty_commit(repository, tmp_path):
+    folder = tmp_path / "unpacked"
+    folder.mkdir()
+    for name in ("train.py", "render.py"):
+        (folder / name).write_text("")
+    with pytest.raises(InputError, match="a folder that git does not know"):
+        look("ga-official", settings(folder, repository[1]), REPOSITORY)
+    assert look("ga-official", settings(folder, ""), REPOSITORY).record["commit"] == ""
+
+
+def test_a_command_of_several_words_is_an_interpreter(repository):
+    found = look("ga-official", settings(*repository, python=f"env {sys.executable}"), REPOSITORY)
+    assert found.python[1:] == (sys.executable,)
+
+
+def test_nothing_that_the_checkout_configures_is_run(repository, tmp_path):
+    folder, commit = repository
+    (folder / "hook.sh").write_text(f"#!/bin/sh\ntouch {tmp_path}/ran\n")
+    (folder / "hook.sh").chmod(0o755)
+    for name in ("core.fsmonitor", "diff.external"):
+        subprocess.run(["git", "-C", str(folder), "config", name, str(folder / "hook.sh")], check=True)
+    (folder / "train.py").write_text("changed")
+    look("ga-official", settings(folder, commit), REPOSITORY)
+    assert not (tmp_path / "ran").exists()
+
+
+def test_where_the_checkout_lies_does_not_make_another_avatar():
+    one, other = (GAOfficialConfig(checkout=place, python=place) for place in ("a", "b"))
+    assert with_first_names(one) == with_first_names(other)
+    assert with_first_names(one) != with_first_names(replace(one, commit="1234567"))
+
+
+@pytest.mark.parametrize(
+    ("changes", "found"),
+    [
+        ({"background": np.full(3, 0.5)}, "white or black"),
+        ({"head": {"parents": np.array([-1, 0, 0, 0, 0])}}, "FLAME's joints"),
+        ({"head": {"expression_basis": np.zeros((300, 3, 101))}}, "at most 100 directions"),
+        ({"head": {"regions": {}}}, "face"),
+    ],
+)
+def test_clips_that_the_code_cannot_take_are_refused(repository, official_clip, changes, found):
+    if "head" in changes:
+        changes = {"head": replace(official_clip.head, **changes["head"])}
+    with pytest.raises(InputError, match=found):
+        StandIn(settings(*repository)).check(replace(official_clip, **changes), BUDGET)
+
+
+def test_pixels_that_are_not_square_are_refused(repository, official_clip):
+    cameras = dict(official_clip.cameras)
+    K = cameras["02"].K.copy()
+    K[1, 1] *= 1.05
+    cameras["02"] = replace(cameras["02"], K=K)
+    with pytest.raises(InputError, match="square pixels"):
+        StandIn(settings(*repository)).check(replace(official_clip, cameras=cameras), BUDGET)
