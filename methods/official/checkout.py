@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import re
 import shlex
 import shutil
@@ -14,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ...bench.errors import InputError
+from ...bench.io.documents import checked, parse_json
 from ...bench.io.files import read_bytes
 from .config import OfficialConfig
 from .process import environment
@@ -25,7 +25,7 @@ MOST_SOURCE = 2**22
 
 _PROBE = """
 import importlib, json, sys
-found = {"python": sys.version.split()[0], "missing": {}}
+found = {"python": sys.version.split()[0], "missing": {}, "failed": ""}
 for name in sys.argv[1:]:
     try:
         importlib.import_module(name)
@@ -34,6 +34,11 @@ for name in sys.argv[1:]:
 if "torch" in sys.argv[1:] and "torch" not in found["missing"]:
     import torch
     found["torch"], found["cuda"] = torch.__version__, bool(torch.cuda.is_available())
+if not found["missing"]:
+    try:
+        TRIAL
+    except BaseException as error:
+        found["failed"] = (type(error).__name__ + ": " + str(error))[:200]
 print("\\nheadbench-probe " + json.dumps(found))
 """
 
@@ -48,12 +53,15 @@ class Repository:
     commit : the one that its adapter was written for.
     scripts : files that tell its checkout from another folder.
     modules : what has to be importable in its interpreter.
+    trial : a statement that has to work there, "" for none, and what to do where it does not.
     """
 
     url: str
     commit: str
     scripts: tuple[str, ...]
     modules: tuple[str, ...]
+    trial: str = ""
+    trial_remedy: str = ""
 
 
 @dataclass(frozen=True)
@@ -181,10 +189,11 @@ def _interpreter(method: str, config: OfficialConfig) -> tuple[str, ...]:
 
 def _probed(method: str, python: Sequence[str], repository: Repository) -> dict[str, Any]:
     """Versions of the interpreter, once it has shown that it can import what the code needs."""
-    source, command = f"settings.{method}.python", [*python, "-c", _PROBE, *repository.modules]
+    source = f"settings.{method}.python"
+    program = _PROBE.replace("TRIAL", repository.trial or "pass")
     try:
         done = subprocess.run(
-            command,
+            [*python, "-c", program, *repository.modules],
             check=False,
             capture_output=True,
             stdin=subprocess.DEVNULL,
@@ -192,30 +201,37 @@ def _probed(method: str, python: Sequence[str], repository: Repository) -> dict[
             env=environment(),
             start_new_session=True,
         )
-        lines = done.stdout.decode(errors="replace").split("\n")
-        answer = next((line for line in lines if line.startswith("headbench-probe ")), "")
-        found = json.loads(answer.partition(" ")[2])
-        missing, cuda, versions = (
-            dict(found["missing"]),
-            found.get("cuda"),
-            (found["python"], found.get("torch")),
-        )
     except subprocess.TimeoutExpired as error:
         expected = f"an answer within {PROBE_S:g} s"
         raise InputError(python[0], source, expected, "none", "Try it by hand: import torch.") from error
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        said = (
-            done.stderr.decode(errors="replace").strip()[-200:]
-            if isinstance(error, ValueError)
-            else str(error)
-        )
-        raise InputError(python[0], source, "a Python interpreter", said or "no answer") from error
-    if missing:
-        name, why = next(iter(missing.items()))
+    except OSError as error:
+        raise InputError(python[0], source, "a Python interpreter", error.strerror or str(error)) from error
+    lines = done.stdout.decode(errors="replace").split("\n")
+    answer = next((line.partition(" ")[2] for line in lines if line.startswith("headbench-probe ")), None)
+    if answer is None:
+        said = done.stderr.decode(errors="replace").strip()[-200:]
+        raise InputError(python[0], source, "a Python interpreter", said or "no answer")
+    found = checked(parse_json(answer, python[0], source), _Probed, python[0])
+    if found.missing:
+        name, why = next(iter(found.missing.items()))
         expected = f"an interpreter that imports {', '.join(repository.modules)}"
-        remedy = f"Install {', '.join(missing)} as {repository.url} says (methods/official/README.md)."
+        remedy = f"Install {', '.join(found.missing)} as {repository.url} says (methods/official/README.md)."
         raise InputError(python[0], source, expected, f"{name}: {why}", remedy)
-    if cuda is False:
+    if found.failed:
+        expected = f"that {repository.trial} works"
+        raise InputError(python[0], source, expected, found.failed, repository.trial_remedy)
+    if found.cuda is False:
         remedy = "Run it on a machine with an NVIDIA GPU and a CUDA build of PyTorch."
         raise InputError(python[0], source, "PyTorch that finds a CUDA device", "none", remedy)
-    return {"python": str(versions[0])[:40], "torch": versions[1] and str(versions[1])[:40]}
+    return {"python": found.python, "torch": found.torch}
+
+
+@dataclass(frozen=True)
+class _Probed:
+    """What the interpreter answers."""
+
+    python: str
+    missing: dict[str, str]
+    failed: str
+    torch: str | None = None
+    cuda: bool | None = None

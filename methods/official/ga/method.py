@@ -46,6 +46,10 @@ RENDERS, TRUTHS = "renders", "gt"
 _PROGRESS, _LOSS = re.compile(r"Training progress:.*?(\d+)/\d+ \["), re.compile(r"Loss=([\d.]+)")
 _DRAWN = re.compile(r"Rendering progress:.*?(\d+)/\d+ ")
 
+LOADER_MODULES = ("tqdm", "numpy", "PIL.Image")
+LOADER_TRIAL = "import numpy, PIL.Image; PIL.Image.fromarray(numpy.zeros((1, 1, 3), dtype=numpy.byte), 'RGB')"
+LOADER_REMEDY = "Their loader hands signed bytes to Pillow, which newer versions refuse: install an older one, such as pillow==9.5."
+
 GA_REPOSITORY = Repository(
     "https://github.com/ShenhanQian/GaussianAvatars",
     GAOfficialConfig().commit,

@@ -23,7 +23,7 @@ from ...shared.loop import Fit
 from ..checkout import Checkout, Repository
 from ..config import TGAOfficialConfig
 from ..ga.head_files import OfficialHead
-from ..ga.method import PLY_FILE, GALayoutMethod, copy_file
+from ..ga.method import LOADER_MODULES, LOADER_REMEDY, LOADER_TRIAL, PLY_FILE, GALayoutMethod, copy_file
 from ..method import Listed, Workplace
 from ..process import Ended
 from ..spec import TGA_OFFICIAL
@@ -46,7 +46,9 @@ class TGAOfficial(GALayoutMethod[TGAOfficialConfig]):
         "https://github.com/ant-research/TensorialGaussianAvatar",
         TGAOfficialConfig().commit,
         ("train.py", "render.py", "scene/dataset_readers.py", "flame_model/flame.py"),
-        ("torch", "diff_gaussian_rasterization", "simple_knn._C", "roma", "plyfile", "tqdm", "PIL"),
+        ("torch", "diff_gaussian_rasterization", "simple_knn._C", "roma", "plyfile", *LOADER_MODULES),
+        LOADER_TRIAL,
+        LOADER_REMEDY,
     )
 
     def check_clip(self, clip: Clip, checkout: Checkout) -> None:

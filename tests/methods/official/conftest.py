@@ -31,7 +31,8 @@ def repository(tmp_path, head):
     count = len(lip_rings(head)[0])
     first = len(head.template) + 5
     rings = list(range(first, first + 2 * count, 2)), list(range(first + 1, first + 2 * count, 2))
-    return tmp_path / "repository", make_repository(tmp_path / "repository", rings)
+    sizes = max(rings[1]) + 1 + 120, len(head.faces) + 168
+    return tmp_path / "repository", make_repository(tmp_path / "repository", rings, sizes)
 
 
 @pytest.fixture

@@ -10,8 +10,11 @@ from pathlib import Path
 from headbench.bench.contracts import Budget
 from headbench.methods.official.config import GAOfficialConfig
 from headbench.methods.official.ga.method import GAOfficial
+from headbench.methods.official.tga.method import TGAOfficial
 
 BUDGET = Budget(iterations=20)
+LINES_BEGIN = 12
+"""Iteration at which the stand-in of TGA's training begins to train feature lines."""
 
 COMMON = """
 import argparse, json, os, sys, time
@@ -72,6 +75,13 @@ if behaviour != "no ply":
 dynamic = ("expr", "rotation", "neck_pose", "jaw_pose", "eyes_pose", "translation")
 refined = {name: np.concatenate([meshes[t][name] for t in sorted(meshes)]) for name in dynamic}
 refined["expr"] = refined["expr"] + np.float32(0.25)
+if (source / "sorted_jaw_poses.npz").exists():
+    bases = np.load(source / "sorted_jaw_poses.npz")["jaw_poses"]
+    labels = np.load(source / "train_cluster_16.npz")["labels"]
+    assert bases.shape == (16, 4) and bases.dtype == np.float32
+    assert labels.shape == (len(meshes),) and labels.dtype == np.int64
+    for name in ("triplane.pth", "feat_line.pth"):
+        (made / name).write_bytes(b"tensors")
 np.savez(made / "flame_param.npz", **refined, dynamic_offset=np.zeros((len(meshes), 9, 3), np.float32))
 """
 
@@ -99,18 +109,29 @@ for index, frame in enumerate(shown):
     Image.fromarray(image).save(folder / "renders" / f"{index:05d}.png")
     Image.open(source / frame["file_path"]).save(folder / "gt" / f"{index:05d}.png")
 print()
-if behaviour == "crash in the end":
+if (source / "sorted_jaw_poses.npz").exists():
+    assert (model / "point_cloud" / f"iteration_{arguments.iteration}" / "feat_line.pth").exists()
     open("/nowhere/fps.txt", "a")
 """
 
+MODEL = """
+self.mesh_lst = torch.zeros([T, {}, 3], requires_grad=False).cuda()
+self.face_center_lst = torch.zeros([T, {}, 3], requires_grad=False).cuda()
+"""
 
-def make_repository(folder: Path, rings: tuple[list[int], list[int]]) -> str:
-    """Write the stand-in and commit it; return its commit. ``rings`` are the vertices its teeth would hang on."""
+
+def make_repository(folder: Path, rings: tuple[list[int], list[int]], sizes: tuple[int, int]) -> str:
+    """Write the stand-in and commit it; return its commit.
+
+    ``rings`` are the vertices that its teeth would hang on, ``sizes`` the vertices and triangles, teeth included, that
+    TGA's code would fix.
+    """
     for name in ("scene", "flame_model"):
         (folder / name).mkdir(parents=True)
-    (folder / "train.py").write_text(COMMON + TRAIN)
+    (folder / "train.py").write_text(f"offset_start_iter = {LINES_BEGIN}\n{COMMON}{TRAIN}")
     (folder / "render.py").write_text(COMMON + RENDER)
     (folder / "scene" / "dataset_readers.py").write_text("")
+    (folder / "scene" / "flame_gaussian_model.py").write_text(MODEL.format(*sizes))
     upper, lower = (", ".join(map(str, ring)) + "," for ring in rings)
     source = "".join(
         f'self.v.register_buffer(\n    "lip_outside_ring_{name}",\n    torch.tensor([\n        {ring} \n    ])\n)\n'
@@ -137,7 +158,13 @@ def make_repository(folder: Path, rings: tuple[list[int], list[int]]) -> str:
 class StandIn(GAOfficial):
     """`GAOfficial` around the stand-in, which needs no module that is not here."""
 
-    repository = replace(GAOfficial.repository, modules=("json",))
+    repository = replace(GAOfficial.repository, modules=("json",), trial="")
+
+
+class TensorialStandIn(TGAOfficial):
+    """`TGAOfficial` around the stand-in."""
+
+    repository = replace(TGAOfficial.repository, modules=("json",), trial="")
 
 
 class Resuming(StandIn):

@@ -11,6 +11,8 @@ from headbench.bench.configuration import with_first_names
 from headbench.bench.errors import InputError
 from headbench.methods.official.checkout import Repository, look
 from headbench.methods.official.config import GAOfficialConfig
+from headbench.methods.official.ga.method import GAOfficial
+from headbench.methods.official.tga.method import TGAOfficial
 
 from .repository import BUDGET, StandIn, settings
 
@@ -56,6 +58,14 @@ def test_modules_that_are_missing_are_named(repository):
     lacking = replace(REPOSITORY, modules=("json", "no_such_module"))
     with pytest.raises(InputError, match="no_such_module: ModuleNotFoundError"):
         look("ga-official", settings(*repository), lacking)
+
+
+def test_a_trial_that_fails_says_what_to_do(repository):
+    trying = replace(REPOSITORY, trial="import json; json.loads('{')", trial_remedy="Install another.")
+    with pytest.raises(InputError, match=r"JSONDecodeError.*Install another\."):
+        look("ga-official", settings(*repository), trying)
+    for method in (GAOfficial, TGAOfficial):
+        compile(method.repository.trial, "trial", "exec")
 
 
 def test_a_folder_without_git_needs_an_empty_commit(repository, tmp_path):

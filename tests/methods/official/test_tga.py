@@ -1,0 +1,79 @@
+"""What TGA's adapter has beyond GaussianAvatars': sizes fixed in their code, jaw bases, clusters, an author's path."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from headbench.bench.contracts import Budget, no_progress
+from headbench.bench.errors import InputError
+from headbench.bench.io.arrays import read_npz
+from headbench.bench.io.documents import read_json
+from headbench.bench.runner.adaptation import TrainingView
+from headbench.datasets.steps.clusters import cluster_expressions
+from headbench.datasets.steps.jaw_bases import jaw_quaternions
+from headbench.methods.official.config import TGAOfficialConfig
+from headbench.methods.official.method import Workplace
+
+from .repository import BUDGET, LINES_BEGIN, TensorialStandIn, settings
+
+
+@pytest.fixture
+def method(repository):
+    found = settings(*repository)
+    return TensorialStandIn(TGAOfficialConfig(found.checkout, found.python, found.commit))
+
+
+def test_it_trains_and_renders_though_their_log_has_no_place(method, official_clip, tmp_path):
+    arguments = {"device": "cpu", "seed": 0, "progress": no_progress}
+    avatar = method.fit(TrainingView(official_clip), tmp_path / "a", BUDGET, **arguments)
+    names = {path.name for path in avatar.files()}
+    assert names >= {"point_cloud.ply", "triplane.pth", "feat_line.pth", "sorted_jaw_poses.npz"}
+    keys = official_clip.splits["novel_view"]
+    wanted = {k: (official_clip.cameras[k.camera], official_clip.poses[k.timestep]) for k in keys}
+    assert dict(avatar.render_listed(wanted, (1.0, 1.0, 1.0), no_progress)).keys() == set(keys)
+    record = read_json(tmp_path / "a" / "training.json")
+    assert record["leaks"] == []
+    assert any("jaw bases from training poses" in line for line in record["differences"])
+
+
+def test_jaw_bases_and_clusters_are_those_of_training(method, official_clip, tmp_path):
+    work = Workplace(tmp_path)
+    work.make()
+    method.export(official_clip, method.look(), work, no_progress)
+    bases = read_npz(work.input / "sorted_jaw_poses.npz")["jaw_poses"]
+    timesteps = sorted({key.timestep for key in official_clip.splits["train"]})
+    allowed = jaw_quaternions([official_clip.poses[t] for t in timesteps])
+    allowed = np.concatenate([allowed, [[1.0, 0, 0, 0]]])
+    assert np.abs(bases @ allowed.T).max(axis=1) == pytest.approx(1, abs=1e-6)
+    held_out = [t for t in official_clip.poses if t not in timesteps]
+    others = jaw_quaternions([official_clip.poses[t] for t in held_out])
+    assert np.abs(bases @ others.T).max() < 1 - 1e-6
+    labels = read_npz(work.input / "train_cluster_16.npz")["labels"]
+    known = cluster_expressions(official_clip).by_timestep
+    assert labels.tolist() == [known[t] for t in timesteps]
+
+
+def test_a_run_too_short_for_their_lines_is_refused(method, official_clip):
+    with pytest.raises(InputError, match=f"more than {LINES_BEGIN}"):
+        method.check(official_clip, Budget(iterations=LINES_BEGIN))
+    method.check(official_clip, Budget(iterations=LINES_BEGIN + 1))
+
+
+def test_a_mesh_of_another_size_than_theirs_is_refused(method, official_clip, repository):
+    source = repository[0] / "scene" / "flame_gaussian_model.py"
+    text = source.read_text()
+    source.write_text(
+        text.replace("face_center_lst = torch.zeros([T, ", "face_center_lst = torch.zeros([T, 9")
+    )
+    with pytest.raises(InputError, match="triangles with teeth"):
+        method.check(official_clip, BUDGET)
+    source.write_text("")
+    with pytest.raises(InputError, match="Check out the commit"):
+        method.check(official_clip, BUDGET)
+
+
+def test_a_head_without_a_face_is_refused(method, official_clip):
+    regions = {name: part for name, part in official_clip.head.regions.items() if name != "face"}
+    with pytest.raises(InputError, match="a region face"):
+        method.check(replace(official_clip, head=replace(official_clip.head, regions=regions)), BUDGET)
