@@ -99,12 +99,23 @@ def look(method: str, config: OfficialConfig, repository: Repository) -> Checkou
 
     Raises `InputError` that names the setting and the next step for the first that is not as it should be.
     """
-    folder, record = _folder(method, config, repository)
+    folder, record = look_at_folder(method, config, repository)
+    python, versions = look_at_interpreter(method, config, repository)
+    return Checkout(folder, python, record | versions)
+
+
+def look_at_interpreter(
+    method: str, config: OfficialConfig, repository: Repository
+) -> tuple[tuple[str, ...], dict[str, Any]]:
+    """Command and versions of the interpreter; see `look`."""
     python = _interpreter(method, config)
-    return Checkout(folder, python, record | _probed(method, python, repository))
+    return python, _probed(method, python, repository)
 
 
-def _folder(method: str, config: OfficialConfig, repository: Repository) -> tuple[Path, dict[str, Any]]:
+def look_at_folder(
+    method: str, config: OfficialConfig, repository: Repository
+) -> tuple[Path, dict[str, Any]]:
+    """The checkout, and its commit and changes; see `look`."""
     source, commit = f"settings.{method}", config.commit
     remedy = (
         f"git clone --recursive {repository.url} DIR && git -C DIR checkout {repository.commit[:12]}; then --set "

@@ -13,9 +13,9 @@ class OfficialConfig:
     Attributes
     ----------
     checkout : folder of a checkout of the authors' repository. It is read, never written.
-    python : command that starts the interpreter in which their code runs: a path, or words such as ``conda run -n ga
-        python`` or ``apptainer exec --nv ga.sif python``. A container has to see the checkout and the run folder by the
-        same paths.
+    python : command that starts the interpreter in which their code runs: a path, or words such as ``conda run
+        --no-capture-output -n ga python`` or ``apptainer exec --nv ga.sif python``. A container has to see the checkout
+        and the run folder by the same paths.
     commit : what is checked out, by the first seven digits or more; "" takes whatever is there.
     arguments : appended to their training command.
     device : where their code computes; "cuda" is all that it knows.

@@ -27,6 +27,7 @@ GA_OFFICIAL = MethodSpec(
     summary="GaussianAvatars by its authors' code, in a checkout and an environment of yours; needs CUDA.",
     implementation="headbench.methods.official.ga.method:GAOfficial",
     config="headbench.methods.official.config:GAOfficialConfig",
+    needs="headbench.methods.official.needs:ga",
     presets={
         "smoke": {"budget": {"iterations": 60}, "arguments": _short_run()},
         "demo": {"budget": {"iterations": 2_000}, "arguments": _short_run()},
@@ -42,6 +43,7 @@ TGA_OFFICIAL = MethodSpec(
     summary="The method of ours by its authors' code, in a checkout and an environment of yours; needs CUDA.",
     implementation="headbench.methods.official.tga.method:TGAOfficial",
     config="headbench.methods.official.config:TGAOfficialConfig",
+    needs="headbench.methods.official.needs:tga",
     # Their feature lines begin at an iteration that their code fixes: no shorter run trains the method.
     presets={"paper": {"budget": {"iterations": PAPER_ITERATIONS}}},
     native=False,

@@ -9,6 +9,7 @@ import pytest
 
 from headbench.bench.configuration import with_first_names
 from headbench.bench.errors import InputError
+from headbench.methods.official import needs
 from headbench.methods.official.checkout import Repository, look
 from headbench.methods.official.config import GAOfficialConfig
 from headbench.methods.official.ga.method import GAOfficial
@@ -66,6 +67,16 @@ def test_a_trial_that_fails_says_what_to_do(repository):
         look("ga-official", settings(*repository), trying)
     for method in (GAOfficial, TGAOfficial):
         compile(method.repository.trial, "trial", "exec")
+
+
+def test_doctor_says_what_is_there_and_what_is_not(repository, monkeypatch):
+    nothing = [*needs.ga(GAOfficialConfig(), "cpu")]
+    assert [(need.what, need.found) for need in nothing] == [("checkout", ""), ("environment", "")]
+    assert "git clone" in nothing[0].remedy
+    monkeypatch.setattr(needs, "GAOfficial", StandIn)
+    found = [*needs.ga(settings(*repository), "cpu")]
+    assert found[0].found.endswith(repository[1][:12])
+    assert found[1].found.startswith("Python 3")
 
 
 def test_a_folder_without_git_needs_an_empty_commit(repository, tmp_path):

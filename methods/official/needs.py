@@ -1,0 +1,40 @@
+"""What official methods need of a machine, for ``headbench doctor``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from ...bench.errors import InputError
+from ...bench.specs import Need
+from .checkout import look_at_folder, look_at_interpreter
+from .config import OfficialConfig
+from .ga.method import GAOfficial
+from .method import OfficialMethod
+from .tga.method import TGAOfficial
+
+
+def ga(config: OfficialConfig, device: str) -> Iterator[Need]:
+    """Checkout and environment of GaussianAvatars."""
+    return _needs(GAOfficial, config)
+
+
+def tga(config: OfficialConfig, device: str) -> Iterator[Need]:
+    """Checkout and environment of the method of `ours`."""
+    return _needs(TGAOfficial, config)
+
+
+def _needs(method: type[OfficialMethod[Any]], config: OfficialConfig) -> Iterator[Need]:
+    try:
+        folder, record = look_at_folder(method.name, config, method.repository)
+    except InputError as error:
+        yield Need("checkout", "", str(error))
+    else:
+        changed = f", {len(record['changed'])} files changed" if record.get("changed") else ""
+        yield Need("checkout", f"{folder}, {record['commit'][:12] or 'no commit'}{changed}")
+    try:
+        _, versions = look_at_interpreter(method.name, config, method.repository)
+    except InputError as error:
+        yield Need("environment", "", str(error))
+    else:
+        yield Need("environment", f"Python {versions['python']}, torch {versions['torch']}")
