@@ -47,6 +47,11 @@ class Workplace:
 
     root: Path
 
+    @classmethod
+    def at(cls, root: Path) -> Workplace:
+        """By absolute paths, since the program's working directory is another than ours."""
+        return cls(root.absolute())
+
     @property
     def input(self) -> Path:
         return self.root / "input"
@@ -218,7 +223,7 @@ class OfficialMethod(ABC, Generic[Config]):
         return avatar
 
     def _train(self, fit: Fit, checkout: Checkout, held: IO[str]) -> None:
-        work, start = Workplace(fit.out / TRAINING), time.monotonic()
+        work, start = Workplace.at(fit.out / TRAINING), time.monotonic()
         frames, iterations = len(fit.clip.splits["train"]), fit.budget.iterations or 0
         self._export(fit, checkout, work)
         command = self.train_command(fit, checkout, work)
@@ -302,7 +307,7 @@ class OfficialAvatar:
         method, folder = self._method, self._folder
         checkout = method.look()
         frames = [Listed(number, key, *view) for number, (key, view) in enumerate(views.items())]
-        work = Workplace(folder / RENDERING)
+        work = Workplace.at(folder / RENDERING)
         prepare_folder(work.root)
         with _alone(work.root) as held:
             _remove(work.root, but=_LOCK)

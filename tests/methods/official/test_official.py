@@ -71,6 +71,14 @@ def test_an_avatar_is_trained_kept_and_read_again(method, avatar, official_clip,
         fit(method, official_clip, tmp_path / "avatar", seed=1)
 
 
+def test_folders_may_be_relative(repository, official_clip, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    method = StandIn(settings(Path(repository[0].name), repository[1]))
+    avatar = fit(method, official_clip, Path("out") / "avatar")
+    asked = views(official_clip, "novel_view")
+    assert dict(avatar.render_listed(asked, (1.0, 1.0, 1.0), no_progress)).keys() == asked.keys()
+
+
 def test_the_record_names_commit_and_differences(repository, avatar, tmp_path):
     record = read_json(tmp_path / "avatar" / "training.json")
     assert record["official"]["commit"] == repository[1]
