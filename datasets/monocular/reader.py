@@ -33,6 +33,8 @@ log = logging.getLogger(__name__)
 
 CONVENTION = 350
 """Frames held out at the end of a video, by INSTA's script and by GaussianBlendshapes' loader."""
+HELD_OUT_SUFFIX = "-held-out"
+"""Of the name of what is held out of a video that is trained on."""
 SHORT, SHORT_SHARE = 2 * CONVENTION, 4
 """A video of fewer frames than the first has one of so many held out, since 350 would be most of it."""
 
@@ -65,7 +67,8 @@ def read_video(
 ) -> CaptureClip:
     """Read a tracked video, or all videos of one subject in IMavatar's layout.
 
-    Timesteps count the frames in the order of their names, videos one behind the other.
+    Timesteps count the frames in the order of their names, videos one behind the other. What is held out of a video
+    that is trained on becomes a sequence of its own, ``video-held-out``.
 
     Parameters
     ----------
@@ -99,9 +102,11 @@ def read_video(
     check_motion(sources, toothed, track.shape, static_offset, poses)
 
     keys = [FrameKey(subject, f.sequence, index, camera.id) for index, f in enumerate(track.frames)]
-    files = {key: FrameFiles(frame.image, frame.mask) for key, frame in zip(keys, track.frames)}
     splits, held_out = _split(root, keys, track, held_out_frames, held_out_sequences)
+    names = _sequences(splits)
+    splits = {name: tuple(names[key] for key in part) for name, part in splits.items()}
     check_disjoint(root, splits)
+    files = {names[key]: FrameFiles(frame.image, frame.mask) for key, frame in zip(keys, track.frames)}
     used = {*track.files, *(file for frame in track.frames for file in (frame.image, frame.mask))}
     used |= {root / DECLARATION_FILE} if declaration else set()
     digests = content_digests(used, remembered_for=root if remembered else None, progress=progress)
@@ -188,6 +193,16 @@ def _split(
         )
     log.info("%s: held out are %s", root.name, words)
     return splits, words
+
+
+def _sequences(splits: Mapping[str, Sequence[FrameKey]]) -> dict[FrameKey, FrameKey]:
+    """What each frame is called: the held-out part of a video that is trained on is a sequence of its own."""
+    trained = {key.sequence for key in splits["train"]}
+    names = {key: key for part in splits.values() for key in part}
+    for key in splits["self_reenactment"]:
+        if key.sequence in trained:
+            names[key] = key._replace(sequence=f"{key.sequence}{HELD_OUT_SUFFIX}")
+    return names
 
 
 def _last(count: int, asked: int | None) -> tuple[int, str]:

@@ -13,6 +13,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,7 @@ from headbench.metrics.lpips_network import SQUEEZE
 
 from ..datasets.head.flame_files import write_flame
 from ..datasets.head.toy import toy_head
+from ..datasets.monocular.videos import Recording, write_imavatar, write_insta
 from ..datasets.nersemble.benchmark_folder import write_benchmark
 from ..datasets.nersemble.recordings import write_recording
 from ..datasets.tiny_capture import make_plan, rig, write_tiny_capture
@@ -114,6 +116,15 @@ def recording(folder: Path, samples: Path) -> None:
 def videos(folder: Path, samples: Path) -> None:
     """A raw recording as videos."""
     write_recording(folder, images=False, sequences={"EMO-1-shout+laugh": 2, "FREE": 2})
+
+
+def monocular(folder: Path, samples: Path) -> None:
+    """The capture's frontal camera as tracked videos, in both layouts."""
+    clip = read_capture(samples / "capture" / "capture")
+    clip = replace(clip, poses={t: replace(pose, neck=np.zeros(3)) for t, pose in clip.poses.items()})
+    video = Recording(clip, next(iter(clip.cameras)))
+    write_insta(video, folder / "insta", parameters=("exp",))
+    write_imavatar(video, folder / "imavatar", ["a", "b"])
 
 
 def run(folder: Path, samples: Path) -> None:
@@ -221,8 +232,8 @@ def synthetic(folder: Path, samples: Path) -> None:
 SAMPLES: dict[str, Callable[[Path, Path], None]] = {
     sample.__name__: sample
     for sample in (
-        *(capture, heads, recording, videos, run, unfinished, two_subjects, checkpoint, compact, ply, colmap),
-        benchmark,
+        *(capture, heads, recording, videos, monocular, run, unfinished, two_subjects, checkpoint, compact, ply),
+        *(colmap, benchmark),
         *(exclusions, baseline, settings, weights, images, bundles, synthetic),
     )
 }

@@ -18,6 +18,7 @@ from headbench.datasets.colmap.model import read_model
 from headbench.datasets.colmap.reader import model_cameras
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.loaders import load_head
+from headbench.datasets.monocular.reader import read_video
 from headbench.datasets.steps.exclude import read_exclusions
 from headbench.methods.shared.checkpoint import load_checkpoint
 from headbench.metrics.lpips_network import SQUEEZE, load_backbone
@@ -55,7 +56,15 @@ def command(line: str) -> Callable[[], None]:
 
 def read_clip() -> None:
     """Open a capture and decode a frame of each split."""
-    clip = read_capture("capture")
+    _look_at(read_capture("capture"))
+
+
+def read_video_clip(folder: str) -> Callable[[], None]:
+    """Open a tracked video, as `read_clip` does a capture."""
+    return lambda: _look_at(read_video(folder))
+
+
+def _look_at(clip) -> None:
     for keys in clip.splits.values():
         if keys:
             clip.image(keys[0])
@@ -91,6 +100,7 @@ def colmap(folder: str) -> Callable[[], object]:
 
 RUN = ("run/run.json", "run/rows.parquet")
 CELLS = (*RUN, "run/901/**/*")
+LAYOUTS = ("insta", "imavatar")
 MEAN = "--methods mean-image --preset smoke --set metrics=psnr --set frames_per_task=1"
 GATE = "gate run --baseline baseline.json"
 OURS = AVATAR.format("ours")
@@ -130,6 +140,11 @@ TARGETS = [
     reader("recording check", "recording", f"{PREPARE} --out out --check", share=800),
     reader("recording", "recording", f"{PREPARE} --out out", share=300),
     reader("videos", "videos", f"{PREPARE} --out out", "recording/**/*", 200),
+    *(
+        reader(f"monocular {name}", "monocular", read_video_clip(name), f"{name}/**/*", 600)
+        for name in LAYOUTS
+    ),
+    reader("monocular run", "monocular", f"run --data imavatar --out out {MEAN}", "imavatar/**/*"),
     reader("run table", "run", "table run", RUN, 1200),
     reader("run table cost", "run", "table run --layout cost --format html", RUN, 200),
     reader("run compare", "run", "compare run", RUN, 500),

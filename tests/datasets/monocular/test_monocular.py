@@ -121,6 +121,8 @@ def test_the_last_frames_by_name_are_held_out(written, kind, settings, held_out,
     assert clip.timesteps("self_reenactment") == [*range(12 - held_out, 12)]
     assert clip.timesteps("train") == [*range(12 - held_out)]
     assert clip.splits["novel_view"] == ()
+    sequences = {name: {key.sequence for key in keys} for name, keys in clip.splits.items()}
+    assert not sequences["train"] & sequences["self_reenactment"]
     assert said in clip.steps[0].parameters["held_out"]
     assert "one camera" in clip.steps[0].parameters["novel_view"]
 
