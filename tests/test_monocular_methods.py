@@ -1,0 +1,67 @@
+"""Videos of one camera from their folder to a table: methods train on them, and what cannot be measured is said."""
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from headbench.bench.runner import run as runner
+from headbench.bench.runner.captures import reader_of
+from headbench.bench.runner.config import RunConfig
+from headbench.bench.runner.store import RunFolder
+from headbench.datasets.ga.reader import read_capture
+from headbench.reports.table_report import table_text
+
+from .datasets.head.toy import toy_head
+from .datasets.monocular.videos import Recording, write_imavatar, write_insta
+from .datasets.tiny_capture import FRONTAL, make_plan, rig, write_tiny_capture
+from .fuzz.samples import SETTINGS
+
+
+@pytest.fixture(scope="module")
+def videos(tmp_path_factory):
+    """One camera of a capture in both layouts."""
+    folder = tmp_path_factory.mktemp("videos")
+    head = toy_head(16, version="procedural2020")
+    cameras = rig(24, 32, 12.3, 15.1)[:2]
+    plan = make_plan(head=head, cameras=cameras, static_offset=np.zeros_like(head.template))
+    clip = read_capture(write_tiny_capture(folder / "data", plan).union)
+    still = {t: replace(pose, neck=np.zeros(3, np.float32)) for t, pose in clip.poses.items()}
+    recording = Recording(replace(clip, poses=still), FRONTAL)
+    write_insta(recording, folder / "insta", test=2, parameters=("exp",))
+    write_imavatar(recording, folder / "imavatar")
+    return folder
+
+
+def compare(folder, out, *methods):
+    data = str(folder)
+    runner.run(
+        RunConfig(
+            data=data,
+            out=str(out),
+            reader=reader_of(data),
+            methods=methods,
+            preset="smoke",
+            metrics=("psnr",),
+            settings={name: SETTINGS[name] for name in methods if name in SETTINGS},
+        )
+    )
+    return pd.read_parquet(RunFolder(out).rows)
+
+
+@pytest.mark.parametrize("layout", ["insta", "imavatar"])
+def test_tables_of_a_video_say_what_is_missing(videos, tmp_path, layout):
+    rows = compare(videos / layout, tmp_path / "out", "mean-image", "nearest-camera")
+    assert set(rows["task"]) == {"self_reenactment"}
+    assert (rows["status"] == "ok").all()
+    text = table_text([tmp_path / "out"])
+    assert "Novel view is missing: the captures hold out no camera" in text
+    assert text.count("Novel view") == 1
+
+
+def test_methods_train_on_a_video(videos, tmp_path):
+    rows = compare(videos / "insta", tmp_path / "out", "ga", "ours", "gbs")
+    assert set(rows["method"]) == {"ga", "ours", "gbs"}
+    assert (rows["status"] == "ok").all()
+    assert rows["value"].between(1, 60).all()
