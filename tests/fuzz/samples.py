@@ -232,9 +232,9 @@ def synthetic(folder: Path, samples: Path) -> None:
 SAMPLES: dict[str, Callable[[Path, Path], None]] = {
     sample.__name__: sample
     for sample in (
-        *(capture, heads, recording, videos, monocular, run, unfinished, two_subjects, checkpoint, compact, ply),
-        *(colmap, benchmark),
-        *(exclusions, baseline, settings, weights, images, bundles, synthetic),
+        *(capture, heads, recording, videos, monocular, run, unfinished, two_subjects, checkpoint),
+        *(compact, ply, colmap, benchmark, exclusions, baseline, settings, weights, images, bundles),
+        synthetic,
     )
 }
 
