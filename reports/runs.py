@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from operator import attrgetter
 from pathlib import Path
@@ -199,12 +199,19 @@ class RunSet:
         }
         tasks = tuple(dict.fromkeys(task for run in runs for task in run.tasks))
         trivial = tuple(label for label, record in records.items() if record.trivial)
-        metrics = _metrics(runs)
-        if part != WHOLE:
-            rows = _of_part(rows, part, runs[0].folder.rows)
-            tasks = tuple(task for task in tasks if task in rows.tasks)
-            metrics = tuple(spec for spec in metrics if spec.name in rows.metrics)
-        return cls(runs, rows, metrics, tasks, records, trivial, part.text)
+        return cls(runs, rows, _metrics(runs), tasks, records, trivial).of(part)
+
+    def of(self, part: Part) -> RunSet:
+        """A part of the frames of runs that were read whole.
+
+        Raises `InputError` for a region or a sequence that they do not have.
+        """
+        if part == WHOLE:
+            return self
+        rows = _of_part(self.rows, part, self.runs[0].folder.rows)
+        tasks = tuple(task for task in self.tasks if task in rows.tasks)
+        metrics = tuple(spec for spec in self.metrics if spec.name in rows.metrics)
+        return replace(self, rows=rows, tasks=tasks, metrics=metrics, part=part.text)
 
     @property
     def methods(self) -> tuple[str, ...]:

@@ -68,10 +68,16 @@ def compare_runs(settings: CompareSettings, progress: Progress = no_progress) ->
     Raises `InputError` for runs, methods and metrics that do not fit.
     """
     from ..runs import Part, RunSet
+
+    part = Part(settings.region, settings.sequences)
+    return compare_methods(RunSet.read([Path(folder) for folder in settings.runs], part), settings, progress)
+
+
+def compare_methods(runs: RunSet, settings: CompareSettings, progress: Progress = no_progress) -> Findings:
+    """`compare_runs` of runs that are read already; the settings' runs, region and sequences are not looked at."""
     from ..table_report import COMPARISON
     from .comparisons import compare
 
-    runs = RunSet.read([Path(folder) for folder in settings.runs], Part(settings.region, settings.sequences))
     pairs = _pairs(runs, settings.against, settings.trivial)
     known = {spec.name: spec for spec in runs.metrics}
     for name in settings.metrics:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
-from ..runs import WHOLE, Part, RunSet
+from ..runs import RunSet
 from ..statistics.comparisons import LEVEL, PairedComparison, compare
 from ..table_report import table_of
 from ..tables import Table, TableCell, TableRow
@@ -17,15 +15,13 @@ MARKING = (
 )
 
 
-def ablation_table(folders: Sequence[Path], method: str, part: Part = WHOLE) -> Table:
+def ablation_table(runs: RunSet, method: str) -> Table:
     """Differences of ablations from a method, with the columns of the comparison table.
 
     Parameters
     ----------
-    folders : a run with ``method``, then of each ablation a run that has nothing else; they give the rows' names.
-    part : of the frames.
+    runs : a run with ``method``, then of each ablation a run that has nothing else; their folders give the rows' names.
     """
-    runs = RunSet.read(folders, part)
     in_first = [record.name for record in runs.runs[0].manifest.methods if not record.trivial]
     own, ablations = runs.ranked[in_first.index(method)], runs.ranked[len(in_first) :]
     table = table_of(runs)
@@ -41,8 +37,8 @@ def ablation_table(folders: Sequence[Path], method: str, part: Part = WHOLE) -> 
         columns.append([_cell(each, column.digits) for each in found])
     versions = {row.method: row.version for row in table.rows}
     rows = tuple(
-        TableRow(folder.name, versions[label], False, cells)
-        for folder, label, cells in zip(folders[1:], ablations, zip(*columns), strict=True)
+        TableRow(run.folder.root.name, versions[label], False, cells)
+        for run, label, cells in zip(runs.runs[1:], ablations, zip(*columns), strict=True)
     )
     return replace(table, groups=(("Ablations", rows),), notes=(), marking=MARKING)
 

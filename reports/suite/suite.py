@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from ...bench.runner.run import run
 from ...bench.runner.scoring import FULL
 from ...bench.specs import Findings
 from ..runs import Part, RunSet
-from ..statistics.command import CompareSettings, compare_runs
+from ..statistics.command import CompareSettings, compare_methods
 from ..table_report import table_of
 from ..writers import to_markdown
 from .ablations import ablation_table
@@ -106,26 +107,25 @@ def results(run_folder: Path, every: list[Path]) -> str:
     are such differences, of whole frames and of the face, in all sequences and in each held-out one.
     """
     runs = RunSet.read([run_folder])
+    tested = sorted({frame[1] for frame in runs.rows.frames("self_reenactment", FULL)})
     parts = {"All frames": Part()}
     parts |= {f"Region {region}": Part(region) for region in sorted(runs.rows.regions - {FULL})}
-    tested = {frame[1] for frame in runs.rows.frames("self_reenactment", FULL)}
-    parts |= {f"Sequence {name}": Part(sequences=(name,)) for name in sorted(tested)}
-    sections = [_section(title, [run_folder], part) for title, part in parts.items()]
-    for region in (FULL, "face") if len(every) > 1 else ():
-        for chosen in ((), *((name,) for name in sorted(tested))):
+    parts |= {f"Sequence {name}": Part(sequences=(name,)) for name in tested}
+    sections = [_section(title, runs.of(part)) for title, part in parts.items()]
+    if len(every) > 1:
+        runs = RunSet.read(every)
+        for region, chosen in product((FULL, "face"), ((), *((name,) for name in tested))):
             title = ", ".join(["Ablations of ours", *([] if region == FULL else [region]), *chosen])
-            table = ablation_table(every, OURS, Part(region, chosen))
+            table = ablation_table(runs.of(Part(region, chosen)), OURS)
             sections.append(f"## {title}\n\n{to_markdown(table).strip()}")
     return "\n\n".join(sections) + "\n"
 
 
-def _section(title: str, folders: list[Path], part: Part) -> str:
+def _section(title: str, runs: RunSet) -> str:
     """A table and, where ours is among several methods, their differences from it."""
-    runs = RunSet.read(folders, part)
     text = f"## {title}\n\n{to_markdown(table_of(runs)).strip()}"
     if OURS not in runs.ranked or len(runs.ranked) < 2:
         return text
-    settings = CompareSettings(
-        tuple(map(str, folders)), against=OURS, region=part.region, sequences=part.sequences
-    )
-    return f"{text}\n\n```text\n{compare_runs(settings).text}\n```"
+    folders = tuple(str(run.folder.root) for run in runs.runs)
+    compared = compare_methods(runs, CompareSettings(folders, against=OURS))
+    return f"{text}\n\n```text\n{compared.text}\n```"

@@ -12,7 +12,7 @@ def test_rows_are_ablations_and_cells_their_differences(make_run):
     both = ("toy_plugin:MIRROR", "toy_plugin:METHOD")
     whole = make_run("whole", methods=both, settings={"toy": {"level": 0.25}})
     less = make_run("less", settings={"toy": {"level": 0.5}})
-    table = ablation_table([whole, less], "toy")
+    table = ablation_table(RunSet.read([whole, less]), "toy")
     (row,) = table.rows
     assert row.method == "less"
     plain = {line.method: line for line in table_of(RunSet.read([whole, less])).rows}
