@@ -69,16 +69,13 @@ def pair(first: pd.DataFrame, second: pd.DataFrame) -> tuple[SubjectPairs, ...]:
         where = " ".join(map(str, unmatched[0]))
         raise InputError("rows", where, "a value of both methods", f"{len(unmatched)} frames with one alone")
     joined = pd.concat(tables, axis=1, keys=["first", "second"]).sort_index()
+    timesteps = joined.groupby(level=["subject", "sequence", "timestep"], sort=True)
+    sums, counts = timesteps.sum(), timesteps.size().to_numpy().astype(np.float64)
+    first_sums, second_sums = sums["first"].to_numpy(), sums["second"].to_numpy()
     subjects: dict[str, list[SequencePairs]] = {}
-    for (subject, _), part in joined.groupby(level=["subject", "sequence"], sort=True):
-        timesteps = part.groupby(level="timestep", sort=True)
-        sums = timesteps.sum()
-        sequence = SequencePairs(
-            sums["first"].to_numpy().T,
-            sums["second"].to_numpy().T,
-            np.asarray(timesteps.size(), dtype=np.float64),
-        )
-        subjects.setdefault(str(subject), []).append(sequence)
+    for own in sums.groupby(level=["subject", "sequence"], sort=True).indices.values():
+        sequence = SequencePairs(first_sums[own].T, second_sums[own].T, counts[own])
+        subjects.setdefault(str(sums.index[own[0]][0]), []).append(sequence)
     return tuple(SubjectPairs(subject, tuple(sequences)) for subject, sequences in subjects.items())
 
 

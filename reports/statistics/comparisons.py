@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 
@@ -146,10 +147,10 @@ def compare(
     checked by `Rows.check`. Raises `InputError` where both methods are complete, yet not on the same frames.
     """
     comparisons = []
+    summaries = {name: summarise(rows, name, metric, task) for name in dict.fromkeys(chain(*pairs))}
     for names in pairs:
         comparison = PairedComparison(task, metric, higher_is_better, *names, level)
-        summaries = [summarise(rows, name, metric, task) for name in names]
-        absent = [f"{name}: {s.reason}" for name, s in zip(names, summaries) if s.value is None]
+        absent = [f"{name}: {summaries[name].reason}" for name in names if summaries[name].value is None]
         if absent:
             comparisons.append(replace(comparison, reason=" ".join(absent)))
             continue
