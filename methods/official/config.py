@@ -42,3 +42,10 @@ class TGAOfficialConfig(OfficialConfig):
     """The method of `ours` by its authors' code; the commit is the one that the adapter was written for."""
 
     commit: str = "828adf5575cfe493907de7cc04ad78aba70bcd10"
+
+
+@dataclass(frozen=True)
+class GBSOfficialConfig(OfficialConfig):
+    """GaussianBlendshapes by its authors' code; the commit is the one that the adapter was written for."""
+
+    commit: str = "2952da7d246e5790140dbb477d1468214564f092"

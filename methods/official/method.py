@@ -19,6 +19,8 @@ from ...bench.contracts import Budget, Camera, Clip, Frame, FrameKey, HeadPose, 
 from ...bench.errors import InputError, UnavailableError
 from ...bench.io.documents import read_json
 from ...bench.io.files import digest_file, prepare_folder, write_json
+from ...bench.io.images import probe_image
+from ...datasets.images import write_image
 from ..shared.avatar_files import is_finished, run_digest, write_record
 from ..shared.loop import Fit, Outcome, check_budget, check_training_split
 from .checkout import Checkout, Repository, look
@@ -91,6 +93,8 @@ class OfficialMethod(ABC, Generic[Config]):
     version: ClassVar[str]
     config_class: ClassVar[Any]
     repository: ClassVar[Repository]
+    variables: ClassVar[Mapping[str, str]] = {}
+    """Variables of the environment that the authors' programs need besides `process.environment`."""
 
     def __init__(self, config: Config | None = None):
         self.config: Config = config or self.config_class()
@@ -113,6 +117,10 @@ class OfficialMethod(ABC, Generic[Config]):
     @abstractmethod
     def train_command(self, fit: Fit, checkout: Checkout, work: Workplace) -> list[str]:
         """The training command."""
+
+    def shrink_command(self, fit: Fit, checkout: Checkout, work: Workplace) -> list[str] | None:
+        """A command, run when training has ended, that leaves out of its output what rendering never reads."""
+        return None
 
     def resume(self, work: Workplace) -> list[str] | None:
         """Arguments that continue from the program's own checkpoints; None where it is to begin anew, as by default."""
@@ -160,6 +168,10 @@ class OfficialMethod(ABC, Generic[Config]):
     @abstractmethod
     def render_name(self, number: int) -> str:
         """File name of a render, by its number in the list: the repository's rule."""
+
+    def is_render(self, name: str) -> bool:
+        """Whether a file beside the renders is one of them: the program may write more into that folder."""
+        return True
 
     @abstractmethod
     def read_back(self, frame: Listed, path: Path, work: Workplace) -> Frame:
@@ -238,9 +250,18 @@ class OfficialMethod(ABC, Generic[Config]):
                 fit.progress(frames + min(found[0], iterations), frames + iterations, found[1])
 
         command = [*command, *(more or ()), *self.config.arguments]
-        ended = run_program(command, work.program, fit.out / TRAINING_LOG, on_line, held=held)
+        ended = run_program(
+            command, work.program, fit.out / TRAINING_LOG, on_line, variables=self.variables, held=held
+        )
         if ended.code:
             raise ended.error(f"The training command of {checkout.folder} {described(ended.code)}")
+        shrinking = self.shrink_command(fit, checkout, work)
+        if shrinking is not None:
+            shrunk = run_program(
+                shrinking, work.program, fit.out / TRAINING_LOG, on_line, variables=self.variables, held=held
+            )
+            if shrunk.code:
+                raise shrunk.error(f"Leaving the optimiser out of its output {described(shrunk.code)}")
         try:
             kept = self.keep(fit, work)
         except (InputError, OSError) as error:
@@ -321,7 +342,9 @@ class OfficialAvatar:
                     progress(min(drawn, len(frames)), len(frames))
 
             command = method.render_command(folder, checkout, work)
-            ended = run_program(command, work.program, folder / RENDERING_LOG, on_line, held=held)
+            ended = run_program(
+                command, work.program, folder / RENDERING_LOG, on_line, variables=method.variables, held=held
+            )
             if ended.code and not method.excused(ended):
                 raise ended.error(f"The render command of {checkout.folder} {described(ended.code)}")
             yield from _read_back(method, folder, frames, work, ended)
@@ -335,6 +358,7 @@ def _read_back(
     renders = method.render_folder(folder, work)
     index = {name: FrameKey(*key) for name, key in read_json(work.root / INDEX).items()}
     found = {path.name for path in renders.iterdir()} if renders.is_dir() else set()
+    found = {name for name in found if method.is_render(name)}
     for what, names in (("lacks", index.keys() - found), ("has besides", found - index.keys())):
         if names:
             first = min(names)
@@ -352,8 +376,9 @@ def _read_back(
 def check_export(work: Workplace, images: Mapping[str, FrameKey], clip: Clip) -> None:
     """Prove that the program is given training frames alone.
 
-    Every image under the program's folders is one that was exported for a training key, each key once. `clip` gives no
-    pixels of other frames (`headbench.bench.runner.adaptation.TrainingView`), so that none can stand under such a name.
+    Every image under the program's folders is one that was exported for a training key, each key once, or a placeholder,
+    which has a single pixel and so shows no frame. `clip` gives no pixels of other frames
+    (`headbench.bench.runner.adaptation.TrainingView`), so that none can stand under such a name.
 
     Raises `InputError` for an image of another frame, one that nobody exported, and one that is gone.
     """
@@ -364,6 +389,7 @@ def check_export(work: Workplace, images: Mapping[str, FrameKey], clip: Clip) ->
     if len(set(images.values())) != len(images):
         raise InputError(work.root, "images", "each training frame once", "one twice")
     there = {path for path in _files(work) if Path(path).suffix.lower() in _IMAGES}
+    there -= {path for path in there - images.keys() if _is_placeholder(work.root / path)}
     for what, names in (
         ("an exported image", images.keys() - there),
         ("exported images alone", there - images.keys()),
@@ -372,6 +398,18 @@ def check_export(work: Workplace, images: Mapping[str, FrameKey], clip: Clip) ->
             raise InputError(
                 work.root / min(names), "", what, "none" if what.startswith("an ") else "another image"
             )
+
+
+def write_placeholder(path: Path) -> None:
+    """Write what stands for an image that a loader insists on: one pixel, black and transparent."""
+    write_image(path, np.zeros((1, 1, 4), np.uint8))
+
+
+def _is_placeholder(path: Path) -> bool:
+    if path.suffix != ".png" or path.is_symlink():
+        return False
+    info = probe_image(path)
+    return (info.width, info.height) == (1, 1)
 
 
 _IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".exr", ".mp4", ".avi", ".mkv")

@@ -10,6 +10,7 @@ from ...bench.specs import Need
 from .checkout import look_at_folder, look_at_interpreter
 from .config import OfficialConfig
 from .ga.method import GAOfficial
+from .gbs.method import GBSOfficial
 from .method import OfficialMethod
 from .tga.method import TGAOfficial
 
@@ -22,6 +23,11 @@ def ga(config: OfficialConfig, device: str) -> Iterator[Need]:
 def tga(config: OfficialConfig, device: str) -> Iterator[Need]:
     """Checkout and environment of the method of `ours`."""
     return _needs(TGAOfficial, config)
+
+
+def gbs(config: OfficialConfig, device: str) -> Iterator[Need]:
+    """Checkout and environment of GaussianBlendshapes."""
+    return _needs(GBSOfficial, config)
 
 
 def _needs(method: type[OfficialMethod[Any]], config: OfficialConfig) -> Iterator[Need]:

@@ -7,6 +7,9 @@ from typing import Any
 
 from ...bench.specs import MethodSpec
 from ..ga.spec import SHORT
+from ..gbs.spec import GBS
+from ..gbs.spec import SHORT as GBS_SHORT
+from ..gbs.spec import SHORT_SPLATS as GBS_SHORT_SPLATS
 from ..shared.config import PAPER_ITERATIONS, SHORT_SPLATS
 
 
@@ -49,4 +52,38 @@ TGA_OFFICIAL = MethodSpec(
     native=False,
     source="3D Gaussian Head Avatars with Expressive Dynamic Appearances by Compact Tensorial Representations, "
     "CVPR 2025, arXiv 2504.14967",
+)
+
+
+def _short_blendshapes(samples: int) -> tuple[str, ...]:
+    """The same for GaussianBlendshapes, of which their script offers fewer, and splats to begin with."""
+    options: Mapping[str, Any] = {
+        "--position_lr_init": GBS_SHORT_SPLATS["position_lr"],
+        "--position_lr_final": GBS_SHORT_SPLATS["position_lr_final"],
+        "--scaling_lr": GBS_SHORT_SPLATS["scale_lr"],
+        "--rotation_lr": GBS_SHORT_SPLATS["rotation_lr"],
+        "--feature_lr": GBS_SHORT["sh_dc_lr"],
+        "--init_face_point_number": samples,
+    }
+    return tuple(str(word) for pair in options.items() for word in pair)
+
+
+GBS_OFFICIAL = MethodSpec(
+    name="gbs-official",
+    summary="GaussianBlendshapes by its authors' code, in a checkout and an environment of yours; needs CUDA.",
+    implementation="headbench.methods.official.gbs.method:GBSOfficial",
+    config="headbench.methods.official.config:GBSOfficialConfig",
+    needs="headbench.methods.official.needs:gbs",
+    presets={
+        name: {
+            "budget": GBS.presets[name]["budget"],
+            "arguments": _short_blendshapes(GBS.presets[name]["samples"]),
+        }
+        for name in ("smoke", "demo", "fast")
+    }
+    | {"paper": {"budget": GBS.presets["paper"]["budget"]}},
+    head_models=GBS.head_models,
+    monocular=True,
+    native=False,
+    source=GBS.source,
 )

@@ -66,6 +66,14 @@ class OfficialHead:
     @classmethod
     def of(cls, head: HeadAsset, checkout: Path) -> OfficialHead:
         """Fit a clip's head model to their code. Raises `InputError` where it does not."""
+        own = cls.numbered(head)
+        if _same_faces(own.faces, checkout / TEMPLATE_FILE):
+            return own  # FLAME's own topology: their numbers are right as they are
+        return own._with_lips(_their_rings(checkout), f"head model {head.version!r}")
+
+    @classmethod
+    def numbered(cls, head: HeadAsset) -> OfficialHead:
+        """A head with its own numbers, its teeth left out. Raises `InputError` for bases and joints of other sizes."""
         where = f"head model {head.version!r}"
         for name, size, most in (
             ("identity", head.shape_basis.shape[2], FLAME_IDENTITY_SIZE),
@@ -83,10 +91,7 @@ class OfficialHead:
         faces = head.faces[np.isin(head.faces, kept).all(axis=1)]
         number = np.full(len(head.template), -1)
         number[kept] = np.arange(len(kept))
-        own = cls(head, kept, number[faces])
-        if _same_faces(own.faces, checkout / TEMPLATE_FILE):
-            return own  # FLAME's own topology: their numbers are right as they are
-        return own._with_lips(_their_rings(checkout), where)
+        return cls(head, kept, number[faces])
 
     def _with_lips(self, wanted: tuple[IntArray, IntArray], where: str) -> OfficialHead:
         """Number the vertices anew so that those wanted are the rings of the lips."""
@@ -114,16 +119,25 @@ class OfficialHead:
 
     def write(self, folder: Path) -> None:
         """Write the four files below the program's working directory."""
+        model = self.model()
+        write_bytes(folder / MODEL_FILE, pickled(model))
+        write_bytes(folder / MASKS_FILE, pickled({name: self._region(name) for name in MASKS}))
+        write_text(folder / TEMPLATE_FILE, obj_text(model["v_template"], self.faces))
+        write_landmarks(folder / LANDMARKS_FILE, {"full_lmk": (1, LANDMARKS)})
+
+    def model(self, offset: FloatArray | None = None) -> dict[str, np.ndarray]:
+        """The arrays of FLAME's file by their names; ``offset`` (V, 3), of the clip's head, is added to the template."""
         head, weights = self.head, self.vertices(self.head.skinning_weights).astype(np.float64)
         weights[self.order < 0, 0] = 1.0
         parents = np.maximum(head.parents, 0)
-        model: dict[str, np.ndarray] = {
-            "v_template": self.vertices(head.template).astype(np.float64),
+        template = head.template if offset is None else head.template + offset
+        return {
+            "v_template": self.vertices(template).astype(np.float64),
             "f": self.faces.astype(np.uint32),
             "shapedirs": np.concatenate(
                 [
-                    _padded(self.vertices(head.shape_basis), FLAME_IDENTITY_SIZE),
-                    _padded(self.vertices(head.expression_basis), EXPRESSION_SIZE),
+                    padded(self.vertices(head.shape_basis), FLAME_IDENTITY_SIZE),
+                    padded(self.vertices(head.expression_basis), EXPRESSION_SIZE),
                 ],
                 axis=2,
             ).astype(np.float32),
@@ -132,21 +146,6 @@ class OfficialHead:
             "kintree_table": np.stack([parents, np.arange(len(parents))]).astype(np.int64),
             "weights": weights,
         }
-        write_bytes(folder / MODEL_FILE, pickled(model))
-        write_bytes(folder / MASKS_FILE, pickled({name: self._region(name) for name in MASKS}))
-        # One texture coordinate for all corners: nothing of it is ever drawn.
-        lines = ["v {:.9g} {:.9g} {:.9g}".format(*vertex) for vertex in model["v_template"]]
-        lines += ["vt 0 0", *("f {}/1 {}/1 {}/1".format(*face) for face in self.faces + 1)]
-        write_text(folder / TEMPLATE_FILE, "\n".join(lines) + "\n")
-        # Landmarks are loaded, never asked for: all stand on one triangle. A record of fields is read like a dictionary.
-        fields = [
-            ("full_lmk_faces_idx", "<i8", (1, LANDMARKS)),
-            ("full_lmk_bary_coords", "<f4", (1, LANDMARKS, 3)),
-        ]
-        landmarks = np.zeros((), dtype=fields)
-        landmarks["full_lmk_bary_coords"] = 1 / 3
-        with atomic_path(folder / LANDMARKS_FILE) as temporary, temporary.open("wb") as stream:
-            np.save(stream, landmarks, allow_pickle=False)
 
     def _region(self, name: str) -> IntArray:
         return np.flatnonzero(np.isin(self.order, self.head.regions.get(name, []))).astype(np.int64)
@@ -173,10 +172,32 @@ class OfficialTracking:
         if pose.head_model != version:
             raise InputError("pose", "head_model", repr(version), repr(pose.head_model))
         values = {k: v for k, v in pose_to_parameters(pose).items() if k != "eyelids"}
-        values["expr"] = _padded(values["expr"], EXPRESSION_SIZE)
-        shape = _padded(np.asarray(self.shape, np.float32)[None], FLAME_IDENTITY_SIZE)[0]
+        values["expr"] = padded(values["expr"], EXPRESSION_SIZE)
+        shape = padded(np.asarray(self.shape, np.float32)[None], FLAME_IDENTITY_SIZE)[0]
         offset = self.head.vertices(np.asarray(self.static_offset, np.float32))[None]
         return {**values, "shape": shape, "static_offset": offset}
+
+
+def obj_text(vertices: FloatArray, faces: IntArray) -> str:
+    """A mesh as an OBJ file, with one texture coordinate for all corners: nothing of it is ever drawn."""
+    lines = ["v {:.9g} {:.9g} {:.9g}".format(*vertex) for vertex in vertices]
+    lines += ["vt 0 0", *("f {}/1 {}/1 {}/1".format(*face) for face in np.asarray(faces) + 1)]
+    return "\n".join(lines) + "\n"
+
+
+def write_landmarks(path: Path, sizes: Mapping[str, tuple[int, ...]]) -> None:
+    """Write landmarks that code loads and never asks for: all of them on the first triangle.
+
+    ``sizes`` is how many by their prefix. A record of fields is read like the dictionary of FLAME's own file.
+    """
+    fields = []
+    for name, size in sizes.items():
+        fields += [(f"{name}_faces_idx", "<i8", size), (f"{name}_bary_coords", "<f4", (*size, 3))]
+    landmarks = np.zeros((), dtype=fields)
+    for name in sizes:
+        landmarks[f"{name}_bary_coords"] = 1 / 3
+    with atomic_path(path) as temporary, temporary.open("wb") as stream:
+        np.save(stream, landmarks, allow_pickle=False)
 
 
 def pickled(arrays: Mapping[str, np.ndarray]) -> bytes:
@@ -184,11 +205,11 @@ def pickled(arrays: Mapping[str, np.ndarray]) -> bytes:
     from io import BytesIO
 
     stream = BytesIO()
-    _Pickler(stream, protocol=4).dump(dict(arrays))
+    ArrayPickler(stream, protocol=4).dump(dict(arrays))
     return stream.getvalue()
 
 
-class _Pickler(pickle.Pickler):
+class ArrayPickler(pickle.Pickler):
     """Writes an array as a call of its class with shape, type and bytes.
 
     How numpy itself pickles an array names a module that moved with version 2, which older versions cannot find.
@@ -201,7 +222,7 @@ class _Pickler(pickle.Pickler):
         return np.ndarray, (value.shape, value.dtype.str, bytearray(contiguous.tobytes()))
 
 
-def _padded(values: FloatArray, size: int) -> FloatArray:
+def padded(values: FloatArray, size: int) -> FloatArray:
     """Zeros appended along the last axis."""
     missing = size - values.shape[-1]
     return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, missing)])

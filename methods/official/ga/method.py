@@ -127,8 +127,7 @@ class GALayoutMethod(OfficialMethod[Config]):
 
     def done(self, line: str) -> tuple[int, str] | None:
         """From the progress bar of their training."""
-        match, loss = _PROGRESS.search(line), _LOSS.search(line)
-        return None if match is None else (int(match[1]), f"loss {loss[1]}" if loss else "")
+        return trained(line)
 
     def keep(self, fit: Fit, work: Workplace) -> dict[str, Any]:
         """Their splats and arguments; the subject's shape and offset, without the zeros that their file has beside them."""
@@ -187,8 +186,7 @@ class GALayoutMethod(OfficialMethod[Config]):
 
     def drawn(self, line: str) -> int | None:
         """From the progress bar of their renderer."""
-        match = _DRAWN.search(line)
-        return None if match is None else int(match[1])
+        return rendered(line)
 
     def render_folder(self, folder: Path, work: Workplace) -> Path:
         """Renders of the test split."""
@@ -272,6 +270,18 @@ def _refined(clip: Clip, timesteps: np.ndarray, made: Path) -> RefinedTracking:
         for name, theirs in THEIR_NAMES.items()
     }
     return RefinedTracking(clip.subject, timesteps, tracked, refined)
+
+
+def trained(line: str) -> tuple[int, str] | None:
+    """Iterations and loss of the progress bar that training scripts derived from 3DGS's draw."""
+    match, loss = _PROGRESS.search(line), _LOSS.search(line)
+    return None if match is None else (int(match[1]), f"loss {loss[1]}" if loss else "")
+
+
+def rendered(line: str) -> int | None:
+    """Frames of the progress bar that render scripts derived from 3DGS's draw."""
+    match = _DRAWN.search(line)
+    return None if match is None else int(match[1])
 
 
 def free_port() -> int:

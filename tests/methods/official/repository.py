@@ -138,6 +138,11 @@ def make_repository(folder: Path, rings: tuple[list[int], list[int]], sizes: tup
         for name, ring in (("upper", upper), ("lower", lower))
     )
     (folder / "flame_model" / "flame.py").write_text(source)
+    return commit_all(folder)
+
+
+def commit_all(folder: Path) -> str:
+    """Make a repository of a folder; return its commit."""
     git = [
         "git",
         "-C",

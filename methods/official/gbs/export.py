@@ -1,0 +1,247 @@
+"""Videos in the form that GaussianBlendshapes' loader reads, which is Metrical Tracker's and INSTA's.
+
+``checkpoint/00000.frame``, a torch file of numpy arrays for each frame; ``images/00000.png``, straight alpha;
+``canonical.obj``. Frames are numbered without a gap, and which is which is in a map of ours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from ....bench.contracts import Camera, Clip, FloatArray, FrameKey, HeadPose, Progress
+from ....bench.errors import InputError
+from ....bench.io.arrays import read_npy
+from ....bench.io.files import atomic_path, grouped_writes, read_bytes, write_bytes, write_text
+from ....datasets.head.arrays import faces_in_region
+from ....datasets.head.loaders import FLAME_IDENTITY_SIZE
+from ....datasets.head.subject import PosedSubject
+from ....datasets.head.teeth import with_teeth_where_possible
+from ....datasets.images import write_image
+from ...shared.avatar_files import Subject, head_arrays
+from ..checkout import Checkout
+from ..ga.export import mark
+from ..ga.head_files import (
+    EXPRESSION_SIZE,
+    MOST_TEMPLATE,
+    ArrayPickler,
+    OfficialHead,
+    obj_text,
+    padded,
+    pickled,
+    write_landmarks,
+)
+from ..method import Listed, Workplace, write_placeholder
+from ..video import cameras_at_rest, six_numbers, straight_rgba
+
+SOURCES = ("*.py", "config/*.py", "FLAME/*.py", "utils/*.py")
+"""Their program, which is run from a copy: it opens the eyelid bases beside its own file, whatever head it is given."""
+BILLBOARDS = ("data/up_billboard_tri.obj", "data/down_billboard_tri.obj")
+MODEL_FILE, LANDMARKS_FILE = "data/FLAME2020/generic_model.pkl", "data/landmark_embedding.npy"
+BACK_FILE, NECK_FILE = "data/FLAME2020/back_of_head.txt", "data/FLAME2020/neck_exclude_vertex.txt"
+EYELID_FILES = ("FLAME/blendshapes/l_eyelid.npy", "FLAME/blendshapes/r_eyelid.npy")
+MEDIAPIPE_FILE, MEDIAPIPE_LANDMARKS = "FLAME/mediapipe/mediapipe_landmark_embedding.npz", 105
+LANDMARKS = {"static_lmk": (51,), "dynamic_lmk": (79, 17)}
+LOADER, CONFIG = "FLAME/dataset.py", "config/config_blendshapes.py"
+TEXTURE_SIZE = 140
+"""Texture coefficients of a frame; loaded and never used."""
+GRIDS = {"WeightID_256.pt": "grid_id", "Weight5node_256.pt": "tar_feature"}
+"""Files of their look-up grids, and what is looked up."""
+
+
+def held_out(checkout: Checkout) -> int:
+    """How many frames at the end of every video their loader takes for a test."""
+    return int(checkout.constant(LOADER, r"self\.n_seg = (\d+)", "n_seg"))
+
+
+class VideoHead:
+    """A head model and one identity as their code is given them: teeth left out, the static offset in the template.
+
+    Raises `InputError` where their code cannot take the head.
+    """
+
+    def __init__(self, subject: Subject, head: Any, checkout: Checkout):
+        self.official = OfficialHead.numbered(head)
+        self.identity = subject
+        self.posed = PosedSubject(head, subject.shape, subject.static_offset)
+        self._checkout = checkout.folder
+        eyelids = read_npy(self._checkout / EYELID_FILES[0])
+        self.is_flames = len(eyelids) == len(self.official.order)
+        """Whether vertices and triangles are FLAME's, so that what their code knows by number is right."""
+        if not self.is_flames:
+            self._back = self._triangles("scalp")
+            self._offset = self._mouth() - self._cylinder(checkout)
+
+    def write_program(self, folder: Path) -> None:
+        """Write their program and the files that it opens by its working directory."""
+        for pattern in SOURCES:
+            for path in sorted(self._checkout.glob(pattern)):
+                name = path.relative_to(self._checkout).as_posix()
+                write_bytes(folder / name, read_bytes(path, "a source file", MOST_TEMPLATE))
+        for name in BILLBOARDS:
+            write_bytes(folder / name, read_bytes(self._checkout / name, "an OBJ file", MOST_TEMPLATE))
+        write_bytes(folder / MODEL_FILE, pickled(self.official.model(self.identity.static_offset)))
+        write_landmarks(folder / LANDMARKS_FILE, LANDMARKS)
+        count = MEDIAPIPE_LANDMARKS
+        landmarks: dict[str, np.ndarray] = {
+            "lmk_face_idx": np.zeros(count, np.int64),
+            "lmk_b_coords": np.full((count, 3), 1 / 3, np.float32),
+            "landmark_indices": np.arange(count),
+        }
+        with atomic_path(folder / MEDIAPIPE_FILE) as temporary, temporary.open("wb") as stream:
+            np.savez(stream, allow_pickle=False, **landmarks)
+        basis = head_arrays(self.official.head).eyelid_basis
+        for side, name in enumerate(EYELID_FILES):
+            values = np.zeros((len(self.official.head.template), 3)) if basis is None else basis[:, :, side]
+            with atomic_path(folder / name) as temporary, temporary.open("wb") as stream:
+                np.save(stream, self.official.vertices(values).astype(np.float64), allow_pickle=False)
+        self._write_lists(folder)
+
+    def write_identity(self, folder: Path) -> None:
+        """Write the canonical mesh, and for heads that are not FLAME's where the mouth is."""
+        head, neutral = self.official, self.posed.neutral
+        write_text(folder / "canonical.obj", obj_text(head.vertices(neutral), head.faces))
+        if not self.is_flames:
+            write_text(folder / "offset.txt", "{:.9g} {:.9g} {:.9g}\n".format(*self._offset))
+
+    def frame(self, camera: Camera, pose: HeadPose) -> dict[str, dict[str, np.ndarray]]:
+        """What a frame's file says, of a camera in the head's frame: arrays with a leading axis of one."""
+        world, K = np.asarray(camera.world_to_camera, np.float64), np.asarray(camera.K, np.float64)
+        eyelids = np.zeros(2) if pose.eyelids is None else pose.eyelids
+        flame: dict[str, FloatArray] = {
+            "shape": padded(np.asarray(self.identity.shape), FLAME_IDENTITY_SIZE),
+            "exp": padded(np.asarray(pose.expression), EXPRESSION_SIZE),
+            "tex": np.zeros(TEXTURE_SIZE),
+            "jaw": six_numbers(pose.jaw),
+            "eyes": six_numbers(pose.eyes),
+            "eyelids": eyelids,
+        }
+        # PyTorch3D's camera, x to the left and y up, lengths in halves of the image's smaller side. It draws the mesh
+        # beside the renders; splats are projected by OpenCV's, which follows.
+        turned = np.diag([-1.0, -1.0, 1.0])
+        half = min(camera.width, camera.height) / 2
+        middle = np.array([camera.width, camera.height]) / 2
+        pytorch3d = {
+            "R": (turned @ world[:3, :3]).T[:2].ravel(),
+            "t": turned @ world[:3, 3],
+            "fl": K[:1, 0] / half,
+            "pp": -(K[:2, 2] - middle) / half,
+        }
+        opencv = {"R": world[:3, :3], "t": world[:3, 3], "K": K}
+        parts: dict[str, Mapping[str, np.ndarray]] = {"flame": flame, "camera": pytorch3d, "opencv": opencv}
+        return {
+            part: {name: np.asarray(array, np.float32)[None] for name, array in values.items()}
+            for part, values in parts.items()
+        }
+
+    def _write_lists(self, folder: Path) -> None:
+        """Triangles of the back of the head and vertices of the neck: theirs, or ours where the head is another."""
+        if self.is_flames:
+            for name in (BACK_FILE, NECK_FILE):
+                content = read_bytes(self._checkout / name, "a list of numbers", MOST_TEMPLATE)
+                write_bytes(folder / name, content)
+            return
+        neck = np.flatnonzero(np.isin(self.official.order, self.official.head.regions.get("neck", [])))
+        for name, numbers in ((BACK_FILE, self._back), (NECK_FILE, neck)):
+            write_text(folder / name, "".join(f"{number}\n" for number in numbers))
+
+    def _triangles(self, region: str) -> np.ndarray:
+        """Triangles of a region, by their numbers in their mesh."""
+        head = self.official.head
+        faces_in_region(head, region)  # its error names what is missing
+        inside = np.isin(self.official.order, head.regions[region])
+        triangles = np.flatnonzero(inside[self.official.faces].all(axis=1))
+        if len(triangles) < 3:
+            where = f"head model {head.version!r}"
+            raise InputError(
+                where, f"regions[{region}]", "a part of the surface", f"{len(triangles)} triangles"
+            )
+        return triangles
+
+    def _mouth(self) -> FloatArray:
+        """(3,) middle of the box around the teeth, metres."""
+        head = with_teeth_where_possible(head_arrays(self.official.head))
+        if "teeth" not in head.regions:
+            expected = "lips, behind which their code puts teeth"
+            raise InputError(f"head model {head.version!r}", "regions", expected, "none")
+        offset = np.zeros((len(head.template), 3))
+        offset[: len(self.identity.static_offset)] = self.identity.static_offset
+        teeth = PosedSubject(head, self.identity.shape, offset).neutral[head.regions["teeth"]]
+        return np.asarray(0.5 * (teeth.min(0) + teeth.max(0)), np.float64)
+
+    @staticmethod
+    def _cylinder(checkout: Checkout) -> FloatArray:
+        """(3,) the middle of the room that their teeth are held in, metres."""
+        numbers = checkout.constant(CONFIG, r"cylinder_params = \[([^\]]+)\]", "cylinder_params")
+        return np.array([float(number) for number in numbers.split(",")[:3]])
+
+
+def write_training(
+    clip: Clip, head: VideoHead, placeholders: int, work: Workplace, progress: Progress
+) -> dict[str, FrameKey]:
+    """Write the training frames as a video, and behind them the frames that their loader holds out: placeholders.
+
+    A placeholder has an image of one pixel, and pose and camera of the first training frame. Returns the key of every
+    other image by its place.
+    """
+    keys = sorted(clip.splits["train"], key=lambda key: (key.timestep, key.camera))
+    views = [(clip.cameras[key.camera], clip.poses[key.timestep]) for key in keys]
+    cameras = cameras_at_rest(head.posed, views)
+    images: dict[str, FrameKey] = {}
+    head.write_identity(work.input)
+    with grouped_writes():
+        for number, (key, camera, (_, pose)) in enumerate(zip(keys, cameras, views)):
+            write_image(work.input / image_name(number), straight_rgba(clip, key))
+            write_torch(work.input / frame_name(number), head.frame(camera, pose))
+            images[f"input/{image_name(number)}"] = key
+            progress(number + 1, len(keys), "exporting")
+        first = head.frame(cameras[0], views[0][1])
+        for number in range(len(keys), len(keys) + placeholders):
+            write_placeholder(work.input / image_name(number))
+            write_torch(work.input / frame_name(number), first)
+    return images
+
+
+def write_list(frames: Sequence[Listed], head: VideoHead, work: Workplace) -> None:
+    """Write frames to render as a video whose images are marks, see `..ga.export.mark`.
+
+    Their renderer fills two look-up grids of 256^3 nodes first, which takes minutes, and reads all that it needs of them
+    from the checkpoint instead. Grids of one node, in the files that it keeps them in, spare it that.
+    """
+    head.write_identity(work.input)
+    cameras = cameras_at_rest(head.posed, [(frame.camera, frame.pose) for frame in frames])
+    with grouped_writes():
+        for frame, camera in zip(frames, cameras):
+            image = np.full((camera.height, camera.width, 4), 255, np.uint8)
+            image[..., :3] = mark(frame.number)
+            write_image(work.input / image_name(frame.number), image)
+            write_torch(work.input / frame_name(frame.number), head.frame(camera, frame.pose))
+    for file, name in GRIDS.items():
+        box = {"bbox_min": torch.zeros(3), "bbox_max": torch.ones(3), "grid_size": [1, 1, 1]}
+        write_torch(work.input / file, {**box, name: torch.zeros(1, 1, 1, 1)})
+
+
+def image_name(number: int) -> str:
+    """Place of a frame's image."""
+    return f"images/{number:05d}.png"
+
+
+def frame_name(number: int) -> str:
+    """Place of a frame's parameters."""
+    return f"checkpoint/{number:05d}.frame"
+
+
+def write_torch(path: Path, content: Mapping[str, Any]) -> None:
+    """Write a file for ``torch.load`` whose numpy arrays every version of numpy reads."""
+    with atomic_path(path) as temporary, temporary.open("wb") as stream:
+        torch.save(dict(content), stream, pickle_module=_ArrayPickles)
+
+
+class _ArrayPickles:
+    """What ``torch.save`` takes from a pickle module."""
+
+    Pickler = ArrayPickler

@@ -1,0 +1,226 @@
+"""GaussianBlendshapes by its authors' code.
+
+Ma et al., "3D Gaussian Blendshapes for Head Avatar Animation", SIGGRAPH 2024.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from ....bench.contracts import Clip, Frame, FrameKey, Progress
+from ....bench.errors import InputError
+from ....bench.io.documents import read_json
+from ....bench.io.files import write_json
+from ....bench.io.images import read_png
+from ...gbs.config import BlendshapeTraining, GBSConfig
+from ...shared.avatar_files import (
+    HEAD_FILE,
+    SUBJECT_FILE,
+    Subject,
+    read_shared_head,
+    read_subject,
+    save_shared_head,
+    write_subject,
+)
+from ...shared.loop import Fit
+from ...shared.schedule import DensifySchedule, Timeline
+from ..checkout import Checkout, Repository
+from ..config import GBSOfficialConfig
+from ..ga.export import check_mark
+from ..ga.head_files import EXPRESSION_SIZE
+from ..ga.method import copy_file, rendered, trained
+from ..method import Listed, OfficialMethod, Workplace
+from ..spec import GBS_OFFICIAL
+from ..video import check_masks
+from .export import VideoHead, held_out, write_list, write_training
+
+FILES = {
+    name: f"{name}{suffix}"
+    for name, suffix in {
+        "fix_chkpnt": ".pth",
+        "mouth0_chkpnt": ".pth",
+        "mouth1_chkpnt": ".pth",
+        "acc": ".npy",
+    }.items()
+}
+"""What their renderer opens, by the begin of its name, which goes on with the iteration; and what we call it."""
+BACKGROUND_FILE = "background.json"
+SHRINK = """
+import sys, torch
+for path in sys.argv[1:]:
+    state, iteration = torch.load(path)
+    kept = tuple({} if isinstance(part, dict) and "param_groups" in part else part for part in state)
+    torch.save((kept, iteration), path)
+"""
+"""Takes the optimiser's state out of checkpoints, two thirds of them, which their renderer opens and drops."""
+
+WITHOUT_FIX = "2952da7d246e5790140dbb477d1468214564f092"
+"""The commit that this adapter was written for."""
+
+
+class GBSOfficial(OfficialMethod[GBSOfficialConfig]):
+    """The method: see the module."""
+
+    name, version = GBS_OFFICIAL.name, GBS_OFFICIAL.version
+    config_class = GBSOfficialConfig
+    repository = Repository(
+        "https://github.com/zjumsj/GaussianBlendshapes",
+        WITHOUT_FIX,
+        ("train.py", "test.py", "FLAME/dataset.py", "FLAME/FLAME.py", "FLAME/blendshapes/l_eyelid.npy"),
+        (
+            *("torch", "torch.utils.tensorboard", "pytorch3d.renderer", "diff_gaussian_rasterization"),
+            *("simple_knn._C", "point_cloud_utils", "plyfile", "cv2", "tqdm", "numpy"),
+        ),
+        "from diff_gaussian_rasterization import RotSH3_C3, CompositeBlendShape, InvMat3x3",
+        "Its rasteriser and its simple-knn have the names of others': install those of its own submodules folder, in an "
+        "environment of their own.",
+    )
+    # Their frames and checkpoints hold more than tensors, which newer versions of torch read only where they are told to.
+    variables: ClassVar[Mapping[str, str]] = {"TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD": "1"}
+
+    def check_clip(self, clip: Clip, checkout: Checkout) -> None:
+        """Refuse a clip without masks, and a head that their code cannot take."""
+        check_masks(clip, "GaussianBlendshapes")
+        held_out(checkout)
+        VideoHead(Subject.of(clip), clip.head, checkout)
+
+    def export(
+        self, clip: Clip, checkout: Checkout, work: Workplace, progress: Progress
+    ) -> dict[str, FrameKey]:
+        """The training frames as a tracked video, their program beside the files that it opens."""
+        head = VideoHead(Subject.of(clip), clip.head, checkout)
+        head.write_program(work.program)
+        return write_training(clip, head, held_out(checkout), work, progress)
+
+    def train_command(self, fit: Fit, checkout: Checkout, work: Workplace) -> list[str]:
+        """Their script, with densification and the fall of the learning rate on the course of a run of this length."""
+        iterations = fit.budget.iterations or 0
+        published = BlendshapeTraining()
+        timeline = Timeline(iterations, published.schedule_length)
+        schedule = DensifySchedule.of(published, timeline, white=False)
+        options: dict[str, Any] = {
+            "--source_path": work.input,
+            "--model_path": work.model,
+            "--iterations": iterations,
+            "--position_lr_max_steps": max(1, timeline.at(GBSConfig().position_settles)),
+            "--densify_from_iter": schedule.start,
+            "--densification_interval": schedule.every,
+            "--densify_until_iter": max(0, schedule.stop),
+            "--opacity_reset_interval": schedule.prune_extent_from,  # opacities are never reset; sizes are cut from then on
+            "--checkpoint_iterations": iterations,
+            "--test_iterations": 0,  # their own scores of held-out frames, which are placeholders
+        }
+        words = [str(word) for pair in options.items() for word in pair]
+        return [*checkout.python, str(work.program / "train.py"), *words]
+
+    def shrink_command(self, fit: Fit, checkout: Checkout, work: Workplace) -> list[str] | None:
+        """Run in their interpreter, on the device that the tensors are to be read back to."""
+        names = [
+            f"{name}{fit.budget.iterations}.pth" for name, ours in FILES.items() if ours.endswith(".pth")
+        ]
+        return [*checkout.python, "-c", SHRINK, *(str(work.model / name) for name in names)]
+
+    def done(self, line: str) -> tuple[int, str] | None:
+        """From the progress bar of their training."""
+        return trained(line)
+
+    def keep(self, fit: Fit, work: Workplace) -> dict[str, Any]:
+        """What their renderer opens; the subject and the head model."""
+        for name, ours in FILES.items():
+            copy_file(work.model / f"{name}{fit.budget.iterations}{Path(ours).suffix}", fit.out / ours)
+        write_subject(fit.out / SUBJECT_FILE, Subject.of(fit.clip))
+        save_shared_head(fit.out, fit.clip.head)
+        return {}
+
+    def files(self, folder: Path) -> list[Path]:
+        """Splats, what their differences begin with, and the subject."""
+        return [folder / name for name in (*FILES.values(), SUBJECT_FILE)]
+
+    def shared_files(self, folder: Path) -> list[Path]:
+        """The head model."""
+        return [folder / HEAD_FILE]
+
+    def write_list(
+        self,
+        folder: Path,
+        frames: Sequence[Listed],
+        background: Sequence[float],
+        checkout: Checkout,
+        work: Workplace,
+    ) -> None:
+        """The frames as a video, and a model folder that leads to the avatar's files."""
+        model = read_shared_head(folder)
+        head = VideoHead(read_subject(folder / SUBJECT_FILE, model), model, checkout)
+        head.write_program(work.program)
+        write_list(frames, head, work)
+        for name, ours in FILES.items():
+            # Gigabytes, which are read alone.
+            (work.model / f"{name}1{Path(ours).suffix}").symlink_to((folder / ours).absolute())
+        write_json(work.root / BACKGROUND_FILE, {"background": [float(level) for level in background]})
+
+    def render_command(self, folder: Path, checkout: Checkout, work: Workplace) -> list[str]:
+        """Their script for all frames of a video, whatever split their loader takes them for."""
+        options: dict[str, Any] = {
+            "--source_path": work.input,
+            "--model_path": work.model,
+            "--load_iteration": 1,
+            "--render_seq": True,
+            "--render_test": False,
+            "--dump_for_viewer": False,
+        }
+        words = [str(word) for pair in options.items() for word in pair]
+        return [*checkout.python, str(work.program / "test.py"), *words]
+
+    def drawn(self, line: str) -> int | None:
+        """From the progress bar of their renderer."""
+        return rendered(line)
+
+    def render_folder(self, folder: Path, work: Workplace) -> Path:
+        """Renders of the whole video, and what is written beside them."""
+        return work.model / "seq" / "split_1"
+
+    def render_name(self, number: int) -> str:
+        """By the frame's number."""
+        return f"pred_{number:05d}.png"
+
+    def is_render(self, name: str) -> bool:
+        """Not the ground truth, meshes, masks and mouths that their script writes into the same folder."""
+        return name.startswith("pred_") and not name.startswith("pred_mask_")
+
+    def read_back(self, frame: Listed, path: Path, work: Workplace) -> Frame:
+        """A render on black and its coverage, put on the background asked for, once the ground truth shows the frame."""
+        number = path.name.removeprefix("pred_")
+        check_mark(path.with_name(f"gt_{number}"), frame.number)
+        parts = []
+        for file in (path, path.with_name(f"pred_mask_{number}")):
+            image = read_png(file)
+            if image.shape[:2] != (frame.camera.height, frame.camera.width):
+                expected = f"{frame.camera.width}x{frame.camera.height} pixels"
+                raise InputError(file, str(frame.key), expected, f"{image.shape[1]}x{image.shape[0]}")
+            parts.append(image.astype(np.float32) / 255)
+        rgb, alpha = parts[0], parts[1][..., 0]
+        ground = np.array(read_json(work.root / BACKGROUND_FILE)["background"], np.float32)
+        return Frame(np.clip(rgb + (1 - alpha[..., None]) * ground, 0, 1), alpha)
+
+    def remarks(self, clip: Clip, seed: int) -> dict[str, list[str]]:
+        """What a reader of results has to know."""
+        differences = [
+            "frames are numbered anew; those at the end, which their code holds out, are placeholders of one pixel",
+            "the background is taken out of half-covered pixels, and the static offset is part of the template",
+        ]
+        if clip.head.expression_basis.shape[2] < EXPRESSION_SIZE:
+            size = clip.head.expression_basis.shape[2]
+            differences.append(f"an expression basis of {size} directions is padded with zeros")
+        if self.config.commit and WITHOUT_FIX.startswith(self.config.commit):
+            differences.append(
+                "a commit before the authors' fix of June 2025 (5017124), which they say matters for multi-view captures"
+            )
+        if seed:
+            differences.append(
+                f"their code fixes the seed at 0; seed {seed} is a repetition, not another start"
+            )
+        return {"leaks": [], "differences": differences}

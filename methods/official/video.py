@@ -1,0 +1,57 @@
+"""What the codes that train on a tracked video have in common: straight colours, rotations of six numbers, the head's frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ...bench.contracts import ByteArray, Camera, Clip, FloatArray, FrameKey, HeadPose
+from ...bench.errors import InputError
+from ...datasets.head.subject import PosedSubject, camera_in_head_frame
+from ...datasets.steps.masks import recomposite
+
+
+def check_masks(clip: Clip, name: str) -> None:
+    """Raise `InputError` where a training frame has no mask: the code takes the head's coverage from a fourth channel."""
+    for key in clip.splits["train"]:
+        if clip.mask(key) is None:
+            expected = (
+                f"a mask; the code of {name} trains on the head alone, by a fourth channel of its images"
+            )
+            remedy = "Matte the capture (INSTA's generate.sh does), or compare with the native method, which goes without."
+            raise InputError(f"clip {clip.subject}", str(key), expected, "none", remedy)
+
+
+def straight_rgba(clip: Clip, key: FrameKey) -> ByteArray:
+    """(H, W, 4) straight alpha: what the head contributes to a pixel over its coverage, without the background.
+
+    Colours times coverage are the frame on black, to half a level.
+    """
+    mask = clip.mask(key)
+    assert mask is not None, "checked before"
+    coverage = mask.astype(np.float32) / 255
+    image = clip.image(key).astype(np.float32) / 255
+    black = np.zeros(3, np.float32)
+    colours = recomposite(image, coverage, np.asarray(clip.background, np.float32), black)
+    colours /= np.maximum(coverage, 1 / 255)[..., None]
+    return np.dstack([np.round(255 * colours).astype(np.uint8), mask])
+
+
+def six_numbers(turns: FloatArray) -> FloatArray:
+    """(6 n,) the first two rows of each rotation's matrix, of (3 n,) axis-angle vectors."""
+    matrices = Rotation.from_rotvec(np.reshape(turns, (-1, 3))).as_matrix()
+    return np.asarray(matrices[:, :2].ravel(), np.float64)
+
+
+def cameras_at_rest(
+    subject: PosedSubject, views: Sequence[tuple[Camera, HeadPose]], size: int = 64
+) -> list[Camera]:
+    """The camera of each view relative to a head that does not move; a video's poses have no motion left to move."""
+    cameras = []
+    for start in range(0, len(views), size):
+        part = views[start : start + size]
+        motions = subject.motions([pose for _, pose in part])
+        cameras += [camera_in_head_frame(camera, motion) for (camera, _), motion in zip(part, motions)]
+    return cameras

@@ -1,0 +1,292 @@
+"""GaussianBlendshapes' adapter: the video that their loader reads, placeholders, renders on black read back by key."""
+
+import subprocess
+import sys
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from headbench.bench.contracts import Budget, no_progress
+from headbench.bench.errors import InputError
+from headbench.bench.io.documents import read_json
+from headbench.bench.io.images import read_pixels
+from headbench.bench.runner.adaptation import TrainingView
+from headbench.datasets.head.subject import PosedSubject
+from headbench.datasets.images import write_image
+from headbench.methods.official.checkout import Checkout
+from headbench.methods.official.config import GBSOfficialConfig
+from headbench.methods.official.gbs.export import GRIDS
+from headbench.methods.official.gbs.method import SHRINK, GBSOfficial
+from headbench.methods.official.method import Listed, Workplace, check_export
+from headbench.methods.official.process import ProgramError
+from headbench.methods.official.spec import GBS_OFFICIAL
+
+from .blendshapes_repository import CYLINDER, HELD_OUT, BlendshapesStandIn, make_blendshapes_repository
+from .repository import settings
+
+BUDGET = Budget(iterations=2_000)
+
+
+def stand_in(folder, vertices=1, change="shown"):
+    commit = make_blendshapes_repository(folder, vertices, change)
+    found = settings(folder, commit)
+    return BlendshapesStandIn(GBSOfficialConfig(found.checkout, found.python, found.commit))
+
+
+@pytest.fixture
+def method(tmp_path):
+    return stand_in(tmp_path / "repository")
+
+
+@pytest.fixture
+def moving_clip(official_clip):
+    """With eyelids in its poses, and jaws that differ."""
+    poses = {t: replace(pose, eyelids=np.array([0.1 * t, 0.5])) for t, pose in official_clip.poses.items()}
+    return replace(official_clip, poses=poses)
+
+
+@pytest.fixture
+def exported(method, moving_clip, tmp_path):
+    work = Workplace.at(tmp_path / "work")
+    work.make()
+    return work, method.export(TrainingView(moving_clip), method.look(), work, no_progress)
+
+
+def fit(method, clip, out):
+    return method.fit(TrainingView(clip), out, BUDGET, device="cpu", seed=0, progress=no_progress)
+
+
+def views(clip, *splits):
+    keys = [key for split in splits for key in clip.splits[split]]
+    return {key: (clip.cameras[key.camera], clip.poses[key.timestep]) for key in keys}
+
+
+def read_frame(work, number):
+    with torch.serialization.safe_globals([np.ndarray]):
+        return torch.load(work.input / f"checkpoint/{number:05d}.frame", weights_only=True)
+
+
+def test_frames_are_rendered_under_their_keys_on_any_ground(method, official_clip, tmp_path):
+    avatar = fit(method, official_clip, tmp_path / "a")
+    names = {path.name for path in avatar.files()}
+    assert names == {"fix_chkpnt.pth", "mouth0_chkpnt.pth", "mouth1_chkpnt.pth", "acc.npy", "subject.npz"}
+    wanted = views(official_clip, "self_reenactment", "novel_view", "train")
+    poses = [pose for _, pose in wanted.values()]
+    motions = PosedSubject.of(official_clip).motions(poses)
+    for ground in ((1.0, 1.0, 1.0), (0.0, 0.5, 1.0)):
+        found = dict(avatar.render_listed(wanted, ground, no_progress))
+        assert found.keys() == wanted.keys()
+        for (key, (camera, pose)), motion in zip(wanted.items(), motions):
+            frame = found[key]
+            assert frame.rgb.shape == (camera.height, camera.width, 3)
+            shift = (camera.world_to_camera @ motion)[0, 3]
+            jaw = np.sin(pose.jaw[0])  # in the first two rows, that of x is the last number
+            levels = 60 + np.array([20 * pose.expression[0], 200 * -jaw, 100 * shift])
+            expected = np.floor(np.clip(levels, 0, 153)) / 255 + 0.4 * np.array(ground)
+            assert np.abs(frame.rgb - expected).max() < 1.01 / 255
+            assert frame.alpha == pytest.approx(0.6)
+
+
+def test_the_record_tells_placeholders_padding_and_the_fix(method, official_clip, tmp_path):
+    fit(method, official_clip, tmp_path / "a")
+    record = read_json(tmp_path / "a" / "training.json")
+    assert record["leaks"] == []
+    told = " ".join(record["differences"])
+    assert "placeholders of one pixel" in told
+    assert "8 directions is padded" in told
+    assert "5017124" not in told
+    assert any("5017124" in line for line in BlendshapesStandIn().remarks(official_clip, 0)["differences"])
+
+
+def test_the_schedule_keeps_its_fractions_of_a_shorter_run(method, official_clip, tmp_path):
+    fit(method, official_clip, tmp_path / "a")
+    log = (tmp_path / "a" / "training.log").read_text()
+    for name, value in {
+        "position_lr_max_steps": 1_500,
+        "densify_from_iter": 25,
+        "densify_until_iter": 750,
+        "opacity_reset_interval": 150,
+        "test_iterations": 0,
+    }.items():
+        assert f"'{name}': '{value}'" in log
+
+
+def test_images_times_their_alpha_are_the_frames_on_black(exported, moving_clip):
+    work, images = exported
+    assert sorted(images) == [f"input/images/{number:05d}.png" for number in range(len(images))]
+    assert set(images.values()) == set(moving_clip.splits["train"])
+    for place, key in images.items():
+        pixels = read_pixels(work.root / place).astype(float)
+        share = moving_clip.masks[key][..., None] / 255
+        assert np.array_equal(pixels[..., 3:], moving_clip.masks[key][..., None])
+        on_black = moving_clip.images[key][..., ::-1] - (1 - share) * 255 * moving_clip.background
+        assert np.abs(pixels[..., :3] * share - np.clip(on_black, 0, 255 * share)).max() < 0.51
+
+
+def test_frames_hold_pose_and_both_cameras_in_the_heads_frame(exported, moving_clip):
+    work, images = exported
+    subject = PosedSubject.of(moving_clip)
+    points = subject.neutral[::7]
+    for number, key in enumerate(images.values()):
+        camera, pose = moving_clip.cameras[key.camera], moving_clip.poses[key.timestep]
+        found = {
+            part: {k: v[0] for k, v in values.items()} for part, values in read_frame(work, number).items()
+        }
+        flame, seen, drawn = found["flame"], found["opencv"], found["camera"]
+        assert np.array_equal(flame["exp"][:8], pose.expression)
+        assert not flame["exp"][8:].any()
+        assert flame["shape"][:6] == pytest.approx(moving_clip.shape)
+        assert flame["eyelids"] == pytest.approx(pose.eyelids)
+        rotation = np.cross(flame["jaw"][:3], flame["jaw"][3:])
+        assert rotation[2] == pytest.approx(np.cos(pose.jaw[0]), abs=1e-6)
+        world = points @ subject.motions([pose])[0][:3, :3].T + subject.motions([pose])[0][:3, 3]
+        local = world @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        pixels = (local @ camera.K.T)[:, :2] / local[:, 2:]
+        theirs = (points @ seen["R"].T + seen["t"]) @ seen["K"].T
+        assert np.abs(theirs[:, :2] / theirs[:, 2:] - pixels).max() < 1e-3
+        rows = drawn["R"].reshape(2, 3)
+        turn = np.vstack([rows, np.cross(*rows)])
+        right = points @ turn + drawn["t"]
+        flat = drawn["fl"] * right[:, :2] / right[:, 2:] + drawn["pp"]
+        size = np.array([camera.width, camera.height])
+        assert np.abs(size / 2 - flat * min(size) / 2 - pixels).max() < 1e-3
+
+
+def test_the_end_that_their_loader_holds_out_is_placeholders(exported, moving_clip):
+    work, images = exported
+    count = len(images)
+    assert len(list((work.input / "checkpoint").iterdir())) == count + HELD_OUT
+    first = read_frame(work, 0)
+    for number in range(count, count + HELD_OUT):
+        assert read_pixels(work.input / f"images/{number:05d}.png").tolist() == [[[0, 0, 0, 0]]]
+        again = read_frame(work, number)
+        assert all(np.array_equal(again[p][k], first[p][k]) for p in first for k in first[p])
+    check_export(work, images, moving_clip)
+
+
+@pytest.mark.parametrize("shape", [(1, 2, 4), (36, 28, 3)])
+def test_the_guard_takes_one_pixel_for_a_placeholder_alone(exported, moving_clip, shape):
+    work, images = exported
+    write_image(work.input / f"images/{len(images):05d}.png", np.zeros(shape, np.uint8))
+    with pytest.raises(InputError, match="another image"):
+        check_export(work, images, moving_clip)
+
+
+def test_another_head_brings_its_own_lists_and_mouth(exported, moving_clip):
+    work, _ = exported
+    head = moving_clip.head
+    back = np.loadtxt(work.program / "data/FLAME2020/back_of_head.txt").astype(int)
+    assert np.isin(head.faces[back], head.regions["scalp"]).all()
+    neck = np.loadtxt(work.program / "data/FLAME2020/neck_exclude_vertex.txt").astype(int)
+    assert np.array_equal(np.sort(neck), np.sort(head.regions["neck"]))
+    middle = np.loadtxt(work.input / "offset.txt") + CYLINDER
+    lips = PosedSubject.of(moving_clip).neutral[head.regions["lips"]]
+    assert (lips.min(0)[:2] < middle[:2]).all()
+    assert (middle[:2] < lips.max(0)[:2]).all()
+    assert middle[2] < lips.max(0)[2]
+
+
+def test_a_head_of_flames_topology_keeps_theirs(moving_clip, tmp_path):
+    method = stand_in(tmp_path / "repository", vertices=len(moving_clip.head.template))
+    work = Workplace.at(tmp_path / "work")
+    work.make()
+    method.export(TrainingView(moving_clip), method.look(), work, no_progress)
+    assert not (work.input / "offset.txt").exists()
+    for name in ("back_of_head", "neck_exclude_vertex"):
+        path = work.program / f"data/FLAME2020/{name}.txt"
+        assert path.read_text() == "3\n1\n2\n"
+
+
+def test_eyelid_bases_are_those_of_the_clips_head(official_clip, tmp_path):
+    basis = np.random.default_rng(0).standard_normal((*official_clip.head.template.shape, 2))
+    clip = replace(official_clip, head=replace(official_clip.head, eyelid_basis=basis))
+    method = stand_in(tmp_path / "repository")
+    work = Workplace.at(tmp_path / "work")
+    work.make()
+    method.export(TrainingView(clip), method.look(), work, no_progress)
+    for index, side in enumerate("lr"):
+        path = work.program / f"FLAME/blendshapes/{side}_eyelid.npy"
+        assert np.array_equal(np.load(path), basis[..., index])
+    assert not np.load(tmp_path / f"repository/FLAME/blendshapes/{side}_eyelid.npy").any()
+
+
+def test_grids_that_nobody_reads_have_one_node(method, official_clip, tmp_path):
+    avatar = fit(method, official_clip, tmp_path / "a")
+    work = Workplace.at(tmp_path / "work")
+    work.make()
+    listed = [next(iter(views(official_clip, "novel_view").values()))]
+    frames = [Listed(0, official_clip.splits["novel_view"][0], *listed[0])]
+    method.write_list(tmp_path / "a", frames, (1, 1, 1), method.look(), work)
+    for file, name in GRIDS.items():
+        assert torch.load(work.input / file, weights_only=True)[name].numel() == 1
+    assert (work.model / "fix_chkpnt1.pth").resolve() == avatar.files()[0].resolve()
+
+
+@pytest.mark.parametrize(
+    ("changes", "found"),
+    [
+        ({"masks": None}, "a mask"),
+        ({"regions": {"scalp": np.arange(2)}}, "regions"),
+        ({"regions": {}}, "scalp"),
+        ({"expression_basis": np.zeros((300, 3, 101))}, "at most 100 directions"),
+    ],
+)
+def test_clips_without_mask_or_head_to_fit_are_refused(method, official_clip, changes, found):
+    if "masks" in changes:
+        clip = replace(official_clip, masks=dict.fromkeys(official_clip.masks))
+    else:
+        clip = replace(official_clip, head=replace(official_clip.head, **changes))
+    with pytest.raises(InputError, match=found):
+        method.check(clip, BUDGET)
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    {
+        "{} if index == 1 else shown": "lacks 1 of 3 renders, first pred_00001.png",
+        "{k: v for k, v in shown.items() if k != 'pred_mask'}": "pred_mask_00000.png",
+        "shown | {'pred_mask': shown['pred_mask'][1:]}": r"expected 28x36 pixels, found 28x35",
+        "shown | {'gt': shown['gt'] + np.uint8(16)}": "the mark of frame 0",
+    }.items(),
+)
+def test_renders_that_are_not_as_they_should_be(official_clip, tmp_path, change, expected):
+    method = stand_in(tmp_path / "repository", change=change)
+    avatar = fit(method, official_clip, tmp_path / "a")
+    with pytest.raises(ProgramError, match=expected):
+        list(avatar.render_listed(views(official_clip, "novel_view"), (1.0, 1.0, 1.0), no_progress))
+
+
+def test_checkpoints_lose_their_optimiser_and_nothing_else(tmp_path):
+    values = torch.nn.Parameter(torch.arange(3.0))
+    optimiser = torch.optim.Adam([values])
+    values.sum().backward()
+    optimiser.step()
+    before = values.detach().clone()
+    path = tmp_path / "fix_chkpnt40.pth"
+    torch.save(((3, values, {"kept": 1}, optimiser.state_dict(), 1.0), 40), path)
+    subprocess.run([sys.executable, "-c", SHRINK, str(path)], check=True)
+    (degree, found, other, state, scale), iteration = torch.load(path, weights_only=True)
+    assert (degree, other, state, scale, iteration) == (3, {"kept": 1}, {}, 1.0, 40)
+    assert isinstance(found, torch.nn.Parameter)
+    assert torch.equal(found, before)
+
+
+def test_what_rendering_never_reads_is_left_out_by_their_python(official_clip, tmp_path):
+    fit = SimpleNamespace(budget=BUDGET, clip=official_clip)
+    checkout = Checkout(tmp_path, ("conda", "run", "python"), {})
+    command = GBSOfficial.shrink_command(stand_in(tmp_path / "r"), fit, checkout, Workplace(tmp_path))
+    assert command[:4] == ["conda", "run", "python", "-c"]
+    names = [f"{name}2000.pth" for name in ("fix_chkpnt", "mouth0_chkpnt", "mouth1_chkpnt")]
+    assert command[5:] == [str(tmp_path / "model" / name) for name in names]
+
+
+def test_short_presets_take_the_native_rates():
+    assert GBS_OFFICIAL.monocular
+    assert set(GBS_OFFICIAL.presets) == {"smoke", "demo", "fast", "paper"}
+    demo = GBS_OFFICIAL.presets["demo"]
+    assert demo["budget"] == {"iterations": 2_000}
+    assert demo["arguments"][-2:] == ("--init_face_point_number", "12000")
+    assert "arguments" not in GBS_OFFICIAL.presets["paper"]
