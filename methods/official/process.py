@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import IO
 
 from ...bench.errors import HeadbenchError, shortened
+from ...bench.io.files import flush_renames
 
 KEPT = (
     *("PATH", "HOME", "USER", "LANG", "LC_ALL", "TMPDIR", "XDG_CACHE_HOME", "XDG_RUNTIME_DIR"),
@@ -79,7 +80,7 @@ def run_program(
     """Run a command in ``folder`` until it ends; its output, both streams, is appended to ``log``.
 
     The program and all that it starts are one process group, which is ended when this call is interrupted, and what the
-    program left running is ended with it.
+    program left running is ended with it. What was written for it is on disk before, whatever group of writes is open.
 
     Parameters
     ----------
@@ -89,6 +90,7 @@ def run_program(
 
     Raises `ProgramError` where the command cannot be started.
     """
+    flush_renames()
     with log.open("ab") as stream:
         stream.write(f"$ {' '.join(command)}\n".encode())
         try:

@@ -11,7 +11,7 @@ import pytest
 from headbench.bench.contracts import Budget, ListedFrames, SharingAvatar, no_progress
 from headbench.bench.errors import HeadbenchError, InputError, UnavailableError
 from headbench.bench.io.documents import read_json
-from headbench.bench.io.files import digest_file
+from headbench.bench.io.files import digest_file, grouped_writes
 from headbench.bench.io.images import read_png
 from headbench.bench.runner.adaptation import TrainingView
 from headbench.methods.official.ga.windows import inside
@@ -122,6 +122,12 @@ def test_every_held_out_frame_is_rendered_under_its_key(avatar, official_clip, t
         assert np.abs(frame.rgb[0, 0, :2] * 255 - expected).max() <= 1.01
         assert np.ptp(frame.rgb, axis=(0, 1)).max() == 0
     assert not (tmp_path / "avatar" / RENDERING).exists()
+
+
+def test_a_list_is_on_disk_where_the_harness_groups_writes(avatar, official_clip):
+    wanted = views(official_clip, "novel_view")
+    with grouped_writes():
+        assert dict(avatar.render_listed(wanted, (1.0, 1.0, 1.0), no_progress)).keys() == wanted.keys()
 
 
 def test_a_frame_on_its_own_cannot_be_had(avatar, official_clip):
