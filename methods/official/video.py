@@ -13,24 +13,27 @@ from ...datasets.head.subject import PosedSubject, camera_in_head_frame
 from ...datasets.steps.masks import recomposite
 
 
-def check_masks(clip: Clip, name: str) -> None:
-    """Raise `InputError` where a training frame has no mask: the code takes the head's coverage from a fourth channel."""
-    for key in clip.splits["train"]:
-        if clip.mask(key) is None:
-            expected = (
-                f"a mask; the code of {name} trains on the head alone, by a fourth channel of its images"
-            )
-            remedy = "Matte the capture (INSTA's generate.sh does), or compare with the native method, which goes without."
-            raise InputError(f"clip {clip.subject}", str(key), expected, "none", remedy)
+def check_masks(clip: Clip) -> None:
+    """Raise `InputError` for a clip without masks, by its first training frame; `straight_rgba` does for any other."""
+    coverage_of(clip, clip.splits["train"][0])
+
+
+def coverage_of(clip: Clip, key: FrameKey) -> ByteArray:
+    """(H, W) mask of a frame. Raises `InputError` where there is none."""
+    mask = clip.mask(key)
+    if mask is None:
+        expected = "a mask; the code trains on the head alone, by a fourth channel of its images"
+        remedy = "Matte the capture (INSTA's generate.sh does), or compare with the native method, which goes without."
+        raise InputError(f"clip {clip.subject}", str(key), expected, "none", remedy)
+    return mask
 
 
 def straight_rgba(clip: Clip, key: FrameKey) -> ByteArray:
     """(H, W, 4) straight alpha: what the head contributes to a pixel over its coverage, without the background.
 
-    Colours times coverage are the frame on black, to half a level.
+    Colours times coverage are the frame on black, to half a level. Raises `InputError` for a frame without a mask.
     """
-    mask = clip.mask(key)
-    assert mask is not None, "checked before"
+    mask = coverage_of(clip, key)
     coverage = mask.astype(np.float32) / 255
     image = clip.image(key).astype(np.float32) / 255
     black = np.zeros(3, np.float32)

@@ -84,7 +84,7 @@ class GBSOfficial(OfficialMethod[GBSOfficialConfig]):
 
     def check_clip(self, clip: Clip, checkout: Checkout) -> None:
         """Refuse a clip without masks, and a head that their code cannot take."""
-        check_masks(clip, "GaussianBlendshapes")
+        check_masks(clip)
         held_out(checkout)
         VideoHead(Subject.of(clip), clip.head, checkout)
 

@@ -243,6 +243,13 @@ def test_clips_without_mask_or_head_to_fit_are_refused(method, official_clip, ch
         method.check(clip, BUDGET)
 
 
+def test_a_mask_that_is_missing_later_is_named(method, official_clip, tmp_path):
+    last = official_clip.splits["train"][-1]
+    clip = replace(official_clip, masks=official_clip.masks | {last: None})
+    with pytest.raises(InputError, match=f"{last}.*a mask"):
+        fit(method, clip, tmp_path / "a")
+
+
 @pytest.mark.parametrize(
     ("change", "expected"),
     {
