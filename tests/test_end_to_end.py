@@ -280,6 +280,7 @@ CASES = {
         case("doctor", r"(?s)ours +ready.*All default methods can run here"),
         case("doctor gha --device cpu", "The methods named can run here"),
     ],
+    "parity": [],  # in tests/methods/official, with a stand-in for the authors' repository
     "submission render": [],  # these three in tests/datasets/nersemble, with a benchmark's folder
     "submission write": [],
     "submission check": [],

@@ -167,7 +167,9 @@ def resolve_method(spec: MethodSpec, preset: str, settings: Mapping[str, Any]) -
         if values:
             raise InputError(source, next(iter(values)), "no settings: this method has none", "a setting")
         return ResolvedMethod(spec, None, budget)
-    return ResolvedMethod(spec, build(resolve(spec.config), values, source), budget)
+    settings = build(resolve(spec.config), values, source)
+    label = getattr(settings, "label", "")  # of a method that is another with these settings
+    return ResolvedMethod(replace(spec, name=f"{spec.name} ({label})") if label else spec, settings, budget)
 
 
 def resolve_metrics(config: RunConfig) -> list[MetricSpec]:

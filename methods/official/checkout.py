@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 import shlex
 import shutil
 import subprocess
+import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,10 @@ SHORTEST_COMMIT = 7
 PROBE_S = 300.0
 """Seconds that the interpreter has to import the modules that are asked of it; the first time they come from disk."""
 MOST_SOURCE = 2**22
+
+SHIM = "headbench.methods.official.shim.cpu"
+SHIMMED = ("diff_gaussian_rasterization", "simple_knn", "nvdiffrast")
+"""Packages that the shim stands in for."""
 
 _PROBE = """
 import importlib, json, sys
@@ -109,7 +115,10 @@ def look_at_interpreter(
 ) -> tuple[tuple[str, ...], dict[str, Any]]:
     """Command and versions of the interpreter; see `look`."""
     python = _interpreter(method, config)
-    return python, _probed(method, python, repository)
+    if config.device != "cuda":
+        needed = tuple(name for name in repository.modules if name.partition(".")[0] not in SHIMMED)
+        repository = replace(repository, modules=(*needed, SHIM), trial="")
+    return python, _probed(method, python, repository, cuda=config.device == "cuda")
 
 
 def look_at_folder(
@@ -180,6 +189,8 @@ def _git(folder: Path, *arguments: str) -> str:
 
 def _interpreter(method: str, config: OfficialConfig) -> tuple[str, ...]:
     source = f"settings.{method}"
+    if config.device != "cuda" and not config.python:
+        return (sys.executable,)
     remedy = f"--set settings.{method}.python=/path/to/environment/bin/python, or a command that starts one."
     try:
         words = shlex.split(config.python)
@@ -188,7 +199,9 @@ def _interpreter(method: str, config: OfficialConfig) -> tuple[str, ...]:
     if not words:
         found = repr(config.python)[:80] if config.python else "none"
         raise InputError(source, "python", "the interpreter that the checkout's code runs in", found, remedy)
-    program = shutil.which(str(Path(words[0]).expanduser()))
+    program = shutil.which(
+        os.path.expanduser(words[0])
+    )  # a Path would lose the ./ that tells a file from a name
     if program is None:
         raise InputError(
             words[0], f"{source}.python", "a program that can be run", "none of that name", remedy
@@ -198,7 +211,7 @@ def _interpreter(method: str, config: OfficialConfig) -> tuple[str, ...]:
     return (str(absolute), *words[1:])
 
 
-def _probed(method: str, python: Sequence[str], repository: Repository) -> dict[str, Any]:
+def _probed(method: str, python: Sequence[str], repository: Repository, *, cuda: bool) -> dict[str, Any]:
     """Versions of the interpreter, once it has shown that it can import what the code needs."""
     source = f"settings.{method}.python"
     program = _PROBE.replace("TRIAL", repository.trial or "pass")
@@ -231,8 +244,9 @@ def _probed(method: str, python: Sequence[str], repository: Repository) -> dict[
     if found.failed:
         expected = f"that {repository.trial} works"
         raise InputError(python[0], source, expected, found.failed, repository.trial_remedy)
-    if found.cuda is False:
-        remedy = "Run it on a machine with an NVIDIA GPU and a CUDA build of PyTorch."
+    if cuda and found.cuda is False:
+        remedy = "Run it on a machine with an NVIDIA GPU and a CUDA build of PyTorch"
+        remedy += f", or by our renderer: --set settings.{method}.device=cpu-shim."
         raise InputError(python[0], source, "PyTorch that finds a CUDA device", "none", remedy)
     return {"python": found.python, "torch": found.torch}
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 
 @dataclass(frozen=True)
@@ -18,16 +19,27 @@ class OfficialConfig:
         and the run folder by the same paths.
     commit : what is checked out, by the first seven digits or more; "" takes whatever is there.
     arguments : appended to their training command.
-    device : where their code computes; "cuda" is all that it knows.
+    device : where their code computes. "cuda" is all that it knows; "cpu-shim" puts our CPU renderer in place of its
+        rasteriser and stand-ins in place of what else needs CUDA (`shim.cpu`), by the interpreter of headbench unless
+        ``python`` names another that has it. Rows are then labelled "(cpu-shim)" and are not the original's.
+    order : in which the training images are taken: as their code draws them, or as the native method does with the same
+        seed, so that both see the same image in each iteration.
     """
 
     checkout: str = ""
     python: str = ""
     commit: str = ""
     arguments: tuple[str, ...] = ()
-    device: Literal["cuda"] = "cuda"
+    device: Literal["cuda", "cpu-shim"] = "cuda"
+    order: Literal["published", "native"] = "published"
 
+    added: ClassVar[Mapping[str, Any]] = {"order": "published"}
     places: ClassVar[tuple[str, ...]] = ("checkout", "python")
+
+    @property
+    def label(self) -> str:
+        """What stands behind the method's name in rows and tables."""
+        return "" if self.device == "cuda" else self.device
 
 
 @dataclass(frozen=True)

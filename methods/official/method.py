@@ -15,7 +15,7 @@ from typing import IO, Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 
-from ...bench.contracts import Budget, Camera, Clip, Frame, FrameKey, HeadPose, Progress
+from ...bench.contracts import Budget, Camera, Clip, Frame, FrameKey, HeadAsset, HeadPose, Progress
 from ...bench.errors import InputError, UnavailableError
 from ...bench.io.documents import read_json
 from ...bench.io.files import digest_file, prepare_folder, write_json
@@ -23,6 +23,8 @@ from ...bench.io.images import probe_image
 from ...datasets.images import write_image
 from ..shared.avatar_files import is_finished, run_digest, write_record
 from ..shared.loop import Fit, Outcome, check_budget, check_training_split
+from ..shared.schedule import ShuffledEpochs
+from ..shared.threads import threads
 from .checkout import Checkout, Repository, look
 from .config import OfficialConfig
 from .process import Ended, described, run_program
@@ -31,6 +33,11 @@ TRAINING, RENDERING = "training", "rendering"
 """Folders inside the avatar's: of a training under way, and of frames being rendered. Neither outlives its work."""
 TRAINING_LOG, RENDERING_LOG = "training.log", "rendering.log"
 EXPORTED = "exported.json"
+PLAN, LAUNCHER = "plan.json", Path(__file__).parent / "shim" / "launch.py"
+
+Patch = tuple[str, str, str]
+"""A source file of theirs, a text in it, and what stands there instead when it is run."""
+
 INDEX = "index.json"
 
 Config = TypeVar("Config", bound=OfficialConfig)
@@ -93,6 +100,8 @@ class OfficialMethod(ABC, Generic[Config]):
     version: ClassVar[str]
     config_class: ClassVar[Any]
     repository: ClassVar[Repository]
+    shimmed: ClassVar[bool] = False
+    """Whether `shim` is made for the repository."""
     variables: ClassVar[Mapping[str, str]] = {}
     """Variables of the environment that the authors' programs need besides `process.environment`."""
 
@@ -185,7 +194,67 @@ class OfficialMethod(ABC, Generic[Config]):
         """For the record: ``leaks`` of held-out data, and ``differences`` from what the authors publish."""
         return {"leaks": [], "differences": []}
 
+    def patches(self, head: HeadAsset, iterations: int, checkout: Checkout) -> list[Patch]:
+        """Texts of their sources that the CPU shim replaces in memory in a training of so many iterations."""
+        return []
+
+    def patches_to_render(self, folder: Path, checkout: Checkout) -> list[Patch]:
+        """The same for rendering an avatar."""
+        return []
+
+    def image_name(self, path: str) -> str:
+        """How their loader names an image of the export, by its place."""
+        return Path(path).name
+
     # ------------------------------------------------------------------ the method
+
+    def check_launch(self) -> None:
+        """Raise `InputError` where the shim, or an order of the images, is asked of code that neither is made for."""
+        asked = {"device": (self.config.device, "cuda"), "order": (self.config.order, "published")}
+        for name, (value, only) in asked.items():
+            if value != only and not self.shimmed:
+                expected = f"{only}; the shim does not know what this code needs"
+                raise InputError(f"settings.{self.name}", name, expected, value)
+
+    def _launched(
+        self,
+        command: Sequence[str],
+        checkout: Checkout,
+        work: Workplace,
+        *,
+        patches: Sequence[Patch],
+        order: Sequence[str] = (),
+    ) -> list[str]:
+        """A command of theirs, by way of our launcher where there is something to do before."""
+        shim = self.config.device != "cuda"
+        if not (shim or patches or order):
+            return list(command)
+        plan = {"shim": shim, "threads": threads(), "patches": list(patches), "order": list(order)}
+        write_json(work.root / PLAN, plan)
+        shutil.copyfile(LAUNCHER, work.root / LAUNCHER.name)
+        python, script = command[: len(checkout.python)], command[len(checkout.python) :]
+        return [*python, str(work.root / LAUNCHER.name), str(work.root / PLAN), *script]
+
+    def _order(self, fit: Fit, work: Workplace) -> list[str]:
+        """Names of the images that the native method takes with this seed, one for each iteration; empty for theirs."""
+        if self.config.order == "published":
+            return []
+        images = read_json(work.root / EXPORTED)["images"]
+        names = {FrameKey(*key): self.image_name(path) for path, key in images.items()}
+        keys = fit.clip.splits["train"]
+        sampler = ShuffledEpochs(len(keys), fit.seed)
+        return [names[keys[sampler(i)]] for i in range(1, (fit.budget.iterations or 0) + 1)]
+
+    def _of_launch(self, patches: Sequence[Patch]) -> list[str]:
+        """For the record, what our launcher changed."""
+        differences = []
+        if self.config.device != "cuda":
+            differences.append(
+                "run on a CPU by our renderer in place of their CUDA rasteriser (cpu-shim): not the original"
+            )
+        if self.config.order == "native":
+            differences.append("images in the order in which the native method draws them with this seed")
+        return differences + [f"{file}: {old!r} read as {new!r}" for file, old, new in patches]
 
     def look(self) -> Checkout:
         """Check the settings; see `checkout.look`."""
@@ -203,6 +272,7 @@ class OfficialMethod(ABC, Generic[Config]):
                 "budget", "seconds", "iterations alone; their code knows no clock", "seconds", remedy
             )
         check_training_split(clip)
+        self.check_launch()
         checkout = self.look()
         self.check_clip(clip, checkout)
         self.check_length(budget.iterations, checkout)
@@ -249,7 +319,15 @@ class OfficialMethod(ABC, Generic[Config]):
             if found is not None:
                 fit.progress(frames + min(found[0], iterations), frames + iterations, found[1])
 
-        command = [*command, *(more or ()), *self.config.arguments]
+        shim = self.config.device != "cuda"
+        patches = self.patches(fit.clip.head, iterations, checkout) if shim else []
+        command = self._launched(
+            [*command, *(more or ()), *self.config.arguments],
+            checkout,
+            work,
+            patches=patches,
+            order=self._order(fit, work),
+        )
         ended = run_program(
             command, work.program, fit.out / TRAINING_LOG, on_line, variables=self.variables, held=held
         )
@@ -271,11 +349,14 @@ class OfficialMethod(ABC, Generic[Config]):
         fit.progress(frames + iterations, frames + iterations)
         official = {
             **checkout.record,
+            "device": self.config.device,
             "arguments": list(self.config.arguments),
             "continued": more is not None,
         }
-        remarks = {**self.remarks(fit.clip, fit.seed), "official": official}
-        write_record(fit, Outcome(iterations, iterations, time.monotonic() - start), **remarks, **kept)
+        remarks = self.remarks(fit.clip, fit.seed)
+        remarks["differences"] += self._of_launch(patches)
+        recorded = {**remarks, "official": official, **kept}
+        write_record(fit, Outcome(iterations, iterations, time.monotonic() - start), **recorded)
 
     def _export(self, fit: Fit, checkout: Checkout, work: Workplace) -> None:
         """Write the program's input, or keep what an earlier call wrote whole; then hold it to the training split."""
@@ -341,7 +422,12 @@ class OfficialAvatar:
                 if drawn is not None:
                     progress(min(drawn, len(frames)), len(frames))
 
-            command = method.render_command(folder, checkout, work)
+            command = method._launched(
+                method.render_command(folder, checkout, work),
+                checkout,
+                work,
+                patches=method.patches_to_render(folder, checkout) if method.config.device != "cuda" else [],
+            )
             ended = run_program(
                 command, work.program, folder / RENDERING_LOG, on_line, variables=method.variables, held=held
             )

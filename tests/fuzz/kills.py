@@ -67,6 +67,13 @@ WRITERS = [
     Writer("pareto", "run", "pareto run --out out"),
     Writer("gate", "baseline", "gate run --baseline baseline.json --junit a.xml --markdown a.md"),
     Writer("gate update", "baseline", "gate run --baseline baseline.json --update"),
+    Writer(
+        "parity",
+        "official",
+        "parity ga --checkout repository --python ./python --commit= --device cpu-shim --data capture "
+        "--iterations 3 --orders 1 --frames 1 --tolerance 100 --out out",
+        ("*.log",),
+    ),
     Writer("compact", "run", f"compact {AVATAR.format('ours')} --out out --compare capture"),
     Writer("export ply", "run", f"export ply {AVATAR.format('ga')} --out out.ply"),
     Writer("export colmap", "capture", "export colmap capture --out out"),

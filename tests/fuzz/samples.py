@@ -37,6 +37,7 @@ from ..datasets.nersemble.recordings import write_recording
 from ..datasets.tiny_capture import make_plan, rig, write_tiny_capture
 from ..methods.gha.small import SMALL as SMALL_GHA
 from ..methods.insta.small import SMALL as SMALL_INSTA
+from ..methods.official.repository import lip_numbers, make_interpreter, make_repository
 
 STAMP = "stamp"
 AVATAR = "run/901/{}/seed-0/avatar"
@@ -224,6 +225,13 @@ def bundles(folder: Path, samples: Path) -> None:
         _main("bundle", str(samples / "run" / "run"), *words)
 
 
+def official(folder: Path, samples: Path) -> None:
+    """A stand-in for an official repository and its interpreter."""
+    with_capture(folder, samples)
+    make_repository(folder / "repository", *lip_numbers(toy_head(16)))
+    make_interpreter(folder / "python")
+
+
 def synthetic(folder: Path, samples: Path) -> None:
     """A synthetic capture as `synth` leaves it."""
     _main("synth", *SYNTH.split(), "--out", str(folder / "synthetic"))
@@ -234,7 +242,7 @@ SAMPLES: dict[str, Callable[[Path, Path], None]] = {
     for sample in (
         *(capture, heads, recording, videos, monocular, run, unfinished, two_subjects, checkpoint),
         *(compact, ply, colmap, benchmark, exclusions, baseline, settings, weights, images, bundles),
-        synthetic,
+        *(official, synthetic),
     )
 }
 

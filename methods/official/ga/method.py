@@ -18,6 +18,7 @@ from ....bench.contracts import Clip, FloatArray, Frame, FrameKey, Progress
 from ....bench.errors import InputError
 from ....bench.io.arrays import MAX_MAGNITUDE, Member, read_arrays
 from ....bench.io.files import atomic_path
+from ....datasets.head.teeth import RING_LENGTH, ROWS
 from ...shared.avatar_files import (
     HEAD_FILE,
     SUBJECT_FILE,
@@ -42,6 +43,8 @@ from .windows import check_square_pixels
 
 PLY_FILE, TRACKING_FILE, ARGUMENTS_FILE = "point_cloud.ply", "driving.npz", "cfg_args"
 PARAMETERS_FILE = "flame_param.npz"
+TEETH_VERTICES = len(ROWS) * RING_LENGTH
+"""Vertices that their head model adds to FLAME's."""
 RENDERS, TRUTHS = "renders", "gt"
 _PROGRESS, _LOSS = re.compile(r"Training progress:.*?(\d+)/\d+ \["), re.compile(r"Loss=([\d.]+)")
 _DRAWN = re.compile(r"Rendering progress:.*?(\d+)/\d+ ")
@@ -82,6 +85,8 @@ THEIR_NAMES = {
 class GALayoutMethod(OfficialMethod[Config]):
     """What the repositories with GaussianAvatars' loader and head model have in common."""
 
+    shimmed = True
+
     def check_clip(self, clip: Clip, checkout: Checkout) -> None:
         """Refuse other backgrounds than white and black, pixels that are not square, heads that their code cannot take."""
         where = f"clip {clip.subject}"
@@ -113,7 +118,7 @@ class GALayoutMethod(OfficialMethod[Config]):
             "--resolution": 1,
             "--iterations": iterations,
             "--position_lr_max_steps": iterations,
-            "--densify_from_iter": schedule.start,
+            "--densify_from_iter": _first_round(schedule),
             "--densification_interval": schedule.every,
             "--densify_until_iter": max(0, schedule.stop),
             "--opacity_reset_interval": schedule.reset_every,
@@ -173,7 +178,9 @@ class GALayoutMethod(OfficialMethod[Config]):
         copy_file(folder / ARGUMENTS_FILE, work.model / ARGUMENTS_FILE)
         values = [tracking.parameters(pose) for pose in poses]
         moving = {name: np.concatenate([value[name] for value in values]) for name in THEIR_NAMES.values()}
-        still = {"shape": values[0]["shape"], "static_offset": values[0]["static_offset"]}
+        # Their training saves offsets with rows for the teeth that their head model adds, and their renderer reads them so.
+        offset = np.pad(values[0]["static_offset"], [(0, 0), (0, TEETH_VERTICES), (0, 0)])
+        still = {"shape": values[0]["shape"], "static_offset": offset}
         arrays = {**moving, **still, **self._more_parameters(len(poses), still["static_offset"])}
         with atomic_path(made / PARAMETERS_FILE) as temporary:
             np.savez_compressed(temporary, allow_pickle=False, **arrays)
@@ -216,7 +223,7 @@ class GALayoutMethod(OfficialMethod[Config]):
             )
         if eyelids_are_lost(clip.head):
             differences.append("their head model has no eyelid bases: eyelids follow the expression alone")
-        if seed:
+        if seed and self.config.order == "published":
             differences.append(
                 f"their code fixes the seed at 0; seed {seed} is a repetition, not another start"
             )
@@ -294,6 +301,17 @@ def free_port() -> int:
 def _schedule(iterations: int) -> DensifySchedule:
     """When splats are added in a run of this length: fractions of the published one, as in the native method."""
     return DensifySchedule.of(SplatTraining(), Timeline(iterations, PAPER_ITERATIONS), white=True)
+
+
+def _first_round(schedule: DensifySchedule) -> int:
+    """Iteration after which their rounds begin; their code resets opacities at it, on white, however short the run.
+
+    The native methods have no such reset in a short run. Where their first round comes later in any case, the start is
+    put at 0, which no iteration is.
+    """
+    if schedule.first_reset is None and schedule.start < schedule.every:
+        return 0
+    return schedule.start
 
 
 def _white(background: Sequence[float] | FloatArray, where: str) -> bool:

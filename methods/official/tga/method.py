@@ -13,18 +13,29 @@ from typing import Any
 
 import numpy as np
 
-from ....bench.contracts import Clip, FloatArray, FrameKey, Progress
+from ....bench.contracts import Clip, FloatArray, FrameKey, HeadAsset, Progress
 from ....bench.errors import InputError
 from ....datasets.ga.writer import save_npz
-from ....datasets.head.teeth import RING_LENGTH, ROWS
+from ....datasets.head.teeth import RING_LENGTH
 from ....datasets.steps.clusters import cluster_expressions
 from ....datasets.steps.jaw_bases import DEFAULT_COUNT, jaw_bases
+from ...shared.avatar_files import read_shared_head
+from ...shared.config import PAPER_ITERATIONS
 from ...shared.loop import Fit
+from ...shared.schedule import Timeline
 from ..checkout import Checkout, Repository
 from ..config import TGAOfficialConfig
 from ..ga.head_files import OfficialHead
-from ..ga.method import LOADER_MODULES, LOADER_REMEDY, LOADER_TRIAL, PLY_FILE, GALayoutMethod, copy_file
-from ..method import Listed, Workplace
+from ..ga.method import (
+    LOADER_MODULES,
+    LOADER_REMEDY,
+    LOADER_TRIAL,
+    PLY_FILE,
+    TEETH_VERTICES,
+    GALayoutMethod,
+    copy_file,
+)
+from ..method import Listed, Patch, Workplace
 from ..process import Ended
 from ..spec import TGA_OFFICIAL
 
@@ -56,13 +67,9 @@ class TGAOfficial(GALayoutMethod[TGAOfficialConfig]):
         super().check_clip(clip, checkout)
         where = f"head model {clip.head.version!r}"
         head = OfficialHead.of(clip.head, checkout.folder)
-        teeth = len(ROWS) * RING_LENGTH, 12 * (RING_LENGTH - 1)
-        found = len(head.order) + teeth[0], len(head.faces) + teeth[1]
-        fixed = tuple(
-            int(checkout.constant(_MODEL_SOURCE, rf"self\.{name} = torch\.zeros\(\[T, (\d+), 3\]", name))
-            for name in ("mesh_lst", "face_center_lst")
-        )
-        if found != fixed:
+        found = _sizes(head)
+        fixed = _fixed_sizes(checkout)
+        if found != fixed and self.config.device == "cuda":
             expected = (
                 f"{fixed[0]} vertices and {fixed[1]} triangles with teeth, as {_MODEL_SOURCE} fixes them"
             )
@@ -88,10 +95,29 @@ class TGAOfficial(GALayoutMethod[TGAOfficialConfig]):
 
     def check_length(self, iterations: int, checkout: Checkout) -> None:
         """Refuse a run too short for their feature lines to begin."""
-        begin = int(checkout.constant(_TRAIN_SOURCE, r"offset_start_iter = (\d+)", "offset_start_iter"))
-        if iterations <= begin:
+        begin = _lines_begin(checkout)
+        if iterations <= begin and self.config.device == "cuda":
             expected = f"more than {begin}, where {_TRAIN_SOURCE} begins to train its feature lines"
             raise InputError(f"settings.{self.name}", "budget.iterations", expected, f"{iterations}")
+
+    def patches(self, head: HeadAsset, iterations: int, checkout: Checkout) -> list[Patch]:
+        """Sizes of another head, and the beginning of their lines at its fraction of a shorter run."""
+        begin = _lines_begin(checkout)
+        moved = Timeline(iterations, PAPER_ITERATIONS).at(begin)
+        lines = (_TRAIN_SOURCE, f"offset_start_iter = {begin}", f"offset_start_iter = {moved}")
+        return [*self._sizes_of(head, checkout), *([lines] if begin != moved else [])]
+
+    def patches_to_render(self, folder: Path, checkout: Checkout) -> list[Patch]:
+        """Sizes of another head."""
+        return self._sizes_of(read_shared_head(folder), checkout)
+
+    def _sizes_of(self, head: HeadAsset, checkout: Checkout) -> list[Patch]:
+        fixed, found = _fixed_sizes(checkout), _sizes(OfficialHead.of(head, checkout.folder))
+        return [
+            (_MODEL_SOURCE, f"torch.zeros([T, {theirs}, ", f"torch.zeros([T, {ours}, ")
+            for theirs, ours in zip(fixed, found)
+            if theirs != ours
+        ]
 
     def keep(self, fit: Fit, work: Workplace) -> dict[str, Any]:
         """Besides, the jaw bases, which their renderer reads again."""
@@ -133,3 +159,22 @@ class TGAOfficial(GALayoutMethod[TGAOfficialConfig]):
 
     def _more_parameters(self, count: int, offset: FloatArray) -> Mapping[str, FloatArray]:
         return {"jaw_quat_weight": np.zeros((count, DEFAULT_COUNT), np.float32)}
+
+
+def _sizes(head: OfficialHead) -> tuple[int, int]:
+    """Vertices and triangles of a head in their code, teeth included."""
+    return len(head.order) + TEETH_VERTICES, len(head.faces) + 12 * (RING_LENGTH - 1)
+
+
+def _fixed_sizes(checkout: Checkout) -> tuple[int, int]:
+    """Those that their code fixes."""
+    vertices, triangles = (
+        int(checkout.constant(_MODEL_SOURCE, rf"self\.{name} = torch\.zeros\(\[T, (\d+), 3\]", name))
+        for name in ("mesh_lst", "face_center_lst")
+    )
+    return vertices, triangles
+
+
+def _lines_begin(checkout: Checkout) -> int:
+    """Iteration at which their code begins to train its feature lines."""
+    return int(checkout.constant(_TRAIN_SOURCE, r"offset_start_iter = (\d+)", "offset_start_iter"))

@@ -5,10 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from headbench.datasets.head.teeth import lip_rings
-
 from ..toy_clip import toy_clip
-from .repository import make_repository
+from .repository import lip_numbers, make_repository
 
 OFFSETS = {"00": (0.0, 0.0), "01": (3.3, -2.2), "02": (-1.6, 4.1)}
 
@@ -28,11 +26,7 @@ def official_clip(head):
 @pytest.fixture
 def repository(tmp_path, head):
     """Folder and commit of the stand-in, whose lips have numbers that no vertex of the head has."""
-    count = len(lip_rings(head)[0])
-    first = len(head.template) + 5
-    rings = list(range(first, first + 2 * count, 2)), list(range(first + 1, first + 2 * count, 2))
-    sizes = max(rings[1]) + 1 + 120, len(head.faces) + 168
-    return tmp_path / "repository", make_repository(tmp_path / "repository", rings, sizes)
+    return tmp_path / "repository", make_repository(tmp_path / "repository", *lip_numbers(head))
 
 
 @pytest.fixture

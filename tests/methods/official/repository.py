@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from headbench.bench.contracts import Budget
+from headbench.datasets.head.teeth import lip_rings
 from headbench.methods.official.config import GAOfficialConfig
 from headbench.methods.official.ga.method import GAOfficial
 from headbench.methods.official.tga.method import TGAOfficial
@@ -105,7 +106,7 @@ for index, frame in enumerate(shown):
     image = np.zeros((height, width, 3), np.uint8)
     image[..., 0] = np.clip(100 + 40 * parameters["expr"][t, 0], 0, 255)
     image[..., 1] = np.clip(100 + 900 * parameters["rotation"][t, 0], 0, 255)
-    image[..., 2] = 20 * int(frame["camera_id"])
+    image[..., 2] = 20 * int(frame["camera_id"]) % 256
     Image.fromarray(image).save(folder / "renders" / f"{index:05d}.png")
     Image.open(source / frame["file_path"]).save(folder / "gt" / f"{index:05d}.png")
 print()
@@ -185,3 +186,26 @@ def settings(checkout: Path, commit: str, **changes) -> GAOfficialConfig:
     """Settings that find the stand-in."""
     values = {"checkout": str(checkout), "python": sys.executable, "commit": commit} | changes
     return GAOfficialConfig(**values)
+
+
+INTERPRETER = """#!{python}
+import json, os, sys
+if sys.argv[1] == "-c":
+    print("headbench-probe", json.dumps({{"python": "3", "missing": {{}}, "failed": "", "torch": "2", "cuda": True}}))
+else:
+    os.execv({python!r}, [{python!r}, *sys.argv[1:]])
+"""
+
+
+def make_interpreter(path: Path) -> Path:
+    """Write an interpreter that says it has every module that is asked for, and otherwise is this one."""
+    path.write_text(INTERPRETER.format(python=sys.executable))
+    path.chmod(0o755)
+    return path
+
+
+def lip_numbers(head) -> tuple[tuple[list[int], list[int]], tuple[int, int]]:
+    """Rings and sizes, as `make_repository` takes them: lips at numbers that no vertex of the head has."""
+    count, first = len(lip_rings(head)[0]), len(head.template) + 5
+    rings = list(range(first, first + 2 * count, 2)), list(range(first + 1, first + 2 * count, 2))
+    return rings, (max(rings[1]) + 1 + 120, len(head.faces) + 168)

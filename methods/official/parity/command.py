@@ -1,0 +1,81 @@
+"""``headbench parity``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import tyro
+
+from ....bench.contracts import Progress, no_progress
+from ....bench.runner.config import parse_size
+from ....bench.specs import Findings, writes
+
+
+@dataclass(frozen=True)
+class ParitySettings:
+    """Trains both on one capture with equal settings, the published ones at this length, both with the same image in each
+    iteration, and scores all renders by one implementation of the metrics. Repeated with other orders of the images, for
+    the order alone moves results by half a decibel. Writes parity.md, parity.json and the run. Started again after a kill
+    it continues. Exit code 1: PSNR differs by more than the tolerance in the mean over orders, or a training failed.
+    """
+
+    method: tyro.conf.Positional[Literal["ga", "ours"]]
+    """The native method. The authors' code of ours is that of TensorialGaussianAvatar (`tga-official`)."""
+
+    checkout: str
+    """Folder of a checkout of the authors' repository; it is read, never written."""
+
+    out: str
+    """Folder to write."""
+
+    data: str | None = None
+    """Capture to train on. Default: a synthetic one is made in OUT/capture, of SIZE with --cameras and --timesteps."""
+
+    head: str | None = None
+    """Head model for captures that bring none: FLAME pickle or npz."""
+
+    iterations: int = 1_000
+    """Length of each training."""
+
+    orders: int = 3
+    """Orders of the images, each a training of either method. One alone gives no interval."""
+
+    device: Literal["cuda", "cpu-shim"] = "cuda"
+    """What the authors' code computes with: CUDA, or our CPU renderer in place of its rasteriser (methods/official/README.md),
+    which shows what training and head model differ by, not the rasterisers."""
+
+    python: str = ""
+    """Interpreter for the authors' code, as settings.ga-official.python of `headbench run`. Default with cpu-shim: this one."""
+
+    commit: str | None = None
+    """What is checked out; default: the commit that the adapter was written for, "" takes whatever is there."""
+
+    frames: int | None = None
+    """Held-out frames scored for each task, evenly spread; default: all."""
+
+    tolerance: float = 0.3
+    """Mean difference of PSNR, in decibels, up to which the two count as equal."""
+
+    size: str = "96x136"
+    """Width x height of the synthetic capture's images in pixels."""
+
+    cameras: int = 8
+    """Views of the synthetic capture, the held-out one included."""
+
+    timesteps: int = 24
+    """Timesteps of the synthetic capture."""
+
+    def __post_init__(self) -> None:
+        """Refuse what has no meaning."""
+        parse_size(self.size)
+        if self.iterations < 1 or self.orders < 1 or not self.tolerance > 0:
+            raise ValueError("iterations and orders must be at least 1, the tolerance above 0")
+
+
+@writes("out")
+def parity(settings: ParitySettings, progress: Progress = no_progress) -> Findings:
+    """Train a method and its authors' code on one capture with equal settings, and tell how their results differ."""
+    from .parity import compare
+
+    return compare(settings, progress)

@@ -1,0 +1,273 @@
+"""A native method against its authors' code: one capture, equal settings, the same image in each iteration."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from statistics import fmean, stdev
+from typing import Any
+
+from scipy.stats import t as student_t
+
+from ....bench.configuration import build
+from ....bench.contracts import Budget, Progress
+from ....bench.io.documents import read_json
+from ....bench.io.files import write_json, write_text
+from ....bench.io.lock import locked
+from ....bench.progress import log_to_file
+from ....bench.registry import get
+from ....bench.rows import Rows
+from ....bench.runner.config import RunConfig, parse_size, resolve_methods
+from ....bench.runner.run import run
+from ....bench.runner.scoring import FULL
+from ....bench.runner.store import RunFolder
+from ....bench.specs import Findings
+from ...shared.config import PAPER_ITERATIONS, SplatTraining
+from ...shared.schedule import DensifySchedule, Timeline
+from .command import ParitySettings
+
+OFFICIAL = {"ga": "ga-official", "ours": "tga-official"}
+METRICS = {"psnr": "dB", "ssim": ""}
+TASKS = ("novel_view", "self_reenactment")
+CONFIDENCE = 0.95
+_VERTICES = re.compile(rb"element vertex (\d+)")
+
+CAUSES = {
+    "ga": (
+        "what is drawn at random besides the order: where the children of split splats land, first colours",
+        "splats nearer than 0.2 m are left out by theirs, than 0.01 m by ours",
+    ),
+    "ours": (
+        "what is drawn at random besides the order: first values of planes, lines and networks, split splats",
+        "splats nearer than 0.2 m are left out by theirs, than 0.01 m by ours",
+    ),
+}
+"""Why results differ at equal settings and order, by native method; the avatar's record adds what its adapter changed."""
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Of one metric in one task, official minus native, over orders.
+
+    Attributes
+    ----------
+    native, official : mean over frames, then sequences, then subjects, for each order.
+    difference : their mean difference.
+    half_width : of its 95 % interval (Student's t over orders); None with a single order.
+    """
+
+    task: str
+    metric: str
+    native: tuple[float, ...]
+    official: tuple[float, ...]
+    difference: float
+    half_width: float | None
+
+
+def compare(settings: ParitySettings, progress: Progress) -> Findings:
+    """Train and score both, and write the table of their differences; see the command."""
+    out = Path(settings.out)
+    config = run_config(settings, out)
+    native, official = (method.spec.name for method in resolve_methods(config))
+    _check_before(config)
+    with log_to_file(out / "parity.log"):
+        if settings.data is None:
+            _make_capture(settings, out, progress)
+        rows = run(config)
+    differences = differences_of(rows, native, official, config.seeds)
+    cells = {
+        name: _cells(RunFolder(Path(config.out)), rows, name, config.seeds) for name in (native, official)
+    }
+    changed = sorted({line for cell in cells[official] for line in cell["differences"]})
+    causes = [*CAUSES[settings.method], *changed]
+    text = _text(settings, native, official, differences, cells, causes, rows)
+    write_text(out / "parity.md", text)
+    data = {
+        "native": native,
+        "official": official,
+        "iterations": settings.iterations,
+        "settings": {name: config.settings[name] for name in config.methods},
+        "differences": [asdict(each) for each in differences],
+        "avatars": cells,
+        "causes": causes,
+        "run": "run",
+    }
+    write_json(out / "parity.json", data)
+    apart = [d for d in differences if d.metric == "psnr" and abs(d.difference) > settings.tolerance]
+    return Findings(text, data, bool(differences) and not apart and not rows.failed)
+
+
+def run_config(settings: ParitySettings, out: Path) -> RunConfig:
+    """The comparison, with settings that make the two do the same."""
+    official = OFFICIAL[settings.method]
+    of_theirs: dict[str, Any] = {
+        "checkout": settings.checkout,
+        "python": settings.python,
+        "device": settings.device,
+        "order": "native",
+    }
+    if settings.commit is not None:
+        of_theirs["commit"] = settings.commit
+    of_both = {"budget": {"iterations": settings.iterations}}
+    values = {
+        "data": settings.data or str(_capture(out)),
+        "out": str(out / "run"),
+        "methods": (settings.method, official),
+        "preset": "paper",
+        "seeds": tuple(range(settings.orders)),
+        "tasks": TASKS,
+        "metrics": tuple(METRICS),
+        "regions": (),
+        "frames_per_task": settings.frames,
+        "device": "cuda" if settings.device == "cuda" else "cpu",
+        "reader_settings": {} if settings.head is None else {"head": settings.head},
+        "settings": {
+            settings.method: {**of_both, **as_theirs(settings.method, settings.iterations)},
+            official: {**of_both, **of_theirs},
+        },
+    }
+    return build(RunConfig, values, "parity")
+
+
+def as_theirs(native: str, iterations: int) -> dict[str, Any]:
+    """Settings of a native method that make a run of any length do what the authors' program is told to do.
+
+    Their program raises the harmonics' degree each 1,000 iterations whatever the length, removes large splats from the
+    first regular reset of opacities on, and here draws no image more often than another.
+    """
+    timeline = Timeline(iterations, PAPER_ITERATIONS)
+    schedule = DensifySchedule.of(SplatTraining(), timeline, white=True)
+    assert schedule.reset_every is not None
+    moment = math.ceil(schedule.reset_every * PAPER_ITERATIONS / iterations)
+    settings: dict[str, Any] = {"splats": {"prune_extent_from": moment}}
+    if native == "ga":
+        return {**settings, "min_sh_every": 1_000}
+    return {**settings, "sampling": {"balanced": False}}
+
+
+def differences_of(rows: Rows, native: str, official: str, orders: Sequence[int]) -> list[Difference]:
+    """Differences by task and metric, of the orders that both have values of."""
+    found = []
+    for task in TASKS:
+        for metric in METRICS:
+            of_native, of_official = (_means(rows, name, task, metric) for name in (native, official))
+            both = [order for order in orders if order in of_native and order in of_official]
+            if not both:
+                continue
+            apart = [of_official[order] - of_native[order] for order in both]
+            values = [tuple(of[order] for order in both) for of in (of_native, of_official)]
+            found.append(Difference(task, metric, values[0], values[1], fmean(apart), _half_width(apart)))
+    return found
+
+
+def _means(rows: Rows, method: str, task: str, metric: str) -> dict[int, float]:
+    """Mean over frames, then sequences, then subjects, by order."""
+    table = rows.select(method=method, metric=metric, task=task, region=FULL, seeds=rows.seeds(method))
+    whole = table.groupby("seed")["status"].agg(lambda status: set(status) == {"ok"})
+    table = table[table["seed"].map(whole).astype(bool)]
+    means = table.groupby(["seed", "subject", "sequence"])["value"].mean()
+    by_order = means.groupby(["seed", "subject"]).mean().groupby("seed").mean()
+    return dict(zip(map(int, by_order.index), map(float, by_order), strict=True))
+
+
+def _half_width(values: Sequence[float]) -> float | None:
+    if len(values) < 2:
+        return None
+    quantile = float(student_t.ppf(0.5 + CONFIDENCE / 2, len(values) - 1))
+    return quantile * stdev(values) / math.sqrt(len(values))
+
+
+def _check_before(config: RunConfig) -> None:
+    """Find out what is wrong with checkout and interpreter before a capture is made."""
+    for method in resolve_methods(config):
+        made = method.create()
+        if hasattr(made, "look"):
+            checkout = made.look()
+            made.check_length(Budget(**asdict(method.budget)).iterations, checkout)
+
+
+def _capture(out: Path) -> Path:
+    return out / "capture"
+
+
+def _make_capture(settings: ParitySettings, out: Path, progress: Progress) -> None:
+    from ....datasets.synthetic.capture import synthesize
+
+    size = parse_size(settings.size)
+    with locked(_capture(out), beside=True):
+        synthesize(
+            _capture(out),
+            cameras=settings.cameras,
+            timesteps=settings.timesteps,
+            size=size,
+            progress=progress,
+        )
+
+
+def _cells(run_folder: RunFolder, rows: Rows, method: str, orders: Sequence[int]) -> list[dict[str, Any]]:
+    """Splats and changes of every avatar of a method."""
+    found = []
+    for subject in sorted(rows.subjects):
+        for order in orders:
+            folder = run_folder.cell(subject, method, order).avatar
+            record = read_json(folder / "training.json") if (folder / "training.json").exists() else {}
+            entry = {"subject": subject, "order": order, "splats": record.get("splats") or _splats(folder)}
+            found.append({**entry, "differences": record.get("differences", [])})
+    return found
+
+
+def _splats(folder: Path) -> int | None:
+    """Splats of an avatar in GaussianAvatars' file; None where it has none."""
+    path = folder / "point_cloud.ply"
+    if not path.is_file():
+        return None
+    with path.open("rb") as stream:
+        match = _VERTICES.search(stream.read(4096))
+    return None if match is None else int(match[1])
+
+
+def _text(
+    settings: ParitySettings,
+    native: str,
+    official: str,
+    differences: Sequence[Difference],
+    cells: Mapping[str, Sequence[Mapping[str, Any]]],
+    causes: Sequence[str],
+    rows: Rows,
+) -> str:
+    titles = {name: get("metrics", name).label for name in METRICS}
+    lines = [
+        f"# {native} and {official}, {settings.iterations:,} iterations each",
+        "",
+        (
+            "Equal settings and the same image in each iteration; every order of the images is a training of both. Means over "
+            "frames, then sequences, then subjects; the difference is official minus native, with its 95 % interval over orders."
+        ),
+        "",
+        "| task | metric | order | " + f"{native} | {official} | difference |",
+        "| :--- | :--- | ---: | ---: | ---: | ---: |",
+    ]
+    for each in differences:
+        digits = 2 if each.metric == "psnr" else 4
+        head = f"{each.task.replace('_', ' ')} | {titles[each.metric]}"
+        for order, (ours, theirs) in enumerate(zip(each.native, each.official)):
+            lines.append(
+                f"| {head} | {order} | {ours:.{digits}f} | {theirs:.{digits}f} | {theirs - ours:+.{digits}f} |"
+            )
+        width = "" if each.half_width is None else f" ± {each.half_width:.{digits}f}"
+        lines.append(
+            f"| {head} | all | {fmean(each.native):.{digits}f} | {fmean(each.official):.{digits}f} "
+            f"| **{each.difference:+.{digits}f}{width}** |"
+        )
+    splats = [
+        f"{name}: " + ", ".join(str(cell["splats"] or "?") for cell in cells[name])
+        for name in (native, official)
+    ]
+    lines += ["", "Splats by order: " + "; ".join(splats) + ".", "", "Known causes of differences:", ""]
+    lines += [f"- {cause}" for cause in causes]
+    if rows.failed:
+        lines += ["", f"Failed: {', '.join(rows.failed)}; see run/tables/comparison.md for the reasons."]
+    return "\n".join(lines) + "\n"

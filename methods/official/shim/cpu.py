@@ -1,0 +1,147 @@
+"""What lets official code written for CUDA run on a CPU: our renderer in place of theirs, and stand-ins for the rest.
+
+Installed into the interpreter that runs their scripts, before them (`launch`). Their files are not touched. What they then
+compute is not their method on their rasteriser: results carry the label "(cpu-shim)".
+"""
+
+from __future__ import annotations
+
+import builtins
+import importlib.util
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import PIL.Image
+import torch
+import torch.utils.data
+from scipy.spatial import KDTree
+from torch import Tensor
+from torch.overrides import TorchFunctionMode
+
+from . import rasterizer
+
+
+def install(threads: int) -> None:
+    """Put the shim before everything that is imported later."""
+    torch.set_num_threads(threads)
+    _module("diff_gaussian_rasterization", rasterizer.PUBLIC)
+    _module("simple_knn")
+    _module("simple_knn._C", {"distCUDA2": mean_square_distances})
+    # Imported by scripts that draw no mesh, read no OBJ file from elsewhere and measure no LPIPS here.
+    context = {"RasterizeCudaContext": _Nothing, "RasterizeGLContext": _Nothing}
+    unused: dict[str, dict[str, Any]] = {
+        "nvdiffrast": {},
+        "nvdiffrast.torch": context,
+        "iopath": {},
+        "iopath.common": {},
+        "iopath.common.file_io": {"PathManager": LocalPaths},
+        "torchvision": {},
+        "torchvision.models": {},
+    }
+    for name, content in unused.items():
+        if name.partition(".")[0] in sys.modules or importlib.util.find_spec(name.partition(".")[0]) is None:
+            _module(name, content)
+    _without_cuda()
+    _signed_images()
+
+
+def mean_square_distances(points: Tensor) -> Tensor:
+    """(N,) mean of the squared distances from each of (N, 3) points to its three nearest neighbours."""
+    found, _ = KDTree(points.detach().numpy()).query(points.detach().numpy(), k=4)
+    return torch.from_numpy(np.square(found[:, 1:]).mean(axis=1)).to(points.dtype)
+
+
+class LocalPaths:
+    """``iopath``'s path manager for files of this machine."""
+
+    def open(self, path: Any, mode: str = "r", **options: Any) -> Any:
+        """Open a file."""
+        return builtins.open(path, mode, **options)
+
+    def exists(self, path: Any) -> bool:
+        """Whether there is such a file."""
+        import os
+
+        return os.path.exists(path)
+
+
+class _Nothing:
+    """Can be made, and nothing else."""
+
+
+def _module(name: str, content: Mapping[str, Any] | None = None) -> None:
+    module = ModuleType(name)
+    module.__dict__.update(content or {})
+    sys.modules[name] = module
+    parent, _, child = name.rpartition(".")
+    if parent:
+        setattr(sys.modules[parent], child, module)
+
+
+class OnCPU(TorchFunctionMode):
+    """Takes every mention of a CUDA device for the CPU."""
+
+    def __torch_function__(
+        self,
+        func: Callable[..., Any],
+        types: Sequence[type],
+        args: tuple[Any, ...] = (),
+        kwargs: dict[str, Any] | None = None,
+    ) -> Any:
+        kwargs = kwargs or {}
+        if "device" in kwargs:
+            kwargs = {**kwargs, "device": _on_cpu(kwargs["device"])}
+        if func is Tensor.to:
+            args = tuple(map(_on_cpu, args))
+        return func(*args, **kwargs)
+
+
+def _on_cpu(value: Any) -> Any:
+    return "cpu" if isinstance(value, str | torch.device) and str(value).startswith("cuda") else value
+
+
+class _Event:
+    """A CUDA event that measures nothing."""
+
+    def __init__(self, *arguments: Any, **options: Any):
+        pass
+
+    def record(self, *arguments: Any) -> None:
+        pass
+
+    def synchronize(self) -> None:
+        pass
+
+    def elapsed_time(self, other: Any) -> float:
+        return 0.0
+
+
+def _without_cuda() -> None:
+    replaced: Any = torch.cuda
+    for name in ("synchronize", "set_device", "empty_cache"):
+        setattr(replaced, name, lambda *arguments, **options: None)
+    replaced.Event = _Event
+    for of in (Tensor, torch.nn.Module):
+        of.cuda = lambda self, *arguments, **options: self  # type: ignore[method-assign,union-attr,assignment]
+    OnCPU().__enter__()  # for the life of the process
+    stock: Any = torch.utils.data.DataLoader
+
+    def loader(*arguments: Any, **options: Any) -> Any:
+        # Workers are for decoding beside a GPU; here they would take the cores that training needs.
+        options |= {"num_workers": 0, "pin_memory": False, "persistent_workers": False}
+        return stock(*arguments, **options)
+
+    torch.utils.data.DataLoader = loader  # type: ignore[misc,assignment]
+
+
+def _signed_images() -> None:
+    stock: Any = PIL.Image.fromarray
+
+    def fromarray(values: Any, *arguments: Any, **options: Any) -> Any:
+        values = values.view(np.uint8) if getattr(values, "dtype", None) == np.int8 else values
+        return stock(values, *arguments, **options)
+
+    PIL.Image.fromarray = fromarray  # type: ignore[assignment]

@@ -1,0 +1,75 @@
+"""Starts a script of an official repository as it stands, after what a plan asks for: ``launch.py PLAN SCRIPT ...``.
+
+Run by the interpreter of the authors' code, where headbench need not be installed: nothing of it is imported, but for the
+CPU shim, which needs it. A copy of this file lies beside the plan.
+"""
+
+import json
+import os
+import sys
+from importlib.machinery import SourceFileLoader
+from typing import Any
+
+
+def main() -> None:
+    """Read the plan, do what it asks for, and run the script in this process."""
+    with open(sys.argv[1], encoding="utf-8") as stream:
+        plan = json.load(stream)
+    script = os.path.abspath(sys.argv[2])
+    sys.argv = sys.argv[2:]
+    sys.path[0] = os.path.dirname(script)  # in place of this file's folder, as Python does for a script
+    if plan["shim"]:
+        from headbench.methods.official.shim.cpu import install
+
+        install(plan["threads"])
+    if plan["patches"]:
+        patch_sources(plan["patches"], os.path.dirname(script))
+    if plan["order"]:
+        feed_order(plan["order"])
+    main_module = sys.modules["__main__"]
+    main_module.__file__ = script
+    SourceFileLoader("__main__", script).exec_module(main_module)
+
+
+def patch_sources(patches: Any, root: str) -> None:
+    """Replace texts in sources below ``root`` when they are compiled; files stay as they are.
+
+    ``patches`` are [file, old text, new text]; each old text has to stand in its file.
+    """
+    sys.pycache_prefix = os.path.join(root, "no-such-folder")  # code compiled before has no replacements
+    by_path: dict = {}
+    for file, old, new in patches:
+        by_path.setdefault(os.path.realpath(os.path.join(root, file)), []).append((old, new))
+    loader: Any = SourceFileLoader
+    compiled = loader.source_to_code
+
+    def source_to_code(self: Any, data: Any, path: Any, **options: Any) -> Any:
+        for old, new in by_path.get(os.path.realpath(path), ()):
+            if old.encode() not in data:
+                sys.exit(
+                    f"{path}: expected {old!r}, found none; this commit is not the one the adapter knows"
+                )
+            data = data.replace(old.encode(), new.encode())
+        return compiled(self, data, path, **options)
+
+    loader.source_to_code = source_to_code
+
+
+def feed_order(order: Any) -> None:
+    """Let loaders that draw at random give the images of these names, in this order."""
+    import torch.utils.data
+
+    data: Any = torch.utils.data
+    stock = data.DataLoader
+
+    def loader(dataset: Any, shuffle: bool = False, sampler: Any = None, **options: Any) -> Any:
+        if not shuffle and sampler is None:
+            return stock(dataset, **options)
+        index = {os.path.basename(camera.image_path): at for at, camera in enumerate(dataset.cameras)}
+        return stock(dataset, sampler=[index[name] for name in order], **options)
+
+    data.DataLoader = loader
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,144 @@
+"""``headbench parity`` around a stand-in for the authors' repository."""
+
+import json
+import math
+import re
+
+import numpy as np
+import pytest
+
+from headbench.bench import cli
+from headbench.bench.contracts import Budget
+from headbench.bench.errors import InputError
+from headbench.bench.io.documents import read_json
+from headbench.bench.rows import Row, Rows
+from headbench.methods.official.config import GBSOfficialConfig
+from headbench.methods.official.gbs.method import GBSOfficial
+from headbench.methods.official.parity.command import ParitySettings
+from headbench.methods.official.parity.parity import as_theirs, differences_of, run_config
+from headbench.methods.shared.config import PAPER_ITERATIONS, SplatTraining
+from headbench.methods.shared.schedule import DensifySchedule, ShuffledEpochs, Timeline
+
+from ...datasets.head.toy import toy_head
+from ...datasets.tiny_capture import make_plan, rig, write_tiny_capture
+from .repository import lip_numbers, make_interpreter, make_repository
+
+OFFICIAL = "ga-official (cpu-shim)"
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A directory with a capture, a repository and an interpreter."""
+    head = toy_head(16, version="procedural2020")
+    lengths = {"FREE": 2, "EMO-1-shout+laugh": 3}
+    offset = np.zeros_like(head.template)
+    cameras = rig(24, 32, 12.3, 15.1)[:2]
+    plan = make_plan(lengths=lengths, cameras=cameras, head=head, static_offset=offset, subject="901")
+    write_tiny_capture(tmp_path / "capture", plan)
+    make_repository(tmp_path / "repository", *lip_numbers(head))
+    make_interpreter(tmp_path / "python")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def parity(*words):
+    line = "parity ga --checkout repository --python ./python --commit= --device cpu-shim --data capture --out out"
+    return cli.main([*line.split(), *words])
+
+
+def test_both_are_trained_and_their_difference_tabled(folder, capsys):
+    words = ("--iterations", "5", "--orders", "2", "--tolerance", "200")
+    assert parity(*words) == 0
+    text = (folder / "out" / "parity.md").read_text()
+    assert capsys.readouterr().out.strip() == text.strip()
+    assert re.search(r"\| novel view \| PSNR \| all \| .*\*\*[+-][\d.]+ ± [\d.]+\*\*", text)
+    assert OFFICIAL in text
+    assert "not the original" in text
+    found = read_json(folder / "out" / "parity.json")
+    assert {entry["task"] for entry in found["differences"]} == {"novel_view", "self_reenactment"}
+    rows = Rows.read(folder / "out" / "run" / "rows.parquet")
+    assert rows.methods == {"ga", OFFICIAL}
+    avatar = folder / "out" / "run" / "901" / OFFICIAL / "seed-0" / "avatar"
+    record = read_json(avatar / "training.json")
+    assert record["official"]["device"] == "cpu-shim"
+    assert any("order in which the native method" in line for line in record["differences"])
+    # Again: nothing is trained anew, and another tolerance has another verdict.
+    log = (avatar / "training.log").read_bytes()
+    assert parity(*words[:-1], "0.001") == 1
+    assert (avatar / "training.log").read_bytes() == log
+
+
+def test_the_order_is_that_of_the_native_method(folder, monkeypatch):
+    (folder / "repository" / "behaviour.txt").write_text("crash")
+    assert parity("--iterations", "7", "--orders", "2") == 1
+    text = (folder / "out" / "parity.md").read_text()
+    assert f"Failed: {OFFICIAL}" in text
+    for order in range(2):
+        training = folder / "out" / "run" / "901" / OFFICIAL / f"seed-{order}" / "avatar" / "training"
+        images = json.loads((training / "exported.json").read_text())["images"]
+        keys = {path.rpartition("/")[2]: tuple(key) for path, key in images.items()}
+        found = [keys[name] for name in json.loads((training / "plan.json").read_text())["order"]]
+        assert len(found) == 7
+        # The tiny capture's one training camera: the clip lists its frames by timestep.
+        train = sorted(keys.values(), key=lambda key: key[2])
+        sampler = ShuffledEpochs(len(train), order)
+        assert found == [train[sampler(i)] for i in range(1, 8)]
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (("--checkout", "nowhere"), "git clone --recursive"),
+        (("--python", "no-such-program"), "settings.ga-official.python"),
+        (("--commit", "0123456"), "commit 0123456"),
+        (("--data", "nowhere"), "nowhere"),
+    ],
+)
+def test_bad_input_is_told_before_any_work(folder, capsys, words, expected):
+    assert parity(*words) == 2
+    assert expected in capsys.readouterr().err
+    assert not list(folder.glob("out/run/901"))
+
+
+def test_settings_do_what_the_program_is_told(tmp_path):
+    for iterations in (600, 2_000, 40_000, PAPER_ITERATIONS):
+        changes = as_theirs("ga", iterations)["splats"]
+        timeline = Timeline(iterations, PAPER_ITERATIONS)
+        schedule = DensifySchedule.of(SplatTraining(**changes), timeline, white=True)
+        # Their program removes large splats after the iteration of its first regular reset.
+        assert schedule.prune_extent_from == schedule.reset_every
+    config = run_config(ParitySettings("ours", checkout="x", out="y"), tmp_path)
+    assert config.methods == ("ours", "tga-official")
+    assert config.settings["ours"]["sampling"] == {"balanced": False}
+
+
+def test_differences_are_paired_by_order():
+    values = {"ga": (20.0, 22.0, 24.0), "official": (21.0, 22.0, 26.0)}
+    rows = [
+        Row(name, "1", order, "novel_view", "s", sequence, 0, "c", "full", "psnr", value + shift, "hash")
+        for name, of in values.items()
+        for order, value in enumerate(of)
+        for sequence, shift in (("one", -1.0), ("two", 1.0))
+    ]
+    (found,) = differences_of(Rows.of(rows), "ga", "official", range(3))
+    assert found.native == pytest.approx(values["ga"])
+    assert found.difference == pytest.approx(1.0)
+    # Student's t with two degrees of freedom, 97.5 %: 4.3027; the differences 1, 0, 2 have a deviation of 1.
+    assert found.half_width == pytest.approx(4.302653 / math.sqrt(3), rel=1e-6)
+    (single,) = differences_of(Rows.of(rows), "ga", "official", [0])
+    assert single.half_width is None
+
+
+@pytest.mark.parametrize("settings", [{"device": "cpu-shim"}, {"order": "native"}])
+def test_code_that_the_shim_does_not_know_is_refused(settings, official_clip):
+    method = GBSOfficial(GBSOfficialConfig(**settings))
+    with pytest.raises(InputError, match="the shim does not know"):
+        method.check(official_clip, Budget(iterations=5))
+
+
+def test_settings_without_meaning_are_refused():
+    for wrong in ({"orders": 0}, {"tolerance": 0.0}):
+        with pytest.raises(ValueError, match="at least 1"):
+            ParitySettings("ga", checkout="x", out="y", **wrong)
+    with pytest.raises(InputError, match="WIDTHxHEIGHT"):
+        ParitySettings("ga", checkout="x", out="y", size="big")
