@@ -9,8 +9,8 @@ import shlex
 import shutil
 import subprocess
 import sys
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +60,7 @@ class Repository:
     scripts : files that tell its checkout from another folder.
     modules : what has to be importable in its interpreter.
     trial : a statement that has to work there, "" for none, and what to do where it does not.
+    downloads : files that the authors offer apart from it and expect in it, and where each comes from.
     """
 
     url: str
@@ -68,6 +69,7 @@ class Repository:
     modules: tuple[str, ...]
     trial: str = ""
     trial_remedy: str = ""
+    downloads: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -140,6 +142,9 @@ def look_at_folder(
     if missing:
         expected = f"a checkout of {repository.url}, with {', '.join(repository.scripts)}"
         raise InputError(folder, f"{source}.checkout", expected, f"none of {', '.join(missing)}", remedy)
+    for name, where in repository.downloads.items():
+        if not (folder / name).is_file():
+            raise InputError(folder / name, f"{source}.checkout", "a file that the code reads", "none", where)
     if commit and not re.fullmatch(rf"[0-9a-f]{{{SHORTEST_COMMIT},40}}", commit):
         expected = f"{SHORTEST_COMMIT} to 40 digits of a commit, or nothing"
         raise InputError(source, "commit", expected, repr(commit)[:60])

@@ -61,3 +61,24 @@ class GBSOfficialConfig(OfficialConfig):
     """GaussianBlendshapes by its authors' code; the commit is the one that the adapter was written for."""
 
     commit: str = "2952da7d246e5790140dbb477d1468214564f092"
+
+
+@dataclass(frozen=True)
+class GHAOfficialConfig(OfficialConfig):
+    """Gaussian Head Avatar by its authors' code; the commit is the one that the adapter was written for.
+
+    Their scripts have no options but a configuration file, which is written here, so that ``arguments`` has to be empty.
+
+    Attributes
+    ----------
+    mesh_fraction : part of the iterations that the mesh head takes; their scripts are stopped by hand.
+    """
+
+    commit: str = "d006861f117e1a74174c29631383386ad876922c"
+    mesh_fraction: float = 0.05
+
+    def __post_init__(self) -> None:
+        if not 0 < self.mesh_fraction < 1:
+            raise ValueError(f"mesh_fraction must lie between 0 and 1, found {self.mesh_fraction}")
+        if self.arguments:
+            raise ValueError("arguments must be empty: the authors' scripts have none")

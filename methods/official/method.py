@@ -7,6 +7,7 @@ import os
 import shutil
 import time
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,7 +16,17 @@ from typing import IO, Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 
-from ...bench.contracts import Budget, Camera, Clip, Frame, FrameKey, HeadAsset, HeadPose, Progress
+from ...bench.contracts import (
+    Budget,
+    Camera,
+    Clip,
+    FloatArray,
+    Frame,
+    FrameKey,
+    HeadAsset,
+    HeadPose,
+    Progress,
+)
 from ...bench.errors import InputError, UnavailableError
 from ...bench.io.documents import read_json
 from ...bench.io.files import digest_file, prepare_folder, write_json
@@ -462,7 +473,7 @@ def _read_back(
 def check_export(work: Workplace, images: Mapping[str, FrameKey], clip: Clip) -> None:
     """Prove that the program is given training frames alone.
 
-    Every image under the program's folders is one that was exported for a training key, each key once, or a placeholder,
+    Every image under the program's folders is one that was exported for a training key, each as often, or a placeholder,
     which has a single pixel and so shows no frame. `clip` gives no pixels of other frames
     (`headbench.bench.runner.adaptation.TrainingView`), so that none can stand under such a name.
 
@@ -472,8 +483,9 @@ def check_export(work: Workplace, images: Mapping[str, FrameKey], clip: Clip) ->
     for path, key in images.items():
         if key not in allowed:
             raise InputError(work.root / path, str(key), "a training frame", "a held-out one")
-    if len(set(images.values())) != len(images):
-        raise InputError(work.root, "images", "each training frame once", "one twice")
+    if len(set(Counter(images.values()).values())) > 1:
+        expected, found = "as many images of each training frame", "more of one than of another"
+        raise InputError(work.root, "images", expected, found)
     there = {path for path in _files(work) if Path(path).suffix.lower() in _IMAGES}
     there -= {path for path in there - images.keys() if _is_placeholder(work.root / path)}
     for what, names in (
@@ -550,4 +562,9 @@ def _remove(folder: Path, but: str = "") -> None:
 
 def opaque(rgb: np.ndarray) -> Frame:
     """A frame of an 8-bit image (H, W, 3) whose coverage nobody knows."""
-    return Frame(rgb.astype(np.float32) / 255, np.ones(rgb.shape[:2], np.float32))
+    return opaque_colours(rgb.astype(np.float32) / 255)
+
+
+def opaque_colours(rgb: FloatArray) -> Frame:
+    """A frame of colours (H, W, 3) in [0, 1] whose coverage nobody knows."""
+    return Frame(rgb, np.ones(rgb.shape[:2], np.float32))

@@ -11,6 +11,7 @@ from .checkout import look_at_folder, look_at_interpreter
 from .config import OfficialConfig
 from .ga.method import GAOfficial
 from .gbs.method import GBSOfficial
+from .gha.method import GHAOfficial
 from .method import OfficialMethod
 from .tga.method import TGAOfficial
 
@@ -28,6 +29,11 @@ def tga(config: OfficialConfig, device: str) -> Iterator[Need]:
 def gbs(config: OfficialConfig, device: str) -> Iterator[Need]:
     """Checkout and environment of GaussianBlendshapes."""
     return _needs(GBSOfficial, config)
+
+
+def gha(config: OfficialConfig, device: str) -> Iterator[Need]:
+    """Checkout, its downloads, and environment of Gaussian Head Avatar."""
+    return _needs(GHAOfficial, config)
 
 
 def _needs(method: type[OfficialMethod[Any]], config: OfficialConfig) -> Iterator[Need]:

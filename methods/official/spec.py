@@ -10,6 +10,7 @@ from ..ga.spec import SHORT
 from ..gbs.spec import GBS
 from ..gbs.spec import SHORT as GBS_SHORT
 from ..gbs.spec import SHORT_SPLATS as GBS_SHORT_SPLATS
+from ..gha.spec import GHA
 from ..shared.config import PAPER_ITERATIONS, SHORT_SPLATS
 
 
@@ -86,4 +87,19 @@ GBS_OFFICIAL = MethodSpec(
     monocular=True,
     native=False,
     source=GBS.source,
+)
+
+GHA_OFFICIAL = MethodSpec(
+    name="gha-official",
+    summary="Gaussian Head Avatar by its authors' code, in a checkout and an environment of yours; needs CUDA.",
+    implementation="headbench.methods.official.gha.method:GHAOfficial",
+    config="headbench.methods.official.config:GHAOfficialConfig",
+    needs="headbench.methods.official.needs:gha",
+    presets={
+        "smoke": {"budget": {"iterations": 60}},
+        "paper": {"budget": {"iterations": PAPER_ITERATIONS}},
+    },
+    preset_resolutions=GHA.preset_resolutions,
+    native=False,
+    source=GHA.source,
 )

@@ -85,7 +85,12 @@ def mark(number: int) -> ByteArray:
 
 def check_mark(path: Path, number: int) -> None:
     """Raise `InputError` where a file is not the mark of a frame: what is rendered there is another one."""
-    pixels = read_png(path).reshape(-1, 3).astype(int)
+    check_mark_in(read_png(path), path, number)
+
+
+def check_mark_in(image: ByteArray, path: Path, number: int) -> None:
+    """Raise `InputError` where the pixels of a part of a file are not the mark of a frame; see `check_mark`."""
+    pixels = image.reshape(-1, 3).astype(int)
     off = int(np.abs(pixels - mark(number).astype(int)).max())
     if off >= MARK_STEP // 2:
         raise InputError(path, "", f"the mark of frame {number}", "that of another: the order was changed")

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import TypeVar, cast
 
 import cv2
 import numpy as np
 
 from ....bench.contracts import ByteArray, Camera, FloatArray
 from ....bench.errors import InputError
+
+Image = TypeVar("Image", ByteArray, FloatArray)
 
 LARGEST_ERROR = 0.1
 """Pixels by which a projection may be off at the image's border, where pixels are not quite square or have a skew."""
@@ -34,10 +39,16 @@ class Window:
         rows = slice(self.top, self.top + self.camera.height)
         return np.ascontiguousarray(image[rows, self.left : self.left + self.camera.width])
 
-    def uncut(self, image: ByteArray, camera: Camera) -> ByteArray:
+    def uncut(self, image: Image, camera: Camera) -> Image:
         """The image of the camera, out of one of the box, which lies around it."""
         rows = slice(-self.top, camera.height - self.top)
-        return np.ascontiguousarray(image[rows, -self.left : camera.width - self.left])
+        return cast(Image, np.ascontiguousarray(image[rows, -self.left : camera.width - self.left]))
+
+    def padded(self, image: ByteArray, fill: int) -> ByteArray:
+        """An image (H, W, C) of the camera inside the box, which lies around it, and ``fill`` beyond the image."""
+        whole = np.full((self.camera.height, self.camera.width, image.shape[2]), fill, np.uint8)
+        whole[-self.top : image.shape[0] - self.top, -self.left : image.shape[1] - self.left] = image
+        return whole
 
 
 def inside(camera: Camera) -> Window:
@@ -95,3 +106,41 @@ def _towards(direction: FloatArray) -> FloatArray:
         return np.eye(3)
     rotation, _ = cv2.Rodrigues(axis / sine * math.atan2(sine, float(unit[2])))
     return np.asarray(rotation, np.float64)
+
+
+def square(camera: Camera, side: int) -> Window:
+    """The square window around an image with the principal point in its middle; pixels need not be square.
+
+    Raises `InputError` for a side below `square_side`.
+    """
+    K = np.asarray(camera.K, np.float64)
+    (left, off_x), (top, off_y) = (_centred(float(K[axis, 2]), side) for axis in range(2))
+    if not _encloses(camera, side):
+        raise InputError(f"camera {camera.id}", "side", f"{square_side([camera])} pixels or more", str(side))
+    turned = np.eye(4)
+    turned[:3, :3] = _towards(np.array([-off_x / K[0, 0], -off_y / K[1, 1], 1.0]))
+    centred = np.array([[K[0, 0], 0.0, side / 2], [0.0, K[1, 1], side / 2], [0.0, 0.0, 1.0]])
+    world_to_camera = turned @ np.asarray(camera.world_to_camera, np.float64)
+    moved = replace(camera, width=side, height=side, K=centred, world_to_camera=world_to_camera)
+    return Window(moved, left, top)
+
+
+def square_side(cameras: Iterable[Camera]) -> int:
+    """The smallest side of a square window that `square` can put around the image of each camera."""
+    cameras = list(cameras)
+    shortest = max(max(camera.width, camera.height) for camera in cameras)
+    return next(side for side in itertools.count(shortest) if all(_encloses(c, side) for c in cameras))
+
+
+def _encloses(camera: Camera, side: int) -> bool:
+    for axis, size in enumerate((camera.width, camera.height)):
+        begin, _ = _centred(float(camera.K[axis, 2]), side)
+        if begin > 0 or begin + side < size:
+            return False
+    return True
+
+
+def _centred(center: float, side: int) -> tuple[int, float]:
+    """Begin of a window with a point in its middle, and how far right of the middle, half a pixel at most, it is."""
+    begin = math.floor(center - side / 2 + 0.5)
+    return begin, center - begin - side / 2

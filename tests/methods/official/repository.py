@@ -11,6 +11,7 @@ from headbench.bench.contracts import Budget
 from headbench.datasets.head.teeth import lip_rings
 from headbench.methods.official.config import GAOfficialConfig
 from headbench.methods.official.ga.method import GAOfficial
+from headbench.methods.official.gha.method import GHAOfficial
 from headbench.methods.official.tga.method import TGAOfficial
 
 BUDGET = Budget(iterations=20)
@@ -144,6 +145,11 @@ def make_repository(folder: Path, rings: tuple[list[int], list[int]], sizes: tup
 
 def commit_all(folder: Path) -> str:
     """Make a repository of a folder; return its commit."""
+    return committed(folder)
+
+
+def committed(folder: Path) -> str:
+    """Commit all files of a folder; return the commit."""
     git = [
         "git",
         "-C",
@@ -209,3 +215,138 @@ def lip_numbers(head) -> tuple[tuple[list[int], list[int]], tuple[int, int]]:
     count, first = len(lip_rings(head)[0]), len(head.template) + 5
     rings = list(range(first, first + 2 * count, 2)), list(range(first + 1, first + 2 * count, 2))
     return rings, (max(rings[1]) + 1 + 120, len(head.faces) + 168)
+
+
+# ------------------------------------------------------------------ Gaussian Head Avatar
+
+HEAD_AVATAR = {
+    "lib/dataset/Dataset.py": "",
+    "config/config.py": "",
+    "lib/recorder/Recorder.py": """
+import os
+
+class MeshHeadTrainRecorder:
+    files, loss = ("meshhead",), "loss_rgb"
+
+    def __init__(self, config):
+        self.config = config
+        self.folder = os.path.join(config["checkpoint_path"], config["name"])
+        os.makedirs(self.folder)
+
+    def log(self, values):
+        assert set(values) == {"iter", self.loss}
+        if values["iter"] % self.config["save_freq"] == 0:
+            for name in self.files:
+                with open(os.path.join(self.folder, name + "_latest"), "w") as stream:
+                    stream.write(str(values["iter"] + 1))
+
+class GaussianHeadTrainRecorder(MeshHeadTrainRecorder):
+    files, loss = ("gaussianhead", "supres"), "loss_rgb_hr"
+""",
+    "lib/trainer/MeshHeadTrainer.py": """
+class MeshHeadTrainer:
+    def __init__(self, frames, recorder):
+        self.frames, self.recorder = frames, recorder
+
+    def train(self, start_epoch, epochs):
+        for iteration in range(start_epoch, epochs * self.frames):
+            self.recorder.log({"iter": iteration, self.recorder.loss: 0.5})
+""",
+    "lib/trainer/GaussianHeadTrainer.py": """
+from lib.trainer.MeshHeadTrainer import MeshHeadTrainer
+
+class GaussianHeadTrainer(MeshHeadTrainer):
+    pass
+""",
+}
+HEAD_AVATAR_STAGE = """
+import json, os, sys
+import cv2
+import numpy as np
+from lib.recorder.Recorder import {recorder} as Recorder
+from lib.trainer.{trainer} import {trainer} as Trainer
+
+assert os.path.exists("assets/tets_data.npz")
+here = os.path.dirname(os.path.abspath(__file__))
+with open(sys.argv[2]) as stream:
+    config = json.load(stream)
+data = config["dataset"]
+side, frames = data["original_resolution"], os.listdir(os.path.join(data["dataroot"], "images"))
+for frame in frames:
+    for camera in data["camera_ids"]:
+        place = os.path.join(data["dataroot"], "images", frame, "%s_" + camera + ".jpg")
+        assert {{cv2.imread(place % kind).shape for kind in ("image", "mask", "visible")}} == {{(side, side, 3)}}
+        small = {{cv2.imread(place % (kind + "_lowres")).shape for kind in ("image", "mask", "visible")}}
+        assert small == {{(256, 256, 3)}}
+        K = np.load(os.path.join(data["dataroot"], "cameras", frame, "camera_" + camera + ".npz"))["intrinsic"]
+        assert K[0, 2] == K[1, 2] == side / 2
+    values = np.load(os.path.join(data["dataroot"], "params", frame, "params.npz"))
+    module = config["meshheadmodule"]
+    assert module["exp_color_mlp"][0] == 128 + values["exp_coeff"].shape[1]
+    assert values["pose"].shape == (1, 6) and values["scale"].shape == (1,)
+    landmarks = np.load(os.path.join(data["dataroot"], "params", frame, "lmk_3d.npy"))
+    assert landmarks.shape[0] >= 66
+behaviour = os.path.join(here, "behaviour.txt")
+behaviour = open(behaviour).read() if os.path.exists(behaviour) else ""
+if behaviour == "crash" and "{trainer}".startswith("Gaussian"):
+    raise RuntimeError("CUDA out of memory")
+trainer = Trainer(len(frames), Recorder(config["recorder"]))
+if behaviour == "stop":
+    trainer.train = lambda start, epochs: None
+trainer.train(0, 1)
+"""
+HEAD_AVATAR_RENDERER = """
+import glob, json, os, sys
+import cv2
+import numpy as np
+
+here = os.path.dirname(os.path.abspath(__file__))
+behaviour = os.path.join(here, "behaviour.txt")
+behaviour = open(behaviour).read() if os.path.exists(behaviour) else ""
+with open(sys.argv[2]) as stream:
+    config = json.load(stream)
+data = config["dataset"]
+images, parameters = (
+    sorted(glob.glob(os.path.join(data["dataroot"], data[kind]))) for kind in ("image_files", "param_files")
+)
+assert len(images) == len(parameters)
+if behaviour == "reversed":
+    images = images[::-1]
+os.makedirs(os.path.join(config["recorder"]["result_path"], config["recorder"]["name"]))
+assert open(config["load_supres_checkpoint"]).read() == open(config["load_gaussianhead_checkpoint"]).read()
+size = data["resolution"] - (2 if behaviour == "other size" else 0)
+before = None
+for index, (image, path) in enumerate(zip(images, parameters)):
+    values = np.load(path)
+    shown = np.concatenate([values["exp_coeff"][0], values["pose"][0]])
+    before = shown if before is None else before * 0.5 + shown * 0.5
+    beside = cv2.resize(cv2.imread(image), (size, size))
+    color = np.clip([120, 100 + 300 * before[-6], 100 + 40 * before[0]], 0, 255)
+    render = np.empty((size, size, 3), np.uint8)
+    render[:] = color.astype(np.uint8)
+    if behaviour == "one too few" and index == 1:
+        continue
+    name = os.path.join(config["recorder"]["result_path"], config["recorder"]["name"], "%06d.jpg" % index)
+    cv2.imwrite(name, np.hstack([beside, render]))
+"""
+
+
+def make_head_avatar_repository(folder: Path) -> str:
+    """Write a stand-in for Gaussian Head Avatar's and commit it; return its commit."""
+    files = dict(HEAD_AVATAR)
+    for script, kind in (("train_meshhead.py", "MeshHead"), ("train_gaussianhead.py", "GaussianHead")):
+        files[script] = HEAD_AVATAR_STAGE.format(recorder=f"{kind}TrainRecorder", trainer=f"{kind}Trainer")
+    files["reenactment.py"] = HEAD_AVATAR_RENDERER
+    for name, text in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+    commit = committed(folder)
+    (folder / "assets").mkdir()
+    (folder / "assets" / "tets_data.npz").write_bytes(b"tetrahedra")
+    return commit
+
+
+class HeadAvatarStandIn(GHAOfficial):
+    """`GHAOfficial` around the stand-in."""
+
+    repository = replace(GHAOfficial.repository, modules=("json",))

@@ -1,0 +1,337 @@
+"""Gaussian Head Avatar by its authors' code.
+
+Xu et al., "Gaussian Head Avatar: Ultra High-fidelity Head Avatar via Dynamic Gaussians", CVPR 2024.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ....bench.contracts import Clip, Frame, FrameKey, Progress
+from ....bench.errors import InputError
+from ....bench.io.documents import read_json
+from ....bench.io.files import read_bytes, write_bytes, write_json
+from ...gha.config import GHAConfig
+from ...gha.driving import code_size
+from ...shared.avatar_files import (
+    HEAD_FILE,
+    SUBJECT_FILE,
+    Subject,
+    read_shared_head,
+    read_subject,
+    save_shared_head,
+    write_subject,
+)
+from ...shared.loop import Fit
+from ..checkout import Checkout, Repository
+from ..config import GHAOfficialConfig
+from ..ga.export import check_mark_in
+from ..ga.method import copy_file
+from ..ga.windows import square_side
+from ..method import Listed, OfficialMethod, Workplace, opaque_colours
+from ..spec import GHA_OFFICIAL
+from .export import (
+    IMAGES,
+    PARAMETERS,
+    Tracking,
+    read_render,
+    training_side,
+    whole_timesteps,
+    write_list,
+    write_training,
+)
+
+MESH, GAUSSIANS = "train_meshhead.py", "train_gaussianhead.py"
+REENACTMENT = "reenactment.py"
+LAUNCHER = Path(__file__).with_name("stages.py")
+PLAN = "stages.json"
+NETWORKS = ("gaussianhead_latest", "supres_latest")
+SIDE_FILE = "square.json"
+TETRAHEDRA = "assets/tets_data.npz"
+RENDERED = 2048
+"""Side of their renders: 512 splatted pixels, which their renderer fixes, and four times as many after it."""
+MOST_SIDE, MOST_LAUNCHER, SHORTEST = 1 << 15, 1 << 16, 2
+_DONE = re.compile(r"^headbench: iteration (\d+) loss ([\d.]+|nan|inf)")
+_DRAWN = re.compile(r"^headbench: drawn (\d+)")
+
+GHA_REPOSITORY = Repository(
+    "https://github.com/YuelangX/Gaussian-Head-Avatar",
+    GHAOfficialConfig().commit,
+    (MESH, GAUSSIANS, REENACTMENT, "lib/dataset/Dataset.py", "config/config.py"),
+    (
+        *("torch", "torchvision", "kaolin", "pytorch3d.ops.knn", "diff_gaussian_rasterization"),
+        *("simple_knn._C", "lpips", "yacs.config", "einops", "tensorboardX", "prefetch_generator"),
+        *("skimage.io", "cv2", "tqdm"),
+    ),
+    downloads={TETRAHEDRA: "Download it from the link on the repository's page, and put it there."},
+)
+
+
+class GHAOfficial(OfficialMethod[GHAOfficialConfig]):
+    """The method: see the module."""
+
+    name, version = GHA_OFFICIAL.name, GHA_OFFICIAL.version
+    config_class, repository = GHAOfficialConfig, GHA_REPOSITORY
+
+    def check_clip(self, clip: Clip, checkout: Checkout) -> None:
+        """Refuse other backgrounds than white, skewed pixels, timesteps with cameras missing, a head without a face."""
+        where = f"clip {clip.subject}"
+        _check_white(clip.background, where)
+        for name in sorted({key.camera for keys in clip.splits.values() for key in keys}):
+            skew = abs(float(clip.cameras[name].K[0, 1]))
+            if skew > 1e-3 * float(clip.cameras[name].K[0, 0]):
+                raise InputError(where, f"camera {name}", "no skew; the code knows none", f"{skew:.2f}")
+        whole_timesteps(clip)
+        Tracking.of(clip.head, Subject.of(clip))
+
+    def check_length(self, iterations: int, checkout: Checkout) -> None:
+        """Refuse a run without an iteration for each of the two stages."""
+        if iterations < SHORTEST:
+            expected = f"{SHORTEST} or more, one for each stage"
+            raise InputError(f"settings.{self.name}", "budget.iterations", expected, f"{iterations}")
+
+    def export(
+        self, clip: Clip, checkout: Checkout, work: Workplace, progress: Progress
+    ) -> dict[str, FrameKey]:
+        """The training frames in their layout; the tetrahedra where their program looks for them."""
+        target = work.program / TETRAHEDRA
+        target.parent.mkdir(parents=True)
+        os.symlink(checkout.folder / TETRAHEDRA, target)
+        return write_training(clip, Tracking.of(clip.head, Subject.of(clip)), work, progress)
+
+    def train_command(self, fit: Fit, checkout: Checkout, work: Workplace) -> list[str]:
+        """Both of their scripts, one after the other, by the launcher."""
+        mesh, gaussians = self._lengths(fit.budget.iterations or 0)
+        clip = fit.clip
+        cameras = len({key.camera for key in clip.splits["train"]})
+        shared = {
+            "gpu_id": 0,
+            "batch_size": 1,
+            "load_meshhead_checkpoint": "",
+            "meshheadmodule": _networks(code_size(clip.head), mesh=True),
+        }
+        dataset = {
+            "dataroot": str(work.input),
+            "camera_ids": [f"{index:02d}" for index in range(cameras)],
+            "original_resolution": training_side(clip),
+        }
+        published = GHAConfig()
+        first = {
+            **shared,
+            "lr_net": published.mesh_lr,
+            "lr_lmk": published.landmark_lr,
+            "dataset": {
+                **dataset,
+                "resolution": published.mesh_size,
+                "num_sample_view": min(published.mesh_views, cameras),
+            },
+            "recorder": _recorder("meshhead", work, mesh),
+        }
+        second = {
+            **shared,
+            "load_meshhead_checkpoint": str(_checkpoints(work, "meshhead") / "meshhead_latest"),
+            "lr_net": published.network_lr,
+            "lr_pose": published.correction_lr,
+            "optimize_pose": True,
+            "dataset": {**dataset, "resolution": RENDERED},
+            "supresmodule": _SHARPENER,
+            "gaussianheadmodule": _networks(code_size(clip.head), mesh=False),
+            "recorder": _recorder("gaussianhead", work, gaussians),
+        }
+        parts = []
+        for script, config, length, before in ((MESH, first, mesh, 0), (GAUSSIANS, second, gaussians, mesh)):
+            path = work.root / f"{Path(script).stem}.yaml"
+            write_json(path, config)  # JSON is YAML
+            parts.append({"script": script, "config": str(path), "iterations": length, "before": before})
+        return self._staged(checkout, work, parts, fit.seed)
+
+    def done(self, line: str) -> tuple[int, str] | None:
+        """From the launcher, which counts both stages."""
+        match = _DONE.search(line)
+        return None if match is None else (int(match[1]), f"loss {match[2]}")
+
+    def keep(self, fit: Fit, work: Workplace) -> dict[str, Any]:
+        """Their Gaussians with the networks that drive them, super-resolution, and the subject."""
+        for name in NETWORKS:
+            copy_file(_checkpoints(work, "gaussianhead") / name, fit.out / name)
+        write_json(fit.out / SIDE_FILE, {"side": training_side(fit.clip)})
+        write_subject(fit.out / SUBJECT_FILE, Subject.of(fit.clip))
+        save_shared_head(fit.out, fit.clip.head)
+        return {}
+
+    def files(self, folder: Path) -> list[Path]:
+        """Gaussians, networks, subject, and the side of the images that it was trained on."""
+        return [folder / name for name in (*NETWORKS, SUBJECT_FILE, SIDE_FILE)]
+
+    def shared_files(self, folder: Path) -> list[Path]:
+        """The head model."""
+        return [folder / HEAD_FILE]
+
+    def write_list(
+        self,
+        folder: Path,
+        frames: Sequence[Listed],
+        background: Sequence[float],
+        checkout: Checkout,
+        work: Workplace,
+    ) -> None:
+        """The frames of each camera as an application of their own, all run by the launcher."""
+        _check_white(background, "render")
+        head = read_shared_head(folder)
+        tracking = Tracking.of(head, read_subject(folder / SUBJECT_FILE, head))
+        side = max(_side(folder), square_side(frame.camera for frame in frames))
+        renders = self.render_folder(folder, work)
+        renders.mkdir(parents=True)
+        parts = []
+        for place, numbers in write_list(frames, tracking, side, work):
+            config = {
+                "gpu_id": 0,
+                "load_gaussianhead_checkpoint": str(folder.absolute() / NETWORKS[0]),
+                "load_supres_checkpoint": str(folder.absolute() / NETWORKS[1]),
+                "dataset": {
+                    "dataroot": str(place),
+                    "image_files": f"{IMAGES}/*.png",
+                    "param_files": f"{PARAMETERS}/*.npz",
+                    "camera_path": str(place / "camera.npz"),
+                    "pose_code_path": "",
+                    "freeview": False,
+                    "resolution": RENDERED,
+                    "original_resolution": side,
+                },
+                "supresmodule": _SHARPENER,
+                "gaussianheadmodule": _networks(code_size(head), mesh=False),
+                "recorder": {"name": place.name, "result_path": str(work.model / "results")},
+            }
+            path = work.root / f"{place.name}.yaml"
+            write_json(path, config)
+            part = {"script": REENACTMENT, "config": str(path), "numbers": numbers, "renders": str(renders)}
+            parts.append(part)
+        write_json(work.root / SIDE_FILE, {"side": side})
+        self._staged(checkout, work, parts, 0)
+
+    def render_command(self, folder: Path, checkout: Checkout, work: Workplace) -> list[str]:
+        """The launcher, with the plan that was written with the list."""
+        return [*checkout.python, str(work.root / LAUNCHER.name), str(work.root / PLAN)]
+
+    def drawn(self, line: str) -> int | None:
+        """From the launcher."""
+        match = _DRAWN.search(line)
+        return None if match is None else int(match[1])
+
+    def render_folder(self, folder: Path, work: Workplace) -> Path:
+        """Where the launcher puts them."""
+        return work.model / "renders"
+
+    def render_name(self, number: int) -> str:
+        """By the number that the plan gives to each frame of a camera."""
+        return f"{number:06d}.png"
+
+    def read_back(self, frame: Listed, path: Path, work: Workplace) -> Frame:
+        """A render, once the image beside it has shown which frame it is."""
+        beside, render = read_render(path, frame, _side(work.root), RENDERED)
+        check_mark_in(beside, path, frame.number)
+        return opaque_colours(render)
+
+    def remarks(self, clip: Clip, seed: int) -> dict[str, list[str]]:
+        """What a reader of results has to know."""
+        side = training_side(clip)
+        codes = code_size(clip.head)
+        differences = [
+            "the capture has no held-out frames in it; cameras and timesteps are numbered anew",
+            f"the head model's {codes} values of expression, jaw, eyes and eyelids stand for 64 expression coefficients "
+            + "of the Basel Face Model; the networks' first layers are as wide as that needs",
+            "landmarks are vertices of the head model: 48 of the face, 18 of the lips, and more of the face in place of "
+            + "each hundredth vertex of the Basel Face Model",
+            f"images are laid in squares of {side} pixels with the principal point in the middle; nothing beyond the "
+            + f"image's border enters a loss. Their loader takes squares to {RENDERED} pixels; renders are taken back",
+            "images and renders are PNG in place of JPEG; their renderer rounds down to 8 bits",
+            "the mask of the second stage is white: images lie on white already",
+            "training ends after a number of iterations, which the authors' does not",
+            "renders show listed poses; the authors' smooths them over time",
+        ]
+        return {"leaks": [], "differences": differences}
+
+    def _lengths(self, iterations: int) -> tuple[int, int]:
+        mesh = min(iterations - 1, max(1, round(iterations * self.config.mesh_fraction)))
+        return mesh, iterations - mesh
+
+    @staticmethod
+    def _staged(checkout: Checkout, work: Workplace, parts: Sequence[dict[str, Any]], seed: int) -> list[str]:
+        """Write launcher and plan; return the command."""
+        launcher = work.root / LAUNCHER.name
+        write_bytes(launcher, read_bytes(LAUNCHER, "the launcher", MOST_LAUNCHER))
+        write_json(work.root / PLAN, {"checkout": str(checkout.folder), "seed": seed, "parts": list(parts)})
+        return [*checkout.python, str(launcher), str(work.root / PLAN)]
+
+
+_SHARPENER = {
+    "input_dim": GHAConfig().channels,
+    "output_dim": 3,
+    "network_capacity": GHAConfig().sr_widths[-1],
+}
+
+
+def _networks(codes: int, *, mesh: bool) -> dict[str, Any]:
+    """The published sizes, for an expression code of ``codes`` values in place of 64."""
+    gha = GHAConfig()
+    frequencies = 4
+    point, pose = (size * (1 + 2 * frequencies) for size in (3, 6))
+    shared = {
+        "exp_color_mlp": [gha.features + codes, *gha.expression_color_hidden, gha.channels],
+        "pose_color_mlp": [gha.features + pose, *gha.pose_color_hidden, gha.channels],
+        "exp_deform_mlp": [point + codes, *gha.expression_deform_hidden, 3],
+        "pose_deform_mlp": [point + pose, *gha.pose_deform_hidden, 3],
+        "pos_freq": frequencies,
+        "dist_threshold_near": gha.near_squared,
+        "dist_threshold_far": gha.far_squared,
+        "deform_scale": gha.displacement_scale,
+    }
+    if mesh:
+        return {
+            **shared,
+            "geo_mlp": [point, *gha.geometry_hidden, 4 + gha.features],
+            "model_bbox": [[-1.6, 1.6], [-1.7, 1.8], [-2.5, 1.0]],
+            "subdivide": False,
+        }
+    return {
+        **shared,
+        "num_add_mouth_points": gha.mouth_points,
+        "exp_attributes_mlp": [gha.features + codes, *gha.expression_attribute_hidden, 8],
+        "pose_attributes_mlp": [gha.features + pose, *gha.pose_attribute_hidden, 8],
+        "exp_coeffs_dim": codes,
+        "attributes_scale": gha.attribute_scale,
+    }
+
+
+def _recorder(name: str, work: Workplace, iterations: int) -> dict[str, Any]:
+    """Checkpoints after the first iteration and the last; pictures of the first alone."""
+    return {
+        "name": name,
+        "logdir": str(work.model / "log" / name),
+        "checkpoint_path": str(work.model / "checkpoints"),
+        "result_path": str(work.model / "results"),
+        "save_freq": max(1, iterations - 1),
+        "show_freq": 10**9,
+    }
+
+
+def _checkpoints(work: Workplace, name: str) -> Path:
+    return work.model / "checkpoints" / name
+
+
+def _side(folder: Path) -> int:
+    path = folder / SIDE_FILE
+    side = read_json(path).get("side")
+    if not isinstance(side, int) or not 1 <= side <= MOST_SIDE:
+        raise InputError(path, "side", f"1 to {MOST_SIDE} pixels", repr(side)[:60])
+    return side
+
+
+def _check_white(background: Sequence[float] | Any, where: str) -> None:
+    levels = [float(value) for value in background]
+    if levels != [1.0] * 3:
+        raise InputError(where, "background", "white; the code knows no other", str(tuple(levels)))

@@ -1,0 +1,102 @@
+"""Runs scripts of Gaussian Head Avatar's authors, each for as long as it is told; copied to where they run.
+
+Their training has no number of iterations, and their renderer writes JPEG beside the image it was given. A plan (JSON)
+lists scripts and configurations; each runs in a process of its own, by the interpreter that runs this file. Nothing but
+the standard library is needed here, and Python 3.8.
+"""
+
+import json
+import os
+import random
+import runpy
+import subprocess
+import sys
+
+RECORDERS = {
+    "train_meshhead.py": "MeshHeadTrainRecorder",
+    "train_gaussianhead.py": "GaussianHeadTrainRecorder",
+}
+TRAINERS = {
+    "train_meshhead.py": ("lib.trainer.MeshHeadTrainer", "MeshHeadTrainer"),
+    "train_gaussianhead.py": ("lib.trainer.GaussianHeadTrainer", "GaussianHeadTrainer"),
+}
+LOSSES = ("loss_rgb", "loss_rgb_hr")
+EPOCHS = 10**9
+
+
+def main():
+    """Run the parts of a plan one after another, or one of them."""
+    with open(sys.argv[1]) as stream:
+        plan = json.load(stream)
+    if len(sys.argv) > 2:
+        run(plan["checkout"], plan["seed"], plan["parts"][int(sys.argv[2])])
+        return
+    for number in range(len(plan["parts"])):
+        code = subprocess.call([sys.executable, os.path.abspath(__file__), sys.argv[1], str(number)])
+        if code:
+            sys.exit(code if code > 0 else 128 - code)
+
+
+def run(checkout, seed, part):
+    """One script with its configuration, until it ends or its iterations are done."""
+    script = part["script"]
+    sys.path.insert(0, checkout)
+    sys.argv = [os.path.join(checkout, script), "--config", part["config"]]
+    seeded(seed)
+    if script in TRAINERS:
+        bounded(script, part)
+    else:
+        numbered(part)
+    runpy.run_path(sys.argv[0], run_name="__main__")
+    if script in TRAINERS:
+        sys.exit(f"{script} ended before its {part['iterations']} iterations")
+
+
+def seeded(seed):
+    """Seed what draws numbers in their code."""
+    import torch
+
+    random.seed(seed)
+    torch.manual_seed(seed)
+
+
+def bounded(script, part):
+    """End a training after its last iteration is recorded; their number of epochs sets no other end."""
+    import importlib
+
+    recorder = getattr(importlib.import_module("lib.recorder.Recorder"), RECORDERS[script])
+    module, name = TRAINERS[script]
+    trainer = getattr(importlib.import_module(module), name)
+    record, train = recorder.log, trainer.train
+
+    def log(self, values):
+        record(self, values)
+        done = values["iter"] + 1
+        loss = next(float(values[name]) for name in LOSSES if name in values)
+        print(f"\nheadbench: iteration {part['before'] + done} loss {loss:.4f}", flush=True)
+        if done == part["iterations"]:
+            # Not by an exception: the threads of their loader wait for somebody to take what they have read.
+            sys.stdout.flush()
+            os._exit(0)
+
+    recorder.log = log
+    trainer.train = lambda self, start=0, epochs=0: train(self, start, EPOCHS)
+
+
+def numbered(part):
+    """Write renders as PNG, by the numbers that the plan gives to the frames of this camera."""
+    import cv2
+
+    write = cv2.imwrite
+
+    def imwrite(path, image, *rest):
+        number = part["numbers"][int(os.path.splitext(os.path.basename(path))[0])]
+        done = write(os.path.join(part["renders"], f"{number:06d}.png"), image)
+        print(f"\nheadbench: drawn {number + 1}", flush=True)
+        return done
+
+    cv2.imwrite = imwrite
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,224 @@
+"""What GHA's adapter has beyond the others: two stages, squares, smoothing undone, renders of each camera by number."""
+
+import re
+import sys
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from headbench.bench.contracts import Budget, Camera, no_progress
+from headbench.bench.errors import InputError
+from headbench.bench.io.documents import read_json
+from headbench.bench.io.images import read_png
+from headbench.bench.runner.adaptation import TrainingView
+from headbench.methods.official.config import GHAOfficialConfig
+from headbench.methods.official.ga.windows import square, square_side
+from headbench.methods.official.gha import method as implementation
+from headbench.methods.official.gha.export import MOUTH_ROWS, Tracking, overshot
+from headbench.methods.official.method import TRAINING_LOG, Workplace, check_export
+from headbench.methods.official.process import ProgramError
+from headbench.methods.shared.avatar_files import Subject
+
+from .repository import HeadAvatarStandIn, make_head_avatar_repository
+
+BUDGET = Budget(iterations=20)
+
+
+@pytest.fixture
+def repository(tmp_path):
+    """Folder and commit of the stand-in."""
+    return tmp_path / "repository", make_head_avatar_repository(tmp_path / "repository")
+
+
+@pytest.fixture(autouse=True)
+def small_renders(monkeypatch):
+    """Renders of 64 pixels instead of 2048."""
+    monkeypatch.setattr(implementation, "RENDERED", 64)
+
+
+@pytest.fixture
+def method(repository):
+    return HeadAvatarStandIn(
+        GHAOfficialConfig(str(repository[0]), sys.executable, repository[1], mesh_fraction=0.25)
+    )
+
+
+@pytest.fixture
+def avatar(method, official_clip, tmp_path):
+    return fit(method, official_clip, tmp_path / "avatar")
+
+
+def fit(method, clip, out, progress=no_progress):
+    return method.fit(TrainingView(clip), out, BUDGET, device="cpu", seed=0, progress=progress)
+
+
+def views(clip, *splits):
+    return {k: (clip.cameras[k.camera], clip.poses[k.timestep]) for s in splits for k in clip.splits[s]}
+
+
+def test_both_stages_are_run_and_frames_come_back_by_key(method, official_clip, tmp_path):
+    calls = []
+    avatar = fit(
+        method, official_clip, tmp_path / "a", lambda done, total, note="": calls.append((done, note))
+    )
+    frames = len(official_clip.splits["train"])
+    assert calls[-1][0] == frames + 20
+    assert (frames + 7, "loss 0.5000") in calls
+    log = (tmp_path / "a" / TRAINING_LOG).read_text()
+    assert [int(n) for n in re.findall(r"^headbench: iteration (\d+)", log, re.MULTILINE)] == [*range(1, 21)]
+    names = {path.name for path in avatar.files()}
+    assert names == {"gaussianhead_latest", "supres_latest", "subject.npz", "square.json"}
+    assert (
+        tmp_path / "a" / "gaussianhead_latest"
+    ).read_text() == "15"  # its last of 20, after 5 of the mesh head
+    record = read_json(tmp_path / "a" / "training.json")
+    assert record["leaks"] == []
+    assert any("Basel Face Model" in line for line in record["differences"])
+    wanted = views(official_clip, "novel_view", "self_reenactment", "train")
+    found = dict(avatar.render_listed(wanted, (1.0, 1.0, 1.0), no_progress))
+    assert found.keys() == wanted.keys()
+    tracking = Tracking.of(official_clip.head, Subject.of(official_clip))
+    for key, frame in found.items():
+        camera, pose = wanted[key]
+        assert frame.rgb.shape == (camera.height, camera.width, 3)
+        values = tracking.parameters(pose)
+        red, green = 100 + 40 * values["exp_coeff"][0, 0], 100 + 300 * values["pose"][0, 0]
+        assert np.abs(frame.rgb[0, 0] * 255 - np.clip([red, green, 120], 0, 255)).max() <= 1.01
+
+
+@pytest.mark.parametrize(
+    ("behaviour", "expected"),
+    {"crash": "exit code 1.*CUDA out of memory", "stop": "ended before its 5 iterations"}.items(),
+)
+def test_a_stage_that_fails_says_so(method, repository, official_clip, tmp_path, behaviour, expected):
+    (repository[0] / "behaviour.txt").write_text(behaviour)
+    with pytest.raises(ProgramError, match=expected):
+        fit(method, official_clip, tmp_path / "avatar")
+    (repository[0] / "behaviour.txt").write_text("")
+    assert fit(method, official_clip, tmp_path / "avatar").files()
+
+
+@pytest.mark.parametrize(
+    ("behaviour", "expected"),
+    {
+        "reversed": "the mark of frame",
+        "other size": "expected 128x64 pixels, found 124x62",
+        "one too few": r"lacks 1 of 3 renders, first 000001.png",
+    }.items(),
+)
+def test_renders_that_are_not_what_was_listed_are_found(
+    avatar, repository, official_clip, behaviour, expected
+):
+    (repository[0] / "behaviour.txt").write_text(behaviour)
+    with pytest.raises(ProgramError, match=expected):
+        list(avatar.render_listed(views(official_clip, "novel_view"), (1.0, 1.0, 1.0), no_progress))
+
+
+def test_only_training_frames_are_exported_and_to_the_bit(method, official_clip, tmp_path):
+    # A neck that is not bent has no pose correctives and skins nothing: the face moves rigidly.
+    straight = {t: replace(pose, neck=np.zeros(3, np.float32)) for t, pose in official_clip.poses.items()}
+    official_clip = replace(official_clip, poses=straight)
+    work = Workplace(tmp_path / "work")
+    work.make()
+    images = method.export(TrainingView(official_clip), method.look(), work, no_progress)
+    check_export(work, images, official_clip)
+    assert set(images.values()) == set(official_clip.splits["train"])
+    side = square_side(official_clip.cameras[name] for name in ("00", "01"))
+    for place, key in images.items():
+        if "/image_0" not in place:
+            continue
+        camera = official_clip.cameras[key.camera]
+        window = square(camera, side)
+        shown = read_png(work.root / place)
+        assert np.array_equal(window.uncut(shown, camera), official_clip.images[key])
+        seen = read_png(work.root / place.replace("/image_", "/visible_"))[..., 0]
+        assert seen.sum() == 255 * camera.width * camera.height
+        assert (shown[seen == 0] == 255).all()
+    folders = sorted((work.input / "params").iterdir())
+    timesteps = sorted({key.timestep for key in official_clip.splits["train"]})
+    assert len(folders) == len(timesteps)
+    tracking = Tracking.of(official_clip.head, Subject.of(official_clip))
+    for folder, timestep in zip(folders, timesteps, strict=True):
+        values = dict(np.load(folder / "params.npz"))
+        rotation, _ = cv2.Rodrigues(values["pose"][0, :3].astype(np.float64))
+        still = tracking.driver.unposed(tracking.driver.arguments([official_clip.poses[timestep]]))[0].numpy()
+        moved = values["scale"] * still[tracking.rows] @ rotation.T + values["pose"][0, 3:]
+        assert np.abs(moved - np.load(folder / "lmk_3d.npy")).max() < 1e-6
+    lips = set(official_clip.head.regions["lips"])
+    assert set(tracking.rows[MOUTH_ROWS]) <= lips
+
+
+def without(clip):
+    regions = {name: part for name, part in clip.head.regions.items() if name != "lips"}
+    _, *rest = clip.splits["train"]
+    return {
+        "background": replace(clip, background=np.zeros(3)),
+        "lips": replace(clip, head=replace(clip.head, regions=regions)),
+        "frame": replace(clip, splits={**clip.splits, "train": tuple(rest)}),
+        "skew": replace(
+            clip,
+            cameras={n: replace(c, K=c.K + np.eye(3, k=1) * [0, 1, 0]) for n, c in clip.cameras.items()},
+        ),
+    }
+
+
+@pytest.mark.parametrize(
+    ("case", "expected"),
+    [
+        ("background", "expected white"),
+        ("lips", "region 'lips'"),
+        ("frame", "training frame of each of 2 cameras"),
+        ("skew", "no skew"),
+    ],
+)
+def test_clips_that_their_code_cannot_take_are_refused(method, official_clip, case, expected):
+    with pytest.raises(InputError, match=expected):
+        method.check(without(official_clip)[case], BUDGET)
+
+
+def test_what_is_missing_of_checkout_and_length_is_named(method, repository, official_clip):
+    with pytest.raises(InputError, match="2 or more"):
+        method.check(official_clip, Budget(iterations=1))
+    (repository[0] / "assets" / "tets_data.npz").unlink()
+    with pytest.raises(InputError, match=r"tets_data.npz.*link on the repository's page"):
+        method.check(official_clip, BUDGET)
+
+
+@pytest.mark.parametrize("change", [{"mesh_fraction": 0.0}, {"mesh_fraction": 1.0}, {"arguments": ("-x",)}])
+def test_settings_without_a_meaning_are_refused(change):
+    with pytest.raises(ValueError, match="mesh_fraction|arguments"):
+        GHAOfficialConfig(**change)
+
+
+def test_smoothing_over_time_is_undone():
+    rng = np.random.default_rng(0)
+    shown, before = {}, None
+    for _ in range(500):
+        wanted = {"exp_coeff": rng.normal(size=(1, 40)), "pose": rng.normal(size=(1, 6)), "scale": np.ones(1)}
+        given = overshot(wanted, shown)
+        for name in ("exp_coeff", "pose"):
+            drawn = given[name] if before is None else before[name] * 0.5 + given[name] * 0.5
+            assert np.abs(drawn - wanted[name]).max() < 2e-6
+            given[name] = drawn
+        before = given
+
+
+@pytest.mark.parametrize("offset", [(0, 0), (0.5, -0.5), (7.3, -2.8), (-3.5, 11.25)])
+def test_a_square_has_the_principal_point_in_its_middle(offset):
+    width, height = 60, 81
+    K = np.array([[90.0, 0, width / 2 + offset[0]], [0, 93.0, height / 2 + offset[1]], [0, 0, 1]])
+    camera = Camera("a", width, height, K, np.eye(4))
+    side = square_side([camera])
+    window = square(camera, side)
+    with pytest.raises(InputError):
+        square(camera, side - 1)
+    image = np.arange(width * height * 3, dtype=np.uint8).reshape(height, width, 3)
+    assert np.array_equal(window.uncut(window.padded(image, 9), camera), image)
+    points = np.random.default_rng(1).uniform([-0.25, -0.3, 1], [0.25, 0.3, 1], (200, 3))
+    there = points @ window.camera.world_to_camera[:3, :3].T @ window.camera.K.T
+    here = points @ K.T
+    found = there[:, :2] / there[:, 2:] + [window.left, window.top]
+    assert np.abs(found - here[:, :2]).max() < 0.15  # half a pixel taken up by a turn of a camera of 60 by 81
+    assert window.camera.K[0, 2] == window.camera.K[1, 2] == side / 2
