@@ -36,7 +36,7 @@ from ..specs import MetricSpec
 from .adaptation import AdaptedClip, TrainingView
 from .config import ResolvedMethod
 from .scoring import FULL, Frames, make_metric, score_frames
-from .store import Cell, RunFolder
+from .store import Cell, RunFolder, avatar_files
 
 log = logging.getLogger(__name__)
 RESULT_FORMAT = 1  # raise when a step changes what it leaves behind
@@ -188,7 +188,7 @@ def fit(job: Job) -> Avatar:
             peak_memory_bytes=memory.peak,
             memory_before_bytes=memory.before,
             method=job.method.record(),
-            files=job.cell.digests(path for path in job.cell.avatar.rglob("*") if path.is_file()),
+            files=job.cell.digests(avatar_files(job.cell.avatar)),
         )
         log.info("%s: trained in %s", job.name, duration(seconds))
     avatar: Avatar = method.load(job.cell.avatar, device=job.device)

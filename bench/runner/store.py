@@ -142,6 +142,11 @@ class Cell:
         self.begin(name, fingerprint, status="done", **record)
 
 
+def avatar_files(folder: Path) -> list[Path]:
+    """Files of an avatar's folder, sorted; logs, which official programs leave there, are no part of the avatar."""
+    return sorted(path for path in folder.rglob("*") if path.is_file() and path.suffix != ".log")
+
+
 def _damage(path: Path, known: str) -> str:
     if not path.is_file():
         return "is missing"

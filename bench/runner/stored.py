@@ -10,7 +10,7 @@ from ..io.files import digest, digest_file
 from ..registry import get
 from ..specs import MethodSpec
 from .config import ResolvedMethod, default_names, resolve_method
-from .store import RunFolder
+from .store import RunFolder, avatar_files
 
 
 def avatar_folder(folder: Path) -> Path:
@@ -55,7 +55,6 @@ def stored_method(folder: Path, method: str = "", preset: str = "") -> ResolvedM
 
 
 def avatar_digest(folder: Path) -> str:
-    """Digest of all files of an avatar."""
+    """Digest of all files of an avatar; see `avatar_files`."""
     home = avatar_folder(folder)
-    files = sorted(path for path in home.rglob("*") if path.is_file())
-    return digest([[path.relative_to(home).as_posix(), digest_file(path)] for path in files])
+    return digest([[path.relative_to(home).as_posix(), digest_file(path)] for path in avatar_files(home)])

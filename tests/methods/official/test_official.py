@@ -14,8 +14,16 @@ from headbench.bench.io.documents import read_json
 from headbench.bench.io.files import digest_file, grouped_writes
 from headbench.bench.io.images import read_png
 from headbench.bench.runner.adaptation import TrainingView
+from headbench.bench.runner.stored import avatar_digest
 from headbench.methods.official.ga.windows import inside
-from headbench.methods.official.method import RENDERING, TRAINING, TRAINING_LOG, Workplace, check_export
+from headbench.methods.official.method import (
+    RENDERING,
+    RENDERING_LOG,
+    TRAINING,
+    TRAINING_LOG,
+    Workplace,
+    check_export,
+)
 from headbench.methods.official.process import ProgramError
 
 from .conftest import brightness
@@ -122,6 +130,16 @@ def test_every_held_out_frame_is_rendered_under_its_key(avatar, official_clip, t
         assert np.abs(frame.rgb[0, 0, :2] * 255 - expected).max() <= 1.01
         assert np.ptp(frame.rgb, axis=(0, 1)).max() == 0
     assert not (tmp_path / "avatar" / RENDERING).exists()
+
+
+def test_logs_are_no_part_of_an_avatar(avatar, official_clip, tmp_path):
+    folder = tmp_path / "avatar"
+    before = avatar_digest(folder)
+    list(avatar.render_listed(views(official_clip, "novel_view"), (1.0, 1.0, 1.0), no_progress))
+    assert {path.name for path in folder.glob("*.log")} == {TRAINING_LOG, RENDERING_LOG}
+    assert avatar_digest(folder) == before
+    (folder / "point_cloud.ply").write_bytes(b"another")
+    assert avatar_digest(folder) != before
 
 
 def test_a_list_is_on_disk_where_the_harness_groups_writes(avatar, official_clip):
