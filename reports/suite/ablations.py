@@ -16,7 +16,9 @@ MARKING = (
 
 
 def ablation_table(runs: RunSet, method: str) -> Table:
-    """Differences of ablations from a method, with the columns of the comparison table.
+    """Differences of ablations from a method, with those columns of the comparison table that do not depend on the machine.
+
+    Speeds are left out: those of runs made one after another differ by up to a tenth without any difference of the method.
 
     Parameters
     ----------
@@ -25,8 +27,10 @@ def ablation_table(runs: RunSet, method: str) -> Table:
     in_first = [record.name for record in runs.runs[0].manifest.methods if not record.trivial]
     own, ablations = runs.ranked[in_first.index(method)], runs.ranked[len(in_first) :]
     table = table_of(runs)
+    bound = {spec.name for spec in runs.metrics if spec.machine_bound}
+    kept = tuple(column for column in table.columns if column.metric not in bound)
     columns = []
-    for column in table.columns:
+    for column in kept:
         found = compare(
             *(runs.rows, [(label, own) for label in ablations]),
             task=column.task,
@@ -40,7 +44,7 @@ def ablation_table(runs: RunSet, method: str) -> Table:
         TableRow(run.folder.root.name, versions[label], False, cells)
         for run, label, cells in zip(runs.runs[1:], ablations, zip(*columns), strict=True)
     )
-    return replace(table, groups=(("Ablations", rows),), notes=(), marking=MARKING)
+    return replace(table, columns=kept, groups=(("Ablations", rows),), notes=(), marking=MARKING)
 
 
 def _cell(found: PairedComparison, digits: int) -> TableCell:

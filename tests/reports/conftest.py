@@ -133,9 +133,12 @@ def write_run(tmp_path, write_manifest):
         folder = RunFolder(tmp_path / name)
         of_avatar = ("storage", "fps")
         specs = [
-            MetricSpec(m, m.upper(), "", m not in ("lpips", "storage"), 4, "m:m", kind=kind)
+            MetricSpec(
+                *(m, m.upper(), "", m not in ("lpips", "storage"), 4, "m:m"),
+                kind="avatar" if m in of_avatar else "frame",
+                machine_bound=m == "fps",
+            )
             for m in lines
-            for kind in ["avatar" if m in of_avatar else "frame"]
         ]
         settings = {method: (settings or {}).get(method) for method in methods}
         protocols = {task: f"hash-{task}" for task in TASKS}

@@ -149,22 +149,25 @@ def test_a_method_that_checks_is_asked_before_any_work(config, toy):
 
 
 @pytest.mark.parametrize(
-    ("needs", "fits"),
+    ("needs", "found"),
     [
-        ({"head_models": ("flame2020", "flame2023")}, False),
-        ({"head_models": ("toy",)}, True),
-        ({"monocular": True}, False),  # the toy's head is none whose motion could go into the cameras
-        ({"implementation": "toy_plugin:NoSuchClass"}, False),
+        ({"head_models": ("flame2020", "flame2023")}, "a head model in FLAME's layout"),
+        ({"head_models": ("toy",)}, None),
+        (
+            {"monocular": True},
+            "a head model in FLAME's layout",
+        ),  # the toy's head is none whose motion could go into the cameras
+        ({"implementation": "toy_plugin:NoSuchClass"}, "no attribute 'NoSuchClass'"),
     ],
 )
-def test_needs_are_checked_before_training(config, toy, monkeypatch, refuses, needs, fits):
+def test_needs_are_checked_before_training(config, toy, monkeypatch, refuses, needs, found):
     monkeypatch.setattr(toy.ToyClip, "head", types.SimpleNamespace(version="toy"))
     monkeypatch.setattr(toy, "SAME_NAME", replace(toy.METHOD, name="needy", **needs))
     both = ("toy_plugin:METHOD", "toy_plugin:SAME_NAME")
-    if fits:
+    if found is None:
         assert set(rows_of(config, methods=both)["status"]) == {"ok"}
     else:
-        refuses(config, "", HeadbenchError, methods=both)
+        refuses(config, found, HeadbenchError, methods=both)
 
 
 def test_several_views_for_a_monocular_method_are_refused(config, toy, monkeypatch, refuses):

@@ -25,6 +25,21 @@ def test_rows_are_ablations_and_cells_their_differences(make_run):
     assert [float(cell.text.split()[0]) for cell in row.cells] == pytest.approx(wanted, abs=1e-3)
 
 
+def test_speeds_of_different_runs_are_not_compared(write_run):
+    folders = [
+        write_run("whole", {"ours": 30.0}),
+        write_run("less", {"ours": 29.0}, {"ours": {"less": True}}),
+    ]
+    runs = RunSet.read(folders)
+    table = ablation_table(runs, "ours")
+    assert "fps" in {column.metric for column in table_of(runs).columns}
+    assert "fps" not in {column.metric for column in table.columns}
+    assert [cell.value for cell in table.rows[0].cells] == pytest.approx(
+        [{"psnr": -1.0, "ssim": -0.025, "lpips": 0.001, "storage": -0.1}[c.metric] for c in table.columns]
+    )
+    assert "Speed" not in table.caption
+
+
 @pytest.mark.parametrize(
     ("found", "text", "rank"),
     [
