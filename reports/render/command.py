@@ -40,7 +40,10 @@ class RenderSettings:
     """How far the orbit goes on beyond the outermost cameras, degrees."""
 
     video: bool = False
-    """Write videos, too: one for each sequence and camera."""
+    """Write videos, too: one for each sequence and camera. Needs PyAV (extra `video`)."""
+
+    beside: bool = False
+    """Put the captured image beside each frame of the videos."""
 
     fps: float = 25.0
     """Frames per second of the videos."""
@@ -65,6 +68,8 @@ class RenderSettings:
             raise ValueError("views is at least 1, beyond from 0 to less than 180 degrees")
         if not 0.0 < self.fps <= 1000.0:
             raise ValueError(f"fps is {self.fps}; above 0, at most 1000")
+        if self.beside and (not self.video or self.frames == "orbit"):
+            raise ValueError("beside is for videos of captured frames; an orbit has none")
 
 
 @writes("out")
@@ -72,7 +77,7 @@ def render(settings: RenderSettings, progress: Progress = no_progress) -> Findin
     """Render a stored avatar: frames of a task, or an orbit; as images and video.
 
     Images are 8-bit PNG of the capture's size on its background, an orbit's of the size that the method works at. Videos are
-    H.264 where OpenCV has an encoder, else MPEG-4.
+    WebM (VP9), which browsers play.
     """
     from .render import render_avatar
 

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from ...bench.contracts import ByteArray, Camera, Clip, FloatArray, FrameKey, HeadPose, Progress
+from ...bench.contracts import ByteArray, Camera, Clip, FloatArray, HeadPose, Progress
 from ...bench.errors import InputError
 from ...bench.io.files import grouped_writes
 from ...bench.io.images import quantise, read_png, write_png
-from ...bench.io.video import write_video
+from ...bench.io.video import webm_writer, write_webm
 from ...bench.runner.adaptation import AdaptedClip, MethodNeeds, carry_out, plan
 from ...bench.runner.captures import open_clips, reader_of
 from ...bench.runner.config import RunConfig
@@ -27,13 +28,14 @@ ORBIT = "orbit"
 
 
 class Shot(NamedTuple):
-    """A frame to render: its file, what it is of, and the way to the size it is written at."""
+    """A frame to render: its file, what it is of, the way to the size it is written at, and its captured image, if any."""
 
     path: Path
     video: Path
     camera: Camera
     pose: HeadPose
     finish: Callable[[FloatArray], FloatArray]
+    captured: Callable[[], ByteArray] | None = None
 
 
 def render_avatar(settings: RenderSettings, progress: Progress) -> Findings:
@@ -42,6 +44,8 @@ def render_avatar(settings: RenderSettings, progress: Progress) -> Findings:
     Raises `InputError` for what is no avatar, a capture that the method cannot take, and for cameras and timesteps
     that the capture lacks.
     """
+    if settings.video:
+        webm_writer()
     method = stored_method(Path(settings.avatar), settings.method, settings.preset)
     clip = _clip(settings)
     needs = MethodNeeds.of(method.spec)
@@ -60,7 +64,7 @@ def render_avatar(settings: RenderSettings, progress: Progress) -> Findings:
             rgb = avatar.render(shot.camera, shot.pose, background).rgb
             write_png(shot.path, quantise(shot.finish(rgb)))
             progress(index + 1, len(shots), shot.path.name)
-    videos = _videos(shots, settings.fps) if settings.video else []
+    videos = _videos(shots, settings) if settings.video else []
     text = f"{out}: {len(shots)} frames in {shots[0].path.parent.name}/" + "".join(f"\n{v}" for v in videos)
     return Findings(text, {"out": out, "frames": [shot.path for shot in shots], "videos": videos})
 
@@ -96,12 +100,11 @@ def _frames(settings: RenderSettings, clip: Clip, form: AdaptedClip, out: Path) 
         seen = form.key(key)
         camera, pose = form.clip.cameras[seen.camera], form.clip.poses[seen.timestep]
         name = Cell(out).render(settings.frames, key).name
-        video = out / f"{settings.frames}_{key.sequence}_{key.camera}.mp4"
-        yield Shot(out / settings.frames / name, video, camera, pose, _finish(form, key))
-
-
-def _finish(form: AdaptedClip, key: FrameKey) -> Callable[[FloatArray], FloatArray]:
-    return lambda rgb: form.restore(key, rgb)
+        video = out / f"{settings.frames}_{key.sequence}_{key.camera}.webm"
+        yield Shot(
+            *(out / settings.frames / name, video, camera, pose),
+            *(partial(form.restore, key), partial(clip.image, key)),
+        )
 
 
 def _orbit(settings: RenderSettings, form: AdaptedClip, out: Path) -> Iterator[Shot]:
@@ -116,7 +119,7 @@ def _orbit(settings: RenderSettings, form: AdaptedClip, out: Path) -> Iterator[S
     for number, view in enumerate(views):
         pose = poses[number % len(poses)]
         yield Shot(
-            out / ORBIT / f"{number:05d}.png", out / f"{ORBIT}.mp4", view.camera, pose, lambda rgb: rgb
+            out / ORBIT / f"{number:05d}.png", out / f"{ORBIT}.webm", view.camera, pose, lambda rgb: rgb
         )
 
 
@@ -128,16 +131,17 @@ def _known(option: str, asked: Sequence[int | str], known: Iterable[int | str], 
         raise InputError("command line", option, f"those of {of}: {shown}", ", ".join(map(str, unknown)))
 
 
-def _videos(shots: Sequence[Shot], fps: float) -> list[Path]:
+def _videos(shots: Sequence[Shot], settings: RenderSettings) -> list[Path]:
     """Write the frames of each video in order of their names, which is that of time."""
-    parts: dict[Path, list[Path]] = {}
+    parts: dict[Path, list[Shot]] = {}
     for shot in shots:
-        parts.setdefault(shot.video, []).append(shot.path)
-    for video, paths in parts.items():
-        write_video(video, (_even(read_png(path)) for path in paths), fps)
+        parts.setdefault(shot.video, []).append(shot)
+    for video, members in parts.items():
+        write_webm(video, (_pictured(shot, settings.beside) for shot in members), settings.fps)
     return list(parts)
 
 
-def _even(image: ByteArray) -> ByteArray:
-    """The image, its last row or column repeated where the codec would not take an odd size."""
-    return np.pad(image, ((0, image.shape[0] % 2), (0, image.shape[1] % 2), (0, 0)), mode="edge")
+def _pictured(shot: Shot, beside: bool) -> ByteArray:
+    """The frame as a video has it: as it was written, with the captured image on its left if asked for."""
+    image = read_png(shot.path)
+    return np.hstack([shot.captured(), image]) if beside and shot.captured else image

@@ -57,7 +57,7 @@ WRITERS = [
         f"evaluate {AVATAR.format('ga')} --avatar --like run --out out",
         MEASURED_FILES,
     ),
-    Writer("render", "run", f"render {AVATAR.format('ga')} --capture capture --out out --video", ("*.mp4",)),
+    Writer("render", "run", f"render {AVATAR.format('ga')} --capture capture --out out --video", ("*.webm",)),
     Writer("sweep", "run", "sweep run --methods ga --variants half", MEASURED_FILES),
     Writer("curve", "run", "curve run --methods ga --fractions 1/2 1 --frames 1", MEASURED_CURVE),
     Writer("bundle", "run", "bundle run --out out.zip --by Somebody --renders"),

@@ -1,12 +1,14 @@
 """Frames of stored avatars: those of a run to the bit, named so that they can be scored; orbits; videos."""
 
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from headbench.bench.errors import InputError
+from headbench.bench.errors import InputError, UnavailableError
 from headbench.bench.io.images import read_png
 from headbench.bench.runner.store import RunFolder
 from headbench.reports.render.command import RenderSettings, render
@@ -37,13 +39,26 @@ def test_frames_are_those_of_the_run(settings, cell, tmp_path, split):
     assert all(a.read_bytes() == b.read_bytes() for a, b in zip(found, theirs))
 
 
-def test_cameras_and_timesteps_choose_what_videos_hold(settings):
-    findings = render(replace(settings, cameras=("1", "3"), timesteps=(4, 5), video=True, fps=10.0))
+@pytest.mark.parametrize("beside", [False, True])
+def test_cameras_and_timesteps_choose_what_videos_hold(settings, beside):
+    chosen = replace(settings, cameras=("1", "3"), timesteps=(4, 5), video=True, fps=10.0, beside=beside)
+    findings = render(chosen)
     assert len(findings.data["frames"]) == 4
-    for video in findings.data["videos"]:
+    assert [path.name for path in findings.data["videos"]] == [
+        "self_reenactment_FREE_1.webm",
+        "self_reenactment_FREE_3.webm",
+    ]
+    for video, camera in zip(findings.data["videos"], "13"):
         stream = cv2.VideoCapture(str(video))
-        assert (stream.get(cv2.CAP_PROP_FRAME_COUNT), stream.get(cv2.CAP_PROP_FPS)) == (2, 10)
-    assert len(findings.data["videos"]) == 2
+        assert stream.get(cv2.CAP_PROP_FPS) == 10
+        for timestep in (4, 5):
+            wanted = read_png(video.parent / f"self_reenactment/FREE_{timestep:05d}_{camera}.png")
+            if beside:
+                wanted = np.hstack([np.full_like(wanted, 40 * timestep), wanted])  # as the clip has them
+            shown = stream.read()[1][..., ::-1].astype(float)
+            assert shown.shape == wanted.shape
+            assert np.abs(shown - wanted).mean() < 4
+        assert not stream.read()[0]
 
 
 def test_an_orbit_looks_at_the_head_from_all_sides(settings):
@@ -52,7 +67,7 @@ def test_an_orbit_looks_at_the_head_from_all_sides(settings):
         rows, columns = np.nonzero(read_png(path)[..., 0] < 200)
         assert abs(rows.mean() - 14.5) < 1  # the ball is where the cameras look, and its picture where K says
         assert abs(columns.mean() - 11.5) < 1
-    assert [path.name for path in frames.data["videos"]] == ["orbit.mp4"]
+    assert [path.name for path in frames.data["videos"]] == ["orbit.webm"]
 
 
 @pytest.mark.parametrize(
@@ -73,7 +88,14 @@ def test_what_cannot_be_rendered_is_refused_before_work(settings, tmp_path, monk
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("change", [{"views": 0}, {"beyond": 180.0}, {"fps": 0.0}])
+@pytest.mark.parametrize("change", [{"views": 0}, {"beyond": 180.0}, {"fps": 0.0}, {"beside": True}])
 def test_settings_without_meaning_are_refused(settings, change):
     with pytest.raises(ValueError, match="is"):
         replace(settings, **change)
+
+
+def test_a_video_without_its_writer_is_refused_before_work(settings, monkeypatch):
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(UnavailableError, match="PyAV"):
+        render(replace(settings, video=True))
+    assert not Path(settings.out).exists()
