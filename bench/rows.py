@@ -186,14 +186,18 @@ class Rows:
     def of_part(self, region: str, sequences: Collection[str], full: str) -> Rows:
         """Rows of frames over one region, which stands for the ``full`` one, in some sequences (none named: all).
 
-        Rows of avatars as a whole stay.
+        Rows of avatars as a whole stay, and so do those that stand for all frames of a task because a method failed, for
+        every task and metric that the part has frames of.
         """
         table = self._table
         avatar = table["task"] == ""
         chosen = table["region"] == region
         if sequences:
             chosen &= table["sequence"].isin(list(sequences))
-        return Rows(table[avatar | chosen].assign(region=full))
+        chosen &= ~avatar & (table["timestep"] >= 0)
+        measured = pd.MultiIndex.from_frame(table.loc[chosen, ["task", "metric"]])
+        failed = (table["timestep"] < 0) & pd.MultiIndex.from_frame(table[["task", "metric"]]).isin(measured)
+        return Rows(table[avatar | chosen | failed].assign(region=full))
 
     @property
     def regions(self) -> set[str]:

@@ -66,8 +66,8 @@ class RunData:
         return processor if device == "cpu" else f"{device}, {processor}"
 
     def keys(self, task: str) -> Sequence[FrameKey]:
-        """Frames of a task, sorted."""
-        return sorted(self.manifest.protocols[task].keys)
+        """Frames of a task, sorted; none of a task that was not scored."""
+        return sorted(self.manifest.protocols[task].keys) if task in self.manifest.protocols else []
 
     @property
     def seed(self) -> int:
@@ -165,6 +165,7 @@ class RunSet:
     """Runs on the same frames, in the order given. The methods in their ``rows`` are named by labels.
 
     ``part`` says in words which part of the frames the rows are of, "" for all. ``records`` says by label what the method was, as in the manifest; ``trivial`` has labels of trivial baselines.
+    ``keys`` has the frames of each task by the protocol, those included that no method has a value of.
     """
 
     runs: tuple[RunData, ...]
@@ -173,6 +174,7 @@ class RunSet:
     tasks: tuple[str, ...]
     records: Mapping[str, MethodRecord]
     trivial: tuple[str, ...]
+    keys: Mapping[str, frozenset[FrameKey]]
     part: str = ""
 
     @classmethod
@@ -199,7 +201,8 @@ class RunSet:
         }
         tasks = tuple(dict.fromkeys(task for run in runs for task in run.tasks))
         trivial = tuple(label for label, record in records.items() if record.trivial)
-        return cls(runs, rows, _metrics(runs), tasks, records, trivial).of(part)
+        keys = {task: frozenset(key for run in runs for key in run.keys(task)) for task in tasks}
+        return cls(runs, rows, _metrics(runs), tasks, records, trivial, keys).of(part)
 
     def of(self, part: Part) -> RunSet:
         """A part of the frames of runs that were read whole.
@@ -211,7 +214,11 @@ class RunSet:
         rows = _of_part(self.rows, part, self.runs[0].folder.rows)
         tasks = tuple(task for task in self.tasks if task in rows.tasks)
         metrics = tuple(spec for spec in self.metrics if spec.name in rows.metrics)
-        return replace(self, rows=rows, tasks=tasks, metrics=metrics, part=part.text)
+        chosen = {
+            task: frozenset(k for k in keys if not part.sequences or k.sequence in part.sequences)
+            for task, keys in self.keys.items()
+        }
+        return replace(self, rows=rows, tasks=tasks, metrics=metrics, keys=chosen, part=part.text)
 
     @property
     def methods(self) -> tuple[str, ...]:

@@ -215,6 +215,7 @@ def table_of(runs: RunSet, layout: str = COMPARISON, published: bool = False) ->
         machine=runs.machine,
         part=runs.part if tasks else "",
         missing=runs.missing if tasks else (),
+        keys=runs.keys,
         avatar_title=TITLES.get(layout, AVATAR_TITLE),
     )
     if published:

@@ -6,10 +6,11 @@ A value is a mean of means: frames -> sequence -> subject -> seed, each level we
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
+from ..bench.contracts import FrameKey
 from ..bench.protocol import TASK_TITLES
 from ..bench.rows import ALL, Rows
 from ..bench.runner.scoring import FULL
@@ -151,6 +152,7 @@ def build_table(
     machine: str = "",
     part: str = "",
     missing: Sequence[str] = (),
+    keys: Mapping[str, Collection[FrameKey]] | None = None,
     avatar_title: str = AVATAR_TITLE,
 ) -> Table:
     """Build the comparison table of whole images.
@@ -163,6 +165,7 @@ def build_table(
     metrics : columns of the table, in order; those per frame appear once in each task, the others last.
     methods : in order; one without rows is shown as not measured.
     trivial : those of ``methods`` that are trivial baselines: listed apart, not ranked.
+    keys : frames of each task, where more are scored than there are rows of.
     protocol_ids : readable name of each task's protocol, for the caption, like ``image_size``, ``machine``, ``part`` and the
         sentences of ``missing``.
     avatar_title : heading of the columns that are of no task.
@@ -196,7 +199,10 @@ def build_table(
         columns=columns,
         groups=tuple((title, members) for title, members in groups if members),
         notes=tuple(notes),
-        tasks=tuple(_task_summary(rows, task, protocol_ids.get(task, "")) for task in tasks),
+        tasks=tuple(
+            _task_summary(rows, task, protocol_ids.get(task, ""), (keys or {}).get(task, ()))
+            for task in tasks
+        ),
         seeds=max(1, len(rows.seeds(ALL))),
         marking=_marking(columns, lines, bests),
         image_size=image_size,
@@ -206,8 +212,10 @@ def build_table(
     )
 
 
-def _task_summary(rows: Rows, task: str, protocol_id: str) -> TaskSummary:
-    frames = rows.frames(task, FULL)
+def _task_summary(rows: Rows, task: str, protocol_id: str, keys: Collection[FrameKey]) -> TaskSummary:
+    frames: set[tuple[str, str, int, str]] = rows.frames(task, FULL)
+    subjects = {key[0] for key in frames}
+    frames |= {key for key in keys if key.subject not in subjects}  # on these every method failed
     subjects = {key[0] for key in frames}
     title = TASK_TITLES.get(task, task)
     return TaskSummary(task, title, protocol_id, "".join(rows.protocols(task)), len(frames), len(subjects))

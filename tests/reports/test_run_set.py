@@ -109,3 +109,28 @@ def test_a_part_that_runs_do_not_have_is_refused(faces, part, words):
 def test_no_run_is_refused():
     with pytest.raises(InputError, match="at least one folder"):
         RunSet.read([])
+
+
+@pytest.fixture
+def half_failed(faces):
+    """The run with a region, with one subject failed: a row for each metric and task, of no frame."""
+    import pandas as pd
+
+    rows = pd.read_parquet(faces / "rows.parquet")
+    lost = rows["subject"] == "subject2"
+    failed = rows[lost & (rows["region"] == "full")].drop_duplicates(["task", "metric"])
+    failed = failed.assign(
+        sequence="", timestep=-1, camera="", value=float("nan"), status="failed", reason="E"
+    )
+    pd.concat([rows[~lost], failed]).to_parquet(faces / "rows.parquet", index=False)
+    return faces
+
+
+@pytest.mark.parametrize("part", [Part(), Part("face"), Part(sequences=("FREE",)), Part("face", ("FREE",))])
+def test_a_method_that_failed_on_a_subject_has_no_mean_of_the_others(half_failed, part):
+    table = table_of(RunSet.read([half_failed], part))
+    assert {cell.status for row in table.rows for cell in row.cells} == {"failed"}
+    assert all(task.subjects == 2 for task in table.tasks)
+    assert [task.task for task in table.tasks] == (
+        ["self_reenactment"] if part.sequences else ["novel_view", "self_reenactment"]
+    )
