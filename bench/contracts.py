@@ -336,8 +336,11 @@ class Method(Protocol):
 class CheckedMethod(Method, Protocol):
     """A method that can tell before any long work whether `fit` could do it. Optional."""
 
-    def check(self, clip: Clip, budget: Budget) -> None:
-        """Raise `InputError` for settings that name what is not there, and for what `fit` would refuse."""
+    def check(self, clip: Clip | None, budget: Budget) -> None:
+        """Raise `InputError` for settings that name what is not there, and for what `fit` would refuse.
+
+        First called without a clip, before anything is made that takes long: then all but the clip is looked at.
+        """
 
 
 @runtime_checkable

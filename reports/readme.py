@@ -76,7 +76,8 @@ def demo_block(gallery: Path) -> str:
     """Return the README's block for the stored result of the demo: Markdown."""
     record = RunFolder(gallery).read_manifest()
     machine = record.machine
-    minutes = ", ".join(f"{method} {value:.1f}" for method, value in _minutes(gallery) if value >= 0.05)
+    timed = [(method, value) for method, value in _minutes(gallery) if value is not None]
+    minutes = ", ".join(f"{method} {value:.1f}" for method, value in timed if value >= 0.05)
     cost = (
         f"Minutes of training: {minutes}, on {machine['cores']} cores ({machine['processor']}); the largest process took "
         f"{(record.peak_memory_bytes or 0) / 1e9:.1f} GB."
@@ -85,15 +86,17 @@ def demo_block(gallery: Path) -> str:
     return f"{picture}\n\n{table_text([gallery], 'md').strip()}\n\n{cost}"
 
 
-def _minutes(run_folder: Path) -> list[tuple[str, float]]:
-    """Minutes of training of every method that was trained, of one subject after another.
+def _minutes(run_folder: Path) -> list[tuple[str, float | None]]:
+    """Minutes of training of every method and subject that was trained; None of one that was interrupted.
 
     Not the run's own length: of one that was continued it is that of its last part.
     """
     rows = Rows.read(RunFolder(run_folder).rows)
     trained = rows.select(method=ALL, metric="training_time", task="", region=FULL, seeds=ALL)
-    trained = trained[trained["status"] == "ok"]
-    return list(zip(trained["method"].astype(str), trained["value"].astype(float)))
+    ended = trained["status"] == "ok"
+    return [
+        (str(m), float(v) if ok else None) for m, v, ok in zip(trained["method"], trained["value"], ended)
+    ]
 
 
 def suite_results(folder: Path) -> str:
@@ -108,11 +111,13 @@ def _runs(folder: Path) -> list[Path]:
 
 def suite_block(folder: Path) -> str:
     """Return the README's block for the stored results of the suite: Markdown."""
-    hours = sum(value for each in _runs(folder) for _, value in _minutes(each)) / 60
+    minutes = [value for each in _runs(folder) for _, value in _minutes(each)]
+    hours = sum(value for value in minutes if value is not None) / 60
+    interrupted = f", without {minutes.count(None)} that were interrupted" if None in minutes else ""
     return (
         f"{table_text([folder / 'run'], 'md').strip()}\n\n"
         f"[Tables by region and by part of FREE, paired differences with tests]({SUITE}/{RESULTS}). "
-        f"Training took {hours:.1f} hours."
+        f"{len(minutes)} trainings, baselines included, took {hours:.1f} hours{interrupted}."
     )
 
 

@@ -117,8 +117,11 @@ def _open(settings: EvaluateSettings) -> tuple[RunConfig, list[Clip]]:
     if label in discover("methods"):
         expected = "a name that no registered method has"
         raise InputError("command line", "--label", expected, repr(label), f"For example {label}-official.")
-    if Path(settings.out).resolve() == Path(settings.like or "").resolve():
-        raise InputError("command line", "--out", "a folder of its own", "that of the run")
+    folder = RunFolder(Path(settings.out))
+    held = [method.name for method in folder.read_manifest().methods] if folder.manifest.exists() else [label]
+    if held != [label]:
+        expected, found = f"a new folder, or one with {label} alone", f"a run of {', '.join(held)}"
+        raise InputError("command line", "--out", expected, found, "Its results would be lost.")
     if settings.like is not None:
         options = RunOptions(data=settings.clip, head=settings.head, trust=settings.trust)
         config, clips = open_run_clips(

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..contracts import Avatar, Clip
+from ..contracts import Avatar, CheckedMethod, Clip
 from ..errors import HeadbenchError, InputError, UnavailableError
 from ..io.files import atomic_path, output_inside, prepare_folder
 from ..io.lock import locked
@@ -60,6 +60,10 @@ def _run(
     for method in methods:
         method.create()  # an implementation that cannot be imported or made is not to be found out hours later
     clips = open_clips(config)
+    for method in methods:
+        cells = [folder.cell(clip.subject, method.spec.name, seed) for clip in clips for seed in config.seeds]
+        if not all(cell.ended("measure") for cell in cells):
+            check_settings(method)
     protocols = make_protocols(config.tasks, clips, config.frames_per_task)
     jobs = make_jobs(config, methods, clips, protocols, folder)
     for job in jobs:
@@ -86,6 +90,13 @@ def _run(
     write_reports(folder.root)
     log.info("finished in %s: %s", duration(time.perf_counter() - start), folder.root)
     return rows
+
+
+def check_settings(method: ResolvedMethod) -> None:
+    """Let a method that can tell refuse its settings before anything is made that takes long."""
+    made = method.create()
+    if isinstance(made, CheckedMethod):
+        made.check(None, method.budget)
 
 
 def write_reports(run_folder: Path) -> list[Path]:

@@ -133,6 +133,14 @@ class Cell:
         state = self.step(name)
         return state is not None and state.get("fingerprint") == fingerprint and state.get("status") == "done"
 
+    def ended(self, name: str) -> bool:
+        """Say whether the step ended, with whatever inputs; not of a record that cannot be read."""
+        try:
+            state = self.step(name)
+        except InputError:
+            return False
+        return state is not None and state.get("status") == "done"
+
     def begin(self, name: str, fingerprint: str, *, status: str = "started", **record: Any) -> None:
         """Record that the step works on these inputs."""
         write_json(self.folder / f"{name}.json", {"fingerprint": fingerprint, "status": status, **record})

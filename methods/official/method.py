@@ -271,22 +271,23 @@ class OfficialMethod(ABC, Generic[Config]):
         """Check the settings; see `checkout.look`."""
         return look(self.name, self.config, self.repository)
 
-    def check(self, clip: Clip, budget: Budget) -> None:
+    def check(self, clip: Clip | None, budget: Budget) -> None:
         """Raise `InputError` for a checkout or an interpreter that is not there, and work that the code cannot do."""
         self._checked(clip, budget)
 
-    def _checked(self, clip: Clip, budget: Budget) -> Checkout:
+    def _checked(self, clip: Clip | None, budget: Budget) -> Checkout:
         check_budget(budget)
         if budget.iterations is None or budget.seconds is not None:
             remedy = f"--set settings.{self.name}.budget.iterations=N, and no seconds."
             raise InputError(
                 "budget", "seconds", "iterations alone; their code knows no clock", "seconds", remedy
             )
-        check_training_split(clip)
         self.check_launch()
         checkout = self.look()
-        self.check_clip(clip, checkout)
         self.check_length(budget.iterations, checkout)
+        if clip is not None:
+            check_training_split(clip)
+            self.check_clip(clip, checkout)
         return checkout
 
     def fit(

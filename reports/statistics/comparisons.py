@@ -118,12 +118,16 @@ class PairedComparison:
         return sum(sign * value > 0 for _, value in self.differences)
 
     @property
+    def testable(self) -> bool:
+        """Whether so many subjects could give a corrected p-value at the level at all."""
+        return self.family * least_p(self.subjects) <= self.level
+
+    @property
     def verdict(self) -> str:
         """What may be said, in words."""
         if self.difference is None or self.p_holm is None:
             return "no comparison"
-        # Whether so many subjects could give a corrected p-value at the level at all.
-        if self.family * least_p(self.subjects) > self.level:
+        if not self.testable:
             needed = subjects_needed(self.level, self.family)
             return f"not testable with {counted(self.subjects, 'subject')} (it takes {needed})"
         if self.p_holm > self.level:

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 from ..runs import RunSet
-from ..statistics.comparisons import LEVEL, PairedComparison, compare
+from ..statistics.comparisons import LEVEL, PairedComparison, compare, counted, subjects_needed
 from ..table_report import table_of
 from ..tables import Table, TableCell, TableRow
 
-MARKING = (
-    f"Ablation minus method, mean over subjects and its {100 * (1 - LEVEL):g} % interval. Bold: they differ by the exact "
-    f"sign-flip test over subjects, Holm over the ablations of a column, {LEVEL:.0%}."
-)
+MEANING = f"Ablation minus method, mean over subjects and its {100 * (1 - LEVEL):g} % interval."
+TEST = f"exact sign-flip test over subjects, Holm over the ablations of a column, {LEVEL:.0%}"
 
 
 def ablation_table(runs: RunSet, method: str) -> Table:
@@ -29,7 +28,7 @@ def ablation_table(runs: RunSet, method: str) -> Table:
     table = table_of(runs)
     bound = {spec.name for spec in runs.metrics if spec.machine_bound}
     kept = tuple(column for column in table.columns if column.metric not in bound)
-    columns = []
+    columns, tested = [], []
     for column in kept:
         found = compare(
             *(runs.rows, [(label, own) for label in ablations]),
@@ -39,12 +38,22 @@ def ablation_table(runs: RunSet, method: str) -> Table:
             level=LEVEL,
         )
         columns.append([_cell(each, column.digits) for each in found])
+        tested += [each for each in found if each.p_holm is not None]
     versions = {row.method: row.version for row in table.rows}
     rows = tuple(
         TableRow(run.folder.root.name, versions[label], False, cells)
         for run, label, cells in zip(runs.runs[1:], ablations, zip(*columns), strict=True)
     )
-    return replace(table, columns=kept, groups=(("Ablations", rows),), notes=(), marking=MARKING)
+    return replace(table, columns=kept, groups=(("Ablations", rows),), notes=(), marking=_marking(tested))
+
+
+def _marking(tested: Sequence[PairedComparison]) -> str:
+    if any(each.testable for each in tested) or not tested:
+        return f"{MEANING} Bold: they differ ({TEST})."
+    first = tested[0]
+    needed = subjects_needed(LEVEL, first.family)
+    subjects = counted(first.subjects, "subject")
+    return f"{MEANING} With {subjects} no test can tell whether they differ (it takes {needed}; {TEST})."
 
 
 def _cell(found: PairedComparison, digits: int) -> TableCell:

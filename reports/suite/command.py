@@ -2,15 +2,37 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from ...bench.contracts import Progress, no_progress
+from ...bench.errors import InputError
 from ...bench.runner.config import parse_size
 from ...bench.specs import Findings, writes
 
 SEED = 26_000
 """Of the suite's captures. Settings of methods are chosen on captures of seeds below 10,000 (`README.md`)."""
+
+ABLATIONS: Mapping[str, Mapping[str, Any]] = {
+    "no-lines": {"lines": {"enabled": False}},
+    "lines-move-splats": {"lines": {"dynamic": ["position", "rotation", "scale"]}},
+    "lines-color": {"lines": {"dynamic": ["color"]}},
+    "no-penalty": {"penalty": {"weight": 0.0}},
+    "no-balanced-sampling": {"sampling": {"balanced": False}},
+    "fixed-sizes": {"capacity": {"mode": "fixed"}},
+    "harmonics": {"color": "sh"},
+    "lines-in-head": {"lines": {"bounds": "head"}},
+    "no-direction-smoothing": {"planes": {"direction_smoothing": 0.0}},
+    "published": {
+        "capacity": {"mode": "fixed"},
+        "lines": {"bounds": "head"},
+        "planes": {"direction_smoothing": 0.0, "residual_lr": 0.0, "move_splats": True},
+    },
+}
+"""Settings of ours by the name of what is left out or changed; the first two are the paper's Table 4."""
+
+ALL = "all"
 
 
 @dataclass(frozen=True)
@@ -33,11 +55,12 @@ class SuiteSettings:
     seeds: tuple[int, ...] = (0,)
     """Seeds of the training."""
 
-    ablations: bool = False
-    """Train ours with parts left out, too: each a run of its own on the same captures."""
+    ablations: tuple[str, ...] = ()
+    """Train ours with these parts left out or changed, too, each a run of its own on the same captures; or "all"."""
 
     subjects: int = 10
-    """How many of the suite's subjects, from the first; fewer than 6 allow no test of significance."""
+    """How many of the suite's subjects, from the first. To be told apart two methods take 6 of them, five methods 8, ten
+    ablations 9."""
 
     cameras: int = 8
     """Views of each, the held-out one included."""
@@ -55,8 +78,16 @@ class SuiteSettings:
     """As for `headbench synth`."""
 
     def __post_init__(self) -> None:
-        """Refuse sizes that are none."""
+        """Refuse sizes and names that are none."""
         parse_size(self.size)
+        unknown = [name for name in self.ablations if name not in (*ABLATIONS, ALL)]
+        if unknown:
+            raise InputError("command line", "--ablations", f"{', '.join(ABLATIONS)} or {ALL}", unknown[0])
+
+    @property
+    def chosen(self) -> tuple[str, ...]:
+        """Names of the ablations asked for, in the order of `ABLATIONS`."""
+        return tuple(name for name in ABLATIONS if name in self.ablations or ALL in self.ablations)
 
 
 @writes("out")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -12,37 +11,27 @@ from ...bench.errors import InputError
 from ...bench.io.files import write_text
 from ...bench.machine import check_device
 from ...bench.registry import discover, get, resolve
-from ...bench.runner.config import RunConfig, parse_size, resolve_methods, resolve_metrics
-from ...bench.runner.run import run
+from ...bench.runner.config import (
+    ResolvedMethod,
+    RunConfig,
+    parse_size,
+    resolve_methods,
+    resolve_metrics,
+)
+from ...bench.runner.run import check_settings, run
 from ...bench.runner.scoring import FULL
+from ...bench.runner.store import RunFolder
 from ...bench.specs import Findings
 from ..runs import Part, RunSet
 from ..statistics.command import CompareSettings, compare_methods
 from ..table_report import table_of
 from ..writers import to_markdown
 from .ablations import ablation_table
-from .command import SEED, SuiteSettings
+from .command import ABLATIONS, SEED, SuiteSettings
 
 OURS = "ours"
 REGIONS = ("face", "mouth", "eyes", "hair", "neck", "ears")
 """Parts of the frame that have tables of their own."""
-ABLATIONS: Mapping[str, Mapping[str, Any]] = {
-    "no-lines": {"lines": {"enabled": False}},
-    "lines-move-splats": {"lines": {"dynamic": ["position", "rotation", "scale"]}},
-    "lines-color": {"lines": {"dynamic": ["color"]}},
-    "no-penalty": {"penalty": {"weight": 0.0}},
-    "no-balanced-sampling": {"sampling": {"balanced": False}},
-    "fixed-sizes": {"capacity": {"mode": "fixed"}},
-    "harmonics": {"color": "sh"},
-    "lines-in-head": {"lines": {"bounds": "head"}},
-    "no-direction-smoothing": {"planes": {"direction_smoothing": 0.0}},
-    "published": {
-        "capacity": {"mode": "fixed"},
-        "lines": {"bounds": "head"},
-        "planes": {"direction_smoothing": 0.0, "residual_lr": 0.0, "move_splats": True},
-    },
-}
-"""Settings of ours by the name of what is left out or changed; the first two are the paper's Table 4."""
 
 
 def run_suite(settings: SuiteSettings, progress: Progress) -> Findings:
@@ -58,14 +47,20 @@ def run_suite(settings: SuiteSettings, progress: Progress) -> Findings:
         expected = f"{OURS} among them, which --ablations are compared with"
         raise InputError("command line", "--methods", expected, ", ".join(methods))
     runs = {"run": _config(settings, out, "run", methods, {})}
-    for name, changes in ABLATIONS.items() if settings.ablations else ():
-        runs[f"ablation-{name}"] = _config(
-            settings, out, f"ablation-{name}", ("ours",), {"ours": dict(changes)}
-        )
-    for config in runs.values():
-        resolve_methods(config)
+    for name in settings.chosen:
+        changes = {OURS: dict(ABLATIONS[name])}
+        runs[f"ablation-{name}"] = _config(settings, out, f"ablation-{name}", (OURS,), changes)
+    for name, config in runs.items():
+        resolved = resolve_methods(config)
         resolve_metrics(config)
         check_device(config.device)
+        folder = RunFolder(Path(config.out))
+        if not (folder.manifest.exists() and folder.read_manifest().status == "done"):
+            for method in resolved:
+                check_settings(method)
+        if name != "run" and resolved[0].record() == _ours(runs["run"]).record():
+            expected = f"ablations that change {OURS} of preset {settings.preset}"
+            raise InputError("command line", "--ablations", expected, name.removeprefix("ablation-"))
     make = resolve(get("datasets", "synthetic").implementation)
     make(
         out / "capture",
@@ -84,6 +79,10 @@ def run_suite(settings: SuiteSettings, progress: Progress) -> Findings:
     write_text(out / "results.md", text)
     data = {"out": out, "runs": [out / name for name in runs], "failed": failed}
     return Findings(f"{text}\n{out / 'results.md'}", data, not any(failed.values()))
+
+
+def _ours(config: RunConfig) -> ResolvedMethod:
+    return next(method for method in resolve_methods(config) if method.spec.name == OURS)
 
 
 def _config(

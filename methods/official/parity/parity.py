@@ -13,7 +13,7 @@ from typing import Any
 from scipy.stats import t as student_t
 
 from ....bench.configuration import build
-from ....bench.contracts import Budget, Progress
+from ....bench.contracts import Progress
 from ....bench.io.documents import read_json
 from ....bench.io.files import write_json, write_text
 from ....bench.io.lock import locked
@@ -21,7 +21,7 @@ from ....bench.progress import log_to_file
 from ....bench.registry import get
 from ....bench.rows import Rows
 from ....bench.runner.config import RunConfig, parse_size, resolve_methods
-from ....bench.runner.run import run
+from ....bench.runner.run import check_settings, run
 from ....bench.runner.scoring import FULL
 from ....bench.runner.store import RunFolder
 from ....bench.specs import Findings
@@ -71,8 +71,10 @@ def compare(settings: ParitySettings, progress: Progress) -> Findings:
     """Train and score both, and write the table of their differences; see the command."""
     out = Path(settings.out)
     config = run_config(settings, out)
-    native, official = (method.spec.name for method in resolve_methods(config))
-    _check_before(config)
+    methods = resolve_methods(config)
+    for method in methods:
+        check_settings(method)
+    native, official = (method.spec.name for method in methods)
     with log_to_file(out / "parity.log"):
         if settings.data is None:
             _make_capture(settings, out, progress)
@@ -178,15 +180,6 @@ def _half_width(values: Sequence[float]) -> float | None:
         return None
     quantile = float(student_t.ppf(0.5 + CONFIDENCE / 2, len(values) - 1))
     return quantile * stdev(values) / math.sqrt(len(values))
-
-
-def _check_before(config: RunConfig) -> None:
-    """Find out what is wrong with checkout and interpreter before a capture is made."""
-    for method in resolve_methods(config):
-        made = method.create()
-        if hasattr(made, "look"):
-            checkout = made.look()
-            made.check_length(Budget(**asdict(method.budget)).iterations, checkout)
 
 
 def _capture(out: Path) -> Path:

@@ -133,9 +133,13 @@ def test_a_registered_name_is_no_label(run, images, tmp_path):
         scored(images, run, tmp_path / "out", label="ga")
 
 
-def test_the_runs_own_folder_is_no_place_to_write(run, images):
-    with pytest.raises(InputError, match="a folder of its own"):
+def test_the_folder_of_a_run_is_no_place_to_write(run, images, tmp_path):
+    with pytest.raises(InputError, match="a new folder, .* found a run of "):
         scored(images, run, run)
+    scored(images, run, tmp_path / "out")
+    scored(images, run, tmp_path / "out")
+    with pytest.raises(InputError, match="a new folder, "):
+        scored(images, run, tmp_path / "out", label="others")
 
 
 def test_what_to_score_against_has_to_be_said(images, tmp_path):

@@ -8,6 +8,7 @@ from headbench.bench import cli
 from headbench.bench.registry import get
 from headbench.bench.runner.config import resolve_method
 from headbench.reports.suite import suite as module
+from headbench.reports.suite.command import ABLATIONS
 
 SMALL = ("--subjects", "2", "--cameras", "2", "--timesteps", "60", "--size", "16x16", "--edition", "1")
 
@@ -28,10 +29,10 @@ def test_the_suite_makes_subjects_and_tables_by_region_and_part(tmp_path, capsys
     assert all(path.stat().st_mtime_ns == time for path, time in made.items() if "renders" in path.parts)
 
 
-@pytest.mark.parametrize("name", module.ABLATIONS)
+@pytest.mark.parametrize("name", ABLATIONS)
 def test_every_ablation_is_a_setting_of_ours_that_changes_it(name):
     plain = resolve_method(get("methods", "ours"), "fast", {})
-    changed = resolve_method(get("methods", "ours"), "fast", module.ABLATIONS[name])
+    changed = resolve_method(get("methods", "ours"), "fast", ABLATIONS[name])
     assert changed.record() != plain.record()
 
 
@@ -41,7 +42,13 @@ def test_every_ablation_is_a_setting_of_ours_that_changes_it(name):
         (["--methods", "nothing"], "nothing"),
         (["--preset", "huge"], "huge"),
         (["--size", "big"], "WIDTHxHEIGHT"),
-        (["--ablations", "--methods", "ga"], "ours among them"),
+        (["--ablations", "all", "--methods", "ga"], "ours among them"),
+        (["--ablations", "no-head"], "no-lines, lines-move-splats"),
+        (
+            ["--ablations", "no-lines", "fixed-sizes", "--preset", "paper"],
+            "ablations that change ours of preset paper",
+        ),
+        (["--methods", "ours", "ga-official"], "checkout"),
     ],
 )
 def test_what_cannot_be_run_is_refused_before_a_capture_is_made(tmp_path, capsys, words, match):
