@@ -127,7 +127,7 @@ def half_failed(faces):
 
 
 @pytest.mark.parametrize("part", [Part(), Part("face"), Part(sequences=("FREE",)), Part("face", ("FREE",))])
-def test_a_method_that_failed_on_a_subject_has_no_mean_of_the_others(half_failed, part):
+def test_a_failed_subject_leaves_no_mean_of_the_others(half_failed, part):
     table = table_of(RunSet.read([half_failed], part))
     assert {cell.status for row in table.rows for cell in row.cells} == {"failed"}
     assert all(task.subjects == 2 for task in table.tasks)
