@@ -62,7 +62,7 @@ def call(words: Sequence[str]) -> int:
         description=description,
         args=words,
         config=config,
-        registry=_optional_values(),
+        registry=_values(),
     )
     return code
 
@@ -164,8 +164,11 @@ def _nested(group: Mapping[str, Command]) -> Command:
     return chosen
 
 
-def _optional_values() -> tyro.constructors.ConstructorRegistry:
-    """How options that may be left out (``str | None``) are read and shown: as their values are."""
+def _values() -> tyro.constructors.ConstructorRegistry:
+    """How two kinds of options are read and shown.
+
+    Those that may be left out (``str | None``) as their values are; lists (``tuple[str, ...]``) also with commas.
+    """
     registry = tyro.constructors.ConstructorRegistry()
 
     @registry.primitive_rule
@@ -182,6 +185,27 @@ def _optional_values() -> tyro.constructors.ConstructorRegistry:
         return replace(
             value,
             str_from_instance=lambda found: ["none"] if found is None else value.str_from_instance(found),
+        )
+
+    @registry.primitive_rule
+    def listed(
+        info: tyro.constructors.PrimitiveTypeInfo,
+    ) -> tyro.constructors.PrimitiveConstructorSpec[Any] | None:
+        kinds = get_args(info.type)
+        named = {
+            tyro.conf.Positional,
+            tyro.conf.UseAppendAction,
+        } & info.markers  # folders; each option one value
+        if info.type_origin is not tuple or named or kinds not in [(kind, ...) for kind in (str, int, float)]:
+            return None
+        return tyro.constructors.PrimitiveConstructorSpec(
+            nargs="*",
+            metavar=f"[{kinds[0].__name__.upper()} [{kinds[0].__name__.upper()} ...]]",
+            instance_from_str=lambda words: tuple(
+                kinds[0](part) for word in words for part in word.split(",") if part
+            ),
+            is_instance=lambda found: isinstance(found, tuple),
+            str_from_instance=lambda found: [str(value) for value in found],
         )
 
     return registry

@@ -24,6 +24,19 @@ class Settings:
     limit: float = 0.5
     """Most that may be wrong."""
 
+@dataclass(frozen=True)
+class Lists:
+    paths: tyro.conf.Positional[tuple[str, ...]]
+    """Where."""
+    names: tuple[str, ...] = ()
+    """Which."""
+    levels: tuple[float, ...] = (1.0,)
+    """How much."""
+
+def count(settings: Lists, progress):
+    """Count them."""
+    return Findings("", {"lists": [settings.paths, settings.names, settings.levels]})
+
 @writes("path")
 def make(settings: Settings, progress):
     """Make it."""
@@ -59,6 +72,20 @@ def test_settings_are_options_and_findings_are_printed(offer, capsys):
     assert capsys.readouterr().out == "looked at here\n"
     assert cli.main(["look", "here", "--limit", "0.25", "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == {"limit": 0.25}
+
+
+@pytest.mark.parametrize(
+    ("words", "lists"),
+    [
+        (["a,b", "c"], [["a,b", "c"], [], [1.0]]),  # a comma in a file's name is one
+        (["a", "--names", "x,y", "z", "--levels", "0.5,2"], [["a"], ["x", "y", "z"], [0.5, 2.0]]),
+        (["a", "--names", "x,", "y", "--levels=-1,2"], [["a"], ["x", "y"], [-1.0, 2.0]]),
+    ],
+)
+def test_lists_have_commas_or_spaces(offer, capsys, words, lists):
+    offer("count", function="toy_command:count")
+    assert cli.main(["count", *words, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == {"lists": lists}
 
 
 def test_findings_decide_the_exit_code(offer, capsys):
