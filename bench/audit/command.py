@@ -123,7 +123,8 @@ class EvaluateSettings:
     names: str = ""
     """How the images are named, if not by key: official-ga, official-tga (FOLDER is the model's, with test/ours_N/renders and
     val/ours_N/renders as their render.py writes them), official-gbs (test/split_N, put on the capture's background by
-    their masks), or a file MAP.csv with the columns file, sequence, timestep, camera (and subject with several)."""
+    their masks), official-insta (FOLDER is experiments/CONFIG/debug, with its overlay), or a file MAP.csv with the columns
+    file, sequence, timestep, camera (and subject with several)."""
 
     like: str | None = None
     """Run whose protocols to follow: capture, reader and its settings, tasks, frames, metrics are taken from it."""

@@ -15,7 +15,7 @@ import numpy as np
 from ..contracts import ByteArray, Clip, FrameKey
 from ..errors import InputError
 from ..io.files import read_bytes
-from ..io.images import read_png
+from ..io.images import read_pixels, read_png
 from ..registry import get, resolve, unknown
 from ..runner.captures import found_captures
 from ..runner.config import RunConfig
@@ -28,7 +28,10 @@ _MAP_REMEDY = "Name the images one by one with --names MAP.csv (columns file, se
 
 
 class Render(NamedTuple):
-    """An image of a frame. With ``alpha``, whose red channel is its coverage, it is on black; else on the background."""
+    """An image of a frame. With ``alpha`` it is on black; else on the background.
+
+    Coverage is the fourth channel of ``alpha`` if that is the image itself, else its red channel.
+    """
 
     image: Path
     alpha: Path | None = None
@@ -99,7 +102,13 @@ def composited(render: Render, background: Sequence[float]) -> ByteArray:
     """(H, W, 3) pixels of a render on black, put on ``background`` by its coverage."""
     assert render.alpha is not None
     image = read_png(render.image).astype(np.float32)
-    coverage = read_png(render.alpha)[..., :1].astype(np.float32) / 255
+    if render.alpha == render.image:
+        pixels = read_pixels(render.image)
+        if pixels.ndim != 3 or pixels.shape[2] != 4:
+            raise InputError(render.image, "", "colours and coverage (RGBA)", "no coverage")
+        coverage = pixels[..., 3:].astype(np.float32) / 255
+    else:
+        coverage = read_png(render.alpha)[..., :1].astype(np.float32) / 255
     ground = 255 * np.asarray(background, np.float32)
     return np.rint(image + (1 - coverage) * ground).clip(0, 255).astype(np.uint8)
 
@@ -153,12 +162,7 @@ GBS_TEST_FRAMES = 350
 
 def _gaussian_blendshapes(folder: Path, clip: Clip, listing: Listing) -> Renders:
     """``test/split_<iterations>/pred_<index>.png``: the last 350 frames; ``seq/...``: all of them. On black."""
-    frames = sorted(_every_frame(clip), key=lambda key: (key.timestep, key.camera))
-    repeated = [t for t, n in Counter(key.timestep for key in frames).items() if n > 1]
-    if repeated:
-        expected = "a capture of one camera, whose timesteps give the order"
-        found = f"several frames at timestep {repeated[0]}"
-        raise InputError(f"clip {clip.subject}", "cameras", expected, found, _MAP_REMEDY)
+    frames = _of_one_camera(clip, _every_frame(clip))
     found_: Renders = {}
     for name, numbered in (("seq", frames), ("test", frames[-GBS_TEST_FRAMES:])):
         made = _latest(folder / name, "split")
@@ -173,12 +177,37 @@ def _gaussian_blendshapes(folder: Path, clip: Clip, listing: Listing) -> Renders
     return found_
 
 
+def _insta(folder: Path, clip: Clip, listing: Listing) -> Renders:
+    """``overlay/<index>.png`` in the folder of its output: the test split, in the order of meshes' names. On black."""
+    held_out = {key.sequence for key in clip.splits["self_reenactment"]}
+    frames = _of_one_camera(clip, [key for key in _every_frame(clip) if key.sequence in held_out])
+    made = folder / "overlay"
+    if not made.is_dir():
+        expected = "overlay, as the program leaves it in experiments/CONFIG/debug of the video's folder"
+        raise InputError(folder, "", expected, "none")
+    images = _numbered(made, "", [len(frames)], "transforms_test.json")
+    return {key: Render(image, image) for key, image in zip(frames, images)}
+
+
+def _of_one_camera(clip: Clip, keys: Iterable[FrameKey]) -> list[FrameKey]:
+    """Frames in order. Raises `InputError` where the order is not given by their timesteps."""
+    frames = sorted(keys, key=lambda key: (key.timestep, key.camera))
+    repeated = [t for t, n in Counter(key.timestep for key in frames).items() if n > 1]
+    if repeated:
+        expected = "a capture of one camera, whose timesteps give the order"
+        found = f"several frames at timestep {repeated[0]}"
+        raise InputError(f"clip {clip.subject}", "cameras", expected, found, _MAP_REMEDY)
+    return frames
+
+
 OFFICIAL: Mapping[str, Callable[[Path, Clip, Listing], Renders]] = {
     "official-ga": _gaussian_avatars,
     "official-tga": _gaussian_avatars,
     "official-gbs": _gaussian_blendshapes,
+    "official-insta": _insta,
 }
-"""How the official repositories of GaussianAvatars, ours (TensorialGaussianAvatar) and GaussianBlendshapes number renders."""
+"""How the official repositories of GaussianAvatars, ours (TensorialGaussianAvatar), GaussianBlendshapes and INSTA number
+renders."""
 
 
 def _every_frame(clip: Clip) -> set[FrameKey]:

@@ -9,7 +9,7 @@ import shlex
 import shutil
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from typing import Any
 from ...bench.errors import InputError
 from ...bench.io.documents import checked, parse_json
 from ...bench.io.files import read_bytes
-from .config import OfficialConfig
+from .config import INSTAOfficialConfig, OfficialConfig
 from .process import environment
 
 SHORTEST_COMMIT = 7
@@ -48,6 +48,12 @@ if not found["missing"]:
 print("\\nheadbench-probe " + json.dumps(found))
 """
 
+_DEVICES = """
+import ctypes
+driver, count = ctypes.CDLL("libcuda.so.1"), ctypes.c_int()
+print("headbench-devices", 0 if driver.cuInit(0) or driver.cuDeviceGetCount(ctypes.byref(count)) else count.value)
+"""
+
 
 @dataclass(frozen=True)
 class Repository:
@@ -58,7 +64,7 @@ class Repository:
     url : where it is.
     commit : the one that its adapter was written for.
     scripts : files that tell its checkout from another folder.
-    modules : what has to be importable in its interpreter.
+    modules : what has to be importable in its interpreter, where it has one.
     trial : a statement that has to work there, "" for none, and what to do where it does not.
     downloads : files that the authors offer apart from it and expect in it, and where each comes from.
     """
@@ -79,7 +85,7 @@ class Checkout:
     Attributes
     ----------
     folder : of the checkout, absolute.
-    python : command of the interpreter.
+    python : command of the interpreter, or of the program where the code is one.
     record : commit, files that differ from it, versions; for the avatar's record.
     """
 
@@ -102,25 +108,87 @@ def find_constant(folder: Path, file: str, pattern: str, what: str) -> str:
     return match[1]
 
 
-def look(method: str, config: OfficialConfig, repository: Repository) -> Checkout:
-    """Check the settings of a method: folder, commit, interpreter, what it can import, and a GPU.
-
-    Raises `InputError` that names the setting and the next step for the first that is not as it should be.
-    """
-    folder, record = look_at_folder(method, config, repository)
-    python, versions = look_at_interpreter(method, config, repository)
-    return Checkout(folder, python, record | versions)
+Environment = tuple[tuple[str, ...], dict[str, Any]]
+"""Command of what runs the code of a checkout, and versions for the avatar's record."""
 
 
-def look_at_interpreter(
-    method: str, config: OfficialConfig, repository: Repository
-) -> tuple[tuple[str, ...], dict[str, Any]]:
+def look_at_interpreter(method: str, config: OfficialConfig, repository: Repository) -> Environment:
     """Command and versions of the interpreter; see `look`."""
     python = _interpreter(method, config)
     if config.device != "cuda":
         needed = tuple(name for name in repository.modules if name.partition(".")[0] not in SHIMMED)
         repository = replace(repository, modules=(*needed, SHIM), trial="")
     return python, _probed(method, python, repository, cuda=config.device == "cuda")
+
+
+def look_at_program(method: str, config: INSTAOfficialConfig, repository: Repository) -> Environment:
+    """Command and version of the program that a build leaves in the checkout, and a GPU; see `look`."""
+    source = f"settings.{method}.program"
+    try:
+        words = shlex.split(config.program)
+    except ValueError:
+        words = []
+    if not words:
+        raise InputError(source, "", "the program that was built", repr(config.program)[:80])
+    if not config.checkout:
+        raise InputError(f"settings.{method}", "checkout", "the folder that the program was built in", "none")
+    inside = Path(config.checkout).expanduser().resolve() / words[0]
+    built = f"Build it as {repository.url} says: cmake . -B build && cmake --build build -j, in the checkout."
+    program = shutil.which(inside if len(words) == 1 else os.path.expanduser(words[0]))
+    if program is None:
+        raise InputError(
+            inside if len(words) == 1 else words[0], source, "a program that can be run", "none", built
+        )
+    command = (str(Path.cwd() / program), *words[1:])
+    said = _answer([*command, "--version"], source)
+    match = re.search(r"neural graphics primitives version (\S{1,40})", said)
+    if match is None:
+        found = " ".join(said.split())[-200:] or "no answer"
+        raise InputError(
+            program, source, "an answer to --version, as the authors' program gives", found, built
+        )
+    devices = re.search(r"headbench-devices (\d+)", _answer([sys.executable, "-c", _DEVICES], source))
+    if devices is None or devices[1] == "0":
+        remedy = "Run it on a machine with an NVIDIA GPU."
+        raise InputError(program, source, "a CUDA device, by NVIDIA's driver", "none", remedy)
+    return command, {"program": f"instant-ngp {match[1]}"}
+
+
+def _answer(command: Sequence[str], source: str) -> str:
+    """What a command says, both streams, within `PROBE_S`."""
+    try:
+        done = subprocess.run(
+            command,
+            check=False,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            stdin=subprocess.DEVNULL,
+            timeout=PROBE_S,
+            env=environment(),
+            start_new_session=True,
+        )
+    except subprocess.TimeoutExpired as error:
+        raise InputError(command[0], source, f"an answer within {PROBE_S:g} s", "none") from error
+    except OSError as error:
+        expected = "a program of this machine"
+        raise InputError(command[0], source, expected, error.strerror or str(error)) from error
+    return done.stdout.decode(errors="replace")
+
+
+def look(
+    method: str,
+    config: OfficialConfig,
+    repository: Repository,
+    environment: Callable[[], Environment] | None = None,
+) -> Checkout:
+    """Check the settings of a method: folder, commit, what runs its code, what that can import, and a GPU.
+
+    ``environment`` looks at what runs the code; None takes `look_at_interpreter`. Raises `InputError` that names the
+    setting and the next step for the first that is not as it should be.
+    """
+    folder, record = look_at_folder(method, config, repository)
+    python, versions = environment() if environment else look_at_interpreter(method, config, repository)
+    return Checkout(folder, python, record | versions)
 
 
 def look_at_folder(
@@ -130,8 +198,13 @@ def look_at_folder(
     source, commit = f"settings.{method}", config.commit
     remedy = (
         f"git clone --recursive {repository.url} DIR && git -C DIR checkout {repository.commit[:12]}; then --set "
-        f"settings.{method}.checkout=DIR and --set settings.{method}.python=PYTHON of an environment made as its "
-        "installation page says (methods/official/README.md)."
+        f"settings.{method}.checkout=DIR"
+        + (
+            f" and --set settings.{method}.python=PYTHON of an environment made"
+            if repository.modules
+            else ", built"
+        )
+        + " as its installation page says (methods/official/README.md)."
     )
     if not config.checkout:
         raise InputError(source, "checkout", f"the folder of a checkout of {repository.url}", "none", remedy)

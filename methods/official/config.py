@@ -82,3 +82,29 @@ class GHAOfficialConfig(OfficialConfig):
             raise ValueError(f"mesh_fraction must lie between 0 and 1, found {self.mesh_fraction}")
         if self.arguments:
             raise ValueError("arguments must be empty: the authors' scripts have none")
+
+
+@dataclass(frozen=True)
+class INSTAOfficialConfig(OfficialConfig):
+    """INSTA by its authors' code; the commit is the one that the adapter was written for.
+
+    Their code is a program and no Python, so that ``python`` has to be empty.
+
+    Attributes
+    ----------
+    program : what their build made: a file, in the checkout unless its path is absolute, or words that start it, such
+        as ``apptainer exec --nv insta.sif /path/INSTA/build/rta``.
+    images_on_gpu : training images that lie in the GPU's memory; of more, their code draws others every 1,500 iterations.
+    """
+
+    commit: str = "9c17968ed719f487025577f0fc477749134639c6"
+    program: str = "build/rta"
+    images_on_gpu: int = 1700
+
+    places: ClassVar[tuple[str, ...]] = (*OfficialConfig.places, "program")
+
+    def __post_init__(self) -> None:
+        if self.python:
+            raise ValueError("python must be empty: the authors' code is a program; set program")
+        if self.images_on_gpu < 1:
+            raise ValueError(f"images_on_gpu must be at least 1, found {self.images_on_gpu}")

@@ -36,7 +36,7 @@ from ..shared.avatar_files import is_finished, run_digest, write_record
 from ..shared.loop import Fit, Outcome, check_budget, check_training_split
 from ..shared.schedule import ShuffledEpochs
 from ..shared.threads import threads
-from .checkout import Checkout, Repository, look
+from .checkout import Checkout, Environment, Repository, look, look_at_interpreter
 from .config import OfficialConfig
 from .process import Ended, described, run_program
 
@@ -269,7 +269,11 @@ class OfficialMethod(ABC, Generic[Config]):
 
     def look(self) -> Checkout:
         """Check the settings; see `checkout.look`."""
-        return look(self.name, self.config, self.repository)
+        return look(self.name, self.config, self.repository, self.look_at_environment)
+
+    def look_at_environment(self) -> Environment:
+        """Check what runs their code: an interpreter, by default."""
+        return look_at_interpreter(self.name, self.config, self.repository)
 
     def check(self, clip: Clip | None, budget: Budget) -> None:
         """Raise `InputError` for a checkout or an interpreter that is not there, and work that the code cannot do."""

@@ -7,11 +7,12 @@ from typing import Any
 
 from ...bench.errors import InputError
 from ...bench.specs import Need
-from .checkout import look_at_folder, look_at_interpreter
+from .checkout import look_at_folder
 from .config import OfficialConfig
 from .ga.method import GAOfficial
 from .gbs.method import GBSOfficial
 from .gha.method import GHAOfficial
+from .insta.method import INSTAOfficial
 from .method import OfficialMethod
 from .tga.method import TGAOfficial
 
@@ -36,6 +37,11 @@ def gha(config: OfficialConfig, device: str) -> Iterator[Need]:
     return _needs(GHAOfficial, config)
 
 
+def insta(config: OfficialConfig, device: str) -> Iterator[Need]:
+    """Checkout of INSTA, the program that was built in it, and a GPU."""
+    return _needs(INSTAOfficial, config)
+
+
 def _needs(method: type[OfficialMethod[Any]], config: OfficialConfig) -> Iterator[Need]:
     try:
         folder, record = look_at_folder(method.name, config, method.repository)
@@ -45,8 +51,11 @@ def _needs(method: type[OfficialMethod[Any]], config: OfficialConfig) -> Iterato
         changed = f", {len(record['changed'])} files changed" if record.get("changed") else ""
         yield Need("checkout", f"{folder}, {record['commit'][:12] or 'no commit'}{changed}")
     try:
-        _, versions = look_at_interpreter(method.name, config, method.repository)
+        _, versions = method(config).look_at_environment()
     except InputError as error:
         yield Need("environment", "", str(error))
     else:
-        yield Need("environment", f"Python {versions['python']}, torch {versions['torch']}")
+        known = {"python": "Python ", "torch": "torch "}
+        yield Need(
+            "environment", ", ".join(f"{known.get(name, '')}{value}" for name, value in versions.items())
+        )

@@ -11,6 +11,7 @@ from ..gbs.spec import GBS
 from ..gbs.spec import SHORT as GBS_SHORT
 from ..gbs.spec import SHORT_SPLATS as GBS_SHORT_SPLATS
 from ..gha.spec import GHA
+from ..insta.spec import INSTA
 from ..shared.config import PAPER_ITERATIONS, SHORT_SPLATS
 
 
@@ -102,4 +103,17 @@ GHA_OFFICIAL = MethodSpec(
     preset_resolutions=GHA.preset_resolutions,
     native=False,
     source=GHA.source,
+)
+
+INSTA_OFFICIAL = MethodSpec(
+    name="insta-official",
+    summary="INSTA by its authors' code, a program that you have built in a checkout; needs CUDA.",
+    implementation="headbench.methods.official.insta.method:INSTAOfficial",
+    config="headbench.methods.official.config:INSTAOfficialConfig",
+    needs="headbench.methods.official.needs:insta",
+    # Their settings have no schedule to shorten.
+    presets={name: {"budget": INSTA.presets[name]["budget"]} for name in ("smoke", "demo", "fast", "paper")},
+    monocular=True,
+    native=False,
+    source=INSTA.source,
 )

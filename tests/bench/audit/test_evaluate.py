@@ -268,6 +268,35 @@ def test_gaussianblendshapes_numbers_the_last_350_frames(tmp_path):
         OFFICIAL["official-gbs"](tmp_path, clip, {})
 
 
+def test_insta_numbers_the_frames_that_are_held_out(tmp_path):
+    parts = ("video",) * 4 + ("video-held-out",) * 3
+    keys = [FrameKey("s", sequence, timestep, "0") for timestep, sequence in enumerate(parts)]
+    splits = {"train": keys[:3], "self_reenactment": keys[4:6]}
+    clip = SimpleNamespace(subject="s", splits=splits, excluded={keys[3]: "why", keys[6]: "why"})
+    (tmp_path / "overlay").mkdir()
+    for index in range(3):
+        (tmp_path / "overlay" / f"{index:05d}.png").touch()
+    found = OFFICIAL["official-insta"](tmp_path, clip, {})
+    assert {key: render.image.name for key, render in found.items()} == {
+        key: f"{index:05d}.png" for index, key in enumerate(keys[4:])
+    }
+    (tmp_path / "overlay/00002.png").unlink()
+    with pytest.raises(InputError, match="3 images.*transforms_test.json, found 2"):
+        OFFICIAL["official-insta"](tmp_path, clip, {})
+    with pytest.raises(InputError, match="expected overlay, as the program leaves it"):
+        OFFICIAL["official-insta"](tmp_path / "overlay", clip, {})
+
+
+def test_coverage_may_be_the_fourth_channel(tmp_path):
+    path = tmp_path / "00000.png"
+    cv2.imwrite(str(path), np.full((2, 3, 4), (0, 50, 100, 204), np.uint8))  # blue, green, red, coverage
+    image = composited(Render(path, path), (1.0, 0.5, 0.0))
+    assert image.tolist() == np.full((2, 3, 3), (151, 76, 0)).tolist()
+    write_png(path, np.zeros((2, 3, 3), np.uint8))
+    with pytest.raises(InputError, match="RGBA"):
+        composited(Render(path, path), (1.0, 0.5, 0.0))
+
+
 def test_renders_on_black_are_put_on_the_background(tmp_path):
     write_png(tmp_path / "pred.png", np.full((2, 3, 3), (100, 50, 0), np.uint8))
     write_png(tmp_path / "mask.png", np.full((2, 3, 3), (204, 0, 0), np.uint8))  # red has the coverage, 0.8

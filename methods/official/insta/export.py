@@ -1,0 +1,312 @@
+"""Videos and lists of frames in the form that INSTA's program reads, which is that of Metrical Tracker with ``generate.sh``.
+
+``transforms_train.json`` (camera-to-world with OpenCV's axes, metres; intrinsics of each frame), ``images`` with straight
+alpha, ``meshes``, ``flame/exp``, ``depth`` (16 bits, millimetres), ``seg_mask`` (a class in the red channel),
+``canonical.obj``; and ``mesh_masks``, which the program opens by its working directory. The head stands still.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from ....bench.contracts import (
+    ByteArray,
+    Camera,
+    Clip,
+    FloatArray,
+    FrameKey,
+    HeadAsset,
+    HeadPose,
+    IntArray,
+    Progress,
+)
+from ....bench.errors import InputError
+from ....bench.io.files import grouped_writes, read_bytes, write_bytes, write_json, write_text
+from ....datasets.head.subject import BATCH, PosedSubject, pose_in_head_frame
+from ....datasets.images import write_image
+from ...insta.config import InstaConfig
+from ...insta.marching import CanonicalSurface, PosedSurface
+from ...insta.rendering import camera_rays
+from ...insta.warp import bare_triangles, mouth_triangles
+from ...shared.avatar_files import Subject
+from ...shared.subject_mesh import pose_key
+from ..checkout import Checkout
+from ..ga.head_files import MOST_TEMPLATE
+from ..method import Listed, Workplace, write_placeholder
+from ..video import cameras_at_rest, straight_rgba
+
+MASKS: Mapping[str, tuple[str, ...]] = {
+    "lips": ("lips", "mouth_socket"),
+    "right_ear": ("right_ear",),
+    "left_ear": ("left_ear",),
+    "eye_region": ("eye_region",),
+    "boundary": ("boundary",),
+    "face": ("face",),
+}
+"""Their meshes that tell a region by red vertices, and our regions; a vertex of several belongs to the first."""
+MASK_FOLDER = "mesh_masks"
+SKIN, MOUTH, HAIR = 250, 140, 80
+"""Classes of pixels: losses of the mouth weigh more, and up to 90 there is no loss of depth."""
+CONDITIONS = 16
+"""Expression coefficients that the network reads; their program takes for granted that a file has as many."""
+REACH = 0.45
+"""Metres from the head's origin: their scene is a cube of one metre, and there has to be room about the head."""
+MILLIMETRES, FARTHEST = 1000, 65_535
+TRAIN, TEST, CANONICAL = "transforms_train.json", "transforms_test.json", "canonical.obj"
+PLACEHOLDER = "images/placeholder.png"
+PART = 1000
+"""Frames to render in one call: meshes of all lie in the GPU's memory."""
+
+
+@dataclass(frozen=True, eq=False)
+class VideoMesh:
+    """A head model and one identity as their program is given them: meshes without teeth, the static offset in them.
+
+    Attributes
+    ----------
+    head, posed : the clip's own, with teeth where it has them.
+    kept : (V',) vertices of theirs.
+    faces : (F', 3) triangles by theirs.
+    masks : files of regions, by name.
+    is_flames : whether vertices are FLAME's, so that triangles and regions are theirs.
+    """
+
+    head: HeadAsset
+    posed: PosedSubject
+    kept: IntArray
+    faces: IntArray
+    masks: Mapping[str, bytes]
+    is_flames: bool
+
+    @classmethod
+    def of(cls, subject: Subject, head: HeadAsset, checkout: Checkout) -> VideoMesh:
+        """Raises `InputError` for a head that is not where their scene is."""
+        posed = PosedSubject(head, subject.shape, subject.static_offset)
+        kept = np.setdiff1d(np.arange(len(head.template)), head.regions.get("teeth", []))
+        farthest = float(np.abs(posed.neutral[kept]).max())
+        if farthest > REACH:
+            expected = f"vertices within {REACH} m of the origin along each axis, as FLAME's are"
+            raise InputError(f"head model {head.version!r}", "template", expected, f"{farthest:.3g} m")
+        files = {
+            name: read_bytes(checkout.folder / MASK_FOLDER / f"{name}.obj", "an OBJ file", MOST_TEMPLATE)
+            for name in MASKS
+        }
+        text = files["lips"].decode(errors="replace")
+        if len(re.findall(r"^v\s", text, re.MULTILINE)) == len(kept):
+            corners = re.findall(r"^f\s+(\d+)\S*\s+(\d+)\S*\s+(\d+)\S*\s*$", text, re.MULTILINE)
+            theirs = np.array(corners, np.int64).reshape(-1, 3) - 1
+            if len(theirs) and 0 <= theirs.min() and theirs.max() < len(kept):
+                return cls(head, posed, kept, theirs, files, True)
+        number = np.full(len(head.template), -1)
+        number[kept] = np.arange(len(kept))
+        faces = number[head.faces[np.isin(head.faces, kept).all(axis=1)]]
+        return cls(head, posed, kept, faces, _masks(head, kept, faces, posed.neutral), False)
+
+    def write_masks(self, folder: Path) -> None:
+        """Write the files of regions below the program's working directory."""
+        for name, content in self.masks.items():
+            write_bytes(folder / MASK_FOLDER / f"{name}.obj", content)
+
+    def write_canonical(self, folder: Path) -> None:
+        """Write the mesh that the field is about: no expression, the jaw open as the tracker leaves it."""
+        rest, still = np.zeros(3), np.zeros(self.head.expression_basis.shape[2])
+        jaw = np.array([InstaConfig().jaw_opening, 0.0, 0.0])
+        pose = HeadPose(self.head.version, still, rest, rest, jaw, np.zeros(6), rest)
+        self.write(folder / CANONICAL, self.posed.meshes([pose])[0])
+
+    def write(self, path: Path, vertices: FloatArray) -> None:
+        """Write a mesh of the clip's head."""
+        write_text(path, _vertices(vertices[self.kept]) + _triangles(self.faces))
+
+    def write_poses(self, folder: Path, poses: Mapping[str, HeadPose]) -> None:
+        """Write mesh and expression of each frame, by the frame's name; an equal pose is written once and linked to."""
+        at_rest = {name: pose_in_head_frame(pose) for name, pose in poses.items()}
+        first: dict[bytes, str] = {}
+        for name, pose in at_rest.items():
+            first.setdefault(pose_key(pose), name)
+        written = [*first.values()]
+        for start in range(0, len(written), BATCH):
+            names = written[start : start + BATCH]
+            for name, mesh in zip(names, self.posed.meshes([at_rest[name] for name in names])):
+                self.write(folder / mesh_name(name), mesh)
+        for name, pose in at_rest.items():
+            values = np.zeros(max(CONDITIONS, len(pose.expression)))
+            values[: len(pose.expression)] = pose.expression
+            write_text(folder / expression_name(name), "".join(f"{value:.8f}\n" for value in values))
+            source = first[pose_key(pose)]
+            if source != name:
+                (folder / mesh_name(name)).symlink_to(Path(mesh_name(source)).name)
+
+
+def _vertices(vertices: FloatArray, colours: IntArray | None = None) -> str:
+    rows = vertices if colours is None else np.hstack([vertices, colours])
+    line = "v" + " {:.8g}" * rows.shape[1] + "\n"
+    return "".join(line.format(*row) for row in rows.tolist())
+
+
+def _triangles(faces: IntArray) -> str:
+    return "".join("f {} {} {}\n".format(*face) for face in (faces + 1).tolist())
+
+
+def _masks(head: HeadAsset, kept: IntArray, faces: IntArray, neutral: FloatArray) -> dict[str, bytes]:
+    """Meshes whose red vertices are a region's."""
+    taken = np.zeros(len(head.template), bool)
+    files = {}
+    for name, regions in MASKS.items():
+        inside = np.zeros(len(head.template), bool)
+        for region in regions:
+            inside[np.asarray(head.regions.get(region, ()), dtype=np.int64)] = True
+        inside &= ~taken
+        taken |= inside
+        colours = np.where(inside[kept, None], [1, 0, 0], [0, 0, 1])
+        files[name] = (_vertices(neutral[kept], colours) + _triangles(faces)).encode()
+    return files
+
+
+def mesh_name(name: str) -> str:
+    """Place of a frame's mesh; their program takes frames in the order of these."""
+    return f"meshes/{name}.obj"
+
+
+def expression_name(name: str) -> str:
+    """Place of a frame's expression coefficients."""
+    return f"flame/exp/{name}.txt"
+
+
+def frame_name(number: int) -> str:
+    """Name of a frame in a folder; names are in the order of numbers."""
+    return f"{number:06d}"
+
+
+def check_camera(camera: Camera) -> None:
+    """Raise `InputError` for a camera that their JSON cannot describe."""
+    if camera.K[0, 1]:
+        raise InputError(f"camera {camera.id}", "K[0, 1]", "no skew", f"{camera.K[0, 1]:g}")
+
+
+def write_training(clip: Clip, head: VideoMesh, work: Workplace, progress: Progress) -> dict[str, FrameKey]:
+    """Write the training frames, and as the split that their program renders in the end one that shows nothing.
+
+    It has an image of one pixel, and pose and camera of the first training frame. Depths and classes of pixels are
+    those of the mesh, where theirs are of a tracker and of a network that parses faces. Returns the key of every other
+    image by its place.
+    """
+    keys = sorted(clip.splits["train"], key=lambda key: (key.timestep, key.camera))
+    views = [(clip.cameras[key.camera], clip.poses[key.timestep]) for key in keys]
+    cameras = cameras_at_rest(head.posed, views)
+    surfaces = _Surfaces(head)
+    images: dict[str, FrameKey] = {}
+    records = []
+    head.write_canonical(work.input)
+    with grouped_writes():
+        head.write_poses(work.input, {frame_name(i): pose for i, (_, pose) in enumerate(views)})
+        for number, (key, camera, (_, pose)) in enumerate(zip(keys, cameras, views)):
+            name, pixels = frame_name(number), straight_rgba(clip, key)
+            classes, depth = surfaces.seen(pose, camera, pixels[..., 3])
+            for part, image in (("images", pixels), ("seg_mask", classes), ("depth", depth)):
+                write_image(work.input / f"{part}/{name}.png", image)
+                images[f"input/{part}/{name}.png"] = key
+            parts = {"depth_path": f"depth/{name}.png", "seg_mask_path": f"seg_mask/{name}.png"}
+            records.append({**record(name, camera, f"images/{name}.png"), **parts})
+            progress(number + 1, len(keys), "exporting")
+        write_placeholder(work.input / PLACEHOLDER)
+        shared = {**intrinsics(cameras[0]), "integer_depth_scale": 1 / MILLIMETRES}
+        write_json(work.input / TRAIN, {**shared, "frames": records})
+        last = record(frame_name(0), cameras[0], PLACEHOLDER)
+        write_json(work.input / TEST, {**shared, "frames": [last]})
+    return images
+
+
+class _Surfaces:
+    """What pixels of a clip's frames show of the mesh."""
+
+    def __init__(self, head: VideoMesh):
+        self._posed = head.posed
+        self._surface = CanonicalSurface(head.head, torch.from_numpy(head.posed.neutral))
+        mouth, bare = mouth_triangles(head.head).numpy(), bare_triangles(head.head).numpy()
+        self._classes = np.select([mouth, bare], [MOUTH, SKIN], HAIR).astype(np.uint8)
+        self._last: tuple[bytes, PosedSurface] | None = None
+
+    def seen(self, pose: HeadPose, camera: Camera, coverage: ByteArray) -> tuple[ByteArray, np.ndarray]:
+        """(H, W, 3) class in the red channel and (H, W) uint16 depth, millimetres along the axis; 0 where nothing is.
+
+        Hair where there is coverage beside the mesh.
+        """
+        rows, columns = np.nonzero(coverage)
+        rays = camera_rays(camera, columns, rows, 0.0)
+        found = self._of(pose).first_hit(rays)
+        hit = (found.triangles >= 0).numpy()
+        classes = np.zeros((*coverage.shape, 3), np.uint8)
+        classes[rows, columns, 0] = np.where(hit, self._classes[found.triangles.clamp_min(0).numpy()], HAIR)
+        along = found.values.numpy() * (rays.directions @ np.asarray(camera.world_to_camera[2, :3]))
+        depth = np.zeros(coverage.shape, np.uint16)
+        depth[rows, columns] = np.rint(np.where(hit, MILLIMETRES * along, 0)).clip(0, FARTHEST)
+        return classes, depth
+
+    def _of(self, pose: HeadPose) -> PosedSurface:
+        still = pose_in_head_frame(pose)
+        key = pose_key(still)
+        if self._last is None or self._last[0] != key:
+            self._last = key, self._surface.pose(torch.from_numpy(self._posed.meshes([still])[0]))
+        return self._last[1]
+
+
+def record(name: str, camera: Camera, image: str, *, height: int | None = None) -> dict[str, Any]:
+    """A frame of their JSON, its camera in the head's frame.
+
+    ``height`` is that of the image where it is not the camera's: their program takes focal lengths in images' heights.
+    """
+    return {
+        "transform_matrix": np.linalg.inv(np.asarray(camera.world_to_camera, np.float64)).tolist(),
+        "file_path": image,
+        "mesh_path": mesh_name(name),
+        "exp_path": expression_name(name),
+        **intrinsics(camera, (height or camera.height) / camera.height),
+    }
+
+
+def intrinsics(camera: Camera, scale: float = 1.0) -> dict[str, float]:
+    """Size, focal lengths times ``scale`` and principal point, pixels; the last is read as a share of the size."""
+    K = np.asarray(camera.K, np.float64)
+    return {
+        "w": float(camera.width),
+        "h": float(camera.height),
+        "fl_x": scale * float(K[0, 0]),
+        "fl_y": scale * float(K[1, 1]),
+        "cx": float(K[0, 2]),
+        "cy": float(K[1, 2]),
+    }
+
+
+def write_list(frames: Sequence[Listed], head: VideoMesh, work: Workplace) -> list[dict[str, Any]]:
+    """Write frames to render, in folders of one image size and at most `PART` frames each; return what to render.
+
+    That is ``folder``, ``width``, ``height`` and the ``numbers`` of its frames in order. Images are one pixel: rendering
+    reads none, and their program would hold all of them in the GPU's memory.
+    """
+    by_size: dict[tuple[int, int], list[Listed]] = {}
+    for frame in frames:
+        check_camera(frame.camera)
+        by_size.setdefault((frame.camera.width, frame.camera.height), []).append(frame)
+    parts: list[dict[str, Any]] = []
+    for (width, height), same in by_size.items():
+        for start in range(0, len(same), PART):
+            part, folder = same[start : start + PART], f"part_{len(parts):04d}"
+            cameras = cameras_at_rest(head.posed, [(frame.camera, frame.pose) for frame in part])
+            names = [frame_name(index) for index in range(len(part))]
+            with grouped_writes():
+                head.write_canonical(work.input / folder)
+                head.write_poses(work.input / folder, dict(zip(names, (frame.pose for frame in part))))
+                write_placeholder(work.input / folder / PLACEHOLDER)
+                records = [record(n, c, PLACEHOLDER, height=1) for n, c in zip(names, cameras)]
+                write_json(work.input / folder / TEST, {"frames": records})
+            numbers = [frame.number for frame in part]
+            parts.append({"folder": folder, "width": width, "height": height, "numbers": numbers})
+    return parts

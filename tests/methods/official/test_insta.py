@@ -1,0 +1,311 @@
+"""INSTA's adapter: the video that its program reads, where that may lie, renders on black read back by key."""
+
+import json
+import re
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from headbench.bench.contracts import Budget, no_progress
+from headbench.bench.errors import InputError
+from headbench.bench.io.documents import read_json
+from headbench.bench.runner.adaptation import TrainingView
+from headbench.datasets.head.subject import PosedSubject, pose_in_head_frame
+from headbench.datasets.monocular.mesh_fit import read_vertices
+from headbench.methods.official import checkout, needs
+from headbench.methods.official.config import INSTAOfficialConfig
+from headbench.methods.official.insta import export
+from headbench.methods.official.insta.export import HAIR, MOUTH, SKIN, VideoMesh
+from headbench.methods.official.insta.method import INSTAOfficial
+from headbench.methods.official.method import TRAINING_LOG, Listed, Workplace, check_export
+from headbench.methods.official.process import ProgramError
+from headbench.methods.shared.avatar_files import Subject
+
+from .insta_repository import make_insta_repository
+
+BUDGET = Budget(iterations=20)
+GROUND = (1.0, 1.0, 1.0)
+
+
+@pytest.fixture(autouse=True)
+def a_gpu(monkeypatch):
+    monkeypatch.setattr(checkout, "_DEVICES", "print('headbench-devices', 1)")
+
+
+@pytest.fixture
+def repository(tmp_path):
+    """Folder and commit of the stand-in, at a place with words in it that their program looks for in paths."""
+    folder = tmp_path / "train and test $(false)"
+    return folder, make_insta_repository(folder)
+
+
+@pytest.fixture
+def method(repository):
+    return INSTAOfficial(INSTAOfficialConfig(str(repository[0]), commit=repository[1]))
+
+
+@pytest.fixture
+def behave(repository):
+    return (repository[0] / "build" / "behaviour.txt").write_text
+
+
+@pytest.fixture
+def avatar(method, official_clip, tmp_path):
+    return fit(method, official_clip, tmp_path / "train" / "avatar")
+
+
+@pytest.fixture
+def exported(method, official_clip, tmp_path):
+    work = Workplace.at(tmp_path / "work")
+    work.make()
+    return work, method.export(TrainingView(official_clip), method.look(), work, no_progress)
+
+
+def fit(method, clip, out, progress=no_progress):
+    return method.fit(TrainingView(clip), out, BUDGET, device="cpu", seed=0, progress=progress)
+
+
+def views(clip, *splits):
+    return {k: (clip.cameras[k.camera], clip.poses[k.timestep]) for s in splits for k in clip.splits[s]}
+
+
+def test_frames_are_rendered_under_their_keys_on_any_ground(avatar, official_clip, monkeypatch):
+    monkeypatch.setattr(export, "PART", 4)  # more than one call of the program
+    assert {path.name for path in avatar.files()} == {"snapshot.msgpack", "subject.npz"}
+    wanted = views(official_clip, "self_reenactment", "novel_view", "train")
+    odd = next(iter(wanted))
+    wanted[odd] = (replace(wanted[odd][0], width=30), wanted[odd][1])  # and one of another size
+    subject = PosedSubject.of(official_clip)
+    drawn: list[int] = []
+    for ground in (GROUND, (0.0, 0.5, 1.0)):
+        drawn.clear()
+        found = dict(avatar.render_listed(wanted, ground, lambda done, total, note="": drawn.append(done)))
+        assert found.keys() == wanted.keys()
+        assert drawn == sorted(drawn)
+        assert drawn[-1] == len(wanted)
+        for key, (camera, pose) in wanted.items():
+            rgb = found[key].rgb
+            assert rgb.shape == (camera.height, camera.width, 3)
+            mesh = subject.meshes([pose_in_head_frame(pose)])[0]
+            levels = [30 + 20 * pose.expression[0], 5000 * mesh.std(), camera.K[0, 0]]
+            place = np.linalg.inv(camera.world_to_camera @ subject.motions([pose])[0])[:3, 3]
+            for pixel, shown in ((rgb[1, 1], levels), (rgb[0, 0], 75 + 60 * place)):
+                expected = np.floor(np.clip(shown, 0, 153)) / 255 + 0.4 * np.array(ground)
+                assert np.abs(pixel - expected).max() < 1.01 / 255
+            assert found[key].alpha == pytest.approx(0.6)
+
+
+def test_progress_log_and_record_are_those_of_the_program(method, repository, official_clip, tmp_path):
+    calls = []
+    fit(method, official_clip, tmp_path / "a", lambda done, total, note="": calls.append((done, note)))
+    frames = len(official_clip.splits["train"])
+    assert calls[-1][0] == frames + 20
+    assert (frames + 7, "loss 0.7") in calls
+    log = (tmp_path / "a" / TRAINING_LOG).read_text()
+    assert f"loads {frames} 1700" in log
+    assert len(re.findall(r"iteration=\d+", log)) == 20
+    record = read_json(tmp_path / "a" / "training.json")
+    assert record["official"]["commit"] == repository[1]
+    assert record["official"]["program"] == "instant-ngp 1.0dev"
+    assert record["leaks"] == []
+    assert any("8 expression coefficients" in line for line in record["differences"])
+
+
+@pytest.mark.parametrize(
+    ("behaviour", "expected"),
+    {"crash": "exit code 1.*out of memory", "no snapshot": "no whole avatar.*snapshot.msgpack"}.items(),
+)
+def test_a_training_that_fails_begins_anew(method, behave, official_clip, tmp_path, behaviour, expected):
+    """Renders that it left beside its input are none of the images that it may be given."""
+    behave(behaviour)
+    with pytest.raises(ProgramError, match=expected):
+        fit(method, official_clip, tmp_path / "a")
+    behave("")
+    calls = []
+    assert fit(method, official_clip, tmp_path / "a", lambda done, *_: calls.append(done)).files()
+    assert min(calls) > len(official_clip.splits["train"]), "the export was kept"
+
+
+@pytest.mark.parametrize(
+    ("behaviour", "expected"),
+    {
+        "crash in rendering": "exit code 1.*out of memory",
+        "one too few": r"lacks 1 of 3 renders, first 000001.png \(toy/",
+        "other size": "expected 28x36 pixels, found 27x36",
+        "reversed": "exit code 1.*rendered by the camera of another",
+        "no cameras": "exit code 1.*wrote no .*transforms_overlay.json",
+        "no coverage": "expected colours and coverage",
+    }.items(),
+)
+def test_renders_that_are_not_what_was_listed_are_found(avatar, behave, official_clip, behaviour, expected):
+    behave(behaviour)
+    with pytest.raises(ProgramError, match=expected):
+        list(avatar.render_listed(views(official_clip, "novel_view"), GROUND, no_progress))
+    behave("")
+    assert len(dict(avatar.render_listed(views(official_clip, "novel_view"), GROUND, no_progress))) == 3
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"program": "build/none"}, "build/none.*program: expected a program that can be run.*cmake"),
+        ({"program": "no-such-program build/rta"}, "no-such-program"),
+        ({"program": "'unclosed"}, "the program that was built"),
+        ({"program": "/bin/true"}, "an answer to --version.*cmake"),
+        ({"commit": "0" * 40}, "expected commit 000000000000"),
+        ({"checkout": "/nowhere"}, "no such folder.*git clone.*built as its installation page says"),
+        ({"device": "cpu-shim"}, "device: expected cuda"),
+    ],
+)
+def test_faults_of_settings_are_named_before_any_work(method, official_clip, changes, expected):
+    with pytest.raises(InputError, match=expected):
+        INSTAOfficial(replace(method.config, **changes)).check(official_clip, BUDGET)
+
+
+def test_doctor_says_whether_program_and_gpu_are_there(method, monkeypatch):
+    assert [need.found for need in needs.insta(INSTAOfficialConfig(), "cpu")] == ["", ""]
+    found = [*needs.insta(method.config, "cpu")]
+    assert [need.what for need in found] == ["checkout", "environment"]
+    assert found[0].found
+    assert found[1].found == "instant-ngp 1.0dev"
+    monkeypatch.setattr(checkout, "_DEVICES", "print('headbench-devices', 0)")
+    assert "a CUDA device" in [*needs.insta(method.config, "cpu")][1].remedy
+
+
+@pytest.mark.parametrize("change", [{"python": "python"}, {"images_on_gpu": 0}])
+def test_settings_without_a_meaning_are_refused(change):
+    with pytest.raises(ValueError, match="python|images_on_gpu"):
+        INSTAOfficialConfig(**change)
+
+
+def test_words_may_start_the_program(method, repository):
+    program = f"env A=1 '{repository[0]}/build/rta'"
+    found = INSTAOfficial(replace(method.config, program=program)).look()
+    assert found.python[1:] == ("A=1", f"{repository[0]}/build/rta")
+
+
+def clips(clip):
+    skewed = replace(clip.cameras["00"], K=clip.cameras["00"].K + [[0, 1, 0], [0, 0, 0], [0, 0, 0]])
+    return {
+        "mask": replace(clip, masks=dict.fromkeys(clip.masks)),
+        "skew": replace(clip, cameras={**clip.cameras, "00": skewed}),
+        "place": replace(clip, static_offset=clip.static_offset + np.array([0, 0.5, 0])),
+    }
+
+
+@pytest.mark.parametrize(
+    ("case", "expected"), {"mask": "a mask", "skew": "no skew", "place": "of the origin"}.items()
+)
+def test_clips_that_their_code_cannot_take_are_refused(method, official_clip, case, expected):
+    with pytest.raises(InputError, match=expected):
+        method.check(clips(official_clip)[case], BUDGET)
+
+
+# ------------------------------------------------------------------ what the program is given
+
+
+def test_the_export_is_the_training_frames_and_a_pixel(exported, official_clip):
+    work, images = exported
+    keys = official_clip.splits["train"]
+    check_export(work, images, official_clip)
+    assert set(images.values()) == set(keys)
+    assert len(images) == 3 * len(keys)
+    (last,) = read_json(work.input / "transforms_test.json")["frames"]
+    assert cv2.imread(str(work.input / last["file_path"]), -1).tolist() == [[[0, 0, 0, 0]]]
+    frames = read_json(work.input / "transforms_train.json")["frames"]
+    assert last["mesh_path"] == frames[0]["mesh_path"]
+    timesteps = {images[f"input/{frame['file_path']}"].timestep for frame in frames}
+    meshes = {(work.input / frame["mesh_path"]).resolve() for frame in frames}
+    assert len(meshes) == len(timesteps) < len(frames)
+
+
+def test_projections_are_those_of_the_clip(exported, official_clip):
+    work, images = exported
+    subject = PosedSubject.of(official_clip)
+    for frame in read_json(work.input / "transforms_train.json")["frames"]:
+        key = images[f"input/{frame['file_path']}"]
+        camera, pose = official_clip.cameras[key.camera], official_clip.poses[key.timestep]
+        mesh = read_vertices(work.input / frame["mesh_path"], len(official_clip.head.template))
+        still = subject.meshes([pose_in_head_frame(pose)])[0]
+        assert np.abs(mesh - still).max() < 1e-7
+        motion = subject.motions([pose])[0]
+        world = still @ motion[:3, :3].T + motion[:3, 3]
+        local = world @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        pixels = (local @ camera.K.T)[:, :2] / local[:, 2:]
+        there = np.linalg.inv(frame["transform_matrix"])
+        seen = mesh @ there[:3, :3].T + there[:3, 3]
+        focal, center = np.array([frame["fl_x"], frame["fl_y"]]), np.array([frame["cx"], frame["cy"]])
+        assert np.abs(focal * seen[:, :2] / seen[:, 2:] + center - pixels).max() < 1e-3
+        assert (frame["w"], frame["h"]) == (camera.width, camera.height)
+        values = np.loadtxt(work.input / frame["exp_path"])
+        assert np.abs(values[:8] - pose.expression).max() < 1e-7
+        assert not values[8:].any()
+
+
+def test_depth_and_classes_are_those_of_the_mesh(exported, official_clip):
+    work, images = exported
+    for frame in read_json(work.input / "transforms_train.json")["frames"]:
+        mask = official_clip.masks[images[f"input/{frame['file_path']}"]]
+        depth = cv2.imread(str(work.input / frame["depth_path"]), cv2.IMREAD_UNCHANGED)
+        classes = cv2.imread(str(work.input / frame["seg_mask_path"]), cv2.IMREAD_UNCHANGED)[..., 2]
+        assert depth.dtype == np.uint16
+        assert not depth[mask == 0].any()
+        assert not classes[mask == 0].any()
+        assert set(np.unique(classes)) <= {0, SKIN, MOUTH, HAIR}
+        mesh = read_vertices(work.input / frame["mesh_path"], len(official_clip.head.template))
+        there = np.linalg.inv(frame["transform_matrix"])
+        far = (mesh @ there[:3, :3].T + there[:3, 3])[:, 2]
+        known = depth[depth > 0] / 1000
+        assert len(known)
+        assert far.min() - 1e-3 < known.min()
+        assert known.max() < far.max() + 1e-3
+        # A vertex that no other is in front of lies where the depth of its pixel says.
+        focal, center = np.array([frame["fl_x"], frame["fl_y"]]), np.array([frame["cx"], frame["cy"]])
+        nearest = (mesh @ there[:3, :3].T + there[:3, 3])[far.argmin()]
+        column, row = (focal * nearest[:2] / nearest[2] + center).astype(int)
+        if mask[row, column]:
+            assert abs(depth[row, column] / 1000 - nearest[2]) < 0.01
+
+
+def test_a_head_of_flames_topology_keeps_their_triangles(official_clip, tmp_path):
+    count = len(official_clip.head.template)
+    text = "v 0 0 0 1 0 0\n" * count + "f 1//1 2//2 3//3\n"
+    commit = make_insta_repository(tmp_path / "repository", text)
+    method = INSTAOfficial(INSTAOfficialConfig(str(tmp_path / "repository"), commit=commit))
+    mesh = VideoMesh.of(Subject.of(official_clip), official_clip.head, method.look())
+    assert mesh.is_flames
+    assert mesh.faces.tolist() == [[0, 1, 2]]
+    mesh.write_masks(tmp_path)
+    assert (tmp_path / "mesh_masks/face.obj").read_text() == text
+
+
+def test_regions_of_another_head_are_red_vertices(method, official_clip, tmp_path):
+    head = official_clip.head
+    mesh = VideoMesh.of(Subject.of(official_clip), head, method.look())
+    assert not mesh.is_flames
+    mesh.write_masks(tmp_path)
+    seen = np.zeros(len(head.template), int)
+    for name, regions in export.MASKS.items():
+        lines = (tmp_path / "mesh_masks" / f"{name}.obj").read_text().splitlines()
+        red = np.array([line.split()[4:] == ["1", "0", "0"] for line in lines if line.startswith("v ")])
+        seen += red
+        members = np.concatenate([head.regions.get(region, np.array([], int)) for region in regions])
+        assert set(np.flatnonzero(red)) <= set(members.tolist())
+    assert seen.max() == 1
+
+
+def test_a_list_has_focal_lengths_for_images_of_a_pixel(method, official_clip, tmp_path):
+    work = Workplace.at(tmp_path / "work")
+    work.make()
+    mesh = VideoMesh.of(Subject.of(official_clip), official_clip.head, method.look())
+    wanted = views(official_clip, "novel_view", "train")
+    frames = [Listed(7 + i, key, *view) for i, (key, view) in enumerate(wanted.items())]
+    (part,) = export.write_list(frames, mesh, work)
+    assert part["numbers"] == [frame.number for frame in frames]
+    document = json.loads((work.input / part["folder"] / "transforms_test.json").read_text())
+    for frame, listed in zip(document["frames"], frames, strict=True):
+        K = listed.camera.K
+        assert [36 * frame[name] for name in ("fl_x", "fl_y")] == pytest.approx([K[0, 0], K[1, 1]])
+        assert [frame[name] for name in ("cx", "cy", "w", "h")] == [K[0, 2], K[1, 2], 28, 36]
