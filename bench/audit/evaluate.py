@@ -22,7 +22,7 @@ from ..runner.config import ResolvedMethod, RunConfig, RunOptions, default_names
 from ..runner.run import describe, make_jobs, write_reports
 from ..runner.steps import DIGESTS, Job, measure, render
 from ..runner.store import Cell, RunFolder
-from ..runner.stored import avatar_digest, avatar_folder, stored_method
+from ..runner.stored import avatar_digest, avatar_folder, shows_another, stored_heads, stored_method
 from ..specs import Findings, MethodSpec
 from .command import EvaluateSettings
 from .naming import Render, check_truth, composited, named_renders
@@ -65,6 +65,10 @@ def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress
             raise InputError(
                 str(config.data), "", "the capture of the avatar's subject", f"{len(clips)} captures"
             )
+        shown = shows_another(source, clips[0].subject, clips[0].head, clips[0].shape)
+        if shown:
+            expected = f"an avatar of {clips[0].subject}, whom the capture shows"
+            raise InputError(avatar_folder(source), "subject", expected, f"one of {shown}")
         of = stored_method(source, settings.method, settings.preset)
         avatar = of.create().load(avatar_folder(source), device=config.device)
         method = images_method(config.methods[0], avatar_digest(source)[:12])
@@ -139,7 +143,7 @@ def _open(settings: EvaluateSettings) -> tuple[RunConfig, list[Clip]]:
             frames_per_task=settings.frames_per_task,
         )
         clips = open_clips(config)
-    heads = config.heads if settings.avatar else {}
+    heads = {**stored_heads(Path(settings.folder)), **config.heads} if settings.avatar else {}
     config = replace(
         config,
         out=settings.out,

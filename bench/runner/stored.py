@@ -5,7 +5,11 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import numpy as np
+
+from ..contracts import FloatArray, HeadAsset
 from ..errors import InputError
+from ..io.arrays import TEXT, Member, read_arrays
 from ..io.files import digest, digest_file
 from ..registry import get
 from ..specs import MethodSpec
@@ -52,6 +56,37 @@ def stored_method(folder: Path, method: str = "", preset: str = "") -> ResolvedM
         preset, settings = preset or config.preset, dict(config.settings.get(of, {}))
     preset = preset or ("fast" if "fast" in spec.presets or not spec.presets else next(iter(spec.presets)))
     return resolve_method(spec, preset, settings)
+
+
+HEAD_FILE = "head_model.npz"
+"""The head model beside an avatar, which all native methods store."""
+
+
+def stored_heads(folder: Path) -> dict[str, str]:
+    """File of the head model beside an avatar, by its version: what `adaptation.plan` refits a capture to; {} without one."""
+    path = avatar_folder(folder) / HEAD_FILE
+    return {str(read_arrays(path, {"version": TEXT})["version"]): str(path)} if path.is_file() else {}
+
+
+SUBJECT_FILE = "subject.npz"
+"""Where native avatars, imported ones and most official ones say whom they show."""
+SAME_SHAPE = 1e-4
+"""Largest difference of two shape coefficients of one subject; files hold float32."""
+
+
+def shows_another(folder: Path, subject: str, head: HeadAsset, shape: FloatArray) -> str:
+    """The name of the subject that a stored avatar shows, if that is another than the one given; "" where nobody knows.
+
+    Another is who has another name and another shape; shapes of two head models do not compare.
+    """
+    path = avatar_folder(folder) / SUBJECT_FILE
+    if not path.is_file():
+        return ""
+    found = read_arrays(path, {"name": TEXT, "head_model": TEXT, "shape": Member("f", (None,))})
+    name, own = str(found["name"]), found["shape"]
+    if str(found["head_model"]) == head.version and own.shape == np.shape(shape):
+        return name if np.abs(own - shape).max(initial=0.0) > SAME_SHAPE else ""
+    return name if name != subject else ""
 
 
 def avatar_digest(folder: Path) -> str:

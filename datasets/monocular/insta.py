@@ -186,7 +186,9 @@ def _intrinsics(
         raise InputError(path, f"{where}.fl_y", "a positive focal length in pixels", f"{second:g}")
     cx = width / 2 if given["cx"] is None else given["cx"]
     cy = height / 2 if given["cy"] is None else given["cy"]
-    return np.array([[focal, 0.0, cx], [0.0, second, cy], [0.0, 0.0, 1.0]])
+    K = np.array([[focal, 0.0, cx], [0.0, second, cy], [0.0, 0.0, 1.0]])
+    check_numbers(path, where, K, MAX_MAGNITUDE)
+    return K
 
 
 class _Meshes:
@@ -255,7 +257,7 @@ class _Meshes:
     def _numbers(self, path: Path) -> FloatArray:
         text = read_bytes(path, "a text file of numbers", MAX_TEXT)
         try:
-            values = np.array(text.split(), dtype=bytes).astype(np.float64)
+            values = np.array([float(word) for word in text.split()])  # no array of the longest word
         except ValueError as error:
             raise InputError(path, "", "numbers, one a line", "other text") from error
         check_numbers(path, "", values, MAX_MAGNITUDE)

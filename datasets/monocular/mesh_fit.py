@@ -45,7 +45,9 @@ def read_vertices(path: Path, count: int) -> FloatArray:
         remedy = "Give the head model the video was tracked with."
         raise InputError(path, "v", f"{count} vertices, as the head model has", f"{len(found)}", remedy)
     try:
-        vertices = np.array(found).astype(np.float64)
+        vertices = np.array(
+            [[float(word) for word in vertex] for vertex in found]
+        )  # no array of the longest word
     except ValueError as error:
         raise InputError(path, "v", "three numbers for each vertex", "text that is none") from error
     check_numbers(path, "v", vertices, MAX_MAGNITUDE)

@@ -113,7 +113,7 @@ def fix_camera(
         if (camera.width, camera.height) != (first.width, first.height):
             expected = f"{first.width}x{first.height} pixels, as the first image of the video"
             raise InputError(frame.image, "", expected, f"{camera.width}x{camera.height}")
-        if off > SAME_INTRINSICS:
+        if not off <= SAME_INTRINSICS:
             file, entry = frame.where
             expected = "the intrinsics of the first frame, as one camera has"
             raise InputError(file, entry, expected, f"others, by {off:g} pixels")

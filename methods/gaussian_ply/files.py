@@ -13,6 +13,7 @@ from ...bench.contracts import HeadAsset, HeadPose, Progress
 from ...bench.errors import InputError
 from ...bench.io.files import check_name, check_writable
 from ...bench.io.lock import LOCK_FILE
+from ...bench.runner.stored import SAME_SHAPE
 from ...bench.specs import Findings
 from ...datasets.clip import CaptureClip
 from ...datasets.ga.tracking import Tracking, find_head, read_animation
@@ -130,8 +131,6 @@ def neutral_pose(head: HeadAsset) -> HeadPose:
 
 
 FLAME_PARAM_FILE = "flame_param.npz"
-SAME_SHAPE = 1e-4
-"""Largest difference of two shape coefficients of one subject; files hold float32."""
 
 
 def import_avatar(settings: ImportGASettings, progress: Progress) -> Findings:
@@ -155,6 +154,8 @@ def import_avatar(settings: ImportGASettings, progress: Progress) -> Findings:
     save_shared_head(out, head)
     if refined is not None:
         refined.save(out / DRIVING_FILE)
+    else:
+        (out / DRIVING_FILE).unlink(missing_ok=True)
     write_ga_splats(out / PLY_FILE, splats, binding)
     used = len(binding.unique())
     triangles = f"{used} of {len(head.faces)} triangles"

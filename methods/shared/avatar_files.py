@@ -15,11 +15,10 @@ from ...bench.errors import InputError
 from ...bench.io.arrays import MAX_MAGNITUDE, TEXT, Member, read_arrays
 from ...bench.io.documents import read_json
 from ...bench.io.files import atomic_path, digest, write_json
+from ...bench.runner.stored import HEAD_FILE, SUBJECT_FILE
 from ...datasets.head.arrays import STORED, HeadArrays, read_head, save_head
 from .loop import Fit, Outcome
 
-HEAD_FILE = "head_model.npz"
-SUBJECT_FILE = "subject.npz"
 RECORD_FILE = "training.json"
 _SIZES = {"rotation": 3, "neck": 3, "jaw": 3, "eyes": 6, "translation": 3}
 TRACKED = ("expression", "rotation", "neck", "jaw", "eyes", "translation")

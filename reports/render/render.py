@@ -18,7 +18,7 @@ from ...bench.runner.adaptation import AdaptedClip, MethodNeeds, carry_out, plan
 from ...bench.runner.captures import open_clips, reader_of
 from ...bench.runner.config import RunConfig
 from ...bench.runner.store import Cell
-from ...bench.runner.stored import avatar_folder, stored_method
+from ...bench.runner.stored import avatar_folder, stored_heads, stored_method
 from ...bench.specs import Findings
 from ..robustness.extremes import head_center
 from ..robustness.viewpoints import turntable
@@ -49,7 +49,7 @@ def render_avatar(settings: RenderSettings, progress: Progress) -> Findings:
     method = stored_method(Path(settings.avatar), settings.method, settings.preset)
     clip = _clip(settings)
     needs = MethodNeeds.of(method.spec)
-    adaptation = plan(clip, needs, {})
+    adaptation = plan(clip, needs, stored_heads(Path(settings.avatar)))
     avatar = method.create().load(avatar_folder(Path(settings.avatar)), device=settings.device)
     out = Path(settings.out)
     form = AdaptedClip(clip)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 from ....bench.contracts import Progress
 from ....bench.errors import InputError
 from ....bench.io.files import grouped_writes
 from ....bench.io.images import quantise, write_png
-from ....bench.runner.stored import avatar_folder, stored_method
+from ....bench.runner.stored import HEAD_FILE, avatar_folder, shows_another, stored_method
 from ....bench.specs import Findings
 from ...head.arrays import HeadArrays, read_head
 from ...head.loaders import load_head
@@ -17,7 +18,8 @@ from .command import SubmissionRenderSettings
 from .data import read_sequence
 from .tracks import MONO
 
-HEAD_FILE = "head_model.npz"
+log = logging.getLogger(__name__)
+
 WHITE = (1.0, 1.0, 1.0)
 
 
@@ -37,6 +39,18 @@ def render_participant(settings: SubmissionRenderSettings, progress: Progress) -
         name: read_sequence(Path(settings.data), MONO, settings.participant, name, head)
         for name in MONO.sequences[settings.participant]
     }
+    if not method.spec.resolution.native:
+        expected = "one that works at the size of the benchmark's images, 512x512"
+        found = f"{method.spec.name}, which works at another"
+        raise InputError(
+            "command line", "--method, --preset", expected, found, "Train it with another preset."
+        )
+    for name, sequence in sequences.items():
+        shown = shows_another(folder, settings.participant, head, sequence.shape)
+        if shown:
+            log.warning(
+                "%s shows %s, with another shape than %s has in %s", folder, shown, settings.participant, name
+            )
     avatar = method.create().load(folder, device=settings.device)
     home = Path(settings.out) / settings.participant
     total = sum(len(sequence.poses) * len(sequence.cameras) for sequence in sequences.values())

@@ -54,13 +54,15 @@ class Difference:
 
     Attributes
     ----------
-    native, official : mean over frames, then sequences, then subjects, for each order.
+    orders : those that both have whole results of.
+    native, official : mean over frames, then sequences, then subjects, for each of them.
     difference : their mean difference.
     half_width : of its 95 % interval (Student's t over orders); None with a single order.
     """
 
     task: str
     metric: str
+    orders: tuple[int, ...]
     native: tuple[float, ...]
     official: tuple[float, ...]
     difference: float
@@ -161,7 +163,9 @@ def differences_of(rows: Rows, native: str, official: str, orders: Sequence[int]
                 continue
             apart = [of_official[order] - of_native[order] for order in both]
             values = [tuple(of[order] for order in both) for of in (of_native, of_official)]
-            found.append(Difference(task, metric, values[0], values[1], fmean(apart), _half_width(apart)))
+            found.append(
+                Difference(task, metric, tuple(both), values[0], values[1], fmean(apart), _half_width(apart))
+            )
     return found
 
 
@@ -246,7 +250,7 @@ def _text(
     for each in differences:
         digits = 2 if each.metric == "psnr" else 4
         head = f"{each.task.replace('_', ' ')} | {titles[each.metric]}"
-        for order, (ours, theirs) in enumerate(zip(each.native, each.official)):
+        for order, ours, theirs in zip(each.orders, each.native, each.official, strict=True):
             lines.append(
                 f"| {head} | {order} | {ours:.{digits}f} | {theirs:.{digits}f} | {theirs - ours:+.{digits}f} |"
             )

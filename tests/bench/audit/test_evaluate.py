@@ -319,6 +319,16 @@ def test_a_stored_avatar_scores_as_in_its_run(run, cell, images, tmp_path):
     assert cli.main(["verify", str(tmp_path / "out"), "--trust"]) == 0
 
 
+def test_an_avatar_of_another_subject_is_refused(run, cell, toy, tmp_path, monkeypatch):
+    stored = tmp_path / "stored"
+    shutil.copytree(cell.avatar, stored)
+    np.savez(stored / "subject.npz", name="subject7", head_model="toy", shape=np.full(2, 0.5, np.float32))
+    monkeypatch.setattr(toy.ToyClip, "head", SimpleNamespace(version="toy"))
+    with pytest.raises(InputError, match="found one of subject7"):
+        evaluate(options(stored, run, tmp_path / "out", **AVATAR))
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize(
     ("folder", "others", "match"),
     [

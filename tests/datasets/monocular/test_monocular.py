@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import tracemalloc
 from dataclasses import replace
 
 import cv2
@@ -17,6 +18,7 @@ from headbench.bench.protocol import make_protocols
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import save_head
 from headbench.datasets.head.subject import PosedSubject
+from headbench.datasets.monocular.mesh_fit import read_vertices
 from headbench.datasets.monocular.reader import CONVENTION, _last, find_videos, read_video
 from headbench.datasets.open import find_reader, open_clip
 
@@ -190,6 +192,7 @@ INSTA_FAULTS = {
     "another size": (lambda document: document.update(w=512.0), "expected 48"),
     "text": (lambda document: document.update(fl_x="far"), "fl_x"),
     "negative": (lambda document: document.update(fl_x=-1.0), "positive focal length"),
+    "too large": (lambda document: document.update(fl_x=10**400), "magnitude|finite"),
     "VHAP's meshes": (lambda document: each(document, timestep_index=0), "--flame-mode param"),
     "no frames": (lambda document: document.update(frames=[]), "at least one frame"),
 }
@@ -228,6 +231,17 @@ def test_faulty_files_of_insta_are_named(written, tmp_path, fault):
         (folder / file).write_bytes(content)
     with pytest.raises(InputError, match=message):
         read_video(folder)
+
+
+def test_a_long_number_takes_no_memory_for_every_vertex(tmp_path):
+    path = tmp_path / "canonical.obj"
+    path.write_bytes(b"v 0 0 0." + b"1" * 10**6 + b"\n" + b"v 0 0 0\n" * 999)
+    tracemalloc.start()
+    vertices = read_vertices(path, 1_000)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert vertices[0, 2] == pytest.approx(1 / 9)
+    assert peak < 20e6
 
 
 def test_splits_that_share_frames_are_refused(written, tmp_path):

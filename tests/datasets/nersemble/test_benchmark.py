@@ -16,6 +16,7 @@ from headbench.bench.contracts import Frame, no_progress
 from headbench.bench.errors import HeadbenchError, InputError
 from headbench.bench.io.images import write_png
 from headbench.bench.io.video import write_video
+from headbench.bench.specs import MethodSpec, ResolutionRule
 from headbench.datasets.head.arrays import save_head
 from headbench.datasets.head.subject import PosedSubject
 from headbench.datasets.nersemble.benchmark import tracks
@@ -334,7 +335,7 @@ def test_the_cost_of_the_codec_is_that_of_unrelated_errors():
     assert after_encoding(before, float(np.mean(codec**2))) == pytest.approx(after, abs=0.02)
 
 
-def test_an_avatar_renders_all_test_frames(benchmark, head, tmp_path, monkeypatch):
+def test_an_avatar_renders_all_test_frames(benchmark, head, tmp_path, monkeypatch, capsys):
     """Frames that the writer takes, of the size and names of the track; the pose tells them apart."""
     from headbench.datasets.nersemble.benchmark import render as module
 
@@ -343,7 +344,8 @@ def test_an_avatar_renders_all_test_frames(benchmark, head, tmp_path, monkeypatc
         return Frame(np.full((camera.height, camera.width, 3), level, np.float32), np.ones((512, 512)))
 
     avatar = SimpleNamespace(render=shown)
-    method = SimpleNamespace(create=lambda: SimpleNamespace(load=lambda path, device: avatar))
+    spec = MethodSpec("shown", "shown", "")
+    method = SimpleNamespace(spec=spec, create=lambda: SimpleNamespace(load=lambda path, device: avatar))
     monkeypatch.setattr(module, "stored_method", lambda *_: method)
     (tmp_path / "avatar").mkdir()
     words = [
@@ -363,4 +365,11 @@ def test_an_avatar_renders_all_test_frames(benchmark, head, tmp_path, monkeypatc
     assert len(files) == 2 * 4 * 4
     assert files[0].name == "EMO-1-shout+laugh_00000_220700191.png"
     assert len({path.read_bytes() for path in files}) > 4
+    assert "another shape" not in capsys.readouterr().err
+    np.savez(tmp_path / "avatar/subject.npz", name="074", head_model=head.version, shape=np.full(3, 9.0))
+    assert cli.main(words) == 0
+    assert "shows 074, with another shape than 393" in capsys.readouterr().err
     assert cli.main([*words[:5], "--participant", "074", "--out", str(tmp_path / "o")]) == 2
+    method.spec = replace(spec, resolution=ResolutionRule(size=(1024, 1024)))
+    assert cli.main([*words[:-1], str(tmp_path / "larger")]) == 2
+    assert not (tmp_path / "larger").exists()

@@ -137,7 +137,7 @@ def test_stored_parameters_refine_training_poses_only(capture, tmp_path):
     avatar, findings = with_beside(tmp_path, capture=str(capture))
     clip = read_capture(capture)
     assert f"{len(clip.poses)} timesteps, {len(clip.timesteps('train'))} of them" in findings.text
-    plain = GA().load(plain_import(capture, tmp_path), device="cpu")
+    plain = GA().load(plain_import(capture, tmp_path, of_refined=True), device="cpu")
     for timestep, pose in clip.poses.items():
         shown = pose
         if timestep in clip.timesteps("train"):
@@ -147,9 +147,12 @@ def test_stored_parameters_refine_training_poses_only(capture, tmp_path):
         np.testing.assert_allclose(found.means, expected.means, atol=1e-6)
 
 
-def plain_import(capture, tmp_path):
+def plain_import(capture, tmp_path, of_refined=False):
+    """An import without stored parameters, into a folder that an import with them was made in before."""
     ply = ga_file(tmp_path / "point_cloud.ply", ROWS)
     out = tmp_path / "plain"
+    if of_refined:
+        import_ga(ImportGASettings(str(ply), capture=str(capture), out=str(out)))
     import_ga(ImportGASettings(str(ply), capture=str(capture), out=str(out), flame_param="none"))
     return out
 

@@ -127,6 +127,9 @@ def test_differences_are_paired_by_order():
     assert found.half_width == pytest.approx(4.302653 / math.sqrt(3), rel=1e-6)
     (single,) = differences_of(Rows.of(rows), "ga", "official", [0])
     assert single.half_width is None
+    kept = [row for row in rows if (row.method, row.seed) != ("official", 0)]
+    (found,) = differences_of(Rows.of(kept), "ga", "official", range(3))
+    assert (found.orders, found.native) == ((1, 2), pytest.approx(values["ga"][1:]))
 
 
 @pytest.mark.parametrize("settings", [{"device": "cpu-shim"}, {"order": "native"}])

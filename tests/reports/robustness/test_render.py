@@ -11,6 +11,7 @@ import pytest
 from headbench.bench.errors import InputError, UnavailableError
 from headbench.bench.io.images import read_png
 from headbench.bench.runner.store import RunFolder
+from headbench.reports.render import render as module
 from headbench.reports.render.command import RenderSettings, render
 
 
@@ -68,6 +69,15 @@ def test_an_orbit_looks_at_the_head_from_all_sides(settings):
         assert abs(rows.mean() - 14.5) < 1  # the ball is where the cameras look, and its picture where K says
         assert abs(columns.mean() - 11.5) < 1
     assert [path.name for path in frames.data["videos"]] == ["orbit.webm"]
+
+
+def test_a_capture_is_refitted_to_the_head_model_of_the_avatar(settings, cell, monkeypatch):
+    asked = []
+    monkeypatch.setattr(module, "plan", lambda clip, needs, heads: asked.append(heads))
+    render(settings)
+    np.savez(cell.avatar / "head_model.npz", version="flame2020")
+    render(settings)
+    assert asked == [{}, {"flame2020": str(cell.avatar / "head_model.npz")}]
 
 
 @pytest.mark.parametrize(
