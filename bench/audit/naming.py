@@ -69,7 +69,7 @@ def named_renders(names: str, folder: Path, config: RunConfig, clips: Sequence[C
 
 
 def check_truth(clip: Clip, renders: Renders, keys: Iterable[FrameKey], count: int = 8) -> None:
-    """Hold the ground truth that lies beside renders against the clip's, at some frames.
+    """Hold the ground truth that lies beside renders against the clip's, at some frames; on black where renders are.
 
     Raises `InputError` where they differ by more than `TRUTH_RMS`: renders of other frames, or of another background.
     """
@@ -79,7 +79,13 @@ def check_truth(clip: Clip, renders: Renders, keys: Iterable[FrameKey], count: i
         assert path is not None
         if not path.is_file():
             continue
-        truth, own = read_png(path), clip.image(key)
+        truth, own = read_png(path), clip.image(key).astype(np.float32)
+        if renders[key].alpha is not None:
+            mask = clip.mask(key)
+            if mask is None:
+                continue  # nobody knows what of the image is background
+            ground = 255 * np.asarray(clip.background, np.float32)
+            own -= (1 - mask[..., None].astype(np.float32) / 255) * ground
         if truth.shape != own.shape:
             found = f"one of {truth.shape[1]} x {truth.shape[0]}"
             expected = f"the ground truth of {key}, {own.shape[1]} x {own.shape[0]} pixels"
@@ -171,7 +177,8 @@ def _gaussian_blendshapes(folder: Path, clip: Clip, listing: Listing) -> Renders
         of = "the capture" if name == "seq" else f"its last {GBS_TEST_FRAMES}"
         images = _numbered(made, "pred_", [len(numbered)], of)
         for key, image in zip(numbered, images):
-            found_[key] = Render(image, made / image.name.replace("pred_", "pred_mask_"))
+            mask, truth = (made / image.name.replace("pred_", other) for other in ("pred_mask_", "gt_"))
+            found_[key] = Render(image, mask, truth)
     if not found_:
         raise InputError(folder, "", "test/split_N, as test.py leaves it in the model's folder", "none")
     return found_

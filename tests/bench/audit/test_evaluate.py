@@ -1,6 +1,7 @@
 """Folders of images by key: scored as a run scores its own, in every layout; what is wrong is said before work."""
 
 import shutil
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import cv2
@@ -10,7 +11,7 @@ import pytest
 
 from headbench.bench import cli
 from headbench.bench.audit.command import EvaluateSettings, evaluate
-from headbench.bench.audit.naming import OFFICIAL, Render, composited
+from headbench.bench.audit.naming import OFFICIAL, Render, check_truth, composited
 from headbench.bench.contracts import FrameKey
 from headbench.bench.errors import InputError
 from headbench.bench.io.images import read_png, write_png
@@ -259,6 +260,7 @@ def test_gaussianblendshapes_numbers_the_last_350_frames(tmp_path):
         for index in range(count):
             (made / f"pred_{index:05d}.png").touch()
         found = OFFICIAL["official-gbs"](tmp_path, clip, {})
+        assert {render.truth.name for render in found.values()} >= {"gt_00000.png"}
         for key in keys[-count:]:
             index = key.timestep - (400 - count) if name == "test" else key.timestep
             assert found[key].image.name == f"pred_{index:05d}.png" or name == "seq"
@@ -266,6 +268,29 @@ def test_gaussianblendshapes_numbers_the_last_350_frames(tmp_path):
     (tmp_path / "seq/split_40000/pred_00399.png").unlink()
     with pytest.raises(InputError, match="400 images.*found 399"):
         OFFICIAL["official-gbs"](tmp_path, clip, {})
+
+
+@pytest.mark.parametrize("masked", [True, False])
+def test_ground_truth_of_renders_on_black_is_compared_there(tmp_path, masked):
+    """rgb * coverage lies beside the renders; the clip has the same on white."""
+    keys = [FrameKey("s", "video", timestep, "0") for timestep in range(2)]
+    colours = np.random.default_rng(0).integers(0, 256, (2, 8, 6, 3))
+    mask = np.tile(np.array([0, 64, 128, 191, 255, 255], np.uint8), (8, 1))
+    part = mask[..., None] / 255
+    on_white = np.rint(colours * part + 255 * (1 - part)).astype(np.uint8)
+    clip = SimpleNamespace(
+        background=np.ones(3),
+        image=lambda key: on_white[key.timestep],
+        mask=lambda key: mask if masked else None,
+    )
+    paths = [tmp_path / f"gt_{number:05d}.png" for number in range(2)]
+    for path, own in zip(paths, colours):
+        write_png(path, np.rint(own * part).astype(np.uint8))
+    own = {key: Render(tmp_path / "a.png", tmp_path / "b.png", path) for key, path in zip(keys, paths)}
+    check_truth(clip, own, keys)
+    swapped = {keys[0]: own[keys[1]], keys[1]: own[keys[0]]}
+    with pytest.raises(InputError, match="renders of another capture") if masked else nullcontext():
+        check_truth(clip, swapped, keys)
 
 
 def test_insta_numbers_the_frames_that_are_held_out(tmp_path):
