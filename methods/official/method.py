@@ -142,10 +142,6 @@ class OfficialMethod(ABC, Generic[Config]):
         """A command, run when training has ended, that leaves out of its output what rendering never reads."""
         return None
 
-    def resume(self, work: Workplace) -> list[str] | None:
-        """Arguments that continue from the program's own checkpoints; None where it is to begin anew, as by default."""
-        return None
-
     @abstractmethod
     def done(self, line: str) -> tuple[int, str] | None:
         """Iterations done and a few words, where a line of the training's output tells."""
@@ -299,8 +295,8 @@ class OfficialMethod(ABC, Generic[Config]):
     ) -> OfficialAvatar:
         """Export the training frames, run the authors' training on them, and keep what rendering needs.
 
-        A call that was killed continues from the program's checkpoints where it has any that are whole, and from its
-        export. Raises `InputError` before any work for what `check` refuses and a budget in seconds, `ProgramError`
+        After a kill the training begins anew, on the export that is there: the repositories' checkpoints lack what it would
+        need to go on as it was. Raises `InputError` before any work for what `check` refuses and a budget in seconds, `ProgramError`
         where the program fails.
         """
         run = run_digest(self.name, self.version, self.config, clip, budget, seed)
@@ -325,9 +321,7 @@ class OfficialMethod(ABC, Generic[Config]):
         frames, iterations = len(fit.clip.splits["train"]), fit.budget.iterations or 0
         self._export(fit, checkout, work)
         command = self.train_command(fit, checkout, work)
-        more = self.resume(work)
-        if more is None:
-            _remove(work.model)
+        _remove(work.model)
         work.make()
 
         def on_line(line: str) -> None:
@@ -338,7 +332,7 @@ class OfficialMethod(ABC, Generic[Config]):
         shim = self.config.device != "cuda"
         patches = self.patches(fit.clip.head, iterations, checkout) if shim else []
         command = self._launched(
-            [*command, *(more or ()), *self.config.arguments],
+            [*command, *self.config.arguments],
             checkout,
             work,
             patches=patches,
@@ -367,7 +361,6 @@ class OfficialMethod(ABC, Generic[Config]):
             **checkout.record,
             "device": self.config.device,
             "arguments": list(self.config.arguments),
-            "continued": more is not None,
         }
         remarks = self.remarks(fit.clip, fit.seed)
         remarks["differences"] += self._of_launch(patches)

@@ -26,7 +26,7 @@ import numpy as np
 from PIL import Image
 
 parser = argparse.ArgumentParser()
-for name in ("source_path", "model_path", "iterations", "iteration", "start_checkpoint"):
+for name in ("source_path", "model_path", "iterations", "iteration"):
     parser.add_argument("--" + name)
 arguments, others = parser.parse_known_args()
 source, model = Path(arguments.source_path), Path(arguments.model_path)
@@ -53,10 +53,9 @@ assert sorted(meshes) == list(range(len(meshes)))
 sizes = {Image.open(source / f["file_path"]).size == (f["w"], f["h"]) for f in listed}
 assert sizes == {True}
 iterations = int(arguments.iterations)
-done = int(Path(arguments.start_checkpoint).read_text()) if arguments.start_checkpoint else 0
-print("starts at", done)
 model.mkdir(parents=True, exist_ok=True)
-for iteration in range(done + 1, iterations + 1):
+print("finds", sorted(path.name for path in model.iterdir()))
+for iteration in range(1, iterations + 1):
     bar = f"\\rTraining progress:  {iteration}%|#| {iteration}/{iterations} [00:01<00:10, 5.0it/s, Loss=0.{iteration}]"
     print(bar, end="", flush=True)
     (model / "checkpoint").write_text(str(iteration))
@@ -177,15 +176,6 @@ class TensorialStandIn(TGAOfficial):
     """`TGAOfficial` around the stand-in."""
 
     repository = replace(TGAOfficial.repository, modules=("json",), trial="")
-
-
-class Resuming(StandIn):
-    """One whose program has checkpoints to continue from."""
-
-    def resume(self, work):
-        """Its checkpoint, where there is one."""
-        path = work.model / "checkpoint"
-        return ["--start_checkpoint", str(path)] if path.exists() else None
 
 
 def settings(checkout: Path, commit: str, **changes) -> GAOfficialConfig:
