@@ -165,7 +165,8 @@ class RunSet:
     """Runs on the same frames, in the order given. The methods in their ``rows`` are named by labels.
 
     ``part`` says in words which part of the frames the rows are of, "" for all. ``records`` says by label what the method was, as in the manifest; ``trivial`` has labels of trivial baselines.
-    ``keys`` has the frames of each task by the protocol, those included that no method has a value of.
+    ``keys`` has the frames of each task by the protocol, those included that no method has a value of. ``shown`` has by
+    label the first run of the method and its name there, whose renders are shown.
     """
 
     runs: tuple[RunData, ...]
@@ -175,6 +176,7 @@ class RunSet:
     records: Mapping[str, MethodRecord]
     trivial: tuple[str, ...]
     keys: Mapping[str, frozenset[FrameKey]]
+    shown: Mapping[str, tuple[RunData, str]]
     part: str = ""
 
     @classmethod
@@ -202,7 +204,11 @@ class RunSet:
         tasks = tuple(dict.fromkeys(task for run in runs for task in run.tasks))
         trivial = tuple(label for label, record in records.items() if record.trivial)
         keys = {task: frozenset(key for run in runs for key in run.keys(task)) for task in tasks}
-        return cls(runs, rows, _metrics(runs), tasks, records, trivial, keys).of(part)
+        shown: dict[str, tuple[RunData, str]] = {}
+        for run, own in zip(runs, labels):
+            for method in run.methods:
+                shown.setdefault(own[method], (run, method))
+        return cls(runs, rows, _metrics(runs), tasks, records, trivial, keys, shown).of(part)
 
     def of(self, part: Part) -> RunSet:
         """A part of the frames of runs that were read whole.

@@ -22,3 +22,9 @@ CONTACT_SHEET = ReportSpec(
     summary="Some frames of each task side by side: ground truth, renders and error maps of all methods, as PNG.",
     implementation="headbench.reports.contact_sheet:write_contact_sheet",
 )
+
+PAGE = ReportSpec(
+    name="page",
+    summary="One HTML file with tables, frames of all methods side by side, curves and the record of the run.",
+    implementation="headbench.reports.page.report:write_page",
+)

@@ -175,7 +175,9 @@ def render_page(template: str, **content: Any) -> str:
 
     here = Path(__file__).parent
     environment = Environment(
-        autoescape=True, keep_trailing_newline=True, loader=FileSystemLoader([here, here / "leaderboard"])
+        autoescape=True,
+        keep_trailing_newline=True,
+        loader=FileSystemLoader([here, here / "leaderboard", here / "page"]),
     )
     ranks = {1: "first", 2: "second", 3: "third"}
     return environment.get_template(template).render(spans=_spans, ranks=ranks, **content)

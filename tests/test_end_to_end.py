@@ -86,6 +86,7 @@ def test_trained_methods_beat_the_mean_image_even_after_seconds(run):
 
 def test_tables_and_pictures_are_left_to_look_at(run, capsys):
     assert {path.suffix for path in run.tables.iterdir()} == {".md", ".csv", ".tex", ".html", ".json"}
+    assert '<script type="application/json" id="images">["' in run.page.read_text()
     sheet = cv2.imread(str(run.contact_sheet))
     assert sheet.shape[0] > 300
     assert sheet.std() > 10
@@ -176,6 +177,9 @@ CASES = {
         case("table {demo} --layout paper-4 --published", "Published"),
         case("table {demo} plain", "one seed"),
         case("table {demo} --region face --sequences FREE", "Region: face. Sequences: FREE."),
+    ],
+    "report": [
+        case("report {demo} --out report.html --max-mb 5", "frames with pictures", "report.html"),
     ],
     "verify": [case("verify {demo}", "as recorded")],
     "bundle": [

@@ -13,7 +13,7 @@
         rows.parquet              what was measured
         measure.json              what it was measured of, digest of the rows
     adapted/<subject>/            tracking refitted for methods that want another head model
-    tables/, contact_sheet.png    views of the rows
+    tables/, contact_sheet.png, report.html    views of the rows
 """
 
 from __future__ import annotations
@@ -189,6 +189,10 @@ class RunFolder:
     @property
     def contact_sheet(self) -> Path:
         return self.root / "contact_sheet.png"
+
+    @property
+    def page(self) -> Path:
+        return self.root / "report.html"
 
     def cell(self, subject: str, method: str, seed: int) -> Cell:
         """Return the folder of one avatar."""

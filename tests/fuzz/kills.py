@@ -42,15 +42,16 @@ class Writer:
     measured: tuple[str, ...] = ()
 
 
-MEASURED_FILES = ("measure.json", "points.csv", "pareto.png", "cost.*")
+PAGE = "report.html"  # speeds stand on it
+MEASURED_FILES = ("measure.json", "points.csv", "pareto.png", "cost.*", PAGE)
 MEASURED_CURVE = ("fit.json", "measure.json", "curve.csv", "curve.png")
 WRITERS = [
     Writer("synth", "settings", f"synth {SYNTH} --out out"),
-    Writer("run", "unfinished", "run --config config.json"),
+    Writer("run", "unfinished", "run --config config.json", (PAGE,)),
     Writer("prepare", "recording", f"{PREPARE} --out out"),
     Writer("record", "synthetic", "record nersemble synthetic/UNION2_900 --out out"),
     Writer("refit", "heads", "refit capture --target head.npz --out out"),
-    Writer("evaluate", "images", "evaluate images --like run --out out --label theirs"),
+    Writer("evaluate", "images", "evaluate images --like run --out out --label theirs", (PAGE,)),
     Writer(
         "evaluate avatar",
         "run",
@@ -60,6 +61,7 @@ WRITERS = [
     Writer("render", "run", f"render {AVATAR.format('ga')} --capture capture --out out --video", ("*.webm",)),
     Writer("sweep", "run", "sweep run --methods ga --variants half", MEASURED_FILES),
     Writer("curve", "run", "curve run --methods ga --fractions 1/2 1 --frames 1", MEASURED_CURVE),
+    Writer("report", "run", "report run --out report.html"),
     Writer("bundle", "run", "bundle run --out out.zip --by Somebody --renders"),
     Writer("leaderboard", "bundles", "leaderboard build . --out out"),
     Writer("extremes", "run", "extremes run --views 1 --dimensions 1 --methods ga ours"),

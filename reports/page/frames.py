@@ -1,0 +1,218 @@
+"""Which frames a page shows as pictures, and the pictures: WebP in data URIs, within a number of bytes."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from functools import cache
+from itertools import groupby, zip_longest
+from threading import Lock
+from typing import NamedTuple
+
+import cv2
+
+from ...bench.contracts import ByteArray, Clip, FrameKey, Progress
+from ...bench.errors import HeadbenchError, InputError
+from ...bench.runner.captures import open_run_clips
+from ...bench.runner.config import RunOptions
+from ...bench.specs import MetricSpec
+from ..runs import RunSet
+
+WORST = 5
+"""Timesteps of each method and task whose frames are always shown."""
+LOSSLESS, LOSSY = 101, 90
+"""Qualities of OpenCV's WebP encoder; above 100 it keeps every pixel."""
+BATCH = 32
+"""Frames that are encoded before their bytes are counted."""
+
+
+class Frame(NamedTuple):
+    """A frame of a task."""
+
+    task: str
+    key: FrameKey
+
+    @property
+    def group(self) -> tuple[str, ...]:
+        """Task, subject, sequence and camera."""
+        return self.task, self.key.subject, self.key.sequence, self.key.camera
+
+
+@dataclass
+class Pictures:
+    """Pictures of frames: of each the ground truth's first, then each method's, as the base64 of a WebP or a reason.
+
+    ``lossless`` are frames whose pictures keep every pixel. ``truth`` says why there is no ground truth; "" where there is.
+    """
+
+    shown: dict[Frame, list[str | None]] = field(default_factory=dict)
+    reasons: dict[Frame, list[str]] = field(default_factory=dict)
+    lossless: set[Frame] = field(default_factory=set)
+    first_cameras_lossless: bool = True
+    truth: str = ""
+    bytes: int = 0
+
+
+def frame_values(runs: RunSet, metrics: Sequence[MetricSpec]) -> dict[tuple[str, str, Frame], float]:
+    """Value by metric, label and frame of the whole images that are shown."""
+    found = {}
+    for task in runs.tasks:
+        for key in runs.keys[task]:
+            for label, (run, name) in runs.shown.items():
+                for spec in metrics:
+                    value = run.value(spec.name, name, task, key)
+                    if value is not None:
+                        found[spec.name, label, Frame(task, key)] = value
+    return found
+
+
+def worst_frames(
+    values: Mapping[tuple[str, str, Frame], float], runs: RunSet, spec: MetricSpec, count: int = WORST
+) -> list[Frame]:
+    """The worst frames of each method that is no trivial baseline (all, where there is no other) and each task by a metric,
+    one for each timestep."""
+    found: dict[Frame, None] = {}
+    sign = 1 if spec.higher_is_better else -1
+    for label in runs.ranked or runs.methods:
+        for task in runs.tasks:
+            own = [
+                (sign * v, f) for (m, n, f), v in values.items() if (m, n, f.task) == (spec.name, label, task)
+            ]
+            moments: dict[tuple[str, str, int], Frame] = {}
+            for _, frame in sorted(own):
+                moments.setdefault(frame.key[:3], frame)
+            found.update(dict.fromkeys([*moments.values()][:count]))
+    return [*found]
+
+
+def spread(frames: Sequence[Frame]) -> Iterator[Frame]:
+    """Frames in the order in which they are added: each task, subject, sequence and camera alike, evenly over time and
+    finer with every turn."""
+    ordered = sorted(frames, key=lambda f: (f.group, f.key.timestep))
+    groups = [_refined([*members]) for _, members in groupby(ordered, key=lambda f: f.group)]
+    return (frame for turn in zip_longest(*groups) for frame in turn if frame is not None)
+
+
+def _refined(items: Sequence[Frame]) -> list[Frame]:
+    """First and last, then the middle of the longest gaps, level by level."""
+    order = dict.fromkeys([0, len(items) - 1])
+    parts = 2
+    while len(order) < len(items):
+        order.update(dict.fromkeys(round(i * (len(items) - 1) / parts) for i in range(parts + 1)))
+        parts *= 2
+    return [items[index] for index in order]
+
+
+def open_truth(runs: RunSet, options: RunOptions) -> tuple[dict[str, Clip], str]:
+    """The captures by subject, and why there are none: the first run's whose capture can be opened."""
+    reasons = []
+    for run in runs.runs:
+        try:
+            return {clip.subject: clip for clip in open_run_clips(run.folder.root, options)[1]}, ""
+        except (HeadbenchError, OSError) as error:
+            reasons.append(" ".join(str(error).split()))
+    return {}, reasons[0]
+
+
+def encode(image: ByteArray, quality: int) -> str:
+    """An (H, W, 3) image as the base64 of a WebP."""
+    done, data = cv2.imencode(".webp", image[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, quality])
+    if not done:
+        raise InputError("report", "image", "pixels that WebP can hold", f"shape {image.shape}")
+    return base64.b64encode(data).decode("ascii")
+
+
+def choose_pictures(
+    runs: RunSet, worst: Sequence[Frame], budget: int, options: RunOptions, progress: Progress
+) -> Pictures:
+    """Encode the worst frames, then others while they fit in ``budget`` bytes of base64.
+
+    Raises `InputError` where the worst ones do not fit.
+    """
+    clips, why = open_truth(runs, options)
+    pictures = Pictures(truth=why)
+    source = _Source(runs, clips, why)
+    every = [Frame(task, key) for task in runs.tasks for key in runs.keys[task]]
+    first_cameras = {task: min((k.camera for k in runs.keys[task]), default="") for task in runs.tasks}
+    rest = [frame for frame in spread(every) if frame not in set(worst)]
+    done = 0
+
+    with ThreadPoolExecutor() as pool:
+
+        def add(frames: Sequence[Frame], qualities: Sequence[int], limit: int) -> bool:
+            nonlocal done
+            for start in range(0, len(frames), BATCH):
+                batch, of_batch = frames[start : start + BATCH], qualities[start : start + BATCH]
+                for frame, quality, (images, reasons) in zip(
+                    batch, of_batch, pool.map(source.read, batch, of_batch)
+                ):
+                    size = sum(len(image) + 3 for image in images if image is not None)
+                    if pictures.bytes + size > limit:
+                        return False
+                    pictures.shown[frame], pictures.reasons[frame] = images, reasons
+                    pictures.bytes += size
+                    if quality == LOSSLESS:
+                        pictures.lossless.add(frame)
+                done += len(batch)
+                progress(done, len(every), "pictures")
+            return True
+
+        if not add(worst, [LOSSLESS] * len(worst), budget // 2):
+            pictures = Pictures(truth=why, first_cameras_lossless=False)
+            done = 0
+            if not add(worst, [LOSSY] * len(worst), budget):
+                shown = f"{len(pictures.shown)} of {len(worst)} fit"
+                raise InputError("command line", "--max-mb", f"room for the {len(worst)} worst frames", shown)
+        elif worst:
+            own = sum(frame.key.camera == first_cameras[frame.task] for frame in rest)
+            pictures.first_cameras_lossless = pictures.bytes * (1 + own / len(worst)) <= budget / 2
+        exact = {f for f in rest if pictures.first_cameras_lossless and f.key.camera == first_cameras[f.task]}
+        add(rest, [LOSSLESS if frame in exact else LOSSY for frame in rest], budget)
+    progress(len(every), len(every), "pictures")
+    return pictures
+
+
+@dataclass
+class _Source:
+    """Reads and encodes a frame's pictures, in any thread."""
+
+    runs: RunSet
+    clips: Mapping[str, Clip]
+    why: str
+    lock: Lock = field(default_factory=Lock)
+
+    def __post_init__(self) -> None:
+        self.reason = cache(self._reason)
+
+    def read(self, frame: Frame, quality: int) -> tuple[list[str | None], list[str]]:
+        images: list[ByteArray | None] = [self._truth(frame.key)]
+        reasons = ["" if images[0] is not None else self.why or "no capture of this subject"]
+        for label in self.runs.methods:
+            image, reason = self._render(label, frame)
+            if image is not None and images[0] is not None and image.shape != images[0].shape:
+                size = " x ".join(map(str, image.shape[1::-1]))
+                image, reason = None, f"of another size than the ground truth ({size})"
+            images.append(image)
+            reasons.append(reason)
+        return [None if image is None else encode(image, quality) for image in images], reasons
+
+    def _truth(self, key: FrameKey) -> ByteArray | None:
+        with self.lock:  # a clip keeps what it decoded, for one thread at a time
+            return self.clips[key.subject].image(key) if key.subject in self.clips else None
+
+    def _render(self, label: str, frame: Frame) -> tuple[ByteArray | None, str]:
+        run, name = self.runs.shown[label]
+        try:
+            image = run.render(name, frame.task, frame.key)
+        except HeadbenchError as error:
+            return None, " ".join(str(error).split())
+        if image is not None:
+            return image, ""
+        with self.lock:
+            return None, self.reason(label, frame.task, frame.key.subject)
+
+    def _reason(self, label: str, task: str, subject: str) -> str:
+        run, name = self.runs.shown[label]
+        return " ".join(run.reason(name, task, FrameKey(subject, "", 0, "")).split())

@@ -1,0 +1,348 @@
+"""The HTML page of runs: what stands on it, and the file."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...bench.contracts import Progress, no_progress
+from ...bench.errors import InputError
+from ...bench.io.files import check_writable, write_text
+from ...bench.protocol import TASK_TITLES
+from ...bench.rows import ALL
+from ...bench.runner.config import RunOptions
+from ...bench.runner.scoring import FULL
+from ...bench.runner.store import RunFolder
+from ...bench.specs import Findings, MetricSpec
+from ..aggregate import summarise
+from ..drawing import colour_map
+from ..pareto.points import LATENCY, SIZE, SPEED, pareto_front
+from ..runs import Part, RunData, RunSet
+from ..statistics.command import CompareSettings, compare_methods
+from ..table_report import COMPARISON, TITLES, layouts, table_of
+from ..tables import AVATAR_TITLE, Table
+from ..writers import render_page
+from .command import PageSettings
+from .frames import Frame, Pictures, choose_pictures, frame_values, worst_frames
+
+HERE = Path(__file__).parent
+MEGABYTE = 10**6
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A table with a heading."""
+
+    title: str
+    table: Table
+
+
+def write_page(run_folder: Path) -> list[Path]:
+    """Write ``report.html`` of a run that has just ended; return the file. Its process has loaded the run's plug-ins."""
+    out = RunFolder(run_folder).page
+    write_report(PageSettings((str(run_folder),), str(out), trust=True))
+    return [out]
+
+
+def write_report(settings: PageSettings, progress: Progress = no_progress) -> Findings:
+    """`headbench report`: read runs and write the page."""
+    out = Path(settings.out)
+    if out.is_dir() or not out.parent.is_dir():
+        found = "a folder" if out.is_dir() else f"no folder {out.parent}"
+        raise InputError(out, "--out", "a file to write, in a folder that is there", found)
+    check_writable(out, "--out")
+    runs = RunSet.read([Path(folder) for folder in settings.runs])
+    page, pictures = page_text(runs, settings.max_mb, settings, progress)
+    write_text(out, page)
+    frames = sum(len(keys) for keys in runs.keys.values())
+    size = len(page.encode())
+    shown = len(pictures.shown)
+    text = f"{out}: {size / MEGABYTE:.1f} MB, {shown} of {frames} frames with pictures"
+    text += f"; no ground truth: {pictures.truth}" if pictures.truth else ""
+    return Findings(text, {"out": out, "bytes": size, "frames": frames, "shown": shown})
+
+
+def page_text(
+    runs: RunSet, max_mb: float, options: RunOptions, progress: Progress = no_progress
+) -> tuple[str, Pictures]:
+    """The page, and the pictures on it. Raises `InputError` where ``max_mb`` does not suffice."""
+    metrics = [spec for spec in runs.metrics if spec.per_frame and COMPARISON in spec.tables]
+    values = frame_values(runs, metrics)
+    worst = worst_frames(values, runs, metrics[0]) if metrics else []
+    content = {
+        "title": f"headbench: {', '.join(_name(run) for run in runs.runs)}",
+        "tables": _parts(runs),
+        "layouts": [
+            Shown(TITLES.get(name, name), table_of(runs, name))
+            for name in layouts(runs)
+            if name != COMPARISON
+        ],
+        "comparisons": _comparisons(runs),
+        "records": [_record(run) for run in runs.runs],
+        "failed": _failed(runs),
+        "script": (HERE / "page.js").read_text("utf-8"),
+        "style": (HERE / "page.css").read_text("utf-8"),
+    }
+    data = _data(runs, metrics, values)
+    empty = Pictures(truth="-" * 400)
+    room = int(max_mb * MEGABYTE) - len(_filled(content, data, [], empty).encode()) - 1000
+    entry = 8 * (len(runs.methods) + 2)  # bytes of a frame's entry in the list, beside its pictures
+    pictures = choose_pictures(runs, worst, room - entry * len(data["frames"]), options, progress)
+    images: list[str] = []
+    for index, frame in enumerate(_frames(runs)):
+        if frame in pictures.shown:
+            data["frames"][index]["p"] = _places(frame, pictures, images, data["reasons"])
+            data["frames"][index]["l"] = int(frame in pictures.lossless)
+    page = _filled(content, data, images, pictures)
+    if len(page.encode()) > max_mb * MEGABYTE:
+        found = f"{len(page.encode()) / MEGABYTE:.2f} needed"
+        raise InputError("command line", "--max-mb", "room for tables and record", found)
+    return page, pictures
+
+
+def _places(frame: Frame, pictures: Pictures, images: list[str], reasons: list[str]) -> list[int]:
+    """Index of each picture of a frame among ``images``, -1 - index of its reason where there is none."""
+    places = []
+    for image, reason in zip(pictures.shown[frame], pictures.reasons[frame]):
+        if image is not None:
+            places.append(len(images))
+            images.append(image)
+            continue
+        if reason not in reasons:
+            reasons.append(reason)
+        places.append(-1 - reasons.index(reason))
+    return places
+
+
+def _filled(content: dict[str, Any], data: dict[str, Any], images: Sequence[str], pictures: Pictures) -> str:
+    policy = "; ".join(
+        [
+            "default-src 'none'",
+            "img-src data:",
+            f"script-src '{_digest(content['script'])}'",
+            f"style-src '{_digest(content['style'])}'",
+            "base-uri 'none'",
+            "form-action 'none'",
+        ]
+    )
+    words = {
+        "shown": len(pictures.shown),
+        "lossless": len(pictures.lossless),
+        "frames": len(data["frames"]),
+        "truth": pictures.truth,
+        "first_cameras": pictures.first_cameras_lossless,
+    }
+    return render_page(
+        "page.html", **content, policy=policy, words=words, data=_json(data), images=_json(list(images))
+    )
+
+
+def _digest(text: str) -> str:
+    """As a content security policy names a script or a style."""
+    return f"sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}"
+
+
+def _json(value: Any) -> str:
+    """JSON that may stand in a script element: it has no "<"."""
+    return json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":")).replace(
+        "<", r"\u003c"
+    )
+
+
+def _frames(runs: RunSet) -> list[Frame]:
+    return [Frame(task, key) for task in runs.tasks for key in sorted(runs.keys[task])]
+
+
+def _data(
+    runs: RunSet, metrics: Sequence[MetricSpec], values: dict[tuple[str, str, Frame], float]
+) -> dict[str, Any]:
+    """What the script reads: names once, frames by index into them, values by metric and method."""
+    frames = _frames(runs)
+    subjects, sequences, cameras = (
+        sorted({getattr(frame.key, part) for frame in frames}) for part in ("subject", "sequence", "camera")
+    )
+    places = [{name: index for index, name in enumerate(names)} for names in (subjects, sequences, cameras)]
+
+    def number(spec: MetricSpec, label: str, frame: Frame) -> float | None:
+        value = values.get((spec.name, label, frame))
+        return None if value is None else round(value, spec.digits + 2)
+
+    return {
+        "methods": list(runs.methods),
+        "trivial": list(runs.trivial),
+        "tasks": [TASK_TITLES.get(task, task) for task in runs.tasks],
+        "subjects": subjects,
+        "sequences": sequences,
+        "cameras": cameras,
+        "metrics": [
+            {"label": s.label, "unit": s.unit, "digits": s.digits, "up": s.higher_is_better} for s in metrics
+        ],
+        "frames": [
+            {
+                "at": [
+                    runs.tasks.index(frame.task),
+                    places[0][frame.key.subject],
+                    places[1][frame.key.sequence],
+                    places[2][frame.key.camera],
+                    frame.key.timestep,
+                ],
+                "v": [[number(spec, label, frame) for label in runs.methods] for spec in metrics],
+            }
+            for frame in frames
+        ],
+        "reasons": [],
+        "colours": colour_map(np.linspace(0, 1, 256)[None])[0].tolist(),
+        "plots": _plots(runs, metrics),
+    }
+
+
+def _parts(runs: RunSet) -> list[Shown]:
+    """The comparison of all frames, of each region and of each held-out sequence."""
+    found = [Shown("All frames", table_of(runs))]
+    found += [
+        Shown(f"Region: {region}", table_of(runs.of(Part(region=region))))
+        for region in sorted(runs.rows.regions - {FULL})
+    ]
+    sequences = sorted({key.sequence for key in runs.keys.get("self_reenactment", ())})
+    if len({key.sequence for keys in runs.keys.values() for key in keys}) > 1:
+        measured = [name for name in sequences if name in runs.rows.sequences]
+        found += [Shown(f"Sequence: {name}", table_of(runs.of(Part(sequences=(name,))))) for name in measured]
+    return found
+
+
+def _plots(runs: RunSet, metrics: Sequence[MetricSpec]) -> list[dict[str, Any]]:
+    """Quality by the first metric against size and frame time, with the front; none where there is nothing to draw."""
+    plots = []
+    for task in runs.tasks if metrics else ():
+        for cost, words in (("megabytes", "Size (MB)"), ("milliseconds", "Frame time (ms)")):
+            points = []
+            for label in runs.ranked:
+                quality = summarise(runs.rows, label, metrics[0].name, task).value
+                x = _cost(runs, label, cost)
+                if quality is not None and x is not None and x > 0:
+                    points.append((label, x, quality))
+            if len(points) < 2:
+                continue
+            sign = 1 if metrics[0].higher_is_better else -1
+            plots.append(
+                {
+                    "title": f"{TASK_TITLES.get(task, task)}: {metrics[0].label} against {words.split(' (')[0].lower()}",
+                    "x": words,
+                    "y": f"{metrics[0].label} ({metrics[0].unit})" if metrics[0].unit else metrics[0].label,
+                    "points": [list(p) for p in points],
+                    "front": pareto_front([p[1] for p in points], [sign * p[2] for p in points]),
+                }
+            )
+    return plots
+
+
+def _cost(runs: RunSet, label: str, cost: str) -> float | None:
+    """Size, or the median time of a frame, or that of the mean rate where there is no median, as in `Point`."""
+    if cost == "megabytes":
+        return summarise(runs.rows, label, SIZE, "").value
+    milliseconds, rate = (summarise(runs.rows, label, name, "").value for name in (LATENCY, SPEED))
+    return milliseconds if milliseconds is not None or not rate else 1000.0 / rate
+
+
+def _comparisons(runs: RunSet) -> dict[str, Any]:
+    """Paired differences by task and metric, or why there are none."""
+    if len(runs.ranked) < 2:
+        return {"reason": "A comparison takes two methods that are no trivial baselines.", "groups": []}
+    specs = {spec.name: spec for spec in runs.metrics}
+    settings = CompareSettings(tuple(str(run.folder.root) for run in runs.runs))
+    findings = compare_methods(runs, settings)
+    groups: dict[tuple[str, str], list[list[str]]] = {}
+    for one in findings.data["comparisons"]:
+        spec = specs[one["metric"]]
+        task = TASK_TITLES.get(one["task"], one["task"]) or AVATAR_TITLE
+        unit = f" ({spec.unit})" if spec.unit else ""
+        better = "higher" if spec.higher_is_better else "lower"
+        line = [f"{one['first']} − {one['second']}"]
+        if one["difference"] is None:
+            line += ["–", "–", "–", f"{one['verdict']}: {one['reason']}"]
+        else:
+            digits = spec.digits + 1
+            bounds = (one["low"], one["high"])
+            interval = "–" if None in bounds else " to ".join(f"{bound:+.{digits}f}" for bound in bounds)
+            line += [f"{one['difference']:+.{digits}f}", interval, f"{one['p_holm']:.4f}", one["verdict"]]
+        groups.setdefault((task, f"{spec.label}{unit}, {better} is better"), []).append(line)
+    subjects = len(runs.rows.subjects)
+    return {
+        "reason": "",
+        "subjects": subjects,
+        "level": findings.data["level"],
+        "testable": any("not testable" not in line[-1] for lines in groups.values() for line in lines),
+        "groups": [{"title": f"{task}, {what}", "lines": lines} for (task, what), lines in groups.items()],
+    }
+
+
+def _name(run: RunData) -> str:
+    return run.folder.root.resolve().name
+
+
+def _record(run: RunData) -> dict[str, Any]:
+    """What made a run's numbers, as text; without names of folders of the machine."""
+    manifest = run.manifest
+    excluded = {
+        (*key, why): None for protocol in manifest.protocols.values() for key, why in protocol.excluded
+    }
+    machine = manifest.machine
+    return {
+        "name": _name(run),
+        "done": manifest.status == "done",
+        "facts": [
+            ("Machine", run.machine),
+            ("Cores", str(machine.get("cores", ""))),
+            ("System", str(machine.get("system", ""))),
+            ("Python", str(machine.get("python", ""))),
+            *((str(name), str(version)) for name, version in dict(machine.get("packages") or {}).items()),
+            ("Seconds of the last start", "" if manifest.seconds is None else f"{manifest.seconds:.0f}"),
+        ],
+        "protocols": [
+            (TASK_TITLES.get(task, task), p.id, p.hash, str(len(p.keys)), p.resolution, p.quantisation)
+            for task, p in manifest.protocols.items()
+        ],
+        "clips": [(clip.subject, clip.fingerprint) for clip in manifest.clips],
+        "methods": [(m.name, m.version, json.dumps(m.budget)) for m in manifest.methods],
+        "configuration": json.dumps(_without_folders(asdict(manifest.configuration)), indent=1, default=str),
+        "settings": json.dumps(
+            _without_folders({m.name: m.config for m in manifest.methods}), indent=1, default=str
+        ),
+        "excluded": _excluded(excluded),
+    }
+
+
+def _excluded(frames: dict[tuple[Any, ...], None]) -> list[tuple[str, str, str, str, str]]:
+    """Subject, sequence, timestep, how many cameras, reason."""
+    moments: dict[tuple[Any, ...], int] = {}
+    for subject, sequence, timestep, _, why in frames:
+        moments[subject, sequence, timestep, why] = moments.get((subject, sequence, timestep, why), 0) + 1
+    return [(subject, seq, str(t), str(n), why) for (subject, seq, t, why), n in sorted(moments.items())]
+
+
+def _without_folders(value: Any) -> Any:
+    """A value whose absolute paths are cut to their last part."""
+    if isinstance(value, dict):
+        return {key: _without_folders(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_folders(item) for item in value]
+    return os.path.basename(value) if isinstance(value, str) and os.path.isabs(value) else value
+
+
+def _failed(runs: RunSet) -> list[tuple[str, str, str, str]]:
+    """Method, seed, subject and error of each avatar that failed."""
+    found: dict[tuple[str, str, str, str], None] = {}
+    for label in runs.rows.failed:
+        own = runs.rows.select(method=label, metric=ALL, task=ALL, region=ALL, seeds=ALL)
+        own = own[own["status"] == "failed"].drop_duplicates(["seed", "subject", "reason"])
+        for seed, subject, reason in own[["seed", "subject", "reason"]].itertuples(index=False, name=None):
+            found[label, str(seed), str(subject), str(reason)] = None
+    return [*found]

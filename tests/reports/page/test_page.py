@@ -1,0 +1,267 @@
+import base64
+import json
+import re
+from html.parser import HTMLParser
+
+import cv2
+import numpy as np
+import pytest
+
+from headbench.bench.contracts import FrameKey
+from headbench.bench.errors import InputError
+from headbench.bench.rows import ALL, Rows
+from headbench.bench.runner.config import RunOptions
+from headbench.reports.page import frames
+from headbench.reports.page.command import PageSettings, report
+from headbench.reports.page.frames import Frame, choose_pictures, spread
+from headbench.reports.page.report import write_page
+from headbench.reports.runs import RunData, RunSet
+from headbench.reports.table_report import layouts, table_text
+
+HOSTILE = "<img src=x onerror=alert(1)>'\"&" + "m" * 80
+
+
+class Page(HTMLParser):
+    """What a browser finds: tables as lists of rows, elements with their attributes, text of the data elements."""
+
+    def __init__(self, path):
+        super().__init__()
+        self.tables, self.elements, self.texts, self.inside = [], [], {}, None
+        self.feed(path.read_text())
+
+    def handle_starttag(self, tag, attributes):
+        attributes = dict(attributes)
+        self.elements.append((tag, attributes))
+        self.inside = f"{tag}#{attributes['id']}" if "id" in attributes else tag
+        if tag == "table":
+            self.tables.append([])
+        elif tag == "tr":
+            self.tables[-1].append([])
+        elif tag in ("td", "th") and self.tables:
+            self.tables[-1][-1].append([attributes.get("title"), ""])
+
+    def handle_data(self, text):
+        self.texts[self.inside] = self.texts.get(self.inside, "") + text
+        if self.tables and self.tables[-1] and self.tables[-1][-1]:
+            self.tables[-1][-1][-1][1] += text
+
+    @property
+    def data(self):
+        return json.loads(self.texts["script#data"])
+
+    @property
+    def images(self):
+        return json.loads(self.texts["script#images"])
+
+
+@pytest.fixture
+def page(toy_run, tmp_path):
+    """Make the page of the toy run with changed settings, and read it."""
+
+    def make(runs=(toy_run,), **changes):
+        out = tmp_path / "page.html"
+        settings = {"runs": tuple(map(str, runs)), "out": str(out), "trust": True, **changes}
+        found = report(PageSettings(**settings))
+        assert found.data["bytes"] == out.stat().st_size
+        return Page(out)
+
+    return make
+
+
+def numbers(table):
+    """Method, then the full value and the text without marks of each cell, of a table of the page."""
+    body = [row for row in table[2:] if len(row) > 1]
+    return {row[0][1]: [cell[0] for cell in row[1:]] for row in body}
+
+
+def test_the_tables_show_the_numbers_of_headbench_table(page, write_run):
+    run = write_run("run", {"good": 30.0, "better": 31.25, "mean-image": 12.0})
+    found = page([run])
+    known = layouts(RunSet.read([run]))
+    asked = [json.loads(table_text([run], "json", name)) for name in known]
+    assert asked
+    for table, expected in zip(found.tables, asked):
+        rows = [row for _, group in expected["groups"] for row in group]
+        wanted = {
+            r["method"]: [None if c["value"] is None else str(c["value"]) for c in r["cells"]] for r in rows
+        }
+        assert numbers(table) == wanted
+
+
+def test_parts_are_the_regions_and_sequences_of_the_run(page, write_run):
+    run = RunData.read(write_run("run", {"good": 30.0, "better": 31.0}))
+    rows = run.rows.select(method=ALL, metric=ALL, task=ALL, region=ALL, seeds=ALL)
+    face = rows[rows["timestep"] >= 0].assign(region="face", value=rows["value"] + 1)
+    Rows.joined([Rows(rows), Rows(face)]).write(run.folder.rows)
+    found = page([run.folder.root])
+    titles = [attributes["data-title"] for tag, attributes in found.elements if tag == "article"]
+    assert titles == ["All frames", "Region: face"]
+    expected = json.loads(table_text([run.folder.root], "json", region="face"))
+    first = expected["groups"][0][1][0]
+    assert numbers(found.tables[1])[first["method"]] == [str(c["value"]) for c in first["cells"]]
+
+
+def test_the_front_joins_the_methods_that_none_beats(page, write_run):
+    plots = page([write_run("run", {"a": 30.0, "b": 31.0, "mean-image": 12.0})]).data["plots"]
+    assert [plot["x"] for plot in plots] == ["Size (MB)", "Frame time (ms)"] * 2
+    size, time = plots[:2]
+    assert size["points"] == [["a", 8.0, 30.0], ["b", pytest.approx(8.1), 31.0]]
+    assert [point[1] for point in time["points"]] == pytest.approx([1000 / 130, 1000 / 131])
+    assert (size["front"], time["front"]) == ([0, 1], [1])
+
+
+def test_pictures_are_the_pixels_of_renders_and_capture(page, toy_run):
+    found = page()
+    run = RunData.read(toy_run)
+    data = found.data
+    for entry in data["frames"]:
+        task, subject, sequence, camera, timestep = entry["at"]
+        key = FrameKey(
+            data["subjects"][subject], data["sequences"][sequence], timestep, data["cameras"][camera]
+        )
+        name = run.tasks[task]
+        expected = [run.ground_truth(key), run.render("toy", name, key)]
+        for place, image in zip(entry["p"], expected):
+            raw = np.frombuffer(base64.b64decode(found.images[place]), np.uint8)
+            shown = cv2.imdecode(raw, cv2.IMREAD_COLOR)[..., ::-1].astype(int)
+            assert np.abs(shown - image).max() <= (0 if entry["l"] else 12)
+        value = run.value("error", "toy", name, key)
+        assert entry["v"][0][0] == pytest.approx(value, abs=1e-3)
+    assert {entry["l"] for entry in data["frames"]} == {0, 1}
+    assert len(data["frames"]) == sum(map(len, RunSet.read([toy_run]).keys.values()))
+
+
+def test_a_failed_method_stands_with_its_error(page, toy_run):
+    found = page()
+    reasons = {found.data["reasons"][-1 - entry["p"][2]] for entry in found.data["frames"]}
+    assert reasons == {"RuntimeError: the training diverged"}
+    (failed,) = [table for table in found.tables if table[0][-1][1].strip() == "Error"]
+    assert {row[3][1].split("\n")[0] for row in failed[1:]} == {"RuntimeError: the training diverged"}
+
+
+def test_without_the_capture_the_page_says_why(page, toy_run, tmp_path):
+    (tmp_path / "data").rename(tmp_path / "gone")
+    found = page()
+    assert "neither there" in found.data["reasons"][0]
+    assert all(entry["p"][0] == -1 and entry["p"][1] >= 0 for entry in found.data["frames"])
+    assert "no ground truth on this page" in " ".join(found.texts.values())
+    again = page(data=str(tmp_path / "gone"))
+    assert all(entry["p"][0] >= 0 for entry in again.data["frames"])
+
+
+def test_without_renders_the_page_says_so(page, toy_run):
+    for path in toy_run.rglob("*.png"):
+        path.unlink()
+    found = page()
+    assert {found.data["reasons"][-1 - entry["p"][1]] for entry in found.data["frames"]} == {"not rendered"}
+
+
+def test_nothing_refers_to_another_place(page, toy_run):
+    found = page()
+    for tag, attributes in found.elements:
+        assert tag not in ("link", "img", "iframe", "object", "base", "form")
+        assert not [
+            name for name in attributes if name.startswith("on") or name in ("src", "style", "srcset")
+        ]
+        assert attributes.get("href", "#").startswith("#")
+    (policy,) = [
+        a["content"] for tag, a in found.elements if a.get("http-equiv") == "Content-Security-Policy"
+    ]
+    assert policy.startswith("default-src 'none'; img-src data:; script-src 'sha256-")
+    assert "unsafe" not in policy
+    assert "http" not in re.sub(r"http://www\.w3\.org/2000/svg", "", found.texts["script"])
+    assert str(toy_run.parent) not in " ".join(found.texts.values())
+
+
+def test_hostile_names_stand_as_text(page, write_run):
+    found = page([write_run("run", {HOSTILE: 30.0, "other": 31.0})])
+    assert found.data["methods"] == [HOSTILE, "other"]
+    assert HOSTILE in numbers(found.tables[0])
+    assert [tag for tag, _ in found.elements].count("script") == 3
+    assert "img" not in [tag for tag, _ in found.elements]
+
+
+def test_an_error_cannot_end_the_script_it_stands_in(page, toy_run):
+    run = RunData.read(toy_run)
+    rows = run.rows.select(method=ALL, metric=ALL, task=ALL, region=ALL, seeds=ALL)
+    reason = "</script><script>alert(1)</script>"
+    Rows(rows.assign(reason=rows["reason"].where(rows["status"] != "failed", reason))).write(run.folder.rows)
+    found = page()
+    assert [tag for tag, _ in found.elements].count("script") == 3
+    assert found.data["reasons"] == [reason]
+
+
+def test_the_worst_frames_are_always_there(toy_run, monkeypatch):
+    runs = RunSet.read([toy_run])
+    every = [Frame(task, key) for task in runs.tasks for key in sorted(runs.keys[task])]
+    spec = next(s for s in runs.metrics if s.name == "error")
+    values = {("error", "toy", frame): float(index) for index, frame in enumerate(every)}
+    moments = {}
+    for frame in reversed(every) if not spec.higher_is_better else every:
+        moments.setdefault((frame.task, *frame.key[:3]), frame)
+    worst = frames.worst_frames(values, runs, spec, count=1)
+    expected = {}
+    for frame in moments.values():
+        expected.setdefault(frame.task, frame)
+    assert set(worst) == set(expected.values())
+    images = np.random.default_rng(0).integers(0, 256, (4, 4, 3), dtype=np.uint8)
+    monkeypatch.setattr(frames._Source, "read", lambda *_: (["x" * 997, None], ["", images.shape]))
+    limits = 1000 * len(worst)
+    some = choose_pictures(runs, worst, 2 * limits + 999, RunOptions(trust=True), lambda *_: None)
+    assert set(worst) <= set(some.shown)
+    assert some.bytes == 2 * limits
+    few = choose_pictures(runs, worst, limits, RunOptions(trust=True), lambda *_: None)
+    assert set(few.shown) == set(worst)
+    assert not few.lossless
+    with pytest.raises(InputError, match="--max-mb"):
+        choose_pictures(runs, worst, limits - 1, RunOptions(trust=True), lambda *_: None)
+
+
+def test_frames_are_added_evenly_and_from_all_groups():
+    every = [
+        Frame("t", FrameKey("s", "q", timestep, camera)) for camera in "ab" for timestep in range(0, 90, 10)
+    ]
+    order = [*spread(every)]
+    assert sorted(order) == sorted(every)
+    assert [(f.key.camera, f.key.timestep) for f in order[:6]] == [
+        *(("a", 0), ("b", 0), ("a", 80), ("b", 80), ("a", 40), ("b", 40))
+    ]
+    assert [f.key.timestep for f in order[6::2][:2]] == [20, 60]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"max_mb": 0.1}, r"--max-mb"),
+        ({"out": "nowhere/page.html"}, r"in a folder that is there, found no folder nowhere"),
+        ({"runs": ("nothing",)}, r"no run.json"),
+    ],
+)
+def test_faulty_input_is_refused_and_leaves_no_file(page, toy_run, tmp_path, monkeypatch, changes, message):
+    monkeypatch.chdir(tmp_path)
+    before = sorted(tmp_path.rglob("*"))
+    if "max_mb" in changes:
+        monkeypatch.setattr(frames, "encode", lambda image, quality: "x" * 10**6)
+    with pytest.raises(InputError, match=message):
+        page(**changes)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_run_half_done(page, toy_run, change_manifest):
+    change_manifest(toy_run, lambda m: m.update(status="started"))
+    assert "has not ended" in " ".join(page().texts.values())
+    (toy_run / "rows.parquet").unlink()
+    with pytest.raises(InputError, match="the rows of a finished run"):
+        page()
+
+
+def test_one_page_of_two_runs(page, toy_run, make_run):
+    other = make_run("other", methods=("toy_plugin:METHOD",), seeds=(1,))
+    found = page([make_run("first"), other])
+    assert found.data["methods"] == ["toy"]
+    assert all(entry["p"][1] >= 0 for entry in found.data["frames"])
+
+
+def test_a_run_writes_its_page_beside_the_tables(toy_run):
+    assert write_page(toy_run) == [toy_run / "report.html"]
+    assert Page(toy_run / "report.html").data["methods"] == ["toy", "failing"]
