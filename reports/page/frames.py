@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -105,6 +106,11 @@ def _refined(items: Sequence[Frame]) -> list[Frame]:
     return [items[index] for index in order]
 
 
+def without_folders(text: str) -> str:
+    """One line in which absolute paths are cut to their last part: a page is sent to others."""
+    return re.sub(r"(?<![\w./])(?:/[^\s/:,'\"]+)+/([^\s/:,'\"]+)", r"\1", " ".join(text.split()))
+
+
 def open_truth(runs: RunSet, options: RunOptions) -> tuple[dict[str, Clip], str]:
     """The captures by subject, and why there are none: the first run's whose capture can be opened."""
     reasons = []
@@ -112,7 +118,7 @@ def open_truth(runs: RunSet, options: RunOptions) -> tuple[dict[str, Clip], str]
         try:
             return {clip.subject: clip for clip in open_run_clips(run.folder.root, options)[1]}, ""
         except (HeadbenchError, OSError) as error:
-            reasons.append(" ".join(str(error).split()))
+            reasons.append(without_folders(str(error)))
     return {}, reasons[0]
 
 
@@ -187,27 +193,33 @@ class _Source:
         self.reason = cache(self._reason)
 
     def read(self, frame: Frame, quality: int) -> tuple[list[str | None], list[str]]:
-        images: list[ByteArray | None] = [self._truth(frame.key)]
-        reasons = ["" if images[0] is not None else self.why or "no capture of this subject"]
+        truth, reason = self._truth(frame.key)
+        images: list[ByteArray | None] = [truth]
+        reasons = [reason]
         for label in self.runs.methods:
             image, reason = self._render(label, frame)
-            if image is not None and images[0] is not None and image.shape != images[0].shape:
+            if image is not None and truth is not None and image.shape != truth.shape:
                 size = " x ".join(map(str, image.shape[1::-1]))
                 image, reason = None, f"of another size than the ground truth ({size})"
             images.append(image)
             reasons.append(reason)
         return [None if image is None else encode(image, quality) for image in images], reasons
 
-    def _truth(self, key: FrameKey) -> ByteArray | None:
-        with self.lock:  # a clip keeps what it decoded, for one thread at a time
-            return self.clips[key.subject].image(key) if key.subject in self.clips else None
+    def _truth(self, key: FrameKey) -> tuple[ByteArray | None, str]:
+        if key.subject not in self.clips:
+            return None, self.why or "no capture of this subject"
+        try:
+            with self.lock:  # a clip keeps what it decoded, for one thread at a time
+                return self.clips[key.subject].image(key), ""
+        except (HeadbenchError, OSError) as error:
+            return None, without_folders(str(error))
 
     def _render(self, label: str, frame: Frame) -> tuple[ByteArray | None, str]:
         run, name = self.runs.shown[label]
         try:
             image = run.render(name, frame.task, frame.key)
         except HeadbenchError as error:
-            return None, " ".join(str(error).split())
+            return None, without_folders(str(error))
         if image is not None:
             return image, ""
         with self.lock:

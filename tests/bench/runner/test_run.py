@@ -346,7 +346,7 @@ def test_a_report_that_fails_stops_no_other(monkeypatch, toy, tmp_path, caplog):
 
 CELL = ("avatar", "avatar/level.txt", "fit.json", "renders", "renders/novel_view", "rows.parquet")
 LINKED = (
-    *("run.json", "rows.parquet", "contact_sheet.png", "tables", "subject1", "subject1/toy"),
+    *("run.json", "rows.parquet", "contact_sheet.png", "report.html", "tables", "subject1", "subject1/toy"),
     *("subject1/toy/seed-0", *(f"subject1/toy/seed-0/{name}" for name in CELL)),
 )
 

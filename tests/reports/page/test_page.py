@@ -143,10 +143,23 @@ def test_without_the_capture_the_page_says_why(page, toy_run, tmp_path):
     (tmp_path / "data").rename(tmp_path / "gone")
     found = page()
     assert "neither there" in found.data["reasons"][0]
+    assert str(tmp_path) not in " ".join(found.texts.values())
     assert all(entry["p"][0] == -1 and entry["p"][1] >= 0 for entry in found.data["frames"])
     assert "no ground truth on this page" in " ".join(found.texts.values())
     again = page(data=str(tmp_path / "gone"))
     assert all(entry["p"][0] >= 0 for entry in again.data["frames"])
+
+
+def test_damaged_images_leave_the_others(page, toy_run, toy, monkeypatch):
+    def damaged(clip, key):
+        raise InputError("/somewhere/private/image.png", "", "an image", "none")
+
+    (path,) = (toy_run / "subject1" / "toy").rglob("EMO_00001_b.png")  # tables look at the first of a camera
+    path.write_bytes(b"no image")
+    monkeypatch.setattr(toy.ToyClip, "image", damaged)
+    reasons = page().data["reasons"]
+    assert any(reason.startswith("image.png: expected an image") for reason in reasons)
+    assert any(".png: " in reason and "PNG" in reason for reason in reasons)
 
 
 def test_without_renders_the_page_says_so(page, toy_run):
