@@ -34,7 +34,7 @@ _OF_OTHERS = {
     "run": "benchmark fit train",
     "sweep": "prune",
     "synth": "generate synthesize",
-    "table": "report results show",
+    "table": "results show",
 }
 WORDS_OF_OTHERS = {word: name for name, words in _OF_OTHERS.items() for word in words.split()}
 """What other toolkits call their commands, and which of ours does it."""

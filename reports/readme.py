@@ -113,7 +113,9 @@ def suite_block(folder: Path) -> str:
     """Return the README's block for the stored results of the suite: Markdown."""
     minutes = [value for each in _runs(folder) for _, value in _minutes(each)]
     hours = sum(value for value in minutes if value is not None) / 60
-    interrupted = f", without {minutes.count(None)} that were interrupted" if None in minutes else ""
+    interrupted = (
+        f", not counting {minutes.count(None)} that were interrupted and continued" if None in minutes else ""
+    )
     return (
         f"{table_text([folder / 'run'], 'md').strip()}\n\n"
         f"[Tables by region and by part of FREE, paired differences with tests]({SUITE}/{RESULTS}). "
