@@ -44,7 +44,7 @@ class Writer:
 
 PAGE = "report.html"  # speeds stand on it
 MEASURED_FILES = ("measure.json", "points.csv", "pareto.png", "cost.*", PAGE)
-MEASURED_CURVE = ("fit.json", "measure.json", "curve.csv", "curve.png")
+MEASURED_CURVE = ("fit.json", "measure.json", "curve.csv", "curve.png", PAGE)
 WRITERS = [
     Writer("synth", "settings", f"synth {SYNTH} --out out"),
     Writer("run", "unfinished", "run --config config.json", (PAGE,)),
@@ -74,7 +74,7 @@ WRITERS = [
         "official",
         "parity ga --checkout repository --python ./python --commit= --device cpu-shim --data capture "
         "--iterations 3 --orders 1 --frames 1 --tolerance 100 --out out",
-        ("*.log",),
+        ("*.log", PAGE),
     ),
     Writer("compact", "run", f"compact {AVATAR.format('ours')} --out out --compare capture"),
     Writer("export ply", "run", f"export ply {AVATAR.format('ga')} --out out.ply"),
