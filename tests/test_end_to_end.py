@@ -180,6 +180,7 @@ CASES = {
     ],
     "report": [
         case("report {demo} --out report.html --max-mb 5", "frames with pictures", "report.html"),
+        case("report {demo} --split", "frames with pictures", "report/index.html"),
     ],
     "verify": [case("verify {demo}", "as recorded")],
     "bundle": [

@@ -10,6 +10,7 @@ import numpy as np
 from ..contracts import FloatArray, HeadAsset
 from ..errors import InputError
 from ..io.arrays import TEXT, Member, read_arrays
+from ..io.documents import checked, read_json
 from ..io.files import digest, digest_file
 from ..registry import get
 from ..specs import MethodSpec
@@ -87,6 +88,18 @@ def shows_another(folder: Path, subject: str, head: HeadAsset, shape: FloatArray
     if str(found["head_model"]) == head.version and own.shape == np.shape(shape):
         return name if np.abs(own - shape).max(initial=0.0) > SAME_SHAPE else ""
     return name if name != subject else ""
+
+
+TRAINING_FILE = "training.json"
+"""Where methods record how a training went. Its "losses", if any, are pairs of an iteration and the loss up to there."""
+
+
+def training_losses(folder: Path) -> list[tuple[int, float]]:
+    """The losses that an avatar's training recorded; none where it recorded none. Raises `InputError` for a damaged record."""
+    path = folder / TRAINING_FILE
+    if not path.is_file():
+        return []
+    return checked(read_json(path).get("losses", []), list[tuple[int, float]], path, "losses")
 
 
 def avatar_digest(folder: Path) -> str:

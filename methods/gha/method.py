@@ -88,6 +88,7 @@ class GHA(TrainedMethod[GHAConfig, GHAAvatar]):
             mesh.iterations + outcome.iterations,
             mesh.iterations + outcome.planned,
             mesh.seconds + outcome.seconds,
+            [(mesh.iterations + at, value) for at, value in outcome.losses],
         )
         counts = {"splats": len(tensors["points"]), "mesh_iterations": mesh.iterations}
         finish_fit(fit, whole, Subject.of(clip), clip.head, **counts)

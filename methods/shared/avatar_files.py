@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,11 +15,11 @@ from ...bench.errors import InputError
 from ...bench.io.arrays import MAX_MAGNITUDE, TEXT, Member, read_arrays
 from ...bench.io.documents import read_json
 from ...bench.io.files import atomic_path, digest, write_json
-from ...bench.runner.stored import HEAD_FILE, SUBJECT_FILE
+from ...bench.runner.stored import HEAD_FILE, SUBJECT_FILE, TRAINING_FILE
 from ...datasets.head.arrays import STORED, HeadArrays, read_head, save_head
 from .loop import Fit, Outcome
 
-RECORD_FILE = "training.json"
+RECORDED_LOSSES = 200  # losses of an avatar's record at most
 _SIZES = {"rotation": 3, "neck": 3, "jaw": 3, "eyes": 6, "translation": 3}
 TRACKED = ("expression", "rotation", "neck", "jaw", "eyes", "translation")
 
@@ -152,7 +152,7 @@ def is_finished(folder: Path, run: str) -> bool:
 
     Raises `InputError` where it holds that of another.
     """
-    path = folder / RECORD_FILE
+    path = folder / TRAINING_FILE
     if not path.exists():
         return False
     found = read_json(path).get("run")
@@ -168,7 +168,18 @@ def write_record(fit: Fit, outcome: Outcome, **more: Any) -> None:
     done: dict[str, Any] = {"iterations": outcome.iterations, "planned_iterations": outcome.planned}
     if fit.trials:
         done["trials"] = [asdict(trial) for trial in fit.trials]
-    write_json(fit.out / RECORD_FILE, {"run": fit.run, **done, "seconds": round(outcome.seconds, 3), **more})
+    if outcome.losses:
+        done["losses"] = [[at, float(f"{value:.4g}")] for at, value in thinned(outcome.losses)]
+    write_json(
+        fit.out / TRAINING_FILE, {"run": fit.run, **done, "seconds": round(outcome.seconds, 3), **more}
+    )
+
+
+def thinned(losses: Sequence[tuple[int, float]], count: int = RECORDED_LOSSES) -> list[tuple[int, float]]:
+    """At most ``count`` pairs of a last iteration and the mean loss up to it, over equal numbers of pairs."""
+    size = -(-len(losses) // count)
+    groups = [losses[start : start + size] for start in range(0, len(losses), size)]
+    return [(group[-1][0], sum(value for _, value in group) / len(group)) for group in groups]
 
 
 def finish_fit(fit: Fit, outcome: Outcome, subject: Subject, head: HeadAsset, **more: Any) -> None:

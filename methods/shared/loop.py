@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -76,11 +77,15 @@ class Fit:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a run went: iterations done of those planned, and seconds over all its parts."""
+    """How a run went: iterations done of those planned, and seconds over all its parts.
+
+    ``losses`` are pairs of an iteration and the loss of its image, from every `REPORT_EVERY`-th iteration, the first and the last planned one.
+    """
 
     iterations: int
     planned: int
     seconds: float
+    losses: Sequence[tuple[int, float]] = ()
 
 
 def train(
@@ -114,6 +119,7 @@ def train(
     path, compiled = fit.out / CHECKPOINT, available()
     saved = load_checkpoint(path, fit.run, fit.device)
     started = clock() if began is None else began
+    losses: list[tuple[int, float]] = []
     if saved is None:
         iteration, spent = 0, 0.0
         total = budget.iterations
@@ -128,6 +134,7 @@ def train(
             iteration, total, spent = int(saved["iteration"]), int(saved["total"]), float(saved["seconds"])
             trainable.begin(Timeline(total, published_length))
             trainable.load_state(saved["trainable"])
+            losses += [(int(at), float(value)) for at, value in saved["losses"]]
         except (KeyError, IndexError, TypeError, ValueError, AttributeError, RuntimeError) as error:
             found = f"another ({type(error).__name__}: {error})"
             raise InputError(path, "state", "the state of this method", found, REMEDY) from error
@@ -142,22 +149,24 @@ def train(
             iteration += 1
             loss = trainable.loss(iteration, sampler(iteration))
             loss.backward()
-            if (iteration % REPORT_EVERY == 0 or iteration == 1) and not loss.isfinite():
-                remedy = "Training diverged; check the tracking (NaN?) or lower the learning rates."
-                raise InputError(fit.out, f"iteration {iteration}", "a finite loss", str(loss.item()), remedy)
+            note = ""
+            if iteration % REPORT_EVERY == 0 or iteration in (1, total):
+                value = loss.item()
+                if not math.isfinite(value):
+                    remedy = "Training diverged; check the tracking (NaN?) or lower the learning rates."
+                    raise InputError(fit.out, f"iteration {iteration}", "a finite loss", str(value), remedy)
+                losses.append((iteration, value))
+                note = f"{estimated}loss {value:.4f}; "
             trainable.after_backward(iteration)
             if iteration < total:
                 trainable.optimiser.step()
             trainable.optimiser.zero_grad()
             if clock() - last_save >= checkpoint_every_s and iteration < total:
-                done = {"iteration": iteration, "total": total, "seconds": seconds()}
+                done = {"iteration": iteration, "total": total, "seconds": seconds(), "losses": losses}
                 save_checkpoint(path, fit.run, {**done, "trainable": trainable.state()})
                 last_save = clock()
-            note = ""
-            if iteration % REPORT_EVERY == 0 or iteration == total:
-                note = f"{estimated}loss {loss.item():.4f}; {trainable.note()}"
-            fit.progress(iteration, total, note)
-    return Outcome(iteration, total, seconds())
+            fit.progress(iteration, total, note + trainable.note() if note else "")
+    return Outcome(iteration, total, seconds(), losses)
 
 
 def check_budget(budget: Budget) -> None:

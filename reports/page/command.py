@@ -10,7 +10,7 @@ from ...bench.contracts import Progress, no_progress
 from ...bench.runner.config import RunOptions
 from ...bench.specs import Findings
 
-MAX_MB = 20.0
+MAX_MB, MAX_SPLIT_MB = 20.0, 500.0
 
 
 @dataclass(frozen=True)
@@ -18,27 +18,31 @@ class PageSettings(RunOptions):
     """Write one HTML file that shows finished runs: tables, frames of all methods side by side, curves, the record.
 
     It needs no network and no other file. Pictures are chosen to fit in --max-mb: the worst frames of each method and task
-    always, the others evenly over time.
+    always, the others evenly over time. With --split it is a folder whose index.html loads pictures when they are looked at,
+    for large runs.
     """
 
     runs: tyro.conf.Positional[tuple[str, ...]]
     """Folders of finished runs on the same frames, as for `headbench table`."""
 
-    out: str = "report.html"
-    """File to write."""
+    out: str | None = None
+    """File to write, with --split a folder that is new or holds an earlier report. By default report.html or report."""
 
-    max_mb: float = MAX_MB
-    """Megabytes (10^6 bytes) that the file may have."""
+    split: bool = False
+    """Whether pictures lie in files of their own, in a folder with the page."""
+
+    max_mb: float | None = None
+    """Megabytes (10^6 bytes) that it may have. By default 20, with --split 500."""
 
     def __post_init__(self) -> None:
         if not self.runs:
             raise ValueError("runs: at least one folder")
-        if not 0.1 <= self.max_mb <= 1000:
-            raise ValueError(f"max-mb is {self.max_mb}; from 0.1 to 1000")
+        if self.max_mb is not None and not 0.1 <= self.max_mb <= (most := 4000 if self.split else 1000):
+            raise ValueError(f"max-mb is {self.max_mb}; from 0.1 to {most}")
 
 
 def report(settings: PageSettings, progress: Progress = no_progress) -> Findings:
-    """Write one HTML file that shows finished runs and opens without a network.
+    """Write one HTML file, or a folder, that shows finished runs and opens without a network.
 
     Raises `InputError` for folders that are no finished runs or do not compare, a file that cannot be written, and
     bytes that do not suffice.

@@ -96,13 +96,39 @@ function step(by) {
 }
 const shown = (value, metric) => value === null ? "–" : `${value.toFixed(metric.digits)} ${metric.unit}`.trim();
 
+// Pictures in files beside the page: each file is a script that calls addPictures. The last few are kept.
+const files = new Map();
+const wanted = {};
+function addPictures(file, pictures) { wanted[file](pictures); }
+function fileOf(file) {
+  if (!files.has(file)) {
+    files.set(file, new Promise((resolve, reject) => {
+      wanted[file] = resolve;
+      const script = make("script", {src: data.files[file][0]});
+      script.addEventListener("load", () => script.remove());
+      script.addEventListener("error", () => { script.remove(); files.delete(file); reject(new Error(`${data.files[file][0]} cannot be read`)); });
+      document.head.append(script);
+    }));
+    if (files.size > 12) files.delete(files.keys().next().value);
+  }
+  return files.get(file);
+}
+async function bytesOf(index) {
+  if (!data.files.length) return images[index];
+  let file = 0;
+  for (; index >= data.files[file][1]; file++) index -= data.files[file][1];
+  return (await fileOf(file))[index];
+}
 // Pictures, decoded once and kept for a while.
 const decoded = new Map();
 function picture(index) {
   if (!decoded.has(index)) {
-    const image = new Image();
-    image.src = "data:image/webp;base64," + images[index];
-    decoded.set(index, image.decode().then(() => image));
+    decoded.set(index, bytesOf(index).then(text => {
+      const image = new Image();
+      image.src = "data:image/webp;base64," + text;
+      return image.decode().then(() => image);
+    }));
+    decoded.get(index).catch(() => decoded.delete(index));
     if (decoded.size > 400) decoded.delete(decoded.keys().next().value);
   }
   return decoded.get(index);
@@ -175,9 +201,13 @@ function errorMap(truth, image) {
 async function content(frame, index, errors) {
   const at = frame.p ? frame.p[index] : NONE;
   if (at < 0) return {reason: at === NONE ? "No pictures of this frame in this file." : data.reasons[-1 - at]};
-  const image = await picture(at);
-  if (!errors || index === 0) return {image};
-  return frame.p[0] < 0 ? {reason: "No error map without ground truth."} : {map: errorMap(await picture(frame.p[0]), image)};
+  try {
+    const image = await picture(at);
+    if (!errors || index === 0) return {image};
+    return frame.p[0] < 0 ? {reason: "No error map without ground truth."} : {map: errorMap(await picture(frame.p[0]), image)};
+  } catch (error) {
+    return {reason: error.message};
+  }
 }
 function paint(own, {image, map, reason}) {
   own.reason.textContent = reason || "";
@@ -241,17 +271,22 @@ function apart(labels, gap, low, high) {
   for (let i = labels.length - 1, limit = high; i >= 0; i--) { labels[i].at = Math.min(labels[i].at, limit); limit = labels[i].at - gap; }
   return labels;
 }
-function frameOf(W, H, right, ys, yText, xText, label) {
+function frameOf(W, H, right, ys, yText, xText, label, text = t => t) {
   const box = {l: 56, r: W - right, t: 24, b: H - 40}, svg = draw("svg", {viewBox: `0 0 ${W} ${H}`, role: "img", "aria-label": label});
   let low = Math.min(...ys), high = Math.max(...ys);
   const margin = (high - low || Math.abs(high) || 1) * 0.06;
   low -= margin; high += margin;
   const y = v => box.b - (v - low) / (high - low) * (box.b - box.t);
   for (const t of ticks(low, high)) {
-    svg.append(draw("line", {class: "grid", x1: box.l, x2: box.r, y1: y(t), y2: y(t)}), draw("text", {x: box.l - 6, y: y(t) + 4, "text-anchor": "end"}, t));
+    svg.append(draw("line", {class: "grid", x1: box.l, x2: box.r, y1: y(t), y2: y(t)}), draw("text", {x: box.l - 6, y: y(t) + 4, "text-anchor": "end"}, text(t)));
   }
   svg.append(draw("text", {x: 4, y: 14}, yText), draw("text", {x: (box.l + box.r) / 2, y: H - 6, "text-anchor": "middle"}, xText));
   return {svg, box, y};
+}
+function legendOf(svg, box, labels) {
+  for (const l of apart(labels, 15, box.t, box.b)) {
+    svg.append(draw("line", {class: "line", x1: box.r + 8, x2: box.r + 26, y1: l.at, y2: l.at, stroke: colour(l.i), "stroke-dasharray": dash(l.i)}), draw("text", {x: box.r + 31, y: l.at + 4}, short(l.name)));
+  }
 }
 let curveKey = "", cursor = null;
 function curves() {
@@ -272,9 +307,7 @@ function curves() {
       svg.append(points.length > 1 ? draw("polyline", {class: "line", points: points.join(" "), stroke: colour(i), "stroke-dasharray": dash(i)}) : draw("circle", {cx: points[0][0], cy: points[0][1], r: 4, fill: colour(i)}));
       labels.push({y: points[points.length - 1][1], name, i});
     });
-    for (const l of apart(labels, 15, box.t, box.b)) {
-      svg.append(draw("line", {class: "line", x1: box.r + 8, x2: box.r + 26, y1: l.at, y2: l.at, stroke: colour(l.i), "stroke-dasharray": dash(l.i)}), draw("text", {x: box.r + 31, y: l.at + 4}, short(l.name)));
-    }
+    legendOf(svg, box, labels);
     cursor = draw("line", {class: "now", y1: box.t, y2: box.b});
     const hit = draw("rect", {class: "hit", x: box.l, y: box.t, width: box.r - box.l, height: box.b - box.t});
     hit.addEventListener("click", e => {
@@ -305,6 +338,19 @@ for (const plot of data.plots) {
   $("plots").append(make("div", {}, make("h3", {textContent: plot.title}), svg));
 }
 if (!data.plots.length) $("front").hidden = true;
+if (data.training.length) {
+  const points = data.training.flatMap(c => c.points), end = Math.max(...points.map(p => p[0]));
+  const {svg, box, y} = frameOf(960, 320, 190, points.map(p => Math.log10(p[1])), "Loss, first = 1", "Iteration",
+    `Training loss over iterations, divided by the first one: ${data.training.map(c => `${data.methods[c.method]} ends at ${c.points.at(-1)[1]}`).join("; ")}`, t => +(10 ** t).toPrecision(2));
+  const x = t => box.l + t / end * (box.r - box.l), labels = [];
+  for (const t of ticks(0, end, 8)) svg.append(draw("text", {x: x(t), y: box.b + 18, "text-anchor": "middle"}, t));
+  for (const {method, points} of data.training) {
+    svg.append(draw("polyline", {class: "line", points: points.map(p => [x(p[0]), y(Math.log10(p[1]))]).join(" "), stroke: colour(method), "stroke-dasharray": dash(method)}));
+    labels.push({y: y(Math.log10(points.at(-1)[1])), name: data.methods[method], i: method});
+  }
+  legendOf(svg, box, labels);
+  $("losses").append(svg);
+} else $("training").hidden = true;
 
 // Places worth a look: one frame for each timestep of a subject and sequence.
 function list(target, score, text) {

@@ -5,9 +5,8 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
-import os
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +14,8 @@ import numpy as np
 
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
-from ...bench.io.files import check_writable, write_text
+from ...bench.io.files import check_writable, prepare_folder, write_text
 from ...bench.protocol import TASK_TITLES
-from ...bench.rows import ALL
 from ...bench.runner.config import RunOptions
 from ...bench.runner.scoring import FULL
 from ...bench.runner.store import RunFolder
@@ -25,13 +23,25 @@ from ...bench.specs import Findings, MetricSpec
 from ..aggregate import summarise
 from ..drawing import colour_map
 from ..pareto.points import LATENCY, SIZE, SPEED, pareto_front
-from ..runs import Part, RunData, RunSet
+from ..runs import Part, RunSet
 from ..statistics.command import CompareSettings, compare_methods
 from ..table_report import COMPARISON, TITLES, layouts, table_of
 from ..tables import AVATAR_TITLE, Table
 from ..writers import render_page
-from .command import PageSettings
+from .command import MAX_MB, MAX_SPLIT_MB, PageSettings
 from .frames import Frame, Pictures, choose_pictures, frame_values, worst_frames
+from .record import failed_cells, name_of, record_of
+from .split import (
+    ENTRY_BYTES,
+    FILE_BYTES,
+    INDEX,
+    PictureFile,
+    check_folder,
+    remove_others,
+    split,
+    write_pictures,
+)
+from .training import loss_curves
 
 HERE = Path(__file__).parent
 MEGABYTE = 10**6
@@ -54,31 +64,53 @@ def write_page(run_folder: Path) -> list[Path]:
 
 def write_report(settings: PageSettings, progress: Progress = no_progress) -> Findings:
     """`headbench report`: read runs and write the page."""
-    out = Path(settings.out)
-    if out.is_dir() or not out.parent.is_dir():
+    out = Path(settings.out or ("report" if settings.split else "report.html"))
+    max_mb = settings.max_mb or (MAX_SPLIT_MB if settings.split else MAX_MB)
+    if settings.split:
+        check_folder(out)
+        prepare_folder(out)
+    elif out.is_dir() or not out.parent.is_dir():
         found = "a folder" if out.is_dir() else f"no folder {out.parent}"
         raise InputError(out, "--out", "a file to write, in a folder that is there", found)
-    check_writable(out, "--out")
+    else:
+        check_writable(out, "--out")
     runs = RunSet.read([Path(folder) for folder in settings.runs])
-    page, pictures = page_text(runs, settings.max_mb, settings, progress)
-    write_text(out, page)
+    page, pictures, files = page_text(runs, max_mb, settings, progress, apart=settings.split)
+    if settings.split:
+        write_pictures(out, files)
+        write_text(out / INDEX, page)
+        remove_others(out, files)
+    else:
+        write_text(out, page)
     frames = sum(len(keys) for keys in runs.keys.values())
-    size = len(page.encode())
+    size = _size(page, files)
     shown = len(pictures.shown)
     text = f"{out}: {size / MEGABYTE:.1f} MB, {shown} of {frames} frames with pictures"
     text += f"; no ground truth: {pictures.truth}" if pictures.truth else ""
     return Findings(text, {"out": out, "bytes": size, "frames": frames, "shown": shown})
 
 
+def _size(page: str, files: Sequence[PictureFile]) -> int:
+    return len(page.encode()) + sum(len(file.text) for file in files)
+
+
 def page_text(
-    runs: RunSet, max_mb: float, options: RunOptions, progress: Progress = no_progress
-) -> tuple[str, Pictures]:
-    """The page, and the pictures on it. Raises `InputError` where ``max_mb`` does not suffice."""
+    runs: RunSet,
+    max_mb: float,
+    options: RunOptions,
+    progress: Progress = no_progress,
+    *,
+    apart: bool = False,
+) -> tuple[str, Pictures, list[PictureFile]]:
+    """The page, the pictures that belong to it, and the files that they lie in where they are not on the page itself.
+
+    Raises `InputError` where ``max_mb`` does not suffice.
+    """
     metrics = [spec for spec in runs.metrics if spec.per_frame and COMPARISON in spec.tables]
     values = frame_values(runs, metrics)
     worst = worst_frames(values, runs, metrics[0]) if metrics else []
     content = {
-        "title": f"headbench: {', '.join(_name(run) for run in runs.runs)}",
+        "title": f"headbench: {', '.join(name_of(run) for run in runs.runs)}",
         "tables": _parts(runs),
         "layouts": [
             Shown(TITLES.get(name, name), table_of(runs, name))
@@ -86,26 +118,32 @@ def page_text(
             if name != COMPARISON
         ],
         "comparisons": _comparisons(runs),
-        "records": [_record(run) for run in runs.runs],
-        "failed": _failed(runs),
+        "records": [record_of(run) for run in runs.runs],
+        "failed": failed_cells(runs),
         "script": (HERE / "page.js").read_text("utf-8"),
         "style": (HERE / "page.css").read_text("utf-8"),
     }
     data = _data(runs, metrics, values)
     empty = Pictures(truth="-" * 400)
-    room = int(max_mb * MEGABYTE) - len(_filled(content, data, [], empty).encode()) - 1000
+    limit = int(max_mb * MEGABYTE)
+    room = limit - len(_filled(content, data, [], empty).encode()) - 1000
+    room -= (
+        ENTRY_BYTES * (1 + 2 * limit // FILE_BYTES) if apart else 0
+    )  # two files together have more than that
     entry = 8 * (len(runs.methods) + 2)  # bytes of a frame's entry in the list, beside its pictures
     pictures = choose_pictures(runs, worst, room - entry * len(data["frames"]), options, progress)
     images: list[str] = []
-    for index, frame in enumerate(_frames(runs)):
-        if frame in pictures.shown:
-            data["frames"][index]["p"] = _places(frame, pictures, images, data["reasons"])
-            data["frames"][index]["l"] = int(frame in pictures.lossless)
-    page = _filled(content, data, images, pictures)
-    if len(page.encode()) > max_mb * MEGABYTE:
-        found = f"{len(page.encode()) / MEGABYTE:.2f} needed"
+    entries = dict(zip(_frames(runs), data["frames"]))
+    for frame in sorted(pictures.shown, key=lambda f: (f.group, f.key.timestep)):  # as they are looked at
+        entries[frame]["p"] = _places(frame, pictures, images, data["reasons"])
+        entries[frame]["l"] = int(frame in pictures.lossless)
+    files = split(images) if apart else []
+    data["files"] = [[file.name, file.count] for file in files]
+    page = _filled(content, data, [] if apart else images, pictures, apart=apart)
+    if (size := _size(page, files)) > limit:
+        found = f"{size / MEGABYTE:.2f} needed"
         raise InputError("command line", "--max-mb", "room for tables and record", found)
-    return page, pictures
+    return page, pictures, files
 
 
 def _places(frame: Frame, pictures: Pictures, images: list[str], reasons: list[str]) -> list[int]:
@@ -122,12 +160,21 @@ def _places(frame: Frame, pictures: Pictures, images: list[str], reasons: list[s
     return places
 
 
-def _filled(content: dict[str, Any], data: dict[str, Any], images: Sequence[str], pictures: Pictures) -> str:
+def _filled(
+    content: dict[str, Any],
+    data: dict[str, Any],
+    images: Sequence[str],
+    pictures: Pictures,
+    *,
+    apart: bool = False,
+) -> str:
+    # Opened from a disk, a page has no origin of its own, and 'self' names nothing.
+    beside = " 'self' file:" if apart else ""
     policy = "; ".join(
         [
             "default-src 'none'",
             "img-src data:",
-            f"script-src '{_digest(content['script'])}'",
+            f"script-src '{_digest(content['script'])}'{beside}",
             f"style-src '{_digest(content['style'])}'",
             "base-uri 'none'",
             "form-action 'none'",
@@ -201,6 +248,7 @@ def _data(
         "reasons": [],
         "colours": colour_map(np.linspace(0, 1, 256)[None])[0].tolist(),
         "plots": _plots(runs, metrics),
+        "training": loss_curves(runs),
     }
 
 
@@ -282,67 +330,3 @@ def _comparisons(runs: RunSet) -> dict[str, Any]:
         "testable": any("not testable" not in line[-1] for lines in groups.values() for line in lines),
         "groups": [{"title": f"{task}, {what}", "lines": lines} for (task, what), lines in groups.items()],
     }
-
-
-def _name(run: RunData) -> str:
-    return run.folder.root.resolve().name
-
-
-def _record(run: RunData) -> dict[str, Any]:
-    """What made a run's numbers, as text; without names of folders of the machine."""
-    manifest = run.manifest
-    excluded = {
-        (*key, why): None for protocol in manifest.protocols.values() for key, why in protocol.excluded
-    }
-    machine = manifest.machine
-    return {
-        "name": _name(run),
-        "done": manifest.status == "done",
-        "facts": [
-            ("Machine", run.machine),
-            ("Cores", str(machine.get("cores", ""))),
-            ("System", str(machine.get("system", ""))),
-            ("Python", str(machine.get("python", ""))),
-            *((str(name), str(version)) for name, version in dict(machine.get("packages") or {}).items()),
-            ("Seconds of the last start", "" if manifest.seconds is None else f"{manifest.seconds:.0f}"),
-        ],
-        "protocols": [
-            (TASK_TITLES.get(task, task), p.id, p.hash, str(len(p.keys)), p.resolution, p.quantisation)
-            for task, p in manifest.protocols.items()
-        ],
-        "clips": [(clip.subject, clip.fingerprint) for clip in manifest.clips],
-        "methods": [(m.name, m.version, json.dumps(m.budget)) for m in manifest.methods],
-        "configuration": json.dumps(_without_folders(asdict(manifest.configuration)), indent=1, default=str),
-        "settings": json.dumps(
-            _without_folders({m.name: m.config for m in manifest.methods}), indent=1, default=str
-        ),
-        "excluded": _excluded(excluded),
-    }
-
-
-def _excluded(frames: dict[tuple[Any, ...], None]) -> list[tuple[str, str, str, str, str]]:
-    """Subject, sequence, timestep, how many cameras, reason."""
-    moments: dict[tuple[Any, ...], int] = {}
-    for subject, sequence, timestep, _, why in frames:
-        moments[subject, sequence, timestep, why] = moments.get((subject, sequence, timestep, why), 0) + 1
-    return [(subject, seq, str(t), str(n), why) for (subject, seq, t, why), n in sorted(moments.items())]
-
-
-def _without_folders(value: Any) -> Any:
-    """A value whose absolute paths are cut to their last part."""
-    if isinstance(value, dict):
-        return {key: _without_folders(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_without_folders(item) for item in value]
-    return os.path.basename(value) if isinstance(value, str) and os.path.isabs(value) else value
-
-
-def _failed(runs: RunSet) -> list[tuple[str, str, str, str]]:
-    """Method, seed, subject and error of each avatar that failed."""
-    found: dict[tuple[str, str, str, str], None] = {}
-    for label in runs.rows.failed:
-        own = runs.rows.select(method=label, metric=ALL, task=ALL, region=ALL, seeds=ALL)
-        own = own[own["status"] == "failed"].drop_duplicates(["seed", "subject", "reason"])
-        for seed, subject, reason in own[["seed", "subject", "reason"]].itertuples(index=False, name=None):
-            found[label, str(seed), str(subject), str(reason)] = None
-    return [*found]

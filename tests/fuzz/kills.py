@@ -62,6 +62,7 @@ WRITERS = [
     Writer("sweep", "run", "sweep run --methods ga --variants half", MEASURED_FILES),
     Writer("curve", "run", "curve run --methods ga --fractions 1/2 1 --frames 1", MEASURED_CURVE),
     Writer("report", "run", "report run --out report.html"),
+    Writer("report split", "run", "report run --split"),
     Writer("bundle", "run", "bundle run --out out.zip --by Somebody --renders"),
     Writer("leaderboard", "bundles", "leaderboard build . --out out"),
     Writer("extremes", "run", "extremes run --views 1 --dimensions 1 --methods ga ours"),

@@ -12,8 +12,8 @@ from headbench.bench.io.documents import read_json
 from headbench.bench.io.files import digest_file
 from headbench.bench.registry import discover
 from headbench.bench.runner.config import resolve_method
+from headbench.bench.runner.stored import TRAINING_FILE
 from headbench.bench.specs import MethodSpec
-from headbench.methods.shared.avatar_files import RECORD_FILE
 
 from .insta.small import SMALL as SMALL_INSTA
 from .toy_clip import toy_pose
@@ -89,5 +89,5 @@ def test_the_published_leak_would_be_noticed(clip, altered, tmp_path):
 def test_the_published_leak_is_on_the_avatars_record(clip, tmp_path):
     for variant in ("paper", "official"):
         stored(resolved("ours", lines={"jaw_bases_variant": variant}), clip, tmp_path / variant)
-        leaks = read_json(tmp_path / variant / RECORD_FILE)["leaks"]
+        leaks = read_json(tmp_path / variant / TRAINING_FILE)["leaks"]
         assert bool(leaks) == (variant == "official")

@@ -24,6 +24,7 @@ from ....bench.runner.config import RunConfig, parse_size, resolve_methods
 from ....bench.runner.run import check_settings, run
 from ....bench.runner.scoring import FULL
 from ....bench.runner.store import RunFolder
+from ....bench.runner.stored import TRAINING_FILE
 from ....bench.specs import Findings
 from ...shared.config import PAPER_ITERATIONS, SplatTraining
 from ...shared.schedule import DensifySchedule, Timeline
@@ -210,7 +211,8 @@ def _cells(run_folder: RunFolder, rows: Rows, method: str, orders: Sequence[int]
     for subject in sorted(rows.subjects):
         for order in orders:
             folder = run_folder.cell(subject, method, order).avatar
-            record = read_json(folder / "training.json") if (folder / "training.json").exists() else {}
+            path = folder / TRAINING_FILE
+            record = read_json(path) if path.exists() else {}
             entry = {"subject": subject, "order": order, "splats": record.get("splats") or _splats(folder)}
             found.append({**entry, "differences": record.get("differences", [])})
     return found

@@ -13,6 +13,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.errors import InputError
 from headbench.bench.io.documents import read_json
+from headbench.bench.runner.stored import TRAINING_FILE
 from headbench.methods.gha import mesh_training as mesh_phase
 from headbench.methods.gha import method
 from headbench.methods.gha.avatar import AVATAR_FILE, DRIVING_FILE, GHAAvatar
@@ -21,7 +22,6 @@ from headbench.methods.gha.gaussian_training import GaussianTraining
 from headbench.methods.gha.kernel import available
 from headbench.methods.gha.mesh_training import FOLDER, MeshTraining
 from headbench.methods.gha.method import GHA, parted, within
-from headbench.methods.shared.avatar_files import RECORD_FILE
 from headbench.methods.shared.loop import CHECKPOINT
 from headbench.tests.benchmarks.timing import torch_threads
 
@@ -103,7 +103,9 @@ def test_a_gaussian_is_stored_in_its_floats_and_no_more(trained):
     assert 0 < overhead < 8_000  # names, shapes and settings
     assert [path.name for path in avatar.files()] == [AVATAR_FILE, "subject.npz"]
     assert (
-        read_json(folder / RECORD_FILE)["splats"] == len(table) <= SMALL["max_points"] + SMALL["mouth_points"]
+        read_json(folder / TRAINING_FILE)["splats"]
+        == len(table)
+        <= SMALL["max_points"] + SMALL["mouth_points"]
     )
 
 
@@ -237,7 +239,7 @@ def test_seconds_bound_a_run_and_the_avatar_is_whole(clip, tmp_path):
     clock, seen = Ticking(), []
     avatar = fit_in_seconds(clip, tmp_path, clock, 100.0, lambda d, t, n="": seen.append((d, t)))
     assert seen == sorted(seen)
-    record = read_json(tmp_path / RECORD_FILE)
+    record = read_json(tmp_path / TRAINING_FILE)
     done, planned, mesh = (record[name] for name in ("iterations", "planned_iterations", "mesh_iterations"))
     mesh_planned = seen[0][1]
     assert 0 < mesh < mesh_planned
@@ -263,7 +265,7 @@ def test_seconds_of_preparation_are_taken_off_the_budget(clip, tmp_path, monkeyp
     avatar = fit_in_seconds(clip, tmp_path, clock, 100.0)
     # Beyond what was asked for go at most the trial steps of two stages, two looks each, and the last iteration.
     assert clock.now < max(100, mesh) + 2 * 20
-    assert read_json(tmp_path / RECORD_FILE)["seconds"] > clock.now - 10
+    assert read_json(tmp_path / TRAINING_FILE)["seconds"] > clock.now - 10
     assert avatar.render(*views(clip)).rgb.shape[2] == 3
 
 

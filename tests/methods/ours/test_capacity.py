@@ -11,10 +11,11 @@ from hypothesis import strategies as st
 
 from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.runner.adaptation import TrainingView
+from headbench.bench.runner.stored import TRAINING_FILE
 from headbench.methods.ours.capacity import plan_capacity
 from headbench.methods.ours.config import Capacity, Lines, OursConfig, Penalty
 from headbench.methods.ours.method import Ours
-from headbench.methods.shared.avatar_files import RECORD_FILE, Subject
+from headbench.methods.shared.avatar_files import Subject
 from headbench.methods.shared.config import SplatTraining
 from headbench.methods.shared.subject_mesh import SubjectMesh
 
@@ -179,7 +180,7 @@ def test_a_planned_avatar_trains_renders_and_keeps_its_plan(clip, tmp_path, capl
     truth = clip.image(key) / 255
     assert np.abs(image - truth).mean() < np.abs(1 - truth).mean()
     assert "capacity for motion above" in caplog.text
-    record = json.loads((tmp_path / RECORD_FILE).read_text())["capacity"]
+    record = json.loads((tmp_path / TRAINING_FILE).read_text())["capacity"]
     assert record["lines"] == (change == "expressive") == ("lines" in avatar.field.tensors)
     planned = {each["name"]: each for each in record["decisions"]}
     assert len(avatar.field.tensors["plane_xy"]) == planned["planes.resolution"]["chosen"] ** 2
@@ -191,4 +192,4 @@ def test_a_planned_avatar_trains_renders_and_keeps_its_plan(clip, tmp_path, capl
 def test_a_fixed_capacity_has_no_plan(clip, tmp_path):
     config = changed(SMALL, capacity={"mode": "fixed"}, planes={"resolution": 8})
     Ours(config).fit(clip, tmp_path, Budget(iterations=5), device="cpu", seed=0, progress=no_progress)
-    assert json.loads((tmp_path / RECORD_FILE).read_text())["capacity"] is None
+    assert json.loads((tmp_path / TRAINING_FILE).read_text())["capacity"] is None

@@ -120,6 +120,16 @@ def test_a_killed_run_goes_on_from_its_checkpoint(tmp_path, kill_at):
     assert torch.equal(again.optimiser["x"], unbroken.optimiser["x"])
 
 
+@pytest.mark.parametrize("kill_at", [None, 10, 15])
+def test_losses_are_recorded_from_every_tenth_iteration(tmp_path, kill_at):
+    if kill_at:
+        with pytest.raises(KeyboardInterrupt):
+            run(Drift(), tmp_path, Budget(iterations=23), killing(kill_at), every=0.0)
+    outcome = run(Drift(), tmp_path, Budget(iterations=23))
+    # Adam's step for a constant gradient is the learning rate.
+    assert outcome.losses == [(i, pytest.approx(-0.5 * (i - 1))) for i in (1, 10, 20, 23)]
+
+
 def test_seconds_of_preparation_count(tmp_path):
     clock = Clock()
     clock.now = 30.0

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from headbench.reports.page import split
 from headbench.reports.page.command import PageSettings, report
 
 from .test_page import HOSTILE
@@ -27,9 +28,10 @@ def opened(browser, tmp_path):
     """Open the page of a run at a width; afterwards there was no message, no dialog and no request but for the file."""
     contexts, faults, requests = [], [], []
 
-    def start(run, width=1200, scheme="light"):
+    def start(run, width=1200, scheme="light", split=False):
         out = tmp_path / "page.html"
-        report(PageSettings((str(run),), str(out), trust=True))
+        report(PageSettings((str(run),), str(out), split=split, trust=True))
+        out = out / "index.html" if split else out
         context = browser.new_context(viewport={"width": width, "height": 800}, color_scheme=scheme)
         contexts.append(context)
         tab = context.new_page()
@@ -45,7 +47,10 @@ def opened(browser, tmp_path):
     for context in contexts:
         context.close()
     assert faults == []
-    assert {Path(url).name for url in requests if not url.startswith("data:")} == {"page.html"}
+    beside = {url for url in requests if "/page.html/pictures/" in url and url.startswith("file:")}
+    assert {Path(url).name for url in {*requests} - beside if not url.startswith("data:")} <= {
+        *("page.html", "index.html")
+    }
 
 
 def pixels(tab, name):
@@ -94,6 +99,18 @@ def test_frames_follow_scrubber_keys_and_error_maps(opened, toy_run):
     tab.keyboard.press("0")
     assert "scale(1)" in tab.locator("#panels canvas").last.get_attribute("style")
     assert "the training diverged" in tab.locator("#panels .reason").nth(2).text_content()
+
+
+def test_pictures_apart_are_loaded_when_they_are_shown(opened, toy_run, tmp_path, monkeypatch):
+    monkeypatch.setattr(split, "FILE_BYTES", 300)
+    expected = pixels(opened(toy_run), "toy")
+    (tmp_path / "page.html").unlink()
+    tab = opened(toy_run, split=True)
+    assert pixels(tab, "toy") == expected
+    tab.keyboard.press("e")
+    assert pixels(tab, "Error map of toy") != expected
+    loaded, there = tab.evaluate("[files.size, data.files.length]")
+    assert 0 < loaded < there
 
 
 def test_the_slider_shows_one_left_and_the_other_right(opened, toy_run):

@@ -11,7 +11,7 @@ from headbench.bench.contracts import FrameKey
 from headbench.bench.errors import InputError
 from headbench.bench.rows import ALL, Rows
 from headbench.bench.runner.config import RunOptions
-from headbench.reports.page import frames
+from headbench.reports.page import frames, split
 from headbench.reports.page.command import PageSettings, report
 from headbench.reports.page.frames import Frame, choose_pictures, spread
 from headbench.reports.page.report import write_page
@@ -273,6 +273,57 @@ def test_one_page_of_two_runs(page, toy_run, make_run):
     found = page([make_run("first"), other])
     assert found.data["methods"] == ["toy"]
     assert all(entry["p"][1] >= 0 for entry in found.data["frames"])
+
+
+def test_pictures_apart_are_those_of_one_file(page, toy_run, tmp_path, monkeypatch):
+    monkeypatch.setattr(split, "FILE_BYTES", 300)
+    single = page()
+    folder = tmp_path / "folder"
+    (folder / "pictures").mkdir(parents=True)
+    (folder / "pictures" / "of-an-earlier-page.js").write_text("")
+    for _ in range(2):
+        found = report(PageSettings((str(toy_run),), str(folder), split=True, trust=True))
+    assert found.data["bytes"] == sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+    apart = Page(folder / "index.html")
+    assert apart.images == []
+    texts = [(folder / name).read_text() for name, _ in apart.data["files"]]
+    assert len(texts) > 3
+    assert len([*(folder / "pictures").iterdir()]) == len(texts)
+    loaded = []
+    for index, text in enumerate(texts):
+        number, pictures = json.loads(f"[{re.fullmatch(r'addPictures.(.*).;', text.strip())[1]}]")
+        assert (number, len(pictures)) == (index, apart.data["files"][index][1])
+        loaded += pictures
+    assert loaded == single.images
+    assert apart.data["frames"] == single.data["frames"]
+
+
+def test_a_folder_with_other_files_is_not_written_to(toy_run, tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.tex").write_text("")
+    with pytest.raises(InputError, match=r"earlier report alone, found thesis\.tex"):
+        report(PageSettings((str(toy_run),), str(tmp_path / "mine"), split=True, trust=True))
+    assert [path.name for path in (tmp_path / "mine").iterdir()] == ["thesis.tex"]
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "expected"),
+    [
+        ([[1, 2.0], [9, 1.0]], [[1, 4.0], [9, 1.0]], [[1, 1.0], [9, 0.375]]),
+        ([[1, 2.0], [9, 1.0]], [[1, 4.0], [8, 1.0]], [[1, 1.0], [9, 0.5]]),
+        ([[1, 2.0], [9, 1.0]], "damaged", [[1, 1.0], [9, 0.5]]),
+        ([[1, 2.0], [9, -1.0]], None, None),
+        (None, None, None),
+    ],
+)
+def test_losses_are_means_of_subjects_with_equal_iterations(page, make_run, first, second, expected):
+    run = make_run("run", methods=("toy_plugin:METHOD",))
+    for subject, losses in (("subject1", first), ("subject2", second)):
+        if losses is not None:
+            path = run / subject / "toy" / "seed-0" / "avatar" / "training.json"
+            path.write_text(json.dumps({"losses": losses}))
+    curves = page([run]).data["training"]
+    assert curves == ([] if expected is None else [{"method": 0, "points": expected}])
 
 
 def test_a_run_writes_its_page_beside_the_tables(toy_run):

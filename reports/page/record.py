@@ -1,0 +1,76 @@
+"""What made a run's numbers: protocols, captures, versions, settings, excluded frames, failures, as text."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import asdict
+from typing import Any
+
+from ...bench.protocol import TASK_TITLES
+from ...bench.rows import ALL
+from ..runs import RunData, RunSet
+
+
+def name_of(run: RunData) -> str:
+    return run.folder.root.resolve().name
+
+
+def record_of(run: RunData) -> dict[str, Any]:
+    """What made a run's numbers, as text; without names of folders of the machine."""
+    manifest = run.manifest
+    excluded = {
+        (*key, why): None for protocol in manifest.protocols.values() for key, why in protocol.excluded
+    }
+    machine = manifest.machine
+    return {
+        "name": name_of(run),
+        "done": manifest.status == "done",
+        "facts": [
+            ("Machine", run.machine),
+            ("Cores", str(machine.get("cores", ""))),
+            ("System", str(machine.get("system", ""))),
+            ("Python", str(machine.get("python", ""))),
+            *((str(name), str(version)) for name, version in dict(machine.get("packages") or {}).items()),
+            ("Seconds of the last start", "" if manifest.seconds is None else f"{manifest.seconds:.0f}"),
+        ],
+        "protocols": [
+            (TASK_TITLES.get(task, task), p.id, p.hash, str(len(p.keys)), p.resolution, p.quantisation)
+            for task, p in manifest.protocols.items()
+        ],
+        "clips": [(clip.subject, clip.fingerprint) for clip in manifest.clips],
+        "methods": [(m.name, m.version, json.dumps(m.budget)) for m in manifest.methods],
+        "configuration": json.dumps(_without_folders(asdict(manifest.configuration)), indent=1, default=str),
+        "settings": json.dumps(
+            _without_folders({m.name: m.config for m in manifest.methods}), indent=1, default=str
+        ),
+        "excluded": _excluded(excluded),
+    }
+
+
+def _excluded(frames: dict[tuple[Any, ...], None]) -> list[tuple[str, str, str, str, str]]:
+    """Subject, sequence, timestep, how many cameras, reason."""
+    moments: dict[tuple[Any, ...], int] = {}
+    for subject, sequence, timestep, _, why in frames:
+        moments[subject, sequence, timestep, why] = moments.get((subject, sequence, timestep, why), 0) + 1
+    return [(subject, seq, str(t), str(n), why) for (subject, seq, t, why), n in sorted(moments.items())]
+
+
+def _without_folders(value: Any) -> Any:
+    """A value whose absolute paths are cut to their last part."""
+    if isinstance(value, dict):
+        return {key: _without_folders(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_folders(item) for item in value]
+    return os.path.basename(value) if isinstance(value, str) and os.path.isabs(value) else value
+
+
+def failed_cells(runs: RunSet) -> list[tuple[str, str, str, str]]:
+    """Method, seed, subject and error of each avatar that failed."""
+    found: dict[tuple[str, str, str, str], None] = {}
+    for label in runs.rows.failed:
+        own = runs.rows.select(method=label, metric=ALL, task=ALL, region=ALL, seeds=ALL)
+        own = own[own["status"] == "failed"].drop_duplicates(["seed", "subject", "reason"])
+        for seed, subject, reason in own[["seed", "subject", "reason"]].itertuples(index=False, name=None):
+            found[label, str(seed), str(subject), str(reason)] = None
+    return [*found]

@@ -1,0 +1,75 @@
+"""The pictures of a page in files beside it, each loaded when one of its pictures is looked at.
+
+A page opened from a disk may not read the pixels of images beside it, but it may run scripts; so the files are scripts that
+hand over their pictures. They are named by their content: a page never finds those of another.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from ...bench.errors import InputError
+from ...bench.io.files import TEMPORARY, check_inside, write_text
+
+INDEX, FOLDER = "index.html", "pictures"
+FILE_BYTES = 2 * 10**6
+"""Of a file about: one that a slow disk or network brings in a moment."""
+ENTRY_BYTES = 100
+"""Of a file at most, beside its pictures: its name on the page and the call in it."""
+
+
+@dataclass(frozen=True)
+class PictureFile:
+    """A file of consecutive pictures: its name below the page's folder, its text, how many pictures it holds."""
+
+    name: str
+    text: str
+    count: int
+
+
+def split(images: Sequence[str]) -> list[PictureFile]:
+    """Pictures, as base64, in files with at most `FILE_BYTES` of them, or with one picture."""
+    groups: list[list[str]] = []
+    used = 0
+    for image in images:
+        if not groups or used + len(image) > FILE_BYTES:
+            groups.append([])
+            used = 0
+        groups[-1].append(image)
+        used += len(image)
+    return [_file(index, group) for index, group in enumerate(groups)]
+
+
+def _file(index: int, images: list[str]) -> PictureFile:
+    text = f"addPictures({index}, {json.dumps(images, separators=(',', ':'))});\n"
+    return PictureFile(f"{FOLDER}/{hashlib.sha256(text.encode()).hexdigest()[:20]}.js", text, len(images))
+
+
+def check_folder(folder: Path) -> None:
+    """Raise `InputError` for a folder that holds anything but an earlier report."""
+    if folder.exists() and not folder.is_dir():
+        raise InputError(folder, "--out", "a folder", "a file")
+    names = [path.name for path in folder.glob("*") if not path.name.startswith(TEMPORARY)]
+    others = sorted({*names} - {INDEX, FOLDER})
+    if others:
+        expected = "a new folder, or one with an earlier report alone"
+        raise InputError(folder, "--out", expected, f"{others[0]} in it")
+
+
+def write_pictures(folder: Path, files: Sequence[PictureFile]) -> None:
+    """Write the files that are not there yet; those of an earlier page stay until `remove_others`."""
+    check_inside(folder / FOLDER)
+    for file in files:
+        write_text(folder / file.name, file.text)
+
+
+def remove_others(folder: Path, files: Sequence[PictureFile]) -> None:
+    """Remove the pictures of earlier pages."""
+    names = {file.name for file in files}
+    for path in (folder / FOLDER).glob("*.js"):
+        if f"{FOLDER}/{path.name}" not in names:
+            path.unlink()
