@@ -26,8 +26,11 @@ PROBE_S = 300.0
 MOST_SOURCE = 2**22
 
 SHIM = "headbench.methods.official.shim.cpu"
-SHIMMED = ("diff_gaussian_rasterization", "simple_knn", "nvdiffrast")
-"""Packages that the shim stands in for."""
+SHIMMED = (
+    *("diff_gaussian_rasterization", "simple_knn", "nvdiffrast"),
+    *("pytorch3d", "point_cloud_utils", "torch.utils.tensorboard"),
+)
+"""Packages and modules that the shim stands in for."""
 
 _PROBE = """
 import importlib, json, sys
@@ -116,7 +119,7 @@ def look_at_interpreter(method: str, config: OfficialConfig, repository: Reposit
     """Command and versions of the interpreter; see `look`."""
     python = _interpreter(method, config)
     if config.device != "cuda":
-        needed = tuple(name for name in repository.modules if name.partition(".")[0] not in SHIMMED)
+        needed = tuple(name for name in repository.modules if not {name, name.partition(".")[0]} & {*SHIMMED})
         repository = replace(repository, modules=(*needed, SHIM), trial="")
     return python, _probed(method, python, repository, cuda=config.device == "cuda")
 

@@ -209,6 +209,10 @@ class OfficialMethod(ABC, Generic[Config]):
         """The same for rendering an avatar."""
         return []
 
+    def patches_for_order(self) -> list[Patch]:
+        """Texts that are replaced where the order of the images is given, in code that draws them without a loader."""
+        return []
+
     def image_name(self, path: str) -> str:
         """How their loader names an image of the export, by its place."""
         return Path(path).name
@@ -331,6 +335,7 @@ class OfficialMethod(ABC, Generic[Config]):
 
         shim = self.config.device != "cuda"
         patches = self.patches(fit.clip.head, iterations, checkout) if shim else []
+        patches += self.patches_for_order() if self.config.order == "native" else []
         command = self._launched(
             [*command, *self.config.arguments],
             checkout,

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ....bench.contracts import Clip, Frame, FrameKey, Progress
+from ....bench.contracts import Clip, Frame, FrameKey, HeadAsset, Progress
 from ....bench.errors import InputError
 from ....bench.io.documents import read_json
 from ....bench.io.files import write_json
@@ -33,7 +33,7 @@ from ..config import GBSOfficialConfig
 from ..ga.export import check_mark
 from ..ga.head_files import EXPRESSION_SIZE
 from ..ga.method import copy_file, rendered, trained
-from ..method import Listed, OfficialMethod, Workplace
+from ..method import Listed, OfficialMethod, Patch, Workplace
 from ..spec import GBS_OFFICIAL
 from ..video import check_masks
 from .export import VideoHead, held_out, write_list, write_training
@@ -49,6 +49,8 @@ FILES = {
 }
 """What their renderer opens, by the begin of its name, which goes on with the iteration; and what we call it."""
 BACKGROUND_FILE = "background.json"
+MODEL_SOURCE, GRID_NODES = "FLAME/face_gs_model.py", 256
+"""Where their code fills grids of the nearest triangles and of skinning weights, and nodes a side of either."""
 SHRINK = """
 import sys, torch
 for path in sys.argv[1:]:
@@ -79,6 +81,7 @@ class GBSOfficial(OfficialMethod[GBSOfficialConfig]):
         "Its rasteriser and its simple-knn have the names of others': install those of its own submodules folder, in an "
         "environment of their own.",
     )
+    shimmed = True
     # Their frames and checkpoints hold more than tensors, which newer versions of torch read only where they are told to.
     variables: ClassVar[Mapping[str, str]] = {"TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD": "1"}
 
@@ -116,6 +119,22 @@ class GBSOfficial(OfficialMethod[GBSOfficialConfig]):
         }
         words = [str(word) for pair in options.items() for word in pair]
         return [*checkout.python, str(work.program / "train.py"), *words]
+
+    def patches(self, head: HeadAsset, iterations: int, checkout: Checkout) -> list[Patch]:
+        """Coarser look-up grids: their C++ code fills 256^3 nodes in minutes, stand-ins take hours."""
+        return [
+            (MODEL_SOURCE, f"N_res{grid} = {GRID_NODES}\n", f"N_res{grid} = {GRID_NODES // 2}\n")
+            for grid in (1, 2)
+        ]
+
+    def patches_for_order(self) -> list[Patch]:
+        """They draw the number of a frame; the one that is due takes its place."""
+        drawn = "viewpoint_stack.pop(random.randint(0, len(viewpoint_stack)-1))"
+        return [("train.py", drawn, "int(images_in_order[iteration - 1])")]
+
+    def image_name(self, path: str) -> str:
+        """The number of a frame."""
+        return str(int(Path(path).stem))
 
     def shrink_command(self, fit: Fit, checkout: Checkout, work: Workplace) -> list[str] | None:
         """Run in their interpreter, on the device that the tensors are to be read back to."""
@@ -219,7 +238,7 @@ class GBSOfficial(OfficialMethod[GBSOfficialConfig]):
             differences.append(
                 "a commit before the authors' fix of June 2025 (5017124), which they say matters for multi-view captures"
             )
-        if seed:
+        if seed and self.config.order == "published":
             differences.append(
                 f"their code fixes the seed at 0; seed {seed} is a repetition, not another start"
             )

@@ -20,7 +20,7 @@ class ParitySettings:
     it continues. Exit code 1: PSNR differs by more than the tolerance in the mean over orders, or a training failed.
     """
 
-    method: tyro.conf.Positional[Literal["ga", "ours"]]
+    method: tyro.conf.Positional[Literal["ga", "gbs", "ours"]]
     """The native method. The authors' code of ours is that of TensorialGaussianAvatar (`tga-official`)."""
 
     checkout: str
@@ -57,6 +57,9 @@ class ParitySettings:
     tolerance: float = 0.3
     """Mean difference of PSNR, in decibels, up to which the two count as equal."""
 
+    samples: int = 5_000
+    """Splats on the head at the start, for gbs; published: 50,000, whose differences for each expression take gigabytes."""
+
     size: str = "96x136"
     """Width x height of the synthetic capture's images in pixels."""
 
@@ -69,8 +72,8 @@ class ParitySettings:
     def __post_init__(self) -> None:
         """Refuse what has no meaning."""
         parse_size(self.size)
-        if self.iterations < 1 or self.orders < 1 or not self.tolerance > 0:
-            raise ValueError("iterations and orders must be at least 1, the tolerance above 0")
+        if self.iterations < 1 or self.orders < 1 or self.samples < 10 or not self.tolerance > 0:
+            raise ValueError("iterations and orders must be at least 1, samples 10, the tolerance above 0")
 
 
 @writes("out")

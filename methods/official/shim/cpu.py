@@ -21,15 +21,16 @@ from scipy.spatial import KDTree
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
-from . import rasterizer
+from . import blendshapes, rasterizer
 
 
 def install(threads: int) -> None:
     """Put the shim before everything that is imported later."""
     torch.set_num_threads(threads)
-    _module("diff_gaussian_rasterization", rasterizer.PUBLIC)
+    _module("diff_gaussian_rasterization", rasterizer.PUBLIC | blendshapes.RASTERIZER)
+    _module("diff_gaussian_rasterization._C", blendshapes.RASTERIZER_KERNELS)
     _module("simple_knn")
-    _module("simple_knn._C", {"distCUDA2": mean_square_distances})
+    _module("simple_knn._C", {"distCUDA2": mean_square_distances, **blendshapes.NEIGHBOURS})
     # Imported by scripts that draw no mesh, read no OBJ file from elsewhere and measure no LPIPS here.
     context = {"RasterizeCudaContext": _Nothing, "RasterizeGLContext": _Nothing}
     unused: dict[str, dict[str, Any]] = {
@@ -40,9 +41,10 @@ def install(threads: int) -> None:
         "iopath.common.file_io": {"PathManager": LocalPaths},
         "torchvision": {},
         "torchvision.models": {},
+        **blendshapes.PACKAGES,
     }
     for name, content in unused.items():
-        if name.partition(".")[0] in sys.modules or importlib.util.find_spec(name.partition(".")[0]) is None:
+        if not _is_installed(name):
             _module(name, content)
     _without_cuda()
     _signed_images()
@@ -52,6 +54,17 @@ def mean_square_distances(points: Tensor) -> Tensor:
     """(N,) mean of the squared distances from each of (N, 3) points to its three nearest neighbours."""
     found, _ = KDTree(points.detach().numpy()).query(points.detach().numpy(), k=4)
     return torch.from_numpy(np.square(found[:, 1:]).mean(axis=1)).to(points.dtype)
+
+
+def _is_installed(name: str) -> bool:
+    """Whether a module is that of an installed package, or one of our own stands in for the package already."""
+    package = name.partition(".")[0]
+    if package == "torch":  # brings a module that imports another package
+        package = name.rpartition(".")[2]
+    known = sys.modules.get(package)
+    if known is not None:
+        return known.__spec__ is not None
+    return importlib.util.find_spec(package) is not None
 
 
 class LocalPaths:

@@ -49,7 +49,8 @@ class GaussianRasterizer(nn.Module):
         scales: Tensor | None = None,
         rotations: Tensor | None = None,
         cov3D_precomp: Tensor | None = None,
-    ) -> tuple[Tensor, Tensor]:
+        alpha_point_id: int | None = None,
+    ) -> tuple[Tensor, ...]:
         """Render (N,) splats.
 
         Parameters
@@ -60,20 +61,24 @@ class GaussianRasterizer(nn.Module):
         opacities : (N, 1) or (N,) in [0, 1].
         shs, colors_precomp : (N, K, 3) harmonics of which ``sh_degree`` are used, or (N, 3) colours; one of both.
         cov3D_precomp : not taken.
+        alpha_point_id : of GaussianBlendshapes' fork; 0 asks for the coverage by all splats besides.
 
         Returns
         -------
-        Image (3, H, W); radii (N,), above 0 for every splat in view, whatever its opacity.
+        Image (3, H, W); coverage (H, W) where it is asked for; radii (N,), above 0 for every splat in view, whatever its
+        opacity.
 
         Raises
         ------
-        ValueError : both or none of harmonics and colours, or covariances.
+        ValueError : both or none of harmonics and colours, covariances, or coverage by some splats.
         """
         to = self.raster_settings
         if (shs is None) == (colors_precomp is None):
             raise ValueError("expected either shs or colors_precomp")
         if cov3D_precomp is not None or scales is None or rotations is None:
             raise ValueError("expected scales and rotations; the shim takes no covariances")
+        if alpha_point_id not in (None, 0):
+            raise ValueError("expected alpha_point_id 0; the shim knows the coverage by all splats alone")
         if shs is not None:
             colors_precomp = _colors(shs, means3D - to.campos, to.sh_degree)
         assert colors_precomp is not None
@@ -89,7 +94,10 @@ class GaussianRasterizer(nn.Module):
             means2d_offset=offset,
             check_values=False,
         )
-        return rendering.image.permute(2, 0, 1), rendering.radii
+        image = rendering.image.permute(2, 0, 1)
+        return (
+            (image, rendering.radii) if alpha_point_id is None else (image, rendering.alpha, rendering.radii)
+        )
 
     def markVisible(self, positions: Tensor) -> Tensor:
         """(N,) whether positions are beyond the near plane."""

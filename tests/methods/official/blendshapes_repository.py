@@ -68,6 +68,12 @@ assert {image.size for image in images[-held_out:]} == {(1, 1)}
 assert min(image.size[0] for image in images[:-held_out]) > 1
 iterations = int(arguments.iterations)
 print("options", vars(arguments))
+import random
+taken = []
+for iteration in range(1, iterations + 1):
+    viewpoint_stack = list(range(count - held_out))
+    taken.append(viewpoint_stack.pop(random.randint(0, len(viewpoint_stack)-1)))
+print("taken", taken[:40])
 for iteration in range(10, iterations + 1, 10):
     bar = f"\\rTraining progress:  5%|#| {iteration}/{iterations} [00:01<00:10, 5.0it/s, Loss=0.{iteration}]"
     print(bar, end="", flush=True)

@@ -1,5 +1,6 @@
 """GaussianBlendshapes' adapter: the video that their loader reads, placeholders, renders on black read back by key."""
 
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -23,6 +24,7 @@ from headbench.methods.official.gbs.method import SHRINK, GBSOfficial
 from headbench.methods.official.method import Listed, Workplace, check_export
 from headbench.methods.official.process import ProgramError
 from headbench.methods.official.spec import GBS_OFFICIAL
+from headbench.methods.shared.schedule import ShuffledEpochs
 
 from .blendshapes_repository import CYLINDER, HELD_OUT, BlendshapesStandIn, make_blendshapes_repository
 from .repository import settings
@@ -88,6 +90,19 @@ def test_frames_are_rendered_under_their_keys_on_any_ground(method, official_cli
             expected = np.floor(np.clip(levels, 0, 153)) / 255 + 0.4 * np.array(ground)
             assert np.abs(frame.rgb - expected).max() < 1.01 / 255
             assert frame.alpha == pytest.approx(0.6)
+
+
+def test_images_are_taken_in_the_order_of_the_native_method(method, official_clip, tmp_path):
+    method.config = replace(method.config, order="native")
+    fit(method, official_clip, tmp_path / "a")
+    log = (tmp_path / "a" / "training.log").read_text()
+    taken = [int(number) for number in re.search(r"taken \[(.*)\]", log)[1].split(",")]
+    keys = official_clip.splits["train"]
+    numbers = {key: n for n, key in enumerate(sorted(keys, key=lambda key: (key.timestep, key.camera)))}
+    sampler = ShuffledEpochs(len(keys), 0)
+    assert taken == [numbers[keys[sampler(i)]] for i in range(1, 41)]
+    record = read_json(tmp_path / "a" / "training.json")
+    assert any("images_in_order" in line for line in record["differences"])
 
 
 def test_the_record_tells_placeholders_padding_and_the_fix(method, official_clip, tmp_path):

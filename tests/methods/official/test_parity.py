@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 
 from headbench.bench import cli
+from headbench.bench.configuration import build
 from headbench.bench.contracts import Budget
 from headbench.bench.errors import InputError
 from headbench.bench.io.documents import read_json
 from headbench.bench.rows import Row, Rows
-from headbench.methods.official.config import GBSOfficialConfig
-from headbench.methods.official.gbs.method import GBSOfficial
+from headbench.methods.gbs.config import GBSConfig
+from headbench.methods.official.config import GHAOfficialConfig
+from headbench.methods.official.gha.method import GHAOfficial
 from headbench.methods.official.parity.command import ParitySettings
 from headbench.methods.official.parity.parity import as_theirs, differences_of, run_config
 from headbench.methods.shared.config import PAPER_ITERATIONS, SplatTraining
@@ -102,7 +104,7 @@ def test_bad_input_is_told_before_any_work(folder, capsys, words, expected):
 
 def test_settings_do_what_the_program_is_told(tmp_path):
     for iterations in (600, 2_000, 40_000, PAPER_ITERATIONS):
-        changes = as_theirs("ga", iterations)["splats"]
+        changes = as_theirs("ga", iterations, 0)["splats"]
         timeline = Timeline(iterations, PAPER_ITERATIONS)
         schedule = DensifySchedule.of(SplatTraining(**changes), timeline, white=True)
         # Their program removes large splats after the iteration of its first regular reset.
@@ -110,6 +112,10 @@ def test_settings_do_what_the_program_is_told(tmp_path):
     config = run_config(ParitySettings("ours", checkout="x", out="y"), tmp_path)
     assert config.methods == ("ours", "tga-official")
     assert config.settings["ours"]["sampling"] == {"balanced": False}
+    config = run_config(ParitySettings("gbs", checkout="x", out="y", samples=300), tmp_path)
+    assert config.settings["gbs-official"]["arguments"] == ("--init_face_point_number", "300")
+    native = build(GBSConfig, {k: v for k, v in config.settings["gbs"].items() if k != "budget"}, "gbs")
+    assert (native.samples, native.teeth_samples, native.min_sh_every) == (300, 30, 1_000)
 
 
 def test_differences_are_paired_by_order():
@@ -134,7 +140,7 @@ def test_differences_are_paired_by_order():
 
 @pytest.mark.parametrize("settings", [{"device": "cpu-shim"}, {"order": "native"}])
 def test_code_that_the_shim_does_not_know_is_refused(settings, official_clip):
-    method = GBSOfficial(GBSOfficialConfig(**settings))
+    method = GHAOfficial(GHAOfficialConfig(**settings))
     with pytest.raises(InputError, match="the shim does not know"):
         method.check(official_clip, Budget(iterations=5))
 
