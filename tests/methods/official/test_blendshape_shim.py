@@ -16,7 +16,7 @@ def draw(*shape, seed=0, dtype=torch.float64):
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=dtype)
 
 
-def test_turned_harmonics_have_the_value_of_before_at_the_direction_of_before():
+def test_turned_harmonics_have_the_values_of_before():
     rotations = axis_angle_to_matrix(draw(5, 3))
     coefficients = draw(5, 16, 3, seed=1).requires_grad_()
     turned = shim.rotate_harmonics(rotations, coefficients)

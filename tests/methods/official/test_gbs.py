@@ -92,7 +92,7 @@ def test_frames_are_rendered_under_their_keys_on_any_ground(method, official_cli
             assert frame.alpha == pytest.approx(0.6)
 
 
-def test_images_are_taken_in_the_order_of_the_native_method(method, official_clip, tmp_path):
+def test_images_are_taken_in_the_native_order(method, official_clip, tmp_path):
     method.config = replace(method.config, order="native")
     fit(method, official_clip, tmp_path / "a")
     log = (tmp_path / "a" / "training.log").read_text()
