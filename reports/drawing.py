@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -18,7 +19,8 @@ from matplotlib.patches import Rectangle
 from PIL import Image
 
 from ..bench.contracts import ByteArray, FloatArray
-from ..bench.io.files import atomic_path
+from ..bench.io.files import write_bytes
+from ..bench.io.provenance import COMPOSITE, mark_png
 
 INK, MUTED, LINE, BOX = "#1e1e1e", "#6e6e6e", "#cdcdcd", "#e1e1e1"
 GAP, MARGIN, MARKED = 8, 24, 3
@@ -123,8 +125,9 @@ class _Paper:
                 size = (max(1, width), max(1, height))
                 image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
             pixels[top : top + image.shape[0], left : left + image.shape[1]] = image
-        with atomic_path(path) as temporary:
-            Image.fromarray(pixels).save(temporary)
+        plain = io.BytesIO()
+        Image.fromarray(pixels).save(plain, "png")
+        write_bytes(path, mark_png(plain.getvalue(), COMPOSITE))
 
 
 @style.context("default")  # whatever the user's matplotlibrc says, such as text.usetex

@@ -17,6 +17,7 @@ from ..contracts import Progress, no_progress
 from ..errors import InputError
 from ..io.documents import MAX_JSON_BYTES, checked, parse_json
 from ..io.files import atomic_path, digest_file, write_json
+from ..io.provenance import RENDER, source_type
 from ..manifest import Manifest
 from ..runner.steps import DIGESTS
 from ..runner.store import STAGES, RunFolder
@@ -49,6 +50,7 @@ class Bundle:
     headbench : the version that wrote it.
     renders : whether the scored frames are in it.
     files : SHA-256 of every other file, by its place.
+    digital_source_type : what the frames are, see `headbench.bench.io.provenance`; "" without them.
     """
 
     by: str
@@ -57,6 +59,7 @@ class Bundle:
     headbench: str
     renders: bool
     files: dict[str, str]
+    digital_source_type: str = ""
     format: Literal[1] = 1
 
 
@@ -84,7 +87,8 @@ def write_bundle(settings: BundleSettings, progress: Progress = no_progress) -> 
         files = {name: digest_file(path) for name, path in sorted(sources.items())}
         index = staged.root / INDEX
         bundle = Bundle(
-            settings.by, settings.link, settings.comment, version("headbench"), settings.renders, files
+            *(settings.by, settings.link, settings.comment, version("headbench"), settings.renders, files),
+            source_type(RENDER) if settings.renders else "",
         )
         write_json(index, asdict(bundle))
         with atomic_path(out) as temporary, zipfile.ZipFile(temporary, "w") as archive:

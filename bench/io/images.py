@@ -14,6 +14,7 @@ import numpy as np
 from ..contracts import ByteArray, FloatArray
 from ..errors import InputError
 from .files import open_regular, write_bytes
+from .provenance import mark_png
 
 MAX_PIXELS = 2**25
 """Of an image, as in 8192 x 4096: a header of a few bytes can declare any size, and decoding takes its memory."""
@@ -174,14 +175,17 @@ def quantise(rgb: FloatArray) -> ByteArray:
     return np.rint(np.clip(rgb, 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
-def write_png(path: Path, image: ByteArray) -> bytes:
-    """Write an (H, W, 3) 8-bit sRGB image, atomically; return what was written."""
+def write_png(path: Path, image: ByteArray, kind: str = "") -> bytes:
+    """Write an (H, W, 3) 8-bit sRGB image, atomically; return what was written.
+
+    ``kind`` marks it, see `provenance`; "" for frames that metrics are computed from.
+    """
     ok, encoded = cv2.imencode(
         ".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_PNG_COMPRESSION, 3]
     )
     if not ok:
         raise InputError(path, "", "an image that PNG can hold", f"shape {image.shape}, {image.dtype}")
-    content = encoded.tobytes()
+    content = mark_png(encoded.tobytes(), kind) if kind else encoded.tobytes()
     write_bytes(path, content)
     return content
 

@@ -18,6 +18,7 @@ import cv2
 from ..contracts import ByteArray
 from ..errors import HeadbenchError, InputError, UnavailableError
 from .files import atomic_path
+from .provenance import note
 
 _H264, _MPEG4 = "avc1", "mp4v"
 
@@ -77,14 +78,17 @@ def webm_writer() -> Any:
         ) from None
 
 
-def write_webm(path: Path, frames: Iterable[ByteArray], fps: float) -> None:
+def write_webm(path: Path, frames: Iterable[ByteArray], fps: float, kind: str) -> None:
     """Write (H, W, 3) RGB frames of one size as WebM: VP9 of constant quality, without subsampling of colours.
+
+    ``kind`` marks it in the tag COMMENT, see `provenance`.
 
     On the demo's renders 44 dB at 2 kB a frame. Raises `UnavailableError` without PyAV, `InputError` for no frames.
     """
     av = webm_writer()
     stream: Any = None
     with atomic_path(path) as temporary, av.open(str(temporary), "w", format="webm") as container:
+        container.metadata["comment"] = note(kind)
         for frame in frames:
             if stream is None:
                 rate = Fraction(fps).limit_denominator(1001)

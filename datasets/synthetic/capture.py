@@ -26,6 +26,7 @@ from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.io.documents import read_json
 from ...bench.io.files import TEMPORARY, grouped_writes, write_bytes, write_json, write_text
+from ...bench.io.provenance import PATH_TRACED, xmp
 from ...bench.machine import processor_count
 from ...bench.start import end_with_parent, starting_workers
 from ..images import is_whole
@@ -34,7 +35,7 @@ from .performance import KINDS, Kind, share_out
 from .plan import EDITIONS, SERIALS, Edition, SubjectPlan, SynthSettings, load_geometry, plan_subject
 from .renderer import CaptureRenderer
 
-MANIFEST = "synthesis.json"
+MANIFEST, MARK = "synthesis.json", "provenance.xmp"
 _VERSION = 3
 _SMALL = 400_000  # pixels in all that are rendered sooner than another process starts
 _README = """This folder holds synthetic recordings made by `headbench synth`.
@@ -280,6 +281,8 @@ def _claim(out: Path, wanted: Mapping[str, Any]) -> None:
         write_json(manifest, wanted)
     if not readme.exists():
         write_text(readme, _README)
+    if not (out / MARK).exists():
+        write_text(out / MARK, xmp(PATH_TRACED))
 
 
 def _is_foreign(path: Path) -> bool:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ...bench.contracts import FloatArray
+from ...bench.io.provenance import RENDER, note
 from ..ga.storage import COLUMNS
 from ..shared.networks import coefficient_count, sh_basis
 from ..shared.ply import write_ply
@@ -112,4 +113,4 @@ def write_gaussians(path: Path, splats: PosedSplats, dc: Tensor, rest: Tensor) -
         np.log(np.maximum(splats.scales, np.finfo(np.float32).tiny)),
         splats.quats,
     ]
-    write_ply(path, STANDARD, np.concatenate(columns, axis=1).astype(np.float32))
+    write_ply(path, STANDARD, np.concatenate(columns, axis=1).astype(np.float32), note(RENDER))

@@ -28,12 +28,16 @@ EXPECTED, MAX_BYTES = "a PLY file", 2**30
 HEADER_LIMIT = 65536  # bytes; a longer header is no file of ours
 
 
-def write_ply(path: Path, names: tuple[str, ...], table: FloatArray) -> None:
-    """Write an (N, len(names)) table as binary little-endian float32 vertices, whole or not at all."""
+def write_ply(path: Path, names: tuple[str, ...], table: FloatArray, comment: str = "") -> None:
+    """Write an (N, len(names)) table as binary little-endian float32 vertices, whole or not at all.
+
+    A comment stands at the end of the header: some viewers count the lines before the properties.
+    """
     if table.ndim != 2 or table.shape[1] != len(names):
         raise ValueError(f"table: expected (N, {len(names)}), found {table.shape}")
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
     header += [f"property float {name}" for name in names]
+    header += [f"comment {comment}"] if comment else []
     header.append("end_header")
     with atomic_path(path) as temporary, temporary.open("wb") as stream:
         stream.write(("\n".join(header) + "\n").encode("ascii"))

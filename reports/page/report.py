@@ -15,6 +15,7 @@ import numpy as np
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.io.files import check_writable, prepare_folder, write_text
+from ...bench.io.provenance import COMPOSITE, source_type, tool
 from ...bench.protocol import TASK_TITLES
 from ...bench.runner.config import RunOptions
 from ...bench.runner.scoring import FULL
@@ -120,6 +121,8 @@ def page_text(
         "comparisons": _comparisons(runs),
         "records": [record_of(run) for run in runs.runs],
         "failed": failed_cells(runs),
+        "tool": tool(),
+        "source_type": source_type(COMPOSITE),
         "script": (HERE / "page.js").read_text("utf-8"),
         "style": (HERE / "page.css").read_text("utf-8"),
     }

@@ -13,6 +13,7 @@ from ...bench.contracts import ByteArray, Camera, Clip, FloatArray, HeadPose, Pr
 from ...bench.errors import InputError
 from ...bench.io.files import grouped_writes
 from ...bench.io.images import quantise, read_png, write_png
+from ...bench.io.provenance import COMPOSITE, RENDER
 from ...bench.io.video import webm_writer, write_webm
 from ...bench.runner.adaptation import AdaptedClip, MethodNeeds, carry_out, plan
 from ...bench.runner.captures import open_clips, reader_of
@@ -62,7 +63,7 @@ def render_avatar(settings: RenderSettings, progress: Progress) -> Findings:
     with grouped_writes():
         for index, shot in enumerate(shots):
             rgb = avatar.render(shot.camera, shot.pose, background).rgb
-            write_png(shot.path, quantise(shot.finish(rgb)))
+            write_png(shot.path, quantise(shot.finish(rgb)), RENDER)
             progress(index + 1, len(shots), shot.path.name)
     videos = _videos(shots, settings) if settings.video else []
     text = f"{out}: {len(shots)} frames in {shots[0].path.parent.name}/" + "".join(f"\n{v}" for v in videos)
@@ -137,7 +138,8 @@ def _videos(shots: Sequence[Shot], settings: RenderSettings) -> list[Path]:
     for shot in shots:
         parts.setdefault(shot.video, []).append(shot)
     for video, members in parts.items():
-        write_webm(video, (_pictured(shot, settings.beside) for shot in members), settings.fps)
+        kind = COMPOSITE if settings.beside else RENDER
+        write_webm(video, (_pictured(shot, settings.beside) for shot in members), settings.fps, kind)
     return list(parts)
 
 

@@ -19,6 +19,7 @@ from ...bench.contracts import Avatar, Camera, Clip, FloatArray, Frame, FrameKey
 from ...bench.errors import UnavailableError
 from ...bench.io.files import write_json
 from ...bench.io.images import quantise, write_png
+from ...bench.io.provenance import RENDER
 from ...bench.protocol import Protocol, TaskWithoutTruth, make_protocol_without_truth
 from ...bench.rows import Row, Rows
 from ...bench.runner.adaptation import MethodNeeds
@@ -259,7 +260,7 @@ def splats_of(avatar: Avatar, pose: HeadPose) -> Any:
 def write_frame(path: Path, frame: Frame) -> None:
     """Write the frame as 8-bit PNG; one that is not finite leaves no file, since any level would hide it."""
     if np.isfinite(frame.rgb).all():
-        write_png(path, quantise(frame.rgb))
+        write_png(path, quantise(frame.rgb), RENDER)
     else:
         path.unlink(missing_ok=True)
 

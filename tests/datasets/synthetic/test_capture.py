@@ -116,6 +116,7 @@ def test_the_second_edition_is_a_capture_of_its_own(capture, tmp_path):
         synthesize(capture[0], **SMALL, edition=2)
     (union,) = synthesize(tmp_path / "capture", **SMALL, edition=2)
     assert json.loads((tmp_path / "capture/synthesis.json").read_text())["edition"] == 2
+    assert "digitalsourcetype/algorithmicMedia<" in (tmp_path / "capture/provenance.xmp").read_text()
     assert json.loads((union / "headbench.json").read_text())["synthetic"]["edition"] == 2
     first, second = read_capture(capture[1]), read_capture(union)
     assert not first.static_offset.any()

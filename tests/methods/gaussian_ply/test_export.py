@@ -45,7 +45,8 @@ def parse(path):
     lines = header.decode("ascii").split("\n")
     assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
     count = int(lines[2].removeprefix("element vertex "))
-    assert lines[3:] == [f"property float {name}" for name in NAMES] + [""]
+    assert lines[3:-2] == [f"property float {name}" for name in NAMES]
+    assert lines[-2].endswith("trainedAlgorithmicMedia")
     assert len(body) == count * 248
     return np.array([struct.unpack("<62f", body[248 * i : 248 * (i + 1)]) for i in range(count)])
 

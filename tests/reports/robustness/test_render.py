@@ -37,7 +37,7 @@ def test_frames_are_those_of_the_run(settings, cell, tmp_path, split):
     found = render(replace(settings, frames=split)).data["frames"]
     theirs = sorted((cell.folder / "renders" / split).iterdir())
     assert [path.name for path in found] == [path.name for path in theirs]
-    assert all(a.read_bytes() == b.read_bytes() for a, b in zip(found, theirs))
+    assert all(np.array_equal(read_png(a), read_png(b)) for a, b in zip(found, theirs))
 
 
 @pytest.mark.parametrize("beside", [False, True])

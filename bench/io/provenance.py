@@ -1,0 +1,56 @@
+"""Marks of provenance: files that leave the suite say that programs made what they show.
+
+The term is IPTC's digital source type (https://cv.iptc.org/newscodes/digitalsourcetype/), which image archives and social
+networks read. In images it stands in XMP beside the pixels, which stay as they are. Frames that metrics are computed from
+carry none: their digests are recorded.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from importlib.metadata import version
+
+RENDER = "trainedAlgorithmicMedia"
+"""Made by a model trained on recordings: a render of an avatar."""
+COMPOSITE = "compositeWithTrainedAlgorithmicMedia"
+"""Renders beside other pictures: sheets, pages, videos with the captured image."""
+PATH_TRACED = "algorithmicMedia"
+"""Made by a program without training data: a synthetic capture."""
+
+_SCHEME = "http://cv.iptc.org/newscodes/digitalsourcetype/"
+_XMP = """<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>
+<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
+<rdf:Description rdf:about="" xmlns:xmp="http://ns.adobe.com/xap/1.0/" xmlns:Iptc4xmpExt="http://iptc.org/std/Iptc4xmpExt/2008-02-29/">
+<xmp:CreatorTool>{tool}</xmp:CreatorTool>
+<Iptc4xmpExt:DigitalSourceType>{source}</Iptc4xmpExt:DigitalSourceType>
+</rdf:Description></rdf:RDF></x:xmpmeta>
+<?xpacket end="r"?>"""
+_HEADER = 33  # bytes of a PNG's signature and IHDR chunk, which come first
+
+
+def tool() -> str:
+    """The suite's name and version."""
+    return f"headbench {version('headbench')}"
+
+
+def source_type(kind: str) -> str:
+    """IPTC's address of one of the terms above."""
+    return _SCHEME + kind
+
+
+def note(kind: str) -> str:
+    """For formats without fields for it: what made the file, in one line."""
+    return f"{tool()}; digital source type {source_type(kind)}"
+
+
+def xmp(kind: str) -> str:
+    """An XMP packet: of a file, or of the files beside it."""
+    return _XMP.format(tool=tool(), source=source_type(kind))
+
+
+def mark_png(content: bytes, kind: str) -> bytes:
+    """A PNG file with an XMP packet behind its header (an iTXt chunk); everything else to the byte as it was."""
+    chunk = b"iTXt" + b"XML:com.adobe.xmp" + bytes(5) + xmp(kind).encode()
+    framed = struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
+    return content[:_HEADER] + framed + content[_HEADER:]
