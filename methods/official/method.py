@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, ClassVar, Generic, TypeVar
+from typing import IO, Any, ClassVar, Generic, Literal, TypeVar
 
 import numpy as np
 
@@ -111,8 +111,8 @@ class OfficialMethod(ABC, Generic[Config]):
     version: ClassVar[str]
     config_class: ClassVar[Any]
     repository: ClassVar[Repository]
-    shimmed: ClassVar[bool] = False
-    """Whether `shim` is made for the repository."""
+    shimmed: ClassVar[Literal["", "bound splats", "blendshapes"]] = ""
+    """Which code `shim` has to stand in for things of; "" where it is not made for the repository."""
     variables: ClassVar[Mapping[str, str]] = {}
     """Variables of the environment that the authors' programs need besides `process.environment`."""
 
@@ -240,7 +240,7 @@ class OfficialMethod(ABC, Generic[Config]):
         shim = self.config.device != "cuda"
         if not (shim or patches or order):
             return list(command)
-        plan = {"shim": shim, "threads": threads(), "patches": list(patches), "order": list(order)}
+        plan = {"shim": self.shimmed if shim else "", "threads": threads(), "patches": list(patches), "order": list(order)}
         write_json(work.root / PLAN, plan)
         shutil.copyfile(LAUNCHER, work.root / LAUNCHER.name)
         python, script = command[: len(checkout.python)], command[len(checkout.python) :]

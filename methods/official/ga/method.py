@@ -85,7 +85,7 @@ THEIR_NAMES = {
 class GALayoutMethod(OfficialMethod[Config]):
     """What the repositories with GaussianAvatars' loader and head model have in common."""
 
-    shimmed = True
+    shimmed = "bound splats"
 
     def check_clip(self, clip: Clip, checkout: Checkout) -> None:
         """Refuse other backgrounds than white and black, pixels that are not square, heads that their code cannot take."""

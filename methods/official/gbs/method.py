@@ -81,7 +81,7 @@ class GBSOfficial(OfficialMethod[GBSOfficialConfig]):
         "Its rasteriser and its simple-knn have the names of others': install those of its own submodules folder, in an "
         "environment of their own.",
     )
-    shimmed = True
+    shimmed = "blendshapes"
     # Their frames and checkpoints hold more than tensors, which newer versions of torch read only where they are told to.
     variables: ClassVar[Mapping[str, str]] = {"TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD": "1"}
 

@@ -24,8 +24,12 @@ from torch.overrides import TorchFunctionMode
 from . import blendshapes, rasterizer
 
 
-def install(threads: int) -> None:
-    """Put the shim before everything that is imported later."""
+def install(threads: int, code: str) -> None:
+    """Put the shim before everything that is imported later.
+
+    ``code``: "bound splats" or "blendshapes", see `OfficialMethod.shimmed`. Code that tries a package and goes on without it
+    has to find none, so that stand-ins are for those alone that need them.
+    """
     torch.set_num_threads(threads)
     _module("diff_gaussian_rasterization", rasterizer.PUBLIC | blendshapes.RASTERIZER)
     _module("diff_gaussian_rasterization._C", blendshapes.RASTERIZER_KERNELS)
@@ -41,7 +45,7 @@ def install(threads: int) -> None:
         "iopath.common.file_io": {"PathManager": LocalPaths},
         "torchvision": {},
         "torchvision.models": {},
-        **blendshapes.PACKAGES,
+        **(blendshapes.PACKAGES if code == "blendshapes" else {}),
     }
     for name, content in unused.items():
         if not _is_installed(name):

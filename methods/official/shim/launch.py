@@ -21,7 +21,7 @@ def main() -> None:
     if plan["shim"]:
         from headbench.methods.official.shim.cpu import install
 
-        install(plan["threads"])
+        install(plan["threads"], plan["shim"])
     if plan["patches"]:
         patch_sources(plan["patches"], os.path.dirname(script))
     if plan["order"]:
