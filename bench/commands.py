@@ -27,7 +27,6 @@ _OF_OTHERS = {
     "compare": "analyze",
     "doctor": "diagnose info",
     "evaluate": "eval evaluation metrics test",
-    "export ply": "view viewer",
     "inspect": "visualize",
     "lint": "check validate",
     "prepare nersemble": "preprocess process-data process",
@@ -35,6 +34,7 @@ _OF_OTHERS = {
     "sweep": "prune",
     "synth": "generate synthesize",
     "table": "results show",
+    "view": "viewer gui",
 }
 WORDS_OF_OTHERS = {word: name for name, words in _OF_OTHERS.items() for word in words.split()}
 """What other toolkits call their commands, and which of ours does it."""

@@ -288,6 +288,29 @@ class SharingAvatar(Avatar, Protocol):
         """Files needed besides `files`, the same for every subject; not counted as an avatar's storage."""
 
 
+class Splats(Protocol):
+    """Splats of one pose in the world: float32 arrays of N splats."""
+
+    @property
+    def means(self) -> FloatArray: ...  # (N, 3) metres
+    @property
+    def quats(self) -> FloatArray: ...  # (N, 4) unit, wxyz
+    @property
+    def scales(self) -> FloatArray: ...  # (N, 3) metres
+    @property
+    def opacities(self) -> FloatArray: ...  # (N,)
+    @property
+    def colors(self) -> FloatArray | None: ...  # (N, 3) as a camera sees them
+
+
+@runtime_checkable
+class SplatAvatar(Avatar, Protocol):
+    """An avatar of 3D Gaussians. Optional."""
+
+    def splats(self, pose: HeadPose, camera: Camera | None = None) -> Splats:
+        """Splats of a pose; with colours where a camera says from where they are seen."""
+
+
 @runtime_checkable
 class ListedFrames(Avatar, Protocol):
     """An avatar that another program draws, for many frames in one call. Optional.

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..bench.contracts import Avatar, Camera, HeadPose, Measurement, SharingAvatar
+from ..bench.contracts import Avatar, Camera, HeadPose, Measurement, SharingAvatar, SplatAvatar
 from ..bench.errors import InputError
 from ..bench.specs import MetricSpec
 
@@ -72,7 +72,7 @@ def storage(avatar: Avatar, workload: Sequence[tuple[Camera, HeadPose]] = ()) ->
     for _, pose in workload[:1]:
         details["driving_bytes"] = driving_bytes(pose)
         details["driving_kb_s"] = driving_bytes(pose) * DRIVING_RATE / KILO
-        if hasattr(avatar, "splats"):
+        if isinstance(avatar, SplatAvatar):
             count = len(avatar.splats(pose).means)
             details["primitives"] = count
             if count:

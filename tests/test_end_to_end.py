@@ -182,6 +182,7 @@ CASES = {
         case("report {demo} --out report.html --max-mb 5", "frames with pictures", "report.html"),
         case("report {demo} --split", "frames with pictures", "report/index.html"),
     ],
+    "view": [case("view {demo} --port 0 --seconds 0", "the viewer of .*ours has ended")],
     "verify": [case("verify {demo}", "as recorded")],
     "bundle": [
         case("bundle plain --out board/plain.zip --by Somebody --renders", "plain.zip", "board/plain.zip"),

@@ -240,7 +240,12 @@ class OfficialMethod(ABC, Generic[Config]):
         shim = self.config.device != "cuda"
         if not (shim or patches or order):
             return list(command)
-        plan = {"shim": self.shimmed if shim else "", "threads": threads(), "patches": list(patches), "order": list(order)}
+        plan = {
+            "shim": self.shimmed if shim else "",
+            "threads": threads(),
+            "patches": list(patches),
+            "order": list(order),
+        }
         write_json(work.root / PLAN, plan)
         shutil.copyfile(LAUNCHER, work.root / LAUNCHER.name)
         python, script = command[: len(checkout.python)], command[len(checkout.python) :]

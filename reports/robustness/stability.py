@@ -15,7 +15,18 @@ from typing import Any
 
 import numpy as np
 
-from ...bench.contracts import Avatar, Camera, Clip, FloatArray, Frame, FrameKey, HeadPose, Progress
+from ...bench.contracts import (
+    Avatar,
+    Camera,
+    Clip,
+    FloatArray,
+    Frame,
+    FrameKey,
+    HeadPose,
+    Progress,
+    SplatAvatar,
+    Splats,
+)
 from ...bench.errors import UnavailableError
 from ...bench.io.files import write_json
 from ...bench.io.images import quantise, write_png
@@ -87,7 +98,7 @@ class LimitCheck:
         return f"{self.measure} is {self.value:.3g}, limits {self.lower:.3g} to {self.upper:.3g}"
 
 
-def measure(frame: Frame, camera: Camera, splats: Any = None) -> Measures:
+def measure(frame: Frame, camera: Camera, splats: Splats | None = None) -> Measures:
     """Measure one frame. ``splats`` has means, scales, quats, opacities as numpy arrays, None where there are none."""
     alpha = np.asarray(frame.alpha, np.float64)
     arrays = [np.asarray(frame.rgb), alpha]
@@ -244,17 +255,16 @@ def run_cases(
 
 
 def render_measured(
-    avatar: Avatar, camera: Camera, pose: HeadPose, background: Sequence[float], splats: Any = None
+    avatar: Avatar, camera: Camera, pose: HeadPose, background: Sequence[float], splats: Splats | None = None
 ) -> tuple[Frame, Measures]:
     """Render a frame and measure it, with the ``splats`` of that pose where they are known."""
     frame = avatar.render(camera, pose, background)
     return frame, measure(frame, camera, splats_of(avatar, pose) if splats is None else splats)
 
 
-def splats_of(avatar: Avatar, pose: HeadPose) -> Any:
+def splats_of(avatar: Avatar, pose: HeadPose) -> Splats | None:
     """Splats of a pose where the avatar is one of splats, else None."""
-    give = getattr(avatar, "splats", None)
-    return None if give is None else give(pose)
+    return avatar.splats(pose) if isinstance(avatar, SplatAvatar) else None
 
 
 def write_frame(path: Path, frame: Frame) -> None:

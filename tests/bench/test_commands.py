@@ -123,7 +123,7 @@ def test_two_words_share_the_first(offer, capsys):
         ("benchmark", "`headbench run`"),
         ("eval", "`headbench evaluate`"),
         ("EVAL", "`headbench evaluate`"),
-        ("view", "`headbench export ply`"),
+        ("viewer", "`headbench view`"),
         ("tabel", "`headbench table`"),
         ("export-ply", "`headbench export ply`"),
         ("export pyl", "`headbench export ply`"),

@@ -38,6 +38,12 @@ SPLATS = BenchmarkSpec(
     stress="headbench.tests.benchmarks.splats.stress:measure",
 )
 
+VIEWER = BenchmarkSpec(
+    name="viewer",
+    summary="the viewer in a browser: updates a second while a slider moves, milliseconds by step",
+    speed="headbench.tests.benchmarks.viewer:measure",
+)
+
 AVATAR = BenchmarkSpec(
     name="avatar",
     summary="a frame of an avatar of ours: time by step, and what each saving saves",

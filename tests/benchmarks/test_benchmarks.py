@@ -14,7 +14,7 @@ from headbench.bench.registry import resolve
 from headbench.datasets.head.model import HeadModel
 from headbench.datasets.head.procedural.model import procedural_head
 from headbench.methods.splats import available_backends, rasterize
-from headbench.tests.benchmarks import clusters, images, prepare, refit, statistics, training
+from headbench.tests.benchmarks import clusters, images, prepare, refit, statistics, training, viewer
 from headbench.tests.benchmarks.avatar import speed as avatar
 from headbench.tests.benchmarks.head import speed as head_speed
 from headbench.tests.benchmarks.specs import CLUSTERS
@@ -43,6 +43,7 @@ SMALLEST = {
         {"QUICK_TIMESTEPS": 3, "QUICK_SCIPY_FRAMES": 1, "FLAME_SIZES": (12, 8)},
         ["procedural 2023 to 2020", "300 + 100, other random bases"],
     ),
+    "viewer": (viewer, {"QUICK_SPLATS": (700,), "QUICK_SECONDS": 0.1}, ["700", "images", "splats"]),
     "statistics": (statistics, {"QUICK_TRIALS": 3, "REPLICATES": 20}, list(statistics.CASES)),
 }
 

@@ -175,7 +175,17 @@ def test_a_script_for_cuda_runs_as_it_stands(tmp_path, code):
     drawn, listed = (
         [f"/x/images/{name}" for name in order] for order in (names, ["2.png", "0.png", "1.png"])
     )
-    expected = [code == "blendshapes", 6, 20, [1.0, 1.0], (255, 0, 1), drawn, listed, ["--a", "1"], "__main__"]
+    expected = [
+        code == "blendshapes",
+        6,
+        20,
+        [1.0, 1.0],
+        (255, 0, 1),
+        drawn,
+        listed,
+        ["--a", "1"],
+        "__main__",
+    ]
     assert f"result {expected}" in found
     assert "FIXED = 5" in (tmp_path / "code" / "script.py").read_text()
 

@@ -98,13 +98,14 @@ class Ball:
 class Splatty(Ball):
     """Gives splats too, one of which grows."""
 
-    def splats(self, pose):
+    def splats(self, pose, camera=None):
         grown = 0.2 if abs(pose.expression[0]) > 1.5 else 0.002
         return SimpleNamespace(
             means=np.asarray(pose.translation, np.float32)[None],
             quats=np.array([[1.0, 0, 0, 0]]),
             scales=np.array([[0.001, 0.001, grown]]),
             opacities=np.array([0.9]),
+            colors=None if camera is None else np.array([[0.5, 0.5, 0.5]]),
         )
 
 

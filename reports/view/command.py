@@ -1,0 +1,70 @@
+"""``headbench view``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import tyro
+
+from ...bench.contracts import Progress, no_progress
+from ...bench.runner.config import RunOptions
+from ...bench.specs import Findings
+
+
+@dataclass(frozen=True)
+class ViewSettings(RunOptions):
+    """Move avatars in a browser: side by side, from any view, with sliders and with recorded sequences.
+
+    Images are drawn on this machine, smaller while something moves. Ends with Ctrl-C. Needs viser (extra `view`).
+    """
+
+    avatars: tyro.conf.Positional[tuple[str, ...]]
+    """Folders of runs, or of avatars (RUN/SUBJECT/METHOD/seed-0); an imported avatar needs --data, its capture."""
+
+    methods: tuple[str, ...] = ()
+    """Of runs, only these; by default all that are trained, without the trivial baselines."""
+
+    subjects: tuple[str, ...] = ()
+    """Of runs, only these; by default the first."""
+
+    source: str | None = None
+    """Capture of another subject, with the same head model, whose sequences drive the avatars too."""
+
+    expressions: int = 10
+    """Sliders for so many leading expressions of each head model."""
+
+    method: str = ""
+    """Method that reads an imported avatar."""
+
+    device: str = ""
+    """Where to draw; by default where the run was trained."""
+
+    host: str = "127.0.0.1"
+    """Address to listen at. Any other than the machine's own lets everybody who reaches it look and draw."""
+
+    port: int = 8080
+    """Port to listen at; 0 takes a free one."""
+
+    seconds: float | None = None
+    """Stop after so long; by default when interrupted."""
+
+    def __post_init__(self) -> None:
+        if not self.avatars:
+            raise ValueError("avatars: at least one folder")
+        if not 0 <= self.port < 65536:
+            raise ValueError(f"port is {self.port}; from 0 to 65535")
+        if self.expressions < 0:
+            raise ValueError(f"expressions is {self.expressions}; at least 0")
+        if self.seconds is not None and self.seconds < 0:
+            raise ValueError(f"seconds is {self.seconds}; at least 0")
+
+
+def view(settings: ViewSettings, progress: Progress = no_progress) -> Findings:
+    """Move avatars in a browser: side by side, from any view, with sliders and recorded sequences.
+
+    Raises `InputError` for folders without avatars, captures that are not there and a port that is taken, `UnavailableError`
+    without viser.
+    """
+    from .server import view_avatars
+
+    return view_avatars(settings, progress)

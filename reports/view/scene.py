@@ -1,0 +1,284 @@
+"""What a viewer shows: avatars with the captures they were made from, and the recordings that drive them."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from ...bench.contracts import Avatar, Camera, Clip, FloatArray, FrameKey, HeadPose
+from ...bench.errors import HeadbenchError, InputError
+from ...bench.runner.adaptation import AdaptedClip, MethodNeeds, carry_out, plan
+from ...bench.runner.captures import open_clips, open_run_clips, reader_of, run_configuration
+from ...bench.runner.config import ResolvedMethod, RunConfig, resolve_methods
+from ...bench.runner.run import load, make_jobs
+from ...bench.runner.store import RunFolder
+from ...bench.runner.stored import avatar_folder, stored_heads, stored_method
+from ..robustness.extremes import head_center, training_poses
+from ..robustness.reenactment import RigidMean, check_heads, retarget
+from .command import ViewSettings
+
+log = logging.getLogger(__name__)
+NEUTRAL = "neutral"
+"""What drives where no recording does."""
+MOST_SHOWN = 12
+"""Avatars at once; more would be drawn too small to see."""
+
+
+Recording = dict[int, dict[str, FrameKey]]
+"""The frames of one sequence of a subject: keys by timestep and camera."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """An avatar, the clip it is compared on, and that clip in the form of its method.
+
+    Attributes
+    ----------
+    label : says which it is; unique.
+    sources : clips of other subjects in the form of its method, by subject.
+    """
+
+    label: str
+    avatar: Avatar
+    clip: Clip
+    form: AdaptedClip
+    sources: Mapping[str, AdaptedClip]
+
+    @property
+    def version(self) -> str:
+        """Of the head model that its poses are of."""
+        return self.form.clip.head.version
+
+    @cached_property
+    def neutral(self) -> HeadPose:
+        """The face at rest, where the head is at the first training timestep."""
+        pose = self.form.clip.poses[self.form.key(self._first).timestep]
+        none = {name: np.zeros_like(getattr(pose, name)) for name in ("expression", "neck", "jaw", "eyes")}
+        lids = None if pose.eyelids is None else np.zeros_like(pose.eyelids)
+        return replace(pose, **none, eyelids=lids, timestep=None)
+
+    @cached_property
+    def reach(self) -> FloatArray:
+        """(E,) how far the slider of each expression goes: 1.5 times the largest coefficient tracked in training."""
+        largest = np.abs([pose.expression for pose in training_poses(self.form.clip)]).max(axis=0)
+        return np.asarray(np.where(largest > 0, 1.5 * largest, 1.0))
+
+    @cached_property
+    def center(self) -> FloatArray:
+        """(3,) the middle of the head in the world of `clip`, metres."""
+        return head_center(self.clip)
+
+    def pose(self, key: FrameKey | None) -> HeadPose:
+        """The pose that was recorded with a frame: of its own subject as it is, of another retargeted; None: neutral."""
+        if key is None:
+            return self.neutral
+        if key.subject == self.clip.subject:
+            return self.form.clip.poses[self.form.key(key).timestep]
+        source = self.sources[key.subject]
+        poses = source.clip.poses[source.key(key).timestep]
+        return retarget(poses, self._means[key.subject], self._means[""], self.clip.subject)
+
+    def camera(self, view: Camera, key: FrameKey | None) -> Camera:
+        """A camera of the world of `clip` as the method sees the world at a timestep.
+
+        A method that wants one video has the head stand still and the camera move.
+        """
+        own = key if key is not None and key.subject == self.clip.subject else self._first
+        seen = self.form.clip.cameras[self.form.key(own).camera].world_to_camera
+        return replace(
+            view,
+            world_to_camera=view.world_to_camera
+            @ np.linalg.inv(self.clip.cameras[own.camera].world_to_camera)
+            @ seen,
+        )
+
+    @property
+    def _first(self) -> FrameKey:
+        return min(self.clip.splits["train"], key=lambda key: (key.timestep, key.camera))
+
+    @cached_property
+    def _means(self) -> dict[str, RigidMean]:
+        clips = {"": self.form.clip, **{name: form.clip for name, form in self.sources.items()}}
+        return {name: RigidMean.of(training_poses(clip)) for name, clip in clips.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """The avatars shown, in order, and the recordings by name.
+
+    Attributes
+    ----------
+    missing : avatars of the runs that are not there, each with the reason.
+    """
+
+    shown: Sequence[Shown]
+    recordings: Mapping[str, Recording]
+    missing: Sequence[str]
+
+    @property
+    def first(self) -> Shown:
+        """The avatar in whose world the viewer's camera is."""
+        return self.shown[0]
+
+    def heads(self) -> dict[str, FloatArray]:
+        """How far the sliders of each head model go, by its version."""
+        reach: dict[str, FloatArray] = {}
+        for shown in self.shown:
+            known = reach.get(shown.version)
+            reach[shown.version] = shown.reach if known is None else np.maximum(known, shown.reach)
+        return reach
+
+
+def open_scene(settings: ViewSettings, kept: Path) -> Scene:
+    """Load the avatars that are asked for; ``kept`` is a folder for tracking that has to be refitted.
+
+    Raises `InputError` where there is nothing to show, or more than `MOST_SHOWN`.
+    """
+    missing: list[str] = []
+    shown: list[Shown] = []
+    for number, name in enumerate(settings.avatars):
+        shown += _opened(Path(name), settings, kept / str(number), missing)
+    if not shown:
+        found = "; ".join(missing) or "none"
+        raise InputError(" ".join(settings.avatars), "", "a trained avatar", found, "Start the run again.")
+    if len(shown) > MOST_SHOWN:
+        remedy = "Choose with --methods and --subjects."
+        raise InputError(
+            " ".join(settings.avatars), "", f"at most {MOST_SHOWN} avatars", str(len(shown)), remedy
+        )
+    for reason in missing:
+        log.warning("not shown: %s", reason)
+    if len({avatar.label for avatar in shown}) < len(shown):
+        shown = [replace(avatar, label=f"{n}: {avatar.label}") for n, avatar in enumerate(shown, 1)]
+    return Scene(shown, _recordings(shown), missing)
+
+
+def _opened(path: Path, settings: ViewSettings, kept: Path, missing: list[str]) -> Iterator[Shown]:
+    if not path.is_dir():
+        raise InputError(path, "", "the folder of a run or of an avatar", "no such folder")
+    run, cell = _run_of(path)
+    if run is None:
+        yield _imported(path, settings, kept)
+        return
+    options = replace(settings, avatars=(str(run),))
+    methods = _chosen(run, resolve_methods(run_configuration(run, options)), settings, cell)
+    config, clips = open_run_clips(run, options, out=kept)
+    names = [clip.subject for clip in clips]
+    wanted = (cell[0],) if cell else settings.subjects or tuple(names[:1])
+    if unknown := sorted({*wanted} - {*names}):
+        raise InputError(run, "--subjects", f"those of the run: {', '.join(names)}", ", ".join(unknown))
+    clips = [clip for clip in clips if clip.subject in wanted]
+    config = replace(config, device=settings.device or config.device)
+    source = _source(settings, config)
+    seeds = (cell[2],) if cell else config.seeds
+    for job in make_jobs(replace(config, seeds=seeds), methods, clips, {}, RunFolder(run), kept):
+        state = job.cell.step("fit")
+        if state is None or state.get("status") != "done":
+            why = "not trained" if state is None else "its training did not end"
+            missing.append(f"{job.name}: {why}")
+            continue
+        try:
+            avatar = load(job)
+        except HeadbenchError as error:
+            missing.append(f"{job.name}: {error}")
+            continue
+        label = " ".join(
+            [job.method.spec.name]
+            + ([job.clip.subject] if len(wanted) > 1 or len(settings.avatars) > 1 else [])
+            + ([f"seed {job.seed}"] if len(seeds) > 1 else [])
+        )
+        yield Shown(label, avatar, job.clip, job.form, _driving(source, job.clip, job.method, config, kept))
+
+
+def _run_of(path: Path) -> tuple[Path | None, tuple[str, str, int] | None]:
+    """The run that a folder is, or lies in with subject, method and seed; None for an avatar of no run."""
+    if (path / "run.json").is_file():
+        return path, None
+    home = avatar_folder(path).resolve()
+    if len(home.parents) > 3 and home.name == "avatar" and (home.parents[3] / "run.json").is_file():
+        seed = home.parent.name.removeprefix("seed-")
+        if seed.isdigit():
+            return home.parents[3], (home.parents[2].name, home.parents[1].name, int(seed))
+    return None, None
+
+
+def _chosen(
+    run: Path,
+    methods: Sequence[ResolvedMethod],
+    settings: ViewSettings,
+    cell: tuple[str, str, int] | None,
+) -> list[ResolvedMethod]:
+    names = [method.spec.name for method in methods]
+    asked = (cell[1],) if cell else settings.methods
+    if unknown := sorted({*asked} - {*names}):
+        raise InputError(run, "--methods", f"those of the run: {', '.join(names)}", ", ".join(unknown))
+    return [m for m in methods if (m.spec.name in asked if asked else not m.spec.trivial)]
+
+
+def _imported(path: Path, settings: ViewSettings, kept: Path) -> Shown:
+    method = stored_method(path, settings.method)
+    if settings.data is None:
+        expected = "the capture that the avatar was made from, with its cameras and poses"
+        raise InputError("command line", "--data", expected, "none, and the avatar lies in no run")
+    config = _config(settings.data, settings, kept)
+    clips = open_clips(config)
+    if len(clips) > 1:
+        names = ", ".join(clip.subject for clip in clips)
+        raise InputError(settings.data, "", "one capture", names, "Name one capture.")
+    form = _form(clips[0], MethodNeeds.of(method.spec), stored_heads(path), kept)
+    avatar = method.create().load(avatar_folder(path), device=config.device)
+    source = _source(settings, config)
+    return Shown(method.spec.name, avatar, clips[0], form, _driving(source, clips[0], method, config, kept))
+
+
+def _config(data: str, settings: ViewSettings, kept: Path) -> RunConfig:
+    return RunConfig(
+        data=data,
+        out=str(kept),
+        reader=reader_of(data),
+        reader_settings={} if settings.head is None else {"head": settings.head},
+        device=settings.device or "cpu",
+    )
+
+
+def _form(clip: Clip, needs: MethodNeeds, heads: Mapping[str, str], kept: Path) -> AdaptedClip:
+    adaptation = plan(clip, needs, heads)
+    if adaptation is None:
+        return AdaptedClip(clip)
+    return carry_out(adaptation, needs, kept / "adapted" / clip.subject, f"adapting {clip.subject}")
+
+
+def _source(settings: ViewSettings, config: RunConfig) -> list[Clip]:
+    if settings.source is None:
+        return []
+    source = _config(settings.source, settings, Path(config.out))
+    return open_clips(replace(source, reader_settings=source.reader_settings or config.reader_settings))
+
+
+def _driving(
+    source: Sequence[Clip], clip: Clip, method: ResolvedMethod, config: RunConfig, kept: Path
+) -> dict[str, AdaptedClip]:
+    others = [other for other in source if other.subject != clip.subject]
+    for other in others:
+        check_heads(other.head, clip.head, f"clip {other.subject}")
+    needs = MethodNeeds.of(method.spec)
+    return {other.subject: _form(other, needs, config.heads, kept / "sources") for other in others}
+
+
+def _recordings(shown: Sequence[Shown]) -> dict[str, Recording]:
+    """Sequences by subject and name, those held out last and marked; of subjects that drive every avatar."""
+    found: dict[str, Recording] = {}
+    clips = {avatar.clip.subject: avatar.clip for avatar in shown}
+    own = {*clips} if len(clips) == 1 else set()
+    sources = [form.clip for form in shown[0].sources.values()]
+    for clip in [clips[name] for name in own] + sources:
+        for split, mark in (("train", ""), ("novel_view", ""), ("self_reenactment", ", held out")):
+            for key in sorted(clip.splits.get(split, ())):
+                name = f"{key.subject}: {key.sequence}{mark}"
+                found.setdefault(name, {}).setdefault(key.timestep, {})[key.camera] = key
+    return found

@@ -1,0 +1,113 @@
+"""The viewer's server: a session for each browser, on viser."""
+
+from __future__ import annotations
+
+import importlib
+import io
+import ipaddress
+import logging
+import socket
+import tempfile
+import threading
+import time
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stdout
+from pathlib import Path
+from typing import Any
+
+from ...bench.contracts import Progress
+from ...bench.errors import InputError, UnavailableError
+from ...bench.specs import Findings
+from .command import ViewSettings
+from .scene import Scene, open_scene
+from .session import Session
+
+log = logging.getLogger(__name__)
+
+
+def view_avatars(settings: ViewSettings, progress: Progress) -> Findings:
+    """Serve until interrupted, or for the seconds asked for."""
+    viser()
+    check_port(settings.host, settings.port)
+    with tempfile.TemporaryDirectory(prefix="headbench-view-") as kept:
+        scene = open_scene(settings, Path(kept))
+        with serving(scene, settings) as server:
+            address = f"http://{settings.host}:{server.get_port()}"
+            names = ", ".join(shown.label for shown in scene.shown)
+            log.warning("%s: %s (Ctrl-C ends it)", address, names)
+            ends = None if settings.seconds is None else time.monotonic() + settings.seconds
+            try:
+                while ends is None or time.monotonic() < ends:
+                    time.sleep(0.2)
+            except KeyboardInterrupt:
+                pass
+    return Findings(f"the viewer of {names} has ended", {"address": address})
+
+
+@contextmanager
+def serving(scene: Scene, settings: ViewSettings) -> Iterator[Any]:
+    """A running server, which stops in the end; its ``sessions`` by client."""
+    if not _is_loopback(settings.host):
+        log.warning(
+            "Everybody who reaches %s can look at these avatars and use this machine to draw them.",
+            settings.host,
+        )
+    with redirect_stdout(io.StringIO()):  # it prints a banner
+        server = viser().ViserServer(host=settings.host, port=settings.port, label="headbench", verbose=False)
+    # It can open a tunnel to a public address on a browser's wish; no picture of anybody leaves this way.
+    server.request_share_url = lambda verbose=True: None
+    server.gui.configure_theme(show_logo=False, show_share_button=False)
+    server.gui.main_panel.dock_right()
+    # What is drawn for a browser that goes meanwhile is not missed.
+    warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
+    server.sessions = {}
+    lock = threading.Lock()
+
+    @server.on_client_connect
+    def begin(client: Any) -> None:
+        server.sessions[client.client_id] = Session(client, scene, settings.expressions, lock)
+
+    @server.on_client_disconnect
+    def end(client: Any) -> None:
+        session = server.sessions.pop(client.client_id, None)
+        if session is not None:
+            session.close()
+
+    try:
+        yield server
+    finally:
+        for session in list(server.sessions.values()):
+            session.close()
+        with redirect_stdout(io.StringIO()):
+            server.stop()
+
+
+def viser() -> Any:
+    """The module. Raises `UnavailableError` where it is not installed."""
+    try:
+        return importlib.import_module("viser")
+    except ImportError:
+        remedy = "Install it: pip install viser, the extra `view`."
+        raise UnavailableError("The viewer runs on viser, which is not here.", remedy) from None
+
+
+def check_port(host: str, port: int) -> None:
+    """Raise `InputError` for an address that cannot be listened at; viser would take another port."""
+    try:
+        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
+        with socket.socket(family, socket.SOCK_STREAM) as trial:
+            trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            trial.bind((host, port))
+    except OSError as error:
+        expected = "an address of this machine and a port that is free"
+        raise InputError(
+            "command line", "--port", expected, f"{host}:{port}: {error}", "Choose another --port."
+        ) from None
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"

@@ -1,0 +1,270 @@
+"""One browser at the viewer: draws what its controls and its camera ask for, again and again."""
+
+from __future__ import annotations
+
+import logging
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...bench.contracts import ByteArray, Camera, FloatArray
+from ...bench.errors import HeadbenchError
+from ...bench.io.images import write_png
+from ...bench.io.provenance import COMPOSITE
+from ...bench.io.video import write_webm
+from ..robustness.viewpoints import turntable
+from .drawing import draw, rotations, splats_of
+from .panel import Panel
+from .scene import Scene
+from .state import FreeView, State
+
+log = logging.getLogger(__name__)
+SCALE = 100.0
+"""Units of the browser's world in a metre: covariances travel as 16-bit floats, which would round those in square metres."""
+DRAFT_S = 0.06
+"""What a draft may take while something moves; its size follows from what the last one took."""
+REST_S = 0.3
+"""After so long without a change the image is drawn in full."""
+LEAST_DRAFT = 0.12
+STILL = 1e-4
+"""Motion of the camera that is not drawn: metres, and as much of a unit quaternion."""
+DRAFT_QUALITY = 85
+APART_M = 0.35
+"""Between avatars side by side, where the browser draws splats."""
+MOST_HEIGHT = 1080
+VIDEO_HEIGHT = 512
+TURNTABLE_VIEWS, BEYOND_DEGREES = 90, 30.0
+
+
+class Session:
+    """A browser and what it sees. One thread draws; ``lock`` is held meanwhile, for avatars are shared.
+
+    Attributes
+    ----------
+    updates : images or sets of splats sent so far.
+    """
+
+    def __init__(self, client: Any, scene: Scene, expressions: int, lock: threading.Lock):
+        self._client, self._scene, self._lock = client, scene, lock
+        self._changed, self._closed = threading.Event(), False
+        self._draft = 0.5
+        self._handles: dict[int, Any] = {}
+        self._seen: FloatArray | None = None
+        self._offset: FloatArray = np.zeros(3)
+        self._tasks: list[Callable[[], None]] = []
+        self.updates = 0
+        self._look_at_head()
+        self._panel = Panel(client, scene, expressions, self._changed.set, self._jump)
+        client.camera.on_update(lambda _: self._camera_moved())
+        self._panel.screenshot.on_click(lambda _: self._do(self._screenshot))
+        self._panel.turntable.on_click(lambda _: self._do(self._turntable))
+        self._panel.sequence.on_click(lambda _: self._do(self._sequence))
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._changed.set()
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop drawing; called when the browser has gone."""
+        self._closed = True
+        self._changed.set()
+        self._thread.join(timeout=10.0)
+
+    # -------------------------------------------------------------- the loop
+
+    def _run(self) -> None:
+        last = time.perf_counter()
+        while not self._closed:
+            try:
+                if self._tasks:
+                    self._tasks.pop(0)()
+                self._changed.wait(timeout=None if not self._panel.playing else 0.0)
+                if self._panel.playing:
+                    frames = int((time.perf_counter() - last) * self._panel.fps.value)
+                    if frames:
+                        last += frames / self._panel.fps.value
+                        self._panel.advance(frames)
+                    else:
+                        time.sleep(0.005)
+                        continue
+                else:
+                    last = time.perf_counter()
+                self._changed.clear()
+                self._show(self._draft)
+                whole = self._panel.playing or self._panel.state.splats
+                if not whole and not self._changed.wait(timeout=REST_S):
+                    self._show(1.0)
+            except HeadbenchError as error:
+                self._say(str(error))
+            except Exception as error:
+                if self._closed:
+                    return
+                log.exception("the viewer could not draw")
+                self._say(f"{type(error).__name__}: {error}")
+
+    def _show(self, scale: float) -> None:
+        state, start = self._panel.state, time.perf_counter()
+        if state.splats:
+            self._show_splats(state, start)
+            return
+        for handle in self._handles.values():
+            handle.visible = False
+        with self._lock:
+            drawn = draw(self._scene, state, self._view(), self._size(), scale)
+        between = time.perf_counter()
+        whole = scale == 1.0
+        self._client.scene.set_background_image(
+            drawn.image, "png" if whole else "jpeg", jpeg_quality=DRAFT_QUALITY
+        )
+        self._client.flush()
+        end = time.perf_counter()
+        self.updates += 1
+        if not whole:
+            self._draft = float(np.clip(scale * np.sqrt(DRAFT_S / (end - start)), LEAST_DRAFT, 0.99))
+        each = ", ".join(f"{name} {time_:.0f} ms" for name, time_ in drawn.milliseconds.items())
+        height, width = drawn.image.shape[:2]
+        self._panel.show_times(
+            f"{width}x{height}{'' if whole else ' while moving'}: {each}; sent in {1e3 * (end - between):.0f} ms"
+        )
+
+    def _show_splats(self, state: State, start: float) -> None:
+        self._client.scene.set_background_image(None)
+        told = []
+        right = self._view().world_to_camera[0, :3]
+        middle = (len(self._scene.shown) - 1) / 2
+        for number, shown in enumerate(self._scene.shown):
+            with self._lock:
+                splats = splats_of(self._scene, shown, state, self._view())
+            if splats is None:
+                told.append(f"{shown.label} has no plain splats")
+                continue
+            drawn = time.perf_counter()
+            if not self._handles:
+                self._offset = right
+                self._step_back()
+            centers = SCALE * (splats.centers + ((number - middle) * APART_M) * self._offset)
+            values = (
+                centers.astype(np.float32),
+                SCALE**2 * splats.covariances,
+                *(splats.colors, splats.opacities),
+            )
+            if number in self._handles:
+                self._handles[number].visible = True
+                self._handles[number].set_gaussians(*values)
+            else:
+                add = self._client.scene.add_gaussian_splats
+                self._handles[number] = add(f"/avatar {number}", *values)
+            packed = time.perf_counter()
+            told.append(
+                f"{shown.label}: {len(centers):,} splats posed in {1e3 * (drawn - start):.0f} ms,"
+                f" packed in {1e3 * (packed - drawn):.0f} ms"
+            )
+            start = packed
+        self._client.flush()
+        self.updates += 1
+        self._panel.show_times("; ".join(told))
+
+    # -------------------------------------------------------------- the camera
+
+    def _size(self) -> tuple[int, int]:
+        """Width and height of the browser's canvas, pixels, at most `MOST_HEIGHT` high."""
+        camera = self._client.camera
+        width, height = max(1, camera.image_width), max(1, camera.image_height)
+        factor = min(1.0, MOST_HEIGHT / height)
+        return round(width * factor), round(height * factor)
+
+    def _camera_moved(self) -> None:
+        """Take note of a change that can be seen; where the browser slows a motion down, it tells of smaller ones."""
+        camera = self._client.camera
+        now = np.concatenate([camera.position / SCALE, camera.wxyz, [camera.fov, *self._size()]])
+        if self._seen is None or np.abs(now - self._seen).max() > STILL:
+            self._seen = now
+            self._changed.set()
+
+    def _view(self) -> FreeView:
+        camera = self._client.camera
+        to_world = np.eye(4)
+        to_world[:3, :3] = rotations(np.array([camera.wxyz]))[0]
+        to_world[:3, 3] = np.asarray(camera.position) / SCALE
+        return FreeView(np.linalg.inv(to_world), float(camera.fov))
+
+    def _look_at_head(self) -> None:
+        """Start from the front, so near that the head fills the view as in a camera of the capture."""
+        clip = self._scene.first.clip
+        cameras = [clip.cameras[name] for name in sorted({key.camera for key in clip.splits["train"]})]
+        front = turntable(cameras, self._scene.first.center, 1, 0.0)[0].camera
+        self._place(front)
+
+    def _place(self, view: Camera) -> None:
+        camera, center = self._client.camera, self._scene.first.center
+        with self._client.atomic():
+            camera.up_direction = -view.world_to_camera[1, :3]
+            camera.position = SCALE * view.center
+            depth = float(np.linalg.norm(center - view.center))
+            camera.look_at = SCALE * (view.center + depth * view.world_to_camera[2, :3])
+            camera.fov = FreeView.of(view).fov
+
+    def _step_back(self) -> None:
+        """Let all avatars side by side be seen."""
+        camera, factor = self._client.camera, 1 + 0.5 * (len(self._scene.shown) - 1)
+        camera.position = camera.look_at + factor * (camera.position - camera.look_at)
+
+    def _jump(self, name: str) -> None:
+        if name:
+            self._place(self._scene.first.clip.cameras[name])
+        self._changed.set()
+
+    # -------------------------------------------------------------- what is saved
+
+    def _do(self, task: Callable[[], None]) -> None:
+        self._tasks.append(task)
+        self._changed.set()
+
+    def _say(self, text: str, title: str = "Not done") -> None:
+        self._client.add_notification(title=title, body=text, auto_close_seconds=20)
+
+    def _screenshot(self) -> None:
+        with self._lock:
+            image = draw(self._scene, self._panel.state, self._view(), self._size()).image
+        with tempfile.TemporaryDirectory() as folder:
+            content = write_png(Path(folder) / "view.png", image, COMPOSITE)
+        self._client.send_file_download("headbench.png", content, save_immediately=True)
+
+    def _turntable(self) -> None:
+        clip = self._scene.first.clip
+        cameras = [clip.cameras[name] for name in sorted({key.camera for key in clip.splits["train"]})]
+        views = turntable(cameras, self._scene.first.center, TURNTABLE_VIEWS, BEYOND_DEGREES)
+        state = replace(self._panel.state, camera="")
+        self._save("turntable", ((state, FreeView.of(view.camera)) for view in views), len(views))
+
+    def _sequence(self) -> None:
+        state, view = self._panel.state, self._view()
+        steps = self._panel.timesteps
+        self._save("sequence", ((replace(state, timestep=step), view) for step in steps), len(steps))
+
+    def _save(self, name: str, moments: Iterator[tuple[State, FreeView]], count: int) -> None:
+        width, height = self._size()
+        factor = min(1.0, VIDEO_HEIGHT / height)
+        size = 2 * round(width * factor / 2), 2 * round(height * factor / 2)
+        bar = self._client.gui.add_progress_bar(0.0)
+
+        def images() -> Iterator[ByteArray]:
+            for number, (state, view) in enumerate(moments, 1):
+                if self._closed:
+                    raise HeadbenchError("the browser has gone")
+                with self._lock:
+                    yield draw(self._scene, state, view, size).image
+                bar.value = 100 * number / count
+
+        try:
+            with tempfile.TemporaryDirectory() as folder:
+                path = Path(folder) / f"{name}.webm"
+                write_webm(path, images(), float(self._panel.fps.value), COMPOSITE)
+                self._client.send_file_download(path.name, path.read_bytes(), save_immediately=True)
+        finally:
+            bar.remove()

@@ -1,0 +1,168 @@
+"""``headbench bench viewer``: how often a browser sees something new while a slider moves, and what each step takes."""
+
+from __future__ import annotations
+
+import importlib
+import shutil
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ...bench.contracts import Camera, FloatArray, FrameKey, HeadAsset, HeadPose, Progress
+from ...bench.runner.adaptation import AdaptedClip
+from ...bench.specs import Findings
+from ...datasets.head.procedural.model import procedural_head
+from ...reports.view.command import ViewSettings
+from ...reports.view.drawing import draw, splats_of
+from ...reports.view.scene import Scene, Shown
+from ...reports.view.server import serving
+from ...reports.view.state import FreeView, Sliders, State
+from .avatar.untrained import cameras_around, random_poses, untrained_avatar
+from .timing import table
+
+SPLATS, QUICK_SPLATS = (20_000, 60_000), (2_000,)
+WINDOW = 1280, 720
+SECONDS, QUICK_SECONDS = 8.0, 1.0
+LEAST_RATE = 8.0
+"""Updates a second demanded of images of the smaller avatar, browser included, on two cores without a GPU."""
+MOVE_MS = 30
+SOFTWARE_WEBGL = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+COUNT_UPLOADS = """
+window.uploads = 0;
+for (const name of ["texImage2D", "texSubImage2D"]) {
+  const given = WebGL2RenderingContext.prototype[name];
+  WebGL2RenderingContext.prototype[name] = function (...values) { window.uploads++; return given.apply(this, values); };
+}"""
+MOVE_SLIDER = """([x, y, every]) => { let step = 0; window.moving = setInterval(() => { step++;
+  for (const made of [PointerEvent, MouseEvent]) document.dispatchEvent(new made(
+    made === PointerEvent ? "pointermove" : "mousemove",
+    {clientX: x + 40 * Math.sin(step / 10), clientY: y, bubbles: true, buttons: 1})); }, every); }"""
+
+
+@dataclass(frozen=True, eq=False)
+class _Clip:
+    """A capture without images, as much as a viewer asks of one."""
+
+    head: HeadAsset
+    cameras: dict[str, Camera]
+    poses: dict[int, HeadPose]
+    splits: dict[str, tuple[FrameKey, ...]]
+    subject: str = "untrained"
+    shape: FloatArray = field(default_factory=lambda: np.zeros(1))
+    background: FloatArray = field(default_factory=lambda: np.ones(3))
+
+
+def measure(quick: bool, progress: Progress) -> Findings:
+    """Serve untrained avatars of ours, move a slider in Chromium; passed where images of the first keep `LEAST_RATE`.
+
+    Without Playwright and Chromium the rates of a browser are missing, and nothing is judged.
+    """
+    counts, seconds = (QUICK_SPLATS, QUICK_SECONDS) if quick else (SPLATS, SECONDS)
+    chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    rows = []
+    for done, (count, mode) in enumerate((count, mode) for count in counts for mode in ("images", "splats")):
+        progress(done, 2 * len(counts), f"{count} splats, {mode}")
+        scene = _scene(count)
+        row: dict[str, Any] = {"splats": count, "mode": mode, **_stages(scene, mode == "splats")}
+        if chromium:
+            row |= _in_browser(scene, mode, chromium, seconds)
+        rows.append(row)
+    progress(2 * len(counts), 2 * len(counts), "")
+    names = ("pose and draw ms", "pack ms", "sent a second", "uploads a second")
+    lines = [
+        table(
+            ["splats", "drawn as", *names],
+            [[f"{row['splats']:,}", row["mode"], *(_cell(row.get(name)) for name in names)] for row in rows],
+        ),
+        f"A window of {WINDOW[0]}x{WINDOW[1]}, WebGL in software. pack: JPEG of a draft. sent: by the server while a slider moves.",
+        "uploads: textures that the browser gave to WebGL; one image takes two.",
+    ]
+    faults = []
+    if not chromium:
+        lines.append(
+            "The browser's rates are missing: there is no Chromium. Install it: apt-get install chromium."
+        )
+    elif not quick and rows[0]["sent a second"] < LEAST_RATE:
+        faults = [f"{rows[0]['sent a second']:.1f} updates a second, fewer than {LEAST_RATE:g}"]
+    return Findings("\n".join([*lines, *faults]), {"rows": rows}, passed=not faults)
+
+
+def _cell(value: float | None) -> str:
+    return "?" if value is None else f"{value:.1f}"
+
+
+def _scene(count: int) -> Scene:
+    head = procedural_head("2023")
+    cameras = {camera.id: camera for camera in cameras_around(head, 4, 550, 802)}
+    poses = dict(enumerate(random_poses(head, 4)))
+    keys = tuple(FrameKey("untrained", "EMO-1", t, name) for t in poses for name in cameras)
+    clip: Any = _Clip(head, cameras, poses, {"train": keys})
+    return Scene([Shown("ours", untrained_avatar(head, count), clip, AdaptedClip(clip), {})], {}, ())
+
+
+def _stages(scene: Scene, splats: bool, repeats: int = 8) -> dict[str, float]:
+    """Medians of milliseconds, with another expression each time."""
+    import cv2
+
+    view = FreeView.of(next(iter(scene.first.clip.cameras.values())))
+    drawn, packed = [], []
+    for number in range(repeats):
+        state = State(Sliders({scene.first.version: (0.1 * number + 0.05,)}), splats=splats)
+        start = time.perf_counter()
+        if splats:
+            splats_of(scene, scene.first, state, view)
+            drawn.append(time.perf_counter() - start)
+            continue
+        image = draw(scene, state, view, WINDOW, 0.99).image
+        between = time.perf_counter()
+        cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 85])
+        drawn.append(between - start)
+        packed.append(time.perf_counter() - between)
+    stages = {"pose and draw ms": drawn} | ({"pack ms": packed} if packed else {})
+    return {name: 1e3 * float(np.median(values)) for name, values in stages.items()}
+
+
+def _in_browser(scene: Scene, mode: str, chromium: str, seconds: float) -> dict[str, float]:
+    """Rates while a slider is dragged; Playwright wants a thread without a running event loop."""
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(_browse, scene, mode, chromium, seconds).result()
+
+
+def _browse(scene: Scene, mode: str, chromium: str, seconds: float) -> dict[str, float]:
+    with serving(scene, ViewSettings(("bench",), port=0)) as server, _page(chromium) as page:
+        page.goto(f"http://127.0.0.1:{server.get_port()}")
+        page.get_by_text("Drawn by trained models").wait_for()
+        if mode == "splats":
+            page.get_by_label("Drawn as", exact=True).locator("visible=true").first.click()
+            page.get_by_role("option").filter(has_text="splats").first.click()
+            page.get_by_text("splats posed in").wait_for()
+        page.wait_for_timeout(1000)
+        box = page.get_by_role("slider").nth(2).bounding_box()
+        x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+        page.mouse.move(x, y)
+        page.mouse.down()
+        page.evaluate(MOVE_SLIDER, [x, y, MOVE_MS])
+        (session,) = server.sessions.values()
+        sent, first, start = session.updates, page.evaluate("window.uploads"), time.perf_counter()
+        page.wait_for_timeout(1e3 * seconds)
+        last, elapsed = page.evaluate("window.uploads"), time.perf_counter() - start
+        return {
+            "sent a second": (session.updates - sent) / elapsed,
+            "uploads a second": (last - first) / elapsed,
+        }
+
+
+@contextmanager
+def _page(chromium: str) -> Iterator[Any]:
+    playwright = importlib.import_module("playwright.sync_api")
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=chromium, args=SOFTWARE_WEBGL)
+        page = browser.new_page(viewport=dict(zip(("width", "height"), WINDOW)))
+        page.add_init_script(COUNT_UPLOADS)
+        yield page
+        browser.close()

@@ -1,0 +1,134 @@
+"""The viewer in Chromium: what is moved is seen to move, for each browser alone."""
+
+import shutil
+import time
+
+import pytest
+
+from headbench.reports.view.command import ViewSettings
+from headbench.reports.view.server import serving
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+pytest.importorskip("viser", reason="viser is not installed")
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium on this machine")
+SOFTWARE_WEBGL = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+CANVAS = {"x": 40, "y": 200, "width": 260, "height": 190}
+"""Part of the page beside the panel and below viser's note on software WebGL."""
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE_WEBGL)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def opened(browser):
+    """Open the viewer in a browser of its own; nothing outside of this machine was asked for, and there was no fault."""
+    contexts, faults = [], []
+
+    def start(server):
+        address = f"127.0.0.1:{server.get_port()}"
+        contexts.append(browser.new_context(viewport={"width": 640, "height": 400}))
+        tab = contexts[-1].new_page()
+        tab.set_default_timeout(20_000)
+        tab.on("pageerror", lambda error: faults.append(str(error)))
+        tab.on(
+            "request",
+            lambda request: (
+                None
+                if address in request.url or request.url.startswith(("data:", "blob:"))
+                else faults.append(request.url)
+            ),
+        )
+        tab.goto(f"http://{address}")
+        tab.get_by_text("Drawn by trained models").wait_for()
+        return tab
+
+    yield start
+    for context in contexts:
+        context.close()
+    assert faults == []
+
+
+def settled(tab):
+    """The pixels of the canvas as soon as three pictures of it are the same."""
+    pictures, end = [tab.screenshot(clip=CANVAS)], time.monotonic() + 40
+    while len(pictures) < 3 or len({*pictures[-3:]}) > 1:
+        assert time.monotonic() < end, "the picture never rests"
+        tab.wait_for_timeout(400)
+        pictures.append(tab.screenshot(clip=CANVAS))
+    return pictures[-1]
+
+
+def type_value(tab, label, value):
+    """Type the value of a slider, as one would; keys on the slider itself turn the camera too."""
+    labelled = f"xpath=//*[normalize-space(text())='{label}']"
+    field = tab.locator(f"{labelled}/following::input[not(@type='hidden')][1]")
+    field.fill(value)
+    field.press("Enter")
+
+
+def choose(tab, label, option):
+    tab.get_by_label(label, exact=True).locator("visible=true").first.click()
+    tab.get_by_role("option").filter(has_text=option).first.click()
+
+
+def serve(scene):
+    return serving(scene, ViewSettings(("run",), port=0, expressions=2))
+
+
+def test_a_slider_moves_one_browser_alone(scene, opened):
+    with serve(scene) as server:
+        one, two = opened(server), opened(server)
+        before = settled(one), settled(two)
+        type_value(one, "open", "0.4")
+        assert settled(one) != before[0]
+        assert settled(two) == before[1]
+        one.get_by_text("Reset sliders").click()
+        assert settled(one) == before[0]
+
+
+def test_a_camera_shows_the_capture_beside(scene, opened):
+    with serve(scene) as server:
+        tab = opened(server)
+        before = settled(tab)
+        choose(tab, "Sequence", "held out")
+        choose(tab, "Camera", min(scene.first.clip.cameras))
+        assert settled(tab) != before
+
+
+def test_splats_are_drawn_by_the_browser(scene, opened):
+    with serve(scene) as server:
+        tab = opened(server)
+        before = settled(tab)
+        choose(tab, "Drawn as", "splats")
+        tab.get_by_text("splats posed in").wait_for()
+        assert settled(tab) != before
+        choose(tab, "Drawn as", "images")
+        tab.get_by_text("sent in").wait_for()
+
+
+def test_what_is_saved_comes_as_files(scene, opened):
+    with serve(scene) as server:
+        tab = opened(server)
+        tab.get_by_text("Save", exact=True).click()
+        for button, name, start in (
+            ("Screenshot", "headbench.png", b"\x89PNG"),
+            ("Turntable video", "turntable.webm", b"\x1a\x45\xdf\xa3"),
+        ):
+            with tab.expect_download() as download:
+                tab.get_by_role("button", name=button).click()
+            assert download.value.suggested_filename == name
+            content = download.value.path().read_bytes()
+            assert content.startswith(start)
+            assert b"trainedAlgorithmicMedia" in content or b"ompositeWithTrainedAlgorithmicMedia" in content
+
+
+def test_a_server_can_be_started_again(scene, opened):
+    for _ in range(2):
+        with serve(scene) as server:
+            settled(opened(server))
