@@ -16,6 +16,7 @@ import tyro
 from .configuration import build, merge, parse_assignments
 from .contracts import Progress
 from .errors import InputError
+from .executors.settings import Execution, ExecutorName
 from .io.documents import read_yaml
 from .io.files import check_writable, prepare_folder, write_json
 from .io.lock import locked
@@ -142,8 +143,14 @@ class RunSettings:
     """Head model for captures that bring none: FLAME pickle or npz."""
     seeds: str | None = None
     """Seeds of the training, separated by commas: an avatar is trained for each. Default: 0."""
+    executor: ExecutorName | None = None
+    """Where cells (a subject, a method, a seed) are worked on: inline, one after another; processes, several at once on this
+    machine; slurm, a job for each. Default: inline."""
+    workers: int | None = None
+    """How many processes. Default: one for each core."""
     set: Assignments = ()
-    """Any setting, for example `frames_per_task=50`, `settings.ga.budget.iterations=5000`; repeatable."""
+    """Any setting, for example `frames_per_task=50`, `settings.ga.budget.iterations=5000`, `execution.slurm.hours=8`;
+    repeatable."""
 
 
 def run(settings: RunSettings, progress: Progress) -> Findings:
@@ -162,9 +169,12 @@ def run(settings: RunSettings, progress: Progress) -> Findings:
         from .runner.captures import reader_of  # which takes long to import
 
         values["reader"] = reader_of(values["data"])
+    given = {name: getattr(settings, name) for name in ("executor", "workers")}
+    given = {key: value for key, value in given.items() if value is not None}
+    execution = build(Execution, merge(values.pop("execution", {}), given), source, "execution.")
     config = build(RunConfig, values, source)
     with _log_file(Path(config.out)):
-        return _run(config)
+        return _run(config, execution)
 
 
 @dataclass(frozen=True)
@@ -263,10 +273,10 @@ def _synthesise(arguments: dict[str, Any]) -> None:
         resolve(get("datasets", "synthetic").implementation)(**arguments, progress=report)
 
 
-def _run(config: RunConfig, **record: Any) -> Findings:
+def _run(config: RunConfig, execution: Execution | None = None, **record: Any) -> Findings:
     from .runner.run import run as run_comparison
 
-    rows = run_comparison(config, **record)
+    rows = run_comparison(config, execution, **record)
     text = f"{_table([config.out])}\n\nPictures, tables and everything else: {config.out}"
     return Findings(
         text, {"out": config.out, "failed": rows.failed, "means": means(config.out)}, not rows.failed

@@ -87,6 +87,8 @@ def doctor(settings: DoctorSettings, progress: Progress) -> Findings:
             elif plugin.spec.needs:
                 needs = tuple(_asked(plugin.spec.needs, None, settings.device))
                 patients.append(Patient(group, name, False, needs))
+    if not named:
+        patients.append(Patient("executors", "slurm", False, tuple(_slurm())))
     ill = [patient for patient in patients if patient.counts and patient.state == "missing"]
     machine = machine_record()
     head = (
@@ -125,6 +127,19 @@ def _device(device: str) -> Iterator[Need]:
         yield Need(f"device {device}", "", str(error))
     else:
         yield Need(f"device {device}", "there")
+
+
+def _slurm() -> Iterator[Need]:
+    import shutil
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        found = version("submitit")
+    except PackageNotFoundError:
+        found = ""
+    yield Need("submitit", found, "pip install 'headbench[slurm]'")
+    remedy = "Commands of the cluster; without one, `--executor processes` uses the cores of this machine."
+    yield Need("sbatch", shutil.which("sbatch") or "", remedy)
 
 
 def _method(

@@ -57,6 +57,18 @@ def locked(folder: Path, *, beside: bool = False) -> Iterator[None]:
                     folder.rmdir()
 
 
+def is_locked(folder: Path) -> bool:
+    """Whether a process of this machine works in ``folder``, as far as its lock tells."""
+    try:
+        with open(folder / LOCK_FILE, encoding="utf-8", opener=no_link) as stream:
+            fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    return False
+
+
 def _acquire(path: Path) -> IO[str]:
     path.parent.mkdir(parents=True, exist_ok=True)
     while True:

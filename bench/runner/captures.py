@@ -26,10 +26,11 @@ HARNESS = ("progress", "remembered")
 """Keywords of a reader that are no settings: the harness gives them, see `DatasetSpec`."""
 
 
-def open_clips(config: RunConfig, *, remembered: bool = True) -> list[Clip]:
+def open_clips(config: RunConfig, *, remembered: bool = True, only: int | None = None) -> list[Clip]:
     """Open every capture under ``config.data``, each validated whole by its reader, at the size to be measured at.
 
-    ``remembered`` is False where every byte has to be read, whatever a reader remembers of an earlier time.
+    ``remembered`` is False where every byte has to be read, whatever a reader remembers of an earlier time. ``only`` is
+    the index of a single capture to open, None for all.
 
     Raises `InputError` for a folder without captures, a setting the reader does not know or of the wrong type,
     subjects that are not distinct, and whatever the reader finds wrong.
@@ -39,7 +40,8 @@ def open_clips(config: RunConfig, *, remembered: bool = True) -> list[Clip]:
     if not root.exists():
         raise InputError(root, "--data", "a capture folder", "no such folder")
     clips: list[Clip] = []
-    for path, read in found_captures(spec, root, config.reader_settings, remembered=remembered):
+    found = found_captures(spec, root, config.reader_settings, remembered=remembered)
+    for path, read in found if only is None else found[only : only + 1]:
         with progress(f"reading {path.name}") as report:
             clips.append(_reduced(_checked(read(report)), config))
     subjects = [clip.subject for clip in clips]

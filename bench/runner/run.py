@@ -14,6 +14,8 @@ import numpy as np
 
 from ..contracts import Avatar, CheckedMethod, Clip
 from ..errors import HeadbenchError, InputError, UnavailableError
+from ..executors.outcome import outcome_path
+from ..executors.settings import Execution, check_slurm
 from ..io.files import atomic_path, output_inside, prepare_folder
 from ..io.lock import locked
 from ..machine import check_device, machine_record, peak_memory_bytes
@@ -28,25 +30,31 @@ from .adaptation import AdaptedClip, MethodNeeds
 from .captures import open_clips, open_run_clips, relative_paths, run_configuration
 from .config import ResolvedMethod, RunConfig, RunOptions, resolve_methods, resolve_metrics
 from .scoring import check_regions, make_metric
-from .steps import Job, failed_rows, fit, measure, render, steps_ahead
+from .steps import Job, failed_rows, fit, measure, reason_of, render, steps_ahead
 from .store import RunFolder
 
 log = logging.getLogger(__name__)
 
 
-def run(config: RunConfig, **record: Any) -> Rows:
+def run(config: RunConfig, execution: Execution | None = None, **record: Any) -> Rows:
     """Run a comparison into ``config.out`` and return its rows; ``record`` is added to the manifest.
+
+    ``execution`` says where its cells are worked on, None for this process.
 
     Everything that can be checked is checked before the first long step: settings, device, methods, captures, the
     output folder, and that no other process works in it. A method that fails is recorded as failed and the others
     go on. Started again with the same configuration after a kill, it keeps what is done and continues what is not.
     """
     methods, metrics = resolve_methods(config), resolve_metrics(config)
-    check_device(config.device)
+    execution = execution or Execution()
+    if execution.executor == "slurm":
+        check_slurm()  # its jobs look for the device, which the machine that submits them may lack
+    else:
+        check_device(config.device)
     folder = RunFolder(Path(config.out))
     prepare_folder(folder.root)
     with locked(folder.root):
-        return _run(config, methods, metrics, folder, record)
+        return _run(config, methods, metrics, folder, execution, record)
 
 
 def _run(
@@ -54,6 +62,7 @@ def _run(
     methods: Sequence[ResolvedMethod],
     metrics: Sequence[MetricSpec],
     folder: RunFolder,
+    execution: Execution,
     record: Mapping[str, Any],
 ) -> Rows:
     start = time.perf_counter()
@@ -82,7 +91,12 @@ def _run(
         log.warning("%s", reason)
     for protocol in protocols.values():
         log.info("%s, protocol %s: %d frames", protocol.task, protocol.hash, len(protocol.keys))
-    rows = run_jobs(jobs, metrics)
+    if execution.executor == "inline":
+        rows = run_jobs(jobs, metrics)
+    else:
+        from ..executors.run import execute
+
+        rows = execute(jobs, metrics, folder, execution)
     rows.write(folder.rows)
     seconds = round(time.perf_counter() - start, 3)
     done = replace(manifest, status="done", seconds=seconds, peak_memory_bytes=peak_memory_bytes())
@@ -193,16 +207,17 @@ def run_jobs(jobs: Sequence[Job], metrics: Sequence[MetricSpec]) -> Rows:
 
 def _run_cell(job: Job, metrics: Sequence[MetricSpec]) -> Rows:
     log.info("%s", job.name)
+    outcome_path(job.cell.folder).unlink(missing_ok=True)  # of a process or a job that worked on it earlier
     try:
         avatar = fit(job)
         render(job, avatar)
         return measure(job, avatar, metrics)
     except HeadbenchError as error:
         log.error("%s failed: %s", job.name, error)
-        return failed_rows(job, metrics, error)
+        return failed_rows(job, metrics, reason_of(error))
     except Exception as error:
         log.exception("%s failed", job.name)
-        return failed_rows(job, metrics, error)
+        return failed_rows(job, metrics, reason_of(error))
 
 
 def warn_of_missing_metrics(metrics: Sequence[MetricSpec], clip: Clip) -> None:

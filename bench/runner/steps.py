@@ -339,6 +339,38 @@ def measure(job: Job, avatar: Avatar, metrics: Sequence[MetricSpec]) -> Rows:
     return result
 
 
+def stored_rows(job: Job, metrics: Sequence[MetricSpec], *, retry: bool = False) -> Rows | None:
+    """The rows of a cell that is done, read back; None where something is missing, damaged or made of other inputs.
+
+    ``retry``: measurements that could not be had count as missing, since they are to be tried again.
+    """
+    fitted = job.cell.step("fit")
+    made_of = digest(job.fit_fingerprint, _avatar_record(job))
+    if fitted is None or not job.cell.is_done("fit", job.fit_fingerprint):
+        return None
+    if not job.cell.is_done(DIGESTS, made_of) or job.cell.damage(fitted.get("files", {})):
+        return None
+    rendered = recorded_frames(job)
+    frames = {name: rendered.get(name, "") for name in map(job.cell.name, job.frame_paths)}
+    if job.cell.damage(frames):
+        return None
+    known, _, old = _measured_before(job)
+    if any(known.get(spec.name) != _measure_fingerprint(job, spec, rendered) for spec in metrics):
+        return None
+    parts = [old.select(method=ALL, metric=spec.name, task=ALL, region=ALL, seeds=ALL) for spec in metrics]
+    had = {spec.implementation for spec, part in zip(metrics, parts) if "ok" in set(part["status"])}
+    if retry and any(spec.implementation not in had for spec in metrics):
+        return None
+    return Rows.joined([Rows(part) for part in parts])
+
+
+def measured(job: Job, metrics: Sequence[MetricSpec]) -> list[MetricSpec]:
+    """Those metrics that were measured of the avatar and the frames that the cell has now."""
+    known = _measured_before(job)[0]
+    rendered = recorded_frames(job)
+    return [spec for spec in metrics if known.get(spec.name) == _measure_fingerprint(job, spec, rendered)]
+
+
 def _measured_before(job: Job) -> tuple[dict[str, str], dict[str, Any], Rows]:
     """Fingerprints and details of the measurements that were taken, by metric, and the rows."""
     step = job.cell.step("measure")
@@ -362,9 +394,13 @@ def _measure_fingerprint(job: Job, spec: MetricSpec, rendered: Mapping[str, str]
     return digest(RESULT_FORMAT, job.fit_fingerprint, protocols, *metric, regions, what)
 
 
-def failed_rows(job: Job, metrics: Sequence[MetricSpec], error: Exception) -> Rows:
-    """Rows that show a failed cell as failed, with its error."""
-    reason = f"{type(error).__name__}: {error}"
+def reason_of(error: Exception) -> str:
+    """Why a cell failed, as its rows say it."""
+    return f"{type(error).__name__}: {error}"
+
+
+def failed_rows(job: Job, metrics: Sequence[MetricSpec], reason: str) -> Rows:
+    """Rows that show a failed cell as failed, with its reason."""
     rows = [
         _row(job, spec, protocol, status="failed", reason=reason)
         for spec in metrics

@@ -12,6 +12,7 @@
         digests.json              digests of the frames as they were rendered
         rows.parquet              what was measured
         measure.json              what it was measured of, digest of the rows
+        outcome.json, job.log     of the process or job that worked on it, see `bench.executors`
     adapted/<subject>/            tracking refitted for methods that want another head model
     tables/, contact_sheet.png, report.html    views of the rows
 """

@@ -240,7 +240,9 @@ def test_output_that_goes_nowhere(command, code):
 def test_seeds_are_a_list_and_presets_are_those_of_the_methods(monkeypatch, tmp_path):
     seen = []
     monkeypatch.setattr(
-        builtin, "_run", lambda config: seen.append((config.seeds, config.preset)) or Findings("", {})
+        builtin,
+        "_run",
+        lambda config, execution: seen.append((config.seeds, config.preset)) or Findings("", {}),
     )
     for words in ([], ["--seeds", "3,1,4"], ["--seeds", "7", "--preset", "of-a-plug-in"]):
         assert cli.main(["run", "--data", str(tmp_path), "--out", str(tmp_path / "out"), *words]) == 0
@@ -251,7 +253,9 @@ def test_a_run_takes_the_reader_that_finds_its_capture(monkeypatch, tmp_path, to
     seen = []
     plugins = {name: Plugin(name, "", replace(toy.READER, name=name)) for name in ("toy", "other")}
     monkeypatch.setattr(captures, "discover", lambda group: {"toy": plugins["toy"]})
-    monkeypatch.setattr(builtin, "_run", lambda config: seen.append(config.reader) or Findings("", {}))
+    monkeypatch.setattr(
+        builtin, "_run", lambda config, execution: seen.append(config.reader) or Findings("", {})
+    )
     (tmp_path / "data").mkdir()
     words = ["run", "--data", str(tmp_path / "data"), "--out", str(tmp_path / "out")]
     assert cli.main(words) == 0
@@ -261,3 +265,39 @@ def test_a_run_takes_the_reader_that_finds_its_capture(monkeypatch, tmp_path, to
     assert seen == ["ga", "toy", "colmap"]
     monkeypatch.setattr(captures, "discover", lambda group: plugins)
     assert cli.main(words) == 2
+
+
+@pytest.mark.parametrize(
+    ("words", "executor", "workers", "partition"),
+    [
+        ((), "inline", None, None),
+        (("--executor", "processes", "--workers", "3"), "processes", 3, None),
+        (
+            ("--set", "execution.executor=slurm", "--set", "execution.slurm.partition=gpu"),
+            "slurm",
+            None,
+            "gpu",
+        ),
+    ],
+)
+def test_a_run_takes_its_executor_from_options_and_settings(
+    words, executor, workers, partition, tmp_path, monkeypatch
+):
+    seen = []
+    monkeypatch.setattr(builtin, "_run", lambda config, execution: seen.append(execution) or Findings("", {}))
+    assert cli.main(["run", "--data", "d", "--out", str(tmp_path / "o"), *words]) == 0
+    assert [(e.executor, e.workers, e.slurm.partition) for e in seen] == [(executor, workers, partition)]
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("execution.slurm.partitoin=x", "Did you mean 'partition'"),
+        ("execution.workers=0", "at least 1"),
+        ("execution.slurm.hours=0", "at least a minute"),
+        ("execution.executor=dask", "inline"),
+    ],
+)
+def test_settings_of_executors_are_checked(setting, message, tmp_path, capsys):
+    assert cli.main(["run", "--data", "d", "--out", str(tmp_path / "o"), "--set", setting]) == 2
+    assert message in capsys.readouterr().err

@@ -1,0 +1,67 @@
+"""``outcome.json`` of a cell: what its process or job is doing, or how it ended."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal, Required
+
+from typing_extensions import TypedDict
+
+from ..errors import InputError
+from ..io.documents import checked, read_json
+from ..io.files import write_json
+
+
+class Outcome(TypedDict, total=False):
+    """Attributes.
+
+    status : the truth of how a cell ended; a job that is gone while it says "running" was killed.
+    speed : whether speed is measured, too: a pass of its own, see `bench.executors.run`.
+    reason : why it failed, as in its rows.
+    doing, since : the step it is at, and the time (ISO 8601, UTC) when it was begun.
+    seconds : that it took.
+    restarts : how often it was started again.
+    job : of the cluster, "" for a process of ``host``.
+    machine : see `machine_record`.
+    """
+
+    status: Required[Literal["running", "done", "failed"]]
+    speed: Required[bool]
+    reason: str
+    doing: str
+    since: str
+    seconds: float
+    restarts: int
+    job: str
+    process: int
+    host: str
+    machine: dict[str, Any]
+
+
+def outcome_path(cell: Path) -> Path:
+    """Where the outcome of the cell in a folder lies."""
+    return cell / "outcome.json"
+
+
+def read_outcome(cell: Path) -> Outcome | None:
+    """Read the outcome of the cell in a folder; None where there is none. Raises `InputError` for a damaged one."""
+    path = outcome_path(cell)
+    if not path.exists():
+        return None
+    outcome: Outcome = checked(read_json(path), Outcome, path)
+    return outcome
+
+
+def write_outcome(cell: Path, outcome: Outcome) -> None:
+    """Write it, atomically."""
+    write_json(outcome_path(cell), outcome)
+
+
+def forget_outcome(cell: Path, speed: bool) -> None:
+    """Remove the outcome of an earlier pass of the same kind, so that it is not taken for that of one that begins."""
+    try:
+        outcome = read_outcome(cell)
+    except InputError:  # damaged
+        outcome = None
+    if outcome is None or outcome["speed"] == speed:
+        outcome_path(cell).unlink(missing_ok=True)

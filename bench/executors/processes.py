@@ -1,0 +1,141 @@
+"""The executor ``processes``: several workers on this machine, its cores shared out among them."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+from collections import deque
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from pathlib import Path
+from typing import Any
+
+from ..start import end_with_parent, starting_workers
+from .ended import Ended
+from .outcome import forget_outcome
+from .worker import Work, Worker
+
+STOP_S = 5.0
+"""Seconds that a worker has to end in when it is asked to."""
+
+
+@dataclass(eq=False)
+class _Process:
+    process: Any
+    connection: Connection
+    work: Work | None = None
+
+
+class Processes:
+    """Workers that take cells one after another; one that was killed is replaced.
+
+    Parameters
+    ----------
+    workers : at most so many at once.
+    threads : of each, None for as many as this process has.
+    """
+
+    def __init__(self, workers: int, threads: int | None):
+        self._count, self._threads = workers, threads
+        self._waiting: deque[Work] = deque()
+        self._processes: list[_Process] = []
+
+    @property
+    def running(self) -> int:
+        """How many cells are worked on."""
+        return sum(process.work is not None for process in self._processes)
+
+    def submit(self, works: Sequence[Work]) -> None:
+        """Work on these cells, in order, after those that wait already."""
+        for work in works:
+            forget_outcome(Path(work.run) / work.cell, work.speed)
+        self._waiting.extend(works)
+
+    def poll(self, seconds: float) -> list[Ended]:
+        """Wait until a cell ends, at most so long; return those that ended."""
+        idle = [process for process in self._processes if process.work is None]
+        while self._waiting and (idle or len(self._processes) < self._count):
+            process = idle.pop() if idle else self._start()
+            process.work = self._waiting.popleft()
+            process.connection.send(process.work)
+        ready = wait([p.connection for p in self._processes if p.work is not None], seconds)
+        return [self._ended(p) for p in list(self._processes) if p.connection in ready]
+
+    def close(self) -> None:
+        """End all workers; what they were at continues from its checkpoint another time."""
+        for process in self._processes:
+            process.process.terminate()
+        for process in self._processes:
+            process.process.join(STOP_S)
+            if process.process.is_alive():
+                process.process.kill()
+                process.process.join()
+            process.connection.close()
+        self._processes = []
+
+    def _ended(self, process: _Process) -> Ended:
+        assert process.work is not None
+        work, process.work = process.work, None
+        try:
+            error = process.connection.recv()
+        except (EOFError, OSError):
+            self._processes.remove(process)
+            process.process.join()
+            process.connection.close()
+            return Ended(work, f"its process was ended by {_cause(process.process.exitcode)}")
+        if error is not None:
+            raise error
+        return Ended(work)
+
+    def _start(self) -> _Process:
+        ours, theirs = multiprocessing.Pipe()
+        process = multiprocessing.get_context("spawn").Process(target=_serve, args=(theirs,))
+        with starting_workers(), _threads(self._threads):
+            process.start()
+        theirs.close()
+        started = _Process(process, ours)
+        self._processes.append(started)
+        return started
+
+
+def _serve(connection: Connection) -> None:
+    """Work on the cells that come, until nothing comes any more."""
+    end_with_parent()
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    worker = Worker()
+    while True:
+        try:
+            work: Work = connection.recv()
+        except EOFError:
+            return
+        error = None
+        try:
+            worker.work(work)
+        except Exception as raised:  # noqa: BLE001 - the other process reports it
+            error = raised
+        connection.send(error)
+
+
+@contextmanager
+def _threads(count: int | None) -> Iterator[None]:
+    """Let processes that are started in the block have so many threads: their libraries read it when imported."""
+    before = os.environ.get("OMP_NUM_THREADS")
+    if count is not None:
+        os.environ["OMP_NUM_THREADS"] = str(count)
+    try:
+        yield
+    finally:
+        if count is not None:
+            del os.environ["OMP_NUM_THREADS"]
+            if before is not None:
+                os.environ["OMP_NUM_THREADS"] = before
+
+
+def _cause(code: int | None) -> str:
+    if code is not None and code < 0:
+        hint = ", perhaps for want of memory" if -code == signal.SIGKILL else ""
+        return f"{signal.Signals(-code).name}{hint}"
+    return f"exit code {code}"

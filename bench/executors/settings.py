@@ -1,0 +1,102 @@
+"""Where the cells of a run are worked on: in this process, in processes of this machine, or as jobs of a cluster."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import shutil
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from ..errors import UnavailableError
+
+ExecutorName = Literal["inline", "processes", "slurm"]
+
+
+@dataclass(frozen=True)
+class SlurmSettings:
+    """What a job of Slurm asks for; each works on one cell.
+
+    Attributes
+    ----------
+    partition : None for the cluster's default.
+    gpus, cpus, memory_gb, hours : of each job. ``cpus`` is also the number of its threads.
+    parallel : most jobs of an array that run at once.
+    exclusive : whether jobs that measure speed take a node of their own. Without it, neighbours disturb them.
+    setup : lines of shell that a job runs first, such as ``module load cuda``.
+    parameters : further options of ``sbatch`` by name, such as ``{"account": "vision", "qos": "long"}``.
+    """
+
+    partition: str | None = None
+    gpus: int = 0
+    cpus: int = 4
+    memory_gb: float = 8.0
+    hours: float = 4.0
+    parallel: int = 64
+    exclusive: bool = True
+    setup: tuple[str, ...] = ()
+    parameters: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Refuse what no job can ask for."""
+        if self.gpus < 0 or self.cpus < 1 or self.memory_gb <= 0 or self.parallel < 1:
+            raise ValueError("gpus is at least 0, cpus and parallel are at least 1, memory_gb is above 0")
+        if self.hours < 1 / 60:
+            raise ValueError(f"hours is {self.hours}; at least a minute")
+
+
+@dataclass(frozen=True)
+class Execution:
+    """How the cells of a run are worked on. Nothing of it enters a fingerprint.
+
+    Attributes
+    ----------
+    executor : ``inline``, one after another in this process; ``processes``, several at once on this machine; ``slurm``, a
+        job for each.
+    workers : of ``processes``; None: one for each core.
+    threads : of each worker; None: the cores shared out. Speed is measured with those of this process.
+    restarts : how often a cell is started again whose process or job was killed, lost or out of time.
+    poll_s : seconds between questions to Slurm.
+    """
+
+    executor: ExecutorName = "inline"
+    workers: int | None = None
+    threads: int | None = None
+    restarts: int = 3
+    poll_s: float = 5.0
+    slurm: SlurmSettings = field(default_factory=SlurmSettings)
+
+    def __post_init__(self) -> None:
+        """Refuse what nothing can be worked on with."""
+        for name in ("workers", "threads"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"{name} is {value}; at least 1, or none")
+        if self.restarts < 0 or self.poll_s <= 0:
+            raise ValueError("restarts is at least 0, poll_s is above 0")
+
+
+def import_submitit() -> Any:
+    """Import the package submitit, which would otherwise close the log files that are open. Raises `UnavailableError`."""
+    level = "SUBMITIT_LOG_LEVEL"
+    before = os.environ.get(level)
+    os.environ[level] = "NOCONFIG"
+    try:
+        return importlib.import_module("submitit")
+    except ImportError as error:
+        raise UnavailableError(
+            "The package submitit is not here.", "pip install 'headbench[slurm]'"
+        ) from error
+    finally:
+        del os.environ[level]
+        if before is not None:
+            os.environ[level] = before
+
+
+def check_slurm() -> None:
+    """Raise `UnavailableError` unless jobs can be submitted from here."""
+    missing = [name for name in ("sbatch", "srun", "squeue", "scontrol") if shutil.which(name) is None]
+    if missing:
+        remedy = "Start this on a machine that submits to a cluster, or choose --executor processes."
+        raise UnavailableError(f"Slurm is not here: there is no {', '.join(missing)}.", remedy)
+    import_submitit()

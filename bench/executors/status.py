@@ -1,0 +1,171 @@
+"""The state of a run's cells: by their own files, and by Slurm's queue where they are jobs."""
+
+from __future__ import annotations
+
+import logging
+import platform
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from itertools import product
+from pathlib import Path
+from typing import Literal
+
+from ..errors import HeadbenchError
+from ..io.lock import is_locked
+from ..manifest import Manifest
+from ..progress import duration
+from ..rows import ALL
+from ..runner.store import RunFolder
+from ..specs import Findings
+from .outcome import Outcome, read_outcome
+from .slurm import queue, read_submitted
+from .worker import JOB_LOG, is_speed
+
+log = logging.getLogger(__name__)
+State = Literal["waiting", "running", "done", "failed"]
+STATES: tuple[State, ...] = ("waiting", "running", "done", "failed")
+SHOWN = 30
+"""Cells that are shown by name."""
+
+
+@dataclass(frozen=True)
+class CellState:
+    """A cell as it is now.
+
+    Attributes
+    ----------
+    note : what it is doing or waits for, why it failed.
+    seconds : worked on it until now, None where that is not known.
+    """
+
+    subject: str
+    method: str
+    seed: int
+    state: State
+    note: str = ""
+    seconds: float | None = None
+    restarts: int = 0
+
+    @property
+    def name(self) -> str:
+        """As logs name it."""
+        return f"{self.subject} {self.method} seed {self.seed}"
+
+
+def run_status(run: Path) -> Findings:
+    """Describe the cells of a run. Raises `InputError` for a folder that is none."""
+    folder = RunFolder(run)
+    cells = cell_states(folder, folder.read_manifest())
+    counts = Counter(cell.state for cell in cells)
+    left, bound = time_left(cells)
+    text = f"{run}: {len(cells)} cells: {', '.join(f'{counts[state]} {state}' for state in STATES)}"
+    if left is not None:
+        text += f"; {'more than' if bound else 'about'} {duration(left)} left"
+    told = [cell for state in ("failed", "running") for cell in cells if cell.state == state]
+    told += [cell for cell in cells if cell.state == "waiting" and cell.note]
+    lines = []
+    for cell in told[:SHOWN]:
+        again = f", restarts: {cell.restarts}" if cell.restarts else ""
+        lines.append(f"{cell.state:<8} {cell.name}: {cell.note}{again}")
+    if len(told) > SHOWN:
+        lines.append(f"and {len(told) - SHOWN} more")
+    data = {
+        "counts": {state: counts[state] for state in STATES},
+        "seconds_left": left,
+        "cells": [asdict(cell) for cell in cells],
+    }
+    return Findings("\n".join([text, *lines]), data, not counts["failed"])
+
+
+def time_left(cells: Sequence[CellState]) -> tuple[float | None, bool]:
+    """Seconds until all cells are done, by those of each method that are, and whether that is a lower bound alone.
+
+    None where nothing is left, or nothing known of it.
+    """
+    took: dict[str, list[float]] = {}
+    for cell in cells:
+        if cell.state == "done" and cell.seconds is not None:
+            took.setdefault(cell.method, []).append(cell.seconds)
+    means = {method: sum(each) / len(each) for method, each in took.items()}
+    left = [cell for cell in cells if cell.state in ("waiting", "running")]
+    known = [max(0.0, means[cell.method] - (cell.seconds or 0.0)) for cell in left if cell.method in means]
+    at_once = max(1, sum(cell.state == "running" for cell in left))
+    return (sum(known) / at_once, len(known) < len(left)) if known else (None, False)
+
+
+def cell_states(folder: RunFolder, manifest: Manifest) -> list[CellState]:
+    """State of each cell, in the order in which they are worked on."""
+    submitted = read_submitted(folder.root)
+    queued = None if submitted is None else _queue()
+    jobs = {} if submitted is None else submitted["jobs"]
+    failed = dict(_failed(folder, manifest))
+    speed = any(map(is_speed, manifest.metrics))
+    works = is_locked(folder.root)
+    found = []
+    for clip, method, seed in product(manifest.clips, manifest.methods, manifest.configuration.seeds):
+        key = clip.subject, method.name, seed
+        cell = folder.cell(*key)
+        outcome = read_outcome(cell.folder)
+        if outcome is not None:
+            job = jobs.get(cell.folder.relative_to(folder.root).as_posix(), "")
+            found.append(_of_outcome(key, cell.folder, outcome, speed, job, queued))
+        elif key in failed:
+            found.append(CellState(*key, "failed", failed[key]))
+        elif cell.ended("measure"):
+            found.append(CellState(*key, "done"))
+        elif works and cell.folder.exists() and not jobs:
+            found.append(CellState(*key, "running"))
+        else:
+            found.append(CellState(*key, "waiting"))
+    return found
+
+
+def _of_outcome(
+    key: tuple[str, str, int],
+    folder: Path,
+    outcome: Outcome,
+    speed: bool,
+    job: str,
+    queued: Mapping[str, str] | None,
+) -> CellState:
+    seconds, restarts = outcome.get("seconds"), outcome.get("restarts", 0)
+    if outcome["status"] == "failed":
+        return CellState(
+            *key, "failed", f"{outcome.get('reason', '')}; see {folder / JOB_LOG}", seconds, restarts
+        )
+    if outcome["status"] == "done":
+        if speed and not outcome["speed"]:
+            return CellState(*key, "waiting", "for its speed to be measured", seconds, restarts)
+        return CellState(*key, "done", "", seconds, restarts)
+    host = outcome.get("host", "")
+    if job and queued is not None:
+        lives, state = queued.get(job) == "RUNNING", queued.get(job, "")
+    else:
+        lives, state = not outcome.get("job") and (host != platform.node() or is_locked(folder)), ""
+    if not lives:
+        note = f"job {job} is {state}" if state else "interrupted; start the run again to continue"
+        return CellState(*key, "waiting", note, seconds, restarts)
+    since = datetime.fromisoformat(outcome["since"]) if "since" in outcome else datetime.now(UTC)
+    elapsed = max(0.0, (datetime.now(UTC) - since).total_seconds())
+    where = f"job {job} on {host}" if job else f"process {outcome.get('process')} on {host}"
+    return CellState(*key, "running", f"{outcome.get('doing', '')} ({where})", elapsed, restarts)
+
+
+def _failed(folder: RunFolder, manifest: Manifest) -> Iterator[tuple[tuple[str, str, int], str]]:
+    """Cells that have failed rows in a run that ended, with the reason."""
+    if manifest.status != "done" or not folder.rows.exists():
+        return
+    rows = folder.read_rows(manifest).select(method=ALL, metric=ALL, task=ALL, region=ALL, seeds=ALL)
+    for row in rows[rows["status"] == "failed"].itertuples():
+        yield (str(row.subject), str(row.method), int(str(row.seed))), str(row.reason)
+
+
+def _queue() -> Mapping[str, str] | None:
+    """Slurm's queue; None where it cannot be asked."""
+    try:
+        return queue()
+    except HeadbenchError as error:
+        log.warning("The jobs' states are not known: %s", error)
+        return None

@@ -1,0 +1,137 @@
+"""Cells worked on by several processes: the same rows as in one, whatever becomes of the processes."""
+
+import os
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import psutil
+import pytest
+
+from headbench.bench import cli
+from headbench.bench.executors.outcome import read_outcome
+from headbench.bench.executors.settings import Execution
+from headbench.bench.executors.status import CellState, time_left
+from headbench.bench.io.lock import is_locked
+from headbench.bench.runner import run as runner
+from headbench.bench.runner.store import RunFolder
+
+TWO = Execution("processes", workers=2, threads=1)
+OPTIONS = ("--executor", "processes", "--workers", "1", "--set", "execution.threads=1")
+
+
+def wait_for(condition, seconds=60):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def cell_of(config, subject, method):
+    return RunFolder(Path(config.out)).cell(subject, method, 0).folder
+
+
+def test_rows_equal_those_of_one_process(config, rows_of, inline):
+    assert rows_of(config, TWO).equals(inline)
+    assert set(inline["status"]) == {"ok", "failed"}
+    outcome = read_outcome(cell_of(config, "subject2", "failing"))
+    assert (outcome["status"], outcome["reason"]) == ("failed", "RuntimeError: the training diverged")
+    assert "Traceback" in (cell_of(config, "subject2", "failing") / "job.log").read_text()
+    assert outcome["process"] != os.getpid()
+
+
+def test_done_cells_are_kept_and_failed_ones_tried_again(config, rows_of, inline):
+    rows_of(config, TWO)
+    paths = [cell_of(config, "subject1", name) / "outcome.json" for name in ("toy", "failing")]
+    before = [path.stat().st_mtime_ns for path in paths]
+    assert rows_of(config, TWO).equals(inline)
+    assert [path.stat().st_mtime_ns == time for path, time in zip(paths, before)] == [True, False]
+    render = next((cell_of(config, "subject1", "toy") / "renders").rglob("*.png"))
+    render.write_bytes(b"damaged")
+    assert rows_of(config, TWO).equals(inline)
+    assert rows_of(config).equals(inline)  # and inline afterwards
+    assert not paths[0].exists()
+
+
+def test_a_killed_process_is_started_again_and_continues(config, rows_of):
+    config = replace(config, methods=("dying_plugin:DYING", "toy_plugin:METHOD"))
+    rows = rows_of(config, TWO)
+    assert set(rows["status"]) == {"ok"}
+    cell = cell_of(config, "subject1", "dying")
+    assert (cell / "avatar" / "starts.log").read_text() == "xx"  # the second found what the first had left
+    assert read_outcome(cell)["restarts"] == 1
+    assert "about to be killed" in (cell / "job.log").read_text()
+
+
+def test_one_that_is_killed_each_time_fails_alone(config, rows_of):
+    config = replace(config, methods=("dying_plugin:ALWAYS", "toy_plugin:METHOD"))
+    rows = rows_of(config, replace(TWO, restarts=1))
+    assert set(rows[rows["method"] == "toy"]["status"]) == {"ok"}
+    failed = rows[rows["method"] == "always"]
+    assert set(failed["status"]) == {"failed"}
+    assert failed["reason"].str.contains("SIGKILL.*2 times").all()
+
+
+def test_a_full_disk_ends_the_run_and_no_cell_is_failed(config):
+    with pytest.raises(OSError, match="No space left"):
+        runner.run(replace(config, methods=("dying_plugin:FULL",)), TWO)
+    assert not RunFolder(Path(config.out)).rows.exists()
+
+
+def test_speed_is_measured_after_the_trainings_alone(config, rows_of):
+    config = replace(config, methods=("toy_plugin:METHOD",), metrics=("psnr", "toy_plugin:ERROR", "fps"))
+    rows = rows_of(config, TWO)
+    assert set(rows["status"]) == {"ok"}
+    assert rows["metric"].drop_duplicates().tolist() == ["psnr", "error", "fps"]
+    spans = []
+    for subject in ("subject1", "subject2", "subject3"):
+        outcome = read_outcome(cell_of(config, subject, "toy"))
+        assert outcome["speed"]
+        spans.append(outcome["process"])
+    assert len(set(spans)) == 1  # one process, one after another
+
+
+def test_with_the_parent_killed_workers_end(config, command, tmp_path, rows_of, capsys):
+    config = replace(config, methods=("dying_plugin:SLOW",))
+    cell = cell_of(config, "subject1", "slow")
+    first = command(config, *OPTIONS)
+    wait_for((cell / "avatar" / "starts.log").exists)
+    worker = read_outcome(cell)["process"]
+    capsys.readouterr()
+    assert cli.main(["status", config.out]) == 0
+    assert "3 cells: 2 waiting, 1 running, 0 done, 0 failed" in capsys.readouterr().out
+    second = command(config, *OPTIONS)  # two attachments at once
+    assert second.wait(60) == 2
+    assert "no other process works in" in second.stdout.read()
+    first.kill()
+    wait_for(lambda: not psutil.pid_exists(worker) and not is_locked(cell))
+    assert cli.main(["status", config.out]) == 0
+    assert "interrupted; start the run again" in capsys.readouterr().out
+    (tmp_path / "go").touch()
+    assert command(config, *OPTIONS).wait(60) == 0
+    assert (cell / "avatar" / "starts.log").read_text() == "xx"
+    assert cli.main(["status", config.out]) == 0
+    assert "3 done" in capsys.readouterr().out
+
+
+def test_status_shows_failed_cells_with_their_logs(config, capsys):
+    runner.run(config, TWO)
+    assert cli.main(["status", config.out]) == 1
+    shown = capsys.readouterr().out
+    assert "0 waiting, 0 running, 3 done, 3 failed" in shown
+    assert "failing seed 0: RuntimeError: the training diverged; see " in shown
+    runner.run(config)  # inline leaves no outcomes, but rows
+    assert cli.main(["status", config.out]) == 1
+    assert "3 done, 3 failed" in capsys.readouterr().out
+
+
+def test_time_left_is_by_method_and_shared_out():
+    def cell(method, state, seconds=None):
+        return CellState("s", method, 0, state, "", seconds)
+
+    done = [cell("a", "done", 10.0), cell("a", "done", 20.0)]
+    assert time_left(done) == (None, False)
+    assert time_left([*done, cell("a", "waiting"), cell("a", "running", 5.0)]) == (25.0, False)
+    two = [cell("a", "running", 5.0), cell("a", "running", 5.0), cell("b", "waiting")]
+    assert time_left([*done, *two]) == (10.0, True)
+    assert time_left([cell("b", "waiting")]) == (None, False)
