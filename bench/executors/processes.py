@@ -56,13 +56,11 @@ class Processes:
 
     def poll(self, seconds: float) -> list[Ended]:
         """Wait until a cell ends, at most so long; return those that ended."""
-        idle = [process for process in self._processes if process.work is None]
-        while self._waiting and (idle or len(self._processes) < self._count):
-            process = idle.pop() if idle else self._start()
-            process.work = self._waiting.popleft()
-            process.connection.send(process.work)
+        self._fill()
         ready = wait([p.connection for p in self._processes if p.work is not None], seconds)
-        return [self._ended(p) for p in list(self._processes) if p.connection in ready]
+        ended = [self._ended(p) for p in list(self._processes) if p.connection in ready]
+        self._fill()
+        return ended
 
     def close(self) -> None:
         """End all workers; what they were at continues from its checkpoint another time."""
@@ -75,6 +73,14 @@ class Processes:
                 process.process.join()
             process.connection.close()
         self._processes = []
+
+    def _fill(self) -> None:
+        """Give cells that wait to workers that have none."""
+        idle = [process for process in self._processes if process.work is None]
+        while self._waiting and (idle or len(self._processes) < self._count):
+            process = idle.pop() if idle else self._start()
+            process.work = self._waiting.popleft()
+            process.connection.send(process.work)
 
     def _ended(self, process: _Process) -> Ended:
         assert process.work is not None

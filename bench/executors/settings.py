@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from ..errors import UnavailableError
+from ..machine import check_device
 
 ExecutorName = Literal["inline", "processes", "slurm"]
 
@@ -93,8 +94,17 @@ def import_submitit() -> Any:
             os.environ[level] = before
 
 
-def check_slurm() -> None:
-    """Raise `UnavailableError` unless jobs can be submitted from here."""
+def check_executor(execution: Execution, device: str) -> None:
+    """Make sure that cells can be worked on.
+
+    Raises
+    ------
+    InputError : this machine has no such device. Slurm's jobs look themselves: where they are submitted may be none.
+    UnavailableError : jobs cannot be submitted from here.
+    """
+    if execution.executor != "slurm":
+        check_device(device)
+        return
     missing = [name for name in ("sbatch", "srun", "squeue", "scontrol") if shutil.which(name) is None]
     if missing:
         remedy = "Start this on a machine that submits to a cluster, or choose --executor processes."

@@ -8,7 +8,7 @@ import os
 import platform
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from datetime import UTC, datetime
@@ -18,7 +18,11 @@ from typing import TYPE_CHECKING, Any
 from ..errors import InputError
 
 if TYPE_CHECKING:
+    from ..contracts import Clip
+    from ..protocol import Protocol
+    from ..runner.config import ResolvedMethod, RunConfig
     from ..runner.steps import Job
+    from ..runner.store import RunFolder
     from ..specs import MetricSpec
     from .outcome import Outcome
 
@@ -80,7 +84,8 @@ class Worker:
     """Works on cells, one after another, and keeps the capture opened last, since cells of a subject follow each other."""
 
     def __init__(self) -> None:
-        self._opened: tuple[tuple[str, int], Callable[[Work], Job]] | None = None
+        self._run: _Run | None = None
+        self._clips: list[Clip] = []
         self._machine: dict[str, Any] | None = None
 
     def work(self, work: Work) -> None:
@@ -136,7 +141,9 @@ class Worker:
         from ..progress import RunProgress
         from ..runner.steps import fit, measure, measured, render, steps_ahead
 
-        job, metrics = self._job(work), self._metrics
+        job = self._job(work)
+        assert self._run is not None
+        metrics = self._run.metrics
         last = time.monotonic()
 
         def show(text: Callable[[], str]) -> None:
@@ -155,43 +162,58 @@ class Worker:
         measure(job, avatar, metrics)
 
     def _job(self, work: Work) -> Job:
-        key = work.run, work.capture
-        if self._opened is None or self._opened[0] != key:
-            self._opened = None
-            self._opened = key, self._open(work)
-        return self._opened[1](work)
+        from ..runner.captures import open_clips
+        from ..runner.run import make_jobs
 
-    def _open(self, work: Work) -> Callable[[Work], Job]:
-        """Open the capture of a cell, by the record of its run; return what makes the subject's cells."""
+        if self._run is None or self._run.folder.root != Path(work.run):
+            self._run = _Run.read(Path(work.run))
+            self._clips = []
+        config, recorded = self._run.config, self._run.fingerprints
+        if [clip.subject for clip in self._clips] != [work.subject]:
+            self._clips = []  # the former, before another takes memory
+            self._clips = open_clips(config, only=work.capture)
+        if {clip.subject: clip.fingerprint for clip in self._clips} != {work.subject: recorded[work.subject]}:
+            found = ", ".join(clip.subject for clip in self._clips) or "none"
+            raise InputError(config.data, work.subject, "the capture that the run began with", found)
+        methods, chosen = [self._run.methods[work.method]], replace(config, seeds=(work.seed,))
+        return make_jobs(chosen, methods, self._clips, self._run.protocols, self._run.folder)[0]
+
+
+@dataclass(frozen=True)
+class _Run:
+    """A run as its record has it."""
+
+    folder: RunFolder
+    config: RunConfig
+    fingerprints: Mapping[str, str]
+    methods: Mapping[str, ResolvedMethod]
+    metrics: Sequence[MetricSpec]
+    protocols: Mapping[str, Protocol]
+
+    @classmethod
+    def read(cls, root: Path) -> _Run:
         from ..machine import check_device
         from ..protocol import Protocol
-        from ..runner.captures import open_clips
         from ..runner.config import resolve_methods, resolve_metrics
-        from ..runner.run import make_jobs
         from ..runner.store import RunFolder
 
-        folder = RunFolder(Path(work.run))
+        folder = RunFolder(root)
         manifest = folder.read_manifest()
-        config = replace(manifest.configuration, out=work.run)
+        config = replace(manifest.configuration, out=str(root))
         check_device(config.device)
-        clips = open_clips(config, only=work.capture)
-        recorded = {clip.subject: clip.fingerprint for clip in manifest.clips}
-        if {clip.subject: clip.fingerprint for clip in clips} != {work.subject: recorded.get(work.subject)}:
-            found = ", ".join(clip.subject for clip in clips) or "none"
-            raise InputError(config.data, work.subject, "the capture that the run began with", found)
         protocols = {}
         for task, record in manifest.protocols.items():
             protocols[task] = Protocol(**{f.name: getattr(record, f.name) for f in fields(Protocol)})
             if protocols[task].hash != record.hash:
                 raise InputError(folder.manifest, f"protocols.{task}", record.hash, protocols[task].hash)
-        methods = {method.spec.name: method for method in resolve_methods(config)}
-        self._metrics = resolve_metrics(config)
-
-        def job(work: Work) -> Job:
-            chosen = replace(config, seeds=(work.seed,))
-            return make_jobs(chosen, [methods[work.method]], clips, protocols, folder)[0]
-
-        return job
+        return cls(
+            folder,
+            config,
+            {clip.subject: clip.fingerprint for clip in manifest.clips},
+            {method.spec.name: method for method in resolve_methods(config)},
+            resolve_metrics(config),
+            protocols,
+        )
 
 
 def job_id() -> str:

@@ -15,10 +15,10 @@ import numpy as np
 from ..contracts import Avatar, CheckedMethod, Clip
 from ..errors import HeadbenchError, InputError, UnavailableError
 from ..executors.outcome import outcome_path
-from ..executors.settings import Execution, check_slurm
+from ..executors.settings import Execution, check_executor
 from ..io.files import atomic_path, output_inside, prepare_folder
 from ..io.lock import locked
-from ..machine import check_device, machine_record, peak_memory_bytes
+from ..machine import machine_record, peak_memory_bytes
 from ..manifest import AdaptedRecord, ClipRecord, Manifest, MethodRecord, ProtocolRecord
 from ..progress import duration, run_progress
 from ..protocol import Protocol, make_protocols, missing_tasks
@@ -47,10 +47,7 @@ def run(config: RunConfig, execution: Execution | None = None, **record: Any) ->
     """
     methods, metrics = resolve_methods(config), resolve_metrics(config)
     execution = execution or Execution()
-    if execution.executor == "slurm":
-        check_slurm()  # its jobs look for the device, which the machine that submits them may lack
-    else:
-        check_device(config.device)
+    check_executor(execution, config.device)
     folder = RunFolder(Path(config.out))
     prepare_folder(folder.root)
     with locked(folder.root):

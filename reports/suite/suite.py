@@ -8,8 +8,8 @@ from typing import Any
 
 from ...bench.contracts import Progress
 from ...bench.errors import InputError
+from ...bench.executors.settings import check_executor
 from ...bench.io.files import write_text
-from ...bench.machine import check_device
 from ...bench.registry import discover, get, resolve
 from ...bench.runner.config import (
     ResolvedMethod,
@@ -39,7 +39,7 @@ def run_suite(settings: SuiteSettings, progress: Progress) -> Findings:
 
     Raises `InputError` for methods, presets and sizes that do not fit, before the first capture is made.
     """
-    out = Path(settings.out)
+    out, execution = Path(settings.out), settings.execution
     methods = settings.methods or tuple(
         name for name, plugin in discover("methods").items() if plugin.spec and plugin.spec.demo
     )
@@ -53,7 +53,7 @@ def run_suite(settings: SuiteSettings, progress: Progress) -> Findings:
     for name, config in runs.items():
         resolved = resolve_methods(config)
         resolve_metrics(config)
-        check_device(config.device)
+        check_executor(execution, config.device)
         folder = RunFolder(Path(config.out))
         if not (folder.manifest.exists() and folder.read_manifest().status == "done"):
             for method in resolved:
@@ -74,7 +74,7 @@ def run_suite(settings: SuiteSettings, progress: Progress) -> Findings:
         tracking_error=settings.tracking_error,
         progress=progress,
     )
-    failed = {name: run(config).failed for name, config in runs.items()}
+    failed = {name: run(config, execution).failed for name, config in runs.items()}
     text = results(out / "run", [out / name for name in runs])
     write_text(out / "results.md", text)
     data = {"out": out, "runs": [out / name for name in runs], "failed": failed}

@@ -49,6 +49,9 @@ def test_every_ablation_is_a_setting_of_ours_that_changes_it(name):
             "ablations that change ours of preset paper",
         ),
         (["--methods", "ours", "ga-official"], "checkout"),
+        (["--executor", "processes", "--workers", "0"], "at least 1"),
+        (["--set", "preset=smoke"], "expected one of execution"),
+        (["--executor", "slurm", "--set", "execution.slurm.gpus=-1"], "at least 0"),
     ],
 )
 def test_what_cannot_be_run_is_refused_before_a_capture_is_made(tmp_path, capsys, words, match):
