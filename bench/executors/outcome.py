@@ -22,6 +22,7 @@ class Outcome(TypedDict, total=False):
     seconds : that it took.
     restarts : how often it was started again.
     job : of the cluster, "" for a process of ``host``.
+    threads : what OMP_NUM_THREADS said, "" for as many as there are cores.
     machine : see `machine_record`.
     """
 
@@ -35,6 +36,7 @@ class Outcome(TypedDict, total=False):
     job: str
     process: int
     host: str
+    threads: str
     machine: dict[str, Any]
 
 

@@ -12,13 +12,15 @@ import sys
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
+from typing import Any
 
+from ..errors import shortened
 from ..machine import processor_count
 from ..progress import progress
 from ..rows import Rows
 from ..runner.steps import Job, failed_rows, stored_rows
 from ..runner.store import RunFolder
-from ..specs import MetricSpec
+from ..specs import MAX_LABEL, MetricSpec
 from .ended import Ended, Executor
 from .outcome import read_outcome
 from .processes import Processes
@@ -27,6 +29,7 @@ from .slurm import Slurm
 from .worker import JOB_LOG, Work, is_speed
 
 log = logging.getLogger(__name__)
+DAMAGED = "its results are missing or damaged"
 Failures = dict[str, str]
 """Why cells failed, by their place."""
 
@@ -39,28 +42,35 @@ def execute(
     A cell that is done is kept. One whose process or job was lost is started again, `Execution.restarts` times at most. One
     that fails has failed rows.
     """
-    places = {place_of(job): job for job in jobs}
     works = _works(jobs, folder)
+    places = {work.cell: job for work, job in zip(works, jobs)}
     failures: Failures = {}
-    rows = {place: stored_rows(job, metrics, retry=True) for place, job in places.items()}
-    left = [work for work in works if rows[work.cell] is None]
     steady = [metric for metric in metrics if not is_speed(metric)]
+    left = [work for work in works if stored_rows(places[work.cell], metrics, retry=True) is None]
     first = [work for work in left if stored_rows(places[work.cell], steady, retry=True) is None]
     _Pass(places, steady, failures, execution).run(first, folder)
     if any(map(is_speed, metrics)):
         left = [replace(work, speed=True) for work in left if work.cell not in failures]
         _Pass(places, metrics, failures, execution, speed=True).run(left, folder)
-    for place, job in places.items():
-        if place in failures:
-            rows[place] = failed_rows(job, metrics, failures[place])
-        elif rows[place] is None:
-            rows[place] = stored_rows(job, metrics)
-    return Rows.joined([each for each in rows.values() if each is not None])
+    return Rows.joined([_merged(job, metrics, failures.get(place)) for place, job in places.items()])
 
 
-def place_of(job: Job) -> str:
-    """Place of a cell in its run folder."""
-    return f"{job.clip.subject}/{job.method.spec.name}/seed-{job.seed}"
+def _merged(job: Job, metrics: Sequence[MetricSpec], failure: str | None) -> Rows:
+    """Rows of a cell that has ended."""
+    rows = stored_rows(job, metrics) if failure is None else None
+    return failed_rows(job, metrics, failure or f"HeadbenchError: {DAMAGED}") if rows is None else rows
+
+
+def machine_of(jobs: Sequence[Job], otherwise: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The machine that cells were worked on; ``otherwise`` where none tells, the names of all where there were several."""
+    outcomes = [read_outcome(job.cell.folder) for job in jobs]
+    machines = [outcome["machine"] for outcome in outcomes if outcome is not None and "machine" in outcome]
+    if not machines:
+        return otherwise
+    names = sorted({str(machine.get("processor")) for machine in machines})
+    if len(names) > 1:
+        log.warning("Cells were worked on by %s: their times and speeds do not compare.", ", ".join(names))
+    return {**machines[0], "processor": shortened(" and ".join(names), MAX_LABEL - 10)}
 
 
 def _works(jobs: Sequence[Job], folder: RunFolder) -> list[Work]:
@@ -124,7 +134,7 @@ class _Pass:
                 return None
             reason = outcome.get("reason", "") if outcome["status"] == "failed" else ""
         if not reason:
-            lost = ended.lost or "its results are missing or damaged"
+            lost = ended.lost or DAMAGED
             if ended.again and work.restarts < self._execution.restarts:
                 log.warning("%s: %s; it is started again", job.name, lost)
                 return replace(work, restarts=work.restarts + 1)

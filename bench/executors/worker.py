@@ -117,6 +117,7 @@ class Worker:
             "job": job_id(),
             "process": os.getpid(),
             "host": platform.node(),
+            "threads": os.environ.get("OMP_NUM_THREADS", ""),
             "machine": self._machine,
         }
         with output_inside(run), locked(cell), _output_to(cell / JOB_LOG), log_to_file(cell / JOB_LOG):

@@ -91,9 +91,10 @@ def _run(
     if execution.executor == "inline":
         rows = run_jobs(jobs, metrics)
     else:
-        from ..executors.run import execute
+        from ..executors.run import execute, machine_of
 
         rows = execute(jobs, metrics, folder, execution)
+        manifest = replace(manifest, machine=dict(machine_of(jobs, manifest.machine)))
     rows.write(folder.rows)
     seconds = round(time.perf_counter() - start, 3)
     done = replace(manifest, status="done", seconds=seconds, peak_memory_bytes=peak_memory_bytes())

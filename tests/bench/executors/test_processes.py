@@ -12,6 +12,8 @@ from headbench.bench import cli
 from headbench.bench.executors.outcome import read_outcome
 from headbench.bench.executors.settings import Execution
 from headbench.bench.executors.status import CellState, time_left
+from headbench.bench.io.documents import read_json
+from headbench.bench.io.files import write_json
 from headbench.bench.io.lock import is_locked
 from headbench.bench.runner import run as runner
 from headbench.bench.runner.store import RunFolder
@@ -135,3 +137,15 @@ def test_time_left_is_by_method_and_shared_out():
     two = [cell("a", "running", 5.0), cell("a", "running", 5.0), cell("b", "waiting")]
     assert time_left([*done, *two]) == (10.0, True)
     assert time_left([cell("b", "waiting")]) == (None, False)
+
+
+def test_the_machine_is_that_of_the_cells(config, caplog):
+    runner.run(replace(config, methods=("toy_plugin:METHOD",)), TWO)
+    folder = RunFolder(Path(config.out))
+    own = folder.read_manifest().machine
+    for subject, processor in (("subject1", "A"), ("subject2", "B"), ("subject3", "A")):
+        path = cell_of(config, subject, "toy") / "outcome.json"
+        write_json(path, {**read_json(path), "machine": {**own, "processor": processor}})
+    runner.run(replace(config, methods=("toy_plugin:METHOD",)), TWO)
+    assert folder.read_manifest().machine == {**own, "processor": "A and B"}
+    assert "do not compare" in caplog.text

@@ -114,12 +114,16 @@ def test_a_cancelled_job_is_a_failed_cell_until_resubmitted(config, slurm, comma
     config = replace(config, methods=("dying_plugin:SLOW",))
     first = command(config, *OPTIONS)
     wait_for(lambda: starts(config, "subject1", "slow"))
-    job = read_submitted(Path(config.out))["jobs"]["subject1/slow/seed-0"]
+    jobs = read_submitted(Path(config.out))["jobs"]
+    job, late = (jobs[f"subject{n}/slow/seed-0"] for n in (1, 2))
     subprocess.run(["scancel", job], check=True)
-    wait_for(lambda: job not in queue())
+    wait_for(lambda: job not in queue() and starts(config, "subject2", "slow"))
+    subprocess.run(["scancel", "-s", "USR2", late], check=True)  # what Slurm sends before time is out
+    wait_for(lambda: queue().get(late) != "RUNNING")
     (tmp_path / "go").touch()
     assert first.wait(90) == 1
     assert "was cancelled" in first.stdout.read()
+    assert starts(config, "subject2", "slow") == "xx"
     assert command(config, *OPTIONS).wait(90) == 0
 
 
