@@ -265,6 +265,14 @@ CASES = {
         )
     ],
     "compact": [case(f"compact {cell('ours')}/avatar --out compact", "all", "compact/compact.safetensors")],
+    "export html": [
+        case(
+            f"export html {cell(name)} --out {name}.html --capture {{capture}}",
+            "dB; the least",
+            f"{name}.html",
+        )
+        for name in ("ours", "ga", "gbs")
+    ],
     "export ply": [
         case(f"export ply {cell(name)}/avatar --out {name}.ply", "splats", f"{name}.ply")
         for name in ("ours", "ga")

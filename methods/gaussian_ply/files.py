@@ -52,7 +52,7 @@ def export_avatar(settings: ExportPlySettings, progress: Progress) -> Findings:
     """
     folder, out = Path(settings.avatar), Path(settings.out)
     check_writable(out, "--out")
-    avatar = _read(folder)
+    avatar = read_splat_avatar(folder)
     pose = _pose(settings, read_shared_head(folder), progress)
     splats = avatar.splats(pose)
     data: dict[str, Any] = {"out": out, "splats": len(splats.means), "timestep": pose.timestep}
@@ -77,7 +77,8 @@ def export_avatar(settings: ExportPlySettings, progress: Progress) -> Findings:
     return Findings(text, data)
 
 
-def _read(folder: Path) -> GAAvatar | GBSAvatar | OursAvatar:
+def read_splat_avatar(folder: Path) -> GAAvatar | GBSAvatar | OursAvatar:
+    """Read an avatar by what lies in its folder. Raises `InputError` for what is none of coloured splats."""
     if (folder / PLY_FILE).exists():
         foreign = [name for name in read_names(folder / PLY_FILE) if name not in COLUMNS]
         if foreign:
