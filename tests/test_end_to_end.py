@@ -277,6 +277,13 @@ CASES = {
         case(f"export ply {cell(name)}/avatar --out {name}.ply", "splats", f"{name}.ply")
         for name in ("ours", "ga")
     ],
+    **{
+        f"export {form}": [
+            case(f"export {form} {cell(name)} --out {name}.{form}", "dB or more", f"{name}.{form}")
+            for name in ("ours", "ga", "gbs", "gha")
+        ]
+        for form in ("glb", "sog")
+    },
     "import ga": [
         case(
             f"import ga {cell('ga')}/avatar/point_cloud.ply --capture {{capture}} --out imported",

@@ -1,4 +1,4 @@
-"""``headbench export ply`` and ``headbench import ga``."""
+"""``headbench export ply|glb|sog`` and ``headbench import ga``."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from ...datasets.options import CaptureOptions
 
 
 @dataclass(frozen=True)
-class ExportPlySettings(CaptureOptions):
-    """Write an avatar in one pose as a 3D Gaussian splatting PLY that common viewers open."""
+class ExportOptions(CaptureOptions):
+    """Which pose of which avatar is written."""
 
     avatar: tyro.conf.Positional[str]
-    """Folder of an avatar of ours, ga or gbs (RUN/SUBJECT/METHOD/seed-0/avatar)."""
+    """Folder of an avatar of ours, ga, gbs or gha (RUN/SUBJECT/METHOD/seed-0)."""
 
     out: str
-    """PLY file to write."""
+    """File to write."""
 
     capture: str | None = None
     """Capture with the pose to write; without one the pose is neutral."""
@@ -37,6 +37,21 @@ class ExportPlySettings(CaptureOptions):
             raise ValueError(
                 f"directions must be at least 32, twice the coefficients, found {self.directions}"
             )
+
+
+@dataclass(frozen=True)
+class ExportPlySettings(ExportOptions):
+    """Write an avatar in one pose as a 3D Gaussian splatting PLY, in full precision, that common viewers open."""
+
+
+@dataclass(frozen=True)
+class ExportGlbSettings(ExportOptions):
+    """Write an avatar in one pose as binary glTF with KHR_gaussian_splatting, in full precision."""
+
+
+@dataclass(frozen=True)
+class ExportSogSettings(ExportOptions):
+    """Write an avatar in one pose as SOG, which web viewers open: about a sixth of a PLY's bytes. Needs gaussforge (extra `formats`)."""
 
 
 @dataclass(frozen=True)
@@ -63,11 +78,31 @@ class ImportGASettings(CaptureOptions):
 def export_ply(settings: ExportPlySettings, progress: Progress = no_progress) -> Findings:
     """Write an avatar in one pose as a 3D Gaussian splatting PLY that common viewers open.
 
-    The findings state how well harmonics represent its colours.
+    The findings state bytes, how well harmonics represent its colours, and the PSNR of what is read back.
     """
-    from .files import export_avatar
+    return _export(settings, "ply", progress)
 
-    return export_avatar(settings, progress)
+
+def export_glb(settings: ExportGlbSettings, progress: Progress = no_progress) -> Findings:
+    """Write an avatar in one pose as binary glTF with splats.
+
+    The findings are those of `export ply`.
+    """
+    return _export(settings, "glb", progress)
+
+
+def export_sog(settings: ExportSogSettings, progress: Progress = no_progress) -> Findings:
+    """Write an avatar in one pose as SOG, a compact format of web viewers.
+
+    The findings are those of `export ply`.
+    """
+    return _export(settings, "sog", progress)
+
+
+def _export(settings: ExportOptions, name: str, progress: Progress) -> Findings:
+    from .export import export_pose
+
+    return export_pose(settings, name, progress)
 
 
 @writes("out")

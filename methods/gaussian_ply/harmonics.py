@@ -3,19 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ...bench.contracts import FloatArray
-from ...bench.io.provenance import RENDER, note
-from ..ga.storage import COLUMNS
 from ..shared.networks import coefficient_count, sh_basis
-from ..shared.ply import write_ply
-from ..shared.rendering import PosedSplats
 
 DEGREE = 3
 BEHIND = 0.02
@@ -93,24 +87,3 @@ def fit_harmonics(radiance: Callable[[Tensor], Tensor], normals: Tensor, directi
         residual[rows] = ((weights * error).sum(1) / weights.sum(1)).sqrt()
     channels = coefficients.transpose(1, 2)
     return HarmonicsFit(channels[:, :, 0].contiguous(), channels[:, :, 1:].contiguous(), residual)
-
-
-STANDARD = COLUMNS[:-1]
-"""62 float32: position, zero normals, harmonics (the rest channel by channel), opacity logit, log-scales, wxyz."""
-
-OPACITY_MARGIN = 1e-6  # logits stay finite
-
-
-def write_gaussians(path: Path, splats: PosedSplats, dc: Tensor, rest: Tensor) -> None:
-    """Write splats in the world, with (N, 3) and (N, 3, 15) harmonics along world directions."""
-    opacities = splats.opacities.astype(np.float64).clip(OPACITY_MARGIN, 1 - OPACITY_MARGIN)
-    columns: list[FloatArray] = [
-        splats.means,
-        np.zeros_like(splats.means),
-        dc.cpu().numpy(),
-        rest.flatten(1).cpu().numpy(),
-        np.log(opacities / (1 - opacities))[:, None],
-        np.log(np.maximum(splats.scales, np.finfo(np.float32).tiny)),
-        splats.quats,
-    ]
-    write_ply(path, STANDARD, np.concatenate(columns, axis=1).astype(np.float32), note(RENDER))

@@ -13,12 +13,14 @@ import numpy as np
 import torch
 
 from ...bench.contracts import Camera, FloatArray, HeadPose, Progress
+from ...bench.errors import InputError
 from ...bench.io.files import check_writable, write_text
 from ...bench.io.provenance import RENDER, note, source_type, tool
 from ...bench.runner.stored import avatar_folder
 from ...bench.specs import Findings
-from ..gaussian_ply.files import neutral_pose, read_splat_avatar
+from ..gaussian_ply.export import neutral_pose, read_splat_avatar
 from ..gbs.avatar import GBSAvatar
+from ..gha.avatar import GHAAvatar
 from ..shared.avatar_files import SUBJECT_FILE, read_shared_head, read_subject
 from ..splats import rasterize
 from .bake import Source, bake
@@ -46,6 +48,9 @@ def export_page(settings: ExportHtmlSettings, progress: Progress) -> Findings:
     folder, out = avatar_folder(Path(settings.avatar)), Path(settings.out)
     check_writable(out, "--out")
     avatar = read_splat_avatar(folder)
+    if isinstance(avatar, GHAAvatar):
+        found = "one of gha, whose splats are features that a network turns into colours"
+        raise InputError(folder, "", "an avatar of ours, ga or gbs", found, "`headbench view` shows it.")
     head = read_shared_head(folder)
     rest, reach = neutral_pose(head), np.full(head.expression_basis.shape[2], COEFFICIENT)
     if settings.capture is not None:

@@ -224,7 +224,16 @@ def test_a_folder_that_is_written_is_locked(offer, capsys, tmp_path):
 def test_every_command_with_a_folder_to_write_locks_it():
     """All but those that lock for themselves: they check first, or lock what they find to be written."""
     own = {"curve", "demo", "evaluate", "extremes", "prepare nersemble", "reenact", "run", "sweep", "synth"}
-    files = {"bench", "bundle", "export html", "export ply", "report", "stress"}  # --out is one
+    files = {
+        "bench",
+        "bundle",
+        "export glb",
+        "export html",
+        "export ply",
+        "export sog",
+        "report",
+        "stress",
+    }  # --out is one
     for plugin in registry.discover("commands").values():
         spec = plugin.spec
         names = {field.name for field in dataclasses.fields(spec.settings)}

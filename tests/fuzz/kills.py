@@ -79,6 +79,10 @@ WRITERS = [
     ),
     Writer("compact", "run", f"compact {AVATAR.format('ours')} --out out --compare capture"),
     Writer("export html", "run", f"export html {AVATAR.format('ga')} --out out.html"),
+    *(
+        Writer(f"export {form}", "run", f"export {form} {AVATAR.format('ga')} --out out.{form}")
+        for form in ("glb", "sog")
+    ),
     Writer("export ply", "run", f"export ply {AVATAR.format('ga')} --out out.ply"),
     Writer("export colmap", "capture", "export colmap capture --out out"),
     Writer("import ga", "ply", "import ga point_cloud.ply --capture capture --out out"),

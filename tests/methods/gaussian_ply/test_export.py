@@ -17,7 +17,7 @@ from headbench.datasets.ga.reader import read_capture
 from headbench.methods.ga.config import GAConfig
 from headbench.methods.ga.method import GA
 from headbench.methods.gaussian_ply.command import ExportPlySettings, export_ply
-from headbench.methods.gaussian_ply.files import neutral_pose
+from headbench.methods.gaussian_ply.export import neutral_pose
 from headbench.methods.gaussian_ply.harmonics import BEHIND, fit_harmonics, sphere
 from headbench.methods.gbs.config import GBSConfig
 from headbench.methods.gbs.method import GBS
@@ -143,7 +143,6 @@ def test_a_viewer_shows_a_blendshape_avatar_in_a_turned_pose(tmp_path):
     ("files", "found"),
     [
         ({"point_cloud.ply": ("x", "offset_0")}, "offset_0: .* a column of another method"),
-        ({"avatar.safetensors": {"table": torch.zeros(1)}}, "an avatar of gha"),
         ({"field.npz": None}, "an avatar of insta"),
         ({"mean.npz": None}, "none of them"),
         ({"run.json": None}, "avatar inside"),
@@ -158,7 +157,7 @@ def test_what_cannot_be_exported_names_what_can(tmp_path, files, found):
             save_file(content, tmp_path / name)
     with pytest.raises(InputError, match=found) as caught:
         export_ply(ExportPlySettings(str(tmp_path), out=str(tmp_path / "x.ply")))
-    assert "ours, ga or gbs" in caught.value.expected
+    assert "ours, ga, gbs or gha" in caught.value.expected
 
 
 def test_colours_that_are_harmonics_are_found_exactly():

@@ -1,0 +1,174 @@
+"""Avatars in one pose as files of splats that viewers open, and what each file loses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...bench.contracts import HeadAsset, HeadPose, Progress
+from ...bench.errors import InputError
+from ...bench.io.files import check_writable
+from ...bench.runner.stored import avatar_folder
+from ...bench.specs import Findings
+from ..compact.file import COMPACT_FILE
+from ..ga.method import GAAvatar
+from ..ga.storage import COLUMNS, PLY_FILE
+from ..gbs.avatar import GBSAvatar
+from ..gha.avatar import GHAAvatar
+from ..insta.avatar import FIELD_FILE as RADIANCE_FILE
+from ..ours.avatar import OursAvatar
+from ..ours.storage import FIELD_FILE
+from ..shared.avatar_files import read_shared_head
+from ..shared.networks import C0, sh_basis
+from ..shared.ply import read_names
+from ..shared.tensor_files import read_safetensors
+from ..splats import rasterize
+from ..web.bake import Source
+from ..web.model import FIELD_OF_VIEW, look
+from .command import ExportOptions
+from .formats import FORMATS, Splats
+from .harmonics import DEGREE, fit_harmonics, sphere, turn_harmonics
+
+EXPORTED = "an avatar of ours, ga, gbs or gha"
+DRAWN = "No file of splats can hold it; `headbench extremes` and `headbench reenact` draw its frames."
+VIEWS = ((0.0, 0.0), (0.6, 0.0), (-0.6, 0.2))
+"""Azimuth and elevation, radians, from which the loss is measured."""
+SIZE = 400
+PLAIN = "its colours before super-resolution, which no file of splats can hold"
+
+SplatMethodAvatar = GAAvatar | GBSAvatar | OursAvatar | GHAAvatar
+
+
+class Colours(NamedTuple):
+    """Harmonics along world directions, (N, 3) and (N, 3, 15), how near they are in words, and errors by splat if known."""
+
+    dc: Tensor
+    rest: Tensor
+    words: str
+    residual: Tensor | None = None
+
+
+def export_pose(settings: ExportOptions, name: str, progress: Progress) -> Findings:
+    """Write an avatar in one pose in a format of `FORMATS`, read it back, and compare.
+
+    Raises `InputError` for a folder that holds no avatar of splats, and for a timestep that the capture lacks;
+    `UnavailableError` where the format's library is not installed.
+    """
+    folder, out = avatar_folder(Path(settings.avatar)), Path(settings.out)
+    check_writable(out, "--out")
+    form = FORMATS[name]
+    form.check()
+    avatar = read_splat_avatar(folder)
+    pose = _pose(settings, read_shared_head(folder), progress)
+    splats = avatar.splats(pose)
+    colours = harmonics_of(avatar, pose, settings.directions)
+    form.write(out, Splats.of(splats, colours.dc, colours.rest))
+    lost = _least_psnr(avatar, pose, form.read(out))
+    data = {"out": out, "splats": len(splats.means), "timestep": pose.timestep}
+    data |= {"bytes": out.stat().st_size, "psnr": lost}
+    if colours.residual is not None:
+        # Splats that hardly show would hide how far off those are that do.
+        weight = splats.opacities / max(float(splats.opacities.sum()), 1e-12)
+        residual = colours.residual
+        data["residual_rms"] = float(np.sqrt((weight * residual.numpy() ** 2).sum()))
+        data["residual_p95"] = float(torch.quantile(residual, 0.95)) if len(residual) else 0.0
+    text = f"{out}: {len(splats.means)} splats, {out.stat().st_size / 1e6:.2f} MB; {colours.words};"
+    return Findings(f"{text} PSNR against the avatar's own frames {lost:.1f} dB or more", data)
+
+
+def harmonics_of(avatar: SplatMethodAvatar, pose: HeadPose, directions: int) -> Colours:
+    """Colours of a pose as spherical harmonics of degree 3, exactly or as near as they come."""
+    if isinstance(avatar, GAAvatar):
+        return Colours(*avatar.harmonics(), "its own spherical harmonics, exactly")
+    if isinstance(avatar, GBSAvatar):
+        turned = turn_harmonics(*avatar.harmonics(pose))
+        return Colours(*turned, "its spherical harmonics in this pose, turned with the surface")
+    if isinstance(avatar, GHAAvatar):
+        colors = avatar.splats(pose, look(0.0, 0.0, 1.0, np.zeros(3), SIZE)).colors
+        assert colors is not None
+        dc = torch.from_numpy((colors - 0.5) / C0)
+        return Colours(dc, dc.new_zeros(len(dc), 3, 15), PLAIN)
+    seen_from = avatar.seen_from(pose)
+    fit = fit_harmonics(seen_from.radiance, seen_from.normals, sphere(directions))
+    mean = float(fit.residual.square().mean().sqrt()) if len(fit.residual) else 0.0
+    words = f"harmonics fitted to the planes' colours, off by {mean:.4f} (rms)"
+    return Colours(fit.dc, fit.rest, words, fit.residual)
+
+
+def _least_psnr(avatar: SplatMethodAvatar, pose: HeadPose, found: Splats) -> float:
+    """dB, the least of `VIEWS`: the file's splats drawn by our renderer against the avatar's frames, on white."""
+    source = Source(avatar, pose, np.zeros(3), np.zeros((4, 3)))
+    extent = np.quantile(source.seen(pose).means, (0.005, 0.995), axis=0)
+    distance = float((extent[1] - extent[0]).max()) / np.tan(np.radians(FIELD_OF_VIEW))
+    worst = np.inf
+    for azimuth, elevation in VIEWS:
+        camera = source.camera(look(azimuth, elevation, 1.5 * distance, extent.mean(axis=0), SIZE))
+        along = torch.nn.functional.normalize(found.means - torch.from_numpy(camera.center).float(), dim=1)
+        harmonics = torch.cat([found.dc[:, :, None], found.rest], dim=2)
+        colors = torch.relu(0.5 + (harmonics * sh_basis(along, DEGREE)[:, None]).sum(2))
+        motion, K = (torch.from_numpy(np.asarray(m, np.float32)) for m in (camera.world_to_camera, camera.K))
+        drawn = rasterize(
+            *(found.means, found.quats, found.scales, found.opacities, colors),
+            *(motion, K, camera.width, camera.height),
+            background=torch.ones(3),
+        )
+        error = float(np.square(drawn.image.clamp(0, 1).numpy() - avatar.render(camera, pose).rgb).mean())
+        worst = min(worst, -10 * float(np.log10(max(error, 1e-12))))
+    return worst
+
+
+def read_splat_avatar(folder: Path) -> SplatMethodAvatar:
+    """Read an avatar by what lies in its folder. Raises `InputError` for what is none of coloured splats."""
+    if (folder / PLY_FILE).exists():
+        foreign = [name for name in read_names(folder / PLY_FILE) if name not in COLUMNS]
+        if foreign:
+            found = "a column of another method, which would be lost"
+            raise InputError(folder / PLY_FILE, foreign[0], EXPORTED, found)
+        return GAAvatar.read(folder, "cpu")
+    if (folder / COMPACT_FILE).exists():
+        return OursAvatar.read(folder, "cpu")
+    path = folder / FIELD_FILE
+    names = set(read_safetensors(path)[0]) if path.exists() else set()
+    if "differences" in names:
+        return GBSAvatar.read(folder, "cpu")
+    if "table" in names:
+        return GHAAvatar.read(folder, "cpu")
+    if names:
+        return OursAvatar.read(folder, "cpu")
+    if (folder / RADIANCE_FILE).exists():
+        raise InputError(folder, "", EXPORTED, "an avatar of insta, a radiance field without splats", DRAWN)
+    remedy = "The avatars of a run lie in SUBJECT/METHOD/seed-N/avatar inside its folder."
+    expected = f"{EXPORTED}: {PLY_FILE}, {FIELD_FILE} or {COMPACT_FILE}"
+    raise InputError(folder, "", expected, "none of them", remedy if (folder / "run.json").exists() else "")
+
+
+def _pose(settings: ExportOptions, head: HeadAsset, progress: Progress) -> HeadPose:
+    if settings.capture is None:
+        return neutral_pose(head)
+    clip = settings.open(settings.capture, progress)
+    timestep = settings.timestep
+    if timestep is None:
+        timestep = min(key.timestep for key in clip.splits["train"])
+    if timestep not in clip.poses:
+        expected = f"a timestep of the capture, {min(clip.poses)} to {max(clip.poses)}"
+        raise InputError("--timestep", "", expected, str(timestep))
+    return clip.poses[timestep]
+
+
+def neutral_pose(head: HeadAsset) -> HeadPose:
+    """Nothing moved: zero expression, rotations and translation."""
+    zero = np.zeros(3, np.float32)
+    return HeadPose(
+        head.version,
+        expression=np.zeros(head.expression_basis.shape[2], np.float32),
+        rotation=zero,
+        neck=zero,
+        jaw=zero,
+        eyes=np.zeros(6, np.float32),
+        translation=zero,
+        eyelids=None if head.eyelid_basis is None else np.zeros(2, np.float32),
+    )
