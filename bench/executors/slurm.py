@@ -41,6 +41,8 @@ FINAL = {
     "DEADLINE": "missed its deadline",
 }
 """Ends that would be the same another time, or that somebody wanted."""
+STUCK = {"PartitionTimeLimit", "PartitionNodeLimit", "BadConstraints", "JobHeldAdmin", "JobHeldUser"}
+"""Reasons to wait that do not pass."""
 _THREADS = (
     "export OMP_NUM_THREADS=$SLURM_CPUS_PER_TASK",
     "export SRUN_CPUS_PER_TASK=$SLURM_CPUS_PER_TASK",  # which srun took from the job itself before Slurm 22.05
@@ -87,6 +89,7 @@ class Slurm:
         self._folder, self._execution, self._speed = folder, execution, speed
         self._jobs: dict[str, _Job] = {}
         self._running = self._unanswered = 0
+        self._warned: set[str] = set()
         known = read_submitted(folder.root)
         self._numbers = known["jobs"] if known is not None and known["speed"] == speed else {}
         self._known = dict(self._numbers)
@@ -129,7 +132,11 @@ class Slurm:
             return []
         self._unanswered = 0
         found = []
-        self._running = sum(states.get(job.number) == "RUNNING" for job in self._jobs.values())
+        own = [states[job.number] for job in self._jobs.values() if job.number in states]
+        self._running = sum(each.state == "RUNNING" for each in own)
+        for reason in {each.reason for each in own} & STUCK - self._warned:
+            log.warning("jobs wait for %s, which only `scontrol` or `scancel` and other settings end", reason)
+            self._warned.add(reason)
         for cell, job in list(self._jobs.items()):
             ended = None if job.number in states else self._look(job)
             if ended is not None:
@@ -206,10 +213,22 @@ class _State(NamedTuple):
     reason: str
 
 
-def queue() -> Mapping[str, str]:
-    """State of each of the user's jobs that has not ended, by its number."""
-    lines = _ask("squeue", "-h", "-r", "-u", str(os.getuid()), "-o", "%i %T").splitlines()
-    return dict(line.split(maxsplit=1) for line in lines if " " in line)
+class Queued(NamedTuple):
+    """A job that has not ended: its state, such as RUNNING, and why it waits."""
+
+    state: str
+    reason: str
+
+    @property
+    def shown(self) -> str:
+        """For people."""
+        return f"{self.state} ({self.reason})"
+
+
+def queue() -> Mapping[str, Queued]:
+    """The user's jobs that have not ended, by number."""
+    lines = _ask("squeue", "-h", "-r", "-u", str(os.getuid()), "-o", "%i|%T|%r").splitlines()
+    return {number: Queued(state, reason) for number, state, reason in (x.split("|", 2) for x in lines)}
 
 
 def end_of(number: str) -> _State:

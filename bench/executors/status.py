@@ -20,7 +20,7 @@ from ..rows import ALL
 from ..runner.store import RunFolder
 from ..specs import Findings
 from .outcome import Outcome, read_outcome
-from .slurm import queue, read_submitted
+from .slurm import Queued, queue, read_submitted
 from .worker import JOB_LOG, is_speed
 
 log = logging.getLogger(__name__)
@@ -107,14 +107,16 @@ def cell_states(folder: RunFolder, manifest: Manifest) -> list[CellState]:
     for clip, method, seed in product(manifest.clips, manifest.methods, manifest.configuration.seeds):
         key = clip.subject, method.name, seed
         cell = folder.cell(*key)
+        place = cell.folder.relative_to(folder.root).as_posix()
         outcome = read_outcome(cell.folder)
         if outcome is not None:
-            job = jobs.get(cell.folder.relative_to(folder.root).as_posix(), "")
-            found.append(_of_outcome(key, cell.folder, outcome, speed, job, queued))
+            found.append(_of_outcome(key, cell.folder, outcome, speed, jobs.get(place, ""), queued))
         elif key in failed:
             found.append(CellState(*key, "failed", failed[key]))
         elif cell.ended("measure"):
             found.append(CellState(*key, "done"))
+        elif queued and place in jobs and jobs[place] in queued:
+            found.append(CellState(*key, "waiting", f"job {jobs[place]} is {queued[jobs[place]].shown}"))
         elif works and cell.folder.exists() and not jobs:
             found.append(CellState(*key, "running"))
         else:
@@ -128,7 +130,7 @@ def _of_outcome(
     outcome: Outcome,
     speed: bool,
     job: str,
-    queued: Mapping[str, str] | None,
+    queued: Mapping[str, Queued] | None,
 ) -> CellState:
     seconds, restarts = outcome.get("seconds"), outcome.get("restarts", 0)
     if outcome["status"] == "failed":
@@ -141,7 +143,8 @@ def _of_outcome(
         return CellState(*key, "done", "", seconds, restarts)
     host = outcome.get("host", "")
     if job and queued is not None:
-        lives, state = queued.get(job) == "RUNNING", queued.get(job, "")
+        entry = queued.get(job)
+        lives, state = entry is not None and entry.state == "RUNNING", "" if entry is None else entry.shown
     else:
         lives, state = not outcome.get("job") and (host != platform.node() or is_locked(folder)), ""
     if not lives:
@@ -162,7 +165,7 @@ def _failed(folder: RunFolder, manifest: Manifest) -> Iterator[tuple[tuple[str, 
         yield (str(row.subject), str(row.method), int(str(row.seed))), str(row.reason)
 
 
-def _queue() -> Mapping[str, str] | None:
+def _queue() -> Mapping[str, Queued] | None:
     """Slurm's queue; None where it cannot be asked."""
     try:
         return queue()

@@ -119,7 +119,7 @@ def test_a_cancelled_job_is_a_failed_cell_until_resubmitted(config, slurm, comma
     subprocess.run(["scancel", job], check=True)
     wait_for(lambda: job not in queue() and starts(config, "subject2", "slow"))
     subprocess.run(["scancel", "-s", "USR2", late], check=True)  # what Slurm sends before time is out
-    wait_for(lambda: queue().get(late) != "RUNNING")
+    wait_for(lambda: late not in queue() or queue()[late].state != "RUNNING")
     (tmp_path / "go").touch()
     assert first.wait(90) == 1
     assert "was cancelled" in first.stdout.read()
