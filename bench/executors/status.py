@@ -26,6 +26,7 @@ from .worker import JOB_LOG, is_speed
 log = logging.getLogger(__name__)
 State = Literal["waiting", "running", "done", "failed"]
 STATES: tuple[State, ...] = ("waiting", "running", "done", "failed")
+SPEED = "for its speed to be measured"
 SHOWN = 30
 """Cells that are shown by name."""
 
@@ -61,10 +62,13 @@ def run_status(run: Path) -> Findings:
     counts = Counter(cell.state for cell in cells)
     left, bound = time_left(cells)
     text = f"{run}: {len(cells)} cells: {', '.join(f'{counts[state]} {state}' for state in STATES)}"
+    speed = sum(cell.note == SPEED for cell in cells)
+    if speed:
+        text += f"; {speed} of those waiting are done but for their speed, which is measured last"
     if left is not None:
         text += f"; {'more than' if bound else 'about'} {duration(left)} left"
     told = [cell for state in ("failed", "running") for cell in cells if cell.state == state]
-    told += [cell for cell in cells if cell.state == "waiting" and cell.note]
+    told += [cell for cell in cells if cell.state == "waiting" and cell.note not in ("", SPEED)]
     lines = []
     for cell in told[:SHOWN]:
         again = f", restarts: {cell.restarts}" if cell.restarts else ""
@@ -82,15 +86,18 @@ def run_status(run: Path) -> Findings:
 def time_left(cells: Sequence[CellState]) -> tuple[float | None, bool]:
     """Seconds until all cells are done, by those of each method that are, and whether that is a lower bound alone.
 
+    How long speed takes to measure is not known beforehand.
+
     None where nothing is left, or nothing known of it.
     """
     took: dict[str, list[float]] = {}
     for cell in cells:
-        if cell.state == "done" and cell.seconds is not None:
+        if cell.state != "running" and cell.seconds is not None:
             took.setdefault(cell.method, []).append(cell.seconds)
     means = {method: sum(each) / len(each) for method, each in took.items()}
     left = [cell for cell in cells if cell.state in ("waiting", "running")]
-    known = [max(0.0, means[cell.method] - (cell.seconds or 0.0)) for cell in left if cell.method in means]
+    begun = [cell for cell in left if cell.state == "running" or cell.seconds is None]
+    known = [max(0.0, means[cell.method] - (cell.seconds or 0.0)) for cell in begun if cell.method in means]
     at_once = max(1, sum(cell.state == "running" for cell in left))
     return (sum(known) / at_once, len(known) < len(left)) if known else (None, False)
 
@@ -139,7 +146,7 @@ def _of_outcome(
         )
     if outcome["status"] == "done":
         if speed and not outcome["speed"]:
-            return CellState(*key, "waiting", "for its speed to be measured", seconds, restarts)
+            return CellState(*key, "waiting", SPEED, seconds, restarts)
         return CellState(*key, "done", "", seconds, restarts)
     host = outcome.get("host", "")
     if job and queued is not None:

@@ -137,6 +137,7 @@ def test_time_left_is_by_method_and_shared_out():
     two = [cell("a", "running", 5.0), cell("a", "running", 5.0), cell("b", "waiting")]
     assert time_left([*done, *two]) == (10.0, True)
     assert time_left([cell("b", "waiting")]) == (None, False)
+    assert time_left([cell("a", "waiting", 8.0), cell("a", "waiting")]) == (8.0, True)  # one for its speed
 
 
 def test_the_machine_is_that_of_the_cells(config, caplog):
