@@ -121,8 +121,11 @@ class Worker:
             "machine": self._machine,
         }
         with output_inside(run), locked(cell), _output_to(cell / JOB_LOG), log_to_file(cell / JOB_LOG):
-            earlier = read_outcome(cell) if work.speed else None
-            before = 0.0 if earlier is None else earlier.get("seconds", 0.0)
+            before = 0.0
+            first = read_outcome(cell) if work.speed else None
+            if first is not None and not first["speed"]:
+                before = first.get("seconds", 0.0)
+                outcome["restarts"] += first.get("restarts", 0)
             write_outcome(cell, outcome)
             try:
                 self._measure(work, lambda doing: write_outcome(cell, {**outcome, "doing": doing}))

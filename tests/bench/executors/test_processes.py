@@ -81,14 +81,14 @@ def test_a_full_disk_ends_the_run_and_no_cell_is_failed(config):
 
 
 def test_speed_is_measured_after_the_trainings_alone(config, rows_of):
-    config = replace(config, methods=("toy_plugin:METHOD",), metrics=("psnr", "toy_plugin:ERROR", "fps"))
+    config = replace(config, methods=("dying_plugin:DYING",), metrics=("psnr", "toy_plugin:ERROR", "fps"))
     rows = rows_of(config, TWO)
     assert set(rows["status"]) == {"ok"}
     assert rows["metric"].drop_duplicates().tolist() == ["psnr", "error", "fps"]
     spans = []
     for subject in ("subject1", "subject2", "subject3"):
-        outcome = read_outcome(cell_of(config, subject, "toy"))
-        assert outcome["speed"]
+        outcome = read_outcome(cell_of(config, subject, "dying"))
+        assert (outcome["speed"], outcome["restarts"]) == (True, 1)
         spans.append(outcome["process"])
     assert len(set(spans)) == 1  # one process, one after another
 
