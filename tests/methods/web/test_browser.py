@@ -100,6 +100,24 @@ def test_a_slider_and_a_drag_change_what_is_seen(exported, opened):
     assert tab.get_by_role("heading").text_content() == "<script>x</script>"
 
 
+@pytest.mark.parametrize("width", [640, 900, 390])
+def test_sliders_and_words_are_inside_the_page(exported, opened, width):
+    tab = opened(exported.page)
+    tab.set_viewport_size({"width": width, "height": 620})
+    ends = tab.evaluate(
+        """() => [...document.querySelectorAll("aside input")].map(input => {
+            const panel = input.closest("aside"), {right, left} = input.getBoundingClientRect();
+            return [left, right, panel.getBoundingClientRect().left + panel.clientWidth];
+        })"""
+    )
+    assert len(ends) > 5
+    assert [(right, inner) for _, right, inner in ends if right > inner] == []
+    assert min(right - left for left, right, _ in ends) > 40
+    assert tab.evaluate(
+        "[...document.querySelectorAll('aside, .note')].every(e => e.scrollWidth <= e.clientWidth)"
+    )
+
+
 def test_a_damaged_file_says_so(run, exported, opened, tmp_path):
     text = exported.page.read_text()
     start = text.index("octet-stream") + 400
