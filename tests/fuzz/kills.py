@@ -96,6 +96,12 @@ WRITERS = [
     Writer("steps", "capture", "steps capture --out out"),
     Writer("lint", "capture", "lint capture"),
     Writer("verify", "run", "verify run"),
+    Writer(
+        "processes",
+        "unfinished",
+        "run --config config.json --executor processes --workers 1",
+        (PAGE, "outcome.json"),
+    ),
 ]
 
 
