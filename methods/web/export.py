@@ -39,6 +39,8 @@ JAW, JAW_SIDE, NECK, EYES = 0.4, 0.12, 0.4, 0.4
 VIEWS = ((0.0, 0.0), (0.6, 0.0), (-0.6, 0.2))
 """Azimuth and elevation, radians, from which the loss is measured."""
 SIZE = 320
+TOGETHER = ("expression 1", "expression 2", "jaw open")
+"""Sliders that are also tried at their upper ends at once: morphs add up, avatars need not."""
 DISTANCE_BY_HEIGHT = 2.6
 """Distance of the camera by the extent of the splats."""
 
@@ -142,6 +144,9 @@ def measure_losses(
             values = np.zeros(len(page.sliders))
             values[number] = value
             trials.append((group, values))
+    trials.append(
+        ("together", np.array([slider.high * (slider.name in TOGETHER) for slider in page.sliders]))
+    )
     losses: dict[str, float] = {}
     for done, (group, values) in enumerate(trials):
         pose = source.pose(page.sliders, values)

@@ -64,7 +64,7 @@ def test_the_bytes_keep_what_can_be_seen(exported):
 def test_what_the_page_loses_is_told(exported):
     findings = exported.findings
     assert findings.data["bytes"] == exported.page.stat().st_size
-    assert findings.data["psnr"].keys() == {"rest", "expressions", "jaw", "neck", "eyes"}
+    assert findings.data["psnr"].keys() == {"rest", "expressions", "jaw", "neck", "eyes", "together"}
     assert min(findings.data["psnr"].values()) > 38
     assert "dB" in findings.text
 
