@@ -1,5 +1,6 @@
-"""Avatars of every splat method as glTF and SOG: read back by a parser of the tests, or by the library's."""
+"""Avatars of every splat method as glTF and SOG, read back by parsers of the tests."""
 
+import io
 import json
 import re
 import struct
@@ -8,6 +9,8 @@ import zipfile
 
 import numpy as np
 import pytest
+from PIL import Image
+from scipy.spatial import cKDTree
 
 from headbench.bench.errors import InputError, UnavailableError
 from headbench.bench.runner.stored import avatar_folder
@@ -20,6 +23,7 @@ from headbench.methods.gaussian_ply.command import (
     export_sog,
 )
 from headbench.methods.gaussian_ply.export import neutral_pose, read_splat_avatar
+from headbench.methods.gaussian_ply.formats import FORMATS
 from headbench.methods.shared.avatar_files import read_shared_head
 from headbench.methods.web.command import ExportHtmlSettings, export_html
 
@@ -87,6 +91,67 @@ def test_gltf_holds_the_splats_as_the_extension_says(run, tmp_path, method):
     assert findings.data["psnr"] > (100 if method == "ga" else 30)
 
 
+def decode_sog(path):
+    """Header and columns of a SOG, version 2, by the formulas of PlayCanvas' specification."""
+    archive = zipfile.ZipFile(path)
+    meta = json.loads(archive.read("meta.json"))
+    assert meta["version"] == 2
+    count = meta["count"]
+
+    def image(name):
+        return np.asarray(Image.open(io.BytesIO(archive.read(name))).convert("RGBA")).astype(int)
+
+    def pixels(part):
+        return [image(name).reshape(-1, 4)[:count] for name in meta[part]["files"]]
+
+    low, high = pixels("means")
+    least, most = np.array(meta["means"]["mins"]), np.array(meta["means"]["maxs"])
+    logs = least + (most - least) * (256 * high + low)[:, :3] / 65535
+    (sizes,), (turns,), (base,) = pixels("scales"), pixels("quats"), pixels("sh0")
+    left_out = turns[:, 3] - 252  # the largest of w, x, y, z
+    assert set(left_out) <= {0, 1, 2, 3}
+    others = (turns[:, :3] / 255 - 0.5) * np.sqrt(2)
+    quats = np.empty((count, 4))
+    for number in range(4):
+        rows = left_out == number
+        quats[np.ix_(rows, np.delete(np.arange(4), number))] = others[rows]
+        quats[rows, number] = np.sqrt(1 - (others[rows] ** 2).sum(1))
+    assert meta["shN"]["bands"] == 3
+    centroids_name, labels_name = meta["shN"]["files"]
+    centroids, labels = image(centroids_name), image(labels_name).reshape(-1, 4)[:count]
+    entry = labels[:, 0] + 256 * labels[:, 1]
+    taken = [centroids[entry // 64, 15 * (entry % 64) + k, :3] for k in range(15)]
+    return meta, {
+        "means": np.sign(logs) * np.expm1(np.abs(logs)),
+        "quats": quats,
+        "scales": np.exp(np.array(meta["scales"]["codebook"])[sizes[:, :3]]),
+        "opacities": base[:, 3] / 255,
+        "dc": np.array(meta["sh0"]["codebook"])[base[:, :3]],
+        "rest": np.array(meta["shN"]["codebook"])[np.stack(taken, axis=2)],
+    }
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_sog_holds_the_splats_as_its_specification_says(run, tmp_path, method):
+    pytest.importorskip("gaussforge")
+    folder, out = str(folder_of(run, method)), str(tmp_path / "x")
+    export_sog(ExportSogSettings(folder, out=f"{out}.sog"))
+    export_ply(ExportPlySettings(folder, out=f"{out}.ply"))
+    meta, found = decode_sog(f"{out}.sog")
+    assert meta["asset"]["generator"].startswith("headbench")
+    assert "trainedAlgorithmicMedia" in meta["asset"]["note"]
+    splats = FORMATS["ply"].read(tmp_path / "x.ply")._asdict()
+    # SOG orders splats anew.
+    distance, order = cKDTree(splats["means"].numpy()).query(found["means"])
+    assert distance.max() < 1e-4
+    assert len(np.unique(order)) > 0.95 * len(order)
+    turned = np.abs((found["quats"] * splats["quats"].numpy()[order]).sum(1))
+    assert np.quantile(turned, 0.05) > 0.999
+    for name in ("scales", "opacities", "dc", "rest"):
+        expected = splats[name].numpy()[order]
+        assert np.quantile(np.abs(found[name] - expected), 0.95) <= 0.02 * max(np.abs(expected).max(), 1e-6)
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_sog_loses_little(run, tmp_path, method):
     pytest.importorskip("gaussforge")
@@ -103,7 +168,7 @@ def test_sog_loses_little(run, tmp_path, method):
 def test_without_the_library_the_error_says_what_to_install(run, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "gaussforge", None)
     out = tmp_path / "x.sog"
-    with pytest.raises(UnavailableError, match="pip install gaussforge"):
+    with pytest.raises(UnavailableError, match=r"pip install 'headbench\[formats\]'"):
         export_sog(ExportSogSettings(str(folder_of(run, "ga")), out=str(out)))
     assert not out.exists()
 
