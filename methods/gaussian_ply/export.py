@@ -70,13 +70,15 @@ def export_pose(settings: ExportOptions, name: str, progress: Progress) -> Findi
     lost = _least_psnr(avatar, pose, form.read(out))
     data = {"out": out, "splats": len(splats.means), "timestep": pose.timestep}
     data |= {"bytes": out.stat().st_size, "psnr": lost}
+    off = ""
     if colours.residual is not None:
         # Splats that hardly show would hide how far off those are that do.
         weight = splats.opacities / max(float(splats.opacities.sum()), 1e-12)
         residual = colours.residual
         data["residual_rms"] = float(np.sqrt((weight * residual.numpy() ** 2).sum()))
         data["residual_p95"] = float(torch.quantile(residual, 0.95)) if len(residual) else 0.0
-    text = f"{out}: {len(splats.means)} splats, {out.stat().st_size / 1e6:.2f} MB; {colours.words};"
+        off = f", off by {data['residual_rms']:.4f} (rms), {data['residual_p95']:.4f} (95 % of splats)"
+    text = f"{out}: {len(splats.means)} splats, {out.stat().st_size / 1e6:.2f} MB; {colours.words}{off};"
     return Findings(f"{text} PSNR against the avatar's own frames {lost:.1f} dB or more", data)
 
 
@@ -94,9 +96,7 @@ def harmonics_of(avatar: SplatMethodAvatar, pose: HeadPose, directions: int) -> 
         return Colours(dc, dc.new_zeros(len(dc), 3, 15), PLAIN)
     seen_from = avatar.seen_from(pose)
     fit = fit_harmonics(seen_from.radiance, seen_from.normals, sphere(directions))
-    mean = float(fit.residual.square().mean().sqrt()) if len(fit.residual) else 0.0
-    words = f"harmonics fitted to the planes' colours, off by {mean:.4f} (rms)"
-    return Colours(fit.dc, fit.rest, words, fit.residual)
+    return Colours(fit.dc, fit.rest, "harmonics fitted to the planes' colours", fit.residual)
 
 
 def _least_psnr(avatar: SplatMethodAvatar, pose: HeadPose, found: Splats) -> float:
