@@ -271,7 +271,7 @@ CASES = {
             "dB; the least",
             f"{name}.html",
         )
-        for name in ("ours", "ga", "gbs")
+        for name in ("ours",)
     ],
     "export ply": [
         case(f"export ply {cell(name)}/avatar --out {name}.ply", "splats", f"{name}.ply")
@@ -280,7 +280,7 @@ CASES = {
     **{
         f"export {form}": [
             case(f"export {form} {cell(name)} --out {name}.{form}", "dB or more", f"{name}.{form}")
-            for name in ("ours", "ga", "gbs", "gha")
+            for name in ("ours", "gha")
         ]
         for form in ("glb", "sog")
     },

@@ -19,6 +19,7 @@ def found(tmp_path_factory):
     return json.loads(done.stdout.splitlines()[-1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_a_frame_equals_that_of_the_cpu(found, method):
     assert found[method]["drawn"] > 0.05

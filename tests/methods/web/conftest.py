@@ -26,7 +26,9 @@ def run(tmp_path_factory):
     return small_run(tmp_path_factory.mktemp("web"), "ga", "gbs", "ours")
 
 
-@pytest.fixture(scope="package", params=["ga", "gbs", "ours"])
+@pytest.fixture(
+    scope="package", params=[*(pytest.param(name, marks=pytest.mark.slow) for name in ("ga", "gbs")), "ours"]
+)
 def exported(run, request, tmp_path_factory):
     """A page of each method, as the command writes it."""
     kept = {}

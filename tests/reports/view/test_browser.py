@@ -92,6 +92,7 @@ def test_a_slider_moves_one_browser_alone(scene, opened):
         assert settled(one) == before[0]
 
 
+@pytest.mark.slow
 def test_a_camera_shows_the_capture_beside(scene, opened):
     with serve(scene) as server:
         tab = opened(server)
@@ -112,6 +113,7 @@ def test_splats_are_drawn_by_the_browser(scene, opened):
         tab.get_by_text("sent in").wait_for()
 
 
+@pytest.mark.slow
 def test_what_is_saved_comes_as_files(scene, opened):
     with serve(scene) as server:
         tab = opened(server)
@@ -128,6 +130,7 @@ def test_what_is_saved_comes_as_files(scene, opened):
             assert b"trainedAlgorithmicMedia" in content or b"ompositeWithTrainedAlgorithmicMedia" in content
 
 
+@pytest.mark.slow
 def test_a_server_can_be_started_again(scene, opened):
     for _ in range(2):
         with serve(scene) as server:
