@@ -7,7 +7,7 @@ JOBS   ?= 2
 SEED   ?= 0
 SECONDS ?= 600
 
-.PHONY: help setup demo test check fuzz kills gate baseline bench readme release-source dist wheels clean
+.PHONY: help setup demo test check fuzz kills gpu gate baseline bench readme release-source dist wheels clean
 
 help:
 	@echo "make setup   make $(VENV) with headbench in it"
@@ -16,6 +16,7 @@ help:
 	@echo "make check   style, types, architecture"
 	@echo "make fuzz    give damaged files to every reader for ten minutes (SEED=0, SECONDS=600)"
 	@echo "make kills   kill every command that writes before each change of the disk, and start it again (the same)"
+	@echo "make gpu     does a GPU give the CPU's numbers, and how fast; WHEELS=DIR collects wheels to install without a network"
 	@echo "make gate    compare the numbers of a small demo with tests/demo_baseline.json"
 	@echo "make baseline  write that baseline again, after a change that is meant to move them"
 	@echo "make bench   measure the speed of the splat renderer"
@@ -49,6 +50,9 @@ fuzz: setup
 
 kills: setup
 	$(BIN)/python -m headbench.tests.fuzz.kills --seed $(SEED) --seconds $(SECONDS)
+
+gpu: setup
+	$(BIN)/python -m headbench.tests.gpu $(if $(WHEELS),--wheels $(WHEELS))
 
 # Seconds of seeded training on a capture made on the spot. PSNR moved by up to 0.005 dB and SSIM by up to 0.00013 between
 # one and two threads, and with numpy, torch and libm held to SSE4; the baseline allows about ten times that.

@@ -16,7 +16,8 @@ import tyro
 from .configuration import build, merge, parse_assignments
 from .contracts import Progress
 from .errors import InputError
-from .executors.settings import Execution, ExecutorName
+from .executors.command import ExecutionOptions
+from .executors.settings import Execution, ExecutorName, check_executor
 from .io.documents import read_yaml
 from .io.files import check_writable, prepare_folder, write_json
 from .io.lock import locked
@@ -61,7 +62,8 @@ def demo(settings: DemoSettings, progress: Progress) -> Findings:
     capture = {"preset": settings.preset, "seed": settings.seed, "out": settings.out}
     given = merge({"capture": capture}, {"capture": values.pop("capture", {})})
     config = build(DemoConfig, given["capture"], "--set", "capture.")
-    comparison = build(RunConfig, merge(demo_run_config(config), values), "--set")
+    device = str(values.get("device", RunConfig.device))
+    comparison = build(RunConfig, merge(demo_run_config(config, device), values), "--set")
     # Errors before the capture is made, which takes minutes.
     resolve_methods(comparison)
     resolve_metrics(comparison)
@@ -76,7 +78,7 @@ def demo(settings: DemoSettings, progress: Progress) -> Findings:
 
 
 @dataclass(frozen=True)
-class SynthSettings:
+class SynthSettings(ExecutionOptions):
     """Path-traced heads with expression-dependent wrinkles and blush, on NeRSemble's camera rig, with sequences
     named as there. Frames already rendered with the same settings are kept.
     """
@@ -113,10 +115,12 @@ class SynthSettings:
 
 def synth(settings: SynthSettings, progress: Progress) -> Findings:
     """Render a synthetic multi-view capture in the GaussianAvatars/VHAP layout."""
-    out = Path(settings.out)
+    out, execution = Path(settings.out), settings.execution
+    check_executor(execution, "cpu")
     prepare_folder(out)
     with locked(out, beside=True):  # a capture is made in an empty folder
-        _synthesise({**asdict(settings), "out": out, "size": parse_size(settings.size)})
+        size = parse_size(settings.size)
+        _synthesise({**settings.others, "out": out, "size": size, "execution": execution})
     return Findings(settings.out, {"out": out})
 
 

@@ -367,11 +367,19 @@ class CheckedMethod(Method, Protocol):
 
 
 @runtime_checkable
+class PreparedMethod(Method, Protocol):
+    """A method with something to load or compile for a device that is no part of training. Optional."""
+
+    def prepare(self, device: str) -> None:
+        """Do it; called before the clock of a training starts. Raises `UnavailableError` where it cannot be had."""
+
+
+@runtime_checkable
 class Metric(Protocol):
     """One number per frame; never a mean.
 
     A metric that is faster on many frames also offers ``batched(pairs) -> iterator of values``: the values in
-    order, the pairs of image and ground truth read lazily.
+    order, the pairs of image and ground truth read lazily. One that can compute on a GPU offers ``on(device) -> metric``.
     """
 
     def __call__(self, image: ByteArray, target: ByteArray) -> float:

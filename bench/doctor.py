@@ -90,7 +90,7 @@ def doctor(settings: DoctorSettings, progress: Progress) -> Findings:
     if not named:
         patients.append(Patient("executors", "slurm", False, tuple(_slurm())))
     ill = [patient for patient in patients if patient.counts and patient.state == "missing"]
-    machine = machine_record()
+    machine = machine_record(settings.device)
     head = (
         f"{machine['processor']}, {machine['cores']} cores, {machine['memory_bytes'] / 1e9:.0f} GB; "
         f"Python {machine['python']}, torch {machine['packages']['torch']}"

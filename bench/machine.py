@@ -19,7 +19,7 @@ from .errors import HeadbenchError, InputError
 from .registry import resolve
 
 OPENCV = "opencv-contrib-python-headless"
-RECORDED_PACKAGES = ("headbench", "torch", "numpy", OPENCV, "scikit-image", "mitsuba")
+RECORDED_PACKAGES = ("headbench", "torch", "gsplat", "numpy", OPENCV, "scikit-image", "mitsuba")
 ACCELERATOR_FIELDS = ("name", "driver_version", "memory.total", "power.limit", "clocks.sm", "clocks.max.sm")
 RUSAGE_UNIT = 1 if sys.platform == "darwin" else 1024
 STATUS, RESET_PEAK = Path("/proc/self/status"), Path("/proc/self/clear_refs")
@@ -31,8 +31,12 @@ def processor_count() -> int:
     return len(available(0)) if available else os.cpu_count() or 1
 
 
-def machine_record() -> dict[str, Any]:
-    """Processor, memory, system and the versions of packages that influence results."""
+def machine_record(device: str = "cpu") -> dict[str, Any]:
+    """Processor, memory, system and the versions of packages that influence results.
+
+    For a CUDA ``device`` the entry "device" tells its name, memory, compute capability, the CUDA version of torch, and whether
+    matrix products and convolutions may round to TF32.
+    """
     import psutil
 
     return {
@@ -43,7 +47,54 @@ def machine_record() -> dict[str, Any]:
         "python": platform.python_version(),
         "packages": {name: _version(name) for name in RECORDED_PACKAGES},
         "accelerators": accelerators(),
+        **_device_record(device),
     }
+
+
+def _device_record(device: str) -> dict[str, Any]:
+    """The entry ``device``; none for the CPU, and where a run is described on another machine than it is worked on."""
+    if not _is_cuda(device) or not resolve("torch:cuda").is_available():
+        return {}
+    use_device(device)
+    properties = resolve("torch:cuda").get_device_properties(device)
+    found = {
+        "name": properties.name,
+        "memory_bytes": properties.total_memory,
+        "capability": f"{properties.major}.{properties.minor}",
+        "cuda": resolve("torch:version").cuda,
+    }
+    return {"device": found}
+
+
+def _is_cuda(device: str) -> bool:
+    return device.partition(":")[0] == "cuda"
+
+
+def use_device(device: str) -> None:
+    """Make a CUDA device the current one, whose work is waited for, and turn TF32 off; nothing for other devices.
+
+    TF32 rounds the factors of matrix products and convolutions to 10 bits of mantissa; torch lets convolutions do so.
+    """
+    if _is_cuda(device):
+        if ":" in device:  # without a number it means the current one
+            resolve("torch:cuda").set_device(device)
+        backends: Any = resolve("torch:backends")
+        backends.cuda.matmul.allow_tf32 = False
+        backends.cudnn.allow_tf32 = False
+
+
+def check_device_answers(device: str) -> None:
+    """Raise `HeadbenchError` where a CUDA device answers this process no more, as after an illegal access to its memory."""
+    if not _is_cuda(device):
+        return
+    try:
+        resolve("torch:cuda").synchronize(device)
+    except RuntimeError as error:
+        first = next(iter(str(error).splitlines()), "")
+        message = (
+            f"{device} answers this process no more: {first}. Start the command again; what is done is kept."
+        )
+        raise HeadbenchError(message) from error
 
 
 def accelerators() -> list[dict[str, str]]:
@@ -61,7 +112,7 @@ def accelerators() -> list[dict[str, str]]:
 
 
 class PeakMemory:
-    """Context that finds the largest resident memory of this process while it lasts.
+    """Context that finds the largest resident memory of this process while it lasts, and of a CUDA device what torch took.
 
     Linux keeps that maximum, and lets a process reset it; elsewhere a thread looks every 20 ms, which can miss a
     short spike. A child that ended meanwhile counts singly, if it was the largest so far: others are not known.
@@ -70,10 +121,16 @@ class PeakMemory:
     ----------
     before : bytes resident when it was entered.
     peak : largest resident bytes until it was left.
+    device_record : of a CUDA device, else empty: ``device_memory_before_bytes`` and ``peak_device_memory_bytes``, what tensors of
+        this process had of it when it was entered and at most until it was left; ``tf32``, whether it was on then.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, device: str = "cpu") -> None:
         import psutil
+
+        self.device_record: dict[str, Any] = {}
+        self._device = device
+        self._cuda: Any = resolve("torch:cuda") if _is_cuda(device) else None
 
         self.before = self.peak = 0
         self._ended = threading.Event()
@@ -81,6 +138,11 @@ class PeakMemory:
         self._process = psutil.Process()
 
     def __enter__(self) -> Self:
+        if self._cuda is not None:
+            self._cuda.reset_peak_memory_stats(self._device)
+            self.device_record = {
+                "device_memory_before_bytes": int(self._cuda.memory_allocated(self._device))
+            }
         self._children = _children_peak()
         self.before = self.peak = self._process.memory_info().rss
         try:
@@ -91,6 +153,12 @@ class PeakMemory:
         return self
 
     def __exit__(self, *error: object) -> None:
+        if self._cuda is not None:
+            backends = resolve("torch:backends")
+            self.device_record |= {
+                "peak_device_memory_bytes": int(self._cuda.max_memory_allocated(self._device)),
+                "tf32": bool(backends.cuda.matmul.allow_tf32 or backends.cudnn.allow_tf32),
+            }
         if self._watcher is None:
             self.peak = max(self.before, _resident_peak())
         else:

@@ -127,7 +127,8 @@ class Manifest:
     paths : files and folders that the configuration names, by dotted key, relative to the run folder;
         None where an earlier version wrote it.
     metrics, methods, protocols : in the order of the configuration; protocols by task.
-    machine : processor, cores, memory in bytes, system, versions of packages, accelerators.
+    machine : processor, cores, memory in bytes, system, versions of packages, accelerators; of a run on a CUDA device that
+        device, CUDA's version and whether TF32 was on, since there is a record of it. See `machine_record`.
     adapted : clips that were brought into another form for a method.
     seconds, peak_memory_bytes : of the run's last start; None until it ended.
     capture_seconds : how long the demo's capture took to make.

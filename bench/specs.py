@@ -125,6 +125,7 @@ class MethodSpec:
     demo : ``headbench demo`` takes it.
     variants : "package.module:function" of ``(avatar folder, clip, device) -> Iterator[Variant]``: what can be derived
         from a trained avatar without training (``headbench sweep``); "" for nothing.
+    devices : kinds of devices that it computes on, such as "cpu"; empty means any. A run on another refuses it.
     needs : "package.module:function" of ``(config, device) -> Iterable[Need]``: what a machine has to have, each looked
         for without long work, network or changes of the disk; "" for nothing but what headbench is installed with.
     first_implementation : what ``implementation`` was when the first runs were made, "" for the same: digests of what an
@@ -145,6 +146,7 @@ class MethodSpec:
     default: bool = False
     demo: bool = False
     variants: str = ""
+    devices: tuple[str, ...] = ()
     needs: str = ""
     first_implementation: str = ""
     resolution: ResolutionRule = ResolutionRule()
@@ -153,6 +155,10 @@ class MethodSpec:
     def __post_init__(self) -> None:
         """Refuse what no results could be read with."""
         _check_labels(name=self.name, version=self.version)
+
+    def computes_on(self, device: str) -> bool:
+        """Tell whether it computes on a device such as "cuda:1"."""
+        return not self.devices or device.split(":")[0] in self.devices
 
     def at_preset(self, preset: str) -> MethodSpec:
         """This method with the image size of a preset."""

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..bench.contracts import ByteArray
 from ..bench.errors import HeadbenchError, UnavailableError
+from ..bench.machine import use_device
 from ..bench.specs import MetricSpec, Need
 
 if TYPE_CHECKING:
@@ -45,13 +46,18 @@ LPIPS_VGG = replace(
 
 @dataclass(frozen=True)
 class SharedLpips:
-    """LPIPS on the CPU whose weights are loaded when first used, once in a process.
+    """LPIPS whose weights are loaded when first used, once in a process and for a device.
 
     Every use raises `UnavailableError` where the weights cannot be had. Attributes: see `Lpips`.
     """
 
     net: str = "alex"
     scaled: bool = True
+    device: str = "cpu"
+
+    def on(self, device: str) -> SharedLpips:
+        """The same on another device; on a GPU in float32 without TF32."""
+        return replace(self, device=device)
 
     def __call__(self, image: ByteArray, target: ByteArray) -> float:
         """LPIPS of two (H, W, 3) 8-bit images."""
@@ -62,19 +68,20 @@ class SharedLpips:
         return self._loaded().batched(pairs)
 
     def _loaded(self) -> Lpips:
-        loaded = _load(self.net, self.scaled)
+        loaded = _load(self.net, self.scaled, self.device)
         if isinstance(loaded, UnavailableError):
             raise UnavailableError(loaded.what, loaded.remedy)
         return loaded
 
 
 @functools.cache
-def _load(net: str, scaled: bool) -> Lpips | UnavailableError:
+def _load(net: str, scaled: bool, device: str) -> Lpips | UnavailableError:
     """The network, or why there is none: remembered either way."""
     from .lpips_network import Lpips
 
+    use_device(device)
     try:
-        return Lpips(net, scaled=scaled)
+        return Lpips(net, scaled=scaled, device=device)
     except UnavailableError as error:
         return error
 

@@ -304,15 +304,17 @@ def stage_times(
     for frame in _within(islice(stream, frames), limit_s, clock):
         synchronise()
         last = clock()
-        drawn = drawing.draw(*frame, WHITE, end_stage)
-        last = clock()
-        drawing.read_back(drawn)
+        # A copy that `draw` begins after its last stage is part of reading back.
+        drawing.read_back(drawing.draw(*frame, WHITE, end_stage))
         end_stage(READ_BACK)
     return {stage: float(np.median(values)) for stage, values in times.items()}
 
 
 def synchroniser() -> Callable[[], None]:
-    """What waits for the work handed to an accelerator; nothing to wait for where torch has begun no such work."""
+    """What waits for the work handed to an accelerator; nothing to wait for where torch has begun no such work.
+
+    It waits for torch's current device, which `use_device` has made that of the avatar.
+    """
     torch = sys.modules.get("torch")
     if torch is not None and torch.cuda.is_available() and torch.cuda.is_initialized():
         wait: Callable[[], None] = torch.cuda.synchronize

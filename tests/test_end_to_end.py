@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
@@ -28,14 +29,20 @@ TINY = ("--preset", "smoke", "--set", "frames_per_task=3")
 METHODS = {"mean-image", "nearest-camera", "ga", "gbs", "gha", "insta", "ours"}
 
 
-@pytest.fixture(scope="module", autouse=True)
-def few_timed_frames():
+@contextmanager
+def timed_in_few_frames():
     """Time a few frames: how many decides how exact speeds are, which nothing here asks for."""
     few = partial(
         speed.SpeedProtocol, warm_up=2, warm_up_s=0.1, window=1, latency=3, throughput=3, stages=2, static=2
     )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(speed, "SpeedProtocol", few)
+        yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_timed_frames():
+    with timed_in_few_frames():
         yield
 
 

@@ -1,14 +1,50 @@
-"""``headbench status``."""
+"""``headbench status``, and the options of commands whose work an executor can do."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from typing import Annotated, Any
 
 import tyro
 
+from ..configuration import build, merge, parse_assignments
 from ..contracts import Progress
+from ..registry import unknown
 from ..specs import Findings
+from .settings import Execution, ExecutorName
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExecutionOptions:
+    """How the work of a command is done."""
+
+    executor: ExecutorName = "inline"
+    """Where it is done, as for `headbench run`."""
+
+    workers: int | None = None
+    """How many processes, as for `headbench run`."""
+
+    set: Annotated[
+        tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="execution.KEY=VALUE")
+    ] = ()
+    """A setting of the executor, for example `execution.slurm.partition=gpu`; repeatable."""
+
+    @property
+    def execution(self) -> Execution:
+        """How it is done. Raises `InputError` for settings that are none."""
+        given = parse_assignments(self.set)
+        if stray := sorted(given.keys() - {"execution"}):
+            raise unknown("command line", "--set", stray[0], ["execution"])
+        options = {"executor": self.executor, "workers": self.workers}
+        options = {key: value for key, value in options.items() if value not in ("inline", None)}
+        return build(Execution, merge(given.get("execution", {}), options), "command line", "execution.")
+
+    @property
+    def others(self) -> dict[str, Any]:
+        """The settings that decide what comes out: all but these."""
+        own = {field.name for field in fields(ExecutionOptions)}
+        return {name: value for name, value in asdict(self).items() if name not in own}
 
 
 @dataclass(frozen=True)

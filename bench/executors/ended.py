@@ -1,15 +1,15 @@
-"""What an executor tells of a cell."""
+"""What an executor reports of a task."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
-from .worker import Work
+from .task import Task
 
 
 class Ended(NamedTuple):
-    """A cell whose process or job is over; its outcome says how, if it was left one.
+    """A task whose process or job is over; its outcome says how, if it was left one.
 
     Attributes
     ----------
@@ -17,23 +17,23 @@ class Ended(NamedTuple):
     again : whether to start it again if there is none.
     """
 
-    work: Work
+    task: Task
     lost: str = ""
     again: bool = True
 
 
 class Executor(Protocol):
-    """Works on cells somewhere."""
+    """Works on tasks somewhere."""
 
     @property
     def running(self) -> int:
-        """How many cells are worked on."""
+        """How many tasks are worked on."""
 
-    def submit(self, works: Sequence[Work]) -> None:
-        """Have these cells worked on."""
+    def submit(self, tasks: Sequence[Task]) -> None:
+        """Have these tasks worked on."""
 
     def poll(self, seconds: float) -> list[Ended]:
-        """Wait for news, at most so long; return the cells that ended since."""
+        """Wait for news, at most so long; return the tasks that ended since."""
 
     def close(self) -> None:
         """Let go of what is held here; called once, however it ended."""

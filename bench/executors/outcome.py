@@ -1,4 +1,4 @@
-"""``outcome.json`` of a cell: what its process or job is doing, or how it ended."""
+"""``outcome.json`` of a task: what its process or job is doing, or how it ended."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from ..io.files import write_json
 class Outcome(TypedDict, total=False):
     """Attributes.
 
-    status : the truth of how a cell ended; a job that is gone while it says "running" was killed.
-    speed : whether speed is measured, too: a pass of its own, see `bench.executors.run`.
-    reason : why it failed, as in its rows.
+    status : how a task ended; a job that is gone while it says "running" was killed.
+    speed : whether speed is measured, too: a pass of its own over a run's cells, see `bench.executors.run`.
+    reason : why it failed, as in the rows of a cell.
     doing, since : the step it is at, and the time (ISO 8601, UTC) when it was begun.
     seconds : that it took.
     restarts : how often it was started again.
@@ -40,30 +40,30 @@ class Outcome(TypedDict, total=False):
     machine: dict[str, Any]
 
 
-def outcome_path(cell: Path) -> Path:
-    """Where the outcome of the cell in a folder lies."""
-    return cell / "outcome.json"
+def outcome_path(task: Path) -> Path:
+    """Where the outcome of the task in a folder lies."""
+    return task / "outcome.json"
 
 
-def read_outcome(cell: Path) -> Outcome | None:
-    """Read the outcome of the cell in a folder; None where there is none. Raises `InputError` for a damaged one."""
-    path = outcome_path(cell)
+def read_outcome(task: Path) -> Outcome | None:
+    """Read the outcome of the task in a folder; None where there is none. Raises `InputError` for a damaged one."""
+    path = outcome_path(task)
     if not path.exists():
         return None
     outcome: Outcome = checked(read_json(path), Outcome, path)
     return outcome
 
 
-def write_outcome(cell: Path, outcome: Outcome) -> None:
+def write_outcome(task: Path, outcome: Outcome) -> None:
     """Write it, atomically."""
-    write_json(outcome_path(cell), outcome)
+    write_json(outcome_path(task), outcome)
 
 
-def forget_outcome(cell: Path, speed: bool) -> None:
+def forget_outcome(task: Path, speed: bool) -> None:
     """Remove the outcome of an earlier pass of the same kind, so that it is not taken for that of one that begins."""
     try:
-        outcome = read_outcome(cell)
+        outcome = read_outcome(task)
     except InputError:  # damaged
         outcome = None
     if outcome is None or outcome["speed"] == speed:
-        outcome_path(cell).unlink(missing_ok=True)
+        outcome_path(task).unlink(missing_ok=True)

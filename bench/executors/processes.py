@@ -10,13 +10,13 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
-from pathlib import Path
 from typing import Any
 
 from ..start import end_with_parent, starting_workers
 from .ended import Ended
-from .outcome import forget_outcome
-from .worker import Work, Worker
+from .outcome import forget_outcome, read_outcome
+from .task import Task
+from .worker import work_on
 
 STOP_S = 5.0
 """Seconds that a worker has to end in when it is asked to."""
@@ -26,11 +26,11 @@ STOP_S = 5.0
 class _Process:
     process: Any
     connection: Connection
-    work: Work | None = None
+    task: Task | None = None
 
 
 class Processes:
-    """Workers that take cells one after another; one that was killed is replaced.
+    """Workers that take tasks one after another; one that was killed is replaced.
 
     Parameters
     ----------
@@ -40,24 +40,24 @@ class Processes:
 
     def __init__(self, workers: int, threads: int | None):
         self._count, self._threads = workers, threads
-        self._waiting: deque[Work] = deque()
+        self._waiting: deque[Task] = deque()
         self._processes: list[_Process] = []
 
     @property
     def running(self) -> int:
-        """How many cells are worked on."""
-        return sum(process.work is not None for process in self._processes)
+        """How many tasks are worked on."""
+        return sum(process.task is not None for process in self._processes)
 
-    def submit(self, works: Sequence[Work]) -> None:
-        """Work on these cells, in order, after those that wait already."""
-        for work in works:
-            forget_outcome(Path(work.run) / work.cell, work.speed)
-        self._waiting.extend(works)
+    def submit(self, tasks: Sequence[Task]) -> None:
+        """Work on these tasks, in order, after those that wait already."""
+        for task in tasks:
+            forget_outcome(task.folder, task.speed)
+        self._waiting.extend(tasks)
 
     def poll(self, seconds: float) -> list[Ended]:
-        """Wait until a cell ends, at most so long; return those that ended."""
+        """Wait until a task ends, at most so long; return those that ended."""
         self._fill()
-        ready = wait([p.connection for p in self._processes if p.work is not None], seconds)
+        ready = wait([p.connection for p in self._processes if p.task is not None], seconds)
         ended = [self._ended(p) for p in list(self._processes) if p.connection in ready]
         self._fill()
         return ended
@@ -75,26 +75,38 @@ class Processes:
         self._processes = []
 
     def _fill(self) -> None:
-        """Give cells that wait to workers that have none."""
-        idle = [process for process in self._processes if process.work is None]
+        """Give tasks that wait to workers that have none."""
+        idle = [process for process in self._processes if process.task is None]
         while self._waiting and (idle or len(self._processes) < self._count):
             process = idle.pop() if idle else self._start()
-            process.work = self._waiting.popleft()
-            process.connection.send(process.work)
+            process.task = self._waiting.popleft()
+            process.connection.send(process.task)
 
     def _ended(self, process: _Process) -> Ended:
-        assert process.work is not None
-        work, process.work = process.work, None
+        assert process.task is not None
+        task, process.task = process.task, None
         try:
             error = process.connection.recv()
         except (EOFError, OSError):
             self._processes.remove(process)
             process.process.join()
             process.connection.close()
-            return Ended(work, f"its process was ended by {_cause(process.process.exitcode)}")
+            return Ended(task, f"its process was ended by {_cause(process.process.exitcode)}")
         if error is not None:
             raise error
-        return Ended(work)
+        outcome = read_outcome(task.folder)
+        if task.device != "cpu" and outcome is not None and outcome["status"] == "failed":
+            self._replace(process)
+        return Ended(task)
+
+    def _replace(self, process: _Process) -> None:
+        """End a worker: after an error of CUDA all that a process asks of the device fails."""
+        self._processes.remove(process)
+        process.connection.close()
+        process.process.join(STOP_S)
+        if process.process.is_alive():
+            process.process.kill()
+            process.process.join()
 
     def _start(self) -> _Process:
         ours, theirs = multiprocessing.Pipe()
@@ -108,18 +120,17 @@ class Processes:
 
 
 def _serve(connection: Connection) -> None:
-    """Work on the cells that come, until nothing comes any more."""
+    """Work on the tasks that come, until nothing comes any more."""
     end_with_parent()
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    worker = Worker()
     while True:
         try:
-            work: Work = connection.recv()
+            task: Task = connection.recv()
         except EOFError:
             return
         error = None
         try:
-            worker.work(work)
+            work_on(task)
         except Exception as raised:  # noqa: BLE001 - the other process reports it
             error = raised
         connection.send(error)

@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 from ..errors import UnavailableError
 from ..machine import check_device
+from ..specs import MetricSpec
 
 ExecutorName = Literal["inline", "processes", "slurm"]
 
@@ -75,6 +76,11 @@ class Execution:
                 raise ValueError(f"{name} is {value}; at least 1, or none")
         if self.restarts < 0 or self.poll_s <= 0:
             raise ValueError("restarts is at least 0, poll_s is above 0")
+
+
+def is_speed(metric: MetricSpec) -> bool:
+    """Whether neighbours on the machine would change what a metric of an avatar measures."""
+    return metric.machine_bound and metric.kind == "avatar"
 
 
 def import_submitit() -> Any:

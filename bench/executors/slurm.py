@@ -1,6 +1,6 @@
-"""The executor ``slurm``: a job of the cluster for each cell, submitted by submitit, followed by squeue and scontrol.
+"""The executor ``slurm``: a job of the cluster for each task, submitted by submitit, followed by squeue and scontrol.
 
-Jobs go on when the process that follows them ends; ``submitted.json`` tells the next one which cell is which job.
+Jobs go on when the process that follows them ends; ``submitted.json`` lists for the next one which task is which job.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from typing import Any, NamedTuple
 
 from typing_extensions import TypedDict
 
-from ..errors import HeadbenchError, InputError
+from ..errors import HeadbenchError, InputError, UnavailableError
 from ..io.documents import checked, read_json
-from ..io.files import write_json
-from ..runner.store import RunFolder
+from ..io.files import check_room, digest, write_json
 from .ended import Ended
 from .outcome import forget_outcome, read_outcome
 from .settings import Execution, import_submitit
-from .worker import Work
+from .task import Task
+from .worker import FULL_DISK
 
 log = logging.getLogger(__name__)
 MAX_ARRAY = 1000
@@ -33,6 +33,8 @@ ANSWER_S = 60
 """Seconds that Slurm has to answer a question in."""
 POLLS = 3
 """A job that is gone has left no outcome after so many polls: files may appear late on a network file system."""
+CANCEL_S = 120.0
+"""Seconds that cancelled jobs have to end in; Slurm kills them after its KillWait, 30 seconds by default."""
 UNANSWERED = 100
 """Questions in a row that Slurm may leave without an answer, such as while its controller is started again."""
 FINAL = {
@@ -43,6 +45,7 @@ FINAL = {
 """Ends that would be the same another time, or that somebody wanted."""
 STUCK = {"PartitionTimeLimit", "PartitionNodeLimit", "BadConstraints", "JobHeldAdmin", "JobHeldUser"}
 """Reasons to wait that do not pass."""
+WAITING = "jobs wait for %s, which does not pass. To give them other settings, end them by `scancel --name %s` and start again"
 _THREADS = (
     "export OMP_NUM_THREADS=$SLURM_CPUS_PER_TASK",
     "export SRUN_CPUS_PER_TASK=$SLURM_CPUS_PER_TASK",  # which srun took from the job itself before Slurm 22.05
@@ -51,76 +54,90 @@ _JOB = re.compile(r"\d+(_\d+)?")
 
 
 class Submitted(TypedDict):
-    """``submitted.json``: the jobs of a pass over the cells of a run, by the cell's place in the run folder."""
+    """``submitted.json``: the jobs of tasks, by the task's place in the output folder; ``speed`` as in `Task`."""
 
     speed: bool
     jobs: dict[str, str]
 
 
-def submitted_path(run: Path) -> Path:
-    """Where the jobs of a run are listed."""
-    return run / "submitted.json"
+def submitted_path(root: Path) -> Path:
+    """Where the jobs of an output folder are listed."""
+    return root / "submitted.json"
 
 
-def read_submitted(run: Path) -> Submitted | None:
-    """Read which cells are which jobs; None where there are none. Raises `InputError` for a damaged list."""
-    path = submitted_path(run)
+def read_submitted(root: Path) -> Submitted | None:
+    """Read which tasks are which jobs; None where there are none. Raises `InputError` for a damaged list."""
+    path = submitted_path(root)
     if not path.exists():
         return None
     submitted: Submitted = checked(read_json(path), Submitted, path)
-    for cell, job in submitted["jobs"].items():
+    for place, job in submitted["jobs"].items():
         if not _JOB.fullmatch(job):
-            raise InputError(path, f"jobs.{cell}", "the number of a job", repr(job))
+            raise InputError(path, f"jobs.{place}", "the number of a job", repr(job))
     return submitted
 
 
 @dataclass
 class _Job:
-    work: Work
+    task: Task
     number: str
     polls: int = 0
     """At how many it was gone without an outcome."""
+    earlier: bool = False
+    """Submitted by an earlier process."""
 
 
 class Slurm:
-    """Jobs for cells; those that ``submitted.json`` lists for this pass already are followed instead."""
+    """Jobs for tasks; those that ``submitted.json`` lists already are followed instead.
 
-    def __init__(self, folder: RunFolder, execution: Execution, speed: bool):
-        self._folder, self._execution, self._speed = folder, execution, speed
+    A process that was killed between submitting jobs and listing them left jobs that nothing is known of but their name,
+    which is the output folder's own: they are cancelled before any are submitted.
+    """
+
+    def __init__(self, root: Path, execution: Execution, speed: bool):
+        self._root, self._execution, self._speed = root, execution, speed
         self._jobs: dict[str, _Job] = {}
         self._running = self._unanswered = 0
         self._warned: set[str] = set()
-        known = read_submitted(folder.root)
+        known = read_submitted(root)
         self._numbers = known["jobs"] if known is not None and known["speed"] == speed else {}
         self._known = dict(self._numbers)
+        self._strays_gone = False
 
     @property
     def running(self) -> int:
         """How many jobs run."""
         return self._running
 
-    def submit(self, works: Sequence[Work]) -> None:
+    def submit(self, tasks: Sequence[Task]) -> None:
         """Submit jobs. Raises `InputError` where Slurm refuses them, with its words."""
         left = []
-        for work in works:
-            known = self._known.pop(work.cell, None)
+        for task in tasks:
+            known = self._known.pop(task.place, None)
             if known is None:
-                left.append(work)
+                left.append(task)
             else:
-                self._jobs[work.cell] = _Job(work, known)
-        if self._jobs and len(left) < len(works):
-            log.info("following %d jobs that were submitted before", len(works) - len(left))
+                self._jobs[task.place] = _Job(task, known, earlier=True)
+        if self._jobs and len(left) < len(tasks):
+            log.info(
+                "following %d jobs that were submitted before, with the settings of then",
+                len(tasks) - len(left),
+            )
+        if left and not self._strays_gone:
+            _cancel_others(job_name(self._root), set(self._numbers.values()))
+            self._strays_gone = True
         for start in range(0, len(left), MAX_ARRAY):
             part = left[start : start + MAX_ARRAY]
-            for work in part:
-                forget_outcome(self._folder.root / work.cell, self._speed)
-            for work, number in zip(part, self._submit(part)):
-                self._jobs[work.cell] = _Job(work, number)
-                self._numbers[work.cell] = number
-            self._write()
+            for task in part:
+                forget_outcome(task.folder, self._speed)
+            for task, number in zip(part, self._submit(part)):
+                self._jobs[task.place] = _Job(task, number)
+                self._numbers[task.place] = number
+            submitted: Submitted = {"speed": self._speed, "jobs": self._numbers}
+            write_json(submitted_path(self._root), submitted)
 
     def poll(self, seconds: float) -> list[Ended]:
-        """Ask Slurm after so many seconds; return the cells whose jobs have ended."""
+        """Ask Slurm after so many seconds; return the tasks whose jobs have ended."""
         time.sleep(seconds)
         try:
             states = queue()
@@ -135,54 +152,52 @@ class Slurm:
         own = [states[job.number] for job in self._jobs.values() if job.number in states]
         self._running = sum(each.state == "RUNNING" for each in own)
         for reason in {each.reason for each in own} & STUCK - self._warned:
-            log.warning("jobs wait for %s, which only `scontrol` or `scancel` and other settings end", reason)
+            log.warning(WAITING, reason, job_name(self._root))
             self._warned.add(reason)
-        for cell, job in list(self._jobs.items()):
+        for place, job in list(self._jobs.items()):
             ended = None if job.number in states else self._look(job)
             if ended is not None:
                 found.append(ended)
-                del self._jobs[cell]
+                del self._jobs[place]
         return found
 
     def close(self) -> None:
         """Leave the jobs to the cluster; forget them where all have ended."""
         if self._jobs:
             log.info(
-                "%d jobs go on; `headbench status` shows them, the same command follows them", len(self._jobs)
+                "%d jobs are left to the cluster; `headbench status` shows those of a run, the same command follows them",
+                len(self._jobs),
             )
         else:
-            submitted_path(self._folder.root).unlink(missing_ok=True)
+            submitted_path(self._root).unlink(missing_ok=True)
 
     def _look(self, job: _Job) -> Ended | None:
-        outcome = read_outcome(self._folder.root / job.work.cell)
+        outcome = read_outcome(job.task.folder)
         if outcome is not None and outcome["speed"] == self._speed and outcome["status"] != "running":
-            return Ended(job.work)
+            return Ended(job.task)
         job.polls += 1
         if job.polls < POLLS:
             return None
-        state, reason = end_of(job.number)
-        why = f"job {job.number} ended as {state}{reason}"
-        if state in FINAL:
-            return Ended(job.work, f"job {job.number} {FINAL[state]}", again=False)
-        return Ended(job.work, why)
+        state, reason, code = end_of(job.number)
+        if state in FINAL and not (job.earlier and state == "CANCELLED"):  # who starts again wants it done
+            return Ended(job.task, f"job {job.number} {FINAL[state]}", again=False)
+        if code in FULL_DISK and not job.earlier:  # there may be room since; see `Task.__call__`
+            raise OSError(code, f"{os.strerror(code)} (job {job.number})", str(job.task.folder))
+        check_room(self._root)  # a job that could not even open its log leaves no reason
+        return Ended(job.task, f"job {job.number} ended as {state}{reason}")
 
-    def _write(self) -> None:
-        submitted: Submitted = {"speed": self._speed, "jobs": self._numbers}
-        write_json(submitted_path(self._folder.root), submitted)
-
-    def _submit(self, works: Sequence[Work]) -> list[str]:
+    def _submit(self, tasks: Sequence[Task]) -> list[str]:
         submitit = import_submitit()
         settings = self._execution.slurm
-        executor = submitit.SlurmExecutor(
-            folder=self._folder.root / "jobs", max_num_timeout=self._execution.restarts
-        )
+        folder = self._root / "jobs"
+        executor = submitit.SlurmExecutor(folder=folder, max_num_timeout=self._execution.restarts)
         extra: dict[str, Any] = {"requeue": True, **settings.parameters}
         if settings.gpus:
             extra = {"gpus": settings.gpus, **extra}
         if self._speed and settings.exclusive:
             extra = {"exclusive": True, **extra}
         parameters: dict[str, Any] = {
-            "job_name": f"headbench-{self._folder.root.name}",
+            "job_name": job_name(self._root),
             "time": max(1, round(settings.hours * 60)),
             "cpus_per_task": settings.cpus,
             "mem": f"{round(settings.memory_gb * 1024)}M",
@@ -193,9 +208,12 @@ class Slurm:
         if settings.partition is not None:
             parameters["partition"] = settings.partition
         executor.update_parameters(**parameters)
-        (self._folder.root / "jobs").mkdir(exist_ok=True)
+        folder.mkdir(exist_ok=True)
         try:
-            return [str(job.job_id) for job in executor.map_array(_call, list(works))]
+            return [str(job.job_id) for job in executor.map_array(_call, list(tasks))]
+        except OSError as error:
+            error.filename = error.filename or str(folder)  # the system reports a full disk without a name
+            raise
         except submitit.core.utils.FailedJobError as error:
             asked = f"partition {settings.partition or 'by default'}, {settings.cpus} cpus, {settings.gpus} gpus, "
             asked += f"{settings.memory_gb:g} GB, {settings.hours:g} hours"
@@ -204,20 +222,42 @@ class Slurm:
             raise InputError("execution.slurm", asked, "jobs that sbatch takes", found, remedy) from error
 
 
-def _call(work: Work) -> None:
-    work()
+def _call(task: Task) -> None:
+    task()
+
+
+def job_name(root: Path) -> str:
+    """Name of all jobs for an output folder, and of none for another."""
+    return f"headbench-{root.name}-{digest(str(root.resolve()))[:8]}"
+
+
+def _cancel_others(name: str, known: set[str]) -> None:
+    """Cancel the jobs of a name that are not known, and wait until they have ended, since they may be at work."""
+    strays = [number for number, job in queue().items() if job.name == name and number not in known]
+    if not strays:
+        return
+    log.warning("%d jobs that an earlier process submitted and did not list are cancelled", len(strays))
+    _ask("scancel", *strays)
+    end = time.monotonic() + CANCEL_S
+    while left := sorted(queue().keys() & set(strays)):
+        if time.monotonic() > end:
+            what = f"Jobs {', '.join(left[:5])} of an earlier start do not end."
+            raise UnavailableError(what, "End them with `scancel` and start again.")
+        time.sleep(1.0)
 
 
 class _State(NamedTuple):
     state: str
     reason: str
+    code: int
 
 
 class Queued(NamedTuple):
-    """A job that has not ended: its state, such as RUNNING, and why it waits."""
+    """A job that has not ended: its state, such as RUNNING, why it waits, and what it is called."""
 
     state: str
     reason: str
+    name: str
 
     @property
     def shown(self) -> str:
@@ -227,8 +267,8 @@ class Queued(NamedTuple):
 
 def queue() -> Mapping[str, Queued]:
     """The user's jobs that have not ended, by number."""
-    lines = _ask("squeue", "-h", "-r", "-u", str(os.getuid()), "-o", "%i|%T|%r").splitlines()
-    return {number: Queued(state, reason) for number, state, reason in (x.split("|", 2) for x in lines)}
+    lines = _ask("squeue", "-h", "-r", "-u", str(os.getuid()), "-o", "%i|%T|%r|%j").splitlines()
+    return {number: Queued(*fields) for number, *fields in (line.split("|", 3) for line in lines)}
 
 
 def end_of(number: str) -> _State:
@@ -236,10 +276,11 @@ def end_of(number: str) -> _State:
     try:
         text = _ask("scontrol", "show", "job", number)
     except HeadbenchError:
-        return _State("UNKNOWN", "")
+        return _State("UNKNOWN", "", 0)
     found = dict(re.findall(r"(\w+)=(\S*)", text))
     reason = found.get("Reason", "None")
-    return _State(found.get("JobState", "UNKNOWN"), "" if reason == "None" else f" ({reason})")
+    code = found.get("ExitCode", "0").partition(":")[0]
+    return _State(found.get("JobState", "UNKNOWN"), "" if reason == "None" else f" ({reason})", int(code))
 
 
 def _ask(*command: str) -> str:
@@ -247,7 +288,8 @@ def _ask(*command: str) -> str:
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=ANSWER_S, check=True)
     except subprocess.CalledProcessError as error:
-        raise HeadbenchError(f"{command[0]}: {' '.join(error.stderr.split())}") from error
+        hint = "`scontrol ping` tells whether Slurm answers here."
+        raise HeadbenchError(f"{command[0]}: {' '.join(error.stderr.split())}. {hint}") from error
     except (OSError, subprocess.TimeoutExpired) as error:
         raise HeadbenchError(f"{command[0]}: {error}") from error
     return done.stdout

@@ -20,8 +20,9 @@ from ..rows import ALL
 from ..runner.store import RunFolder
 from ..specs import Findings
 from .outcome import Outcome, read_outcome
+from .settings import is_speed
 from .slurm import Queued, queue, read_submitted
-from .worker import JOB_LOG, is_speed
+from .task import TASK_LOG
 
 log = logging.getLogger(__name__)
 State = Literal["waiting", "running", "done", "failed"]
@@ -142,7 +143,7 @@ def _of_outcome(
     seconds, restarts = outcome.get("seconds"), outcome.get("restarts", 0)
     if outcome["status"] == "failed":
         return CellState(
-            *key, "failed", f"{outcome.get('reason', '')}; see {folder / JOB_LOG}", seconds, restarts
+            *key, "failed", f"{outcome.get('reason', '')}; see {folder / TASK_LOG}", seconds, restarts
         )
     if outcome["status"] == "done":
         if speed and not outcome["speed"]:

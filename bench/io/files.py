@@ -31,6 +31,9 @@ MAX_NAME_BYTES = 120
 GROUP_FILES, GROUP_SECONDS, FLUSHES = 64, 2.0, 16
 """Most files of a group, how long the first of it waits, how many are flushed at once."""
 
+ROOM_BYTES = 64 * 2**10
+"""Less than that is no room to work with."""
+
 TEMPORARY = ".tmp-headbench-"
 """How the names of temporary files begin; those of dead processes are removed by this."""
 
@@ -330,6 +333,18 @@ def prepare_folder(folder: Path) -> None:
     """Make the folder of ``--out`` and prove that it can be written, before any work. Raises `InputError`."""
     with _writable(folder, "--out", "a folder"):
         _try_to_write(folder)
+
+
+def check_room(folder: Path) -> None:
+    """Write a little in a folder. Raises `OSError`, which names the folder, where the disk has no room for it."""
+    try:
+        with tempfile.TemporaryFile(dir=folder, prefix=TEMPORARY) as stream:
+            stream.write(bytes(ROOM_BYTES))
+            stream.flush()
+            os.fsync(stream.fileno())
+    except OSError as error:
+        error.filename = str(folder)
+        raise
 
 
 @contextmanager

@@ -116,7 +116,7 @@ def synthesis_arguments(steps: Sequence[Mapping[str, Any]], subject: str) -> dic
     known here.
     """
     make = resolve(get("datasets", "synthetic").implementation)
-    where, given = f"capture of {subject}", ("out", "pictures", "workers", "progress")
+    where, given = f"capture of {subject}", ("out", "pictures", "execution", "workers", "progress")
     parameters = steps[0].get("parameters") if steps else None
     recorded = parameters.get("synthetic") if isinstance(parameters, Mapping) else None
     if not isinstance(recorded, Mapping) or not str(recorded.get("head")).startswith("procedural"):
@@ -147,7 +147,13 @@ def run_configuration(run: Path, options: RunOptions) -> RunConfig:
 
 
 def open_run_clips(
-    run: Path, options: RunOptions, *, out: Path | None = None, altered: bool = False, remembered: bool = True
+    run: Path,
+    options: RunOptions,
+    *,
+    out: Path | None = None,
+    altered: bool = False,
+    remembered: bool = True,
+    only: int | None = None,
 ) -> tuple[RunConfig, list[Clip]]:
     """Open the captures that a run was made from; return its settings as well, see `run_configuration`.
 
@@ -155,7 +161,7 @@ def open_run_clips(
     ----------
     out : becomes ``out`` of the settings, where opening may keep what took long; None: the run, whose lock is held.
     altered : return what is there even if it is not what the run was made from.
-    remembered : see `open_clips`.
+    remembered, only : see `open_clips`.
 
     Raises
     ------
@@ -168,7 +174,7 @@ def open_run_clips(
     for config in _configurations(run, options):
         config = config if out is None else replace(config, out=str(out))
         try:
-            clips = open_clips(config, remembered=remembered)
+            clips = open_clips(config, remembered=remembered, only=only)
         except InputError as error:
             refused.append(error)
             continue

@@ -20,6 +20,8 @@ from .adaptation import MethodNeeds
 
 CANONICAL = "canonical"
 """The metric profile that bare metric names belong to."""
+DEVICES = r"(cpu|cuda|mps|xpu)(:\d+)?"
+"""What a device may be called."""
 
 
 def default_names(group: Literal["methods", "metrics"]) -> tuple[str, ...]:
@@ -78,7 +80,7 @@ class RunConfig:
                 raise ValueError(f"{name} is empty")
             if len(set(values)) != len(values):
                 raise ValueError(f"{name} names something twice: {', '.join(map(str, values))}")
-        if not re.fullmatch(r"(cpu|cuda|mps|xpu)(:\d+)?", self.device):
+        if not re.fullmatch(DEVICES, self.device):
             raise ValueError(f"device is {self.device!r}; cpu, cuda, cuda:1 and the like")
         if self.divide < 1:
             raise ValueError(f"divide is {self.divide}; a whole number from 1")
@@ -137,12 +139,20 @@ def stored_settings(method: str, settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def resolve_methods(config: RunConfig) -> list[ResolvedMethod]:
-    """Resolve every method of a run. Raises `InputError` for unknown methods, presets and settings."""
+    """Resolve every method of a run.
+
+    Raises `InputError` for unknown methods, presets and settings, and for methods that do not compute on the run's device.
+    """
     specs: list[MethodSpec] = [get("methods", name) for name in config.methods]
     for name, count in Counter(spec.name for spec in specs).items():
         check_name(name, "registry of methods", "name")
         if count > 1:
             raise InputError("methods", name, "each method once", f"{count} of that name")
+    for spec in specs:
+        if not spec.computes_on(config.device):
+            expected, found = f"{' or '.join(spec.devices)} for method {spec.name}", repr(config.device)
+            remedy = f"Leave {spec.name} out of this run, or run it by itself with device={spec.devices[0]}."
+            raise InputError("settings", "device", expected, found, remedy)
     stray = set(config.settings) - {spec.name for spec in specs}
     if stray:
         raise unknown("settings", "method", min(stray), [spec.name for spec in specs])
@@ -259,12 +269,13 @@ class DemoConfig:
         return Path(self.out) / "capture"
 
 
-def demo_run_config(config: DemoConfig) -> dict[str, Any]:
-    """Settings of the comparison, as `RunConfig` fields."""
+def demo_run_config(config: DemoConfig, device: str) -> dict[str, Any]:
+    """Settings of the comparison, as `RunConfig` fields, of the methods that compute on ``device``."""
+    specs = {name: plugin.spec for name, plugin in discover("methods").items() if plugin.spec}
     return {
         "data": str(config.capture_folder),
         "out": config.out,
-        "methods": tuple(n for n, plugin in discover("methods").items() if plugin.spec and plugin.spec.demo),
+        "methods": tuple(n for n, spec in specs.items() if spec.demo and spec.computes_on(device)),
         "preset": config.preset,
         "seeds": (config.seed,),
     }

@@ -18,7 +18,7 @@ from ..executors.outcome import outcome_path
 from ..executors.settings import Execution, check_executor
 from ..io.files import atomic_path, output_inside, prepare_folder
 from ..io.lock import locked
-from ..machine import machine_record, peak_memory_bytes
+from ..machine import check_device_answers, machine_record, peak_memory_bytes
 from ..manifest import AdaptedRecord, ClipRecord, Manifest, MethodRecord, ProtocolRecord
 from ..progress import duration, run_progress
 from ..protocol import Protocol, make_protocols, missing_tasks
@@ -50,8 +50,12 @@ def run(config: RunConfig, execution: Execution | None = None, **record: Any) ->
     check_executor(execution, config.device)
     folder = RunFolder(Path(config.out))
     prepare_folder(folder.root)
+    start = time.perf_counter()
     with locked(folder.root):
-        return _run(config, methods, metrics, folder, execution, record)
+        rows = _run(config, methods, metrics, folder, execution, record)
+        write_reports(folder.root)  # with the captures gone from memory
+    log.info("finished in %s: %s", duration(time.perf_counter() - start), folder.root)
+    return rows
 
 
 def _run(
@@ -96,11 +100,10 @@ def _run(
         rows = execute(jobs, metrics, folder, execution)
         manifest = replace(manifest, machine=dict(machine_of(jobs, manifest.machine)))
     rows.write(folder.rows)
+    folder.speed_pass.unlink(missing_ok=True)
     seconds = round(time.perf_counter() - start, 3)
     done = replace(manifest, status="done", seconds=seconds, peak_memory_bytes=peak_memory_bytes())
     done.write(folder.manifest)
-    write_reports(folder.root)
-    log.info("finished in %s: %s", duration(time.perf_counter() - start), folder.root)
     return rows
 
 
@@ -215,6 +218,7 @@ def _run_cell(job: Job, metrics: Sequence[MetricSpec]) -> Rows:
         return failed_rows(job, metrics, reason_of(error))
     except Exception as error:
         log.exception("%s failed", job.name)
+        check_device_answers(job.device)
         return failed_rows(job, metrics, reason_of(error))
 
 
@@ -258,11 +262,13 @@ def describe(
             for clip in clips
         ),
         protocols={task: ProtocolRecord.of(protocol) for task, protocol in protocols.items()},
-        machine=machine_record(),
+        machine=machine_record(config.device),
     )
 
 
-def trained(run: Path, methods: Sequence[str], options: RunOptions, out: Path) -> tuple[RunConfig, list[Job]]:
+def trained(
+    run: Path, methods: Sequence[str], options: RunOptions, out: Path, only: int | None = None
+) -> tuple[RunConfig, list[Job]]:
     """Return the settings of a run and its cells whose avatar is trained; `load` reads one.
 
     Parameters
@@ -271,6 +277,7 @@ def trained(run: Path, methods: Sequence[str], options: RunOptions, out: Path) -
     methods : names of those wanted; empty: all but the trivial baselines, which nothing can drive to extremes.
     options : where the run's files are now.
     out : folder to keep clips in that methods need in another form; its lock is held. It becomes ``out`` of the settings.
+    only : see `open_clips`.
 
     Raises
     ------
@@ -287,7 +294,7 @@ def trained(run: Path, methods: Sequence[str], options: RunOptions, out: Path) -
     wanted = [m for m in resolved if (m.spec.name in methods if methods else not m.spec.trivial)]
     if not wanted:
         raise InputError(folder.manifest, "methods", "a method that is no trivial baseline", ", ".join(names))
-    config, clips = open_run_clips(run, options, out=out)
+    config, clips = open_run_clips(run, options, out=out, only=only)
     jobs = make_jobs(config, wanted, clips, {}, folder, out)
     for job in jobs:
         state = job.cell.step("fit")

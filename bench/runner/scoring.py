@@ -43,10 +43,15 @@ class Frames(NamedTuple):
     """Has the truth, and knows the regions if any are asked for."""
 
 
-def make_metric(spec: MetricSpec) -> Any:
-    """Import what a spec names; a class is made without arguments."""
+def make_metric(spec: MetricSpec, device: str = "cpu") -> Any:
+    """Import what a spec names; a class is made without arguments.
+
+    On a CUDA device where there is one and the metric can use it; results of a run on another machine are measured on the CPU.
+    """
     implementation = resolve(spec.implementation)
-    return implementation() if isinstance(implementation, type) else implementation
+    metric = implementation() if isinstance(implementation, type) else implementation
+    usable = device.startswith("cuda") and hasattr(metric, "on") and resolve("torch:cuda").is_available()
+    return metric.on(device) if usable else metric
 
 
 def check_regions(clip: Clip, wanted: Sequence[str] | None) -> tuple[str, ...]:
@@ -72,6 +77,7 @@ def score_frames(
     specs: Sequence[MetricSpec],
     regions: Sequence[str] = (),
     progress: Progress = no_progress,
+    device: str = "cpu",
 ) -> dict[str, list[Score]]:
     """Score frames by per-frame metrics; return each metric's scores, in the order of ``keys``.
 
@@ -79,13 +85,14 @@ def score_frames(
     ----------
     regions : beside the whole frame, for metrics that know regions. A frame in which a region has no pixel has no
         score there: what is seen is a property of the truth, so that it is missing alike for every method.
+    device : of the run; see `make_metric`.
 
     Raises
     ------
     HeadbenchError : a value that is not finite.
     """
     scored: dict[str, list[Score]] = {}
-    metrics = {spec.name: make_metric(spec) for spec in specs}
+    metrics = {spec.name: make_metric(spec, device) for spec in specs}
     at_once = [
         spec for spec in specs if spec.kind != "temporal" and not hasattr(metrics[spec.name], "batched")
     ]

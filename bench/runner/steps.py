@@ -23,12 +23,13 @@ from ..contracts import (
     HeadPose,
     ListedFrames,
     Measurement,
+    PreparedMethod,
     Progress,
 )
 from ..errors import HeadbenchError, InputError, UnavailableError
 from ..io.files import check_name, digest, digest_file, grouped_writes, refuse_links
 from ..io.images import quantise, read_png, write_png
-from ..machine import PeakMemory, processor_seconds
+from ..machine import PeakMemory, processor_seconds, use_device
 from ..progress import RunProgress, duration, progress
 from ..protocol import Protocol
 from ..rows import ALL, Row, Rows
@@ -167,8 +168,11 @@ def fit(job: Job) -> Avatar:
     if earlier is None or earlier["status"] != "done":
         interruptions = 0 if earlier is None else earlier.get("interruptions", 0) + 1
         job.cell.begin("fit", job.fit_fingerprint, interruptions=interruptions)
+        use_device(job.device)
+        if isinstance(method, PreparedMethod):
+            method.prepare(job.device)
         start, processor = time.perf_counter(), processor_seconds()
-        with PeakMemory() as memory, job.progress(TRAINING) as report:
+        with PeakMemory(job.device) as memory, job.progress(TRAINING) as report:
             try:
                 _train(job, method, report)
             except InputError as error:
@@ -187,6 +191,7 @@ def fit(job: Job) -> Avatar:
             interruptions=interruptions,
             peak_memory_bytes=memory.peak,
             memory_before_bytes=memory.before,
+            **memory.device_record,
             method=job.method.record(),
             files=job.cell.digests(avatar_files(job.cell.avatar)),
         )
@@ -284,6 +289,11 @@ def recorded_frames(job: Job) -> dict[str, str]:
     return {} if state is None else state.get("files", {})
 
 
+def trained_files(job: Job) -> Mapping[str, str]:
+    """SHA-256 of the files of a cell's avatar, by their place in the cell's folder."""
+    return _avatar_record(job)[1]
+
+
 def _avatar_record(job: Job) -> tuple[str, Mapping[str, str]]:
     """What distinguishes trained avatars of the same settings."""
     state = job.cell.step("fit")
@@ -357,11 +367,11 @@ def stored_rows(job: Job, metrics: Sequence[MetricSpec], *, retry: bool = False)
     known, _, old = _measured_before(job)
     if any(known.get(spec.name) != _measure_fingerprint(job, spec, rendered) for spec in metrics):
         return None
-    parts = [old.select(method=ALL, metric=spec.name, task=ALL, region=ALL, seeds=ALL) for spec in metrics]
-    had = {spec.implementation for spec, part in zip(metrics, parts) if "ok" in set(part["status"])}
+    measured = old.metrics_with_values
+    had = {spec.implementation for spec in metrics if spec.name in measured}
     if retry and any(spec.implementation not in had for spec in metrics):
         return None
-    return Rows.joined([Rows(part) for part in parts])
+    return old.of_metrics([spec.name for spec in metrics])
 
 
 def measured(job: Job, metrics: Sequence[MetricSpec]) -> list[MetricSpec]:
@@ -434,7 +444,7 @@ def _score(job: Job, specs: Sequence[MetricSpec], protocol: Protocol) -> dict[st
     frames = Frames(lambda key: read_png(job.cell.render(protocol.task, key)), job.clip)
     by_name = {spec.name: spec for spec in specs}
     with job.progress(f"measuring {protocol.task}") as report:
-        scored = score_frames(keys, frames, specs, job.regions, report)
+        scored = score_frames(keys, frames, specs, job.regions, report, job.device)
     return {
         name: [
             _row(job, by_name[name], protocol, s.key, s.value, s.status, s.reason, s.region) for s in scores

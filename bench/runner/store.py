@@ -13,6 +13,7 @@
         rows.parquet              what was measured
         measure.json              what it was measured of, digest of the rows
         outcome.json, job.log     of the process or job that worked on it, see `bench.executors`
+    speed.json                    while speed is measured last, see `bench.executors`: cells that failed before
     adapted/<subject>/            tracking refitted for methods that want another head model
     tables/, contact_sheet.png, report.html    views of the rows
 """
@@ -47,6 +48,7 @@ class StepState(TypedDict, total=False):
     rows : SHA-256 of ``rows.parquet``.
     fingerprints, details : of the measurements, by metric.
     seconds, processor_seconds, interruptions, peak_memory_bytes, memory_before_bytes, method : of the training.
+    peak_device_memory_bytes, device_memory_before_bytes, tf32 : likewise, of a CUDA device; see `PeakMemory`.
     derived_from : digest of the trained avatar that this one was derived from without training.
     """
 
@@ -61,6 +63,9 @@ class StepState(TypedDict, total=False):
     interruptions: int
     peak_memory_bytes: int
     memory_before_bytes: int
+    peak_device_memory_bytes: int
+    device_memory_before_bytes: int
+    tf32: bool
     method: dict[str, Any]
     derived_from: str
 
@@ -177,6 +182,11 @@ class RunFolder:
     @property
     def rows(self) -> Path:
         return self.root / "rows.parquet"
+
+    @property
+    def speed_pass(self) -> Path:
+        """Here while speed is measured after all cells were worked on: which had failed by then, and why."""
+        return self.root / "speed.json"
 
     @property
     def adapted(self) -> Path:

@@ -6,6 +6,7 @@ run out of memory or not return at all. Every count and length is held against t
 
 from __future__ import annotations
 
+import importlib
 import math
 import os
 import signal
@@ -19,14 +20,20 @@ from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
-import pycolmap as pycolmap  # noqa: PLC0414 - the writer imports it from here
 
 from ...bench.errors import InputError
 from ...bench.io.files import check_name
 
-# Its import replaces the handler of SIGTERM by one that prints a stack, behind the interpreter's back.
-if threading.current_thread() is threading.main_thread():
-    signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)
+
+@cache
+def pycolmap() -> Any:
+    """The package pycolmap, imported when first used, with the program's own handler of SIGTERM kept."""
+    package = importlib.import_module("pycolmap")
+    # Its import replaces the handler by one that prints a stack, behind the interpreter's back.
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)
+    return package
+
 
 T = TypeVar("T")
 
@@ -72,9 +79,9 @@ class ColmapModel:
 def camera_models() -> dict[int, tuple[str, int]]:
     """Name and number of parameters of the camera models pycolmap knows, by COLMAP's number."""
     models = {}
-    for name, number in pycolmap.CameraModelId.__members__.items():
+    for name, number in pycolmap().CameraModelId.__members__.items():
         if name != "INVALID":
-            camera = pycolmap.Camera.create_from_model_name(1, name, 1.0, 1, 1)
+            camera = pycolmap().Camera.create_from_model_name(1, name, 1.0, 1, 1)
             models[int(number)] = (name, len(camera.params))
     return models
 

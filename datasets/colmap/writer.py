@@ -9,7 +9,7 @@ import shutil
 import tempfile
 from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -100,12 +100,12 @@ def export_model(
             raise InputError("clip", str(key), expected, name, "Export with --names nested.")
     first = min(key.timestep for key in keys)
     vertices = PosedSubject.of(clip).meshes([clip.poses[first]])[0]
-    model = pycolmap.Reconstruction()
+    model = pycolmap().Reconstruction()
     for number, name in enumerate(ids, start=1):
         camera = clip.cameras[name]
         params = [camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]]
         model.add_camera_with_trivial_rig(
-            pycolmap.Camera(
+            pycolmap().Camera(
                 camera_id=number, model="PINHOLE", width=camera.width, height=camera.height, params=params
             )
         )
@@ -116,8 +116,8 @@ def export_model(
             if key.timestep == first:
                 views[number] = _observe(vertices, np.asarray(clip.head.faces), camera, picture)
             pixels = views[number].pixels if number in views else np.zeros((0, 2))
-            image = pycolmap.Image(names[key], pixels, ids.index(key.camera) + 1, number)
-            model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(camera.world_to_camera[:3]))
+            image = pycolmap().Image(names[key], pixels, ids.index(key.camera) + 1, number)
+            model.add_image_with_trivial_frame(image, pycolmap().Rigid3d(camera.world_to_camera[:3]))
             write_image(out / "images" / names[key], picture)
             mask = clip.mask(key)
             if mask is not None:
@@ -162,23 +162,23 @@ def _observe(vertices: FloatArray, faces: np.ndarray, camera: Camera, picture: B
     return _Observation(before[seen], pixels[seen], picture[row[seen], column[seen]])
 
 
-def _add_points(model: pycolmap.Reconstruction, vertices: FloatArray, views: dict[int, _Observation]) -> None:
+def _add_points(model: Any, vertices: FloatArray, views: dict[int, _Observation]) -> None:
     """Add all vertices, in order, with their mean colours and the images that observe them."""
     sums, counts = np.zeros((len(vertices), 3)), np.zeros(len(vertices))
-    tracks: list[list[pycolmap.TrackElement]] = [[] for _ in vertices]
+    tracks: list[list[Any]] = [[] for _ in vertices]
     for number, view in views.items():
         sums[view.vertices] += view.colors
         counts[view.vertices] += 1
         for index, vertex in enumerate(view.vertices.tolist()):
-            tracks[vertex].append(pycolmap.TrackElement(number, index))
+            tracks[vertex].append(pycolmap().TrackElement(number, index))
     means = np.where(counts[:, None] > 0, sums / np.maximum(counts, 1)[:, None], _UNSEEN)
     colors = np.round(means).astype(np.uint8)
     for vertex, track, color in zip(vertices, tracks, colors):
-        model.add_point3D(vertex, pycolmap.Track(track), color)
+        model.add_point3D(vertex, pycolmap().Track(track), color)
     model.update_point_3d_errors()
 
 
-def _write_model(model: pycolmap.Reconstruction, folder: Path, model_format: ModelFormat) -> None:
+def _write_model(model: Any, folder: Path, model_format: ModelFormat) -> None:
     """Write a model elsewhere, then copy its files to their place: none of them is ever half-written.
 
     Files of the other format go first: readers take the binary ones before the others, whichever is newer.

@@ -21,7 +21,7 @@ from ...bench.io.files import check_name, digest
 from ...bench.io.images import ImageInfo
 from ..clip import CaptureClip, FrameFiles
 from ..foreign import MONOCULAR, describe
-from ..head.arrays import HeadArrays
+from ..head.arrays import HeadArrays, in_memory
 from ..images import ImageStore
 from ..steps.exclude import exclude_given, exclude_timesteps
 from ..steps.masks import check_colour, mask_below_neck, set_background
@@ -138,10 +138,11 @@ def read_capture(
         **tracking.notes,
     }
     contents = {Path(os.path.relpath(file, folder)).as_posix(): value for file, value in digests.items()}
-    source = digest(tracking.head.fingerprint(), contents, subject)
+    fingerprint = tracking.head.fingerprint()
+    source = digest(fingerprint, contents, subject)
     clip = CaptureClip(
         subject=subject,
-        head=tracking.head,
+        head=in_memory(tracking.head, fingerprint),
         shape=tracking.shape,
         static_offset=tracking.static_offset,
         cameras=rig.resolve(convention),

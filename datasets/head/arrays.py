@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
+from weakref import WeakValueDictionary
 
 import numpy as np
 
@@ -281,3 +282,11 @@ def faces_in_region(asset: HeadAsset, name: str) -> IntArray:
     inside = np.zeros(asset.template.shape[0], dtype=bool)
     inside[asset.regions[name]] = True
     return np.flatnonzero(inside[asset.faces].all(axis=1))
+
+
+_in_memory: WeakValueDictionary[str, HeadArrays] = WeakValueDictionary()
+
+
+def in_memory(head: HeadArrays, fingerprint: str) -> HeadArrays:
+    """The head of this fingerprint that is in memory already, else ``head``: captures have the same one in a file each."""
+    return _in_memory.setdefault(fingerprint, head)

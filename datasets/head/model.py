@@ -194,7 +194,14 @@ class HeadModel(torch.nn.Module):
     def pose_arguments(self, poses: Sequence[HeadPose]) -> dict[str, Tensor]:
         """Poses as arguments of `forward`, in this model's dtype and on its device.
 
-        ``eyelids`` is among them only where the model has eyelid bases (zeros for poses that lack them).
+        ``eyelids`` is among them only where the model has eyelid bases (zeros for poses that lack them). Raises as
+        `pose_columns`.
+        """
+        doubles = {name: torch.from_numpy(values) for name, values in self.pose_columns(poses).items()}
+        return {name: values.to(self.template) for name, values in doubles.items()}
+
+    def pose_columns(self, poses: Sequence[HeadPose]) -> dict[str, FloatArray]:
+        """What `pose_arguments` gives, as float64 arrays on the host: (T, n) each.
 
         Raises
         ------
@@ -211,8 +218,7 @@ class HeadModel(torch.nn.Module):
         if self.eyelid_matrix is not None:
             lids = [np.zeros(2) if pose.eyelids is None else pose.eyelids for pose in poses]
             columns["eyelids"] = np.stack(lids)
-        doubles = {name: torch.from_numpy(np.asarray(values, np.float64)) for name, values in columns.items()}
-        return {name: values.to(self.template) for name, values in doubles.items()}
+        return {name: np.asarray(values, np.float64) for name, values in columns.items()}
 
     def _check_pose(self, pose: HeadPose, sizes: dict[str, int]) -> None:
         where = f"pose of {pose.subject or 'unnamed subject'}"

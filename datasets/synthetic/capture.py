@@ -12,8 +12,10 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-from collections.abc import Iterator, Mapping, Sequence
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -23,7 +25,9 @@ import torch
 from threadpoolctl import threadpool_limits
 
 from ...bench.contracts import Progress, no_progress
-from ...bench.errors import InputError
+from ...bench.errors import HeadbenchError, InputError
+from ...bench.executors.settings import Execution
+from ...bench.executors.task import TASK_LOG, Task
 from ...bench.io.documents import read_json
 from ...bench.io.files import TEMPORARY, grouped_writes, write_bytes, write_json, write_text
 from ...bench.io.provenance import PATH_TRACED, xmp
@@ -36,6 +40,8 @@ from .plan import EDITIONS, SERIALS, Edition, SubjectPlan, SynthSettings, load_g
 from .renderer import CaptureRenderer
 
 MANIFEST, MARK = "synthesis.json", "provenance.xmp"
+TASKS = ".tasks"
+"""Folder of an executor's tasks, as long as a capture is not whole."""
 _VERSION = 3
 _SMALL = 400_000  # pixels in all that are rendered sooner than another process starts
 _README = """This folder holds synthetic recordings made by `headbench synth`.
@@ -63,6 +69,7 @@ def synthesize(
     edition: Edition = 1,
     pictures: str | Path | None = None,
     workers: int | None = None,
+    execution: Execution | None = None,
     progress: Progress = no_progress,
 ) -> list[Path]:
     """Photograph ``subjects`` performing heads and write them as captures; return their union folders.
@@ -86,6 +93,7 @@ def synthesize(
     pictures : folder of an earlier capture that differs in its tracking alone: its pictures are linked (copied where links
         cannot be), not rendered.
     workers : processes that render; by default as many as there are cores, or one where there is little to do.
+    execution : where subjects are rendered, a task each; None for this process, and ``workers``, one subject after another.
 
     Raises
     ------
@@ -94,6 +102,8 @@ def synthesize(
         other settings or not whole.
     UnavailableError
         For edition 2 where the compiled kernel is missing.
+    HeadbenchError
+        A task of ``execution`` failed.
     """
     counts = panels if edition == 2 else renderer
     samples = (
@@ -129,10 +139,11 @@ def synthesize(
     total = subjects * timesteps * cameras
     done = 0
     progress(done, total, "planned")
+    if execution is not None and execution.executor != "inline":
+        _work_off(out, plans, execution)
     for plan in plans:
-        missing = [(s, t, _missing(plan, s, t)) for s, t in plan.moments()]
-        done += timesteps * cameras - sum(len(names) for _, _, names in missing)
-        work = [entry for entry in missing if entry[2]]
+        work = _left(plan)
+        done += timesteps * cameras - sum(len(names) for _, _, names in work)
         for sequence, count in _render_missing(out, plan, work, workers):
             done += count
             progress(done, total, f"{plan.person.name} {sequence}")
@@ -189,6 +200,52 @@ def _begin(out: Path, index: int, settings: SynthSettings) -> None:
 def _render(job: Job) -> None:
     with grouped_writes():
         _renderer[0].render_frames(*job)
+
+
+def _work_off(out: Path, plans: Sequence[SubjectPlan], execution: Execution) -> None:
+    """Have an executor render the subjects that lack pictures. Raises `HeadbenchError` where one failed."""
+    from ...bench.executors.schedule import Schedule
+
+    root = out.resolve() / TASKS  # which nothing reads as a capture
+    by_name = {plan.person.name: plan for plan in plans if _left(plan)}
+    tasks = [
+        Task.of(
+            root,
+            name,
+            f"{__name__}:render_subject",
+            out=str(out),
+            index=plan.index,
+            settings=asdict(plan.settings),
+        )
+        for name, plan in by_name.items()
+    ]
+    root.mkdir(exist_ok=True)
+    failed = Schedule("subjects", lambda task: not _left(by_name[task.place]), execution).work_off(tasks)
+    for name, reason in failed.items():
+        raise HeadbenchError(f"Subject {name} failed: {reason} Its log is {root / name / TASK_LOG}.")
+    shutil.rmtree(root)
+
+
+def render_subject(task: Task, report: Callable[[str], None]) -> None:
+    """Render what is missing of a subject, as an executor's task, with the threads that it was given."""
+    given = task.arguments
+    settings = SynthSettings(**{**given["settings"], "size": tuple(given["settings"]["size"])})
+    out = Path(given["out"])
+    plan = plan_subject(out, given["index"], load_geometry(settings.head), settings)
+    work = _left(plan)
+    total, done = sum(len(names) for _, _, names in work), 0
+    threads = os.environ.get("OMP_NUM_THREADS", "")
+    for sequence, count in _render_missing(out, plan, work, int(threads) if threads.isdigit() else None):
+        done += count
+        report(f"{done} of {total} {sequence}")
+
+
+def _left(plan: SubjectPlan) -> list[Job]:
+    """What is missing of a subject."""
+    missing = [
+        (sequence, timestep, _missing(plan, sequence, timestep)) for sequence, timestep in plan.moments()
+    ]
+    return [entry for entry in missing if entry[2]]
 
 
 def _missing(plan: SubjectPlan, sequence: str, timestep: int) -> tuple[str, ...]:

@@ -14,8 +14,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-import drjit
-import mitsuba
 import numpy as np
 
 from ...bench.contracts import ByteArray, Camera, FloatArray, HeadPose, IntArray
@@ -80,10 +78,14 @@ class PathTracer:
     """
 
     def __init__(self, lights: Sequence[Light], samples: int, threads: int = 1):
+        import drjit
+        import mitsuba
+
         if mitsuba.variant() != VARIANT:
             mitsuba.set_variant(VARIANT)
         mitsuba.set_log_level(mitsuba.LogLevel.Error)  # it writes to the terminal, past Python's logging
         drjit.set_thread_count(threads)
+        self._mitsuba: Any = mitsuba
         self._lights = lights
         self._samples = sample_count(samples)
         self._meshes: dict[str, Any] = {}
@@ -95,11 +97,11 @@ class PathTracer:
         self, name: str, vertices: FloatArray, faces: IntArray, albedo: FloatArray, material: str
     ) -> None:
         """Add a mesh: (n, 3) world positions, (m, 3) triangles, (n, 3) linear reflectance."""
-        properties = mitsuba.Properties()
-        properties["mesh_bsdf"] = mitsuba.load_dict(_bsdf(MATERIALS[material]))
-        mesh = mitsuba.Mesh(name, len(vertices), len(faces), has_vertex_normals=True, props=properties)
+        properties = self._mitsuba.Properties()
+        properties["mesh_bsdf"] = self._mitsuba.load_dict(_bsdf(MATERIALS[material]))
+        mesh = self._mitsuba.Mesh(name, len(vertices), len(faces), has_vertex_normals=True, props=properties)
         mesh.add_attribute("vertex_color", 3, _flat(albedo))
-        parameters = mitsuba.traverse(mesh)
+        parameters = self._mitsuba.traverse(mesh)
         parameters["vertex_positions"] = _flat(vertices)
         parameters["faces"] = np.ascontiguousarray(faces, np.uint32).ravel()
         parameters.update()
@@ -129,7 +131,9 @@ class PathTracer:
         if rows.start < rows.stop and columns.start < columns.stop:
             sensor = self._sensor(camera, rows, columns)
             pixels[rows, columns] = np.array(
-                mitsuba.render(self._scene, sensor=sensor, spp=self._samples, seed=mitsuba.UInt32(seed))
+                self._mitsuba.render(
+                    self._scene, sensor=sensor, spp=self._samples, seed=self._mitsuba.UInt32(seed)
+                )
             )
         alpha = np.clip(pixels[..., 3], 0.0, 1.0)
         return pixels[..., :3] / np.maximum(pixels[..., 3:], 1e-6) * (alpha[..., None] > 0), alpha
@@ -149,14 +153,14 @@ class PathTracer:
                     "direction": [float(-value) for value in light.direction],
                     "irradiance": {"type": "rgb", "value": [float(value) for value in light.irradiance]},
                 }
-            self._scene = mitsuba.load_dict(content)
-            self._parameters = mitsuba.traverse(self._scene)
+            self._scene = self._mitsuba.load_dict(content)
+            self._parameters = self._mitsuba.traverse(self._scene)
         return self._parameters
 
     def _sensor(self, camera: Camera, rows: slice, columns: slice) -> Any:
         K = camera.K
         to_world = np.linalg.inv(camera.world_to_camera) @ np.diag([-1.0, -1.0, 1.0, 1.0])
-        return mitsuba.load_dict(
+        return self._mitsuba.load_dict(
             {
                 "type": "perspective",
                 "fov": float(np.degrees(2.0 * np.arctan(0.5 * camera.width / K[0, 0]))),
@@ -166,7 +170,7 @@ class PathTracer:
                 # Mitsuba offsets the film, not the point: the sign turns.
                 "principal_point_offset_x": float(0.5 - K[0, 2] / camera.width),
                 "principal_point_offset_y": float(0.5 - K[1, 2] / camera.height),
-                "to_world": mitsuba.ScalarTransform4f(to_world.tolist()),
+                "to_world": self._mitsuba.ScalarTransform4f(to_world.tolist()),
                 "film": {
                     "type": "hdrfilm",
                     "width": camera.width,

@@ -162,7 +162,7 @@ def write_reduced(path: Path, tensors: Mapping[str, Tensor], kind: Kind, exact: 
             stored[name] = value.to(torch.float16).contiguous()
         else:
             stored |= _eight_bits(name, value)
-    write_bytes(path, save(stored))
+    write_bytes(path, save({name: value.cpu() for name, value in stored.items()}))
 
 
 def read_reduced(path: Path) -> dict[str, Tensor]:

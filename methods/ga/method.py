@@ -137,7 +137,7 @@ class GAAvatar(StoredSplatAvatar):
         self.mesh, self.subject, self.refined = mesh, subject, refined
         self.splat_tensors, self.binding = splats, binding
         super().__init__(stored, self._placed, device, cutoffs)
-        self._to_world = WorldTransform(binding, splats["log_scales"], splats["quats"])
+        self._to_world = WorldTransform(binding, splats["means"], splats["log_scales"], splats["quats"])
         occupied = coefficient_count(occupied_degree(splats["sh_rest"])) - 1
         self._shade = HarmonicColors(splats["sh_dc"], splats["sh_rest"][:, :, :occupied].contiguous())
 
@@ -160,7 +160,7 @@ class GAAvatar(StoredSplatAvatar):
     def _placed(self, pose: HeadPose, end_stage: Callable[[str], None]) -> PlacedSplats:
         if self.refined is not None:
             pose = self.refined(pose)
-        frames = self.mesh.frames(self.mesh.posed(self.mesh.arguments([pose])))
+        frames, _ = self.mesh.drive(pose)
         end_stage("drive")
         splats = self.splat_tensors
         world = self._to_world(frames, splats["means"], splats["log_scales"], splats["quats"])

@@ -175,6 +175,12 @@ class Rig:
     head, shape, static_offset : of the subject, as those of `SubjectMesh`.
     points : on its neutral mesh.
     expressions : K, leading expressions that splats follow; the joints follow all.
+
+    Attributes
+    ----------
+    mesh : the subject's.
+    corners, barycentric : (3 P,) int64 vertices and (3, P, 1) weights of the points' corners, all first corners first.
+    turns, turned : (4 F, K) `initial_rotations` of the triangles with points, and (P,) int64 each point's one of them.
     """
 
     def __init__(
@@ -191,10 +197,10 @@ class Rig:
         self.expressions = min(expressions, model.expression_size)
         like = model.template
         self._triangles = torch.from_numpy(points.triangles).to(device)
-        self._corners = self.mesh.faces[self._triangles].t().reshape(-1)
-        self._barycentric = torch.from_numpy(points.barycentric).to(like).t()[:, :, None]
-        self._weights = self._at_points(model.skinning_weights)
-        self.rest = self._at_points(self.mesh.canonical)
+        self.corners = self.mesh.faces[self._triangles].t().reshape(-1)
+        self.barycentric = torch.from_numpy(points.barycentric).to(like).t()[:, :, None]
+        self._weights = self.at_points(model.skinning_weights)
+        self.rest = self.at_points(self.mesh.canonical)
         directions = model.expression_matrix.unflatten(1, (-1, 3))
         self._joints = (model.joint_regressor @ self.mesh.canonical)[None]
         self._joint_directions = torch.einsum("jv,evc->ejc", model.joint_regressor, directions).flatten(1)
@@ -202,8 +208,8 @@ class Rig:
         basis = model.expression_matrix[: self.expressions].t().unflatten(0, (-1, 3))
         used = torch.unique(self._triangles)
         turns = initial_rotations(self.mesh.canonical, basis, self.mesh.faces[used])
-        self._turned = torch.searchsorted(used, self._triangles)
-        self._turns = turns.flatten(0, 1)
+        self.turned = torch.searchsorted(used, self._triangles)
+        self.turns = turns.flatten(0, 1)
 
     def arguments(self, poses: Sequence[HeadPose]) -> dict[str, Tensor]:
         """Driving signal as tensors. Raises `InputError` for another head model's pose."""
@@ -227,21 +233,21 @@ class Rig:
         relative = torch.cat([turns.flatten(1), offsets], dim=1)
         linear, offset = (self._weights @ relative).split([9, 3], dim=1)
         feature = (rotations[0, 1:] - torch.eye(3).to(rotations)).flatten()
-        shift = self._at_points((torch.cat([coefficients, feature]) @ self._basis).view(-1, 3))
+        shift = self.at_points((torch.cat([coefficients, feature]) @ self._basis).view(-1, 3))
         offset = offset + arguments["translation"]
         if "eyelids" in arguments and model.eyelid_matrix is not None:
             lids = (arguments["eyelids"][0] @ model.eyelid_matrix).view(-1, 3)
-            offset = offset + self._at_points(lids) @ (rotations[0, 0] @ rotations[0, 1]).t()
+            offset = offset + self.at_points(lids) @ (rotations[0, 0] @ rotations[0, 1]).t()
         # By way of the quaternion it is a rotation to rounding, however far the blended transforms were from one.
         quaternion = matrix_to_quaternion(nearest_rotation(linear.view(-1, 3, 3), SKINNING_STEPS))
         rotation, product = quaternion_to_matrix(quaternion).flatten(1), left_products(quaternion).flatten(1)
-        turn = (self._turns @ coefficients).view(-1, 4)[self._turned]
+        turn = (self.turns @ coefficients).view(-1, 4)[self.turned]
         return torch.cat([linear, offset, rotation, product, turn, shift], dim=1)
 
-    def _at_points(self, values: Tensor) -> Tensor:
+    def at_points(self, values: Tensor) -> Tensor:
         """(P, C) of (V, C) vertex values."""
-        corners = values.index_select(0, self._corners).view(3, -1, values.shape[1])
-        return (corners * self._barycentric).sum(0)
+        corners = values.index_select(0, self.corners).view(3, -1, values.shape[1])
+        return (corners * self.barycentric).sum(0)
 
 
 POLAR_STEPS = 8

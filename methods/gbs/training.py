@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -110,6 +111,7 @@ class GBSTraining(SplatTrainer):
         self._start(splats, shared, binding, len(counts), 1.0, seed, **books)
         self._sizes = torch.ones(len(counts), device=device)
         self._entries: tuple[Tensor, Entries] | None = None
+        self._of_teeth: tuple[Tensor, Sequence[Tensor]] | None = None
         self._of_splats: tuple[Tensor, BoundedCache[tuple[PointMotions, Tensor]]] | None = None
 
     def begin(self, timeline: Timeline) -> None:
@@ -133,13 +135,18 @@ class GBSTraining(SplatTrainer):
         if coverage is not None and config.alpha_weight:
             loss = loss + config.alpha_weight * (rendering.alpha - coverage).square().mean()
         if self._cylinder is not None and config.teeth_weight:
-            part = self._part.index_select(0, self.binding)
-            for row in range(1, self._rows + 1):
-                teeth = (part == row).nonzero().squeeze(1)
-                if len(teeth):
-                    violation = self._cylinder.violation(optimiser["means"].index_select(0, teeth))
-                    loss = loss + config.teeth_weight * violation
+            for teeth in self._teeth():
+                violation = self._cylinder.violation(optimiser["means"].index_select(0, teeth))
+                loss = loss + config.teeth_weight * violation
         return loss
+
+    def _teeth(self) -> Sequence[Tensor]:
+        """Splats of each row of teeth that has any, as they are now bound."""
+        if self._of_teeth is None or self._of_teeth[0] is not self.binding:
+            part = self._part.index_select(0, self.binding)
+            rows = [(part == row).nonzero().squeeze(1) for row in range(1, self._rows + 1)]
+            self._of_teeth = self.binding, [teeth for teeth in rows if len(teeth)]
+        return self._of_teeth[1]
 
     def _splat_motions(self, pose: int) -> tuple[PointMotions, Tensor]:
         """What a pose does to the splats as they are now bound, and with which shares it takes their differences."""

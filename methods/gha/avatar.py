@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from safetensors.torch import save
@@ -19,11 +20,13 @@ from ...bench.io.arrays import Member
 from ...bench.io.documents import parse_json
 from ...bench.io.files import write_bytes
 from ..shared.avatar_files import SUBJECT_FILE, RefinedTracking, read_shared_head, read_subject
-from ..shared.rendering import LastPose, PosedSplats, posed_splats
+from ..shared.device_frame import to_device
+from ..shared.rendering import Drawn, LastPose, PosedSplats, posed_splats, read_back
 from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors
 from ..shared.threads import torch_on_one_thread
 from . import kernel
 from .config import GHAConfig
+from .device_frame import DeviceSplats
 from .driving import Driver, code_size
 from .gaussian_head import POINTS, FeatureSplats, GaussianHead
 
@@ -35,6 +38,10 @@ class GHAAvatar:
 
     Files: ``avatar.safetensors`` and ``subject.npz`` count as storage; beside them lie the shared head model, and the
     corrected head poses of the training timesteps, which are driving signal.
+
+    Parameters
+    ----------
+    driver : on the CPU, wherever the tensors are: what it computes is small.
     """
 
     def __init__(
@@ -48,6 +55,9 @@ class GHAAvatar:
         self._folder, self._driver, self._head = folder, driver, head
         self._tensors, self._corrected = tensors, corrected
         self._last = LastPose(self._computed)
+        self._ground = tensors["background"].cpu().numpy()
+        on_device = tensors["points"].device.type != "cpu"
+        self._on_device = DeviceSplats(head, tensors) if on_device else None
 
     @classmethod
     def read(cls, folder: Path, device: str) -> GHAAvatar:
@@ -59,8 +69,8 @@ class GHAAvatar:
             *(shared, subject.shape, subject.static_offset),
             origin=tensors["origin"].cpu().numpy(),
             unit=head.config.unit,
-            expression_scale=tensors["expression_scale"],
-            device=device,
+            expression_scale=tensors["expression_scale"].cpu(),
+            device="cpu",
         )
         driving = folder / DRIVING_FILE
         corrected = RefinedTracking.read(driving) if driving.exists() else None
@@ -83,10 +93,10 @@ class GHAAvatar:
             size = [side * self._head.config.upscale for side in alpha.shape]
             alpha = F.interpolate(alpha[None, None], size, mode="bilinear", align_corners=False)[0, 0]
         alpha = alpha[: camera.height, : camera.width].clamp(0, 1)
-        other = image.new_tensor([float(channel) for channel in background]) - trained
+        other = np.asarray([float(channel) for channel in background], np.float32) - self._ground
         if other.any():
-            image = image + (1 - alpha)[..., None] * other
-        return Frame(image.clamp(0, 1).cpu().numpy(), alpha.contiguous().cpu().numpy())
+            image = image + (1 - alpha)[..., None] * to_device(other, image.device)
+        return read_back(Drawn(image.clamp(0, 1), alpha.contiguous()))
 
     @torch.no_grad()
     def splats(self, pose: HeadPose, camera: Camera | None = None) -> PosedSplats:
@@ -105,7 +115,10 @@ class GHAAvatar:
 
     def _computed(self, pose: HeadPose, end_stage: Callable[[str], None]) -> FeatureSplats:
         signal = self._driver.signals(self._driver.arguments([pose]))[0]
-        return self._head.splats(self._tensors, signal, self._driver.motion(signal))
+        motion = self._driver.motion(signal)
+        if self._on_device is not None:
+            return self._on_device(signal, motion)
+        return self._head.splats(self._tensors, signal, motion)
 
 
 AVATAR_FILE = "avatar.safetensors"

@@ -121,7 +121,7 @@ class Driver:
     def motion(self, signal: Signal, correction: Tensor | None = None) -> HeadMotion:
         """Rigid motion of the head; differentiable in the (6,) correction of rotation and translation."""
         if correction is None:
-            correction = torch.zeros(POSE_SIZE).to(signal.rotation)
+            correction = signal.rotation.new_zeros(POSE_SIZE)
         parts = signal.rotation, signal.neck, signal.translation, *signal.joints, self.origin
         found = kernel.motion if kernel.usable(signal.rotation) else reference_motion
         return HeadMotion(*found(torch.stack(parts), correction))

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ...bench.contracts import Camera
 from ..shared.binding import WorldSplats, left_products
+from ..shared.rendering import view_of
 from ..shared.threads import torch_on_one_thread
 from ..splats import rasterize
 from . import kernel
@@ -107,11 +108,11 @@ class GaussianHead:
 
     def draw(self, splats: FeatureSplats, camera: Camera, background: Tensor) -> FeatureImage:
         """Splat the features for a camera of the full size; their background is (3,) colour, then ones."""
-        small = feature_camera(camera, self.config.upscale)
         world = splats.world
+        view = view_of(feature_camera(camera, self.config.upscale), str(world.means.device))
         rendering = rasterize(
             *(world.means, world.quats, world.scales, splats.opacities, splats.features),
-            *(small.world_to_camera, small.K, small.width, small.height),
+            *(view.world_to_camera, view.K, view.camera.width, view.camera.height),
             background=feature_background(background, self.config.channels),
             check_values=False,
         )

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from ...bench.contracts import Camera
 from ...bench.errors import InputError
+from ..shared.device_frame import sent
 from ..shared.loop import TrainingImages
 from ..shared.optimisation import Optimiser, logit
 from ..shared.schedule import Sampler, Timeline, log_linear, torch_generator
@@ -120,7 +121,7 @@ class GaussianTraining:
         if not self._config.expression_noise:
             return None
         generator = torch_generator(self._scene.seed, "gha-expression", iteration)
-        noise = torch.randn(len(signal.expression), generator=generator).to(signal.expression)
+        noise = sent(torch.randn(len(signal.expression), generator=generator), signal.expression.device)
         return self._config.expression_noise * noise
 
     def after_backward(self, iteration: int) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache
 from itertools import product
 from typing import NamedTuple
 
@@ -223,10 +223,10 @@ def marching_tetrahedra(distance: Tensor, tets: Tensor) -> Crossings:
     """
     inside = distance.detach() < 0
     codes = (inside[tets].to(torch.int64) << torch.arange(4, device=tets.device)).sum(1)
-    table, counts = (part.to(tets.device) for part in _cases())
+    table, counts, ends_of_edges = _cases(tets.device)
     crossed = counts[codes] > 0
     tets, codes = tets[crossed], codes[crossed]
-    pairs = tets[:, torch.tensor(EDGES, device=tets.device)].sort(dim=2).values  # (T, 6, 2)
+    pairs = tets[:, ends_of_edges].sort(dim=2).values  # (T, 6, 2)
     keys = pairs[..., 0] * len(distance) + pairs[..., 1]
     wanted = []
     for face in range(2):
@@ -238,9 +238,9 @@ def marching_tetrahedra(distance: Tensor, tets: Tensor) -> Crossings:
     return Crossings(ends, first / (first - second), faces)
 
 
-@lru_cache(maxsize=1)
-def _cases() -> tuple[Tensor, Tensor]:
-    """(16, 2, 3) edges of the triangles of each case and (16,) their number; bit k says that corner k is inside.
+@cache
+def _cases(device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    """(16, 2, 3) edges of the triangles of each case, (16,) their number, and `EDGES`; bit k says that corner k is inside.
 
     Each polygon is laid through the middles of its edges in a tetrahedron of positive volume and turned so that its
     normal points away from the corners inside.
@@ -262,4 +262,5 @@ def _cases() -> tuple[Tensor, Tensor]:
         counts[case] = len(ring) - 2
         for face in range(counts[case]):
             table[case, face] = ring[0], ring[face + 1], ring[face + 2]
-    return torch.from_numpy(table), torch.from_numpy(counts)
+    found = torch.from_numpy(table), torch.from_numpy(counts), torch.tensor(EDGES)
+    return found[0].to(device), found[1].to(device), found[2].to(device)

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from ...bench.contracts import FrameKey
 from ..shared.checkpoint import load_checkpoint, save_checkpoint
+from ..shared.device_frame import sent
 from ..shared.loop import CHECKPOINT, Fit, recomposited, train
 from ..shared.optimisation import Optimiser
 from ..shared.rendering import View, view_of
@@ -206,9 +207,8 @@ def grid_about(neutral: Tensor, config: GHAConfig, device: str, *, finer: int = 
 
 def roughness(vertices: Tensor, faces: Tensor) -> Tensor:
     """Mean squared component of the uniform Laplacian: how far vertices are from the mean of their neighbours."""
-    ends = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     # Along each edge of a closed surface two triangles run, in opposite directions, so one direction will do.
-    start, stop = ends.unbind(1)
+    start, stop = faces.t().reshape(-1), faces.roll(-1, 1).t().reshape(-1)
     sums = torch.zeros_like(vertices).index_add(0, start, vertices.index_select(0, stop))
     counts = vertices.new_zeros(len(vertices)).index_add(0, start, vertices.new_ones(len(start)))
     return (sums / counts.clamp_min(1)[:, None] - vertices).square().mean()
@@ -223,7 +223,7 @@ def soft_overlap(coverage: Tensor, mask: Tensor) -> Tensor:
 
 def _reduced(image: np.ndarray, height: int, width: int, device: str) -> Tensor:
     """(height, width, C) area means in [0, 1] of an 8-bit image."""
-    values = torch.from_numpy(np.array(image, copy=True)).to(device).float().div_(255)
+    values = sent(torch.from_numpy(np.array(image, copy=True)), device).float().div_(255)
     if values.shape[:2] == (height, width):
         return values
     planes = F.interpolate(values.permute(2, 0, 1)[None], (height, width), mode="area")

@@ -64,6 +64,10 @@ class Mlp:
         """The layer that the inputs come into once more; 0 where there is one layer alone."""
         return len(self.widths) // 2 if self.hidden else 0
 
+    def takes_inputs(self, layer: int) -> bool:
+        """Whether the inputs come into a layer, after the values of the layer before, if any."""
+        return layer in (0, self._again)
+
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Shape of every tensor, by name."""
         widths = self.widths

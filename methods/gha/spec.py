@@ -70,9 +70,13 @@ GHA = MethodSpec(
     implementation="headbench.methods.gha.method:GHA",
     config="headbench.methods.gha.config:GHAConfig",
     needs="headbench.methods.shared.needs:gha",
-    presets={**SHORT_PRESETS, "paper": {"budget": {"iterations": PAPER_ITERATIONS}}},
-    preset_resolutions={
-        "paper": ResolutionRule(square="pad", size=(2048, 2048), speed_size=(1024, 1024)),
+    presets={
+        **SHORT_PRESETS,
+        "gpu": {"budget": {"iterations": 30_000}},
+        "paper": {"budget": {"iterations": PAPER_ITERATIONS}},
     },
+    preset_resolutions=dict.fromkeys(
+        ("gpu", "paper"), ResolutionRule(square="pad", size=(2048, 2048), speed_size=(1024, 1024))
+    ),
     source="Gaussian Head Avatar: Ultra High-fidelity Head Avatar via Dynamic Gaussians, CVPR 2024, arXiv 2312.03029",
 )

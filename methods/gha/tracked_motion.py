@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from ...bench.contracts import FloatArray, IntArray
 from ...datasets.head.geometry import vertex_normals
+from ..shared.device_frame import sent
 from ..shared.optimisation import Optimiser
 from ..shared.schedule import log_linear, torch_generator
 from .config import GHAConfig
@@ -73,8 +74,8 @@ class TrackedMotion(NamedTuple):
         """Mean squared error of the network's displacements, relative to the vertices' motion, over a draw of codes
         and vertices."""
         device = self.codes.device
-        rows = torch.randint(self.encoded.shape[0], (POINTS_AT_ONCE,), generator=generator).to(device)
-        drawn = torch.randint(len(self.codes), (CODES_AT_ONCE,), generator=generator).to(device)
+        rows = sent(torch.randint(self.encoded.shape[0], (POINTS_AT_ONCE,), generator=generator), device)
+        drawn = sent(torch.randint(len(self.codes), (CODES_AT_ONCE,), generator=generator), device)
         found = self.scale * torch.tanh(network(weights, self.encoded[rows], self.codes[drawn]))
         squared = (found - self.moves[drawn[:, None], rows]).square().sum(2)
         return (self.weights[rows] * squared).mean()

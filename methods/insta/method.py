@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 
+from ...bench.errors import InputError
 from ...bench.io.files import write_json
 from ..shared.avatar_files import Subject, finish_fit
 from ..shared.loop import Fit, train
@@ -22,6 +23,13 @@ class Insta(TrainedMethod[InstaConfig, InstaAvatar]):
 
     name, version = SPEC.name, SPEC.version
     config_class, avatar_class = InstaConfig, InstaAvatar
+    draws_splats = False
+
+    def prepare(self, device: str) -> None:
+        """Raise `InputError` for any device but the CPU; README.md says why."""
+        if not SPEC.computes_on(device):
+            remedy = "Train and render it with device=cpu."
+            raise InputError(f"method {self.name}", "device", " or ".join(SPEC.devices), repr(device), remedy)
 
     def _train(self, fit: Fit, config: InstaConfig) -> None:
         clip, subject = fit.clip, Subject.of(fit.clip)

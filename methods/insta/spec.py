@@ -42,6 +42,7 @@ INSTA = MethodSpec(
     summary="INSTA: a canonical hash-grid radiance field, warped by the nearest triangle of the tracked mesh.",
     implementation="headbench.methods.insta.method:Insta",
     config="headbench.methods.insta.config:InstaConfig",
+    devices=("cpu",),
     needs="headbench.methods.shared.needs:insta",
     presets={
         "smoke": {"budget": {"iterations": 40}, **SHORT},
@@ -52,6 +53,7 @@ INSTA = MethodSpec(
             "log2_table": 17,
             "finest_resolution": 768,
         },
+        "gpu": {"budget": {"iterations": 20_000}},
         "paper": {"budget": {"iterations": 20_000}},
     },
     monocular=True,

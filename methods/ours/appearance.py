@@ -157,16 +157,15 @@ class OursAppearance:
         return ShadedSplats(world, changed_colors(colors, splats), torch.sigmoid(splats.logits), penalty)
 
     def offsets(self, optimiser: Optimiser, positions: Tensor, expression: Tensor, jaw: Tensor) -> Tensor:
-        """(N, D) offsets; zero, and not computed, outside the lines' box."""
+        """(N, D) offsets; zero outside the lines' box."""
         if usable(positions):
             blended = blend_lines(optimiser["lines"], expression, jaw)
             return table_offsets(optimiser, self.line_box, blended, positions)
-        inside = self.line_box.contains(positions).nonzero().squeeze(1)
-        unit = self.line_box.unit(positions.index_select(0, inside))
+        # Computed outside, too: on a GPU the host would wait for the number of those inside.
         blended = blend_lines(optimiser["lines"], expression, jaw)
-        position = line_position(unit, self._config.lines.resolution)
+        position = line_position(self.line_box.unit(positions), self._config.lines.resolution)
         offsets = line_offsets(optimiser, blended, position)
-        return offsets.new_zeros(len(positions), offsets.shape[1]).index_copy(0, inside, offsets)
+        return torch.where(self.line_box.contains(positions)[:, None], offsets, 0)
 
     def _turn(self, iteration: int) -> Tensor:
         """(3, 3) small random rotation of this iteration."""
@@ -200,7 +199,10 @@ class OursAppearance:
         pose = self._clip.poses[timestep]
         arguments = self._mesh.arguments([pose])
         frames = self._mesh.frames(self._mesh.posed(arguments))
-        expression, jaw = driving_coefficients(pose, self.expressions, self.jaw_bases, self._device)
+        expression, jaw = (
+            torch.from_numpy(values).to(self._device)
+            for values in driving_coefficients(pose, self.expressions, self.jaw_bases)
+        )
         weights = frames.size.new_zeros(len(frames.size))
         if self._config.lines.enabled and self._config.penalty.weight:
             meshes = self._mesh.unposed(arguments), self._mesh.canonical
@@ -209,12 +211,11 @@ class OursAppearance:
 
 
 def driving_coefficients(
-    pose: HeadPose, expressions: int, bases: FloatArray, device: str
-) -> tuple[Tensor, Tensor]:
-    """Blend coefficients of the lines: the first expression coefficients, and the jaw's weights on its bases."""
-    expression = torch.as_tensor(np.asarray(pose.expression)[:expressions], dtype=torch.float32)
+    pose: HeadPose, expressions: int, bases: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Blend coefficients of the lines, float32: the first expression coefficients, and the jaw's weights on its bases."""
     jaw = jaw_weights(jaw_quaternions([pose]), bases)[0] if len(bases) else np.zeros(0)
-    return expression.to(device), torch.as_tensor(jaw, dtype=torch.float32).to(device)
+    return np.array(pose.expression[:expressions], np.float32), np.asarray(jaw, np.float32)
 
 
 def softened(offsets: Tensor, softness: float) -> Tensor:

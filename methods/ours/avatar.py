@@ -76,7 +76,7 @@ class OursAvatar(StoredSplatAvatar):
         self._binding = columns["binding"][:, 0].to(torch.int64)
         self._canonical = CanonicalFrames.of(mesh.frames(mesh.canonical))
         positions = self._canonical.positions(self._binding, self.neutral.means)
-        self._to_world = WorldTransform(self._binding, self.neutral.log_scales, self.neutral.quats)
+        self._to_world = WorldTransform(self._binding, *self.neutral[:3])
         self.colors: PlaneColors | HarmonicColors
         self.line_offsets: LineOffsets | None = None
         if "sh_dc" not in tensors:
@@ -136,16 +136,17 @@ class OursAvatar(StoredSplatAvatar):
         """(N,) logits of the opacities when all driving coefficients are 0."""
         if self.line_offsets is None:
             return self.neutral.logits
-        still = self.neutral.logits.new_zeros
-        offsets = self.line_offsets(still(self._expressions), still(len(self._jaw_bases)))
+        still = self.neutral.logits.new_zeros(self._expressions + len(self._jaw_bases))
+        offsets = self.line_offsets(still)
         return apply_offsets(self.neutral, offsets, self.field.dynamic).logits
 
     def _posed(self, pose: HeadPose) -> DrivenPose:
-        frames = self.mesh.frames(self.mesh.posed(self.mesh.arguments([pose])))
-        offsets = None
-        if self.line_offsets is not None:
-            coefficients = driving_coefficients(pose, self._expressions, self._jaw_bases, self._device)
-            offsets = self.line_offsets(*coefficients)
+        if self.line_offsets is None:
+            frames, offsets = self.mesh.drive(pose)[0], None
+        else:
+            driving = driving_coefficients(pose, self._expressions, self._jaw_bases)
+            frames, coefficients = self.mesh.drive(pose, np.concatenate(driving))
+            offsets = self.line_offsets(coefficients)
         return DrivenPose(frames, self._canonical.turns(frames), offsets)
 
     def _placed(self, pose: HeadPose, end_stage: Callable[[str], None]) -> PlacedSplats:

@@ -15,7 +15,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from ..shared import avatar_kernel
+from ..shared import avatar_kernel, device_frame
 from ..shared.binding import Frames, apply_matrices
 from ..shared.networks import (
     C0,
@@ -236,6 +236,8 @@ class CanonicalFrames:
         """(F, 3, 3) rotations that take world directions of a posed mesh to canonical ones: R_c R_t^T."""
         if avatar_kernel.usable(frames.rotation) and not frames.rotation.requires_grad:
             return avatar_kernel.turns_between(self.rotation, frames.rotation)
+        if device_frame.usable(frames.rotation):
+            return device_frame.turns_between(self.rotation, frames.rotation)
         return self.rotation @ frames.rotation.transpose(1, 2)
 
 

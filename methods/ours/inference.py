@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..shared import avatar_kernel
+from ..shared import avatar_kernel, device_frame
 from ..shared.binding import Frames
 from ..shared.networks import C0, CPU_BLOCK, ENCODING_SIZE, FREQUENCIES, encode, sum_rows
 from .field import (
@@ -54,6 +54,7 @@ class LineOffsets:
 
     def __init__(self, tensors: Mapping[str, Tensor], positions: Tensor):
         self._lines, self._count = tensors["lines"], len(positions)
+        self._jaw_bases = len(tensors["jaw_bases"])
         box = Bounds(*tensors["line_box"])
         inside = box.contains(positions).nonzero().squeeze(1)
         unit = box.unit(positions.index_select(0, inside))
@@ -74,10 +75,17 @@ class LineOffsets:
             hidden = pad(self._second, 0, 1), pad(self._biases[0], 0)
             self._kernel_layers = *hidden, pad(self._last.t(), 1), self._biases[1]
             self._kernel_first_bias = pad(self._first_bias, 0)
+        self._on_device: DeviceLines | None = None
+        if positions.device.type != "cpu":
+            layers = self._first, self._first_bias, self._second, self._last, *self._biases
+            place = self.inside, device_frame.WeightedRows(*self._position), self._count
+            self._on_device = DeviceLines(self._lines, self._jaw_bases, layers, *place)
 
-    def __call__(self, expression: Tensor, jaw: Tensor) -> Tensor:
-        """(N, D) offsets of all splats for a frame's coefficients."""
-        table = self.table(expression, jaw)
+    def __call__(self, coefficients: Tensor) -> Tensor:
+        """(N, D) offsets of all splats for the (E + J,) coefficients of a frame, the jaw's last."""
+        if self._on_device is not None:
+            return self._on_device(coefficients)
+        table = self.table(coefficients)
         out = table.new_empty if len(self.inside) == self._count else table.new_zeros
         offsets = out(self._count, self._last.shape[1])
         if self._fast:
@@ -89,8 +97,9 @@ class LineOffsets:
             offsets.index_copy_(0, self.inside, self.by_torch(table))
         return offsets
 
-    def table(self, expression: Tensor, jaw: Tensor) -> Tensor:
+    def table(self, coefficients: Tensor) -> Tensor:
         """(3 L, H) first layer, but for its bias, at the samples of a frame's blended lines."""
+        expression, jaw = coefficients.split([len(coefficients) - self._jaw_bases, self._jaw_bases])
         return line_table(blend_lines(self._lines, expression, jaw), self._first)
 
     def by_torch(self, table: Tensor) -> Tensor:
@@ -108,6 +117,46 @@ class LineOffsets:
             torch.addmm(second_bias, first, self._second, out=out).relu_()
             torch.addmm(last_bias, out, self._last, out=inside[block])
         return inside
+
+
+class DeviceLines:
+    """`LineOffsets` in few operations: the first layer of each line is known, so that a frame blends layers instead.
+
+    Parameters
+    ----------
+    lines : (E + J, 3, L, C), of which the last ``jaw_bases`` are the jaw's.
+    layers : weight and bias of the first layer, (H, 6 C) and (H,), then (H, H) and (H, D), transposed, and their biases.
+    inside, at_rows : (M,) int64 of ``count`` splats, and where they read the (3 L, H) first layer at the lines' samples.
+    """
+
+    def __init__(
+        self,
+        lines: Tensor,
+        jaw_bases: int,
+        layers: tuple[Tensor, ...],
+        inside: Tensor,
+        at_rows: device_frame.WeightedRows,
+        count: int,
+    ):
+        first, first_bias, self._second, self._last, self._second_bias, self._last_bias = layers
+        parts = first.view(len(first), 2, AXES, -1).unbind(1)
+        kinds = zip(lines.split([len(lines) - jaw_bases, jaw_bases]), parts)
+        columns = [torch.einsum("nalc,hac->alhn", own, part).flatten(0, 2) for own, part in kinds]
+        self._layers = torch.cat(columns, dim=1)
+        # A point reads one sample of each axis in all, so the bias is read once.
+        bias = first_bias.new_zeros(AXES, lines.shape[2], len(first))
+        bias[0] = first_bias
+        self._bias = bias.flatten()
+        self._inside, self._at_rows = inside, at_rows
+        self._nothing = first_bias.new_zeros(count, len(self._last_bias))
+
+    def __call__(self, coefficients: Tensor) -> Tensor:
+        """(N, D) offsets of all splats for (E + J,) coefficients."""
+        table = torch.addmv(self._bias, self._layers, coefficients)
+        first = self._at_rows(table.view(-1, len(self._second))).relu_()
+        second = torch.addmm(self._second_bias, first, self._second).relu_()
+        offsets = torch.addmm(self._last_bias, second, self._last)
+        return self._nothing.index_copy(0, self._inside, offsets)
 
 
 def _lexicographic(rows: Tensor, resolution: int) -> Tensor:
@@ -147,6 +196,10 @@ class PlaneColors:
                 parts[1],
             )
         self._known: tuple[Tensor, Tensor, Tensor] | None = None
+        self._on_device: device_frame.DirectionLayer | None = None
+        if from_position.device.type != "cpu":
+            self._on_device = device_frame.DirectionLayer(of_direction)
+            self._half, self._scaled = from_position.new_tensor(0.5), (C0 * last).t().contiguous()
 
     def __call__(self, means: Tensor, center: Tensor, turns: Tensor, binding: Tensor) -> Tensor:
         """Colours (N, 3) >= 0 of splats at (N, 3) means as a camera at ``center`` sees them.
@@ -156,8 +209,13 @@ class PlaneColors:
         turns : (F, 3, 3) world directions to canonical ones, by triangle.
         binding : (N,) int64, the triangle of each splat.
 
-        The colours of the last call are kept, and given again for the same tensor of means seen from the same place.
+        The colours of the last call are kept, and given again for the same tensor of means seen from the same place; not on
+        a GPU, which would have to be waited for to compare places.
         """
+        if self._on_device is not None:
+            directions = device_frame.directions_from(means, center, turns, binding)
+            hidden = self._on_device(self._network[0], directions).relu_()
+            return torch.addmm(self._half, hidden, self._scaled).relu_()
         if self._known is not None and self._known[0] is means and torch.equal(self._known[1], center):
             return self._known[2]
         if self._fast:

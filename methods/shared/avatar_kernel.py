@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from ..splats.cpu import KERNEL, instruction_sets
+from . import device_frame
 from .binding import Frames, WorldSplats, apply_matrices, to_world
 from .networks import sh_degree, sh_to_rgb
 from .threads import threads
@@ -188,25 +189,30 @@ class WorldTransform:
     Parameters
     ----------
     binding : (N,) int64, the triangle of each splat.
-    log_scales, quats : (N, 3) and (N, 4), as most frames have them.
+    means, log_scales, quats : (N, 3), (N, 3) and (N, 4), as most frames have them.
     """
 
-    def __init__(self, binding: Tensor, log_scales: Tensor, quats: Tensor):
-        self._binding, self._log_scales, self._quats = binding, log_scales, quats
-        self._fast = usable(quats)
-        if self._fast:
+    def __init__(self, binding: Tensor, means: Tensor, log_scales: Tensor, quats: Tensor):
+        self._binding, self._means, self._log_scales, self._quats = binding, means, log_scales, quats
+        self._fast, self._on_device = usable(quats), quats.device.type != "cpu"
+        if self._fast or self._on_device:
             self._known = _unit(quats), log_scales.exp()
+        if self._on_device:
+            self._homogeneous = pad(means, (0, 1), value=1.0)
 
     def __call__(self, frames: Frames, means: Tensor, log_scales: Tensor, quats: Tensor) -> WorldSplats:
         """Splats in the world; log-scales and quaternions may be others than the known ones."""
-        if not self._fast:
+        if not (self._fast or device_frame.usable(means)):
             return to_world(frames, self._binding, means, log_scales, quats)
         units, scales = self._known
         if quats is not self._quats:
             units = _unit(quats)
         if log_scales is not self._log_scales:
             scales = log_scales.exp()
-        return splats_to_world(frames, self._binding, means, units, scales)
+        if self._fast:
+            return splats_to_world(frames, self._binding, means, units, scales)
+        means = self._homogeneous if means is self._means else pad(means, (0, 1), value=1.0)
+        return device_frame.splats_to_world(frames, self._binding, means, units, scales)
 
 
 class HarmonicColors:
@@ -220,6 +226,7 @@ class HarmonicColors:
     def __init__(self, dc: Tensor, rest: Tensor):
         self._dc, self._rest = dc, rest
         self._packed = pack_harmonics(dc, rest) if usable(dc) else None
+        self._on_device = device_frame.coefficients_of(dc, rest) if dc.device.type != "cpu" else None
 
     def along(self, directions: Tensor) -> Tensor:
         """Colours (N, 3) >= 0 along (N, 3) unit vectors from the camera to the splats."""
@@ -234,6 +241,9 @@ class HarmonicColors:
         """
         if self._packed is not None:
             return shade(self._packed, means, center, turns, binding)
+        if self._on_device is not None and device_frame.usable(means):
+            directions = device_frame.directions_from(means, center, turns, binding)
+            return device_frame.shade(self._on_device, directions)
         directions = torch.nn.functional.normalize(means - center, dim=1)
         if turns is not None and binding is not None:
             directions = apply_matrices(turns.reshape(-1, 9).index_select(0, binding), directions)

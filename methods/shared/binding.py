@@ -80,8 +80,7 @@ def to_world(
     log_scales : (N, 3) logarithms in the same unit.
     quats : (N, 4), real part first, of any length.
     """
-    count = len(frames.size)
-    linear = (frames.size[:, None, None] * frames.rotation).view(count, 9)
+    linear = (frames.size[:, None, None] * frames.rotation).flatten(1)
     # One gather instead of four, and one scatter for its gradient. The quaternion goes along as the matrix that
     # multiplies by it: products of small matrices are several times faster than sums over columns.
     turn = left_products(frames.quaternion).flatten(1)

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -18,6 +19,7 @@ from ...bench.contracts import Budget, ByteArray, Clip, FrameKey, Progress
 from ...bench.errors import InputError
 from .avatar_kernel import available
 from .checkpoint import REMEDY, load_checkpoint, save_checkpoint
+from .device_frame import pinned, sent
 from .optimisation import Optimiser
 from .schedule import Sampler, Timeline
 from .threads import torch_on_one_thread
@@ -117,6 +119,7 @@ def train(
     budget, clock = fit.budget, fit.clock
     check_budget(budget)
     path, compiled = fit.out / CHECKPOINT, available()
+    wait = synchroniser(fit.device)
     saved = load_checkpoint(path, fit.run, fit.device)
     started = clock() if began is None else began
     losses: list[tuple[int, float]] = []
@@ -127,7 +130,7 @@ def train(
             assert budget.seconds is not None
             left = budget.seconds if began is None else budget.seconds - (clock() - began)
             with torch_on_one_thread(compiled):
-                total = _estimate(trainable, sampler, left, published_length, clock)
+                total = _estimate(trainable, sampler, left, published_length, clock, wait)
         trainable.begin(Timeline(total, published_length))
     else:
         try:
@@ -166,7 +169,13 @@ def train(
                 save_checkpoint(path, fit.run, {**done, "trainable": trainable.state()})
                 last_save = clock()
             fit.progress(iteration, total, note + trainable.note() if note else "")
+    wait()
     return Outcome(iteration, total, seconds(), losses)
+
+
+def synchroniser(device: str) -> Callable[[], None]:
+    """What waits for the work handed to a CUDA device; nothing for others, which do it at once."""
+    return partial(torch.cuda.synchronize, device) if torch.device(device).type == "cuda" else lambda: None
 
 
 def check_budget(budget: Budget) -> None:
@@ -180,15 +189,22 @@ def check_budget(budget: Budget) -> None:
 
 
 def _estimate(
-    trainable: Trainable, sampler: Sampler, seconds: float, published_length: int, clock: Callable[[], float]
+    trainable: Trainable,
+    sampler: Sampler,
+    seconds: float,
+    published_length: int,
+    clock: Callable[[], float],
+    wait: Callable[[], None],
 ) -> int:
     """How many iterations fit into so many seconds, one at least, from a few steps that change nothing."""
     trainable.begin(Timeline(published_length, published_length))
     durations = []
     for step in range(1, TIMED_STEPS + 2):
+        wait()
         before = clock()
         trainable.loss(1, sampler(step)).backward()
         trainable.optimiser.zero_grad()
+        wait()
         durations.append(clock() - before)
     # The first step pays for lazy initialisation; the median of the rest is robust to an outlier.
     typical = sorted(durations[1:])[TIMED_STEPS // 2]
@@ -220,7 +236,7 @@ class TrainingImages:
         image = self._ahead[1].result()
         following = self._sampler(iteration + 1)
         self._ahead = (following, self._pool.submit(self._load, following))
-        return image.to(self._device).to(torch.float32).div_(255)
+        return sent(image, self._device).to(torch.float32).div_(255)
 
     def close(self) -> None:
         """Stop the decoding thread."""
@@ -234,7 +250,7 @@ class TrainingImages:
         if self._masks:
             image = np.dstack([image, _checked(key, "mask", self._clip.mask(key), image.shape[:2])])
         # A clip's images may be read-only and shared; torch wants an array it may write to.
-        return torch.from_numpy(np.array(image, copy=True))
+        return pinned(torch.from_numpy(np.array(image, copy=True)), self._device)
 
 
 def _checked(key: FrameKey, name: str, pixels: ByteArray | None, shape: tuple[int, ...]) -> ByteArray:

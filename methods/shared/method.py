@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 
 from ...bench.contracts import Budget, Clip, Progress
+from ...bench.machine import use_device
+from ..splats import cuda
 from .avatar_files import is_finished, run_digest
 from .loop import CHECKPOINT, Fit, check_budget, check_training_split
 from .sizes import FOLDER, Size, choose_sizes
@@ -22,13 +24,14 @@ class TrainedMethod(Generic[Config, Avatar]):
     """A `Method` but for its training, `_train`, which writes the avatar under ``fit.out``.
 
     A derived class names its settings' class, its avatar's (with ``read(folder, device)``), and the name and version
-    of its spec.
+    of its spec; one that draws no splats says so.
     """
 
     name: ClassVar[str]
     version: ClassVar[str]
     config_class: ClassVar[Any]
     avatar_class: ClassVar[Any]
+    draws_splats: ClassVar[bool] = True
 
     def __init__(self, config: Config | None = None):
         self.config: Config = config or self.config_class()
@@ -44,6 +47,7 @@ class TrainedMethod(Generic[Config, Avatar]):
         """
         check_budget(budget)
         check_training_split(clip)
+        self.prepare(device)
         config, settings = self._resolved(clip, device)
         run = run_digest(self.name, self.version, settings, clip, budget, seed)
         if not is_finished(out, run):
@@ -52,8 +56,16 @@ class TrainedMethod(Generic[Config, Avatar]):
         self._remove_training_files(out)
         return self.load(out, device=device)
 
+    def prepare(self, device: str) -> None:
+        """Make ready what draws on ``device``; see `cuda.prepare`."""
+        if self.draws_splats:
+            cuda.prepare(device)
+        else:
+            use_device(device)
+
     def load(self, path: Path, *, device: str) -> Avatar:
         """Read an avatar that `fit` wrote."""
+        self.prepare(device)
         avatar: Avatar = self.avatar_class.read(path, device)
         return avatar
 

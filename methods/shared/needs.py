@@ -22,12 +22,16 @@ def splats(config: Any, device: str) -> Iterator[Need]:
     slow = f"{cuda.REMEDY} The slow reference backend draws meanwhile."
     yield Need("GPU", gpu, "PyTorch with CUDA, and an NVIDIA driver: https://pytorch.org/get-started.")
     yield Need("gsplat", "installed" if there else "", slow, required=False)
+    if there and not cuda.compiled():
+        yield Need("CUDA toolkit", cuda.toolkit(), cuda.toolkit_remedy())
 
 
 def insta(config: Any, device: str) -> Iterator[Need]:
-    """INSTA's kernel."""
+    """INSTA's kernel, and the device that it is for."""
     from ..insta.kernel import KERNEL
 
+    if not device.startswith("cpu"):
+        yield Need(f"code for {device}", "", f"INSTA does not compute on {device!r}: run it with device=cpu.")
     yield KERNEL.need()
 
 

@@ -6,6 +6,7 @@ in moving activations of all splats to memory and back.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterator
 from typing import Any
@@ -41,7 +42,7 @@ class _Color(torch.autograd.Function):
     def forward(ctx: Any, first: Tensor, last: Tensor, directions: Tensor, *features: Tensor) -> Tensor:
         keep = any(ctx.needs_input_grad)
         colors = directions.new_empty(len(directions), len(last))
-        half = directions.new_tensor(0.5)
+        half = directions.new_full((), 0.5)
         saved: list[Tensor] = []
         for rows in _blocks(directions):
             inputs = torch.cat([*(f[rows] for f in features), encode(directions[rows])], dim=1)
@@ -125,7 +126,7 @@ def _encoding_adjoint(encoded: Tensor, gradient: Tensor) -> Tensor:
     """Gradient by directions, (n, 3), of `encode` from its (n, 27) values and their gradient."""
     waves, by_waves = (values[:, 3:].reshape(-1, len(FREQUENCIES), 2, 3) for values in (encoded, gradient))
     turned = by_waves[:, :, 0] * waves[:, :, 1] - by_waves[:, :, 1] * waves[:, :, 0]
-    return gradient[:, :3] + (turned * gradient.new_tensor(FREQUENCIES)[:, None]).sum(1)
+    return gradient[:, :3] + (turned * _frequencies(gradient.dtype, gradient.device)[:, None]).sum(1)
 
 
 def _blocks(rows: Tensor) -> Iterator[slice]:
@@ -199,16 +200,24 @@ def sample_plane(plane: Tensor, coordinates: Tensor, resolution: int) -> Tensor:
 def sample_triplane(planes: dict[str, Tensor], points: Tensor, resolution: int) -> tuple[Tensor, ...]:
     """Features of the three planes at (N, 3) points in [-1, 1], in the order of `PAIRS`."""
     return tuple(
-        sample_plane(planes[name], points[:, [width, height]], resolution) for name, width, height in PAIRS
+        # The two coordinates by steps: a list of numbers would be copied to the device.
+        sample_plane(planes[name], points[:, width : height + 1 : height - width], resolution)
+        for name, width, height in PAIRS
     )
 
 
 def encode(values: Tensor) -> Tensor:
     """(N, 9 D) positional encoding of (N, D) values: identity, then sin and cos at 1, 2, 4, 8 (no pi)."""
-    frequencies = values.new_tensor(FREQUENCIES)
+    frequencies = _frequencies(values.dtype, values.device)
     angles = frequencies[:, None] * values[:, None, :]
     waves = torch.stack([torch.sin(angles), torch.cos(angles)], dim=2)
     return torch.cat([values, waves.flatten(1)], dim=1)
+
+
+@functools.cache
+def _frequencies(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """`FREQUENCIES` where they are used: made at each call, the host would wait for the device."""
+    return torch.tensor(FREQUENCIES, dtype=dtype).to(device)
 
 
 def smoothing(spread: float) -> Tensor:

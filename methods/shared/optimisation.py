@@ -13,6 +13,7 @@ from ...bench.contracts import FloatArray
 from ...datasets.head.rotations import quaternion_to_matrix
 from .avatar_kernel import call, usable
 from .config import DensifiedTraining
+from .device_frame import sent
 from .schedule import DensifySchedule, torch_generator
 
 EPS = 1e-15
@@ -215,7 +216,7 @@ class Densifier:
 
         Pixels become normalised device units by half the image size, as the published thresholds have it.
         """
-        half = gradient.new_tensor([0.5 * width, 0.5 * height])
+        half = sent(torch.tensor([0.5 * width, 0.5 * height], dtype=gradient.dtype), gradient.device)
         seen = visible.to(gradient.dtype)
         self._gradient_sum += torch.linalg.vector_norm(gradient * half, dim=1) * seen
         self._views += seen
@@ -273,7 +274,7 @@ class Densifier:
             return asks
         # Stable: equal gradients are taken in order, so that a resumed run takes the same ones.
         order = torch.argsort(
-            torch.where(asks, gradient, gradient.new_tensor(-1.0)), descending=True, stable=True
+            torch.where(asks, gradient, gradient.new_full((), -1.0)), descending=True, stable=True
         )
         chosen = torch.zeros_like(asks)
         chosen[order[:room]] = True

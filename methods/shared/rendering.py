@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ from ..splats import rasterize
 from ..splats.constants import ALPHA_MIN, TRANSMITTANCE_MIN
 from .avatar_files import HEAD_FILE
 from .binding import WorldSplats
+from .device_frame import to_device
 from .subject_mesh import pose_key
 
 Value = TypeVar("Value")
@@ -50,13 +51,21 @@ USUAL = Cutoffs()
 """The renderer's defaults."""
 
 
+class Copy(NamedTuple):
+    """A frame on its way into pinned host memory, colours before alpha, and the event after which it is there."""
+
+    host: Tensor
+    ready: torch.cuda.Event
+
+
 class Drawn(NamedTuple):
-    """A drawn frame, still where it was computed."""
+    """A drawn frame, still where it was computed; from a CUDA device its copy has begun."""
 
     image: Tensor
     """(H, W, 3) in [0, 1]."""
     alpha: Tensor
     """(H, W) in [0, 1]."""
+    copy: Copy | None = None
 
 
 def draw_splats(
@@ -64,7 +73,6 @@ def draw_splats(
     opacities: Tensor,
     colors: Tensor,
     view: View,
-    background: Sequence[float],
     end_stage: Callable[[str], None] = no_stage,
     cutoffs: Cutoffs = USUAL,
 ) -> Drawn:
@@ -72,7 +80,7 @@ def draw_splats(
     rendering = rasterize(
         *(world.means, world.quats, world.scales, opacities, colors),
         *(view.world_to_camera, view.K, view.camera.width, view.camera.height),
-        background=world.means.new_tensor([float(channel) for channel in background]),
+        background=view.background,
         alpha_min=cutoffs.alpha_min,
         transmittance_min=cutoffs.transmittance_min,
         check_values=False,
@@ -80,12 +88,32 @@ def draw_splats(
     end_stage("rasterize")
     drawn = Drawn(rendering.image.clamp(0, 1), rendering.alpha.clamp(0, 1))
     end_stage("post")
-    return drawn
+    return _copied_ahead(drawn) if drawn.image.is_cuda else drawn
+
+
+def _copied_ahead(drawn: Drawn) -> Drawn:
+    """Begin to copy a frame: whoever reads it back waits for it alone, not for frames that were drawn after it."""
+    joined = _joined(drawn)
+    host = torch.empty(joined.shape, dtype=joined.dtype, pin_memory=joined.is_cuda)
+    host.copy_(joined, non_blocking=True)
+    ready = torch.cuda.Event()
+    ready.record(torch.cuda.current_stream(joined.device))
+    return drawn._replace(copy=Copy(host, ready))
+
+
+def _joined(drawn: Drawn) -> Tensor:
+    return torch.cat([drawn.image.reshape(-1), drawn.alpha.reshape(-1)])
 
 
 def read_back(drawn: Drawn) -> Frame:
-    """Bring a drawn frame into host memory, as numpy."""
-    return Frame(_numpy(drawn.image), _numpy(drawn.alpha))
+    """Bring a drawn frame into host memory, as numpy; from a GPU by one copy."""
+    image, alpha = drawn.image, drawn.alpha
+    if drawn.copy is not None:
+        drawn.copy.ready.synchronize()
+    if drawn.copy is not None or image.device.type != "cpu":
+        host = _joined(drawn).cpu() if drawn.copy is None else drawn.copy.host
+        image, alpha = host[: image.numel()].view(image.shape), host[image.numel() :].view(alpha.shape)
+    return Frame(_numpy(image), _numpy(alpha))
 
 
 def posed_splats(world: WorldSplats, opacities: Tensor, colors: Tensor | None) -> PosedSplats:
@@ -100,21 +128,21 @@ def _numpy(values: Tensor) -> np.ndarray:
 
 @dataclass(frozen=True)
 class View:
-    """A camera as tensors."""
+    """A camera as tensors, and what is behind the head: (C,), none unless asked for."""
 
     camera: Camera
     world_to_camera: Tensor
     K: Tensor
     center: Tensor
+    background: Tensor
 
 
-def view_of(camera: Camera, device: str) -> View:
-    """Put a camera on a device."""
-
-    def tensor(values: Any) -> Tensor:
-        return torch.as_tensor(np.asarray(values), dtype=torch.float32, device=device)
-
-    return View(camera, tensor(camera.world_to_camera), tensor(camera.K), tensor(camera.center))
+def view_of(camera: Camera, device: str, background: Sequence[float] = ()) -> View:
+    """Put a camera and a background on a device, all at once."""
+    parts = camera.world_to_camera, camera.K, camera.center, [float(channel) for channel in background]
+    joined = to_device(np.concatenate([np.ravel(part) for part in parts]), device)
+    transform, K, center, behind = joined.split([16, 9, 3, len(background)])
+    return View(camera, transform.view(4, 4), K.view(3, 3), center, behind)
 
 
 def scene_extent(cameras: Mapping[str, Camera]) -> float:
@@ -179,10 +207,10 @@ class StoredSplatAvatar:
         end_stage: Callable[[str], None] = no_stage,
     ) -> Drawn:
         """Draw one frame, stage by stage; see `StagedAvatar`."""
-        placed, view = self._place(pose, end_stage), view_of(camera, self._device)
+        placed, view = self._place(pose, end_stage), view_of(camera, self._device, background)
         colors = placed.colors(view.center)
         end_stage("deform")
-        return draw_splats(placed.world, placed.opacities, colors, view, background, end_stage, self._cutoffs)
+        return draw_splats(placed.world, placed.opacities, colors, view, end_stage, self._cutoffs)
 
     def render(self, camera: Camera, pose: HeadPose, background: Sequence[float] = (1.0, 1.0, 1.0)) -> Frame:
         """Render one frame. Raises `InputError` where the pose is of another head model."""

@@ -15,12 +15,12 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from ...datasets.head.model import HeadModel
-from . import losses
+from . import device_frame, losses
 from .avatar_kernel import call, splats_to_world, triangles, usable
 from .binding import Frames, WorldSplats
 from .binding import to_world as reference_to_world
 from .binding import triangle_frames as reference_triangle_frames
-from .networks import sh_to_rgb
+from .networks import coefficient_count, sh_to_rgb
 
 
 def photometric_loss(image: Tensor, truth: Tensor, ssim_weight: float, backend: str = "cpu") -> Tensor:
@@ -244,7 +244,11 @@ class _ToWorld(torch.autograd.Function):
 def harmonic_colors(dc: Tensor, rest: Tensor, vectors: Tensor, degree: int, backend: str = "cpu") -> Tensor:
     """Compiled form of `networks.sh_to_rgb`; (N, 3) vectors from the camera to the splats may have any length."""
     if not usable(dc):
-        return sh_to_rgb(dc, rest, torch.nn.functional.normalize(vectors, dim=1), degree)
+        directions = torch.nn.functional.normalize(vectors, dim=1)
+        if dc.device.type == "cpu":
+            return sh_to_rgb(dc, rest, directions, degree)
+        rest = rest[:, :, : coefficient_count(degree) - 1]
+        return device_frame.shade(device_frame.coefficients_of(dc, rest), directions)
     return _HarmonicColors.apply(dc, rest, vectors, degree, backend)  # type: ignore[no-untyped-call]
 
 

@@ -2,22 +2,33 @@
 
 gsplat (Apache-2.0, https://github.com/nerfstudio-project/gsplat) is an optional extra: ``pip install headbench[cuda]``.
 It is driven through its functions for projection, tile lists and compositing instead of through its one big function, so
-that offsets of the 2D means and absolute gradients come out as here.
+that offsets of the 2D means and absolute gradients come out as here. Releases 1.5 and 1.6 are known. Their wheels hold
+sources: the extension is compiled when gsplat is first used on a machine, which takes minutes and needs the CUDA toolkit.
+`prepare` does it before anything is timed. With ``antialiased``, 1.6 lets no opacity fall below 0.5 % of its value, where
+the other backends let it go to 0.
 """
 
 from __future__ import annotations
 
+import fcntl
 import functools
 import importlib
 import importlib.util
+import inspect
 import logging
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from ...bench.errors import UnavailableError
+from ...bench.machine import use_device
 from .constants import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN
 from .reference import published_radii
 from .request import Rendering, Request
@@ -25,6 +36,9 @@ from .request import Rendering, Request
 log = logging.getLogger(__name__)
 
 REMEDY = "pip install 'headbench[cuda]', on a machine with an NVIDIA GPU and the CUDA toolkit."
+
+CHANNELS = (1, 2, 3, 4, 5, 8, 9, 16, 17, 32)
+"""Colour channels that kernels are compiled for, in 1.5 and 1.6 alike; other numbers are filled up with zeros."""
 
 
 @functools.cache
@@ -58,16 +72,77 @@ def _warn_once(reason: str, remedy: str) -> None:
     log.warning("On this GPU splats are drawn by the slow reference backend: %s. %s", reason, remedy)
 
 
+def prepare(device: str) -> None:
+    """Load gsplat if ``device`` is a CUDA device and it is installed; see `use_device`. Before anything is timed.
+
+    Raises `UnavailableError` where gsplat's extension can neither be loaded nor compiled.
+    """
+    use_device(device)
+    if torch.device(device).type == "cuda" and usable():
+        load()
+
+
 @functools.cache
 def load() -> ModuleType:
-    """Import gsplat. Raises `UnavailableError` where it or a GPU is missing."""
+    """Import gsplat and its extension, which is compiled where this machine has not done so before.
+
+    Raises `UnavailableError` where gsplat, a GPU or the CUDA toolkit is missing, and where compiling fails.
+    """
     if not torch.cuda.is_available():
         missing = "The renderer's backend 'cuda' needs a GPU that torch sees; there is none."
         raise UnavailableError(missing, REMEDY)
+    if importlib.util.find_spec("gsplat") is None:
+        raise UnavailableError("The renderer's backend 'cuda' needs gsplat; it is not installed.", REMEDY)
+    if not compiled():
+        log.info(
+            "Loading gsplat; the first time on a machine it compiles its CUDA extension, which takes minutes."
+        )
     try:
-        return importlib.import_module("gsplat")
-    except ImportError as error:
-        raise UnavailableError(f"The renderer's backend 'cuda' needs gsplat: {error}.", REMEDY) from error
+        with _one_process():
+            gsplat = importlib.import_module("gsplat")
+            extension = importlib.import_module("gsplat.cuda._backend")._C
+    except Exception as error:  # the compiler's errors are of many kinds
+        reason = next(iter(str(error).splitlines()), type(error).__name__)
+        raise UnavailableError(
+            f"gsplat's CUDA extension cannot be loaded: {reason}.", toolkit_remedy()
+        ) from error
+    if extension is None:
+        raise UnavailableError(
+            "gsplat has to compile its CUDA extension; there is no nvcc.", toolkit_remedy()
+        )
+    return gsplat
+
+
+@contextmanager
+def _one_process() -> Iterator[None]:
+    """Keep other processes of headbench from loading gsplat meanwhile, which removes what another one is compiling."""
+    from torch.utils.cpp_extension import get_default_build_root
+
+    root = Path(os.environ.get("TORCH_EXTENSIONS_DIR", get_default_build_root()))
+    root.mkdir(parents=True, exist_ok=True)
+    with open(root / "headbench-gsplat.lock", "w", encoding="ascii") as stream:
+        fcntl.flock(stream, fcntl.LOCK_EX)
+        yield
+
+
+def compiled() -> bool:
+    """Whether gsplat was installed with a compiled extension; it is not imported."""
+    spec = importlib.util.find_spec("gsplat")
+    folders = [] if spec is None else spec.submodule_search_locations or []
+    return any(path.suffix in (".so", ".pyd") for folder in folders for path in Path(folder).glob("csrc.*"))
+
+
+def toolkit() -> str:
+    """Folder of the CUDA toolkit that torch compiles extensions with; "" where it has no nvcc."""
+    from torch.utils.cpp_extension import CUDA_HOME
+
+    return str(CUDA_HOME) if CUDA_HOME and (Path(CUDA_HOME) / "bin" / "nvcc").is_file() else ""
+
+
+def toolkit_remedy() -> str:
+    """How to get what gsplat is compiled with."""
+    version = f" {torch.version.cuda}, with which torch was built," if torch.version.cuda else ""
+    return f"Install the CUDA toolkit{version} (nvcc) and a C++ compiler, and set CUDA_HOME to the toolkit's folder."
 
 
 def supports(request: Request) -> bool:
@@ -125,24 +200,34 @@ def draw(gsplat: Any, request: Request) -> Rendering:
         means2d = _TakeAbsolute.apply(means2d, request.means2d_abs, holder)
         holder.append(means2d)
     with torch.no_grad():
-        _, keys, splats = gsplat.isect_tiles(means2d, radii, depths, TILE, columns, rows)
+        # 1.6 leaves out tiles that a splat's box meets and its ellipse does not.
+        known = inspect.signature(gsplat.isect_tiles).parameters
+        ellipses = {"conics": conics, "opacities": opacities.contiguous()} if "conics" in known else {}
+        _, keys, splats = gsplat.isect_tiles(means2d, radii, depths, TILE, columns, rows, **ellipses)
         offsets = gsplat.isect_offset_encode(keys, views, columns, rows)
+    channels = request.colors.shape[-1]
+    padding = next(number for number in CHANNELS if number >= channels) - channels
+    colors, backgrounds = request.colors, request.backgrounds
+    if padding:
+        colors, backgrounds = pad(colors, (0, padding)), pad(backgrounds, (0, padding))
     images, alphas = gsplat.rasterize_to_pixels(
         means2d,
         conics,
-        request.colors.expand(views, count, -1),
+        colors.expand(views, count, -1),
         opacities,
         request.width,
         request.height,
         TILE,
         offsets,
         splats,
-        backgrounds=request.backgrounds,
+        backgrounds=backgrounds,
         absgrad=collects,
     )
     # gsplat's own radii are 0 for splats too faint to be drawn, and are cut to their opacity.
     return request.rendering(
-        request.unstacked(images), request.unstacked(alphas.squeeze(-1)), lambda: published_radii(request)
+        request.unstacked(images[..., :channels]),
+        request.unstacked(alphas.squeeze(-1)),
+        lambda: published_radii(request),
     )
 
 
@@ -162,14 +247,19 @@ class _TakeAbsolute(torch.autograd.Function):
 
 @functools.cache
 def warn_of_clamp(device: str) -> None:
-    """Warn once where this gsplat clamps alpha elsewhere than we do: some releases do at 0.999."""
+    """Warn once where this gsplat clamps alpha elsewhere than we do: 1.5 does at 0.999, a constant of its kernels.
+
+    A splat that lets 1 % through here lets 0.1 % through there, and the next one of that kind is drawn, too. So a pixel
+    differs by at most 1 % of the range of colours, and by nothing where no splat's alpha is above 0.99.
+    """
     highest = clamp_of(load(), device)
     if abs(highest - ALPHA_MAX) > 1e-4:
         log.warning(
-            "This gsplat clamps alpha at %.4g, headbench's other backends at %.4g: images differ behind and within "
-            "splats more opaque than that.",
+            "This gsplat clamps alpha at %.4g, headbench's other backends at %.4g: pixels behind more opaque splats differ "
+            "by up to %.2g of the range of colours. gsplat 1.6 clamps where they do.",
             highest,
             ALPHA_MAX,
+            1 - min(highest, ALPHA_MAX),
         )
 
 

@@ -88,8 +88,8 @@ def rotation_matrices(quats: Tensor) -> Tensor:
     return torch.stack(entries, dim=-1).reshape(-1, 3, 3)
 
 
-def project(request: Request, view: CameraInputs, subset: Tensor) -> Footprints:
-    """Project the splats ``subset`` (indices) of ``request`` onto the image plane of ``view``.
+def project(request: Request, view: CameraInputs, subset: Tensor | slice) -> Footprints:
+    """Project the splats ``subset`` (indices, or a slice) of ``request`` onto the image plane of ``view``.
 
     The covariance is factored as ``Q Qᵀ + eps2d I`` with ``Q = J W R S`` (EWA Splatting, eq. 24-31: J the
     Jacobian of the perspective division, W the camera's rotation, R S the splat's axes). By the
@@ -130,7 +130,7 @@ def _find_drawn(request: Request, view: CameraInputs) -> tuple[Tensor, Tensor, T
 
     Conditions are stated positively, so that a NaN anywhere culls.
     """
-    subset = _in_depth(request, view)
+    subset = _in_depth(request, view).nonzero().squeeze(-1)
     footprints = project(request, view, subset)
     radii = torch.zeros(len(request.means), dtype=torch.int32, device=request.means.device)
     radii[subset] = _published_radii(request, footprints)
@@ -154,15 +154,16 @@ def published_radii(request: Request) -> Tensor:
     )
     for index, of_view in enumerate(radii):
         view = request.view(index)
-        subset = _in_depth(request, view)
-        of_view[subset] = _published_radii(request, project(request, view, subset))
+        # Of all splats, not of those in depth alone: on a GPU, training asks for it, and must not wait for their number.
+        radii_of_all = _published_radii(request, project(request, view, slice(None)))
+        of_view.copy_(torch.where(_in_depth(request, view), radii_of_all, 0))
     return radii
 
 
 def _in_depth(request: Request, view: CameraInputs) -> Tensor:
-    """Indices (M,) of the splats between the near and the far plane."""
+    """(N,) which splats are between the near and the far plane."""
     depths = request.means @ view.viewmat[2, :3] + view.viewmat[2, 3]
-    return ((depths > request.near) & (depths < request.far)).nonzero().squeeze(-1)
+    return (depths > request.near) & (depths < request.far)
 
 
 def _published_radii(request: Request, footprints: Footprints) -> Tensor:
@@ -174,9 +175,9 @@ def _published_radii(request: Request, footprints: Footprints) -> Tensor:
     xx, xy, yy = footprints.covariances.unbind(-1)
     spread = torch.sqrt((0.25 * (xx - yy) ** 2 + xy * xy).clamp(min=0.1))
     radii = torch.ceil(3 * torch.sqrt(0.5 * (xx + yy) + spread))
-    size = radii.new_tensor([-(-side // TILE) * TILE for side in (request.width, request.height)])
+    width, height = (-(-side // TILE) * TILE for side in (request.width, request.height))
     low, high = footprints.means - radii[:, None], footprints.means + radii[:, None]
-    in_view = (high >= 1.5).all(-1) & (low < size + 0.5).all(-1)
+    in_view = (high >= 1.5).all(-1) & (low[:, 0] < width + 0.5) & (low[:, 1] < height + 0.5)
     keep = in_view & _resolved(footprints) & (radii < RADIUS_MAX)
     return torch.where(keep, radii, 0).to(torch.int32)
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import tyro
 
 from ...bench.contracts import Progress, no_progress
+from ...bench.executors.command import ExecutionOptions
 from ...bench.io.files import output_inside
 from ...bench.io.lock import locked
 from ...bench.runner.config import RunOptions
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class ExtremesSettings(RunOptions):
+class ExtremesSettings(RunOptions, ExecutionOptions):
     """Render a run's avatars in views and expressions beyond those of training; 1 where a limit is broken."""
 
     run: tyro.conf.Positional[str]
@@ -116,10 +117,12 @@ def extremes_run(settings: ExtremesSettings, progress: Progress = no_progress) -
     Does not pass where a limit is broken. Raises `InputError` for a folder that is no finished run, and for a capture
     that is not the run's.
     """
+    from ...bench.executors.settings import check_executor
     from .extremes import TASK as EXTREMES
     from .extremes import judge_extremes
     from .sheets import write_extremes_sheet
 
+    check_executor(settings.execution, "cpu")
     return run_robustness_test(settings, EXTREMES, judge_extremes, write_extremes_sheet, progress)
 
 

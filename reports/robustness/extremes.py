@@ -11,9 +11,10 @@ import cv2
 import numpy as np
 
 from ...bench.contracts import Clip, FloatArray, FrameKey, HeadPose, Progress
+from ...bench.executors.task import Task
 from ...bench.io.files import digest
-from ...bench.runner.run import load
-from ...bench.runner.steps import Job
+from ...bench.runner.run import load, trained
+from ...bench.runner.steps import Job, trained_files
 from .command import ExtremesSettings
 from .stability import (
     EXPRESSION_LIMITS,
@@ -28,6 +29,7 @@ from .stability import (
     typical,
     write_frame,
 )
+from .tasks import leave_frames, rendered_by_tasks
 from .viewpoints import Viewpoint, turntable
 
 NO_VARIATION = 1e-9
@@ -140,7 +142,12 @@ def judge_extremes(
     Under ``out`` it leaves the rows, a record of views, limits and findings, and the frames that the contact
     sheet shows.
     """
-    cases = [_case(job, ExtremesPlan.of(job.form.clip, settings), out) for job in jobs]
+    plans = [ExtremesPlan.of(job.form.clip, settings) for job in jobs]
+    cases = [_case(job, plan, out) for job, plan in zip(jobs, plans)]
+    if settings.execution.executor != "inline":
+        subjects = list(dict.fromkeys(job.clip.subject for job in jobs))
+        made_of = [_fingerprint(job, plan) for job, plan in zip(jobs, plans)]
+        cases = rendered_by_tasks(cases, subjects, made_of, settings, out)
     limits = {"views": asdict(VIEW_LIMITS), "expressions": asdict(EXPRESSION_LIMITS)}
     return run_cases(TASK, cases, settings, limits, out, progress)
 
@@ -162,6 +169,23 @@ def _case(job: Job, plan: ExtremesPlan, out: Path) -> RobustnessCase:
         (f"views and expressions of {job.clip.subject}", plan.fingerprint),
         lambda report: (_judged(job, plan, cell_folder(out, job), report), details),
     )
+
+
+def _fingerprint(job: Job, plan: ExtremesPlan) -> str:
+    """What the frames of an avatar depend on."""
+    return digest(plan.fingerprint, job.fit_fingerprint, trained_files(job))
+
+
+def render_avatar(task: Task, report: Callable[[str], None]) -> None:
+    """Render and judge one avatar, as an executor's task; leave what came out in its folder."""
+    given = {**task.arguments["settings"]}
+    given |= {name: tuple(given[name]) for name in ("methods", "sigmas")}
+    settings, out = ExtremesSettings(**given), Path(task.root)
+    chosen = task.arguments["method"], task.arguments["seed"]
+    _, jobs = trained(Path(settings.run), chosen[:1], settings, out, only=task.arguments["capture"])
+    (job,) = (job for job in jobs if (job.method.spec.name, job.seed) == chosen)
+    plan = ExtremesPlan.of(job.form.clip, settings)
+    leave_frames(_case(job, plan, out), _fingerprint(job, plan), cell_folder(out, job), report)
 
 
 def _key(job: Job, extreme: ExtremePose, number: int, view: Viewpoint) -> FrameKey:

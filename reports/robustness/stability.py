@@ -28,6 +28,7 @@ from ...bench.contracts import (
     Splats,
 )
 from ...bench.errors import UnavailableError
+from ...bench.executors.command import ExecutionOptions
 from ...bench.io.files import write_json
 from ...bench.io.images import quantise, write_png
 from ...bench.io.provenance import RENDER
@@ -245,7 +246,7 @@ def run_cases(
     Rows.of(rows).write(out / ROWS_FILE)
     by_hash = sorted({protocol.hash: protocol for protocol in protocols.values()}.items())
     record = {
-        "settings": asdict(settings),
+        "settings": settings.others if isinstance(settings, ExecutionOptions) else asdict(settings),
         "limits": limits,
         "protocols": [{"id": p.id, "hash": name, **asdict(p)} for name, p in by_hash],
         "avatars": avatars,

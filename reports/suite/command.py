@@ -4,15 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-import tyro
-
-from ...bench.configuration import build, merge, parse_assignments
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
-from ...bench.executors.settings import Execution, ExecutorName
-from ...bench.registry import unknown
+from ...bench.executors.command import ExecutionOptions
 from ...bench.runner.config import parse_size
 from ...bench.specs import Findings, writes
 
@@ -41,7 +37,7 @@ ALL = "all"
 
 
 @dataclass(frozen=True)
-class SuiteSettings:
+class SuiteSettings(ExecutionOptions):
     """The whole benchmark: makes the suite's synthetic subjects, trains and measures methods on all, writes result tables.
 
     Subjects differ in shape, skin, hair and performance; their tracking has errors, and their held-out sequence three parts:
@@ -76,17 +72,6 @@ class SuiteSettings:
     size: str = "144x208"
     """Width x height of the images in pixels."""
 
-    executor: ExecutorName = "inline"
-    """Where cells are worked on, as for `headbench run`."""
-
-    workers: int | None = None
-    """How many processes, as for `headbench run`."""
-
-    set: Annotated[
-        tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="execution.KEY=VALUE")
-    ] = ()
-    """A setting of the executor, for example `execution.slurm.partition=gpu`; repeatable."""
-
     edition: Literal[2, 1] = 2
     """As for `headbench synth`."""
 
@@ -99,16 +84,6 @@ class SuiteSettings:
         unknown = [name for name in self.ablations if name not in (*ABLATIONS, ALL)]
         if unknown:
             raise InputError("command line", "--ablations", f"{', '.join(ABLATIONS)} or {ALL}", unknown[0])
-
-    @property
-    def execution(self) -> Execution:
-        """How cells are worked on. Raises `InputError` for settings that are none."""
-        given = parse_assignments(self.set)
-        if stray := sorted(given.keys() - {"execution"}):
-            raise unknown("command line", "--set", stray[0], ["execution"])
-        options = {"executor": self.executor, "workers": self.workers}
-        options = {key: value for key, value in options.items() if value not in ("inline", None)}
-        return build(Execution, merge(given.get("execution", {}), options), "command line", "execution.")
 
     @property
     def chosen(self) -> tuple[str, ...]:

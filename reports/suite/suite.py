@@ -72,6 +72,7 @@ def run_suite(settings: SuiteSettings, progress: Progress) -> Findings:
         performance="parts",
         edition=settings.edition,
         tracking_error=settings.tracking_error,
+        execution=execution,
         progress=progress,
     )
     failed = {name: run(config, execution).failed for name, config in runs.items()}

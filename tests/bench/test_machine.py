@@ -3,14 +3,22 @@
 import os
 import sys
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import torch
 
 from headbench.bench import machine
-from headbench.bench.errors import InputError
-from headbench.bench.machine import PeakMemory, accelerators, check_device, machine_record
+from headbench.bench.errors import HeadbenchError, InputError
+from headbench.bench.machine import (
+    PeakMemory,
+    accelerators,
+    check_device,
+    check_device_answers,
+    machine_record,
+    use_device,
+)
 
 MB = 1_000_000
 
@@ -71,3 +79,67 @@ def test_a_device_that_is_not_there_is_refused(monkeypatch, kind, count, number,
     else:
         with pytest.raises(InputError, match=refused.format(kind)):
             check_device(kind + number)
+
+
+@pytest.fixture
+def pretended_gpu(monkeypatch):
+    """A CUDA device as far as the record asks for one, on which tensors took 7 bytes, then 5."""
+    peaks = {"cuda:1": 7}
+    cuda = SimpleNamespace(
+        is_available=lambda: True,
+        set_device=lambda device: peaks.__setitem__("current", device),
+        get_device_properties=lambda device: SimpleNamespace(
+            name=f"Abacus {device}", total_memory=9, major=9, minor=0
+        ),
+        reset_peak_memory_stats=lambda device: peaks.__setitem__(device, 0),
+        memory_allocated=lambda device: 2,
+        max_memory_allocated=lambda device: peaks[device],
+        synchronize=lambda device: peaks["fault"](),
+    )
+    flags = {"cuda": SimpleNamespace(matmul=SimpleNamespace(allow_tf32=True))}
+    backends = SimpleNamespace(**flags, cudnn=SimpleNamespace(allow_tf32=True))
+    for name, value in {"cuda": cuda, "backends": backends}.items():
+        monkeypatch.setattr(torch, name, value)
+    return peaks
+
+
+def test_the_record_tells_of_the_device(pretended_gpu):
+    record = machine_record("cuda:1")
+    assert record["device"] == {
+        "name": "Abacus cuda:1",
+        "memory_bytes": 9,
+        "capability": "9.0",
+        "cuda": torch.version.cuda,
+    }
+    assert pretended_gpu["current"] == "cuda:1"
+    assert {"torch", "gsplat"} <= record["packages"].keys()
+    assert "device" not in machine_record()
+
+
+@pytest.mark.parametrize(
+    ("device", "current", "tf32"), [("cpu", None, True), ("cuda", None, False), ("cuda:1", "cuda:1", False)]
+)
+def test_a_cuda_device_is_used_without_tf32(pretended_gpu, device, current, tf32):
+    use_device(device)  # torch refuses to make "cuda" current, without a number
+    assert pretended_gpu.get("current") == current
+    flags = torch.backends.cuda.matmul.allow_tf32, torch.backends.cudnn.allow_tf32
+    assert flags == (tf32, tf32)
+
+
+def test_peak_memory_is_that_of_the_device_used(pretended_gpu):
+    with PeakMemory("cuda:1") as memory:
+        pretended_gpu["cuda:1"] = 5
+    found = {"device_memory_before_bytes": 2, "peak_device_memory_bytes": 5, "tf32": True}
+    assert memory.device_record == found
+    with PeakMemory() as memory:
+        pass
+    assert memory.device_record == {}
+
+
+def test_a_device_lost_to_this_process_is_told(pretended_gpu):
+    pretended_gpu["fault"] = Mock()
+    check_device_answers("cuda")
+    pretended_gpu["fault"].side_effect = RuntimeError("CUDA error: illegal memory access\nCompile with")
+    check_device_answers("cpu")
+    with pytest.raises(HeadbenchError, match=r"illegal memory access\. Start the command again"):
+        check_device_answers("cuda:1")

@@ -51,6 +51,20 @@ def test_a_query_gives_what_agrees_with_every_name(rows, named, count):
         assert set(found[column]) <= {named[column]}
 
 
+def test_rows_of_metrics_are_the_queries_joined(rows):
+    order = ["ssim", "absent", "psnr"]
+    expected = Rows.joined([Rows(rows.select(**{**NAMED, "metric": name})) for name in order])
+    assert rows.of_metrics(order).select(**NAMED).equals(expected.select(**NAMED))
+    assert rows.metrics_with_values == {"psnr", "ssim"}
+
+
+def test_many_parts_are_joined_in_order(rows):
+    whole = rows.select(**NAMED)
+    parts = [Rows(whole[index % len(whole) :][:3]) for index in range(200)]
+    expected = pd.concat([part.select(**NAMED) for part in parts], ignore_index=True)
+    pd.testing.assert_frame_equal(Rows.joined(parts).select(**NAMED), expected)
+
+
 def test_rows_are_the_same_when_read_back(rows, tmp_path):
     rows.write(tmp_path / "rows.parquet")
     again = Rows.read(tmp_path / "rows.parquet")

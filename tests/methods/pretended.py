@@ -7,15 +7,19 @@ are refused, as CUDA refuses them.
 from __future__ import annotations
 
 import functools
+import subprocess
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
+from torch.utils._mode_utils import no_dispatch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map
 
@@ -97,6 +101,9 @@ def perform(function: Any, args: Any, kwargs: dict[str, Any], counts: Counter[st
         raise DeviceError(f"{function}: a generator of the CPU")
     count(name, function, args, kwargs, here, there, goes_here, counts)
     known = {id(value.held): value for value in here}
+    if torch.Tag.inplace_view in function.tags:  # changes the form of the wrapper, too
+        with no_dispatch():
+            function(*args, **kwargs)
     args, kwargs = tree_map(
         lambda value: value.held if isinstance(value, Pretended) else value, (args, kwargs)
     )
@@ -182,12 +189,36 @@ class _FromLists(TorchFunctionMode):
         return function(*args, **kwargs)
 
 
+class _Module:
+    """What torch asks of ``torch.pretended``."""
+
+    is_available = is_initialized = staticmethod(lambda: True)
+    _is_in_bad_fork = is_autocast_enabled = staticmethod(lambda: False)
+    current_device = staticmethod(lambda: 0)
+    device_count = staticmethod(lambda: 1)
+    get_amp_supported_dtype = staticmethod(lambda: [torch.float16])
+    manual_seed_all = synchronize = staticmethod(lambda *_: None)
+
+
 @functools.cache
 def register() -> None:
-    """Make torch know the device. Before the first gradient of the process, for which torch then starts threads."""
-    from torch.utils.backend_registration import _setup_privateuseone_for_python_backend
+    """Make torch know the device. Before the first gradient of the process, for which torch then starts threads.
 
-    _setup_privateuseone_for_python_backend(DEVICE)
+    Compiles the device's guard, as torch's own for devices written in Python ends the process in the backward pass.
+    """
+    from torch.utils import backend_registration
+
+    torch.utils.rename_privateuse1_backend(DEVICE)
+    torch.utils.generate_methods_for_privateuse1_backend()
+    torch._register_device_module(DEVICE, _Module())
+    torch._C._acc.register_python_privateuseone_hook(backend_registration._DummyPrivateUse1Hook())
+    home = Path(torch.__file__).parent
+    with TemporaryDirectory() as folder:
+        library = str(Path(folder) / "guard.so")
+        source = str(Path(__file__).with_name("pretended_guard.cpp"))
+        flags = ["-std=c++20", "-shared", "-fPIC", f"-I{home / 'include'}", f"-L{home / 'lib'}", "-lc10"]
+        subprocess.run(["g++", source, *flags, "-o", library], check=True)
+        torch.ops.load_library(library)
 
 
 @contextmanager

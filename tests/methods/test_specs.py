@@ -1,12 +1,21 @@
 """Specs: every preset resolves, and the paper presets are the published values."""
 
+from dataclasses import replace
+
 import pytest
 
 from headbench.bench.configuration import build
 from headbench.bench.contracts import Budget
+from headbench.bench.errors import InputError
 from headbench.bench.io.files import digest
 from headbench.bench.registry import resolve
-from headbench.bench.runner.config import resolve_method
+from headbench.bench.runner.config import (
+    DemoConfig,
+    RunConfig,
+    demo_run_config,
+    resolve_method,
+    resolve_methods,
+)
 from headbench.methods.ga.config import GAConfig
 from headbench.methods.ga.spec import GA
 from headbench.methods.gbs.config import GBSConfig
@@ -21,7 +30,7 @@ from headbench.methods.shared.schedule import DensifySchedule, Timeline
 from headbench.methods.trivial.spec import MEAN_IMAGE, NEAREST_CAMERA
 
 SPECS = {spec.name: spec for spec in (OURS, GA, GBS, GHA, INSTA, MEAN_IMAGE, NEAREST_CAMERA)}
-PRESETS = ("smoke", "demo", "fast", "paper")
+PRESETS = ("smoke", "demo", "fast", "gpu", "paper")
 
 
 @pytest.mark.parametrize("name", SPECS)
@@ -38,6 +47,19 @@ def test_presets_resolve(name, preset):
     else:
         assert settings == {}
         implementation()
+
+
+def test_insta_is_refused_on_a_gpu_before_any_work(tmp_path):
+    config = RunConfig("data", "out", methods=("ours", "insta"), device="cuda:1")
+    with pytest.raises(
+        InputError, match=r"device: expected cpu for method insta, found 'cuda:1'.*device=cpu"
+    ):
+        resolve_methods(config)
+    with pytest.raises(InputError, match="device=cpu"):
+        resolve(INSTA.implementation)().load(tmp_path, device="cuda")
+    assert resolve_methods(replace(config, device="cpu"))
+    everywhere, on_gpus = (demo_run_config(DemoConfig(), device)["methods"] for device in ("cpu", "cuda"))
+    assert set(everywhere) - set(on_gpus) == {"insta"}
 
 
 @pytest.mark.parametrize("name", SPECS)
@@ -93,6 +115,16 @@ def test_short_presets_share_rates_that_paper_leaves_alone(preset):
     assert values(ga.splats, *RATES) == values(ours.splats, *RATES) == (0.2, 1e-3, 0.05, 0.05, 0.01)
     assert values(gbs.splats, *RATES[2:]) == values(ga.splats, *RATES[2:])
     assert values(gbs, "sh_dc_lr", "sh_rest_lr") == values(ga, "sh_dc_lr", "sh_rest_lr") == (0.02, 1e-3)
+
+
+@pytest.mark.parametrize("spec", [OURS, GA, GBS, GHA, INSTA], ids=lambda spec: spec.name)
+def test_the_gpu_preset_is_the_published_one_but_shorter(spec):
+    gpu, paper = (resolve_method(spec, preset, {}) for preset in ("gpu", "paper"))
+    assert gpu.config == paper.config
+    assert gpu.spec.resolution == paper.spec.resolution
+    # INSTA's published training is short already.
+    assert min(paper.budget.iterations, 30_000) <= gpu.budget.iterations <= 60_000
+    assert list(spec.presets)[-2:] == ["gpu", "paper"]
 
 
 def test_the_paper_preset_of_gha_is_the_published_design():

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pymeshlab
 import tyro
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import dijkstra
@@ -97,6 +96,8 @@ def feature_points() -> FloatArray:
 
 def clean(vertices: FloatArray, faces: IntArray, *, merge: float, flip: bool) -> tuple[FloatArray, IntArray]:
     """Largest piece of the mesh; vertices nearer than ``merge`` metres made one, slivers flipped if asked."""
+    import pymeshlab
+
     meshes = pymeshlab.MeshSet()
     meshes.add_mesh(pymeshlab.Mesh(vertices, faces))
     meshes.meshing_merge_close_vertices(threshold=pymeshlab.PureValue(merge))

@@ -21,7 +21,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import nlopt
 import numpy as np
 from scipy.linalg.lapack import dposv
 
@@ -342,7 +341,8 @@ def _solve(gram: FloatArray, right: FloatArray) -> FloatArray:
     return np.asarray(solution)
 
 
-_ALGORITHMS = {"slsqp": nlopt.LD_SLSQP, "lbfgs": nlopt.LD_LBFGS, "mma": nlopt.LD_MMA}
+_ALGORITHMS = {"slsqp": "LD_SLSQP", "lbfgs": "LD_LBFGS", "mma": "LD_MMA"}
+"""Names of nlopt's constants."""
 
 
 class Solution(NamedTuple):
@@ -393,7 +393,9 @@ def solve_frame(
     if not searched.any():
         objective(first, np.zeros(0))
         return best[0]
-    search = nlopt.opt(_ALGORITHMS[settings.algorithm], int(searched.sum()))
+    import nlopt
+
+    search = nlopt.opt(getattr(nlopt, _ALGORITHMS[settings.algorithm]), int(searched.sum()))
     search.set_min_objective(objective)
     search.set_lower_bounds(-limit[searched] / scale)
     search.set_upper_bounds(limit[searched] / scale)

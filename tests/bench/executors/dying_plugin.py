@@ -33,6 +33,15 @@ class FullDisk(ToyMethod):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(out / "level.txt"))
 
 
+class FailingOnce(ToyMethod):
+    def fit(self, clip, out, budget, **arguments):
+        out.mkdir(parents=True, exist_ok=True)
+        if not (out / "starts.log").exists():
+            (out / "starts.log").touch()
+            raise RuntimeError("the first training diverged")
+        return super().fit(clip, out, budget, **arguments)
+
+
 class Slow(ToyMethod):
     """Trains until a file `go` lies in the working directory."""
 
@@ -48,4 +57,5 @@ class Slow(ToyMethod):
 DYING = replace(METHOD, name="dying", implementation="dying_plugin:Dying")
 ALWAYS = replace(METHOD, name="always", implementation="dying_plugin:AlwaysDying")
 FULL = replace(METHOD, name="full", implementation="dying_plugin:FullDisk")
+FAILING_ONCE = replace(METHOD, name="once", implementation="dying_plugin:FailingOnce")
 SLOW = replace(METHOD, name="slow", implementation="dying_plugin:Slow")

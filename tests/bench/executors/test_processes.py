@@ -4,14 +4,19 @@ import os
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import psutil
 import pytest
 
 from headbench.bench import cli
 from headbench.bench.executors.outcome import read_outcome
+from headbench.bench.executors.processes import Processes
+from headbench.bench.executors.run import machine_of
+from headbench.bench.executors.schedule import Schedule
 from headbench.bench.executors.settings import Execution
 from headbench.bench.executors.status import CellState, time_left
+from headbench.bench.executors.task import Task
 from headbench.bench.io.documents import read_json
 from headbench.bench.io.files import write_json
 from headbench.bench.io.lock import is_locked
@@ -40,6 +45,36 @@ def test_rows_equal_those_of_one_process(config, rows_of, inline):
     assert (outcome["status"], outcome["reason"]) == ("failed", "RuntimeError: the training diverged")
     assert "Traceback" in (cell_of(config, "subject2", "failing") / "job.log").read_text()
     assert outcome["process"] != os.getpid()
+
+
+@pytest.mark.parametrize("workers", [None, 2])
+def test_a_device_that_is_not_there_fails_each_task(tmp_path, workers):
+    tasks = [
+        replace(Task.of(tmp_path, place, "math:sqrt"), device="xpu", restarts=0) for place in ("one", "two")
+    ]
+    for task in tasks:
+        task.folder.mkdir()
+    schedule = Schedule("tasks", lambda task: True, Execution("processes", workers=workers))
+    failures = schedule.work_off(tasks)
+    assert set(failures) == {"one", "two"}
+    for task in tasks:
+        assert "device" in failures[task.place]
+        assert "none that torch can use" in (task.folder / "job.log").read_text()
+    processes = {read_outcome(task.folder)["process"] for task in tasks}
+    assert len(processes) == 2, "a failure on a device may be that of its process"
+
+
+def test_machines_of_several_kinds_are_all_named(config, rows_of, inline, caplog):
+    rows_of(config, TWO)
+    cells = [cell_of(config, "subject1", name) for name in ("toy", "failing")]
+    for cell, card in zip(cells, "AB"):
+        path = cell / "outcome.json"
+        outcome = read_json(path)
+        outcome["machine"]["device"] = {"name": f"Card {card}", "memory_bytes": 9}
+        write_json(path, outcome)
+    jobs = [SimpleNamespace(cell=SimpleNamespace(folder=cell)) for cell in cells]
+    assert machine_of(jobs, {})["device"] == {"name": "Card A and Card B", "memory_bytes": 9}
+    assert "Card A, Card B: their times and speeds do not compare" in caplog.text
 
 
 def test_done_cells_are_kept_and_failed_ones_tried_again(config, rows_of, inline):
@@ -91,6 +126,30 @@ def test_speed_is_measured_after_the_trainings_alone(config, rows_of):
         assert (outcome["speed"], outcome["restarts"]) == (True, 1)
         spans.append(outcome["process"])
     assert len(set(spans)) == 1  # one process, one after another
+
+
+def test_ended_while_speed_is_measured_it_goes_on_with_that(config, rows_of, tmp_path, monkeypatch):
+    config = replace(
+        config, methods=("toy_plugin:METHOD", "dying_plugin:FAILING_ONCE"), metrics=("psnr", "fps")
+    )
+    with monkeypatch.context() as patch:
+        patch.setattr("headbench.bench.executors.schedule.Processes", EndsAtSpeed)
+        with pytest.raises(KeyboardInterrupt):
+            runner.run(config, TWO)
+    rows = rows_of(config, TWO)
+    assert set(rows[rows["method"] == "toy"]["status"]) == {"ok"}
+    assert set(rows[rows["method"] == "once"]["status"]) == {"failed"}  # not trained again in that pass
+    again = rows_of(config, TWO)
+    assert set(again["status"]) == {"ok"}  # but by a start after the run has ended
+
+
+class EndsAtSpeed(Processes):
+    """Ends the run where it would begin to measure speed."""
+
+    def submit(self, tasks):
+        if tasks[0].speed:
+            raise KeyboardInterrupt
+        super().submit(tasks)
 
 
 def test_with_the_parent_killed_workers_end(config, command, tmp_path, rows_of, capsys):

@@ -5,7 +5,7 @@ import pytest
 
 from headbench.bench.contracts import Camera
 from headbench.bench.errors import InputError
-from headbench.bench.runner.captures import open_clips
+from headbench.bench.runner.captures import open_clips, synthesis_arguments
 from headbench.bench.runner.config import RunConfig
 
 
@@ -96,3 +96,14 @@ def test_two_captures_of_one_subject_are_refused(config, toy, tmp_path, monkeypa
     monkeypatch.setattr(toy, "read", lambda path: toy.ToyClip("same"))
     with pytest.raises(InputError, match="same, same"):
         open_clips(config())
+
+
+@pytest.mark.parametrize("name", ["out", "pictures", "execution", "workers", "progress"])
+def test_a_bundle_decides_nothing_but_what_is_captured(name):
+    recorded = {"head": "procedural", "seed": 3}
+    steps = [{"parameters": {"synthetic": recorded}}]
+    assert synthesis_arguments(steps, "a")["seed"] == 3
+    # What a stranger's bundle says of an executor would be run as a script of the shell.
+    recorded[name] = {"executor": "slurm", "slurm": {"setup": ["touch owned"]}}
+    with pytest.raises(InputError, match=rf"{name}: expected one of cameras, .*, found '{name}'"):
+        synthesis_arguments(steps, "a")

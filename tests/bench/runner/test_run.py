@@ -2,6 +2,7 @@
 
 import json
 import math
+import time
 import types
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +15,7 @@ from headbench.bench.errors import HeadbenchError, InputError
 from headbench.bench.io.documents import read_json
 from headbench.bench.io.lock import locked
 from headbench.bench.registry import Plugin
-from headbench.bench.runner import adaptation
+from headbench.bench.runner import adaptation, steps
 from headbench.bench.runner import run as runner
 from headbench.bench.runner.config import RunConfig
 from headbench.bench.runner.store import RunFolder
@@ -104,6 +105,31 @@ def test_the_record_of_training_counts_interruptions(config, toy, monkeypatch, c
     runner.run(config)
     assert cell.step("fit")["interruptions"] == 2
     assert RunFolder(Path(config.out)).cell("subject2", "toy", 0).step("fit")["interruptions"] == 0
+
+
+def test_what_a_method_prepares_is_not_timed_as_training(config, toy, monkeypatch, cell):
+    now, order = [0.0], []
+
+    def prepare(self, device):
+        order.append(device)
+        now[0] += 1000.0
+
+    fit = toy.ToyMethod.fit
+
+    def timed_fit(self, *arguments, **options):
+        order.append("fit")
+        now[0] += 1.0
+        return fit(self, *arguments, **options)
+
+    monkeypatch.setattr(toy.ToyMethod, "prepare", prepare, raising=False)
+    monkeypatch.setattr(toy.ToyMethod, "fit", timed_fit)
+    monkeypatch.setattr(
+        steps, "time", types.SimpleNamespace(perf_counter=lambda: now[0], monotonic=time.monotonic)
+    )
+    runner.run(config)
+    assert order[:2] == ["cpu", "fit"]
+    assert cell.step("fit")["seconds"] == 1.0
+    assert "peak_device_memory_bytes" not in cell.step("fit")
 
 
 def test_a_method_that_looks_at_held_out_frames_fails(config):

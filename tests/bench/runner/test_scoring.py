@@ -3,6 +3,7 @@
 import math
 import threading
 import types
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -178,3 +179,30 @@ def test_unknown_profiles_and_undefined_metrics_are_refused():
         resolved(metric_profiles=("skimge",))
     with pytest.raises(InputError, match=r"metrics, lpips: expected one that the profiles skimage define"):
         resolved(metric_profiles=("skimage",))
+
+
+class OnDevice(Batched):
+    """The same, one level more on a device other than the CPU."""
+
+    def __init__(self, device="cpu"):
+        self.device = device
+
+    def on(self, device):
+        return OnDevice(device)
+
+    def __call__(self, image, truth):
+        return super().__call__(image, truth) + (self.device != "cpu")
+
+
+# Results of a run on a GPU are measured on the CPU where there is none.
+@pytest.mark.parametrize(
+    ("device", "there", "more"),
+    [("cpu", True, 0), ("mps", True, 0), ("cuda:1", True, 1), ("cuda:1", False, 0)],
+)
+def test_a_metric_that_can_computes_on_the_gpu_of_the_run(monkeypatch, device, there, more):
+    cuda = SimpleNamespace(is_available=lambda: there)
+    monkeypatch.setattr(scoring, "resolve", lambda name: cuda if name == "torch:cuda" else OnDevice)
+    spec = MetricSpec("d", "D", "", False, 1, "there:OnDevice", "a difference")
+    (plain,) = score_frames(KEYS[:1], Frames(render, RegionalToyClip()), [spec])["d"]
+    (found,) = score_frames(KEYS[:1], Frames(render, RegionalToyClip()), [spec], device=device)["d"]
+    assert found.value == plain.value + more

@@ -174,7 +174,7 @@ class _Parts:
     def __init__(self, avatar: OursAvatar, pose: HeadPose, camera: Camera):
         self._avatar, self._tensors = avatar, avatar.field.tensors
         self._mesh, self._pose = avatar.mesh, pose
-        self._view = view_of(camera, "cpu")
+        self._view = view_of(camera, "cpu", (1.0, 1.0, 1.0))
         with torch.no_grad():
             self._vertices = self.mesh()
             self._frames = self.frames()
@@ -189,7 +189,7 @@ class _Parts:
             features = plane_features(self._tensors, Bounds(*self._tensors["plane_box"]), self._positions)
             self._from_position = position_part(self._tensors, features)
             splats = avatar.neutral
-            self._carrier = WorldTransform(self._binding, splats.log_scales, splats.quats)
+            self._carrier = WorldTransform(self._binding, *splats[:3])
             self._coefficients = self._driving()
             self._offsets = self.offsets()
             self._splats = self._changed(self._offsets)
@@ -204,17 +204,19 @@ class _Parts:
 
     def offsets(self) -> Tensor:
         assert self._avatar.line_offsets is not None
-        return self._avatar.line_offsets(*self._coefficients)
+        return self._avatar.line_offsets(torch.cat(self._coefficients))
 
     def offsets_by_torch(self) -> Tensor:
         """With the first layer on the blended lines, all units of all layers."""
         assert self._avatar.line_offsets is not None
-        return self._avatar.line_offsets.by_torch(self._avatar.line_offsets.table(*self._coefficients))
+        return self._avatar.line_offsets.by_torch(
+            self._avatar.line_offsets.table(torch.cat(self._coefficients))
+        )
 
     def units_on(self) -> float:
         """Part of the first layer's units that are on, over all splats inside."""
         assert self._avatar.line_offsets is not None
-        table = self._avatar.line_offsets.table(*self._coefficients)
+        table = self._avatar.line_offsets.table(torch.cat(self._coefficients))
         return float((sum_rows(table, *self._place) > 0).float().mean())
 
     def offsets_by_line(self) -> Tensor:
@@ -266,7 +268,7 @@ class _Parts:
 
     def raster(self) -> Any:
         opacities = torch.sigmoid(self._splats.logits)
-        return read_back(draw_splats(self._world, opacities, self._shown, self._view, (1.0, 1.0, 1.0)))
+        return read_back(draw_splats(self._world, opacities, self._shown, self._view))
 
     def plain(self) -> Any:
         """A whole frame by training's functions, nothing known beforehand but the canonical positions."""
@@ -284,7 +286,8 @@ class _Parts:
 
     def _driving(self) -> tuple[Tensor, Tensor]:
         bases = self._tensors["jaw_bases"].numpy().astype(float)
-        return driving_coefficients(self._pose, len(self._tensors["lines"]) - len(bases), bases, "cpu")
+        found = driving_coefficients(self._pose, len(self._tensors["lines"]) - len(bases), bases)
+        return torch.from_numpy(found[0]), torch.from_numpy(found[1])
 
     def _changed(self, offsets: Tensor) -> Any:
         return apply_offsets(self._avatar.neutral, offsets, self._avatar.field.dynamic)

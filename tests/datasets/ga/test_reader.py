@@ -102,6 +102,11 @@ def test_one_camera_has_no_novel_view(tmp_path):
     }
 
 
+def test_captures_of_one_head_model_share_it_in_memory(pristine_capture):
+    first, second = read_capture(pristine_capture.union), read_capture(pristine_capture.union)
+    assert first.head is second.head
+
+
 def test_captures_are_found_from_the_folder_above(pristine_capture, tmp_path):
     root = pristine_capture.writer.root
     assert find_captures(root) == [pristine_capture.union]

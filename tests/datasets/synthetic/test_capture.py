@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from headbench.bench.errors import InputError
+from headbench.bench.errors import HeadbenchError, InputError
+from headbench.bench.executors.settings import Execution
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.synthetic.capture import synthesize
 from headbench.datasets.synthetic.panels import KERNEL
@@ -87,6 +88,27 @@ def test_pictures_are_those_of_a_capture_tracked_otherwise(capture, tmp_path):
     (half / "synthesis.json").write_bytes((capture[0] / "synthesis.json").read_bytes())
     with pytest.raises(InputError, match="found none that is whole"):
         synthesize(tmp_path / "third", **SMALL, tracking_error=1.0, pictures=half)
+
+
+@pytest.mark.slow
+def test_by_tasks_the_files_are_the_same(tmp_path):
+    pair = {**SMALL, "cameras": 2, "timesteps": 8, "subjects": 2}
+    outs = [tmp_path / name for name in ("one", "two")]
+    synthesize(outs[0], **pair)
+    synthesize(outs[1], **pair, execution=Execution("processes", workers=2, threads=1))
+    found = [{p.relative_to(out): p.read_bytes() for p in out.rglob("*") if p.is_file()} for out in outs]
+    assert found[0] == found[1]
+
+
+@pytest.mark.slow
+def test_a_subject_that_fails_is_named_with_its_log(tmp_path, monkeypatch):
+    # Where the process that renders has another idea of what there is, the outcome is not believed.
+    monkeypatch.setattr(
+        "headbench.datasets.synthetic.capture._missing", lambda plan, sequence, timestep: ("0",)
+    )
+    once = Execution("processes", workers=1, threads=1, restarts=0)
+    with pytest.raises(HeadbenchError, match="Subject 900 failed: .*missing.*job.log"):
+        synthesize(tmp_path, **SMALL, execution=once)
 
 
 @pytest.mark.parametrize("left", [["README.txt"], [".tmp-headbench-a.json"], ["synthesis.json"], []])

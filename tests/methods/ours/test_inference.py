@@ -9,8 +9,9 @@ import torch
 from headbench.bench.contracts import HeadPose
 from headbench.bench.errors import InputError
 from headbench.methods.ours.avatar import OursAvatar
-from headbench.methods.ours.field import Bounds, blend_lines, line_offsets, line_position
-from headbench.methods.ours.inference import LineOffsets, PlaneColors, encode_columns
+from headbench.methods.ours.field import Bounds, blend_lines, line_offsets, line_position, normalised_weight
+from headbench.methods.ours.inference import DeviceLines, LineOffsets, PlaneColors, encode_columns
+from headbench.methods.shared import device_frame
 from headbench.methods.shared.networks import CPU_BLOCK, encode
 from headbench.methods.shared.subject_mesh import KnownPoses, pose_key
 
@@ -59,9 +60,9 @@ def test_offsets_are_those_of_training(clip, tmp_path):
     low, high = tensors["line_box"]
     generator = torch.Generator().manual_seed(4)
     points = low + (high - low) * (1.4 * torch.rand(15000, 3, generator=generator) - 0.2)
-    jaw = torch.rand(2, generator=generator)
-    expression = torch.randn(len(tensors["lines"]) - 2, generator=generator)
-    found = LineOffsets(tensors, points)(expression, jaw)
+    jaw = torch.rand(len(tensors["jaw_bases"]), generator=generator)
+    expression = torch.randn(len(tensors["lines"]) - len(jaw), generator=generator)
+    found = LineOffsets(tensors, points)(torch.cat([expression, jaw]))
     box = Bounds(low, high)
     inside = box.contains(points)
     assert 2 * CPU_BLOCK < inside.sum() < 15000  # several blocks, the last one short
@@ -69,8 +70,14 @@ def test_offsets_are_those_of_training(clip, tmp_path):
     position = line_position(box.unit(points[inside]), tensors["lines"].shape[2])
     np.testing.assert_allclose(found[inside], line_offsets(tensors, blended, position), atol=1e-5)
     assert not found[~inside].any()
+    rows = device_frame.WeightedRows(*position)
+    layers = (normalised_weight(tensors, 0), tensors["line_bias_0"])
+    layers += tuple(normalised_weight(tensors, layer).t() for layer in (1, 2))
+    layers += (tensors["line_bias_1"], tensors["line_bias_2"])
+    few = DeviceLines(tensors["lines"], len(jaw), layers, inside.nonzero()[:, 0], rows, len(points))
+    np.testing.assert_allclose(few(torch.cat([expression, jaw])), found, atol=1e-5)
     exact = {name: value.double() for name, value in tensors.items()}
-    slow = LineOffsets(exact, points.double())(expression.double(), jaw.double())
+    slow = LineOffsets(exact, points.double())(torch.cat([expression, jaw]).double())
     np.testing.assert_allclose(found, slow, atol=1e-5)
 
 

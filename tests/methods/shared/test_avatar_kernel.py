@@ -231,7 +231,7 @@ def test_known_shapes_and_others_are_transformed_as_defined(dtype):
     normal, binding = numbers(0), torch.arange(50) % 10
     means, log_scales, quats = (normal(50, n).to(dtype) for n in (3, 3, 4))
     frames = Frames(*(value.to(dtype) for value in mesh(normal, 10)))
-    carrier = avatar_kernel.WorldTransform(binding, log_scales, quats)
+    carrier = avatar_kernel.WorldTransform(binding, means, log_scales, quats)
     for shape in ((log_scales, quats), (log_scales + 1, quats), (log_scales, 2 * quats.flip(1))):
         expected = to_world(frames, binding, means, *shape)
         for found, other in zip(carrier(frames, means, *shape), expected):

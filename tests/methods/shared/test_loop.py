@@ -50,8 +50,10 @@ class Clock:
         return self.now
 
 
-def run(model, folder, budget, progress=no_progress, clock=None, every=1e9, name="run", began=None):
-    fit = Fit(None, folder, budget, "cpu", 0, progress, name, clock or Clock())
+def run(
+    model, folder, budget, progress=no_progress, clock=None, every=1e9, name="run", began=None, device="cpu"
+):
+    fit = Fit(None, folder, budget, device, 0, progress, name, clock or Clock())
     sampler = lambda iteration: iteration % 3
     return train(model, sampler, fit, published_length=100, checkpoint_every_s=every, began=began)
 
@@ -82,6 +84,19 @@ def test_torch_has_one_thread_where_kernels_are_compiled(tmp_path, monkeypatch, 
         report = lambda *_: seen.append((torch.get_num_threads(), threads()))
         run(Drift(), tmp_path, Budget(iterations=2), report)
     assert seen == [expected] * 2
+
+
+def test_steps_are_timed_until_their_device_has_done_them(tmp_path, monkeypatch):
+    clock, queue = Clock(), Clock()
+
+    def synchronize(device):
+        assert device == "cuda:1"
+        clock.now, queue.now = clock.now + queue.now, 0.0
+
+    monkeypatch.setattr(torch.cuda, "synchronize", synchronize)
+    outcome = run(Drift(queue, 0.5), tmp_path, Budget(seconds=80.0), clock=clock, device="cuda:1")
+    assert outcome.planned == 100
+    assert outcome.seconds == pytest.approx(0.5 * (100 + loop.TIMED_STEPS + 1))
 
 
 def test_seconds_alone_give_an_estimate_of_iterations(tmp_path):

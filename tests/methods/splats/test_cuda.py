@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import logging
+import sys
 from functools import partial
 from types import SimpleNamespace
 
@@ -17,11 +18,30 @@ from headbench.tests.benchmarks.splats.scenes import cloud, head_shell, relative
 from .cases import request_of
 
 slow = importlib.import_module("headbench.methods.splats.rasterize")  # the package's name is the function's
+COMPILED_CHANNELS = (1, 2, 3, 4, 5, 8, 9, 16, 17, 32)  # by gsplat 1.5 and 1.6 alike, as far as 32
 needs_gpu = pytest.mark.skipif(not cuda.usable(), reason="needs a GPU and gsplat (extra `cuda`)")
 
 
+class _AbsoluteGradients(torch.autograd.Function):
+    """Leaves ``absgrad`` on the 2D means in the backward pass, and not before, as gsplat 1.5 does."""
+
+    @staticmethod
+    def forward(ctx, image, means2d):
+        ctx.save_for_backward(means2d)
+        return image.view_as(image)
+
+    @staticmethod
+    def backward(ctx, gradient):
+        (means2d,) = ctx.saved_tensors
+        means2d.absgrad = torch.full_like(means2d, 3.0)
+        return gradient, None
+
+
 class FakeGsplat:
-    """gsplat's functions in plain torch on the CPU, of any dtype; draws every splat at every pixel."""
+    """gsplat's functions in plain torch on the CPU, of any dtype; draws every splat at every pixel.
+
+    As there, rows of splats out of view are memory that nobody wrote, here NaN, but for radii and compensations of 0.
+    """
 
     def __init__(self, clamp=0.99):
         self.clamp = clamp
@@ -55,7 +75,9 @@ class FakeGsplat:
         factor = (torch.linalg.det(sharp) / torch.linalg.det(blurred)).clamp(min=0).sqrt()
         seen = (depths > near_plane) & (depths < far_plane)
         radii = torch.where(seen[..., None], torch.tensor([7, 9]), 0).to(torch.int32)
-        return radii, f * ratio + c, depths, conics, factor if calc_compensations else None
+        means2d, conics = (torch.where(seen[..., None], x, torch.nan) for x in (f * ratio + c, conics))
+        depths, factor = torch.where(seen, depths, torch.nan), torch.where(seen, factor, 0)
+        return radii, means2d, depths, conics, factor if calc_compensations else None
 
     def isect_tiles(self, means2d, radii, depths, tile, columns, rows):
         order = torch.where(radii[..., 0] > 0, depths, torch.inf).argsort(dim=1, stable=True)
@@ -68,6 +90,8 @@ class FakeGsplat:
         self, means2d, conics, colors, opacities, width, height, tile, offsets, lists, *, backgrounds, absgrad
     ):
         assert offsets.shape[1:] == (-(-height // tile), -(-width // tile))
+        assert colors.shape[-1] in COMPILED_CHANNELS
+        assert backgrounds.shape == (len(colors), colors.shape[-1])
         images, alphas = [], []
         centers = [torch.arange(n).to(means2d) + 0.5 for n in (height, width)]
         y, x = torch.meshgrid(*centers, indexing="ij")
@@ -86,14 +110,26 @@ class FakeGsplat:
                 light = light * (1 - alpha)
             images.append(image + light[..., None] * backgrounds[view])
             alphas.append(1 - light[..., None])
-        if absgrad:
-            means2d.absgrad = torch.full_like(means2d, 3.0)
-        return torch.stack(images), torch.stack(alphas)
+        image = torch.stack(images)
+        return _AbsoluteGradients.apply(image, means2d) if absgrad else image, torch.stack(alphas)
 
 
-@pytest.mark.parametrize("antialiased", [False, True])
-def test_gsplat_is_driven_to_draw_what_the_reference_draws(antialiased):
-    one, other = cloud(25, 19, 14, seed=1, size=0.1), cloud(25, 19, 14, seed=2)
+class NewGsplat(FakeGsplat):
+    """Takes the ellipses of splats, as gsplat 1.6 does."""
+
+    def isect_tiles(self, means2d, radii, depths, tile, columns, rows, conics=None, opacities=None):
+        assert conics.shape == (*means2d.shape[:2], 3)
+        assert opacities.shape == means2d.shape[:2]
+        return super().isect_tiles(means2d, radii, depths, tile, columns, rows)
+
+
+@pytest.mark.parametrize("gsplat", [FakeGsplat(), NewGsplat()])
+@pytest.mark.parametrize(("antialiased", "channels"), [(False, 3), (True, 3), (False, 7)])
+def test_gsplat_is_driven_to_draw_what_the_reference_draws(antialiased, channels, gsplat):
+    one, other = (cloud(25, 19, 14, seed=seed, size=0.1, channels=channels) for seed in (1, 2))
+    one.means[:4] = torch.tensor(
+        [[0.1, 0.2, -5.0], [0, 0, 2e3], [0.3, 0, 2e3], [0.1, 0.0, -9.0]]
+    )  # not in view
     names = ("means", "quats", "scales", "opacities", "colors", "viewmat", "offset")
 
     options = {
@@ -114,9 +150,10 @@ def test_gsplat_is_driven_to_draw_what_the_reference_draws(antialiased):
         upstream = torch.randn(result.image.shape, generator=rng).double()
         return result, torch.autograd.grad((result.image, result.alpha), leaves, (upstream, upstream[..., 0]))
 
-    result, gradients = outcome(lambda *a, **o: cuda.draw(FakeGsplat(), request_of(*a, **o)))
+    result, gradients = outcome(lambda *a, **o: cuda.draw(gsplat, request_of(*a, **o)))
     truth, true_gradients = outcome(partial(rasterize, backend="reference"))
     assert torch.equal(result.radii, truth.radii), "not gsplat's own, which opacity changes"
+    assert (result.radii[0] == 0).sum() >= 4, "rows that are not valid were met"
     torch.testing.assert_close(result.image, truth.image)
     torch.testing.assert_close(result.alpha, truth.alpha)
     for name, value, wanted in zip(names, gradients, true_gradients, strict=True):
@@ -130,6 +167,50 @@ def test_absolute_gradients_are_taken_from_gsplat():
     cuda.draw(FakeGsplat(), request).image.sum().backward()
     assert absolute.grad is not None
     assert (absolute.grad == 3).all()
+
+
+EXTENSIONS = {
+    "_C = None": "there is no nvcc.*Install the CUDA toolkit",
+    "raise RuntimeError('Error building\\nmuch more')": "cannot be loaded: Error building. Install the CUDA toolkit",
+    "raise ImportError('no rich')": "cannot be loaded: no rich",
+    "_C = 'compiled'": None,
+}
+
+
+@pytest.mark.parametrize(("extension", "refused"), EXTENSIONS.items())
+def test_the_extension_is_compiled_when_gsplat_is_loaded(monkeypatch, tmp_path, caplog, extension, refused):
+    for name in ("gsplat", "gsplat/cuda"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "__init__.py").touch()
+    locked = "import fcntl, os\nlock = os.environ['TORCH_EXTENSIONS_DIR'] + '/headbench-gsplat.lock'\n"
+    locked += (
+        "try:\n    fcntl.flock(open(lock), fcntl.LOCK_EX | fcntl.LOCK_NB)\nexcept BlockingIOError:\n    "
+    )
+    (tmp_path / "gsplat/cuda/_backend.py").write_text(locked + extension)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "set_device", lambda device: None)
+    monkeypatch.setenv("TORCH_EXTENSIONS_DIR", str(tmp_path / "extensions"))
+    for cached in (cuda.usable, cuda.load):
+        cached.cache_clear()
+    try:
+        with caplog.at_level(logging.INFO, "headbench"):
+            cuda.prepare("cpu")
+            assert "gsplat" not in sys.modules
+            if refused:
+                with pytest.raises(UnavailableError, match=refused):
+                    cuda.prepare("cuda:1")
+            else:
+                cuda.prepare("cuda:1")
+                assert cuda.load().cuda._backend._C == "compiled"
+        assert ["compiles its CUDA extension" in record.message for record in caplog.records] == [True]
+        (tmp_path / "gsplat" / "csrc.cpython-311-x86_64-linux-gnu.so").touch()
+        assert cuda.compiled()
+    finally:
+        for cached in (cuda.usable, cuda.load):
+            cached.cache_clear()
+        for name in [name for name in sys.modules if name.partition(".")[0] == "gsplat"]:
+            del sys.modules[name]
 
 
 @pytest.mark.parametrize("clamp", [0.99, 0.999])

@@ -72,6 +72,25 @@ def test_avatars_that_render_lists_alone_are_missing(ball_run, others):
     assert (folder / "extremes" / SHEET_FILE).exists() == bool(others)
 
 
+def test_by_tasks_the_files_are_the_same(ball_run):
+    folder = ball_run("BURSTING", "LISTED", "BALL")
+    outs = [folder.parent / name for name in ("inline", "tasks")]
+    found = [
+        extremes_run(settings(folder, out=str(out), executor=executor, workers=2))
+        for out, executor in zip(outs, ("inline", "processes"))
+    ]
+    assert [f.passed for f in found] == [False, False]
+    left = [{p.relative_to(out).as_posix(): p for p in out.rglob("*") if p.is_file()} for out in outs]
+    assert left[1].keys() - left[0].keys() == {
+        f"{subject}/{method}/seed-0/{name}"
+        for subject in ("ball-a", "ball-bee")
+        for method in ("bursting", "listed", "ball")
+        for name in ("outcome.json", "job.log")
+    }
+    for name, path in left[0].items():
+        assert path.read_bytes().replace(b"inline", b"tasks") == left[1][name].read_bytes(), name
+
+
 def test_a_burst_is_found_where_it_is_and_nowhere_else(ball_run):
     folder = ball_run("BURSTING", "BALL")
     found = extremes_run(settings(folder))

@@ -1,0 +1,95 @@
+"""Has tasks worked on by an executor: submits them, follows them, starts lost ones again."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from ..machine import processor_count
+from ..progress import progress
+from .ended import Ended, Executor
+from .outcome import read_outcome
+from .processes import Processes
+from .settings import Execution
+from .slurm import Slurm
+from .task import TASK_LOG, Task
+
+log = logging.getLogger(__name__)
+DAMAGED = "its results are missing or damaged"
+Failures = dict[str, str]
+"""Why tasks failed, by their place."""
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Tasks of one kind.
+
+    Attributes
+    ----------
+    label : what they are called together, for the progress.
+    is_done : whether the results of a task whose outcome says so are there and whole.
+    execution : by which executor, any but "inline".
+    speed : whether they measure speed, one at a time with all threads, see `Task.speed`.
+    """
+
+    label: str
+    is_done: Callable[[Task], bool]
+    execution: Execution
+    speed: bool = False
+
+    def work_off(self, tasks: Sequence[Task]) -> Failures:
+        """Have the tasks worked on, all of one root, whose lock is held; return which failed and why.
+
+        Raises
+        ------
+        InputError : Slurm refuses jobs.
+        OSError : the disk is full or read-only; no task is failed by that.
+        """
+        failures: Failures = {}
+        if not tasks:
+            return failures
+        executor = self._executor(Path(tasks[0].root), len(tasks), tasks[0].device)
+        with closing(executor), progress(self.label) as report:
+            executor.submit(tasks)
+            done = 0
+            while done < len(tasks):
+                for ended in executor.poll(self.execution.poll_s):
+                    again = self._again(ended, failures)
+                    if again is not None:
+                        executor.submit([again])
+                    else:
+                        done += 1
+                note = f"{executor.running} running" + (f", {len(failures)} failed" if failures else "")
+                report(done, len(tasks), note)
+        return failures
+
+    def _executor(self, root: Path, tasks: int, device: str) -> Executor:
+        if self.execution.executor == "slurm":
+            return Slurm(root, self.execution, self.speed)
+        if self.speed:
+            return Processes(1, None)
+        cores = processor_count()
+        workers = min(self.execution.workers or (cores if device == "cpu" else 1), tasks)
+        return Processes(workers, self.execution.threads or max(1, cores // workers))
+
+    def _again(self, ended: Ended, failures: Failures) -> Task | None:
+        """What to submit again of a task that ended; None where it is done, or failed, which is recorded."""
+        task = ended.task
+        outcome = read_outcome(task.folder)
+        reason = ""
+        if outcome is not None and outcome["speed"] == self.speed:
+            if outcome["status"] == "done" and self.is_done(task):
+                return None
+            reason = outcome.get("reason", "") if outcome["status"] == "failed" else ""
+        if not reason:
+            lost = ended.lost or DAMAGED
+            if ended.again and task.restarts < self.execution.restarts:
+                log.warning("%s: %s; it is started again", task.place, lost)
+                return replace(task, restarts=task.restarts + 1)
+            reason = f"HeadbenchError: {lost}" + (f", {task.restarts + 1} times" if task.restarts else "")
+        failures[task.place] = reason
+        log.error("%s failed: %s; see %s", task.place, reason, task.folder / TASK_LOG)
+        return None
