@@ -1,4 +1,4 @@
-"""What all tests share: a user's cache of their own."""
+"""What all tests share: a user's cache of their own, seeded random numbers."""
 
 from __future__ import annotations
 
@@ -12,13 +12,15 @@ if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
+import torch
 from hypothesis import HealthCheck, settings
 
 from headbench.bench.io import files
 
-# How long an example takes says something of the machine's load, nothing of the code.
-settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
-settings.load_profile("untimed")
+# How long an example takes says something of the machine's load, nothing of the code. The examples are the same in every
+# run, so that a red run is the change's doing; `make fuzz` looks for new ones.
+settings.register_profile("repeatable", deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True)
+settings.load_profile("repeatable")
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -29,6 +31,12 @@ def own_cache(tmp_path_factory):
         patch.setenv("TORCH_HOME", os.environ.get("TORCH_HOME") or str(cache / "torch"))
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
         yield
+
+
+@pytest.fixture(autouse=True)
+def seeded():
+    """Every test starts from the same random numbers, in whatever order the tests run."""
+    torch.manual_seed(0)
 
 
 @pytest.fixture(scope="session", autouse=True)

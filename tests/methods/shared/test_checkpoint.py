@@ -54,7 +54,7 @@ def test_damage_anywhere_is_found(tmp_path):
     path = tmp_path / "checkpoint.safetensors"
     save_checkpoint(path, "run", {"x": torch.randn(10), "name": [1, "a", None]})
     whole = path.read_bytes()
-    flipped = (whole[:i] + b"!" + whole[i + 1 :] for i in range(0, len(whole), 3))
+    flipped = (whole[:i] + bytes([whole[i] ^ 1]) + whole[i + 1 :] for i in range(0, len(whole), 3))
     for content in (whole[:200], b"", whole + b"\0", *flipped):
         path.write_bytes(content)
         with pytest.raises(InputError, match=r"[Dd]elete it"):
