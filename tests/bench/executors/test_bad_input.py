@@ -2,6 +2,7 @@
 
 import errno
 import os
+import tempfile
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -67,6 +68,21 @@ def no_space_in_a_job(out, programs, monkeypatch):
 
 
 @contextmanager
+def no_space_for_a_log(out, programs, monkeypatch):
+    programs(sbatch="echo Submitted batch job 7", scontrol="echo JobState=FAILED ExitCode=1:0")
+
+    make = tempfile.TemporaryFile
+
+    def temporary_file(**arguments):
+        if slurm.submitted_path(out).exists():
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return make(**arguments)
+
+    monkeypatch.setattr("tempfile.TemporaryFile", temporary_file)
+    yield
+
+
+@contextmanager
 def two_at_once(out, programs, monkeypatch):
     with locked(out):
         yield
@@ -84,6 +100,7 @@ CASES = {
         "{out}/subject1/toy/seed-0: No space left on device (job 7)",
         "Make room",
     ),
+    "disk full, no log": (no_space_for_a_log, SLURM, "{out}: No space left", "Make room"),
     "disk full, process": (
         None,
         PROCESSES,
