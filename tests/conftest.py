@@ -19,7 +19,9 @@ from headbench.bench.io import files
 
 # How long an example takes says something of the machine's load, nothing of the code. The examples are the same in every
 # run, so that a red run is the change's doing; `make fuzz` looks for new ones.
-settings.register_profile("repeatable", deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True)
+settings.register_profile(
+    "repeatable", deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True
+)
 settings.load_profile("repeatable")
 
 
