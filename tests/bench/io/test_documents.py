@@ -123,7 +123,7 @@ def test_yaml_that_breaks_a_rule_is_refused_with_its_place(tmp_path, text, key, 
     ["a: [", "\x00", "[" * DEEP, "a: " + "[" * 70 + "]" * 70, "a: b\n---\na: c"],
     ids=lambda text: text[:12],
 )
-def test_text_that_is_no_yaml_is_refused_shortly_in_whatever_words_of_the_parser(tmp_path, text):
+def test_text_that_is_no_yaml_is_refused_in_one_line(tmp_path, text):
     path = tmp_path / "a.yaml"
     path.write_text(text)
     with pytest.raises(InputError) as caught:
