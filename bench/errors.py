@@ -82,6 +82,11 @@ class UnavailableError(HeadbenchError):
         super().__init__(f"{what} {remedy}")
 
 
+def install_extra(extra: str) -> str:
+    """How to install an optional extra of pyproject.toml. It names the checkout: headbench is on no package index."""
+    return f"Run in the headbench checkout: pip install -e '.[{extra}]'"
+
+
 def shortened(text: str, longest: int) -> str:
     """Text of bounded length, its middle left out, and without control characters other than line ends."""
     if len(text) > longest:

@@ -120,3 +120,20 @@ def test_tables_are_generated_from_the_stored_rows_never_typed():
         assert README.split(begin)[1].split(end)[0].strip() == block.strip()
     results = ROOT / readme.SUITE / readme.RESULTS
     assert results.read_text(encoding="utf-8") == readme.suite_results(ROOT / readme.SUITE)
+
+
+def test_nothing_installs_headbench_by_its_name():
+    # It is on no package index, where anybody could register that name. Extras are installed from a checkout.
+    by_name = re.compile(r"(?<![\w./-])headbench\[\w|pip install(?: -\S+)* ['\"]?headbench(?![\w./-])")
+    extra = re.compile(r"(?:install_extra\([\"']|-e '\.\[)([\w,]+)")
+    known = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["optional-dependencies"]
+    listed = subprocess.run(
+        ["git", "grep", "-lIE", "install|headbench"], cwd=ROOT, check=True, capture_output=True
+    )
+    named, extras = [], set()
+    for name in listed.stdout.decode().splitlines():
+        text = (ROOT / name).read_text("utf-8")
+        named += [f"{name}: {found[0]}" for found in by_name.finditer(text)]
+        extras |= {word for found in extra.findall(text) for word in found.split(",")}
+    assert named == []
+    assert {"cuda", "slurm"} <= extras <= set(known)

@@ -168,7 +168,7 @@ def test_sog_loses_little(run, tmp_path, method):
 def test_without_the_library_the_error_says_what_to_install(run, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "gaussforge", None)
     out = tmp_path / "x.sog"
-    with pytest.raises(UnavailableError, match=r"pip install 'headbench\[formats\]'"):
+    with pytest.raises(UnavailableError, match=r"pip install -e '.\[formats\]'"):
         export_sog(ExportSogSettings(str(folder_of(run, "ga")), out=str(out)))
     assert not out.exists()
 
