@@ -134,7 +134,8 @@ class RunSettings:
     data: str | None = None
     """Capture, such as one in the GaussianAvatars/VHAP layout: a UNION folder, a sequence folder, or a folder of them."""
     out: str | None = None
-    """Folder for everything the run makes."""
+    """Folder for everything the run makes. A run in it is continued: methods, seeds and metrics may be added, but none left
+    out; captures, frames, tasks and regions have to be the same."""
     methods: str | None = None
     """Names, separated by commas; see `headbench list methods`. Default: all that compare fairly here:
     mean-image,nearest-camera,ga,ours."""

@@ -85,14 +85,14 @@ class Rows:
 
     @classmethod
     def joined(cls, parts: Iterable[Rows]) -> Rows:
-        """Several rows as one, in order; at least one part."""
+        """Several rows as one, in order."""
         tables = (part._table for part in parts)
         whole = []
         while batch := list(islice(tables, JOINED_AT_ONCE)):
             table = pd.concat(batch)
             # Text of joined tables stays in as many small pieces as there were tables, until it is taken from them.
             whole.append(table.take(np.arange(len(table))))
-        return cls(pd.concat(whole, ignore_index=True))
+        return cls(pd.concat(whole, ignore_index=True)) if whole else cls.of([])
 
     @classmethod
     def read(cls, path: Path) -> Rows:
@@ -231,7 +231,7 @@ class Rows:
         """The rows of some metrics, in the order of ``names``."""
         metric = self._table["metric"]
         # One table, not joined parts: thousands of small parts take thirty times the memory of their content.
-        places = np.concatenate([np.flatnonzero(metric == name) for name in names])
+        places = np.concatenate([np.empty(0, int), *(np.flatnonzero(metric == name) for name in names)])
         return Rows(self._table.take(places).reset_index(drop=True))
 
     def check(self) -> None:
@@ -247,6 +247,13 @@ class Rows:
         if len(mixed):
             found = ", ".join(self.versions(str(mixed.index[0])))
             raise InputError("rows", f"version of {mixed.index[0]}", "one version of each method", found)
+
+    def values_lacking(self, other: Rows) -> list[str]:
+        """What ``other`` has measured values of and these rows have none of, whatever the version and protocol."""
+        columns = ["metric", "region", "method", "seed", "task", *FRAME]
+        theirs, own = (r._table.loc[r._table["status"] == "ok", columns] for r in (other, self))
+        lacking = theirs[~pd.MultiIndex.from_frame(theirs).isin(pd.MultiIndex.from_frame(own))]
+        return [" ".join(map(str, row)) for row in lacking.itertuples(index=False, name=None)]
 
     def check_protocols(self, source: Path | str, expected: Mapping[str, str] | None = None) -> None:
         """Raise `InputError` where rows of one task come from several protocols, or from another than ``expected``.

@@ -89,11 +89,12 @@ def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress
     folder = RunFolder(Path(config.out))
     prepare_folder(folder.root)
     with locked(folder.root):
+        manifest = describe(config, [method], metrics, clips, protocols)
+        manifest = replace(manifest, evaluated=str(source))
+        folder.check_kept(manifest)
         jobs = [
             replace(job, method=method) for job in make_jobs(config, adapted_for, clips, protocols, folder)
         ]
-        manifest = describe(config, [method], metrics, clips, protocols)
-        manifest = replace(manifest, evaluated=str(source))
         manifest.write(folder.manifest)
         parts = []
         for index, job in enumerate(jobs):
@@ -106,7 +107,7 @@ def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress
             parts.append(measure(job, avatar, metrics))
             progress(index + 1, len(jobs), job.name)
         rows = Rows.joined(parts)
-        rows.write(folder.rows)
+        folder.write_rows(rows)
         replace(manifest, status="done").write(folder.manifest)
         write_reports(folder.root)
     together = [*([Path(settings.like)] if settings.like else []), folder.root]

@@ -15,6 +15,7 @@ from ..contracts import Budget, TaskName
 from ..errors import HeadbenchError, InputError
 from ..io.files import check_name
 from ..registry import discover, get, resolve, unknown
+from ..source import code_digest, forget_code, is_outside
 from ..specs import RENAMED_METRICS, MethodSpec, MetricSpec, ProfileSpec
 from .adaptation import MethodNeeds
 
@@ -104,6 +105,7 @@ class ResolvedMethod:
     def record(self) -> dict[str, Any]:
         """Everything that decides what this method does, for the manifest."""
         needs = MethodNeeds.of(self.spec)
+        code = code_digest(self.spec.implementation) if self.spec.implementation else ""
         return {
             "name": self.spec.name,
             "version": self.spec.version,
@@ -112,12 +114,19 @@ class ResolvedMethod:
             "config": None if self.config is None else asdict(self.config),
             "budget": asdict(self.budget),
             **({} if needs == MethodNeeds() else {"needs": asdict(needs)}),
+            **({"code": code} if code else {}),
         }
 
     def identity(self) -> dict[str, Any]:
-        """The same for fingerprints, which change neither with names of settings nor with where the class is."""
+        """The same for fingerprints, which change neither with names of settings nor with where the class is.
+
+        The code of a method of this package is left out: its version says whether results change.
+        """
+        record = self.record()
+        if not is_outside(self.spec.implementation):
+            record.pop("code", None)
         implementation = self.spec.first_implementation or self.spec.implementation
-        return {**self.record(), "implementation": implementation, "config": with_first_names(self.config)}
+        return {**record, "implementation": implementation, "config": with_first_names(self.config)}
 
 
 def stored_settings(method: str, settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -143,6 +152,7 @@ def resolve_methods(config: RunConfig) -> list[ResolvedMethod]:
 
     Raises `InputError` for unknown methods, presets and settings, and for methods that do not compute on the run's device.
     """
+    forget_code()
     specs: list[MethodSpec] = [get("methods", name) for name in config.methods]
     for name, count in Counter(spec.name for spec in specs).items():
         check_name(name, "registry of methods", "name")
@@ -192,6 +202,7 @@ def resolve_metrics(config: RunConfig) -> list[MetricSpec]:
     ------
     InputError : an unknown metric or profile, a metric that none of the profiles asked for defines.
     """
+    forget_code()
     profiles: list[ProfileSpec] = [get("profiles", name) for name in config.metric_profiles]
     defined = {metric.name for metric in get("profiles", CANONICAL).metrics}
     found: list[MetricSpec] = []

@@ -75,6 +75,8 @@ def _run(
         if not all(cell.ended("measure") for cell in cells):
             check_settings(method)
     protocols = make_protocols(config.tasks, clips, config.frames_per_task)
+    planned = describe(config, methods, metrics, clips, protocols)
+    folder.check_kept(planned)
     jobs = make_jobs(config, methods, clips, protocols, folder)
     for job in jobs:
         job.check()
@@ -86,7 +88,7 @@ def _run(
         for job in jobs
         if job.adapted is not None and job.seed == config.seeds[0]
     )
-    manifest = replace(describe(config, methods, metrics, clips, protocols), adapted=forms, **record)
+    manifest = replace(planned, adapted=forms, **record)
     manifest.write(folder.manifest)
     for reason in missing_tasks(config.tasks, protocols).values():
         log.warning("%s", reason)
@@ -99,7 +101,7 @@ def _run(
 
         rows = execute(jobs, metrics, folder, execution)
         manifest = replace(manifest, machine=dict(machine_of(jobs, manifest.machine)))
-    rows.write(folder.rows)
+    folder.write_rows(rows)
     folder.speed_pass.unlink(missing_ok=True)
     seconds = round(time.perf_counter() - start, 3)
     done = replace(manifest, status="done", seconds=seconds, peak_memory_bytes=peak_memory_bytes())

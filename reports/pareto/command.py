@@ -52,7 +52,8 @@ class SweepSettings(RunOptions):
     """Folder of a finished run."""
 
     out: str | None = None
-    """Folder to write, a run folder itself; default: `sweep` in the folder of the run."""
+    """Folder to write, a run folder itself; default: `sweep` in the folder of the run. A sweep in it is continued: variants may
+    be added, but none left out."""
 
     methods: tuple[str, ...] = ()
     """Methods to derive from; default: all that know how."""

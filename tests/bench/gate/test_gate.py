@@ -163,8 +163,9 @@ def test_a_region_of_fewer_frames_is_code_3(stored, judged, baseline):
 
 
 def test_another_protocol_is_code_3_not_a_comparison(config, judged):
-    runner.run(dataclasses.replace(config, frames_per_task=1))
-    code, out = judged()
+    other = dataclasses.replace(config, frames_per_task=1, out=config.out + "-other")
+    runner.run(other)
+    code, out = judged(run=other.out)
     assert code == 3
     assert "other frames or settings" in out
 
