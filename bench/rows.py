@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
@@ -19,6 +20,7 @@ from .errors import InputError, shortened
 from .io.files import atomic_path
 from .specs import LABEL, RENAMED_METRICS, is_label
 
+log = logging.getLogger(__name__)
 FRAME = ["subject", "sequence", "timestep", "camera"]
 """Columns that name a frame."""
 STATUSES = ("ok", "missing", "failed")
@@ -271,6 +273,40 @@ class Rows:
 
     def _of(self, method: str | All) -> pd.DataFrame:
         return self.select(method=method, metric=ALL, task=ALL, region=ALL, seeds=ALL)
+
+
+def check_rows_kept(path: Path, cells: Iterable[tuple[str, str, int]], protocols: Iterable[str]) -> None:
+    """Refuse, before any work, to replace the rows at ``path`` by rows that lack some of them.
+
+    Rows that cannot be read are no loss: a warning says that they are written again.
+
+    Parameters
+    ----------
+    path : file of rows that is going to be replaced, if there is one.
+    cells : method, subject and seed of everything that the new rows are of.
+    protocols : hashes of the protocols that the new rows are measured by.
+
+    Raises
+    ------
+    InputError : the file holds rows of another cell, or by another protocol.
+    """
+    if not path.exists():
+        return
+    try:
+        table = Rows.read(path)._table
+    except InputError as error:
+        log.warning("%s The rows are written again.", error)
+        return
+    kept = "the rows of an earlier call among those of this one"
+    found = set(table[["method", "subject", "seed"]].drop_duplicates().itertuples(index=False, name=None))
+    lost = [f"{method} of {subject}, seed {seed}" for method, subject, seed in sorted(found - {*cells})]
+    if lost:
+        remedy = "Ask for these as well, or choose another --out."
+        raise InputError(path, "", kept, f"others: {'; '.join(lost)}", remedy)
+    others = sorted(set(table["protocol"]) - {*protocols, ""})
+    if others:
+        found_by = f"rows by another protocol, {others[0]}, of other frames or settings"
+        raise InputError(path, "", kept, found_by, "Choose another --out.")
 
 
 def _read_table(path: Path) -> pa.Table:

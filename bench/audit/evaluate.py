@@ -11,7 +11,14 @@ from PIL import Image, UnidentifiedImageError
 
 from ..contracts import Avatar, Budget, Camera, Clip, Frame, FrameKey, HeadPose, Progress, no_progress
 from ..errors import HeadbenchError, InputError
-from ..io.files import atomic_path, check_name, digest, digest_file, grouped_writes, prepare_folder
+from ..io.files import (
+    atomic_path,
+    check_name,
+    check_output_folder,
+    digest,
+    digest_file,
+    grouped_writes,
+)
 from ..io.images import probe_image, write_png
 from ..io.lock import locked
 from ..protocol import Protocol, make_protocols
@@ -87,7 +94,7 @@ def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress
         method = images_method(config.methods[0], digest(digests)[:12])
         adapted_for = [method]
     folder = RunFolder(Path(config.out))
-    prepare_folder(folder.root)
+    check_output_folder(folder.root)
     with locked(folder.root):
         manifest = describe(config, [method], metrics, clips, protocols)
         manifest = replace(manifest, evaluated=str(source))

@@ -16,7 +16,7 @@ from ..contracts import Avatar, CheckedMethod, Clip
 from ..errors import HeadbenchError, InputError, UnavailableError
 from ..executors.outcome import outcome_path
 from ..executors.settings import Execution, check_executor
-from ..io.files import atomic_path, output_inside, prepare_folder
+from ..io.files import atomic_path, check_output_folder, output_inside
 from ..io.lock import locked
 from ..machine import check_device_answers, machine_record, peak_memory_bytes
 from ..manifest import AdaptedRecord, ClipRecord, Manifest, MethodRecord, ProtocolRecord
@@ -49,7 +49,7 @@ def run(config: RunConfig, execution: Execution | None = None, **record: Any) ->
     execution = execution or Execution()
     check_executor(execution, config.device)
     folder = RunFolder(Path(config.out))
-    prepare_folder(folder.root)
+    check_output_folder(folder.root)
     start = time.perf_counter()
     with locked(folder.root):
         rows = _run(config, methods, metrics, folder, execution, record)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+import tyro
 
 from ..contracts import FloatArray, HeadAsset
 from ..errors import InputError
@@ -17,16 +19,23 @@ from ..specs import MethodSpec
 from .config import ResolvedMethod, default_names, resolve_method
 from .store import RunFolder, avatar_files
 
+AVATAR_FOLDER = (
+    "folder of an avatar: a cell of a run (RUN/SUBJECT/METHOD/seed-0), the folder avatar in it, or what `headbench import ga` "
+    "or `headbench compact` wrote"
+)
+AvatarFolder = Annotated[
+    tyro.conf.Positional[str], tyro.conf.arg(help=f"{AVATAR_FOLDER[0].upper()}{AVATAR_FOLDER[1:]}.")
+]
+"""Argument of every command that takes a stored avatar; `avatar_folder` resolves it."""
+
 
 def avatar_folder(folder: Path) -> Path:
     """The folder with the files of an avatar: this one, or ``avatar`` in the cell of a run. Raises `InputError`."""
     inside = folder / "avatar"
     found = inside if inside.is_dir() else folder
     if not found.is_dir() or not any(path.is_file() for path in found.iterdir()):
-        expected = "the folder of an avatar, such as RUN/SUBJECT/METHOD/seed-0/avatar"
-        raise InputError(
-            folder, "", expected, "no such folder" if not found.is_dir() else "one without files"
-        )
+        reason = "no such folder" if not found.is_dir() else "one without files"
+        raise InputError(folder, "", f"the {AVATAR_FOLDER}", reason)
     return found
 
 

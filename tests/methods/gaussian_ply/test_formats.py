@@ -175,5 +175,5 @@ def test_without_the_library_the_error_says_what_to_install(run, tmp_path, monke
 
 def test_a_page_cannot_hold_what_a_network_draws(run, tmp_path):
     settings = ExportHtmlSettings(str(folder_of(run, "gha")), str(tmp_path / "x.html"))
-    with pytest.raises(InputError, match=r"one of gha.*headbench view"):
+    with pytest.raises(InputError, match=r"an avatar of ours, ga or gbs, found one of gha.*headbench view"):
         export_html(settings)
