@@ -99,7 +99,7 @@ def test_a_list_without_values_is_refused(offer, capsys, words):
     assert "at least one value" in capsys.readouterr().err
 
 
-def test_every_command_that_takes_a_stored_avatar_says_the_same_of_it():
+def test_commands_that_take_an_avatar_describe_it_alike():
     specs = {name: plugin.spec for name, plugin in registry.discover("commands").items()}
     found = {
         name: get_type_hints(spec.settings, include_extras=True)["avatar"]

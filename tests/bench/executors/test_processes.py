@@ -135,7 +135,7 @@ def test_speed_alone_is_measured(config, rows_of):
     assert set(rows["status"]) == {"ok"}
 
 
-def test_kept_cells_are_named_and_changed_code_fails_those_that_are_not(config, caplog):
+def test_kept_cells_are_named_and_changed_code_fails_others(config, caplog):
     caplog.set_level("INFO", logger="headbench")
     config = replace(config, methods=("toy_plugin:METHOD",))
     runner.run(config, TWO)

@@ -272,7 +272,7 @@ def test_values_that_cannot_be_had_again_stay(config, toy, cell, monkeypatch):
     assert set(rows_of(config).query("subject == 'subject1'")["status"]) == {"failed"}
 
 
-def test_what_a_killed_run_measured_stays_where_less_is_asked_for(config, toy, monkeypatch):
+def test_what_a_killed_run_measured_stays(config, toy, monkeypatch):
     """No rows of the run exist yet that could be lost, those of its cells do."""
     whole = rows_of(config)
     RunFolder(Path(config.out)).rows.unlink()
@@ -342,7 +342,7 @@ def test_changed_code_of_a_plug_in_is_refused(config, edit, toy, refuses, monkey
     assert len(toy.FITS) == 2 * kill
 
 
-def test_a_metric_of_a_plug_in_is_measured_again_if_its_code_changes(config, edit, toy):
+def test_changed_code_of_a_metric_is_measured_again(config, edit, toy):
     config = replace(config, **EDITED)
     before = rows_of(config)
     toy.FITS.clear()

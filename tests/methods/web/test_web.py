@@ -96,7 +96,7 @@ def test_bad_settings_are_refused(bad):
 
 
 @pytest.mark.parametrize("file", [None, "field.npz", "mean.npz"])  # none, of insta, of mean-image
-def test_a_folder_without_an_avatar_that_fits_names_the_methods_that_do(tmp_path, file):
+def test_a_folder_without_a_fitting_avatar_is_refused(tmp_path, file):
     avatar = tmp_path / "avatar"
     avatar.mkdir()
     if file:
