@@ -339,7 +339,9 @@ CASES = {
 @pytest.fixture(scope="module")
 def elsewhere(tmp_path_factory):
     """The directory that commands run in: neither that of the run nor one above it."""
-    return tmp_path_factory.mktemp("elsewhere")
+    folder = tmp_path_factory.mktemp("elsewhere")
+    (folder / "board").mkdir()
+    return folder
 
 
 def test_every_listed_command_has_a_case(capsys):

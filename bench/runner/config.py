@@ -8,7 +8,9 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+import tyro
 
 from ..configuration import build, merge, with_first_names, with_new_names
 from ..contracts import Budget, TaskName
@@ -226,6 +228,16 @@ def resolve_metrics(config: RunConfig) -> list[MetricSpec]:
     return [
         replace(m, tables=("comparison", *m.tables)) if m.profile == first != CANONICAL else m for m in found
     ]
+
+
+AVATAR_FOLDER = (
+    "folder of an avatar: a cell of a run (RUN/SUBJECT/METHOD/seed-0), the folder avatar in it, or what `headbench import ga` "
+    "or `headbench compact` wrote"
+)
+AvatarFolder = Annotated[
+    tyro.conf.Positional[str], tyro.conf.arg(help=f"{AVATAR_FOLDER[0].upper()}{AVATAR_FOLDER[1:]}.")
+]
+"""Argument of every command that takes a stored avatar; `bench.runner.stored.avatar_folder` resolves it."""
 
 
 @dataclass(frozen=True, kw_only=True)

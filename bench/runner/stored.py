@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-import tyro
 
 from ..contracts import FloatArray, HeadAsset
 from ..errors import InputError
@@ -16,17 +14,8 @@ from ..io.documents import checked, read_json
 from ..io.files import digest, digest_file
 from ..registry import get
 from ..specs import MethodSpec
-from .config import ResolvedMethod, default_names, resolve_method
+from .config import AVATAR_FOLDER, ResolvedMethod, default_names, resolve_method
 from .store import RunFolder, avatar_files
-
-AVATAR_FOLDER = (
-    "folder of an avatar: a cell of a run (RUN/SUBJECT/METHOD/seed-0), the folder avatar in it, or what `headbench import ga` "
-    "or `headbench compact` wrote"
-)
-AvatarFolder = Annotated[
-    tyro.conf.Positional[str], tyro.conf.arg(help=f"{AVATAR_FOLDER[0].upper()}{AVATAR_FOLDER[1:]}.")
-]
-"""Argument of every command that takes a stored avatar; `avatar_folder` resolves it."""
 
 
 def avatar_folder(folder: Path) -> Path:

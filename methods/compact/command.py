@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from ...bench.contracts import Progress, no_progress
-from ...bench.runner.stored import AvatarFolder
+from ...bench.runner.config import AvatarFolder
 from ...bench.specs import Findings, writes
 from ...datasets.options import CaptureOptions
 from .precision import Precision

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import tyro
 
 from ...bench.contracts import Progress, no_progress
-from ...bench.runner.stored import AvatarFolder
+from ...bench.runner.config import AvatarFolder
 from ...bench.specs import Findings, writes
 from ...datasets.options import CaptureOptions
 

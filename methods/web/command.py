@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ...bench.contracts import Progress, no_progress
-from ...bench.runner.stored import AvatarFolder
+from ...bench.runner.config import AvatarFolder
 from ...bench.specs import Findings
 from ...datasets.options import CaptureOptions
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from ...bench.contracts import Progress, no_progress
-from ...bench.runner.stored import AvatarFolder
+from ...bench.runner.config import AvatarFolder
 from ...bench.specs import Findings, writes
 
 

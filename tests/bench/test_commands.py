@@ -12,7 +12,7 @@ import pytest
 
 from headbench.bench import cli, commands, registry
 from headbench.bench.io.lock import locked
-from headbench.bench.runner.stored import AvatarFolder
+from headbench.bench.runner.config import AvatarFolder
 
 TOY = '''
 from dataclasses import dataclass

@@ -10,7 +10,7 @@ import tyro
 
 from ....bench.contracts import Progress, no_progress
 from ....bench.errors import ExitCode, UnavailableError
-from ....bench.runner.stored import AvatarFolder
+from ....bench.runner.config import AvatarFolder
 from ....bench.specs import Findings, writes
 
 SHOWN = 20
