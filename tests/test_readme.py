@@ -118,6 +118,12 @@ def test_tables_are_generated_from_the_stored_rows_never_typed():
     for name, block in blocks.items():
         begin, end = readme.marks(name)
         assert README.split(begin)[1].split(end)[0].strip() == block.strip()
+
+
+@pytest.mark.slow
+def test_all_tables_of_the_suite_are_generated():
+    from headbench.reports import readme
+
     results = ROOT / readme.SUITE / readme.RESULTS
     assert results.read_text(encoding="utf-8") == readme.suite_results(ROOT / readme.SUITE)
 
