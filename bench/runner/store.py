@@ -49,6 +49,8 @@ class StepState(TypedDict, total=False):
     fingerprints, details : of the measurements, by metric.
     seconds, processor_seconds, interruptions, peak_memory_bytes, memory_before_bytes, method : of the training.
     peak_device_memory_bytes, device_memory_before_bytes, tf32 : likewise, of a CUDA device; see `PeakMemory`.
+    load : machine, threads and cores of the training, and cores that others kept busy meanwhile; see `ProcessorLoad`.
+    earlier : values that were measured again since, each time with when, on which machine and under which load.
     derived_from : digest of the trained avatar that this one was derived from without training.
     """
 
@@ -67,6 +69,8 @@ class StepState(TypedDict, total=False):
     device_memory_before_bytes: int
     tf32: bool
     method: dict[str, Any]
+    load: dict[str, Any]
+    earlier: list[dict[str, Any]]
     derived_from: str
 
 
