@@ -7,12 +7,20 @@ JOBS   ?= 2
 SEED   ?= 0
 SECONDS ?= 600
 
-.PHONY: help setup demo test check fuzz kills gpu gate baseline bench readme release-source dist wheels clean
+# Build of PyTorch: cpu, cuda, or what pip's indexes offer of the two, the smaller first.
+TORCH  ?=
+
+.PHONY: help setup lock demo test test-slow test-latest check fuzz kills nightly gpu gpu-checks gate baseline bench readme \
+  release-source dist wheels clean
 
 help:
-	@echo "make setup   make $(VENV) with headbench in it"
+	@echo "make setup   make $(VENV) with headbench in it, from the lock (TORCH=cpu or cuda chooses PyTorch's build)"
+	@echo "make lock    write the lock again, requirements*.txt, with the newest versions that pyproject.toml admits"
 	@echo "make demo    compare avatar methods on a capture made on the spot (OUT=$(OUT))"
 	@echo "make test    run the tests (in JOBS=$(JOBS) processes)"
+	@echo "make test-latest  run the tests with the newest versions instead of the lock, in $(VENV)-latest"
+	@echo "make test-slow    run the tests marked slow"
+	@echo "make nightly      run what takes too long for every change: the list in .ci/run"
 	@echo "make check   style, types, architecture"
 	@echo "make fuzz    give damaged files to every reader for ten minutes (SEED=0, SECONDS=600)"
 	@echo "make kills   kill every command that writes before each change of the disk, and start it again (the same)"
@@ -23,21 +31,51 @@ help:
 	@echo "make dist    sdist, and manylinux wheel for this machine, in dist/ (URL=the repository's public address)"
 	@echo "make wheels  manylinux wheels for x86-64 and aarch64, all Pythons; needs docker or podman"
 
-setup: $(VENV)/.installed
+# The marker names the build of PyTorch that was asked for, so that `make gpu` installs its own.
+INSTALLED = $(VENV)/.installed$(addprefix -,$(TORCH))
+setup: $(INSTALLED)
 
-# Reinstalled when packaging or the kernel changes; Python sources are used in place.
+# Exact versions with hashes, nothing resolved and nothing built but headbench itself. Reinstalled when packaging or the
+# kernels change; Python sources are used in place.
 KERNEL := $(shell git ls-files "*CMakeLists.txt" "*.cmake" "*.cpp" "*.h" 2>/dev/null)
-$(VENV)/.installed: pyproject.toml constraints.txt __init__.py $(KERNEL)
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "headbench needs Python 3.11 or newer; set PYTHON=")'
-	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+PIP     = $(BIN)/python -m pip --disable-pip-version-check
+LOCKED  = $(PIP) install --quiet --no-deps --require-hashes --only-binary :all:
+$(INSTALLED): pyproject.toml $(wildcard requirements*.txt) __init__.py $(KERNEL)
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14) and \
+	  f"headbench is locked for Python 3.11 to 3.13, and this is {sys.version.split()[0]}; set PYTHON=")'
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@build=$(TORCH); if [ -z "$$build" ]; then build=cpu; \
+	  $(LOCKED) --dry-run -r requirements-torch-cpu.txt >/dev/null 2>&1 || { build=cuda; \
+	  echo "No index that pip is configured for has PyTorch's CPU build: installing the one with CUDA, several GB."; }; fi; \
+	echo "Installing PyTorch ($$build)" && $(LOCKED) -r requirements-torch-$$build.txt
+	@echo "Installing packages" && $(LOCKED) -r requirements.txt -r requirements-dev.txt
+	@echo "Building headbench" && $(PIP) install --quiet --no-deps --no-build-isolation --editable .
+	@$(PIP) check
 	@touch $@
+
+lock:
+	@test -x $(VENV)-lock/bin/python || $(PYTHON) -m venv $(VENV)-lock
+	@$(VENV)-lock/bin/python -m pip install --quiet --disable-pip-version-check uv
+	$(VENV)-lock/bin/python .ci/lock.py
 
 demo: setup
 	$(BIN)/headbench demo --out $(OUT)
 
 test: setup
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
+
+test-slow: setup
+	$(BIN)/python -m pytest -m "slow and not slurm"
+
+nightly:
+	.ci/run nightly
+
+# A break by a new release of a package is seen here first. PyTorch too is the newest that pip's indexes offer.
+test-latest:
+	test -x $(VENV)-latest/bin/python || $(PYTHON) -m venv $(VENV)-latest
+	$(VENV)-latest/bin/python -m pip install --quiet --disable-pip-version-check --upgrade --upgrade-strategy eager -e '.[dev]'
+	$(VENV)-latest/bin/python -m pip list
+	$(VENV)-latest/bin/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
 check: setup
 	$(BIN)/ruff check .
@@ -51,7 +89,9 @@ fuzz: setup
 kills: setup
 	$(BIN)/python -m headbench.tests.fuzz.kills --seed $(SEED) --seconds $(SECONDS)
 
-gpu: setup
+gpu:
+	$(MAKE) gpu-checks TORCH=cuda
+gpu-checks: setup
 	$(BIN)/python -m headbench.tests.gpu $(if $(WHEELS),--wheels $(WHEELS))
 
 # Seconds of seeded training on a capture made on the spot. PSNR moved by up to 0.005 dB and SSIM by up to 0.00013 between
@@ -103,4 +143,4 @@ wheels: setup release-source
 	$(BIN)/cibuildwheel --platform linux --archs x86_64,aarch64 --output-dir dist $(RELEASE)
 
 clean:
-	rm -rf build $(VENV)
+	rm -rf build $(VENV) $(VENV)-latest $(VENV)-lock

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -15,11 +15,11 @@ import tyro
 
 from .configuration import build, merge, parse_assignments
 from .contracts import Progress
-from .errors import InputError
-from .executors.command import ExecutionOptions
+from .errors import HeadbenchError, InputError
+from .executors.command import ExecutionOptions, chosen_execution
 from .executors.settings import Execution, ExecutorName, check_executor
 from .io.documents import read_yaml
-from .io.files import check_writable, prepare_folder, write_json
+from .io.files import check_output_folder, check_writable, removed_if_empty, write_json
 from .io.lock import locked
 from .machine import check_device
 from .progress import log_to_file
@@ -69,7 +69,7 @@ def demo(settings: DemoSettings, progress: Progress) -> Findings:
     resolve_metrics(comparison)
     check_device(comparison.device)
     out = Path(settings.out)
-    prepare_folder(out)
+    check_output_folder(out)
     with _log_file(out):
         start = time.perf_counter()
         with locked(out):
@@ -117,7 +117,7 @@ def synth(settings: SynthSettings, progress: Progress) -> Findings:
     """Render a synthetic multi-view capture in the GaussianAvatars/VHAP layout."""
     out, execution = Path(settings.out), settings.execution
     check_executor(execution, "cpu")
-    prepare_folder(out)
+    check_output_folder(out)
     with locked(out, beside=True):  # a capture is made in an empty folder
         size = parse_size(settings.size)
         _synthesise({**settings.others, "out": out, "size": size, "execution": execution})
@@ -134,7 +134,8 @@ class RunSettings:
     data: str | None = None
     """Capture, such as one in the GaussianAvatars/VHAP layout: a UNION folder, a sequence folder, or a folder of them."""
     out: str | None = None
-    """Folder for everything the run makes."""
+    """Folder for everything the run makes. A run in it is continued: methods, seeds and metrics may be added, but none left
+    out; captures, frames, tasks and regions have to be the same."""
     methods: str | None = None
     """Names, separated by commas; see `headbench list methods`. Default: all that compare fairly here:
     mean-image,nearest-camera,ga,ours."""
@@ -151,7 +152,7 @@ class RunSettings:
     """Where cells (a subject, a method, a seed) are worked on: inline, one after another; processes, several at once on this
     machine; slurm, a job for each. Default: inline."""
     workers: int | None = None
-    """How many processes. Default: one for each core."""
+    """How many processes, with `--executor processes`. Default: one for each core."""
     set: Assignments = ()
     """Any setting, for example `frames_per_task=50`, `settings.ga.budget.iterations=5000`, `execution.slurm.hours=8`;
     repeatable."""
@@ -173,9 +174,7 @@ def run(settings: RunSettings, progress: Progress) -> Findings:
         from .runner.captures import reader_of  # which takes long to import
 
         values["reader"] = reader_of(values["data"])
-    given = {name: getattr(settings, name) for name in ("executor", "workers")}
-    given = {key: value for key, value in given.items() if value is not None}
-    execution = build(Execution, merge(values.pop("execution", {}), given), source, "execution.")
+    execution = chosen_execution(values.pop("execution", {}), settings.executor, settings.workers, source)
     config = build(RunConfig, values, source)
     with _log_file(Path(config.out)):
         return _run(config, execution)
@@ -320,13 +319,28 @@ def _measure(settings: StressSettings, kind: str, progress: Progress) -> Finding
     return findings
 
 
-def _log_file(out: Path) -> AbstractContextManager[None]:
-    """Log to a run's file; not where the folder cannot be made, which the run then reports properly."""
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except (OSError, ValueError):
-        return nullcontext()
-    return log_to_file(out / "run.log") if os.access(out, os.W_OK) else nullcontext()
+@contextmanager
+def _log_file(out: Path) -> Iterator[None]:
+    """Log to a run's file; not where the folder cannot be made, which the run then reports properly.
+
+    A run that is refused before it has written anything else leaves neither the file nor a new folder.
+    """
+    log = out / "run.log"
+    is_new = is_writable = False
+    with ExitStack() as stack:
+        with suppress(OSError, ValueError):
+            stack.enter_context(removed_if_empty(out))
+            out.mkdir(parents=True, exist_ok=True)
+            is_new, is_writable = not log.exists(), os.access(out, os.W_OK)
+        if is_writable:
+            stack.enter_context(log_to_file(log))
+        try:
+            yield
+        except HeadbenchError:
+            with suppress(OSError):
+                if is_new and [*out.iterdir()] == [log]:
+                    log.unlink()
+            raise
 
 
 def _reference(value: Any) -> Any:

@@ -164,6 +164,14 @@ def _nested(group: Mapping[str, Command]) -> Command:
     return chosen
 
 
+def _parts(words: Sequence[str], kind: Callable[[str], Any]) -> tuple[Any, ...]:
+    """The values of a list, separated by commas, too. Raises `ValueError` for none: the option would be ignored."""
+    parts = tuple(kind(part) for word in words for part in word.split(",") if part)
+    if not parts:
+        raise ValueError("expected at least one value, found none")
+    return parts
+
+
 def _values() -> tyro.constructors.ConstructorRegistry:
     """How two kinds of options are read and shown.
 
@@ -200,10 +208,8 @@ def _values() -> tyro.constructors.ConstructorRegistry:
             return None
         return tyro.constructors.PrimitiveConstructorSpec(
             nargs="*",
-            metavar=f"[{kinds[0].__name__.upper()} [{kinds[0].__name__.upper()} ...]]",
-            instance_from_str=lambda words: tuple(
-                kinds[0](part) for word in words for part in word.split(",") if part
-            ),
+            metavar=f"{kinds[0].__name__.upper()} [{kinds[0].__name__.upper()} ...]",
+            instance_from_str=lambda words: _parts(words, kinds[0]),
             is_instance=lambda found: isinstance(found, tuple),
             str_from_instance=lambda found: [str(value) for value in found],
         )

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 import tyro
 
 from .contracts import Progress
-from .errors import ExitCode, HeadbenchError
+from .errors import ExitCode, HeadbenchError, install_extra
 from .specs import Findings, MethodSpec, Need
 
 State = Literal["ready", "partly", "missing"]
@@ -137,7 +137,7 @@ def _slurm() -> Iterator[Need]:
         found = version("submitit")
     except PackageNotFoundError:
         found = ""
-    yield Need("submitit", found, "pip install 'headbench[slurm]'")
+    yield Need("submitit", found, install_extra("slurm"))
     remedy = "Commands of the cluster; without one, `--executor processes` uses the cores of this machine."
     yield Need("sbatch", shutil.which("sbatch") or "", remedy)
 

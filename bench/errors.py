@@ -74,12 +74,18 @@ class InputError(HeadbenchError):
 class UnavailableError(HeadbenchError):
     """Something optional is not there (a package, weights, a compiler); says how to get it.
 
-    A metric that raises this is shown as missing with the reason, never guessed.
+    A metric that raises this is shown as missing with the reason, never guessed. ``note`` is what tables say of it, one short
+    line; default: the whole message.
     """
 
-    def __init__(self, what: str, remedy: str):
-        self.what, self.remedy = what, remedy
+    def __init__(self, what: str, remedy: str, note: str = ""):
+        self.what, self.remedy, self.note = what, remedy, note or f"{what} {remedy}"
         super().__init__(f"{what} {remedy}")
+
+
+def install_extra(extra: str) -> str:
+    """How to install an optional extra of pyproject.toml. It names the checkout: headbench is on no package index."""
+    return f"Run in the headbench checkout: pip install -e '.[{extra}]'"
 
 
 def shortened(text: str, longest: int) -> str:

@@ -23,7 +23,10 @@ Derived = TypedDict("Derived", {"from": str, "variant": str, "change": str})
 
 @dataclass(frozen=True)
 class MethodRecord:
-    """A method as it ran; see `ResolvedMethod.record`. ``needs`` are those of a form other than the clip's own."""
+    """A method as it ran; see `ResolvedMethod.record`. ``needs`` are those of a form other than the clip's own.
+
+    ``code`` is the digest of its code, see `bench.source`; None in runs of an earlier version.
+    """
 
     name: str
     version: str
@@ -33,6 +36,7 @@ class MethodRecord:
     budget: dict[str, Any]
     needs: dict[str, Any] | None = None
     derived: Derived | None = None
+    code: str | None = None
 
 
 @dataclass(frozen=True)
@@ -222,7 +226,7 @@ class Manifest:
         """Write ``run.json``, atomically."""
         record = {name: value for name, value in asdict(self).items() if value is not None}
         for method in record["methods"]:
-            for name in ("needs", "derived"):
+            for name in ("needs", "derived", "code"):
                 if method[name] is None:
                     del method[name]
         for metric in record["metrics"]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -20,6 +21,7 @@ from .errors import InputError, shortened
 from .io.files import atomic_path
 from .specs import LABEL, RENAMED_METRICS, is_label
 
+log = logging.getLogger(__name__)
 FRAME = ["subject", "sequence", "timestep", "camera"]
 """Columns that name a frame."""
 STATUSES = ("ok", "missing", "failed")
@@ -102,14 +104,14 @@ class Rows:
 
     @classmethod
     def joined(cls, parts: Iterable[Rows]) -> Rows:
-        """Several rows as one, in order; at least one part."""
+        """Several rows as one, in order."""
         tables = (part._table for part in parts)
         whole = []
         while batch := list(islice(tables, JOINED_AT_ONCE)):
             table = pd.concat(batch)
             # Text of joined tables stays in as many small pieces as there were tables, until it is taken from them.
             whole.append(table.take(np.arange(len(table))))
-        return cls(pd.concat(whole, ignore_index=True))
+        return cls(pd.concat(whole, ignore_index=True)) if whole else cls.of([])
 
     @classmethod
     def read(cls, path: Path) -> Rows:
@@ -263,7 +265,7 @@ class Rows:
         """The rows of some metrics, in the order of ``names``."""
         metric = self._table["metric"]
         # One table, not joined parts: thousands of small parts take thirty times the memory of their content.
-        places = np.concatenate([np.flatnonzero(metric == name) for name in names])
+        places = np.concatenate([np.empty(0, int), *(np.flatnonzero(metric == name) for name in names)])
         return Rows(self._table.take(places).reset_index(drop=True))
 
     def check(self) -> None:
@@ -279,6 +281,13 @@ class Rows:
         if len(mixed):
             found = ", ".join(self.versions(str(mixed.index[0])))
             raise InputError("rows", f"version of {mixed.index[0]}", "one version of each method", found)
+
+    def values_lacking(self, other: Rows) -> list[str]:
+        """What ``other`` has measured values of and these rows have none of, whatever the version and protocol."""
+        columns = ["metric", "region", "method", "seed", "task", *FRAME]
+        theirs, own = (r._table.loc[r._table["status"] == "ok", columns] for r in (other, self))
+        lacking = theirs[~pd.MultiIndex.from_frame(theirs).isin(pd.MultiIndex.from_frame(own))]
+        return [" ".join(map(str, row)) for row in lacking.itertuples(index=False, name=None)]
 
     def check_protocols(self, source: Path | str, expected: Mapping[str, str] | None = None) -> None:
         """Raise `InputError` where rows of one task come from several protocols, or from another than ``expected``.
@@ -296,6 +305,40 @@ class Rows:
 
     def _of(self, method: str | All) -> pd.DataFrame:
         return self.select(method=method, metric=ALL, task=ALL, region=ALL, seeds=ALL)
+
+
+def check_rows_kept(path: Path, cells: Iterable[tuple[str, str, int]], protocols: Iterable[str]) -> None:
+    """Refuse, before any work, to replace the rows at ``path`` by rows that lack some of them.
+
+    Rows that cannot be read are no loss: a warning says that they are written again.
+
+    Parameters
+    ----------
+    path : file of rows that is going to be replaced, if there is one.
+    cells : method, subject and seed of everything that the new rows are of.
+    protocols : hashes of the protocols that the new rows are measured by.
+
+    Raises
+    ------
+    InputError : the file holds rows of another cell, or by another protocol.
+    """
+    if not path.exists():
+        return
+    try:
+        table = Rows.read(path)._table
+    except InputError as error:
+        log.warning("%s The rows are written again.", error)
+        return
+    kept = "the rows of an earlier call among those of this one"
+    found = set(table[["method", "subject", "seed"]].drop_duplicates().itertuples(index=False, name=None))
+    lost = [f"{method} of {subject}, seed {seed}" for method, subject, seed in sorted(found - {*cells})]
+    if lost:
+        remedy = "Ask for these as well, or choose another --out."
+        raise InputError(path, "", kept, f"others: {'; '.join(lost)}", remedy)
+    others = sorted(set(table["protocol"]) - {*protocols, ""})
+    if others:
+        found_by = f"rows by another protocol, {others[0]}, of other frames or settings"
+        raise InputError(path, "", kept, found_by, "Choose another --out.")
 
 
 def _read_table(path: Path) -> pa.Table:

@@ -118,7 +118,8 @@ class MethodSpec:
     preset_resolutions : the same by preset name, for presets that work at another size; see `at_preset`.
     native : runs on our own implementation; False for an adapter to an official repository.
     version : of what the method makes. Raise it with each change of the code that changes results: a finished avatar is
-        kept as long as version, settings and data are the same, whatever the code is now.
+        kept as long as version, settings and data are the same. For methods of this package a change of the code is a
+        warning then; for plug-ins outside it, the run is refused.
     source : the paper.
     trivial : a trivial baseline, which every real method should beat; shown in tables, never ranked.
     default : a run that names no methods takes it.

@@ -70,7 +70,7 @@ class SharedLpips:
     def _loaded(self) -> Lpips:
         loaded = _load(self.net, self.scaled, self.device)
         if isinstance(loaded, UnavailableError):
-            raise UnavailableError(loaded.what, loaded.remedy)
+            raise UnavailableError(loaded.what, loaded.remedy, loaded.note)
         return loaded
 
 

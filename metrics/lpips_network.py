@@ -45,6 +45,7 @@ SCALE = (0.458, 0.448, 0.450)
 EPSILON = 1e-10
 VARIABLE = "HEADBENCH_LPIPS_WEIGHTS"
 TIMEOUT_S = 5.0
+NO_WEIGHTS = "LPIPS: weights missing, see headbench doctor"
 
 
 class Lpips:
@@ -281,6 +282,7 @@ def find_backbone(spec: NetworkSpec, path: Path | None = None) -> Path:
             f"LPIPS needs the ImageNet weights of its {spec.name} network, which are not on this machine and "
             f"could not be fetched ({problem}).",
             f"Download {spec.url} elsewhere and put it into {cache_folder()}, or set {VARIABLE} to the file.",
+            NO_WEIGHTS,
         )
     return target
 
@@ -320,6 +322,7 @@ def _named(spec: NetworkSpec, path: Path, option: str) -> Path:
         raise UnavailableError(
             f"LPIPS needs the ImageNet weights of its {spec.name} network; {option} names {path}, which has none.",
             f"Download {spec.url} and put it there.",
+            NO_WEIGHTS,
         )
     expected = f"a file, or a folder with {spec.file} or {spec.features_file}"
     raise InputError(option, "", expected, f"{path}, not there")

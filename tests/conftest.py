@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import re
+import shutil
 from pathlib import Path
 
 # OpenMP's workers spin while they wait, as the command line prevents; processes that share the cores take one each. Read
@@ -41,12 +43,49 @@ def seeded():
     torch.manual_seed(0)
 
 
+@pytest.fixture(scope="module")
+def browser():
+    """Chromium without a screen, with WebGL drawn by the processor."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    names = ("chromium", "chromium-browser", "google-chrome")
+    chromium = next(filter(None, map(shutil.which, names)), None)
+    if chromium is None:
+        pytest.skip("there is no Chromium on this machine")
+    flags = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=chromium, args=flags)
+        yield browser
+        browser.close()
+
+
 @pytest.fixture(scope="session", autouse=True)
 def no_flushes():
     """Leave out the waiting for the disk, which takes more time than all else that tests do with files."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(files, "_flush", lambda path: None)
         yield
+
+
+ALLOWED_SKIPS = {
+    r"needs a GPU and gsplat": "no GPU in CI",
+    r"^the anchor needs numba": "an optional reference of a benchmark; numba follows numpy late",
+    r"is not beside the repository|beside the repository$|which is not there$": "files of others, which are not committed",
+    r"^Slurm is not installed": "run on a cluster with `pytest -m slurm`",
+}
+"""Reasons for which a test may be skipped in CI (regular expressions), and why each is accepted."""
+
+
+def pytest_sessionfinish(session):
+    """In CI a skipped test is an error unless its reason is one of `ALLOWED_SKIPS`."""
+    reporter = session.config.pluginmanager.get_plugin("terminalreporter")
+    if not os.environ.get("CI") or "PYTEST_XDIST_WORKER" in os.environ or reporter is None:
+        return
+    reasons = {report.longrepr[2].removeprefix("Skipped: ") for report in reporter.stats.get("skipped", [])}
+    refused = sorted(r for r in reasons if not any(re.search(known, r) for known in ALLOWED_SKIPS))
+    if refused:
+        reporter.section("skips that are not allowed in CI")
+        reporter.write_line("\n".join(refused))
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
 
 def pytest_collection_modifyitems(items):

@@ -50,6 +50,7 @@ def few_timed_frames():
 def run(tmp_path_factory):
     """The folder of one small comparison from nothing, its paths given from a directory that is left afterwards."""
     home = tmp_path_factory.mktemp("home")
+    (home / "board").mkdir()  # for bundles
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(home)
         assert cli.main(["demo", "--out", "demo", *TINY]) == 0
@@ -338,7 +339,9 @@ CASES = {
 @pytest.fixture(scope="module")
 def elsewhere(tmp_path_factory):
     """The directory that commands run in: neither that of the run nor one above it."""
-    return tmp_path_factory.mktemp("elsewhere")
+    folder = tmp_path_factory.mktemp("elsewhere")
+    (folder / "board").mkdir()
+    return folder
 
 
 def test_every_listed_command_has_a_case(capsys):

@@ -38,11 +38,18 @@ def test_the_ci_example_installs_from_checkouts():
     checked_out = {
         step.get("with", {}).get("path", ".") for step in steps if "checkout" in step.get("uses", "")
     }
-    installs = [step["run"].split() for step in steps if step.get("run", "").startswith("pip install")]
+    installs = [
+        line.split() for step in steps for line in step.get("run", "").splitlines() if "pip install" in line
+    ]
+    assert len(installs) == 2
     for words in installs:
-        sources = words[2 : words.index("-c")]
-        assert {source.removeprefix("./") for source in sources} <= checked_out
-        assert (ROOT / words[-1].removeprefix("headbench/")).is_file()
+        for source in words[2:]:
+            place = source.removeprefix("./")
+            assert (
+                source.startswith("-")
+                or place in checked_out
+                or (ROOT / place.removeprefix("headbench/")).is_file()
+            )
     used = {step["run"].split()[1] for step in steps if step.get("run", "").startswith("headbench ")}
     assert used <= set(discover("commands"))
 
@@ -81,7 +88,10 @@ def test_the_container_copies_every_package_and_no_more():
         "__init__.py",
         "py.typed",
         "pyproject.toml",
-        "constraints.txt",
+        "requirements.txt",
+        "requirements-dev.txt",
+        "requirements-torch-cpu.txt",
+        "requirements-torch-cuda.txt",
     }
     assert copied == set(packages.values()) | files
     assert all((ROOT / name).exists() for name in copied)
@@ -108,5 +118,28 @@ def test_tables_are_generated_from_the_stored_rows_never_typed():
     for name, block in blocks.items():
         begin, end = readme.marks(name)
         assert README.split(begin)[1].split(end)[0].strip() == block.strip()
+
+
+@pytest.mark.slow
+def test_all_tables_of_the_suite_are_generated():
+    from headbench.reports import readme
+
     results = ROOT / readme.SUITE / readme.RESULTS
     assert results.read_text(encoding="utf-8") == readme.suite_results(ROOT / readme.SUITE)
+
+
+def test_nothing_installs_headbench_by_its_name():
+    # It is on no package index, where anybody could register that name. Extras are installed from a checkout.
+    by_name = re.compile(r"(?<![\w./-])headbench\[\w|pip install(?: -\S+)* ['\"]?headbench(?![\w./-])")
+    extra = re.compile(r"(?:install_extra\([\"']|-e '\.\[)([\w,]+)")
+    known = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["optional-dependencies"]
+    listed = subprocess.run(
+        ["git", "grep", "-lIE", "install|headbench"], cwd=ROOT, check=True, capture_output=True
+    )
+    named, extras = [], set()
+    for name in listed.stdout.decode().splitlines():
+        text = (ROOT / name).read_text("utf-8")
+        named += [f"{name}: {found[0]}" for found in by_name.finditer(text)]
+        extras |= {word for found in extra.findall(text) for word in found.split(",")}
+    assert named == []
+    assert {"cuda", "slurm"} <= extras <= set(known)

@@ -16,7 +16,7 @@ from typing import Literal
 from ..contracts import Progress, no_progress
 from ..errors import InputError
 from ..io.documents import MAX_JSON_BYTES, checked, parse_json
-from ..io.files import atomic_path, digest_file, write_json
+from ..io.files import atomic_path, check_writable, digest_file, write_json
 from ..io.provenance import RENDER, source_type
 from ..manifest import Manifest
 from ..runner.steps import DIGESTS
@@ -70,6 +70,7 @@ def write_bundle(settings: BundleSettings, progress: Progress = no_progress) -> 
     not as they were rendered.
     """
     folder, out = RunFolder(Path(settings.run)), Path(settings.out)
+    check_writable(out, "--out")
     manifest = folder.read_manifest()
     manifest.check_done(folder.manifest)
     rows = folder.read_rows(manifest)

@@ -97,7 +97,7 @@ class EvaluateSettings:
     """
 
     folder: tyro.conf.Positional[str]
-    """Folder with the images, or with --avatar that of a stored avatar."""
+    """Folder with the images, or with --avatar that of an avatar as `headbench render` takes it."""
 
     out: str
     """Folder to write: that of a run with one method, which every report, `table`, `compare`, `gate` and `verify` read."""

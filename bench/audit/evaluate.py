@@ -11,7 +11,14 @@ from PIL import Image, UnidentifiedImageError
 
 from ..contracts import Avatar, Budget, Camera, Clip, Frame, FrameKey, HeadPose, Progress, no_progress
 from ..errors import HeadbenchError, InputError
-from ..io.files import atomic_path, check_name, digest, digest_file, grouped_writes, prepare_folder
+from ..io.files import (
+    atomic_path,
+    check_name,
+    check_output_folder,
+    digest,
+    digest_file,
+    grouped_writes,
+)
 from ..io.images import probe_image, write_png
 from ..io.lock import locked
 from ..protocol import Protocol, make_protocols
@@ -87,13 +94,14 @@ def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress
         method = images_method(config.methods[0], digest(digests)[:12])
         adapted_for = [method]
     folder = RunFolder(Path(config.out))
-    prepare_folder(folder.root)
+    check_output_folder(folder.root)
     with locked(folder.root):
+        manifest = describe(config, [method], metrics, clips, protocols)
+        manifest = replace(manifest, evaluated=str(source))
+        folder.check_kept(manifest)
         jobs = [
             replace(job, method=method) for job in make_jobs(config, adapted_for, clips, protocols, folder)
         ]
-        manifest = describe(config, [method], metrics, clips, protocols)
-        manifest = replace(manifest, evaluated=str(source))
         manifest.write(folder.manifest)
         parts = []
         for index, job in enumerate(jobs):
@@ -106,7 +114,7 @@ def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress
             parts.append(measure(job, avatar, metrics))
             progress(index + 1, len(jobs), job.name)
         rows = Rows.joined(parts)
-        rows.write(folder.rows)
+        folder.write_rows(rows)
         replace(manifest, status="done").write(folder.manifest)
         write_reports(folder.root)
     together = [*([Path(settings.like)] if settings.like else []), folder.root]

@@ -16,7 +16,7 @@ from ..protocol import Protocol
 from ..runner.captures import open_clips
 from ..runner.config import ResolvedMethod, RunConfig, resolve_methods, resolve_metrics
 from ..runner.run import make_jobs
-from ..runner.steps import Job, fit, measure, measured, render, steps_ahead
+from ..runner.steps import Job, fit, measure, render, steps_ahead
 from ..runner.store import RunFolder
 from ..specs import MetricSpec
 from .settings import is_speed
@@ -49,10 +49,7 @@ def work_on_cell(task: Task, report: Callable[[str], None]) -> None:
     job = replace(job, line=RunProgress({job.name: steps_ahead(job, metrics)}, show))
     avatar = fit(job)
     render(job, avatar)
-    if not task.speed:
-        kept = measured(job, metrics)
-        metrics = [metric for metric in metrics if metric in kept or not is_speed(metric)]
-    measure(job, avatar, metrics)
+    measure(job, avatar, metrics if task.speed else [metric for metric in metrics if not is_speed(metric)])
 
 
 class _Opened:
@@ -103,11 +100,18 @@ class _Run:
         check_device(config.device)
         recorded = manifest.protocols.items()
         protocols = {task: record.protocol(folder.manifest) for task, record in recorded}
+        methods = {method.spec.name: method for method in resolve_methods(config)}
+        began_with = {method.name: method.code for method in manifest.methods}
+        for name, method in methods.items():
+            code = method.identity().get("code")  # of a plug-in outside the package
+            if code not in (None, began_with.get(name)):
+                expected = f"{began_with.get(name)}, the digest of the plug-in's code when the run began"
+                raise InputError(folder.manifest, f"methods, code of {name}", expected, code)
         return cls(
             folder,
             config,
             {clip.subject: clip.fingerprint for clip in manifest.clips},
-            {method.spec.name: method for method in resolve_methods(config)},
+            methods,
             resolve_metrics(config),
             protocols,
         )

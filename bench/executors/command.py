@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,10 +11,27 @@ import tyro
 
 from ..configuration import build, merge, parse_assignments
 from ..contracts import Progress
+from ..errors import InputError
 from ..registry import unknown
 from ..runner.config import RunOptions
 from ..specs import Findings
 from .settings import Execution, ExecutorName
+
+
+def chosen_execution(
+    settings: Mapping[str, Any], executor: ExecutorName | None, workers: int | None, source: str
+) -> Execution:
+    """Settings of an executor with the options ``--executor`` and ``--workers``, None where not given, laid over them.
+
+    Raises `InputError` for settings that are none, and for workers of an executor that has none.
+    """
+    options = {"executor": executor, "workers": workers}
+    given = {key: value for key, value in options.items() if value is not None}
+    execution = build(Execution, merge(settings, given), source, "execution.")
+    if workers is not None and execution.executor != "processes":
+        expected = "--executor processes, whose number of processes it is"
+        raise InputError("command line", "--workers", expected, f"--executor {execution.executor}")
+    return execution
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,7 +42,7 @@ class ExecutionOptions:
     """Where it is done, as for `headbench run`."""
 
     workers: int | None = None
-    """How many processes, as for `headbench run`."""
+    """How many processes, as for `headbench run`; with `--executor processes` alone."""
 
     set: Annotated[
         tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="execution.KEY=VALUE")
@@ -37,9 +55,8 @@ class ExecutionOptions:
         given = parse_assignments(self.set)
         if stray := sorted(given.keys() - {"execution"}):
             raise unknown("command line", "--set", stray[0], ["execution"])
-        options = {"executor": self.executor, "workers": self.workers}
-        options = {key: value for key, value in options.items() if value not in ("inline", None)}
-        return build(Execution, merge(given.get("execution", {}), options), "command line", "execution.")
+        executor = None if self.executor == "inline" else self.executor
+        return chosen_execution(given.get("execution", {}), executor, self.workers, "command line")
 
     @property
     def others(self) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from ..errors import shortened
 from ..io.documents import checked, read_json
 from ..io.files import write_json
 from ..rows import Rows
-from ..runner.steps import Job, failed_rows, stored_rows
+from ..runner.steps import Job, failed_rows, log_kept, stored_rows, trained_files
 from ..runner.store import RunFolder
 from ..specs import MAX_LABEL, MetricSpec
 from .cell import cell_task
@@ -40,6 +40,10 @@ def execute(
     tasks = [cell_task(job, captures[job.clip.subject], folder) for job in jobs]
     places = {task.place: job for task, job in zip(tasks, jobs)}
     steady = [metric for metric in metrics if not is_speed(metric)]
+
+    for job in jobs:
+        if job.cell.is_done("fit", job.fit_fingerprint) and not job.cell.damage(trained_files(job)):
+            log_kept(job)
 
     def left(wanted: Sequence[MetricSpec]) -> list[Task]:
         return [

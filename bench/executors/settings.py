@@ -8,7 +8,7 @@ import shutil
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from ..errors import UnavailableError
+from ..errors import UnavailableError, install_extra
 from ..machine import check_device
 from ..specs import MetricSpec
 
@@ -91,9 +91,7 @@ def import_submitit() -> Any:
     try:
         return importlib.import_module("submitit")
     except ImportError as error:
-        raise UnavailableError(
-            "The package submitit is not here.", "pip install 'headbench[slurm]'"
-        ) from error
+        raise UnavailableError("The package submitit is not installed.", install_extra("slurm")) from error
     finally:
         del os.environ[level]
         if before is not None:

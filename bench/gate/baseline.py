@@ -147,7 +147,7 @@ class Tolerance:
     """Which way a metric is better, and how far it may move without a verdict.
 
     A number may differ by ``absolute`` or by ``relative`` times the baseline's size, whichever is more.
-    ``machine_bound`` numbers are judged on the machine of the baseline alone.
+    ``machine_bound`` numbers are judged on request, and on the machine of the baseline alone.
     """
 
     higher_is_better: bool

@@ -36,6 +36,10 @@ class GateSettings:
     """With --update: `same` (default) demands the very same captures, by fingerprint, ever after; `remade` is for ones
     synthesised again for every run, whose pictures differ in last bits between processors: all else must be the same."""
 
+    judge_speed: bool = False
+    """Also judge metrics that depend on the machine and its load (frames per second, milliseconds, training time, memory),
+    where the baseline was measured on a machine of the same kind. Without it they are shown and decide nothing."""
+
     junit: str | None = None
     """Also write a JUnit XML file: one test case for every task, method, subject and metric."""
 
@@ -46,13 +50,15 @@ class GateSettings:
         """Refuse what contradicts itself."""
         if self.captures is not None and not self.update:
             raise ValueError("--captures is written into the baseline: give it with --update")
+        if self.update and (self.judge_speed or self.junit is not None or self.markdown is not None):
+            raise ValueError("--update judges nothing: leave out --judge-speed, --junit and --markdown")
 
 
 def gate(settings: GateSettings, progress: Progress = no_progress) -> Findings:
     """Hold a run against a committed baseline: exit code 1 where a number got worse, 3 where one is missing.
 
     Results or a baseline that are missing or invalid are a finding too, with exit code 3, so that CI does not
-    take them for a usage error. Nothing is written then but the reports asked for.
+    take them for a usage error. Nothing is written then but the reports asked for, which say so.
     """
     for option, path in (("--junit", settings.junit), ("--markdown", settings.markdown)):
         if path is not None:
@@ -63,20 +69,38 @@ def gate(settings: GateSettings, progress: Progress = no_progress) -> Findings:
     try:
         return _update(settings) if settings.update else _judge(settings)
     except InputError as error:
+        from .verdicts import failed_junit, failed_markdown
+
+        _write_reports(settings, failed_junit(str(error)), failed_markdown(str(error)))
         return Findings(
             f"Gate: missing or invalid: {error}", {"error": str(error)}, False, ExitCode.NO_VERDICT
         )
 
 
+def _write_reports(settings: GateSettings, junit: str, markdown: str) -> None:
+    """Write the reports asked for."""
+    for path, text in ((settings.junit, junit), (settings.markdown, markdown)):
+        if path is not None:
+            write_text(Path(path), text)
+
+
 def _judge(settings: GateSettings) -> Findings:
     from .baseline import Baseline, read_results
-    from .verdicts import environment_changes, exit_code, judge, to_junit, to_markdown, to_text
+    from .verdicts import (
+        environment_changes,
+        exit_code,
+        judge,
+        to_junit,
+        to_markdown,
+        to_text,
+        unjudged_notes,
+    )
 
     baseline, results = Baseline.read(Path(settings.baseline)), read_results(Path(settings.results))
-    verdicts = judge(results, baseline)
+    verdicts = judge(results, baseline, speed=settings.judge_speed)
     code = exit_code(verdicts)
     changes = environment_changes(baseline.environment, results.environment)
-    notes = [f"Environment changed: {change}." for change in changes]
+    notes = [*unjudged_notes(verdicts), *(f"Environment changed: {change}." for change in changes)]
     if baseline.captures == "remade":
         notes.append("Captures were made again for these results, as the baseline declares.")
     unavailable = results.unavailable.keys() & baseline.unavailable.keys()
@@ -84,10 +108,7 @@ def _judge(settings: GateSettings) -> Findings:
         notes.append(f"Unavailable here as in the baseline: {len(unavailable)} numbers.")
     if any(verdict.outcome in ("improved", "new") for verdict in verdicts) and code == 0:
         notes.append("The baseline can be brought up to date with --update.")
-    if settings.junit is not None:
-        write_text(Path(settings.junit), to_junit(verdicts, notes))
-    if settings.markdown is not None:
-        write_text(Path(settings.markdown), to_markdown(verdicts, code, notes))
+    _write_reports(settings, to_junit(verdicts, notes), to_markdown(verdicts, code, notes))
     data = {
         "code": code,
         "verdicts": [{**asdict(v), "place": str(v.place), "change": v.change} for v in verdicts],
@@ -109,7 +130,9 @@ def _update(settings: GateSettings) -> Findings:
     before = earlier.frames if earlier else {}
     baseline.write(path)
     lines = [f"{path}: {len(baseline.values)} numbers written."]
-    lines += [f"  was: {verdict}" for verdict in verdicts if verdict.outcome not in ("pass", "missing")]
+    lines += [
+        f"  was: {verdict}" for verdict in verdicts if verdict.outcome not in ("pass", "missing", "unjudged")
+    ]
     for place, count in baseline.frames.items():
         if before.get(place, count) != count:
             lines.append(f"  frames: {place}: {before[place]} to {count}")

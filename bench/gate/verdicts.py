@@ -13,13 +13,14 @@ from .baseline import MACHINE, Baseline, Place, Results, Tolerance
 
 Outcome = Literal["pass", "regressed", "improved", "missing", "new", "unjudged"]
 ORDER: tuple[Outcome, ...] = ("missing", "regressed", "improved", "new", "unjudged", "pass")
+NOT_JUDGED = "such metrics depend on the machine and its load; --judge-speed judges them"
 ROUNDING = 1e-9
 """Share of a tolerance that is rounding: a number moved by exactly the tolerance passes."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What became of one number. ``unjudged``: bound to a machine, and measured on another one."""
+    """What became of one number. ``unjudged``: it depends on the machine, and was not to be judged or is of another one."""
 
     place: Place
     outcome: Outcome
@@ -36,12 +37,12 @@ class Verdict:
     def __str__(self) -> str:
         place = self.place
         what = f"{place.measured} of {place.method}, subject {place.subject}, {place.task}"
-        if self.outcome == "missing" or self.found is None:
-            return f"{what}: missing: {self.reason}"
+        if self.found is None:
+            return f"{what}: {self.outcome}: {self.reason}"
         digits, unit = (self.tolerance.digits, self.tolerance.unit) if self.tolerance else (4, "")
         unit = f" {unit}" if unit else ""
         if self.baseline is None or self.tolerance is None:
-            return f"{what}: new: {_shown(self.found, digits)}{unit}"
+            return f"{what}: {self.outcome}: {_shown(self.found, digits)}{unit}{self.reason and ': ' + self.reason}"
         moved = self.found - self.baseline
         allowed = self.tolerance.allowed(self.baseline)
         return (
@@ -56,10 +57,12 @@ def _shown(value: float, digits: int, sign: str = "") -> str:
     return f"{value:{sign}.{digits}f}" if abs(value) < 1e15 else f"{value:{sign}g}"
 
 
-def judge(results: Results, baseline: Baseline) -> list[Verdict]:
+def judge(results: Results, baseline: Baseline, *, speed: bool = False) -> list[Verdict]:
     """Give every number of baseline and results its verdict, the gravest first.
 
     Numbers of a task whose protocol is not the baseline's are missing: they were measured, but of something else.
+    ``speed``: judge machine-bound numbers as well, if both were measured on one machine; else they are unjudged, even
+    where there are none.
     """
     other = _other_protocols(results, baseline)
     same_machine = all(baseline.environment.get(name) == results.environment.get(name) for name in MACHINE)
@@ -69,7 +72,9 @@ def judge(results: Results, baseline: Baseline) -> list[Verdict]:
         found = results.values.get(place)
         outcome: Outcome = "missing"
         reason = other.get(place.task, "")
-        if reason:
+        if tolerance.machine_bound and not speed:
+            outcome, reason = "unjudged", NOT_JUDGED
+        elif reason:
             found = None
         elif found is None:
             known = results.problems.get(place) or results.unavailable.get(place)
@@ -85,7 +90,11 @@ def judge(results: Results, baseline: Baseline) -> list[Verdict]:
     lacking = {**results.problems, **unavailable}
     for place in {**results.values, **lacking}.keys() - baseline.values.keys():
         tolerance = Tolerance.default(results.metrics[place.metric])
-        if place in lacking:
+        if tolerance.machine_bound and not speed:
+            verdicts.append(
+                Verdict(place, "unjudged", results.values.get(place), None, tolerance, NOT_JUDGED)
+            )
+        elif place in lacking:
             reason = f"{lacking[place]} (not in the baseline either)"
             verdicts.append(Verdict(place, "missing", None, None, tolerance, reason))
         else:
@@ -94,9 +103,9 @@ def judge(results: Results, baseline: Baseline) -> list[Verdict]:
 
 
 def exit_code(verdicts: Sequence[Verdict]) -> ExitCode:
-    """3 where a number is missing, since what cannot be compared is not judged; else 1 where one regressed."""
-    outcomes = {verdict.outcome for verdict in verdicts}
-    if "missing" in outcomes or not verdicts:
+    """3 where a number is missing or none was judged, since nothing can be said then; else 1 where one regressed."""
+    outcomes = {verdict.outcome for verdict in verdicts} - {"unjudged"}
+    if "missing" in outcomes or not outcomes:
         return ExitCode.NO_VERDICT
     return ExitCode.NEGATIVE if "regressed" in outcomes else ExitCode.OK
 
@@ -149,6 +158,18 @@ def _flat(record: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
+def unjudged_notes(verdicts: Sequence[Verdict]) -> list[str]:
+    """A note for each reason why numbers were not judged, with the metrics."""
+    places: dict[str, list[Place]] = {}
+    for verdict in verdicts:
+        if verdict.outcome == "unjudged":
+            places.setdefault(verdict.reason, []).append(verdict.place)
+    return [
+        f"Not judged, {len(own)} numbers of {', '.join(sorted({place.metric for place in own}))}: {reason}."
+        for reason, own in places.items()
+    ]
+
+
 SHOWN = 20
 TITLES = {0: "nothing got worse", 1: "regressed", 3: "missing or invalid"}
 
@@ -161,8 +182,8 @@ def headline(verdicts: Sequence[Verdict], code: int) -> str:
 
 
 def to_text(verdicts: Sequence[Verdict], code: int, notes: Sequence[str]) -> str:
-    """Headline, everything that did not simply pass (the gravest first), notes."""
-    others = [verdict for verdict in verdicts if verdict.outcome != "pass"]
+    """Headline, everything that was judged and did not simply pass (the gravest first), notes."""
+    others = [verdict for verdict in verdicts if verdict.outcome not in ("pass", "unjudged")]
     lines = [headline(verdicts, code), *(f"  {verdict}" for verdict in others[:SHOWN])]
     if len(others) > SHOWN:
         lines.append(f"  and {len(others) - SHOWN} more")
@@ -204,6 +225,25 @@ def to_junit(verdicts: Sequence[Verdict], notes: Sequence[str]) -> str:
             else:
                 ElementTree.SubElement(case, "system-out").text = _xml(str(verdict))
         ElementTree.SubElement(suite, "system-out").text = _xml("\n".join(notes))
+    return _document(root)
+
+
+def failed_markdown(message: str) -> str:
+    """The summary where results or baseline are missing or invalid."""
+    return f"### Gate: {TITLES[3]}\n\n{_escaped(message)}\n"
+
+
+def failed_junit(message: str) -> str:
+    """The JUnit XML where results or baseline are missing or invalid: one test case, with an error."""
+    root = ElementTree.Element("testsuites", name="headbench gate")
+    counts = {"tests": "1", "failures": "0", "errors": "1", "skipped": "0"}
+    suite = ElementTree.SubElement(root, "testsuite", {"name": "gate", **counts})
+    case = ElementTree.SubElement(suite, "testcase", classname="gate", name="results and baseline")
+    ElementTree.SubElement(case, "error", message=_xml(message))
+    return _document(root)
+
+
+def _document(root: ElementTree.Element) -> str:
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
 

@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, is_dataclass
 from functools import partial
 from io import FileIO
@@ -320,19 +320,37 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def check_writable(path: Path, option: str) -> None:
-    """Make sure, before long work, that a file can be written at ``path``; makes its folder.
+    """Make sure, before long work, that a file can be written at ``path``, in a folder that exists.
 
     Raises `InputError`, naming the ``option`` that asked for the file.
     """
     with _writable(path, option, "a file"):
         _check_target(path)
+        if not path.parent.is_dir():
+            expected = "a file in an existing folder"
+            raise InputError(path, option, expected, f"no folder {path.parent}", "Make that folder first.")
         _try_to_write(path.parent)
 
 
-def prepare_folder(folder: Path) -> None:
-    """Make the folder of ``--out`` and prove that it can be written, before any work. Raises `InputError`."""
-    with _writable(folder, "--out", "a folder"):
+def check_output_folder(folder: Path) -> None:
+    """Make sure, before any work, that the folder of ``--out`` can be made and written. Raises `InputError`.
+
+    A folder that does not exist yet is not left behind.
+    """
+    with _writable(folder, "--out", "a folder"), removed_if_empty(folder):
         _try_to_write(folder)
+
+
+@contextmanager
+def removed_if_empty(folder: Path) -> Iterator[None]:
+    """When the block ends, remove the folder and its parents if the block made them and they are empty."""
+    made = list(takewhile(lambda path: not path.exists(), (folder, *folder.parents)))
+    try:
+        yield
+    finally:
+        for path in made:
+            with suppress(OSError):
+                path.rmdir()
 
 
 def check_room(folder: Path) -> None:

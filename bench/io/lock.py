@@ -8,13 +8,20 @@ import json
 import os
 import platform
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO
 
 from ..errors import InputError
-from .files import check_inside, flush_renames, no_link, output_inside, remove_dead_temporaries
+from .files import (
+    check_inside,
+    flush_renames,
+    no_link,
+    output_inside,
+    remove_dead_temporaries,
+    removed_if_empty,
+)
 
 LOCK_FILE = "run.lock"
 _MOST = 1000  # characters of a lock file that are read
@@ -26,7 +33,8 @@ def locked(folder: Path, *, beside: bool = False) -> Iterator[None]:
 
     The lock is the system's (``flock``), so that it ends with its process however that ends: a file left by a killed
     one keeps nobody out. Under it, temporary files of dead processes are removed, and nothing is written through
-    links that lead out of the folder. ``beside``: the lock file lies beside the folder, which may have to be empty.
+    links that lead out of the folder. ``beside``: the lock file lies beside the folder, which may have to be empty. A new
+    folder in which nothing was written is removed.
 
     Raises
     ------
@@ -35,26 +43,23 @@ def locked(folder: Path, *, beside: bool = False) -> Iterator[None]:
     """
     path = folder.resolve().parent / f".{folder.resolve().name}.lock" if beside else folder / LOCK_FILE
     check_inside(folder)
-    is_new = not folder.exists()
-    stream = _acquire(path)
-    try:
-        owner = {"process": os.getpid(), "host": platform.node(), "since": _now()}
-        stream.seek(0)
-        stream.truncate()
-        stream.write(json.dumps(owner) + "\n")
-        stream.flush()
-        remove_dead_temporaries(folder)
-        with output_inside(folder):
-            yield
-    finally:
+    with removed_if_empty(folder):
+        stream = _acquire(path)
         try:
-            flush_renames()
+            owner = {"process": os.getpid(), "host": platform.node(), "since": _now()}
+            stream.seek(0)
+            stream.truncate()
+            stream.write(json.dumps(owner) + "\n")
+            stream.flush()
+            remove_dead_temporaries(folder)
+            with output_inside(folder):
+                yield
         finally:
-            path.unlink(missing_ok=True)  # while still locked: whoever waits sees that the file has gone
-            stream.close()
-            if is_new:
-                with suppress(OSError):  # unless it is empty: nothing came of it
-                    folder.rmdir()
+            try:
+                flush_renames()
+            finally:
+                path.unlink(missing_ok=True)  # while still locked: whoever waits sees that the file has gone
+                stream.close()
 
 
 def is_locked(folder: Path) -> bool:

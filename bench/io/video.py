@@ -16,7 +16,7 @@ from typing import Any
 import cv2
 
 from ..contracts import ByteArray
-from ..errors import HeadbenchError, InputError, UnavailableError
+from ..errors import HeadbenchError, InputError, UnavailableError, install_extra
 from .files import atomic_path
 from .provenance import note
 
@@ -72,9 +72,8 @@ def webm_writer() -> Any:
     try:
         return importlib.import_module("av")
     except ImportError:
-        remedy = "Install PyAV: pip install av, the extra `video`."
         raise UnavailableError(
-            "Videos for browsers are written by PyAV, which is not here.", remedy
+            "Videos for browsers are written by PyAV, which is not installed.", install_extra("video")
         ) from None
 
 

@@ -8,13 +8,16 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+import tyro
 
 from ..configuration import build, merge, with_first_names, with_new_names
 from ..contracts import Budget, TaskName
 from ..errors import HeadbenchError, InputError
 from ..io.files import check_name
 from ..registry import discover, get, resolve, unknown
+from ..source import code_digest, forget_code, is_outside
 from ..specs import RENAMED_METRICS, MethodSpec, MetricSpec, ProfileSpec
 from .adaptation import MethodNeeds
 
@@ -104,6 +107,7 @@ class ResolvedMethod:
     def record(self) -> dict[str, Any]:
         """Everything that decides what this method does, for the manifest."""
         needs = MethodNeeds.of(self.spec)
+        code = code_digest(self.spec.implementation) if self.spec.implementation else ""
         return {
             "name": self.spec.name,
             "version": self.spec.version,
@@ -112,12 +116,19 @@ class ResolvedMethod:
             "config": None if self.config is None else asdict(self.config),
             "budget": asdict(self.budget),
             **({} if needs == MethodNeeds() else {"needs": asdict(needs)}),
+            **({"code": code} if code else {}),
         }
 
     def identity(self) -> dict[str, Any]:
-        """The same for fingerprints, which change neither with names of settings nor with where the class is."""
+        """The same for fingerprints, which change neither with names of settings nor with where the class is.
+
+        The code of a method of this package is left out: its version says whether results change.
+        """
+        record = self.record()
+        if not is_outside(self.spec.implementation):
+            record.pop("code", None)
         implementation = self.spec.first_implementation or self.spec.implementation
-        return {**self.record(), "implementation": implementation, "config": with_first_names(self.config)}
+        return {**record, "implementation": implementation, "config": with_first_names(self.config)}
 
 
 def stored_settings(method: str, settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -143,6 +154,7 @@ def resolve_methods(config: RunConfig) -> list[ResolvedMethod]:
 
     Raises `InputError` for unknown methods, presets and settings, and for methods that do not compute on the run's device.
     """
+    forget_code()
     specs: list[MethodSpec] = [get("methods", name) for name in config.methods]
     for name, count in Counter(spec.name for spec in specs).items():
         check_name(name, "registry of methods", "name")
@@ -192,6 +204,7 @@ def resolve_metrics(config: RunConfig) -> list[MetricSpec]:
     ------
     InputError : an unknown metric or profile, a metric that none of the profiles asked for defines.
     """
+    forget_code()
     profiles: list[ProfileSpec] = [get("profiles", name) for name in config.metric_profiles]
     defined = {metric.name for metric in get("profiles", CANONICAL).metrics}
     found: list[MetricSpec] = []
@@ -215,6 +228,16 @@ def resolve_metrics(config: RunConfig) -> list[MetricSpec]:
     return [
         replace(m, tables=("comparison", *m.tables)) if m.profile == first != CANONICAL else m for m in found
     ]
+
+
+AVATAR_FOLDER = (
+    "folder of an avatar: a cell of a run (RUN/SUBJECT/METHOD/seed-0), the folder avatar in it, or what `headbench import ga` "
+    "or `headbench compact` wrote"
+)
+AvatarFolder = Annotated[
+    tyro.conf.Positional[str], tyro.conf.arg(help=f"{AVATAR_FOLDER[0].upper()}{AVATAR_FOLDER[1:]}.")
+]
+"""Argument of every command that takes a stored avatar; `bench.runner.stored.avatar_folder` resolves it."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,7 +16,7 @@ from ..contracts import Avatar, CheckedMethod, Clip
 from ..errors import HeadbenchError, InputError, UnavailableError
 from ..executors.outcome import outcome_path
 from ..executors.settings import Execution, check_executor
-from ..io.files import atomic_path, output_inside, prepare_folder
+from ..io.files import atomic_path, check_output_folder, output_inside
 from ..io.lock import locked
 from ..machine import check_device_answers, machine_record, peak_memory_bytes
 from ..manifest import AdaptedRecord, ClipRecord, Manifest, MethodRecord, ProtocolRecord
@@ -49,7 +49,7 @@ def run(config: RunConfig, execution: Execution | None = None, **record: Any) ->
     execution = execution or Execution()
     check_executor(execution, config.device)
     folder = RunFolder(Path(config.out))
-    prepare_folder(folder.root)
+    check_output_folder(folder.root)
     start = time.perf_counter()
     with locked(folder.root):
         rows = _run(config, methods, metrics, folder, execution, record)
@@ -75,6 +75,8 @@ def _run(
         if not all(cell.ended("measure") for cell in cells):
             check_settings(method)
     protocols = make_protocols(config.tasks, clips, config.frames_per_task)
+    planned = describe(config, methods, metrics, clips, protocols)
+    folder.check_kept(planned)
     jobs = make_jobs(config, methods, clips, protocols, folder)
     for job in jobs:
         job.check()
@@ -86,7 +88,7 @@ def _run(
         for job in jobs
         if job.adapted is not None and job.seed == config.seeds[0]
     )
-    manifest = replace(describe(config, methods, metrics, clips, protocols), adapted=forms, **record)
+    manifest = replace(planned, adapted=forms, **record)
     manifest.write(folder.manifest)
     for reason in missing_tasks(config.tasks, protocols).values():
         log.warning("%s", reason)
@@ -99,7 +101,7 @@ def _run(
 
         rows = execute(jobs, metrics, folder, execution)
         manifest = replace(manifest, machine=dict(machine_of(jobs, manifest.machine)))
-    rows.write(folder.rows)
+    folder.write_rows(rows)
     folder.speed_pass.unlink(missing_ok=True)
     seconds = round(time.perf_counter() - start, 3)
     done = replace(manifest, status="done", seconds=seconds, peak_memory_bytes=peak_memory_bytes())

@@ -139,7 +139,7 @@ def _score_frame(
                 values = metric.in_regions(image, truth, masks)
                 scores += [Score(spec.name, key, name, float(value)) for name, value in values.items()]
         except UnavailableError as error:
-            scores.append(_missing(spec, key, str(error)))
+            scores.append(_missing(spec, key, error.note))
     return scores
 
 
@@ -156,7 +156,7 @@ def _batched(
         for key, value in zip(keys, values, strict=True):
             yield Score(spec.name, key, FULL, float(value))
     except UnavailableError as error:
-        yield from (_missing(spec, key, str(error)) for key in keys)
+        yield from (_missing(spec, key, error.note) for key in keys)
 
 
 def _temporal(
@@ -180,7 +180,7 @@ def _temporal(
         try:
             return Score(spec.name, key, FULL, float(metric(*images)))
         except UnavailableError as error:
-            return _missing(spec, key, str(error))
+            return _missing(spec, key, error.note)
 
     yield from _ahead(pool, score, keys)
 

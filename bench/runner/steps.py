@@ -34,11 +34,12 @@ from ..machine import PeakMemory, ProcessorLoad, machine_name, processor_seconds
 from ..progress import RunProgress, duration, progress
 from ..protocol import Protocol
 from ..rows import ALL, Row, Rows
+from ..source import code_digest, is_outside
 from ..specs import MetricSpec
 from .adaptation import AdaptedClip, TrainingView
 from .config import ResolvedMethod
 from .scoring import FULL, Frames, make_metric, score_frames
-from .store import Cell, RunFolder, avatar_files
+from .store import Cell, RunFolder, StepState, avatar_files
 
 log = logging.getLogger(__name__)
 RESULT_FORMAT = 1  # raise when a step changes what it leaves behind
@@ -113,21 +114,30 @@ class Job:
         return replace(self, method=method, cell=folder.cell(self.clip.subject, spec.name, self.seed))
 
     def check(self) -> None:
-        """Refuse a folder that holds an avatar made of something else, or links out of it.
+        """Refuse a folder that holds an avatar made of something else, or by other code, or links out of it.
 
         Damaged records of steps are removed, with a warning.
         """
         refuse_links(self.cell.folder)
         self.cell.drop_damaged_records()
         state = self.cell.step("fit")
-        if state is not None and state.get("fingerprint") != self.fit_fingerprint:
-            raise InputError(
-                self.cell.folder / "fit.json",
-                "fingerprint",
-                f"{self.fit_fingerprint[:12]}, that of this run's settings and data",
-                f"{str(state.get('fingerprint'))[:12]}, an avatar of other settings, data or method version",
-                "Choose another --out, or delete that folder.",
-            )
+        if state is None or state.get("fingerprint") == self.fit_fingerprint:
+            return
+        file, remedy = self.cell.folder / "fit.json", f"Choose another --out, or delete {self.cell.folder}."
+        code, earlier = (record.get("code") for record in (self.method.record(), state.get("method", {})))
+        if is_outside(self.method.spec.implementation) and "method" in state and code != earlier:
+            expected = f"{code}, the digest of the code of {self.method.spec.implementation}"
+            found = "none: it was trained before the code of plug-ins was recorded"
+            if earlier:
+                found = f"{earlier}: the code of the plug-in has changed since its training {_age(state)}"
+            raise InputError(file, "method, code", expected, found, remedy)
+        raise InputError(
+            file,
+            "fingerprint",
+            f"{self.fit_fingerprint[:12]}, that of this run's settings and data",
+            f"{str(state.get('fingerprint'))[:12]}, an avatar of other settings, data, method version or code",
+            remedy,
+        )
 
     def check_method(self) -> None:
         """Let a method that can tell refuse what it could not train or render; not where all is done already."""
@@ -168,7 +178,8 @@ def fit(job: Job) -> Avatar:
         job.cell.set_aside(job.cell.avatar)  # no record says what it was made of, or it is damaged
     if earlier is None or earlier["status"] != "done":
         interruptions = 0 if earlier is None else earlier.get("interruptions", 0) + 1
-        job.cell.begin("fit", job.fit_fingerprint, interruptions=interruptions)
+        record = job.method.record()
+        job.cell.begin("fit", job.fit_fingerprint, interruptions=interruptions, method=record)
         use_device(job.device)
         if isinstance(method, PreparedMethod):
             method.prepare(job.device)
@@ -195,12 +206,38 @@ def fit(job: Job) -> Avatar:
             memory_before_bytes=memory.before,
             **memory.device_record,
             load={"machine": load.machine, **load.details},
-            method=job.method.record(),
+            method=record,
+            finished_at=datetime.now(UTC).timestamp(),
             files=job.cell.digests(avatar_files(job.cell.avatar)),
         )
         log.info("%s: trained in %s", job.name, duration(seconds))
+    else:
+        log_kept(job)
     avatar: Avatar = method.load(job.cell.avatar, device=job.device)
     return avatar
+
+
+def log_kept(job: Job) -> None:
+    """Log when the avatar of a finished training was trained; warn if the code of its method has changed since."""
+    state = job.cell.step("fit")
+    assert state is not None
+    spec = job.method.spec
+    log.info("%s: kept: trained %s, version %s", job.name, _age(state), spec.version)
+    earlier = state.get("method", {}).get("code")
+    if earlier and earlier != job.method.record().get("code"):
+        package = spec.implementation.partition(":")[0].rpartition(".")[0]
+        log.warning(
+            "%s: the code of %s has changed since this avatar was trained. It is kept because the version is still %s. If "
+            "the change affects results, raise the version in the spec, or delete %s to train it again.",
+            *(job.name, package, spec.version, job.cell.folder),
+        )
+
+
+def _age(state: StepState) -> str:
+    """How long ago a training ended; in records of earlier versions and of unfinished trainings there is no time."""
+    if "finished_at" not in state:
+        return "in an earlier run"
+    return f"{duration(max(0.0, datetime.now(UTC).timestamp() - state['finished_at']))} ago"
 
 
 def _train(job: Job, method: Any, report: Progress) -> None:
@@ -310,7 +347,7 @@ def measure(
 
     Metrics of one implementation are one measurement: they are read back, or taken again, together. A measurement that
     gave any number is read back; one that could not be had is tried again. Damaged rows are measured again, with a
-    warning.
+    warning. Rows of metrics that are not asked for stay in the cell's file, with what they were measured of.
 
     Parameters
     ----------
@@ -359,12 +396,15 @@ def measure(
         else:
             parts.append(Rows.of([_avatar_row(job, spec, measured[spec.implementation])]))
     result = Rows.joined(parts)
-    job.cell.begin("measure", job.fit_fingerprint, **record)  # a kill before `finish` is no damage
-    result.write(job.cell.rows)
+    others = sorted(old.metrics - fingerprints.keys())
+    job.cell.begin(
+        "measure", job.fit_fingerprint, **record
+    )  # a kill between the rows and their record is no damage
+    Rows.joined([result, old.of_metrics(others)] if others else [result]).write(job.cell.rows)
     job.cell.finish(
         "measure",
         job.fit_fingerprint,
-        fingerprints=fingerprints,
+        fingerprints=known | fingerprints,
         details=details,
         rows=digest_file(job.cell.rows),
         **record,
@@ -411,13 +451,6 @@ def stored_rows(job: Job, metrics: Sequence[MetricSpec], *, retry: bool = False)
     return old.of_metrics([spec.name for spec in metrics])
 
 
-def measured(job: Job, metrics: Sequence[MetricSpec]) -> list[MetricSpec]:
-    """Those metrics that were measured of the avatar and the frames that the cell has now."""
-    known = _measured_before(job)[0]
-    rendered = recorded_frames(job)
-    return [spec for spec in metrics if known.get(spec.name) == _measure_fingerprint(job, spec, rendered)]
-
-
 def _measured_before(job: Job) -> tuple[dict[str, str], dict[str, Any], Rows]:
     """Fingerprints and details of the measurements that were taken, by metric, and the rows."""
     step = job.cell.step("measure")
@@ -437,7 +470,9 @@ def _measure_fingerprint(job: Job, spec: MetricSpec, rendered: Mapping[str, str]
     what: Any = _avatar_record(job)
     if spec.per_frame:
         what = {name: rendered.get(name) for name in map(job.cell.name, job.frame_paths)}
-    metric = (spec.name, spec.implementation, spec.detail)
+    metric: tuple[str, ...] = (spec.name, spec.implementation, spec.detail)
+    if is_outside(spec.implementation):
+        metric = (*metric, code_digest(spec.implementation))
     return digest(RESULT_FORMAT, job.fit_fingerprint, protocols, *metric, regions, what)
 
 

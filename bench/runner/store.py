@@ -33,7 +33,7 @@ from ..errors import InputError
 from ..io.documents import checked, read_json
 from ..io.files import digest_file, write_json
 from ..manifest import Manifest
-from ..rows import Rows
+from ..rows import ALL, Rows
 
 log = logging.getLogger(__name__)
 
@@ -48,6 +48,7 @@ class StepState(TypedDict, total=False):
     rows : SHA-256 of ``rows.parquet``.
     fingerprints, details : of the measurements, by metric.
     seconds, processor_seconds, interruptions, peak_memory_bytes, memory_before_bytes, method : of the training.
+    finished_at : when the training ended, in seconds since 1970 (UTC).
     peak_device_memory_bytes, device_memory_before_bytes, tf32 : likewise, of a CUDA device; see `PeakMemory`.
     load : machine, threads and cores of the training, and cores that others kept busy meanwhile; see `ProcessorLoad`.
     earlier : values that were measured again since, each time with when, on which machine and under which load.
@@ -69,11 +70,14 @@ class StepState(TypedDict, total=False):
     device_memory_before_bytes: int
     tf32: bool
     method: dict[str, Any]
+    finished_at: float
     load: dict[str, Any]
     earlier: list[dict[str, Any]]
     derived_from: str
 
 
+DISCARD = "Choose another --out. To discard the results in this file, delete it: trained avatars are kept."
+"""What to do about rows that would be lost."""
 STAGES = ("fit", "digests", "measure")
 
 
@@ -160,6 +164,17 @@ class Cell:
         self.begin(name, fingerprint, status="done", **record)
 
 
+def _kept_design(manifest: Manifest) -> dict[str, str]:
+    """What may not change when a run is started again, by what error messages call it."""
+    regions = manifest.configuration.regions
+    protocols = sorted(manifest.protocols.items())
+    return {
+        "tasks": ", ".join(task for task, _ in protocols),
+        "regions": "the default ones" if regions is None else ", ".join(regions) or "none",
+        **{f"captures or frames of {task}": f"protocol {protocol.hash}" for task, protocol in protocols},
+    }
+
+
 def avatar_files(folder: Path) -> list[Path]:
     """Files of an avatar's folder, sorted; logs, which official programs leave there, are no part of the avatar."""
     return sorted(path for path in folder.rglob("*") if path.is_file() and path.suffix != ".log")
@@ -212,6 +227,60 @@ class RunFolder:
     def cell(self, subject: str, method: str, seed: int) -> Cell:
         """Return the folder of one avatar."""
         return Cell(self.root / subject / method / f"seed-{seed}")
+
+    def check_kept(self, planned: Manifest) -> None:
+        """Make sure that a planned run keeps all rows that the folder has; called before any work.
+
+        Methods, seeds and metrics may be added, not left out. Captures, frames, tasks and regions have to be the same.
+
+        Raises `InputError` for a plan that would lose rows.
+        """
+        earlier = self._earlier_rows()
+        if earlier is None:
+            return
+        for key, known, named in (
+            ("methods", earlier.methods, [method.name for method in planned.methods]),
+            ("seeds", set(map(str, earlier.seeds(ALL))), list(map(str, planned.configuration.seeds))),
+            ("metrics", earlier.metrics, [metric.name for metric in planned.metrics]),
+        ):
+            lost = sorted(known - set(named))
+            if lost:
+                expected = f"all that it has results for ({', '.join(sorted(known))}), and optionally more"
+                raise InputError(
+                    self.rows, key, expected, f"{', '.join(named)} without {', '.join(lost)}", DISCARD
+                )
+        try:
+            before = _kept_design(self.read_manifest())
+        except InputError:
+            return  # not readable; rows that would be lost are an error of `write_rows`
+        for key, value in _kept_design(planned).items():
+            if value != before.get(key):
+                raise InputError(self.rows, key, f"{before.get(key)}, as in the earlier run", value, DISCARD)
+
+    def write_rows(self, rows: Rows) -> None:
+        """Write ``rows.parquet``.
+
+        Raises `InputError`, and leaves the file as it is, where it has values that ``rows`` lack.
+        """
+        earlier = self._earlier_rows()
+        lost = [] if earlier is None else rows.values_lacking(earlier)
+        if lost:
+            expected = "new rows with a value for each one in this file"
+            found = f"{len(lost)} without, such as {lost[0]}"
+            raise InputError(self.rows, "", expected, found, f"The file is left unchanged. {DISCARD}")
+        rows.write(self.rows)
+
+    def _earlier_rows(self) -> Rows | None:
+        """The rows in the folder; None where there are none. Of a damaged file a warning is logged."""
+        if not self.rows.exists():
+            return None
+        try:
+            return Rows.read(self.rows)
+        except InputError as error:
+            if isinstance(error.__cause__, OSError) and error.__cause__.errno is not None:
+                raise  # not damaged: the disk or its permissions are at fault
+            log.warning("%s It is written again.", error)
+            return None
 
     def read_manifest(self) -> Manifest:
         """Read ``run.json``. Raises `InputError` where there is none, or one of another format."""

@@ -14,7 +14,7 @@ from ..io.documents import checked, read_json
 from ..io.files import digest, digest_file
 from ..registry import get
 from ..specs import MethodSpec
-from .config import ResolvedMethod, default_names, resolve_method
+from .config import AVATAR_FOLDER, ResolvedMethod, default_names, resolve_method
 from .store import RunFolder, avatar_files
 
 
@@ -23,10 +23,8 @@ def avatar_folder(folder: Path) -> Path:
     inside = folder / "avatar"
     found = inside if inside.is_dir() else folder
     if not found.is_dir() or not any(path.is_file() for path in found.iterdir()):
-        expected = "the folder of an avatar, such as RUN/SUBJECT/METHOD/seed-0/avatar"
-        raise InputError(
-            folder, "", expected, "no such folder" if not found.is_dir() else "one without files"
-        )
+        reason = "no such folder" if not found.is_dir() else "one without files"
+        raise InputError(folder, "", f"the {AVATAR_FOLDER}", reason)
     return found
 
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-import tyro
-
 from ...bench.contracts import Progress, no_progress
+from ...bench.runner.config import AvatarFolder
 from ...bench.specs import Findings, writes
 from ...datasets.options import CaptureOptions
 from .precision import Precision
@@ -16,8 +15,7 @@ from .precision import Precision
 class CompactSettings(CaptureOptions):
     """Store an avatar of ours in about a fifteenth of its bytes."""
 
-    avatar: tyro.conf.Positional[str]
-    """Folder of the avatar, with its exact file."""
+    avatar: AvatarFolder
 
     out: str
     """Folder to write: the compact file, and the head model beside it."""

@@ -13,7 +13,9 @@ import numpy as np
 from ...bench.contracts import ByteArray, Clip, HeadAsset, Progress
 from ...bench.errors import InputError
 from ...bench.io.images import quantise
+from ...bench.runner.stored import avatar_folder
 from ...bench.specs import Findings
+from ..gaussian_ply.export import stored_kind
 from ..ours.avatar import OursAvatar
 from ..ours.storage import FIELD_FILE, Field
 from ..shared.avatar_files import read_shared_head, save_shared_head
@@ -35,9 +37,11 @@ def compact_avatar(settings: CompactSettings, progress: Progress) -> Findings:
     Raises `InputError` for a folder without the exact file of an avatar of ours, and for the capture of another
     subject.
     """
-    folder, out = Path(settings.avatar), Path(settings.out)
-    if not (folder / FIELD_FILE).exists():
-        raise InputError(folder, FIELD_FILE, "the exact file of an avatar of ours", "none")
+    folder, out = avatar_folder(Path(settings.avatar)), Path(settings.out)
+    kind = stored_kind(folder)
+    if kind != "ours" or not (folder / FIELD_FILE).exists():
+        found = f"an avatar of {kind}" if kind not in ("", "ours") else "none"
+        raise InputError(folder, FIELD_FILE, "the exact file of an avatar of ours", found)
     exact = OursAvatar.read(folder, "cpu", exact=True)
     head = read_shared_head(folder)
     clip = None

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import tyro
 
 from ...bench.contracts import Progress, no_progress
+from ...bench.runner.config import AvatarFolder
 from ...bench.specs import Findings, writes
 from ...datasets.options import CaptureOptions
 
@@ -15,8 +16,7 @@ from ...datasets.options import CaptureOptions
 class ExportOptions(CaptureOptions):
     """Which pose of which avatar is written."""
 
-    avatar: tyro.conf.Positional[str]
-    """Folder of an avatar of ours, ga, gbs or gha (RUN/SUBJECT/METHOD/seed-0)."""
+    avatar: AvatarFolder
 
     out: str
     """File to write."""

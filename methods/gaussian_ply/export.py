@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -33,14 +34,24 @@ from .command import ExportOptions
 from .formats import FORMATS, Splats
 from .harmonics import DEGREE, fit_harmonics, sphere, turn_harmonics
 
-EXPORTED = "an avatar of ours, ga, gbs or gha"
-DRAWN = "No file of splats can hold it; `headbench extremes` and `headbench reenact` draw its frames."
 VIEWS = ((0.0, 0.0), (0.6, 0.0), (-0.6, 0.2))
 """Azimuth and elevation, radians, from which the loss is measured."""
 SIZE = 400
 PLAIN = "its colours before super-resolution, which no file of splats can hold"
 
 SplatMethodAvatar = GAAvatar | GBSAvatar | OursAvatar | GHAAvatar
+AVATARS: Mapping[str, type[SplatMethodAvatar]] = {
+    "ours": OursAvatar,
+    "ga": GAAvatar,
+    "gbs": GBSAvatar,
+    "gha": GHAAvatar,
+}
+"""Avatars of splats by the name of their method."""
+NOT_HELD = {
+    "insta": "a radiance field without splats",
+    "gha": "whose splats are features that a network turns into colours",
+}
+"""Why a format cannot hold the avatars of a method."""
 
 
 class Colours(NamedTuple):
@@ -121,29 +132,37 @@ def _least_psnr(avatar: SplatMethodAvatar, pose: HeadPose, found: Splats) -> flo
     return worst
 
 
-def read_splat_avatar(folder: Path) -> SplatMethodAvatar:
-    """Read an avatar by what lies in its folder. Raises `InputError` for what is none of coloured splats."""
+def stored_kind(folder: Path) -> str:
+    """Name of the native method whose avatar lies in a folder, by its files; "" for any other."""
     if (folder / PLY_FILE).exists():
+        return "ga"
+    if (folder / COMPACT_FILE).exists():
+        return "ours"
+    path = folder / FIELD_FILE
+    names = set(read_safetensors(path)[0]) if path.exists() else set()
+    if names:
+        return "gbs" if "differences" in names else "gha" if "table" in names else "ours"
+    return "insta" if (folder / RADIANCE_FILE).exists() else ""
+
+
+def read_splat_avatar(folder: Path, methods: Sequence[str] = tuple(AVATARS)) -> SplatMethodAvatar:
+    """Read an avatar by what lies in its folder. Raises `InputError` for one of another method than ``methods``."""
+    kind, names = stored_kind(folder), list(methods)
+    expected = f"an avatar of {', '.join(names[:-1])} or {names[-1]}"
+    if not kind:
+        files = f"{expected}: {PLY_FILE}, {FIELD_FILE} or {COMPACT_FILE}"
+        remedy = "The avatars of a run lie in SUBJECT/METHOD/seed-N/avatar inside its folder."
+        is_run = (folder / "run.json").exists()
+        raise InputError(folder, "", files, "none of them", remedy if is_run else "")
+    if kind not in names:
+        found, remedy = f"one of {kind}, {NOT_HELD[kind]}", "`headbench view` and `headbench render` show it."
+        raise InputError(folder, "", expected, found, remedy)
+    if kind == "ga":
         foreign = [name for name in read_names(folder / PLY_FILE) if name not in COLUMNS]
         if foreign:
             found = "a column of another method, which would be lost"
-            raise InputError(folder / PLY_FILE, foreign[0], EXPORTED, found)
-        return GAAvatar.read(folder, "cpu")
-    if (folder / COMPACT_FILE).exists():
-        return OursAvatar.read(folder, "cpu")
-    path = folder / FIELD_FILE
-    names = set(read_safetensors(path)[0]) if path.exists() else set()
-    if "differences" in names:
-        return GBSAvatar.read(folder, "cpu")
-    if "table" in names:
-        return GHAAvatar.read(folder, "cpu")
-    if names:
-        return OursAvatar.read(folder, "cpu")
-    if (folder / RADIANCE_FILE).exists():
-        raise InputError(folder, "", EXPORTED, "an avatar of insta, a radiance field without splats", DRAWN)
-    remedy = "The avatars of a run lie in SUBJECT/METHOD/seed-N/avatar inside its folder."
-    expected = f"{EXPORTED}: {PLY_FILE}, {FIELD_FILE} or {COMPACT_FILE}"
-    raise InputError(folder, "", expected, "none of them", remedy if (folder / "run.json").exists() else "")
+            raise InputError(folder / PLY_FILE, foreign[0], expected, found)
+    return AVATARS[kind].read(folder, "cpu")
 
 
 def _pose(settings: ExportOptions, head: HeadAsset, progress: Progress) -> HeadPose:

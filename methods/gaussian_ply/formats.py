@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from ...bench.contracts import FloatArray
-from ...bench.errors import HeadbenchError, UnavailableError
+from ...bench.errors import HeadbenchError, UnavailableError, install_extra
 from ...bench.io.files import read_bytes, write_bytes
 from ...bench.io.provenance import RENDER, note, tool
 from ..ga.storage import COLUMNS
@@ -179,8 +179,9 @@ def _library() -> Any:
     try:
         return importlib.import_module("gaussforge").GaussForge()
     except ImportError:
-        remedy = "Install it: pip install 'headbench[formats]'."
-        raise UnavailableError("SOG is written by gaussforge, which is not here.", remedy) from None
+        raise UnavailableError(
+            "SOG is written by gaussforge, which is not installed.", install_extra("formats")
+        ) from None
 
 
 def _converted(content: bytes, source: str, target: str) -> bytes:

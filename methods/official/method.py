@@ -29,7 +29,7 @@ from ...bench.contracts import (
 )
 from ...bench.errors import InputError, UnavailableError
 from ...bench.io.documents import read_json
-from ...bench.io.files import digest_file, prepare_folder, write_json
+from ...bench.io.files import check_output_folder, digest_file, write_json
 from ...bench.io.images import probe_image
 from ...datasets.images import write_image
 from ..shared.avatar_files import is_finished, run_digest, write_record
@@ -311,7 +311,6 @@ class OfficialMethod(ABC, Generic[Config]):
         run = run_digest(self.name, self.version, self.config, clip, budget, seed)
         if not is_finished(out, run):
             checkout = self._checked(clip, budget)
-            prepare_folder(out / TRAINING)
             with _alone(out / TRAINING) as held:
                 self._train(Fit(clip, out, budget, self.config.device, seed, progress, run), checkout, held)
         _remove(out / TRAINING)
@@ -429,7 +428,6 @@ class OfficialAvatar:
         checkout = method.look()
         frames = [Listed(number, key, *view) for number, (key, view) in enumerate(views.items())]
         work = Workplace.at(folder / RENDERING)
-        prepare_folder(work.root)
         with _alone(work.root) as held:
             _remove(work.root, but=_LOCK)
             work.make()
@@ -539,10 +537,12 @@ def _as_recorded(record: Path, work: Workplace) -> bool:
 
 @contextmanager
 def _alone(folder: Path) -> Iterator[IO[str]]:
-    """Hold the lock of a folder; a program that inherits it holds it on, should we be killed before it ends.
+    """Make a folder and hold its lock; a program that inherits it holds it on, should we be killed before it ends.
 
     Raises `InputError` where a program of an earlier call still runs.
     """
+    check_output_folder(folder)
+    folder.mkdir(parents=True, exist_ok=True)
     with (folder / _LOCK).open("a+") as stream:
         try:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)

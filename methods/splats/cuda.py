@@ -1,6 +1,6 @@
 """The CUDA backend: gsplat's kernels behind the same function, imported when first used.
 
-gsplat (Apache-2.0, https://github.com/nerfstudio-project/gsplat) is an optional extra: ``pip install headbench[cuda]``.
+gsplat (Apache-2.0, https://github.com/nerfstudio-project/gsplat) is the optional extra ``cuda``.
 It is driven through its functions for projection, tile lists and compositing instead of through its one big function, so
 that offsets of the 2D means and absolute gradients come out as here. Releases 1.5 and 1.6 are known. Their wheels hold
 sources: the extension is compiled when gsplat is first used on a machine, which takes minutes and needs the CUDA toolkit.
@@ -27,7 +27,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from ...bench.errors import UnavailableError
+from ...bench.errors import UnavailableError, install_extra
 from ...bench.machine import use_device
 from .constants import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN
 from .reference import published_radii
@@ -35,7 +35,7 @@ from .request import Rendering, Request
 
 log = logging.getLogger(__name__)
 
-REMEDY = "pip install 'headbench[cuda]', on a machine with an NVIDIA GPU and the CUDA toolkit."
+REMEDY = f"{install_extra('cuda')} (needs an NVIDIA GPU and the CUDA toolkit)."
 
 CHANNELS = (1, 2, 3, 4, 5, 8, 9, 16, 17, 32)
 """Colour channels that kernels are compiled for, in 1.5 and 1.6 alike; other numbers are filled up with zeros."""

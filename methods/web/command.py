@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import tyro
-
 from ...bench.contracts import Progress, no_progress
+from ...bench.runner.config import AvatarFolder
 from ...bench.specs import Findings
 from ...datasets.options import CaptureOptions
 
@@ -15,11 +14,10 @@ from ...datasets.options import CaptureOptions
 class ExportHtmlSettings(CaptureOptions):
     """Write one HTML file with an avatar in it and sliders that move it; it needs no network and no other file.
 
-    Browsers with WebGL2 draw it. The findings tell the bytes, and what the page loses against headbench's renderer.
+    Of methods ours, ga and gbs. Browsers with WebGL2 draw it. The findings tell the bytes, and what the page loses against headbench's renderer.
     """
 
-    avatar: tyro.conf.Positional[str]
-    """Folder of an avatar of ours, ga or gbs (RUN/SUBJECT/METHOD/seed-0)."""
+    avatar: AvatarFolder
 
     out: str
     """HTML file to write."""

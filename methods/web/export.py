@@ -13,12 +13,11 @@ import numpy as np
 import torch
 
 from ...bench.contracts import Camera, FloatArray, HeadPose, Progress
-from ...bench.errors import InputError
 from ...bench.io.files import check_writable, write_text
 from ...bench.io.provenance import RENDER, note, source_type, tool
 from ...bench.runner.stored import avatar_folder
 from ...bench.specs import Findings
-from ..gaussian_ply.export import neutral_pose, read_splat_avatar
+from ..gaussian_ply.export import AVATARS, neutral_pose, read_splat_avatar
 from ..gbs.avatar import GBSAvatar
 from ..gha.avatar import GHAAvatar
 from ..shared.avatar_files import SUBJECT_FILE, read_shared_head, read_subject
@@ -28,6 +27,8 @@ from .command import ExportHtmlSettings
 from .model import JOINTS, Moved, Slider, WebAvatar, look
 from .payload import decode, encode, quaternions
 
+COLOURED = [name for name, avatar in AVATARS.items() if avatar is not GHAAvatar]
+"""Methods whose splats have colours, which a page can draw without a network."""
 DIRECTIONS = 96
 """Viewing directions, even over the sphere, at which colours are looked at."""
 COEFFICIENT = 2.0
@@ -49,10 +50,8 @@ def export_page(settings: ExportHtmlSettings, progress: Progress) -> Findings:
     """Bake, write, read back and compare; see the settings."""
     folder, out = avatar_folder(Path(settings.avatar)), Path(settings.out)
     check_writable(out, "--out")
-    avatar = read_splat_avatar(folder)
-    if isinstance(avatar, GHAAvatar):
-        found = "one of gha, whose splats are features that a network turns into colours"
-        raise InputError(folder, "", "an avatar of ours, ga or gbs", found, "`headbench view` shows it.")
+    avatar = read_splat_avatar(folder, COLOURED)
+    assert not isinstance(avatar, GHAAvatar), "refused above"
     head = read_shared_head(folder)
     rest, reach = neutral_pose(head), np.full(head.expression_basis.shape[2], COEFFICIENT)
     if settings.capture is not None:

@@ -43,10 +43,10 @@ class CurveSettings(RunOptions):
 
     fractions: tuple[str, ...] = ()
     """Parts of the method's budget, or of the training cameras or timesteps, above 0 and at most 1; default: 1/16 1/8 1/4 1/2
-    1."""
+    1. Not with `--over tracking_error`."""
 
     levels: tuple[float, ...] = ()
-    """Levels for `--over tracking_error`, as for `headbench synth`; default: 0 1 2."""
+    """Levels for `--over tracking_error`, as for `headbench synth`; default: 0 1 2. Not with another `--over`."""
 
     camera: str = ""
     """Training camera to hold out; default: the one nearest to the mean position of the training cameras."""
@@ -58,9 +58,12 @@ class CurveSettings(RunOptions):
     """Score at most so many frames of each subject in the held-out camera, and as many of the held-out timesteps."""
 
     def __post_init__(self) -> None:
-        unused = "fractions" if self.over == "tracking_error" else "levels"
-        if getattr(self, unused):
-            raise ValueError(f"{unused}: none with --over {self.over}")
+        if self.levels and self.over != "tracking_error":
+            raise ValueError(f"--levels needs --over tracking_error; found --over {self.over}")
+        if self.fractions and self.over == "tracking_error":
+            raise ValueError(
+                "--fractions needs --over budget, cameras or timesteps; found --over tracking_error"
+            )
         if len(set(self.parts)) != len(self.parts):
             raise ValueError(f"fractions: each once; found {' '.join(self.fractions)}")
         if len(set(self.levels)) != len(self.levels):
@@ -97,7 +100,8 @@ def _part(text: str) -> Fraction:
 def curve_run(settings: CurveSettings, progress: Progress = no_progress) -> Findings:
     """Quality against training time and what else a training is given, measured on training frames that are held out.
 
-    Writes ``curve.csv`` and ``curve.png`` into the run folder of all trainings. Started again, it keeps what is done.
+    Writes ``curve.csv`` and ``curve.png`` into the run folder of all trainings. Started again, it keeps what is done and
+    refuses to leave out points that are there.
     Raises `InputError` for a folder that is no finished run, and for methods without a budget.
     """
     from ...bench.runner.store import RunFolder

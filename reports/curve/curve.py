@@ -17,7 +17,7 @@ from ...bench.io.files import write_text
 from ...bench.machine import check_device
 from ...bench.manifest import MethodRecord
 from ...bench.protocol import Protocol, make_protocols
-from ...bench.rows import ALL, Rows
+from ...bench.rows import ALL, Rows, check_rows_kept
 from ...bench.runner.captures import open_run_clips, run_configuration
 from ...bench.runner.config import ResolvedMethod, RunConfig, resolve_methods, resolve_metrics
 from ...bench.runner.run import describe, make_jobs, run_jobs, warn_of_missing_metrics
@@ -52,7 +52,7 @@ def curve(settings: CurveSettings, out: Path) -> Findings:
     ------
     InputError
         For a method that the run does not have or that has no budget, a capture that is not the run's or has too few
-        frames to hold some out, and a folder with trainings of other settings.
+        frames to hold some out, and a folder with trainings of other settings, or with some that would be left out.
     """
     run = RunFolder(Path(settings.run))
     wanted = _wanted(settings, run)
@@ -82,6 +82,8 @@ def curve(settings: CurveSettings, out: Path) -> Findings:
     for job in jobs:
         job.check()
         job.check_method()
+    cells = [(job.method.spec.name, job.clip.subject, job.seed) for job in jobs]
+    check_rows_kept(folder.rows, cells, [protocol.hash for protocol in protocols.values()])
     warn_of_missing_metrics(metrics, held[0])
     manifest = replace(
         describe(config, [], metrics, subjects, protocols),

@@ -14,7 +14,7 @@ import numpy as np
 
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
-from ...bench.io.files import check_writable, prepare_folder, write_text
+from ...bench.io.files import check_output_folder, check_writable, write_text
 from ...bench.io.provenance import COMPOSITE, source_type, tool
 from ...bench.protocol import TASK_TITLES
 from ...bench.runner.config import RunOptions
@@ -69,10 +69,7 @@ def write_report(settings: PageSettings, progress: Progress = no_progress) -> Fi
     max_mb = settings.max_mb or (MAX_SPLIT_MB if settings.split else MAX_MB)
     if settings.split:
         check_folder(out)
-        prepare_folder(out)
-    elif out.is_dir() or not out.parent.is_dir():
-        found = "a folder" if out.is_dir() else f"no folder {out.parent}"
-        raise InputError(out, "--out", "a file to write, in a folder that is there", found)
+        check_output_folder(out)
     else:
         check_writable(out, "--out")
     runs = RunSet.read([Path(folder) for folder in settings.runs])

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import tyro
 
 from ...bench.contracts import Progress, no_progress
-from ...bench.io.files import output_inside, prepare_folder, write_text
+from ...bench.io.files import check_output_folder, output_inside, write_text
 from ...bench.io.lock import locked
 from ...bench.runner.config import RunOptions
 from ...bench.specs import Findings, writes
@@ -52,7 +52,8 @@ class SweepSettings(RunOptions):
     """Folder of a finished run."""
 
     out: str | None = None
-    """Folder to write, a run folder itself; default: `sweep` in the folder of the run."""
+    """Folder to write, a run folder itself; default: `sweep` in the folder of the run. A sweep in it is continued: variants may
+    be added, but none left out."""
 
     methods: tuple[str, ...] = ()
     """Methods to derive from; default: all that know how."""
@@ -93,7 +94,7 @@ def pareto(settings: ParetoSettings, progress: Progress = no_progress) -> Findin
     points, left_out, metric = read_points(
         [Path(r) for r in settings.runs], settings.task, settings.metric, settings.time
     )
-    prepare_folder(out)
+    check_output_folder(out)
     rising = metric.higher_is_better
     fronts = {cost: front_of(points, cost, higher_is_better=rising) for cost in COSTS}
     names = [field.name for field in fields(Point)]

@@ -49,24 +49,30 @@ def sweep(settings: SweepSettings, out: Path, progress: Progress) -> Rows:
         if name not in known:
             raise InputError("sweep", "variants", "a variant of these methods", repr(name))
 
-    frames: list[Rows] = []
-    records: dict[str, MethodRecord] = {}
-    total = sum(len(variants) + 1 for _, variants in derived)
-    for base, variants in derived:
-        for variant in (None, *variants):
-            job = replace(base, protocols=protocols).variant(variant.name if variant else "", folder)
-            progress(len(frames), total, job.name)
-            frames.append(_measured(job, base, variant, metrics))
-            source: Derived | None = None
-            if variant is not None:
-                source = {"from": base.method.spec.name, "variant": variant.name, "change": variant.summary}
-            records[job.method.spec.name] = MethodRecord(**job.method.record(), derived=source)
-    rows = Rows.joined(frames)
-    rows.write(folder.rows)
+    cells = [
+        (replace(base, protocols=protocols).variant(variant.name if variant else "", folder), base, variant)
+        for base, variants in derived
+        for variant in (None, *variants)
+    ]
+    records = {job.method.spec.name: _record(job, base, variant) for job, base, variant in cells}
     manifest = describe(config, [], metrics, clips, protocols)
-    done = replace(manifest, methods=tuple(records.values()), sweep_of=settings.run, status="done")
-    done.write(folder.manifest)
+    manifest = replace(manifest, methods=tuple(records.values()), sweep_of=settings.run)
+    folder.check_kept(manifest)
+    frames: list[Rows] = []
+    for job, base, variant in cells:
+        progress(len(frames), len(cells), job.name)
+        frames.append(_measured(job, base, variant, metrics))
+    rows = Rows.joined(frames)
+    folder.write_rows(rows)
+    replace(manifest, status="done").write(folder.manifest)
     return rows
+
+
+def _record(job: Job, base: Job, variant: Variant | None) -> MethodRecord:
+    source: Derived | None = None
+    if variant is not None:
+        source = {"from": base.method.spec.name, "variant": variant.name, "change": variant.summary}
+    return MethodRecord(**job.method.record(), derived=source)
 
 
 def _chosen(job: Job, names: Sequence[str]) -> Iterator[Variant]:

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-import tyro
-
 from ...bench.contracts import Progress, no_progress
+from ...bench.runner.config import AvatarFolder
 from ...bench.specs import Findings, writes
 
 
@@ -15,8 +14,7 @@ from ...bench.specs import Findings, writes
 class RenderSettings:
     """Render a stored avatar: frames of a task, or an orbit; as images, and as video."""
 
-    avatar: tyro.conf.Positional[str]
-    """Folder of an avatar, such as RUN/SUBJECT/METHOD/seed-0/avatar or what `headbench import ga` wrote."""
+    avatar: AvatarFolder
 
     capture: str
     """Capture with the cameras and poses; of another subject, too, if its head model is that of the avatar."""

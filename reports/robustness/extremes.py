@@ -22,6 +22,7 @@ from .stability import (
     JudgedFrame,
     RobustnessCase,
     cell_folder,
+    checked_protocols,
     judge,
     render_measured,
     run_cases,
@@ -144,12 +145,13 @@ def judge_extremes(
     """
     plans = [ExtremesPlan.of(job.form.clip, settings) for job in jobs]
     cases = [_case(job, plan, out) for job, plan in zip(jobs, plans)]
+    protocols = checked_protocols(TASK, cases, out)
     if settings.execution.executor != "inline":
         subjects = list(dict.fromkeys(job.clip.subject for job in jobs))
         made_of = [_fingerprint(job, plan) for job, plan in zip(jobs, plans)]
         cases = rendered_by_tasks(cases, subjects, made_of, settings, out)
     limits = {"views": asdict(VIEW_LIMITS), "expressions": asdict(EXPRESSION_LIMITS)}
-    return run_cases(TASK, cases, settings, limits, out, progress)
+    return run_cases(TASK, cases, protocols, settings, limits, out, progress)
 
 
 def _case(job: Job, plan: ExtremesPlan, out: Path) -> RobustnessCase:

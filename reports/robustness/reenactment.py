@@ -27,6 +27,7 @@ from .stability import (
     Limits,
     RobustnessCase,
     cell_folder,
+    checked_protocols,
     judge,
     render_measured,
     run_cases,
@@ -134,7 +135,8 @@ def judge_reenactment(
         remedy = "Name a capture of another subject with --source."
         raise InputError(settings.run, "subjects", "another subject to drive with", f"{found} alone", remedy)
     cases = [_case(driven, out) for driven in pairs]
-    return run_cases(TASK, cases, settings, asdict(LIMITS), out, progress)
+    protocols = checked_protocols(TASK, cases, out)
+    return run_cases(TASK, cases, protocols, settings, asdict(LIMITS), out, progress)
 
 
 def _case(driven: Driven, out: Path) -> RobustnessCase:

@@ -33,7 +33,7 @@ from ...bench.io.files import write_json
 from ...bench.io.images import quantise, write_png
 from ...bench.io.provenance import RENDER
 from ...bench.protocol import Protocol, TaskWithoutTruth, make_protocol_without_truth
-from ...bench.rows import Row, Rows
+from ...bench.rows import Row, Rows, check_rows_kept
 from ...bench.runner.adaptation import MethodNeeds
 from ...bench.runner.scoring import FULL
 from ...bench.runner.steps import Job
@@ -204,19 +204,13 @@ class RobustnessCase:
         return MethodNeeds.of(self.job.method.spec)
 
 
-def run_cases(
-    task: TaskWithoutTruth,
-    cases: Sequence[RobustnessCase],
-    settings: Any,
-    limits: Any,
-    out: Path,
-    progress: Progress,
-) -> list[dict[str, Any]]:
-    """Render and judge all cases; leave rows and a record under ``out``, and return the record of each avatar.
+def checked_protocols(
+    task: TaskWithoutTruth, cases: Sequence[RobustnessCase], out: Path
+) -> dict[MethodNeeds, Protocol]:
+    """The protocols of all cases; avatars of methods with equal needs are shown the same frames, and so share one.
 
-    An avatar that cannot be rendered so (`UnavailableError`) has missing rows, and its record says why.
+    Raises `InputError`, before any work, where rows of an earlier call in ``out`` would be lost.
     """
-    # Avatars of methods with equal needs are shown the same frames, and so share a protocol.
     protocols: dict[MethodNeeds, Protocol] = {}
     for needs in {case.needs: None for case in cases}:
         own = [case for case in cases if case.needs == needs]
@@ -227,6 +221,26 @@ def run_cases(
             [size for case in own for size in case.sizes],
             dict(case.condition for case in own),
         )
+    jobs = [case.job for case in cases]
+    cells = [(job.method.spec.name, job.clip.subject, job.seed) for job in jobs]
+    check_rows_kept(out / ROWS_FILE, cells, [protocol.hash for protocol in protocols.values()])
+    return protocols
+
+
+def run_cases(
+    task: TaskWithoutTruth,
+    cases: Sequence[RobustnessCase],
+    protocols: Mapping[MethodNeeds, Protocol],
+    settings: Any,
+    limits: Any,
+    out: Path,
+    progress: Progress,
+) -> list[dict[str, Any]]:
+    """Render and judge all cases; leave rows and a record under ``out``, and return the record of each avatar.
+
+    An avatar that cannot be rendered so (`UnavailableError`) has missing rows, and its record says why.
+    ``protocols`` are those of `checked_protocols`.
+    """
     done, total = 0, sum(len(case.keys) for case in cases)
     rows: list[Row] = []
     avatars = []

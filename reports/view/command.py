@@ -19,7 +19,7 @@ class ViewSettings(RunOptions):
     """
 
     avatars: tyro.conf.Positional[tuple[str, ...]]
-    """Folders of runs, or of avatars (RUN/SUBJECT/METHOD/seed-0); an imported avatar needs --data, its capture."""
+    """Folders of runs, or of avatars as `headbench render` takes them; an imported avatar needs --data, its capture."""
 
     methods: tuple[str, ...] = ()
     """Of runs, only these; by default all that are trained, without the trivial baselines."""

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from ...bench.contracts import Progress
-from ...bench.errors import InputError, UnavailableError
+from ...bench.errors import InputError, UnavailableError, install_extra
 from ...bench.specs import Findings
 from .command import ViewSettings
 from .scene import Scene, open_scene
@@ -88,8 +88,9 @@ def viser() -> Any:
     try:
         return importlib.import_module("viser")
     except ImportError:
-        remedy = "Install it: pip install viser, the extra `view`."
-        raise UnavailableError("The viewer runs on viser, which is not here.", remedy) from None
+        raise UnavailableError(
+            "The viewer runs on viser, which is not installed.", install_extra("view")
+        ) from None
 
 
 def check_port(host: str, port: int) -> None:

@@ -74,6 +74,29 @@ def test_bad_input_is_refused_before_work(capsys, tmp_path, monkeypatch, words, 
     error = capsys.readouterr().err
     assert found in error
     assert "Traceback" not in error
+    assert [path.name for path in tmp_path.iterdir()] == ["run.yaml"]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "demo --preset smoke --set capture.head=none.npz",
+        "synth --cameras 99",
+        "run --data none",
+        "suite --methods none",
+        "render none --capture none",
+        "refit none --target 2023",
+        "inspect none",
+        "export colmap none",
+        "import ga none.ply",
+        "compact none",
+    ],
+)
+def test_a_refused_command_leaves_no_folder(capsys, tmp_path, monkeypatch, words):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main([*words.split(), "--out", "above/out"]) == 2
+    assert "none" in capsys.readouterr().err or "99" in words
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_lists_are_machine_readable(capsys):
@@ -88,7 +111,9 @@ def test_a_capture_is_made_in_an_empty_folder_by_one_process(monkeypatch, tmp_pa
     seen = []
 
     def make(*, out, dynamics, **arguments):
+        out.mkdir(exist_ok=True)
         seen.append((list(out.iterdir()), {path.name for path in tmp_path.iterdir()}, dynamics))
+        (out / "image.png").touch()
 
     monkeypatch.setattr(builtin, "resolve", lambda reference: make)
     assert cli.main(["synth", "--out", str(tmp_path / "capture"), "--dynamics", "2"]) == 0
@@ -290,14 +315,18 @@ def test_a_run_takes_its_executor_from_options_and_settings(
 
 
 @pytest.mark.parametrize(
-    ("setting", "message"),
+    ("words", "message"),
     [
-        ("execution.slurm.partitoin=x", "Did you mean 'partition'"),
-        ("execution.workers=0", "at least 1"),
-        ("execution.slurm.hours=0", "at least a minute"),
-        ("execution.executor=dask", "inline"),
+        ("--set execution.slurm.partitoin=x", "Did you mean 'partition'"),
+        ("--set execution.workers=0", "at least 1"),
+        ("--set execution.slurm.hours=0", "at least a minute"),
+        ("--set execution.executor=dask", "inline"),
+        ("--workers 2", "--workers: expected --executor processes"),
     ],
 )
-def test_settings_of_executors_are_checked(setting, message, tmp_path, capsys):
-    assert cli.main(["run", "--data", "d", "--out", str(tmp_path / "o"), "--set", setting]) == 2
+@pytest.mark.parametrize("command", ["run --data d", "synth"])
+def test_settings_of_executors_are_checked(command, words, message, tmp_path, capsys, monkeypatch):
+    for work in ("_run", "_synthesise"):
+        monkeypatch.setattr(builtin, work, lambda *arguments: pytest.fail("went on"))
+    assert cli.main([*command.split(), "--out", str(tmp_path / "o"), *words.split()]) == 2
     assert message in capsys.readouterr().err

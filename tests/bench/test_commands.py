@@ -6,11 +6,13 @@ import json
 import re
 import subprocess
 from importlib.metadata import EntryPoint
+from typing import get_type_hints
 
 import pytest
 
 from headbench.bench import cli, commands, registry
 from headbench.bench.io.lock import locked
+from headbench.bench.runner.config import AvatarFolder
 
 TOY = '''
 from dataclasses import dataclass
@@ -86,6 +88,26 @@ def test_lists_have_commas_or_spaces(offer, capsys, words, lists):
     offer("count", function="toy_command:count")
     assert cli.main(["count", *words, "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == {"lists": lists}
+
+
+@pytest.mark.parametrize("words", [["--levels"], ["--levels", ","], ["--names", "--levels", "1"]])
+def test_a_list_without_values_is_refused(offer, capsys, words):
+    offer("count", function="toy_command:count")
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["count", "a", *words])
+    assert ended.value.code == 2
+    assert "at least one value" in capsys.readouterr().err
+
+
+def test_commands_that_take_an_avatar_describe_it_alike():
+    specs = {name: plugin.spec for name, plugin in registry.discover("commands").items()}
+    found = {
+        name: get_type_hints(spec.settings, include_extras=True)["avatar"]
+        for name, spec in specs.items()
+        if get_type_hints(spec.settings).get("avatar") is str
+    }
+    assert {"compact", "export html", "export ply", "render", "submission render"} <= found.keys()
+    assert set(found.values()) == {AvatarFolder}
 
 
 def test_findings_decide_the_exit_code(offer, capsys):

@@ -15,7 +15,7 @@ import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from ...bench.contracts import ByteArray, Progress, no_progress
-from ...bench.errors import UnavailableError
+from ...bench.errors import UnavailableError, install_extra
 from ...bench.specs import Findings
 from ...metrics.lpips_network import ALEX, Lpips, find_backbone, load_backbone
 from ...metrics.psnr import psnr
@@ -100,7 +100,7 @@ def lpips_ways_or_reason(pairs: Pairs) -> tuple[Ways, str]:
         ways = lpips_ways(pairs)
     except UnavailableError as error:
         return {}, str(error)
-    missing = "The package lpips is not installed: pip install headbench[peers]."
+    missing = f"The package lpips is not installed. {install_extra('peers')}"
     return ways, "" if "lpips" in ways else missing
 
 

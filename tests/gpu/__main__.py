@@ -29,13 +29,21 @@ LIMIT_S = 600.0
 NO_DEVICE = 3
 
 
+LOCK = [
+    word for name in ("torch-cuda.txt", "dev.txt") for word in ("--requirement", f"requirements-{name}")
+] + ["--requirement", "requirements.txt"]
+"""The locked packages of a machine with a GPU, as pip takes them."""
+
+
 def wheels(folder: Path) -> int:
-    """Collect what headbench needs on a GPU, and what builds it, as wheels; print how to install from them."""
-    packages = [".[dev,cuda]", "scikit-build-core", "nanobind", "cmake", "ninja", "setuptools"]
-    command = [sys.executable, "-m", "pip", "wheel", "--wheel-dir", str(folder.resolve())]
-    done = subprocess.run([*command, "--constraint", "constraints.txt", *packages], cwd=ROOT, check=False)
+    """Collect the locked packages for a machine with a GPU as wheels; print how to install from them."""
+    command = [sys.executable, "-m", "pip", "download", "--only-binary", ":all:", "--no-deps"]
+    done = subprocess.run([*command, "--dest", str(folder.resolve()), *LOCK], cwd=ROOT, check=False)
     if done.returncode == 0:
-        print(f"Install: pip install --no-index --find-links {folder} -e '.[dev,cuda]'")
+        print(
+            f"Install: pip install --no-deps --no-index --find-links {folder} {' '.join(LOCK)} && "
+            "pip install --no-deps --no-build-isolation --editable ."
+        )
     return done.returncode
 
 

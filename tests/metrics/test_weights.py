@@ -50,6 +50,7 @@ def test_without_weights_or_network_the_remedy_is_named_once(bare_machine):
             weights.find_backbone(SQUEEZE)
         for part in ("the network is down", SQUEEZE.url, str(weights.cache_folder()), weights.VARIABLE):
             assert part in str(caught.value)
+        assert caught.value.note == weights.NO_WEIGHTS
     assert bare_machine == [(SQUEEZE.url, weights.TIMEOUT_S)]
 
 

@@ -10,6 +10,7 @@ import tyro
 
 from ....bench.contracts import Progress, no_progress
 from ....bench.errors import ExitCode, UnavailableError
+from ....bench.runner.config import AvatarFolder
 from ....bench.specs import Findings, writes
 
 SHOWN = 20
@@ -17,10 +18,10 @@ SHOWN = 20
 
 @dataclass(frozen=True)
 class SubmissionRenderSettings:
-    """Render the test frames of a participant of the NeRSemble benchmark's monocular track from a stored avatar."""
+    """Render the test frames of a participant of the NeRSemble benchmark's monocular track from a stored avatar, which was
+    trained on the participant's training sequences."""
 
-    avatar: tyro.conf.Positional[str]
-    """Folder of the avatar, trained on the participant's training sequences."""
+    avatar: AvatarFolder
 
     data: str
     """The benchmark's folder, as nersemble-benchmark-download leaves it: it holds mono_flame_avatar/."""

@@ -95,6 +95,24 @@ def test_changed_images_are_scored_again_in_the_same_folder(run, images, tmp_pat
     assert set(after["version"]) != set(before["version"])
 
 
+def test_less_than_was_scored_is_refused(images, tmp_path):
+    def score(*metrics):
+        evaluate(
+            EvaluateSettings(
+                str(images),
+                out=str(tmp_path / "out"),
+                clip=str(tmp_path / "data"),
+                label="theirs",
+                reader="toy_plugin:READER",
+                metrics=metrics,
+            )
+        )
+
+    score("psnr", "toy_plugin:ERROR")
+    with pytest.raises(InputError, match="without error"):
+        score("psnr")
+
+
 def test_missing_images_are_counted_before_anything_is_written(run, images, tmp_path):
     gone = sorted(images.iterdir())[:2]
     for path in gone:

@@ -10,6 +10,8 @@ import psutil
 import pytest
 
 from headbench.bench import cli
+from headbench.bench.errors import InputError
+from headbench.bench.executors.cell import _Run
 from headbench.bench.executors.outcome import read_outcome
 from headbench.bench.executors.processes import Processes
 from headbench.bench.executors.run import machine_of
@@ -126,6 +128,27 @@ def test_speed_is_measured_after_the_trainings_alone(config, rows_of):
         assert (outcome["speed"], outcome["restarts"]) == (True, 1)
         spans.append(outcome["process"])
     assert len(set(spans)) == 1  # one process, one after another
+
+
+def test_speed_alone_is_measured(config, rows_of):
+    rows = rows_of(replace(config, methods=("toy_plugin:METHOD",), metrics=("fps",)), TWO)
+    assert set(rows["status"]) == {"ok"}
+
+
+def test_kept_cells_are_named_and_changed_code_fails_others(config, caplog):
+    caplog.set_level("INFO", logger="headbench")
+    config = replace(config, methods=("toy_plugin:METHOD",))
+    runner.run(config, TWO)
+    assert ": kept" not in caplog.text
+    runner.run(config, TWO)
+    assert caplog.text.count("toy seed 0: kept: trained ") == 3
+    folder = RunFolder(Path(config.out))
+    assert _Run.read(folder.root).methods.keys() == {"toy"}
+    record = read_json(folder.manifest)
+    record["methods"][0]["code"] = "of another"
+    write_json(folder.manifest, record)
+    with pytest.raises(InputError, match="code of toy: expected of another"):
+        _Run.read(folder.root)
 
 
 def test_ended_while_speed_is_measured_it_goes_on_with_that(config, rows_of, tmp_path, monkeypatch):

@@ -133,5 +133,5 @@ def test_without_slurm_it_says_what_is_missing(config, monkeypatch, rows_of):
     monkeypatch.undo()
     monkeypatch.setitem(sys.modules, "submitit", None)
     monkeypatch.setattr("shutil.which", lambda name: name)
-    with pytest.raises(UnavailableError, match=r"pip install 'headbench\[slurm\]'"):
+    with pytest.raises(UnavailableError, match=r"pip install -e '.\[slurm\]'"):
         rows_of(config, SLURM)

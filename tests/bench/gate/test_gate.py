@@ -163,8 +163,9 @@ def test_a_region_of_fewer_frames_is_code_3(stored, judged, baseline):
 
 
 def test_another_protocol_is_code_3_not_a_comparison(config, judged):
-    runner.run(dataclasses.replace(config, frames_per_task=1))
-    code, out = judged()
+    other = dataclasses.replace(config, frames_per_task=1, out=config.out + "-other")
+    runner.run(other)
+    code, out = judged(run=other.out)
     assert code == 3
     assert "other frames or settings" in out
 
@@ -189,18 +190,60 @@ def test_remade_captures_compare_where_the_baseline_says_so(config, toy, monkeyp
     assert "made again" in out
 
 
-def test_speed_is_judged_on_its_own_machine_alone(baseline, judged):
+@pytest.fixture
+def slower(baseline):
+    """The baseline with a machine-bound metric that is worse now; a function that makes it one of another machine."""
     record = read_json(baseline)
     record["tolerances"]["files"]["machine_bound"] = True
     record["values"] = {k: v - 100 if k.endswith("files") else v for k, v in record["values"].items()}
     write_json(baseline, record)
-    assert judged()[0] == 1  # more files than before, on this machine
-    record["environment"]["processor"] = "abacus"
-    write_json(baseline, record)
-    code, out = judged()
+
+    def of_another_machine():
+        record["environment"]["processor"] = "abacus"
+        write_json(baseline, record)
+
+    return of_another_machine
+
+
+def test_speed_is_judged_on_request_and_on_its_own_machine_alone(slower, judged, tmp_path):
+    junit, markdown = tmp_path / "gate.xml", tmp_path / "gate.md"
+    code, out = judged("--junit", str(junit), "--markdown", str(markdown))
     assert code == 0
     assert "2 unjudged, 4 pass" in out
+    for text in (out, markdown.read_text(), junit.read_text()):
+        assert "--judge-speed" in text
+    avatar = ElementTree.parse(junit).find("testsuite[@name='avatar']")
+    assert (avatar.get("failures"), avatar.get("skipped")) == ("0", "2")
+    code, out = judged("--judge-speed")
+    assert code == 1
+    assert "2 regressed, 4 pass" in out
+    slower()
+    code, out = judged("--judge-speed")
+    assert code == 0
+    assert "2 unjudged, 4 pass" in out
+    assert "measured on another machine" in out
     assert "Environment changed: processor: abacus to" in out
+
+
+@pytest.mark.parametrize(
+    ("change", "counted"),
+    [
+        (lambda rows: rows[rows["metric"] != "files"], "2 unjudged, 4 pass"),
+        (
+            lambda rows: rows.assign(status=["failed" if m == "files" else "ok" for m in rows["metric"]]),
+            "4 pass",
+        ),
+    ],
+)
+def test_missing_speed_is_code_3_on_request_alone(slower, stored, judged, change, counted):
+    rows, write = stored
+    write(change(rows))
+    code, out = judged()
+    assert code == 0
+    assert counted in out
+    code, out = judged("--judge-speed")
+    assert code == 3
+    assert "2 missing, 4 pass" in out
 
 
 def test_a_number_unavailable_in_the_baseline_too_is_no_loss(stored, judged, tmp_path):
@@ -262,12 +305,24 @@ def test_junit_and_markdown_say_the_same(run, baseline, remeasured, tmp_path):
     assert "<details><summary>5 passed</summary>" in text
 
 
-def test_invalid_results_are_code_3_and_leave_no_stale_report(run, baseline, tmp_path, capsys):
-    junit = tmp_path / "gate.xml"
-    assert gate(run, baseline, "--junit", str(junit)) == 0
-    assert gate(tmp_path / "nowhere", baseline, "--junit", str(junit)) == 3
-    assert not junit.exists()
-    assert gate(run, tmp_path / "no-baseline.json") == 3
+def test_invalid_results_are_code_3_and_the_reports_say_so(run, baseline, tmp_path, capsys):
+    junit, markdown = tmp_path / "gate.xml", tmp_path / "gate.md"
+    reports = "--junit", str(junit), "--markdown", str(markdown)
+    damaged = tmp_path / "damaged.json"
+    damaged.write_text(baseline.read_text()[:100])
+    for folder, file in (
+        (tmp_path / "nowhere", baseline),
+        (run, tmp_path / "no-baseline.json"),
+        (run, damaged),
+    ):
+        assert gate(run, baseline, *reports) == 0
+        assert gate(folder, file, *reports) == 3
+        (suite,) = ElementTree.parse(junit).getroot()
+        assert (suite.get("tests"), suite.get("errors")) == ("1", "1")
+        wrong = str(folder if file == baseline else file)
+        assert wrong in suite.find("testcase/error").get("message")
+        assert "missing or invalid" in markdown.read_text()
+        assert wrong in markdown.read_text().replace("\\", "")
     started = dataclasses.replace(RunFolder(run).read_manifest(), status="started")
     started.write(RunFolder(run).manifest)
     assert gate(run, baseline) == 3
@@ -327,9 +382,23 @@ def test_wrong_usage_is_code_2(run, baseline, capsys):
     with pytest.raises(SystemExit) as stop:
         cli.main(["gate", str(run)])
     assert stop.value.code == 2
-    with pytest.raises(SystemExit) as stop:
-        gate(run, baseline, "--captures", "remade")
-    assert stop.value.code == 2
+    for options in (
+        ["--captures", "remade"],
+        ["--update", "--judge-speed"],
+        ["--update", "--junit", "gate.xml"],
+    ):
+        with pytest.raises(SystemExit) as stop:
+            gate(run, baseline, *options)
+        assert stop.value.code == 2
+
+
+@pytest.mark.parametrize("option", ["--junit", "--markdown", "--baseline"])
+def test_the_folder_of_a_file_to_write_must_exist(run, baseline, tmp_path, option, capsys):
+    path = str(tmp_path / "none" / "below" / "file")
+    options = (path, "--update") if option == "--baseline" else (baseline, option, path)
+    assert gate(run, *options) == 2
+    assert f"{path}, {option}" in capsys.readouterr().err
+    assert not (tmp_path / "none").exists()
 
 
 def test_update_keeps_tolerances_that_were_set_by_hand(run, baseline):

@@ -58,7 +58,9 @@ def test_a_move_by_exactly_the_tolerance_passes(hundredths, tolerance):
     assert verdict_of(expected - absolute, expected, Tolerance(True, absolute)).outcome == "pass"
 
 
-@pytest.mark.parametrize(("outcomes", "code"), [([], 3), (["pass"], 0), (["improved", "new", "unjudged"], 0)])
+@pytest.mark.parametrize(
+    ("outcomes", "code"), [([], 3), (["unjudged"], 3), (["pass"], 0), (["improved", "new", "unjudged"], 0)]
+)
 def test_exit_codes(outcomes, code):
     assert exit_code([Verdict(PLACE, outcome) for outcome in outcomes]) == code
 

@@ -105,10 +105,6 @@ def test_json_that_keeps_the_rules_is_read_as_it_is(tmp_path_factory, value):
         (ALIASES, "", "alias"),
         ("a: &a [*a]", "", "alias"),
         ("- 1", "", "list"),
-        ("a: [", "", "while parsing"),
-        ("\x00", "", "characters are not allowed"),
-        ("[" * DEEP, "", "deeper"),
-        ("a: b\n---\na: c", "", "document"),
     ],
     ids=lambda text: str(text)[:20],
 )
@@ -119,6 +115,22 @@ def test_yaml_that_breaks_a_rule_is_refused_with_its_place(tmp_path, text, key, 
         read_yaml(path)
     assert (caught.value.file, caught.value.key) == (str(path), key)
     assert found in caught.value.found
+    assert len(str(caught.value)) < 1000
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["a: [", "\x00", "[" * DEEP, "a: " + "[" * 70 + "]" * 70, "a: b\n---\na: c"],
+    ids=lambda text: text[:12],
+)
+def test_text_that_is_no_yaml_is_refused_in_one_line(tmp_path, text):
+    path = tmp_path / "a.yaml"
+    path.write_text(text)
+    with pytest.raises(InputError) as caught:
+        read_yaml(path)
+    assert caught.value.file == str(path)
+    assert "YAML" in caught.value.expected
+    assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 1000
 
 

@@ -9,7 +9,7 @@ import sys
 import pytest
 
 from headbench.bench.errors import InputError
-from headbench.bench.io.files import TEMPORARY
+from headbench.bench.io.files import TEMPORARY, check_output_folder
 from headbench.bench.io.lock import LOCK_FILE, locked
 from headbench.bench.progress import log_to_file
 
@@ -103,11 +103,14 @@ def test_a_lock_beside_leaves_the_folder_empty(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("beside", [False, True])
 @pytest.mark.parametrize("there", [False, True])
-def test_a_new_folder_in_which_nothing_came_of_it_is_removed(tmp_path, there):
-    folder = tmp_path / "out"
+def test_new_folders_in_which_nothing_was_written_are_removed(tmp_path, there, beside):
+    folder = tmp_path / "above" / "out"
     if there:
-        folder.mkdir()
-    with pytest.raises(RuntimeError), locked(folder):
+        folder.mkdir(parents=True)
+    check_output_folder(folder)
+    assert (tmp_path / "above").exists() == folder.exists() == there
+    with pytest.raises(RuntimeError), locked(folder, beside=beside):
         raise RuntimeError
-    assert folder.exists() == there
+    assert (tmp_path / "above").exists() == folder.exists() == there

@@ -1,9 +1,13 @@
 """The harness on toy plug-ins: what a run leaves, resumes, refuses and records."""
 
+import importlib
 import json
 import math
+import re
+import sys
 import time
 import types
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,9 +17,11 @@ import pytest
 from headbench.bench import cli
 from headbench.bench.errors import HeadbenchError, InputError
 from headbench.bench.io.documents import read_json
+from headbench.bench.io.files import write_json
 from headbench.bench.io.lock import locked
 from headbench.bench.registry import Plugin
 from headbench.bench.runner import adaptation, steps
+from headbench.bench.runner import config as runner_config
 from headbench.bench.runner import run as runner
 from headbench.bench.runner.config import RunConfig
 from headbench.bench.runner.store import RunFolder
@@ -214,12 +220,152 @@ def test_other_settings_in_the_same_folder_are_refused(config, refuses):
     refuses(config, "Choose another --out", settings={"toy": {"level": 0.75}})
 
 
-def test_measuring_something_else_trains_nothing_again(config, toy):
+BOTH = {"methods": ("toy_plugin:METHOD", "toy_plugin:MIRROR"), "seeds": (0, 1)}
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"methods": ("toy_plugin:METHOD",)}, r"rows\.parquet, methods: .*mirror, toy.*without mirror"),
+        ({"seeds": (1, 2)}, "seeds: .*0, 1.*without 0"),
+        ({"metrics": ("toy_plugin:ERROR", "psnr")}, "metrics: .*without files"),
+        ({"tasks": ("novel_view",)}, "tasks: .*found novel_view"),
+        ({"frames_per_task": 1}, "frames of novel_view: "),
+        ({"regions": ()}, "regions: "),
+        ({"data": "more"}, "captures or frames of novel_view: "),
+    ],
+)
+def test_a_run_that_would_lose_rows_is_refused(config, refuses, tmp_path, changes, match):
+    config = replace(config, **BOTH)
     runner.run(config)
+    folder = RunFolder(Path(config.out))
+    before = folder.rows.read_bytes(), folder.manifest.read_bytes()
+    if "data" in changes:
+        for name in ("subject1", "subject2", "subject3"):
+            (tmp_path / "more" / name).mkdir(parents=True)
+        changes = {"data": str(tmp_path / "more")}
+    refuses(config, match, **changes)
+    assert (folder.rows.read_bytes(), folder.manifest.read_bytes()) == before
+    folder.rows.unlink()  # as the error says, for those who want that
+    assert len(rows_of(config, **changes))
+
+
+def test_methods_seeds_and_metrics_may_be_added(config, toy):
+    before = rows_of(config)
     toy.FITS.clear()
-    rows = rows_of(config, metrics=("toy_plugin:ERROR",), tasks=("novel_view",))
-    assert set(rows["task"]) == {"novel_view"}
+    more = (*config.metrics, "toy_plugin:FILES_LOAD")
+    rows = rows_of(config, **BOTH, metrics=more, tasks=config.tasks[::-1])
+    assert len(rows.merge(before)) == len(before)
+    assert len(rows) == 4 * (len(before) + 2)
+    assert len(toy.FITS) == 6
+
+
+def test_values_that_cannot_be_had_again_stay(config, toy, cell, monkeypatch):
+    rows = rows_of(config)
+    (cell.avatar / "level.txt").unlink()
+    monkeypatch.setattr(toy.ToyMethod, "fit", lambda *arguments, **options: 1 / 0)
+    with pytest.raises(InputError, match="found 6 without, such as error full toy 0 novel_view subject1 EMO"):
+        runner.run(config)
+    file = RunFolder(Path(config.out)).rows
+    assert pd.read_parquet(file).equals(rows)
+    file.unlink()
+    assert set(rows_of(config).query("subject == 'subject1'")["status"]) == {"failed"}
+
+
+def test_what_a_killed_run_measured_stays(config, toy, monkeypatch):
+    """No rows of the run exist yet that could be lost, those of its cells do."""
+    whole = rows_of(config)
+    RunFolder(Path(config.out)).rows.unlink()
+    rows_of(config, metrics=("toy_plugin:ERROR",))
+    monkeypatch.setattr(toy, "files_in_avatar", lambda *arguments: 1 / 0)
+    assert rows_of(config).equals(whole)
+
+
+def test_a_cell_that_is_kept_says_so(config, cell, caplog):
+    caplog.set_level("INFO", logger="headbench")
+    runner.run(config)
+    assert ": kept" not in caplog.text
+    runner.run(config)
+    assert re.search(r"subject1 toy seed 0: kept: trained \d+ s ago, version 1", caplog.text)
+    record = cell.step("fit")
+    del record["finished_at"]
+    write_json(cell.folder / "fit.json", record)
+    runner.run(config)
+    assert "kept: trained in an earlier run, version 1" in caplog.text
+
+
+@pytest.fixture
+def edit(toy, tmp_path, monkeypatch):
+    """Write plug-ins, a method of two files and a metric, with parts of their text replaced, to be imported anew."""
+    texts = {
+        "edited_plugin": "import edited_level, toy_plugin as toy\n"
+        "class Method(toy.ToyMethod):\n    pass\n"
+        "METHOD = toy.replace(toy.METHOD, implementation='edited_plugin:Method')\n",
+        "edited_level": "LEVEL = 1",
+        "edited_metric": "import toy_plugin as toy\n"
+        "def error(image, truth):\n    return toy.mean_error(image, truth)\n"
+        "ERROR = toy.replace(toy.ERROR, implementation='edited_metric:error')\n",
+    }
+    folder = tmp_path / "plug-ins"
+    folder.mkdir()
+    monkeypatch.syspath_prepend(folder)
+
+    def edit(**changes):
+        for name, text in texts.items():
+            (folder / f"{name}.py").write_text(text.replace(*changes.get(name, ("", ""))))
+            sys.modules.pop(name, None)
+        importlib.invalidate_caches()
+
+    edit()
+    yield edit
+    for name in texts:
+        sys.modules.pop(name, None)
+
+
+EDITED = {"methods": ("edited_plugin:METHOD",), "metrics": ("edited_metric:ERROR", "toy_plugin:FILES")}
+
+
+@pytest.mark.parametrize("kill", [False, True])
+def test_changed_code_of_a_plug_in_is_refused(config, edit, toy, refuses, monkeypatch, kill):
+    """Also between the parts of a training that was interrupted."""
+    config = replace(config, **EDITED)
+    with monkeypatch.context() as patch:
+        if kill:
+            patch.setattr(toy.ToyMethod, "fit", killed)
+        with pytest.raises(KeyboardInterrupt) if kill else nullcontext():
+            runner.run(config)
+    when = "in an earlier run" if kill else r"\d+ s ago"
+    edit(edited_level=("1", "2"))
+    refuses(config, f"method, code: .*edited_plugin:Method.*changed since its training {when}")
+    edit()
+    runner.run(config)
+    assert len(toy.FITS) == 2 * kill
+
+
+def test_changed_code_of_a_metric_is_measured_again(config, edit, toy):
+    config = replace(config, **EDITED)
+    before = rows_of(config)
+    toy.FITS.clear()
+    edit(edited_metric=("(image, truth)\nE", "(image, truth) + 1\nE"))
+    after = rows_of(config)
+    assert (after["value"] - before["value"]).tolist() == [float(m == "error") for m in after["metric"]]
     assert toy.FITS == []
+
+
+def test_changed_code_of_a_native_method_is_warned_of(config, cell, monkeypatch, caplog):
+    """Its version says whether the results are other ones, and whoever edits it may forget that."""
+    for module in (steps, runner_config):
+        monkeypatch.setattr(module, "is_outside", lambda reference: False)
+    codes = ["first"]
+    for module in (steps, runner_config):
+        monkeypatch.setattr(module, "code_digest", lambda reference: codes[-1])
+    rows = rows_of(config)
+    assert rows_of(config).equals(rows)
+    assert "has changed" not in caplog.text
+    codes.append("second")
+    assert rows_of(config).equals(rows)
+    assert f"delete {cell.folder} to train it again" in caplog.text
+    assert manifest_of(config)["methods"][0]["code"] == "second"
 
 
 def test_a_failing_method_is_recorded_and_the_others_go_on(config):

@@ -2,7 +2,7 @@
 
 Scalar loops over splats and pixels, tiles touched by the bounding box, one thread. It has the renderer's constants and
 draws the same image. Its backward pass ends at the 2D means, inverse covariances, opacities and colours: leaving out the
-rest flatters it. numba is an optional extra (``pip install headbench[bench]``) and imported when `load` is called.
+rest flatters it. numba is the optional extra ``bench`` and is imported when `load` is called.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ....bench.contracts import FloatArray, IntArray
-from ....bench.errors import UnavailableError
+from ....bench.errors import UnavailableError, install_extra
 from ....methods.splats.constants import ALPHA_MAX, ALPHA_MIN, FRUSTUM_MARGIN, TILE, TRANSMITTANCE_MIN
 from .scenes import Scene
 
@@ -57,9 +57,7 @@ def load() -> Anchor:
     try:
         import numba
     except ImportError as error:
-        raise UnavailableError(
-            f"The anchor needs numba: {error}.", "pip install 'headbench[bench]'"
-        ) from error
+        raise UnavailableError(f"The anchor needs numba: {error}.", install_extra("bench")) from error
     compiled: dict[str, Any] = {
         function.__name__: numba.njit(error_model="numpy")(function)
         for function in (_project, _fill_tiles, _draw, _draw_backward)

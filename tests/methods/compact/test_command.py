@@ -48,8 +48,10 @@ def test_parts_and_their_costs_are_told(trained, tmp_path):
     assert OursAvatar.read(tmp_path, "cpu").subject.name == "901"
 
 
-def test_without_a_capture_only_sizes_are_told(trained, tmp_path):
-    findings = compact(CompactSettings(str(trained[1]), out=str(tmp_path)))
+@pytest.mark.parametrize("cell", [False, True])
+def test_without_a_capture_only_sizes_are_told(trained, tmp_path, cell):
+    avatar = trained[1].parent if cell else trained[1]  # the folder that has it as "avatar" is one of a cell
+    findings = compact(CompactSettings(str(avatar), out=str(tmp_path)))
     assert "quality" not in findings.data
     assert findings.data["splats_kept"] == findings.data["splats"]
     assert "dB" not in findings.text
@@ -63,7 +65,11 @@ def test_enlarged_pictures_have_no_truth(trained, tmp_path):
 
 
 def test_what_does_not_belong_together_is_refused(trained, tmp_path):
-    with pytest.raises(InputError, match="exact file"):
+    (tmp_path / "a.txt").touch()
+    with pytest.raises(InputError, match="exact file.*found none"):
+        compact(CompactSettings(str(tmp_path), out=str(tmp_path / "out")))
+    (tmp_path / "point_cloud.ply").touch()
+    with pytest.raises(InputError, match="exact file.*found an avatar of ga"):
         compact(CompactSettings(str(tmp_path), out=str(tmp_path / "out")))
     other = write_tiny_capture(tmp_path / "other", make_plan(subject="902")).union
     with pytest.raises(InputError, match="902"):

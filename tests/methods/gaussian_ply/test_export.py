@@ -143,7 +143,7 @@ def test_a_viewer_shows_a_blendshape_avatar_in_a_turned_pose(tmp_path):
     ("files", "found"),
     [
         ({"point_cloud.ply": ("x", "offset_0")}, "offset_0: .* a column of another method"),
-        ({"field.npz": None}, "an avatar of insta"),
+        ({"field.npz": None}, "one of insta"),
         ({"mean.npz": None}, "none of them"),
         ({"run.json": None}, "avatar inside"),
     ],

@@ -168,12 +168,12 @@ def test_sog_loses_little(run, tmp_path, method):
 def test_without_the_library_the_error_says_what_to_install(run, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "gaussforge", None)
     out = tmp_path / "x.sog"
-    with pytest.raises(UnavailableError, match=r"pip install 'headbench\[formats\]'"):
+    with pytest.raises(UnavailableError, match=r"pip install -e '.\[formats\]'"):
         export_sog(ExportSogSettings(str(folder_of(run, "ga")), out=str(out)))
     assert not out.exists()
 
 
 def test_a_page_cannot_hold_what_a_network_draws(run, tmp_path):
     settings = ExportHtmlSettings(str(folder_of(run, "gha")), str(tmp_path / "x.html"))
-    with pytest.raises(InputError, match=r"one of gha.*headbench view"):
+    with pytest.raises(InputError, match=r"an avatar of ours, ga or gbs, found one of gha.*headbench view"):
         export_html(settings)

@@ -1,7 +1,5 @@
 """Pages with avatars in Chromium, opened from the disk: what WebGL draws is what headbench's renderer draws."""
 
-import shutil
-
 import cv2
 import numpy as np
 import pytest
@@ -10,19 +8,7 @@ from headbench.methods.web.export import draw
 from headbench.methods.web.model import look
 from headbench.methods.web.payload import decode, encode
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium on this machine")
-SOFTWARE_WEBGL = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 SIDE = 200
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE_WEBGL)
-        yield browser
-        browser.close()
 
 
 @pytest.fixture

@@ -95,6 +95,13 @@ def test_bad_settings_are_refused(bad):
         replace(ExportHtmlSettings("a", "b"), **bad)
 
 
-def test_a_folder_without_an_avatar_is_refused(tmp_path):
-    with pytest.raises(InputError, match="an avatar"):
-        export_html(ExportHtmlSettings(str(tmp_path), str(tmp_path / "page.html")))
+@pytest.mark.parametrize("file", [None, "field.npz", "mean.npz"])  # none, of insta, of mean-image
+def test_a_folder_without_a_fitting_avatar_is_refused(tmp_path, file):
+    avatar = tmp_path / "avatar"
+    avatar.mkdir()
+    if file:
+        (avatar / file).touch()
+    with pytest.raises(InputError, match="an avatar") as caught:
+        export_html(ExportHtmlSettings(str(avatar), str(tmp_path / "page.html")))
+    assert "gha" not in str(caught.value)
+    assert ("ours, ga or gbs" in str(caught.value)) == bool(file)

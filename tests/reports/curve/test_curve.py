@@ -234,8 +234,8 @@ def test_with_one_camera_timesteps_alone_are_held_out(plugin, tmp_path):
         ({"fractions": ("1/0",)}, "above 0 and at most 1"),
         ({"fractions": ("half",)}, "above 0 and at most 1"),
         ({"fractions": ("0.5", "1/2")}, "each once"),
-        ({"over": "tracking_error", "fractions": ("1",)}, "none with --over tracking_error"),
-        ({"levels": (1.0,)}, "none with --over budget"),
+        ({"over": "tracking_error", "fractions": ("1",)}, "--fractions needs .*found --over tracking_error"),
+        ({"levels": (1.0,)}, "--levels needs --over tracking_error; found --over budget"),
         ({"over": "tracking_error", "levels": (1.0, 1.0)}, "each once"),
         ({"over": "tracking_error", "levels": (4.5,)}, "from 0 to 4"),
         ({"over": "tracking_error", "levels": (float("nan"),)}, "from 0 to 4"),
@@ -268,6 +268,38 @@ def test_other_frames_held_out_want_another_folder(make_run):
     curve_run(settings(run, fractions=("1",)))
     with pytest.raises(InputError, match="Choose another --out"):
         curve_run(settings(run, fractions=("1",), camera="4"))
+
+
+@pytest.mark.parametrize(
+    ("less", "found"),
+    [
+        ({"methods": ("noting",)}, r"timed\+1 of ball-a, seed 0; timed\+1-4 of ball-a, seed 0"),
+        ({"fractions": ("1",)}, r"noting\+1-4 of ball-a"),
+        ({"frames": 1}, "another protocol"),
+    ],
+)
+def test_points_that_are_there_are_not_left_out(make_run, plugin, less, found):
+    run = make_run("curve_plugin:METHOD", "curve_plugin:TIMED")
+    whole = {"fractions": ("1", "1/4")}
+    curve_run(settings(run, **whole))
+    before = {path: path.read_bytes() for path in (run / "curve").iterdir() if path.is_file()}
+    with pytest.raises(InputError, match=found):
+        curve_run(settings(run, **{**whole, **less}))
+    assert before == {path: path.read_bytes() for path in (run / "curve").iterdir() if path.is_file()}
+    curve_run(settings(run, fractions=("1", "1/2", "1/4")))
+    assert len(table(run)) == 6
+    assert len(plugin.FITS) == 6
+
+
+def test_damaged_rows_are_written_again(make_run, plugin, caplog):
+    run = make_run("curve_plugin:METHOD")
+    curve_run(settings(run, fractions=("1",)))
+    rows = run / "curve" / "rows.parquet"
+    before = rows.read_bytes()
+    rows.write_bytes(before[:100])
+    curve_run(settings(run, fractions=("1",)))
+    assert rows.read_bytes() == before
+    assert "written again" in caplog.text
 
 
 def test_a_run_that_did_not_end_and_a_curve_are_no_runs(make_run, plugin):

@@ -1,6 +1,5 @@
 """The page in Chromium, opened from the disk."""
 
-import shutil
 from pathlib import Path
 
 import pytest
@@ -9,18 +8,6 @@ from headbench.reports.page import split
 from headbench.reports.page.command import PageSettings, report
 
 from .test_page import HOSTILE
-
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium on this machine")
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield browser
-        browser.close()
 
 
 @pytest.fixture

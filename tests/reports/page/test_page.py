@@ -246,7 +246,7 @@ def test_frames_are_added_evenly_and_from_all_groups():
     ("changes", "message"),
     [
         ({"max_mb": 0.1}, r"--max-mb"),
-        ({"out": "nowhere/page.html"}, r"in a folder that is there, found no folder nowhere"),
+        ({"out": "nowhere/page.html"}, r"in an existing folder, found no folder nowhere"),
         ({"runs": ("nothing",)}, r"no run.json"),
     ],
 )

@@ -73,6 +73,18 @@ def test_a_second_sweep_measures_nothing_again(finished, toy, monkeypatch):
     assert swept(finished).equals(first)
 
 
+@pytest.mark.parametrize(
+    ("settings", "match"),
+    [({"variants": ("light",)}, r"without varying\+dark"), ({"frames": 1}, "frames of novel_view")],
+)
+def test_a_sweep_that_would_lose_rows_is_refused(finished, toy, settings, match):
+    swept(finished)
+    toy.MADE.clear()
+    with pytest.raises(InputError, match=match):
+        swept(finished, **settings)
+    assert toy.MADE == []
+
+
 def test_variants_of_another_training_are_refused(finished, toy):
     swept(finished)
     cell = RunFolder(finished / "sweep").cell("subject1", "varying+dark", 0)

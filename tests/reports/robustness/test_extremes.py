@@ -76,8 +76,8 @@ def test_by_tasks_the_files_are_the_same(ball_run):
     folder = ball_run("BURSTING", "LISTED", "BALL")
     outs = [folder.parent / name for name in ("inline", "tasks")]
     found = [
-        extremes_run(settings(folder, out=str(out), executor=executor, workers=2))
-        for out, executor in zip(outs, ("inline", "processes"))
+        extremes_run(settings(folder, out=str(out), **how))
+        for out, how in zip(outs, ({}, {"executor": "processes", "workers": 2}))
     ]
     assert [f.passed for f in found] == [False, False]
     left = [{p.relative_to(out).as_posix(): p for p in out.rglob("*") if p.is_file()} for out in outs]
@@ -89,6 +89,17 @@ def test_by_tasks_the_files_are_the_same(ball_run):
     }
     for name, path in left[0].items():
         assert path.read_bytes().replace(b"inline", b"tasks") == left[1][name].read_bytes(), name
+
+
+@pytest.mark.parametrize("less", [{"methods": ("ball",)}, {"beyond": 10.0}])
+def test_rows_that_are_there_are_not_left_out(ball_run, less):
+    folder = ball_run("BALL", "BURSTING")
+    whole = {"methods": ("ball", "bursting")}
+    extremes_run(settings(folder, **whole))
+    before = (folder / "extremes" / ROWS_FILE).read_bytes()
+    with pytest.raises(InputError, match="hoose another --out"):
+        extremes_run(settings(folder, **{**whole, **less}))
+    assert (folder / "extremes" / ROWS_FILE).read_bytes() == before
 
 
 def test_a_burst_is_found_where_it_is_and_nowhere_else(ball_run):

@@ -55,9 +55,12 @@ def test_another_performance_is_another_protocol(ball_run):
     folder = ball_run("BALL")
     hashes = set()
     for frames in (1, 2):
-        reenact_run(settings(folder, frames=frames))
-        hashes |= set(pd.read_parquet(folder / "cross_reenactment" / ROWS_FILE)["protocol"])
+        out = folder / f"frames-{frames}"
+        reenact_run(settings(folder, frames=frames, out=str(out)))
+        hashes |= set(pd.read_parquet(out / ROWS_FILE)["protocol"])
     assert len(hashes) == 2
+    with pytest.raises(InputError, match="another protocol"):  # the rows of two frames would be lost
+        reenact_run(settings(folder, frames=1, out=str(out)))
 
 
 def test_the_source_is_shown_in_the_same_camera(ball_run):

@@ -1,6 +1,5 @@
 """The viewer in Chromium: what is moved is seen to move, for each browser alone."""
 
-import shutil
 import time
 
 import pytest
@@ -8,21 +7,9 @@ import pytest
 from headbench.reports.view.command import ViewSettings
 from headbench.reports.view.server import serving
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 pytest.importorskip("viser", reason="viser is not installed")
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium on this machine")
-SOFTWARE_WEBGL = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 CANVAS = {"x": 40, "y": 200, "width": 260, "height": 190}
 """Part of the page beside the panel and below viser's note on software WebGL."""
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE_WEBGL)
-        yield browser
-        browser.close()
 
 
 @pytest.fixture

@@ -185,7 +185,7 @@ def test_a_port_that_is_taken_is_refused_at_once(run):
 
 def test_without_viser_the_error_says_what_to_install(run, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(UnavailableError, match="pip install viser"):
+    with pytest.raises(UnavailableError, match=r"pip install -e '.\[view\]'"):
         view(ViewSettings((str(run.root),)))
 
 

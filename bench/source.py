@@ -1,0 +1,127 @@
+"""The source code of plug-ins: which files it is in, and their digest.
+
+Results are kept as long as what made them is the same. For a method of this package, its version says so. A plug-in outside
+the package may be edited without a new version, so the digest of its files counts as well.
+"""
+
+from __future__ import annotations
+
+import ast
+import os
+import sys
+from collections.abc import Iterator
+from functools import cache
+from importlib.machinery import EXTENSION_SUFFIXES
+from pathlib import Path
+
+from .io.files import digest, digest_file
+from .registry import resolve
+
+_OWN = __name__.partition(".")[0]
+_LEFT_OUT = {_OWN, *sys.stdlib_module_names}
+_INSTALLED = {"site-packages", "dist-packages"}
+_SUFFIXES = (".py", *(suffix for suffix in EXTENSION_SUFFIXES if suffix.count(".") > 1))
+"""Of modules. A plain ".so" is left out: it may be any library, and large."""
+
+
+def is_outside(reference: str) -> bool:
+    """Whether ``"package.module:Object"`` names an object outside this package."""
+    return bool(reference) and reference.partition(":")[0].partition(".")[0] != _OWN
+
+
+@cache
+def code_digest(reference: str) -> str:
+    """First 12 hex digits of the digest of the code of ``"package.module:Object"``; "" if it is not stored in files.
+
+    Inside this package, the code is the Python files in the folder of the named module.
+
+    Outside, it is all modules of the package that contains the named module (the outermost folder with an ``__init__.py``,
+    else the outermost folder), or the file of a module without a package. Further modules count if these files import
+    them from the same folder on the module path, unless that is a folder of installed packages. Modules that are imported
+    by a computed name are not found.
+
+    Relative file names are part of the digest, their location is not. The result is cached, see `forget_code`.
+    """
+    module = reference.partition(":")[0]
+    resolve(reference)  # imports the module
+    if is_outside(reference):
+        files = _with_imports(module)
+    else:
+        file = _file(module)
+        files = {} if file is None else {path.name: path for path in file.parent.glob("*.py")}
+    named = [[name, digest_file(path)] for name, path in sorted(files.items()) if path.is_file()]
+    return digest(named)[:12] if named else ""
+
+
+def forget_code() -> None:
+    """Clear the cache of `code_digest`: files may have changed since."""
+    code_digest.cache_clear()
+
+
+def _file(module: str) -> Path | None:
+    """The file of an imported module; None for a namespace package, and for a module that is not in a file."""
+    file = getattr(sys.modules.get(module), "__file__", None)
+    return Path(file) if file else None
+
+
+def _root(module: str) -> tuple[Path, Path] | None:
+    """Folder of the package that contains a module, or its file, and the folder on the module path that holds it."""
+    parts = module.split(".")
+    for depth in range(1, len(parts) + 1):
+        name = ".".join(parts[:depth])
+        file = _file(name)
+        if file is not None and hasattr(sys.modules[name], "__path__"):
+            return file.parent, file.parents[depth]
+        if file is not None:
+            above = [file, *file.parents]
+            return above[depth - 1], above[depth]
+    return None
+
+
+def _with_imports(module: str) -> dict[str, Path]:
+    """Files of the package that contains a module, and of what they import from beside it, by relative name."""
+    found, own = _root(module), _file(module)
+    if found is None:
+        return {}
+    root, home = found
+    installed = not _INSTALLED.isdisjoint(home.parts)
+    files: dict[str, Path] = {}
+    seen = {root, own or root}  # its own file may be a compiled one of any name
+    left = list(seen)
+    while left:
+        new = _below(left.pop(), home)
+        files |= new
+        for path in new.values():
+            names = set() if installed else _imports(path) - _LEFT_OUT
+            beside = {p for name in names for p in (home / f"{name}.py", home / name) if p.exists()}
+            left += beside - seen
+            seen |= beside
+    return files
+
+
+def _below(root: Path, home: Path) -> dict[str, Path]:
+    """Files of all modules below a folder, or the file itself, by name relative to ``home``."""
+    return {os.path.relpath(path, home): path for path in _walk(root)}
+
+
+def _walk(root: Path) -> Iterator[Path]:
+    if not root.is_dir():
+        yield root
+    for folder, folders, names in os.walk(root):
+        folders[:] = [name for name in folders if name.isidentifier()]  # no others can be imported
+        yield from (Path(folder, name) for name in names if name.endswith(_SUFFIXES))
+
+
+def _imports(path: Path) -> set[str]:
+    """First parts of the absolute names that a Python file imports; none if it cannot be parsed."""
+    try:
+        tree = ast.parse(path.read_bytes() if path.suffix == ".py" else b"")
+    except (SyntaxError, ValueError, OSError):
+        return set()
+    names: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names |= {alias.name.partition(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and not node.level and node.module:
+            names.add(node.module.partition(".")[0])
+    return names
