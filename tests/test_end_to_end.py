@@ -237,6 +237,10 @@ CASES = {
             "frames in novel_view",
         ),
     ],
+    "frames": [
+        case("frames {demo} --out frames", "frames.csv and MAP.csv", "frames/frames.csv", "frames/MAP.csv"),
+        case("frames {capture} --out listed --frames-per-task 2", "frames.csv", "listed/MAP.csv"),
+    ],
     "gate": [
         case("gate {demo} --baseline demo.json --update", "numbers written", "demo.json"),
         case("gate {demo} --baseline demo.json", "nothing got worse"),
