@@ -433,7 +433,7 @@ class TrainingMetric(Protocol):
     """One number of how an avatar was trained (time, memory)."""
 
     def __call__(self, record: Mapping[str, Any]) -> Measurement:
-        """Take it from the record of the fit: ``seconds``, ``interruptions``, ``peak_memory_bytes``.
+        """Take it from the record of the fit: ``seconds``, ``interruptions``, ``peak_memory_bytes``, ``load``.
 
         Raises `UnavailableError` where the record does not have it.
         """

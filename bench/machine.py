@@ -11,12 +11,14 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Self
 
-from .errors import HeadbenchError, InputError
+from .errors import HeadbenchError, InputError, shortened
 from .registry import resolve
+from .specs import MAX_LABEL
 
 OPENCV = "opencv-contrib-python-headless"
 RECORDED_PACKAGES = ("headbench", "torch", "gsplat", "numpy", OPENCV, "scikit-image", "mitsuba")
@@ -173,6 +175,98 @@ class PeakMemory:
             self.peak = max(self.peak, self._process.memory_info().rss)
             if self._ended.wait(0.02):
                 return
+
+
+SHORTEST_LOAD_S = 0.5
+"""Seconds below which the load of a machine is not known: the system counts processor time in steps of 10 ms."""
+BUSY = ("user", "nice", "system", "irq", "softirq", "steal")
+"""Fields of a core's processor times during which it works, for the machine's own processes or for another guest."""
+
+
+class ProcessorLoad:
+    """Context that finds how many of the cores that this process may use were kept busy by other processes meanwhile.
+
+    The processor times of those cores less those of this process and its children: the load average counts this process,
+    too, and follows a change only within a minute.
+
+    Parameters
+    ----------
+    device : what is computed on, for `machine`.
+    wait : stay in the context until the load can be known, `SHORTEST_LOAD_S`.
+
+    Attributes
+    ----------
+    machine : see `machine_name`.
+    threads : of torch and of this package's kernels, 1 where nothing has imported torch.
+    cores : that this process may use.
+    other_cores : mean number of them that others kept busy; None if the context was too short or the system does not tell.
+    """
+
+    def __init__(self, device: str = "cpu", *, wait: bool = False) -> None:
+        self.machine, self.cores = machine_name(device), processor_count()
+        self.threads = 1
+        self.other_cores: float | None = None
+        self._wait = wait
+
+    def __enter__(self) -> Self:
+        self._start = time.perf_counter()
+        self._own, self._busy = _own_processor_seconds(), _busy_seconds()
+        return self
+
+    def __exit__(self, kind: object, *error: object) -> None:
+        torch = sys.modules.get("torch")
+        self.threads = 1 if torch is None else int(torch.get_num_threads())
+        if self._wait and kind is None:
+            time.sleep(max(0.0, self._start + SHORTEST_LOAD_S - time.perf_counter()))
+        # The own time is taken around the others', so that what is done between the two is never another's.
+        busy, own = _busy_seconds(), _own_processor_seconds()
+        seconds = time.perf_counter() - self._start
+        if seconds >= SHORTEST_LOAD_S and self._busy is not None and busy is not None:
+            others = busy - self._busy - (own - self._own)
+            self.other_cores = round(min(max(0.0, others / seconds), self.cores), 3)
+
+    @property
+    def details(self) -> dict[str, float]:
+        """Its numbers, for a `Measurement`; without `other_cores` if that is not known."""
+        known = {} if self.other_cores is None else {"other_cores": self.other_cores}
+        return {"threads": self.threads, "cores": self.cores, **known}
+
+
+def machine_name(device: str = "cpu") -> str:
+    """The processor with the number of cores that this process may use, and the CUDA device: times compare on one alone."""
+    cores = processor_count()
+    name = f"{_processor()} ({cores} core{'s' * (cores > 1)})"
+    record = _device_record(device).get("device")
+    return shortened(name if record is None else f"{record['name']}, {name}", MAX_LABEL - 10)
+
+
+def _own_processor_seconds() -> float:
+    """Processor time of this process, of its finished children and of those that run."""
+    import psutil
+
+    seconds = processor_seconds()
+    for child in psutil.Process().children(recursive=True):
+        with suppress(psutil.Error):  # it may have ended meanwhile
+            times = child.cpu_times()
+            seconds += times.user + times.system
+    return seconds
+
+
+def _busy_seconds() -> float | None:
+    """Time that the cores which this process may use have worked, together; None where the system does not tell."""
+    import psutil
+
+    try:
+        cores = psutil.cpu_times(percpu=True)
+    except (OSError, psutil.Error):
+        return None
+    if not any(sum(core) for core in cores):
+        return None
+    available = getattr(os, "sched_getaffinity", None)
+    allowed = available(0) if available else range(len(cores))
+    # Where some cores are switched off their places say nothing: then all count.
+    chosen = [cores[index] for index in allowed] if max(allowed) < len(cores) else cores
+    return float(sum(getattr(core, name, 0.0) for core in chosen for name in BUSY))
 
 
 def peak_memory_bytes() -> int:

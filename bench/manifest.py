@@ -82,6 +82,13 @@ class ProtocolRecord:
         own = {f.name: getattr(protocol, f.name) for f in fields(protocol)}
         return cls(protocol.id, protocol.hash, **own)
 
+    def protocol(self, source: Path) -> Protocol:
+        """The protocol that was recorded, in the file ``source``. Raises `InputError` for another hash than the recorded one."""
+        protocol = Protocol(**{f.name: getattr(self, f.name) for f in fields(Protocol)})
+        if protocol.hash != self.hash:
+            raise InputError(source, f"protocols.{self.task}", self.hash, protocol.hash)
+        return protocol
+
     @property
     def design(self) -> str:
         """Digest of all but the fingerprints of the captures."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
@@ -28,7 +29,11 @@ STATUSES = ("ok", "missing", "failed")
 
 @dataclass(frozen=True)
 class Row:
-    """One measured value, or why there is none. Per-avatar values have no task, timestep -1 and no camera."""
+    """One measured value, or why there is none. Per-avatar values have no task, timestep -1 and no camera.
+
+    ``machine``, ``threads`` and ``other_cores`` are of times alone, see `machine.ProcessorLoad`: "", 0 and NaN elsewhere, and
+    where they were not recorded.
+    """
 
     method: str
     version: str
@@ -44,11 +49,23 @@ class Row:
     protocol: str
     status: str = "ok"  # ok | missing | failed
     reason: str = ""
+    machine: str = ""
+    threads: int = 0
+    other_cores: float = math.nan
 
 
 COLUMNS = tuple(f.name for f in fields(Row))
-WHOLE, NUMBERS = ("seed", "timestep"), ("seed", "timestep", "value")
+WHOLE, NUMBERS = ("seed", "timestep", "threads"), ("seed", "timestep", "value", "threads", "other_cores")
 TEXTS = tuple(name for name in COLUMNS if name not in NUMBERS)
+LATER: Mapping[str, Any] = {"machine": "", "threads": 0, "other_cores": math.nan}
+"""Columns that earlier versions did not write, and what stands for them."""
+TYPES = {
+    "seed": "int64",
+    "timestep": "int64",
+    "value": "float64",
+    "threads": "int64",
+    "other_cores": "float64",
+}
 
 MAX_FILE_BYTES = 256 * 2**20
 MAX_TEXT_BYTES = 256 * 2**20
@@ -83,7 +100,7 @@ class Rows:
     def of(cls, rows: Iterable[Row]) -> Rows:
         """Rows that were just measured."""
         frame = pd.DataFrame([asdict(row) for row in rows], columns=list(COLUMNS))
-        return cls(frame.astype({"seed": "int64", "timestep": "int64", "value": "float64"}))
+        return cls(frame.astype(TYPES))
 
     @classmethod
     def joined(cls, parts: Iterable[Rows]) -> Rows:
@@ -215,6 +232,21 @@ class Rows:
         failed = (table["timestep"] < 0) & pd.MultiIndex.from_frame(table[["task", "metric"]]).isin(measured)
         return Rows(table[avatar | chosen | failed].assign(region=full))
 
+    def updated(self, new: Rows) -> Rows:
+        """These rows in their order, those of ``new`` in place of the ones of the same method, seed, frame, region and metric.
+
+        Raises `InputError` for new rows in whose place there is none.
+        """
+        identity = ["method", "seed", "task", *FRAME, "region", "metric"]
+        own, others = (pd.MultiIndex.from_frame(table[identity]) for table in (self._table, new._table))
+        places = own.get_indexer(others)
+        if (places < 0).any():
+            where = " ".join(map(str, others[int(np.argmin(places))]))
+            raise InputError("rows", where, "a row to replace", "none")
+        chosen = np.arange(len(own))
+        chosen[places] = len(own) + np.arange(len(others))
+        return Rows(pd.concat([self._table, new._table]).take(chosen).reset_index(drop=True))
+
     @property
     def regions(self) -> set[str]:
         """Regions that frames were measured over."""
@@ -321,14 +353,20 @@ def _read_table(path: Path) -> pa.Table:
         found = f"{about.num_rows} rows"
         raise InputError(path, "", f"at most {size + SPARE_ROWS} rows in {size} bytes", found)
     names = Counter(about.schema.column(index).path for index in range(about.num_columns))
-    wrong = [f"{names[name] or 'no'} {name}" for name in COLUMNS if names[name] != 1]
+    wrong = [
+        f"{names[name] or 'no'} {name}"
+        for name in COLUMNS
+        if names[name] != 1 and (names[name] or name not in LATER)
+    ]
     if wrong:
         raise InputError(path, "columns", f"once each {', '.join(COLUMNS)}", ", ".join(wrong))
     others = column_codecs(path) - {UNCOMPRESSED, SNAPPY}
     if others:  # which can make a gigabyte of a small file
         raise InputError(path, "compression", "SNAPPY or none", f"codec {min(others)} of the format")
-    with pq.ParquetFile(path, read_dictionary=list(TEXTS)) as file:
-        table = file.read(columns=list(COLUMNS), use_threads=False, use_pandas_metadata=False)
+    present = [name for name in COLUMNS if names[name]]
+    texts = [name for name in TEXTS if names[name]]
+    with pq.ParquetFile(path, read_dictionary=texts) as file:
+        table = file.read(columns=present, use_threads=False, use_pandas_metadata=False)
         table.validate(full=True)
         return table
 
@@ -336,16 +374,16 @@ def _read_table(path: Path) -> pa.Table:
 def _checked(table: pa.Table, path: Path) -> pd.DataFrame:
     """Check columns and turn them into those that `Rows.of` makes."""
     columns: dict[str, Any] = {}
-    for name in COLUMNS:
+    for name in table.column_names:
         column = table.column(name).combine_chunks()
         expected = "whole numbers" if name in WHOLE else "numbers" if name in NUMBERS else "text"
         known = pa.types.is_int64 if name in WHOLE else pa.types.is_float64 if name in NUMBERS else _is_text
         if not known(column.type) and not (pa.types.is_null(column.type) and not len(column)):
             raise InputError(path, name, expected, f"{column.type}")
-        if name != "value" and column.null_count:
+        if name not in ("value", "other_cores") and column.null_count:
             raise InputError(path, name, f"{expected} in every row", f"{column.null_count} empty entries")
         columns[name] = _texts(column, path, name) if name in TEXTS else column.to_numpy(zero_copy_only=False)
-    frame = pd.DataFrame(columns).astype({"seed": "int64", "timestep": "int64", "value": "float64"})
+    frame = pd.DataFrame({name: columns.get(name, LATER.get(name)) for name in COLUMNS}).astype(TYPES)
     strange = sorted(set(frame["status"]) - set(STATUSES))
     if strange:
         raise InputError(path, "status", f"one of {', '.join(STATUSES)}", ", ".join(map(repr, strange)))
@@ -354,6 +392,10 @@ def _checked(table: pa.Table, path: Path) -> pd.DataFrame:
         first = undefined.iloc[0]
         where = f"{first['metric']} of {first['method']}, {first['subject']} {first['timestep']}"
         raise InputError(path, where, "a finite value", str(first["value"]))
+    for name in ("threads", "other_cores"):
+        wrong = frame.loc[(frame[name] < 0) | np.isinf(frame[name]), name]
+        if len(wrong):
+            raise InputError(path, name, "a number from 0", str(wrong.iloc[0]))
     return frame
 
 

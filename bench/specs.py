@@ -271,6 +271,8 @@ class DatasetSpec:
     Settings whose annotation admits a `Path` name files; a run finds them again after it was moved together with them.
     ``listing`` names a function ``path -> {split: [(timestep, camera), ...]}``: the frames in the order in which the
     capture's own files list them, all of them, by which official repositories number their renders; "" for none.
+    ``pose_files`` names a function ``path -> {timestep: file}``: the file with the tracking parameters of each timestep;
+    "" where timesteps have no files of their own.
     ``needs`` is as that of a method, called with None for the config.
     """
 
@@ -280,6 +282,7 @@ class DatasetSpec:
     find: str = ""
     reads: bool = True
     listing: str = ""
+    pose_files: str = ""
     needs: str = ""
 
 

@@ -8,6 +8,7 @@ GA_LAYOUT = DatasetSpec(
     implementation="headbench.datasets.ga.reader:read_capture",
     find="headbench.datasets.ga.reader:find_captures",
     listing="headbench.datasets.ga.reader:listed_frames",
+    pose_files="headbench.datasets.ga.reader:pose_files",
 )
 
 COLMAP = DatasetSpec(
@@ -15,6 +16,7 @@ COLMAP = DatasetSpec(
     summary="A COLMAP dataset with tracked FLAME parameters beside its model, as `export colmap --tracking` writes.",
     implementation="headbench.datasets.colmap.reader:read_dataset",
     find="headbench.datasets.colmap.reader:find_datasets",
+    pose_files="headbench.datasets.colmap.reader:pose_files",
 )
 
 MONOCULAR = DatasetSpec(

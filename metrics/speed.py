@@ -158,8 +158,8 @@ def fps(avatar: Avatar, workload: Sequence[tuple[Camera, HeadPose]]) -> Measurem
     ``mean_ms``, ``p5_ms``, ``p50_ms``, ``p95_ms``, ``p99_ms``, ``iqr_ms``, ``max_ms`` and ``processor_ms`` (mean time
     of all threads) of the latency; ``throughput_fps``; ``<stage>_ms``, the median of each stage where the avatar reports
     stages; ``static_ms``, the median where neither camera nor pose changes; ``warm_up_frames``; ``stationary`` (1 or
-    0); ``load``, the mean number of busy processes of the last minute; ``threads``. Numbers of different machines do
-    not compare.
+    0); ``load``, the mean number of busy processes of the last minute. A run adds threads and the cores that others kept busy,
+    see `bench.machine.ProcessorLoad`. Numbers of different machines do not compare.
 
     Raises `InputError` for a workload whose neighbours do not differ.
     """
@@ -201,13 +201,11 @@ def measure_speed(
         medians = stage_times(drawing, stream, plan.stages, plan.stages_s, clock)
         details |= {f"{stage}_ms": value for stage, value in medians.items()}
     static = latencies(drawing, repeat(next(stream)), plan.static, plan.static_s, clock)
-    torch = sys.modules.get("torch")
     details |= {
         "static_ms": float(np.median(static)),
         "warm_up_frames": warm_up_frames,
         "stationary": float(stationary),
         "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan"),
-        "threads": 1 if torch is None else int(torch.get_num_threads()),
     }
     return Measurement(1000 / details["mean_ms"], {k: v for k, v in details.items() if np.isfinite(v)})
 

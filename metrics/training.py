@@ -34,7 +34,9 @@ TRAINING_MEMORY = replace(
 
 
 def training_time(record: Mapping[str, Any]) -> Measurement:
-    """Minutes of wall clock from the start of the fit to its end. Details: ``seconds``.
+    """Minutes of wall clock from the start of the fit to its end.
+
+    Details: ``seconds``, and where the record has them ``threads``, ``cores`` and ``other_cores`` of `ProcessorLoad`.
 
     Raises `UnavailableError` where the training was interrupted, since the record has the last part alone.
     """
@@ -43,7 +45,9 @@ def training_time(record: Mapping[str, Any]) -> Measurement:
         times = "once" if interruptions == 1 else f"{interruptions} times"
         raise UnavailableError(f"The training was interrupted {times}.", "Train it in one go for its time.")
     seconds = _number(record, "seconds")
-    return Measurement(seconds / 60, {"seconds": seconds})
+    load = record.get("load", {})
+    known = {name: float(load[name]) for name in ("threads", "cores", "other_cores") if name in load}
+    return Measurement(seconds / 60, {"seconds": seconds, **known})
 
 
 def training_memory(record: Mapping[str, Any]) -> Measurement:

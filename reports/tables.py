@@ -16,6 +16,7 @@ from ..bench.rows import ALL, Rows
 from ..bench.runner.scoring import FULL
 from ..bench.specs import MetricSpec
 from .aggregate import Aggregate, subject_means, summarise, whole_images
+from .conditions import conditions, marks, measured_on
 from .statistics.comparisons import LEVEL, BestSet, best_set, counted
 
 
@@ -166,8 +167,8 @@ def build_table(
     methods : in order; one without rows is shown as not measured.
     trivial : those of ``methods`` that are trivial baselines: listed apart, not ranked.
     keys : frames of each task, where more are scored than there are rows of.
-    protocol_ids : readable name of each task's protocol, for the caption, like ``image_size``, ``machine``, ``part`` and the
-        sentences of ``missing``.
+    protocol_ids : readable name of each task's protocol, for the caption, like ``image_size``, ``machine`` (where the rows do not
+        tell on which one speed was measured), ``part`` and the sentences of ``missing``.
     avatar_title : heading of the columns that are of no task.
 
     Raises
@@ -184,10 +185,20 @@ def build_table(
         Column(task, title, m.name, m.label, m.unit, m.digits, m.higher_is_better)
         for m, task, title in places
     )
+    found = conditions(rows, metrics, methods)
+    marked = marks(found, trivial)
     notes: list[str] = []
     lines: list[TableRow] = []
     for method in methods:
-        cells = tuple(_cell(summarise(rows, method, c.metric, c.task), c.digits, notes) for c in columns)
+        cells = tuple(
+            _cell(
+                summarise(rows, method, c.metric, c.task),
+                c.digits,
+                notes,
+                marked.get((c.metric, method), ""),
+            )
+            for c in columns
+        )
         lines.append(TableRow(method, ", ".join(rows.versions(method)), method in trivial, cells))
     bests = [_best(rows, lines, index, column) for index, column in enumerate(columns)]
     lines = _ranked(lines, columns, bests)
@@ -206,7 +217,7 @@ def build_table(
         seeds=max(1, len(rows.seeds(ALL))),
         marking=_marking(columns, lines, bests),
         image_size=image_size,
-        machine=machine,
+        machine=measured_on(found.get("fps", {}), trivial, machine),
         part=part,
         missing=tuple(missing),
     )
@@ -221,15 +232,17 @@ def _task_summary(rows: Rows, task: str, protocol_id: str, keys: Collection[Fram
     return TaskSummary(task, title, protocol_id, "".join(rows.protocols(task)), len(frames), len(subjects))
 
 
-def _cell(aggregate: Aggregate, digits: int, notes: list[str]) -> TableCell:
+def _cell(aggregate: Aggregate, digits: int, notes: list[str], mark: str) -> TableCell:
+    """A cell; ``mark`` is the note for its value, "" for none."""
+    text = mark if aggregate.value is not None else aggregate.reason
+    if text not in ("", *notes):
+        notes.append(text)
+    note = notes.index(text) if text else None
     if aggregate.value is not None:
         # A digit more than the value: seeds move means less than methods do.
         spread = "" if aggregate.spread is None else f"{aggregate.spread:.{digits + 1}f}"
-        return TableCell("ok", aggregate.value, f"{aggregate.value:.{digits}f}", spread)
-    if aggregate.reason not in notes:
-        notes.append(aggregate.reason)
-    text = "failed" if aggregate.status == "failed" else "–"
-    return TableCell(aggregate.status, None, text, note=notes.index(aggregate.reason))
+        return TableCell("ok", aggregate.value, f"{aggregate.value:.{digits}f}", spread, note=note)
+    return TableCell(aggregate.status, None, "failed" if aggregate.status == "failed" else "–", note=note)
 
 
 def _competing(lines: Sequence[TableRow], index: int) -> list[str]:

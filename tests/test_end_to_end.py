@@ -176,6 +176,7 @@ CASES = {
     "demo": [],  # the run of this module, and `test_the_result_is_there_for_machines`
     "synth": [case(OTHERS, "others", "others/synthesis.json")],
     "run": [case(PLAIN, r"\| nearest-camera", "plain/rows.parquet", "plain/tables/comparison.md")],
+    "speed": [case("speed {demo} --methods mean-image", "speed measured again, avatars: 1")],
     "status": [case("status plain", "2 cells: 0 waiting, 0 running, 2 done, 0 failed")],
     "suite": [case(SUITE, "Sequence FREE-3-beyond", "suite/results.md", "suite/run/rows.parquet")],
     "list": [case(f"list {what}", r"\w") for what in (*SPEC_TYPES, "presets")],
@@ -235,6 +236,10 @@ CASES = {
             f"render {cell('gha')} --method gha --capture {{capture}} --out gha --frames novel_view --timesteps 0",
             "frames in novel_view",
         ),
+    ],
+    "frames": [
+        case("frames {demo} --out frames", "frames.csv and MAP.csv", "frames/frames.csv", "frames/MAP.csv"),
+        case("frames {capture} --out listed --frames-per-task 2", "frames.csv", "listed/MAP.csv"),
     ],
     "gate": [
         case("gate {demo} --baseline demo.json --update", "numbers written", "demo.json"),

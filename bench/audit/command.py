@@ -1,4 +1,4 @@
-"""``headbench verify``, ``headbench bundle`` and ``headbench evaluate``."""
+"""``headbench verify``, ``headbench bundle``, ``headbench evaluate`` and ``headbench frames``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import tyro
 from ..contracts import Progress, TaskName, no_progress
 from ..errors import InputError
 from ..runner.config import RunOptions
-from ..specs import LABEL, Findings, is_label
+from ..specs import LABEL, Findings, is_label, writes
 
 
 @dataclass(frozen=True)
@@ -126,6 +126,9 @@ class EvaluateSettings:
     their masks), official-insta (FOLDER is experiments/CONFIG/debug, with its overlay), or a file MAP.csv with the columns
     file, sequence, timestep, camera (and subject with several)."""
 
+    any_background: bool = False
+    """Score images as they are even where their background is not the capture's, which is refused otherwise."""
+
     like: str | None = None
     """Run whose protocols to follow: capture, reader and its settings, tasks, frames, metrics are taken from it."""
 
@@ -163,3 +166,38 @@ def evaluate(settings: EvaluateSettings, progress: Progress = no_progress) -> Fi
     from .evaluate import evaluate_folder
 
     return evaluate_folder(settings, progress)
+
+
+@dataclass(frozen=True)
+class FramesSettings(RunOptions):
+    """List the frames that `headbench evaluate` scores, for renders that are made outside of headbench.
+
+    Writes OUT/frames.csv, one row for each frame: task, key (subject, sequence, timestep, camera), the file name that
+    `headbench evaluate` expects in a folder of images, size, background, intrinsics in pixels (the centre of the top left
+    pixel is at 0.5, 0.5), the first three rows of the 4 x 4 world-to-camera matrix (OpenCV axes, metres), and the file
+    with the tracking parameters of the timestep, where the capture has one. OUT/MAP.csv has the same frames in the form
+    that `headbench evaluate --names` takes: replace the names in its column file by those of your renders.
+    """
+
+    source: tyro.conf.Positional[str]
+    """Folder of a run, whose protocols are followed, or a capture (or folder of several)."""
+
+    out: str
+    """Folder to write."""
+
+    tasks: tuple[TaskName, ...] = ()
+    """Tasks to list for a capture; default: those of `headbench run`."""
+
+    frames_per_task: int | None = None
+    """For a capture: at most so many frames per subject and task, evenly spaced, as `headbench run` takes them."""
+
+    reader: str = ""
+    """Which dataset reader opens the capture; default: the one that finds it."""
+
+
+@writes("out")
+def frames(settings: FramesSettings, progress: Progress = no_progress) -> Findings:
+    """List the frames to render outside of headbench: names, cameras and pose files as CSV."""
+    from .frames import write_frames
+
+    return write_frames(settings)

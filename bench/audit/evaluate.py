@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 from PIL import Image, UnidentifiedImageError
@@ -24,13 +25,14 @@ from ..io.lock import locked
 from ..protocol import Protocol, make_protocols
 from ..registry import discover, get, resolve
 from ..rows import Rows
-from ..runner.captures import open_clips, open_run_clips, reader_of
+from ..runner.captures import capture_configuration, open_clips, open_run_clips
 from ..runner.config import ResolvedMethod, RunConfig, RunOptions, default_names, resolve_metrics
 from ..runner.run import describe, make_jobs, write_reports
 from ..runner.steps import DIGESTS, Job, measure, render
 from ..runner.store import Cell, RunFolder
 from ..runner.stored import avatar_digest, avatar_folder, shows_another, stored_heads, stored_method
 from ..specs import Findings, MethodSpec
+from .background import check_background
 from .command import EvaluateSettings
 from .naming import Render, check_truth, composited, named_renders
 
@@ -83,6 +85,10 @@ def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress
         adapted_for = [replace(of, spec=replace(of.spec, name=method.spec.name))]
     else:
         images = find_images(source, clips, protocols, settings.names, config)
+        if not settings.any_background:
+            for task, clip in product(protocols, clips):
+                of_task = {key: render for (t, key), render in images.items() if t == task}
+                check_background(clip, {k: r for k, r in of_task.items() if k.subject == clip.subject})
         digests = [
             [
                 task,
@@ -137,17 +143,21 @@ def _open(settings: EvaluateSettings) -> tuple[RunConfig, list[Clip]]:
     if settings.like is not None:
         options = RunOptions(data=settings.clip, head=settings.head, trust=settings.trust)
         config, clips = open_run_clips(
-            Path(settings.like), options, out=Path(settings.out), altered=settings.clip is not None
+            Path(settings.like),
+            options,
+            out=Path(settings.out),
+            altered=settings.clip is not None,
+            used=("metrics",),
         )
     else:
-        config = RunConfig(
-            data=str(settings.clip),
-            out=settings.out,
+        config = capture_configuration(
+            str(settings.clip),
+            settings.out,
+            settings.reader,
+            settings.head,
             tasks=settings.tasks,
             metrics=settings.metrics
             or tuple(n for n in default_names("metrics") if settings.avatar or get("metrics", n).per_frame),
-            reader=settings.reader or reader_of(str(settings.clip)),
-            reader_settings={} if settings.head is None else {"head": settings.head},
             frames_per_task=settings.frames_per_task,
         )
         clips = open_clips(config)

@@ -19,10 +19,12 @@ from ..io.images import read_pixels, read_png
 from ..registry import get, resolve, unknown
 from ..runner.captures import found_captures
 from ..runner.config import RunConfig
+from ..runner.store import Cell
 from ..specs import DatasetSpec
 
 MAP = "a list of names, MAP.csv"
 COLUMNS = ("file", "sequence", "timestep", "camera")
+MAP_COLUMNS = ("file", *FrameKey._fields)
 MAX_MAP_BYTES = 64 * 2**20
 _MAP_REMEDY = "Name the images one by one with --names MAP.csv (columns file, sequence, timestep, camera)."
 
@@ -66,6 +68,11 @@ def named_renders(names: str, folder: Path, config: RunConfig, clips: Sequence[C
         listing: Listing = resolve(spec.listing)(path) if spec.listing else {}
         found |= OFFICIAL[names](own, clip, listing)
     return found
+
+
+def image_name(task: str, key: FrameKey) -> PurePosixPath:
+    """Where the image of a frame lies by default in a folder of images, whatever the number of subjects."""
+    return PurePosixPath(key.subject, task, Cell(Path()).render(task, key).name)
 
 
 def check_truth(clip: Clip, renders: Renders, keys: Iterable[FrameKey], count: int = 8) -> None:

@@ -19,7 +19,7 @@ from ..manifest import Manifest, ProtocolRecord
 from ..protocol import Protocol, make_protocols
 from ..registry import get, resolve
 from ..rows import ALL, FRAME, Rows
-from ..runner.captures import open_run_clips, synthesis_arguments
+from ..runner.captures import Plugins, open_run_clips, synthesis_arguments
 from ..runner.config import resolve_methods, resolve_metrics
 from ..runner.run import load, make_jobs
 from ..runner.steps import DIGESTS, Job, measure, recorded_frames
@@ -133,10 +133,13 @@ def _verify(
     folder = RunFolder(Path(settings.run))
     manifest = folder.read_manifest()
     manifest.check_done(folder.manifest)
-    config, clips = open_run_clips(folder.root, settings, out=scratch, altered=True, remembered=False)
-    rows = folder.read_rows(manifest)
     # Otherwise there are images alone, of a bundle or scored by `evaluate`.
     avatars = shown is None and any(method.implementation for method in manifest.methods)
+    used: tuple[Plugins, ...] = ("methods", "metrics") if avatars else ("metrics",)
+    config, clips = open_run_clips(
+        folder.root, settings, out=scratch, altered=True, remembered=False, used=used
+    )
+    rows = folder.read_rows(manifest)
     images = [images_method(method.name, method.version) for method in manifest.methods]
     methods = resolve_methods(config) if avatars else images
     metrics = [metric for metric in resolve_metrics(config) if metric.per_frame or avatars]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ..contracts import Clip
@@ -98,11 +98,8 @@ class _Run:
         manifest = folder.read_manifest()
         config = replace(manifest.configuration, out=str(root))
         check_device(config.device)
-        protocols = {}
-        for task, record in manifest.protocols.items():
-            protocols[task] = Protocol(**{f.name: getattr(record, f.name) for f in fields(Protocol)})
-            if protocols[task].hash != record.hash:
-                raise InputError(folder.manifest, f"protocols.{task}", record.hash, protocols[task].hash)
+        recorded = manifest.protocols.items()
+        protocols = {task: record.protocol(folder.manifest) for task, record in recorded}
         methods = {method.spec.name: method for method in resolve_methods(config)}
         began_with = {method.name: method.code for method in manifest.methods}
         for name, method in methods.items():

@@ -13,6 +13,7 @@ from ..configuration import build, merge, parse_assignments
 from ..contracts import Progress
 from ..errors import InputError
 from ..registry import unknown
+from ..runner.config import RunOptions
 from ..specs import Findings
 from .settings import Execution, ExecutorName
 
@@ -77,3 +78,24 @@ def status(settings: StatusSettings, progress: Progress) -> Findings:
     from .status import run_status
 
     return run_status(Path(settings.run))
+
+
+@dataclass(frozen=True)
+class SpeedSettings(RunOptions):
+    """Loads the stored avatars of a finished run and measures frames per second and times of a frame again, one avatar after
+    another, without training. Only these rows are replaced; the former values stay in measure.json and run.log. Let nothing
+    else run on the machine meanwhile. Exit code 1: an avatar could not be measured and keeps its former speed.
+    """
+
+    run: tyro.conf.Positional[str]
+    """Folder of the run."""
+
+    methods: tuple[str, ...] = ()
+    """Only these methods; default: all of the run."""
+
+
+def speed(settings: SpeedSettings, progress: Progress) -> Findings:
+    """Measure the speed of a finished run's avatars again, without training, and rewrite its tables and report."""
+    from ..runner.speed import measure_speed_again
+
+    return measure_speed_again(Path(settings.run), settings, settings.methods, progress)

@@ -8,7 +8,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import Any, Literal, get_args, get_type_hints
 
 from ..configuration import build_arguments
 from ..contracts import Clip, Progress
@@ -22,6 +22,7 @@ from .config import RunConfig, RunOptions
 from .store import RunFolder
 
 log = logging.getLogger(__name__)
+Plugins = Literal["methods", "metrics"]
 HARNESS = ("progress", "remembered")
 """Keywords of a reader that are no settings: the harness gives them, see `DatasetSpec`."""
 
@@ -109,6 +110,25 @@ def reader_of(root: str) -> str:
     return found[0]
 
 
+def capture_configuration(
+    data: str, out: str, reader: str = "", head: str | None = None, **others: Any
+) -> RunConfig:
+    """Settings that open a capture as a run on it would; ``others`` are further fields of `RunConfig`.
+
+    Parameters
+    ----------
+    reader : name of the dataset reader; "" for `reader_of`.
+    head : file of the head model, for captures that bring none.
+    """
+    return RunConfig(
+        data=data,
+        out=out,
+        reader=reader or reader_of(data),
+        reader_settings={} if head is None else {"head": head},
+        **others,
+    )
+
+
 def synthesis_arguments(steps: Sequence[Mapping[str, Any]], subject: str) -> dict[str, Any]:
     """Settings that make a subject's synthetic capture again, from the steps that its clip records.
 
@@ -154,6 +174,7 @@ def open_run_clips(
     altered: bool = False,
     remembered: bool = True,
     only: int | None = None,
+    used: tuple[Plugins, ...] = ("methods", "metrics"),
 ) -> tuple[RunConfig, list[Clip]]:
     """Open the captures that a run was made from; return its settings as well, see `run_configuration`.
 
@@ -162,6 +183,8 @@ def open_run_clips(
     out : becomes ``out`` of the settings, where opening may keep what took long; None: the run, whose lock is held.
     altered : return what is there even if it is not what the run was made from.
     remembered, only : see `open_clips`.
+    used : which plug-ins the caller resolves from the returned settings. Names that would import a module are refused
+        for these and for the reader alone, since opening captures needs no method and no metric.
 
     Raises
     ------
@@ -171,7 +194,7 @@ def open_run_clips(
     recorded = {clip.subject: clip.fingerprint for clip in RunFolder(run).read_manifest().clips}
     found: list[tuple[RunConfig, list[Clip]]] = []
     refused: list[InputError] = []
-    for config in _configurations(run, options):
+    for config in _configurations(run, options, used):
         config = config if out is None else replace(config, out=str(out))
         try:
             clips = open_clips(config, remembered=remembered, only=only)
@@ -196,13 +219,15 @@ def open_run_clips(
     )
 
 
-def _configurations(run: Path, options: RunOptions) -> Iterator[RunConfig]:
-    """The settings of a run with every place where its capture may be; one at least."""
+def _configurations(
+    run: Path, options: RunOptions, used: tuple[Plugins, ...] = ("methods", "metrics")
+) -> Iterator[RunConfig]:
+    """The settings of a run with every place where its capture may be; one at least. For ``used`` see `open_run_clips`."""
     folder = RunFolder(run)
     manifest = folder.read_manifest()
     config = replace(manifest.configuration, out=str(run))
     if not options.trust:
-        _check_registered(config, folder.manifest)
+        _check_registered(config, folder.manifest, used)
     if options.head is not None:
         config = replace(config, reader_settings={**config.reader_settings, "head": options.head})
     given = {"data": options.data, "reader_settings.head": options.head}
@@ -246,14 +271,13 @@ def _named(config: RunConfig) -> dict[str, str]:
     return {"data": config.data, **files, **{f"heads.{key}": path for key, path in config.heads.items()}}
 
 
-def _check_registered(config: RunConfig, manifest: Path) -> None:
+def _check_registered(config: RunConfig, manifest: Path, used: tuple[Plugins, ...]) -> None:
     """Refuse names that would import a module which a run folder names: it may come from anybody."""
-    named: Mapping[str, Sequence[str]] = {
-        "methods": config.methods,
-        "metrics": config.metrics,
-        "metric_profiles": config.metric_profiles,
-        "reader": (config.reader,),
-    }
+    named: dict[str, Sequence[str]] = {"reader": (config.reader,)}
+    if "methods" in used:
+        named["methods"] = config.methods
+    if "metrics" in used:
+        named |= {"metrics": config.metrics, "metric_profiles": config.metric_profiles}
     for key, names in named.items():
         for name in names:
             if ":" in name:

@@ -30,7 +30,7 @@ from ..contracts import (
 from ..errors import HeadbenchError, InputError, UnavailableError
 from ..io.files import check_name, digest, digest_file, grouped_writes, refuse_links
 from ..io.images import quantise, read_png, write_png
-from ..machine import PeakMemory, processor_seconds, use_device
+from ..machine import PeakMemory, ProcessorLoad, machine_name, processor_seconds, use_device
 from ..progress import RunProgress, duration, progress
 from ..protocol import Protocol
 from ..rows import ALL, Row, Rows
@@ -184,7 +184,8 @@ def fit(job: Job) -> Avatar:
         if isinstance(method, PreparedMethod):
             method.prepare(job.device)
         start, processor = time.perf_counter(), processor_seconds()
-        with PeakMemory(job.device) as memory, job.progress(TRAINING) as report:
+        load = ProcessorLoad(job.device)
+        with load, PeakMemory(job.device) as memory, job.progress(TRAINING) as report:
             try:
                 _train(job, method, report)
             except InputError as error:
@@ -204,6 +205,7 @@ def fit(job: Job) -> Avatar:
             peak_memory_bytes=memory.peak,
             memory_before_bytes=memory.before,
             **memory.device_record,
+            load={"machine": load.machine, **load.details},
             method=record,
             finished_at=datetime.now(UTC).timestamp(),
             files=job.cell.digests(avatar_files(job.cell.avatar)),
@@ -338,14 +340,24 @@ def _avatar_record(job: Job) -> tuple[str, Mapping[str, str]]:
     return ("", {}) if state is None else (state.get("derived_from", ""), state.get("files", {}))
 
 
-def measure(job: Job, avatar: Avatar, metrics: Sequence[MetricSpec]) -> Rows:
+def measure(
+    job: Job, avatar: Avatar, metrics: Sequence[MetricSpec], again: Sequence[MetricSpec] = ()
+) -> Rows:
     """Score the stored frames and the avatar as a whole; what was measured already is read back.
 
     Metrics of one implementation are one measurement: they are read back, or taken again, together. A measurement that
     gave any number is read back; one that could not be had is tried again. Damaged rows are measured again, with a
     warning. Rows of metrics that are not asked for stay in the cell's file, with what they were measured of.
+
+    Parameters
+    ----------
+    again : those of ``metrics``, all of the avatar as a whole, that are measured again, and no others that were measured or
+        tried. Their former values stay in the record of the measurements, under ``earlier``.
+
+    Raises `UnavailableError` where one of ``again`` has a value but cannot be measured any more; nothing is changed then.
     """
     known, details, old = _measured_before(job)
+    repeated = {spec.implementation for spec in again}
     rendered = recorded_frames(job)
     earlier = {
         spec.name: old.select(method=ALL, metric=spec.name, task=ALL, region=ALL, seeds=ALL)
@@ -354,7 +366,8 @@ def measure(job: Job, avatar: Avatar, metrics: Sequence[MetricSpec]) -> Rows:
     fingerprints = {spec.name: _measure_fingerprint(job, spec, rendered) for spec in metrics}
     had = {spec.implementation for spec in metrics if "ok" in set(earlier[spec.name]["status"])}
     new = {spec.implementation for spec in metrics if known.get(spec.name) != fingerprints[spec.name]}
-    wanted = [spec for spec in metrics if spec.implementation not in had - new]
+    settled = ({spec.implementation for spec in metrics} if again else had) - new - repeated
+    wanted = [spec for spec in metrics if spec.implementation not in settled]
     per_frame = [spec for spec in wanted if spec.per_frame]
     scored = [_score(job, per_frame, protocol) for protocol in job.protocols.values() if per_frame]
     measured: dict[str, Measurement | UnavailableError] = {}
@@ -363,9 +376,17 @@ def measure(job: Job, avatar: Avatar, metrics: Sequence[MetricSpec]) -> Rows:
         for spec in of_avatar:
             if spec.implementation not in measured:
                 measured[spec.implementation] = outcome = _measure_avatar(job, spec, avatar)
+                if isinstance(outcome, UnavailableError) and spec.implementation in repeated & had:
+                    raise outcome
                 found = outcome.details.items() if isinstance(outcome, Measurement) else ()
                 # JSON has no others; a metric of one of them has a row of its own.
                 details[spec.name] = {k: v for k, v in found if not isinstance(v, float) or math.isfinite(v)}
+    replaced = [spec.name for spec in metrics if spec.implementation in repeated & had]
+    step = job.cell.step("measure")
+    history = [] if step is None else [*step.get("earlier", [])]
+    if replaced:
+        history.append(_replaced(old.of_metrics(replaced)))
+    record: dict[str, Any] = {"earlier": history} if history else {}
     parts: list[Rows] = []
     for spec in metrics:
         if spec not in wanted:
@@ -376,7 +397,9 @@ def measure(job: Job, avatar: Avatar, metrics: Sequence[MetricSpec]) -> Rows:
             parts.append(Rows.of([_avatar_row(job, spec, measured[spec.implementation])]))
     result = Rows.joined(parts)
     others = sorted(old.metrics - fingerprints.keys())
-    job.cell.begin("measure", job.fit_fingerprint)  # a kill between the rows and their record is no damage
+    job.cell.begin(
+        "measure", job.fit_fingerprint, **record
+    )  # a kill between the rows and their record is no damage
     Rows.joined([result, old.of_metrics(others)] if others else [result]).write(job.cell.rows)
     job.cell.finish(
         "measure",
@@ -384,8 +407,23 @@ def measure(job: Job, avatar: Avatar, metrics: Sequence[MetricSpec]) -> Rows:
         fingerprints=known | fingerprints,
         details=details,
         rows=digest_file(job.cell.rows),
+        **record,
     )
     return result
+
+
+def _replaced(rows: Rows) -> dict[str, Any]:
+    """Values of a cell that are about to be replaced, and how they were measured, as its record keeps them."""
+    table = rows.select(method=ALL, metric=ALL, task=ALL, region=ALL, seeds=ALL)
+    table = table[table["status"] == "ok"]
+    first = table.iloc[0]
+    conditions = {name: first[name].item() for name in ("threads", "other_cores")}
+    return {
+        "replaced": datetime.now(UTC).isoformat(timespec="seconds"),
+        "machine": str(first["machine"]),
+        **{name: value for name, value in conditions.items() if math.isfinite(value)},
+        "values": dict(zip(map(str, table["metric"]), map(float, table["value"]))),
+    }
 
 
 def stored_rows(job: Job, metrics: Sequence[MetricSpec], *, retry: bool = False) -> Rows | None:
@@ -492,8 +530,12 @@ def _measure_avatar(job: Job, spec: MetricSpec, avatar: Avatar) -> Measurement |
     try:
         if spec.kind == "training":
             return metric(job.cell.step("fit") or {})  # type: ignore[no-any-return]
-        size = job.method.spec.resolution.speed_size
-        return metric(avatar, workload(job.form, job.protocols, size))  # type: ignore[no-any-return]
+        pairs = workload(job.form, job.protocols, job.method.spec.resolution.speed_size)
+        if not spec.machine_bound:
+            return metric(avatar, pairs)  # type: ignore[no-any-return]
+        with ProcessorLoad(job.device, wait=True) as load:
+            found = metric(avatar, pairs)
+        return Measurement(found.value, {**found.details, **load.details})
     except UnavailableError as error:
         return error
 
@@ -501,11 +543,23 @@ def _measure_avatar(job: Job, spec: MetricSpec, avatar: Avatar) -> Measurement |
 def _avatar_row(job: Job, spec: MetricSpec, outcome: Measurement | UnavailableError) -> Row:
     if isinstance(outcome, UnavailableError):
         return _row(job, spec, reason=str(outcome))
-    if not spec.detail:
-        return _row(job, spec, value=outcome.value, status="ok")
-    if spec.detail not in outcome.details:
+    if spec.detail and spec.detail not in outcome.details:
         return _row(job, spec, reason="The avatar does not report it.")
-    return _row(job, spec, value=float(outcome.details[spec.detail]), status="ok")
+    value = float(outcome.details[spec.detail]) if spec.detail else outcome.value
+    return replace(_row(job, spec, value=value, status="ok"), **_conditions(job, spec, outcome.details))
+
+
+def _conditions(job: Job, spec: MetricSpec, details: Mapping[str, float]) -> dict[str, Any]:
+    """Columns of a time: which machine, how many threads, how busy others were; none for what is no time."""
+    if not spec.machine_bound or "threads" not in details:
+        return {}
+    if spec.kind == "training":
+        step = job.cell.step("fit")
+        machine = "" if step is None else str(step.get("load", {}).get("machine", ""))
+    else:
+        machine = machine_name(job.device)
+    others = float(details.get("other_cores", math.nan))
+    return {"machine": machine, "threads": int(details["threads"]), "other_cores": others}
 
 
 def _row(

@@ -50,6 +50,8 @@ class StepState(TypedDict, total=False):
     seconds, processor_seconds, interruptions, peak_memory_bytes, memory_before_bytes, method : of the training.
     finished_at : when the training ended, in seconds since 1970 (UTC).
     peak_device_memory_bytes, device_memory_before_bytes, tf32 : likewise, of a CUDA device; see `PeakMemory`.
+    load : machine, threads and cores of the training, and cores that others kept busy meanwhile; see `ProcessorLoad`.
+    earlier : values that were measured again since, each time with when, on which machine and under which load.
     derived_from : digest of the trained avatar that this one was derived from without training.
     """
 
@@ -69,6 +71,8 @@ class StepState(TypedDict, total=False):
     tf32: bool
     method: dict[str, Any]
     finished_at: float
+    load: dict[str, Any]
+    earlier: list[dict[str, Any]]
     derived_from: str
 
 

@@ -108,6 +108,12 @@ def find_datasets(root: Path) -> list[Path]:
     return [root] if (root / "images").is_dir() and find_model(root) is not None else []
 
 
+def pose_files(path: str | Path) -> dict[int, Path]:
+    """The file with the tracked parameters of every timestep that has one."""
+    files = (Path(path) / TRACKING_FOLDER).glob("*.npz")
+    return {int(file.stem): file for file in files if file.stem.isdecimal()}
+
+
 def read_dataset(
     path: str | Path,
     *,

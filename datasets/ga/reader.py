@@ -207,6 +207,16 @@ def listed_frames(path: str | Path) -> dict[str, list[tuple[int, str]]]:
     }
 
 
+def pose_files(path: str | Path) -> dict[int, Path]:
+    """The ``flame_param`` file of every timestep of a capture. Raises `InputError` as `read_transforms` does."""
+    folder = find_capture(path)
+    files = [folder / file for file in layout.SPLIT_FILES.values() if (folder / file).exists()]
+    entries = [
+        entry for file in files or [folder / layout.ALL_FRAMES_FILE] for entry in read_transforms(file)
+    ]
+    return {entry.timestep: entry.parameters for entry in entries}
+
+
 def _read_splits(folder: Path, resplit: bool) -> dict[str, list[FrameEntry]]:
     """Entries by split name; with ``resplit``, ``transforms.json`` will do in place of the three."""
     paths = {name: folder / file for name, file in layout.SPLIT_FILES.items()}

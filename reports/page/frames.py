@@ -116,7 +116,7 @@ def open_truth(runs: RunSet, options: RunOptions) -> tuple[dict[str, Clip], str]
     reasons = []
     for run in runs.runs:
         try:
-            return {clip.subject: clip for clip in open_run_clips(run.folder.root, options)[1]}, ""
+            return {c.subject: c for c in open_run_clips(run.folder.root, options, used=())[1]}, ""
         except (HeadbenchError, OSError) as error:
             reasons.append(without_folders(str(error)))
     return {}, reasons[0]

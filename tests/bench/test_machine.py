@@ -1,7 +1,10 @@
 """Peak memory against allocations of known size; devices against a driver of our own."""
 
 import os
+import signal
+import subprocess
 import sys
+import time
 from types import SimpleNamespace
 from unittest.mock import Mock
 
@@ -13,6 +16,7 @@ from headbench.bench import machine
 from headbench.bench.errors import HeadbenchError, InputError
 from headbench.bench.machine import (
     PeakMemory,
+    ProcessorLoad,
     accelerators,
     check_device,
     check_device_answers,
@@ -45,6 +49,61 @@ def test_without_allocation_an_earlier_peak_does_not_count():
     with PeakMemory() as memory:
         pass
     assert memory.peak - memory.before < 100 * MB
+
+
+@pytest.mark.parametrize(
+    ("busy", "own", "wait", "expected"),
+    [
+        ((10.0, 11.5), (3.0, 3.5), True, 1.0),
+        ((10.0, 10.5), (3.0, 3.6), True, 0.0),  # the system counts in steps
+        ((10.0, 99.0), (3.0, 3.5), True, 2.0),  # no more than there are
+        ((None, None), (3.0, 3.5), True, None),
+        ((10.0, 11.5), (3.0, 3.5), False, None),  # too short to tell
+    ],
+)
+def test_the_load_is_what_cores_worked_less_the_own_time(monkeypatch, busy, own, wait, expected):
+    now = iter([100.0, 100.1, 101.0] if wait else [100.0, 100.2])
+    waited = []
+    monkeypatch.setattr(machine.time, "perf_counter", lambda: next(now))
+    monkeypatch.setattr(machine.time, "sleep", waited.append)
+    monkeypatch.setattr(machine, "processor_count", lambda: 2)
+    for name, values in (("_busy_seconds", iter(busy)), ("_own_processor_seconds", iter(own))):
+        monkeypatch.setattr(machine, name, lambda values=values: next(values))
+    with ProcessorLoad(wait=wait) as load:
+        pass
+    assert load.other_cores == expected
+    assert ("other_cores" in load.details) == (expected is not None)
+    assert waited == ([pytest.approx(0.4)] if wait else [])
+    assert (load.threads, load.cores) == (torch.get_num_threads(), 2)
+
+
+SPIN = "import time\nend = time.monotonic() + 30\nwhile time.monotonic() < end: pass"
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="another process takes init as its parent")
+@pytest.mark.parametrize("own", [True, False], ids=["a child", "another process"])
+def test_a_busy_process_is_load_unless_it_is_a_child(own):
+    line = f"{sys.executable} -c '{SPIN}' > /dev/null & echo $!"
+    if own:
+        child = subprocess.Popen([sys.executable, "-c", SPIN])
+        number = child.pid
+    else:
+        number = int(subprocess.run(line, shell=True, stdout=subprocess.PIPE, check=True, timeout=9).stdout)
+    try:
+        with ProcessorLoad() as load:
+            before, start = machine._own_processor_seconds(), time.perf_counter()
+            time.sleep(1.0)
+            spent = machine._own_processor_seconds() - before
+            share = spent / (time.perf_counter() - start)
+    finally:
+        os.kill(number, signal.SIGKILL)
+        if own:
+            child.wait()
+    if own:
+        assert share > 0.1
+    else:
+        assert share < 0.1
+        assert load.other_cores > 0.1
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="the stand-in is a shell script")

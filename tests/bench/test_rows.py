@@ -71,6 +71,30 @@ def test_rows_are_the_same_when_read_back(rows, tmp_path):
     assert again.select(**NAMED).equals(rows.select(**NAMED))
 
 
+def test_rows_of_earlier_versions_have_no_record_of_the_load(rows, tmp_path):
+    table = rows.select(**NAMED)
+    old = table.drop(columns=["machine", "threads", "other_cores"])
+    old.to_parquet(tmp_path / "rows.parquet", index=False)
+    pd.testing.assert_frame_equal(Rows.read(tmp_path / "rows.parquet").select(**NAMED), table)
+    assert set(table["machine"]) == {""}
+    assert set(table["threads"]) == {0}
+    assert table["other_cores"].isna().all()
+
+
+def test_rows_are_updated_in_their_places(rows):
+    table = rows.select(**NAMED)
+    new = Rows(
+        table[[7 <= i < 9 for i in range(len(table))]][::-1].assign(value=-1.0, machine="m", threads=2)
+    )
+    found = rows.updated(new).select(**NAMED)
+    changed = found["value"] == -1.0
+    assert list(found.index[changed]) == [7, 8]
+    assert found[~changed].equals(table[~changed])
+    assert set(found["threads"][changed]) == {2}
+    with pytest.raises(InputError, match="another: expected a row to replace"):
+        rows.updated(Rows(table.assign(metric="another")))
+
+
 def written(path, frame, **how):
     frame.to_parquet(path, index=False, **how)
     return path
@@ -95,6 +119,7 @@ def twice(path, frame):
         (lambda p, f: (p.unlink(), p.mkdir()), "no file"),
         (lambda p, f: (p.unlink(), os.mkfifo(p)), "no file"),
         (lambda p, f: written(p, f.drop(columns="protocol")), "no protocol"),
+        (lambda p, f: written(p, f.assign(other_cores=-0.5)), "other_cores: expected a number from 0"),
         (twice, "2 task"),
         (lambda p, f: written(p, f.assign(value="1")), "value: expected numbers"),
         (lambda p, f: written(p, f.assign(value=[[1.0]] * len(f))), "no value"),

@@ -1,6 +1,7 @@
 """A reader, three methods and three metrics small enough to see through, for the harness's own tests."""
 
 import copy
+import time
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
@@ -257,6 +258,15 @@ NOT_HERE = MetricSpec("not_here", "Absent", "", True, 2, "toy_plugin:not_here")
 FILES = MetricSpec("files", "Files", "", False, 0, "toy_plugin:files_in_avatar", kind="avatar")
 FILES_LOAD = replace(FILES, name="files_load", detail="frames")
 FILES_NONE = replace(FILES, name="files_none", detail="not told")
+
+
+def clock_time(avatar, workload):
+    """Another number each time, as speeds are."""
+    return Measurement(time.perf_counter(), {"half": time.perf_counter() / 2})
+
+
+CLOCK = replace(FILES, name="clock", implementation="toy_plugin:clock_time", machine_bound=True)
+CLOCK_HALF = replace(CLOCK, name="clock_half", detail="half")
 
 
 def training_steps(record):

@@ -176,7 +176,9 @@ def _count(work: Path, pipe: int, kill_at: int | None) -> Iterator[None]:
 # What a command leaves.
 
 
-TIMES = re.compile("(?i)seconds|interruptions|memory|since|started|finished|time|fingerprint|training.json")
+TIMES = re.compile(
+    "(?i)seconds|interruptions|memory|since|started|finished|time|fingerprint|load|training.json"
+)
 """Keys of what depends on the clock and on the machine, and of digests of that."""
 MEASURED = "fps|latency_|processor_time|throughput|stage_"
 """Metrics of speed, by how their names begin."""

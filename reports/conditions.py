@@ -1,0 +1,102 @@
+"""How busy the machine was, which it was and how many threads there were when the times of a table were measured."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import pandas as pd
+
+from ..bench.rows import Rows
+from ..bench.specs import MetricSpec
+from .aggregate import whole_images
+
+OTHERS_LIMIT = 0.1
+"""Cores that others may keep busy, all together, before a time is marked.
+
+A frame whose threads wait for each other takes at most a tenth longer where one of their cores is busy for a tenth of the time.
+As much lies between speeds that are measured one after another on an idle machine.
+"""
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """Of the times of one method.
+
+    Attributes
+    ----------
+    places : pairs of machine and number of threads; empty where they were not recorded.
+    others : the most cores that other processes kept busy, 0 where no load was recorded.
+    known : whether the load was recorded for all of them.
+    """
+
+    places: frozenset[tuple[str, int]]
+    others: float
+    known: bool
+
+    @classmethod
+    def of(cls, rows: pd.DataFrame) -> Conditions:
+        """Those of measured rows, at least one."""
+        recorded = rows[rows["threads"] > 0]
+        places = frozenset((str(m), int(t)) for m, t in zip(recorded["machine"], recorded["threads"]))
+        others = rows["other_cores"].astype(float).dropna()
+        return cls(places, float(others.max()) if len(others) else 0.0, len(others) == len(rows))
+
+    @property
+    def loaded(self) -> bool:
+        """Whether others used more than `OTHERS_LIMIT`."""
+        return self.others > OTHERS_LIMIT
+
+    @property
+    def text(self) -> str:
+        """Machines and threads in words; "" where they were not recorded."""
+        return "; ".join(
+            f"{machine} with {threads} thread{'s' * (threads > 1)}"
+            for machine, threads in sorted(self.places)
+        )
+
+
+def conditions(
+    rows: Rows, metrics: Sequence[MetricSpec], methods: Sequence[str]
+) -> dict[str, dict[str, Conditions]]:
+    """Conditions of each metric that depends on the machine, by metric and method, of methods that have a value of it."""
+    found: dict[str, dict[str, Conditions]] = {}
+    for metric in metrics:
+        if metric.machine_bound and not metric.per_frame:
+            own = {method: whole_images(rows, method, metric.name, "") for method in methods}
+            measured = {method: table[table["status"] == "ok"] for method, table in own.items()}
+            found[metric.name] = {m: Conditions.of(table) for m, table in measured.items() if len(table)}
+    return found
+
+
+def marks(
+    found: Mapping[str, Mapping[str, Conditions]], trivial: Sequence[str]
+) -> dict[tuple[str, str], str]:
+    """The note for each metric and method whose time does not compare with the others of its column."""
+    loads = [each.others for by_method in found.values() for each in by_method.values() if each.loaded]
+    most = f"{max(loads):.1f}" if loads else ""
+    notes = {}
+    for metric, by_method in found.items():
+        places = [each.places for method, each in by_method.items() if method not in trivial and each.places]
+        differ = len(set(places)) > 1
+        for method, each in by_method.items():
+            note = []
+            if each.loaded:
+                note.append(
+                    f"Measured under load: other processes kept more than {OTHERS_LIMIT} of a core busy, at most {most} cores."
+                )
+            if differ and each.places and method not in trivial:
+                note.append(f"Measured on {each.text}; others of this column on others: they do not compare.")
+            if note:
+                notes[metric, method] = " ".join(note)
+    return notes
+
+
+def measured_on(by_method: Mapping[str, Conditions], trivial: Sequence[str], machine: str) -> str:
+    """Machines and threads of the methods that are compared; ``machine`` where those were not recorded."""
+    compared = {method: each for method, each in by_method.items() if method not in trivial} or by_method
+    texts: dict[str, None] = {}
+    for each in compared.values():
+        if text := each.text or machine:
+            texts[text if each.known else f"{text}, load not recorded"] = None
+    return "; ".join(texts)

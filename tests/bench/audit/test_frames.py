@@ -1,0 +1,86 @@
+"""Lists of the frames to render: images named by them are scored; what does not fit is refused."""
+
+import csv
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from headbench.bench import cli
+from headbench.bench.contracts import FrameKey
+from headbench.bench.io.images import write_png
+from headbench.bench.runner.store import RunFolder
+
+
+def listed(path):
+    with path.open(newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+@pytest.mark.parametrize("renamed", [False, True])
+def test_the_ground_truth_by_the_listed_names_scores_perfectly(run, toy, tmp_path, renamed):
+    out, images = tmp_path / "frames", tmp_path / "images"
+    assert cli.main(["frames", str(run), "--out", str(out), "--trust"]) == 0
+    frames, names = listed(out / "frames.csv"), listed(out / "MAP.csv")
+    assert [row["file"] for row in frames] == [row["file"] for row in names]
+    clip = toy.read("subject1")
+    for number, row in enumerate(names):
+        if renamed:
+            row["file"] = f"mine/{number}.png"
+        key = FrameKey(row["subject"], row["sequence"], int(row["timestep"]), row["camera"])
+        write_png(images / row["file"], clip.image(key))
+    arguments = ["--like", str(run), "--label", "theirs", "--out", str(tmp_path / "theirs"), "--trust"]
+    if renamed:
+        pd.DataFrame(names).to_csv(out / "MAP.csv", index=False)
+        arguments += ["--names", str(out / "MAP.csv")]
+    assert cli.main(["evaluate", str(images), *arguments]) == 0
+    rows = pd.read_parquet(RunFolder(tmp_path / "theirs").rows)
+    assert (rows[(rows["metric"] == "ssim") & (rows["region"] == "full")]["value"] > 0.9999).all()
+    psnr = rows[(rows["metric"] == "psnr") & (rows["region"] == "full")]["value"]
+    assert len(psnr)
+    assert (psnr >= 100).all()
+
+
+def test_cameras_and_sizes_are_the_captures(run, toy, tmp_path):
+    assert cli.main(["frames", str(run), "--out", str(tmp_path / "frames"), "--trust"]) == 0
+    clip = toy.read("subject1")
+    for row in listed(tmp_path / "frames" / "frames.csv"):
+        camera = clip.cameras[row["camera"]]
+        assert (int(row["width"]), int(row["height"])) == (camera.width, camera.height)
+        assert row["background"] == "#ffffff"
+        pose = [[float(row[f"world_to_camera_{i}{j}"]) for j in range(4)] for i in range(3)]
+        np.testing.assert_array_equal(pose, camera.world_to_camera[:3])
+        assert float(row["fx"]) == camera.K[0, 0]
+
+
+@pytest.mark.parametrize(
+    ("others", "part"),
+    [
+        (["--tasks", "novel_view"], "--tasks"),
+        (["--frames-per-task", "2"], "--frames-per-task"),
+        (["--reader", "ga"], "--reader"),
+    ],
+)
+def test_options_of_a_capture_are_refused_for_a_run(run, tmp_path, capsys, others, part):
+    arguments = ["frames", str(run), "--out", str(tmp_path / "frames"), "--trust", *others]
+    assert cli.main(arguments) == 2
+    assert part in capsys.readouterr().err
+    assert not (tmp_path / "frames").exists()
+
+
+def test_an_edited_list_of_names_is_kept(run, tmp_path):
+    arguments = ["frames", str(run), "--out", str(tmp_path / "frames"), "--trust"]
+    assert cli.main(arguments) == 0
+    assert cli.main(arguments) == 0
+    path = tmp_path / "frames" / "MAP.csv"
+    path.write_text(path.read_text().replace("00000", "x"))
+    edited = path.read_text()
+    assert cli.main(arguments) == 2
+    assert path.read_text() == edited
+
+
+def test_a_capture_is_listed_as_its_run_is(run, tmp_path):
+    assert cli.main(["frames", str(run), "--out", str(tmp_path / "a"), "--trust"]) == 0
+    reader = ["--reader", "toy_plugin:READER"]
+    assert cli.main(["frames", str(tmp_path / "data"), "--out", str(tmp_path / "b"), *reader]) == 0
+    assert listed(tmp_path / "a/frames.csv") == listed(tmp_path / "b/frames.csv")
