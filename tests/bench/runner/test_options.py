@@ -113,7 +113,9 @@ def test_a_module_that_a_run_names_is_not_imported(run, monkeypatch, tmp_path, c
     ):
         assert cli.main([*command, str(run)]) == code
         shown = "".join(capsys.readouterr())
-        needs_no_method = command[0] == "evaluate" and "methods" in change  # it opens captures, and computes metrics
+        needs_no_method = (
+            command[0] == "evaluate" and "methods" in change
+        )  # it opens captures, and computes metrics
         for words in (f"configuration.{next(iter(change))}", "--trust", "'stranger:SPEC'"):
             assert needs_no_method or words in shown
     assert cli.main(["table", str(run)]) in (0, 2)
