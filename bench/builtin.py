@@ -19,7 +19,7 @@ from .errors import HeadbenchError, InputError
 from .executors.command import ExecutionOptions, chosen_execution
 from .executors.settings import Execution, ExecutorName, check_executor
 from .io.documents import read_yaml
-from .io.files import check_output_folder, check_writable, removed_if_empty, write_json
+from .io.files import check_output_folder, check_writable, removed_if_empty, write_json, write_text
 from .io.lock import locked
 from .machine import check_device
 from .progress import log_to_file
@@ -186,8 +186,8 @@ class TableSettings:
 
     runs: tyro.conf.Positional[tuple[str, ...]]
     """Folders of the runs."""
-    format: Literal["md", "csv", "latex", "html", "json"] = "md"
-    """Markdown, CSV, LaTeX (booktabs), a page of HTML, or JSON."""
+    format: Literal["md", "csv", "latex", "html", "json"] | None = None
+    """Markdown, CSV, LaTeX (booktabs), a page of HTML, or JSON. Default: by the suffix of --out, else md."""
     layout: str = "comparison"
     """Which table: comparison, speed (latency, throughput, stages), cost (storage, training), or the paper's: paper-1
     (all methods), paper-3 (INSTA and ours), paper-4 (what an expression may change: a run each)."""
@@ -197,12 +197,32 @@ class TableSettings:
     """Region of the frames to show instead of the whole, such as face."""
     sequences: tuple[str, ...] = ()
     """Only frames of these sequences; default: all."""
+    columns: tuple[str, ...] = ()
+    """Only these metrics and tasks of the layout, by name and in this order, such as `psnr novel_view`; default: all."""
+    digits: tuple[str, ...] = ()
+    """Decimals shown, of all metrics or of one: `3`, `psnr=1 lpips=4`. Default: the layout's."""
+    out: str | None = None
+    """File to write the table to, instead of printing it."""
+
+
+SUFFIXES = {".tex": "latex", ".html": "html", ".csv": "csv", ".json": "json"}
+"""Formats of tables by the suffix of a file; Markdown otherwise."""
 
 
 def table(settings: TableSettings, progress: Progress) -> Findings:
-    """Print a table of finished runs on the same frames."""
-    text = _table(**asdict(settings))
-    return Findings(text, {"format": settings.format, "table": text})
+    """Print a table of finished runs on the same frames, or write it to a file."""
+    options = asdict(settings)
+    out = options.pop("out")
+    if out is not None:
+        check_writable(Path(out), "--out")
+    suffix = Path(out or "").suffix.lower()
+    options["format"] = settings.format or SUFFIXES.get(suffix, "md")
+    text = _table(**options)
+    data = {"format": options["format"], "table": text}
+    if out is None:
+        return Findings(text, data)
+    write_text(Path(out), text)
+    return Findings(out, {**data, "out": out})
 
 
 @dataclass(frozen=True)

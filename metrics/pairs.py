@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..bench.contracts import ByteArray, IntArray
-from ..bench.errors import InputError
+from ..bench.errors import InputError, UnavailableError
 from ..bench.native.loader import Kernel
 
 Mask = NDArray[np.bool_]
@@ -22,22 +22,26 @@ KERNEL = Kernel(
 
 
 def check_pair(image: ByteArray, target: ByteArray, smallest: int = 1) -> None:
-    """Raise `InputError` unless both are (H, W, 3) 8-bit images of one size, H and W at least ``smallest``."""
+    """Raise `InputError` unless both are (H, W, 3) 8-bit images of one size.
+
+    Raises `UnavailableError` where H or W is below ``smallest``: the metric has no value for such images, which is
+    shown in its place.
+    """
     for key, array in (("image", image), ("target", target)):
         if not isinstance(array, np.ndarray) or array.dtype != np.uint8:
             found = str(getattr(array, "dtype", type(array).__name__))
             remedy = "Quantise renders with headbench.bench.io.images.quantise."
             raise InputError("metric", key, "an array of 8-bit unsigned integers", found, remedy)
-        if array.ndim != 3 or array.shape[2] != 3:
+        if array.ndim != 3 or array.shape[2] != 3 or not array.size:
             raise InputError("metric", key, "shape (height, width, 3)", str(array.shape))
-        if min(array.shape[:2]) < smallest:
-            raise InputError(
-                "metric", key, f"at least {smallest} pixels in height and width", str(array.shape)
-            )
     if image.shape != target.shape:
         raise InputError(
             "metric", "image", f"the shape of the ground truth, {target.shape}", str(image.shape)
         )
+    height, width = image.shape[:2]
+    if min(height, width) < smallest:
+        note = f"The metric needs images of at least {smallest} x {smallest} pixels; these have {width} x {height}."
+        raise UnavailableError(note, "Take larger images or leave out the metric.", note)
 
 
 def stack_masks(masks: Mapping[str, Mask], target: ByteArray) -> ByteArray:

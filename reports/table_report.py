@@ -6,7 +6,8 @@ The paper is "3D Gaussian Head Avatars with Expressive Dynamic Appearances by Co
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -16,6 +17,7 @@ from ..bench.errors import InputError
 from ..bench.io.documents import read_json
 from ..bench.io.files import grouped_writes, write_text
 from ..bench.manifest import MethodRecord
+from ..bench.registry import unknown
 from ..bench.specs import MetricSpec
 from .runs import WHOLE, Part, RunSet
 from .tables import AVATAR_TITLE, Table, TableCell, TableRow, build_table
@@ -35,6 +37,51 @@ QUALITY = {"psnr": 2, "ssim": 3, "lpips": 3}
 
 
 @dataclass(frozen=True)
+class Columns:
+    """What a table shows of its layout: metrics and tasks by ``names`` (none of a kind named: all of it), and digits.
+
+    ``digits`` are numbers of decimals, as "3" for every metric and "psnr=1" for one.
+    """
+
+    names: tuple[str, ...] = ()
+    digits: tuple[str, ...] = ()
+
+    def of(self, offered: Iterable[str]) -> tuple[str, ...]:
+        """Those of the ``offered`` names that are asked for, in the order asked for."""
+        names = tuple(offered)
+        return tuple(dict.fromkeys(name for name in self.names if name in names)) or names
+
+    def check(self, metrics: Iterable[str], tasks: Iterable[str]) -> None:
+        """Raise `InputError` for a name that is neither a metric nor a task of the layout, and for digits that are none."""
+        metrics = tuple(metrics)
+        for name in self.names:
+            if name not in (*metrics, *tasks):
+                raise unknown("command line", "--columns", name, (*metrics, *tasks))
+        for metric in self._decimals:
+            if metric not in ("", *metrics):
+                raise unknown("command line", "--digits", metric, metrics)
+
+    def shown(self, spec: MetricSpec) -> MetricSpec:
+        """A metric with the digits asked for."""
+        decimals = self._decimals
+        return replace(spec, digits=decimals.get(spec.name, decimals.get("", spec.digits)))
+
+    @property
+    def _decimals(self) -> dict[str, int]:
+        """Digits by metric, "" for all others."""
+        found = {}
+        for word in self.digits:
+            metric, _, number = word.rpartition("=")
+            if not re.fullmatch("[0-9]", number):
+                raise InputError("command line", "--digits", "N or METRIC=N with N from 0 to 9", word)
+            found[metric] = int(number)
+        return found
+
+
+ALL_COLUMNS = Columns()
+
+
+@dataclass(frozen=True)
 class PaperLayout:
     """A table of the paper: ``digits`` of each metric, in the order of the columns, and ``methods``, () for all."""
 
@@ -42,14 +89,15 @@ class PaperLayout:
     digits: Mapping[str, int] = field(default_factory=lambda: {**QUALITY, "storage": 1, "fps": 0})
     methods: tuple[str, ...] = ()
 
-    def metrics(self, runs: RunSet, name: str) -> tuple[MetricSpec, ...]:
-        """Columns. Raises `InputError` for a metric or a task that the runs lack."""
+    def metrics(self, runs: RunSet, name: str, columns: Columns) -> tuple[MetricSpec, ...]:
+        """The metrics shown. Raises `InputError` for a metric or a task of the layout that is asked for and the runs lack."""
         known = {spec.name: spec for spec in runs.metrics}
-        for what, wanted, there in (("metrics", self.digits, known), ("tasks", TASKS, runs.tasks)):
+        digits = {metric: self.digits[metric] for metric in columns.of(self.digits)}
+        for what, wanted, there in (("metrics", digits, known), ("tasks", columns.of(TASKS), runs.tasks)):
             if not set(wanted) <= set(there):
                 expected, found = ", ".join(wanted), ", ".join(there)
                 raise InputError(runs.runs[0].folder.root, f"{what} of layout {name}", expected, found)
-        return tuple(replace(known[metric], digits=digits) for metric, digits in self.digits.items())
+        return tuple(replace(known[metric], digits=number) for metric, number in digits.items())
 
     def labels(self, runs: RunSet, name: str) -> dict[str, str]:
         """Rows: labels of methods and how the paper writes them, in its order; without trivial baselines."""
@@ -172,11 +220,13 @@ def table_text(
     published: bool = False,
     region: str = WHOLE.region,
     sequences: tuple[str, ...] = (),
+    columns: tuple[str, ...] = (),
+    digits: tuple[str, ...] = (),
 ) -> str:
     """Return a table of one or more runs as text, in a format of `WRITERS`.
 
-    ``published`` adds columns with the figures that papers printed; ``region`` and ``sequences`` are those of `Part`. Raises `InputError` for a format, a layout or
-    runs that do not fit.
+    ``published`` adds columns with the figures that papers printed; ``region`` and ``sequences`` are those of `Part`,
+    ``columns`` and ``digits`` those of `Columns`. Raises `InputError` for a format, a layout, columns or runs that do not fit.
     """
     if format not in WRITERS:
         raise InputError("table", "format", f"one of {', '.join(WRITERS)}", repr(format))
@@ -185,7 +235,7 @@ def table_text(
     if layout not in known:
         raise InputError(run_folders[0], "layout", f"one of {', '.join(known)}", repr(layout))
     _, write = WRITERS[format]
-    return write(table_of(runs, layout, published))
+    return write(table_of(runs, layout, published, Columns(columns, digits)))
 
 
 def layouts(runs: RunSet) -> tuple[str, ...]:
@@ -194,16 +244,25 @@ def layouts(runs: RunSet) -> tuple[str, ...]:
     return tuple(dict.fromkeys([COMPARISON, *asked]))
 
 
-def table_of(runs: RunSet, layout: str = COMPARISON, published: bool = False) -> Table:
+def table_of(
+    runs: RunSet, layout: str = COMPARISON, published: bool = False, columns: Columns = ALL_COLUMNS
+) -> Table:
     """Build a table of runs that were read."""
     names = {label: label for label in runs.methods}
     if layout in PAPER:
-        metrics = PAPER[layout].metrics(runs, layout)
+        columns.check(PAPER[layout].digits, TASKS)
+        metrics = PAPER[layout].metrics(runs, layout, columns)
         names = PAPER[layout].labels(runs, layout)
     else:
-        metrics = tuple(metric for metric in runs.metrics if layout in metric.tables)
+        known = {metric.name: metric for metric in runs.metrics if layout in metric.tables}
+        columns.check(known, runs.tasks if any(metric.per_frame for metric in known.values()) else ())
+        metrics = tuple(known[name] for name in columns.of(known))
+    metrics = tuple(map(columns.shown, metrics))
     # A table without frames' metrics is about no task.
-    tasks = runs.tasks if any(metric.per_frame for metric in metrics) else ()
+    tasks = columns.of(runs.tasks) if any(metric.per_frame for metric in metrics) else ()
+    if not tasks and set(columns.names) & set(runs.tasks):
+        found = ", ".join(columns.names)
+        raise InputError("command line", "--columns", "a metric of frames beside a task", found)
     table = build_table(
         runs.rows,
         metrics,
@@ -214,13 +273,14 @@ def table_of(runs: RunSet, layout: str = COMPARISON, published: bool = False) ->
         image_size=runs.image_size,
         machine=runs.machine,
         part=runs.part if tasks else "",
-        missing=runs.missing if tasks else (),
+        missing=runs.missing if tasks == runs.tasks else (),
         keys=runs.keys,
         avatar_title=TITLES.get(layout, AVATAR_TITLE),
+        name=layout,
     )
     if published:
         table = with_published(table, layout, runs.records)
-        if not any(column.published for column in table.columns):
+        if not table.has_published:
             found = f"none for {', '.join(names)} in layout {layout}"
             raise InputError("table", "--published", "a layout with figures that papers printed", found)
     return table.mapped(lambda row: replace(row, method=names[row.method]))

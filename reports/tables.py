@@ -88,8 +88,11 @@ class TaskSummary:
 
 @dataclass(frozen=True)
 class Table:
-    """A comparison, ready to be written in any format. ``marking`` says what the ranks mean, and by which test,
-    ``part`` which part of the frames the values are of, "" for all, ``missing`` why a task has no columns."""
+    """A comparison, ready to be written in any format.
+
+    ``marking`` says what the ranks mean, and by which test (``tested``: whether there is one), ``part`` which part of
+    the frames the values are of, "" for all, ``missing`` why a task has no columns, ``name`` the layout.
+    """
 
     columns: tuple[Column, ...]
     groups: tuple[tuple[str, tuple[TableRow, ...]], ...]  # (title, rows); empty groups are left out
@@ -101,6 +104,8 @@ class Table:
     machine: str = ""
     part: str = ""
     missing: tuple[str, ...] = ()
+    name: str = ""
+    tested: bool = False
 
     @property
     def rows(self) -> tuple[TableRow, ...]:
@@ -115,6 +120,11 @@ class Table:
     @property
     def caption(self) -> str:
         """One paragraph: what was measured, on how much, under which protocol, and how it was averaged."""
+        return " ".join(self.facts)
+
+    @property
+    def facts(self) -> tuple[str, ...]:
+        """The sentences of the caption."""
         parts = []
         for task in self.tasks:
             size = f"{counted(task.frames, 'frame')}, {counted(task.subjects, 'subject')}"
@@ -127,15 +137,48 @@ class Table:
         seeds = spread if self.seeds > 1 else "one seed"
         parts.append(f"Mean over frames, then sequences, then subjects; {seeds}.")
         parts += [self.marking] if self.marking else []
-        if any(column.published for column in self.columns):
-            parts.append(
-                "Columns headed published: figures from papers, of other data and code, not comparable."
-            )
-        if self.machine and any(column.metric == "fps" for column in self.columns):
+        parts += [PUBLISHED] if self.has_published else []
+        if self.machine and self.has_speed:
             parts.append(f"Speed measured on {self.machine}.")
+        return tuple(parts)
+
+    @property
+    def short_caption(self) -> str:
+        """What a paper prints above the table: `caption` without protocols and without how values were averaged."""
+        subjects = [counted(task.subjects, "subject") for task in self.tasks]
+        same = subjects[0] if len(set(subjects)) == 1 else ""
+        tasks = []
+        for task, own in zip(self.tasks, subjects):
+            sizes = filter(None, [counted(task.frames, "frame"), "" if same else own])
+            tasks.append(f"{task.title} ({', '.join(sizes)})")
+        what = " and ".join(tasks) or " and ".join(dict.fromkeys(column.title for column in self.columns))
+        size = f"images of {self.image_size.replace(' x ', '×')} pixels" if self.image_size else ""
+        parts = [", ".join(filter(None, [what, same, size])) + "."]
+        parts += [self.part] if self.part else []
+        parts += [f"Mean ± standard deviation over {self.seeds} seeds."] if self.seeds > 1 else []
+        ranks = {cell.rank for row in self.rows for cell in row.cells} - {None}
+        if ranks:
+            best = "All methods not distinguishable from the best in bold" if self.tested else "Best in bold"
+            places = ["second underlined", *(["third in italics"] if 3 in ranks else [])]
+            digits = [] if self.tested else ["by the digits shown"]
+            parts.append(", ".join([best, *places, *digits]) + ".")
+        parts += [PUBLISHED] if self.has_published else []
+        if self.machine and self.has_speed:
+            parts.append(f"Speed on {self.machine}.")
         return " ".join(parts)
 
+    @property
+    def has_published(self) -> bool:
+        """Whether a column has figures from papers."""
+        return any(column.published for column in self.columns)
 
+    @property
+    def has_speed(self) -> bool:
+        """Whether a column has frames per second."""
+        return any(column.metric == "fps" for column in self.columns)
+
+
+PUBLISHED = "Columns headed published: figures from papers, of other data and code, not comparable."
 AVATAR_TITLE = "Avatar"
 METHODS_TITLE = "Methods"
 TRIVIAL_TITLE = "Trivial baselines (not ranked)"
@@ -155,6 +198,7 @@ def build_table(
     missing: Sequence[str] = (),
     keys: Mapping[str, Collection[FrameKey]] | None = None,
     avatar_title: str = AVATAR_TITLE,
+    name: str = "",
 ) -> Table:
     """Build the comparison table of whole images.
 
@@ -170,6 +214,7 @@ def build_table(
     protocol_ids : readable name of each task's protocol, for the caption, like ``image_size``, ``machine`` (where the rows do not
         tell on which one speed was measured), ``part`` and the sentences of ``missing``.
     avatar_title : heading of the columns that are of no task.
+    name : of the layout.
 
     Raises
     ------
@@ -220,6 +265,8 @@ def build_table(
         machine=measured_on(found.get("fps", {}), trivial, machine),
         part=part,
         missing=tuple(missing),
+        name=name,
+        tested=any(best is not None and best.methods is not None for best in bests),
     )
 
 

@@ -83,7 +83,8 @@ LATEX_MACROS = {
     "tabpublished": r"\textsf{#1}",
 }
 LATEX_RANKS = {1: "tabfirst", 2: "tabsecond", 3: "tabthird"}
-LATEX_PAGE = r"""% For coloured cells load colortbl and, before this file:
+LATEX_PAGE = r"""% Needs the packages booktabs and graphicx, and a file read as UTF-8, which LaTeX does since 2018.
+% For coloured cells load colortbl and, before this file:
 % \newcommand{\tabfirst}[1]{\cellcolor[rgb]{1,0.6,0.6}#1}, likewise \tabsecond and \tabthird.
 MACROS
 \begin{table*}[t]
@@ -104,12 +105,13 @@ NARROW = 8
 """Columns up to which a table keeps the distance between them."""
 
 
-def to_latex(table: Table, label: str = "tab:headbench") -> str:
-    r"""Write a ``table*`` environment for ``\input``, with booktabs rules.
+def to_latex(table: Table) -> str:
+    r"""Write a ``table*`` environment for ``\input``, with booktabs rules and a caption as papers print it.
 
     It needs the packages booktabs and graphicx; a table wider than the page is scaled to fit it. The macros
     ``\tabfirst``, ``\tabsecond``, ``\tabthird``, ``\tabspread`` and ``\tabpublished`` are provided only if the author
-    has not defined them before; define them to restyle every table at once. The protocol stands in a comment, too.
+    has not defined them before; define them to restyle every table at once. Comments before it state the protocol,
+    the frames and how values were averaged. The label is ``tab:headbench-`` and the layout's name.
     """
     heads, rules, start = [""], [], 2
     for title, count in _spans(table):
@@ -134,15 +136,15 @@ def to_latex(table: Table, label: str = "tab:headbench") -> str:
     parts = {
         "MACROS": "\n".join(rf"\providecommand{{\{name}}}[1]{{{x}}}" for name, x in LATEX_MACROS.items()),
         "NARROW": "\n" + r"\setlength{\tabcolsep}{3pt}" if len(table.columns) > NARROW else "",
-        "CAPTION": escape_latex(table.caption),
-        "LABEL": re.sub(r"[^A-Za-z0-9:.-]", "-", label),
+        "CAPTION": escape_latex(table.short_caption),
+        "LABEL": re.sub(r"[^A-Za-z0-9:.-]", "-", f"tab:headbench-{table.name or 'table'}"),
         "COLUMNS": "l" + "r" * len(table.columns),
         "HEAD": "\n".join([" & ".join(heads) + r" \\", " ".join(rules), " & ".join(names) + r" \\"]),
         "BODY": "\n".join(body),
         "NOTES": "\n".join(notes),
     }
-    comments = [f"{t.title}: protocol {t.protocol_id} {t.protocol_hash}" for t in table.tasks]
     page = re.sub("|".join(parts), lambda match: parts[match[0]], LATEX_PAGE)
+    comments = (f"A table of headbench{f', layout {table.name}' if table.name else ''}.", *table.facts)
     return "".join(f"% {' '.join(text.split())}\n" for text in comments) + page
 
 

@@ -186,6 +186,7 @@ CASES = {
         *(case(f"table {{demo}} --layout {layout} --format csv", FORMATS["csv"]) for layout in LAYOUTS),
         case("table {demo} --layout paper-4 --published", "Published"),
         case("table {demo} plain", "one seed"),
+        case("table {demo} --columns psnr novel_view --digits 1 --out t.tex", "t.tex", "t.tex"),
         case("table {demo} --region face --sequences FREE", "Region: face. Sequences: FREE."),
     ],
     "report": [

@@ -88,10 +88,10 @@ def test_symmetry_identity_and_batches(random_weights):
     assert metric.distances(images[:0], truths[:0]).shape == (0,)
 
 
-def test_frames_a_network_cannot_see_are_refused(random_weights):
+def test_frames_a_network_cannot_see_have_no_value(random_weights):
     metric = Lpips("alex", weights=random_weights)
     small = frames(1, (30, 64))[0]
-    with pytest.raises(InputError, match="at least 31"):
+    with pytest.raises(UnavailableError, match="at least 31 x 31 pixels; these have 64 x 30"):
         metric(small, small)
     with pytest.raises(InputError, match="two stacks"):
         metric.distances(frames(2), frames(3))

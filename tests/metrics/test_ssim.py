@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from skimage.metrics import structural_similarity
 
-from headbench.bench.errors import InputError
+from headbench.bench.errors import InputError, UnavailableError
 from headbench.metrics import pairs as structural
 from headbench.metrics.ssim import (
     Ssim,
@@ -97,12 +97,12 @@ def test_constant_images_have_a_closed_form(form):
 
 
 @EVERY_FORM
-def test_the_smallest_image_is_scored_and_a_smaller_refused(form):
+def test_an_image_below_the_smallest_has_no_value(form):
     side = form.form.smallest
     image, truth = noisy_pair(1, side, side)
     assert form(image, truth) == pytest.approx(ssim_map(image, truth, form.form).mean(), abs=1e-12)
     if side > 1:
-        with pytest.raises(InputError, match=f"at least {side} pixels"):
+        with pytest.raises(UnavailableError, match=f"at least {side} x {side} pixels"):
             form(image[:, 1:], truth[:, 1:])
 
 

@@ -137,6 +137,7 @@ def write_run(tmp_path, write_manifest):
                 *(m, m.upper(), "", m not in ("lpips", "storage"), 4, "m:m"),
                 kind="avatar" if m in of_avatar else "frame",
                 machine_bound=m == "fps",
+                tables=("comparison", *{"storage": ("cost",), "fps": ("speed",)}.get(m, ())),
             )
             for m in lines
         ]

@@ -1,10 +1,19 @@
+import json
+
+import pandas as pd
 import pytest
 
 from headbench.bench.errors import InputError
+from headbench.bench.rows import Rows
+from headbench.bench.runner.store import RunFolder
 from headbench.reports.runs import RunSet
 from headbench.reports.table_report import published_rows, table_of, table_text
 
+from .latex import check_latex, compile_latex
+from .made_rows import TASKS
+
 METRICS = ("psnr", "ssim", "lpips", "storage", "fps")
+ALL = [f"{task}/{name}" for task in TASKS for name in METRICS[:3]] + [*METRICS[3:]]
 OPACITY, GEOMETRY = (
     {"lines": {"dynamic": [*names]}} for names in (["opacity"], ["position", "rotation", "scale"])
 )
@@ -69,6 +78,80 @@ def test_a_published_figure_stands_under_that_word(write_run, format):
     assert "32.97" in text
     assert text.lower().count("published") >= 8
     assert "32.97" not in table_text([folder], format, "paper-3")
+
+
+def test_every_layout_compiles_in_latex(write_run, tmp_path):
+    methods = {"ours": 33.0, "my_own-2": 32.0, "ga": 31.0, "insta": 28.0, "mean-image": 17.0}
+    folder = write_run("a", methods, {"ours": OPACITY})
+    other = write_run("b", {"ours": 33.0}, {"ours": GEOMETRY})
+    published = ("paper-1", "paper-3", "paper-4")
+    texts = [
+        *(table_text([folder], "latex", layout) for layout in ("comparison", "speed", "cost")),
+        *(table_text([folder, other], "latex", layout, layout != "paper-1") for layout in published),
+    ]
+    for text in texts:
+        check_latex(text)
+    compile_latex(texts, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("layout", "columns", "digits", "shown"),
+    [
+        ("comparison", (), (), ALL),
+        ("comparison", ("lpips", "psnr"), (), [f"{task}/{m}" for task in TASKS for m in ("lpips", "psnr")]),
+        ("comparison", ("psnr", "self_reenactment"), (), ["self_reenactment/psnr"]),
+        (
+            "comparison",
+            ("self_reenactment",),
+            (),
+            [name for name in ALL if not name.startswith("novel_view")],
+        ),
+        ("comparison", ("storage",), ("storage=3",), ["storage"]),
+        ("paper-1", ("ssim", "novel_view"), ("1",), ["novel_view/ssim"]),
+        ("speed", ("fps",), ("2",), ["fps"]),
+    ],
+)
+def test_columns_and_digits_are_chosen(write_run, layout, columns, digits, shown):
+    folder = write_run("a", {"ga": 31.0, "gbs": 30.0})
+    text = table_text([folder], "json", layout, columns=columns, digits=digits)
+    table = json.loads(text)
+    found = [f"{c['task']}/{c['metric']}".lstrip("/") for c in table["columns"]]
+    assert found == shown
+    decimals = {digits[0].rpartition("=")[2]} if digits else None
+    cells = [cell["text"] for _, rows in table["groups"] for row in rows for cell in row["cells"]]
+    assert decimals is None or {str(len(text.partition(".")[2])) for text in cells} == decimals
+    whole = json.loads(table_text([folder], "json", layout))
+    assert columns or digits or table == whole
+
+
+@pytest.mark.parametrize(
+    ("layout", "columns", "digits", "message"),
+    [
+        ("comparison", ("psrn",), (), "--columns: expected one of .*, found 'psrn'.*Did you mean 'psnr'"),
+        ("speed", ("psnr",), (), "--columns: expected one of fps, found 'psnr'"),
+        ("speed", ("novel_view",), (), "--columns: expected one of fps, found 'novel_view'"),
+        ("paper-4", ("fps",), (), "--columns: expected one of .*, found 'fps'"),
+        ("comparison", ("storage", "novel_view"), (), "--columns: expected a metric of frames beside a task"),
+        ("comparison", (), ("x",), "--digits: expected N or METRIC=N with N from 0 to 9, found x"),
+        ("comparison", (), ("-1",), "--digits: expected N or METRIC=N with N from 0 to 9, found -1"),
+        ("comparison", (), ("psrn=2",), "--digits: expected one of .*, found 'psrn'"),
+    ],
+)
+def test_columns_and_digits_that_a_table_lacks_are_refused(write_run, layout, columns, digits, message):
+    folder = write_run("a", {"ours": 31.0})
+    with pytest.raises(InputError, match=message):
+        table_text([folder], "md", layout, columns=columns, digits=digits)
+
+
+def test_a_layout_needs_the_metrics_that_are_shown_alone(write_run, change_manifest):
+    folder = write_run("a", {"ours": 31.0})
+    file = RunFolder(folder).rows
+    rows = pd.read_parquet(file)
+    Rows(rows[rows["metric"] != "lpips"]).write(file)
+    change_manifest(folder, lambda m: m.update(metrics=[s for s in m["metrics"] if s["name"] != "lpips"]))
+    with pytest.raises(InputError, match="metrics of layout paper-1"):
+        table_text([folder], "md", "paper-1")
+    assert "31.00" in table_text([folder], "md", "paper-1", columns=("psnr",))
 
 
 def test_layouts_that_a_run_cannot_fill_are_refused(write_run, make_run):

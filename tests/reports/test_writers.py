@@ -1,6 +1,7 @@
 import csv
 import io
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
@@ -18,6 +19,7 @@ from headbench.reports.writers import (
     to_markdown,
 )
 
+from .latex import check_latex, compile_latex, depth
 from .made_rows import table_of
 
 NASTY = "a_b%&{x}$#^~\\|*<i>`é"
@@ -83,28 +85,10 @@ def test_csv_holds_no_formula_of_a_spreadsheet(value, cell):
     assert line == [cell, "1"]
 
 
-def balance(text):
-    """Depth of unescaped braces at the end; -1 as soon as one closes that was not opened."""
-    depth = 0
-    for brace in re.sub(r"\\.", "", text):
-        depth += {"{": 1, "}": -1}.get(brace, 0)
-        if depth < 0:
-            return -1
-    return depth
-
-
 def test_latex_is_a_balanced_booktabs_table(table):
     text = to_latex(table)
-    code = [line for line in text.splitlines() if not line.startswith("%")]
-    assert balance("\n".join(code)) == 0
-    opened = re.findall(r"\\begin\{(\S+?)\}", text)
-    assert opened == ["table*", "tabular", "minipage"]
-    assert re.findall(r"\\end\{(\S+?)\}", text) == ["tabular", "minipage", "table*"]
-    body = [line for line in code if line.endswith(r"\\")]
-    for line in body:
-        spanned = sum(int(n) - 1 for n in re.findall(r"\\multicolumn\{(\d+)\}", line))
-        assert len(re.findall(r"(?<!\\)&", line)) + spanned == 5, line
-    assert text.startswith("% Novel view: protocol  hash-novel_view".replace("  ", " "))
+    check_latex(text)
+    assert re.findall(r"\\begin\{(\S+?)\}", text) == ["table*", "tabular", "minipage"]
     for rule in (r"\toprule", r"\midrule", r"\bottomrule", r"\cmidrule(lr){2-3} \cmidrule(lr){4-5}"):
         assert rule in text
     assert r"PSNR\,(dB) $\uparrow$ & LPIPS $\downarrow$" in text
@@ -115,6 +99,46 @@ def test_latex_is_a_balanced_booktabs_table(table):
     assert r"No 100\% weights\_file." in text
 
 
+def test_latex_has_a_short_caption_and_the_protocol_in_comments(table):
+    table = replace(table, name="paper-1", image_size="144 x 208", part="Region: face.")
+    lines = to_latex(table).splitlines()
+    (caption,) = (line for line in lines if line.startswith(r"\caption"))
+    assert caption == (
+        r"\caption{Novel view (5 frames) and Self-reenactment (5 frames), 2 subjects, "
+        r"images of 144$\times$208 pixels. Region: face. Best in bold, second underlined, by the digits shown.}"
+    )
+    comments = "\n".join(line for line in lines if line.startswith("% "))
+    assert "booktabs and graphicx" in comments
+    for fact in table.facts:
+        assert f"% {fact}\n" in comments
+    assert "protocol (hash-novel_view)" in comments
+    assert r"\label{tab:headbench-paper-1}" in lines
+
+
+def test_latex_compiles_whatever_names_hold(table, tmp_path):
+    names = [NASTY, "ours_2 50% #1 & \\input{x} ^ ~", "naïve Ærø ÿ", "日本語 – “x” …", "a\nb \\end{tabular}"]
+    noted = table.notes[0] + " ".join(names)
+    tables = [
+        replace(
+            table.mapped(lambda row, name=name: replace(row, method=name, cells=marked(row.cells))),
+            name=f"table {number}",
+            notes=(noted,),
+            image_size="144 x 208",
+        )
+        for number, name in enumerate(names)
+    ]
+    texts = [to_latex(one) for one in tables]
+    for text in texts:
+        check_latex(text)
+        assert r"\tabfirst{30.13}\textsuperscript{1}" in text
+    compile_latex(texts, tmp_path)
+
+
+def marked(cells):
+    """The cells, each with a note."""
+    return tuple(replace(cell, note=0) for cell in cells)
+
+
 def test_latex_of_a_nasty_name():
     expected = r"a\_b\%\&\{x\}\$\#\textasciicircum{}\textasciitilde{}\textbackslash{}\textbar{}*\textless{}i\textgreater{}`é"
     assert escape_latex(NASTY) == expected
@@ -123,7 +147,7 @@ def test_latex_of_a_nasty_name():
 @given(st.text(max_size=40))
 def test_latex_text_has_no_live_character(text):
     escaped = escape_latex(text)
-    assert balance(escaped) == 0
+    assert depth(escaped) == 0
     bare = re.sub(r"\$\\[a-z]+\$|\\[a-zA-Z]+|\\[{}$&#%_]", "", escaped)
     assert not set(bare) & set("\\$&#%_^~\n")
     assert all(ord(c) < 256 for c in escaped)

@@ -1,0 +1,83 @@
+"""Checks of LaTeX tables: by a small parser, and by pdfLaTeX where it is installed."""
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+COMMANDS = set(
+    re.findall(
+        r"\w+",
+        """
+        providecommand begin end centering setlength tabcolsep caption label sbox toprule midrule bottomrule cmidrule
+        multicolumn emph textbf underline textit textsf textsuperscript scriptsize footnotesize ifdim wd linewidth
+        resizebox usebox else fi par pm times mu uparrow downarrow rightarrow dots textbackslash textasciicircum
+        textasciitilde textless textgreater textbar texttt tabfirst tabsecond tabthird tabspread tabpublished
+        """,
+    )
+)
+"""What LaTeX, booktabs and graphicx define, and the table's own macros."""
+
+ARTICLE = r"""\documentclass{article}
+\usepackage{booktabs,graphicx}
+\begin{document}
+%s
+\end{document}
+"""
+
+
+def depth(text):
+    """Depth of unescaped braces at the end; -1 as soon as one closes that was not opened."""
+    count = 0
+    for brace in re.findall("[{}]", re.sub(r"\\.", "", text)):
+        count += 1 if brace == "{" else -1
+        if count < 0:
+            return -1
+    return count
+
+
+def check_latex(text):
+    """Assert that a table has balanced braces and environments, lines of one width and known commands alone.
+
+    Returns its lines without comments.
+    """
+    code = [line for line in text.splitlines() if not line.startswith("%")]
+    joined = "\n".join(code)
+    assert depth(joined) == 0
+    open_environments = []
+    for kind, name in re.findall(r"\\(begin|end)\{(\S+?)\}", joined):
+        if kind == "begin":
+            open_environments.append(name)
+        else:
+            assert open_environments.pop() == name
+    assert open_environments == []
+    assert set(re.findall(r"\\([A-Za-z]+)", joined.replace(r"\\", ""))) <= COMMANDS
+    (form,) = re.findall(r"\\begin\{tabular\}\{(\w+)\}", joined)
+    rows = [line for line in code if line.endswith(r"\\")]
+    assert len(rows) > 2
+    for line in rows:
+        spanned = sum(int(n) - 1 for n in re.findall(r"\\multicolumn\{(\d+)\}", line))
+        assert len(re.findall(r"(?<!\\)&", line)) + spanned == len(form) - 1, line
+    return code
+
+
+def compile_latex(texts, folder):
+    """Compile tables in one article; the text of pdfLaTeX's log.
+
+    Asserts that there is a page, no error, no label that two tables have and no box that is wider than its line.
+    """
+    if shutil.which("pdflatex") is None:
+        pytest.skip("pdflatex is not installed")
+    names = []
+    for number, text in enumerate(texts):
+        Path(folder, f"table{number}.tex").write_text(text, encoding="utf-8")
+        names.append(rf"\input{{table{number}}}")
+    Path(folder, "paper.tex").write_text(ARTICLE % "\n\\clearpage\n".join(names), encoding="utf-8")
+    words = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "-no-shell-escape", "paper.tex"]
+    subprocess.run(words, cwd=folder, capture_output=True, check=False, timeout=120)
+    log = Path(folder, "paper.log").read_text(encoding="latin-1")
+    assert Path(folder, "paper.pdf").is_file(), log[-2000:]
+    assert re.search(r"^!|multiply[- ]defined|Overfull \\hbox", log, re.MULTILINE) is None, log[-2000:]
+    return log
