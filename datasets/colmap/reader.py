@@ -119,6 +119,8 @@ def read_dataset(
     *,
     head: str | Path | None = None,
     masks: str | Path | None = None,
+    regions: str | Path | None = None,
+    eyelids: str | Path | None = None,
     subject: str = "",
     background: Sequence[float] | None = None,
     held_out_sequences: Sequence[str] = (),
@@ -132,7 +134,7 @@ def read_dataset(
 
     Parameters
     ----------
-    head, masks : head model and file with its regions, see `find_head`.
+    head, masks, regions, eyelids : head model or its file, and what belongs to it; see `find_head`.
     subject : subject id; "" takes that of the images' names, else the folder's name.
     background : what the images are composited on, (r, g, b) in [0, 1]; None takes the declared one, else white.
     held_out_sequences, held_out_cameras : splits as of the reader ``ga``. Without them every frame is for training.
@@ -164,7 +166,7 @@ def read_dataset(
     subject = check_name(next(iter(subjects), "") or root.name, root, "subject")
     keys = {name: key._replace(subject=subject) for name, key in keys.items()}
     timesteps = {key.timestep: root / TRACKING_FOLDER / parameter_name(key.timestep) for key in keys.values()}
-    asset = find_head(root, declaration, head, masks=masks)
+    asset = find_head(root, declaration, head, masks=masks, regions=regions, eyelids=eyelids)
     tracking = read_tracking(timesteps, asset, subject)
     cameras, lenses = _rig(model, keys)
     files = {key: _frame_files(root, name) for name, key in keys.items()}

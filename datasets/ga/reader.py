@@ -51,6 +51,7 @@ def read_capture(
     head: HeadArrays | str | Path | None = None,
     masks: str | Path | None = None,
     regions: str | Path | None = None,
+    eyelids: str | Path | None = None,
     subject: str = "",
     cy: layout.CyConvention | Literal["auto"] = "auto",
     teeth: TeethPolicy = "auto",
@@ -72,7 +73,7 @@ def read_capture(
 
     Parameters
     ----------
-    head, masks, regions : head model or its file, and files with regions; see `find_head`.
+    head, masks, regions, eyelids : head model or its file, and what belongs to it; see `find_head`.
     subject : subject id; "" takes it from ``headbench.json`` or the folder's name.
     cy : convention of the principal point. "auto" takes what ``headbench.json`` declares, else compares the
         tracked mesh with the masks; where the images do not decide and it matters, that is an `InputError`.
@@ -105,7 +106,7 @@ def read_capture(
     infos = check_images(everything, decode=decode, progress=progress)
     rig = collect_cameras(everything, infos)
     ground, wanted = _backgrounds(folder, declaration, background, everything, infos)
-    asset = find_head(folder, declaration, head, masks=masks, regions=regions)
+    asset = find_head(folder, declaration, head, masks=masks, regions=regions, eyelids=eyelids)
     sequence_subject, _ = layout.parse_sequence_folder(everything[0].sequence_folder)
     named = layout.parse_union_folder(folder.name) or sequence_subject or folder.name
     subject = check_name(subject or (declaration.subject if declaration else named), folder, "subject")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,20 +14,16 @@ from ...bench.contracts import FloatArray, HeadPose
 from ...bench.errors import InputError
 from ...bench.io.arrays import MAX_MAGNITUDE, check_numbers, read_npz
 from ..head.arrays import HeadArrays, check_size
-from ..head.loaders import load_head
+from ..head.loaders import EYELIDS_REMEDY, load_head
 from ..head.teeth import with_teeth, with_teeth_where_possible
 from .layout import DECLARATION_FILE, HEAD_FILE, Declaration
-
-FLAME_MASKS_FILE = "FLAME_masks.pkl"
 
 
 def find_head(
     folder: Path,
     declaration: Declaration | None,
     head: HeadArrays | str | Path | None,
-    *,
-    masks: str | Path | None = None,
-    regions: str | Path | None = None,
+    **files: str | Path | None,
 ) -> HeadArrays:
     """Head model of a capture.
 
@@ -35,7 +32,7 @@ def find_head(
     folder : of the capture.
     head : the head model or its file; None takes the file that ``headbench.json`` names, else the capture's
         ``head_model.npz``.
-    masks, regions : see `load_head`. For a FLAME pickle a ``FLAME_masks.pkl`` beside it is used by itself.
+    files : masks, regions and eyelids of `load_head`, which finds them by itself beside a FLAME pickle.
 
     Raises
     ------
@@ -46,7 +43,7 @@ def find_head(
         asset = head
     else:
         path = Path(head) if head else folder / (declaration.head_file if declaration else HEAD_FILE)
-        asset = _load(path, masks, regions)
+        asset = _load(path, files)
     if declaration and asset.version != declaration.head_model:
         expected = f"{asset.version}, the version of the head model given"
         remedy = "Coefficients of one head model mean nothing to another."
@@ -54,18 +51,17 @@ def find_head(
     return asset
 
 
-def _load(path: Path, masks: str | Path | None, regions: str | Path | None) -> HeadArrays:
+def _load(path: Path, files: Mapping[str, Any]) -> HeadArrays:
     if not path.exists():
         remedy = (
             "Captures of NeRSemble subjects need flame2023.pkl (FLAME 2023, versions with jaw rotation) from "
             "https://flame.is.tue.mpg.de; give its path as head=. Synthetic captures hold their own."
         )
         raise InputError(path, "", "the head model the capture was tracked with", "no such file", remedy)
-    beside = path.with_name(FLAME_MASKS_FILE)
-    if masks is None and path.suffix != ".npz" and beside.exists():
-        masks = beside
-    return load_head(path, masks=masks, regions=regions)
+    return load_head(path, **files)
 
+
+log = logging.getLogger(__name__)
 
 TeethPolicy = Literal["auto", "add", "keep"]
 
@@ -112,6 +108,7 @@ def read_tracking(
     """
     poses: dict[int, HeadPose] = {}
     shape = static = None
+    closed = 0.0
     deviation = {"shape": 0.0, "static_offset_m": 0.0, "dynamic_offset_m": 0.0}
     for timestep, path in sorted(files.items()):
         arrays = read_npz(path)
@@ -124,6 +121,8 @@ def read_tracking(
         deviation["static_offset_m"] = max(deviation["static_offset_m"], _offset_change(path, offset, static))
         dynamic = _offset(path, arrays, "dynamic_offset")
         deviation["dynamic_offset_m"] = max(deviation["dynamic_offset_m"], _largest(dynamic))
+        if "eyelids" in arrays:
+            closed = max(closed, _largest(_array(path, arrays, "eyelids")))
         poses[timestep] = _pose(path, arrays, head, subject, timestep)
     assert shape is not None, "callers have checked that there are timesteps"
     static_offset = np.zeros((len(head.template), 3), dtype=np.float32)
@@ -137,6 +136,13 @@ def read_tracking(
         "change_of_static_offset_ignored_m": deviation["static_offset_m"],
         "dynamic_offset_ignored_m": deviation["dynamic_offset_m"],
     }
+    if closed:
+        used = head.eyelid_basis is not None
+        notes["eyelids"] = f"closed by up to {closed:.2f}" + (
+            "" if used else ", left out: the head model has no basis"
+        )
+        if not used:
+            log.warning("%s: eyelids: %s. %s", min(files.values()).parent, notes["eyelids"], EYELIDS_REMEDY)
     return Tracking(head, poses, shape, static_offset, notes)
 
 

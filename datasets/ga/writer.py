@@ -7,9 +7,10 @@ there and writes parameters and JSONs, the union's last: a folder with a union J
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -61,17 +62,17 @@ def write_sequence(
     shared: Mapping[str, float | int],
     held_out: Sequence[str],
     declaration: layout.Declaration,
+    test: Collection[int] = (),
 ) -> None:
     """Write a sequence's declaration and its four JSONs.
 
     The splits within the sequence are VHAP's: the first 70 % of the timesteps are training and, of the ``held_out``
-    cameras, novel views; the rest is test.
+    cameras, novel views; the rest is test. Or the timesteps of ``test`` are, where it has some.
     """
     declaration.write(folder)
-    boundary = math.ceil(TRAIN_FRACTION * (1 + max(frame["timestep_index"] for frame in frames)))
-    placed = (
-        (frame, frame["timestep_index"] >= boundary, frame["camera_id"] in held_out) for frame in frames
-    )
+    count = 1 + max(frame["timestep_index"] for frame in frames)
+    test = test or range(math.ceil(TRAIN_FRACTION * count), count)
+    placed = ((frame, frame["timestep_index"] in test, frame["camera_id"] in held_out) for frame in frames)
     _write_splits(folder, placed, shared)
     write_json(folder / layout.ALL_FRAMES_FILE, transforms_document(frames, shared))
 
@@ -82,11 +83,13 @@ def write_union(
     test: Sequence[Path],
     held_out: Sequence[str],
     declaration: layout.Declaration | None,
+    partly: Mapping[Path, Collection[int]] = MappingProxyType({}),
 ) -> dict[str, int]:
     """Join sequence folders, ours or VHAP's, into a union beside them; return the frames per split.
 
     Timesteps are renumbered, training sequences first; nothing is copied. Frames of ``test`` are for
-    self-reenactment, with all cameras; of ``train``, the ``held_out`` cameras are for novel views.
+    self-reenactment, with all cameras, as are the timesteps that ``partly`` names of folders of ``train``; of the rest of
+    these, the ``held_out`` cameras are for novel views.
     """
     placed: list[tuple[dict[str, Any], bool, bool]] = []
     start = 0
@@ -99,10 +102,11 @@ def write_union(
         }
         for entry, frame in zip(read_transforms(path), document["frames"], strict=True):
             record = {key: value for key, value in frame.items() if key not in _SINGLE_SEQUENCE_KEYS}
+            tested = folder in test or frame["timestep_index"] in partly.get(folder, ())
             record["timestep_index"] += start
             for key in _PATH_KEYS & record.keys():
                 record[key] = f"../{folder.name}/{record[key]}"
-            placed.append((record, folder in test, entry.camera_id in held_out))
+            placed.append((record, tested, entry.camera_id in held_out))
         start += 1 + max((frame["timestep_index"] for frame in document["frames"]), default=-1)
     for file, group in ((layout.TRAIN_SEQUENCES_FILE, train), (layout.TEST_SEQUENCES_FILE, test)):
         write_text(union / file, "".join(f"{folder.name}\n" for folder in group))
@@ -146,12 +150,14 @@ TRAIN_FRACTION = 0.7
 class SequencePlan:
     """One sequence of a capture: its poses, one per timestep from 0, and the frames to leave out.
 
-    ``excluded`` maps a timestep of this sequence to the reason, such as "tongue out".
+    ``excluded`` maps a timestep of this sequence to the reason, such as "tongue out". ``held_out`` are timesteps that are for
+    self-reenactment while the others are not, as the end of a video.
     """
 
     name: str
     poses: Sequence[HeadPose]
     excluded: Mapping[int, str] = field(default_factory=dict)
+    held_out: frozenset[int] = frozenset()
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,6 +290,7 @@ class CaptureWriter:
             [self.sequence_folder(sequence.name) for sequence in test],
             plan.novel_view_cameras,
             self._declaration([*train, *test], layout.HEAD_FILE),
+            {self.sequence_folder(sequence.name): sequence.held_out for sequence in train},
         )
         return self.union
 
@@ -312,7 +319,7 @@ class CaptureWriter:
         ]
         shared = layout.intrinsics_to_json(plan.cameras[-1], plan.cy)
         declaration = self._declaration([sequence], f"../{self.union.name}/{layout.HEAD_FILE}")
-        write_sequence(folder, frames, shared, plan.novel_view_cameras, declaration)
+        write_sequence(folder, frames, shared, plan.novel_view_cameras, declaration, sequence.held_out)
 
     def _declaration(self, sequences: Sequence[SequencePlan], head_file: str) -> layout.Declaration:
         starts = np.cumsum([0, *(len(sequence.poses) for sequence in sequences)]).tolist()

@@ -12,7 +12,7 @@ import numpy as np
 
 from ...bench.contracts import IntArray
 from ...bench.errors import InputError
-from ...bench.io.arrays import read_npz
+from ...bench.io.arrays import read_npy, read_npz
 from ...bench.io.documents import read_json
 from .arrays import RING_REGIONS, HeadArrays, read_head, with_derived_regions
 from .ict import ict_head, is_ict
@@ -24,11 +24,20 @@ FLAME_IDENTITY_SIZE = 300
 _ZIP = b"PK\x03\x04"
 
 
+MASKS_FILE, REGIONS_FILE = "FLAME_masks.pkl", "regions.json"
+EYELID_FILES = ("l_eyelid.npy", "r_eyelid.npy")
+EYELIDS_REMEDY = f"Put {' and '.join(EYELID_FILES)} of Metrical Tracker or SMIRK beside the head model."
+PLACES = (".", "FLAME_masks", "..", "../FLAME_masks")
+"""Where files that belong to a FLAME pickle are looked for, relative to its folder: beside it, as in the repositories of
+VHAP and GaussianAvatars, or a folder above, as in that of SMIRK."""
+
+
 def load_head(
     path: str | PathLike[str],
     *,
     masks: str | PathLike[str] | None = None,
     regions: str | PathLike[str] | None = None,
+    eyelids: str | PathLike[str] | None = None,
     version: str | None = None,
 ) -> HeadArrays:
     """Load a head model; what the file is follows from its content.
@@ -39,8 +48,13 @@ def load_head(
         or ICT-FaceKit npz.
     masks : ``FLAME_masks.pkl``, for a FLAME pickle; the derived regions are added.
     regions : JSON file ``{name: [vertex, ...]}`` with further regions, such as the lip rings.
+    eyelids : folder of ``l_eyelid.npy`` and ``r_eyelid.npy``, (V, 3) metres by which a closed lid moves, as Metrical
+        Tracker and SMIRK ship them.
     version : names the expression basis. Needed where the file name of a FLAME pickle does not tell
         ("flame2020", "flame2023"); must agree with what a npz of ours says.
+
+    For a FLAME pickle, files that are not given are used where they lie in one of `PLACES` under their usual names:
+    ``FLAME_masks.pkl``, ``regions.json``, ``l_eyelid.npy`` and ``r_eyelid.npy``.
 
     Raises
     ------
@@ -53,20 +67,54 @@ def load_head(
             start = stream.read(len(_ZIP))
     except OSError as error:
         raise InputError(path, "", "a head model file", error.strerror or "nothing readable") from error
-    if start != _ZIP:
-        head = _flame(path, version or flame_version(path))
-    else:
+    if start == _ZIP:
         content = read_npz(path)
         head = ict_head(path, content) if is_ict(content) else read_head(path)
         if version is not None and version != head.version:
             raise InputError(path, "version", repr(version), repr(head.version))
+    elif start[:1] not in _PICKLES or path.suffix.lower() in MESHES:
+        expected = "a head model with its bases: a FLAME pickle, or an npz file"
+        found = "a mesh" if path.suffix.lower() in MESHES else "neither"
+        raise InputError(path, "", expected, found, "A mesh alone has no expressions and no joints.")
+    else:
+        head = _flame(path, version or flame_version(path))
+        masks = masks or _beside(path, MASKS_FILE)
+        regions = regions or _beside(path, REGIONS_FILE)
+        eyelids = eyelids or (_beside(path, EYELID_FILES[0]) or _beside(path, EYELID_FILES[1]) or path).parent
     if masks is not None:
         head = replace(head, regions={**head.regions, **read_masks(masks)})
     if regions is not None:
         head = replace(head, regions={**head.regions, **read_regions(regions)})
     if masks is not None or regions is not None:
         head.validate(regions or masks or path)
+    if eyelids is not None:
+        head = _with_eyelids(head, Path(eyelids), path)
     return with_derived_regions(head)
+
+
+_PICKLES = (b"\x80", b"(", b"}", b"c", b"]")
+"""How a pickle begins, by protocol and by what it holds."""
+MESHES = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf", ".fbx")
+
+
+def _beside(path: Path, name: str) -> Path | None:
+    """A file that belongs to a FLAME pickle, or None."""
+    return next(
+        (path.parent / place / name for place in PLACES if (path.parent / place / name).is_file()), None
+    )
+
+
+def _with_eyelids(head: HeadArrays, folder: Path, file: Path) -> HeadArrays:
+    """The head with the eyelid basis of a folder; as it is where the folder is the head's own and has none."""
+    files = [folder / name for name in EYELID_FILES]
+    if not any(path.is_file() for path in files) and folder == file.parent:
+        return head
+    bases = [read_npy(path) for path in files]
+    for path, basis in zip(files, bases):
+        if basis.shape != head.template.shape or basis.dtype.kind != "f":
+            expected = f"floats of shape {head.template.shape}, those of {file.name}"
+            raise InputError(path, "", expected, f"{basis.dtype} of shape {basis.shape}")
+    return replace(head, eyelid_basis=np.stack(bases, axis=2)).validate(folder)
 
 
 def flame_version(path: Path) -> str:

@@ -9,6 +9,8 @@ import logging
 from dataclasses import replace
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from ...bench.contracts import FloatArray, HeadAsset, IntArray
 from ...bench.errors import InputError
@@ -158,13 +160,15 @@ _REMEDY = (
 def lip_rings(asset: HeadAsset, length: int = RING_LENGTH) -> tuple[IntArray, IntArray]:
     """Upper and lower ring: (n,) vertices each, from one corner of the mouth to the other, pairs matching.
 
-    Rings that are found run from the subject's left to the right, as GaussianAvatars' do.
+    Rings that are found run from the subject's left to the right, as GaussianAvatars' do. The region ``lips`` is a band
+    around the mouth. With D edges from its outer border to its deepest vertices, the upper ring lies D // 2 edges and the
+    lower one D // 3 edges inside the border, without the corners of the mouth. In FLAME, D is 7, and these rings are the
+    two lists of GaussianAvatars' code.
 
     Parameters
     ----------
-    asset : its ring regions are returned as they are if it has both; otherwise the rings are found from
-        ``lips`` and ``face``.
-    length : n of rings that are found; fewer if the rim has fewer vertices.
+    asset : its ring regions are returned as they are if it has both; otherwise the rings are found from ``lips``.
+    length : n of rings that are found; fewer if the lips have fewer vertices there.
 
     Raises
     ------
@@ -173,40 +177,68 @@ def lip_rings(asset: HeadAsset, length: int = RING_LENGTH) -> tuple[IntArray, In
     """
     where = f"head model {asset.version!r}"
     if all(name in asset.regions for name in RING_REGIONS):
-        upper, lower = (np.asarray(asset.regions[name], dtype=np.int64) for name in RING_REGIONS)
-        if len(upper) != len(lower) or len(upper) < 3:
-            found = f"{len(upper)} and {len(lower)}"
+        given, other = (np.asarray(asset.regions[name], dtype=np.int64) for name in RING_REGIONS)
+        if len(given) != len(other) or len(given) < 3:
+            found = f"{len(given)} and {len(other)}"
             raise InputError(where, "lip rings", "two rings of one length, at least 3", found)
-        return upper, lower
-    rim = _rim(asset, where)
-    on_jaw = asset.skinning_weights[rim, JOINT_NAMES.index("jaw")]
-    # Along the rim the jaw's weight jumps between the lips; the corners lie in between.
-    middle = 0.5 * (float(on_jaw.min()) + float(on_jaw.max()))
-    upper, lower = rim[on_jaw < middle], rim[on_jaw >= middle]
+        return given, other
+    if not len(asset.regions.get("lips", ())):
+        raise InputError(where, "regions", "lips", "none of that name", _REMEDY)
+    edges = mesh_edges(asset.faces)
+    edges = np.concatenate([edges, edges[:, ::-1]])
+    depth = _depth_of_lips(asset, edges)
+    deepest = int(depth.max())
+    upper = _arc(asset, edges, depth == deepest // 2, 0)
+    lower = _arc(asset, edges, depth == deepest // 3, 1)
     count = min(length, len(upper), len(lower))
-    if count < 3 or np.ptp(on_jaw) < 0.2:
+    weights = asset.skinning_weights[:, JOINT_NAMES.index("jaw")]
+    if count < 3 or weights[lower].mean() - weights[upper].mean() < 0.2:
         found = f"{len(upper)} and {len(lower)} vertices, told apart by the jaw's skinning weight"
-        raise InputError(where, "lips", "an upper and a lower rim of the mouth", found, _REMEDY)
+        raise InputError(where, "lips", "an upper and a lower lip around the mouth", found, _REMEDY)
     left = min(asset.template[part, 0].max() for part in (upper, lower))
     right = max(asset.template[part, 0].min() for part in (upper, lower))
     across = np.linspace(right, left, count)
     return _pick(asset, upper, across)[::-1], _pick(asset, lower, across)[::-1]
 
 
-def _rim(asset: HeadAsset, where: str) -> IntArray:
-    """Vertices of the outer lips that share an edge with the inner ones."""
-    missing = [name for name in ("lips", "face") if name not in asset.regions]
-    if missing:
-        raise InputError(where, "regions", f"{' and '.join(missing)}", "none of that name", _REMEDY)
-    lips, face = (np.isin(np.arange(len(asset.template)), asset.regions[name]) for name in ("lips", "face"))
-    outer, inner = lips & face, lips & ~face
-    edges = mesh_edges(asset.faces)
-    edges = np.concatenate([edges, edges[:, ::-1]])
-    rim = np.unique(edges[outer[edges[:, 0]] & inner[edges[:, 1]], 0])
-    if not len(rim):
-        found = f"{outer.sum()} outer and {inner.sum()} inner lip vertices without a common edge"
-        raise InputError(where, "lips", "lips that reach from the face into the mouth", found, _REMEDY)
-    return rim
+def _depth_of_lips(asset: HeadAsset, edges: IntArray) -> IntArray:
+    """(V,) edges between each vertex of the lips and their outer border; -1 elsewhere. ``edges`` has both directions."""
+    lips = np.isin(np.arange(len(asset.template)), asset.regions["lips"])
+    border = np.unique(edges[lips[edges[:, 0]] & ~lips[edges[:, 1]], 0])
+    if not len(border):  # a mesh of lips alone
+        border = np.flatnonzero(lips)
+    # The inner border, towards the mouth, is the narrower one.
+    outer = max(_pieces(edges, border, len(lips)), key=lambda piece: np.ptp(asset.template[piece, 0]))
+    depth = np.full(len(lips), -1)
+    depth[outer] = 0
+    reached, steps = outer, 0
+    while len(reached):
+        steps += 1
+        beside = edges[np.isin(edges[:, 0], reached), 1]
+        reached = np.unique(beside[lips[beside] & (depth[beside] < 0)])
+        depth[reached] = steps
+    return depth
+
+
+def _arc(asset: HeadAsset, edges: IntArray, ring: np.ndarray, place: int) -> IntArray:
+    """The upper (``place`` 0) or lower (1) half of a ring around the mouth, (V,) bool, without its two corners."""
+    members = np.flatnonzero(ring)
+    x = asset.template[members, 0]
+    rest = np.setdiff1d(members, members[[x.argmin(), x.argmax()]])
+    halves = sorted(_pieces(edges, rest, len(ring)), key=len)[-2:]
+    if len(halves) < 2:
+        return np.empty(0, np.int64)
+    weights = asset.skinning_weights[:, JOINT_NAMES.index("jaw")]
+    return sorted(halves, key=lambda half: float(weights[half].mean()))[place]
+
+
+def _pieces(edges: IntArray, members: IntArray, vertices: int) -> list[IntArray]:
+    """Connected pieces of a part of the mesh, as vertices."""
+    inside = np.isin(np.arange(vertices), members)
+    own = edges[inside[edges].all(axis=1)]
+    graph = coo_matrix((np.ones(len(own)), own.T), shape=(vertices, vertices))
+    labels = connected_components(graph, directed=False)[1][members]
+    return [members[labels == label] for label in np.unique(labels)]
 
 
 def _pick(asset: HeadAsset, rim: IntArray, across: np.ndarray) -> IntArray:

@@ -224,7 +224,7 @@ def _from_bytes(raw: Any, dtype: Any, shape: Any, order: Any, budget: _Budget) -
     budget.take(raw=len(text))
     content = text.encode("latin1") if isinstance(text, str) else text  # Python 2's bytes are read as latin1
     values = np.frombuffer(content, dtype=resolved).reshape(sizes, order=order)
-    return np.ascontiguousarray(values, dtype=resolved.newbyteorder("="))
+    return np.array(values, dtype=resolved.newbyteorder("="), order="C")  # a copy that may be written to
 
 
 def _from_buffer(raw: Any, dtype: Any, shape: Any, order: Any, axes: Any = None) -> _Array:

@@ -89,6 +89,7 @@ def summary(
         "background": clip.background.tolist(),
         "cy": record.get("cy", ""),
         "leaks": record.get("leaks", []),
+        "eyelids": record.get("eyelids", ""),
         "synthetic": bool(record.get("synthetic")),
         "splits": [asdict(row) for row in splits],
         "excluded": {
@@ -137,6 +138,8 @@ def _text(
             f"{sequence.expression_sigma:>11.2f}" + ("  held out" if sequence.held_out else "")
         )
     lines += ["", space_summary(space) + "."]
+    if clip.steps and clip.steps[0].parameters.get("eyelids"):
+        lines.append(f"Eyelids: {clip.steps[0].parameters['eyelids']}.")
     for name, found in space.novelty.items():
         lines.append(
             f"{name}: {found.outside:.0%} of the expression lies outside the span of training, {found.beyond:.0%} of the "

@@ -54,9 +54,20 @@ class _Document:
 
 def videos(root: Path) -> list[Path]:
     """Folders of a subject's videos: the folder itself, or those below it."""
-    if (root / PARAMETERS).is_file():
+    if _lists_frames(root / PARAMETERS):
         return [root]
-    return sorted(file.parent for file in root.glob(f"*/{PARAMETERS}"))
+    return sorted(file.parent for file in root.glob(f"*/{PARAMETERS}") if _lists_frames(file))
+
+
+def _lists_frames(path: Path) -> bool:
+    """Whether a file of that name is IMavatar's, which lists frames, or is damaged: LAM's has arrays by name."""
+    if not path.is_file():
+        return False
+    try:
+        content = read_json(path)
+    except InputError:
+        return True
+    return not isinstance(content, dict) or "frames" in content or "expr" not in content
 
 
 def read_imavatar(root: Path, head: HeadArrays, progress: Progress) -> Track:

@@ -16,6 +16,7 @@ in the meshes alone and taken from there where the head model has a basis for th
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,15 +34,20 @@ from ...bench.io.images import probe_image
 from ..ga.layout import ALL_FRAMES_FILE, SPLIT_FILES
 from ..ga.transforms import read_rigid
 from ..head.arrays import HeadArrays
+from ..head.loaders import EYELIDS_REMEDY
 from ..head.model import HeadModel
 from .mesh_fit import MeshFit, check_distance, read_vertices, spread
 from .track import Track, VideoFrame, coefficients, frame_number, ordered
 
+log = logging.getLogger(__name__)
+
 EXPRESSIONS, CANONICAL = "flame/exp", "canonical.obj"
 VIDEO = "video"
 """Name of the one sequence."""
-CHECKED_MESHES = 5
-"""Of a video whose parameters are all in files: meshes that are compared with them."""
+CHECKED_MESHES = 50
+"""Of a video whose parameters are all in files: meshes that are compared with them, enough to meet a blink."""
+WORST_VERTEX = 1e-3
+"""Metres that a vertex may lie from a mesh without a warning that eyelids are lost; they move by up to 9 mm."""
 MAX_TEXT = 2**16
 
 
@@ -205,6 +211,7 @@ class _Meshes:
         few = spread(CHECKED_MESHES, len(sources))
         self._compared = {sources[i].number for i in few}
         self._farthest, self._fitted, self._read = 0.0, 0, 0
+        self._missed = self._closed = 0.0
         self.files: set[Path] = set()
 
     def pose(self, source: _Source) -> HeadPose:
@@ -229,17 +236,26 @@ class _Meshes:
                 self._fitted += known is None
                 known = found.turns
                 lids = found.lids if len(found.lids) else None
+                self._missed = max(self._missed, found.farthest)
+                self._closed = max(self._closed, float(found.lids.max(initial=0.0)))
         assert known is not None, "fitted where it was not given"
         rest = np.zeros(3)
         return HeadPose(head.version, expression, rest, rest, known[:3], known[3:], rest, lids)
 
     def notes(self) -> dict[str, Any]:
         """How poses were had."""
+        eyelids = f"from meshes, closed by up to {self._closed:.2f}"
+        if self._head.eyelid_basis is None:
+            eyelids = (
+                f"the head model has no basis; vertices lie up to {1e3 * self._missed:.1f} mm from the meshes"
+            )
+            if self._missed > WORST_VERTEX:
+                log.warning("%s: eyelids: %s. %s", self._root, eyelids, EYELIDS_REMEDY)
         return {
             "jaw_and_eyes_from_meshes": self._fitted,
             "meshes_compared": self._read,
             "mesh_distance_mm": 1e3 * self._farthest,
-            "eyelids": "the head model has no basis" if self._head.eyelid_basis is None else "from meshes",
+            "eyelids": eyelids,
         }
 
     def _rotations(self, path: Path, count: int) -> FloatArray | None:

@@ -74,6 +74,8 @@ class Pose(NamedTuple):
     """(2,) eyelids, left and right; (0,) where the head model has no basis for them."""
     distance: float
     """Median distance of a vertex from the mesh, metres."""
+    farthest: float
+    """Largest distance of a vertex from the mesh, metres."""
 
 
 class MeshFit:
@@ -140,7 +142,8 @@ class MeshFit:
                 turns = turns + step[len(lids) :]
             if np.abs(step).max(initial=0) < _SMALL:
                 break
-        return Pose(turns, lids, _middle(mesh - self._posed(shaped, turns, None, joints) - self._lids @ lids))
+        left = mesh - self._posed(shaped, turns, None, joints) - self._lids @ lids
+        return Pose(turns, lids, _middle(left), float(np.linalg.norm(left, axis=1).max()))
 
     def _posed(
         self,

@@ -55,6 +55,7 @@ def read_video(
     head: HeadArrays | str | Path | None = None,
     masks: str | Path | None = None,
     regions: str | Path | None = None,
+    eyelids: str | Path | None = None,
     subject: str = "",
     teeth: TeethPolicy = "auto",
     background: Sequence[float] | None = None,
@@ -72,7 +73,7 @@ def read_video(
 
     Parameters
     ----------
-    head, masks, regions : head model that the video was tracked with, FLAME 2020 as a rule, see `find_head`.
+    head, masks, regions, eyelids : head model that the video was tracked with, FLAME 2020 as a rule, see `find_head`.
     subject : subject id; "" takes it from ``headbench.json`` or the folder's name.
     teeth : as of the reader ``ga``.
     background : (r, g, b) in [0, 1] that straight alpha and masked images are composited on; None takes the declared
@@ -89,7 +90,7 @@ def read_video(
     """
     root = Path(os.path.abspath(path))
     declaration = Declaration.read(root)
-    asset = _find_head(root, declaration, head, masks, regions)
+    asset = _find_head(root, declaration, head, masks=masks, regions=regions, eyelids=eyelids)
     track = _read_track(root, asset, progress)
     subject = check_name(subject or (declaration.subject if declaration else root.name), root, "subject")
     for frame in track.frames:
@@ -145,8 +146,7 @@ def _find_head(
     root: Path,
     declaration: Declaration | None,
     head: HeadArrays | str | Path | None,
-    masks: str | Path | None,
-    regions: str | Path | None,
+    **files: str | Path | None,
 ) -> HeadArrays:
     if head is None and declaration is None and not (root / HEAD_FILE).exists():
         raise InputError(
@@ -157,7 +157,7 @@ def _find_head(
             "Give it as head= (`headbench run`: --head): Metrical Tracker and IMavatar track with FLAME 2020, "
             "generic_model.pkl from https://flame.is.tue.mpg.de.",
         )
-    return find_head(root, declaration, head, masks=masks, regions=regions)
+    return find_head(root, declaration, head, **files)
 
 
 def _read_track(root: Path, head: HeadArrays, progress: Progress) -> Track:

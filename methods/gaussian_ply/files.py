@@ -7,10 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
+from ...bench.configuration import parse_assignments
 from ...bench.contracts import Progress
 from ...bench.errors import InputError
 from ...bench.io.files import check_name
 from ...bench.io.lock import LOCK_FILE
+from ...bench.registry import unknown
 from ...bench.runner.stored import SAME_SHAPE
 from ...bench.specs import Findings
 from ...datasets.clip import CaptureClip
@@ -31,6 +33,8 @@ from ..shared.avatar_files import (
 from .command import ImportGASettings
 
 FLAME_PARAM_FILE = "flame_param.npz"
+HEAD_SETTINGS = ("masks", "regions", "eyelids")
+"""Settings of readers that an import without a capture takes for its head model, beside ``teeth``."""
 
 
 def import_avatar(settings: ImportGASettings, progress: Progress) -> Findings:
@@ -83,7 +87,13 @@ def _identity(
         raise InputError("command line", "--head", "the head model of the avatar", "none", remedy)
     if clip is None:
         name = settings.subject or ply.stem
-        tracking = read_animation(path, find_head(path.parent, None, settings.head), name)
+        files = parse_assignments(settings.set)
+        teeth = files.pop("teeth", "auto")
+        if stray := sorted(files.keys() - {*HEAD_SETTINGS}):
+            raise unknown("command line", "--set", stray[0], (*HEAD_SETTINGS, "teeth"))
+        tracking = read_animation(
+            path, find_head(path.parent, None, settings.head, **files), name, teeth=teeth
+        )
         subject = Subject(
             check_name(name, "command line", "--subject"),
             tracking.head.version,

@@ -1,6 +1,8 @@
 """What is no capture is answered with the way from it to one."""
 
 import json
+import pickle
+import zipfile
 
 import pytest
 
@@ -58,6 +60,18 @@ def test_what_is_no_capture_is_answered_with_the_way_to_one(tmp_path, case):
         read_capture(tmp_path / "given" / given)
     assert found in caught.value.found
     assert remedy in caught.value.remedy
+
+
+@pytest.mark.parametrize(
+    ("key", "found"), [(b"joint_transforms", "Pixel3DMM"), (b"opencv", "Metrical Tracker")]
+)
+def test_frames_of_trackers_are_told_apart_by_what_they_hold(tmp_path, key, found):
+    (tmp_path / "checkpoint").mkdir()
+    with zipfile.ZipFile(tmp_path / "checkpoint" / "00000.frame", "w") as archive:
+        archive.writestr("00000/data.pkl", pickle.dumps({key.decode(): 1, "flame": {}}))
+    with pytest.raises(InputError) as caught:
+        read_capture(tmp_path)
+    assert found in caught.value.found
 
 
 @pytest.mark.parametrize(

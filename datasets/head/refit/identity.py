@@ -131,7 +131,8 @@ def fit_shape(
 
 
 def _first_alignment(source: HeadAsset, neutral: FloatArray, target: HeadAsset) -> FloatArray:
-    names = [name for name in _LANDMARK_REGIONS if name in source.regions and name in target.regions]
+    regions = source.regions, target.regions
+    names = [name for name in _LANDMARK_REGIONS if all(len(known.get(name, ())) for known in regions)]
     if len(names) < 3:
         expected = f"at least three of the regions {', '.join(_LANDMARK_REGIONS)} in both models"
         raise InputError(f"head model {source.version!r}", "regions", expected, ", ".join(names) or "none")

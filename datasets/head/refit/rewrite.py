@@ -25,7 +25,7 @@ def write_capture(clip: CaptureClip, out: Path, progress: Progress = no_progress
     ------
     InputError
         Where the layout cannot hold the clip: a camera without a frame at some timestep, splits other than by
-        held-out sequences and cameras, exclusions other than of whole timesteps.
+        held-out timesteps and cameras, exclusions other than of whole timesteps.
     """
     plan, index = capture_plan(clip)
     writer = CaptureWriter(out, plan)
@@ -58,19 +58,24 @@ def capture_plan(clip: CaptureClip, source: str | Path = "") -> tuple[CapturePla
     for timestep, name in sorted({(key.timestep, key.sequence) for key in clip.files}):
         timesteps.setdefault(name, []).append(timestep)
     index = {timestep: number for found in timesteps.values() for number, timestep in enumerate(found)}
-    test = {key.sequence for key in clip.splits["self_reenactment"]}
     novel = {key.camera for key in clip.splits["novel_view"]}
+    held: dict[str, set[int]] = {}  # timesteps of each sequence in the capture written
+    for key in clip.splits["self_reenactment"]:
+        held.setdefault(key.sequence, set()).add(index[key.timestep])
     for split, keys in clip.splits.items():
         for key in keys:
-            if split != _split(key, test, novel):
-                expected = "splits by held-out sequences and cameras, which the layout can hold"
+            placed = "novel_view" if key.camera in novel else "train"
+            if split != ("self_reenactment" if index[key.timestep] in held.get(key.sequence, ()) else placed):
+                expected = "splits by held-out timesteps and cameras, which the layout can hold"
                 raise InputError(where, "splits", expected, f"{key} in {split}")
+    shared = {key.sequence for name in ("train", "novel_view") for key in clip.splits[name]}
     background = tuple(float(value) for value in clip.background)
     sequences = [
         SequencePlan(
             name,
             [clip.poses[timestep] for timestep in found],
             {index[k.timestep]: why for k, why in clip.excluded.items() if k.sequence == name},
+            frozenset(held.get(name, ())) if name in shared else frozenset(),
         )
         for name, found in timesteps.items()
     ]
@@ -81,7 +86,7 @@ def capture_plan(clip: CaptureClip, source: str | Path = "") -> tuple[CapturePla
         static_offset=clip.static_offset,
         cameras=[*clip.cameras.values()],
         sequences=sequences,
-        test_sequences=sorted(test),
+        test_sequences=sorted(held.keys() - shared),
         novel_view_cameras=sorted(novel),
         background=(background[0], background[1], background[2]),
         synthetic=clip.steps[0].parameters.get("synthetic", {}) if clip.steps else {},
@@ -99,12 +104,6 @@ def link_or_copy(source: Path, target: Path) -> None:
             os.link(source, temporary)
         except OSError:
             shutil.copyfile(source, temporary)
-
-
-def _split(key: FrameKey, test: set[str], novel: set[str]) -> str:
-    if key.sequence in test:
-        return "self_reenactment"
-    return "novel_view" if key.camera in novel else "train"
 
 
 def _is_png(path: Path | None) -> TypeGuard[Path]:

@@ -82,6 +82,14 @@ def test_eyelids_survive(tmp_path):
     np.testing.assert_array_equal(clip.poses[0].eyelids, plan.sequence("HAIR").poses[0].eyelids)
 
 
+def test_eyelids_that_the_head_model_lacks_are_said(tmp_path, caplog):
+    head = toy_head(16, eyelids=True)
+    written = write_tiny_capture(tmp_path, make_plan(head=head, lengths={"FREE": 1, "HAIR": 1}))
+    clip = read_capture(written.union, head=replace(head, eyelid_basis=None))
+    assert "left out: the head model has no basis" in clip.steps[0].parameters["eyelids"]
+    assert "Put l_eyelid.npy and r_eyelid.npy" in caplog.text
+
+
 def test_a_single_sequence_is_read_with_its_declared_head(pristine_capture):
     clip = read_capture(pristine_capture.writer.sequence_folder("SEN-01-cramp_small_danger"))
     assert clip.subject == "901"

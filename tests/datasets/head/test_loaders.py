@@ -12,6 +12,7 @@ from headbench.datasets.head.arrays import RING_REGIONS, STORED, save_head
 from headbench.datasets.head.loaders import flame_version, load_head, read_masks
 
 from .flame_files import flame_content, legacy_pickle, write_flame
+from .flame_stand_in import LID, lids, masks, write_stand_in
 from .toy import toy_head
 
 FLAME = toy_head(16, shape_size=300, expression_size=100)
@@ -62,6 +63,57 @@ def test_masks_and_regions(tmp_path):
     for name in RING_REGIONS:
         np.testing.assert_array_equal(head.regions[name], rings[name])  # order kept
     assert {"hair", "ears", "eyeballs", "skin"} <= set(head.regions)
+
+
+@pytest.mark.parametrize("place", [".", "FLAME_masks", "..", "../FLAME_masks"])
+def test_what_belongs_to_a_flame_pickle_is_found(tmp_path, place):
+    path = write_stand_in(tmp_path / "assets" / "FLAME2020", with_masks=False, with_eyelids=False)
+    folder = path.parent / place
+    write_stand_in(folder, "other.pkl")
+    (folder / "regions.json").write_text(json.dumps({"mole": [3, 1]}))
+    head = load_head(path)
+    np.testing.assert_array_equal(head.regions["lips"], masks()["lips"])
+    np.testing.assert_array_equal(head.regions["mole"], [1, 3])
+    np.testing.assert_array_equal(head.eyelid_basis, np.stack(lids(), axis=2))
+    assert float(np.abs(head.eyelid_basis).max()) == pytest.approx(LID)
+
+
+def test_what_is_not_there_is_left_out(tmp_path):
+    head = load_head(write_stand_in(tmp_path / "a" / "b", with_masks=False, with_eyelids=False))
+    assert head.regions == {}
+    assert head.eyelid_basis is None
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda folder: (folder / "r_eyelid.npy").unlink(), "r_eyelid.npy"),
+        (
+            lambda folder: np.save(folder / "l_eyelid.npy", np.zeros((7, 3))),
+            r"l_eyelid.npy: expected floats of shape",
+        ),
+        (lambda folder: np.save(folder / "l_eyelid.npy", lids()[0] * np.nan), "finite"),
+        (lambda folder: (folder / "l_eyelid.npy").write_bytes(b"x"), "l_eyelid.npy"),
+    ],
+)
+def test_eyelids_are_checked(tmp_path, change, message):
+    path = write_stand_in(tmp_path / "a")
+    change(path.parent)
+    with pytest.raises(InputError, match=message):
+        load_head(path)
+
+
+def test_arrays_of_a_pickle_may_be_written_to(tmp_path):
+    """PyTorch warns of others, on every good capture."""
+    head = load_head(write_stand_in(tmp_path))
+    assert all(np.asarray(getattr(head, name)).flags.writeable for name in STORED)
+
+
+@pytest.mark.parametrize("name", ["generic_neutral_mesh.obj", "flame2023.ply", "head.pkl"])
+def test_a_mesh_is_no_head_model(tmp_path, name):
+    (tmp_path / name).write_text("# a head\nv 0 0 0\n")
+    with pytest.raises(InputError, match="a head model with its bases"):
+        load_head(tmp_path / name)
 
 
 def test_our_npz_round_trip(tmp_path):

@@ -11,6 +11,7 @@ from headbench.datasets.head.arrays import RING_REGIONS
 from headbench.datasets.head.model import HeadModel
 from headbench.datasets.head.teeth import lip_rings, with_teeth
 
+from .flame_stand_in import SIDES, masks, rings, stand_in
 from .toy import toy_head
 
 HEAD = toy_head(80, eyelids=True)
@@ -141,46 +142,52 @@ def test_refuses_a_second_set_and_unequal_rings():
         with_teeth(replace(HEAD, regions=HEAD.regions | uneven))
 
 
-def without_rings():
-    """The toy as FLAME_masks.pkl would describe it: lips that reach into the mouth, face that does not."""
-    regions = {name: members for name, members in HEAD.regions.items() if name not in RING_REGIONS}
-    upper, lower = (HEAD.regions[name] for name in RING_REGIONS)
-    inside = np.setdiff1d(HEAD.regions["lips"], [*upper, *lower])
-    regions["face"] = np.setdiff1d(np.union1d(regions["face"], [*upper, *lower]), inside)
-    return replace(HEAD, regions=regions)
+def real_head():
+    """A head with FLAME's masks, whose lips lie wholly inside the face."""
+    return replace(stand_in(), regions=masks())
 
 
-@pytest.mark.parametrize("length", [5, 9, 13])
-def test_rings_are_found_where_the_lips_turn_inwards(length):
-    head = without_rings()
-    true_upper, true_lower = (HEAD.regions[name] for name in RING_REGIONS)
-    upper, lower = lip_rings(head, length)
-    assert len(upper) == len(lower) == length
-    assert set(upper) <= set(true_upper)
-    assert set(lower) <= set(true_lower)
-    for ring in (upper, lower):
-        x = head.template[ring, 0]
+def test_rings_are_those_of_gaussianavatars_rule():
+    """On FLAME the rule gives the two lists of that code, vertex by vertex; the stand-in has the same structure."""
+    for found, expected in zip(lip_rings(real_head()), rings()):
+        np.testing.assert_array_equal(found, expected)
+    toothed = with_teeth(real_head()).validate("toothed")
+    assert len(toothed.template) - len(stand_in().template) == 120
+
+
+@pytest.mark.parametrize("length", [5, 9, 13, 99])
+def test_fewer_vertices_of_a_ring_are_taken_evenly(length):
+    head = real_head()
+    count = min(length, 15)
+    for found, ring in zip(lip_rings(head, length), rings()):
+        assert len(found) == count
+        assert set(found) <= set(ring)
+        x = head.template[found, 0]
         assert (np.diff(x) < 0).all()  # from the left to the right, as published
-        spacing = np.ptp(x) / (length - 1)
-        assert np.abs(x - np.linspace(x[0], x[-1], length)).max() < spacing
-    with_teeth(head).validate("toothed")
+        spacing = np.ptp(x) / (count - 1)
+        assert np.abs(x - np.linspace(x[0], x[-1], count)).max() < 1.5 * spacing
 
 
-def test_all_of_a_short_rim_is_taken():
-    upper, lower = lip_rings(without_rings(), 99)
-    np.testing.assert_array_equal(upper, HEAD.regions["lip_outside_ring_upper"][::-1])
-    np.testing.assert_array_equal(lower, HEAD.regions["lip_outside_ring_lower"][::-1])
+@pytest.mark.parametrize("where", ["outer lips alone in the face", "wall in the face", "no face"])
+def test_rings_do_not_depend_on_how_far_the_face_reaches(where):
+    regions = masks()
+    if where == "no face":
+        del regions["face"]
+    elif where == "wall in the face":
+        regions["face"] = np.arange(regions["face"].max() + 1)
+    else:
+        regions["face"] = regions["face"][2 * SIDES :]
+    for found, expected in zip(lip_rings(replace(stand_in(), regions=regions)), rings()):
+        np.testing.assert_array_equal(found, expected)
 
 
 def test_missing_rings_are_explained():
-    head = without_rings()
-    for name in ("lips", "face"):
-        rest = {key: members for key, members in head.regions.items() if key != name}
-        with pytest.raises(InputError, match=name):
-            lip_rings(replace(head, regions=rest))
-    outside = replace(head, regions=head.regions | {"face": np.arange(len(head.template))})
-    with pytest.raises(InputError, match="into the mouth"):
-        lip_rings(outside)
+    head = real_head()
+    rest = {key: members for key, members in head.regions.items() if key != "lips"}
+    with pytest.raises(InputError, match="lips"):
+        lip_rings(replace(head, regions=rest))
     stiff = np.tile([0.0, 1, 0, 0, 0], (len(head.template), 1))
     with pytest.raises(InputError, match="jaw"):
         lip_rings(replace(head, skinning_weights=stiff))
+    with pytest.raises(InputError, match="an upper and a lower lip"):
+        lip_rings(replace(head, regions={"lips": np.arange(3)}))

@@ -95,6 +95,32 @@ def test_a_video_shows_what_its_capture_shows(recordings, written, kind):
     assert check_clip(clip) == []
 
 
+def test_eyelids_without_a_basis_are_said(tmp_path, caplog):
+    """The meshes blink; a head model that cannot is told from one that can."""
+    head = toy_head(16)
+    basis = np.zeros((*head.template.shape, 2))
+    for side, name in enumerate(("left_eye_region", "right_eye_region")):
+        basis[head.regions[name], 1, side] = -0.008
+    recording = recording_of(tmp_path / "capture", head=replace(head, eyelid_basis=basis))
+    write_insta(recording, tmp_path / "video")
+    able = read_video(tmp_path / "video")
+    assert able.steps[0].parameters["eyelids"].startswith("from meshes, closed by up to 0.")
+    assert "eyelids" not in caplog.text
+    clip = read_video(tmp_path / "video", head=head)
+    assert "the head model has no basis; vertices lie up to" in clip.steps[0].parameters["eyelids"]
+    assert "Put l_eyelid.npy and r_eyelid.npy" in caplog.text
+
+
+def test_a_file_of_another_tool_is_not_taken_for_imavatars(tmp_path):
+    """LAM's flame_params.json has arrays by name and lists no frames."""
+    file = tmp_path / "flame_params.json"
+    file.write_text(json.dumps({"shape": [0.0], "expr": [{"expr0": 0.0}], "rotation": [[0.0, 0.0, 0.0]]}))
+    assert find_videos(tmp_path) == []
+    for text in ('{"frames": []}', "{"):  # IMavatar's, or damaged, which its reader says
+        file.write_text(text)
+        assert find_videos(tmp_path) == [tmp_path]
+
+
 def seen(clip, camera, pose):
     """(V, 3) vertices before the camera, metres."""
     vertices = PosedSubject(clip.head, clip.shape, clip.static_offset).meshes([pose])[0]

@@ -117,7 +117,7 @@ def test_where_the_checkout_lies_does_not_make_another_avatar():
         ({"background": np.full(3, 0.5)}, "white or black"),
         ({"head": {"parents": np.array([-1, 0, 0, 0, 0])}}, "FLAME's joints"),
         ({"head": {"expression_basis": np.zeros((300, 3, 101))}}, "at most 100 directions"),
-        ({"head": {"regions": {}}}, "face"),
+        ({"head": {"regions": {}}}, "lips"),
     ],
 )
 def test_clips_that_the_code_cannot_take_are_refused(repository, official_clip, changes, found):

@@ -134,6 +134,30 @@ def test_splits_the_layout_cannot_hold_are_refused(finished):
         capture_plan(replace(clip, splits=swapped))
 
 
+def test_a_sequence_whose_end_is_held_out_keeps_its_split(finished, tmp_path):
+    """As VHAP exports a video: training and test frames of one sequence, no camera held out."""
+    _, settings, _ = finished
+    clip = read_capture(settings.capture)
+    parts = {name: {*keys} for name, keys in clip.splits.items()}
+    kept = parts["train"] | parts["novel_view"] | parts["self_reenactment"]
+    sequence = min(key.sequence for key in parts["train"])
+    last = max(key.timestep for key in kept if key.sequence == sequence)
+    tested = {key for key in kept if key.sequence == sequence and key.timestep == last}
+    splits = {"train": kept - tested, "novel_view": set(), "self_reenactment": tested}
+    ordered = {name: tuple(sorted(keys)) for name, keys in splits.items()}
+    written = read_capture(write_capture(replace(clip, splits=ordered), tmp_path))
+    by_pose = {tuple(pose.jaw.tolist()): timestep for timestep, pose in clip.poses.items()}
+    found = {
+        name: {
+            key._replace(timestep=by_pose[tuple(written.poses[key.timestep].jaw.tolist())]) for key in keys
+        }
+        for name, keys in written.splits.items()
+    }
+    assert found == splits
+    alone = read_capture(next(tmp_path.glob(f"*_{sequence}_*")))
+    assert {written.poses[key.timestep].jaw.tolist()[0] for key in alone.splits["self_reenactment"]}
+
+
 def test_timesteps_with_gaps_are_numbered_anew(finished, tmp_path):
     _, settings, _ = finished
     clip = read_capture(settings.capture)
