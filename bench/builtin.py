@@ -153,6 +153,8 @@ class RunSettings:
     machine; slurm, a job for each. Default: inline."""
     workers: int | None = None
     """How many processes, with `--executor processes`. Default: one for each core."""
+    unchecked: bool = False
+    """Train although `headbench lint` names an error of a capture that makes its results meaningless."""
     set: Assignments = ()
     """Any setting, for example `frames_per_task=50`, `settings.ga.budget.iterations=5000`, `execution.slurm.hours=8`;
     repeatable."""
@@ -177,7 +179,7 @@ def run(settings: RunSettings, progress: Progress) -> Findings:
     execution = chosen_execution(values.pop("execution", {}), settings.executor, settings.workers, source)
     config = build(RunConfig, values, source)
     with _log_file(Path(config.out)):
-        return _run(config, execution)
+        return _run(config, execution, unchecked=settings.unchecked)
 
 
 @dataclass(frozen=True)

@@ -273,7 +273,8 @@ class DatasetSpec:
     capture's own files list them, all of them, by which official repositories number their renders; "" for none.
     ``pose_files`` names a function ``path -> {timestep: file}``: the file with the tracking parameters of each timestep;
     "" where timesteps have no files of their own.
-    ``needs`` is as that of a method, called with None for the config.
+    ``needs`` is as that of a method, called with None for the config. ``errors`` names a function ``clip -> list of text``: what
+    makes every result of the capture meaningless, which a run looks for before it trains; "" for none.
     """
 
     name: str
@@ -284,6 +285,7 @@ class DatasetSpec:
     listing: str = ""
     pose_files: str = ""
     needs: str = ""
+    errors: str = "headbench.datasets.lint.before_run:errors"
 
 
 @dataclass(frozen=True)

@@ -64,7 +64,7 @@ class SharedLpips:
         return self._loaded()(image, target)
 
     def batched(self, pairs: Iterable[tuple[ByteArray, ByteArray]]) -> Iterator[float]:
-        """Distances of many pairs of one size, in order; ``pairs`` is read lazily."""
+        """Distances of many pairs, in order; ``pairs`` is read lazily."""
         return self._loaded().batched(pairs)
 
     def _loaded(self) -> Lpips:

@@ -26,7 +26,7 @@ import urllib.request
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from http.client import HTTPException
-from itertools import islice
+from itertools import groupby, islice
 from pathlib import Path
 
 import numpy as np
@@ -122,11 +122,11 @@ class Lpips:
         return np.asarray(total.cpu().numpy())
 
     def batched(self, pairs: Iterable[tuple[ByteArray, ByteArray]], size: int = 8) -> Iterator[float]:
-        """Distances of many pairs of one size, in order, ``size`` at a time; ``pairs`` is read lazily."""
-        stream = iter(pairs)
-        while batch := list(islice(stream, size)):
-            images, targets = zip(*batch)
-            yield from map(float, self.distances(np.stack(images), np.stack(targets)))
+        """Distances of many pairs, in order, up to ``size`` of one image size at a time; ``pairs`` is read lazily."""
+        for _, alike in groupby(pairs, key=lambda pair: (pair[0].shape, pair[1].shape)):
+            while batch := list(islice(alike, size)):
+                images, targets = zip(*batch)
+                yield from map(float, self.distances(np.stack(images), np.stack(targets)))
 
     def _target_features(self, targets: ByteArray) -> list[Tensor]:
         """The same as `_features`, from the cache where a frame was seen before: every method has the same ground truth."""

@@ -22,9 +22,9 @@ from ..machine import check_device_answers, machine_record, peak_memory_bytes
 from ..manifest import AdaptedRecord, ClipRecord, Manifest, MethodRecord, ProtocolRecord
 from ..progress import duration, run_progress
 from ..protocol import Protocol, make_protocols, missing_tasks
-from ..registry import discover, resolve
+from ..registry import discover, get, resolve
 from ..rows import Rows
-from ..specs import MetricSpec
+from ..specs import DatasetSpec, MetricSpec
 from . import adaptation
 from .adaptation import AdaptedClip, MethodNeeds
 from .captures import open_clips, open_run_clips, relative_paths, run_configuration
@@ -36,10 +36,13 @@ from .store import RunFolder
 log = logging.getLogger(__name__)
 
 
-def run(config: RunConfig, execution: Execution | None = None, **record: Any) -> Rows:
+def run(
+    config: RunConfig, execution: Execution | None = None, *, unchecked: bool = False, **record: Any
+) -> Rows:
     """Run a comparison into ``config.out`` and return its rows; ``record`` is added to the manifest.
 
-    ``execution`` says where its cells are worked on, None for this process.
+    ``execution`` says where its cells are worked on, None for this process. ``unchecked`` trains although a capture has an
+    error that makes results meaningless (see `DatasetSpec.errors`).
 
     Everything that can be checked is checked before the first long step: settings, device, methods, captures, the
     output folder, and that no other process works in it. A method that fails is recorded as failed and the others
@@ -52,7 +55,7 @@ def run(config: RunConfig, execution: Execution | None = None, **record: Any) ->
     check_output_folder(folder.root)
     start = time.perf_counter()
     with locked(folder.root):
-        rows = _run(config, methods, metrics, folder, execution, record)
+        rows = _run(config, methods, metrics, folder, execution, unchecked, record)
         write_reports(folder.root)  # with the captures gone from memory
     log.info("finished in %s: %s", duration(time.perf_counter() - start), folder.root)
     return rows
@@ -64,6 +67,7 @@ def _run(
     metrics: Sequence[MetricSpec],
     folder: RunFolder,
     execution: Execution,
+    unchecked: bool,
     record: Mapping[str, Any],
 ) -> Rows:
     start = time.perf_counter()
@@ -82,6 +86,9 @@ def _run(
         job.check()
         job.check_method()
     warn_of_missing_metrics(metrics, clips[0])
+    if not unchecked:
+        for clip in {job.clip.subject: job.clip for job in jobs if not job.cell.ended("fit")}.values():
+            check_capture(config, clip)
 
     forms = tuple(
         AdaptedRecord(**adaptation.record(job.clip, job.adapted, job.method.spec.name))
@@ -238,6 +245,20 @@ def warn_of_missing_metrics(metrics: Sequence[MetricSpec], clip: Clip) -> None:
         else:
             if not np.isfinite(value):
                 raise HeadbenchError(f"metric {spec.name} gives {value} for identical images")
+
+
+def check_capture(config: RunConfig, clip: Clip) -> None:
+    """Raise `InputError` for an error of a capture that makes every result meaningless, as `DatasetSpec.errors` finds it."""
+    spec: DatasetSpec = get("datasets", config.reader)
+    found = resolve(spec.errors)(clip) if spec.errors else []
+    if found:
+        raise InputError(
+            config.data,
+            f"capture of {clip.subject}",
+            "a capture on which avatars can be trained",
+            " ".join(found),
+            "`headbench lint` shows more; `headbench run --unchecked` trains all the same.",
+        )
 
 
 def describe(

@@ -57,7 +57,58 @@ def read_transforms(path: Path) -> list[FrameEntry]:
     frames = document.get("frames")
     if not isinstance(frames, list):
         raise InputError(path, "frames", "a list of frames", found_entry(frames))
+    check_lenses(path, document)
     return [parse_frame(path, f"frames[{i}]", frame, document) for i, frame in enumerate(frames)]
+
+
+def check_lenses(path: Path, document: Mapping[str, Any]) -> None:
+    """Raise `InputError` where a transforms JSON states lenses that are no pinhole's, with the keys of nerfstudio.
+
+    Renders have no distortion, so that images with some compare with nothing.
+    """
+    frames = document.get("frames")
+    parts = [("", document)]
+    parts += (
+        [(f"frames[{i}].", f) for i, f in enumerate(frames) if isinstance(f, dict)]
+        if isinstance(frames, list)
+        else []
+    )
+    for where, part in parts:
+        for key in part.keys() & LENS_KEYS:
+            value = part[key]
+            if key == "camera_model":
+                fits = str(value).upper() in PINHOLES
+            else:
+                values = value if isinstance(value, list) else [value]
+                fits = all(v is None or (isinstance(v, (int, float)) and v == 0) for v in values)
+            if not fits:
+                expected = (
+                    f"one of {', '.join(PINHOLES)}"
+                    if key == "camera_model"
+                    else "0, images without distortion"
+                )
+                raise InputError(path, f"{where}{key}", expected, found_entry(value), UNDISTORT)
+
+
+LENS_KEYS = {
+    "k1",
+    "k2",
+    "k3",
+    "k4",
+    "k5",
+    "k6",
+    "p1",
+    "p2",
+    "distortion_params",
+    "is_fisheye",
+    "camera_model",
+}
+PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "RADIAL", "SIMPLE_RADIAL", "FULL_OPENCV", "PERSPECTIVE")
+"""Camera models that are a pinhole where their coefficients of distortion are 0."""
+UNDISTORT = (
+    "Undistort the images and state the pinhole that they then have (`colmap image_undistorter`); the reader colmap takes "
+    "distortion out by itself."
+)
 
 
 def parse_frame(path: Path, where: str, frame: Any, document: Mapping[str, Any]) -> FrameEntry:

@@ -32,7 +32,7 @@ from ...bench.io.documents import checked, read_json
 from ...bench.io.files import read_bytes
 from ...bench.io.images import probe_image
 from ..ga.layout import ALL_FRAMES_FILE, SPLIT_FILES
-from ..ga.transforms import read_rigid
+from ..ga.transforms import check_lenses, read_rigid
 from ..head.arrays import HeadArrays
 from ..head.loaders import EYELIDS_REMEDY
 from ..head.model import HeadModel
@@ -134,7 +134,9 @@ def _files() -> tuple[str, ...]:
 
 
 def _read_document(root: Path, path: Path) -> list[_Source]:
-    document = checked(read_json(path), _Document, path, foreign=True)
+    content = read_json(path)
+    check_lenses(path, content)
+    document = checked(content, _Document, path, foreign=True)
     return [_source(root, path, f"frames[{i}]", frame, document) for i, frame in enumerate(document.frames)]
 
 

@@ -267,7 +267,7 @@ def test_seeds_are_a_list_and_presets_are_those_of_the_methods(monkeypatch, tmp_
     monkeypatch.setattr(
         builtin,
         "_run",
-        lambda config, execution: seen.append((config.seeds, config.preset)) or Findings("", {}),
+        lambda config, execution, unchecked: seen.append((config.seeds, config.preset)) or Findings("", {}),
     )
     for words in ([], ["--seeds", "3,1,4"], ["--seeds", "7", "--preset", "of-a-plug-in"]):
         assert cli.main(["run", "--data", str(tmp_path), "--out", str(tmp_path / "out"), *words]) == 0
@@ -279,7 +279,7 @@ def test_a_run_takes_the_reader_that_finds_its_capture(monkeypatch, tmp_path, to
     plugins = {name: Plugin(name, "", replace(toy.READER, name=name)) for name in ("toy", "other")}
     monkeypatch.setattr(captures, "discover", lambda group: {"toy": plugins["toy"]})
     monkeypatch.setattr(
-        builtin, "_run", lambda config, execution: seen.append(config.reader) or Findings("", {})
+        builtin, "_run", lambda config, execution, unchecked: seen.append(config.reader) or Findings("", {})
     )
     (tmp_path / "data").mkdir()
     words = ["run", "--data", str(tmp_path / "data"), "--out", str(tmp_path / "out")]
@@ -309,7 +309,9 @@ def test_a_run_takes_its_executor_from_options_and_settings(
     words, executor, workers, partition, tmp_path, monkeypatch
 ):
     seen = []
-    monkeypatch.setattr(builtin, "_run", lambda config, execution: seen.append(execution) or Findings("", {}))
+    monkeypatch.setattr(
+        builtin, "_run", lambda config, execution, unchecked: seen.append(execution) or Findings("", {})
+    )
     assert cli.main(["run", "--data", "d", "--out", str(tmp_path / "o"), *words]) == 0
     assert [(e.executor, e.workers, e.slurm.partition) for e in seen] == [(executor, workers, partition)]
 

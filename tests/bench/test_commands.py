@@ -255,6 +255,7 @@ def test_every_command_with_a_folder_to_write_locks_it():
         "export sog",
         "report",
         "stress",
+        "table",
     }  # --out is one
     for plugin in registry.discover("commands").values():
         spec = plugin.spec

@@ -86,6 +86,9 @@ def test_symmetry_identity_and_batches(random_weights):
     assert operator.length_hint(pairs) == 3  # read lazily
     np.testing.assert_allclose(list(batches), one_by_one[1:], rtol=1e-5)
     assert metric.distances(images[:0], truths[:0]).shape == (0,)
+    # Cameras of one capture may have images of different sizes.
+    mixed = [(a[:40], b[:40]) if i % 3 else (a, b) for i, (a, b) in enumerate(zip(images, truths))]
+    np.testing.assert_allclose(list(metric.batched(mixed)), [metric(a, b) for a, b in mixed], rtol=1e-5)
 
 
 def test_frames_a_network_cannot_see_have_no_value(random_weights):

@@ -202,6 +202,15 @@ def test_needs_are_checked_before_training(config, toy, monkeypatch, refuses, ne
         refuses(config, found, HeadbenchError, methods=both)
 
 
+def test_a_capture_without_a_head_is_refused(config, refuses):
+    """By what its reader names as `errors`; the option of the command goes on."""
+    (Path(config.data) / "subject-wall").mkdir()
+    refuses(config, "capture of subject-wall: expected a capture on which .* found HB701: no head is seen.")
+    assert "--unchecked" in str(pytest.raises(InputError, runner.run, config).value)
+    runner.run(config, unchecked=True)
+    runner.run(config)  # nothing is left to train
+
+
 def test_several_views_for_a_monocular_method_are_refused(config, toy, monkeypatch, refuses):
     class TwoViews(toy.ToyClip):
         def __init__(self, path):

@@ -50,6 +50,34 @@ def test_any_value_of_a_frame_is_read_or_refused(capture, key, value):
     path.write_text(original)
 
 
+@pytest.mark.parametrize("everywhere", [False, True])
+@pytest.mark.parametrize(
+    ("lens", "refused"),
+    [
+        ({"k1": -0.35}, "k1"),
+        ({"camera_model": "OPENCV", "k1": 0.0, "p2": 1e-4}, "p2"),
+        ({"camera_model": "OPENCV_FISHEYE", "k1": 0.0}, "camera_model"),
+        ({"distortion_params": [0.0, 0.1]}, "distortion_params"),
+        ({"is_fisheye": True}, "is_fisheye"),
+        ({"k1": "0.1"}, "k1"),
+        ({"camera_model": "OPENCV", "k1": 0, "k2": 0.0, "p1": 0, "p2": 0, "is_fisheye": False}, None),
+        ({"camera_model": "PINHOLE", "k3": None, "distortion_params": [0, 0, 0]}, None),
+    ],
+)
+def test_lenses_that_are_no_pinhole_are_refused(capture, lens, refused, everywhere):
+    """Their images would be compared with renders of a pinhole without a word."""
+    if everywhere:
+        capture.edit("transforms_train.json", lambda document: document.update(lens))
+    else:
+        capture.edit("transforms_train.json", lambda document: document["frames"][-1].update(lens))
+    if refused is None:
+        read_capture(capture.union)
+        return
+    with pytest.raises(InputError, match=r"undistort|distortion") as caught:
+        read_capture(capture.union)
+    assert caught.value.key.rpartition(".")[2] == refused
+
+
 @pytest.mark.parametrize("name", ["x" * 5000, "a\0b", "."])
 @pytest.mark.parametrize("key", ["file_path", "fg_mask_path", "flame_param_path"])
 def test_paths_no_file_can_have_are_refused(capture, key, name):
