@@ -71,6 +71,7 @@ class GHAAvatar:
             unit=head.config.unit,
             expression_scale=tensors["expression_scale"].cpu(),
             device="cpu",
+            center=tensors["center"].cpu().numpy(),
         )
         driving = folder / DRIVING_FILE
         corrected = RefinedTracking.read(driving) if driving.exists() else None
@@ -144,8 +145,8 @@ RENDERING = (
 )
 """Settings that rendering depends on."""
 
-FRAME = ("origin", "background", "expression_scale", "code_low", "code_high")
-"""Small tensors: (3,) metres, (3,) colour that was trained on, (E,) divisors of the expression code, (E,) bounds of it
+FRAME = ("origin", "center", "background", "expression_scale", "code_low", "code_high")
+"""Small tensors: (3,) metres, (3,) metres (absent in avatars of earlier versions: 0), (3,) colour that was trained on, (E,) divisors of the expression code, (E,) bounds of it
 that colour and attributes follow."""
 
 
@@ -168,6 +169,7 @@ def read_avatar(path: Path, expression_size: int, device: str) -> tuple[Gaussian
     float32.
     """
     tensors, metadata = read_safetensors(path)
+    tensors = {"center": torch.zeros(3), **tensors}
     head = GaussianHead.of(_settings(path, metadata.get(CONFIG, "")), expression_size)
     columns = sum(POINTS.values()) + head.config.features
     shapes: dict[str, tuple[int | None, ...]] = {
@@ -176,7 +178,12 @@ def read_avatar(path: Path, expression_size: int, device: str) -> tuple[Gaussian
         "table": (None, columns),
     }
     of_code = ("expression_scale", "code_low", "code_high")
-    shapes |= {"origin": (3,), "background": (3,), **dict.fromkeys(of_code, (expression_size,))}
+    shapes |= {
+        "origin": (3,),
+        "center": (3,),
+        "background": (3,),
+        **dict.fromkeys(of_code, (expression_size,)),
+    }
     members = {name: Member("f", shape, MAX_MAGNITUDE, "f4") for name, shape in shapes.items()}
     # Where nothing bounds the code, these are float32's largest numbers.
     members |= dict.fromkeys(("code_low", "code_high"), Member("f", (expression_size,), dtype="f4"))

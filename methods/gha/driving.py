@@ -24,7 +24,7 @@ from ...datasets.head.rotations import (
     quaternion_to_axis_angle,
 )
 from ..shared.avatar_files import Subject
-from ..shared.rendering import View, view_of
+from ..shared.rendering import View, scene_center, view_of
 from . import kernel
 from .config import GHAConfig
 
@@ -50,7 +50,7 @@ class HeadMotion(NamedTuple):
 
     rotation: Tensor  # (3, 3) canonical frame to world
     translation: Tensor  # (3,) of the canonical frame's origin, metres
-    code: Tensor  # (6,) axis-angle and translation, what networks see of it
+    code: Tensor  # (6,) axis-angle and translation from `Driver.center`, what networks see of it
     quaternion: Tensor  # (4,) of the rotation
 
 
@@ -77,6 +77,7 @@ class Driver:
     shape, static_offset : (S,) identity and (V, 3) metres.
     expression_scale : (E,) that the expression code is divided by; None for ones.
     origin : (3,) of the canonical frame in the unposed head, metres.
+    center : (3,) metres that `HeadMotion.code` has translations relative to, see `scene_center`; None for the world's origin.
     """
 
     def __init__(
@@ -88,6 +89,7 @@ class Driver:
         unit: float,
         expression_scale: Tensor | None,
         device: str,
+        center: FloatArray | None = None,
     ):
         self.model = HeadModel(head, device=device)
         self._identity = {
@@ -97,6 +99,8 @@ class Driver:
         self.neutral = self.model.canonical(**self._identity)[0]
         check_size("subject", "shape, static_offset", self.neutral.cpu().numpy(), np.asarray(head.faces))
         self.origin = torch.as_tensor(np.asarray(origin)).to(self.neutral)
+        self.center = torch.as_tensor(np.zeros(3) if center is None else np.asarray(center)).to(self.neutral)
+        self._code_shift = torch.cat([torch.zeros_like(self.center), self.center])
         self.unit = unit
         self.expression_scale = expression_scale
 
@@ -124,7 +128,8 @@ class Driver:
             correction = signal.rotation.new_zeros(POSE_SIZE)
         parts = signal.rotation, signal.neck, signal.translation, *signal.joints, self.origin
         found = kernel.motion if kernel.usable(signal.rotation) else reference_motion
-        return HeadMotion(*found(torch.stack(parts), correction))
+        motion = HeadMotion(*found(torch.stack(parts), correction))
+        return motion._replace(code=motion.code - self._code_shift)
 
     def rest_arguments(self, codes: Tensor) -> dict[str, Tensor]:
         """Arguments of (B, E) expression codes with the head at rest: the inverse of what `signals` makes of them."""
@@ -264,9 +269,11 @@ class TrainingScene(NamedTuple):
     seed: int
 
     def frame(self) -> dict[str, Tensor]:
-        """What an avatar keeps of it: origin of the canonical frame, background and scale of the expression."""
+        """What an avatar keeps of it: origin of the canonical frame, centre of the head's motion, background, scale of the
+        expression."""
         return {
             "origin": self.driver.origin,
+            "center": self.driver.center,
             "background": self.background,
             "expression_scale": self.expression_scale,
             "code_low": self.code_low,
@@ -286,7 +293,8 @@ def training_scene(clip: Clip, config: GHAConfig, device: str, seed: int) -> Tra
     scale = torch.ones(code_size(clip.head), device=device)
     expressions = clip.head.expression_basis.shape[2]
     scale[expressions : expressions + ANGLES] = config.angle_unit
-    driver = Driver(*identity, neutral[rows].mean(0), config.unit, scale, device)
+    center = scene_center(clip.poses[timestep] for timestep in timesteps)
+    driver = Driver(*identity, neutral[rows].mean(0), config.unit, scale, device, center)
     opened = torch.zeros(1, len(scale), device=device)
     opened[0, expressions] = config.neutral_jaw / config.angle_unit
     signals = driver.signals(tracked)

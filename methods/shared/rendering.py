@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Generic, NamedTuple, TypeVar
@@ -145,16 +145,25 @@ def view_of(camera: Camera, device: str, background: Sequence[float] = ()) -> Vi
     return View(camera, transform.view(4, 4), K.view(3, 3), center, behind)
 
 
-def scene_extent(cameras: Mapping[str, Camera]) -> float:
+def scene_center(poses: Iterable[HeadPose]) -> FloatArray:
+    """(3,) metres near a head in these poses, from which places are measured where a world may have its origin far away.
+
+    Whole metres: a capture around the origin, as all published ones, keeps its numbers, and differences are exact.
+    """
+    places = np.array([pose.translation for pose in poses], np.float64)
+    return np.asarray(places.mean(axis=0).round())
+
+
+def scene_extent(cameras: Mapping[str, Camera], center: FloatArray | None = None) -> float:
     """1.1 times the largest distance of a training camera from their mean centre, metres.
 
-    A single camera has no such radius; half its distance to the origin stands in, so that learning rates and
-    size thresholds keep their scale.
+    A single camera has no such radius; half its distance to ``center``, the place of the head (`scene_center`; None: the
+    world's origin), stands in, so that learning rates and size thresholds keep their scale.
     """
     centers = np.stack([camera.center for camera in cameras.values()])
     radius = float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
     if radius < 1e-6:
-        radius = 0.5 * float(np.linalg.norm(centers[0]))
+        radius = 0.5 * float(np.linalg.norm(centers[0] - (0 if center is None else center)))
     return 1.1 * max(radius, 1e-3)
 
 

@@ -16,7 +16,7 @@ from .binding import Frames, WorldSplats
 from .config import DensifiedTraining, SplatTraining
 from .loop import Fit, Outcome, TrainingImages, train
 from .optimisation import Densifier, Optimiser
-from .rendering import View, scene_extent, view_of
+from .rendering import View, scene_center, scene_extent, view_of
 from .schedule import DensifySchedule, Sampler, Timeline, log_linear
 from .training_kernel import photometric_loss, splat_penalties
 
@@ -229,7 +229,7 @@ class BoundTraining(SplatTrainer):
     ):
         super().__init__(clip, settings, sampler, device)
         self._appearance = appearance
-        extent = scene_extent(self.cameras)
+        extent = scene_extent(self.cameras, scene_center(clip.poses[key.timestep] for key in self.keys))
         start = start or one_per_triangle(face_count, settings.initial_opacity, device)
         splats = {
             **_initial_geometry(start, settings, extent),

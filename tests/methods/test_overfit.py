@@ -10,7 +10,6 @@ from headbench.bench.runner import adaptation
 from headbench.bench.runner.adaptation import MethodNeeds
 from headbench.bench.runner.config import resolve_method
 from headbench.datasets.ga.reader import read_capture
-from headbench.datasets.specs import GA_LAYOUT
 from headbench.datasets.synthetic.capture import synthesize
 from headbench.methods.ga.spec import GA
 from headbench.methods.gbs.spec import GBS
@@ -54,7 +53,7 @@ def test_single_frame_overfit_of_a_path_traced_capture(tmp_path, spec, height, i
     (union,) = synthesize(tmp_path / "capture", cameras=2, timesteps=8, size=(96, height), workers=1)
     clip = read_capture(union)
     needs = MethodNeeds.of(spec)
-    planned = adaptation.plan(clip, needs, GA_LAYOUT, {})
+    planned = adaptation.plan(clip, needs, {})
     if planned is not None:
         clip = adaptation.carry_out(planned, needs, tmp_path / "adapted", "adapting").clip
     assert spec is not GBS or clip.head.version == "procedural2020"

@@ -161,6 +161,7 @@ def test_extent_is_the_largest_distance_from_the_mean_centre():
     # A single camera has one, too.
     assert scene_extent({"a": camera_at(0, 0, 2)}) == pytest.approx(1.1)
     assert scene_extent({"a": camera_at(0, 0, 0)}) > 0
+    assert scene_extent({"a": camera_at(7, 0, 2)}, np.array([7.0, 0, 0])) == pytest.approx(1.1)
 
 
 @pytest.mark.parametrize(
