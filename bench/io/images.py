@@ -126,11 +126,12 @@ def _decode(path: Path, stream: BinaryIO, info: ImageInfo, end: int) -> ByteArra
         raise InputError(path, "", "an image that decodes", f"damaged data ({error.err})"[:200]) from error
     if pixels is None or pixels.dtype != np.uint8 or pixels.shape[:2] != (info.height, info.width):
         raise InputError(path, "", "an image that decodes", "damaged data")
-    if info.channels == 2 and pixels.ndim == 2:
-        pixels = _grey_with_alpha(pixels, content)
-    elif info.channels == 3 and pixels.ndim == 3:
-        pixels = np.ascontiguousarray(pixels[..., :3])  # a table whose colours are all opaque
-    return pixels.astype(np.uint8, copy=False)
+    levels = pixels.astype(np.uint8, copy=False)
+    if info.channels == 2 and levels.ndim == 2:
+        return _grey_with_alpha(levels, content)
+    if info.channels == 3 and levels.shape[2:] == (4,):
+        return np.ascontiguousarray(levels[..., :3])  # a table whose colours are all opaque
+    return levels
 
 
 def _grey_with_alpha(grey: ByteArray, content: bytes) -> ByteArray:
@@ -299,11 +300,15 @@ def write_png(path: Path, image: ByteArray, kind: str = "") -> bytes:
 def read_bgr(path: Path, size: tuple[int, int] | None = None) -> ByteArray:
     """Read an (H, W, 3) 8-bit image in BGR order, without its alpha. Raises `InputError` as `read_pixels` does."""
     pixels = read_pixels(path, size)
-    if pixels.ndim == 2:
-        return cv2.cvtColor(pixels, cv2.COLOR_GRAY2BGR).astype(np.uint8, copy=False)
-    return np.ascontiguousarray(pixels[..., :3])
+    if pixels.ndim == 3 and pixels.shape[2] == 3:
+        return pixels
+    order = cv2.COLOR_GRAY2BGR if pixels.ndim == 2 else cv2.COLOR_BGRA2BGR
+    return cv2.cvtColor(pixels, order).astype(np.uint8, copy=False)
 
 
 def read_png(path: Path) -> ByteArray:
     """Read an (H, W, 3) 8-bit sRGB image, without its alpha. Raises `InputError` as `read_pixels` does."""
-    return np.asarray(cv2.cvtColor(read_bgr(path), cv2.COLOR_BGR2RGB), dtype=np.uint8)
+    pixels = read_pixels(path)
+    orders = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGB}
+    order = orders[1 if pixels.ndim == 2 else pixels.shape[2]]
+    return np.asarray(cv2.cvtColor(pixels, order), dtype=np.uint8)
