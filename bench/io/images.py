@@ -116,7 +116,7 @@ def read_pixels(path: Path, size: tuple[int, int] | None = None) -> ByteArray:
 def _decode(path: Path, stream: BinaryIO, info: ImageInfo, end: int) -> ByteArray:
     """Decode the first ``end`` bytes, which `_probe` has accepted."""
     stream.seek(0)
-    content = stream.read(end)
+    content = stream.read()[:end]
     if info.format == "JPEG" and content.count(_JPEG_SCAN) > MAX_SCANS:
         raise InputError(path, "", f"a JPEG of at most {MAX_SCANS} scans", f"{content.count(_JPEG_SCAN)}")
     try:

@@ -244,6 +244,8 @@ MASKS = {
         NOISE[..., 2],
     ),
     "one bit": (saved(Image.fromarray(ON)), 255 * ON),
+    "grey in opaque RGBA": (saved(picture("L").convert("RGBA")), np.array(picture("L"))),
+    "colours in opaque RGBA": (saved(picture("RGB").convert("RGBA")), 255 + 0 * NOISE[..., 0]),
 }
 
 
