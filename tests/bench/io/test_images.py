@@ -239,9 +239,9 @@ MASKS = {
     "grey table": (saved(picture("P", GREY_TABLE)), 90 * ON),
     "soft grey": (saved(picture("L")), np.array(picture("L"))),
     "soft grey in RGB": (saved(picture("L").convert("RGB")), np.array(picture("L"))),
-    "soft blue in RGB": (
-        saved(Image.fromarray(NOISE[..., :3] * np.array([0, 0, 1], np.uint8))),
-        NOISE[..., 2],
+    "soft red in RGB": (
+        saved(Image.fromarray(NOISE[..., :3] * np.array([1, 0, 0], np.uint8))),
+        NOISE[..., 0],
     ),
     "one bit": (saved(Image.fromarray(ON)), 255 * ON),
     "grey in opaque RGBA": (saved(picture("L").convert("RGBA")), np.array(picture("L"))),
